@@ -18,7 +18,7 @@ TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 CONSTRAINTS ?= constraints.txt
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(addprefix -c ,$(CONSTRAINTS))
 
-.PHONY: demo quick test lint unit coverage mutations bench results wheel docs release clean constraints
+.PHONY: demo quick test lint unit oldest coverage mutations bench results wheel docs release clean constraints
 
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
@@ -38,6 +38,16 @@ lint: $(TESTED)
 
 unit: $(TESTED)
 	$(BIN)/python -m pytest -n auto --dist loadfile
+
+# All tests with the lowest versions that pyproject.toml allows, but without the viewer, which needs NumPy 2; on Python 3.10.
+OLDEST := .venv-oldest
+oldest:
+	$(PYTHON) -m venv $(OLDEST)
+	$(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-check uv
+	printf 'rerun-sdk ; sys_platform == "never"\npyparsing < 3.3\n' > $(OLDEST)/without.txt # matplotlib 3.8 uses its old names
+	$(OLDEST)/bin/uv pip install --quiet --python $(OLDEST)/bin/python --compile-bytecode --resolution lowest-direct \
+		--override $(OLDEST)/without.txt -e '.[dev]'
+	$(OLDEST)/bin/python -m pytest -n auto --dist loadfile
 
 # All tests again, with the lines of vio/ and frontend/ that they reach; LEARNED=1 counts the learned front ends in.
 coverage: $(TESTED)
@@ -103,4 +113,4 @@ constraints: $(VENV)/.learned
 	mv constraints.new constraints.txt
 
 clean:
-	rm -rf $(VENV) demo build dist site *.egg-info
+	rm -rf $(VENV) $(OLDEST) demo build dist site *.egg-info

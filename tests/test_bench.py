@@ -359,7 +359,7 @@ def test_an_undefined_figure_says_why(data: Path, tmp_path: Path) -> None:
     assert record["absent"]["drift_percent"] == "the way is shorter than the drift's lengths"
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
 def test_a_report_of_many_systems_is_drawn(tmp_path: Path) -> None:
     """Their names fit into the figures, which otherwise collapse with a warning."""
     curve = {"seconds": [0, 1], "error_m": [0, 0.1], "quantiles_m": [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]}

@@ -66,12 +66,13 @@ def _events(frames: int = FRAMES) -> tuple[list[ImuSample], list[Any]]:
     return samples, [flight.observe(k, 0.3, noise) for k in range(frames)]
 
 
-@pytest.mark.parametrize("warm", [False, True])
-def test_threads_give_the_poses_of_one_call_after_the_other(flight: Path, warm: bool) -> None:
+@pytest.mark.parametrize(("warm", "most_hz"), [(False, None), (True, None), (False, 10.0)])
+def test_threads_give_the_poses_of_one_call_after_the_other(flight: Path, warm: bool, most_hz: float | None) -> None:
+    config = replace(Config(), dataset=replace(Config().dataset, max_frame_rate=most_hz))
     dataset = vio.open_dataset(flight)
     recording, events = dataset.recording, list(dataset.events())
     expected: list[FrameResult] = []
-    one = Odometry(recording.camera, T_cam0_imu=recording.T_cam0_imu, on_frame=expected.append)
+    one = Odometry(recording.camera, config, T_cam0_imu=recording.T_cam0_imu, on_frame=expected.append)
     for event in events:
         if isinstance(event, StereoFrame):
             one.add_stereo(event.time_ns, event.left, event.right)
@@ -80,7 +81,7 @@ def test_threads_give_the_poses_of_one_call_after_the_other(flight: Path, warm: 
     one.finish()
     results: list[FrameResult] = []
     with LiveOdometry(
-        recording.camera, T_cam0_imu=recording.T_cam0_imu, on_frame=results.append, drop="block", queue_frames=1
+        recording.camera, config, T_cam0_imu=recording.T_cam0_imu, on_frame=results.append, drop="block", queue_frames=1
     ) as live:
         if warm:
             live.warm_up()
@@ -97,6 +98,7 @@ def test_threads_give_the_poses_of_one_call_after_the_other(flight: Path, warm: 
         np.testing.assert_array_equal(a.estimate.T_world_imu, b.estimate.T_world_imu)
         np.testing.assert_array_equal(a.estimate.covariance, b.estimate.covariance)
         assert c is b.estimate
+        assert a.frame.index == b.frame.index
     assert live.latest() is results[-1].estimate
     assert (live.figures.results, live.figures.dropped, live.figures.waiting) == (len(expected), 0, 0)
     assert live.warnings == one.warnings
@@ -140,6 +142,26 @@ def test_calls_return_while_the_worker_is_busy(held: Held, drop: Any, kept: list
     assert held.times == [k * STEP_NS for k in kept]
     assert live.figures.dropped == 5 - len(kept)
     assert live.figures.results == len(kept)
+
+
+@pytest.mark.parametrize("copied", [True, False])
+def test_images_are_copied_unless_the_caller_leaves_them_alone(copied: bool) -> None:
+    taken: list[StereoFrame] = []
+
+    class Noting:
+        def process(self, frame: StereoFrame, prior: Any = None) -> FrontendOutput:
+            taken.append(frame)
+            raise DataError("seen enough")
+
+    left, right = IMAGES[0].copy(), IMAGES[1][::-1]
+    parts = Parts(frontend=Noting())
+    with LiveOdometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, parts=parts, copy_images=copied) as live:
+        live.add_stereo(0, left, right)
+    (frame,) = taken
+    assert (frame.left is left) != copied
+    assert frame.right is not None
+    assert frame.right.flags.c_contiguous
+    np.testing.assert_array_equal(frame.right, right)
 
 
 def test_blocking_waits_for_room() -> None:
@@ -272,14 +294,34 @@ def test_wrong_calls_are_refused_by_the_call_itself(held: Held, call: Any, messa
     assert held.times == [0, 2 * STEP_NS]
 
 
-def test_what_only_the_worker_can_refuse_is_counted_and_said(held: Held) -> None:
-    live = _images(held)
-    held.release()
-    live.add_stereo(0, IMAGE, IMAGE)
-    live.add_observations(STEP_NS, [1], [[1, 2, 0, 2]])
+class Refusing:
+    def select(self, seen: Any, motion: Any = None) -> Any:
+        raise DataError("not these")
+
+
+def test_what_only_the_worker_can_refuse_is_counted_and_said() -> None:
+    live = LiveOdometry(CAMERA, IMAGES_ALONE, parts=Parts(selector=Refusing()))
+    live.add_observations(0, [1], [[1, 2, 0, 2]])
     live.close()
     assert live.figures.refused == 1
-    assert live.warnings == ("observations came after images; one trajectory takes one of them",)
+    assert live.warnings == ("not these",)
+
+
+def test_one_stamp_far_ahead_costs_one_frame_and_one_sample() -> None:
+    samples, seen = _events()
+    results: list[FrameResult] = []
+    with LiveOdometry(CAMERA, T_cam0_imu=T_CAM0_IMU, on_frame=results.append, drop="none") as live:
+        for k, frame in enumerate(seen):
+            ahead_ns = 60_000_000_000 if k == 6 else 0
+            for s in samples:
+                if (k - 1) * STEP_NS < s.time_ns <= k * STEP_NS:
+                    live.add_imu(s.time_ns + ahead_ns * (s.time_ns == k * STEP_NS), s.gyro, s.accel)
+            live.add_observations(k * STEP_NS + ahead_ns, frame.ids, frame.z)
+    assert [r.frame.index for r in results] == [k for k in range(FRAMES) if k != 6]
+    assert [line.partition(" at ")[0] for line in live.warnings if "ahead of the last one" in line] == [
+        "sample",
+        "frame",
+    ]
 
 
 def test_reset_begins_a_new_trajectory() -> None:

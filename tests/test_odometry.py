@@ -212,7 +212,7 @@ IMAGE = np.zeros((200, 320), dtype=np.uint8)
         (lambda o: o.add_stereo(100, IMAGE, IMAGE), "not after the last one"),
         (lambda o: o.add_stereo(1.5, IMAGE, IMAGE), "integer number of nanoseconds"),
         (lambda o: o.add_stereo(2**70, IMAGE, IMAGE), "is no time of a clock"),
-        (lambda o: o.add_imu(2**63 - 1, ONE, ONE), "no times of a clock"),
+        (lambda o: o.add_imu(2**63 - 1, ONE, ONE), "no time of a clock"),
         (lambda o: o.add_stereo(200, IMAGE.astype(np.float64), IMAGE), "the left image has shape .* float64"),
         (lambda o: o.add_stereo(200, IMAGE, IMAGE[:, :300]), "the right image is 300x200, .* 320x200"),
         (lambda o: o.add_stereo(200, IMAGE[:10], IMAGE[:10]), "calibration is for 320x200"),
@@ -350,7 +350,11 @@ def test_one_blas_thread_inside_and_the_callers_number_outside(fails: bool, monk
     inside: list[int] = []
 
     def threads() -> list[int]:
-        return [info["num_threads"] for info in threadpool_info() if info["user_api"] == "blas"]
+        return [
+            info["num_threads"]
+            for info in threadpool_info()
+            if info["user_api"] == "blas" and "opencv" not in info["filepath"]
+        ]
 
     def on_frame(result: FrameResult) -> None:
         if fails:

@@ -216,7 +216,8 @@ def test_memory_does_not_grow_with_frames_beyond_the_map() -> None:
 
 
 def _blas_threads() -> set[int]:
-    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+    libraries = [library for library in threadpool_info() if library["user_api"] == "blas"]
+    return {library["num_threads"] for library in libraries if "opencv" not in library["filepath"]}  # 4.10 has its own
 
 
 @pytest.mark.parametrize("fails", [False, True])

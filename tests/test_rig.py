@@ -164,7 +164,8 @@ def test_raw_rig_from_matrices_is_rectified_as_a_recording_of_these_cameras() ->
     for interpolation in ("linear", "cubic", "lanczos4"):
         rectified = replace(rectifier, interpolation=interpolation)(*raw)
         for image, done, maps in zip(raw, rectified, (expected.map0, expected.map1), strict=True):
-            np.testing.assert_array_equal(done, remap(image, maps, interpolation), "maps of floats")
+            again = remap(image, maps, interpolation)  # by maps of floats, which OpenCV 5 does not round to 1/32 px
+            np.testing.assert_allclose(done.astype(int), again, rtol=0, atol=0 if cv2.__version__ < "5" else 16)
 
 
 @pytest.mark.parametrize(
@@ -275,7 +276,7 @@ def opencv_matrices() -> dict[str, FloatArray]:
     a, b = RIG.cam0, RIG.cam1
     D = [np.array([*c.coefficients, 0.0]) for c in (a, b)]
     R, T = T_CAM1_CAM0[:3, :3], T_CAM1_CAM0[:3, 3]
-    R1, R2, P1, P2, *_ = cv2.stereoRectify(a.K, D[0], b.K, D[1], (a.width, a.height), R, T)
+    R1, R2, P1, P2, *_ = cv2.stereoRectify(a.K, D[0], b.K, D[1], (a.width, a.height), R, T[:, None])
     return {"M1": a.K, "D1": D[0], "M2": b.K, "D2": D[1], "R": R, "T": T, "R1": R1, "R2": R2, "P1": P1, "P2": P2}
 
 

@@ -28,6 +28,7 @@ from vio.datasets.bags.cdr import decoded, fields_of
 from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
 from vio.datasets.rigs import load_rig
 from vio.errors import DataError, MissingDependencyError
+from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw
 from vio.live.live_odometry import LiveOdometry
 from vio.live.pairing import Pairing
@@ -250,17 +251,87 @@ def test_stamps_that_go_back_begin_anew_or_are_refused(caplog: pytest.LogCapture
     graph = Graph()
     taken, sensors, member = _sent(graph)
     out = publisher(Member(graph), {})
-    for time_ns in (10**10, 10**10 + 5, 10**10 + 5, 10**10 + 3, 10**9, 10**9 + 7):
+    for time_ns in (10**10, 10**10 + 5, 10**10 + 5, 10**10 + 3, 10**9, 10**10 + 8, 10**9, 10**9 + 7):
         out.imu("/imu0", "imu", ImuSample(time_ns, np.zeros(3), np.ones(3)))
     out.imu("/imu0", "imu", ImuSample(10**9 + 9, np.full(3, np.nan), np.ones(3)))
     member.spin(0.0)
-    assert taken.samples == [10**10, 10**10 + 5, 10**9, 10**9 + 7]
-    assert (taken.resets, sensors.refused) == (1, 3)
+    assert taken.samples == [10**10, 10**10 + 5, 10**10 + 8, 10**9 + 7]
+    assert (taken.resets, sensors.refused) == (1, 5)
     assert "the stamps went back by 9.0 s" in caplog.text
     _send(graph, "/cam0/image_raw", 10**9, "mono8", GRAY)
     _send(graph, "/cam0/image_raw", 10**9 + 1, "bgr8", GRAY)  # truncated: a third of its bytes
     member.spin(0.0)
-    assert sensors.refused == 4
+    assert sensors.refused == 6
+
+
+def test_one_stamp_far_ahead_begins_nothing_anew() -> None:
+    graph = Graph()
+    taken, sensors, member = _sent(graph)
+    out = publisher(Member(graph), {})
+    times = [10**9, 10**9 + 5, 10**11, 10**9 + 10, 10**9 + 15]
+    for time_ns in times:
+        out.imu("/imu0", "imu", ImuSample(time_ns, np.zeros(3), np.ones(3)))
+    member.spin(0.0)
+    assert taken.samples == times  # the odometry leaves the third one out
+    assert (taken.resets, sensors.refused) == (0, 0)
+
+
+@pytest.mark.parametrize("what", ["reset", "clock"])
+def test_the_node_goes_on_after_a_reset_and_after_a_step_of_the_clock(flight: Path, tmp_path: Path, what: str) -> None:
+    graph, taken, done = Graph(), list[bytes](), threading.Event()
+    receiver, player, asks = Member(graph), Member(graph), Member(graph)
+    receiver.subscribe("/vio/odometry", "", taken.append, "reliable")
+    settings = NodeSettings(TOPICS, quality="reliable", drop="block", out=tmp_path)
+    node = threading.Thread(
+        target=run_node,
+        args=(Member(graph), settings, Config(), load_rig(flight)),
+        kwargs={"should_stop": done.is_set, "say": lambda _: None},
+    )
+    node.start()
+    dataset = vio.open_dataset(flight)
+    play(player, dataset, TOPICS, rate=None, quality="reliable", should_stop=lambda: False, stop=8)
+
+    def received(count: int) -> list[tuple[int, FloatArray]]:
+        deadline = time.monotonic() + 60
+        while len(taken) < count and time.monotonic() < deadline:
+            receiver.spin(0.1)
+        return [_pose(data) for data in taken]
+
+    before = received(7)  # the last one waits for a sample after it
+    step_ns = 0
+    if what == "reset":
+        publisher(asks, {}).empty("/vio/reset")
+    else:
+        step_ns = 3600 * 10**9
+    moved = Shifted(dataset, step_ns)
+    play(player, moved, TOPICS, rate=None, quality="reliable", should_stop=lambda: False, wait=False)
+    poses = received(len(before) + 7)
+    done.set()
+    node.join()
+    first_ns = int(dataset.recording.frame_times_ns[8]) + step_ns
+    poses = [pose for pose in poses if pose[0] >= first_ns]
+    assert len(poses) >= 6
+    saved = read_trajectory(tmp_path / "trajectory.tum")
+    assert saved.times_ns is not None
+    if what == "reset":  # a new trajectory, from the origin
+        np.testing.assert_allclose(poses[0][1][:3, 3], 0.0, atol=1e-9)
+        assert saved.times_ns[0] == poses[0][0]
+    else:
+        assert saved.times_ns[0] == before[0][0]
+        assert np.linalg.norm(poses[-1][1][:3, 3] - before[-1][1][:3, 3]) < 0.5
+
+
+class Shifted:
+    """The second half of a recording, at later times."""
+
+    def __init__(self, dataset: Any, step_ns: int) -> None:
+        self._dataset, self._step_ns, self.recording = dataset, step_ns, dataset.recording
+
+    def events(self, start: int = 0, stop: int | None = None) -> Any:
+        first_ns = int(self.recording.frame_times_ns[8])
+        for event in self._dataset.events(8):
+            if event.time_ns > first_ns - 40_000_000:
+                yield replace(event, time_ns=event.time_ns + self._step_ns)
 
 
 def test_pairs_are_made_of_near_stamps() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import http.server
 import importlib.util
@@ -10,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,6 +29,7 @@ from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.files.trajectories import read_trajectory
 from vio.records import ImuSample, StereoFrame
 from vio.sources.interpolated import ImuInterpolation
+from vio.sources.recorder import FORMS, Form, Recorder
 from vio.sources.run import run_source
 from vio.sources.source import SourceEvent, SourceFrame, SourceSample, open_source
 
@@ -80,7 +83,7 @@ def test_a_live_run_is_repeated_from_its_recording(
     again = vio.run(vio.open_dataset(tmp_path / "kept"), Config()).trajectory
     assert len(live) == len(again)
     np.testing.assert_array_equal(live.T_world_body[:, :3, 3], again.T_world_body[:, :3, 3])
-    assert (tmp_path / "out" / "calibration.yaml").is_file()
+    assert (tmp_path / "out" / "camchain-imucam.yaml").is_file()
     assert (tmp_path / "run.rrd").stat().st_size > 10_000
     assert main(["live", f"video:{video}", *options]) == 1
     assert "kept: is not empty; give --record a new folder" in capsys.readouterr().err
@@ -109,7 +112,8 @@ class Replayed:
         self.closed = True
 
 
-def test_samples_are_recorded_with_all_digits_and_ending_early_keeps_everything(flight: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", FORMS)
+def test_recordings_have_all_digits_and_ending_early_keeps_everything(form: Form, flight: Path, tmp_path: Path) -> None:
     source = Replayed(flight)
     kept, out = tmp_path / "kept", tmp_path / "out"
     run = run_source(
@@ -119,6 +123,7 @@ def test_samples_are_recorded_with_all_digits_and_ending_early_keeps_everything(
         should_stop=lambda: source.given >= 12,
         say=lambda _: None,
         record=kept,
+        record_as=form,
         out=out,
         drop="none",
     )
@@ -129,6 +134,31 @@ def test_samples_are_recorded_with_all_digits_and_ending_early_keeps_everything(
     live = read_trajectory(out / "trajectory.tum")
     assert len(live) == len(again) == 12
     np.testing.assert_array_equal(live.T_world_body[:, :3, 3], again.T_world_body[:, :3, 3])
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_disk_that_cannot_be_written_ends_the_recording(
+    form: Form, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vio.sources.recorder._WAITING", 1)
+    with pytest.raises(DataError, match="cannot be written"):
+        Recorder(Path("/dev/null/kept"), load_rig(flight))
+    recorder = Recorder(tmp_path / "kept", load_rig(flight), form)
+    monkeypatch.setattr("vio.sources.recorder.cv2.imwrite", lambda *_: False)
+    monkeypatch.setattr("vio.datasets.bags.writer.BagWriter.image", _full_disk)
+    frame = SourceFrame(0, np.zeros((90, 160), dtype=np.uint8), None)
+
+    def record() -> None:
+        for k in range(1000):
+            recorder.add(replace(frame, time_ns=k))
+
+    for call in (record, recorder.close):
+        with pytest.raises(DataError, match="cannot be written"):
+            call()
+
+
+def _full_disk(*_: Any) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):

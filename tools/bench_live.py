@@ -1,6 +1,6 @@
 """Latency of `vio.LiveOdometry` against the frame rate, and a soak test.
 
-python -m tools.bench_live latency FLIGHT [FLIGHT …] --rates 10,20,30,60 [--map]
+python -m tools.bench_live latency FLIGHT [FLIGHT …] --rates 10,20,30,60 [--map] [--view]
 python -m tools.bench_live soak --frames 36000 --width 376
 
 `latency` plays a recording in real time, at its own frame rate and at those that divide it, once with the defaults and
@@ -26,6 +26,8 @@ from vio.geometry.lie import se3_inverse
 from vio.live.warm_up import SwayingCamera
 from vio.records import FrameResult, ImuSample, StereoFrame
 from vio.sim.rigs import small_rig
+from vio.view.live import RerunViewer, ViewedRig
+from vio.view.stream import open_stream
 
 _PARTS = 10  # of a soak test that are compared
 _STEP_NS, _SAMPLES = 50_000_000, 10  # a soak test's frame, and IMU samples in it
@@ -46,7 +48,7 @@ class Pauses:
             self.ms.append(1e3 * (time.perf_counter() - self._began))
 
 
-def play(flight: Path, every: int, config: str | None, map_file: Path | None) -> list[str]:
+def play(flight: Path, every: int, config: str | None, map_file: Path | None, view: Path | None) -> list[str]:
     """Play every n-th frame of a recording in real time; return the cells of a row."""
     dataset = vio.open_dataset(flight)
     recording, events = dataset.recording, list(dataset.events())
@@ -54,8 +56,18 @@ def play(flight: Path, every: int, config: str | None, map_file: Path | None) ->
     samples = [event for event in events if isinstance(event, ImuSample)]
     settings = vio.load_config(None if config is None else Path(config))
     calls: dict[str, list[float]] = {"frame": [], "sample": []}
-    with vio.LiveOdometry(recording.camera, settings, T_cam0_imu=recording.T_cam0_imu, map=map_file) as live:
+    watchers: list[RerunViewer] = []
+
+    def on_frame(result: FrameResult) -> None:
+        for watcher in watchers:
+            watcher.frame(result)
+
+    T_cam0_imu = recording.T_cam0_imu
+    with vio.LiveOdometry(recording.camera, settings, T_cam0_imu=T_cam0_imu, on_frame=on_frame, map=map_file) as live:
         live.warm_up()
+        if view is not None:
+            stream, _ = open_stream(str(view), flight.name)
+            watchers.append(RerunViewer(stream, ViewedRig(live.camera, live.T_cam0_body, live.motion, None)))
         began = time.perf_counter() + 0.1 - 1e-9 * frames[0].time_ns
 
         def feed(kind: str, stream: Sequence[StereoFrame | ImuSample]) -> None:
@@ -79,7 +91,8 @@ def play(flight: Path, every: int, config: str | None, map_file: Path | None) ->
         cores = (time.process_time() - before_s[0]) / (time.perf_counter() - before_s[1])
     found, rate = live.figures, 1e9 / float(np.median(np.diff([f.time_ns for f in frames])))
     size = f"{recording.camera.width}x{recording.camera.height}"
-    cells = [size, f"{rate:.0f}", config or "default", "yes" if map_file else "no", f"{len(frames)}"]
+    beside = [name for name, there in (("map", map_file), ("viewer", view)) if there]
+    cells = [size, f"{rate:.0f}", config or "default", " ".join(beside) or "-", f"{len(frames)}"]
     cells += [f"{found.dropped}", f"{cores:.2f}"]
     for value in (found.latency_median_ms, found.latency_95_ms, found.latency_worst_ms):
         cells.append("-" if value is None else f"{value:.0f}")
@@ -90,7 +103,7 @@ def play(flight: Path, every: int, config: str | None, map_file: Path | None) ->
 
 def latency(args: argparse.Namespace) -> None:
     """Print a table in Markdown."""
-    names = ("images", "Hz", "config", "map", "frames", "left out", "cores", "median", "95 %", "worst")
+    names = ("images", "Hz", "config", "beside", "frames", "left out", "cores", "median", "95 %", "worst")
     print("|", " | ".join((*names, "add_imu 95 % / worst", "add_stereo 95 % / worst")), "|")
     print("|", " | ".join(["---"] * (len(names) + 2)), "|")
     for flight in args.flights:
@@ -100,7 +113,8 @@ def latency(args: argparse.Namespace) -> None:
             for rate in args.rates:
                 with tempfile.TemporaryDirectory() as folder:
                     map_file = Path(folder) / "bench.map" if args.map else None
-                    print("|", " | ".join(play(flight, max(1, full // rate), config, map_file)), "|", flush=True)
+                    view = Path(folder) / "bench.rrd" if args.view else None
+                    print("|", " | ".join(play(flight, max(1, full // rate), config, map_file, view)), "|", flush=True)
 
 
 def soak(args: argparse.Namespace) -> None:
@@ -119,6 +133,7 @@ def soak(args: argparse.Namespace) -> None:
     names = (
         "simulated",
         "resident MiB",
+        "points",
         "CPU ms a frame",
         "ms a frame, median",
         "95 %",
@@ -127,7 +142,7 @@ def soak(args: argparse.Namespace) -> None:
     )
     print("|", " | ".join((*names, "collections")), "|")
     print("|", " | ".join(["---"] * (len(names) + 1)), "|")
-    with vio.LiveOdometry(pair, on_frame=on_frame, drop="block") as live:
+    with vio.LiveOdometry(pair, on_frame=on_frame, drop="block", keep_landmarks=args.keep_landmarks) as live:
         live.warm_up()
         pauses.ms.clear()
         source = SwayingCamera(live.camera, T_cam0_imu, 9.81)
@@ -141,7 +156,7 @@ def soak(args: argparse.Namespace) -> None:
                 left, right, _ = source.images(time_ns)
                 assert right is not None
                 live.add_stereo(time_ns, left, right)
-            live.landmarks()  # once all frames so far are done
+            points = len(live.landmarks().ids)  # once all frames so far are done
             with open("/proc/self/statm") as stream:
                 resident = int(stream.read().split()[1]) * resource.getpagesize() / 2**20
             used_ms = 1e3 * (time.process_time() - began_s) * _PARTS / args.frames
@@ -149,6 +164,7 @@ def soak(args: argparse.Namespace) -> None:
             cells = [
                 f"{(frame + 1) * _STEP_NS * 1e-9 / 60:.1f} min",
                 f"{resident:.0f}",
+                f"{points}",
                 f"{used_ms:.1f}",
                 *(f"{v:.1f}" for v in shown),
             ]
@@ -167,10 +183,12 @@ def main() -> int:
     one.add_argument("flights", type=Path, nargs="+")
     one.add_argument("--rates", type=lambda text: [int(word) for word in text.split(",")], default=[10, 20, 30, 60])
     one.add_argument("--map", action="store_true")
+    one.add_argument("--view", action="store_true", help="write what the viewer shows to a file (extra view)")
     one.set_defaults(run=latency)
     two = commands.add_parser("soak")
     two.add_argument("--frames", type=int, default=36_000)
     two.add_argument("--width", type=int, default=376)
+    two.add_argument("--keep-landmarks", type=int, default=100_000)
     two.set_defaults(run=soak)
     args = parser.parse_args()
     args.run(args)

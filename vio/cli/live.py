@@ -27,6 +27,9 @@ def add_parser(commands: Any) -> None:
     )
     add_settings_arguments(parser)
     parser.add_argument("--record", type=Path, metavar="DIR", help="keep images and samples, for vio run DIR")
+    parser.add_argument(
+        "--record-as", choices=("plain", "rosbag2", "mcap"), default="plain", help="folder or ROS 2 bag (default plain)"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="write trajectory and calibration there at the end")
     parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map")
     parser.add_argument("--localise", action="store_true", help="find poses in --map, and leave it as it is")
@@ -76,6 +79,7 @@ def execute(args: argparse.Namespace) -> int:
             say=lambda line: print(line, file=sys.stderr, flush=True),
             out=args.out,
             record=args.record,
+            record_as=args.record_as,
             map=None if args.map is None else MapUse(args.map, args.localise),
             drop=args.drop,
             on_start=show,

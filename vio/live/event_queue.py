@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import queue
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -23,11 +25,16 @@ class QueuedCall:
     frame: bool = False  # whether it brings a frame
     answer: Future[Any] | None = None  # cancelled where the call is never made
 
+    def cancel(self) -> None:
+        """Tell who waits for an answer that the call is never made."""
+        if self.answer is not None:
+            self.answer.cancel()
+
 
 class EventQueue:
     """Calls from any thread to one worker. Samples always find room; of frames, only so many wait.
 
-    The lock is held for a few instructions at a time, so `put` does not wait for the worker's work.
+    Samples are put without a lock, which a worker could hold when the computer halts it.
     """
 
     def __init__(self, most_frames: int, drop: Drop) -> None:
@@ -39,10 +46,10 @@ class EventQueue:
                 behind all others, "block" makes `put` wait for room.
         """
         self._most, self._drop = most_frames, drop
-        self._calls: deque[QueuedCall] = deque()
+        self._calls: queue.SimpleQueue[QueuedCall | None] = queue.SimpleQueue()  # None: the end
         self._frames: deque[QueuedCall] = deque()  # those of the calls that bring frames
         self._changed = threading.Condition()
-        self._closed = False
+        self._closed = self._discards = False
 
     def put(self, call: QueuedCall) -> bool:
         """Add a call; False: another frame, which waited longer, was left out for it.
@@ -50,45 +57,54 @@ class EventQueue:
         Raises:
             VioError: the queue is closed.
         """
+        if not call.frame and call.answer is None:
+            self._add(call)
+            return True
         with self._changed:
             fits = True
             while call.frame and self._drop == "block" and len(self._frames) >= self._most and not self._closed:
                 self._changed.wait()
-            if self._closed:
-                raise VioError("this odometry is closed; build a new one")
-            if call.frame:
+            if call.frame and not self._closed:
                 if self._drop == "oldest" and len(self._frames) >= self._most:
                     self._frames.popleft().make, fits = None, False
                 self._frames.append(call)
-            self._calls.append(call)
-            self._changed.notify_all()
+            self._add(call)
             return fits
+
+    def _add(self, call: QueuedCall) -> None:
+        if self._closed:
+            raise VioError("this odometry is closed; build a new one")
+        self._calls.put(call)
 
     def take(self) -> Callable[[], object] | None:
         """Wait for the oldest call and return it; None: the queue is closed, and nothing waits."""
-        with self._changed:
-            while True:
-                while self._calls:
-                    call = self._calls.popleft()
-                    if call.make is not None:
-                        if call.frame:
-                            self._frames.popleft()
-                            self._changed.notify_all()
-                        return call.make
-                if self._closed:
-                    return None
-                self._changed.wait()
+        while (call := self._calls.get()) is not None:
+            with self._changed if call.frame or call.answer else contextlib.nullcontext():
+                if self._discards:
+                    call.cancel()
+                    continue
+                if call.make is None:
+                    continue
+                if call.frame:
+                    self._frames.popleft()
+                    self._changed.notify_all()
+            return call.make
+        return None
 
     def close(self, *, discard: bool) -> None:
         """Let `take` end once nothing waits; with `discard`, what waits is forgotten."""
         with self._changed:
-            self._closed = True
+            self._closed, self._discards = True, self._discards or discard
+            while discard:
+                try:
+                    call = self._calls.get_nowait()
+                except queue.Empty:
+                    break
+                if call is not None:
+                    call.cancel()
             if discard:
-                for call in self._calls:
-                    if call.answer is not None:
-                        call.answer.cancel()
-                self._calls.clear()
                 self._frames.clear()
+            self._calls.put(None)
             self._changed.notify_all()
 
     @property

@@ -3,29 +3,192 @@
 from __future__ import annotations
 
 import operator
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from vio.errors import DataError
+from vio.datasets.frame_rate import FrameRateLimit
+from vio.errors import ConfigError, DataError
 from vio.filters.inputs import LARGEST
 from vio.geometry.lie import FloatArray
-from vio.records import Image, IntArray, Observations, observations
+from vio.records import (
+    Image,
+    ImuSample,
+    IntArray,
+    MotionSample,
+    MotionSource,
+    Observations,
+    VelocitySample,
+    observations,
+)
 
 _MOST_NS = 2**62  # differences of times stay within 64 bits
 _JUMP_NS, _JUMP_STEPS = 2_000_000_000, 5  # a stamp so far ahead, and so many times the last step, is to be confirmed
 
 
-class JumpGuard:
+Kind: TypeAlias = Literal["stereo", "mono", "rgbd"]
+Shapes: TypeAlias = "tuple[tuple[int, int] | None, ...]"  # height and width of each camera's images; None: any
+
+_CAME = {"stereo": "two images", "mono": "one image", "rgbd": "an image with depths"}
+_TAKES = {
+    "stereo": "two images; give both, or load_rig(..., cameras=1)",
+    "mono": "one image without depth_m; depths need a rig with a depth_factor",
+    "rgbd": "an image with its depth_m",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class GivenFrame:
+    """A frame as a program gave it, checked and numbered."""
+
+    index: int
+    time_ns: int
+    images: tuple[npt.NDArray[np.uint8], ...] = ()  # left, right: (H, W) gray or (H, W, 3) BGR
+    depth_m: FloatArray | None = None
+    seen: Observations | None = None  # in the place of images
+
+
+class Inputs:
+    """Checks, copies and numbers what a live program gives; a call that raises has changed nothing.
+
+    Frames may come from one thread and samples from another, each in order of time.
+    """
+
+    def __init__(
+        self,
+        camera: Kind,
+        shapes: Shapes,
+        motion: MotionSource | None,
+        offset_ns: int,
+        most_hz: float | None,
+        say: Callable[[str], None],
+    ) -> None:
+        """Begin a trajectory.
+
+        Args:
+            camera: what a frame consists of.
+            shapes: of the images, as they are given.
+            motion: the sensor that samples may come from; None: none.
+            offset_ns: subtracted from the samples' stamps, so that they are on the camera's clock.
+            most_hz: frames a second that are used; None: all.
+            say: takes a line about a stamp that is left out.
+        """
+        self._camera, self._shapes, self._motion, self._offset_ns = camera, shapes, motion, offset_ns
+        self._limit, self._say = FrameRateLimit(most_hz), say
+        self._frames = _Stamps("frame")
+        self._samples = _Stamps("sample")
+        self._count = 0  # of frames
+        self._kind: str | None = None  # of frames: images or observations
+
+    def images(
+        self,
+        t_ns: Any,
+        left: npt.ArrayLike,
+        right: npt.ArrayLike | None = None,
+        depth_m: npt.ArrayLike | None = None,
+        *,
+        copy: bool = True,
+    ) -> GivenFrame | None:
+        """Return a frame of images; None: its stamp jumps ahead, or it comes sooner than the frame rate allows.
+
+        Without `copy`, contiguous arrays with memory of their own are taken as they are.
+
+        Raises:
+            DataError: a wrong type, shape or size, a time not after the last frame's, or images of another rig's kind.
+        """
+        given = "stereo" if right is not None else "mono" if depth_m is None else "rgbd"
+        if given != self._camera:
+            raise DataError(f"{_CAME[given]} came, but this rig takes {_TAKES[self._camera]}")
+        images = [_checked_image(left, "left", self._shapes[0])]
+        if right is not None:
+            images.append(_checked_image(right, "right", self._shapes[1]))
+            if self._shapes[0] is None and images[0].shape[:2] != images[1].shape[:2]:
+                sizes = [image.shape[:2] for image in images]
+                raise DataError(f"the images differ in size: {sizes[0]} left, {sizes[1]} right")
+        depth = None if depth_m is None else checked_depths(depth_m, images[0].shape[:2])
+        numbered = self._numbered(t_ns, "images")
+        if numbered is None:
+            return None
+        taken = [_copied(i) if copy or not (i.flags.carray and i.flags.owndata) else i for i in images]
+        return GivenFrame(*numbered, tuple(taken), depth)
+
+    def observations(
+        self, t_ns: Any, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None
+    ) -> GivenFrame | None:
+        """Return a frame of observations; None: as of `images`.
+
+        Raises:
+            DataError: shapes disagree, an id occurs twice, a pixel is not finite, or a time not after the last one.
+        """
+        seen = checked_observations(self._count, t_ns, ids, z, has_right)
+        numbered = self._numbered(t_ns, "observations")
+        return None if numbered is None else GivenFrame(*numbered, seen=replace(seen, time_ns=numbered[1]))
+
+    def samples(
+        self, source: MotionSource, t_ns: Any, first: npt.ArrayLike, second: npt.ArrayLike
+    ) -> list[MotionSample]:
+        """Return samples on the camera's clock, without those whose stamps jump ahead.
+
+        Args:
+            source: the sensor.
+            t_ns: time, or times (N,), in nanoseconds.
+            first: gyro or linear velocity, (3,) or (N, 3).
+            second: accelerometer or angular velocity, likewise.
+
+        Raises:
+            DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
+            ConfigError: samples of this sensor are not used.
+        """
+        if self._motion != source:
+            raise ConfigError(
+                f"{source} samples came, but this odometry runs on motion {self._motion or 'none'}; set the "
+                "configuration's motion, and for an IMU give the rig its T_cam0_imu"
+            )
+        names = ("gyro", "accel") if source == "imu" else ("linear", "angular")
+        times, rows = checked_samples(t_ns, dict(zip(names, (first, second), strict=True)))
+        if times:
+            self._samples.check_order(times[0])
+        sample = ImuSample if source == "imu" else VelocitySample
+        return [
+            sample(time_ns - self._offset_ns, a, b)
+            for time_ns, a, b in zip(times, *rows, strict=True)
+            if self._samples.takes(time_ns, self._say)
+        ]
+
+    def _numbered(self, t_ns: Any, kind: str) -> tuple[int, int] | None:
+        """Return the number and the time of a frame; None: it is left out, and keeps its number."""
+        time_ns = checked_time(t_ns)
+        self._frames.check_order(time_ns)
+        if self._kind not in (None, kind):
+            raise DataError(f"{kind} came after {self._kind}; one trajectory takes one of them")
+        self._kind = kind
+        self._count += 1
+        if not (self._frames.takes(time_ns, self._say) and self._limit.takes(time_ns)):
+            return None
+        return self._count - 1, time_ns
+
+
+class _Stamps:
     """Leaves out a stamp that jumps ahead until the next one confirms it, lest all later ones be refused for it."""
 
-    def __init__(self) -> None:
+    def __init__(self, of: str) -> None:
+        self._of = of
         self._last_ns: int | None = None  # taken
         self._step_ns = 0
         self._held_ns: int | None = None  # left out
 
-    def takes(self, time_ns: int) -> bool:
+    def check_order(self, time_ns: int) -> None:
+        """Raise DataError unless a stamp is after the last one that was taken."""
+        if self._last_ns is not None and time_ns <= self._last_ns:
+            raise DataError(
+                f"{self._of} at {time_ns} ns is not after the last one at {self._last_ns} ns; give them in order of "
+                "time, each once"
+            )
+
+    def takes(self, time_ns: int, say: Callable[[str], None]) -> bool:
         """Whether an event may be taken; its time is after the last one that was."""
         last_ns = self._last_ns
         step_ns = 0 if last_ns is None else time_ns - last_ns
@@ -33,18 +196,15 @@ class JumpGuard:
             confirmed = self._held_ns is not None and 0 < time_ns - self._held_ns <= _JUMP_NS
             if not confirmed:
                 self._held_ns = time_ns
+                say(
+                    f"{self._of} at {time_ns} ns: its stamp is {step_ns * 1e-9:.1f} s ahead of the last one; left out, "
+                    "as are others so far ahead until two in a row agree"
+                )
                 return False
             step_ns = self._step_ns
         self._last_ns, self._held_ns = time_ns, None
         self._step_ns = step_ns or self._step_ns
         return True
-
-    @property
-    def ahead_s(self) -> float:
-        """By how much the stamp that was left out is ahead of the last one."""
-        assert self._held_ns is not None
-        assert self._last_ns is not None
-        return (self._held_ns - self._last_ns) * 1e-9
 
 
 def checked_time(t_ns: Any) -> int:
@@ -68,29 +228,34 @@ def checked_samples(t_ns: Any, values: dict[str, npt.ArrayLike]) -> tuple[list[i
     Raises:
         DataError: a wrong shape or type, a value that is not finite, or times that do not increase.
     """
+    if hasattr(t_ns, "__index__") and not getattr(t_ns, "ndim", 0):  # one sample, as drivers give it
+        time_ns = checked_time(t_ns)
+        return [time_ns], [_checked_values(name, value, (3,), time_ns)[None] for name, value in values.items()]
     times: IntArray = np.asarray(t_ns)
-    if not np.issubdtype(times.dtype, np.integer) or times.ndim > 1:
+    if not np.issubdtype(times.dtype, np.integer) or times.ndim != 1:
         raise DataError(f"times must be integer nanoseconds, () or (N,), got {times.dtype} {times.shape}")
-    rows = []
-    for name, value in values.items():
-        try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise DataError(f"{name} is not numeric: {error}") from error
-        if array.shape != (*times.shape, 3):
-            raise DataError(f"{name} has shape {array.shape}, expected {(*times.shape, 3)}")
-        if not (np.abs(array) < LARGEST).all():  # nor is NaN
-            at = f"{name} at {np.atleast_1d(times)[0]} ns"
-            raise DataError(f"{at} is not finite, or beyond any sensor ({LARGEST:g}): {array}")
-        rows.append(array.reshape(-1, 3).copy())
-    if times.ndim == 0 and abs(time_ns := int(times)) <= _MOST_NS:  # one sample, as drivers give it
-        return [time_ns], rows
-    times = np.atleast_1d(times)
+    first_ns = times[0] if len(times) else 0
+    rows = [_checked_values(name, value, (len(times), 3), first_ns) for name, value in values.items()]
     if np.any((times > _MOST_NS) | (times < -_MOST_NS)):
         raise DataError(f"{times[0]} to {times[-1]} ns are no times of a clock; give nanoseconds")
     if (np.diff(times) <= 0).any():
         raise DataError("times of samples must increase; sort them and give each once")
     return times.tolist(), rows
+
+
+def _checked_values(name: str, value: npt.ArrayLike, shape: tuple[int, ...], time_ns: int) -> FloatArray:
+    """Return a copy of the values of samples, the first of which is at a time."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{name} is not numeric: {error}") from error
+    if array.shape != shape:
+        raise DataError(f"{name} has shape {array.shape}, expected {shape}")
+    # Of a single sample, without NumPy's functions: they take a driver's thread several times as long.
+    fits = all(abs(x) < LARGEST for x in array.tolist()) if len(shape) == 1 else (np.abs(array) < LARGEST).all()
+    if not fits:  # nor is NaN
+        raise DataError(f"{name} at {time_ns} ns is not finite, or beyond any sensor ({LARGEST:g}): {array}")
+    return array
 
 
 def checked_observations(
@@ -112,32 +277,33 @@ def checked_observations(
     return seen
 
 
-def check_image(image: npt.ArrayLike, name: str) -> npt.NDArray[np.uint8]:
-    """Return an image as it is, (H, W) gray or (H, W, 3) BGR.
-
-    Raises:
-        DataError: it is neither 8-bit gray nor BGR.
-    """
+def _checked_image(image: npt.ArrayLike, name: str, shape: tuple[int, int] | None) -> npt.NDArray[np.uint8]:
+    """Return an image as it is, (H, W) gray or (H, W, 3) BGR, of the calibration's height and width."""
     array = np.asarray(image)
     if array.dtype != np.uint8 or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)) or not array.size:
         raise DataError(
             f"the {name} image has shape {array.shape} and type {array.dtype}; give uint8, (H, W) gray or (H, W, 3) BGR"
         )
+    if shape is not None and array.shape[:2] != shape:
+        raise DataError(
+            f"the {name} image is {array.shape[1]}x{array.shape[0]}, but the calibration is for "
+            f"{shape[1]}x{shape[0]}; check that calibration and camera belong together"
+        )
     return array
 
 
-def gray(image: npt.ArrayLike, name: str) -> Image:
-    """Return an image as (H, W) uint8.
+def _copied(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return a copy of an image, made without letting another thread run, which would give way after 5 ms only."""
+    return np.frombuffer(bytearray(image.data), dtype=np.uint8).reshape(image.shape)
 
-    Raises:
-        DataError: it is neither 8-bit gray nor BGR.
-    """
-    array = check_image(image, name)
-    if array.ndim == 3:
-        import cv2
 
-        array = np.asarray(cv2.cvtColor(array, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-    return np.array(array, dtype=np.uint8, order="C")  # a copy: the caller may fill its buffer again
+def gray(image: npt.NDArray[np.uint8]) -> Image:
+    """Return an image (H, W) gray or (H, W, 3) BGR as (H, W)."""
+    if image.ndim == 2:
+        return image
+    import cv2
+
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
 def checked_depths(depth_m: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
@@ -150,12 +316,3 @@ def checked_depths(depth_m: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray
     if array.shape != shape:
         raise DataError(f"the depths have shape {array.shape}, but the image {shape}; register them to the image")
     return array
-
-
-def check_size(image: npt.NDArray[np.uint8], expected: tuple[int, int], name: str) -> None:
-    """Raise DataError unless an image has the height and width that the calibration states."""
-    if image.shape[:2] != expected:
-        raise DataError(
-            f"the {name} image is {image.shape[1]}x{image.shape[0]}, but the calibration is for "
-            f"{expected[1]}x{expected[0]}; check that calibration and camera belong together"
-        )

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +15,6 @@ import numpy.typing as npt
 from vio.calibration.stereo_field import CalibratedRig
 from vio.cameras.rig import Rig
 from vio.config import Config
-from vio.datasets.frame_rate import FrameRateLimit
 from vio.errors import ConfigError, DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -24,14 +22,14 @@ from vio.live.build import CONFIGURED, MapUse, Parts
 from vio.live.collector import QuietCollector
 from vio.live.event_queue import DROPS, Drop
 from vio.live.figures import LiveFigures, LiveMonitor
-from vio.live.inputs import check_image, check_size, checked_depths, checked_observations, checked_samples, checked_time
+from vio.live.inputs import GivenFrame, checked_time
 from vio.live.odometry import Odometry
 from vio.live.prediction import PredictedPose
 from vio.live.shared_prediction import SharedPredictor
 from vio.live.stream import EstimateStream
 from vio.live.warm_up import warm_up
 from vio.live.worker import Worker
-from vio.records import Estimate, FrameResult, ImuSample, Landmarks, MotionSample, MotionSource, VelocitySample
+from vio.records import Estimate, FrameResult, Landmarks, MotionSample, MotionSource
 
 log = logging.getLogger(__name__)
 
@@ -59,6 +57,7 @@ class LiveOdometry:
         drop: Drop = "oldest",
         queue_frames: int = 3,
         keep_landmarks: int = 100_000,
+        copy_images: bool = True,
     ) -> None:
         """Start the worker; the first frame begins the trajectory.
 
@@ -75,6 +74,7 @@ class LiveOdometry:
                 so that latency is bounded; "none" leaves out none; "block" makes the call wait, for recordings.
             queue_frames: that may wait.
             keep_landmarks: of the points that do not change any more, how many are kept for `landmarks`, at least.
+            copy_images: False: the caller does not write into an array again that it has added.
 
         Raises:
             VioError: as `Odometry`.
@@ -101,7 +101,7 @@ class LiveOdometry:
         self._collector = QuietCollector()
         self._streams: list[EstimateStream] = []
         self._points: deque[Landmarks] = deque()  # that do not change any more
-        self._keep_landmarks = keep_landmarks
+        self._keep_landmarks, self._copies = keep_landmarks, copy_images
         self._lines: list[str] = []
         self._forget()
         self._worker = Worker(queue_frames, drop, finish=self._odometry.finish, close=self._let_go)
@@ -132,10 +132,7 @@ class LiveOdometry:
         Raises:
             VioError: as `Odometry.add_imu`, or the worker has ended.
         """
-        self._odometry.expect("imu")
-        times, (a, b) = checked_samples(t_ns, {"gyro": gyro, "accel": accel})
-        offset = self._odometry.time_offset_ns
-        self._add_samples(times, [ImuSample(t - offset, *row) for t, *row in zip(times, a, b, strict=True)])
+        self._add_samples(self._odometry.inputs.samples("imu", t_ns, gyro, accel))
 
     def add_velocity(self, t_ns: int | npt.ArrayLike, linear: npt.ArrayLike, angular: npt.ArrayLike) -> None:
         """Take one sample of body velocity, or several in order of time, see `Odometry.add_velocity`.
@@ -143,23 +140,15 @@ class LiveOdometry:
         Raises:
             VioError: as `Odometry.add_velocity`, or the worker has ended.
         """
-        self._odometry.expect("velocity")
-        times, (a, b) = checked_samples(t_ns, {"linear": linear, "angular": angular})
-        offset = self._odometry.time_offset_ns
-        self._add_samples(times, [VelocitySample(t - offset, *row) for t, *row in zip(times, a, b, strict=True)])
+        self._add_samples(self._odometry.inputs.samples("velocity", t_ns, linear, angular))
 
     def add_stereo(self, t_ns: int, left: npt.ArrayLike, right: npt.ArrayLike) -> None:
-        """Take a pair of images, see `Odometry.add_stereo`; they are copied, and processed by the worker.
+        """Take a pair of images, see `Odometry.add_stereo`; they are copied first, see `copy_images`.
 
         Raises:
             VioError: a wrong type, shape or size, a time not after the last frame's, or the worker has ended.
         """
-        if self._odometry.camera.kind != "stereo":
-            raise DataError("this rig has one camera; give its images to add_images")
-        images = [
-            _copied(self._checked(image, name, k)) for k, (image, name) in enumerate(((left, "left"), (right, "right")))
-        ]
-        self._add_frame(t_ns, lambda time_ns: self._odometry.add_stereo(time_ns, *images))
+        self.add_images(t_ns, left, right)
 
     def add_images(
         self,
@@ -174,16 +163,7 @@ class LiveOdometry:
         Raises:
             VioError: as `add_stereo`, or images of another rig's kind.
         """
-        if right is not None:
-            self.add_stereo(t_ns, left, right)
-            return
-        kind = self._odometry.camera.kind
-        if kind == "stereo" or (depth_m is not None) != (kind == "rgbd"):
-            needed = {"stereo": "two images", "rgbd": "an image with depth_m", "mono": "one image without depths"}[kind]
-            raise DataError(f"this rig takes {needed}")
-        image = _copied(self._checked(left, "left", 0))
-        depth = None if depth_m is None else checked_depths(depth_m, image.shape[:2])
-        self._add_frame(t_ns, lambda time_ns: self._odometry.add_images(time_ns, image, depth_m=depth))
+        self._add_frame(self._odometry.inputs.images(t_ns, left, right, depth_m, copy=self._copies))
 
     def add_observations(
         self, t_ns: int, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None = None
@@ -194,10 +174,7 @@ class LiveOdometry:
             VioError: shapes disagree, an id occurs twice, a pixel is not finite, a time not after the last one, or the
                 worker has ended.
         """
-        seen = checked_observations(0, t_ns, ids, z, has_right)
-        self._add_frame(
-            t_ns, lambda time_ns: self._odometry.add_observations(time_ns, seen.ids, seen.z, seen.has_right)
-        )
+        self._add_frame(self._odometry.inputs.observations(t_ns, ids, z, has_right))
 
     def reset(self) -> None:
         """Forget all: the next frame begins a new trajectory in a new world frame.
@@ -209,12 +186,12 @@ class LiveOdometry:
 
     def _reset(self) -> None:
         self._odometry.reset()
+        for stream in self._streams:
+            stream.reset()
         self._forget()
 
     def _forget(self) -> None:
         """Begin with an empty trajectory."""
-        self._limit = FrameRateLimit(self._config.dataset.max_frame_rate)
-        self._last_ns: dict[str, int] = {}
         self._predictor = SharedPredictor(self._config.msckf.gravity_mps2)
         self._points.clear()
 
@@ -316,46 +293,24 @@ class LiveOdometry:
 
     # How
 
-    def _checked(self, image: npt.ArrayLike, name: str, camera: int) -> npt.NDArray[np.uint8]:
-        """Return an image that fits the camera, as it was given."""
-        array, shape = check_image(image, name), self._odometry.image_shapes[camera]
-        if shape is not None:
-            check_size(array, shape, name)
-        return array
-
-    def _check_order(self, of: str, times: list[int]) -> None:
-        last = self._last_ns.get(of)
-        if times and last is not None and times[0] <= last:
-            raise DataError(f"{of} at {times[0]} ns is not after the last one at {last} ns; give them in order of time")
-        if times:
-            self._last_ns[of] = times[-1]
-
-    def _add_samples(self, times: list[int], samples: Sequence[MotionSample]) -> None:
+    def _add_samples(self, samples: Sequence[MotionSample]) -> None:
         """Queue samples, and let predictions begin with them at once."""
-        self._check_order("sample", times)
-        self._put(lambda: self._odometry.add_samples(samples))
+        self._worker.put(lambda: self._process(samples))
         for sample in samples:
             self._predictor.add(sample)
 
-    def _add_frame(self, t_ns: Any, add: Callable[[int], object]) -> None:
-        """Queue a frame, unless the limit on the frame rate leaves it out."""
-        time_ns = checked_time(t_ns)
-        self._check_order("frame", [time_ns])
-        if not self._limit.takes(time_ns):
-            return
-        self._monitor.arrived(time_ns)
-        self._monitor.queued(fits=self._put(lambda: add(time_ns), frame=True))
-
-    def _put(self, add: Callable[[], object], *, frame: bool = False) -> bool:
-        """Queue a call that adds; False: a frame was left out for it."""
-        return self._worker.put(lambda: self._make(add), frame=frame)
+    def _add_frame(self, given: GivenFrame | None) -> None:
+        """Queue a frame, unless it is left out."""
+        if given is not None:
+            self._monitor.arrived(given.time_ns)
+            self._monitor.queued(fits=self._worker.put(lambda: self._process(given), frame=True))
 
     # In the worker
 
-    def _make(self, add: Callable[[], object]) -> None:
-        """Make a call that adds; what only the odometry itself refuses is counted and logged."""
+    def _process(self, given: GivenFrame | Sequence[MotionSample]) -> None:
+        """Process what was added; what only the odometry itself refuses is counted and logged."""
         try:
-            add()
+            self._odometry.process(given)
         except DataError as error:
             self._monitor.refused += 1
             self._say(str(error))
@@ -397,8 +352,3 @@ class LiveOdometry:
     def _say(self, line: str) -> None:
         log.warning("%s", line)
         self._lines.append(line)
-
-
-def _copied(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return a copy of an image, made without letting another thread run, which would give way after 5 ms only."""
-    return np.frombuffer(image.tobytes(), dtype=np.uint8).reshape(image.shape)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,6 @@ from vio.calibration.estimated_rig import estimated_rig
 from vio.calibration.stereo_field import CalibratedRig
 from vio.cameras.rig import Rig, rig_of_rectified
 from vio.config import Config
-from vio.datasets.frame_rate import FrameRateLimit
 from vio.errors import ConfigError, DataError
 from vio.filters.inputs import checked_extrinsics
 from vio.frontend import build_frontend
@@ -25,15 +24,7 @@ from vio.frontend.settings import FrontendSettings
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, live_source
-from vio.live.inputs import (
-    JumpGuard,
-    check_size,
-    checked_depths,
-    checked_observations,
-    checked_samples,
-    checked_time,
-    gray,
-)
+from vio.live.inputs import GivenFrame, Inputs, Shapes, checked_time, gray
 from vio.live.prediction import PosePredictor, PredictedPose
 from vio.numerics.threads import BlasLimit
 from vio.protocols import Frontend
@@ -42,8 +33,6 @@ from vio.records import (
     Event,
     FrameResult,
     FrontendOutput,
-    Image,
-    ImuSample,
     Landmarks,
     LoopEvent,
     MotionSample,
@@ -51,8 +40,6 @@ from vio.records import (
     Observations,
     StereoFrame,
     TrackPrior,
-    VelocitySample,
-    observations,
 )
 
 if TYPE_CHECKING:
@@ -142,11 +129,14 @@ class Odometry:
         parts = replace(self._parts, frontend=self._parts.frontend or self._frontend)
         self._processor = build_processor(self._source, self._config, parts, self._map)
         self._predictor = PosePredictor(self._config.msckf.gravity_mps2)
-        self._kind: str | None = None  # of frames: images or observations
-        self._frames = 0
-        self._limit = FrameRateLimit(self._config.dataset.max_frame_rate)
-        self._last_ns: dict[str, int] = {}  # newest time of each kind of event
-        self._jumps = {"frame": JumpGuard(), "sample": JumpGuard()}
+        self.inputs = Inputs(
+            self.camera.kind,
+            self._image_shapes(),
+            self.motion,
+            self._offset_ns,
+            self._config.dataset.max_frame_rate,
+            self._processor.say,
+        )
 
     # What goes in
 
@@ -162,9 +152,8 @@ class Odometry:
             DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
             ConfigError: this odometry does not use an IMU.
         """
-        self.expect("imu")
-        times, (a, b) = checked_samples(t_ns, {"gyro": gyro, "accel": accel})
-        self.add_samples([ImuSample(t - self._offset_ns, *row) for t, *row in zip(times, a, b, strict=True)])
+        with self._lock:
+            self.process(self.inputs.samples("imu", t_ns, gyro, accel))
 
     def add_velocity(self, t_ns: int | npt.ArrayLike, linear: npt.ArrayLike, angular: npt.ArrayLike) -> None:
         """Take one sample of body velocity, or several in order of time.
@@ -178,29 +167,8 @@ class Odometry:
             DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
             ConfigError: this odometry does not use velocities; set `motion` to velocity.
         """
-        self.expect("velocity")
-        times, (a, b) = checked_samples(t_ns, {"linear": linear, "angular": angular})
-        self.add_samples([VelocitySample(t - self._offset_ns, *row) for t, *row in zip(times, a, b, strict=True)])
-
-    def add_samples(self, samples: Sequence[MotionSample]) -> None:
-        """Take motion samples in order of time, of the kind that `motion` says, on the camera's clock.
-
-        Raises:
-            DataError: a time not after the last sample's.
-        """
         with self._lock:
-            last = self._last_ns.get("sample")
-            if last is not None and samples and samples[0].time_ns <= last:
-                raise DataError(
-                    f"sample at {samples[0].time_ns + self._offset_ns} ns is not after the last one at "
-                    f"{last + self._offset_ns} ns; give them in order of time, each once"
-                )
-            for sample in samples:
-                if not self._is_confirmed("sample", sample.time_ns):
-                    continue
-                if (usable := self._processor.usable(sample)) is not None:
-                    self._predictor.sample(usable)
-                self._deliver(self._add(sample))
+            self.process(self.inputs.samples("velocity", t_ns, linear, angular))
 
     def add_stereo(self, t_ns: int, left: npt.ArrayLike, right: npt.ArrayLike) -> Estimate | None:
         """Take a pair of images and return the newest estimate that it brought; None: it waits for IMU samples.
@@ -216,23 +184,7 @@ class Odometry:
         Raises:
             DataError: a wrong type, shape or size, or a time not after the last frame's.
         """
-        with self._lock:
-            if self.camera.kind != "stereo":
-                raise DataError("this rig has one camera; give its images to add_images")
-            images = [gray(image, name) for image, name in ((left, "left"), (right, "right"))]
-            if images[0].shape != images[1].shape and self._rectifier is None:
-                raise DataError(f"the images differ in size: {images[0].shape} left, {images[1].shape} right")
-            if self._rectifier is not None:
-                for image, name, lens in zip(
-                    images, ("left", "right"), (self._rectifier.rig.cam0, self._rectifier.rig.cam1), strict=True
-                ):
-                    check_size(image, (lens.height, lens.width), name)
-            elif self.camera.width is not None and self.camera.height is not None:
-                check_size(images[0], (self.camera.height, self.camera.width), "left")
-            time_ns = self._new_time("frame", t_ns, kind="images")
-            if not self._is_used(time_ns):
-                return None
-            return self._add_frame(self._rectified(time_ns, *images))
+        return self.add_images(t_ns, left, right)
 
     def add_images(
         self,
@@ -255,25 +207,8 @@ class Odometry:
         Raises:
             DataError: a wrong type, shape or size, a time not after the last frame's, or images of another rig's kind.
         """
-        if right is not None:
-            return self.add_stereo(t_ns, left, right)
         with self._lock:
-            if self.camera.kind == "stereo":
-                raise DataError("this rig has two cameras, but one image came; give both, or load_rig(..., cameras=1)")
-            if (depth_m is not None) != (self.camera.kind == "rgbd"):
-                raise DataError(
-                    "depths came, but the rig has no depth_factor; give the rig one"
-                    if depth_m is not None
-                    else "this rig has depth images (a depth_factor), but no depths came; give depth_m"
-                )
-            image = gray(left, "left")
-            if self.camera.width is not None and self.camera.height is not None:
-                check_size(image, (self.camera.height, self.camera.width), "left")
-            depth = None if depth_m is None else checked_depths(depth_m, image.shape)
-            time_ns = self._new_time("frame", t_ns, kind="images")
-            if not self._is_used(time_ns):
-                return None
-            return self._add_frame(self._rectified(time_ns, image, depth_m=depth))
+            return self.process(self.inputs.images(t_ns, left, right, depth_m))
 
     def add_observations(
         self, t_ns: int, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None = None
@@ -290,12 +225,22 @@ class Odometry:
             DataError: shapes disagree, an id occurs twice, a pixel is not finite, or a time not after the last one.
         """
         with self._lock:
-            seen = checked_observations(self._frames, t_ns, ids, z, has_right)
-            time_ns = self._new_time("frame", t_ns, kind="observations")
-            if not self._is_used(time_ns):
+            return self.process(self.inputs.observations(t_ns, ids, z, has_right))
+
+    def process(self, given: GivenFrame | Sequence[MotionSample] | None) -> Estimate | None:
+        """Process what `inputs` has checked, maybe in another thread; the return value is that of `add_stereo`."""
+        with self._lock:
+            if given is None:
                 return None
-            self._frontend.given[self._frames] = observations(self._frames, time_ns, seen.ids, seen.z, seen.has_right)
-            return self._add_frame(StereoFrame(self._frames, time_ns, None, None))
+            if isinstance(given, GivenFrame):
+                results = self._add(self._frame(given))
+                self._deliver(results)
+                return results[-1].estimate if results else None
+            for sample in given:
+                if (usable := self._processor.usable(sample)) is not None:
+                    self._predictor.sample(usable)
+                self._deliver(self._add(sample))
+            return None
 
     def finish(self) -> list[FrameResult]:
         """Process the frames that still wait, and let the checks report what is left."""
@@ -310,18 +255,6 @@ class Odometry:
         with self._lock:
             self._processor.close()
 
-    def expect(self, source: MotionSource) -> None:
-        """Check that this odometry uses samples of a sensor.
-
-        Raises:
-            ConfigError: it does not.
-        """
-        if self.motion != source:
-            raise ConfigError(
-                f"{source} samples came, but this odometry runs on motion {self.motion or 'none'}; set the "
-                "configuration's motion, and for an IMU give the rig its T_cam0_imu"
-            )
-
     def prepare(self) -> None:
         """Build what the first images would build: the front end, and the maps of the rectification.
 
@@ -332,7 +265,7 @@ class Odometry:
             if self._parts.frontend is None:
                 self._frontend.open()
             if self._rectifier is not None:
-                black = [np.zeros(shape or (1, 1), dtype=np.uint8) for shape in self.image_shapes]
+                black = [np.zeros(shape or (1, 1), dtype=np.uint8) for shape in self._image_shapes()]
                 depth = np.zeros(black[0].shape) if self.camera.kind == "rgbd" else None
                 self._rectifier.frame(0, 0, *black, depth_m=depth)
 
@@ -342,21 +275,6 @@ class Odometry:
     def T_cam0_body(self) -> FloatArray:
         """Extrinsics (4, 4) of the body whose pose is estimated, in the rectified left camera."""
         return self._source.T_cam0_body
-
-    @property
-    def time_offset_ns(self) -> int:
-        """What is subtracted from the IMU's stamps, so that they are on the camera's clock."""
-        return self._offset_ns
-
-    @property
-    def image_shapes(self) -> tuple[tuple[int, int] | None, ...]:
-        """Height and width of the images of each camera, as they are to be given; None: any."""
-        if self._rectifier is not None and self.camera.kind == "stereo":
-            rig = self._rectifier.rig
-            return (rig.cam0.height, rig.cam0.width), (rig.cam1.height, rig.cam1.width)
-        width, height = self.camera.width, self.camera.height
-        shape = None if width is None or height is None else (height, width)
-        return (shape, shape) if self.camera.kind == "stereo" else (shape,)
 
     @property
     def estimate(self) -> Estimate | None:
@@ -458,49 +376,28 @@ class Odometry:
 
     # How
 
-    def _new_time(self, of: str, t_ns: Any, *, kind: str) -> int:
-        """Check a frame's time and kind, and note the kind."""
-        time_ns = checked_time(t_ns)
-        last = self._last_ns.get(of)
-        if last is not None and time_ns <= last:
-            raise DataError(f"{of} at {time_ns} ns is not after the last one at {last} ns; give them in order of time")
-        if self._kind not in (None, kind):
-            raise DataError(f"{kind} came after {self._kind}; one trajectory takes one of them")
-        if kind == "images" and self._parts.frontend is None:
+    def _image_shapes(self) -> Shapes:
+        """Return height and width of the images of each camera, as they are to be given."""
+        if self._rectifier is not None and self.camera.kind == "stereo":
+            rig = self._rectifier.rig
+            return (rig.cam0.height, rig.cam0.width), (rig.cam1.height, rig.cam1.width)
+        width, height = self.camera.width, self.camera.height
+        shape = None if width is None or height is None else (height, width)
+        return (shape, shape) if self.camera.kind == "stereo" else (shape,)
+
+    def _frame(self, given: GivenFrame) -> StereoFrame:
+        """Return a frame for the front end, rectified where the rig is raw."""
+        index, time_ns = given.index, given.time_ns
+        if given.seen is not None:
+            self._frontend.given[index] = given.seen
+            return StereoFrame(index, time_ns, None, None)
+        if self._parts.frontend is None:
             self._frontend.open()
-        self._kind = kind
-        return time_ns
-
-    def _is_used(self, time_ns: int) -> bool:
-        """Whether neither its stamp nor the limit on the frame rate leaves a frame out, which then keeps its number."""
-        used = self._is_confirmed("frame", time_ns) and self._limit.takes(time_ns)
-        self._frames += not used
-        return used
-
-    def _is_confirmed(self, of: str, time_ns: int) -> bool:
-        """Whether a stamp does not jump ahead, or the one before it has jumped as far; else it is said."""
-        jumps = self._jumps[of]
-        if jumps.takes(time_ns):
-            self._last_ns[of] = time_ns
-            return True
-        self._processor.say(
-            f"{of} at {time_ns} ns: its stamp is {jumps.ahead_s:.1f} s ahead of the last one; left out, as are others "
-            "so far ahead until two in a row agree"
-        )
-        return False
-
-    def _rectified(
-        self, time_ns: int, left: Image, right: Image | None = None, *, depth_m: FloatArray | None = None
-    ) -> StereoFrame:
+        images = map(gray, given.images)
+        left, right = next(images), next(images, None)
         if self._rectifier is None:
-            return StereoFrame(self._frames, time_ns, left, right, depth_m)
-        return self._rectifier.frame(self._frames, time_ns, left, right, depth_m=depth_m)
-
-    def _add_frame(self, frame: StereoFrame) -> Estimate | None:
-        self._frames += 1
-        results = self._add(frame)
-        self._deliver(results)
-        return results[-1].estimate if results else None
+            return StereoFrame(index, time_ns, left, right, given.depth_m)
+        return self._rectifier.frame(index, time_ns, left, right, depth_m=given.depth_m)
 
     def _deliver(self, results: list[FrameResult]) -> None:
         for result in results:

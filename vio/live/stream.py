@@ -12,11 +12,12 @@ _MOST = 1000  # estimates that wait for the reader; of a slower one, the oldest 
 
 
 class EstimateStream(Iterator[Estimate]):
-    """Estimates as they come; it ends when the odometry is closed."""
+    """Estimates as they come; it ends when the odometry is closed. `trajectory` counts the resets before the last."""
 
     def __init__(self, raise_failure: Callable[[], None]) -> None:
         """Create an empty stream; `raise_failure` raises what the odometry ended with, if it failed."""
-        self._estimates: deque[Estimate] = deque(maxlen=_MOST)
+        self.trajectory = self._resets = 0
+        self._estimates: deque[tuple[int, Estimate]] = deque(maxlen=_MOST)
         self._changed = threading.Condition()
         self._ended = False
         self._raise_failure = raise_failure
@@ -24,8 +25,12 @@ class EstimateStream(Iterator[Estimate]):
     def put(self, estimate: Estimate) -> None:
         """Add the newest estimate."""
         with self._changed:
-            self._estimates.append(estimate)
+            self._estimates.append((self._resets, estimate))
             self._changed.notify()
+
+    def reset(self) -> None:
+        """Begin a new trajectory."""
+        self._resets += 1
 
     def end(self) -> None:
         """Nothing more will come."""
@@ -39,6 +44,7 @@ class EstimateStream(Iterator[Estimate]):
             while not self._estimates and not self._ended:
                 self._changed.wait()
             if self._estimates:
-                return self._estimates.popleft()
+                self.trajectory, estimate = self._estimates.popleft()
+                return estimate
         self._raise_failure()
         raise StopIteration

@@ -72,7 +72,7 @@ def run_node(
         raise CalibrationError(
             f"the calibration has no T_cam_imu, so that {topics.imu} cannot be used; leave --imu out"
         )
-    with LiveOdometry(found, config, drop=settings.drop, map=settings.map) as odometry:
+    with LiveOdometry(found, config, drop=settings.drop, map=settings.map, copy_images=False) as odometry:
         say("warming up")
         odometry.warm_up()
         sensors = Sensors(transport, topics, odometry, settings.quality)

@@ -11,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import VioError
-from vio.files.atomic import atomic_write_text
-from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.live.live_odometry import LiveOdometry
+from vio.live.results import live_trajectory, write_results
+from vio.live.stream import EstimateStream
 from vio.offline.export_bag import ros_covariance
-from vio.records import NS_PER_S, BodyFrame, Estimate, Trajectory
+from vio.records import NS_PER_S, Estimate
 from vio.ros2.publishing import publisher
 from vio.ros2.sensors import Sensors
 from vio.ros2.transport import Transport
@@ -88,19 +87,17 @@ class Outputs:
         if not poses:
             log.warning("%s: there is no pose yet, nothing was written", folder)
             return
-        folder.mkdir(parents=True, exist_ok=True)
-        write_tum(folder / "trajectory.tum", self._trajectory(poses))
-        with contextlib.suppress(VioError):  # of a rig that no calibration file holds
-            atomic_write_text(folder / "camchain-imucam.yaml", kalibr_text(self._odometry.calibrated_rig().rig))
+        write_results(folder, self._odometry, poses)
 
-    def _run(self, estimates: object) -> None:
-        for estimate in estimates:  # type: ignore[attr-defined]
+    def _run(self, estimates: EstimateStream) -> None:
+        trajectory = 0
+        for estimate in estimates:
+            if estimates.trajectory != trajectory:
+                trajectory, self._poses, self._slow_ns = estimates.trajectory, [], None
             self._publish(estimate)
 
     def _publish(self, estimate: Estimate) -> None:
         time_ns, T = estimate.time_ns, estimate.T_world_imu
-        if self._poses and time_ns <= self._poses[-1][0]:  # a new trajectory
-            self._poses, self._slow_ns = [], None
         self._poses.append((time_ns, T))
         names = self._frames
         covariance = ros_covariance(T, estimate.covariance)
@@ -117,7 +114,7 @@ class Outputs:
 
     def _publish_slowly(self, time_ns: int) -> None:
         recent = self._poses[-_PATH_POSES:]
-        self._out.path(self._names[PATH], self._frames.odom, self._trajectory(recent), time_ns)
+        self._out.path(self._names[PATH], self._frames.odom, live_trajectory(self._odometry, recent), time_ns)
         figures = self._odometry.figures
         with contextlib.suppress(VioError, CancelledError):  # the odometry is being closed
             points = self._odometry.landmarks()
@@ -148,11 +145,6 @@ class Outputs:
             angular = self._sensors.gyro - estimate.gyro_bias
             spread[3:, 3:] = np.eye(3) * _GYRO_VARIANCE
         return linear, angular, spread
-
-    def _trajectory(self, poses: list[tuple[int, FloatArray]]) -> Trajectory:
-        body: BodyFrame = "imu" if self._odometry.motion == "imu" else "cam0"
-        times = np.array([time_ns for time_ns, _ in poses], dtype=np.int64)
-        return Trajectory(np.array([T for _, T in poses]), times, body)
 
 
 def _number(value: float | None) -> str:

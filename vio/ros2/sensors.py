@@ -56,7 +56,8 @@ class Sensors:
     def __init__(self, transport: Transport, topics: SensorTopics, odometry: LiveOdometry, quality: Quality) -> None:
         self._topics, self._odometry = topics, odometry
         self._pairing: Pairing[Image] = Pairing()
-        self._last_ns: dict[str, int] = {}
+        self._newest: dict[str, tuple[int | None, int]] = {}  # the last two stamps, ns
+        self._back: set[str] = set()  # topics whose last stamp lay far before these
         self._levels: list[float] = []  # brightest ones of 16-bit images
         self.gyro: FloatArray | None = None  # (3,) rad/s, of the newest sample
         self.received = dict.fromkeys(topics.kinds, 0)  # messages
@@ -105,24 +106,31 @@ class Sensors:
     def _stamped(self, topic: str, fields: Any) -> int | None:
         """Return a message's stamp; None: it is not after the last one of its topic.
 
-        Where it lies far before that one, all begins anew.
+        Where two in a row lie far before that one, all begins anew.
         """
         self.received[topic] += 1
         time_ns = stamp_of(fields)
-        last = self._last_ns.get(topic)
-        if last is not None and time_ns < last - _BACK_NS:
+        before, last = self._newest.get(topic, (None, None))
+        back = last is not None and time_ns < last - _BACK_NS
+        if last is not None and back and before is not None and before < time_ns:
+            last = before  # that one was far ahead, alone; the odometry has left it out
+        elif back and topic in self._back:
             log.warning(
                 "%s: the stamps went back by %.1f s, as of a publisher that was restarted: a new trajectory begins",
                 topic,
-                (last - time_ns) * 1e-9,
+                ((last or 0) - time_ns) * 1e-9,
             )
             self._odometry.reset()
-            self._last_ns.clear()
-            self._pairing = Pairing()
+            self._newest.clear()
+            self._back.clear()
+            self._pairing, last = Pairing(), None
         elif last is not None and time_ns <= last:
+            if back:
+                self._back.add(topic)
             self._refuse(f"{topic}: the stamp {time_ns} ns is not after the last one, {last} ns")
             return None
-        self._last_ns[topic] = time_ns
+        self._newest[topic] = last, time_ns
+        self._back.discard(topic)
         return time_ns
 
     def _white(self, fields: Any, kind: str, where: str) -> int:

@@ -1,38 +1,44 @@
-"""Keeps what a live source gives as a plain folder, so that the run can be repeated."""
+"""Keeps what a live source gives as a plain folder or a ROS 2 bag, so that the run can be repeated."""
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 import cv2
 
 from vio.cameras.rig import Rig
+from vio.datasets.bags.writer import bag_writer
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
 from vio.files.text import exact_text, seconds_text
-from vio.records import Image
+from vio.records import ImuSample
 from vio.sources.source import SourceEvent, SourceFrame
+
+Form: TypeAlias = Literal["plain", "rosbag2", "mcap"]
+FORMS: tuple[Form, ...] = ("plain", "rosbag2", "mcap")
 
 _WAITING = 100  # frames that may wait for the disk; beyond, the source waits
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # fast
+_CAMERAS = ("cam0", "cam1")
 IMU_HEADER = "timestamp [ns],wx,wy,wz,ax,ay,az\n"
 
 
 class Recorder:
-    """Writes `left/`, `right/`, `times.txt`, `imu.csv` and the calibration, in a thread of its own.
+    """Writes images, times, samples and the calibration, in a thread of its own."""
 
-    Times and samples are written out each frame, so that a recording that ended early is whole up to its last frame.
-    """
-
-    def __init__(self, folder: Path, rig: Rig) -> None:
+    def __init__(self, folder: Path, rig: Rig, form: Form = "plain") -> None:
         """Begin a recording.
 
         Args:
             folder: new or empty.
             rig: calibration of the raw images.
+            form: a plain folder, which is whole up to its last frame however it ends, or a bag, which has to be closed.
 
         Raises:
             DataError: the folder holds something, or cannot be written.
@@ -40,20 +46,16 @@ class Recorder:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise DataError(f"{folder}: is not empty; give --record a new folder")
         self._folder = folder
-        names = ("left",) if rig.cam1 is None else ("left", "right")
         try:
-            for name in names:
-                (folder / name).mkdir(parents=True)
-            imu = rig.T_cam0_imu is not None
-            atomic_write_text(folder / ("camchain-imucam.yaml" if imu else "camchain.yaml"), kalibr_text(rig))
-            self._times = (folder / "times.txt").open("w", encoding="utf-8")
-            self._imu = (folder / "imu.csv").open("w", encoding="utf-8") if imu else None
+            folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise DataError(f"{folder}: cannot be written: {error.strerror}; check disk and rights") from error
-        if self._imu is not None:
-            self._imu.write(IMU_HEADER)
-        self._frames: queue.Queue[SourceFrame | None] = queue.Queue(_WAITING)
-        self._failure: Exception | None = None
+            raise self._unwritable(error) from error
+        name = "camchain.yaml" if rig.T_cam0_imu is None else "camchain-imucam.yaml"
+        atomic_write_text(folder / name, kalibr_text(rig))
+        self._open = _plain(folder, rig) if form == "plain" else _bag(folder, form)
+        self._events: queue.SimpleQueue[SourceEvent | None] = queue.SimpleQueue()
+        self._room = threading.Semaphore(_WAITING)
+        self._failure: DataError | None = None
         self._thread = threading.Thread(target=self._run, name="record", daemon=True)
         self._thread.start()
 
@@ -66,9 +68,8 @@ class Recorder:
         if self._failure is not None:
             raise self._failure
         if isinstance(event, SourceFrame):
-            self._frames.put(event)
-        elif self._imu is not None:
-            self._imu.write(f"{event.time_ns},{exact_text([*event.gyro, *event.accel], ',')}\n")
+            self._room.acquire()
+        self._events.put(event)
 
     def close(self) -> None:
         """Wait for what is not yet written.
@@ -76,28 +77,68 @@ class Recorder:
         Raises:
             DataError: something could not be written.
         """
-        self._frames.put(None)
+        self._events.put(None)
         self._thread.join()
-        self._times.close()
-        if self._imu is not None:
-            self._imu.close()
         if self._failure is not None:
             raise self._failure
 
     def _run(self) -> None:
-        while (frame := self._frames.get()) is not None:
-            if self._failure is None:
-                self._write(frame)
+        try:
+            with self._open as write:
+                while (event := self._events.get()) is not None:
+                    write(event)
+                    if isinstance(event, SourceFrame):
+                        self._room.release()
+        except OSError as error:
+            self._failure = self._unwritable(error)
+        except DataError as error:
+            self._failure = error
+        self._room.release(1)  # who waits for room is the only one, and raises with its next event
 
-    def _write(self, frame: SourceFrame) -> None:
-        for name, image in (("left", frame.left), ("right", frame.right)):
-            if image is not None:
-                self._write_image(self._folder / name / f"{frame.time_ns:019d}.png", image)
-        self._times.write(f"{seconds_text(frame.time_ns)}\n")
-        self._times.flush()
-        if self._imu is not None:
-            self._imu.flush()
+    def _unwritable(self, error: OSError) -> DataError:
+        return DataError(f"{self._folder}: cannot be written: {error.strerror}; check disk and rights")
 
-    def _write_image(self, path: Path, image: Image) -> None:
-        if not cv2.imwrite(str(path), image, _PNG):
-            self._failure = DataError(f"{path}: cannot be written; check the free space of the disk")
+
+@contextlib.contextmanager
+def _plain(folder: Path, rig: Rig) -> Iterator[Callable[[SourceEvent], None]]:
+    """Open `left/`, `right/`, `times.txt` and `imu.csv`; times and samples are written out each frame."""
+    for name in ("left",) if rig.cam1 is None else ("left", "right"):
+        (folder / name).mkdir()
+    with contextlib.ExitStack() as stack:
+        times = stack.enter_context((folder / "times.txt").open("w", encoding="utf-8"))
+        imu = None
+        if rig.T_cam0_imu is not None:
+            imu = stack.enter_context((folder / "imu.csv").open("w", encoding="utf-8"))
+            imu.write(IMU_HEADER)
+
+        def write(event: SourceEvent) -> None:
+            if not isinstance(event, SourceFrame):
+                if imu is not None:
+                    imu.write(f"{event.time_ns},{exact_text([*event.gyro, *event.accel], ',')}\n")
+                return
+            for name, image in (("left", event.left), ("right", event.right)):
+                path = folder / name / f"{event.time_ns:019d}.png"
+                if image is not None and not cv2.imwrite(str(path), image, _PNG):
+                    raise DataError(f"{path}: cannot be written; check the free space of the disk")
+            times.write(f"{seconds_text(event.time_ns)}\n")
+            times.flush()
+            if imu is not None:
+                imu.flush()
+
+        yield write
+
+
+@contextlib.contextmanager
+def _bag(folder: Path, storage: Literal["rosbag2", "mcap"]) -> Iterator[Callable[[SourceEvent], None]]:
+    """Open a bag with the topics of EuRoC's; the calibration is the file beside it."""
+    with bag_writer(folder, storage) as bag:
+
+        def write(event: SourceEvent) -> None:
+            if not isinstance(event, SourceFrame):
+                bag.imu("/imu0", "imu", ImuSample(event.time_ns, event.gyro, event.accel))
+                return
+            for name, image in zip(_CAMERAS, (event.left, event.right), strict=True):
+                if image is not None:
+                    bag.image(f"/{name}/image_raw", name, event.time_ns, image)
+
+        yield write

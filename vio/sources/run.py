@@ -7,21 +7,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from vio.cameras.rig import Rig
 from vio.config import Config
-from vio.datasets.rigs.kalibr import kalibr_text
-from vio.errors import CalibrationError, DataError, VioError
-from vio.files.atomic import atomic_write_text
-from vio.files.trajectories import write_tum
+from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import FloatArray
 from vio.live.build import MapUse
 from vio.live.event_queue import Drop
 from vio.live.figures import LiveFigures
 from vio.live.live_odometry import LiveOdometry
-from vio.records import BodyFrame, FrameResult, Trajectory
-from vio.sources.recorder import Recorder
+from vio.live.results import write_results
+from vio.records import FrameResult
+from vio.sources.recorder import Form, Recorder
 from vio.sources.source import LiveSource, SourceFrame
 
 
@@ -43,6 +39,7 @@ def run_source(
     say: Callable[[str], None],
     out: Path | None = None,
     record: Path | None = None,
+    record_as: Form = "plain",
     map: MapUse | None = None,
     drop: Drop = "oldest",
     on_start: Callable[[LiveOdometry, Rig], Callable[[FrameResult], None] | None] = lambda odometry, rig: None,
@@ -57,6 +54,7 @@ def run_source(
         say: reports that it is ready.
         out: folder for `trajectory.tum` and the calibration that was found.
         record: new folder for what the source gave, which `vio run` repeats.
+        record_as: its form, see `Recorder`.
         map: a map to begin or to continue.
         drop: see `LiveOdometry`.
         on_start: may return what is called with each result, a viewer's.
@@ -82,12 +80,16 @@ def run_source(
                 watcher(result)
 
         samples = 0
-        with LiveOdometry(rig, config, on_frame=on_frame, map=map, drop=drop) as odometry:
+        with LiveOdometry(rig, config, on_frame=on_frame, map=map, drop=drop, copy_images=False) as odometry:
             say("warming up")
             odometry.warm_up()
             watcher = on_start(odometry, rig)
             with contextlib.ExitStack() as stack:
-                recorder = None if record is None else stack.enter_context(contextlib.closing(Recorder(record, rig)))
+                recorder = (
+                    None
+                    if record is None
+                    else stack.enter_context(contextlib.closing(Recorder(record, rig, record_as)))
+                )
                 say("ready")
                 for event in source.events():
                     if should_stop():
@@ -103,16 +105,7 @@ def run_source(
                         samples += 1
                         odometry.add_imu(event.time_ns, event.gyro, event.accel)
         if out is not None:
-            _write(out, odometry, poses)
+            if not poses:
+                raise DataError(f"{out}: no frame has a pose; nothing was written")
+            write_results(out, odometry, poses)
         return LiveRun(odometry.figures, odometry.warnings, samples)
-
-
-def _write(folder: Path, odometry: LiveOdometry, poses: list[tuple[int, FloatArray]]) -> None:
-    if not poses:
-        raise DataError(f"{folder}: no frame has a pose; nothing was written")
-    folder.mkdir(parents=True, exist_ok=True)
-    body: BodyFrame = "imu" if odometry.motion == "imu" else "cam0"
-    times = np.array([time_ns for time_ns, _ in poses], dtype=np.int64)
-    write_tum(folder / "trajectory.tum", Trajectory(np.array([T for _, T in poses]), times, body))
-    with contextlib.suppress(VioError):  # of a rig that no calibration file holds
-        atomic_write_text(folder / "calibration.yaml", kalibr_text(odometry.calibrated_rig().rig))
