@@ -122,7 +122,7 @@ def test_curves_lie_on_the_truth_and_bands_hold_it(runs: tuple[Path, Path]) -> N
     assert np.array_equal(curve.truth.seconds, curve.seconds)
     distance = np.linalg.norm(curve.position - curve.truth.position, axis=1)
     assert np.abs(distance - curve.truth.error_m).max() < 2e-3  # two alignments of nearly the same path
-    # Of this small flight the attitude itself is off by 0.9 degrees with OpenCV 4 and by 1.2 with 5.
+    # With OpenCV 5 the attitude of this small flight is off by 1.2 degrees.
     assert np.abs(curve.attitude - curve.truth.attitude).max() < 1.5
     assert curve.truth.position[0] == pytest.approx(np.zeros(3), abs=1e-12)
     rise = np.diff(curve.position[:, 2]) / np.diff(curve.seconds)
