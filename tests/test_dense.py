@@ -191,7 +191,11 @@ def test_interrupted_it_keeps_what_is_fused(run_folder: Path, tmp_path: Path, mo
     from vio.cli.progress import ProgressBar
 
     monkeypatch.setattr(ProgressBar, "update", lambda self, done, total=None: signal.raise_signal(signal.SIGINT))
-    assert main(["mesh", str(run_folder), "--out", str(tmp_path / "m"), "--voxel", "0.1"]) == 0
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        assert main(["mesh", str(run_folder), "--out", str(tmp_path / "m"), "--voxel", "0.1"]) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
     facts = json.loads((tmp_path / "m" / "mesh.json").read_text())
     assert (facts["frames"], facts["stopped"]) == (1, "interrupted")
     assert facts["chosen"] > 1

@@ -25,7 +25,7 @@ def hold(args):
         print("writing", flush=True)
         time.sleep(60)
 
-class Args: debug, execute = False, staticmethod(hold)
+class Args: command, debug, execute = "hold", False, staticmethod(hold)
 class Parser:
     def parse_known_args(self, argv): return Args, []
 vio.cli.build_parser = Parser
@@ -34,8 +34,9 @@ sys.exit(vio.cli.main([]))
 
 
 def _take_interrupts() -> None:
-    """Undo what a shell does to its background jobs: they ignore Ctrl-C, and so do their children."""
+    """Undo what a shell does to its background jobs: they ignore Ctrl-C, by nohup hang-ups, and so do their children."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def _writing(out: Path) -> subprocess.Popen[str]:
