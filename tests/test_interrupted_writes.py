@@ -34,7 +34,7 @@ sys.exit(vio.cli.main([]))
 
 
 def _take_interrupts() -> None:
-    """Undo what a shell does to its background jobs: they ignore Ctrl-C, by nohup hang-ups, and so do their children."""
+    """Undo what shell and nohup do to background jobs: they ignore Ctrl-C and hang-ups, and so do their children."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
