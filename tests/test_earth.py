@@ -23,6 +23,8 @@ from vio.errors import DataError, EstimationError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp
 from vio.mapping.map_store import MapStore, SessionRow
+from vio.offline.georeference import placed
+from vio.records import LoopEvent
 
 ORIGIN = np.array([49.0, 8.4, 115.0])
 LEVER_M = np.array([1.0, 0.5, 1.5])
@@ -295,7 +297,9 @@ def test_places_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert file.read_bytes() == before
 
 
-def test_places_a_run(flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_places_a_run(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = tmp_path / "run"
     assert main(["run", str(flight), "--out", str(run), "--no-plot", "--json"]) == 0
     before = (run / "trajectory.tum").read_bytes()
@@ -329,3 +333,7 @@ def test_places_a_run(flight: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
         capsys.readouterr()
         assert main(["georeference", *arguments]) == 1
         assert message in capsys.readouterr().err
+    loop = LoopEvent(5, 0, 0, 0, 30, 0.1, joined=False, keyframe_frame=0)  # the first frame, seen again
+    monkeypatch.setattr("vio.offline.georeference.read_loops", lambda _: [loop, replace(loop, keyframe_frame=None)])
+    path = placed(run).path
+    assert (path.first.tolist(), path.second.tolist()) == ([0], [5])

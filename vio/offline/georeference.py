@@ -53,7 +53,8 @@ def _of_run(folder: FilePath) -> Placed:
     if trajectory.times_ns is None or len(trajectory) < 2:
         raise DataError(f"{folder}: its trajectory has no times, which GNSS positions are compared by")
     place = {} if trajectory.frame_indices is None else {int(f): k for k, f in enumerate(trajectory.frame_indices)}
-    loops = [(place.get(o.keyframe_frame or -1), place.get(o.frame)) for o in read_loops(folder) if o.kept]
+    kept = [o for o in read_loops(folder) if o.kept and o.keyframe_frame is not None]
+    loops = [(place.get(o.keyframe_frame), place.get(o.frame)) for o in kept]  # type: ignore[arg-type]
     known = [(i, j) for i, j in loops if i is not None and j is not None and i < j - 1]
     up = up_of(metrics.get("motion"), None)
     camera = trajectory.in_cam0(T_cam0_imu).T_world_body
