@@ -177,6 +177,7 @@ def test_makes_a_mesh_of_a_run(run_folder: Path, capsys: pytest.CaptureFixture[s
         *("mesh.json", "mesh.ply", "points.ply", "mesh.glb", "preview.png", "occupancy.pgm", "occupancy.yaml"),
     }
     plan = yaml.safe_load((run_folder / "mesh" / "occupancy.yaml").read_text())
+    assert (255 - FREE) / 255 < plan["free_thresh"] < (255 - UNKNOWN) / 255 < plan["occupied_thresh"]
     assert plan["image"] == "occupancy.pgm"
     assert plan["resolution"] >= 0.05
     page = run_folder / "report.html"
@@ -242,3 +243,12 @@ def test_exports_keep_the_colours_of_the_images(flight: Path, tmp_path: Path) ->
     assert points[:, 0].mean() > 1.5 * points[:, 2].mean()
     (model,) = (run / "colmap").glob("sparse/0/points3D.*")
     assert model.stat().st_size > 0
+
+
+def test_depth_without_a_surface_gives_none() -> None:
+    depth = np.zeros((64, 64), np.float32)
+    depth[32, 32] = 2
+    with VoxelGrid(0.05) as grid:
+        camera = StereoCamera(100.0, 100.0, 32.0, 32.0, 0.1, 64, 64)
+        grid.fuse(depth, np.zeros((64, 64), np.uint8), camera, np.eye(4), 5.0)
+        assert len(extract_surface(grid, least_seen=1).triangles) == 0

@@ -17,14 +17,15 @@ from vio.cli import main
 from vio.datasets.gnss import read_gnss
 from vio.earth.alignment import Georeference, _Between, _Problem, georeference
 from vio.earth.alignment import Path as GraphPath
+from vio.earth.exports import write_utm
 from vio.earth.geodesy import LocalFrame, ecef, geodetic_of, utm, utm_zone
 from vio.earth.gnss import SIGMA_M, GnssFixes, checked_fixes
 from vio.errors import DataError, EstimationError
-from vio.files.trajectories import read_trajectory
+from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp
 from vio.mapping.map_store import MapStore, SessionRow
 from vio.offline.georeference import placed
-from vio.records import LoopEvent
+from vio.records import LoopEvent, Trajectory
 
 ORIGIN = np.array([49.0, 8.4, 115.0])
 LEVER_M = np.array([1.0, 0.5, 1.5])
@@ -337,3 +338,44 @@ def test_places_a_run(
     monkeypatch.setattr("vio.offline.georeference.read_loops", lambda _: [loop, replace(loop, keyframe_frame=None)])
     path = placed(run).path
     assert (path.first.tolist(), path.second.tolist()) == ([0], [5])
+
+
+def test_landmarks_and_vertical_of_a_run_are_in_its_map(tmp_path: Path) -> None:
+    T = np.tile(np.eye(4), (50, 1, 1))
+    T[:, 0, 3] = 2.0 * np.arange(50)
+    M = np.eye(4)
+    M[:3, :3], M[:3, 3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]], [100, 50, 7]
+    (tmp_path / "metrics.json").write_text(json.dumps({"T_cam0_imu": np.eye(4).tolist(), "motion": "imu"}))
+    times, frames = np.arange(50) * 10**8, np.arange(50)
+    for name, poses in (("trajectory.tum", T), ("map_trajectory.tum", M @ T)):
+        write_tum(tmp_path / name, Trajectory(poses, times, "imu", frame_indices=frames))
+    point = np.array([1, 3, 0, 0], dtype="<f4")
+    (tmp_path / "landmarks.ply").write_bytes(b"ply\nend_header\n" + point.tobytes())
+    of = placed(tmp_path)
+    np.testing.assert_allclose(of.points, [[101, 50, 10]], atol=1e-6)
+    np.testing.assert_allclose(of.path.up_map, M[:3, 2], atol=1e-9)
+
+
+def test_a_drive_that_never_moves_is_refused_in_words() -> None:
+    none, n = np.zeros(0, dtype=np.int64), 60
+    t = np.arange(n) * 10**9
+    path = GraphPath(t, np.tile(np.eye(4), (n, 1, 1)), none, none, np.array([0, 0, 1.0]), np.radians(0.3), none)
+    noise = np.random.default_rng(0).normal(size=(n, 3))
+    fixes = checked_fixes(t, LocalFrame(ORIGIN).geodetic(noise), None, "x")
+    with pytest.raises(EstimationError, match="do not determine"):
+        georeference(path, fixes, np.zeros(3))
+
+
+def test_tables_state_what_is_known(tmp_path: Path) -> None:
+    """Horizontal standard deviations without that of the height, and columns between blanks."""
+    file = tmp_path / "gnss.csv"
+    file.write_text("1,48,11,,0.02,0.02,\n2,48.1,11,,0.02,0.02,\n")
+    assert read_gnss(file, None).covariance[0, 0, 0] < 0.001
+    file.write_text("1 48 11 500\n2 48.1 11 500\n")
+    assert len(read_gnss(file, None).times_ns) == 2
+
+
+def test_a_path_across_the_equator_is_in_one_zone(tmp_path: Path) -> None:
+    write_utm(tmp_path / "x.csv", np.array([[1e-4, 11.0, 0.0], [-1e-4, 11.0, 0.0]]))
+    northings = np.loadtxt(tmp_path / "x.csv", delimiter=",", skiprows=2)[:, 1]
+    assert abs(northings[0] - northings[1]) < 30

@@ -14,7 +14,8 @@ from tests.test_map_store import CAMERA, _features, _pose, _row, fill
 from vio.cli import main
 from vio.errors import DataError
 from vio.geometry.lie import se3_exp
-from vio.mapping.files import check_map, drop_session, extract_map, merge_maps, prune_map
+from vio.mapping.files import check_map, describe_map, drop_session, extract_map, merge_maps, prune_map
+from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import LoopRow, MapStore, SessionRow
 
 
@@ -134,3 +135,34 @@ def test_maps_without_a_common_place_are_not_merged(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="shows no place of"):
         merge_maps(a, b, out)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.map", "b.map"]
+
+
+def test_sessions_that_a_dropped_one_had_joined_stay_where_they_are(tmp_path: Path) -> None:
+    path = tmp_path / "a.map"
+    store = fill(path)
+    for n, (a, b) in ((1, (4, 5)), (2, (6, 7))):
+        store.add_session(SessionRow(f"s{n}", CAMERA, True, 0))
+        for k in (a, b):
+            store.add_keyframe(replace(_row(k), session=n), _features(k))
+        store.add_odometry(a, b, _pose(5))
+    store.add_loop(LoopRow(1, 5, _pose(3), 30, True))
+    store.add_loop(LoopRow(5, 7, _pose(3), 30, True))
+    store.close()
+    drop_session(path, 1)
+    with closing(MapStore(path, read_only=True)) as left:
+        graph = MapGraph(left)
+        before = graph.T_map_cam.rows[4].copy()
+        graph.optimise_part(0)
+        np.testing.assert_allclose(graph.T_map_cam.rows[4, :3, 3], before[:3, 3], atol=1e-9)
+
+
+def test_a_map_behind_a_link_is_changed_where_it_is(tmp_path: Path) -> None:
+    real, link = tmp_path / "real" / "a.map", tmp_path / "a.map"
+    real.parent.mkdir()
+    fill(real).close()
+    real.chmod(0o600)
+    link.symlink_to(real)
+    kept = prune_map(link, 1)["keyframes"]
+    assert link.is_symlink()
+    assert describe_map(real)["keyframes"] == kept < 4
+    assert real.stat().st_mode & 0o777 == 0o600

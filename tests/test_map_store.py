@@ -25,7 +25,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.mapping import map_store
 from vio.mapping.builder import MapBuilder
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.files import merge_maps
+from vio.mapping.files import check_map, merge_maps
 from vio.mapping.map_store import VERSION, KeyframeRow, LoopRow, MapStore, SessionRow
 
 CAMERA = StereoCamera(400.0, 401.0, 319.5, 179.5, 0.12, 640, 360)
@@ -373,3 +373,15 @@ def test_a_long_step_ends_with_a_signal_and_with_its_time(tmp_path: Path, monkey
     finally:
         signal.signal(signal.SIGALRM, before)
     store.close()
+
+
+def test_damage_is_still_found_after_an_upgrade(tmp_path: Path) -> None:
+    path = tmp_path / "a.map"
+    fill(path).close()
+    _make_older(path, 3)
+    with contextlib.closing(sqlite3.connect(path)) as db:
+        db.execute("UPDATE features SET sigma_px = zeroblob(length(sigma_px)) WHERE keyframe = 2")
+        db.commit()
+    MapStore(path).close()
+    with pytest.raises(DataError, match="row 2 of features"):
+        check_map(path)

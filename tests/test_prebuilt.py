@@ -72,7 +72,13 @@ def _cut_manifest(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[:100])
 
 
-@pytest.mark.parametrize("change", [_another_source, _more_sources, _damaged_code, _no_code, _cut_manifest])
+def _other_manifest(folder: Path) -> None:
+    (folder / prebuilt.MANIFEST).write_text("[]")
+
+
+@pytest.mark.parametrize(
+    "change", [_another_source, _more_sources, _damaged_code, _no_code, _cut_manifest, _other_manifest]
+)
 def test_stale_or_damaged_machine_code_is_not_used(change: Callable[[Path], None], folder: Path) -> None:
     change(folder)
     assert not _loads()

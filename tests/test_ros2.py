@@ -276,6 +276,19 @@ def test_one_stamp_far_ahead_begins_nothing_anew() -> None:
     assert (taken.resets, sensors.refused) == (0, 0)
 
 
+def test_one_stamp_a_little_ahead_costs_the_frames_up_to_it(flight: Path) -> None:
+    graph = Graph()
+    image = np.zeros((90, 160), dtype=np.uint8)
+    with LiveOdometry(load_rig(flight), Config()) as odometry:
+        member = Member(graph)
+        sensors = Sensors(member, TOPICS, odometry, "reliable")
+        for ms in (1000, 1050, 1100, 2150, 1200):
+            for topic in TOPICS.cameras:
+                _send(graph, topic, ms * 10**6, "mono8", image)
+            member.spin(0.0)
+    assert sensors.refused == 1
+
+
 @pytest.mark.parametrize("what", ["reset", "clock"])
 def test_the_node_goes_on_after_a_reset_and_after_a_step_of_the_clock(flight: Path, tmp_path: Path, what: str) -> None:
     graph, taken, done = Graph(), list[bytes](), threading.Event()

@@ -455,3 +455,12 @@ def test_the_stand_in_has_only_names_of_depthai() -> None:
         (dai.DeviceInfo, ("getDeviceId", "name")),
     ):
         assert [name for name in names if not hasattr(owner, name)] == []
+
+
+def test_a_recording_that_needs_an_absent_package_says_so(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "apsw", None)
+    recorder = Recorder(tmp_path / "kept", load_rig(flight), "mcap")
+    with pytest.raises(MissingDependencyError):
+        recorder.close()

@@ -15,6 +15,10 @@ class DataError(VioError):
     """A recording, feature file or trajectory cannot be used as it is."""
 
 
+class OrderError(DataError):
+    """A time that is not after the last one."""
+
+
 class CalibrationError(DataError):
     """A calibration is missing or invalid (zero baseline, reflected rotation, …)."""
 

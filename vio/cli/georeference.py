@@ -28,7 +28,8 @@ def add_parser(commands: Any) -> None:
         "--lever-arm",
         default="0,0,0",
         metavar="X,Y,Z",
-        help="the antenna in the body frame of the run (IMU or left camera), or in the left camera of a map, in metres",
+        help="the antenna in the body frame of the run (IMU or left camera), or in the left camera of a map, in metres "
+        "(--lever-arm=-0.1,0,0.3)",
     )
     parser.add_argument("--time-offset", type=float, default=0.0, metavar="S", help="added to the positions' times")
     parser.add_argument("--topic", metavar="T", help="of a bag with several topics of NavSatFix")
@@ -58,7 +59,7 @@ def execute(args: argparse.Namespace) -> int:
         lever_arm_m = np.zeros(0)
     if lever_arm_m.shape != (3,) or not (np.abs(lever_arm_m) < 1e3).all():
         raise ConfigError(f"--lever-arm takes three numbers in metres such as 0.1,0,-0.5, got {args.lever_arm}")
-    if not math.isfinite(args.time_offset) or abs(args.time_offset) > 1e10:
+    if not math.isfinite(args.time_offset) or abs(args.time_offset) > 4e9:
         raise ConfigError(f"--time-offset takes seconds, got {args.time_offset:g}")
     of, fixes = placed(args.path), read_gnss(args.gnss, args.topic)
     for note in fixes.notes:

@@ -50,7 +50,9 @@ def add_parser(commands: Any) -> None:
     prune.add_argument(
         "--density", type=int, default=DENSITY, metavar="N", help=f"in a cubic metre (default {DENSITY})"
     )
-    extract.add_argument("--around", type=parse_point, required=True, metavar="X,Y,Z", help="m, in the map")
+    extract.add_argument(
+        "--around", type=parse_point, required=True, metavar="X,Y,Z", help="m, in the map (--around=-1,2,0)"
+    )
     extract.add_argument("--radius", type=float, required=True, metavar="M", help="m")
     extract.add_argument("--out", type=Path, required=True, metavar="MAP", help="a new file")
     for action in (show, merge, check, drop, prune, extract):

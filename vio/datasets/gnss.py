@@ -10,7 +10,7 @@ from vio.datasets.bags import is_bag
 from vio.datasets.bags.gnss import read_navsatfix
 from vio.datasets.dates import drive_times
 from vio.datasets.tables import numbers_of, read_table, stamps_ns
-from vio.earth.gnss import GnssFixes, checked_fixes
+from vio.earth.gnss import UP_SHARE, GnssFixes, checked_fixes
 from vio.errors import DataError
 from vio.files.text import text_lines
 
@@ -43,18 +43,21 @@ def read_gnss(path: Path, topic: str | None = None) -> GnssFixes:
 def _read_csv(path: Path) -> GnssFixes:
     """Read a table with or without the standard deviations; empty or NaN: not known."""
     lines = [line for _, line in text_lines(path) if line.strip() and not line.lstrip().startswith("#")]
-    columns = 4 if lines and len(lines[-1].replace(";", ",").split(",")) == 4 else 7
+    last = lines[-1].replace(";", ",") if lines else ""
+    columns = 4 if len(last.split("," if "," in last else None)) == 4 else 7
     table = read_table(path, columns, _FORM)
     if table.header and not all(word in name for word, name in zip(("time", "lat", "lon"), table.header, strict=False)):
         raise DataError(f"{path}: has the columns {','.join(table.header)}; expected {_FORM}")
     values = numbers_of(table)
-    sigmas = values[:, 3:] if columns == 7 else np.full((len(values), 3), np.nan)
+    sigmas = values[:, 3:].copy() if columns == 7 else np.full((len(values), 3), np.nan)
+    no_up = np.isnan(sigmas[:, 2])
+    sigmas[no_up, 2] = UP_SHARE * sigmas[no_up, :2].max(axis=1)
     return checked_fixes(stamps_ns(table), values[:, :3], np.eye(3) * sigmas[:, None, :] ** 2, str(path))
 
 
 def _read_oxts(folder: Path) -> GnssFixes:
     """Read KITTI's records of its GNSS/INS unit; the position is that of the IMU."""
-    files = sorted((folder / "data").glob("*.txt"))
+    files = sorted(file for file in (folder / "data").glob("*.txt") if file.stem.isdecimal())
     if not files:
         raise DataError(f"{folder / 'data'}: holds no record; copy it again")
     rows = []

@@ -49,7 +49,7 @@ def extract_surface(grid: VoxelGrid, *, least_seen: int = _LEAST_SEEN) -> Mesh:
         points.append(grid.voxel_m * point[:vertices])
         colours.append(colour[:vertices].copy())
         quads.append(pack(quad[:faces].reshape(-1, 3)).reshape(-1, 4))
-    if not keys:
+    if not any(map(len, quads)):
         none = np.zeros((0, 3), dtype=np.float32)
         return Mesh(none, none, none.astype(np.uint8), none.astype(np.uint32))
     key = np.concatenate(keys)

@@ -41,6 +41,7 @@ _TRUNCATION = 0.999  # probability at which a residual is cut off
 _MU_GROWTH, _MOST_STEPS, _SETTLED = 1.6, 40, 1e-5
 _START_STEPS = 20  # of the robust alignment that it starts from
 _LEAST_FIXES = 3
+_HEIGHT_SIGMA_M = 1e3  # of the first pose, where no position states a height
 _METRE_PER_RAD = 100.0  # weights a turn of a pose against its position in the rigid fit
 
 
@@ -285,6 +286,10 @@ class _Problem:
         # The vertical has one error in all poses: so many count as one.
         tilt = np.broadcast_to(np.eye(3) / (self._path.up_sigma_rad**2 * count), (count, 3, 3))
         add([6 * np.arange(count)], [D], up - self._up_body, tilt)
+        if not weight[:, 1].any():
+            rise = np.zeros((1, 1, 6))
+            rise[0, 0, :3] = T[0, 2, :3]
+            add([np.zeros(1, dtype=np.int64)], [rise], T[:1, 2, 3:4], np.full((1, 1, 1), _HEIGHT_SIGMA_M**-2))
         add(
             [np.array([6 * count])], [np.ones((1, 1, 1))], np.array([[log_scale]]), np.full((1, 1, 1), _SCALE_SIGMA**-2)
         )
@@ -297,12 +302,18 @@ class _Factors:
     """The factors of a sparse symmetric matrix whose last row is full: it is eliminated last."""
 
     def __init__(self, H: csc_matrix) -> None:
-        self._rest = splu(
-            H[:-1, :-1], permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        unknown = "the GNSS positions do not determine where the trajectory is; drive farther, with a turn"
+        try:
+            self._rest = splu(
+                H[:-1, :-1], permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
+        except RuntimeError as error:  # exactly singular
+            raise EstimationError(unknown) from error
         self._border = H[:-1, -1:].toarray()
         self._solved = self._rest.solve(self._border)
         self._last = float(H[-1, -1] - (self._border.T @ self._solved)[0, 0])
+        if not self._last > 0:  # NaN, too
+            raise EstimationError(unknown)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return the solution (6K + 1, n) for a right-hand side."""

@@ -57,7 +57,9 @@ def write_utm(path: Path, geodetic: FloatArray, times_ns: IntArray | None = None
     """Write points (K, 3) in the UTM zone of the first, with times (K,) where given; return its EPSG code."""
     zone, south = utm_zone(geodetic[0]), bool(geodetic[0, 0] < 0)
     epsg = f"EPSG:{(32700 if south else 32600) + zone}"
-    rows = [f"{e:.4f},{n:.4f},{h:.4f}" for (e, n), h in zip(utm(geodetic, zone).tolist(), geodetic[:, 2], strict=True)]
+    xy = utm(geodetic, zone)
+    xy[:, 1] += 1e7 * (float(south) - (geodetic[:, 0] < 0))  # all in the hemisphere of the first
+    rows = [f"{e:.4f},{n:.4f},{h:.4f}" for (e, n), h in zip(xy.tolist(), geodetic[:, 2], strict=True)]
     if times_ns is not None:
         rows = [f"{t},{row}" for t, row in zip(times_ns.tolist(), rows, strict=True)]
     head = f"# {epsg}, UTM zone {zone}{'S' if south else 'N'}, WGS84, height above the ellipsoid\n"

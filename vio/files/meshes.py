@@ -118,6 +118,6 @@ def write_ros_map(folder: Path, name: str, levels: npt.NDArray[np.uint8], cell_m
     text = (
         f"image: {name}.pgm\nmode: trinary\nresolution: {cell_m:g}\n"
         f"origin: [{origin_m[0]:.6g}, {origin_m[1]:.6g}, 0.0]\n"
-        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
     (folder / f"{name}.yaml").write_text(text, encoding="utf-8")

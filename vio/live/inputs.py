@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.datasets.frame_rate import FrameRateLimit
-from vio.errors import ConfigError, DataError
+from vio.errors import ConfigError, DataError, OrderError
 from vio.filters.inputs import LARGEST
 from vio.geometry.lie import FloatArray
 from vio.records import (
@@ -183,7 +183,7 @@ class _Stamps:
     def check_order(self, time_ns: int) -> None:
         """Raise DataError unless a stamp is after the last one that was taken."""
         if self._last_ns is not None and time_ns <= self._last_ns:
-            raise DataError(
+            raise OrderError(
                 f"{self._of} at {time_ns} ns is not after the last one at {self._last_ns} ns; give them in order of "
                 "time, each once"
             )

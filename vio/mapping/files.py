@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import uuid
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -179,15 +180,18 @@ def _keep(path: Path, out: Path, kept: BoolArray) -> dict[str, Any]:
     if not kept.any():
         raise DataError(f"{path}: no keyframe would be left")
     check_path(out)
-    partial = out.with_name(f".{out.name}.{uuid.uuid4().hex[:12]}.partial")
+    target = out.resolve()  # what a link leads to
+    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}.partial")
     source = MapStore(path, read_only=out != path)  # in place, no other process writes meanwhile
     try:
         store = MapStore(partial, create=True, known_as=out)
         with contextlib.closing(source), contextlib.closing(store):
             _copy_rows(source, store, kept)
-        if out.with_name(f"{out.name}-wal").exists():  # its changes would be taken for those of the new file
+        if target.with_name(f"{target.name}-wal").exists():  # its changes would be taken for those of the new file
             raise DataError(f"{out}: another process reads it; try again when that has ended")
-        os.replace(partial, out)
+        if out == path:
+            shutil.copymode(target, partial)
+        os.replace(partial, target)
     except OSError as error:
         raise DataError(f"{out}: cannot be written ({error.strerror or error}); check the folder") from error
     finally:

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
 from vio.geometry.relative_pose import RelativePose
@@ -129,13 +131,18 @@ class MapGraph:
         self.sessions = [replace(s, part=into) if s.part == moved else s for s in self.sessions]
 
     def optimise_part(self, part: int) -> None:
-        """Optimise all keyframes of a part; of the first one, roll and pitch alone where the vertical is known.
+        """Optimise all keyframes of a part; of the first one of what hangs together, roll and pitch alone at most.
 
         What the filter took for the vertical at its first frame is less exact than what it knows of it later.
         """
         rows = self.part == part
+        pairs = [(i, j) for i, j, _ in self.odometry] + [(o.first, o.second) for o in self.loops]
+        first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        links = coo_matrix((np.ones(len(first)), (first, second)), shape=(len(self), len(self)))
+        # A session that was taken out may have been what joined them.
+        piece = connected_components(links, directed=False)[1][rows]
         fixed = np.zeros(len(self), dtype=np.bool_)
-        fixed[int(np.argmax(rows))] = True
+        fixed[np.flatnonzero(rows)[np.unique(piece, return_index=True)[1]]] = True
         self._optimise(rows, fixed, level=True)
 
     def optimise_end(self, first: int) -> None:

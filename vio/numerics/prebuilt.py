@@ -59,7 +59,7 @@ def _loops() -> Mapping[str, Mapping[str, tuple[int, int, str]]]:
         manifest = json.loads((FOLDER / MANIFEST).read_bytes())
         loops: Mapping[str, Mapping[str, tuple[int, int, str]]] = manifest["loops"]
         same = manifest["environment"] == environment() and _runs_here() and manifest["sources"] == source_hash()
-    except (OSError, ValueError, KeyError):  # there is none, or it is damaged
+    except (OSError, ValueError, KeyError, TypeError):  # there is none, or it is damaged
         return {}
     return loops if same else {}
 

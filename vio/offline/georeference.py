@@ -56,12 +56,24 @@ def _of_run(folder: FilePath) -> Placed:
     kept = [o for o in read_loops(folder) if o.kept and o.keyframe_frame is not None]
     loops = [(place.get(o.keyframe_frame), place.get(o.frame)) for o in kept]  # type: ignore[arg-type]
     known = [(i, j) for i, j in loops if i is not None and j is not None and i < j - 1]
+    odometry = read_trajectory(folder / RunFile.TRAJECTORY) if mapped else trajectory
+    if len(odometry) != len(trajectory):
+        raise DataError(f"{folder}: its trajectories in the map and by odometry differ in length; repeat the run")
+    # The landmarks and the vertical are those of the odometry's world.
+    T_map_odom = trajectory.T_world_body @ se3_inverse(odometry.T_world_body)
     up = up_of(metrics.get("motion"), None)
+    if up is not None:
+        up = (T_map_odom[:, :3, :3] @ up).sum(axis=0)
+        up = up / np.linalg.norm(up)
     camera = trajectory.in_cam0(T_cam0_imu).T_world_body
     path = _path(trajectory, known, -camera[0, :3, 1] if up is None else up, _MOUNT_RAD if up is None else _UP_RAD)
     points = read_points(folder / RunFile.LANDMARKS)
     p = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
-    return Placed(folder.resolve().name, path, trajectory, p[np.isfinite(p).all(axis=1)])
+    p = p[np.isfinite(p).all(axis=1)]
+    _, nearest = cKDTree(odometry.T_world_body[:, :3, 3]).query(p)
+    T = T_map_odom[nearest]
+    p = np.einsum("nij,nj->ni", T[:, :3, :3], p) + T[:, :3, 3]
+    return Placed(folder.resolve().name, path, trajectory, p)
 
 
 def _of_map(file: FilePath) -> Placed:

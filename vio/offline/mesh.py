@@ -32,6 +32,7 @@ from vio.runs.mapped import corrected
 _VOXEL_SHARE = 1 / 250  # of the landmarks' depth, at least
 _STEP_SHARE, _STEP_DEG = 0.02, 4.0  # of the landmarks' depth: motion from one image that is used to the next; or turn
 _NEAR_QUANTILE = 0.25  # of the depths of landmarks
+_LEVEL = 0.99  # z of the upward direction above which a map's z is taken for up
 _SIGMA_VOXELS = float(TRUNCATION)  # of a depth, beyond which it is not used
 
 
@@ -88,10 +89,18 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
     T = in_cam0.T_world_body
     if map_file is not None:
         T = _poses_in_map(map_file, in_cam0)
-    depth_m = _landmark_depth_m(folder, T)
+    # The landmarks and the vertical are those of the odometry's world.
+    odometry = read_trajectory(folder / RunFile.TRAJECTORY) if mapped else trajectory
+    T_odom = odometry.in_cam0(T_cam0_imu).T_world_body
+    if len(T_odom) != len(T):
+        raise DataError(f"{folder}: its trajectories in the map and by odometry differ in length; repeat the run")
+    depth_m = _landmark_depth_m(folder, T_odom, None if voxel_m is None else voxel_m / _VOXEL_SHARE)
     voxel_m = _voxel_m(images.camera, depth_m) if voxel_m is None else voxel_m
     chosen = _spread(T, _STEP_SHARE * depth_m)
     up = up_of(metrics.get("motion"), None)
+    if up is not None:
+        up = (T[:, :3, :3] @ np.swapaxes(T_odom[:, :3, :3], 1, 2) @ up).sum(axis=0)
+        up = up / np.linalg.norm(up)
     poses = "map" if mapped or map_file is not None else "odometry"
     return MeshSource(images, T[chosen], trajectory.frame_indices[chosen], poses, up, voxel_m)
 
@@ -135,7 +144,7 @@ def build_mesh(
             "voxels with --voxel, and see whether the run's poses are right"
         )
     R = upright_axes(made_from.T_world_cam0, made_from.up_world)
-    if made_from.up_world is not None:
+    if made_from.up_world is not None and made_from.up_world[2] > _LEVEL:
         R = np.eye(3)  # the floor plan is in the run's own frame, whose z is up
     picture = preview(mesh, made_from.T_world_cam0[:done, :3, 3], R, voxel_m)
     return DenseMap(mesh, occupancy_grid(mesh, R, voxel_m), picture, R, done, blocks)
@@ -187,13 +196,15 @@ def _poses_in_map(file: Path, run: Trajectory) -> FloatArray:
     raise DataError(f"{file}: holds no session of this run; give the map that vio run --map FILE wrote in it")
 
 
-def _landmark_depth_m(folder: Path, T_world_cam0: FloatArray) -> float:
+def _landmark_depth_m(folder: Path, T_world_cam0: FloatArray, otherwise_m: float | None) -> float:
     """Return the depth within which a quarter of the landmarks ahead are; far ones say little of the scene."""
     points = read_points(folder / RunFile.LANDMARKS)
     p = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
     p = p[np.isfinite(p).all(axis=1)]
     depths = [transform_points(se3_inverse(T), p)[:, 2] for T in T_world_cam0[:: max(1, len(T_world_cam0) // 50)]]
     ahead = [float(np.quantile(z[z > 0], _NEAR_QUANTILE)) for z in depths if (z > 0).any()]
+    if not ahead and otherwise_m is not None:
+        return otherwise_m
     if not ahead:
         raise DataError(f"{folder}: the run has no landmarks, so that nothing states the scene's size; give --voxel")
     return float(np.median(ahead))

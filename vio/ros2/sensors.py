@@ -15,7 +15,7 @@ from vio.datasets.bags.index import stamp_of
 from vio.datasets.bags.pictures import compressed_pixels, gray_of, raw_gray, white_of
 from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
 from vio.datasets.images import WHITE_16, UnreadableImageError
-from vio.errors import DataError
+from vio.errors import DataError, OrderError
 from vio.geometry.lie import FloatArray
 from vio.live.live_odometry import LiveOdometry
 from vio.live.pairing import Pairing
@@ -82,12 +82,13 @@ class Sensors:
         except UnreadableImageError as error:
             self._refuse(str(error))
             return
-        if self._topics.right is None:
-            self._odometry.add_images(time_ns, image)
-            return
-        pair = self._pairing.add(side, time_ns, image)
-        if pair is not None:
-            self._odometry.add_stereo(*pair)
+        try:
+            if self._topics.right is None:
+                self._odometry.add_images(time_ns, image)
+            elif (pair := self._pairing.add(side, time_ns, image)) is not None:
+                self._odometry.add_stereo(*pair)
+        except OrderError as error:  # the last one was ahead
+            self._refuse(str(error))
 
     def _imu(self, data: bytes) -> None:
         assert self._topics.imu is not None

@@ -55,7 +55,7 @@ class Recorder:
         self._open = _plain(folder, rig) if form == "plain" else _bag(folder, form)
         self._events: queue.SimpleQueue[SourceEvent | None] = queue.SimpleQueue()
         self._room = threading.Semaphore(_WAITING)
-        self._failure: DataError | None = None
+        self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="record", daemon=True)
         self._thread.start()
 
@@ -91,7 +91,7 @@ class Recorder:
                         self._room.release()
         except OSError as error:
             self._failure = self._unwritable(error)
-        except DataError as error:
+        except Exception as error:  # noqa: BLE001 # raised by the next call
             self._failure = error
         self._room.release(1)  # who waits for room is the only one, and raises with its next event
 
