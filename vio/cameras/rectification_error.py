@@ -250,4 +250,5 @@ def _correct_cylinder(
             for j in range(6):
                 out[m, 2] -= right[0, 8 + j] * rows[j]
             out[m, 2] += rows[6] * (z[m, 2] - cu) * (z[m, 0] - z[m, 2]) / fu * np.sin(y)
-            out[m, 2] = out[m, 0] - (out[m, 0] - out[m, 2]) * np.exp(-coefficients[8])
+            if coefficients[8] != 0.0:
+                out[m, 2] = out[m, 0] - (out[m, 0] - out[m, 2]) * np.exp(-coefficients[8])

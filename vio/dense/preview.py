@@ -12,7 +12,7 @@ _WIDTH, _HEIGHT = 1280, 720
 _FOCAL = 1.1  # widths
 _PITCH_DEG, _ASIDE_DEG = 40.0, 60.0  # that the view looks down, and to the left of the path
 _BACKGROUND = 245
-_AWAY = 0.1  # surfaces that turn their back by more than this are left out
+_AWAY = 0.1  # surfaces that face away by more than this are culled
 _SHARE_SEEN = 0.98  # of the vertices that are to be in the picture
 
 

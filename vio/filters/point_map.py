@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from vio.filters.window import Window
@@ -25,17 +27,17 @@ class PointMap:
             self._stored += len(ids)
             # Features that stay in view are stored again and again.
             if self._stored > _LEAST_MERGE + len(self.parts[0].ids):
-                self.parts, self._stored = [_newest(self.parts)], 0
+                self.parts, self._stored = [newest_points(self.parts)], 0
 
     def take(self) -> Landmarks:
         """Return all points, and forget them."""
-        taken = _newest(self.parts) if self.parts else no_landmarks()
+        taken = newest_points(self.parts) if self.parts else no_landmarks()
         self.parts, self._stored = [], 0
         return taken
 
     def with_landmarks(self, window: Window, covariances: FloatArray) -> Landmarks:
         """Return all points, and the landmarks that are states, with their covariances (M, 3, 3)."""
-        return _newest([*self.parts, Landmarks(window.landmark_ids, window.landmarks, covariances)])
+        return newest_points([*self.parts, Landmarks(window.landmark_ids, window.landmarks, covariances)])
 
     def turn(self, R: FloatArray) -> None:
         """Turn the world by R (3, 3)."""
@@ -46,7 +48,7 @@ class PointMap:
         self.parts = [part for part in self.parts if np.isfinite(part.p_world).all()]
 
 
-def _newest(parts: list[Landmarks]) -> Landmarks:
+def newest_points(parts: Sequence[Landmarks]) -> Landmarks:
     """Join parts of a map; of points that came back under their ids, the last ones."""
     ids = np.concatenate([part.ids for part in parts])[::-1]
     points = np.concatenate([part.p_world for part in parts])[::-1]

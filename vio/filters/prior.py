@@ -59,14 +59,14 @@ class Prior:
         self.P, self.delta = P, delta
         self.error_D_constants = np.insert(self.error_D_constants, [first] * S, 0.0, axis=0)
 
-    def insert_dependent(self, at: int, J: FloatArray, noise: FloatArray, of_scale: FloatArray | None) -> None:
+    def insert_dependent(self, at: int, J: FloatArray, noise: FloatArray, of_scale: FloatArray) -> None:
         """Add errors `J error + noise` at a row.
 
         Args:
             at: the row.
             J: (k, m) of the first m errors.
             noise: covariance (k, k).
-            of_scale: how they depend on the scale that is tested (k,), where it is.
+            of_scale: how they depend on the scale that is tested (k,).
         """
         D, (k, own) = len(self.P), (len(J), slice(0, J.shape[1]))
         added, beside = J @ self.P[own], self.P[:, own] @ J.T  # exact copies where J is the identity
@@ -79,8 +79,7 @@ class Prior:
         delta, V = self.delta, self.error_D_constants
         self.delta = np.concatenate([delta[:at], J @ delta[own], delta[at:]])
         of_new = J @ V[own]
-        if of_scale is not None:
-            of_new[:, 0] = of_scale
+        of_new[:, 0] = of_scale
         self.error_D_constants = np.concatenate([V[:at], of_new, V[at:]])
         self.P = P
 

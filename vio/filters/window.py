@@ -145,15 +145,6 @@ class Window:
             P[state.calibration, state.calibration] += self.calibration.in_world(walk, self.nav.T_world_imu)
         prior.delta[own] = Phi @ prior.delta[own]
 
-    def scaled(self) -> FloatArray:
-        """How all errors (D,) move with the logarithm of the world's scale, equation (S1)."""
-        out = np.zeros(self.state.size)
-        out[:DIM] = scaled_nav(self.nav, self.calibration.T_cam0_imu)
-        centres = (self.exposures() @ se3_inverse(self.calibration.T_cam0_imu))[:, :3, 3]
-        out[self.state.clones].reshape(-1, 6)[:, :3] = centres
-        out[self.state.landmarks] = self.landmarks.reshape(-1)
-        return out
-
     def estimate_block(self, name: str, calibration: Calibration, covariance: FloatArray) -> None:
         """Make states of a block of the calibration.
 

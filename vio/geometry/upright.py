@@ -73,3 +73,15 @@ def attitude_deg(R_view_cam0: FloatArray) -> FloatArray:
     pitch = np.arcsin(np.clip(ahead[:, 2], -1, 1))
     roll = np.arctan2(-right[:, 2], up[:, 2])
     return np.degrees(np.stack([heading, pitch, roll], axis=1))
+
+
+def up_in(T_map: FloatArray, T_world: FloatArray, up_world: FloatArray) -> FloatArray:
+    """Return the mean direction (3,) that is up in a map, by poses (N, 4, 4) there and the same in the world of a run.
+
+    Args:
+        T_map: in the map.
+        T_world: the same in the world of the run.
+        up_world: (3,).
+    """
+    up: FloatArray = (T_map[:, :3, :3] @ np.swapaxes(T_world[:, :3, :3], 1, 2) @ up_world).sum(axis=0)
+    return up / np.linalg.norm(up)

@@ -9,13 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
-import numpy as np
 import numpy.typing as npt
 
 from vio.calibration.stereo_field import CalibratedRig
 from vio.cameras.rig import Rig
 from vio.config import Config
 from vio.errors import ConfigError, DataError
+from vio.filters.point_map import newest_points
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.build import CONFIGURED, MapUse, Parts
@@ -272,11 +272,7 @@ class LiveOdometry:
         return self._odometry.calibrated_rig()
 
     def _landmarks(self) -> Landmarks:
-        parts = [*self._points, self._odometry.landmarks()]
-        names = ("ids", "p_world", "covariance")
-        ids, points, covariances = (np.concatenate([getattr(part, name) for part in parts])[::-1] for name in names)
-        kept, last = np.unique(ids, return_index=True)  # of a point that came back, the newest
-        return Landmarks(kept, points[last], covariances[last])
+        return newest_points([*self._points, self._odometry.landmarks()])
 
     def __enter__(self) -> LiveOdometry:
         """Return itself."""

@@ -13,15 +13,14 @@ from vio.earth.alignment import Georeference, Path, georeference
 from vio.earth.exports import write_geojson, write_kml, write_points_geojson, write_utm
 from vio.earth.gnss import GnssFixes
 from vio.errors import DataError
-from vio.files.trajectories import read_trajectory, write_tum
+from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.geometry.upright import up_of
+from vio.geometry.upright import up_in, up_of
 from vio.mapping.map_store import MapStore
 from vio.records import Trajectory
-from vio.runs.files import RunFile
-from vio.runs.finished import read_points
+from vio.runs.finished import point_positions
 from vio.runs.folder import read_metrics
-from vio.runs.mapped import read_loops
+from vio.runs.mapped import read_loops, read_trajectories
 
 FACTS = "earth.json"
 _UP_RAD, _MOUNT_RAD = float(np.radians(0.3)), float(np.radians(5.0))  # of an IMU's vertical; of an upright camera's
@@ -48,30 +47,22 @@ def placed(source: FilePath) -> Placed:
 
 def _of_run(folder: FilePath) -> Placed:
     metrics, T_cam0_imu = read_metrics(folder)
-    mapped = (folder / RunFile.MAP_TRAJECTORY).is_file()
-    trajectory = read_trajectory(folder / (RunFile.MAP_TRAJECTORY if mapped else RunFile.TRAJECTORY))
+    trajectory, odometry = read_trajectories(folder)
     if trajectory.times_ns is None or len(trajectory) < 2:
         raise DataError(f"{folder}: its trajectory has no times, which GNSS positions are compared by")
     place = {} if trajectory.frame_indices is None else {int(f): k for k, f in enumerate(trajectory.frame_indices)}
     kept = [o for o in read_loops(folder) if o.kept and o.keyframe_frame is not None]
     loops = [(place.get(o.keyframe_frame), place.get(o.frame)) for o in kept]  # type: ignore[arg-type]
     known = [(i, j) for i, j in loops if i is not None and j is not None and i < j - 1]
-    odometry = read_trajectory(folder / RunFile.TRAJECTORY) if mapped else trajectory
-    if len(odometry) != len(trajectory):
-        raise DataError(f"{folder}: its trajectories in the map and by odometry differ in length; repeat the run")
     # The landmarks and the vertical are those of the odometry's world.
-    T_map_odom = trajectory.T_world_body @ se3_inverse(odometry.T_world_body)
     up = up_of(metrics.get("motion"), None)
     if up is not None:
-        up = (T_map_odom[:, :3, :3] @ up).sum(axis=0)
-        up = up / np.linalg.norm(up)
+        up = up_in(trajectory.T_world_body, odometry.T_world_body, up)
     camera = trajectory.in_cam0(T_cam0_imu).T_world_body
     path = _path(trajectory, known, -camera[0, :3, 1] if up is None else up, _MOUNT_RAD if up is None else _UP_RAD)
-    points = read_points(folder / RunFile.LANDMARKS)
-    p = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
-    p = p[np.isfinite(p).all(axis=1)]
+    p = point_positions(folder)
     _, nearest = cKDTree(odometry.T_world_body[:, :3, 3]).query(p)
-    T = T_map_odom[nearest]
+    T = (trajectory.T_world_body @ se3_inverse(odometry.T_world_body))[nearest]
     p = np.einsum("nij,nj->ni", T[:, :3, :3], p) + T[:, :3, 3]
     return Placed(folder.resolve().name, path, trajectory, p)
 

@@ -16,18 +16,16 @@ from vio.dense.surface import Mesh, extract_surface
 from vio.dense.voxel_grid import TRUNCATION, VoxelGrid
 from vio.errors import DataError
 from vio.evaluation.trajectories import rotation_angle_deg
-from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera
-from vio.geometry.upright import up_of, upright_axes
+from vio.geometry.upright import up_in, up_of, upright_axes
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import MapStore
 from vio.offline.run_images import RunImages, run_images
 from vio.records import Image, IntArray, StereoFrame, Trajectory
-from vio.runs.files import RunFile
-from vio.runs.finished import read_points
+from vio.runs.finished import point_positions
 from vio.runs.folder import read_metrics
-from vio.runs.mapped import corrected
+from vio.runs.mapped import corrected, read_trajectories
 
 _VOXEL_SHARE = 1 / 250  # of the landmarks' depth, at least
 _STEP_SHARE, _STEP_DEG = 0.02, 4.0  # of the landmarks' depth: motion from one image that is used to the next; or turn
@@ -81,26 +79,20 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
     images = run_images(folder, metrics)
     if images.seen.kind == "mono":
         raise DataError(f"{folder}: is a run of one camera without depth images; a mesh needs a stereo pair or depths")
-    mapped = map_file is None and (folder / RunFile.MAP_TRAJECTORY).is_file()
-    trajectory = read_trajectory(folder / (RunFile.MAP_TRAJECTORY if mapped else RunFile.TRAJECTORY))
+    trajectory, odometry = read_trajectories(folder)
+    mapped = trajectory is not odometry
     if trajectory.frame_indices is None or trajectory.times_ns is None or len(trajectory) < 1:
         raise DataError(f"{folder}: its trajectory states no frames; repeat the run")
-    in_cam0 = trajectory.in_cam0(T_cam0_imu)
-    T = in_cam0.T_world_body
-    if map_file is not None:
-        T = _poses_in_map(map_file, in_cam0)
     # The landmarks and the vertical are those of the odometry's world.
-    odometry = read_trajectory(folder / RunFile.TRAJECTORY) if mapped else trajectory
-    T_odom = odometry.in_cam0(T_cam0_imu).T_world_body
-    if len(T_odom) != len(T):
-        raise DataError(f"{folder}: its trajectories in the map and by odometry differ in length; repeat the run")
+    by_odometry = odometry.in_cam0(T_cam0_imu)
+    T_odom = by_odometry.T_world_body
+    T = trajectory.in_cam0(T_cam0_imu).T_world_body if map_file is None else _poses_in_map(map_file, by_odometry)
     depth_m = _landmark_depth_m(folder, T_odom, None if voxel_m is None else voxel_m / _VOXEL_SHARE)
     voxel_m = _voxel_m(images.camera, depth_m) if voxel_m is None else voxel_m
     chosen = _spread(T, _STEP_SHARE * depth_m)
     up = up_of(metrics.get("motion"), None)
     if up is not None:
-        up = (T[:, :3, :3] @ np.swapaxes(T_odom[:, :3, :3], 1, 2) @ up).sum(axis=0)
-        up = up / np.linalg.norm(up)
+        up = up_in(T, T_odom, up)
     poses = "map" if mapped or map_file is not None else "odometry"
     return MeshSource(images, T[chosen], trajectory.frame_indices[chosen], poses, up, voxel_m)
 
@@ -198,9 +190,7 @@ def _poses_in_map(file: Path, run: Trajectory) -> FloatArray:
 
 def _landmark_depth_m(folder: Path, T_world_cam0: FloatArray, otherwise_m: float | None) -> float:
     """Return the depth within which a quarter of the landmarks ahead are; far ones say little of the scene."""
-    points = read_points(folder / RunFile.LANDMARKS)
-    p = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
-    p = p[np.isfinite(p).all(axis=1)]
+    p = point_positions(folder)
     depths = [transform_points(se3_inverse(T), p)[:, 2] for T in T_world_cam0[:: max(1, len(T_world_cam0) // 50)]]
     ahead = [float(np.quantile(z[z > 0], _NEAR_QUANTILE)) for z in depths if (z > 0).any()]
     if not ahead and otherwise_m is not None:

@@ -159,6 +159,17 @@ def read_points(path: Path) -> np.ndarray[Any, Any]:
     return np.frombuffer(body, dtype=_PLY_POINT)
 
 
+def point_positions(folder: Path) -> FloatArray:
+    """Return the points (M, 3) of a run in the world of its odometry.
+
+    Raises:
+        DataError: the file cannot be used.
+    """
+    points = read_points(folder / RunFile.LANDMARKS)
+    p = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
+    return p[np.isfinite(p).all(axis=1)]
+
+
 def _evaluation(
     folder: Path, trajectory: Trajectory, reference: Path | None, T_cam0_body: FloatArray
 ) -> Evaluation | None:

@@ -14,6 +14,7 @@ from vio.datasets.common import read_npz
 from vio.errors import DataError
 from vio.files.inputs import read_input
 from vio.files.tables import Records, Rows
+from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import (
     FloatArray,
     quat_xyzw_from_rotation,
@@ -23,7 +24,7 @@ from vio.geometry.lie import (
     se3_inverse,
     se3_log,
 )
-from vio.records import Estimate, IntArray, LoopEvent, LoopMatches, MapKeyframes, no_map_keyframes
+from vio.records import Estimate, IntArray, LoopEvent, LoopMatches, MapKeyframes, Trajectory, no_map_keyframes
 from vio.runs.files import RunFile
 
 if TYPE_CHECKING:
@@ -77,6 +78,21 @@ def corrected(
     xi = se3_log(se3_inverse(end) @ T_map[after])
     share = (index - frames[before]) / np.maximum(frames[after] - frames[before], 1)
     return out @ se3_exp(np.clip(share, 0.0, 1.0)[:, None] * xi)
+
+
+def read_trajectories(folder: Path) -> tuple[Trajectory, Trajectory]:
+    """Return the poses of a run's frames, in its map where it had one, and the same by odometry, as the landmarks are.
+
+    Raises:
+        DataError: a file cannot be used, or they are not of the same frames.
+    """
+    odometry = read_trajectory(folder / RunFile.TRAJECTORY)
+    if not (folder / RunFile.MAP_TRAJECTORY).is_file():
+        return odometry, odometry
+    in_map = read_trajectory(folder / RunFile.MAP_TRAJECTORY)
+    if len(odometry) != len(in_map):
+        raise DataError(f"{folder}: its trajectories in the map and by odometry differ in length; repeat the run")
+    return in_map, odometry
 
 
 def write_loops(folder: Path, loops: Sequence[LoopEvent]) -> None:
