@@ -17,6 +17,7 @@ import numpy as np
 
 from vio.datasets.common import naming
 from vio.datasets.features import FeatureDataset
+from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import refuse_swapped
 from vio.errors import CalibrationError, DataError
 from vio.files.text import read_numbers
@@ -47,7 +48,7 @@ def factor_files(folder: Path) -> tuple[Path, ...]:
     return tuple(sorted(path for path in folder.iterdir() if is_factor_file(path) and path.is_file()))
 
 
-def read_gtsam(path: Path) -> FeatureDataset:
+def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDataset:
     """Read a file of stereo factors, or the only one of a folder.
 
     Raises:
