@@ -81,11 +81,7 @@ def in_colour(dataset: Dataset) -> Dataset:
 
 
 def _for_settings(kind: str, path: Path, settings: DatasetSettings) -> str:
-    """Return the kind that reads a recording with another calibration or named topics.
-
-    Raises:
-        DataError: the recording's kind takes no such setting.
-    """
+    """Return the kind that reads a recording with another calibration or named topics."""
     if settings.topics is not None and kind != "bag":
         raise DataError(f"{path}: --topics names topics of a ROS bag, but this is of kind {kind}; leave it out")
     if settings.calibration is None or kind in ("plain", "mono", "rgbd", "bag", "video"):
@@ -112,11 +108,7 @@ def _parse(source: str) -> tuple[str | None, Path]:
 
 
 def _detect(path: Path) -> str:
-    """Detect the kind of a recording from its content.
-
-    Raises:
-        DataError: the kind is unknown.
-    """
+    """Detect the kind of a recording from its content."""
     kind = _folder_kind(path) if path.is_dir() else _file_kind(path)
     if kind is None:
         raise DataError(_unknown(path))

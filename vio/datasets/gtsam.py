@@ -98,11 +98,7 @@ def _only_file(path: Path) -> Path:
 
 
 def _checked(table: FloatArray, file: Path) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return frame numbers (R,), landmark ids (R,) and pixels uL, uR, v (R, 3) of the rows.
-
-    Raises:
-        DataError: a number is not whole or not finite, or a frame sees a landmark twice.
-    """
+    """Return frame numbers (R,), landmark ids (R,) and pixels uL, uR, v (R, 3) of the rows."""
     whole = (table[:, :2] == np.floor(table[:, :2])) & (np.abs(table[:, :2]) < 2.0**53)
     bad = ~(whole.all(axis=1) & np.isfinite(table[:, 2:5]).all(axis=1))
     if bad.any():
@@ -139,11 +135,7 @@ def _camera(file: Path) -> StereoCamera:
 
 
 def _read_poses(path: Path) -> _Poses:
-    """Read the lines `pose` with a row-major 4 x 4 `T_world_cam`, printed with six digits.
-
-    Raises:
-        DataError: a line is malformed, no rigid transform, or out of order.
-    """
+    """Read the lines `pose` with a row-major 4 x 4 `T_world_cam`, printed with six digits."""
     table = read_numbers(path, 17)
     poses, numbers = table[:, 1:].reshape(-1, 4, 4), table[:, 0]
     for row, T in enumerate(poses):
