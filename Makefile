@@ -37,7 +37,7 @@ lint: $(TESTED)
 	$(BIN)/mypy
 
 unit: $(TESTED)
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # All tests with the lowest versions that pyproject.toml allows, but without the viewer, which needs NumPy 2; on Python 3.10.
 OLDEST := .venv-oldest
@@ -47,11 +47,11 @@ oldest:
 	printf 'rerun-sdk ; sys_platform == "never"\npyparsing < 3.3\n' > $(OLDEST)/without.txt # matplotlib 3.8 uses its old names
 	$(OLDEST)/bin/uv pip install --quiet --python $(OLDEST)/bin/python --compile-bytecode --resolution lowest-direct \
 		--override $(OLDEST)/without.txt -e '.[dev]'
-	$(OLDEST)/bin/python -m pytest -n auto --dist loadfile
+	$(OLDEST)/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # All tests again, with the lines of vio/ and frontend/ that they reach; LEARNED=1 counts the learned front ends in.
 coverage: $(TESTED)
-	$(BIN)/python -m pytest -n auto --dist loadfile --cov --cov-report=term --cov-fail-under=90
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --cov --cov-report=term --cov-fail-under=90
 
 # Break the code on purpose, a line at a time: some test must fail each time (half an hour).
 mutations: $(TESTED)

@@ -375,25 +375,6 @@ def epipolar_distance(
     return np.linalg.norm(seen - far - position[:, None] * along, axis=1)
 
 
-def fit_motion(
-    camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, start: FloatArray, limit_px: float
-) -> FloatArray | None:
-    """Fit a motion (4, 4) `T_curr_prev` to pixels (N, 2) of points (N, 3), from a start (4, 4).
-
-    None with too few points, or if half of them have an error above the limit.
-    """
-    finite = np.isfinite(pixels).all(axis=1)
-    if finite.sum() < _MIN_POINTS:
-        return None
-    p, z = p_prev[finite], pixels[finite]
-    T = _gauss_newton(
-        camera, start[None], p[None], z[None], np.ones((1, len(p))), iterations=_SAMPLE_ITERATIONS, free=slice(0, 6)
-    )[0]
-    T = _refine(camera, T, p, z, limit_px, slice(0, 6))
-    fits = pixel_errors(camera, T, p, z) <= limit_px
-    return T if share_of(fits) > 0.5 else None
-
-
 def predicted_motion(
     camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, expected: FloatArray
 ) -> FloatArray | None:

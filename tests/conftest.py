@@ -13,10 +13,24 @@ from vio.numerics.threads import one_blas_thread
 
 ROOT = Path(__file__).resolve().parent.parent
 
+# The files that take longest. They begin first, so that no worker is left with one when the others have ended.
+LONGEST = (
+    "test_sim_realism", "test_tutorials", "test_colmap", "test_docs", "test_bench_cluster", "test_unfinished_runs",
+    "test_online_calibration", "test_stereo_calibration", "test_self_calibration", "test_map_run", "test_datasets_bags",
+    "test_sim_render", "test_frontend_renders", "test_render_cli", "test_stereo_field", "test_one_camera", "test_wide",
+    "test_bench", "test_ros2", "test_course", "test_faults", "test_map_builder", "test_bench_maps",
+)  # fmt: skip
+
 settings.register_profile("vio", deadline=None)  # no test judges a machine by its speed
 # For tools/mutate.py: the same examples each time, and a failure is not made simpler.
 settings.register_profile("once", deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
 settings.load_profile("vio")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first; `--no-loadscope-reorder` keeps this order among the workers."""
+    rank = {name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 
 @pytest.fixture(scope="session", autouse=True)

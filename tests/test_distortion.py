@@ -14,11 +14,12 @@ from tests.numerics import numeric_jacobian
 from vio.errors import CalibrationError
 from vio.geometry.distortion import (
     CameraModel,
+    _radtan,
+    _radtan_D_xy,
     project_point,
     rectified_camera,
     rig_from_rectified,
     unproject_pixel,
-    uv_D_p_cam,
 )
 from vio.geometry.lie import se3_exp, se3_inverse
 from vio.geometry.stereo import StereoCamera
@@ -58,11 +59,14 @@ def test_a_third_coefficient_of_zero_changes_nothing() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_jacobian_with_five_coefficients() -> None:
+@pytest.mark.parametrize("count", [4, 5, 8])
+def test_jacobian_of_the_radial_tangential_model(count: int) -> None:
+    """Newton's method takes it when pixels are undistorted."""
+    coefficients = (-0.28, 0.07, 2e-4, 2e-5, 0.01, 0.02, 0.03, 0.004)[:count]
     for p in _points(20):
-        np.testing.assert_allclose(
-            uv_D_p_cam(KITTI, p), numeric_jacobian(lambda x: project_point(KITTI, x)[0], p), rtol=1e-6, atol=1e-5
-        )
+        xy = p[:2] / p[2]
+        numeric = numeric_jacobian(lambda x: _radtan(coefficients, x), xy)
+        np.testing.assert_allclose(_radtan_D_xy(coefficients, xy), numeric, rtol=1e-6, atol=1e-8)
 
 
 def test_unprojection_round_trip_over_the_kitti_image() -> None:

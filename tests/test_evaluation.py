@@ -18,11 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from vio.cli import main
 from vio.errors import EvaluationError
+from vio.evaluation.alignment import AlignMode, align_poses, apply_alignment, settle_rotation
 from vio.evaluation.trajectories import (
     KITTI_LENGTHS_M,
-    AlignMode,
-    align_poses,
-    apply_alignment,
     associate,
     associate_times,
     evaluate,
@@ -34,7 +32,6 @@ from vio.evaluation.trajectories import (
     relative_error_distance,
     relative_error_frames,
     rotation_angle_deg,
-    settle_rotation,
 )
 from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import (

@@ -15,7 +15,7 @@ from vio.errors import ConfigError, DataError
 from vio.frontend import contrast, detect, flow, klt, new_features, one_opencv_thread, stereo_fit
 from vio.frontend.detect import cell_index, grid_shape, min_distance_px
 from vio.frontend.klt import KltFrontend
-from vio.frontend.outliers import fit_motion
+from vio.frontend.outliers import _refine
 from vio.frontend.patches import half_image
 from vio.frontend.settings import FrontendSettings, GridSettings, KltSettings
 from vio.frontend.tracks import INLIER_PX
@@ -545,8 +545,7 @@ def test_real_drive_agrees_with_ground_truth(data_dir: Path) -> None:
         p, valid = triangulate(camera, before)
         assert valid.all()
         T_true = se3_inverse(poses[k + 1]) @ poses[k]
-        T = fit_motion(camera, p, after[:, :2], T_true, INLIER_PX)
-        assert T is not None
+        T = _refine(camera, T_true, p, after[:, :2], INLIER_PX, slice(0, 6))
         difference = se3_log(T @ se3_inverse(T_true))
         assert np.linalg.norm(difference[:3]) < 0.08
         assert np.degrees(np.linalg.norm(difference[3:])) < 0.1

@@ -10,7 +10,6 @@ from vio.frontend.outliers import (
     RansacProblem,
     bearing_consensus,
     epipolar_distance,
-    fit_motion,
     pixel_errors,
     rigid_consensus,
     static_tracks,
@@ -174,24 +173,16 @@ def test_points_behind_the_camera_have_infinite_error() -> None:
     assert np.isinf(pixel_errors(CAMERA, behind, p, np.zeros((5, 2)))).all()
 
 
-def test_fit_recovers_a_motion_from_predicted_pixels() -> None:
-    p = scene(50, 20)
-    T = fit_motion(CAMERA, p, pixels(T_TRUE, p, 21, noise=0.0), np.eye(4), LIMIT_PX)
-    assert T is not None
-    np.testing.assert_allclose(T, T_TRUE, atol=1e-6)
-    assert fit_motion(CAMERA, p[:5], np.zeros((5, 2)), np.eye(4), LIMIT_PX) is None
-    assert fit_motion(CAMERA, p, np.full((50, 2), np.nan), np.eye(4), LIMIT_PX) is None
-
-
 @pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
 def test_fit_converges_near_its_start_at_any_rotation(turn: float) -> None:
     T = se3_exp([0.5, -0.3, 0.8, 0.2 * turn, turn, -0.3 * turn])
     after = scene(60, 30)
     start = se3_exp([0.1, 0.05, -0.1, 0.02, -0.05, 0.03]) @ T
-    found = fit_motion(
-        CAMERA, transform_points(np.linalg.inv(T), after), project(CAMERA, after)[:, :2], start, LIMIT_PX
+    before, seen, free = transform_points(np.linalg.inv(T), after), project(CAMERA, after)[:, :2], slice(0, 6)
+    near = outliers._gauss_newton(
+        CAMERA, start[None], before[None], seen[None], np.ones((1, 60)), iterations=5, free=free
     )
-    assert found is not None
+    found = outliers._refine(CAMERA, near[0], before, seen, LIMIT_PX, free)
     np.testing.assert_allclose(found, T, atol=1e-6)
 
 

@@ -14,15 +14,14 @@ import yaml
 
 import vio
 from tests.euroc_maker import EQUIDISTANT_RIG, RADTAN_RIG, calib_cam_to_cam, make_euroc, rigid_text
-from tests.numerics import numeric_jacobian
 from vio.cameras.rig import Rig, remap
 from vio.datasets.kitti import write_calibration
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError
-from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel, uv_D_p_cam
+from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import rectify
-from vio.geometry.sphere_models import double_sphere, double_sphere_D_p, unified, unified_D_p
+from vio.geometry.sphere_models import double_sphere, unified
 from vio.records import ImuDensities
 
 LENSES = {
@@ -68,23 +67,6 @@ def test_pixels_of_every_lens_lead_back_to_their_rays(name: str) -> None:
     assert valid.all()
     assert found.all()
     np.testing.assert_allclose(ray, points / np.linalg.norm(points, axis=1, keepdims=True), atol=1e-8)
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_jacobian_of_every_lens(name: str) -> None:
-    camera = LENSES[name]
-    for p in _points()[:10]:
-        numeric = numeric_jacobian(lambda x: project_point(camera, x)[0], p, eps=1e-6 * p[2])
-        np.testing.assert_allclose(uv_D_p_cam(camera, p), numeric, rtol=1e-5, atol=1e-4)
-
-
-def test_jacobians_of_the_spheres_beyond_ninety_degrees() -> None:
-    p = np.array([1.0, 0.4, -0.3])
-    for model, jacobian in (
-        (lambda x: unified(0.9, x)[0], unified_D_p(0.9, p)),
-        (lambda x: double_sphere((-0.2, 0.6), x)[0], double_sphere_D_p((-0.2, 0.6), p)),
-    ):
-        np.testing.assert_allclose(jacobian, numeric_jacobian(model, p), rtol=1e-6, atol=1e-8)
 
 
 def test_double_sphere_with_one_centre_is_the_unified_model_in_other_parameters() -> None:

@@ -30,13 +30,11 @@ def _build(
     fraction: float = 0.3,
     minimum: int = 2,
     budget: int | None = None,
-    sticky: bool = False,
 ) -> Selector:
     settings = SelectorSettings(
         name=name,  # type: ignore[arg-type]
         keep_fraction=fraction,
         budget=budget,
-        sticky=sticky,
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(selectors, "_LEAST_KEPT", minimum)
@@ -102,38 +100,11 @@ def test_fraction_out_of_range(fraction: float) -> None:
         build_selector(SelectorSettings(keep_fraction=fraction), whole_record=None)
 
 
-@pytest.mark.parametrize("sticky", [False, True])
 @pytest.mark.parametrize("name", [*BUDGETED, "visibility_whole"])
-def test_budget_is_an_absolute_number(name: str, sticky: bool) -> None:
+def test_budget_is_an_absolute_number(name: str) -> None:
     record = _scene(6)
-    selector = _build(name, record, budget=17, sticky=sticky)
+    selector = _build(name, record, budget=17)
     assert [int(selector.select(frame).chosen.sum()) for frame in record] == [17] * len(record)
-
-
-@pytest.mark.parametrize("name", BUDGETED)
-def test_a_sticky_feature_stays_chosen_while_it_is_tracked(name: str) -> None:
-    record = _scene(12)
-    selector = _build(name, record, budget=25, sticky=True)
-    last: set[int] = set()
-    lost = 0
-    for frame in record:
-        chosen = set(frame.ids[selector.select(frame).chosen].tolist())
-        assert last & set(frame.ids.tolist()) <= chosen
-        lost += len(last - set(frame.ids.tolist()))
-        last = chosen
-    assert lost > 0  # some left the image, and others replaced them
-    assert len(last) == 25
-
-
-@pytest.mark.parametrize("name", BUDGETED)
-def test_sticky_respects_a_smaller_budget(name: str) -> None:
-    """A share of fewer features may be less than what was chosen before; only chosen ones are then kept."""
-    record = _scene(2)
-    selector = _build(name, record, fraction=0.5, minimum=1, sticky=True)
-    first = set(record[0].ids[selector.select(record[0]).chosen].tolist())
-    few = record[1].take(np.isin(record[1].ids, sorted(first)))
-    chosen = selector.select(few).chosen
-    assert chosen.sum() == int(np.ceil(0.5 * len(few)))
 
 
 def test_information_spreads_over_the_image_and_chooses_near_points() -> None:

@@ -5,10 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from tests.numerics import numeric_jacobian
 from vio.errors import CalibrationError
 from vio.geometry.distortion import (
     CameraModel,
@@ -17,7 +14,6 @@ from vio.geometry.distortion import (
     rectified_camera,
     rig_from_rectified,
     unproject_pixel,
-    uv_D_p_cam,
 )
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import project
@@ -66,23 +62,6 @@ def test_fisheye_projection_agrees_with_opencv() -> None:
         points[:, None], np.zeros(3), np.zeros(3), camera.K, np.array(camera.coefficients)
     )
     np.testing.assert_allclose(project_point(camera, points)[0], expected[:, 0], atol=1e-9)
-
-
-@pytest.mark.parametrize("name", CAMERAS)
-@settings(max_examples=25, deadline=None)
-@given(x=st.floats(-1.0, 1.0), y=st.floats(-0.7, 0.7), depth=st.floats(0.5, 20.0))
-def test_projection_jacobian(name: str, x: float, y: float, depth: float) -> None:
-    camera = CAMERAS[name]
-    p = np.array([x * depth, y * depth, depth])
-    numeric = numeric_jacobian(lambda q: project_point(camera, q)[0], p, eps=1e-6 * depth)
-    np.testing.assert_allclose(uv_D_p_cam(camera, p), numeric, rtol=1e-5, atol=1e-4)
-
-
-def test_fisheye_jacobian_on_the_optical_axis() -> None:
-    camera = CAMERAS["fisheye"]
-    p = np.array([0.0, 0.0, 2.0])
-    numeric = numeric_jacobian(lambda q: project_point(camera, q)[0], p)
-    np.testing.assert_allclose(uv_D_p_cam(camera, p), numeric, atol=1e-5)
 
 
 def test_points_behind_the_camera_and_beyond_the_model_are_invalid() -> None:

@@ -380,11 +380,11 @@ def test_the_error_moves_the_images_as_much_as_it_says() -> None:
 
 
 def test_odometry_follows_real_looking_flights() -> None:
-    """Three seconds by hand with everything at once: two flights to 1 % of the way, one with people in front to 4 %.
+    """Three seconds by hand with everything at once: one flight to 1 % of the way, one with people in front to 4 %.
 
-    Measured: 6.7, 8.0 and, with people before a blank wall, 20 to 31 mm, which small changes of the front end move.
+    Measured: 6.7 and, with people before a blank wall, 20 to 31 mm, which small changes of the front end move.
     """
-    for seed, share in ((0, 0.01), (1, 0.01), (2, 0.04)):
+    for seed, share in ((0, 0.01), (2, 0.04)):
         simulated = flight() if seed == scenario().seed else SimulatedRecording(plan(replace(scenario(), seed=seed)))
         recording = simulated.recording
         assert recording.reference is not None

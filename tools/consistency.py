@@ -201,16 +201,9 @@ class FirstEstimates(StandardErrors):
         super().keep_landmarks(chosen)
         self._first_landmarks = self._first_landmarks[chosen]
 
-    def add_landmarks(
-        self,
-        ids: IntArray,
-        p_world: FloatArray,
-        A: FloatArray,
-        covariance: FloatArray,
-        by_considered: FloatArray | None = None,
-    ) -> None:
+    def add_landmarks(self, ids: IntArray, p_world: FloatArray, *rest: Any) -> None:
         """Add landmarks (K, 3); where they are now is their first estimate."""
-        super().add_landmarks(ids, p_world, A, covariance, by_considered)
+        super().add_landmarks(ids, p_world, *rest)
         self._first_landmarks = np.concatenate([self._first_landmarks, p_world])
 
     def right_invariant(self, P: FloatArray) -> FloatArray:

@@ -67,7 +67,7 @@ _FIXED = {
     "max_epipolar_px min_correlation min_peak_margin probation_frames wanted_life_frames least_features "
     "max_blind_frames max_left_only_frames",
     "frontend.match": "ratio search_radius max_epipolar_px refine consensus_px",
-    "selector": "minimum horizon_frames pixel_sigma_px",
+    "selector": "minimum horizon_frames pixel_sigma_px sticky",
     "vislam": "start_velocity_sigma_mps start_rate_sigma_radps landmark_prior_sigma_m max_landmark_distance_m",
     "msckf": "pixel_sigma_min_px start_tilt_sigma_deg start_velocity_sigma_mps zero_velocity_sigma_mps "
     "zero_rate_sigma_radps rate_bias_sigma_radps rate_bias_walk stereo_yaw_sigma_deg stereo_field_sigma "

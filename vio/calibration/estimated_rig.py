@@ -18,12 +18,6 @@ def estimated_rig(given: Rig, estimate: Estimate, camera: StereoCamera, where: s
 
     On a cylinder left and right stay as given: its stereo field is not expressed as a rig.
 
-    Args:
-        given: the calibration that the run used.
-        estimate: the run's last one.
-        camera: the rectified pair.
-        where: the recording, for messages.
-
     Raises:
         CalibrationError: no rig of the given lens models is off as the run found it.
     """

@@ -166,10 +166,6 @@ def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
 
     What the run did not estimate stays as given, with its prior standard deviations.
 
-    Args:
-        given: the calibration that the run used.
-        estimate: the run's last one.
-
     Raises:
         CalibrationError: the given rig cannot be rectified.
     """

@@ -132,11 +132,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _check_address_space(command: str) -> None:
-    """Refuse a limit under which the libraries of a command end the process when they are loaded.
-
-    Raises:
-        VioError: `ulimit -v` leaves too little.
-    """
+    """Refuse a limit under which the libraries of a command end the process when they are loaded."""
     if sys.platform == "win32" or command in _LIGHT:
         return
     import resource

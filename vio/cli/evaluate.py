@@ -200,11 +200,7 @@ def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
 
 
 def _truth_of(path: Path) -> tuple[Trajectory, FloatArray | None]:
-    """Return the ground truth of a recording, with its extrinsics.
-
-    Raises:
-        DataError: it is no recording either, or has no ground truth.
-    """
+    """Return the ground truth of a recording, with its extrinsics."""
     from vio.datasets import open_dataset
     from vio.errors import DataError
 

@@ -12,13 +12,7 @@ class ProgressBar:
     """A tqdm bar for work whose total may become known only during it."""
 
     def __init__(self, label: str, total: int | None = None, *, unit: str = "steps") -> None:
-        """Start at zero.
-
-        Args:
-            label: what is being done.
-            total: number of steps, if known.
-            unit: name of the steps.
-        """
+        """Start at zero."""
         hidden = not sys.stderr.isatty()
         self._bar = tqdm(desc=label, total=total, unit=f" {unit}", dynamic_ncols=True, file=sys.stderr, disable=hidden)
 

@@ -252,11 +252,7 @@ def _calibration_or_fault(result: RunResult) -> str | CalibrationError:
 
 
 def _calibration_file(dataset: Dataset, folder: Path, asked: Path | None) -> Path | None:
-    """Return where a run's calibration goes, checked before the processing starts; None: it was not asked for.
-
-    Raises:
-        VioError: the recording has no image size, or the file cannot be written.
-    """
+    """Return where a run's calibration goes, checked before the processing starts; None: it was not asked for."""
     if asked is None:
         return None
     if given_rig(dataset) is None:
@@ -280,11 +276,7 @@ def _calibration_file(dataset: Dataset, folder: Path, asked: Path | None) -> Pat
 
 
 def _open_view(where: str, dataset: Dataset, config: Config, reference: Trajectory | None) -> RerunViewer:
-    """Open rerun's viewer, a file or a web server for a run.
-
-    Raises:
-        VioError: rerun is not installed, or `where` cannot be opened.
-    """
+    """Open rerun's viewer, a file or a web server for a run."""
     from vio.view.live import RerunViewer, ViewedRig
     from vio.view.stream import open_stream
 

@@ -7,6 +7,7 @@ import os
 import zipfile
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
+from importlib import import_module
 from pathlib import Path
 
 from vio.datasets.settings import DatasetSettings
@@ -17,91 +18,20 @@ from vio.protocols import Dataset
 __all__ = ["READERS", "DatasetSettings", "in_colour", "open_dataset"]
 
 
-def _kitti(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.kitti import read_kitti
-
-    return read_kitti(path, settings)
-
-
-def _euroc(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.euroc import read_euroc
-
-    return read_euroc(path, settings)
-
-
-def _kitti_raw(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.kitti_raw import read_kitti_raw
-
-    return read_kitti_raw(path, settings)
-
-
-def _plain(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.plain import read_plain
-
-    return read_plain(path, settings)
-
-
-def _mono(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.plain import read_mono
-
-    return read_mono(path, settings)
-
-
-def _rgbd(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.plain import read_rgbd
-
-    return read_rgbd(path, settings)
-
-
-def _bag(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.bags.reader import read_bag
-
-    return read_bag(path, settings)
-
-
-def _video(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.videos import read_video
-
-    return read_video(path, settings)
-
-
-def _ece276a(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.ece276a import read_ece276a
-
-    return read_ece276a(path, settings)
-
-
-def _utias(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.utias import read_utias
-
-    return read_utias(path, settings)
-
-
-def _gtsam(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.gtsam import read_gtsam
-
-    return read_gtsam(path)
-
-
-def _log(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.observation_log import read_observation_log
-
-    return read_observation_log(path)
-
-
-READERS: dict[str, Callable[[Path, DatasetSettings], Dataset]] = {
-    "kitti": _kitti,
-    "kitti_raw": _kitti_raw,
-    "euroc": _euroc,
-    "plain": _plain,
-    "mono": _mono,
-    "rgbd": _rgbd,
-    "bag": _bag,
-    "video": _video,
-    "ece276a": _ece276a,
-    "utias": _utias,
-    "gtsam": _gtsam,
-    "log": _log,
+# Module and function of the reader of each kind, imported when it is needed.
+READERS = {
+    "kitti": "kitti:read_kitti",
+    "kitti_raw": "kitti_raw:read_kitti_raw",
+    "euroc": "euroc:read_euroc",
+    "plain": "plain:read_plain",
+    "mono": "plain:read_mono",
+    "rgbd": "plain:read_rgbd",
+    "bag": "bags.reader:read_bag",
+    "video": "videos:read_video",
+    "ece276a": "ece276a:read_ece276a",
+    "utias": "utias:read_utias",
+    "gtsam": "gtsam:read_gtsam",
+    "log": "observation_log:read_observation_log",
 }
 _LOOKED_FOR = (
     "a KITTI folder (image_0 image_1 calib.txt times.txt), a KITTI raw drive (image_00 image_01), an EuRoC folder "
@@ -129,7 +59,9 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
     if not path.exists():
         raise DataError(f"{path} does not exist; give {_LOOKED_FOR}")
     settings = options or DatasetSettings()
-    dataset = READERS[_for_settings(kind or _detect(path), path, settings)](path, settings)
+    module, reader = READERS[_for_settings(kind or _detect(path), path, settings)].split(":")
+    read: Callable[[Path, DatasetSettings], Dataset] = getattr(import_module(f"vio.datasets.{module}"), reader)
+    dataset = read(path, settings)
     # The settings of a run that took the left camera also serve its observations, which are of that camera.
     if settings.camera == "both" or (not dataset.recording.has_images and dataset.recording.camera.kind == "mono"):
         return dataset
@@ -149,11 +81,7 @@ def in_colour(dataset: Dataset) -> Dataset:
 
 
 def _for_settings(kind: str, path: Path, settings: DatasetSettings) -> str:
-    """Return the kind that reads a recording with another calibration or named topics.
-
-    Raises:
-        DataError: the recording's kind takes no such setting.
-    """
+    """Return the kind that reads a recording with another calibration or named topics."""
     if settings.topics is not None and kind != "bag":
         raise DataError(f"{path}: --topics names topics of a ROS bag, but this is of kind {kind}; leave it out")
     if settings.calibration is None or kind in ("plain", "mono", "rgbd", "bag", "video"):
@@ -180,11 +108,7 @@ def _parse(source: str) -> tuple[str | None, Path]:
 
 
 def _detect(path: Path) -> str:
-    """Detect the kind of a recording from its content.
-
-    Raises:
-        DataError: the kind is unknown.
-    """
+    """Detect the kind of a recording from its content."""
     kind = _folder_kind(path) if path.is_dir() else _file_kind(path)
     if kind is None:
         raise DataError(_unknown(path))

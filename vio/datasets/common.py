@@ -102,11 +102,6 @@ def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
 def numbers_in(text: str, count: int, where: str) -> FloatArray:
     """Parse the numbers (count,) in one entry of a calibration file.
 
-    Args:
-        text: the entry.
-        count: expected number of values.
-        where: names the file and the entry, for the message.
-
     Raises:
         CalibrationError: the count is wrong, or a value is not a finite number.
     """

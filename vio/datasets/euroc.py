@@ -167,11 +167,7 @@ def _find_images(there: ImageFiles, names: Sequence[str], path: Path, lines: Seq
 
 
 def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray, tuple[str, ...]]:
-    """Indices (F,), (F,) of the left and right images that form pairs, and notes about the pairing.
-
-    Raises:
-        DataError: no image has a partner.
-    """
+    """Indices (F,), (F,) of the left and right images that form pairs, and notes about the pairing."""
     a, b = pair_stamps(left.times_ns, right.times_ns)
     if not len(a):
         spans = [f"{c.times_ns[0]} to {c.times_ns[-1]} ns" for c in (left, right)]
@@ -249,11 +245,6 @@ def _unused(path: Path, mav: Path, truth: Path | None) -> list[str]:
 
 def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progress) -> int:
     """Write a recording as an EuRoC folder of rectified images; the IMU and the ground truth are copied as they are.
-
-    Args:
-        dataset: an unrectified EuRoC recording.
-        out: an existing, empty folder; `mav0` is created in it.
-        progress: called after each frame.
 
     Returns:
         The number of frames written.

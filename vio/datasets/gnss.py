@@ -23,10 +23,6 @@ _OXTS_LEAST_M = 0.02
 def read_gnss(path: Path, topic: str | None = None) -> GnssFixes:
     """Read positions from a table, a KITTI raw drive or its `oxts`, or a ROS bag.
 
-    Args:
-        path: the file or folder.
-        topic: of a bag with several of NavSatFix.
-
     Raises:
         DataError: it holds no positions, or they are damaged.
     """

@@ -17,6 +17,7 @@ import numpy as np
 
 from vio.datasets.common import naming
 from vio.datasets.features import FeatureDataset
+from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import refuse_swapped
 from vio.errors import CalibrationError, DataError
 from vio.files.text import read_numbers
@@ -47,7 +48,7 @@ def factor_files(folder: Path) -> tuple[Path, ...]:
     return tuple(sorted(path for path in folder.iterdir() if is_factor_file(path) and path.is_file()))
 
 
-def read_gtsam(path: Path) -> FeatureDataset:
+def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDataset:
     """Read a file of stereo factors, or the only one of a folder.
 
     Raises:
@@ -97,11 +98,7 @@ def _only_file(path: Path) -> Path:
 
 
 def _checked(table: FloatArray, file: Path) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return frame numbers (R,), landmark ids (R,) and pixels uL, uR, v (R, 3) of the rows.
-
-    Raises:
-        DataError: a number is not whole or not finite, or a frame sees a landmark twice.
-    """
+    """Return frame numbers (R,), landmark ids (R,) and pixels uL, uR, v (R, 3) of the rows."""
     whole = (table[:, :2] == np.floor(table[:, :2])) & (np.abs(table[:, :2]) < 2.0**53)
     bad = ~(whole.all(axis=1) & np.isfinite(table[:, 2:5]).all(axis=1))
     if bad.any():
@@ -138,11 +135,7 @@ def _camera(file: Path) -> StereoCamera:
 
 
 def _read_poses(path: Path) -> _Poses:
-    """Read the lines `pose` with a row-major 4 x 4 `T_world_cam`, printed with six digits.
-
-    Raises:
-        DataError: a line is malformed, no rigid transform, or out of order.
-    """
+    """Read the lines `pose` with a row-major 4 x 4 `T_world_cam`, printed with six digits."""
     table = read_numbers(path, 17)
     poses, numbers = table[:, 1:].reshape(-1, 4, 4), table[:, 0]
     for row, T in enumerate(poses):

@@ -210,11 +210,7 @@ def _read_rigid(path: Path) -> FloatArray:
 
 
 def _read_entries(path: Path) -> dict[str, str]:
-    """Read the lines `name: values`.
-
-    Raises:
-        CalibrationError: a line is of another form, or a name occurs twice.
-    """
+    """Read the lines `name: values`."""
     entries: dict[str, str] = {}
     for number, line in text_lines(path):
         name, colon, values = line.partition(":")
@@ -264,11 +260,6 @@ def _read_times(path: Path, numbers: IntArray) -> tuple[IntArray, tuple[str, ...
 
 def write_rectified_kitti(dataset: RectifiedDataset, out: Path, progress: Progress) -> int:
     """Write a drive as a KITTI odometry folder: `image_0 image_1 calib.txt times.txt` and `T_cam0_imu.txt`.
-
-    Args:
-        dataset: an unrectified drive.
-        out: an existing, empty folder.
-        progress: called after each frame.
 
     Returns:
         The number of frames written.

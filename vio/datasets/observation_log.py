@@ -19,6 +19,7 @@ from vio.cameras.rig import Rig
 from vio.datasets.common import checked_transform, read_npz, shape_text
 from vio.datasets.features import FeatureDataset
 from vio.datasets.samples import MotionSamples, motion_samples
+from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_bytes
 from vio.files.text import check_increasing
@@ -206,7 +207,7 @@ def is_observation_log(names: Sequence[str]) -> bool:
     return {"offsets", "ids", "z"} <= set(names) or "format" in names
 
 
-def read_observation_log(path: Path) -> FeatureDataset:
+def read_observation_log(path: Path, settings: DatasetSettings | None = None) -> FeatureDataset:
     """Read a log; frames that were not processed when it was written yield no event.
 
     Raises:

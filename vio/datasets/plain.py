@@ -223,11 +223,7 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
 
 
 def _depth_factor(rig: Rig, settings: DatasetSettings, where: Path) -> tuple[float, tuple[str, ...]]:
-    """Return the levels per metre of depth images, and a note where setting and calibration differ.
-
-    Raises:
-        CalibrationError: nothing states them.
-    """
+    """Return the levels per metre of depth images, and a note where setting and calibration differ."""
     factor = settings.depth_factor or rig.depth_factor
     if factor is None:
         raise CalibrationError(
@@ -313,11 +309,7 @@ def _missing_note(file: Path, pairs: ImagePairs) -> tuple[str, ...]:
 
 
 def _listed_times(file: Path, pairs: ImagePairs) -> IntArray:
-    """Read the times (F,) of images from EuRoC's list of a camera.
-
-    Raises:
-        DataError: it lacks an image, or cannot be read.
-    """
+    """Read the times (F,) of images from EuRoC's list of a camera."""
     times_ns, rows, _ = stamped_rows(file, 2, "timestamp [ns], filename")
     time_of = dict(zip(rows, times_ns.tolist(), strict=True))
     missing = next((left.name for left, _ in pairs if left.name not in time_of), None)

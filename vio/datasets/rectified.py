@@ -25,12 +25,6 @@ def make_rectifier(
 ) -> Rectifier:
     """Prepare the rectification of a rig; a rig that is rectified already passes images through unchanged.
 
-    Args:
-        rig: both cameras as calibrated.
-        interpolation: how gray values between pixels are found.
-        where: the calibration file, for messages.
-        projection: of the rectified images.
-
     Raises:
         CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
     """

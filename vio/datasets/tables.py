@@ -153,11 +153,7 @@ def read_imu_table(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
 
 
 def _imu_order(table: TextTable) -> list[int] | None:
-    """Return the columns of gyro x y z and accel x y z by the header's names; None: no header.
-
-    Raises:
-        DataError: the header names other things.
-    """
+    """Return the columns of gyro x y z and accel x y z by the header's names; None: no header."""
     if not table.header:
         return None
     found: dict[tuple[str, str], int] = {}

@@ -14,13 +14,20 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import EvaluationError
+from vio.evaluation.alignment import (
+    Alignment,
+    AlignMode,
+    RotationSource,
+    align_poses,
+    apply_alignment,
+    deviation_about_path,
+    settle_rotation,
+)
 from vio.evaluation.reference_axes import attitude_note
-from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts, se3_inverse, so3_exp, so3_hat, so3_log
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_log
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import NS_PER_S, BodyFrame, IntArray, Trajectory
 
-AlignMode: TypeAlias = Literal["se3", "sim3", "first", "none"]
-RotationSource: TypeAlias = Literal["positions", "direction and orientations", "orientations", "first pose", "none"]
 AssociationMode: TypeAlias = Literal["time", "frame"]
 
 KITTI_LENGTHS_M: tuple[float, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
@@ -28,10 +35,6 @@ KITTI_STEP_FRAMES = 10
 _MILLIMETRES_BELOW_M = 0.01  # lengths in words
 _SHORT_M = 10.0  # over shorter lengths a drift for 100 m says nothing that a reader can picture
 RPE_DISTANCE_TOLERANCE = 0.1  # relative tolerance of a pair's path length
-_COLLINEAR = 1e-13  # ratio of squared extents below which points are collinear, to rounding
-_LOOSE_RAD = 0.05  # positions determine the rotation about the path if its standard deviation is below 3 degrees
-_ORIENTATION_GAIN = 10.0  # ratio of standard deviations above which the orientations replace the positions in it
-_CONTRADICTION = 5.0  # standard deviations by which they may differ; more: they do not describe the same body
 _PATH_RATIO = 1.5  # ratio of path lengths above which the reference may be another recording's
 _UNITS = {"millimetres": 1000.0, "centimetres": 100.0}
 _UNIT_SHARE = 0.1  # a ratio of path lengths so near one of these is no chance; odometry without a scale has any ratio
@@ -39,7 +42,6 @@ _PATH_LEAST_M = 1.0  # paths below this may consist of noise
 _MATCHED_SHARE = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
 _MATCHED_ESTIMATE = 0.2  # span of the matched poses, of the estimate; below, the figures are those of a part
 LEAST_POSES = 3  # that determine a scale, and make a figure
-_STATIONARY = 1e-12  # extent, relative to the size of the coordinates, below which points coincide, to rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,16 +97,6 @@ class Coverage:
     estimate: float  # fraction of the estimate's poses that had a reference
     reference_span: float | None  # fraction of the reference's time (or frame) span between first and last match
     longest_gap_s: float | None  # between matched poses; None: one pose, or association by frame
-
-
-@dataclass(frozen=True, slots=True)
-class Alignment:
-    """Similarity from the estimate's world to the reference's: `p_ref = scale R p_est + t`."""
-
-    R: FloatArray  # (3, 3)
-    t: FloatArray  # (3,) metres
-    scale: float
-    rotation_from: RotationSource = "positions"  # direction and orientations: of the path, and of the poses about it
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,75 +301,6 @@ def associate_times(
     return np.array(left, dtype=np.int64), np.array(right, dtype=np.int64)
 
 
-def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignment:
-    """Find the alignment of M >= 1 paired poses (M, 4, 4) that minimises the squared distances of their positions.
-
-    Where the positions do not determine the rotation (one point, or a straight line), the orientations do. `first`
-    makes the first pair of poses equal instead, `none` is the identity.
-
-    Raises:
-        EvaluationError: the scale of `sim3` is undefined, because one of the two does not move.
-
-    Reference: Umeyama, Least-squares estimation of transformation parameters between two point patterns,
-    IEEE TPAMI (1991), equations 34 to 43.
-    """
-    if mode == "none":
-        return Alignment(np.eye(3), np.zeros(3), 1.0, "none")
-    if mode == "first":
-        T = T_ref[0] @ se3_inverse(T_est[0])
-        return Alignment(T[:3, :3], T[:3, 3], 1.0, "first pose")
-    x, y = T_est[:, :3, 3], T_ref[:, :3, 3]
-    x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
-    x_extent, y_extent = _extent(x), _extent(y)
-    covariance = (y - y_mean).T @ (x - x_mean) / len(x)
-    U, d, Vt = np.linalg.svd(covariance)
-    sign = np.array([1.0, 1.0, 1.0 if np.linalg.det(U @ Vt) > 0 else -1.0])
-    R = (U * sign) @ Vt
-    rotation_from: RotationSource = "positions"
-    moving = min(x_extent, y_extent) > 0 and d[0] > _COLLINEAR * x_extent * y_extent
-    if not moving:
-        if mode == "sim3":
-            raise EvaluationError("sim3 alignment needs two trajectories that move together; align with se3 or none")
-        R, rotation_from = nearest_rotation(_orientation_sum(T_est, T_ref)), "orientations"
-    elif d[1] <= _COLLINEAR * d[0]:
-        R = _rotate_about(U[:, 0], R, _orientation_sum(T_est, T_ref))
-        rotation_from = "direction and orientations"
-    scale = float(d @ sign) / x_extent**2 if mode == "sim3" else 1.0
-    return Alignment(R, y_mean - scale * (R @ x_mean), scale, rotation_from)
-
-
-def settle_rotation(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) -> Alignment:
-    """Return the alignment of paired poses (M, 4, 4), turned about the path where positions leave that part open.
-
-    On a nearly straight path the least squares of the positions determine the rotation about the path to
-    `sigma_p` only (math.md, E1), which may be tens of degrees. There the orientations replace them, if their own errors
-    about the path are far smaller and both agree within `sigma_p`. Anywhere else the alignment is returned unchanged.
-    """
-    if alignment.rotation_from != "positions":
-        return alignment
-    axis, sigma = _about_path(alignment, T_est, T_ref)
-    R = _rotate_about(axis, alignment.R, _orientation_sum(T_est, T_ref))
-    scatter = so3_log(R @ T_est[:, :3, :3] @ np.swapaxes(T_ref[:, :3, :3], 1, 2)) @ axis
-    angle = np.linalg.norm(so3_log(R @ alignment.R.T))
-    precise = sigma > max(_LOOSE_RAD, _ORIENTATION_GAIN * np.sqrt(np.mean(scatter**2)))
-    if not precise or angle > _CONTRADICTION * sigma:
-        return alignment
-    t = T_ref[:, :3, 3].mean(axis=0) - alignment.scale * (R @ T_est[:, :3, 3].mean(axis=0))
-    return Alignment(R, t, alignment.scale, "direction and orientations")
-
-
-def _about_path(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) -> tuple[FloatArray, float]:
-    """Return the direction (3,) of a path and the standard deviation, radians, of an alignment's rotation about it."""
-    x, y = alignment.scale * T_est[:, :3, 3] @ alignment.R.T, T_ref[:, :3, 3]
-    x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
-    S = (y - y_mean).T @ (x - x_mean) / len(x)  # symmetric at the least squares
-    axis = np.linalg.svd(S)[0][:, 0]
-    across = np.eye(3) - np.outer(axis, axis)
-    variance = 0.5 * float(np.mean(np.sum(((y - y_mean - x + x_mean) @ across) ** 2, axis=1)))
-    curvature = float(np.trace(across @ S))
-    return axis, float(np.sqrt(variance / curvature)) if curvature > 0 else float("inf")
-
-
 def _scale_free(T_est: FloatArray, T_ref: FloatArray) -> ScaleFree | None:
     """Return the scale of M poses (M, 4, 4) and their error without it; None with too few poses or without motion."""
     if len(T_est) < LEAST_POSES:
@@ -388,12 +311,6 @@ def _scale_free(T_est: FloatArray, T_ref: FloatArray) -> ScaleFree | None:
         return None
     errors = np.linalg.norm(apply_alignment(fit, T_est)[:, :3, 3] - T_ref[:, :3, 3], axis=1)
     return ScaleFree(1 / fit.scale, error_statistics(errors).rmse)
-
-
-def apply_alignment(alignment: Alignment, T_est: FloatArray) -> FloatArray:
-    """Poses (N, 4, 4) in the reference's world; the scale touches positions only."""
-    p = alignment.scale * T_est[:, :3, 3] @ alignment.R.T + alignment.t
-    return se3_from_parts(alignment.R @ T_est[:, :3, :3], p)
 
 
 def relative_error_frames(T_est: FloatArray, T_ref: FloatArray, delta: int) -> RelativeError | None:
@@ -636,18 +553,6 @@ def _take(trajectory: Trajectory, rows: IntArray) -> Trajectory:
     )
 
 
-def _extent(p: FloatArray) -> float:
-    """Root mean square distance from the centroid; 0 where it is within rounding of the coordinates."""
-    extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
-    return extent if extent > _STATIONARY * float(np.abs(p).max()) else 0.0
-
-
-def _orientation_sum(T_est: FloatArray, T_ref: FloatArray) -> FloatArray:
-    """Return C (3, 3) such that the best fit R of `R_ref = R R_est` maximises trace(R^T C)."""
-    out: FloatArray = np.einsum("nij,nkj->ik", T_ref[:, :3, :3], T_est[:, :3, :3])
-    return out
-
-
 def _notes(
     estimate_m: float, reference_m: float, rows: IntArray, estimate: Trajectory, reference: Trajectory
 ) -> tuple[str, ...]:
@@ -679,17 +584,9 @@ def _attitude_notes(
     """Name what explains a large attitude error of M poses (M, 4, 4) whose positions were aligned."""
     if alignment.rotation_from not in ("positions", "direction and orientations"):
         return ()
-    sigma = _about_path(alignment, T_est, T_ref)[1] if alignment.rotation_from == "positions" else 0.0
+    sigma = deviation_about_path(alignment, T_est, T_ref)[1] if alignment.rotation_from == "positions" else 0.0
     note = attitude_note(T_aligned[:, :3, :3], T_ref[:, :3, :3], sigma)
     return () if note is None else (note,)
-
-
-def _rotate_about(axis: FloatArray, R: FloatArray, C: FloatArray) -> FloatArray:
-    """Return the rotation `exp(angle axis^) R` that maximises trace(rotation^T C)."""
-    D = C @ R.T
-    angle = np.arctan2(-np.trace(so3_hat(axis) @ D), np.trace(D) - axis @ D @ axis)
-    out: FloatArray = so3_exp(angle * axis) @ R
-    return out
 
 
 def _cumulative_path_length(positions: FloatArray) -> FloatArray:

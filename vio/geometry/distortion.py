@@ -169,27 +169,6 @@ def project_point(camera: CameraModel, p_cam: npt.ArrayLike) -> tuple[FloatArray
     return xy * (camera.fu, camera.fv) + (camera.cu, camera.cv), valid
 
 
-def uv_D_p_cam(camera: CameraModel, p_cam: npt.ArrayLike) -> FloatArray:
-    """Jacobian (..., 2, 3) of `project_point` with respect to the point (pixels per metre), where it is valid."""
-    p = np.asarray(p_cam, dtype=np.float64)
-    if camera.model == "equidistant":
-        xy_D_p = _equidistant_D_p(camera.coefficients, p)
-    elif camera.model == "double_sphere":
-        xy_D_p = sphere_models.double_sphere_D_p(camera.coefficients, p)
-    elif camera.model == "unified":
-        xy_D_p = sphere_models.unified_D_p(camera.coefficients[0], p)
-        if len(bend := camera.coefficients[1:]):
-            xy_D_p = _radtan_D_xy(bend, sphere_models.unified(camera.coefficients[0], p)[0]) @ xy_D_p
-    else:
-        depth = p[..., 2]
-        xy_D_p = np.zeros((*p.shape[:-1], 2, 3))
-        xy_D_p[..., 0, 0] = xy_D_p[..., 1, 1] = 1 / depth
-        xy_D_p[..., 0, 2], xy_D_p[..., 1, 2] = -p[..., 0] / depth**2, -p[..., 1] / depth**2
-        if camera.model == "radtan":
-            xy_D_p = _radtan_D_xy(camera.coefficients, p[..., :2] / depth[..., None]) @ xy_D_p
-    return np.array([camera.fu, camera.fv])[:, None] * xy_D_p
-
-
 def unproject_pixel(camera: CameraModel, uv: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Unit rays (..., 3) in the camera frame of pixels (..., 2), and a mask (...) where Newton's method converged.
 
@@ -326,25 +305,6 @@ def _equidistant(coefficients: tuple[float, ...], p: FloatArray) -> tuple[FloatA
     near_axis = radius < 1e-12
     scale = np.where(near_axis, 0.0, theta_d / np.where(near_axis, 1.0, radius))
     return p[..., :2] * scale[..., None], valid
-
-
-def _equidistant_D_p(coefficients: tuple[float, ...], p: FloatArray) -> FloatArray:
-    x, y, depth = p[..., 0], p[..., 1], p[..., 2]
-    near_axis = np.hypot(x, y) < 1e-9
-    radius = np.where(near_axis, 1.0, np.hypot(x, y))
-    theta_d, theta_d_D_theta = _theta_polynomial(coefficients, np.arctan2(radius, depth))
-    square = radius**2 + depth**2
-    ex, ey = x / radius, y / radius
-    along, across = theta_d_D_theta * depth / square, theta_d / radius
-    out = np.empty((*p.shape[:-1], 2, 3))
-    out[..., 0, 0] = along * ex * ex + across * ey * ey
-    out[..., 1, 1] = along * ey * ey + across * ex * ex
-    out[..., 0, 1] = out[..., 1, 0] = (along - across) * ex * ey
-    out[..., 0, 2], out[..., 1, 2] = -theta_d_D_theta * radius / square * ex, -theta_d_D_theta * radius / square * ey
-    on_axis = np.zeros((2, 3))
-    on_axis[0, 0] = on_axis[1, 1] = 1.0
-    safe_depth = np.where(near_axis, depth, 1.0)[..., None, None]
-    return np.where(near_axis[..., None, None], on_axis / safe_depth, out)
 
 
 def _unproject_equidistant(coefficients: tuple[float, ...], xy: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:

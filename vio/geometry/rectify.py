@@ -53,10 +53,6 @@ class Rectification(RectifiedPair):
 def rectify(rig: StereoRig, projection: ProjectionMode = "pinhole") -> Rectification:
     """Find the rectified pair of a rig and its maps; its images have the size of the left one and no invalid border.
 
-    Args:
-        rig: both cameras as calibrated.
-        projection: of the rectified images; auto: `projection_of`.
-
     Raises:
         CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
     """

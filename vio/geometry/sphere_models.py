@@ -29,15 +29,6 @@ def unified(xi: float, p: FloatArray) -> tuple[FloatArray, BoolArray]:
     return p[..., :2] / depth[..., None], valid
 
 
-def unified_D_p(xi: float, p: FloatArray) -> FloatArray:
-    """Jacobian (..., 2, 3) of `unified` with respect to the point."""
-    distance = np.linalg.norm(p, axis=-1)
-    depth = p[..., 2] + xi * distance
-    depth_D_p = xi * p / distance[..., None]
-    depth_D_p[..., 2] += 1
-    return _quotient_D_p(p, depth, depth_D_p)
-
-
 def unproject_unified(xi: float, xy: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Unit rays (..., 3) of points (..., 2) of the normalised plane, and a mask (...) of those inside the model."""
     r2 = np.einsum("...i,...i->...", xy, xy)
@@ -54,20 +45,10 @@ def double_sphere(xi_alpha: tuple[float, ...], p: FloatArray) -> tuple[FloatArra
     limit = alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
     limit = (limit + xi) / np.sqrt(2 * limit * xi + xi * xi + 1)
     valid = (p[..., 2] > -limit * d1) & (d1 > _TINY)
-    depth = np.where(valid, _double_depth(xi, alpha, p)[0], 1.0)
+    shifted = xi * d1 + p[..., 2]
+    d2 = np.sqrt(p[..., 0] ** 2 + p[..., 1] ** 2 + shifted**2)
+    depth = np.where(valid, alpha * d2 + (1 - alpha) * shifted, 1.0)
     return p[..., :2] / depth[..., None], valid
-
-
-def double_sphere_D_p(xi_alpha: tuple[float, ...], p: FloatArray) -> FloatArray:
-    """Jacobian (..., 2, 3) of `double_sphere` with respect to the point."""
-    xi, alpha = xi_alpha
-    depth, d1, d2, shifted = _double_depth(xi, alpha, p)
-    shifted_D_p = xi * p / d1[..., None]
-    shifted_D_p[..., 2] += 1
-    d2_D_p = shifted[..., None] * shifted_D_p
-    d2_D_p[..., :2] += p[..., :2]
-    depth_D_p = alpha * d2_D_p / d2[..., None] + (1 - alpha) * shifted_D_p
-    return _quotient_D_p(p, depth, depth_D_p)
 
 
 def unproject_double_sphere(xi_alpha: tuple[float, ...], xy: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -82,22 +63,6 @@ def unproject_double_sphere(xi_alpha: tuple[float, ...], xy: FloatArray) -> tupl
     valid = valid & (second >= 0)
     scale = (mz * xi + np.sqrt(np.where(valid, second, 0.0))) / (mz * mz + r2)
     return _ray(np.where(valid[..., None], xy, 0.0), scale, scale * mz - xi), valid
-
-
-def _double_depth(xi: float, alpha: float, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the divisor of the projection, the distances to both spheres' centres, and the shifted depth (...)."""
-    d1 = np.linalg.norm(p, axis=-1)
-    shifted = xi * d1 + p[..., 2]
-    d2 = np.sqrt(p[..., 0] ** 2 + p[..., 1] ** 2 + shifted**2)
-    return alpha * d2 + (1 - alpha) * shifted, d1, d2, shifted
-
-
-def _quotient_D_p(p: FloatArray, depth: FloatArray, depth_D_p: FloatArray) -> FloatArray:
-    """Jacobian (..., 2, 3) of `p[:2] / depth`."""
-    out: FloatArray = -p[..., :2, None] * depth_D_p[..., None, :] / depth[..., None, None] ** 2
-    out[..., 0, 0] += 1 / depth
-    out[..., 1, 1] += 1 / depth
-    return out
 
 
 def _ray(xy: FloatArray, scale: FloatArray, z: FloatArray) -> FloatArray:

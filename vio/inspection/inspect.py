@@ -31,13 +31,6 @@ def inspect_recording(
 ) -> Inspection:
     """Examine a recording.
 
-    Args:
-        dataset: the recording.
-        build_frontend: makes the front end that tracks its features.
-        pairs: frames looked at.
-        tracked: frames tracked from the first on, to compare the IMU with the images; 0: none.
-        progress: called with (done, total).
-
     Raises:
         DataError: an image has a wrong size, or too many cannot be read.
     """

@@ -112,11 +112,7 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
 def _motion(
     config: Config, sensors: Collection[MotionSource], *, missing: str, logged: RunMotion | None = None
 ) -> MotionSource | None:
-    """Return the motion that is configured; auto: that of a logged run, else the best that sensors and back end share.
-
-    Raises:
-        ConfigError: there is no such sensor, said by `missing`, or the back end has no model for it.
-    """
+    """Return the configured motion; auto: that of a logged run, else the best that sensors and back end share."""
     known = backend_class(config.backend).motion_sources
     if config.motion == "none":
         return None
@@ -199,12 +195,7 @@ def _record(features: Dataset | None) -> Callable[[], list[Observations]] | None
 
 
 def _open_map(use: MapUse, source: Source, config: Config, backend: Backend) -> MapSession:
-    """Open the map of a run.
-
-    Raises:
-        ConfigError: the recording has no images, or the back end keeps no window of poses.
-        DataError: the map cannot be used.
-    """
+    """Open the map of a run."""
     from vio.mapping.session import MapSession
 
     recording = source.recording

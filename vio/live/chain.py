@@ -41,18 +41,7 @@ class Chain:
         use_prior: bool,
         trial: ImuTrial | None = None,
     ) -> None:
-        """Connect the parts.
-
-        Args:
-            camera: the rectified pair.
-            T_cam0_body: (4, 4) extrinsics of the body that the filter estimates.
-            motion: what carries the pose between frames; None: images alone.
-            frontend: gives the observations.
-            selector: chooses among them.
-            backend: estimates.
-            use_prior: whether the front end is offered the pixels that the filter expects.
-            trial: begins again where the IMU turns out to be wrong; None: that is only reported.
-        """
+        """Connect the parts."""
         self.frontend, self.selector, self.backend = frontend, selector, backend
         self.monitor = RunMonitor(camera, T_cam0_body, imu=motion == "imu")
         self._motion = motion

@@ -70,11 +70,7 @@ class ImuTrial:
 
 
 def _estimates(backend: Backend, taken: list[MotionSample | Observations], verdict: ImuVerdict) -> dict[int, Estimate]:
-    """Give everything to a back end; return its estimates by frame number.
-
-    Raises:
-        EstimationError: it is lost.
-    """
+    """Give everything to a back end; return its estimates by frame number."""
     estimates = {}
     for event in taken:
         if isinstance(event, Observations):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-
-import numpy.typing as npt
 
 from vio.calibration.stereo_field import CalibratedRig
 from vio.cameras.rig import Rig
@@ -20,9 +20,10 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.build import CONFIGURED, MapUse, Parts
 from vio.live.collector import QuietCollector
+from vio.live.event_inputs import EventInputs
 from vio.live.event_queue import DROPS, Drop
 from vio.live.figures import LiveFigures, LiveMonitor
-from vio.live.inputs import GivenFrame, checked_time
+from vio.live.inputs import GivenFrame, Inputs, checked_time
 from vio.live.odometry import Odometry
 from vio.live.prediction import PredictedPose
 from vio.live.shared_prediction import SharedPredictor
@@ -36,7 +37,7 @@ log = logging.getLogger(__name__)
 _LANDMARK_FRAMES = 100  # results after which the points that will not change any more are taken from the filter
 
 
-class LiveOdometry:
+class LiveOdometry(EventInputs[None]):
     """`Odometry` with a queue and a worker: calls that add return at once, results come from the worker.
 
     Units, frames and clocks are those of `Odometry`; where no frame is left out, poses are the same to the bit. Samples
@@ -64,12 +65,12 @@ class LiveOdometry:
         Args:
             rig: as of `Odometry`, like `config`, `T_cam0_imu`, `parts`, `map` and `localise`; a map never makes
                 a frame wait.
-            config: every setting.
-            T_cam0_imu: (4, 4) extrinsics, only beside a rectified pair.
-            parts: front end, selector or back end in place of the configured ones.
+            config: likewise.
+            T_cam0_imu: likewise.
+            parts: likewise.
             on_frame: called with the result of each frame, by the worker: what takes long in it delays the next frame.
-            map: file of a map to begin or to continue.
-            localise: find poses in the map, and leave it as it is.
+            map: likewise.
+            localise: likewise.
             drop: what happens where `queue_frames` wait already: "oldest" leaves out the frame that has waited longest,
                 so that latency is bounded; "none" leaves out none; "block" makes the call wait, for recordings.
             queue_frames: that may wait.
@@ -126,55 +127,27 @@ class LiveOdometry:
 
     # What goes in
 
-    def add_imu(self, t_ns: int | npt.ArrayLike, gyro: npt.ArrayLike, accel: npt.ArrayLike) -> None:
-        """Take one IMU sample, or several in order of time, see `Odometry.add_imu`; in microseconds.
+    @property
+    def inputs(self) -> Inputs:
+        """The checks of the present trajectory."""
+        return self._odometry.inputs
+
+    def _checking(self) -> AbstractContextManager[object]:
+        return contextlib.nullcontext()
+
+    def take(self, given: GivenFrame | Sequence[MotionSample] | None) -> None:
+        """Queue what was checked; predictions begin with samples at once.
 
         Raises:
-            VioError: as `Odometry.add_imu`, or the worker has ended.
+            VioError: the worker has ended.
         """
-        self._add_samples(self._odometry.inputs.samples("imu", t_ns, gyro, accel))
-
-    def add_velocity(self, t_ns: int | npt.ArrayLike, linear: npt.ArrayLike, angular: npt.ArrayLike) -> None:
-        """Take one sample of body velocity, or several in order of time, see `Odometry.add_velocity`.
-
-        Raises:
-            VioError: as `Odometry.add_velocity`, or the worker has ended.
-        """
-        self._add_samples(self._odometry.inputs.samples("velocity", t_ns, linear, angular))
-
-    def add_stereo(self, t_ns: int, left: npt.ArrayLike, right: npt.ArrayLike) -> None:
-        """Take a pair of images, see `Odometry.add_stereo`; they are copied first, see `copy_images`.
-
-        Raises:
-            VioError: a wrong type, shape or size, a time not after the last frame's, or the worker has ended.
-        """
-        self.add_images(t_ns, left, right)
-
-    def add_images(
-        self,
-        t_ns: int,
-        left: npt.ArrayLike,
-        right: npt.ArrayLike | None = None,
-        *,
-        depth_m: npt.ArrayLike | None = None,
-    ) -> None:
-        """Take the image of one camera, with depths where it has them, see `Odometry.add_images`.
-
-        Raises:
-            VioError: as `add_stereo`, or images of another rig's kind.
-        """
-        self._add_frame(self._odometry.inputs.images(t_ns, left, right, depth_m, copy=self._copies))
-
-    def add_observations(
-        self, t_ns: int, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None = None
-    ) -> None:
-        """Take what a front end of the caller's own saw in a frame, see `Odometry.add_observations`.
-
-        Raises:
-            VioError: shapes disagree, an id occurs twice, a pixel is not finite, a time not after the last one, or the
-                worker has ended.
-        """
-        self._add_frame(self._odometry.inputs.observations(t_ns, ids, z, has_right))
+        if isinstance(given, GivenFrame):
+            self._monitor.arrived(given.time_ns)
+            self._monitor.queued(fits=self._worker.put(lambda: self._process(given), frame=True))
+        elif given is not None:
+            self._worker.put(lambda: self._process(given))
+            for sample in given:
+                self._predictor.add(sample)
 
     def reset(self) -> None:
         """Forget all: the next frame begins a new trajectory in a new world frame.
@@ -287,26 +260,12 @@ class LiveOdometry:
         else:
             self._worker.end(discard=True)
 
-    # How
-
-    def _add_samples(self, samples: Sequence[MotionSample]) -> None:
-        """Queue samples, and let predictions begin with them at once."""
-        self._worker.put(lambda: self._process(samples))
-        for sample in samples:
-            self._predictor.add(sample)
-
-    def _add_frame(self, given: GivenFrame | None) -> None:
-        """Queue a frame, unless it is left out."""
-        if given is not None:
-            self._monitor.arrived(given.time_ns)
-            self._monitor.queued(fits=self._worker.put(lambda: self._process(given), frame=True))
-
     # In the worker
 
     def _process(self, given: GivenFrame | Sequence[MotionSample]) -> None:
         """Process what was added; what only the odometry itself refuses is counted and logged."""
         try:
-            self._odometry.process(given)
+            self._odometry.take(given)
         except DataError as error:
             self._monitor.refused += 1
             self._say(str(error))

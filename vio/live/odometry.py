@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from vio.calibration.estimated_rig import estimated_rig
 from vio.calibration.stereo_field import CalibratedRig
@@ -24,6 +24,7 @@ from vio.frontend.settings import FrontendSettings
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, live_source
+from vio.live.event_inputs import EventInputs
 from vio.live.inputs import GivenFrame, Inputs, Shapes, checked_time, gray
 from vio.live.prediction import PosePredictor, PredictedPose
 from vio.numerics.threads import BlasLimit
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
     from vio.cameras.rig import Rectifier
 
 
-class Odometry:
+class Odometry(EventInputs["Estimate | None"]):
     """Stereo visual-inertial odometry, one event at a time.
 
     Times are nanoseconds on the clock of the camera's stamps; units are metres, seconds and radians; frames are those
@@ -129,9 +130,9 @@ class Odometry:
         parts = replace(self._parts, frontend=self._parts.frontend or self._frontend)
         self._processor = build_processor(self._source, self._config, parts, self._map)
         self._predictor = PosePredictor(self._config.msckf.gravity_mps2)
-        self.inputs = Inputs(
+        self._inputs = Inputs(
             self.camera.kind,
-            self._image_shapes(),
+            _image_shapes(self.camera, self._rectifier),
             self.motion,
             self._offset_ns,
             self._config.dataset.max_frame_rate,
@@ -140,106 +141,26 @@ class Odometry:
 
     # What goes in
 
-    def add_imu(self, t_ns: int | npt.ArrayLike, gyro: npt.ArrayLike, accel: npt.ArrayLike) -> None:
-        """Take one IMU sample, or several in order of time.
+    @property
+    def inputs(self) -> Inputs:
+        """The checks of the present trajectory."""
+        return self._inputs
 
-        Args:
-            t_ns: time, or times (N,), in nanoseconds on the IMU's clock.
-            gyro: (3,) or (N, 3) rad/s.
-            accel: (3,) or (N, 3) m/s^2, specific force: about +9.81 upwards at rest.
+    def _checking(self) -> AbstractContextManager[object]:
+        return self._lock
 
-        Raises:
-            DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
-            ConfigError: this odometry does not use an IMU.
-        """
-        with self._lock:
-            self.process(self.inputs.samples("imu", t_ns, gyro, accel))
-
-    def add_velocity(self, t_ns: int | npt.ArrayLike, linear: npt.ArrayLike, angular: npt.ArrayLike) -> None:
-        """Take one sample of body velocity, or several in order of time.
-
-        Args:
-            t_ns: time, or times (N,), in nanoseconds on the sensor's clock.
-            linear: (3,) or (N, 3) m/s, body frame.
-            angular: (3,) or (N, 3) rad/s, body frame.
-
-        Raises:
-            DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
-            ConfigError: this odometry does not use velocities; set `motion` to velocity.
-        """
-        with self._lock:
-            self.process(self.inputs.samples("velocity", t_ns, linear, angular))
-
-    def add_stereo(self, t_ns: int, left: npt.ArrayLike, right: npt.ArrayLike) -> Estimate | None:
-        """Take a pair of images and return the newest estimate that it brought; None: it waits for IMU samples.
-
-        A pair that the front end refuses (of swapped cameras, for instance) gives a warning and no estimate. None is
-        also returned for a frame that comes sooner than `dataset.max_frame_rate` allows, which is left out.
-
-        Args:
-            t_ns: time of the exposure in nanoseconds.
-            left: (H, W) uint8 gray or (H, W, 3) uint8 BGR, raw or rectified as the rig says.
-            right: likewise.
-
-        Raises:
-            DataError: a wrong type, shape or size, or a time not after the last frame's.
-        """
-        return self.add_images(t_ns, left, right)
-
-    def add_images(
-        self,
-        t_ns: int,
-        left: npt.ArrayLike,
-        right: npt.ArrayLike | None = None,
-        *,
-        depth_m: npt.ArrayLike | None = None,
-    ) -> Estimate | None:
-        """Take the image of one camera, with depths where it has them; with a right image, as `add_stereo`.
-
-        One camera with an IMU has no estimate until the scale is observable: the return value is None until then.
-
-        Args:
-            t_ns: time of the exposure in nanoseconds.
-            left: (H, W) uint8 gray or (H, W, 3) uint8 BGR, distorted or not as the rig says.
-            right: likewise, where the rig has two cameras.
-            depth_m: (H, W) metres along the optical axis of each pixel of the image, 0 where it is not known.
-
-        Raises:
-            DataError: a wrong type, shape or size, a time not after the last frame's, or images of another rig's kind.
-        """
-        with self._lock:
-            return self.process(self.inputs.images(t_ns, left, right, depth_m))
-
-    def add_observations(
-        self, t_ns: int, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None = None
-    ) -> Estimate | None:
-        """Take what a front end of the caller's own saw in a frame; the return value is that of `add_stereo`.
-
-        Args:
-            t_ns: time of the exposure in nanoseconds.
-            ids: (N,) unique; an id names one feature for ever.
-            z: (N, 4) rectified pixels [ul vl ur vr].
-            has_right: (N,) whether the feature is seen in the right image; None: all are.
-
-        Raises:
-            DataError: shapes disagree, an id occurs twice, a pixel is not finite, or a time not after the last one.
-        """
-        with self._lock:
-            return self.process(self.inputs.observations(t_ns, ids, z, has_right))
-
-    def process(self, given: GivenFrame | Sequence[MotionSample] | None) -> Estimate | None:
+    def take(self, given: GivenFrame | Sequence[MotionSample] | None) -> Estimate | None:
         """Process what `inputs` has checked, maybe in another thread; the return value is that of `add_stereo`."""
         with self._lock:
             if given is None:
                 return None
             if isinstance(given, GivenFrame):
                 results = self._add(self._frame(given))
-                self._deliver(results)
                 return results[-1].estimate if results else None
             for sample in given:
                 if (usable := self._processor.usable(sample)) is not None:
                     self._predictor.sample(usable)
-                self._deliver(self._add(sample))
+                self._add(sample)
             return None
 
     def finish(self) -> list[FrameResult]:
@@ -265,7 +186,8 @@ class Odometry:
             if self._parts.frontend is None:
                 self._frontend.open()
             if self._rectifier is not None:
-                black = [np.zeros(shape or (1, 1), dtype=np.uint8) for shape in self._image_shapes()]
+                shapes = _image_shapes(self.camera, self._rectifier)
+                black = [np.zeros(shape or (1, 1), dtype=np.uint8) for shape in shapes]
                 depth = np.zeros(black[0].shape) if self.camera.kind == "rgbd" else None
                 self._rectifier.frame(0, 0, *black, depth_m=depth)
 
@@ -376,15 +298,6 @@ class Odometry:
 
     # How
 
-    def _image_shapes(self) -> Shapes:
-        """Return height and width of the images of each camera, as they are to be given."""
-        if self._rectifier is not None and self.camera.kind == "stereo":
-            rig = self._rectifier.rig
-            return (rig.cam0.height, rig.cam0.width), (rig.cam1.height, rig.cam1.width)
-        width, height = self.camera.width, self.camera.height
-        shape = None if width is None or height is None else (height, width)
-        return (shape, shape) if self.camera.kind == "stereo" else (shape,)
-
     def _frame(self, given: GivenFrame) -> StereoFrame:
         """Return a frame for the front end, rectified where the rig is raw."""
         index, time_ns = given.index, given.time_ns
@@ -407,7 +320,18 @@ class Odometry:
 
     def _add(self, event: Event) -> list[FrameResult]:
         with self._blas():
-            return self._processor.add(event)
+            results = self._processor.add(event)
+        self._deliver(results)
+        return results
+
+
+def _image_shapes(camera: StereoCamera, rectifier: Rectifier | None) -> Shapes:
+    """Return height and width of the images of each camera, as they are to be given."""
+    if rectifier is not None and camera.kind == "stereo":
+        rig = rectifier.rig
+        return (rig.cam0.height, rig.cam0.width), (rig.cam1.height, rig.cam1.width)
+    shape = None if camera.width is None or camera.height is None else (camera.height, camera.width)
+    return (shape, shape) if camera.kind == "stereo" else (shape,)
 
 
 class _LiveFrontend:
@@ -420,11 +344,7 @@ class _LiveFrontend:
         self._images: Frontend | None = None
 
     def open(self) -> None:
-        """Build the front end for images, which observations do not need.
-
-        Raises:
-            VioError: the settings contradict the camera, or name a file that cannot be read.
-        """
+        """Build the front end for images, which observations do not need."""
         if self._images is None:
             self._images = build_frontend(self._settings.name, self._camera, self._settings)
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.errors import EvaluationError
-from vio.evaluation.trajectories import align_poses, apply_alignment, evaluate, rotation_angle_deg
+from vio.evaluation.alignment import align_poses, apply_alignment
+from vio.evaluation.trajectories import evaluate, rotation_angle_deg
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_inverse
 from vio.numerics.robust import robust_sigma
 from vio.offline.keyframes import TrackedPath

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vio.evaluation.trajectories import align_poses, apply_alignment
+from vio.evaluation.alignment import align_poses, apply_alignment
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.offline.keyframes import TrackedPath

@@ -50,14 +50,6 @@ def run_node(
 ) -> None:
     """Run until it is asked to stop; then write the map and what was asked for.
 
-    Args:
-        transport: of the graph.
-        settings: topics and names.
-        config: every setting.
-        rig: the calibration; None: that of the CameraInfo topics.
-        should_stop: asked a few times a second.
-        say: reports what the node waits for, and that it is ready.
-
     Raises:
         VioError: a topic has another type, images do not fit the calibration, or the estimation has failed.
     """

@@ -55,16 +55,7 @@ class Outputs:
         prefix: str,
         with_tf: bool,
     ) -> None:
-        """Advertise, and begin to publish.
-
-        Args:
-            transport: of the graph.
-            odometry: whose estimates are published.
-            sensors: gives the newest rate of the gyro, and counts.
-            frames: names of the frames.
-            prefix: of the topics' names.
-            with_tf: whether /tf is published.
-        """
+        """Advertise, and begin to publish."""
         self._odometry, self._sensors, self._frames, self._with_tf = odometry, sensors, frames, with_tf
         self._names = {name: f"{prefix}/{name}" for name in KINDS}
         topics = {self._names[name]: kind for name, kind in KINDS.items()}

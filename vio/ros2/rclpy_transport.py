@@ -70,11 +70,7 @@ class RclpyTransport:
 
 
 def _type(kind: str) -> Any:
-    """Return ROS's class of a message type.
-
-    Raises:
-        DataError: its package is not installed.
-    """
+    """Return ROS's class of a message type."""
     try:
         return get_message(kind)
     except (ModuleNotFoundError, AttributeError, ValueError) as error:

@@ -112,11 +112,7 @@ def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 
 @cache
 def _slots(cls: type) -> dict[str, types.MemberDescriptorType]:
-    """Return the slots of one of this package's classes by name.
-
-    Raises:
-        TypeError: it is another's, or a base of it is.
-    """
+    """Return the slots of one of this package's classes by name."""
     for base in cls.__mro__:
         if base not in _BASES and base.__module__.split(".")[0] != _PACKAGE:
             raise TypeError(f"{base.__module__}.{base.__qualname__} does not belong into a checkpoint")
@@ -141,11 +137,7 @@ class _Writer:
         self._kept: list[Any] = []  # so that no id is used twice
 
     def node(self, value: Any) -> Any:
-        """Return the node of a value.
-
-        Raises:
-            NotSavableError: it cannot be saved.
-        """
+        """Return the node of a value."""
         if type(value) in _PLAIN:
             return value
         number = self._numbers.get(id(value))

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vio.evaluation.trajectories import Evaluation, align_poses, settle_rotation
+from vio.evaluation.alignment import align_poses, settle_rotation
+from vio.evaluation.trajectories import Evaluation
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, transform_points
 from vio.files.tables import Rows
 from vio.geometry.upright import attitude_deg, rotated, upright_view

@@ -63,10 +63,6 @@ class FinishedRun:
 def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRun:
     """Read the folder of a run.
 
-    Args:
-        folder: what `vio run` wrote; an unfinished run's may be given too.
-        reference: ground truth to compare with instead of the one that the run was compared with.
-
     Raises:
         DataError: it is no run's folder, or a file in it is missing or damaged.
     """

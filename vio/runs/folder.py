@@ -95,16 +95,6 @@ def finish_run_folder(
     What a run that ended early needs to go on stays in `unfinished/`. The first arguments are those of
     `write_run_folder`.
 
-    Args:
-        folder: of the run.
-        result: the run.
-        reference: ground truth.
-        lengths_m: of the drift.
-        save_observations: also write them.
-        more: added to the metrics.
-        plot: whether to draw `trajectory.png`, which takes 1.4 s of CPU.
-        finished: called with the metrics when everything but the picture is in its place.
-
     Raises:
         VioError: the folder cannot be written.
     """
@@ -140,14 +130,7 @@ def finish_run_folder(
 
 
 def growing_folder(folder: Path, dataset: Dataset, config: Config, request: Mapping[str, Any]) -> GrowingFolder:
-    """Describe a run before its first frame, as its folder says it while the run goes on.
-
-    Args:
-        folder: of the run.
-        dataset: the recording.
-        config: every setting.
-        request: what `vio run --resume` needs to repeat the command.
-    """
+    """Describe a run before its first frame, as its folder says it while the run goes on."""
     recording = dataset.recording
     metrics = {
         "out": str(folder),

@@ -221,12 +221,7 @@ def given_rig(dataset: Dataset) -> Rig | None:
 
 
 def _reopen_map(session: MapSession | None, use: MapUse | None) -> None:
-    """Give a restored session its map's file; the checkpoint itself names no file.
-
-    Raises:
-        ConfigError: the run had a map and none is given, or the other way round.
-        DataError: the map cannot be used.
-    """
+    """Give a restored session its map's file; the checkpoint itself names no file."""
     if (session is None) != (use is None):
         raise ConfigError(f"the run began {'without' if session is None else 'with'} a map; go on in the same way")
     if session is not None and use is not None:
@@ -234,12 +229,7 @@ def _reopen_map(session: MapSession | None, use: MapUse | None) -> None:
 
 
 def _nothing_done(recording: Recording, processor: EventProcessor, stopped: str | None) -> NoReturn:
-    """Say why a run has no frame.
-
-    Raises:
-        StoppedError: it was asked to stop.
-        DataError: its frames could not be read, or a start was observable in none.
-    """
+    """Say why a run has no frame."""
     if stopped is not None:
         raise StoppedError(f"{stopped} before the first frame was done; nothing was written", status=130)
     if processor.frames_waiting:
@@ -282,11 +272,7 @@ class _Loop:
         self._reading = _ReadTimer()
 
     def run(self, events: Iterable[Event], dataset: Dataset, should_stop: Callable[[], str | None]) -> str | None:
-        """Take events to their end; return why they ended before.
-
-        Raises:
-            VioError: data or estimation are at fault.
-        """
+        """Take events to their end; return why they ended before."""
         state, recorder, processor = self._state, self._recorder, self._state.processor
         stopped = None
         resumed = state.frame_ns is not None

@@ -121,11 +121,6 @@ class RunRecorder:
     def frame(self, result: FrameResult, read_ms: float, smoothed: Smoothed) -> None:
         """Take the result of a frame.
 
-        Args:
-            result: what the chain made of it.
-            read_ms: wall time to read it.
-            smoothed: gives the estimates of past frames with all frames since.
-
         Raises:
             DataError: the folder cannot be written.
         """

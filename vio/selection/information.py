@@ -74,11 +74,11 @@ def log_det_gain(prior: FloatArray, L: FloatArray) -> float:
 class Greedy:
     """The result of a greedy choice."""
 
-    order: IntArray  # (S,) rows in the order in which they were chosen, those kept first
+    order: IntArray  # (S,) rows in the order in which they were chosen
     gain: FloatArray  # (N,) nats gained when the row was chosen; other rows: an upper bound of their gain
 
 
-def lazy_greedy(prior: FloatArray, L: FloatArray, ids: IntArray, budget: int, kept: BoolArray) -> Greedy:
+def lazy_greedy(prior: FloatArray, L: FloatArray, ids: IntArray, budget: int) -> Greedy:
     """Choose up to `budget` of N features that together add most to the log-determinant, one at a time.
 
     The result equals that of evaluating every candidate in every round, at least (1 - 1/e) of the optimum, as the
@@ -93,15 +93,14 @@ def lazy_greedy(prior: FloatArray, L: FloatArray, ids: IntArray, budget: int, ke
         L: (N, K, 3, 6).
         ids: (N,) for ties.
         budget: total number to choose.
-        kept: (N,) features that are already chosen; no more than the budget.
     """
     N, K = L.shape[:2]
     delta = np.swapaxes(L, -1, -2) @ L
     flat = np.ascontiguousarray(np.swapaxes(delta.reshape(N, K, 36), 0, 1))
-    information = prior + delta[kept].sum(axis=0)
-    available = np.where(kept, 0.0, 1.0)
+    information = prior
+    available: FloatArray = np.ones(N)
     gain = np.zeros(N)
-    order = np.flatnonzero(kept).tolist()
+    order: list[int] = []
     while True:
         M = np.linalg.inv(information)
         traces = (flat @ (M.reshape(K, 36, 1) / 3))[..., 0]

@@ -42,9 +42,6 @@ class SelectorSettings(Section):
     )
     budget: int | None = setting(None, "observations kept of a frame; null: the share below", at_least=1)
     keep_fraction: float = setting(1 / 7, "share of the features that is kept; the paper keeps 1/7", above=0, at_most=1)
-    sticky: bool = setting(
-        False, "a chosen feature stays chosen while it is tracked; new ones only fill the remaining budget"
-    )
 
 
 class _VisibilityCount:
@@ -66,31 +63,21 @@ class _VisibilityCount:
 
 
 class _Budget:
-    """The number of rows to choose, and the rows kept from the last frame."""
+    """The number of rows to choose."""
 
     def __init__(self, settings: SelectorSettings) -> None:
         self._settings, self._least = settings, _LEAST_KEPT
-        self._last: IntArray = np.zeros(0, dtype=np.int64)
 
     def rows(self, n: int) -> int:
         """Return how many of n rows may be chosen."""
         s = self._settings
         return min(n, max(int(np.ceil(n * s.keep_fraction)), self._least) if s.budget is None else s.budget)
 
-    def kept(self, ids: IntArray) -> BoolArray:
-        """Return the rows (N,) that stay chosen; none unless the selector is sticky."""
-        return np.isin(ids, self._last) if self._settings.sticky else np.zeros(len(ids), dtype=np.bool_)
-
-    def store(self, ids: IntArray, chosen: BoolArray) -> BoolArray:
-        """Store the chosen rows (N,) of a frame and return them."""
-        self._last = ids[chosen]
-        return chosen
-
     def best(self, score: FloatArray, ids: IntArray) -> BoolArray:
-        """Choose the kept rows, then those of largest score; ties go to the smaller id."""
+        """Choose the rows of largest score; ties go to the smaller id."""
         chosen = np.zeros(len(score), dtype=np.bool_)
-        chosen[np.lexsort((ids, -score, ~self.kept(ids)))[: self.rows(len(score))]] = True
-        return self.store(ids, chosen)
+        chosen[np.lexsort((ids, -score))[: self.rows(len(score))]] = True
+        return chosen
 
 
 class KeepAll:
@@ -151,15 +138,10 @@ class InformationGain:
         ids = observations.ids
         L = self._model.add_frame(observations, motion)
         prior = np.repeat(prior_information(motion)[None], L.shape[1], axis=0)
-        budget = self._budget.rows(len(ids))
-        kept = self._budget.kept(ids) & ~observations.stale
-        if kept.sum() > budget:
-            L[~kept], kept = 0.0, np.zeros(len(ids), dtype=np.bool_)
-        greedy = lazy_greedy(prior, L, ids, budget, kept)
+        greedy = lazy_greedy(prior, L, ids, self._budget.rows(len(ids)))
         chosen = np.zeros(len(ids), dtype=np.bool_)
         chosen[greedy.order] = True
         self._model.mark_used(observations, chosen)
-        self._budget.store(ids, chosen)
         nats = log_det_gain(prior, L[chosen])
         return Selection(chosen, greedy.gain, f"{nats:.1f} nats from {chosen.sum()} of {len(ids)}")
 

@@ -53,13 +53,6 @@ def export_euroc(
     Ground truth is written at 200 Hz, in the IMU's clock; its bias columns are zero for a recorded
     IMU.
 
-    Args:
-        recording: what to write; any rig.
-        out: folder to create.
-        replace: whether an older export at `out` may be replaced.
-        noise: densities written to the IMU's sensor.yaml.
-        progress: called after each frame.
-
     Raises:
         SimulationError: the simulation has no IMU.
         VioError: `out` exists and may not be replaced, or cannot be written.

@@ -31,12 +31,6 @@ def export_rgbd(
     A depth has the standard deviation 0.0015 z^2, and is unknown (0) nearer than 0.4 m and beyond 8 m. Ground truth is
     that of the camera, or of the IMU where there is one.
 
-    Args:
-        recording: what to write; any rig.
-        out: folder to create.
-        replace: whether an older export at `out` may be replaced.
-        progress: called after each frame.
-
     Raises:
         VioError: `out` exists and may not be replaced, or cannot be written.
     """

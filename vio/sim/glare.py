@@ -27,14 +27,7 @@ _GHOST_REACH_RAD = 0.9  # beyond this angle from the axis a source makes no ghos
 
 
 def glare(world: World, view: View, rays: CameraRays, strength: float) -> Radiance:
-    """Return the scattered light (H, W) in one image, gray levels of the scene.
-
-    Args:
-        world: scene; its lights are the sources.
-        view: the camera.
-        rays: of the same camera.
-        strength: 1 for a usual, slightly dusty lens.
-    """
+    """Return the scattered light (H, W) in one image, gray levels of the scene."""
     surfaces = surfaces_at(world, view.time_ns)
     coarse = rays.centre[:, ::_GRID_PX, ::_GRID_PX].astype(np.float32)
     directions = coarse / np.linalg.norm(coarse, axis=0)

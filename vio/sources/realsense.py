@@ -69,11 +69,7 @@ class RealSenseSource:
             ) from error
 
     def _opened(self, name: str) -> Any:
-        """Return the device, or a recording in its place.
-
-        Raises:
-            DataError: it is absent.
-        """
+        """Return the device, or a recording in its place."""
         self._context = self._rs.context()
         if self._is_file:
             playback = self._context.load_device(name)

@@ -80,11 +80,7 @@ def _show_mesh(stream: rr.RecordingStream, folder: Path) -> None:
 
 
 def _rig_of(run: FinishedRun) -> ViewedRig:
-    """Return the rig of a run from its folder.
-
-    Raises:
-        DataError: the folder does not hold it.
-    """
+    """Return the rig of a run from its folder."""
     try:
         camera = StereoCamera(**run.metrics["camera"])
     except (KeyError, TypeError) as error:

@@ -151,14 +151,7 @@ class RerunViewer:
             self._spent_s += time.perf_counter() - start
 
     def places(self, index: int, estimate: Estimate, *, is_keyframe: bool, loops: Sequence[LoopEvent]) -> None:
-        """Show keyframes of a map, and its loops within this run as lines between the odometry's positions.
-
-        Args:
-            index: number of the present frame.
-            estimate: of it.
-            is_keyframe: whether it becomes one.
-            loops: whose results have come with it.
-        """
+        """Show keyframes of a map, and its loops within this run as lines between the odometry's positions."""
         import rerun as rr
 
         if is_keyframe:

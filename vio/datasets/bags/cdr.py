@@ -32,11 +32,6 @@ def _store() -> Any:
 def decoded(data: bytes, kind: str, where: str) -> Any:
     """Return the fields of a message.
 
-    Args:
-        data: CDR with its header of four bytes.
-        kind: such as sensor_msgs/msg/Image.
-        where: topic, for messages.
-
     Raises:
         DataError: the message does not fit its type.
     """

@@ -163,11 +163,6 @@ def info_topic(topics: Sequence[Topic], image: Topic) -> str | None:
 def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
     """Pass once over the messages of the chosen topics.
 
-    Args:
-        bag: opened.
-        roles: topics of each role.
-        infos: CameraInfo topics.
-
     Raises:
         DataError: the bag is damaged, or an image topic mixes encodings of different depth.
     """
