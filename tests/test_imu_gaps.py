@@ -207,6 +207,23 @@ def test_a_gap_hides_what_a_brownian_bridge_hides_and_a_hold_what_brownian_motio
     assert np.all((mean > 1.0) & (mean < 1.6)), mean
 
 
+def test_a_gap_longer_than_the_memory_hides_what_the_signal_did_before_it() -> None:
+    """After three seconds of silence come ten quiet samples: what was learned before is not forgotten for them."""
+    rng, found = np.random.default_rng(2), []
+    loud, quiet = rng.normal(0, 0.5, (400, 2, 3)), rng.normal(0, 1e-3, (10, 2, 3))
+    for silence in (100, 600):  # periods of 5 ms
+        motion, zero = ImuMotion(QUIET), np.zeros(3)
+        for k in range(400):
+            motion.take(ImuSample(5_000_000 * k, *loud[k]))
+        for k in range(10):
+            motion.take(ImuSample(5_000_000 * (399 + silence + k), *quiet[k]))
+        state = NavState(np.eye(4), zero, zero, zero, zero)
+        end = 5_000_000 * (399 + silence)
+        step = motion.advance(state, 1_995_000_000, end)
+        found.append(np.sqrt(step.Q[3, 3]) / (5e-3 * silence))  # white noise: the mean rate is off by as much
+    assert 0.5 < found[1] / found[0] < 2.0
+
+
 # What the run says
 
 

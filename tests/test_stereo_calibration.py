@@ -403,6 +403,19 @@ def test_a_turned_right_camera_is_found_and_its_harm_undone(motion: MotionSource
     assert _rms_m(turned) < 0.2 * _rms_m(ignored)
 
 
+def test_a_right_camera_that_is_moved_in_flight_is_found_again() -> None:
+    """By a pitch and a yaw of 0.6 deg after three frames: the rows that are off put the columns in doubt again."""
+    turn = np.radians(0.6)
+
+    def spoil(k: int, seen: Observations) -> Observations:
+        moved = _turned_right(seen.z, test_filter_truth.CAMERA, np.array([turn, turn, 0.0]))
+        return seen if k < 3 else replace(seen, z=moved)
+
+    found, sigma = _field(fly(replace(STRAIGHT, seconds=0.5), None, ON, spoil=spoil))
+    assert abs(found[0] - turn) < 3 * sigma[0]
+    assert sigma[0] < 0.1 * turn
+
+
 def test_no_landmark_enters_while_the_field_is_estimated() -> None:
     """Held at one linearisation, landmarks made the field too sure: 36 where 33 is the 0.999 quantile, 5 without."""
     total = 0.0

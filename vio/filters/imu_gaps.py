@@ -21,6 +21,7 @@ from vio.records import ImuSample, IntArray
 
 _NS = 1e-9
 _MEMORY_S = 2.0  # samples that the structure function is learned from
+_MOST_SAMPLES = 8000  # of them, whatever their stamps say
 _LONGEST_LAG_S = 1.0  # half of it; beyond, the signal is taken to have changed as much as it ever does
 _LEAST_SAMPLES = 10  # with fewer the signal is not characterised
 _UNKNOWN = np.array([3.0, 1.0]) ** 2  # D then: accelerometer (m/s^2)^2, gyro (rad/s)^2, of a vehicle that manoeuvres
@@ -39,17 +40,17 @@ class Hidden:
 
 
 class ImuHistory:
-    """The samples of the last two seconds, and how much their signals change in a given time."""
+    """The samples of the last two seconds but for gaps, and how much their signals change in a given time."""
 
     def __init__(self) -> None:
-        self._samples: deque[ImuSample] = deque()
+        self._samples: deque[ImuSample] = deque(maxlen=_MOST_SAMPLES)
         self._period, self._unmeasured = 0.0, 0  # median distance, and samples since it was computed
 
     def take(self, samples: Sequence[ImuSample]) -> None:
-        """Take samples in order of time and drop what is too old."""
+        """Take samples in order of time and drop what is too old: a gap, however long, makes none so."""
         self._samples.extend(samples)
         self._unmeasured += len(samples)
-        while self._samples and self._samples[-1].time_ns - self._samples[0].time_ns > _MEMORY_S / _NS:
+        while len(self._samples) * self.period_ns() > _MEMORY_S / _NS:
             self._samples.popleft()
 
     def period_ns(self) -> float:

@@ -42,10 +42,14 @@ _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
 _STEREO_WALK = 0.02  # random walk of the stereo field per root second, over its initial standard deviation
 
 
-def stereo_field_sigmas(sigma: float) -> FloatArray:
-    """Initial standard deviations (8,) of the stereo field, in focal lengths, by that of its lens terms."""
+def stereo_field_sigmas(sigma: float, turn_rad: float = 0.0) -> FloatArray:
+    """Initial standard deviations (8,) of the stereo field, in focal lengths, by that of its lens terms.
+
+    Yaw, which moves no row, is known no better than by the turn `turn_rad` that pitch and roll would make of the rows.
+    """
     common = max(sigma, _LEAST_COMMON_SIGMA)
-    return np.array([np.radians(STEREO_YAW_SIGMA_DEG), *[sigma] * 3, *[_RADIAL * common] * 2, common, common])
+    yaw = max(np.radians(STEREO_YAW_SIGMA_DEG), turn_rad)
+    return np.array([yaw, *[sigma] * 3, *[_RADIAL * common] * 2, common, common])
 
 
 @dataclass(frozen=True, slots=True)

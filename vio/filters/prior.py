@@ -49,6 +49,11 @@ class Prior:
         self.delta = M @ self.delta
         self.error_D_constants = M @ self.error_D_constants
 
+    def inflate(self, rows: slice, variances: FloatArray) -> None:
+        """Add variances (k,) to those of some errors."""
+        self.P = self.P.copy()
+        self.P[rows, rows] += np.diag(variances)
+
     def insert(self, first: int, covariance: FloatArray) -> None:
         """Add errors with a covariance (S, S), from the row `first` on, that depend on no other."""
         D, S = len(self.P), len(covariance)

@@ -31,6 +31,7 @@ from vio.records import (
 
 _PRINCIPAL_POINT = 1 / 3  # standard deviation of its coordinates, in focal lengths, over that of the focal length
 _COLUMNS_BY_ROWS = 3.0  # of the standard deviation of a lens term, over the root mean square of the rows' field
+_ROWS_MOVED = 2.0  # how much larger the rows' field must become for what was learned of the columns to be in doubt
 
 
 class RigCalibration:
@@ -42,6 +43,7 @@ class RigCalibration:
         self.rotation: RotationComparison | None = ROTATION_NOT_COMPARABLE  # as others compared them; None: they will
         self._rows = VerticalDisparityModel(camera)
         self._field_variances = prior_variances(settings)["stereo_field"]  # (8,) before anything was seen of it
+        self._rows_off = LEAST_FIELD_SIGMA / _COLUMNS_BY_ROWS  # size of the rows' field that gave them, focal lengths
 
     def first_covariance(self, calibration: Calibration, T_world_imu: FloatArray) -> FloatArray:
         """Covariance (C, C) of the errors of a calibration of which nothing was seen yet, at a pose (4, 4)."""
@@ -57,17 +59,26 @@ class RigCalibration:
         """Learn the rows of a frame; the first ones say how far off the lenses may be, and begin to estimate the field.
 
         An error of turn or lens moves rows and columns alike, so the size of the rows' field is an estimate of the
-        standard deviation of the columns' (empirical Bayes).
+        standard deviation of the columns' (empirical Bayes). Where it grows much later, as a camera has been moved in
+        its mount or the first matches were wrong ones, the columns are in doubt again.
         """
         if self.settings.calibrate_stereo == "off" or self.camera.kind != "stereo":
             return
         self._rows.update(seen)
-        if "stereo_field" not in window.state and self._rows.offset_px is not None:
-            off = np.hypot(self._rows.offset_px, self.camera.residual_px) / self.camera.fu
-            sigma = np.clip(_COLUMNS_BY_ROWS * off, LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA)
-            self._field_variances = stereo_field_sigmas(float(sigma)) ** 2
+        if self._rows.offset_px is None:
+            return
+        off = float(np.hypot(self._rows.offset_px, self.camera.residual_px)) / self.camera.fu
+        begins = "stereo_field" not in window.state
+        if not begins and off <= _ROWS_MOVED * self._rows_off:
+            return
+        sigma = float(np.clip(_COLUMNS_BY_ROWS * off, LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA))
+        variances = stereo_field_sigmas(sigma, self._rows.offset_px / self.camera.fu) ** 2
+        if begins:
             calibration = window.calibration.estimating("stereo_field", self.settings)
-            window.estimate_block("stereo_field", calibration, np.diag(self._field_variances))
+            window.estimate_block("stereo_field", calibration, np.diag(variances))
+        else:
+            window.prior.inflate(window.state["stereo_field"], np.maximum(variances - self._field_variances, 0.0))
+        self._field_variances, self._rows_off = variances, max(off, self._rows_off)
 
     def end_frame(self, window: Window, seen: Observations) -> None:
         """Count a frame of the scale's test; without right views the scale is not the baseline's."""
