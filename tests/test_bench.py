@@ -27,6 +27,7 @@ from vio.bench.figures import coverage, figures_of, pose_nees
 from vio.bench.identity import ROOT, InputDigests, code_and_packages, commit_of, imported_code
 from vio.bench.latex import latex_of
 from vio.bench.report import _as_html, write_bench_report
+from vio.bench.revision import _as_yaml
 from vio.bench.store import Store
 from vio.bench.suite import Suite, config_of, read_suite, shipped_suites, suite_from
 from vio.bench.tables import BY_NAME, METRICS, Outcome, cell_text, markdown, number, summary_rows
@@ -660,6 +661,13 @@ def test_another_revision_runs_in_turns_and_is_compared(
     codes = [read_bench(folder)[1]["code"] for folder in (out, tmp_path / "out@HEAD")]
     assert len(codes) == 2
     assert (tmp_path / "out@HEAD" / "tables.md").is_file()
+
+
+@pytest.mark.parametrize("name", ["realistic", "euroc", str(ROOT / "tools" / "suites" / "maps.yaml")])
+def test_another_revision_is_given_all_of_the_suite(name: str) -> None:
+    suite = replace(read_suite(name), time_limit_s=9.0)
+    again = suite_from(_as_yaml(suite), suite.folder / "again.yaml")
+    assert (again.sequences, again.time_limit_s, again.seeds) == (suite.sequences, 9.0, suite.seeds)
 
 
 def test_a_render_that_fails_is_a_failed_row_and_one_that_works_is_made_once(

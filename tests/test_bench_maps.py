@@ -9,7 +9,7 @@ import pytest
 
 from vio.bench.bench import Place, bench
 from vio.bench.maps import LoopScore, loop_score
-from vio.bench.suite import suite_from
+from vio.bench.suite import chosen, suite_from
 from vio.errors import ConfigError
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.relative_pose import RelativePose
@@ -84,6 +84,7 @@ def test_a_map_is_built_and_another_sequence_is_localised_in_it(tmp_path: Path) 
         },
         tmp_path / "suite.yaml",
     )
+    assert [s.name for s in chosen(suite, ["second"], []).sequences] == ["first", "second"]
     result = bench(suite, Place(tmp_path, tmp_path / "out", tmp_path / "cache"))
     first, second = result.outcomes
     assert (first.failure, second.failure) == (None, None)

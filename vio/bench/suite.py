@@ -164,7 +164,7 @@ def config_of(suite: Suite, sequence: Sequence, configuration: str, seed: int) -
 
 
 def chosen(suite: Suite, only: Iterable[str], configurations: Iterable[str]) -> Suite:
-    """Return the suite with the named sequences and configurations alone; none named: all.
+    """Return the suite with the named sequences and configurations alone, and the maps that they need; none named: all.
 
     Raises:
         ConfigError: a name is unknown.
@@ -176,9 +176,10 @@ def chosen(suite: Suite, only: Iterable[str], configurations: Iterable[str]) -> 
                 near = difflib.get_close_matches(name, known, 1)
                 hint = f"; did you mean '{near[0]}'?" if near else f"; it holds {', '.join(known[:8])}"
                 raise ConfigError(f"suite {suite.name} has no '{name}'{hint}")
+    needed = {*sequences, *(s.map_of for s in suite.sequences if s.name in sequences)}
     return replace(
         suite,
-        sequences=tuple(s for s in suite.sequences if not sequences or s.name in sequences),
+        sequences=tuple(s for s in suite.sequences if not sequences or s.name in needed),
         configurations={name: v for name, v in suite.configurations.items() if not configured or name in configured},
     )
 

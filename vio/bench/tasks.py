@@ -99,17 +99,24 @@ def _task(suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, di
         if sequence.map_of is not None:
             (first,) = (s for s in suite.sequences if s.name == sequence.map_of)
             job["first"], identity["first"] = _common(first, data, digests, seed)
-        config = as_dict(config_of(suite, sequence, name, seed))
-        files = {}
-        for setting, holder, key in _file_settings(config):
-            holder[key] = str((data / holder[key]).absolute())
-            files[setting] = digests.of(Path(holder[key]))
+            job["first"]["config"], identity["first"]["config"] = _settings(suite, first, name, seed, data, digests)
+        config, known = _settings(suite, sequence, name, seed, data, digests)
     except DataError as error:
         return replace(task, failure=" ".join(str(error).split()))
     job |= {"kind": "run", "config": config}
-    known = {**_without(config, files), "files": files}
     size = math.inf if identity["bytes"] is None else identity["bytes"]
     return replace(task, job=job, key=digest_of([_FORM, "run", identity, known]), size=size)
+
+
+def _settings(
+    suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, digests: InputDigests
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the settings of a run, and the part of them that the result depends on: files by their content."""
+    config, files = as_dict(config_of(suite, sequence, name, seed)), {}
+    for setting, holder, key in _file_settings(config):
+        holder[key] = str((data / holder[key]).absolute())
+        files[setting] = digests.of(Path(holder[key]))
+    return config, {**_without(config, files), "files": files}
 
 
 def _common(sequence: Sequence, data: Path, digests: InputDigests, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -173,8 +173,9 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         store = Path(folder) / "map.db"
         use = MapUse(store) if job["map"] else None
         if job["first"] is not None:
-            before, use = _truth(job["first"], config), MapUse(store, localise=True)
-            run(before.dataset, config, start=before.first, stop=before.end, map=MapUse(store))
+            built = merge(Config(), job["first"]["config"], where="the suite")
+            before, use = _truth(job["first"], built), MapUse(store, localise=True)
+            run(before.dataset, built, start=before.first, stop=before.end, map=MapUse(store))
         first, end = truth.first, truth.end
         result = run(truth.dataset, config, start=first, stop=end, viewer=timer, map=use, control=control)
         trajectory = result.trajectory
