@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from tests.numerics import numeric_jacobian, right_retract
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
+from vio.geometry.stereo import StereoCamera
+from vio.mapping.map_graph import MapGraph
+from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.pose_graph import (
     Edges,
     UpDirections,
@@ -158,3 +164,42 @@ def test_a_tilt_of_the_first_pose_does_not_bend_the_map() -> None:
     np.testing.assert_allclose(best[0, :3, 3], start[0, :3, 3], atol=1e-12)
     heading = [np.arctan2(T[1, 0], T[0, 0]) for T in (best[0], start[0])]
     assert abs(heading[0] - heading[1]) < 1e-4
+
+
+def test_a_new_loop_moves_what_is_around_it_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three times around a circle: loops of the second round are settled, one of the third is new."""
+    monkeypatch.setattr("vio.mapping.map_graph._WINDOW", 80)
+    count, period = 300, 100
+    angle = 2 * np.pi * np.arange(count) / period
+    T = se3_exp(np.stack([*(0 * angle for _ in range(5)), angle], axis=1))
+    T[:, :3, 3] = np.stack([50 * np.sin(angle), 50 - 50 * np.cos(angle), 0 * angle], axis=1)
+    rng = RNG(5)
+    store = MapStore(tmp_path / "a.map", create=True)
+    camera = StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360)
+    store.add_session(SessionRow("round", camera, True, 0))
+    graph, start = MapGraph(store), T[0]
+    for k in range(count):
+        if k:
+            motion = _measured(T, k - 1, k, SIGMA, rng)
+            graph.add_motion(k - 1, k, motion)
+            start = start @ motion.T_i_j
+        graph.append(KeyframeRow(0, k, k, start, start, np.eye(6), 0.0, None, 0.0))
+    for k in range(0, 190, 3):
+        graph.loops.append(LoopRow(k, k + period, _measured(T, k, k + period, LOOP_SIGMA, rng), 50, True))
+    for _ in range(3):  # far from the optimum at first
+        graph.optimise_part(0)
+    before = graph.T_map_cam.rows.copy()
+    graph.loops.append(LoopRow(190, 290, _measured(T, 190, 290, LOOP_SIGMA, rng), 50, True))
+    assert not graph.optimise_near(0, 1)
+    near = graph.T_map_cam.rows.copy()
+    moved = np.linalg.norm(near[:, :3, 3] - before[:, :3, 3], axis=1)
+    assert moved[290] > 0.01
+    assert 80 <= (moved > 0).sum() < 200
+    graph.optimise_part(0)
+
+    def around(poses: FloatArray) -> FloatArray:
+        """Where the keyframes of both ends stand from one of them: the rest is too soft to tell."""
+        return (se3_inverse(poses[190]) @ poses[[*range(185, 196), *range(285, 295)]])[:, :3, 3]
+
+    whole = around(graph.T_map_cam.rows)
+    assert np.abs(around(near) - whole).max() < 0.5 * np.abs(around(before) - whole).max()

@@ -167,6 +167,7 @@ class MapBuilder:
         self._pending: list[FoundPlace] = []
         self._last: FoundPlace | None = None  # newest accepted loop
         self._waiting = 0  # loops since the last optimisation
+        self._partial = False  # whether loops were optimised with what is around them alone
         self._optimised = False  # whether loops hold this session: until then it is reported as the odometry has it
         self._moved = False  # poses since the last commit
 
@@ -205,7 +206,7 @@ class MapBuilder:
         row = KeyframeRow(self._own, keyframe.frame, keyframe.time_ns, T, keyframe.T_odom_cam, drift, path, up, sigma)
         graph.append(row)
         if motion is not None:
-            graph.odometry.append((number - 1, number, motion))
+            graph.add_motion(number - 1, number, motion)
         if not self._localise:
             self._store.add_keyframe(row, features)
             if motion is not None:
@@ -230,8 +231,8 @@ class MapBuilder:
         if field is not None and not self._localise and len(self.graph) > self.first:
             self._correct(field, None)
             self._measure_again()
-        if self._waiting:
-            self._optimise()
+        if self._waiting or self._partial:
+            self._optimise(whole=True)
         if not self._optimised:
             own = slice(self.first, None)
             self.graph.T_map_cam.rows[own] = self.graph.T_odom_cam.rows[own]
@@ -554,11 +555,15 @@ class MapBuilder:
         else:
             self.graph.join(int(part[k]), int(part[i]), T)
 
-    def _optimise(self) -> None:
+    def _optimise(self, *, whole: bool = False) -> None:
+        part = self.graph.sessions[self._own].part
+        self._partial = False
         if self._localise:
             self.graph.optimise_end(max(len(self.graph) - _LOCAL, self.first))
+        elif whole:
+            self.graph.optimise_part(part)
         else:
-            self.graph.optimise_part(self.graph.sessions[self._own].part)
+            self._partial = not self.graph.optimise_near(part, self._waiting)
         if self._last is not None and not self.graph.loops[-1].kept:
             self._last = None
         self._waiting, self._moved, self._optimised = 0, True, True

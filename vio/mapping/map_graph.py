@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
 from vio.geometry.relative_pose import RelativePose
@@ -18,6 +19,7 @@ from vio.records import BoolArray, IntArray
 # What the odometry may be off by beyond its own covariance, since errors of the calibration add up along the path:
 # 1 % and 0.5 deg/100 m; peers reach 1.2 % and 0.3 deg/100 m with stereo on KITTI.
 _DRIFT_SHARE, _DRIFT_RAD_PER_M = 0.01, float(np.radians(0.005))
+_WINDOW = 1000  # keyframes that are optimised for a new loop, beside those of its cycle
 UNKNOWN = 1e6  # variance of the motion from one session to the next, m^2 and rad^2: nothing is known of it
 
 
@@ -40,7 +42,7 @@ class Rows:
         """All rows, to be read and written."""
         return self._data[: self._size]
 
-    def __getitem__(self, index: int | slice | IntArray) -> FloatArray:
+    def __getitem__(self, index: int | slice | IntArray | tuple[slice, int | slice]) -> FloatArray:
         return self.rows[index]
 
 
@@ -54,7 +56,10 @@ class MapGraph:
         self.path_m, self._session, self._frame = Rows(), Rows(), Rows()
         self._times: list[int] = []  # ns; too large for float64
         self._ups: list[tuple[int, FloatArray, float]] = []
-        self.odometry: list[tuple[int, int, RelativePose]] = store.odometry()
+        self.odometry: list[tuple[int, int, RelativePose]] = []
+        self._links = Rows(3)  # of each motion of the odometry: its keyframes, and the variance of its position, m^2
+        for motion in store.odometry():
+            self.add_motion(*motion)
         self.loops: list[LoopRow] = store.loops()
         self.odometry_scale = 1.0  # on the covariance of the odometry, so that the loops fit to it
         for row in store.keyframes():
@@ -93,6 +98,11 @@ class MapGraph:
         self._session.append(row.session)
         self._frame.append(row.frame)
         self._times.append(row.time_ns)
+
+    def add_motion(self, first: int, second: int, motion: RelativePose) -> None:
+        """Add what the odometry says of the motion between two keyframes."""
+        self.odometry.append((first, second, motion))
+        self._links.append((first, second, np.trace(motion.covariance[:3, :3])))
 
     def gathered(self, T_odom_cam: FloatArray, motion: RelativePose | None) -> tuple[FloatArray, float]:
         """Return the covariance (6, 6) and the path that the odometry has gathered at a new keyframe.
@@ -136,14 +146,56 @@ class MapGraph:
         What the filter took for the vertical at its first frame is less exact than what it knows of it later.
         """
         rows = self.part == part
-        pairs = [(i, j) for i, j, _ in self.odometry] + [(o.first, o.second) for o in self.loops]
-        first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-        links = coo_matrix((np.ones(len(first)), (first, second)), shape=(len(self), len(self)))
         # A session that was taken out may have been what joined them.
-        piece = connected_components(links, directed=False)[1][rows]
+        piece = connected_components(self._linked(self.loops), directed=False)[1][rows]
         fixed = np.zeros(len(self), dtype=np.bool_)
         fixed[np.flatnonzero(rows)[np.unique(piece, return_index=True)[1]]] = True
         self._optimise(rows, fixed, level=True)
+
+    def optimise_near(self, part: int, newest: int) -> bool:
+        """Optimise what the newest loops move most; keyframes around it stay, as anchors.
+
+        A loop closes a cycle with what was known before. The keyframes of the shortest one, by the variance of its
+        motions, carry most of what it corrects, and others the less the longer the way by them.
+
+        Args:
+            part: of the loops.
+            newest: number of loops that no optimisation has seen, at least one.
+
+        Returns:
+            Whether that is the whole part.
+        """
+        rows = self.part == part
+        if int(rows.sum()) <= _WINDOW:
+            self.optimise_part(part)
+            return True
+        seen, new = self.loops[:-newest], self.loops[-newest:]
+        ends = [k for o in new for k in (o.first, o.second)]
+        away = dijkstra(self._linked([o for o in seen if o.kept]), directed=False, indices=ends)
+        cycle = away[::2] + away[1::2]  # (L, K) length of the shortest cycle of each loop by each keyframe
+        least = cycle.min(axis=1, keepdims=True)
+        joined = np.isfinite(least[:, 0])  # others are of two pieces, which the loops are the first to join
+        detour = np.where(np.isfinite(cycle), cycle, np.minimum(away[::2], away[1::2]))
+        detour[joined] -= least[joined]
+        nearest = np.where(rows, detour.min(axis=0), np.inf)
+        on_cycle = int((detour[joined] <= 1e-9 * least[joined]).any(axis=0).sum())
+        chosen = np.argsort(nearest, kind="stable")[: _WINDOW + on_cycle]
+        free = np.zeros(len(self), dtype=np.bool_)
+        free[chosen[np.isfinite(nearest[chosen])]] = True
+        free[int(np.argmax(rows))] = False
+        pairs = self._linked(self.loops)
+        around = (pairs + pairs.T) @ free.astype(np.float64) > 0
+        self._optimise(free | around, around & ~free)
+        return False
+
+    def _linked(self, loops: Sequence[LoopRow]) -> coo_matrix:
+        """Return the variances of the motions (K, K) between keyframes, by the odometry and by loops."""
+        covariance = np.array([o.pose.covariance for o in loops]).reshape(-1, 6, 6)
+        variance = np.concatenate([self._links[:, 2], np.trace(covariance[:, :3, :3], axis1=1, axis2=2)])
+        pairs = np.array([(o.first, o.second) for o in loops]).reshape(-1, 2)
+        first, second = np.concatenate([self._links[:, :2], pairs]).T
+        ends = first.astype(np.int64), second.astype(np.int64)
+        return coo_matrix((variance, ends), shape=(len(self), len(self))).tocsr()
 
     def optimise_end(self, first: int) -> None:
         """Optimise the keyframes from `first` on against those before it that loops join them to, which stay."""
@@ -164,8 +216,12 @@ class MapGraph:
             level: let the roll and pitch of the first one follow the verticals, if there are any.
         """
         place = np.cumsum(rows) - 1
-        odometry = [(int(place[i]), int(place[j]), m) for i, j, m in self.odometry if rows[i] and rows[j]]
-        scaled = [(i, j, RelativePose(m.T_i_j, self.odometry_scale * m.covariance)) for i, j, m in odometry]
+        ends = self._links.rows[:, :2].astype(np.int64)
+        near = [self.odometry[n] for n in np.flatnonzero(rows[ends].all(axis=1)).tolist()]
+        scaled = [
+            (int(place[i]), int(place[j]), RelativePose(m.T_i_j, self.odometry_scale * m.covariance))
+            for i, j, m in near
+        ]
         inside = [n for n, o in enumerate(self.loops) if rows[o.first] and rows[o.second]]
         loops = [(int(place[o.first]), int(place[o.second]), o.pose) for o in (self.loops[n] for n in inside)]
         up_directions = self._up_directions(rows, place)

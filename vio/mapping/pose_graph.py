@@ -204,7 +204,10 @@ def _step(
         blocks.append((up_directions.pose, up_directions.pose, np.swapaxes(D, 1, 2) @ D))
         np.add.at(gradient, up_directions.pose, -np.einsum("eji,ej->ei", D, r))
     P = free.directions(T)
-    xi = P @ splu((P.T @ _sparse(blocks, count) @ P).tocsc()).solve(P.T @ gradient.ravel())
+    H = (P.T @ _sparse(blocks, count) @ P).tocsc()
+    # Ordered and pivoted as a symmetric matrix, its factors have a tenth of the entries.
+    factors = splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    xi = P @ factors.solve(P.T @ gradient.ravel())
     return np.asarray(xi).reshape(count, 6)
 
 
