@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,10 @@ import numpy as np
 import pytest
 
 from tests.test_frontend_scene import CAMERA
-from tools.faults import CAMERAS, GROUPS, HEALTHY, IMU, Period, table
+from tools.faults import CAMERAS, GROUPS, HEALTHY, IMU
+from tools.faults.__main__ import FIGURES, PAGE, RUNS, tasks
+from tools.faults.changes import Period
+from tools.faults.page import page
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
 from vio.records import Event, ImuSample, Observations, Recording, StereoFrame, Trajectory
@@ -161,9 +165,26 @@ def test_the_table_shows_errors_ratios_and_what_was_said() -> None:
         row | {"group": "cameras", "variant": "black", "ratio": 0.25, "said": ["frame 5: images are black; left out"]},
         row | {"group": "imu", "variant": "zero", "said": [], "error": "DataError: refused"},
     ]
-    text = table(rows, [rows[2] | {"ate_m": 0.4}])
+    text = page({"version": "1", "commit": "abc", "machine": "m", "written": "2026", "packages": {}, "runs": rows})
+    assert "commit abc" in text
     assert "| clean | 4 |" in text
     assert "| night | 5.1 [1] |" in text
     assert "1. r, none, night: frame 7: alarm" in text
-    assert "| r, none | cameras: black | 400 | 4 | 0.2 | images are black |" in text
-    assert "| r, none | imu: zero | – | 4 | 1.0 | DataError: refused |" in text
+    assert "| r, none | cameras: black | 4 | 0.2 | images are black |" in text
+    assert "| r, none | imu: zero | 4 | 1.0 | DataError: refused |" in text
+
+
+def test_the_page_shows_what_was_run() -> None:
+    facts = json.loads(FIGURES.read_text(encoding="utf-8"))
+    assert PAGE.read_text(encoding="utf-8") == page(facts)
+    keys = ("recording", "motion", "group", "variant")
+    wanted = [(Path(s.source).name, s.motion, group, name) for s, group, name in tasks()]
+    assert sorted(tuple(row[key] for key in keys) for row in facts["runs"]) == sorted(wanted)
+    assert all("ate_m" in row for row in facts["runs"] if row["group"] == "healthy")
+
+
+def test_a_part_of_the_runs_is_named() -> None:
+    some = list(tasks(["MH_01_head"], ["imu", "nothing"]))
+    assert [name for s, group, name in some if s.motion == "imu"] == ["nothing", *IMU]
+    assert [(group, name) for s, group, name in some if s.motion == "none"] == [("cameras", "nothing")]
+    assert len(list(tasks())) == sum(len(GROUPS[group]) for s in RUNS for group in s.groups)

@@ -478,11 +478,11 @@ def state(flight_log: Path, tmp_path: Path) -> tuple[Path, Dataset]:
     return tmp_path / "c", dataset
 
 
-def _forge(path: Path, tree: Any) -> None:
+def _forge(path: Path, tree: Any, blobs: bytes = b"") -> None:
     """Put another state into a checkpoint, with the checksum that belongs to it."""
     head = json.loads(path.read_bytes()[8:].split(b"\n")[0])
     text = json.dumps(tree).encode()
-    body = json.dumps({**head, "tree_bytes": len(text)}).encode() + b"\n" + text
+    body = json.dumps({**head, "tree_bytes": len(text)}).encode() + b"\n" + text + blobs
     path.write_bytes(b"%08x" % zlib.crc32(body) + body)
 
 
@@ -512,6 +512,8 @@ def test_a_checkpoint_holds_objects_of_our_own_classes_only(name: str, state: tu
         ["array", "|O", [1], "C", 0, True],
         ["array", "<f8", [2**62], "C", 0, True],
         ["array", "<f8", [0], "C", -8, True],
+        ["array", "<f8", [1], "C", 2**70, True],
+        ["deque", 2**70],
         ["array", "<f8", [-1], "C", 0, True],
         ["generator", "MT19937", {}],
         ["ref", 9],
@@ -532,6 +534,15 @@ def test_a_forged_tree_is_one_line(tree: Any, state: tuple[Path, Dataset]) -> No
     with pytest.raises(DataError, match=r"c: is damaged \(.*\); repeat the run from its start") as error:
         load_checkpoint(path, dataset)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("dtype", ["|O", [["a", "|O"]], [["a", [["b", "|O", [2]]]]]], ids=str)
+def test_bytes_of_a_forged_checkpoint_do_not_become_references(dtype: Any, state: tuple[Path, Dataset]) -> None:
+    """NumPy takes the bytes of a buffer for addresses of objects where the type says so; zeros are None."""
+    path, dataset = state
+    _forge(path, ["list", ["array", dtype, [1], "C", 0, True]], blobs=bytes(16))
+    with pytest.raises(DataError, match="is damaged"):
+        load_checkpoint(path, dataset)
 
 
 def test_what_a_checkpoint_holds_comes_back_with_its_types_layouts_and_references(state: tuple[Path, Dataset]) -> None:

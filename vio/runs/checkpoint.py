@@ -35,6 +35,7 @@ _BIT_GENERATORS = {own.__name__: own for own in (np.random.PCG64, np.random.PCG6
 _PLAIN = frozenset((type(None), bool, int, float, str))
 _SEQUENCES = frozenset((list, tuple, set, frozenset))
 _BASES = (object, Generic, Protocol)  # of the classes whose objects are saved, beside this package's own
+_DAMAGE = OSError, ValueError, ArithmeticError, AttributeError, TypeError, LookupError, ImportError, RecursionError
 _MOST_CHANGES = 3  # of the inputs, named in an error
 
 
@@ -84,7 +85,7 @@ def load_checkpoint(path: Path, dataset: Dataset, inputs: Mapping[str, Any] | No
         body = memoryview(data)[end + 1 :]
         tree = json.loads(bytes(body[: head["tree_bytes"]]))
         return _Reader(dataset, body[head["tree_bytes"] :]).node(tree)
-    except (OSError, ValueError, AttributeError, TypeError, LookupError, ImportError, RecursionError) as error:
+    except _DAMAGE as error:
         raise DataError(f"{path}: is damaged ({error}); repeat the run from its start") from error
 
 
@@ -275,8 +276,10 @@ class _Reader:
     ) -> np.ndarray[Any, Any]:
         if min(start, *shape, 0) < 0:
             raise ValueError("the place of an array is negative")
-        fields = [(name, of, *map(tuple, rest)) for name, of, *rest in dtype] if type(dtype) is list else dtype
-        made: np.ndarray[Any, Any] = np.ndarray(shape, np.dtype(fields), self._blobs, start, order=order).copy(order="K")
+        kind = np.dtype([(name, of, *map(tuple, rest)) for name, of, *rest in dtype] if type(dtype) is list else dtype)
+        if kind.hasobject:  # NumPy would take bytes for addresses
+            raise ValueError("an array of objects does not belong into a checkpoint")
+        made: np.ndarray[Any, Any] = np.ndarray(shape, kind, self._blobs, start, order=order).copy(order="K")
         made.flags.writeable = writeable
         return made
 
