@@ -302,7 +302,7 @@ def no_landmarks() -> Landmarks:
     return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
-RIGHT_TERMS = 4  # coefficients of a stereo field: a0 to a3 of the right columns, equation (R3) of docs/math.md
+RIGHT_TERMS = 4  # coefficients of a rectification error: a0 to a3 of the right columns, equation (R3) of docs/math.md
 FIELD_TERMS = 8  # those, and k1, k2, q1, q2 of both lenses
 ROW_TERMS = 7  # coefficients of the right rows, equation (R2)
 
@@ -581,7 +581,7 @@ class FrameLog:
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """All that the chain made of one frame."""
+    """Everything that came of one frame."""
 
     frame: StereoFrame
     output: FrontendOutput

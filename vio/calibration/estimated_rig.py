@@ -16,7 +16,7 @@ _MOST_LEFT_PX = 5.0  # a rig that leaves more of what the run saw is none of the
 def estimated_rig(given: Rig, estimate: Estimate, camera: StereoCamera, where: str) -> CalibratedRig:
     """Return a given rig with all that a run estimated of it.
 
-    On a cylinder left and right stay as given: its stereo field is not expressed as a rig.
+    On a cylinder left and right stay as given: its rectification error is not expressed as a rig.
 
     Raises:
         CalibrationError: no rig of the given lens models is off as the run found it.

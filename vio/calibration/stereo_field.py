@@ -162,7 +162,7 @@ class CalibratedRig:
 def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
     """Return a given rig with all that a run estimated of it.
 
-    That is the stereo field, baseline and focal length, extrinsics and time offset of the IMU.
+    That is the rectification error, baseline and focal length, extrinsics and time offset of the IMU.
 
     What the run did not estimate stays as given, with its prior standard deviations.
 

@@ -37,7 +37,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--revision",
         metavar="REV",
-        help="run this git revision too, in turns, and compare: A is the revision, B this code",
+        help="run this git revision too, interleaved, and compare: A is the revision, B this code",
     )
     parser.add_argument(
         "--identity",
@@ -159,7 +159,7 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
 
 
 def _compare(args: argparse.Namespace) -> int:
-    """Print what changed; the status is 1 where something became worse, 3 where that cannot be told."""
+    """Print what changed; the status is 1 where something became worse, 3 where that is undecided."""
     from vio.bench.compare import EXIT_STATUS, compare, comparison_lines
     from vio.cli.output import print_result
 

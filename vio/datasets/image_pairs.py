@@ -88,7 +88,7 @@ def _say_skipped(unsaid: list[BadFrame]) -> None:
     unsaid.clear()
 
 
-_WHITE_FRAMES = 8  # that tell the level of white, spread over the recording: the first may be dark
+_WHITE_FRAMES = 8  # that determine the level of white, spread over the recording: the first may be dark
 
 
 def full_scale(pairs: ImagePairs) -> tuple[int, tuple[str, ...]]:

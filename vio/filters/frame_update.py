@@ -51,7 +51,7 @@ _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before an
 # images and an IMU, position NEES after 2 s is 24 of 3 at 0.2, 15 at 0.05, 6 at 0.02, 2.8 at 0.01, 2.5 without any.
 _LANDMARK_DEPTH_SIGMA = 0.01  # by all views
 _LANDMARK_STEREO_SIGMA = 0.1  # or by the right views alone, which know the scale
-# Standard deviation of the baseline over it, and that of a point's stereo depth by the stereo field, over it, at most:
+# Standard deviation of the baseline over it, and that of a point's stereo depth by the rectification, over it, at most:
 # while the scale is open, the same bias falls on the baseline, and on the field.
 # With a prior of 5 % and a baseline that is off by 9.5 %, 15 s of a flight with an IMU end at 4.07 +- 0.03 % with
 # landmarks from the start, at 9.02 +- 0.29 % without any. Where no right image gives depths any more, the bias is the

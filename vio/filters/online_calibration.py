@@ -36,14 +36,14 @@ _EXTRINSIC_ROTATION_WALK_DEG = 2.0e-3
 _EXTRINSIC_TRANSLATION_WALK_M = 1.0e-4
 _TIME_OFFSET_WALK_S = 2.0e-6
 STEREO_YAW_SIGMA_DEG = 0.05  # initial standard deviation of the right camera's rotation about its vertical axis
-LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA = 5.0e-4, 2.0e-3  # the same of the stereo field's other terms, in focal lengths
+LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA = 5.0e-4, 2.0e-3  # the same of the other rectification terms, in focal lengths
 _LEAST_COMMON_SIGMA = 1.0e-3  # at least that of what both lenses have in common, which moves no rows of far points
 _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
-_STEREO_WALK = 0.02  # random walk of the stereo field per root second, over its initial standard deviation
+_STEREO_WALK = 0.02  # random walk of the rectification error per root second, over its initial standard deviation
 
 
 def stereo_field_sigmas(sigma: float, turn_rad: float = 0.0) -> FloatArray:
-    """Initial standard deviations (8,) of the stereo field, in focal lengths, by that of its lens terms.
+    """Initial standard deviations (8,) of the rectification error, in focal lengths, by that of its lens terms.
 
     Yaw, which moves no row, is known no better than by the turn `turn_rad` that pitch and roll would make of the rows.
     """

@@ -4,7 +4,7 @@ The filter counts all pixels of a track as independent. Those of a front end are
 comes back when the track begins again under its id. So the score of a feature, `sum H' R^-1 r` over its life with its
 point eliminated, varies more than its information `sum H' R^-1 H` says. The ratio of the two, over all features, is the
 factor by which information is counted too often (quasi-likelihood: Wedderburn 1974; clusters: Liang & Zeger,
-Longitudinal data analysis using generalized linear models, 1986). Scores are taken by the terms of the stereo field,
+Longitudinal data analysis using generalized linear models, 1986). Scores are taken by the rectification terms,
 (R3) of docs/math.md, which stay the same while poses change.
 """
 

@@ -299,7 +299,7 @@ class Window:
             information: (D, D).
             vector: (D,).
             scaled: for measurements in metres.
-            repeated: for pixels, the factor by which they repeat what was said of the stereo field.
+            repeated: for pixels, the factor by which they repeat what was said of the rectification error.
             considered: for pixels, the part (D, 4) of the constants considered.
         """
         partly = (self.state["stereo_field"], repeated) if repeated > 1 and "stereo_field" in self.state else None

@@ -56,7 +56,7 @@ class LinearTracks:
     z: FloatArray  # (F, N, 4) pixels as they are predicted
     weight: FloatArray  # (F, N) robust weight of each view
     information: TrackInformation
-    stereo: StereoColumns | None  # where the stereo field is estimated
+    stereo: StereoColumns | None  # where the rectification error is estimated
     field: StereoCorrection | None  # what was taken out of the pixels
 
     def newest_innovation(self) -> float | None:
@@ -96,7 +96,7 @@ class WindowTracks:
             T_cam0_world: camera poses (N, 4, 4) at the clones.
             rows: tracks; those without a usable point are left out.
             steps: Gauss-Newton steps on each point.
-            field: what is taken out of the pixels where the stereo field is estimated.
+            field: what is taken out of the pixels where the rectification error is estimated.
         """
         camera, table, T, clones = self._camera, self.table, T_cam0_world, len(T_cam0_world)
         views = self._views(rows, clones, field)
@@ -187,7 +187,7 @@ class WindowTracks:
         return score / self.variance, (A - np.einsum("fas,fas->fs", G, X)) / self.variance
 
     def _views(self, rows: IntArray, clones: int, field: StereoCorrection | None) -> Views:
-        """What rows showed, without the stereo field."""
+        """What rows showed, without the rectification error."""
         views = self.table.views(rows, clones)
         return views if field is None else field.corrected(views)
 

@@ -1,1 +1,1 @@
-"""Events in, estimates out: one frame through the chain, and the class for live use."""
+"""Events in, estimates out: one frame through the pipeline, and the class for live use."""

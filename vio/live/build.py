@@ -16,7 +16,7 @@ from vio.filters import backend_class
 from vio.frontend import build_frontend
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.live.chain import Chain
+from vio.live.frame_pipeline import FramePipeline
 from vio.live.imu_trial import ImuTrial
 from vio.live.processor import EventProcessor
 from vio.protocols import Backend, Dataset, Frontend, Selector
@@ -161,7 +161,7 @@ def build_processor(source: Source, config: Config, parts: Parts, map: MapUse | 
         raise ConfigError(f"lag_frames={config.lag_frames}: needs backend msckf, and must be below msckf.clones")
     seen = camera if features is None else features.recording.camera
     name = config.frontend.name if config.frontend.features is None else "precomputed"
-    chain = Chain(
+    pipeline = FramePipeline(
         camera,
         source.T_cam0_body,
         source.motion,
@@ -175,7 +175,7 @@ def build_processor(source: Source, config: Config, parts: Parts, map: MapUse | 
         else None,
     )
     session = None if map is None else _open_map(map, source, config, backend)
-    return EventProcessor(chain, wait_for_imu=source.motion == "imu", map=session)
+    return EventProcessor(pipeline, wait_for_imu=source.motion == "imu", map=session)
 
 
 def build_backend(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from vio.live.chain import Chain
 from vio.live.event_order import EventOrder
+from vio.live.frame_pipeline import FramePipeline
 from vio.records import Estimate, Event, FrameResult, Landmarks, MotionSample, StereoFrame
 
 if TYPE_CHECKING:
@@ -25,17 +25,17 @@ def _wait_ns(estimate: Estimate) -> int:
 
 
 class EventProcessor:
-    """Takes events through the chain and, where there is one, into the map."""
+    """Takes events through the pipeline and, where there is one, into the map."""
 
-    def __init__(self, chain: Chain, *, wait_for_imu: bool, map: MapSession | None) -> None:
+    def __init__(self, pipeline: FramePipeline, *, wait_for_imu: bool, map: MapSession | None) -> None:
         """Begin a trajectory.
 
         Args:
-            chain: processes one event at a time.
+            pipeline: processes one event at a time.
             wait_for_imu: whether a frame waits for the first sample at or after it.
             map: the trajectory's part of a map; None: no map.
         """
-        self._chain, self._order, self.map = chain, EventOrder(wait_for_imu=wait_for_imu), map
+        self._pipeline, self._order, self.map = pipeline, EventOrder(wait_for_imu=wait_for_imu), map
         self.estimate: Estimate | None = None  # newest; None before the first
         self._last_index = 0  # of the frame that it is of
 
@@ -50,10 +50,10 @@ class EventProcessor:
     def finish(self) -> list[FrameResult]:
         """Process the frames that still wait, and let the checks report what they have not yet reported."""
         results = self._process(self._order.flush())
-        self._chain.monitor.close()
+        self._pipeline.monitor.close()
         if self.estimate is not None:
-            self._chain.begin_again(self._last_index)
-        self.estimate = self._chain.newest(self._last_index, self.estimate)
+            self._pipeline.begin_again(self._last_index)
+        self.estimate = self._pipeline.newest(self._last_index, self.estimate)
         if self.map is not None:
             self.map.finish()
         return results
@@ -66,58 +66,58 @@ class EventProcessor:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the checks have found so far, one line each."""
-        return tuple(self._chain.monitor.lines)
+        return tuple(self._pipeline.monitor.lines)
 
     def say(self, line: str) -> None:
         """Log a line on the events, and add it to the warnings."""
-        self._chain.monitor.say(line)
+        self._pipeline.monitor.say(line)
 
     @property
     def frames_refused(self) -> int:
         """Number of frames that the front end refused."""
-        return self._chain.monitor.frames_refused
+        return self._pipeline.monitor.frames_refused
 
     @property
     def refusal(self) -> str:
         """Why the last frame of those was refused."""
-        return self._chain.monitor.refusal
+        return self._pipeline.monitor.refusal
 
     @property
     def frames_waiting(self) -> int:
         """Number of frames without a pose, as the back end could not be initialised yet."""
-        return self._chain.monitor.frames_waiting
+        return self._pipeline.monitor.frames_waiting
 
     def landmarks(self) -> Landmarks:
         """Return the points of the map so far, after the first frame with a pose."""
-        return self._chain.backend.landmarks()
+        return self._pipeline.backend.landmarks()
 
     def take_landmarks(self) -> Landmarks:
         """Return the points that will not change any more, and forget them; `landmarks` has the others."""
-        return self._chain.backend.take_landmarks()
+        return self._pipeline.backend.take_landmarks()
 
     def usable(self, sample: MotionSample) -> MotionSample | None:
         """Return a motion sample as the estimator takes it; None: it does not, as the sensor was found to be wrong."""
-        return self._chain.usable(sample)
+        return self._pipeline.usable(sample)
 
     def take_revised(self) -> dict[int, Estimate]:
         """Return the estimates, by frame number, that replace earlier ones, and forget them.
 
         There are some where the IMU was found to be wrong, once, in the first minute.
         """
-        return self._chain.take_revised()
+        return self._pipeline.take_revised()
 
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since; None where the window does not hold it."""
-        return self._chain.backend.smoothed(frame_index)
+        return self._pipeline.backend.smoothed(frame_index)
 
     def _process(self, events: list[Event]) -> list[FrameResult]:
-        """Give events that are due to the chain."""
+        """Give events that are due to the pipeline."""
         results: list[FrameResult] = []
         for event in events:
             if not isinstance(event, StereoFrame):
-                self._chain.sample(event)
+                self._pipeline.sample(event)
                 continue
-            result = self._chain.frame(event)
+            result = self._pipeline.frame(event)
             if result is not None:
                 results.append(self._in_map(event, result))
                 self.estimate, self._last_index = results[-1].estimate, event.index
@@ -128,7 +128,7 @@ class EventProcessor:
         """Add what the map says of a frame."""
         if self.map is None:
             return result
-        loops = self.map.frame(frame, result.output.observations, result.estimate, self._chain.backend.relative)
+        loops = self.map.frame(frame, result.output.observations, result.estimate, self._pipeline.backend.relative)
         T = self.map.T_map_odom
         if T is not None:
             T_map_body, covariance = T @ result.estimate.T_world_imu, self.map.covariance

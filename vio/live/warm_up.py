@@ -52,7 +52,7 @@ def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config,
 
 
 def _configs(config: Config) -> list[Config]:
-    """Return the configuration, and one with which landmarks begin at once, not when the stereo field is known."""
+    """Return the configuration, and one with which landmarks begin at once, not when the rectification is known."""
     at_once = replace(config, msckf=replace(config.msckf, calibrate_stereo="off"))
     return [config] if at_once == config else [config, at_once]
 

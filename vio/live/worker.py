@@ -24,7 +24,7 @@ class Worker:
         Args:
             most_frames: that wait, see `EventQueue`.
             drop: likewise.
-            finish: called after the last call, unless the worker failed or was told to forget what waits.
+            finish: called after the last call, unless the worker failed or was asked to forget what waits.
             close: called last, in any case.
         """
         self._queue = EventQueue(most_frames, drop)

@@ -58,7 +58,7 @@ _SHOWN = 64  # keyframes whose points are held, 6 MB: from query to query, most 
 _OF_THE_FILE = ("_store", "_index", "_overlaps", "_shown")
 _ONLY = ("pinhole", "stereo")  # projection and kind of the cameras that maps know
 _SAME_RIG = 0.03  # by which two calibrations of one rig may differ in focal length and baseline
-_FIELD_MOVED_PX = 0.02  # by which a stereo field moves the pixels of a keyframe before all are corrected anew
+_FIELD_MOVED_PX = 0.02  # by which a rectification error moves the pixels of a keyframe before all are corrected anew
 _LOCAL = 20  # keyframes of a localised session that are optimised together
 
 
@@ -278,7 +278,7 @@ class MapBuilder:
         return self._store.features(keyframe).without(graph.sessions[int(graph.session[keyframe])].field)
 
     def _correct(self, field: DisplacementField, features: KeyframeFeatures | None) -> None:
-        """Take a newer estimate of the stereo field of this session, where it differs in a keyframe's features.
+        """Take a newer estimate of the rectification error of this session, where it differs in a keyframe's features.
 
         All that was made of pixels before is forgotten.
         """

@@ -113,7 +113,7 @@ class PlacePoints:
         return StereoPoints(self.p, P, np.ones(len(P), dtype=np.bool_))
 
     def fields(self) -> list[DisplacementField | None]:
-        """Return the stereo field (K,) that was taken out of each point's pixels."""
+        """Return the rectification error (K,) that was taken out of each point's pixels."""
         return [self.views[n].shown.features.field for n in self.view.tolist()]
 
     def shifts(self, field: DisplacementField) -> FloatArray:
@@ -222,7 +222,7 @@ def _covariance_by_fields(
     T_i_k: FloatArray,
     prior: RelativePose | None,
 ) -> FloatArray:
-    """Covariance (6, 6) of a fitted pose by what is not known of the stereo fields, which sessions share."""
+    """Covariance (6, 6) of a fitted pose by what is not known of the rectification errors, which sessions share."""
     fields = {id(f): f for f in (*points.fields(), here.field) if f is not None}
     total = np.zeros((6, 6))
     for field in fields.values():

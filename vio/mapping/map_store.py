@@ -255,7 +255,7 @@ class MapStore:
             self._db.close()
 
     def images(self) -> set[bytes]:
-        """Return a hash of the descriptors of each keyframe that shows enough to be told from any other."""
+        """Return a hash of the descriptors of each keyframe that is distinctive enough."""
         with self._errors():
             least = _TELLING_FEATURES * DESCRIPTOR_BYTES
             rows = self._db.execute("SELECT descriptors FROM features WHERE length(descriptors) >= ?", (least,))

@@ -118,7 +118,7 @@ def _in_pinhole(
 ) -> tuple[StereoCamera, FeatureTracks]:
     """Return the pinhole inside a cylinder, and those of the tracks' pixels that it shows.
 
-    They are without the stereo field of the coefficients (15,) of (R3) and (R2), where there is one.
+    They are without the rectification error of the coefficients (15,) of (R3) and (R2), where there is one.
     """
     z = tracks.z
     if coefficients is not None:

@@ -70,7 +70,6 @@ class SelfCalibration:
     values: FloatArray  # (18,) in the order and units of `NAMES`
     sigmas: FloatArray  # (18,) standard deviations; those of the prior where the motion determines nothing
     covariance: FloatArray  # (18, 18)
-    told: FloatArray  # (18,) share of the prior's variance that the data removed
     segments: int
     points: int
     residual_px: float  # robust standard deviation of a pixel coordinate
@@ -223,7 +222,7 @@ def _with_covariance(
     allowed = width**2 + x**2
     sigmas = np.sqrt(np.minimum(np.diag(covariance), allowed))
     points = int(sum(len(piece.tracks.ids) for piece in pieces))
-    return SelfCalibration(x, sigmas, covariance, 1 - sigmas**2 / allowed, len(pieces), points, sigma)
+    return SelfCalibration(x, sigmas, covariance, len(pieces), points, sigma)
 
 
 def _spread(camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment]) -> float:

@@ -387,5 +387,5 @@ def _extent(
 
 
 def _short(values: FloatArray) -> list[float | None]:
-    """Return values with six digits, which a screen does not tell from all of them, None for NaN."""
+    """Return values with six digits, which a screen does not distinguish from all of them, None for NaN."""
     return [None if v != v else float(f"{v:.6g}") for v in values.tolist()]

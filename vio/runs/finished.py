@@ -38,7 +38,7 @@ class FinishedRun:
     """What `vio run` wrote, read again; N frames."""
 
     folder: Path
-    name: str  # of the folder, and of as many folders above it as tell it from other runs
+    name: str  # of the folder, and of as many folders above it as distinguish it from other runs
     metrics: dict[str, Any]
     estimates: Rows  # (N,) rows of `vio.runs.tables.ESTIMATE`
     frames: dict[str, FloatArray]  # columns (N,) of frames.csv

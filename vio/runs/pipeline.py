@@ -1,4 +1,4 @@
-"""A whole recording through the chain: events in, front end, selector, filter, result out."""
+"""A whole recording through the pipeline: events in, front end, selector, filter, result out."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class RunResult:
     def calibrated_rig(self) -> CalibratedRig | None:
         """Return the calibration with what the run found it to be off by; None: features without an image size.
 
-        On a cylinder left and right stay as given: its stereo field is not expressed as a rig.
+        On a cylinder left and right stay as given: its rectification error is not expressed as a rig.
 
         Raises:
             CalibrationError: no rig of the given lens models is off as the run found it.

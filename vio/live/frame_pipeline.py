@@ -1,4 +1,4 @@
-"""One frame through the whole chain: predict, front end, selector, filter, and the checks beside them."""
+"""One frame through the pipeline: predict, front end, selector, filter, and the checks beside them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from vio.records import (
 )
 
 
-class Chain:
+class FramePipeline:
     """Front end, selector and filter, fed with events in the order of `EventOrder`."""
 
     def __init__(
@@ -74,8 +74,8 @@ class Chain:
             if self.monitor.repeats(frame, expected):
                 output = no_features(frame)
             else:
-                shown = self.monitor.without_repeated_depth(frame)
-                output = self.frontend.process(shown, expected.tracks if expected and self._use_prior else None)
+                checked = self.monitor.without_repeated_depth(frame)
+                output = self.frontend.process(checked, expected.tracks if expected and self._use_prior else None)
         except DataError as error:
             self.monitor.refused(frame.index, str(error))
             return None
