@@ -21,7 +21,7 @@ import pytest
 
 from tests.dataset_makers import make_drive, make_mat, utias_arrays
 from vio.bench import execute
-from vio.bench.bench import Place, _succeeded, bench, read_bench
+from vio.bench.bench import Place, bench, has_succeeded, read_bench
 from vio.bench.engines import _check_workers, run_here
 from vio.bench.figures import coverage, figures_of, pose_nees
 from vio.bench.identity import ROOT, InputDigests, code_and_packages, commit_of, imported_code
@@ -357,7 +357,7 @@ def test_an_undefined_figure_says_why(data: Path, tmp_path: Path) -> None:
     undefined = {name for name in BY_NAME if record["figures"].get(name, record["measured"].get(name)) is None}
     assert {"drift_percent", "nees", "nees_95"} <= undefined
     assert {name: record["absent"][name] for name in undefined}
-    assert record["absent"]["drift_percent"] == "the way is shorter than the drift's lengths"
+    assert record["absent"]["drift_percent"] == "the path is shorter than the drift's lengths"
 
 
 @pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
@@ -373,11 +373,11 @@ def test_a_report_of_many_systems_is_drawn(tmp_path: Path) -> None:
 
 def test_success_is_a_small_error_over_most_frames() -> None:
     record = {"failure": None, "figures": {"ate_m": 0.4, "reference_m": 50.0, "coverage": 1.0}}
-    assert _succeeded(record, 1.0) is True
-    assert _succeeded(record, 0.5) is False
-    assert _succeeded({**record, "figures": {**record["figures"], "coverage": 0.5}}, 1.0) is False  # type: ignore[dict-item]
-    assert _succeeded({**record, "figures": {}}, 1.0) is None
-    assert _succeeded({**record, "failure": "lost"}, 1.0) is False
+    assert has_succeeded(record, 1.0) is True
+    assert has_succeeded(record, 0.5) is False
+    assert has_succeeded({**record, "figures": {**record["figures"], "coverage": 0.5}}, 1.0) is False  # type: ignore[dict-item]
+    assert has_succeeded({**record, "figures": {}}, 1.0) is None
+    assert has_succeeded({**record, "failure": "lost"}, 1.0) is False
 
 
 # --- whole benches --------------------------------------------------------------------------------------------------

@@ -133,6 +133,15 @@ def test_a_table_lists_figures_with_the_reason_of_each_dash() -> None:
     assert lines[6] == "[1] not reported; [2] too short."
 
 
+def test_a_table_says_how_many_runs_succeeded() -> None:
+    known = {"ate_m": 0.1, "coverage": 1.0, "reference_m": 20.0}
+    runs = [["a", "x", 0, known, {}, None, {}], ["a", "x", 1, {**known, "ate_m": 0.3}, {}, None, {}]]
+    text = "<!-- suite: paper figures=ate_m,success -->\n<!-- end -->"
+    lines = with_figures(text, _results(runs=[*runs, ["a", "x", 2, {}, {}, "lost", {}]])).splitlines()
+    assert lines[1] == "| system | ATE m | runs | success |"
+    assert lines[3] == "| x | 0.2 (0.2 ± 0.14), n = 2 | 2 of 3 | 33 % |"
+
+
 @pytest.mark.parametrize(
     "words",
     ["figure=ate_cm", "figures=ate_m figure=ate_m", "figure=ate_m systems=z", "figure=ate_m colour=red", "systems=x"],

@@ -15,10 +15,14 @@ from vio.calibration.severity import Grade, StereoError, length_grade, rows_grad
         (
             StereoError(0.05, 20.0, -0.02, 0.01),
             "negligible",
-            "disparities by -0.02 ± 0.01 px, which costs 0.1 m",
+            "disparities by -0.02 ± 0.01 px, which costs 0.1 ± 0.05 m",
         ),
-        (StereoError(0.05, 20.0, -0.08, 0.03), "negligible", "by -0.08 ± 0.03 px, which costs 0.4 m"),
-        (StereoError(0.05, 20.0, 0.5, 0.01), "worth calibrating", "by +0.50 ± 0.01 px, which costs 2.5 m per 100 m"),
+        (StereoError(0.05, 20.0, -0.08, 0.03), "negligible", "by -0.08 ± 0.03 px, which costs 0.4 ± 0.15 m"),
+        (
+            StereoError(0.05, 20.0, 0.5, 0.01),
+            "worth calibrating",
+            "by +0.50 ± 0.01 px, which costs 2.5 ± 0.05 m per 100 m",
+        ),
         (StereoError(0.05, 20.0, 3.0), "unusable", "disparities by +3.00 px, which costs 15 m per 100 m"),
         (StereoError(4.0, 20.0, 0.0, 0.01), "unusable", "unusable: rows off by 4.00 px (rms), disparities by +0.00"),
         (StereoError(0.1, -20.0), "unusable", "most disparities are negative"),

@@ -8,7 +8,7 @@ of tasks: an interrupted call goes on where it stopped. docs/results.json holds 
 date. A table of a document stands between `<!-- suite: NAME key=value … -->` and `<!-- end -->`:
 
     figure=ate_m              sequences down, systems across
-    figures=ate_m,cpu_ms      a line for each sequence and system, a column for each figure
+    figures=ate_m,cpu_ms      a line for each sequence and system, a column for each figure, or for `success`
     sequences=… systems=…     these alone, in this order
 
 and a figure in a sentence between `<!-- figure: SUITE/SEQUENCE/SYSTEM/FIGURE/DECIMALS -->` and `<!-- end figure -->`.
@@ -28,7 +28,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from vio.bench.bench import read_bench
+from vio.bench.bench import has_succeeded, read_bench
+from vio.bench.suite import SUCCESS_PERCENT
 from vio.bench.tables import BY_NAME, Outcome, Row, full_table, matrix, provenance, summary_rows
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -92,7 +93,9 @@ class Results:
         if figure:
             lines = matrix(rows, BY_NAME[figure], lists["systems"], facts["titles"])
         else:
-            lines = full_table(rows, [BY_NAME[name] for name in lists["figures"]], facts["titles"], for_documents=True)
+            metrics = [BY_NAME[name] for name in lists["figures"] if name != "success"]
+            success = "success" in lists["figures"]
+            lines = full_table(rows, metrics, facts["titles"], for_documents=True, success=success)
         return "\n".join([*lines, "", f"*Suite `{suite}`: {provenance(facts)}.*", ""])
 
     def figure(self, address: str) -> str:
@@ -104,7 +107,8 @@ class Results:
 
 def _outcome(values: Sequence[Any]) -> Outcome:
     sequence, system, seed, figures, measured, failure, absent = values
-    return Outcome(sequence, system, seed, "", figures, measured, failure, None, absent=absent)
+    succeeded = has_succeeded({"figures": figures, "failure": failure}, SUCCESS_PERCENT)
+    return Outcome(sequence, system, seed, "", figures, measured, failure, None, absent=absent, succeeded=succeeded)
 
 
 def read_results(root: Path = ROOT) -> Results:

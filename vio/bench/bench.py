@@ -179,11 +179,11 @@ def _outcome(task: Task, records: Mapping[str, Record], success_percent: float) 
         warnings=tuple(record.get("warnings", ())),
         notes=tuple(record.get("notes", ())),
         absent=record.get("absent", {}),
-        succeeded=_succeeded(record, success_percent),
+        succeeded=has_succeeded(record, success_percent),
     )
 
 
-def _succeeded(record: Record, percent: float) -> bool | None:
+def has_succeeded(record: Record, percent: float) -> bool | None:
     """Whether a run ended with a small error over most frames; None: without a reference, or at rest."""
     if record["failure"] is not None:
         return False

@@ -105,7 +105,7 @@ def absent_reasons(
     if has_reference:
         why = {
             **dict.fromkeys(("ate_sim3_m", "scale_error_percent"), "the positions do not determine a scale"),
-            **dict.fromkeys(("drift_percent", "drift_deg_per_100m"), "the way is shorter than the drift's lengths"),
+            **dict.fromkeys(("drift_percent", "drift_deg_per_100m"), "the path is shorter than the drift's lengths"),
             "nees": "the ground truth is no more exact than the estimate",
         }
         if positions_only:

@@ -19,6 +19,7 @@ from vio.files.yaml_text import MOST_BYTES, read_yaml
 SHIPPED = Path(__file__).resolve().parent / "suites"
 _NAME = re.compile(r"[\w.+-]+")  # of a sequence or configuration: it becomes part of a command line and of a CSV file
 _MOST_SEEDS = 1000
+SUCCESS_PERCENT = 1.0  # of the path, where a suite says nothing else
 PUBLISHED_MEAN = "all"  # in the place of a sequence: the source's own mean
 _PUBLISHED_FIGURES = ("ate_m", "drift_percent", "drift_deg_per_100m")
 _RENDER_OWN = ("--out", "--seed", "--workers", "--json")  # of `vio render`: given by the bench itself
@@ -76,7 +77,7 @@ class Suite:
     published: tuple[Published, ...] = ()
     titles: Mapping[str, str] = field(default_factory=dict)  # of sequences and systems, for tables in documents
     publisher: str | None = None  # where the recordings can be had
-    success_percent: float = 1.0  # a run with an ATE below this share of the way succeeds
+    success_percent: float = SUCCESS_PERCENT  # a run with an ATE below this share of the path succeeds
     time_limit_s: float | None = None  # of a task; then it has no result
 
 
@@ -130,7 +131,7 @@ def suite_from(values: Any, path: Path) -> Suite:
         published=tuple(_published(value, where, sequences) for value in given.get("published") or ()),
         titles={str(k): str(v) for k, v in _mapping(given.get("titles") or {}, where, "'titles'").items()},
         publisher=None if given.get("publisher") is None else str(given["publisher"]),
-        success_percent=_positive(given.get("success_percent", 1.0), "success_percent", where),
+        success_percent=_positive(given.get("success_percent", SUCCESS_PERCENT), "success_percent", where),
         time_limit_s=None
         if given.get("time_limit_s") is None
         else _positive(given["time_limit_s"], "time_limit_s", where),

@@ -7,6 +7,7 @@ import io
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from decimal import Decimal
 from typing import Any
 
 from vio.bench.suite import PUBLISHED_MEAN, Suite
@@ -51,16 +52,16 @@ MORE_METRICS = (
     Metric("reference_m", "length m", 3),
     Metric("frames", "frames", 6),
     Metric("map_ate_m", "ATE m in the map", 3),
-    Metric("map_causal_ate_m", "at the time", 3),
-    Metric("placed", "frames with a place", 3, larger_is_better=True),
-    Metric("place_s", "first place s", 3),
+    Metric("map_causal_ate_m", "causal ATE m in the map", 3),
+    Metric("placed", "frames localised", 3, larger_is_better=True),
+    Metric("place_s", "first localised s", 3),
     Metric("loops", "loops", 4),
-    Metric("loops_false", "false", 3),
-    Metric("loop_error_m", "their error m", 3),
-    Metric("loop_recall", "recall", 3, larger_is_better=True),
+    Metric("loops_false", "false loops", 3),
+    Metric("loop_error_m", "loop error m", 3),
+    Metric("loop_recall", "loop recall", 3, larger_is_better=True),
     Metric("map_nees", "NEES in the map", 3),
-    Metric("map_nees_50", "its median", 3),
-    Metric("map_nees_95", "its 95 %", 3),
+    Metric("map_nees_50", "NEES in the map, median", 3),
+    Metric("map_nees_95", "NEES in the map, 95 %", 3),
     Metric("wall_ms", "wall ms", 3, measured=True),
     Metric("wall_95_ms", "wall ms, 95 %", 3, measured=True),
     Metric("frontend_ms", "front end ms", 3, measured=True),
@@ -179,10 +180,7 @@ def summary_of(rows: Iterable[Row]) -> dict[str, tuple[int, int, dict[str, Cell]
 
 def number(value: float, digits: int) -> str:
     """Return a number with so many significant digits, never in exponents."""
-    if value == 0:
-        return "0"
-    text = f"{value:.{digits}g}"
-    return f"{value:.{digits + 5}f}".rstrip("0").rstrip(".") if "e-" in text else f"{float(text):.12g}"
+    return f"{Decimal(f'{value:.{digits}g}'):f}"
 
 
 def cell_text(cell: Cell, metric: Metric, runs: int | None = None) -> str:
@@ -229,7 +227,7 @@ def markdown(suite: Suite, rows: Sequence[Row], outcomes: Sequence[Outcome], fac
         f"# {suite.name}\n\n{provenance(facts)}{seeds}.\n",
         "## ATE in m\n\nMedian over the seeds (mean ± standard deviation).\n\n" + "\n".join(matrix(rows)),
         "## All figures\n\nMedian over the seeds (mean ± standard deviation), n as in the column of runs where nothing "
-        f"else is said. Success: share of the runs whose ATE is below {suite.success_percent:g} % of the way and that "
+        f"else is said. Success: share of the runs whose ATE is below {suite.success_percent:g} % of the path and that "
         f"cover {100 * SUCCESS_COVERAGE:g} % of the frames.\n\n" + "\n".join(full_table(rows)),
         "## Systems\n\nMedian and worst over the sequences of the medians over seeds; n in brackets.\n\n"
         + "\n".join(system_table(rows)),
@@ -325,6 +323,7 @@ def full_table(
     titles: Mapping[str, str] | None = None,
     *,
     for_documents: bool = False,
+    success: bool = False,
 ) -> Iterator[str]:
     """Yield the table of all figures: a line for each sequence and system.
 
@@ -333,12 +332,13 @@ def full_table(
         metrics: the columns.
         titles: of sequences and systems, by name.
         for_documents: leave out runs and success, and sequence or system where there is one alone.
+        success: for documents, too.
     """
     named, notes = titles or {}, Notes()
     names = ["sequence", "system"]
     if for_documents:
         names = [name for name in names if len({getattr(row, name) for row in rows}) > 1] or names[1:]
-    last = [] if for_documents else ["runs", "success"]
+    last = ["runs", "success"] if success or not for_documents else []
     yield _line([*names, *(metric.title for metric in metrics), *last])
     yield "|" + "---|" * len(names) + "---:|" * (len(metrics) + len(last))
     before: list[str] = []
@@ -349,7 +349,7 @@ def full_table(
         labels = [named.get(getattr(row, name), getattr(row, name)) for name in names]
         shown = ["", *labels[1:]] if for_documents and len(labels) > 1 and labels[:1] == before else labels
         before = labels[:1]
-        yield _line([*shown, *texts, *([] if for_documents else [runs, share])])
+        yield _line([*shown, *texts, *([runs, share] if last else [])])
     yield from notes.lines()
 
 

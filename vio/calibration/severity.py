@@ -52,9 +52,12 @@ class StereoError:
         if self.seen_px < 0:
             return f"{text}, most disparities are negative"
         if self.disparity_px is not None and self.per_100_m is not None:
-            sigma = "" if self.disparity_sigma_px is None else f" ± {self.disparity_sigma_px:.2f}"
-            cost = f"which costs {self.per_100_m:.2g} m per 100 m"
-            return f"{text}, disparities by {self.disparity_px:+.2f}{sigma} px, {cost}"
+            sigma_px, sigma_m = "", ""
+            if self.disparity_sigma_px is not None:
+                sigma_px = f" ± {self.disparity_sigma_px:.2f}"
+                sigma_m = f" ± {100 * self.disparity_sigma_px / self.seen_px:.2g}"
+            cost = f"which costs {self.per_100_m:.2g}{sigma_m} m per 100 m"
+            return f"{text}, disparities by {self.disparity_px:+.2f}{sigma_px} px, {cost}"
         if self.grade == "negligible" or self.seen_px <= 0:
             return text
         return f"{text}; disparities off by as much would cost {100 * self.rows_px / self.seen_px:.2g} m per 100 m"

@@ -155,7 +155,7 @@ def _reference_part(recording: Recording) -> Part:
     truth = recording.reference
     if truth is None:
         return Part("ground truth", "none", {"poses": 0})
-    text = f"{len(truth)} poses of the {truth.body}"
+    text = f"{len(truth)} poses ({truth.body})"
     if truth.times_ns is None:
         return Part("ground truth", text, {"poses": len(truth)})
     times = recording.frame_times_ns

@@ -50,8 +50,9 @@ def page(runs: Sequence[FinishedRun]) -> str:
     from plotly.offline import get_plotlyjs
 
     title = _text(", ".join(run.name for run in runs))
-    parts = [_words(runs), _table(runs), _calibration(runs), _warnings(runs), _images(runs), _settings(runs)]
-    parts += [_figure(section, number) for number, section in enumerate(sections(runs, curves_of(runs)))]
+    path, *figures = (_figure(section, number) for number, section in enumerate(sections(runs, curves_of(runs))))
+    parts = [_words(runs), _warnings(runs), path, _table(runs), _calibration(runs), _images(runs), *figures]
+    parts.append(_settings(runs))
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style>'
