@@ -24,9 +24,9 @@ from vio.mapping.features import KeyframeFeatures
 from vio.mapping.guided_search import LEAST_CORNERS, Guided, PlaceView, Shown, place_points, search, shown
 from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, Verified, matches_of, verify
 from vio.mapping.map_graph import UNKNOWN, MapGraph
-from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
+from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, PlacesRow, SessionRow
 from vio.mapping.overlap import Overlaps
-from vio.mapping.place_index import PlaceIndex
+from vio.mapping.place_index import SEGMENT, PlaceIndex
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray, LoopEvent
 
@@ -155,8 +155,7 @@ class MapBuilder:
         self.graph = MapGraph(store)
         self._shown = lru_cache(_SHOWN)(self._read_shown)
         self._index, self._overlaps = PlaceIndex(), Overlaps()
-        for k in range(len(self.graph)):
-            self._remember(self.graph.sessions[int(self.graph.session[k])].camera, self._features(k))
+        self._remember_all(len(self.graph))
         self.first = len(self.graph)  # keyframe of this session
         sessions = self.graph.sessions
         self._own = len(sessions)
@@ -269,8 +268,7 @@ class MapBuilder:
         if not self._localise:
             store.truncate(len(graph.sessions), len(graph), len(graph.loops))
             self._moved = True
-        for k in range(self.first if self._localise else len(graph)):
-            self._remember(graph.sessions[int(graph.session[k])].camera, self._features(k))
+        self._remember_all(self.first if self._localise else len(graph))
 
     def _features(self, keyframe: int) -> KeyframeFeatures:
         """Return a keyframe's features without what its session found the stereo calibration to be off by."""
@@ -311,6 +309,18 @@ class MapBuilder:
         self._index.add(features.descriptors)
         p, valid = triangulate(camera, features.z, min_disparity_px=LEAST_DISPARITY_PX)
         self._overlaps.add(p[valid & features.has_right])
+        words = self._index.full_segment()
+        if words is not None and not self._localise:
+            self._store.add_places(PlacesRow(words, *self._overlaps.newest(SEGMENT)))
+
+    def _remember_all(self, count: int) -> None:
+        """Let the first keyframes of the file be found again: by what it says of places, the rest by their features."""
+        places = self._store.places()[: count // SEGMENT]
+        self._index.restore([row.words for row in places])
+        for row in places:
+            self._overlaps.restore(row.points, row.stereo)
+        for k, session in enumerate(self.graph.session[len(self._index) : count].tolist(), start=len(self._index)):
+            self._remember(self.graph.sessions[session].camera, self._features(k))
 
     def _update(self, events: tuple[LoopEvent, ...]) -> MapUpdate:
         if not self.is_joined:
