@@ -13,7 +13,7 @@ import math
 import sqlite3
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -348,23 +348,23 @@ class MapStore:
         words = row.words.begins.astype("<u4").tobytes(), row.words.owners.tobytes()
         self._insert("places", (self._count("places"), *words, _blob(row.points), row.stereo.astype("<i8").tobytes()))
 
-    def set_poses(self, T_map_cam: FloatArray) -> None:
-        """Replace the poses (K, 4, 4) of all keyframes."""
-        self._set("keyframes", "T_map_cam", [_blob(T) for T in T_map_cam])
+    def set_poses(self, T_map_cam: Mapping[int, FloatArray]) -> None:
+        """Replace poses (4, 4) of keyframes."""
+        self._set("keyframes", "T_map_cam", {k: _blob(T) for k, T in T_map_cam.items()})
 
-    def set_kept(self, kept: list[bool]) -> None:
-        """Say of each loop whether it agrees with the others."""
+    def set_kept(self, kept: Mapping[int, bool]) -> None:
+        """Say of loops whether they agree with the others."""
         self._set("loops", "kept", kept)
 
     def set_parts(self, parts: list[int]) -> None:
         """Replace the part of each session."""
-        self._set("sessions", "part", parts)
+        self._set("sessions", "part", dict(enumerate(parts)))
 
     def set_loops(self, rows: Sequence[LoopRow]) -> None:
         """Replace what is measured of each loop."""
-        self._set("loops", "T_i_j", [_blob(row.pose.T_i_j) for row in rows])
-        self._set("loops", "covariance", [_blob(row.pose.covariance) for row in rows])
-        self._set("loops", "inliers", [row.inliers for row in rows])
+        self._set("loops", "T_i_j", {n: _blob(row.pose.T_i_j) for n, row in enumerate(rows)})
+        self._set("loops", "covariance", {n: _blob(row.pose.covariance) for n, row in enumerate(rows)})
+        self._set("loops", "inliers", {n: row.inliers for n, row in enumerate(rows)})
 
     def set_field(self, session: int, field: DisplacementField | None) -> None:
         """Replace what a session found its stereo calibration to be off by."""
@@ -385,12 +385,13 @@ class MapStore:
             self._db.execute(f"INSERT INTO {table} VALUES ({'?,' * len(values)}0)", values)
             self._sign(table, f"WHERE {_KEYS[table]} = {int(values[0])}")
 
-    def _set(self, table: str, column: str, values: Sequence[Any]) -> None:
-        """Replace a value of every row, in the order of their numbers."""
+    def _set(self, table: str, column: str, values: Mapping[int, Any]) -> None:
+        """Replace a value of the rows of some numbers."""
         with self._changes():
-            rows = [(value, n) for n, value in enumerate(values)]
-            self._db.executemany(f"UPDATE {table} SET {column} = ? WHERE id = ?", rows)
-            self._sign(table)
+            self._db.executemany(f"UPDATE {table} SET {column} = ? WHERE id = ?", ((v, n) for n, v in values.items()))
+            signed = ", ".join(self._columns(table)[:-1])
+            update = f"UPDATE {table} SET crc32 = row_crc32({signed}) WHERE id = ?"
+            self._db.executemany(update, ((n,) for n in values))
 
     def _sign(self, table: str, which: str = "") -> None:
         """Write the checksums of rows, of their values as they are stored."""
