@@ -79,7 +79,7 @@ def test_a_session_is_dropped(tmp_path: Path) -> None:
 def test_pruning_leaves_loops_and_puts_motions_together(tmp_path: Path) -> None:
     path = tmp_path / "a.map"
     store = fill(path)  # with a loop from keyframe 0 to 3
-    store.set_poses(np.array([se3_exp([0.1 * k, 0, 0, 0, 0, 0]) for k in range(4)]))
+    store.set_poses({k: se3_exp([0.1 * k, 0, 0, 0, 0, 0]) for k in range(4)})
     store.close()
     prune_map(path, 2)
     with closing(MapStore(path, read_only=True)) as left:
@@ -96,7 +96,7 @@ def test_a_part_of_a_map_is_taken_out(tmp_path: Path) -> None:
     path, out = tmp_path / "a.map", tmp_path / "part.map"
     _two_sessions(path)
     with closing(MapStore(path)) as store:
-        store.set_poses(np.array([se3_exp([2.0 * k, 0, 0, 0, 0, 0]) for k in range(6)]))
+        store.set_poses({k: se3_exp([2.0 * k, 0, 0, 0, 0, 0]) for k in range(6)})
     before = path.read_bytes()
     arguments = ["map", "extract", str(path), "--around", "7,0,0", "--radius", "2", "--out", str(out)]
     assert main(arguments) == 0

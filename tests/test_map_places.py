@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +13,8 @@ from vio.geometry.stereo import StereoCamera, project
 from vio.mapping import place_index
 from vio.mapping.features import KeyframeFeatures, _most_alike, _near_rows, extract, no_keyframe_features
 from vio.mapping.loop_geometry import LEAST_INLIERS, match, verify
-from vio.mapping.place_index import PlaceIndex, words_of
+from vio.mapping.map_store import MapStore, PlacesRow
+from vio.mapping.place_index import SEGMENT, PlaceIndex, Segment, words_of
 
 CAMERA = StereoCamera(400.0, 400.0, 319.5, 179.5, 0.12, 640, 360)
 T_I_J = se3_exp([0.4, -0.1, 0.3, 0.05, -0.2, 0.03])
@@ -178,6 +181,32 @@ def test_scores_do_not_depend_on_what_of_the_index_is_merged() -> None:
         few.add(place)
     assert len(few.scores(query)) == 20
     assert index.nbytes < 2 * 8 * sum(len(place) for place in places) + 2 * 8 * 4 * 2**14 + 10_000
+
+
+def test_places_of_a_file_give_the_same_scores(tmp_path: Path) -> None:
+    """Two segments come from the file, the rest is added again; one whose words are not in order is refused."""
+    rng = np.random.default_rng(9)
+    places = [_bits(int(rng.integers(0, 20)), rng) for _ in range(2 * SEGMENT + 40)]
+    whole, again, path = PlaceIndex(), PlaceIndex(), tmp_path / "a.map"
+    store = MapStore(path, create=True)
+    points, stereo = rng.normal(size=(SEGMENT, 32, 3)), np.arange(SEGMENT)
+    for place in places:
+        whole.add(place)
+        if (words := whole.full_segment()) is not None:
+            store.add_places(PlacesRow(words, points, stereo))
+    store.close()
+    store = MapStore(path, read_only=True)
+    rows = store.places()
+    store.close()
+    assert len(rows) == 2
+    np.testing.assert_array_equal(rows[1].points, points)
+    again.restore([row.words for row in rows])
+    for place in places[2 * SEGMENT :]:
+        again.add(place)
+    query = np.concatenate(places[::7])
+    np.testing.assert_array_equal(again.scores(query), whole.scores(query))
+    with pytest.raises(ValueError, match="not in order"):
+        Segment.of(rows[0].words.begins[:, ::-1].copy(), rows[0].words.owners)
 
 
 def test_candidates_are_of_different_places() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,6 +143,12 @@ def test_maps_are_shown_and_merged(
     capsys.readouterr()
     assert main(["map", "merge", str(path), str(tmp_path / "other.map"), "--out", str(out), "--json"]) == 0
     merged = json.loads(capsys.readouterr().out)
+    swapped = tmp_path / "swapped.map"
+    assert main(["map", "merge", str(tmp_path / "other.map"), str(path), "--out", str(swapped), "--json"]) == 0
+    capsys.readouterr()
+    with closing(MapStore(out, read_only=True)) as one, closing(MapStore(swapped, read_only=True)) as other:
+        for rows in ("sessions", "keyframes", "odometry", "loops"):
+            assert repr(getattr(one, rows)()) == repr(getattr(other, rows)())
     assert main(["map", "show", str(path), "--json"]) == 0
     single = json.loads(capsys.readouterr().out)
     assert merged["keyframes"] > single["keyframes"] > 0

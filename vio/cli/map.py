@@ -36,7 +36,9 @@ def add_parser(commands: Any) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     show = actions.add_parser("show", help="what a map holds")
     show.add_argument("map", type=Path, metavar="MAP", help="a map's file")
-    merge = actions.add_parser("merge", help="make one map of two; the frame is that of the first")
+    merge = actions.add_parser(
+        "merge", help="make one map of two, in any order; the frame is that of the one recorded first"
+    )
     merge.add_argument("first", type=Path, metavar="A", help="a map's file")
     merge.add_argument("second", type=Path, metavar="B", help="a map's file")
     merge.add_argument("--out", type=Path, required=True, metavar="MAP", help="the merged map, a new file")

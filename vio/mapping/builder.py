@@ -24,9 +24,9 @@ from vio.mapping.features import KeyframeFeatures
 from vio.mapping.guided_search import LEAST_CORNERS, Guided, PlaceView, Shown, place_points, search, shown
 from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, Verified, matches_of, verify
 from vio.mapping.map_graph import UNKNOWN, MapGraph
-from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
+from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, PlacesRow, SessionRow
 from vio.mapping.overlap import Overlaps
-from vio.mapping.place_index import PlaceIndex
+from vio.mapping.place_index import SEGMENT, PlaceIndex
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray, LoopEvent
 
@@ -55,7 +55,7 @@ _GUIDED_NEIGHBOURS, _GUIDED_OTHERS = 3, 2  # keyframes to each side that belong 
 _GUIDED_SHARE = 0.25
 _GUIDED_M = 0.5  # standard deviation of the position up to which places are searched
 _SHOWN = 64  # keyframes whose points are held, 6 MB: from query to query, most of those searched are the same
-_OF_THE_FILE = ("_store", "_index", "_overlaps", "_shown")
+_OF_THE_FILE = ("_store", "_index", "_overlaps", "_shown", "_stored_poses", "_stored_kept")
 _ONLY = ("pinhole", "stereo")  # projection and kind of the cameras that maps know
 _SAME_RIG = 0.03  # by which two calibrations of one rig may differ in focal length and baseline
 _FIELD_MOVED_PX = 0.02  # by which a rectification error moves the pixels of a keyframe before all are corrected anew
@@ -155,8 +155,7 @@ class MapBuilder:
         self.graph = MapGraph(store)
         self._shown = lru_cache(_SHOWN)(self._read_shown)
         self._index, self._overlaps = PlaceIndex(), Overlaps()
-        for k in range(len(self.graph)):
-            self._remember(self.graph.sessions[int(self.graph.session[k])].camera, self._features(k))
+        self._remember_all(len(self.graph))
         self.first = len(self.graph)  # keyframe of this session
         sessions = self.graph.sessions
         self._own = len(sessions)
@@ -170,6 +169,8 @@ class MapBuilder:
         self._partial = False  # whether loops were optimised with what is around them alone
         self._optimised = False  # whether loops hold this session: until then it is reported as the odometry has it
         self._moved = False  # poses since the last commit
+        # As the file has them:
+        self._stored_poses, self._stored_kept = self.graph.T_map_cam.rows.copy(), [o.kept for o in self.graph.loops]
 
     @property
     def path(self) -> Path:
@@ -245,8 +246,13 @@ class MapBuilder:
         if self._localise:
             return
         if self._moved:
-            self._store.set_poses(self.graph.T_map_cam.rows)
-            self._store.set_kept([o.kept for o in self.graph.loops])
+            T, kept, before = self.graph.T_map_cam.rows, [o.kept for o in self.graph.loops], len(self._stored_poses)
+            moved = np.ones(len(T), dtype=np.bool_)
+            moved[:before] = (T[:before] != self._stored_poses).any(axis=(1, 2))
+            self._store.set_poses({k: T[k] for k in np.flatnonzero(moved).tolist()})
+            known = dict(enumerate(self._stored_kept))
+            self._store.set_kept({n: now for n, now in enumerate(kept) if now != known.get(n)})
+            self._stored_poses, self._stored_kept = T.copy(), kept
             self._store.set_parts([s.part for s in self.graph.sessions])
         self._store.set_field(self._own, self.graph.sessions[self._own].field)
         if self._moved:
@@ -265,12 +271,12 @@ class MapBuilder:
         """Go on from a checkpoint with the file as it was then: what was added since is forgotten."""
         self._store, self._index, self._overlaps = store, PlaceIndex(), Overlaps()
         self._shown = lru_cache(_SHOWN)(self._read_shown)
+        self._stored_poses, self._stored_kept = np.zeros((0, 4, 4)), []
         graph = self.graph
         if not self._localise:
             store.truncate(len(graph.sessions), len(graph), len(graph.loops))
             self._moved = True
-        for k in range(self.first if self._localise else len(graph)):
-            self._remember(graph.sessions[int(graph.session[k])].camera, self._features(k))
+        self._remember_all(self.first if self._localise else len(graph))
 
     def _features(self, keyframe: int) -> KeyframeFeatures:
         """Return a keyframe's features without what its session found the stereo calibration to be off by."""
@@ -311,6 +317,18 @@ class MapBuilder:
         self._index.add(features.descriptors)
         p, valid = triangulate(camera, features.z, min_disparity_px=LEAST_DISPARITY_PX)
         self._overlaps.add(p[valid & features.has_right])
+        words = self._index.full_segment()
+        if words is not None and not self._localise:
+            self._store.add_places(PlacesRow(words, *self._overlaps.newest(SEGMENT)))
+
+    def _remember_all(self, count: int) -> None:
+        """Let the first keyframes of the file be found again: by what it says of places, the rest by their features."""
+        places = self._store.places()[: count // SEGMENT]
+        self._index.restore([row.words for row in places])
+        for row in places:
+            self._overlaps.restore(row.points, row.stereo)
+        for k, session in enumerate(self.graph.session[len(self._index) : count].tolist(), start=len(self._index)):
+            self._remember(self.graph.sessions[session].camera, self._features(k))
 
     def _update(self, events: tuple[LoopEvent, ...]) -> MapUpdate:
         if not self.is_joined:

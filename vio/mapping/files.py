@@ -61,7 +61,7 @@ def merge_maps(first: Path, second: Path, out: Path) -> dict[str, Any]:
 
     Nothing is written where they hold the same recording, or show no place in common. The keyframes of the second map
     are taken up again one after the other, so that its loops are found anew, and those with the first map beside them.
-    The frame is that of the first map.
+    The order of the two does not matter: that which was recorded first is continued, and its frame is kept.
 
     Raises:
         DataError: a file is no map, both hold the same recording or no common place, or `out` exists or cannot be
@@ -72,6 +72,7 @@ def merge_maps(first: Path, second: Path, out: Path) -> dict[str, Any]:
     check_path(out)
     if first.exists() and second.exists() and first.samefile(second):
         raise DataError(f"{second}: is the same map as {first}; give two different ones")
+    first, second = sorted((first, second), key=_begin)
     partial = out.with_name(f".{out.name}.{uuid.uuid4().hex[:12]}.partial")
     try:
         source = MapStore(first, read_only=True)
@@ -96,6 +97,17 @@ def merge_maps(first: Path, second: Path, out: Path) -> dict[str, Any]:
     finally:
         partial.unlink(missing_ok=True)
     return describe_map(out)
+
+
+def _begin(path: Path) -> tuple[Any, ...]:
+    """What orders two maps: one whose z is up first, then by the time of the first keyframe, then by its features."""
+    store = MapStore(path, read_only=True)
+    with contextlib.closing(store):
+        sessions, keyframes = store.sessions(), store.keyframes()
+        if not keyframes:
+            return True, 0, b""
+        seen = store.features(0)
+        return not sessions[0].upright, keyframes[0].time_ns, len(keyframes), seen.descriptors.tobytes()
 
 
 def check_map(path: Path) -> dict[str, Any]:

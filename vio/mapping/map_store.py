@@ -1,4 +1,4 @@
-"""The map's file: SQLite, version 4, described in docs/maps.md; older ones are read, and become 4 when written to.
+"""The map's file: SQLite, version 5, described in docs/maps.md; older ones are read, and become 5 when written to.
 
 What belongs together is written in one transaction, so that a process that dies leaves the state before it. A file is
 checked when it is opened: it has our tables and nothing else, SQLite finds its pages whole, each row agrees with its
@@ -13,7 +13,7 @@ import math
 import sqlite3
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -27,8 +27,10 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures
+from vio.mapping.place_index import SEGMENT, Segment
+from vio.records import IntArray
 
-VERSION = 4
+VERSION = 5
 _OLDEST = 1
 _SINCE = {
     "projection": 2,
@@ -36,9 +38,17 @@ _SINCE = {
     "crc32": 3,
     "field": 4,
     "field_covariance": 4,
-}  # version that brought a column; before 2 all were pinhole stereo pairs
+    "places": 5,
+}  # version that brought a column or a table; before 2 all were pinhole stereo pairs
 _BEFORE = {"projection": "'pinhole'", "kind": "'stereo'", "crc32": "0"}  # what rows of older versions get; else NULL
-_KEYS = {"sessions": "id", "keyframes": "id", "features": "keyframe", "odometry": "second", "loops": "id"}
+_KEYS = {
+    "sessions": "id",
+    "keyframes": "id",
+    "features": "keyframe",
+    "odometry": "second",
+    "loops": "id",
+    "places": "id",
+}
 _TELLING_FEATURES = 20
 _ROTATION_TOLERANCE = 1e-3  # of R R^T
 _MOST_S = 300.0  # of one step with the file
@@ -58,7 +68,10 @@ CREATE TABLE odometry (second INTEGER PRIMARY KEY, first INTEGER NOT NULL, T_i_j
     covariance BLOB NOT NULL, crc32 INTEGER NOT NULL);
 CREATE TABLE loops (id INTEGER PRIMARY KEY, first INTEGER NOT NULL, second INTEGER NOT NULL, T_i_j BLOB NOT NULL,
     covariance BLOB NOT NULL, inliers INTEGER NOT NULL, kept INTEGER NOT NULL, crc32 INTEGER NOT NULL);
+CREATE TABLE places (id INTEGER PRIMARY KEY, begins BLOB NOT NULL, owners BLOB NOT NULL, points BLOB NOT NULL,
+    stereo BLOB NOT NULL, crc32 INTEGER NOT NULL);
 """
+_SHAPES = {"T_map_cam": (4, 4), "T_odom_cam": (4, 4), "T_i_j": (4, 4), "drift": (6, 6), "covariance": (6, 6)}
 
 
 _Row = TypeVar("_Row")
@@ -88,6 +101,15 @@ class KeyframeRow:
     path_m: float  # since the session began
     up_cam: FloatArray | None  # (3,) direction of the vertical; None without an IMU
     up_sigma_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlacesRow:
+    """What finds `SEGMENT` keyframes that follow one another again, made of their features."""
+
+    words: Segment
+    points: FloatArray  # (SEGMENT, P, 3) see `Overlaps`
+    stereo: IntArray  # (SEGMENT,) stereo points
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +144,8 @@ def _errors_of(path: Path) -> Iterator[None]:
 
 
 def _damaged(path: Path, fault: object) -> DataError:
-    return DataError(f"{path}: is damaged or no map ({fault}); restore a copy or build it again")
+    line = " ".join(str(fault).split())
+    return DataError(f"{path}: is damaged or no map ({line}); restore a copy or build it again")
 
 
 class MapStore:
@@ -172,11 +195,15 @@ class MapStore:
                 )
             if read_only:
                 self._db.execute("BEGIN")  # one state of the file, whatever another process commits
+            self._checked: dict[str, list[Any]] = {}  # rows that were read to check them, until they are asked for
+            before = self._pragma("data_version")
             self._check()
             if not read_only:
                 # Readers see the last commit while this process writes; its transaction never ends, so no other writes.
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute("BEGIN IMMEDIATE")
+                if self._pragma("data_version") != before:  # another process wrote meanwhile
+                    self._check()
                 self._bring_up_to_date()
             undo.pop_all()
 
@@ -187,12 +214,14 @@ class MapStore:
             raise _damaged(self.path, f"{', '.join(other)} is not as this program makes it")
         ((answer,),) = self._db.execute("PRAGMA quick_check(1)")
         if answer != "ok":
-            raise _damaged(self.path, " ".join(answer.split()))
-        sessions, rows = len(self.sessions()), self.keyframes()
+            raise _damaged(self.path, answer)
+        self._checked.clear()
+        sessions, rows, odometry, loops = self.sessions(), self.keyframes(), self.odometry(), self.loops()
+        self._checked = {"sessions": sessions, "keyframes": rows, "odometry": odometry, "loops": loops}
         keyframes = len(rows)
-        if any(not 0 <= k.session < sessions for k in rows):
+        if any(not 0 <= k.session < len(sessions) for k in rows):
             raise _damaged(self.path, "a keyframe belongs to no session")
-        pairs = [(i, j) for i, j, _ in self.odometry()] + [(o.first, o.second) for o in self.loops()]
+        pairs = [(i, j) for i, j, _ in odometry] + [(o.first, o.second) for o in loops]
         if any(not 0 <= i < j < keyframes for i, j in pairs):
             raise _damaged(self.path, "a motion is between keyframes that are not there")
         if [k for (k,) in self._db.execute("SELECT keyframe FROM features ORDER BY keyframe")] != list(
@@ -205,14 +234,18 @@ class MapStore:
         if self.version == VERSION:
             return
         for table, statement in zip(_KEYS, _SCHEMA.strip().split(";\n"), strict=True):
+            if self.version < _SINCE.get(table, _OLDEST):
+                self._db.execute(statement)
+                continue
             before = set(self._columns(table))
+            if before == {column for _, name, _, column, *_ in _expected(VERSION) if name == table}:
+                continue
             self._db.execute(f"ALTER TABLE {table} RENAME TO older")
             self._db.execute(statement)
             values = ", ".join(c if c in before else _BEFORE.get(c, "NULL") for c in self._columns(table))
             self._db.execute(f"INSERT INTO {table} SELECT {values} FROM older")
             self._db.execute("DROP TABLE older")
-            if before != set(self._columns(table)):  # else checksums hold, those of rows that are damaged, too
-                self._sign(table)
+            self._sign(table)
         self._db.execute(f"PRAGMA user_version = {VERSION}")
 
     @property
@@ -222,6 +255,12 @@ class MapStore:
 
     def _pragma(self, name: str) -> int:
         return int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
+
+    @contextlib.contextmanager
+    def _changes(self) -> Iterator[None]:
+        self._checked.clear()
+        with self._errors():
+            yield
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
@@ -304,49 +343,55 @@ class MapStore:
         motion = _blob(row.pose.T_i_j), _blob(row.pose.covariance)
         self._insert("loops", (self._count("loops"), row.first, row.second, *motion, row.inliers, row.kept))
 
-    def set_poses(self, T_map_cam: FloatArray) -> None:
-        """Replace the poses (K, 4, 4) of all keyframes."""
-        self._set("keyframes", "T_map_cam", [_blob(T) for T in T_map_cam])
+    def add_places(self, row: PlacesRow) -> None:
+        """Add what finds the keyframes of the next segment again."""
+        words = row.words.begins.astype("<u4").tobytes(), row.words.owners.tobytes()
+        self._insert("places", (self._count("places"), *words, _blob(row.points), row.stereo.astype("<i8").tobytes()))
 
-    def set_kept(self, kept: list[bool]) -> None:
-        """Say of each loop whether it agrees with the others."""
+    def set_poses(self, T_map_cam: Mapping[int, FloatArray]) -> None:
+        """Replace poses (4, 4) of keyframes."""
+        self._set("keyframes", "T_map_cam", {k: _blob(T) for k, T in T_map_cam.items()})
+
+    def set_kept(self, kept: Mapping[int, bool]) -> None:
+        """Say of loops whether they agree with the others."""
         self._set("loops", "kept", kept)
 
     def set_parts(self, parts: list[int]) -> None:
         """Replace the part of each session."""
-        self._set("sessions", "part", parts)
+        self._set("sessions", "part", dict(enumerate(parts)))
 
     def set_loops(self, rows: Sequence[LoopRow]) -> None:
         """Replace what is measured of each loop."""
-        self._set("loops", "T_i_j", [_blob(row.pose.T_i_j) for row in rows])
-        self._set("loops", "covariance", [_blob(row.pose.covariance) for row in rows])
-        self._set("loops", "inliers", [row.inliers for row in rows])
+        self._set("loops", "T_i_j", {n: _blob(row.pose.T_i_j) for n, row in enumerate(rows)})
+        self._set("loops", "covariance", {n: _blob(row.pose.covariance) for n, row in enumerate(rows)})
+        self._set("loops", "inliers", {n: row.inliers for n, row in enumerate(rows)})
 
     def set_field(self, session: int, field: DisplacementField | None) -> None:
         """Replace what a session found its stereo calibration to be off by."""
-        with self._errors():
+        with self._changes():
             update = "UPDATE sessions SET field = ?, field_covariance = ? WHERE id = ?"
             self._db.execute(update, (*_field_blobs(field), session))
             self._sign("sessions", f"WHERE id = {int(session)}")
 
     def truncate(self, sessions: int, keyframes: int, loops: int) -> None:
         """Forget what was added after there were so many."""
-        with self._errors():
+        with self._changes():
             for table, key in _KEYS.items():
-                count = {"sessions": sessions, "loops": loops}.get(table, keyframes)
+                count = {"sessions": sessions, "loops": loops, "places": keyframes // SEGMENT}.get(table, keyframes)
                 self._db.execute(f"DELETE FROM {table} WHERE {key} >= ?", (count,))
 
     def _insert(self, table: str, values: tuple[Any, ...]) -> None:
-        with self._errors():
+        with self._changes():
             self._db.execute(f"INSERT INTO {table} VALUES ({'?,' * len(values)}0)", values)
             self._sign(table, f"WHERE {_KEYS[table]} = {int(values[0])}")
 
-    def _set(self, table: str, column: str, values: Sequence[Any]) -> None:
-        """Replace a value of every row, in the order of their numbers."""
-        with self._errors():
-            rows = [(value, n) for n, value in enumerate(values)]
-            self._db.executemany(f"UPDATE {table} SET {column} = ? WHERE id = ?", rows)
-            self._sign(table)
+    def _set(self, table: str, column: str, values: Mapping[int, Any]) -> None:
+        """Replace a value of the rows of some numbers."""
+        with self._changes():
+            self._db.executemany(f"UPDATE {table} SET {column} = ? WHERE id = ?", ((v, n) for n, v in values.items()))
+            signed = ", ".join(self._columns(table)[:-1])
+            update = f"UPDATE {table} SET crc32 = row_crc32({signed}) WHERE id = ?"
+            self._db.executemany(update, ((n,) for n in values))
 
     def _sign(self, table: str, which: str = "") -> None:
         """Write the checksums of rows, of their values as they are stored."""
@@ -356,8 +401,9 @@ class MapStore:
         return [name for (name,) in self._db.execute("SELECT name FROM pragma_table_info(?)", (table,))]
 
     def _count(self, table: str) -> int:
+        """Number of rows of a table that are numbered from 0 on, without reading them."""
         with self._errors():
-            return int(self._db.execute(f"SELECT count(*) FROM {table}").fetchone()[0])
+            return int(self._db.execute(f"SELECT coalesce(max({_KEYS[table]}), -1) FROM {table}").fetchone()[0]) + 1
 
     # Reading
 
@@ -380,31 +426,44 @@ class MapStore:
         """Return all keyframes."""
 
         def made(
-            _: int, session: int, frame: int, time_ns: int, T_map: bytes, T_odom: bytes, drift: bytes, path_m: float,
-            up: bytes | None, sigma: float | None,
+            _: int, session: int, frame: int, time_ns: int, T_map: FloatArray, T_odom: FloatArray, drift: FloatArray,
+            path_m: float, up: bytes | None, sigma: float | None,
         ) -> KeyframeRow:  # fmt: skip
             numbers = _integer(session), _integer(frame), _integer(time_ns)
             vertical = None if up is None else _array(up, 3), 0.0 if sigma is None else _number(sigma)
-            return KeyframeRow(*numbers, _pose(T_map), _pose(T_odom), _array(drift, 6, 6), _number(path_m), *vertical)
+            return KeyframeRow(*numbers, T_map, T_odom, drift, _number(path_m), *vertical)
 
         return self._read("keyframes", made)
 
     def odometry(self) -> list[tuple[int, int, RelativePose]]:
         """Return all motions between keyframes, (first, second, motion)."""
 
-        def made(second: int, first: int, T: bytes, covariance: bytes) -> tuple[int, int, RelativePose]:
-            return _integer(first), second, RelativePose(_pose(T), _array(covariance, 6, 6))
+        def made(second: int, first: int, T: FloatArray, covariance: FloatArray) -> tuple[int, int, RelativePose]:
+            return _integer(first), second, RelativePose(T, covariance)
 
         return self._read("odometry", made)
 
     def loops(self) -> list[LoopRow]:
         """Return all loops."""
 
-        def made(_: int, first: int, second: int, T: bytes, covariance: bytes, inliers: int, kept: int) -> LoopRow:
-            pose = RelativePose(_pose(T), _array(covariance, 6, 6))
-            return LoopRow(_integer(first), _integer(second), pose, _integer(inliers), bool(kept))
+        def made(
+            _: int, first: int, second: int, T: FloatArray, covariance: FloatArray, inliers: int, kept: int
+        ) -> LoopRow:
+            return LoopRow(
+                _integer(first), _integer(second), RelativePose(T, covariance), _integer(inliers), bool(kept)
+            )
 
         return self._read("loops", made)
+
+    def places(self) -> list[PlacesRow]:
+        """Return what finds keyframes again, of the first full segments; files before version 5 have none."""
+
+        def made(_: int, begins: bytes, owners: bytes, points: bytes, stereo: bytes) -> PlacesRow:
+            words = Segment.of(np.frombuffer(begins, dtype="<u4"), np.frombuffer(owners, dtype=np.uint8))
+            p = np.frombuffer(points, dtype="<f8").reshape(SEGMENT, -1, 3)
+            return PlacesRow(words, p, np.frombuffer(stereo, dtype="<i8").reshape(SEGMENT))
+
+        return self._read("places", made) if self.version >= _SINCE["places"] else []
 
     def features(self, keyframe: int) -> KeyframeFeatures:
         """Return the features of one keyframe."""
@@ -432,19 +491,34 @@ class MapStore:
             DataError: a row is missing, or not what was written.
         """
         key = _KEYS[table]
+        if not which and (checked := self._checked.pop(table, None)) is not None:
+            return checked
         with self._errors():
             rows = self._db.execute(f"SELECT * FROM {table} {which} ORDER BY {key}").fetchall()
-        out, signed = [], self.version >= _SINCE["crc32"]
-        for place, row in enumerate(rows):
+        signed, columns = self.version >= _SINCE["crc32"], self._columns(table)
+        if signed:
+            columns = columns[:-1]
+            for row in rows:
+                if row[-1] != _row_crc32(*row[:-1]):
+                    raise self._bad_row(table, row[0], "its checksum does not agree with its content")
+        if key == "id" and (lost := next((n for n, row in enumerate(rows) if row[0] != n), None)) is not None:
+            raise self._bad_row(table, rows[lost][0], f"row {lost} is missing")
+        values: list[Any] = list(zip(*rows, strict=True)) if rows else [[] for _ in columns]
+        for n, name in enumerate(columns):
+            if name in _SHAPES:
+                values[n], fault = _arrays(values[n], _SHAPES[name])
+                if fault is not None:
+                    raise self._bad_row(table, rows[fault[0]][0], fault[1])
+        out = []
+        for row in zip(*values[: len(columns)], strict=True):
             try:
-                if signed and row[-1] != _row_crc32(*row[:-1]):
-                    raise ValueError("its checksum does not agree with its content")
-                if key == "id" and row[0] != place:
-                    raise ValueError(f"row {place} is missing")
-                out.append(made(*row[: len(row) - signed]))
+                out.append(made(*row))
             except (ValueError, TypeError) as error:
-                raise _damaged(self.path, f"row {row[0]} of {table}: {error}") from error
+                raise self._bad_row(table, row[0], error) from error
         return out
+
+    def _bad_row(self, table: str, number: object, fault: object) -> DataError:
+        return _damaged(self.path, f"row {number} of {table}: {fault}")
 
 
 def _schema_of(database: sqlite3.Connection) -> set[tuple[Any, ...]]:
@@ -463,7 +537,12 @@ def _expected(version: int) -> frozenset[tuple[Any, ...]]:
     """Return what `_schema_of` finds in a map of a version."""
     with contextlib.closing(sqlite3.connect(":memory:")) as database:
         database.executescript(_SCHEMA)
-        return frozenset(row for row in _schema_of(database) if _SINCE.get(row[3], _OLDEST) <= version)
+        return frozenset(row for row in _schema_of(database) if _since(row) <= version)
+
+
+def _since(row: tuple[Any, ...]) -> int:
+    """Version that brought a column, as `_schema_of` gives it."""
+    return max(_SINCE.get(row[1], _OLDEST), _SINCE.get(row[3], _OLDEST))
 
 
 def _row_crc32(*values: Any) -> int:
@@ -501,11 +580,23 @@ def _array(blob: bytes, *shape: int) -> FloatArray:
     return array
 
 
-def _pose(blob: bytes) -> FloatArray:
-    T = _array(blob, 4, 4)
-    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > _ROTATION_TOLERANCE or (T[3] != (0, 0, 0, 1)).any():
-        raise ValueError("a pose is none")
-    return T
+def _arrays(blobs: Sequence[Any], shape: tuple[int, int]) -> tuple[FloatArray, tuple[int, str] | None]:
+    """Return blobs as finite matrices (N, n, n), poses where n is 4, and the first that is none with the reason."""
+    length = 8 * shape[0] * shape[1]
+    wrong = next((n for n, blob in enumerate(blobs) if not isinstance(blob, bytes) or len(blob) != length), None)
+    if wrong is not None:
+        return np.zeros((0, *shape)), (wrong, "a matrix is of another size")
+    out: FloatArray = np.frombuffer(b"".join(blobs), dtype="<f8").reshape(-1, *shape).copy()
+    finite = np.isfinite(out).all(axis=(1, 2))
+    if not finite.all():
+        return out, (int(np.argmin(finite)), "a number is not finite")
+    if shape == (4, 4) and len(out):
+        R = out[:, :3, :3]
+        rigid = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) <= _ROTATION_TOLERANCE
+        rigid &= (out[:, 3] == (0, 0, 0, 1)).all(axis=1)
+        if not rigid.all():
+            return out, (int(np.argmin(rigid)), "a pose is none")
+    return out, None
 
 
 def _number(value: Any) -> float:

@@ -33,6 +33,16 @@ class Overlaps:
         self._points.append(p[chosen] if len(p) else np.full((_POINTS, 3), np.nan))
         self._count.append(len(p))
 
+    def restore(self, points: FloatArray, count: IntArray) -> None:
+        """Take the points (K, P, 3) and counts (K,) that `newest` gave of keyframes, in their order."""
+        for p, n in zip(points, count.tolist(), strict=True):
+            self._points.append(p)
+            self._count.append(n)
+
+    def newest(self, count: int) -> tuple[FloatArray, IntArray]:
+        """Return the points (K, P, 3) of the newest keyframes, and how many stereo points each has (K,)."""
+        return self._points[-count:], self._count[-count:].astype(np.int64)
+
     def expected(
         self, rows: IntArray, T_map_cam: FloatArray, camera: StereoCamera, T_map_here: FloatArray
     ) -> FloatArray:

@@ -9,6 +9,8 @@ Zisserman 2003).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -29,6 +31,7 @@ _SEED = 20120617  # of the choice of bits: any, but the same in all maps
 _NEIGHBOURS = 2  # keyframes before and after a candidate whose scores are added to its own: they show the same place
 _LEAST_TAIL, _TAIL_SHARE = 32, 1 / 16  # keyframes; a merge takes as long as the comparison with ten times as many
 _UNIT = 1 << 16  # of the weights
+SEGMENT = 256  # keyframes whose words a file keeps in the order of the index
 
 
 def words_of(descriptors: Bits) -> Words:
@@ -43,6 +46,27 @@ def _chosen_bits() -> IntArray:
     """Return the bits (T, B) of each table's words."""
     chosen = np.random.default_rng(_SEED).permutation(8 * DESCRIPTOR_BYTES)[: _TABLES * _BITS]
     return chosen.reshape(_TABLES, _BITS).astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """The words of `SEGMENT` keyframes that follow one another, inverted."""
+
+    begins: npt.NDArray[np.uint32]  # (T, W + 1) of each word among the owners
+    owners: npt.NDArray[np.uint8]  # (T, N) keyframes, ordered by word and then by number
+
+    @classmethod
+    def of(cls, begins: npt.NDArray[np.uint32], owners: npt.NDArray[np.uint8]) -> Segment:
+        """Make a segment of the flat arrays of a file.
+
+        Raises:
+            ValueError: they are not those of an index.
+        """
+        begins, owners = begins.reshape(_TABLES, _WORDS + 1), owners.reshape(_TABLES, -1)
+        ends = begins[:, [0, -1]] == (0, owners.shape[1])
+        if not ends.all() or (begins[:, 1:] < begins[:, :-1]).any():
+            raise ValueError("its words are not in order")
+        return cls(begins, owners)
 
 
 class PlaceIndex:
@@ -61,6 +85,7 @@ class PlaceIndex:
         self._sizes: list[int] = []  # features of each keyframe
         self._newest: IntArray = np.zeros((_TABLES, _WORDS), dtype=np.int64)  # keyframe that showed a word last, from 1
         self._frequency: IntArray = np.zeros((_TABLES, _WORDS), dtype=np.int64)  # keyframes with a word
+        self._unsaved: list[Words] = []  # of the keyframes since the last full segment
 
     def __len__(self) -> int:
         """Number of keyframes."""
@@ -76,22 +101,46 @@ class PlaceIndex:
         """Add a keyframe with these descriptors (N, 32)."""
         words = words_of(descriptors)
         self._tail.append(words)
+        self._unsaved.append(words)
         self._sizes.append(words.shape[1])
         _count_words(words, self._newest, len(self._sizes), self._frequency)
         if len(self._tail) >= max(_LEAST_TAIL, int(_TAIL_SHARE * len(self))):
             self._merge()
 
+    def restore(self, segments: Sequence[Segment]) -> None:
+        """Take the first keyframes of a map from its file, into an empty index."""
+        counts = np.array([np.diff(s.begins.astype(np.int64), axis=1) for s in segments]).reshape(-1, _TABLES, _WORDS)
+        np.cumsum(counts.sum(axis=0), axis=1, out=self._begins[:, 1:])
+        self._merged = len(segments) * SEGMENT
+        self._owners = self._room(int(self._begins[0, -1]))
+        cursor = self._begins[:, :-1].copy()
+        for n, segment in enumerate(segments):
+            first = n * SEGMENT
+            _append_segment(segment.begins, segment.owners, first, cursor, self._owners, self._newest, self._frequency)
+            self._sizes += np.bincount(segment.owners[0], minlength=SEGMENT).tolist()
+
+    def full_segment(self) -> Segment | None:
+        """Return the words of the newest keyframes once there are `SEGMENT` of them; they are then forgotten here."""
+        if len(self._unsaved) < SEGMENT:
+            return None
+        words, offsets = _joined(self._unsaved)
+        begins, owners = np.zeros_like(self._begins), np.empty(words.shape, dtype=np.uint16)
+        nothing = np.zeros((_TABLES, 0), dtype=np.uint16)
+        _merge_words(np.zeros_like(begins), nothing, words, offsets, int(np.int64(0)), begins, owners)
+        self._unsaved = []
+        return Segment(begins.astype(np.uint32), owners.astype(np.uint8))
+
+    def _room(self, size: int) -> Owners:
+        count = max(len(self), self._merged)
+        kind = np.min_scalar_type(count) if count > np.iinfo(np.uint16).max else np.dtype(np.uint16)
+        return np.empty((_TABLES, size), dtype=kind)
+
     def _merge(self) -> None:
-        words, offsets = self._joined_tail()
-        kind = np.min_scalar_type(len(self)) if len(self) > np.iinfo(np.uint16).max else np.dtype(np.uint16)
-        owners: Owners = np.empty((_TABLES, self._owners.shape[1] + words.shape[1]), dtype=kind)
+        words, offsets = _joined(self._tail)
+        owners = self._room(self._owners.shape[1] + words.shape[1])
         begins = np.zeros_like(self._begins)
         _merge_words(self._begins, self._owners, words, offsets, self._merged, begins, owners)
         self._begins, self._owners, self._merged, self._tail = begins, owners, len(self), []
-
-    def _joined_tail(self) -> tuple[Words, IntArray]:
-        words = np.concatenate([np.zeros((_TABLES, 0), dtype=np.uint16), *self._tail], axis=1)
-        return words, np.cumsum([0, *(row.shape[1] for row in self._tail)])
 
     def scores(self, descriptors: Bits) -> FloatArray:
         """Return for each keyframe (K,) the weight of the words that it shares with descriptors (N, 32)."""
@@ -104,7 +153,7 @@ class PlaceIndex:
         out = np.zeros(count, dtype=np.int64)
         for table, row in enumerate(known):
             _add_owners(self._begins[table], self._owners[table], row, weight[table], out)
-        _add_weights(*self._joined_tail(), weight, out[self._merged :])
+        _add_weights(*_joined(self._tail), weight, out[self._merged :])
         return out / (_UNIT * np.sqrt(np.maximum(self._sizes, 1.0)))
 
     def candidates(self, descriptors: Bits, allowed: BoolArray, most: int) -> IntArray:
@@ -122,6 +171,34 @@ class PlaceIndex:
             out.append(near.start + int(np.argmax(score[near])))
             left[max(middle - 2 * _NEIGHBOURS, 0) : middle + 2 * _NEIGHBOURS + 1] = 0.0  # those that share its sum
         return np.array(out, dtype=np.int64)
+
+
+def _joined(keyframes: list[Words]) -> tuple[Words, IntArray]:
+    """Return the words (T, N) of all keyframes, and where those of each begin (K + 1,)."""
+    words = np.concatenate([np.zeros((_TABLES, 0), dtype=np.uint16), *keyframes], axis=1)
+    return words, np.cumsum([0, *(row.shape[1] for row in keyframes)])
+
+
+@compiled
+def _append_segment(
+    begins: npt.NDArray[np.uint32],
+    owners: npt.NDArray[np.uint8],
+    first: int,
+    cursor: IntArray,
+    out_owners: Owners,
+    newest: IntArray,
+    frequency: IntArray,
+) -> None:
+    """Add a segment, whose first keyframe is given, at the cursor (T, W) of each word; count its keyframes."""
+    for t in range(len(begins)):
+        for w in range(begins.shape[1] - 1):
+            for e in range(begins[t, w], begins[t, w + 1]):
+                number = first + owners[t, e]
+                out_owners[t, cursor[t, w]] = number
+                cursor[t, w] += 1
+                if newest[t, w] != number + 1:
+                    newest[t, w] = number + 1
+                    frequency[t, w] += 1
 
 
 @compiled
