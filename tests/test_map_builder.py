@@ -338,3 +338,19 @@ def test_loops_carry_the_covariance_of_the_stereo_field(room_walk: Walk, tmp_pat
         sigmas.append([float(np.sqrt(loop.pose.covariance[:3, :3].trace())) for loop in builder.graph.loops])
         builder.close()
     assert np.median(sigmas[1]) > 1.3 * np.median(sigmas[0])
+
+
+def test_a_loop_that_was_measured_wrong_is_right_at_the_end(room_walk: Walk, tmp_path: Path) -> None:
+    """A first measurement that pixels do not hold, such as one by pairs of the wrong corners, is not its own prior."""
+    field = DisplacementField(room_walk.camera, np.zeros(15), np.diag(np.full(15, 1e-10)))
+    builder = _map(room_walk, tmp_path / "a.map")
+    graph = builder.graph
+    wrong = graph.loops[0]
+    T = wrong.pose.T_i_j @ se3_exp([0.15, 0.0, 0.1, 0.0, 0.07, 0.0])
+    graph.loops[0] = replace(wrong, pose=RelativePose(T, wrong.pose.covariance))
+    builder.finish(field)
+    builder.close()
+    loop = graph.loops[0]
+    E = se3_inverse(loop.pose.T_i_j) @ se3_inverse(room_walk.T[loop.first]) @ room_walk.T[loop.second]
+    assert np.linalg.norm(E[:3, 3]) < 0.03
+    assert loop.kept

@@ -231,6 +231,8 @@ class MapBuilder:
         """
         if field is not None and not self._localise and len(self.graph) > self.first:
             self._correct(field, None)
+            if self._waiting:
+                self._optimise()
             self._measure_again()
         if self._waiting or self._partial:
             self._optimise(whole=True)
@@ -298,14 +300,19 @@ class MapBuilder:
         self._shown.cache_clear()
 
     def _measure_again(self) -> None:
-        """Measure the loops of this session once more, from where the map has its keyframes now."""
+        """Measure the loops of this session once more, from where the map has its keyframes now.
+
+        The prior is the odometry, as for a new loop. A loop's first measurement is none: of the pairs around it those
+        that agree with it would be chosen, right or wrong.
+        """
         graph = self.graph
         for n, loop in enumerate(graph.loops):
             i, k = loop.first, loop.second
             if k < self.first:
                 continue
+            prior = self._priors(np.array([i]), k).get(i)
             views = place_points(self._views(i, i))
-            seen = search(views, self._camera, self._features(k), loop.pose, loop.pose)
+            seen = search(views, self._camera, self._features(k), loop.pose if prior is None else prior, prior)
             if seen is not None:
                 graph.loops[n] = replace(loop, pose=seen.pose, inliers=seen.inliers)
                 self._waiting += 1
