@@ -102,7 +102,7 @@ def lazy_greedy(prior: FloatArray, L: FloatArray, ids: IntArray, budget: int) ->
     gain = np.zeros(N)
     order: list[int] = []
     while True:
-        M = np.linalg.inv(information)
+        M: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
         traces = (flat @ (M.reshape(K, 36, 1) / 3))[..., 0]
         bound = np.multiply.reduce(traces + 1.0, axis=0) * available  # exp of two thirds of the bound in nats
         if len(order) >= budget or len(order) >= N:
