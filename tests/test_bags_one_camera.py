@@ -243,20 +243,3 @@ def test_images_logged_late_come_in_the_order_of_their_stamps(folder_of_one: Pat
     assert_same_events(open_dataset(folder_of_one), bag)
     assert_same_events(open_dataset(folder_of_one), bag, 1, 2)
     assert "1 images repeat a stamp and are skipped" in bag.recording.notes
-
-
-def test_images_without_stamps_take_the_times_of_logging(tmp_path: Path) -> None:
-    script = script_of(imu=False)
-    for note in script.notes:
-        note.fields.header.stamp.sec = note.fields.header.stamp.nanosec = 0
-    dataset = open_dataset(script.write(tmp_path / "f"))
-    assert [event.time_ns for event in dataset.events()] == [time_ns for time_ns, _ in FRAMES]
-    assert any("headers of /left/image_raw have no stamps" in note for note in dataset.recording.notes)
-
-
-def test_a_truncated_image_is_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    script = script_of(imu=False, images=False)
-    for k, (time_ns, image) in enumerate(FRAMES):
-        script.image("/left/image_raw", time_ns, image, cut=100 if k == 1 else 0)
-    assert [frame.index for frame in frames_of(open_dataset(script.write(tmp_path / "f")))] == [0, 2, 3]
-    assert "the message is truncated" in caplog.text

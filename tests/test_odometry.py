@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -379,10 +377,7 @@ def test_within_a_run_the_number_of_blas_threads_is_not_asked_for_again() -> Non
         assert isinstance(BlasLimit()(), contextlib.nullcontext)
 
 
-def test_the_public_names_are_there_and_cost_nothing() -> None:
+def test_the_public_names_are_there() -> None:
     assert {"Odometry", "Rig", "load_rig", "run", "open_dataset", "load_config", "evaluate"} <= set(dir(vio))
     for name in vio.__all__:
         assert getattr(vio, name) is not None
-    code = "import sys, vio; print('numpy' in sys.modules, 'yaml' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False", "False"]
