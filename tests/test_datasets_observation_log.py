@@ -217,7 +217,11 @@ def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
         ({"residual_px": -0.5}, "residual_px is -0.5, no number of pixels"),
         ({"run_motion": "wheels"}, "run_motion is 'wheels', none of imu, velocity, none"),
         ({"landmark_ids": [1]}, "landmark_ids lacks landmark_p_world"),
-        ({"reference_T_world_body": np.zeros((2, 4)), "reference_body": "imu"}, "reference poses"),
+        ({"reference_T_world_body": np.zeros((2, 3, 4)), "reference_body": "imu"}, "reference poses"),
+        ({"reference_T_world_body": np.zeros((2, 4)), "reference_body": "imu"}, "reference_T_world_body of the .* 2-D"),
+        ({"reference_times_ns": "x"}, "reference_times_ns of the observation log has type <U1, 0-D"),
+        ({"T_cam0_imu": "x"}, "T_cam0_imu of the observation log has type <U1"),
+        ({"version": [1, 2]}, "version of the observation log has type int64, 1-D"),
     ],
 )
 def test_rejects_a_corrupt_log(changes: dict[str, object], message: str, tmp_path: Path) -> None:

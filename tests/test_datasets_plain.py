@@ -325,6 +325,7 @@ BAD = {
     "times that run backwards": (_write("times.txt", "1\n3\n2\n4\n"), "line 3: the clock runs backwards"),
     "times that are no numbers": (_write("times.txt", "1\nx\n2\n4\n"), "line 2: 'x' is no time"),
     "times out of range": (_write("times.txt", "1\n2\n3\n1e99\n"), "line 4: '1e99' is out of range"),
+    "times out of reach": (_write("times.txt", "1\n2\n3\n1e999999999\n"), "line 4: '1e999999999' is out of range"),
     "an IMU without times": (lambda f: make_plain(f, times=False), r"imu\.csv: needs the times of the images"),
     "an IMU without its pose": (_break(_without_extrinsics), r"imu\.csv: needs the pose of its sensor; add T_cam0_imu"),
     "unsorted IMU stamps": (_edit("imu.csv", "1699999999995000000", "1699999999985000000"), "runs backwards"),

@@ -200,6 +200,7 @@ IMAGE = np.zeros((200, 320), dtype=np.uint8)
         (lambda o: o.add_imu(100, ONE, ONE), "not after the last one"),
         (lambda o: o.add_imu([300, 200], [ONE, ONE], [ONE, ONE]), "must increase"),
         (lambda o: o.add_imu([200, 200], [ONE, ONE], [ONE, ONE]), "must increase"),
+        (lambda o: o.add_imu(np.array([300, 200], np.uint64), [ONE, ONE], [ONE, ONE]), "must increase"),
         (lambda o: o.add_imu(1e9, ONE, ONE), "integer nanoseconds"),
         (lambda o: o.add_imu(200, np.zeros(4), ONE), r"gyro has shape \(4,\)"),
         (lambda o: o.add_imu([200, 300], ONE, ONE), "gyro has shape"),

@@ -142,8 +142,8 @@ def main() -> int:
         for row in _run(work, [task for key, task in wanted.items() if key not in done], options.workers):
             done[_key(row)] = row
             print(json.dumps(row), file=file, flush=True)
-    facts = {"version": __version__, "commit": commit, "machine": machine(), "packages": package_versions()}
-    facts |= {"written": datetime.now(timezone.utc).isoformat(timespec="seconds")}
+    facts: dict[str, Any] = {"version": __version__, "commit": commit, "machine": machine()}
+    facts |= {"packages": package_versions(), "written": datetime.now(timezone.utc).isoformat(timespec="seconds")}
     write(facts | {"runs": [done[key] for key in wanted]})
     return 0
 

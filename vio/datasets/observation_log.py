@@ -60,21 +60,22 @@ _DEFAULTED: dict[str, tuple[str, int]] = {  # likewise; `_with_defaults` says wh
     "motion_is_imu": ("b", 1),
     "motion_values": ("f", 2),
 }
-_OPTIONAL = (
-    "format",
-    "projection",
-    "run_motion",
-    "camera_kind",
-    "residual_px",
-    "T_cam0_imu",
-    "reference_T_world_body",
-    "reference_body",
-    "reference_times_ns",
-    "reference_frame_indices",
-    "landmark_ids",
-    "landmark_p_world",
-    "landmark_covariance",
-)
+_OPTIONAL: dict[str, tuple[str, int]] = {
+    "format": ("U", 0),
+    "projection": ("U", 0),
+    "run_motion": ("U", 0),
+    "camera_kind": ("U", 0),
+    "residual_px": ("f", 0),
+    "T_cam0_imu": ("f", 2),
+    "reference_T_world_body": ("f", 3),
+    "reference_body": ("U", 0),
+    "reference_times_ns": ("i", 1),
+    "reference_frame_indices": ("i", 1),
+    "landmark_ids": ("i", 1),
+    "landmark_p_world": ("f", 2),
+    "landmark_covariance": ("f", 3),
+}
+_KINDS = {**_REQUIRED, **_DEFAULTED, **_OPTIONAL}
 _GROUPS = {  # keys that need others
     "reference_T_world_body": ("reference_body",),
     "landmark_ids": ("landmark_p_world", "landmark_covariance"),
@@ -213,7 +214,7 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
     Raises:
         DataError: the file is no log, was written by a newer version, or is inconsistent.
     """
-    arrays = read_npz(path, (*_REQUIRED, *_DEFAULTED, *_OPTIONAL))
+    arrays = read_npz(path, tuple(_KINDS))
     arrays = _checked(arrays, path)
     frames, offsets, times_ns = arrays["frame_indices"], arrays["offsets"], arrays["frame_times_ns"]
     dense_offsets = offsets[np.searchsorted(frames, np.arange(len(times_ns) + 1))]
@@ -241,15 +242,15 @@ def _checked(arrays: Mapping[str, np.ndarray], path: Path) -> Mapping[str, np.nd
     """Return all arrays but the optional ones, in 64 bits; absent ones have their defaults."""
     if "format" in arrays and str(arrays["format"]) != FORMAT:
         raise DataError(f"{path}: no observation log; create one with `vio run SOURCE --save-observations`")
-    if "version" in arrays and int(arrays["version"]) > VERSION:
+    version = arrays.get("version", np.zeros((), dtype=np.int64))
+    if version.dtype.kind == "i" and version.ndim == 0 and version > VERSION:
         raise DataError(
-            f"{path}: an observation log of version {int(arrays['version'])}, this program reads up to {VERSION}; "
-            "upgrade stereo-vio"
+            f"{path}: an observation log of version {version}, this program reads up to {VERSION}; upgrade stereo-vio"
         )
     for key in _REQUIRED:
         if key not in arrays:
             raise DataError(f"{path}: the observation log lacks {key}; write it again")
-    for key, (kind, dimensions) in {**_REQUIRED, **_DEFAULTED}.items():
+    for key, (kind, dimensions) in _KINDS.items():
         if key in arrays and (arrays[key].dtype.kind != kind or arrays[key].ndim != dimensions):
             raise DataError(f"{path}: {key} of the observation log has type {arrays[key].dtype}, {arrays[key].ndim}-D")
     whole = _with_defaults(arrays)
@@ -305,7 +306,7 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
     if "camera_kind" in arrays and str(arrays["camera_kind"]) not in get_args(CameraKind):
         return f"camera_kind is {str(arrays['camera_kind'])!r}, none of {', '.join(get_args(CameraKind))}"
     residual = arrays.get("residual_px", np.zeros(()))
-    if residual.shape != () or residual.dtype.kind != "f" or not 0 <= residual < np.inf:
+    if not 0 <= residual < np.inf:
         return f"residual_px is {residual.tolist()!r}, no number of pixels"
     poses = arrays.get("reference_T_world_body", np.zeros((0, 4, 4)))
     stamps = [len(arrays[key]) for key in ("reference_times_ns", "reference_frame_indices") if key in arrays]

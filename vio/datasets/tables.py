@@ -108,9 +108,9 @@ def parse_stamps(texts: Sequence[str], where: Callable[[int], str], unit: str | 
             raise DataError(f"{where(k)}: {text!r} is no time; remove or correct that entry")
         values.append(value)
     power = _UNITS[unit] if unit is not None else _power(values[0])
-    limit = Decimal(INT64_MAX)
+    limit = Decimal(INT64_MAX).scaleb(-power)
     for k, value in enumerate(values):
-        if abs(value.scaleb(power)) > limit:
+        if value.copy_abs() > limit:  # abs() would round, which no context can do with an exponent of any size
             raise DataError(f"{where(k)}: {texts[k]!r} is out of range for a time; state its unit in the header ([ns])")
     return check_increasing([int(value.scaleb(power).to_integral_value()) for value in values], where)
 
@@ -118,7 +118,7 @@ def parse_stamps(texts: Sequence[str], where: Callable[[int], str], unit: str | 
 def _power(first: Decimal) -> int:
     """Return the power of ten to nanoseconds by the size of a stamp: 2001 and later, or seconds from any zero."""
     for limit, power in ((Decimal("1e17"), 0), (Decimal("1e14"), 3), (Decimal("1e11"), 6)):
-        if abs(first) >= limit:
+        if first.copy_abs() >= limit:
             return power
     return 9
 
