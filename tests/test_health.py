@@ -106,13 +106,6 @@ def test_two_gaps_without_features_are_two_events() -> None:
     assert len(_lines([GOOD] * 5 + [EMPTY] * 30 + [GOOD] * 5 + [EMPTY] * 30 + [GOOD])) == 4
 
 
-def test_reports_once_that_most_features_are_rejected() -> None:
-    bad = replace(GOOD, used=10, gated=40)
-    (line,) = _lines([GOOD] * 5 + [bad] * 60)
-    assert line.startswith("frame 24: more features rejected than used for 20 frames")
-    assert _lines(([bad] * 15 + [GOOD]) * 3) == []
-
-
 @pytest.mark.parametrize(
     ("more", "message"),
     [

@@ -437,6 +437,7 @@ class UpdateReport:
     nis_per_dof: float | None  # normalised innovation squared over its degrees of freedom; about 1 when consistent
     gated_ids: IntArray = field(default_factory=_no_ids, compare=False)  # of those rejected, where the back end says it
     landmark_ids: IntArray = field(default_factory=_no_ids, compare=False)  # of the landmarks in the map, likewise
+    innovation_ratio: float | None = None  # median innovation over its standard deviation; about 1 when consistent
     started: bool = True  # False: nothing can be estimated yet, and the frame has no pose
 
 
@@ -571,6 +572,7 @@ class FrameLog:
     innovation_median_px: float | None
     nis_per_dof: float | None
     disparity_median_px: float | None = None  # of the features with a right match; None: there is none
+    innovation_ratio: float | None = None
     stages_ms: dict[str, float] = field(default_factory=dict)  # the front end's own stages
 
     @property

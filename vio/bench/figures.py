@@ -114,7 +114,7 @@ def absent_reasons(
         "refused_share": "no observation was offered",
         "cpu_ms": "too few frames for a mean",
         "landmarks_m": "there are no surveyed landmarks",
-        "innovation_px": "no observation was used",
+        **dict.fromkeys(("innovation_px", "innovation_ratio"), "no observation was used"),
         "map_ate_m": "there was no map",
         **dict.fromkeys(("loops", "loops_false", "loop_error_m", "loop_recall"), "no map was built"),
         **dict.fromkeys(("placed", "place_s", "map_causal_ate_m", *_OF_PLACES), "no place was found in a map"),

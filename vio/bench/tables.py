@@ -49,6 +49,7 @@ MORE_METRICS = (
     Metric("used_per_frame", "used a frame", 3),
     Metric("landmarks", "landmarks", 5),
     Metric("innovation_px", "innovation px", 3),
+    Metric("innovation_ratio", "innovation over its sigma", 2),
     Metric("reference_m", "length m", 3),
     Metric("frames", "frames", 6),
     Metric("map_ate_m", "ATE m in the map", 3),

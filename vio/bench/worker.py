@@ -187,6 +187,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             "used_per_frame": float(np.mean(np.asarray(result.frames.column("used"), dtype=np.float64))),
             "landmarks": len(result.landmarks.ids),
             "innovation_px": _median(f.innovation_median_px for f in result.frames),
+            "innovation_ratio": _median(f.innovation_ratio for f in result.frames),
         }
         timer.stages = _stages(result)
         record = {"figures": figures, "failure": result.stopped, "warnings": list(result.warnings[:_MOST_WARNINGS])}

@@ -323,7 +323,10 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
         rows.append(("", f"and {metrics['start_s']:.0f} s in slow frames: loops are compiled once on a machine"))
     rows.append(("back end", f"{metrics['backend']}, motion {metrics['motion']}"))
     if metrics["refused_share"] is not None:
-        rows.append(("refused", f"{100 * metrics['refused_share']:.1f} % of the observations, by the chi-square gates"))
+        refused = f"{100 * metrics['refused_share']:.1f} % of the observations, by the chi-square gates"
+        ratio = metrics.get("innovation_ratio")
+        more = "" if ratio is None else f"; innovations are {ratio:.2g} of their standard deviation (median)"
+        rows.append(("refused", refused + more))
     if metrics.get("scale_sigma") is not None:
         sigma = f"{100 * metrics['scale_sigma']:.2g} %"
         rows.append(("scale", f"one camera: from the IMU, standard deviation {sigma} (median of the frames)"))

@@ -129,6 +129,7 @@ class FrameUpdate:
         predicted = window.camera_move_since(-2) if len(window.clones) > 1 else None
         tracks = self._linearise(window, self.tracks.choose(len(window.clones)), _FIRST_STEPS)
         at_prediction, innovation = tracks, tracks.newest_innovation()
+        innovation_ratio = self.tracks.innovation_ratio(tracks, expected)
         tracks, fitted = self._fit(window, tracks, pixels, innovation)
         step = self._step_errors(window, tracks, predicted, fitted, expected)
         if step is not None:
@@ -159,6 +160,7 @@ class FrameUpdate:
             nis_per_dof=median(nis / dof) if len(nis) else None,
             gated_ids=gated_ids,
             landmark_ids=window.landmark_ids.copy(),
+            innovation_ratio=innovation_ratio,
         )
 
     def _keep_landmarks(self, window: Window, kept: BoolArray) -> None:

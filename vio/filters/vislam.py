@@ -6,6 +6,7 @@ Equation numbers (P1) … (P9) are those of docs/math.md. In the paper's letters
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -229,6 +230,7 @@ class Vislam(Backend):
             landmarks=len(self._map),
             innovation_median_px=innovation,
             nis_per_dof=nis_per_dof,
+            innovation_ratio=None if nis_per_dof is None else math.sqrt(nis_per_dof),
         )
 
     def _lost(self, frame_index: int) -> str:

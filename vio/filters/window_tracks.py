@@ -131,6 +131,25 @@ class WindowTracks:
         z = self._views(rows, len(T), tracks.field).z
         return self._linear(T, rows, tracks.p_world[enough], at.take(enough), tracks.field, z)
 
+    def innovations(self, predicted: LinearTracks, moved: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Squared innovations (F,) in the newest clone over their covariance, and how many pixels (F,) each has.
+
+        Args:
+            predicted: tracks linearised where the motion model has the newest clone.
+            moved: covariance (6, 6) of its motion since the clone before, `[rho; phi]` on the world's side.
+        """
+        at, used = predicted.at, measured_pixels(predicted.at)[:, -1]
+        J = at.z_D_p[:, -1] @ circledot(predicted.p_world)[:, :3]
+        S = J @ moved @ np.swapaxes(J, 1, 2) + self.variance * np.eye(4)
+        squared = np.einsum("fi,fi->f", at.r[:, -1], np.linalg.solve(S, at.r[:, -1, :, None])[..., 0])
+        return squared, used.sum(axis=1)
+
+    def innovation_ratio(self, predicted: LinearTracks, moved: FloatArray) -> float | None:
+        """Median innovation in the newest clone over its standard deviation; None where nothing is seen in it."""
+        squared, pixels = self.innovations(predicted, moved)
+        used = pixels > 0
+        return float(np.sqrt(median(squared[used] / chi_square_table(0.5)[pixels[used]]))) if used.any() else None
+
     def drop_unpredicted(self, predicted: LinearTracks, moved: FloatArray) -> bool:
         """Drop views of the newest clone that contradict the predicted motion permanently.
 
@@ -141,12 +160,9 @@ class WindowTracks:
         Returns:
             Whether there were any.
         """
-        at, used = predicted.at, measured_pixels(predicted.at)[:, -1]
-        J = at.z_D_p[:, -1] @ circledot(predicted.p_world)[:, :3]
-        S = J @ moved @ np.swapaxes(J, 1, 2) + self.variance * np.eye(4)
-        squared = np.einsum("fi,fi->f", at.r[:, -1], np.linalg.solve(S, at.r[:, -1, :, None])[..., 0])
-        wrong: BoolArray = squared > chi_square_table(_VIEW_PROBABILITY)[used.sum(axis=1)]
-        views = np.zeros((len(wrong), at.r.shape[1]), dtype=np.bool_)
+        squared, pixels = self.innovations(predicted, moved)
+        wrong: BoolArray = squared > chi_square_table(_VIEW_PROBABILITY)[pixels]
+        views = np.zeros(predicted.at.r.shape[:2], dtype=np.bool_)
         views[:, -1] = wrong
         self.table.drop_views(predicted.rows, views)
         return bool(wrong.any())

@@ -190,5 +190,6 @@ def _frame_log(
         innovation_median_px=report.innovation_median_px,
         nis_per_dof=report.nis_per_dof,
         disparity_median_px=_median_disparity(output.observations),
+        innovation_ratio=report.innovation_ratio,
         stages_ms=output.stages_ms,
     )

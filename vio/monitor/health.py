@@ -14,7 +14,6 @@ from vio.records import Estimate, UpdateReport
 _NO_FEATURES_S = 1.0  # without a usable feature for longer, the pose is a prediction only
 _GAP_S, _GAP_STEPS = 0.5, 5.0  # between frames: a gap if longer, and so many times the usual time
 _LEAST_STEPS, _RECENT_STEPS = 5, 50  # between frames, for the usual time to be known; and that it is taken from
-_REJECTING_FRAMES = 20
 # No rig comes to this by a camera that turns in its mount (docs/notes/design_decisions.md, exchanged cameras).
 _OTHER_PAIR_PX = 10.0
 _SCALE_OFF_PERCENT, _SCALE_SIGMAS = 1.0, 3.0  # of baseline or focal length, both to be exceeded
@@ -33,7 +32,6 @@ class RunHealth:
         self._without_features = False
         self._steps_s: deque[float] = deque(maxlen=_RECENT_STEPS)
         self._last_index = 0
-        self._rejecting = 0
         self._reported: set[str] = set()
         self._restarted_ns: int | None = None  # time of the last restart
 
@@ -64,7 +62,6 @@ class RunHealth:
             estimate: the state estimate after it.
         """
         lines = [*self._gap(index, estimate), *self._features(index, report, estimate)]
-        lines += self._rejections(index, report)
         lines += self._stereo(index, estimate)
         lines += self._implausible(index, estimate)
         return tuple(lines)
@@ -141,16 +138,6 @@ class RunHealth:
         return [
             f"frame {index}: no usable feature since frame {self._last_used[0]} ({seconds:.1f} s); the pose is a "
             f"prediction, the standard deviation of its position is {sigma:.2f} m"
-        ]
-
-    def _rejections(self, index: int, report: UpdateReport) -> list[str]:
-        """Report when more features are rejected than used for many frames in a row."""
-        self._rejecting = self._rejecting + 1 if report.gated > report.used else 0
-        if self._rejecting != _REJECTING_FRAMES:
-            return []
-        return [
-            f"frame {index}: more features rejected than used for {_REJECTING_FRAMES} frames: wrong matches, moving "
-            "objects in the majority, or a pose that has diverged"
         ]
 
     def _implausible(self, index: int, estimate: Estimate) -> list[str]:

@@ -15,6 +15,7 @@ from vio.imu.findings import ImuVerdict
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RunHealth
 from vio.monitor.imu_faults import ImuFaultReport
+from vio.monitor.refusals import RefusalReport
 from vio.monitor.silence import ImuSilence
 from vio.records import (
     Estimate,
@@ -50,7 +51,8 @@ class RunMonitor:
             T_cam0_body: (4, 4) as the run uses it.
             imu: whether the run propagates with raw IMU samples.
         """
-        self._health = RunHealth()
+        self._health, self._refusals = RunHealth(), RefusalReport(imu=imu)
+        self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
         self._inertial: InertialCheck | None = None
         self._silence = ImuSilence() if imu else None
@@ -134,6 +136,7 @@ class RunMonitor:
         self._report(warnings)
         self._frames += 1
         self._features += len(seen)
+        self._seen = seen
         if self._silence is not None:
             self._report(self._silence.frame(seen.frame_index, seen.time_ns))
         if self._faults is not None:
@@ -216,6 +219,8 @@ class RunMonitor:
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
         self._report(self._health.frame(index, report, estimate))
+        if self._seen is not None:
+            self._report(self._refusals.frame(self._seen, report, estimate))
         self._scale_lines += self._health.scale(index, estimate)
         self._report_scale(last=False)
 

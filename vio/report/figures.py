@@ -194,14 +194,23 @@ def _features(runs: Sequence[FinishedRun]) -> ReportSection:
 
 
 def _innovations(runs: Sequence[FinishedRun]) -> ReportSection:
-    figure = _subplots(2, 1)
-    for run, colour in zip(runs, COLOURS, strict=False):
-        _frame_curve(figure, run, "innovation_median_px", run.name, colour, 1)
-        _frame_curve(figure, run, "nis_per_dof", run.name, colour, 2)
-    figure.update_yaxes(title_text="median (px)", rangemode="tozero", row=1, col=1)
-    figure.update_yaxes(title_text="NIS per dof", rangemode="tozero", row=2, col=1)
-    text = "How far features lie from where the filter expects them, and that squared over its covariance: 1 is "
-    return _over_time("Innovations", figure, text + "consistent, less is cautious, more is overconfident.")
+    shown = {
+        "innovation_median_px": "median (px)",
+        "innovation_ratio": "over their sigma",
+        "nis_per_dof": "NIS per dof",
+    }
+    shown = {name: title for name, title in shown.items() if any(name in run.frames for run in runs)}
+    figure = _subplots(len(shown), 1)
+    for row, (name, title) in enumerate(shown.items(), start=1):
+        for run, colour in zip(runs, COLOURS, strict=False):
+            if name in run.frames:
+                _frame_curve(figure, run, name, run.name, colour, row)
+        figure.update_yaxes(title_text=title, rangemode="tozero", row=row, col=1)
+    text = "How far features lie from where the filter expects them, and that over its standard deviation (median): 1 "
+    text += (
+        "is consistent, less is cautious, more is overconfident; and the squared residuals of tracks over the noise."
+    )
+    return _over_time("Innovations", figure, text)
 
 
 def _biases(runs: Sequence[FinishedRun]) -> list[ReportSection]:

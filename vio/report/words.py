@@ -111,7 +111,7 @@ def run_figures(run: FinishedRun) -> dict[str, str]:
     m, evaluation = run.metrics, run.evaluation
     work = _work_ms(run)
     kitti = None if evaluation is None else evaluation.kitti
-    refused = refused_share(run.frames["used"], run.frames["gated"])
+    refused, innovations = refused_share(run.frames["used"], run.frames["gated"]), m.get("innovation_ratio")
     return {
         "frames": str(len(run.estimates)),
         "path (m)": f"{_path_m(run):.2f}",
@@ -123,6 +123,7 @@ def run_figures(run: FinishedRun) -> dict[str, str]:
         "drift of rotation": "–" if kitti is None else rotation_drift_text(kitti.r_err_deg_per_100m, kitti.lengths_m),
         "features used, median": f"{np.nanmedian(run.frames['used']):.0f}",
         "observations refused (%)": "–" if refused is None else f"{100 * refused:.1f}",
+        "innovations (sigmas), median": "–" if innovations is None else f"{innovations:.2g}",
         "ms a frame, median": f"{np.nanmedian(work):.1f}",
         "ms a frame, 95 %": f"{np.nanpercentile(work, 95):.1f}",
         "landmarks": str(len(run.points)),

@@ -294,6 +294,7 @@ def metrics_of(
     """Collect the metrics for `--json` and metrics.json; null where there is no reference."""
     frames = result.frames
     work_ms = np.array([f.total_ms for f in frames])
+    innovations = np.asarray(frames.column("innovation_ratio"), dtype=np.float64)
     scores = None if evaluation is None else evaluation.as_dict()
     return {
         "out": str(folder),
@@ -317,6 +318,7 @@ def metrics_of(
         "start_s": start_s(work_ms),
         "stages_ms": {name: float(np.median([getattr(f, f"{name}_ms") for f in frames])) for name in STAGES},
         "refused_share": refused_share(frames.column("used"), frames.column("gated")),
+        "innovation_ratio": None if np.isnan(innovations).all() else float(np.nanmedian(innovations)),
         "landmarks": len(result.landmarks.ids),
         "ate_m": None if scores is None else scores["ate_m"],
         "rpe": None if scores is None else scores["rpe"],

@@ -47,7 +47,7 @@ ESTIMATE = np.dtype(
 _STAGES = 16  # of the front end, at most
 _COUNTS = ("detected", "tracked", "matched", "selected", "stale", "used", "gated", "landmarks")
 _TIMES = ("read_ms", "frontend_ms", "monitor_ms", "select_ms", "filter_ms")
-_NUMBERS = ("innovation_median_px", "nis_per_dof", "disparity_median_px")
+_NUMBERS = ("innovation_median_px", "nis_per_dof", "disparity_median_px", "innovation_ratio")
 FRAME = np.dtype(
     [
         ("index", "<i8"),
