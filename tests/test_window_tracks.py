@@ -183,7 +183,7 @@ def test_points_follow_the_poses_as_the_joint_problem_says() -> None:
     prior = np.eye(24) * 1e3
     poses = np.linalg.solve(A + prior, b)
     before = linear.p_world.copy()
-    tracks.move_points(linear, poses, np.zeros(0))
+    tracks.move_points(linear, linear.stereo, poses, np.zeros(0))
     H, r = np.zeros((5 * 16, 24 + 15)), np.zeros(5 * 16)
     lever = point_D_pose(before)
     weight = 1 / (1 + np.sum(linear.at.r**2, axis=2) / (4 * _scales(linear.at, tracks.variance) * 9.0))

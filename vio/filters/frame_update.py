@@ -182,7 +182,7 @@ class FrameUpdate:
         for _ in range(_MOST_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b, _ = self._information(window, tracks, everything, pixels)
-            fitted = self._move_to_optimum(window, tracks, A, b, len(A))
+            fitted = self._move_to_optimum(window, tracks, tracks.stereo, A, b, len(A))
             tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = tracks.newest_innovation()
             # Another step pays only where this one had far to go.
@@ -196,12 +196,21 @@ class FrameUpdate:
         tracks = self._linearise(window, self.tracks.choose(len(window.clones)), _LATER_STEPS)
         return self._fit(window, tracks, pixels, tracks.newest_innovation())
 
-    def _move_to_optimum(self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray, size: int) -> Fit:
+    def _move_to_optimum(
+        self,
+        window: Window,
+        tracks: LinearTracks,
+        columns: StereoColumns | None,
+        A: FloatArray,
+        b: FloatArray,
+        size: int,
+    ) -> Fit:
         """Move the means, and the tracks' points with them, to the optimum of the prior and of given information.
 
         Args:
             window: moved; its prior stays.
             tracks: whose points are moved.
+            columns: theirs of the coefficients estimated; None: there are none.
             A: information (D, D).
             b: its vector (D,).
             size: how many errors, the first ones, it is about.
@@ -210,7 +219,7 @@ class FrameUpdate:
             The fit, with their covariance (size, size) there.
         """
         fitted, error = window.optimum(A, b, size)
-        self.tracks.move_points(tracks, error[window.state.clones], error[window.state.stereo])
+        self.tracks.move_points(tracks, columns, error[window.state.clones], error[window.state.stereo])
         window.relinearise(error)
         return fitted
 
@@ -343,20 +352,22 @@ class FrameUpdate:
         seen = table.seen(tracks.rows)
         lost, leaving = ~seen[:, newest], seen[:, 0] & full
         ending = lost | leaving
-        ended = np.flatnonzero(ending & good)
+        ended, joint = np.flatnonzero(ending & good), self._joint_columns(window, tracks)
+        estimated = window.state.stereo.stop - window.state.stereo.start
+        columns = tracks.stereo if joint is None else joint.of_first(estimated)
         if len(ended):
-            self._overdispersion.add(table.ids(tracks.rows[ended]), *self.tracks.field_scores(tracks, ended))
+            self._overdispersion.add(table.ids(tracks.rows[ended]), *self.tracks.field_scores(tracks, columns, ended))
         # Errors that neighbours share are not in the factor, and the field takes them in with every frame.
         repeated = self._overdispersion.factor
-        joint = self._joint_columns(window, tracks)
         A, b, considered = self._information(window, tracks, ending & good, pixels, joint)
         window.absorb(A, b, repeated=repeated, considered=considered)
         depth_sigma = np.sqrt(self.tracks.variance) * tracks.information.relative_depth_sigma()
-        promoted = self._promote(window, tracks, joint, leaving & good & seen[:, newest], depth_sigma, stereo)
+        candidates = leaving & good & seen[:, newest]
+        promoted = self._promote(window, tracks, columns, joint, candidates, depth_sigma, stereo)
 
         A, b, considered = self._information(window, tracks, good & ~ending, None, joint)
         size = window.state.clones.stop
-        P = self._move_to_optimum(window, tracks, A, b, size).covariance()  # without landmarks
+        P = self._move_to_optimum(window, tracks, columns, A, b, size).covariance()  # without landmarks
         V = window.prior.error_D_constants[:size, 1:]
         if considered is not None:
             V = V - P @ (A[:size, :size] @ V + considered[:size])
@@ -369,7 +380,7 @@ class FrameUpdate:
         covariance = self._variance * tracks.information.point_covariance(done)
         if joint is not None:
             of_points = tracks.information.point_D_clones(done) @ V[window.state.clones]
-            of_points += joint.point_D_stereo(tracks.information)[done, :, -CONSIDERED:]
+            of_points += joint.point_D_stereo(tracks.information, done)[..., -CONSIDERED:]
             covariance = covariance + self._rig.uncertainty(window, of_points)
         self._points.store(table.ids(tracks.rows[done]), table.points[tracks.rows[done]], covariance)
         spent = leaving & ~lost
@@ -384,6 +395,7 @@ class FrameUpdate:
         self,
         window: Window,
         tracks: LinearTracks,
+        columns: StereoColumns | None,
         joint: StereoColumns | None,
         candidates: BoolArray,
         depth_sigma: FloatArray,
@@ -394,7 +406,8 @@ class FrameUpdate:
         Args:
             window: receives the landmarks.
             tracks: linearised at its means.
-            joint: their columns of the coefficients estimated and of those considered.
+            columns: theirs of the coefficients estimated; None: there are none.
+            joint: of these and of those considered.
             candidates: mask (F,) of the tracks that may become landmarks.
             depth_sigma: (F,) standard deviation of each inverse depth, over itself.
             stereo: whether this frame has right pixels, from which the next tracks will get their depths.
@@ -423,13 +436,13 @@ class FrameUpdate:
         p, point_D_poses = tracks.p_world[chosen], tracks.information.point_D_clones(chosen)
         point_D_poses[:, :, -3:] += so3_hat(p)  # the anchor: rotation of the newest exposure
         point_D_stereo = None
-        if tracks.stereo is not None:
-            point_D_stereo = tracks.stereo.point_D_stereo(tracks.information)[chosen]
+        if columns is not None:
+            point_D_stereo = columns.point_D_stereo(tracks.information, chosen)
         A = window.state.jacobian(point_D_poses, point_D_stereo)
         ids = table.ids(tracks.rows[chosen])
         by_considered = None
         if joint is not None:
-            points = joint.point_D_stereo(tracks.information)[chosen]
+            points = joint.point_D_stereo(tracks.information, chosen)
             by_considered = points[..., -CONSIDERED:].reshape(-1, CONSIDERED)
         window.add_landmarks(ids, p, A.reshape(-1, window.state.size), covariance, by_considered)
         return chosen

@@ -204,7 +204,7 @@ class MonoStarter:
                     fitted, error = window.optimum(A, b, len(A))
                 except np.linalg.LinAlgError:
                     return None
-                tracks.move_points(lin, error[window.state.clones], error[window.state.stereo])
+                tracks.move_points(lin, lin.stereo, error[window.state.clones], error[window.state.stereo])
                 window.relinearise(error)
                 if np.abs(error).max() < _CONVERGED:
                     break

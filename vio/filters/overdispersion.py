@@ -26,6 +26,7 @@ class Overdispersion:
         self._scores: dict[int, FloatArray] = {}  # of features, by id, in the order in which they ended last
         self._squares, self._information = np.zeros(FIELD_TERMS), np.zeros(FIELD_TERMS)
         self._tracks = 0
+        self.factor = 1.0  # by how much too often the information of pixels is counted, at least one
 
     def add(self, ids: IntArray, scores: FloatArray, information: FloatArray) -> None:
         """Take in tracks that ended.
@@ -43,12 +44,7 @@ class Overdispersion:
         self._tracks += len(ids)
         while len(self._scores) > _MOST_SCORES:
             self._scores.pop(next(iter(self._scores)))
-
-    @property
-    def factor(self) -> float:
-        """By how much too often the information of pixels is counted, at least one."""
         known = self._information > 0
-        if not known.any():
-            return 1.0
-        ratio = float(np.mean(self._squares[known] / self._information[known]))
-        return max((_PRIOR_TRACKS + self._tracks * ratio) / (_PRIOR_TRACKS + self._tracks), 1.0)
+        if known.any():
+            ratio = float(np.mean(self._squares[known] / self._information[known]))
+            self.factor = max((_PRIOR_TRACKS + self._tracks * ratio) / (_PRIOR_TRACKS + self._tracks), 1.0)

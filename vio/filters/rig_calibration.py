@@ -44,6 +44,7 @@ class RigCalibration:
         self._rows = VerticalDisparityModel(camera)
         self._field_variances = prior_variances(settings)["stereo_field"]  # (8,) before anything was seen of it
         self._rows_off = LEAST_FIELD_SIGMA / _COLUMNS_BY_ROWS  # size of the rows' field that gave them, focal lengths
+        self._field: tuple[Calibration, StereoCorrection | None] | None = None  # at a calibration, by the present rows
 
     def first_covariance(self, calibration: Calibration, T_world_imu: FloatArray) -> FloatArray:
         """Covariance (C, C) of the errors of a calibration of which nothing was seen yet, at a pose (4, 4)."""
@@ -65,6 +66,7 @@ class RigCalibration:
         if self.settings.calibrate_stereo == "off" or self.camera.kind != "stereo":
             return
         self._rows.update(seen)
+        self._field = None
         if self._rows.offset_px is None:
             return
         off = float(np.hypot(self._rows.offset_px, self.camera.residual_px)) / self.camera.fu
@@ -114,6 +116,11 @@ class RigCalibration:
 
     def field(self, window: Window) -> StereoCorrection | None:
         """The stereo calibration's faults at the window's present means; None where they are not estimated."""
+        if self._field is None or self._field[0] is not window.calibration:
+            self._field = window.calibration, self._field_at(window)
+        return self._field[1]
+
+    def _field_at(self, window: Window) -> StereoCorrection | None:
         estimated, stereo = window.calibration.stereo_terms, window.calibration.stereo
         if not len(estimated):
             return None

@@ -170,9 +170,16 @@ class StereoColumns:
         """Return the columns of tracks (K,)."""
         return StereoColumns(self.by_point[rows], self.G[rows], self.A[rows], self.b[rows])
 
-    def point_D_stereo(self, info: TrackInformation) -> FloatArray:
-        """How the estimated points follow errors of the coefficients (F, 3, S), world: `-C^-1 G`."""
-        out: FloatArray = -info.q.p_D_q @ np.linalg.solve(info.C, self.G)
+    def of_first(self, terms: int) -> StereoColumns | None:
+        """Return the columns of the first coefficients; None: of none."""
+        if not terms:
+            return None
+        columns = self.by_point[..., :terms], self.G[..., :terms], self.A[:, :terms, :terms], self.b[:, :terms]
+        return StereoColumns(*columns)
+
+    def point_D_stereo(self, info: TrackInformation, chosen: IntArray) -> FloatArray:
+        """How the estimated points of tracks (K,) follow errors of the coefficients (K, 3, S), world: `-C^-1 G`."""
+        out: FloatArray = -info.q.p_D_q[chosen] @ np.linalg.solve(info.C[chosen], self.G[chosen])
         return out
 
 

@@ -526,7 +526,7 @@ def collect_columns(
     """Write `J' W H` (F, N, 3, S) of each view, and G (F, 3, S), its sum over the views of each track.
 
     And `H' W H` (F, S, S) and `H' W r` (F, S) of each track. H (F, N, 4, S) are the derivatives of the pixels, of which
-    those count that were measured.
+    those count that were measured; right rows do not depend on them.
     """
     terms, wH = H.shape[3], np.empty(H.shape[3])
     for f in range(len(J)):
@@ -540,7 +540,7 @@ def collect_columns(
                     by_point[f, n, i, s] = 0.0
             if weight[f, n] == 0.0:
                 continue
-            for a in range(4):
+            for a in range(3):
                 row = J[f, n, a]
                 if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
                     continue

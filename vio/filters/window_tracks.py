@@ -6,7 +6,7 @@ Everything here is about pixels and points; poses come in as camera poses and go
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -45,7 +45,7 @@ _MOST_DOF = 199
 _MOST_COMMON_NOISE = 4.0  # of a frame over the learned variance: beyond twice the noise it is no blur
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class LinearTracks:
     """Tracks linearised at one estimate of the window."""
 
@@ -56,8 +56,14 @@ class LinearTracks:
     z: FloatArray  # (F, N, 4) pixels as they are predicted
     weight: FloatArray  # (F, N) robust weight of each view
     information: TrackInformation
-    stereo: StereoColumns | None  # where the rectification error is estimated
-    field: StereoCorrection | None  # what was taken out of the pixels
+    field: StereoCorrection | None  # what was taken out of the pixels; None: the rectification error is not estimated
+
+    @cached_property
+    def stereo(self) -> StereoColumns | None:
+        """Columns of the coefficients that are estimated; None: there are none."""
+        if self.field is None:
+            return None
+        return stereo_columns(self.at, self.field.jacobian(self.z), self.information.q.p_D_q, self.weight)
 
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
@@ -178,19 +184,18 @@ class WindowTracks:
     ) -> LinearTracks:
         weight = robust_weights(at, self.variance)
         information = track_information(self._camera, T_cam0_world, at, p_world, weight)
-        columns = None
         # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
-        z = z - at.r
-        if field is not None:
-            columns = stereo_columns(at, field.jacobian(z), information.q.p_D_q, weight)
-        return LinearTracks(T_cam0_world, rows, p_world, at, z, weight, information, columns, field)
+        return LinearTracks(T_cam0_world, rows, p_world, at, z - at.r, weight, information, field)
 
-    def field_scores(self, tracks: LinearTracks, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
+    def field_scores(
+        self, tracks: LinearTracks, columns: StereoColumns | None, chosen: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Scores and information (K, 8) of tracks (K,) by the terms of (R3), their points eliminated, the poses known.
 
-        In the believed noise, where the expected square of a score is its information.
+        In the believed noise, where the expected square of a score is its information. `columns` are the tracks' own of
+        the coefficients estimated, None where there are none.
         """
-        info, columns = tracks.information.take(chosen), tracks.stereo
+        info = tracks.information.take(chosen)
         if columns is None or tracks.field is None or tracks.field.terms[0] > 0:
             none = StereoCorrection(self._camera, np.zeros(ROW_TERMS), np.zeros(TERMS), np.arange(FIELD_TERMS))
             at = Residuals(tracks.at.r[chosen], tracks.at.z_D_p[chosen], tracks.at.ahead[chosen])
@@ -207,9 +212,15 @@ class WindowTracks:
         views = self.table.views(rows, clones)
         return views if field is None else field.corrected(views)
 
-    def move_points(self, tracks: LinearTracks, exposure_errors: FloatArray, stereo_errors: FloatArray) -> None:
+    def move_points(
+        self,
+        tracks: LinearTracks,
+        columns: StereoColumns | None,
+        exposure_errors: FloatArray,
+        stereo_errors: FloatArray,
+    ) -> None:
         """Move each point as its own normal equations say once the clones (6N,) and the field (S,) have moved."""
-        other = 0.0 if tracks.stereo is None else np.einsum("fks,s->fk", tracks.stereo.G, stereo_errors)
+        other = 0.0 if columns is None else np.einsum("fks,s->fk", columns.G, stereo_errors)
         self.table.points[tracks.rows] = tracks.information.moved_points(exposure_errors, other)
 
     def agree(self, at: Residuals) -> bool:

@@ -10,6 +10,7 @@ angle, as OpenCV's fisheye model. Unified and double sphere: `vio.geometry.spher
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -63,6 +64,7 @@ class CameraModel:
                 f"focal lengths and image size must be positive, got fu={self.fu:g}, fv={self.fv:g}, "
                 f"{self.width}x{self.height}"
             )
+        object.__setattr__(self, "coefficients", tuple(self.coefficients))  # a list is no key of a cache
         expected = _COEFFICIENTS[self.model]
         if len(self.coefficients) not in expected:
             raise CalibrationError(
@@ -237,6 +239,7 @@ def _radtan_D_xy(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
     return out
 
 
+@lru_cache(maxsize=256)
 def _radtan_max_radius(coefficients: tuple[float, ...]) -> float:
     """Radius on the undistorted plane where the radial polynomial stops growing: the model folds back beyond it."""
     k1, k2, _, _, k3 = _five(coefficients)
@@ -289,6 +292,7 @@ def _theta_polynomial(coefficients: tuple[float, ...], theta: FloatArray) -> tup
     return value, slope
 
 
+@lru_cache(maxsize=256)
 def _max_theta(coefficients: tuple[float, ...]) -> float:
     """Angle in radians where the distorted angle stops growing, at most pi."""
     k1, k2, k3, k4 = coefficients
