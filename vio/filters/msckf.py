@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from vio.errors import ConfigError, DivergedError, EstimationError
 from vio.filters.frame_update import FrameUpdate
@@ -257,9 +258,7 @@ class Msckf(Backend):
     def _first_window(self, nav: NavState, P: FloatArray, calibration: Calibration) -> Window:
         """A window without clones; P (15, 15) is the covariance of the navigation state."""
         own = self._rig.first_covariance(calibration, nav.T_world_imu)
-        with_own = np.zeros((len(P) + len(own), len(P) + len(own)))
-        with_own[: len(P), : len(P)], with_own[len(P) :, len(P) :] = P, own
-        window = Window(self._propagation.motion, nav, with_own, calibration)
+        window = Window(self._propagation.motion, nav, np.asarray(block_diag(P, own)), calibration)
         before = None if self._window is None else self._window.prior.scale_test
         self._rig.test_scale(window, self._source, before)
         return window

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import lapack
 
 from vio.geometry.lie import FloatArray
-from vio.numerics.scipy_parts import lapack
 from vio.numerics.statistics import chi_square_cdf, chi_square_quantile
 
 _STEPS = 10  # over which corrections are summed: errors that last, such as a gyro's scale, show only in the sum

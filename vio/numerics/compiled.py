@@ -10,7 +10,6 @@ compile that function anew, for this number alone: pass `int(np.int64(1))`.
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -24,21 +23,6 @@ from vio.numerics.prebuilt import attach
 log = logging.getLogger(__name__)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-def _load_numba_alone() -> None:
-    """Load numba's array functions without `scipy.linalg`, whose BLAS they look for, and load once they need it."""
-    if "scipy.linalg" in sys.modules:
-        return
-    sys.modules["scipy.linalg"] = None  # type: ignore[assignment]
-    try:
-        from numba.np import arraymath
-    finally:
-        del sys.modules["scipy.linalg"]
-    arraymath._HAVE_BLAS = True
-
-
-_load_numba_alone()
 
 # Without the entry for callers in C, which nothing here uses, a function compiles in a tenth less time.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
