@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -24,17 +27,18 @@ ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 
-def _run(name: str, *arguments: object) -> str:
-    """Run an example and return what it prints."""
-    ended = subprocess.run(
-        [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert ended.returncode == 0, ended.stderr
-    return ended.stdout
+def _run(name: str, *arguments: object, process: bool = False) -> str:
+    """Run an example as a program, in this process or one of its own, and return what it prints."""
+    argv, printed = [str(ROOT / "examples" / name), *map(str, arguments)], io.StringIO()
+    if process:
+        env = {**os.environ, "PYTHONPATH": str(ROOT)}
+        ended = subprocess.run([sys.executable, *argv], env=env, capture_output=True, text=True, timeout=600)
+        assert ended.returncode == 0, ended.stderr
+        return ended.stdout
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        patch.setattr(sys, "argv", argv)
+        runpy.run_path(argv[0], run_name="__main__")
+    return printed.getvalue()
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
@@ -46,7 +50,7 @@ def test_examples_are_short_and_tested(path: Path) -> None:
 
 
 def test_a_live_loop_prints_a_pose_for_every_frame(flight: Path) -> None:
-    text = _run("live_loop.py", flight)
+    text = _run("live_loop.py", flight, process=True)
     # A machine at full load may leave out frames, and says how many.
     found = re.search(r"results=(\d+), dropped=(\d+), refused=0, waiting=0", text)
     assert found is not None
@@ -78,7 +82,7 @@ def test_results_are_read_as_arrays(flight: Path, tmp_path: Path) -> None:
 
 
 def test_a_front_end_of_ones_own_is_checked_and_used(flight: Path) -> None:
-    text = _run("own_frontend.py", flight)
+    text = _run("own_frontend.py", flight, process=True)
     assert "survival" in text
     ate = re.search(r"ATE ([\d.]+) m", text)
     assert ate is not None
@@ -86,7 +90,7 @@ def test_a_front_end_of_ones_own_is_checked_and_used(flight: Path) -> None:
 
 
 def test_a_viewer_of_ones_own_makes_an_animated_picture(flight: Path, tmp_path: Path) -> None:
-    assert "8 pictures" in _run("animated_picture.py", flight, tmp_path / "run.webp")
+    assert "8 pictures" in _run("animated_picture.py", flight, tmp_path / "run.webp", process=True)
     with Image.open(tmp_path / "run.webp") as found:
         assert found.n_frames == 8
         assert found.size[0] == 960
