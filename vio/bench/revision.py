@@ -91,11 +91,12 @@ def _as_yaml(suite: Suite) -> dict[str, Any]:
         values: dict[str, Any] = {"source": s.source, "reference": s.reference, "stop": s.stop, "settings": s.settings}
         values |= {"render": list(s.render) or None, "lengths_m": None if s.lengths_m is None else list(s.lengths_m)}
         values |= {name: getattr(s, name) for name in ("render_each_seed", "positions_only", "exact_truth", "start")}
-        values |= {"map": s.map or None, "map_of": s.map_of}  # revisions before maps do not know the keys
+        values |= {"map": s.map or None, "map_of": s.map_of}  # older revisions do not know all keys
         sequences[s.name] = {name: value for name, value in values.items() if value is not None}
     configurations = {
         name: {**values, **({"config": str(suite.folder / str(values["config"]))} if values.get("config") else {})}
         for name, values in suite.configurations.items()
     }
-    own = {"name": suite.name, "sequences": sequences, "configurations": configurations, "seeds": list(suite.seeds)}
-    return own if suite.time_limit_s is None else {**own, "time_limit_s": suite.time_limit_s}
+    out: dict[str, Any] = {"name": suite.name, "sequences": sequences, "configurations": configurations}
+    out |= {"seeds": list(suite.seeds), "time_limit_s": suite.time_limit_s}
+    return {name: value for name, value in out.items() if value is not None}

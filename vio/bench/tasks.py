@@ -112,7 +112,8 @@ def _settings(
     suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, digests: InputDigests
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the settings of a run, and the part of them that the result depends on: files by their content."""
-    config, files = as_dict(config_of(suite, sequence, name, seed)), {}
+    config = as_dict(config_of(suite, sequence, name, seed))
+    files: dict[str, str] = {}
     for setting, holder, key in _file_settings(config):
         holder[key] = str((data / holder[key]).absolute())
         files[setting] = digests.of(Path(holder[key]))
