@@ -78,7 +78,6 @@ def test_every_table_of_results_is_written_by_a_suite() -> None:
 
 _STUDIES = (  # measured once, on rigs turned on purpose
     "| right camera turned by | as given | estimated | angle about y found |",
-    "| recording | rows off by (rms) | as given | estimated | a0 |",
 )
 
 
