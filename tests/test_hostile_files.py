@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import zipfile
@@ -20,10 +21,13 @@ from vio.datasets.common import read_npz
 from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import UnreadableImageError, load_gray, white_level
 from vio.errors import CalibrationError, ConfigError, DataError
+from vio.files.tables import check_table
 from vio.files.text import text_lines
 from vio.files.yaml_text import read_yaml
 from vio.filters.settings import MsckfSettings
 from vio.records import StereoFrame
+from vio.runs.finished import read_estimates
+from vio.runs.tables import ESTIMATE
 
 PIXELS = np.random.default_rng(5).integers(0, 256, (24, 32)).astype(np.uint8)
 
@@ -303,3 +307,19 @@ def test_strange_arguments_are_one_line(
     assert error.startswith("error: ")
     assert error.count("\n") == 1
     assert re.search(message, error), error
+
+
+def test_a_header_of_zeros_is_one_line(tmp_path: Path) -> None:
+    """NumPy tokenises a header that it cannot parse, as one of Python 2, and then raises an error of the tokenizer."""
+    stream = io.BytesIO()
+    np.save(stream, np.zeros(2, dtype=ESTIMATE))
+    broken = stream.getvalue()[:50] + bytes(50) + stream.getvalue()[100:]
+    (tmp_path / "a.npy").write_bytes(broken)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("ids.npy", broken)
+    with pytest.raises(DataError, match=r"a\.npy: cannot be read"):
+        read_estimates(tmp_path / "a.npy")
+    with pytest.raises(DataError, match=r"a\.npy: is damaged"):
+        check_table(tmp_path / "a.npy", ESTIMATE, 1)
+    with pytest.raises(DataError, match=r"a\.npz: is damaged"):
+        read_npz(tmp_path / "a.npz", ("ids",))

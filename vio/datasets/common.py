@@ -10,6 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +35,16 @@ _GRAVITY, _GRAVITY_OFF = 9.81, 1.5  # m/s^2; by what accelerations and biases mo
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _MOST_ARRAY_BYTES = 2**31  # the largest published course file takes 140 MB; a bomb of kilobytes claims terabytes
 # What a damaged or encrypted archive also raises: an unknown compression, a header that is no literal.
-_DAMAGE = (NotImplementedError, RuntimeError, MemoryError, TypeError, SyntaxError, lzma.LZMAError, struct.error)
+_DAMAGE = (
+    NotImplementedError,
+    RuntimeError,
+    MemoryError,
+    TypeError,
+    SyntaxError,
+    TokenError,
+    lzma.LZMAError,
+    struct.error,
+)
 _EXACT_ENTRY = 1e-8  # tolerance of the zeros and the one of an intrinsic matrix
 
 

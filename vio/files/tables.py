@@ -10,6 +10,7 @@ import os
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from tokenize import TokenError
 from typing import BinaryIO, Generic, TypeVar, overload
 
 import numpy as np
@@ -153,8 +154,9 @@ def check_table(path: Path, dtype: np.dtype, keep: int, summed: tuple[int, int] 
             raise ValueError(f"it has {len(held)} rows, of another kind or fewer than {keep}")
         if _checksum(held[: summed[0]], 0) != summed[1]:
             raise ValueError("its checksum does not agree with its content")
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{path}: is damaged ({error}); repeat the run from its start") from error
+    except (OSError, ValueError, EOFError, TokenError) as error:  # NumPy takes a damaged header for one of Python 2
+        reason = " ".join(str(error).split())
+        raise DataError(f"{path}: is damaged ({reason}); repeat the run from its start") from error
 
 
 def _checksum(rows: Rows, crc: int) -> int:

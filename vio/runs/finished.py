@@ -7,6 +7,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -113,8 +114,9 @@ def read_estimates(path: Path) -> Rows:
     """Read the table of estimates; columns that an older version did not write are NaN."""
     try:
         found = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{path}: cannot be read ({error}); the run wrote no estimates, repeat it") from error
+    except (OSError, ValueError, EOFError, TokenError) as error:  # NumPy takes a damaged header for one of Python 2
+        reason = " ".join(str(error).split())
+        raise DataError(f"{path}: cannot be read ({reason}); the run wrote no estimates, repeat it") from error
     needed = {"index", "time_ns", "T_world_imu", "covariance"}
     if found.dtype.names is None or not needed <= set(found.dtype.names) or found.ndim != 1 or not len(found):
         raise DataError(f"{path}: is no table of estimates; repeat the run")
