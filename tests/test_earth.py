@@ -15,7 +15,7 @@ from tests.numerics import numeric_jacobian
 from tests.test_map_store import CAMERA, _features, _row
 from vio.cli import main
 from vio.datasets.gnss import read_gnss
-from vio.earth.alignment import Georeference, _Between, _Problem, georeference
+from vio.earth.alignment import Georeference, _Between, _Problem, georeference, heading_deg
 from vio.earth.alignment import Path as GraphPath
 from vio.earth.exports import write_utm
 from vio.earth.geodesy import LocalFrame, ecef, geodetic_of, utm, utm_zone
@@ -23,6 +23,7 @@ from vio.earth.gnss import SIGMA_M, GnssFixes, checked_fixes
 from vio.errors import DataError, EstimationError
 from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp
+from vio.mapping.files import describe_map, extract_map
 from vio.mapping.map_store import MapStore, SessionRow
 from vio.offline.georeference import placed
 from vio.records import LoopEvent, Trajectory
@@ -152,7 +153,7 @@ def test_covariance_of_the_rigid_transform_covers_it() -> None:
     found = [georeference(d.path, d.fixes, LEVER_M) for d in (_drive(seed=s, poses=300) for s in range(8))]
     exact = _drive(seed=0, poses=300).T_enu[0]
     headings = [np.arctan2(f.T_enu_map[1, 0], f.T_enu_map[0, 0]) - np.arctan2(exact[1, 0], exact[0, 0]) for f in found]
-    sigmas = np.array([f.heading_sigma_deg for f in found])
+    sigmas = np.array([heading_deg(f.T_enu_map, f.covariance)[1] for f in found])
     assert 0.3 < np.sqrt(np.mean((np.degrees(headings) / sigmas) ** 2)) < 2.5
 
 
@@ -289,13 +290,36 @@ def _map_of(path: Path, drive: Drive) -> Path:
 def test_places_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = _drive(seed=0, poses=300)
     file, gnss = _map_of(tmp_path / "a.map", drive), _csv(tmp_path / "gnss.csv", drive.fixes)
-    before = file.read_bytes()
+    before = describe_map(file)
     assert main(["georeference", str(file), str(gnss), "--lever-arm", "1,0.5,1.5"]) == 0
     assert "positions used" in capsys.readouterr().out
     saved = json.loads((tmp_path / "a.map.earth" / "earth.json").read_text())
     assert abs(saved["heading_deg"] - np.degrees(YAW_RAD)) < 5
     assert saved["sigma_horizontal_m"] < np.sqrt(2) * SIGMA
-    assert file.read_bytes() == before
+    after = describe_map(file)
+    assert after["earth"]["T_enu_map"] == saved["T_enu_map"]
+    assert {**after, "earth": None, "bytes": 0} == {**before, "bytes": 0}
+    run = tmp_path / "run"  # in the frame of the map
+    run.mkdir()
+    track = Trajectory(drive.path.T_map_body, drive.path.times_ns, "imu", frame_indices=np.arange(300))
+    for name in ("trajectory.tum", "map_trajectory.tum"):
+        write_tum(run / name, track)
+    (run / "landmarks.ply").write_bytes(b"ply\nend_header\n")
+    metrics = {"T_cam0_imu": np.eye(4).tolist(), "motion": "imu", "map": {"joined": True}}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    assert main(["georeference", str(run), str(file)]) == 0
+    assert "GNSS" not in capsys.readouterr().out
+    placed_run = read_trajectory(run / "earth" / "trajectory_enu.tum").T_world_body
+    np.testing.assert_allclose(placed_run, np.array(saved["T_enu_map"]) @ track.T_world_body, atol=1e-5)
+    extract_map(file, tmp_path / "part.map", tuple(drive.path.T_map_body[0, :3, 3]), 50.0)
+    assert describe_map(tmp_path / "part.map")["earth"] == after["earth"]
+    (run / "metrics.json").write_text(json.dumps({**metrics, "map": None}))
+    for arguments, message in (
+        ([str(run), str(file)], "is no run that found its place in a map"),
+        ([str(file), str(_map_of(tmp_path / "b.map", drive))], "nothing says where it is on the earth"),
+    ):
+        assert main(["georeference", *arguments]) == 1
+        assert message in capsys.readouterr().err
 
 
 def test_places_a_run(

@@ -14,7 +14,7 @@ def add_parser(commands: Any) -> None:
         help="place a run or a map on the earth by GNSS positions",
         description="Fuse a finished run, or the keyframes of a map, with GNSS positions as robust factors: "
         "earth.json with T_enu_map and its covariance, the path in east, north, up, and path and landmarks as GeoJSON, "
-        "KML and in UTM. The run and the map stay as they are.",
+        "KML and in UTM. A run stays as it is. A map keeps T_enu_map, which places runs that were localised in it.",
     )
     parser.add_argument("path", type=Path, metavar="RUN|MAP", help="a run's folder, or a map's file")
     parser.add_argument(
@@ -22,7 +22,7 @@ def add_parser(commands: Any) -> None:
         type=Path,
         metavar="GNSS",
         help="a table (time, latitude, longitude, height, and where known the standard deviations east, north, up), a "
-        "KITTI raw drive with oxts, or a ROS bag with NavSatFix",
+        "KITTI raw drive with oxts, a ROS bag with NavSatFix, or the map of a run, once that is placed",
     )
     parser.add_argument(
         "--lever-arm",
@@ -50,8 +50,9 @@ def execute(args: argparse.Namespace) -> int:
     from vio.errors import ConfigError
     from vio.files.atomic import atomic_folder
     from vio.files.printable import json_text
+    from vio.mapping.map_store import is_map
     from vio.numerics.threads import one_blas_thread
-    from vio.offline.georeference import FACTS, place_on_earth, placed
+    from vio.offline.georeference import FACTS, keep_in_map, place_by_map, place_on_earth, placed
 
     try:
         lever_arm_m = np.array([float(word) for word in args.lever_arm.split(",")])
@@ -61,14 +62,19 @@ def execute(args: argparse.Namespace) -> int:
         raise ConfigError(f"--lever-arm takes three numbers in metres such as 0.1,0,-0.5, got {args.lever_arm}")
     if not math.isfinite(args.time_offset) or abs(args.time_offset) > 4e9:
         raise ConfigError(f"--time-offset takes seconds, got {args.time_offset:g}")
-    of, fixes = placed(args.path), read_gnss(args.gnss, args.topic)
-    for note in fixes.notes:
+    of, fixes = placed(args.path), None if is_map(args.gnss) else read_gnss(args.gnss, args.topic)
+    for note in () if fixes is None else fixes.notes:
         logging.getLogger(__name__).log(NOTE, "%s", note)
     out = args.out or (args.path / "earth" if args.path.is_dir() else args.path.with_name(f"{args.path.name}.earth"))
     with one_blas_thread(), atomic_folder(out, replace=True, marker=FACTS) as folder:
         facts = {"out": str(out), "of": str(args.path), "gnss": str(args.gnss)}
-        facts |= place_on_earth(of, fixes, lever_arm_m, args.time_offset, folder)
+        if fixes is None:
+            facts |= place_by_map(of, args.path, args.gnss, folder)
+        else:
+            facts |= place_on_earth(of, fixes, lever_arm_m, args.time_offset, folder)
         (folder / FACTS).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
+    if fixes is not None and not args.path.is_dir():
+        keep_in_map(args.path, facts)
     return print_result(facts, _rows(facts), as_json=args.json)
 
 
@@ -76,14 +82,19 @@ def _rows(f: dict[str, Any]) -> list[tuple[str, str]]:
     """Return where it is as table rows."""
     origin = f["origin"]
     doubtful = "; drive farther, with a turn" if f["heading_sigma_deg"] > 5 else ""
-    return [
+    rows = [
         ("folder", f["out"]),
         ("origin", f"{origin['latitude_deg']:.7f}, {origin['longitude_deg']:.7f}, {origin['height_m']:.2f} m (WGS84)"),
+        ("heading", f"{f['heading_deg']:+.2f} ± {f['heading_sigma_deg']:.2f} deg from east to the map's x{doubtful}"),
+        ("UTM", f["crs"]),
+    ]
+    if "positions" not in f:  # by the map that the run is in
+        return rows
+    return [
+        *rows,
         ("GNSS", f"{f['positions_used']} of {f['positions_inside']} positions used, {f['heights_used']} heights; "
                  f"residuals {f['residual_median_m']:.2f} m (median), {f['residual_90_m']:.2f} m (90 %)"),
-        ("heading", f"{f['heading_deg']:+.2f} ± {f['heading_sigma_deg']:.2f} deg from east to the map's x{doubtful}"),
         ("scale", f"{100 * (f['scale'] - 1):+.2f} ± {100 * f['scale_sigma']:.2f} % by which the path was too short"),
         ("path", f"known to {f['sigma_horizontal_m']:.2f} m, {f['sigma_up_m']:.2f} m in height; "
                  f"{f['bent_rms_m']:.2f} m from the map moved as a whole"),
-        ("UTM", f["crs"]),
     ]  # fmt: skip

@@ -90,6 +90,9 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         ("keyframes", f"{facts['keyframes']}, within {extent} m"),
         ("loops", f"{facts['loops']}, and {facts['loops_rejected']} that contradict the others"),
     ]
+    if facts["earth"] is not None:
+        latitude, longitude, height = facts["earth"]["origin"]
+        rows.append(("earth", f"at {latitude:.7f}, {longitude:.7f}, {height:.2f} m (WGS84)"))
     for number, session in enumerate(facts["sessions"]):
         joined = "" if session["joined"] else "; not joined to the first session"
         path = f"{session['keyframes']} keyframes, path {session['path_m']:.1f} m"

@@ -74,11 +74,17 @@ class Georeference:
     inside: BoolArray  # (N,) positions within the trajectory's time
     residuals: FloatArray  # (N, 3) position minus antenna, m; NaN outside
 
-    @property
-    def heading_sigma_deg(self) -> float:
-        """Standard deviation of the heading of the map."""
-        R = self.T_enu_map[:3, :3]
-        return float(np.degrees(np.sqrt((R @ self.covariance[3:, 3:] @ R.T)[2, 2])))
+
+def heading_deg(T_enu_map: FloatArray, covariance: FloatArray) -> tuple[float, float]:
+    """Return the heading of a map's x axis from east, and its standard deviation.
+
+    Args:
+        T_enu_map: (4, 4).
+        covariance: (6, 6) of xi in T_enu_map exp(xi).
+    """
+    R = T_enu_map[:3, :3]
+    heading, sigma = np.arctan2(R[1, 0], R[0, 0]), np.sqrt((R @ covariance[3:, 3:] @ R.T)[2, 2])
+    return float(np.degrees(heading)), float(np.degrees(sigma))
 
 
 def georeference(path: Path, fixes: GnssFixes, lever_arm_m: FloatArray, time_offset_ns: int = 0) -> Georeference:

@@ -30,7 +30,7 @@ def describe_map(path: Path) -> dict[str, Any]:
     """
     store = MapStore(path, read_only=True)
     with contextlib.closing(store):
-        sessions, keyframes, loops = store.sessions(), store.keyframes(), store.loops()
+        sessions, keyframes, loops, earth = store.sessions(), store.keyframes(), store.loops(), store.earth()
         home = sessions[0].part if sessions else 0
         own = [[k for k in keyframes if k.session == n] for n in range(len(sessions))]
         positions = np.array([k.T_map_cam[:3, 3] for k in keyframes if sessions[k.session].part == home])
@@ -42,6 +42,7 @@ def describe_map(path: Path) -> dict[str, Any]:
             "loops": sum(o.kept for o in loops),
             "loops_rejected": sum(not o.kept for o in loops),
             "extent_m": np.ptp(positions, axis=0).tolist() if len(positions) else [0.0, 0.0, 0.0],
+            "earth": None if earth is None else {"origin": earth.origin, "T_enu_map": earth.T_enu_map.tolist()},
             "sessions": [
                 {
                     "source": session.source,
@@ -217,6 +218,9 @@ def _copy_rows(source: MapStore, store: MapStore, kept: BoolArray) -> None:
     parts = [sessions[n].part for n in owners]
     for n in owners:
         store.add_session(replace(sessions[n], part=parts.index(sessions[n].part)))
+    earth = source.earth()
+    if earth is not None and parts[0] == sessions[0].part:  # the frame is the same
+        store.set_earth(earth)
     number = (np.cumsum(kept) - 1).tolist()
     motions = {second: motion for _, second, motion in source.odometry()}
     since: RelativePose | None = None  # the session's last keyframe that is kept

@@ -39,6 +39,7 @@ _SINCE = {
     "field": 4,
     "field_covariance": 4,
     "places": 5,
+    "earth": 5,
 }  # version that brought a column or a table; before 2 all were pinhole stereo pairs
 _BEFORE = {"projection": "'pinhole'", "kind": "'stereo'", "crc32": "0"}  # what rows of older versions get; else NULL
 _KEYS = {
@@ -48,6 +49,7 @@ _KEYS = {
     "odometry": "second",
     "loops": "id",
     "places": "id",
+    "earth": "id",
 }
 _TELLING_FEATURES = 20
 _ROTATION_TOLERANCE = 1e-3  # of R R^T
@@ -70,8 +72,17 @@ CREATE TABLE loops (id INTEGER PRIMARY KEY, first INTEGER NOT NULL, second INTEG
     covariance BLOB NOT NULL, inliers INTEGER NOT NULL, kept INTEGER NOT NULL, crc32 INTEGER NOT NULL);
 CREATE TABLE places (id INTEGER PRIMARY KEY, begins BLOB NOT NULL, owners BLOB NOT NULL, points BLOB NOT NULL,
     stereo BLOB NOT NULL, crc32 INTEGER NOT NULL);
+CREATE TABLE earth (id INTEGER PRIMARY KEY, latitude_deg REAL NOT NULL, longitude_deg REAL NOT NULL,
+    height_m REAL NOT NULL, T_enu_map BLOB NOT NULL, covariance BLOB NOT NULL, crc32 INTEGER NOT NULL);
 """
-_SHAPES = {"T_map_cam": (4, 4), "T_odom_cam": (4, 4), "T_i_j": (4, 4), "drift": (6, 6), "covariance": (6, 6)}
+_SHAPES = {
+    "T_map_cam": (4, 4),
+    "T_odom_cam": (4, 4),
+    "T_i_j": (4, 4),
+    "T_enu_map": (4, 4),
+    "drift": (6, 6),
+    "covariance": (6, 6),
+}
 
 
 _Row = TypeVar("_Row")
@@ -113,6 +124,15 @@ class PlacesRow:
 
 
 @dataclass(frozen=True, slots=True)
+class EarthRow:
+    """Where a map is on the earth, as GNSS said when it was last asked."""
+
+    origin: tuple[float, float, float]  # WGS84: latitude and longitude in degrees, height in metres
+    T_enu_map: FloatArray  # (4, 4) to east, north, up at the origin, of the first session's part
+    covariance: FloatArray  # (6, 6) of xi in T_enu_map exp(xi)
+
+
+@dataclass(frozen=True, slots=True)
 class LoopRow:
     """A place seen again."""
 
@@ -121,6 +141,15 @@ class LoopRow:
     pose: RelativePose  # of the second camera in the first
     inliers: int
     kept: bool  # False: it contradicts the others
+
+
+def is_map(path: Path) -> bool:
+    """Whether a file is a map of any version: by its header."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        header = file.read(72)
+    return header.startswith(b"SQLite format 3\0") and header[68:] == APPLICATION_ID.to_bytes(4, "big")
 
 
 def check_path(path: Path) -> None:
@@ -348,6 +377,12 @@ class MapStore:
         words = row.words.begins.astype("<u4").tobytes(), row.words.owners.tobytes()
         self._insert("places", (self._count("places"), *words, _blob(row.points), row.stereo.astype("<i8").tobytes()))
 
+    def set_earth(self, row: EarthRow) -> None:
+        """Say where the map is on the earth."""
+        with self._changes():
+            self._db.execute("DELETE FROM earth")
+        self._insert("earth", (0, *row.origin, _blob(row.T_enu_map), _blob(row.covariance)))
+
     def set_poses(self, T_map_cam: Mapping[int, FloatArray]) -> None:
         """Replace poses (4, 4) of keyframes."""
         self._set("keyframes", "T_map_cam", {k: _blob(T) for k, T in T_map_cam.items()})
@@ -377,7 +412,9 @@ class MapStore:
         """Forget what was added after there were so many."""
         with self._changes():
             for table, key in _KEYS.items():
-                count = {"sessions": sessions, "loops": loops, "places": keyframes // SEGMENT}.get(table, keyframes)
+                count = {"sessions": sessions, "loops": loops, "places": keyframes // SEGMENT, "earth": 1}.get(
+                    table, keyframes
+                )
                 self._db.execute(f"DELETE FROM {table} WHERE {key} >= ?", (count,))
 
     def _insert(self, table: str, values: tuple[Any, ...]) -> None:
@@ -454,6 +491,15 @@ class MapStore:
             )
 
         return self._read("loops", made)
+
+    def earth(self) -> EarthRow | None:
+        """Return where the map is on the earth; None: nothing said so."""
+
+        def made(_: int, latitude: float, longitude: float, height: float, T: FloatArray, C: FloatArray) -> EarthRow:
+            return EarthRow((_number(latitude), _number(longitude), _number(height)), T, C)
+
+        rows = self._read("earth", made) if self.version >= _SINCE["earth"] else []
+        return rows[0] if rows else None
 
     def places(self) -> list[PlacesRow]:
         """Return what finds keyframes again, of the first full segments; files before version 5 have none."""

@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from vio.earth.alignment import Georeference, Path, georeference
+from vio.earth.alignment import Georeference, Path, georeference, heading_deg
 from vio.earth.exports import write_geojson, write_kml, write_points_geojson, write_utm
+from vio.earth.geodesy import LocalFrame
 from vio.earth.gnss import GnssFixes
 from vio.errors import DataError
 from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.upright import up_in, up_of
-from vio.mapping.map_store import MapStore
-from vio.records import Trajectory
+from vio.mapping.map_store import EarthRow, MapStore
+from vio.records import BoolArray, Trajectory
 from vio.runs.finished import point_positions
 from vio.runs.folder import read_metrics
 from vio.runs.mapped import read_loops, read_trajectories
@@ -111,10 +112,56 @@ def place_on_earth(
         EstimationError: the positions do not determine its place.
     """
     found = georeference(of.path, fixes, lever_arm_m, round(1e9 * time_offset_s))
-    T = found.T_enu_body
+    epsg = _write(folder, of, found.frame, found.T_enu_body, found.scale, fixes.geodetic, found.used)
+    return _facts(of, fixes, found, epsg)
+
+
+def place_by_map(of: Placed, run: FilePath, file: FilePath, folder: FilePath) -> dict[str, Any]:
+    """Place a run on the earth where the map is that it was localised in; as `place_on_earth`.
+
+    Raises:
+        DataError: the map is nowhere on the earth, or the run is not in its frame.
+    """
+    store = MapStore(file, read_only=True)
+    try:
+        earth = store.earth()
+    finally:
+        store.close()
+    if earth is None:
+        raise DataError(f"{file}: nothing says where it is on the earth; vio georeference {file} GNSS does")
+    of_map = read_metrics(run)[0].get("map") if run.is_dir() else None
+    if not isinstance(of_map, dict) or not of_map.get("joined"):
+        raise DataError(
+            f"{run}: is no run that found its place in a map; vio localise RECORDING --map {file} makes one"
+        )
+    frame = LocalFrame(np.array(earth.origin))
+    none = np.zeros((0, 3)), np.zeros(0, dtype=np.bool_)
+    epsg = _write(folder, of, frame, earth.T_enu_map @ of.path.T_map_body, 1.0, *none)
+    return _where(frame, earth.T_enu_map, earth.covariance) | {"crs": epsg}
+
+
+def keep_in_map(file: FilePath, facts: dict[str, Any]) -> None:
+    """Write into a map where it is on the earth, as `place_on_earth` found it.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    origin = facts["origin"]
+    where = origin["latitude_deg"], origin["longitude_deg"], origin["height_m"]
+    store = MapStore(file)
+    try:
+        store.set_earth(EarthRow(where, np.array(facts["T_enu_map"]), np.array(facts["covariance"])))
+    finally:
+        store.close()
+
+
+def _write(
+    folder: FilePath, of: Placed, frame: LocalFrame, T: FloatArray, scale: float, fixes: FloatArray, used: BoolArray
+) -> str:
+    """Write poses (K, 4, 4) in east, north, up and landmarks as files; return the EPSG code of UTM."""
     write_tum(folder / "trajectory_enu.tum", replace(of.trajectory, T_world_body=T))
-    track = found.frame.geodetic(T[:, :3, 3])
-    write_geojson(folder / "trajectory.geojson", of.name, track, fixes.geodetic, found.used)
+    track = frame.geodetic(T[:, :3, 3])
+    write_geojson(folder / "trajectory.geojson", of.name, track, fixes, used)
     write_kml(folder / "trajectory.kml", of.name, track)
     epsg = write_utm(folder / "trajectory_utm.csv", track, of.path.times_ns)
     if len(of.points):
@@ -122,27 +169,32 @@ def place_on_earth(
         T_map = of.path.T_map_body
         _, nearest = cKDTree(T_map[:, :3, 3]).query(of.points)
         before, after = se3_inverse(T_map[nearest]), T[nearest]
-        p = found.scale * (np.einsum("nij,nj->ni", before[:, :3, :3], of.points) + before[:, :3, 3])
-        landmarks = found.frame.geodetic(np.einsum("nij,nj->ni", after[:, :3, :3], p) + after[:, :3, 3])
+        p = scale * (np.einsum("nij,nj->ni", before[:, :3, :3], of.points) + before[:, :3, 3])
+        landmarks = frame.geodetic(np.einsum("nij,nj->ni", after[:, :3, :3], p) + after[:, :3, 3])
         write_points_geojson(folder / "landmarks.geojson", of.name, landmarks)
         write_utm(folder / "landmarks_utm.csv", landmarks)
-    return _facts(of, fixes, found, epsg)
+    return epsg
+
+
+def _where(frame: LocalFrame, T_enu_map: FloatArray, covariance: FloatArray) -> dict[str, Any]:
+    heading, sigma = heading_deg(T_enu_map, covariance)
+    latitude, longitude, height = frame.origin.tolist()
+    return {
+        "origin": {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height, "datum": "WGS84"},
+        "T_enu_map": T_enu_map.tolist(),
+        "covariance": covariance.tolist(),
+        "heading_deg": heading,
+        "heading_sigma_deg": sigma,
+    }
 
 
 def _facts(of: Placed, fixes: GnssFixes, found: Georeference, epsg: str) -> dict[str, Any]:
     r, used = found.residuals, found.used
     sigma = np.sqrt(np.diagonal(found.position_covariance, axis1=1, axis2=2))
-    heading = float(np.degrees(np.arctan2(found.T_enu_map[1, 0], found.T_enu_map[0, 0])))
     rigid = found.T_enu_map @ of.path.T_map_body
     bent = np.linalg.norm(rigid[:, :3, 3] - found.T_enu_body[:, :3, 3], axis=1)
     horizontal = np.linalg.norm(r[used, :2], axis=1)
-    return {
-        "origin": {"latitude_deg": found.frame.origin[0], "longitude_deg": found.frame.origin[1]}
-        | {"height_m": found.frame.origin[2], "datum": "WGS84"},
-        "T_enu_map": found.T_enu_map.tolist(),
-        "covariance": found.covariance.tolist(),
-        "heading_deg": heading,
-        "heading_sigma_deg": found.heading_sigma_deg,
+    return _where(found.frame, found.T_enu_map, found.covariance) | {
         "scale": found.scale,
         "scale_sigma": found.scale_sigma,
         "positions": len(fixes),
