@@ -12,7 +12,8 @@ _MEDIAN_TO_SIGMA = 1.4826  # standard deviation over median absolute value of a 
 
 def median(values: npt.ArrayLike) -> float:
     """Return the median as NumPy does, to the bit (of nothing: NaN), but for few numbers in a sixth of the time."""
-    ordered = np.sort(np.asarray(values, dtype=np.float64), axis=None)  # NaN come last
+    ordered = np.array(values, dtype=np.float64).ravel()
+    ordered.sort()  # NaN come last
     middle = len(ordered) // 2
     if not len(ordered) or ordered[-1] != ordered[-1]:
         return float("nan")
