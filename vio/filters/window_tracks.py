@@ -123,7 +123,10 @@ class WindowTracks:
         self.table.drop_views(tracks.rows, wrong)
         kept = ~wrong
         at = Residuals(
-            tracks.at.r * kept[..., None], tracks.at.z_D_p * kept[..., None, None], np.ones(len(wrong), dtype=np.bool_)
+            tracks.at.r * kept[..., None],
+            tracks.at.z_D_p * kept[..., None, None],
+            np.ones(len(wrong), dtype=np.bool_),
+            tracks.at.weight,
         )
         enough = np.any(at.z_D_p[:, :, 1, :], axis=2).sum(axis=1) >= 2
         T = tracks.T_cam0_world
@@ -164,7 +167,7 @@ class WindowTracks:
         information = track_information(self._camera, T_cam0_world, at, p_world, weight)
         columns = None
         # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
-        z = z - at.r
+        z = at.predicted(z)
         if field is not None:
             columns = stereo_columns(at, field.jacobian(z), information.q.p_D_q, weight)
         return LinearTracks(T_cam0_world, rows, p_world, at, z, weight, information, columns, field)
@@ -177,7 +180,7 @@ class WindowTracks:
         info, columns = tracks.information.take(chosen), tracks.stereo
         if columns is None or tracks.field is None or tracks.field.terms[0] > 0:
             none = StereoCorrection(self._camera, np.zeros(ROW_TERMS), np.zeros(TERMS), np.arange(FIELD_TERMS))
-            at = Residuals(tracks.at.r[chosen], tracks.at.z_D_p[chosen], tracks.at.ahead[chosen])
+            at = tracks.at.take(chosen)
             columns = stereo_columns(at, none.jacobian(tracks.z[chosen]), info.q.p_D_q, tracks.weight[chosen])
         else:
             columns = columns.take(chosen)
