@@ -27,6 +27,7 @@ _GRAY_SIGMA = 4.0  # standard deviation between the two images of one patch, aft
 _ROW_WEIGHT = (_GRAY_SIGMA / _ROW_SIGMA_PX) ** 2
 _MAX_MOVE_PX = 2.5
 _DONE_PX = 0.05  # step at which a template has converged; the remaining error is a small fraction of it
+_LEAST_SCORE, _MOST_SCORE = 0.1, 0.99999  # that a standard deviation is computed with
 _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
 _DAMPING = 1e-6  # relative to the diagonal: limits the step in weakly textured directions
@@ -46,12 +47,15 @@ class Templates:
     energy: npt.NDArray[np.float32]  # (N,) sum of squares of the patch
     inverse: npt.NDArray[np.float32]  # (N, 8, 8) of the normal matrix
     row_inverse: npt.NDArray[np.float32]  # (N, 6, 6) the same, with the expected row as a prior
+    sigma: npt.NDArray[
+        np.float32
+    ]  # (N, 3) px, of u, v, and of u along a row, by the last alignments: (F1); 0: none yet
 
 
 def empty_templates(count: int, radius: int) -> Templates:
     """Allocate `count` empty templates of a radius."""
     size = (2 * radius + 1) ** 2
-    shapes = ((size,), (2, size), (), (_PARAMETERS, _PARAMETERS), (_ROW_PARAMETERS, _ROW_PARAMETERS))
+    shapes = ((size,), (2, size), (), (_PARAMETERS, _PARAMETERS), (_ROW_PARAMETERS, _ROW_PARAMETERS), (3,))
     return Templates(*(np.zeros((count, *shape), np.float32) for shape in shapes))
 
 
@@ -251,7 +255,8 @@ def align(
 
     Returns:
         The refined warps (N, 2, 3), and the normalised correlation (N,) just before the last step; -1 where the
-        template's centre comes too close to the image border for the patch to fit.
+        template's centre comes too close to the image border for the patch to fit. `store.sigma` holds the standard
+        deviations then, equation (F1).
     """
     radius = int(store.patch.shape[1] ** 0.5) // 2
     warp, score = warp.copy(), np.full(len(warp), -1.0)
@@ -259,7 +264,7 @@ def align(
     expected = np.zeros(len(warp)) if rows is None else np.ascontiguousarray(rows)
     columns = store.patch, store.gradient, store.energy, inverse, offsets(radius)
     image = np.ascontiguousarray(image)
-    _refine(*columns, slots, image, _pairs(image), warp, expected, row_weight, iterations, score)
+    _refine(*columns, slots, image, _pairs(image), warp, expected, row_weight, iterations, score, store.sigma)
     return warp, np.where(inside(image, warp[:, :, 2], radius + 1), score, -1.0)
 
 
@@ -278,8 +283,9 @@ def _refine(
     row_weight: float,
     iterations: int,
     score: FloatArray,
+    sigma: Pixels,
 ) -> None:
-    """Refine the warps (N, 2, 3) in place, and write the correlations (N,) into `score`."""
+    """Refine the warps (N, 2, 3) in place; write the correlations (N,) into `score` and rows (N,) of `sigma` (M, 3)."""
     size, parameters = patch.shape[1], inverse.shape[1]
     at, part, view = np.empty(size, np.int32), np.empty((2, size), np.float32), np.empty(size, np.float32)
     moments, fit = np.empty(_PARAMETERS, np.float32), np.empty(_PARAMETERS)
@@ -304,6 +310,12 @@ def _refine(
             _undo(warp[n], fit)
             if max(abs(fit[0]), abs(fit[1])) <= _DONE_PX:
                 break
+        share = 1.0 / min(max(score[n], _LEAST_SCORE), _MOST_SCORE) ** 2 - 1.0
+        gray2 = share * energy[slot] / size
+        if row_weight > 0.0:
+            sigma[slot, 2] = np.sqrt(gray2 * inverse[slot, 0, 0])
+        else:
+            sigma[slot, 0], sigma[slot, 1] = np.sqrt(gray2 * inverse[slot, 0, 0]), np.sqrt(gray2 * inverse[slot, 1, 1])
 
 
 @compiled_sums

@@ -11,7 +11,7 @@ import numpy as np
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, FrontendOutput, Image, IntArray, Observations, StereoFrame
+from vio.records import BoolArray, FrontendOutput, Image, IntArray, Observations, SigmaArray, StereoFrame
 
 
 @dataclass(slots=True)
@@ -132,6 +132,7 @@ def make_output(
     warnings: tuple[str, ...] = (),
     *,
     shown: BoolArray | None = None,
+    sigma: SigmaArray | None = None,
 ) -> FrontendOutput:
     """Return the output of a front end for a frame.
 
@@ -142,13 +143,15 @@ def make_output(
         watch: the times of the stages.
         warnings: what the frame says of the images.
         shown: mask (N,) of the features to output; None: all.
+        sigma: (N, 3) as in `Observations`.
     """
     rows = np.arange(len(features.ids)) if shown is None else shown.nonzero()[0]
     z = np.empty((len(rows), 4))
     z[:, :2], z[:, 2:] = features.left[rows], features.right[rows]
     has_right = features.has_right[rows]
+    stale, of_rows = np.zeros(len(rows), dtype=np.bool_), None if sigma is None else sigma[rows]
     return FrontendOutput(
-        Observations(frame.index, frame.time_ns, features.ids[rows], z, has_right, np.zeros(len(rows), dtype=np.bool_)),
+        Observations(frame.index, frame.time_ns, features.ids[rows], z, has_right, stale, of_rows),
         tracked=tracked,
         matched=int(has_right.sum()),
         detected=len(rows) - tracked,

@@ -109,7 +109,8 @@ class KltFrontend:
         tracks = self._promote(tracks)
         self._store(images, tracks, motion)
         watch.lap("check")
-        return make_output(frame, tracks, tracked, watch, self._take_lines(), shown=tracks.shown)
+        sigma = self._bank.sigma(tracks.slot, depth_image=kind == "rgbd")
+        return make_output(frame, tracks, tracked, watch, self._take_lines(), shown=tracks.shown, sigma=sigma)
 
     @property
     def _needs_right(self) -> bool:

@@ -10,7 +10,7 @@ from vio.frontend.align import cut_patches, empty_templates, replace_templates, 
 from vio.frontend.columns import joined
 from vio.frontend.patches import ImageLevels
 from vio.geometry.lie import FloatArray
-from vio.records import BoolArray, Image, IntArray
+from vio.records import BoolArray, Image, IntArray, SigmaArray
 
 ANCHOR_RADIUS_PX = 7  # half side of the anchor patch that a feature is aligned with
 INLIER_PX = 1.0  # largest reprojection error of a static feature under the consensus motion
@@ -88,12 +88,20 @@ class AnchorBank:
             self._grow(len(self._taken) + len(centres))
             free = np.flatnonzero(~self._taken)[: len(centres)]
         self._taken[free] = True
+        self.store.sigma[free] = 0.0
         self.replace(free, image, centres)
         return free
 
     def replace(self, slots: IntArray, image: Image, centres: FloatArray) -> None:
         """Replace the anchors in slots (N,) by the patches around pixels (N, 2) of an image."""
         replace_templates(self.store, slots, cut_patches(image, centres, self._radius_px))
+
+    def sigma(self, slots: IntArray, *, depth_image: bool) -> SigmaArray:
+        """Standard deviations (N, 3) of features in slots (N,) as in `Observations`; of a depth image that of `ul`."""
+        out = self.store.sigma[slots]
+        if depth_image:
+            out[:, 2] = out[:, 0]
+        return out
 
     def keep_only(self, slots: IntArray) -> None:
         """Free all slots but these."""

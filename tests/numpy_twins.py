@@ -54,6 +54,7 @@ def prepared(wide: FloatArray) -> Templates:
     on_row[:, 1, 1] += ROW_WEIGHT
     energy = np.sum(centred**2, axis=1)
     columns = (centred, np.stack([gu, gv], axis=1), energy, np.linalg.inv(normal), np.linalg.inv(on_row))
+    columns += (np.zeros((len(wide), 3)),)
     return Templates(*columns)  # type: ignore[arg-type]  # float64
 
 
@@ -164,7 +165,7 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
     r = (np.where(usable > 0, views.z, 0.0) - project(camera, safe)) * usable
     J = (z_D_p_cam(camera, safe) * usable[..., None]) @ R
     ahead: BoolArray = np.all(ok | ~seen, axis=1)
-    return Residuals(r, J, ahead)
+    return Residuals(r, J, ahead, views.weight)
 
 
 def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, seen: BoolArray) -> InverseDepth:
@@ -320,7 +321,7 @@ def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: Floa
     """Collect the normal equations of `r = J (B xi_i + dp) + H s`."""
     F, N, _, S = H.shape
     J = at.z_D_p
-    H = H * np.any(J, axis=3)[..., None]
+    H = H * (np.any(J, axis=3) * at.weight)[..., None]
     WH = H * weight[..., None, None]
     by_point = np.asarray(sum(J[:, :, a, :, None] * WH[:, :, a, None, :] for a in range(3)))
     by_q = np.swapaxes(p_D_q, 1, 2) @ np.swapaxes(by_point, 1, 2).reshape(F, 3, N * S)

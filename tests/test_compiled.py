@@ -213,6 +213,7 @@ def _scene(camera: StereoCamera = CAMERA) -> tuple[FloatArray, FloatArray, Views
     seen[:, 1] = True
     weight[seen] = [1.0, 1.0, 1.0, 0.0]
     weight[rng.uniform(size=(40, 5)) < 0.3, 2] = 0.0
+    weight *= rng.uniform(0.3, 3.0, weight.shape)
     return T, p, Views(z, weight)
 
 

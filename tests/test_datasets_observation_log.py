@@ -53,11 +53,10 @@ def logs(draw: st.DrawFn) -> tuple[Recording, list[Observations], list[MotionSam
         ids = draw(st.lists(st.integers(0, 2**62), min_size=n, max_size=n, unique=True))
         z = draw(st.lists(finite, min_size=4 * n, max_size=4 * n))
         flags = np.array(draw(st.lists(st.booleans(), min_size=2 * n, max_size=2 * n)), dtype=np.bool_)
-        observed.append(
-            Observations(
-                k, int(times[k]), np.array(ids, dtype=np.int64), np.array(z).reshape(n, 4), flags[:n], flags[n:]
-            )
-        )
+        sigma = draw(st.none() | st.lists(st.floats(0.125, 8.0, width=32), min_size=3 * n, max_size=3 * n))
+        sigmas = None if sigma is None else np.array(sigma, dtype=np.float32).reshape(n, 3)
+        columns = np.array(ids, dtype=np.int64), np.array(z).reshape(n, 4), flags[:n], flags[n:], sigmas
+        observed.append(Observations(k, int(times[k]), *columns))
     ticks = sorted(draw(st.lists(st.integers(int(times[0]), int(times[-1])), max_size=5)))
     maker = st.sampled_from([ImuSample, VelocitySample])
     samples = [draw(maker)(t, draw(triple), draw(triple)) for t in ticks]
@@ -124,6 +123,8 @@ def test_round_trip_keeps_every_bit(
         assert (found.frame_index, found.time_ns) == (expected.frame_index, expected.time_ns)
         for field in ("ids", "z", "has_right", "stale"):
             assert _same_bits(getattr(found, field), getattr(expected, field))
+        given = np.zeros((len(expected), 3), np.float32) if expected.sigma is None else expected.sigma
+        assert _same_bits(np.zeros_like(given) if found.sigma is None else found.sigma, given)
     replayed = [event for event in events if not isinstance(event, StereoFrame)]
     assert [type(sample) for sample in replayed] == [type(sample) for sample in samples]
     for a, b in zip(replayed, samples, strict=True):
@@ -215,6 +216,7 @@ def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
         ({"motion_values": np.zeros((1, 6))}, "0 motion times"),
         ({"image_size": [640]}, "the camera is incomplete"),
         ({"residual_px": -0.5}, "residual_px is -0.5, no number of pixels"),
+        ({"sigma": np.ones((1, 2))}, "but sigma is"),
         ({"run_motion": "wheels"}, "run_motion is 'wheels', none of imu, velocity, none"),
         ({"landmark_ids": [1]}, "landmark_ids lacks landmark_p_world"),
         ({"reference_T_world_body": np.zeros((2, 3, 4)), "reference_body": "imu"}, "reference poses"),

@@ -52,6 +52,28 @@ PLAIN = picture(np.eye(3))
 POINTS = np.random.default_rng(5).uniform([40, 40], [260, 160], (60, 2))
 
 
+def test_stated_standard_deviations_follow_the_noise_of_the_patches() -> None:
+    """They are short of the errors by a factor that is the same whatever the noise is (F1).
+
+    Noise of the template is in its gradients too, and neighbouring pixels of an interpolated image share theirs.
+    """
+    rng, shift, centres = np.random.default_rng(8), np.array([0.3, -0.2]), rounded(POINTS)
+    there, slots = picture(np.array([[1.0, 0.0, -shift[0]], [0.0, 1.0, -shift[1]]])), np.arange(len(POINTS))
+    median_px, ratio = [], []
+    for gray in (2.0, 6.0):
+        noisy = [np.clip(np.rint(i + rng.normal(0, gray, i.shape)), 0, 255).astype(np.uint8) for i in (PLAIN, there)]
+        store = templates(cut_patches(noisy[0], centres, 7))
+        left, _ = align(store, slots, noisy[1], shift_warps(centres), 8)
+        right, _ = align(store, slots, noisy[1], shift_warps(centres), 8, centres[:, 1] + shift[1])
+        error = np.concatenate([left[:, :, 2], right[:, :1, 2]], axis=1) - (centres + shift)[:, [0, 1, 0]]
+        ratio.append(np.sqrt(np.mean((error / store.sigma) ** 2, axis=0)))
+        median_px.append(np.median(store.sigma, axis=0))
+    assert (np.array(ratio) > 1.0).all()
+    assert (np.array(ratio) < 2.0).all()
+    np.testing.assert_allclose(ratio[1], ratio[0], rtol=0.25)
+    np.testing.assert_allclose(median_px[1] / median_px[0], 3.0, rtol=0.2)
+
+
 def test_warped_patches_equal_a_loop() -> None:
     """Coordinates are rounded to 1/32 pixel, so the loop uses rounded ones."""
     warp = shift_warps(POINTS[:5])

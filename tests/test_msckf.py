@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.numerics import numeric_jacobian
-from vio.errors import ConfigError, DivergedError, EstimationError
+from vio.errors import ConfigError, DataError, DivergedError, EstimationError
 from vio.evaluation.trajectories import nees, nees_bounds
 from vio.filters import imu_start
 from vio.filters.msckf import Msckf
@@ -26,7 +26,7 @@ from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.prior import posterior
 from vio.filters.restart import restarted
 from vio.filters.settings import MsckfSettings
-from vio.filters.tracks import TrackTable, rows_of
+from vio.filters.tracks import TrackTable, precision, rows_of
 from vio.filters.window import Window
 from vio.geometry.lie import (
     FloatArray,
@@ -397,6 +397,17 @@ def test_track_table_keeps_rows_apart_and_grows() -> None:
     np.testing.assert_array_equal(table.views(rows, 1).z[150, 0], z[450] + 1)
     table.shift()
     assert len(table.rows()) == 0
+
+
+def test_precisions_are_relative_to_the_frames_median_and_bounded() -> None:
+    seen = observations(0, 0, np.arange(5), np.zeros((5, 4)), has_right=[True, False, True, True, True])
+    sigma = np.float32([[2, 2, 4], [2, 1, 99], [2, 0, 2], [0.01, 2, 2], [2, 2, 2e9]])
+    weight = precision(replace(seen, sigma=sigma))
+    expected = [[1, 1, 0.5, 0], [1, 2, 0, 0], [1, 1, 1, 0], [3, 1, 1, 0], [1, 1, 0.1, 0]]
+    np.testing.assert_allclose(weight, expected, rtol=1e-6)
+    np.testing.assert_array_equal(precision(seen), precision(replace(seen, sigma=np.ones((5, 3), np.float32))))
+    with pytest.raises(DataError, match="sigma"):
+        replace(seen, sigma=np.ones((5, 3)))
 
 
 def test_rows_of_a_frame_are_found_by_ids_in_any_order() -> None:

@@ -61,13 +61,13 @@ def test_a_view_is_believed_less_the_worse_it_fits_beside_the_others_of_its_clon
     r[:, 1, 0] = 10.0  # a pose that is off as a whole
     J = np.ones((5, 2, 4, 3))
     J[1, 0] = 0.0  # not seen
-    weights = robust_weights(Residuals(r, J, np.ones(5, dtype=np.bool_)), sigma2=0.25)
+    weights = robust_weights(Residuals(r, J, np.ones(5, dtype=np.bool_), np.ones(r.shape)), sigma2=0.25)
     scale2 = 1.0 / 2.37  # the median of 0, 1, 1, 144 over that of chi-square with 3 degrees of freedom
     expected = 1 / (1 + np.array([0.0, 1.0, 1.0, 144.0]) / (4 * scale2 * CAUCHY**2))
     np.testing.assert_allclose(weights[[0, 2, 3, 4], 0], expected)
     assert weights[1, 0] == 0.0
     np.testing.assert_allclose(weights[:, 1], 1 / (1 + 2.37 / (4 * CAUCHY**2)))
-    quiet = robust_weights(Residuals(r * 1e-3, J, np.ones(5, dtype=np.bool_)), sigma2=0.25)
+    quiet = robust_weights(Residuals(r * 1e-3, J, np.ones(5, dtype=np.bool_), np.ones(r.shape)), sigma2=0.25)
     np.testing.assert_allclose(quiet[4, 0], 1 / (1 + 144e-6 / (4 * 0.25 * CAUCHY**2)))  # never below the noise
 
 

@@ -45,7 +45,7 @@ def test_the_gate_knows_how_many_pixels_were_seen() -> None:
     r = np.zeros((4, 3, 4))
     limits = tracks.variance * np.repeat(chi2.ppf(SETTINGS.gate_probability, [6, 3]), 2)
     r[:, 1, 0] = np.sqrt(limits * [0.999, 1.001, 0.999, 1.001])
-    passed, squares, dof = tracks.gate(Residuals(r, J, np.ones(4, dtype=np.bool_)))
+    passed, squares, dof = tracks.gate(Residuals(r, J, np.ones(4, dtype=np.bool_), np.ones(r.shape)))
     assert passed.tolist() == [True, False, True, False]
     assert dof.tolist() == [6, 6, 3, 3]
     np.testing.assert_allclose(squares, r[:, 1, 0] ** 2 / tracks.variance)
@@ -54,7 +54,9 @@ def test_the_gate_knows_how_many_pixels_were_seen() -> None:
 def test_the_gate_of_a_track_as_long_as_the_table_of_quantiles_or_longer() -> None:
     tracks = WindowTracks(CAMERA, SETTINGS)
     J = np.ones((1, 80, 4, 3))
-    assert tracks.gate(Residuals(np.zeros((1, 80, 4)), J, np.ones(1, dtype=np.bool_)))[2].tolist() == [199]
+    assert tracks.gate(Residuals(np.zeros((1, 80, 4)), J, np.ones(1, np.bool_), np.ones((1, 80, 4))))[2].tolist() == [
+        199
+    ]
 
 
 @pytest.mark.parametrize("moving", [0, 40, 65])
@@ -69,10 +71,10 @@ def test_a_blurred_frame_is_no_frame_of_outliers(moving: int) -> None:
     r = rng.normal(0.0, np.sqrt(3 * tracks.variance * 6 / 9), (80, 3, 4))  # nine pixels, six degrees of freedom
     r[:, :, 3] = 0.0
     r[80 - moving :] += 20.0 * np.sqrt(tracks.variance)
-    passed, _, _ = tracks.gate(Residuals(r, J, np.ones(80, dtype=np.bool_)))
+    passed, _, _ = tracks.gate(Residuals(r, J, np.ones(80, dtype=np.bool_), np.ones(r.shape)))
     assert passed[: 80 - moving].mean() > 0.9
     assert not passed[80 - moving :].any()
-    few = Residuals(r[:10], J[:10], np.ones(10, dtype=np.bool_))
+    few = Residuals(r[:10], J[:10], np.ones(10, dtype=np.bool_), np.ones((10, *r.shape[1:])))
     assert tracks.gate(few)[0].mean() < 0.8  # too few to tell noise from outliers
 
 
@@ -84,7 +86,7 @@ def test_what_moves_slowly_is_no_blur() -> None:
     r = rng.normal(0.0, np.sqrt(tracks.variance * 6 / 9), (80, 3, 4))
     r[:40] += 2.0 * np.sqrt(tracks.variance)
     r[:, :, 3] = 0.0
-    passed, _, _ = tracks.gate(Residuals(r, J, np.ones(80, dtype=np.bool_)))
+    passed, _, _ = tracks.gate(Residuals(r, J, np.ones(80, dtype=np.bool_), np.ones(r.shape)))
     assert passed[40:].mean() > 0.9
     assert passed[:40].mean() < 0.1
 
@@ -211,10 +213,10 @@ def test_images_agree_where_four_fifths_of_the_newest_views_fit() -> None:
     J, r = np.ones((10, 3, 4, 3)), np.zeros((10, 3, 4))
     r[:, 0] = 50.0  # old views are not asked
     r[0, -1, 0] = 50.0
-    assert tracks.agree(Residuals(r, J, np.ones(10, dtype=np.bool_)))
+    assert tracks.agree(Residuals(r, J, np.ones(10, dtype=np.bool_), np.ones(r.shape)))
     r[1, -1, 0] = 50.0
-    assert not tracks.agree(Residuals(r, J, np.ones(10, dtype=np.bool_)))
-    assert not tracks.agree(Residuals(r * 0, J * 0, np.ones(10, dtype=np.bool_)))  # nothing seen
+    assert not tracks.agree(Residuals(r, J, np.ones(10, dtype=np.bool_), np.ones(r.shape)))
+    assert not tracks.agree(Residuals(r * 0, J * 0, np.ones(10, dtype=np.bool_), np.ones(r.shape)))  # nothing seen
 
 
 def test_a_frame_ends_what_it_does_not_show() -> None:

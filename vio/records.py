@@ -6,7 +6,7 @@ everything else float64. Missing is `None` or a mask, never a special number.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -22,6 +22,7 @@ NS_PER_S = 10**9
 Image: TypeAlias = npt.NDArray[np.uint8]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
+SigmaArray: TypeAlias = npt.NDArray[np.float32]  # standard deviations
 BodyFrame: TypeAlias = Literal["imu", "cam0"]
 MotionSource: TypeAlias = Literal["imu", "velocity"]
 RunMotion: TypeAlias = Literal["imu", "velocity", "none"]  # none: images alone
@@ -128,6 +129,7 @@ class Observations:
     z: FloatArray  # (N, 4) rectified pixels [ul vl ur vr]; ur, vr are arbitrary where has_right is False
     has_right: BoolArray  # (N,) False: seen in the left image only
     stale: BoolArray  # (N,) True: the pixels are known to be old (repeated by the source) and must not be trusted
+    sigma: SigmaArray | None = None  # (N, 3) of [ul vl ur], px, relative to one another; 0: not known; None: all alike
 
     def __post_init__(self) -> None:
         """Raise DataError unless types and lengths are those above; the filters check the values."""
@@ -144,6 +146,11 @@ class Observations:
                     f"Observations of frame {self.frame_index}: {name} is {_type_text(value)}, not an array {expected} "
                     f"of {dtype}; vio.records.observations builds them from lists"
                 )
+        sigma = self.sigma
+        if sigma is not None and (sigma.dtype != np.float32 or sigma.shape != (len(self.ids), 3)):
+            raise DataError(
+                f"Observations of frame {self.frame_index}: sigma is {_type_text(sigma)}, not (N, 3) of float32"
+            )
         if not isinstance(self.time_ns, (int, np.integer)):
             raise DataError(f"Observations: time_ns is {_type_text(self.time_ns)}, not whole nanoseconds")
 
@@ -155,7 +162,8 @@ class Observations:
         if index.dtype == np.bool_ and index.all():
             return self
         ids, z, has_right, stale = self.ids[index], self.z[index], self.has_right[index], self.stale[index]
-        return Observations(self.frame_index, self.time_ns, ids, z, has_right, stale)
+        sigma = None if self.sigma is None else self.sigma[index]
+        return Observations(self.frame_index, self.time_ns, ids, z, has_right, stale, sigma)
 
 
 def observations(
@@ -208,6 +216,7 @@ class FeatureTracks:
     z: FloatArray  # (R, 4) rectified pixels [ul vl ur vr]
     has_right: BoolArray  # (R,) as in `Observations`
     stale: BoolArray  # (R,) likewise
+    sigma: SigmaArray | None = None  # (R, 3) likewise
 
     @property
     def frames(self) -> IntArray:
@@ -217,7 +226,9 @@ class FeatureTracks:
     def at(self, frame: int, time_ns: int) -> Observations:
         """The observations of one frame."""
         rows = slice(self.offsets[frame], self.offsets[frame + 1])
-        return Observations(frame, time_ns, self.ids[rows], self.z[rows], self.has_right[rows], self.stale[rows])
+        sigma = None if self.sigma is None else self.sigma[rows]
+        columns = self.ids[rows], self.z[rows], self.has_right[rows], self.stale[rows]
+        return Observations(frame, time_ns, *columns, sigma)
 
 
 def feature_tracks(seen: Mapping[int, Observations], frames: int) -> FeatureTracks:
@@ -232,7 +243,15 @@ def feature_tracks(seen: Mapping[int, Observations], frames: int) -> FeatureTrac
         np.concatenate([np.zeros((0, 4)), *(o.z for o in parts)]),
         np.concatenate([np.zeros(0, dtype=np.bool_), *(o.has_right for o in parts)]),
         np.concatenate([np.zeros(0, dtype=np.bool_), *(o.stale for o in parts)]),
+        joined_sigmas(parts),
     )
+
+
+def joined_sigmas(parts: Sequence[Observations]) -> SigmaArray | None:
+    """The standard deviations (R, 3) of all rows of some frames; None where no frame has any."""
+    if all(o.sigma is None for o in parts):
+        return None
+    return np.concatenate([np.zeros((len(o), 3), np.float32) if o.sigma is None else o.sigma for o in parts])
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,7 @@ from vio.records import (
     Recording,
     RunMotion,
     Trajectory,
+    joined_sigmas,
 )
 from vio.records import observations as frame_observations
 
@@ -66,6 +67,7 @@ _OPTIONAL: dict[str, tuple[str, int]] = {
     "run_motion": ("U", 0),
     "camera_kind": ("U", 0),
     "residual_px": ("f", 0),
+    "sigma": ("f", 2),
     "T_cam0_imu": ("f", 2),
     "reference_T_world_body": ("f", 3),
     "reference_body": ("U", 0),
@@ -106,7 +108,7 @@ def write_observation_log(
     times_ns = np.array([o.time_ns for o in observations], dtype=np.int64)
     if (np.diff(frames) <= 0).any() or not np.array_equal(times_ns, recording.frame_times_ns[frames]):
         raise ValueError("the observations are not in the order of the recording's frames, or have other times")
-    camera = recording.camera
+    camera, sigma = recording.camera, joined_sigmas(observations)
     arrays: dict[str, np.ndarray] = {
         "format": np.array(FORMAT),
         "version": np.array(VERSION, dtype=np.int64),
@@ -127,6 +129,7 @@ def write_observation_log(
         **({} if run_motion is None else {"run_motion": np.array(run_motion)}),
         **({} if camera.kind == "stereo" else {"camera_kind": np.array(camera.kind)}),
         **({"residual_px": np.array(camera.residual_px)} if camera.residual_px else {}),
+        **({} if sigma is None or not sigma.any() else {"sigma": sigma}),
     }
     stream = io.BytesIO()
     np.savez(stream, **arrays)  # type: ignore[arg-type] # the stubs take every keyword for allow_pickle
@@ -218,7 +221,8 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
     arrays = _checked(arrays, path)
     frames, offsets, times_ns = arrays["frame_indices"], arrays["offsets"], arrays["frame_times_ns"]
     dense_offsets = offsets[np.searchsorted(frames, np.arange(len(times_ns) + 1))]
-    tracks = FeatureTracks(dense_offsets, arrays["ids"], arrays["z"], arrays["has_right"], arrays["stale"])
+    sigma = arrays["sigma"].astype(np.float32) if "sigma" in arrays else None
+    tracks = FeatureTracks(dense_offsets, arrays["ids"], arrays["z"], arrays["has_right"], arrays["stale"], sigma)
     motion = MotionSamples[MotionSample](arrays["motion_times_ns"], arrays["motion_values"], arrays["motion_is_imu"])
     kinds: set[MotionSource] = {"imu" if imu else "velocity" for imu in np.unique(motion.is_imu).tolist()}
     recording = Recording(
@@ -308,6 +312,8 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
     residual = arrays.get("residual_px", np.zeros(()))
     if not 0 <= residual < np.inf:
         return f"residual_px is {residual.tolist()!r}, no number of pixels"
+    if "sigma" in arrays and arrays["sigma"].shape != (rows, 3):
+        return f"{rows} ids, but sigma is {shape_text(arrays['sigma'])}"
     poses = arrays.get("reference_T_world_body", np.zeros((0, 4, 4)))
     stamps = [len(arrays[key]) for key in ("reference_times_ns", "reference_frame_indices") if key in arrays]
     if poses.shape[1:] != (4, 4) or any(count != len(poses) for count in stamps):

@@ -19,6 +19,7 @@ from vio.filters.multiview import (
     eliminate_points,
     landmark_residuals,
     relative_stereo_sigma,
+    unweighted,
 )
 from vio.filters.navigation import NO_STEP
 from vio.filters.noise import StepErrors
@@ -36,7 +37,7 @@ from vio.filters.stereo_calibration import (
     landmark_columns,
     stereo_columns,
 )
-from vio.filters.tracks import measured, rows_of
+from vio.filters.tracks import precision, rows_of
 from vio.filters.window import Window
 from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
@@ -121,7 +122,7 @@ class FrameUpdate:
         propagation = self._propagation
         rows, found = rows_of(seen, window.landmark_ids)
         self._keep_landmarks(window, found)
-        pixels = Views(seen.z[rows], measured(seen.has_right[rows]))
+        pixels = Views(seen.z[rows], precision(seen)[rows])
         of_tracks = np.ones(len(seen), dtype=np.bool_)
         of_tracks[rows] = False
         self.tracks.table.add_frame(len(window.clones) - 1, seen.take(of_tracks))
@@ -279,7 +280,7 @@ class FrameUpdate:
                 stereo = stereo + eliminate_points_from_columns(columns, tracks.information, chosen)
         at = self._landmark_residuals(window, pixels) if pixels is not None and len(pixels.z) else None
         if at is not None and pixels is not None and stereo is not None:
-            z = pixels.z - at.r  # as predicted
+            z = unweighted(pixels.z, at.r, at.precision)
             H = self._joint_jacobian(field, z, considered=joint is not None)
             stereo = stereo + landmark_columns(at, H, len(window.clones))
         scaled = None if stereo is None else stereo.scaled(1 / variance)
@@ -329,7 +330,8 @@ class FrameUpdate:
         at = self._landmark_residuals(window, pixels)
         J, field = at.J, self._rig.field(window)
         if field is not None:
-            H = field.jacobian(pixels.z - at.r) * np.any(at.J, axis=2)[..., None]
+            z = unweighted(pixels.z, at.r, at.precision)
+            H = field.jacobian(z) * (at.precision * np.any(at.J, axis=2))[..., None]
             J = np.concatenate([J, H], axis=2)
         nis = leave_one_out_nis(at.r, J, window.landmark_covariance(fitted), at.weight, self.tracks.variance)
         dof = np.maximum(np.any(at.J, axis=2).sum(axis=1), 1)

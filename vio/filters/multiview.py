@@ -37,7 +37,7 @@ class Views:
     """What F tracks showed in N clones."""
 
     z: FloatArray  # (F, N, 4) pixels [ul vl ur vr]; arbitrary where unseen
-    weight: FloatArray  # (F, N, 4) 1 for a pixel coordinate that was measured, 0 else
+    weight: FloatArray  # (F, N, 4) one over a coordinate's relative standard deviation; 0: not measured
 
     def take(self, index: BoolArray) -> Views:
         """Return the tracks of a mask (F,)."""
@@ -46,15 +46,22 @@ class Views:
 
 @dataclass(frozen=True, slots=True)
 class Residuals:
-    """Residuals of tracks at given poses and points, and their Jacobians."""
+    """Residuals of tracks at given poses and points, and their Jacobians, times the weights of the views."""
 
     r: FloatArray  # (F, N, 4) pixels, zero where unseen
     z_D_p: FloatArray  # (F, N, 4, 3) with respect to the point in the world frame, zero where unseen
     ahead: BoolArray  # (F,) the point lies in front of every camera that saw it
+    weight: FloatArray  # (F, N, 4) as in `Views`
 
-    def take(self, index: BoolArray) -> Residuals:
-        """Return the tracks of a mask (F,)."""
-        return self if index.all() else Residuals(self.r[index], self.z_D_p[index], self.ahead[index])
+    def take(self, index: BoolArray | IntArray) -> Residuals:
+        """Return the tracks of a mask (F,) or of rows (K,)."""
+        if index.dtype == np.bool_ and index.all():
+            return self
+        return Residuals(self.r[index], self.z_D_p[index], self.ahead[index], self.weight[index])
+
+    def predicted(self, z: FloatArray) -> FloatArray:
+        """Pixels (F, N, 4) that are expected where z (F, N, 4) were seen."""
+        return unweighted(z, self.r, self.weight)
 
 
 def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views) -> Residuals:
@@ -67,12 +74,17 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
         views: what was seen.
     """
     F, N = len(p_world), len(T_cam0_world)
-    at = Residuals(np.empty((F, N, 4)), np.empty((F, N, 4, 3)), np.empty(F, dtype=np.bool_))
+    at = Residuals(np.empty((F, N, 4)), np.empty((F, N, 4, 3)), np.empty(F, dtype=np.bool_), views.weight)
     least = MIN_DEPTH * camera.baseline_m
     loops.compare_views(
         camera_args(camera), least, T_cam0_world, p_world, views.z, views.weight, at.r, at.z_D_p, at.ahead
     )
     return at
+
+
+def unweighted(z: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArray:
+    """Pixels (..., 4) that are expected where z was seen, of residuals times weights."""
+    return np.asarray(z - np.divide(r, weight, out=np.zeros_like(r), where=weight > 0))
 
 
 def measured_pixels(at: Residuals) -> BoolArray:
@@ -209,9 +221,10 @@ def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
 class LandmarkResiduals:
     """Residuals of landmarks in one camera, their Jacobians `dz = J dp`, and the weights that they enter a fit with."""
 
-    r: FloatArray  # (K, 4) pixels, zero where not measured
-    J: FloatArray  # (K, 4, 3) with respect to the point in the world frame, zero where not measured
+    r: FloatArray  # (K, 4) pixels, zero where not measured, times the precision
+    J: FloatArray  # (K, 4, 3) with respect to the point in the world frame, likewise
     weight: FloatArray  # (K,) robust weights
+    precision: FloatArray  # (K, 4) the weight of `Views`
 
 
 def landmark_residuals(
@@ -229,7 +242,7 @@ def landmark_residuals(
     one = Views(views.z[:, None], views.weight[:, None])
     at = residuals(camera, T_cam0_world[None], p_world, one)
     r, J = at.r.reshape(-1, 4), at.z_D_p.reshape(-1, 4, 3)
-    return LandmarkResiduals(r, J, robust_weights(at, sigma2)[:, 0])
+    return LandmarkResiduals(r, J, robust_weights(at, sigma2)[:, 0], views.weight)
 
 
 @dataclass(frozen=True, slots=True)

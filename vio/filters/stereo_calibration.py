@@ -194,7 +194,9 @@ def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: Floa
     """
     F, N, _, S = H.shape
     columns = StereoColumns(np.empty((F, N, 3, S)), np.empty((F, 3, S)), np.empty((F, S, S)), np.empty((F, S)))
-    loops.collect_columns(at.r, at.z_D_p, H, weight, p_D_q, columns.by_point, columns.G, columns.A, columns.b)
+    loops.collect_columns(
+        at.r, at.z_D_p, H, at.weight, weight, p_D_q, columns.by_point, columns.G, columns.A, columns.b
+    )
     return columns
 
 
@@ -247,7 +249,7 @@ def landmark_columns(at: LandmarkResiduals, H: FloatArray, clones: int) -> Stere
         clones: N, how many exposures there are.
     """
     M, _, S = H.shape
-    H = H * np.any(at.J, axis=2)[..., None]
+    H = H * (at.precision * np.any(at.J, axis=2))[..., None]
     WH = H * at.weight[:, None, None]
     by_point = np.swapaxes(WH, 1, 2) @ at.J  # (M, S, 3)
     cross = np.zeros((S, 6 * clones + 3 * M))

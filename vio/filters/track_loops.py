@@ -516,6 +516,7 @@ def collect_columns(
     r: FloatArray,
     J: FloatArray,
     H: FloatArray,
+    precision: FloatArray,
     weight: FloatArray,
     p_D_q: FloatArray,
     by_point: FloatArray,
@@ -526,7 +527,7 @@ def collect_columns(
     """Write `J' W H` (F, N, 3, S) of each view, and G (F, 3, S), its sum over the views of each track.
 
     And `H' W H` (F, S, S) and `H' W r` (F, S) of each track. H (F, N, 4, S) are the derivatives of the pixels, of which
-    those count that were measured; right rows do not depend on them.
+    those count that were measured; right rows do not depend on them. r and J are times the precision (F, N, 4), H is not.
     """
     terms, wH = H.shape[3], np.empty(H.shape[3])
     for f in range(len(J)):
@@ -545,11 +546,11 @@ def collect_columns(
                 if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
                     continue
                 for s in range(terms):
-                    wH[s] = weight[f, n] * H[f, n, a, s]
+                    wH[s] = weight[f, n] * precision[f, n, a] * H[f, n, a, s]
                     b[f, s] += wH[s] * r[f, n, a]
                 for s in range(terms):
                     for t in range(s + 1):
-                        A[f, s, t] += wH[s] * H[f, n, a, t]
+                        A[f, s, t] += wH[s] * precision[f, n, a] * H[f, n, a, t]
                 for i in range(3):
                     by_q = row[0] * p_D_q[f, 0, i] + row[1] * p_D_q[f, 1, i] + row[2] * p_D_q[f, 2, i]
                     for s in range(terms):

@@ -6,7 +6,12 @@ import numpy as np
 
 from vio.filters.multiview import Views
 from vio.geometry.lie import FloatArray
+from vio.numerics.robust import median
 from vio.records import BoolArray, IntArray, Observations
+
+# Of a pixel, over the frame's median: a residual can be small, or a patch fit badly, by chance.
+_MOST_SIGMA = 10.0
+_MOST_PRECISION = 3.0
 
 
 class TrackTable:
@@ -19,7 +24,7 @@ class TrackTable:
         self._free: list[int] = []
         self._ids = np.zeros(0, dtype=np.int64)
         self._z = np.zeros((0, columns, 4))
-        self._weight = np.zeros((0, columns, 4))
+        self._weight = np.zeros((0, columns, 4))  # as in `Views`
         self.points = np.zeros((0, 3))  # world; the last triangulation of each row, a start for the next
         self.has_point: BoolArray = np.zeros(0, dtype=np.bool_)
         self._grow(256)
@@ -30,7 +35,7 @@ class TrackTable:
         rows = np.array([row_of[i] if i in row_of else self._new_row(i) for i in ids], dtype=np.int64)
         if len(rows):
             self._z[rows, column] = seen.z
-            self._weight[rows, column] = measured(seen.has_right)
+            self._weight[rows, column] = precision(seen)
 
     def rows(self) -> IntArray:
         """Rows (F,) of all tracks, in order of their ids, so that no result depends on the table's history."""
@@ -106,6 +111,21 @@ def measured(has_right: BoolArray) -> FloatArray:
     weight = np.zeros((len(has_right), 4))
     weight[:, :2] = 1.0
     weight[:, 2] = has_right
+    return weight
+
+
+def precision(seen: Observations) -> FloatArray:
+    """One over the standard deviations (N, 4) of `[ul vl ur vr]`, in those of the frame's median; 0: not measured.
+
+    What patches state of a whole frame, such as its blur, is learned instead: errors that last along tracks exceed it.
+    """
+    weight = measured(seen.has_right)
+    if seen.sigma is None:
+        return weight
+    known: BoolArray = (weight[:, :3] > 0) & (seen.sigma > 0)
+    if known.any():
+        relative = np.divide(median(seen.sigma[known]), seen.sigma, out=np.ones_like(seen.sigma), where=known)
+        weight[:, :3] *= np.clip(relative, 1.0 / _MOST_SIGMA, _MOST_PRECISION)
     return weight
 
 

@@ -129,7 +129,10 @@ class WindowTracks:
         self.table.drop_views(tracks.rows, wrong)
         kept = ~wrong
         at = Residuals(
-            tracks.at.r * kept[..., None], tracks.at.z_D_p * kept[..., None, None], np.ones(len(wrong), dtype=np.bool_)
+            tracks.at.r * kept[..., None],
+            tracks.at.z_D_p * kept[..., None, None],
+            np.ones(len(wrong), dtype=np.bool_),
+            tracks.at.weight,
         )
         enough = np.any(at.z_D_p[:, :, 1, :], axis=2).sum(axis=1) >= 2
         T = tracks.T_cam0_world
@@ -185,7 +188,7 @@ class WindowTracks:
         weight = robust_weights(at, self.variance)
         information = track_information(self._camera, T_cam0_world, at, p_world, weight)
         # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
-        return LinearTracks(T_cam0_world, rows, p_world, at, z - at.r, weight, information, field)
+        return LinearTracks(T_cam0_world, rows, p_world, at, at.predicted(z), weight, information, field)
 
     def field_scores(
         self, tracks: LinearTracks, columns: StereoColumns | None, chosen: IntArray
@@ -198,7 +201,7 @@ class WindowTracks:
         info = tracks.information.take(chosen)
         if columns is None or tracks.field is None or tracks.field.terms[0] > 0:
             none = StereoCorrection(self._camera, np.zeros(ROW_TERMS), np.zeros(TERMS), np.arange(FIELD_TERMS))
-            at = Residuals(tracks.at.r[chosen], tracks.at.z_D_p[chosen], tracks.at.ahead[chosen])
+            at = tracks.at.take(chosen)
             columns = stereo_columns(at, none.jacobian(tracks.z[chosen]), info.q.p_D_q, tracks.weight[chosen])
         else:
             columns = columns.take(chosen)

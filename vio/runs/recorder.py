@@ -386,7 +386,7 @@ class SeenFrames(Sequence[Observations]):
             return [self[k] for k in range(len(self))[index]]
         k = range(len(self))[index]
         rows = self._rows.rows(int(self._offsets[k]), int(self._offsets[k + 1]))
-        columns = (np.array(rows[name]) for name in ("id", "z", "has_right", "stale"))
+        columns = (np.array(rows[name]) for name in ("id", "z", "has_right", "stale", "sigma"))
         return Observations(int(self._seen["index"][k]), int(self._seen["time_ns"][k]), *columns)
 
 

@@ -58,7 +58,7 @@ FRAME = np.dtype(
         ("stages_ms", "<f8", (_STAGES,)),
     ]
 )
-OBSERVATION = np.dtype([("id", "<i8"), ("z", "<f8", (4,)), ("has_right", "?"), ("stale", "?")])
+OBSERVATION = np.dtype([("id", "<i8"), ("z", "<f8", (4,)), ("has_right", "?"), ("stale", "?"), ("sigma", "<f4", (3,))])
 SEEN = np.dtype([("index", "<i8"), ("time_ns", "<i8"), ("count", "<i8")])  # one row a frame: its observations
 SAMPLE = np.dtype([("time_ns", "<i8"), ("is_imu", "?"), ("values", "<f8", (6,))])
 MAPPED = np.dtype([("index", "<i8"), ("time_ns", "<i8"), ("T_map_body", "<f8", (4, 4)), ("covariance", "<f8", (6, 6))])
@@ -152,6 +152,7 @@ def observation_rows(seen: Observations) -> Rows:
     """Return the observations of a frame as rows (N,)."""
     rows = np.zeros(len(seen), dtype=OBSERVATION)
     rows["id"], rows["z"], rows["has_right"], rows["stale"] = seen.ids, seen.z, seen.has_right, seen.stale
+    rows["sigma"] = 0.0 if seen.sigma is None else seen.sigma
     return rows
 
 
