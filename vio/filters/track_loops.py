@@ -527,7 +527,7 @@ def collect_columns(
     """Write `J' W H` (F, N, 3, S) of each view, and G (F, 3, S), its sum over the views of each track.
 
     And `H' W H` (F, S, S) and `H' W r` (F, S) of each track. H (F, N, 4, S) are the derivatives of the pixels, of which
-    those count that were measured; right rows do not depend on them. r and J are times the precision (F, N, 4), H is not.
+    those count that were measured; right rows do not depend on them. r and J are times the precision (F, N, 4), H not.
     """
     terms, wH = H.shape[3], np.empty(H.shape[3])
     for f in range(len(J)):
