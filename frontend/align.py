@@ -47,9 +47,7 @@ class Templates:
     energy: npt.NDArray[np.float32]  # (N,) sum of squares of the patch
     inverse: npt.NDArray[np.float32]  # (N, 8, 8) of the normal matrix
     row_inverse: npt.NDArray[np.float32]  # (N, 6, 6) the same, with the expected row as a prior
-    sigma: npt.NDArray[
-        np.float32
-    ]  # (N, 3) px, of u, v, and of u along a row, by the last alignments: (F1); 0: none yet
+    sigma: npt.NDArray[np.float32]  # (N, 3) px, (F1) of the last alignment: of u, v, and u along a row; 0: none yet
 
 
 def empty_templates(count: int, radius: int) -> Templates:
