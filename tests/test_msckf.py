@@ -401,11 +401,16 @@ def test_track_table_keeps_rows_apart_and_grows() -> None:
 
 def test_precisions_are_relative_to_the_frames_median_and_bounded() -> None:
     seen = observations(0, 0, np.arange(5), np.zeros((5, 4)), has_right=[True, False, True, True, True])
-    sigma = np.float32([[2, 2, 4], [2, 1, 99], [2, 0, 2], [0.01, 2, 2], [2, 2, 2e9]])
+    sigma = np.float32([[2, 2, 4], [2, 1, 99], [2, np.nan, 2], [0.01, 0, 2], [2, 2, 2e9]])
     weight = precision(replace(seen, sigma=sigma))
     expected = [[1, 1, 0.5, 0], [1, 2, 0, 0], [1, 1, 1, 0], [3, 1, 1, 0], [1, 1, 0.1, 0]]
     np.testing.assert_allclose(weight, expected, rtol=1e-6)
     np.testing.assert_array_equal(precision(seen), precision(replace(seen, sigma=np.ones((5, 3), np.float32))))
+    few = np.full((5, 3), np.inf, np.float32)
+    few[0] = 2
+    expected = [[1, 1, 1, 0], [0.1, 0.1, 0, 0], *[[0.1, 0.1, 0.1, 0]] * 3]
+    np.testing.assert_allclose(precision(replace(seen, sigma=few)), expected, rtol=1e-6)
+    np.testing.assert_array_equal(precision(seen), precision(replace(seen, sigma=np.full_like(few, np.inf))))
     with pytest.raises(DataError, match="sigma"):
         replace(seen, sigma=np.ones((5, 3)))
 
@@ -670,6 +675,20 @@ def test_wrong_matches_do_not_capture_it() -> None:
     assert distances.max() < 0.4  # without the rejection of views: 5.2
     # The harm is done in the first frames, where tracks have two views and nothing identifies the wrong one.
     assert np.linalg.norm(errors[-1, :3] - errors[10, :3]) < 0.15
+
+
+def test_the_ids_of_rejected_features_are_those_of_tracks_and_landmarks() -> None:
+    settings, flight, noise = replace(EXACT_RIG, clones=5), Flight(frames=6), np.random.default_rng(0)
+    filt = Msckf(CAMERA, T_CAM0_IMU, settings, motion=None)
+    for k in range(6):
+        report = filt.update(flight.observe(k, 0.1, noise))
+    moved = report.landmark_ids[:4]
+    seen = flight.observe(6, 0.1, noise)
+    assert len(moved) == np.isin(moved, seen.ids).sum() == 4
+    z = seen.z + np.where(np.isin(seen.ids, moved)[:, None], [30.0, 10.0, 20.0, 10.0], 0.0)
+    report = filt.update(replace(seen, z=z))
+    assert report.gated == len(report.gated_ids) == len(set(report.gated_ids.tolist()))
+    assert set(moved.tolist()) <= set(report.gated_ids.tolist())
 
 
 def test_blackout_grows_the_covariance_and_is_survived() -> None:

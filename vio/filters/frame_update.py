@@ -151,10 +151,11 @@ class FrameUpdate:
         gated_ids = self.tracks.table.ids(tracks.rows[~good])
         self.tracks.update_pixel_noise(nis, dof)
         pixels, rejected = self._gate_landmarks(window, pixels, fitted)
+        gated_ids = np.concatenate([gated_ids, rejected])
         created = self._marginalise(window, tracks, good, pixels, bool(seen.has_right.any()))
         return UpdateReport(
             used=int(good.sum()) + int((pixels.weight[:, 0] > 0).sum()),
-            gated=int((~good).sum()) + rejected,
+            gated=len(gated_ids),
             initialised=created,
             landmarks=len(window.landmarks),
             innovation_median_px=innovation,
@@ -319,14 +320,14 @@ class FrameUpdate:
         T = window.T_cam0_world(-1)[0]
         return landmark_residuals(self._rig.camera, T, window.landmarks, pixels, self.tracks.variance)
 
-    def _gate_landmarks(self, window: Window, pixels: Views, fitted: Fit) -> tuple[Views, int]:
+    def _gate_landmarks(self, window: Window, pixels: Views, fitted: Fit) -> tuple[Views, IntArray]:
         """Test the landmarks' pixels after a fit; drop the landmarks that keep failing.
 
         Returns:
-            The pixels of the landmarks left, without weight where rejected, and how many observations were rejected.
+            The pixels of the landmarks left, without weight where rejected, and the ids (R,) of those rejected.
         """
         if not len(pixels.z):
-            return pixels, 0
+            return pixels, window.landmark_ids
         at = self._landmark_residuals(window, pixels)
         J, field = at.J, self._rig.field(window)
         if field is not None:
@@ -336,9 +337,10 @@ class FrameUpdate:
         nis = leave_one_out_nis(at.r, J, window.landmark_covariance(fitted), at.weight, self.tracks.variance)
         dof = np.maximum(np.any(at.J, axis=2).sum(axis=1), 1)
         used, dropped = self._landmark_gate.check(window.landmark_ids, nis, dof)
+        rejected = window.landmark_ids[~used]
         self._keep_landmarks(window, ~dropped)
         weight = pixels.weight * used[:, None]
-        return Views(pixels.z[~dropped], weight[~dropped]), int((~used).sum())
+        return Views(pixels.z[~dropped], weight[~dropped]), rejected
 
     def _marginalise(self, window: Window, tracks: LinearTracks, good: BoolArray, pixels: Views, stereo: bool) -> int:
         """Absorb what ends in this frame into the prior, estimate with all that is good, and make room.

@@ -123,8 +123,9 @@ def precision(seen: Observations) -> FloatArray:
     if seen.sigma is None:
         return weight
     known: BoolArray = (weight[:, :3] > 0) & (seen.sigma > 0)
-    if known.any():
-        relative = np.divide(median(seen.sigma[known]), seen.sigma, out=np.ones_like(seen.sigma), where=known)
+    finite = seen.sigma[known & np.isfinite(seen.sigma)]
+    if len(finite):
+        relative = np.divide(median(finite), seen.sigma, out=np.ones_like(seen.sigma), where=known)
         weight[:, :3] *= np.clip(relative, 1.0 / _MOST_SIGMA, _MOST_PRECISION)
     return weight
 

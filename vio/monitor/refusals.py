@@ -34,7 +34,7 @@ class RefusalReport:
 
     def __init__(self, *, imu: bool) -> None:
         """Begin; `imu`: whether an IMU predicts the motion."""
-        self._imu, self._reported = imu, False
+        self.imu, self._reported = imu, False
         self._frames: deque[_Frame] = deque()
 
     def frame(self, seen: Observations, report: UpdateReport, estimate: Estimate) -> list[str]:
@@ -67,7 +67,7 @@ class RefusalReport:
         """The likeliest cause by the evidence."""
         ratios = [f.innovation_ratio for f in self._frames if f.innovation_ratio is not None]
         ratio = median(ratios) if ratios else 0.0
-        if self._imu and ratio > _CONTRADICTED:
+        if self.imu and ratio > _CONTRADICTED:
             return (
                 f"the images show features {ratio:.1f} standard deviations beside where the IMU predicts them; "
                 "check the IMU, its clock and its place on the camera (vio check)"
@@ -75,13 +75,14 @@ class RefusalReport:
         place = self._place()
         if place is not None:
             return f"most lie together {place}; something moves there, or a lens is dirty"
+        where = "they are spread over the image; " if any(f.refused.any() for f in self._frames) else ""
         field = estimate.stereo_field
         if field is not None and rows_grade(field.rows_rms_px) != "negligible":
             return (
-                f"they are spread over the image, and rows differ by {field.rows_rms_px:.2f} px (rms) in a smooth "
-                "pattern; calibrate the cameras (vio calibrate)"
+                f"{where}rows differ by {field.rows_rms_px:.2f} px (rms) in a smooth pattern; "
+                "calibrate the cameras (vio calibrate)"
             )
-        return "they are spread over the image; blurred images, repeated texture, or many things that move"
+        return f"{where}blurred images, repeated texture, or many things that move"
 
     def _place(self) -> str | None:
         """Where in the image half of the refused features lie with few others; None: they are spread."""

@@ -177,6 +177,7 @@ class RunMonitor:
 
     def begun_again(self, index: int, verdict: ImuVerdict, frames: int) -> None:
         """Report that the frames so far were estimated again with what is left of the IMU."""
+        self._refusals.imu = verdict.usable
         what = "the IMU is not used, and images alone go on"
         if verdict.usable:
             parts = (("gyro", verdict.gyro_factor), ("accelerometer", verdict.accel_factor))
