@@ -157,7 +157,10 @@ class WindowTracks:
         """Median innovation in the newest clone over its standard deviation; None where nothing is seen in it."""
         squared, pixels = self.innovations(predicted, moved)
         used = pixels > 0
-        return float(np.sqrt(median(squared[used] / chi_square_table(0.5)[pixels[used]]))) if used.any() else None
+        if not used.any():
+            return None
+        # Below zero where the covariances have lost all digits.
+        return float(np.sqrt(max(median(squared[used] / chi_square_table(0.5)[pixels[used]]), 0.0)))
 
     def drop_unpredicted(self, predicted: LinearTracks, moved: FloatArray) -> bool:
         """Drop views of the newest clone that contradict the predicted motion permanently.
