@@ -665,9 +665,10 @@ def test_another_revision_runs_in_turns_and_is_compared(
 
 @pytest.mark.parametrize("name", ["realistic", "euroc", str(ROOT / "tools" / "suites" / "maps.yaml")])
 def test_another_revision_is_given_all_of_the_suite(name: str) -> None:
-    suite = replace(read_suite(name), time_limit_s=9.0)
+    suite = replace(read_suite(name), time_limit_s=9.0, success_percent=0.5)
     again = suite_from(_as_yaml(suite), suite.folder / "again.yaml")
     assert (again.sequences, again.time_limit_s, again.seeds) == (suite.sequences, 9.0, suite.seeds)
+    assert again.success_percent == 0.5
 
 
 def test_a_render_that_fails_is_a_failed_row_and_one_that_works_is_made_once(

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import itertools
 import json
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.test_frontend_scene import CAMERA
 from tools.faults import CAMERAS, GROUPS, HEALTHY, IMU
+from tools.faults import __main__ as command
 from tools.faults.__main__ import FIGURES, PAGE, RUNS, tasks
 from tools.faults.changes import Period
 from tools.faults.page import page
@@ -188,3 +191,26 @@ def test_a_part_of_the_runs_is_named() -> None:
     assert [name for s, group, name in some if s.motion == "imu"] == ["nothing", *IMU]
     assert [(group, name) for s, group, name in some if s.motion == "none"] == [("cameras", "nothing")]
     assert len(list(tasks())) == sum(len(GROUPS[group]) for s in RUNS for group in s.groups)
+
+
+def test_an_interrupted_call_goes_on_after_its_last_whole_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = list(tasks())[:3]
+    monkeypatch.setattr(command, "tasks", lambda *some: wanted)
+    monkeypatch.setattr(command, "commit_of", lambda root: "abc")
+    row = {"recording": Path(wanted[0][0].source).name, "motion": wanted[0][0].motion}
+    rows = [row | {"group": group, "variant": name} for _, group, name in wanted]
+    (tmp_path / "faults-abc.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows)[:-9])
+    asked: list[Any] = []
+    written: list[dict[str, Any]] = []
+
+    def run(work: Any, left: list[Any], workers: int) -> list[dict[str, Any]]:
+        asked.extend(left)
+        return rows[2:]
+
+    monkeypatch.setattr(command, "_run", run)
+    monkeypatch.setattr(command, "write", written.append)
+    monkeypatch.setattr(sys, "argv", ["faults", "--data", str(tmp_path), "--work", str(tmp_path)])
+    assert command.main() == 0
+    assert asked == wanted[2:]
+    assert written[0]["runs"] == rows
+    assert [json.loads(line) for line in (tmp_path / "faults-abc.jsonl").read_text().splitlines()] == rows

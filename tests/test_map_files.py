@@ -16,7 +16,8 @@ from vio.errors import DataError
 from vio.geometry.lie import se3_exp
 from vio.mapping.files import check_map, describe_map, drop_session, extract_map, merge_maps, prune_map
 from vio.mapping.map_graph import MapGraph
-from vio.mapping.map_store import LoopRow, MapStore, SessionRow
+from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, PlacesRow, SessionRow
+from vio.mapping.place_index import SEGMENT, Segment
 
 
 def _two_sessions(path: Path) -> None:
@@ -47,6 +48,26 @@ def test_a_reader_sees_the_last_commit_while_another_process_writes(tmp_path: Pa
     assert [file.name for file in tmp_path.iterdir()] == ["a.map"], "one file again"
 
 
+def test_a_map_that_grows_while_it_is_opened_is_in_use_and_not_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, read = tmp_path / "a.map", MapStore.keyframes
+    writer = fill(path)
+    writer.commit()
+
+    def meanwhile(store: MapStore) -> list[KeyframeRow]:
+        rows = read(store)
+        writer.add_keyframe(_row(4), _features(4))
+        writer.add_odometry(3, 4, _pose(4))
+        writer.commit()
+        return rows
+
+    monkeypatch.setattr(MapStore, "keyframes", meanwhile)
+    with pytest.raises(DataError, match="wait for the run that uses it"):
+        MapStore(path)
+    writer.close()
+
+
 def test_check_reads_features_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a.map"
     fill(path).close()
@@ -57,6 +78,19 @@ def test_check_reads_features_too(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert main(["map", "show", str(path)]) == 0
     assert main(["map", "check", str(path)]) == 1
     assert "row 2 of features: its checksum does not agree" in capsys.readouterr().err
+
+
+def test_check_reads_places_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.map"
+    with closing(fill(path)) as store:
+        words = Segment(np.zeros((4, 2**14 + 1), dtype=np.uint32), np.zeros((4, 0), dtype=np.uint8))
+        store.add_places(PlacesRow(words, np.zeros((SEGMENT, 32, 3)), np.zeros(SEGMENT, dtype=np.int64)))
+    check_map(path)
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("UPDATE places SET points = zeroblob(8)")
+        database.commit()
+    with pytest.raises(DataError, match="row 0 of places: its checksum does not agree"):
+        check_map(path)
 
 
 def test_a_session_is_dropped(tmp_path: Path) -> None:
@@ -135,6 +169,17 @@ def test_maps_without_a_common_place_are_not_merged(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="shows no place of"):
         merge_maps(a, b, out)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.map", "b.map"]
+
+
+def test_a_map_without_keyframes_is_not_merged(tmp_path: Path) -> None:
+    """The other one begins at time 0 and without an IMU, as KITTI's drives do."""
+    a, b, out = (tmp_path / f"{name}.map" for name in ("a", "b", "out"))
+    MapStore(a, create=True).close()
+    with closing(MapStore(b, create=True)) as store:
+        store.add_session(SessionRow("drive", CAMERA, False, 0))
+        store.add_keyframe(replace(_row(0), time_ns=0), _features(0))
+    with pytest.raises(DataError, match="shows no place of"):
+        merge_maps(a, b, out)
 
 
 def test_sessions_that_a_dropped_one_had_joined_stay_where_they_are(tmp_path: Path) -> None:

@@ -226,3 +226,40 @@ def test_a_new_loop_moves_what_is_around_it_alone(tmp_path: Path, monkeypatch: p
 
     whole = around(graph.T_map_cam.rows)
     assert np.abs(around(near) - whole).max() < 0.5 * np.abs(around(before) - whole).max()
+
+
+def test_loops_that_contradict_each_other_leave_a_piece_where_it_is() -> None:
+    """Nothing but two loops holds the second half, and neither is more likely than the other."""
+    T = np.array([se3_exp([k % 5, 0, 0, 0, 0, 0]) for k in range(10)])
+    steps = [k for k in range(9) if k != 4]
+    odometry = Edges.of([(k, k + 1, RelativePose(se3_exp([1.0, 0, 0, 0, 0, 0]), 1e-4 * np.eye(6))) for k in steps])
+    aside = [RelativePose(se3_exp([0, y, 0, 0, 0, 0]), 1e-4 * np.eye(6)) for y in (-3.0, 3.0)]
+    loops = Edges.of([(0, 5, aside[0]), (1, 6, aside[1])])
+    best = optimise(T, odometry, loops, NO_UP_DIRECTIONS, np.arange(10) == 0)
+    assert not best.kept.any()
+    np.testing.assert_allclose(residual(best.T_map_cam, odometry), 0.0, atol=1e-6)
+
+
+def test_a_loop_in_a_piece_without_the_first_keyframe_is_settled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The session that joined the second piece to the first was taken out of the map."""
+    monkeypatch.setattr("vio.mapping.map_graph._WINDOW", 80)
+    store = MapStore(tmp_path / "a.map", create=True)
+    graph, step = MapGraph(store), se3_exp([1.0, 0, 0, 0, 0, 0])
+    camera = StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360)
+    graph.sessions = [SessionRow(name, camera, True, 0) for name in ("first", "second", "new")]
+    for session, count in enumerate((100, 20, 20)):
+        T = np.eye(4)
+        for k in range(count):
+            if k:
+                graph.add_motion(len(graph) - 1, len(graph), RelativePose(step, 1e-4 * np.eye(6)))
+                T = T @ step
+            graph.append(KeyframeRow(session, k, k, T, T, np.eye(6), 0.0, None, 0.0))
+    before = graph.T_map_cam.rows.copy()
+    measured = RelativePose(se3_exp([0, 0.1, 0, 0, 0, 0]), 1e-4 * np.eye(6))
+    graph.loops = [LoopRow(105, 125, measured, 50, True), LoopRow(110, 130, measured, 50, True)]
+    assert not graph.optimise_near(0, 2)
+    moved = (graph.T_map_cam.rows - before)[:, :3, 3]
+    np.testing.assert_array_equal(moved[:100], 0.0)
+    np.testing.assert_allclose(moved[100:], [[0.0, 0.1 * (k >= 20), 0.0] for k in range(40)], atol=1e-6)

@@ -32,6 +32,7 @@ from tools.faults.page import page
 from vio import __version__, evaluate, load_config, open_dataset
 from vio.bench.identity import commit_of, machine, package_versions
 from vio.errors import VioError
+from vio.files.atomic import atomic_write_text
 from vio.files.trajectories import read_trajectory
 from vio.runs.pipeline import RunResult, run
 
@@ -108,8 +109,8 @@ def write(facts: dict[str, Any]) -> None:
     """Write the figures, one run a line, and their page."""
     head = json.dumps({name: value for name, value in facts.items() if name != "runs"})
     rows = ",\n".join(json.dumps(row, ensure_ascii=False) for row in facts["runs"])
-    FIGURES.write_text(f'{head[:-1]}, "runs": [\n{rows}\n]}}\n', encoding="utf-8", newline="\n")
-    PAGE.write_text(page(facts), encoding="utf-8", newline="\n")
+    atomic_write_text(FIGURES, f'{head[:-1]}, "runs": [\n{rows}\n]}}\n')
+    atomic_write_text(PAGE, page(facts))
 
 
 def main() -> int:
@@ -136,8 +137,9 @@ def main() -> int:
     commit = commit_of(ROOT)
     kept = options.work / f"faults-{commit}.jsonl"
     options.work.mkdir(parents=True, exist_ok=True)
-    done = {_key(row): row for row in map(json.loads, kept.read_text().splitlines())} if kept.is_file() else {}
+    done = {_key(row): row for row in _rows(kept)}
     wanted = {(Path(s.source).name, s.motion, group, name): (s, group, name) for s, group, name in tasks()}
+    atomic_write_text(kept, "".join(f"{json.dumps(row)}\n" for row in done.values()))
     with kept.open("a") as file:
         for row in _run(work, [task for key, task in wanted.items() if key not in done], options.workers):
             done[_key(row)] = row
@@ -146,6 +148,13 @@ def main() -> int:
     facts |= {"packages": package_versions(), "written": datetime.now(timezone.utc).isoformat(timespec="seconds")}
     write(facts | {"runs": [done[key] for key in wanted]})
     return 0
+
+
+def _rows(kept: Path) -> Iterator[dict[str, Any]]:
+    """Yield the rows of an interrupted call; one that is not whole is run again."""
+    for line in kept.read_text().splitlines(keepends=True) if kept.is_file() else ():
+        if line.endswith("\n"):
+            yield json.loads(line)
 
 
 def _run(work: Callable[[Task], dict[str, Any]], wanted: list[Task], workers: int) -> Iterator[dict[str, Any]]:

@@ -14,7 +14,7 @@ import yaml
 
 from vio.bench.bench import Place
 from vio.bench.identity import ROOT
-from vio.bench.suite import Suite
+from vio.bench.suite import SUCCESS_PERCENT, Suite
 from vio.errors import ConfigError, DataError
 from vio.files.atomic import atomic_write_text
 
@@ -99,4 +99,5 @@ def _as_yaml(suite: Suite) -> dict[str, Any]:
     }
     out: dict[str, Any] = {"name": suite.name, "sequences": sequences, "configurations": configurations}
     out |= {"seeds": list(suite.seeds), "time_limit_s": suite.time_limit_s}
+    out["success_percent"] = suite.success_percent if suite.success_percent != SUCCESS_PERCENT else None
     return {name: value for name, value in out.items() if value is not None}

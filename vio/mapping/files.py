@@ -106,7 +106,7 @@ def _begin(path: Path) -> tuple[Any, ...]:
     with contextlib.closing(store):
         sessions, keyframes = store.sessions(), store.keyframes()
         if not keyframes:
-            return True, 0, b""
+            return True, 0, 0, b""
         seen = store.features(0)
         return not sessions[0].upright, keyframes[0].time_ns, len(keyframes), seen.descriptors.tobytes()
 
@@ -121,6 +121,7 @@ def check_map(path: Path) -> dict[str, Any]:
     with contextlib.closing(store):
         for k in range(len(store.keyframes())):
             store.features(k)
+        store.places()
     return describe_map(path)
 
 

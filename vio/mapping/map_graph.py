@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import dijkstra
 
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
 from vio.geometry.relative_pose import RelativePose
@@ -146,11 +146,7 @@ class MapGraph:
         What the filter took for the vertical at its first frame is less exact than what it knows of it later.
         """
         rows = self.part == part
-        # A session that was taken out may have been what joined them.
-        piece = connected_components(self._linked(self.loops), directed=False)[1][rows]
-        fixed = np.zeros(len(self), dtype=np.bool_)
-        fixed[np.flatnonzero(rows)[np.unique(piece, return_index=True)[1]]] = True
-        self._optimise(rows, fixed, level=True)
+        self._optimise(rows, np.zeros(len(self), dtype=np.bool_), level=True)
 
     def optimise_near(self, part: int, newest: int) -> bool:
         """Optimise what the newest loops move most; keyframes around it stay, as anchors.

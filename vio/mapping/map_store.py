@@ -222,12 +222,12 @@ class MapStore:
                     f"{path}: is a map of version {self._pragma('user_version')}, this program reads {VERSION}; use "
                     "the program that wrote it, or build the map again"
                 )
-            if read_only:
-                self._db.execute("BEGIN")  # one state of the file, whatever another process commits
+            self._db.execute("BEGIN")  # one state of the file, whatever another process commits
             self._checked: dict[str, list[Any]] = {}  # rows that were read to check them, until they are asked for
             before = self._pragma("data_version")
             self._check()
             if not read_only:
+                self._db.execute("COMMIT")
                 # Readers see the last commit while this process writes; its transaction never ends, so no other writes.
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute("BEGIN IMMEDIATE")

@@ -7,10 +7,11 @@ squares by graduated non-convexity (Yang et al., 2020): one that contradicts the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, se3_left_jacobian, se3_log, so3_hat
@@ -81,7 +82,7 @@ def optimise(
         odometry: edges that are trusted.
         loops: edges that may be wrong.
         up_directions: directions of the vertical.
-        fixed: (K,) poses that stay; at least one of each connected part.
+        fixed: (K,) poses that stay; of what hangs together without one of them, the first does.
         levelled: one of the fixed poses whose position and heading alone stay, so that its roll and pitch follow the
             up_directions; None: all of them stay.
     """
@@ -171,12 +172,25 @@ def _descend(
     steps: int,
 ) -> FloatArray:
     """Gauss-Newton with fixed weights (L,) of the loops."""
+    free = replace(free, fixed=_anchored(free.fixed, odometry, loops, weight))
     for _ in range(steps):
         xi = _step(T, odometry, loops, weight, up_directions, free)
         T = T @ se3_exp(xi)
         if np.abs(xi).max(initial=0.0) < _CONVERGED:
             break
     return T
+
+
+def _anchored(fixed: BoolArray, odometry: Edges, loops: Edges, weight: FloatArray) -> BoolArray:
+    """Return the poses (K,) that stay: those given, and the first of each piece that no weight joins to one of them."""
+    held = weight > 0
+    ends = np.concatenate([odometry.first, loops.first[held]]), np.concatenate([odometry.second, loops.second[held]])
+    links = coo_matrix((np.ones(len(ends[0])), ends), shape=(len(fixed), len(fixed)))
+    pieces, piece = connected_components(links, directed=False)
+    loose = ~np.isin(np.arange(pieces), piece[fixed])
+    out = fixed.copy()
+    out[np.unique(piece, return_index=True)[1][loose]] = True
+    return out
 
 
 def _step(
