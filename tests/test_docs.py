@@ -234,7 +234,7 @@ def test_readme_shows_what_the_demo_prints(
     shown_drift = {"start_s": 0.0, "t_err_percent": 0.05, "r_err_deg_per_100m": 0.039, "drift_lengths_m": [100]}
     print_result({}, metric_rows({**metrics, **shown_drift}), as_json=False)
     shown = next(block.text for block in _blocks(README) if block.text.startswith("frames "))
-    printed, shown = (re.sub(r"[\d.]+\d( m?m\b)?", "#", text) for text in (capsys.readouterr().out, shown))
+    printed, shown = (re.sub(r"[+-]?[\d.]+\d( m?m\b)?", "#", text) for text in (capsys.readouterr().out, shown))
     assert printed == shown
 
 
