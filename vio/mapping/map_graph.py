@@ -141,7 +141,7 @@ class MapGraph:
         self.sessions = [replace(s, part=into) if s.part == moved else s for s in self.sessions]
 
     def optimise_part(self, part: int) -> None:
-        """Optimise all keyframes of a part; of the first one of what hangs together, roll and pitch alone at most.
+        """Optimise all keyframes of a part; of the first one of a connected component, roll and pitch alone at most.
 
         What the filter took for the vertical at its first frame is less exact than what it knows of it later.
         """

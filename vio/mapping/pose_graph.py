@@ -82,7 +82,7 @@ def optimise(
         odometry: edges that are trusted.
         loops: edges that may be wrong.
         up_directions: directions of the vertical.
-        fixed: (K,) poses that stay; of what hangs together without one of them, the first does.
+        fixed: (K,) poses that stay; of a connected component without one of them, the first does.
         levelled: one of the fixed poses whose position and heading alone stay, so that its roll and pitch follow the
             up_directions; None: all of them stay.
     """
