@@ -49,7 +49,7 @@ if __name__ == "__main__":
     print(check_frontend(CornersAndFlow))
     with tempfile.TemporaryDirectory() as folder:
         if len(sys.argv) < 2:
-            from vio.sim.demo import write_demo_recording
+            from vio.sim.scenarios import write_demo_recording
         source = sys.argv[1] if len(sys.argv) > 1 else str(write_demo_recording(Path(folder) / "street"))
         dataset = open_dataset(source)
         parts = Parts(frontend=CornersAndFlow(dataset.recording.camera))

@@ -25,8 +25,7 @@ from vio.bench.bench import Place, bench, has_succeeded, read_bench
 from vio.bench.engines import _check_workers, run_here
 from vio.bench.figures import coverage, figures_of, pose_nees
 from vio.bench.identity import ROOT, InputDigests, code_and_packages, commit_of, imported_code
-from vio.bench.latex import latex_of
-from vio.bench.report import _as_html, write_bench_report
+from vio.bench.report import _as_html, latex_of, write_bench_report
 from vio.bench.revision import _as_yaml
 from vio.bench.store import Store
 from vio.bench.suite import Suite, config_of, read_suite, shipped_suites, suite_from

@@ -28,7 +28,7 @@ from vio.offline.comparison import GroundTruth, KeyframeComparison, compare_keyf
 from vio.offline.keyframes import TrackedPath, choose_keyframes
 from vio.offline.loop_tracks import loop_rows
 from vio.offline.points import build_tracks, landmarks_of, reprojection, triangulate_tracks
-from vio.offline.poses import align_to_points, position_covariances
+from vio.offline.refine import align_to_points, position_covariances
 from vio.offline.saved_run import read_saved_run, with_poses
 from vio.records import Estimate, LoopEvent, LoopMatches
 from vio.runs.folder import write_run_folder

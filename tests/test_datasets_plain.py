@@ -13,8 +13,7 @@ from tests.dataset_makers import calib_text, make_kitti
 from tests.euroc_maker import KITTI_RIG, RADTAN_RIG, RECTIFIED_RIG, make_euroc, make_kitti_raw, truth_poses
 from tests.plain_maker import STEP_S, make_plain, rig_of
 from vio.datasets import DatasetSettings, open_dataset
-from vio.datasets.image_formats import other_damage
-from vio.datasets.images import UnreadableImageError, load_gray
+from vio.datasets.images import UnreadableImageError, load_gray, other_damage
 from vio.datasets.plain import read_plain
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.tables import parse_stamps, read_imu_table

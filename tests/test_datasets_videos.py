@@ -14,9 +14,9 @@ from tests.plain_maker import rig_of
 from tests.same_events import assert_same_events
 from vio.cli import main
 from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.frame_times import Seconds, frames_between, parse_bound
 from vio.datasets.rigs import load_rig
 from vio.datasets.rigs.kalibr import kalibr_text
-from vio.datasets.span import Seconds, frames_between, parse_bound
 from vio.errors import DataError, VioError
 from vio.geometry.distortion import rig_from_rectified
 from vio.records import StereoFrame

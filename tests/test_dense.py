@@ -189,7 +189,7 @@ def test_makes_a_mesh_of_a_run(run_folder: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_interrupted_it_keeps_what_is_fused(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vio.cli.progress import ProgressBar
+    from vio.cli.output import ProgressBar
 
     monkeypatch.setattr(ProgressBar, "update", lambda self, done, total=None: signal.raise_signal(signal.SIGINT))
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import yaml
 
-import vio.sim.demo
+import vio.sim.scenarios
 from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_npz
 from vio.cli import build_parser, main
 from vio.cli.arguments import config_from
@@ -167,8 +167,8 @@ def readme_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
         # A second of the demo's drive instead of fourteen; otherwise it is the demo.
-        patch.setattr(vio.sim.demo, "_DURATION_S", 1.2)
-        patch.setattr(vio.sim.demo, "_WIDTH_PX", 400)
+        patch.setattr(vio.sim.scenarios, "_DURATION_S", 1.2)
+        patch.setattr(vio.sim.scenarios, "_WIDTH_PX", 400)
         assert main(["demo", "--out", "demo"]) == 0
         flight = "vio render --rig euroc --width 320 --duration 0.5 --out path/to/MH_03_medium"
         assert main(shlex.split(flight)[1:]) == 0

@@ -16,7 +16,7 @@ from vio.bench.worker import _Truth, _used
 from vio.cli import main
 from vio.config import Config, load_config
 from vio.datasets import DatasetSettings, open_dataset
-from vio.datasets.frame_rate import FrameRateLimit
+from vio.datasets.frame_times import FrameRateLimit
 from vio.errors import DataError
 from vio.live.odometry import Odometry
 from vio.monitor.run import RunMonitor

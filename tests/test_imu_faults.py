@@ -14,7 +14,7 @@ from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray
 from vio.imu.clocks import SampleCoverage
 from vio.imu.faults import ImuSampleCheck
-from vio.live.event_order import EventOrder
+from vio.live.processor import EventOrder
 from vio.monitor.run import RunMonitor
 from vio.records import Event, ImuSample, StereoFrame
 

@@ -15,7 +15,7 @@ from vio.filters.msckf import Msckf
 from vio.filters.navigation import ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log
-from vio.live.event_order import EventOrder
+from vio.live.processor import EventOrder
 from vio.monitor.run import RunMonitor
 from vio.records import Event, ImuSample, StereoFrame, UpdateReport, VelocitySample
 

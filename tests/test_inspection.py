@@ -17,7 +17,7 @@ import yaml
 from vio.cli import main
 from vio.geometry.lie import so3_exp
 from vio.inspection.inertial import allan_deviation, noise_part, rest_part
-from vio.inspection.times import clock_facts
+from vio.inspection.inspect import clock_facts
 from vio.records import ImuDensities, ImuRecord
 
 

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from vio.cli.progress import ProgressBar
+from vio.cli.output import ProgressBar
 
 
 class Terminal(io.StringIO):

@@ -35,9 +35,8 @@ from vio.live.pairing import Pairing
 from vio.records import ImuSample
 from vio.ros2.node import NodeSettings, run_node
 from vio.ros2.play import play
-from vio.ros2.publishing import publisher
 from vio.ros2.sensors import Sensors, SensorTopics, Silence, check_types
-from vio.ros2.transport import Quality, open_transport
+from vio.ros2.transport import Quality, open_transport, publisher
 
 TOPICS = SensorTopics("/cam0/image_raw", "/cam1/image_raw", "/imu0")
 IMAGES_ALONE = replace(Config(), motion="none")

@@ -28,10 +28,9 @@ from vio.datasets.rigs import load_rig
 from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.files.trajectories import read_trajectory
 from vio.records import ImuSample, StereoFrame
-from vio.sources.interpolated import ImuInterpolation
 from vio.sources.recorder import FORMS, Form, Recorder
 from vio.sources.run import run_source
-from vio.sources.source import SourceEvent, SourceFrame, SourceSample, open_source
+from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame, SourceSample, open_source
 
 
 @pytest.fixture(scope="module")

@@ -19,12 +19,12 @@ from tests import test_filter_truth
 from tests.euroc_maker import EQUIDISTANT_RIG, RADTAN_RIG
 from tests.test_filter_truth import Course
 from tests.test_stereo_calibration import _turned_right
-from vio.calibration.estimated_rig import estimated_rig
 from vio.calibration.stereo_field import (
     PARAMETERS,
     DisplacementField,
     _Frame,
     calibrated_rig,
+    estimated_rig,
     field_of,
     rig_off_by,
 )

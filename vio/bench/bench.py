@@ -14,8 +14,7 @@ from vio._version import __version__
 from vio.bench.engines import run_here, run_on_dask
 from vio.bench.execute import failed
 from vio.bench.identity import ROOT, Identity, InputDigests, code_digest, commit_of, machine, package_versions
-from vio.bench.latex import latex_of
-from vio.bench.report import write_bench_report
+from vio.bench.report import latex_of, write_bench_report
 from vio.bench.store import Record, Store
 from vio.bench.suite import Suite
 from vio.bench.tables import SUCCESS_COVERAGE, Outcome, csv_of_rows, csv_of_runs, markdown, summary_rows

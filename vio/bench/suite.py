@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from vio.config import Config, load_config, merge
-from vio.datasets.span import parse_bound
+from vio.datasets.frame_times import parse_bound
 from vio.errors import ConfigError
 from vio.files.inputs import read_input
 from vio.files.yaml_text import MOST_BYTES, read_yaml

@@ -24,8 +24,7 @@ from vio.bench.figures import absent_reasons, between, coverage, error_curve, fi
 from vio.bench.identity import code_digest, package_versions
 from vio.config import Config, merge
 from vio.datasets import open_dataset
-from vio.datasets.frame_rate import used_frames
-from vio.datasets.span import frames_between, parse_bound
+from vio.datasets.frame_times import frames_between, parse_bound, used_frames
 from vio.errors import DataError, VioError
 from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.files.printable import json_text

@@ -17,6 +17,7 @@ import numpy as np
 
 from vio.cameras.rectification_error import error_basis
 from vio.cameras.rig import Rig
+from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, project_point, rectified_pair
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import MapArray, rectified_cameras, rectify_pixels
@@ -341,3 +342,30 @@ def _bent(camera: CameraModel, radial: tuple[float, float], p1: float, p2: float
     if camera.model == "equidistant":
         return replace(camera, coefficients=(c[0] + k1, c[1] + k2, *c[2:]))
     return camera
+
+
+_MOST_LEFT_PX = 5.0  # a rig that leaves more of what the run saw is none of these cameras; true ones leave 0.3 px
+
+
+def estimated_rig(given: Rig, estimate: Estimate, camera: StereoCamera, where: str) -> CalibratedRig:
+    """Return a given rig with all that a run estimated of it.
+
+    On a cylinder left and right stay as given: its rectification error is not expressed as a rig.
+
+    Raises:
+        CalibrationError: no rig of the given lens models is off as the run found it.
+    """
+    field = None if camera.is_cylinder else estimate.stereo_field
+    if field is None:
+        return calibrated_rig(given, replace(estimate, stereo_field=None))
+    cause: CalibrationError | None = None
+    try:
+        found = calibrated_rig(given, estimate)
+        if found.left_px <= _MOST_LEFT_PX:
+            return found
+    except CalibrationError as error:  # the fit's steps led out of the possible rigs
+        cause = error
+    raise CalibrationError(
+        f"{where}: no rig with the given lens models is off as the run found it (rows by {field.rows_rms_px:.2f} px "
+        "rms); the calibration may be that of other images, or without their distortion: calibrate the cameras anew"
+    ) from cause

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from vio.config import Config
-    from vio.datasets.span import Seconds
+    from vio.datasets.frame_times import Seconds
 
 
 def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,7 +47,7 @@ def add_span_arguments(parser: argparse.ArgumentParser) -> None:
 
 def bound(text: str) -> int | Seconds:
     """Parse a frame number, or a time after the first frame such as 12.5s."""
-    from vio.datasets.span import parse_bound
+    from vio.datasets.frame_times import parse_bound
 
     return parse_bound(text)
 

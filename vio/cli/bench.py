@@ -82,7 +82,7 @@ def _bench(args: argparse.Namespace) -> int:
     from vio.bench.bench import Place, bench
     from vio.bench.revision import revision_folder, run_in_turns
     from vio.bench.suite import SHIPPED, chosen, read_suite
-    from vio.cli.progress import ProgressBar
+    from vio.cli.output import ProgressBar
     from vio.errors import ConfigError, StoppedError
 
     if args.workers is not None and not 1 <= args.workers <= 1024:

@@ -47,8 +47,7 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
 
-    from vio.cli.output import print_result
-    from vio.cli.progress import ProgressBar
+    from vio.cli.output import ProgressBar, print_result
     from vio.errors import ConfigError
     from vio.files.atomic import atomic_folder
     from vio.files.printable import json_text

@@ -73,10 +73,9 @@ def _recording(args: argparse.Namespace) -> int:
     import logging
     from dataclasses import replace
 
-    from vio.cli.output import NOTE, print_result
-    from vio.cli.progress import ProgressBar
+    from vio.cli.output import NOTE, ProgressBar, print_result
     from vio.datasets import open_dataset
-    from vio.datasets.span import frames_between
+    from vio.datasets.frame_times import frames_between
     from vio.files.atomic import atomic_folder, check_spares
     from vio.files.text import write_text
     from vio.offline.convert import convert

@@ -21,11 +21,10 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from vio.cli.output import print_result
-    from vio.cli.progress import ProgressBar
+    from vio.cli.output import ProgressBar, print_result
     from vio.cli.running import check_out, metric_rows, process
     from vio.config import load_config
-    from vio.sim.demo import write_demo_recording
+    from vio.sim.scenarios import write_demo_recording
 
     check_out(args.out / "run")
     with ProgressBar("rendering the street") as bar:

@@ -60,8 +60,7 @@ def _bag(args: argparse.Namespace) -> int:
 def _colmap(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from vio.cli.output import print_result
-    from vio.cli.progress import ProgressBar
+    from vio.cli.output import ProgressBar, print_result
     from vio.errors import ConfigError
     from vio.files.atomic import atomic_folder
     from vio.files.printable import json_text

@@ -40,8 +40,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import time
 
-    from vio.cli.output import print_result
-    from vio.cli.progress import ProgressBar
+    from vio.cli.output import ProgressBar, print_result
     from vio.cli.stopping import StopRequest
     from vio.dense.voxel_grid import BLOCK
     from vio.errors import ConfigError

@@ -1,8 +1,10 @@
-"""Output of the commands: one JSON object, or a table."""
+"""Output of the commands: one JSON object, or a table, and a progress bar meanwhile."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping
+from types import TracebackType
 from typing import Any
 
 from vio.files.printable import json_text, printable
@@ -20,3 +22,37 @@ def print_result(
         for name, value in rows:
             print(f"{name:<{name_width}} {printable(value)}")
     return 0
+
+
+class ProgressBar:
+    """A tqdm bar on stderr for work whose total may become known only during it; silent where stderr is no terminal."""
+
+    def __init__(self, label: str, total: int | None = None, *, unit: str = "steps") -> None:
+        """Start at zero."""
+        from tqdm import tqdm
+
+        hidden = not sys.stderr.isatty()
+        self._bar = tqdm(desc=label, total=total, unit=f" {unit}", dynamic_ncols=True, file=sys.stderr, disable=hidden)
+
+    def update(self, done: int, total: int | None = None) -> None:
+        """Set the number of steps done, and optionally the total."""
+        self._bar.total = self._bar.total if total is None else total
+        self._bar.update(done - self._bar.n)
+
+    def advance(self) -> None:
+        """Advance by one step."""
+        self._bar.update()
+
+    def close(self) -> None:
+        """Keep the bar as it is, and move the cursor below it."""
+        self._bar.close()
+
+    def __enter__(self) -> ProgressBar:
+        """Return the bar."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the bar, whatever happened."""
+        self.close()

@@ -34,8 +34,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import logging
 
-    from vio.cli.output import NOTE, print_result
-    from vio.cli.progress import ProgressBar
+    from vio.cli.output import NOTE, ProgressBar, print_result
     from vio.datasets import DatasetSettings, open_dataset
     from vio.datasets.euroc import write_rectified_euroc
     from vio.datasets.kitti_raw import write_rectified_kitti

@@ -39,8 +39,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import time
 
-    from vio.cli.output import print_result
-    from vio.cli.progress import ProgressBar
+    from vio.cli.output import ProgressBar, print_result
     from vio.errors import ConfigError
     from vio.numerics.threads import one_blas_thread
     from vio.offline.colmap import quiet

@@ -85,12 +85,10 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import time
 
-    from vio.cli.output import print_result
-    from vio.cli.progress import ProgressBar
+    from vio.cli.output import ProgressBar, print_result
     from vio.errors import ConfigError
     from vio.numerics.threads import one_blas_thread
-    from vio.sim.export import export_euroc, export_kitti
-    from vio.sim.export_rgbd import export_rgbd
+    from vio.sim.export import export_euroc, export_kitti, export_rgbd
     from vio.sim.scenarios import ParallelRecording, default_workers, plan
     from vio.sim.sequence import SimulatedRecording
 

@@ -11,13 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vio.cli.output import NOTE
-from vio.cli.progress import ProgressBar
+from vio.cli.output import NOTE, ProgressBar
 from vio.cli.stopping import StopRequest
 from vio.config import Config, load_config
 from vio.datasets import open_dataset
-from vio.datasets.frame_rate import used_frames
-from vio.datasets.span import Seconds, frames_between
+from vio.datasets.frame_times import Seconds, frames_between, used_frames
 from vio.errors import CalibrationError, ConfigError, DataError, StoppedError, VioError
 from vio.evaluation.trajectories import lengths_text, metres_text, rotation_drift_text
 from vio.files.atomic import (
@@ -45,6 +43,7 @@ from vio.view.annotated import AnnotatedImage
 
 if TYPE_CHECKING:
     from vio.view.live import RerunViewer
+
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from tokenize import TokenError
 import numpy as np
 import numpy.typing as npt
 
-from vio.datasets.frame_rate import used_frames
+from vio.datasets.frame_times import used_frames
 from vio.datasets.samples import MotionSamples, motion_samples
 from vio.errors import CalibrationError, DataError
 from vio.files.inputs import check_regular

@@ -31,10 +31,10 @@ from vio.datasets.euroc_files import (
     rig_read_as,
     stamped_rows,
 )
+from vio.datasets.frame_times import PAIRED_NS, pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import list_images
-from vio.datasets.pairing import PAIRED_NS, pair_stamps
 from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
 from vio.datasets.samples import MotionSamples, imu_samples
 from vio.datasets.settings import DatasetSettings

@@ -8,8 +8,7 @@ import numpy as np
 
 from vio.datasets.bags import is_bag
 from vio.datasets.bags.gnss import read_navsatfix
-from vio.datasets.dates import drive_times
-from vio.datasets.tables import numbers_of, read_table, stamps_ns
+from vio.datasets.tables import drive_times, numbers_of, read_table, stamps_ns
 from vio.earth.gnss import UP_SHARE, GnssFixes, checked_fixes
 from vio.errors import DataError
 from vio.files.text import text_lines

@@ -20,14 +20,15 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.datasets.image_files import ImageFiles, stem_of
-from vio.datasets.image_formats import OTHER_SUFFIXES, other_damage
 from vio.datasets.png import crc32, decode_gray8
 from vio.errors import DataError
 from vio.files.inputs import check_regular, read_input
 from vio.geometry.lie import FloatArray
 from vio.records import Image
 
+OTHER_SUFFIXES = (".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp")
 SUFFIXES = (".png", ".jpg", ".jpeg", *OTHER_SUFFIXES)
+_TIFF_STARTS = (b"II*\0", b"MM\0*")
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 WHITE_16 = 65535  # the level of white in an image that uses all of its 16 bits
@@ -278,3 +279,24 @@ def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) 
         pool.shutdown(wait=True, cancel_futures=True)
         if isinstance(source, Generator):
             source.close()
+
+
+def other_damage(data: bytes) -> str | None:
+    """Describe the damage of an encoded BMP, TIFF, PGM, PPM or WebP image; None: it is complete.
+
+    References: the formats' headers. TIFF states no length; the decoder refuses what it cannot read.
+    """
+    if data.startswith(b"BM") and len(data) >= 6:
+        return "the BMP is truncated" if struct.unpack_from("<I", data, 2)[0] > len(data) else None
+    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        return "the WebP is truncated" if struct.unpack_from("<I", data, 4)[0] + 8 > len(data) else None
+    if data[:2] in (b"P5", b"P6"):
+        header = re.match(rb"P[56]\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s", data)
+        if header is None:
+            return "the PGM or PPM has no valid header"
+        width, height, top = (int(x) for x in header.groups())
+        size = width * height * (3 if data[:2] == b"P6" else 1) * (2 if top > 255 else 1)
+        return "the PGM or PPM is truncated" if len(data) - header.end() < size else None
+    if data.startswith(_TIFF_STARTS):
+        return None
+    return "neither PNG nor JPEG, BMP, TIFF, PGM, PPM or WebP"

@@ -21,11 +21,11 @@ import numpy as np
 
 from vio.cameras.rig import Rectifier
 from vio.datasets.common import check_intrinsics, checked_transform, image_size, naming, numbers_in
-from vio.datasets.dates import drive_times
 from vio.datasets.image_pairs import ImagePairs, first_readable, full_scale, pair_images
 from vio.datasets.kitti import write_calibration, write_times
 from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
 from vio.datasets.settings import DatasetSettings
+from vio.datasets.tables import drive_times
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
 from vio.files.text import text_lines

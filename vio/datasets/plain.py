@@ -21,16 +21,15 @@ import numpy as np
 
 from vio.cameras.rig import Rig
 from vio.datasets.companions import IMU_FILES, calibration_beside, find_calibration_of, read_companions
-from vio.datasets.dates import drive_times, is_date
 from vio.datasets.euroc_files import stamped_rows
+from vio.datasets.frame_times import pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImagePairs, measured_images
 from vio.datasets.images import SUFFIXES, list_images
-from vio.datasets.pairing import pair_stamps
 from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.tables import parse_stamps
+from vio.datasets.tables import drive_times, is_date, parse_stamps
 from vio.datasets.tum_rgbd import LISTS, associated_images, is_tum_folder, published_camera
 from vio.datasets.unused import Layout
 from vio.errors import CalibrationError, DataError

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from vio.datasets.frame_rate import FrameRateLimit
+from vio.datasets.frame_times import FrameRateLimit
 from vio.errors import ConfigError, DataError, OrderError
 from vio.filters.inputs import LARGEST
 from vio.geometry.lie import FloatArray

@@ -19,17 +19,15 @@ from vio.filters.point_map import newest_points
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.build import CONFIGURED, MapUse, Parts
-from vio.live.collector import QuietCollector
 from vio.live.event_inputs import EventInputs
 from vio.live.event_queue import DROPS, Drop
 from vio.live.figures import LiveFigures, LiveMonitor
 from vio.live.inputs import GivenFrame, Inputs, checked_time
 from vio.live.odometry import Odometry
-from vio.live.prediction import PredictedPose
-from vio.live.shared_prediction import SharedPredictor
+from vio.live.prediction import PredictedPose, SharedPredictor
 from vio.live.stream import EstimateStream
 from vio.live.warm_up import warm_up
-from vio.live.worker import Worker
+from vio.live.worker import QuietCollector, Worker
 from vio.records import Estimate, FrameResult, Landmarks, MotionSample, MotionSource
 
 log = logging.getLogger(__name__)

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vio.calibration.estimated_rig import estimated_rig
-from vio.calibration.stereo_field import CalibratedRig
+from vio.calibration.stereo_field import CalibratedRig, estimated_rig
 from vio.cameras.rig import Rig, rig_of_rectified
 from vio.config import Config
 from vio.errors import ConfigError, DataError

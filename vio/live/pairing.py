@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Generic, TypeVar
 
-from vio.datasets.pairing import PAIRED_NS
+from vio.datasets.frame_times import PAIRED_NS
 
 T = TypeVar("T")
 

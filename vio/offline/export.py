@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,8 @@ import numpy as np
 
 from vio.files.meshes import ply_points
 from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.offline.colmap import HALF_PX
 from vio.offline.colmap.model import (
     ColourArray,
     ModelImages,
@@ -18,7 +21,6 @@ from vio.offline.colmap.model import (
     mean_reprojection_error_px,
     write_model,
 )
-from vio.offline.colmap.nerfstudio import nerfstudio_transforms
 from vio.offline.images import write_images
 from vio.offline.keyframes import choose_keyframes
 from vio.offline.loop_tracks import loop_pairs
@@ -112,3 +114,31 @@ def _colours_at(image: Image, uv: FloatArray) -> FloatArray:
     u = np.clip(np.rint(uv[:, 0]).astype(int), 0, image.shape[1] - 1)
     v = np.clip(np.rint(uv[:, 1]).astype(int), 0, image.shape[0] - 1)
     return np.broadcast_to(image[v, u].astype(np.float64).reshape(len(uv), -1), (len(uv), 3))
+
+
+def nerfstudio_transforms(camera: StereoCamera, T_world_cam0: FloatArray, names: ModelImages) -> str:
+    """Return the text of nerfstudio's `transforms.json`; the point cloud is `points.ply` in the same folder.
+
+    Poses are camera to world with x right, y up, z back (OpenGL); the world frame is that of the run, metric.
+    """
+    T_cam0_cam1 = np.eye(4)
+    T_cam0_cam1[0, 3] = camera.baseline_m
+    to_opengl = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [
+        {"file_path": name, "transform_matrix": (T @ to_opengl).tolist()}
+        for k, T_world in enumerate(T_world_cam0)
+        for name, T in ((names.left[k], T_world), (names.right[k], T_world @ T_cam0_cam1))
+    ]
+    document = {
+        "camera_model": "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fu,
+        "fl_y": camera.fv,
+        "cx": camera.cu + HALF_PX,
+        "cy": camera.cv + HALF_PX,
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        "ply_file_path": "points.ply",
+        "frames": frames,
+    }
+    return json.dumps(document, indent=1) + "\n"

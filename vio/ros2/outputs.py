@@ -18,9 +18,8 @@ from vio.live.results import live_trajectory, write_results
 from vio.live.stream import EstimateStream
 from vio.offline.export_bag import ros_covariance
 from vio.records import NS_PER_S, Estimate
-from vio.ros2.publishing import publisher
 from vio.ros2.sensors import Sensors
-from vio.ros2.transport import Transport
+from vio.ros2.transport import Transport, publisher
 
 log = logging.getLogger(__name__)
 

@@ -12,9 +12,8 @@ from vio.geometry.lie import se3_inverse
 from vio.protocols import Dataset
 from vio.records import Event, ImuSample, Recording, StereoFrame
 from vio.ros2.calibration import info_topic
-from vio.ros2.publishing import publisher
 from vio.ros2.sensors import SensorTopics
-from vio.ros2.transport import Quality, Transport
+from vio.ros2.transport import Quality, Transport, publisher
 
 CAMERA_FRAMES, IMU_FRAME = ("cam0", "cam1"), "imu"
 _WAIT_S = 0.05

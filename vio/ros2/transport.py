@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Mapping
-from typing import Literal, Protocol, TypeAlias
+from typing import Any, Literal, Protocol, TypeAlias
 
+from vio.datasets.bags.writer import BagWriter
 from vio.errors import MissingDependencyError
 
 # "sensor": unreliable, as drivers publish; "reliable": none is lost, and the sender waits for a slow receiver;
@@ -58,3 +59,36 @@ def open_transport(name: TransportName = "auto", domain: int | None = None) -> T
     from vio.ros2.dds import DdsTransport
 
     return DdsTransport(domain)
+
+
+class _Published:
+    """Takes the place of a bag: each topic is advertised with its first message, or before."""
+
+    def __init__(self, transport: Transport, qualities: Mapping[str, Quality], default: Quality) -> None:
+        self._transport, self._qualities, self._default = transport, qualities, default
+        self._topics: dict[str, Callable[[bytes], None]] = {}
+
+    def add_connection(self, topic: str, msgtype: str, **_: Any) -> Callable[[bytes], None]:
+        if topic not in self._topics:
+            self._topics[topic] = self._transport.advertise(topic, msgtype, self._qualities.get(topic, self._default))
+        return self._topics[topic]
+
+    def write(self, connection: Callable[[bytes], None], timestamp: int, data: bytes | memoryview) -> None:
+        connection(bytes(data))
+
+
+def publisher(
+    transport: Transport, topics: Mapping[str, str], *, latched: tuple[str, ...] = (), default: Quality = "reliable"
+) -> BagWriter:
+    """Return what makes and publishes messages.
+
+    Args:
+        transport: of the graph.
+        topics: advertised at once, with their types; others are with their first message.
+        latched: topics whose last message a late subscriber gets, besides /tf_static.
+        default: quality of the other topics.
+    """
+    sink = _Published(transport, dict.fromkeys(("/tf_static", *latched), "latched"), default)
+    for topic, kind in topics.items():
+        sink.add_connection(topic, kind)
+    return BagWriter(sink)

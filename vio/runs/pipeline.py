@@ -6,20 +6,22 @@ import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
-from vio.calibration.estimated_rig import estimated_rig
-from vio.calibration.stereo_field import CalibratedRig
+from vio.calibration.stereo_field import CalibratedRig, estimated_rig
 from vio.cameras.rig import Rig, rig_of_rectified
 from vio.config import Config
-from vio.datasets.frame_rate import used_frames
+from vio.datasets.frame_times import used_frames
 from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.files.tables import Records
+from vio.filters.settings import VislamSettings
+from vio.filters.vislam import Vislam
 from vio.frontend import one_opencv_thread
 from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.stereo import StereoCamera
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, recorded_source
 from vio.live.processor import EventProcessor
 from vio.numerics.threads import one_blas_thread
@@ -39,7 +41,6 @@ from vio.records import (
     StereoFrame,
     Trajectory,
 )
-from vio.runs.dead_reckoning import DeadReckoning
 from vio.runs.mapped import MappedRun, mapped_run
 from vio.runs.recorder import GrowingFolder, RunRecorder
 
@@ -401,3 +402,25 @@ def _trajectory(T_world_body: FloatArray, rows: RunRecorder, body: BodyFrame) ->
     """Return poses (N, 4, 4) of the first N frames with an estimate; a run that an error ends may have one less."""
     times_ns, indices = (np.asarray(rows.estimates.column(name))[: len(T_world_body)] for name in ("time_ns", "index"))
     return Trajectory(T_world_body=T_world_body, times_ns=times_ns, body=body, frame_indices=indices)
+
+
+class DeadReckoning:
+    """The paper's filter without its updates."""
+
+    def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, settings: VislamSettings) -> None:
+        settings = replace(settings, mode="dead_reckoning", motion_model="input")
+        self._filter = Vislam(camera, T_cam0_body, settings, motion_sensor=True)
+        self._begun = False
+
+    def add(self, event: Event) -> None:
+        """Take a motion sample."""
+        if not isinstance(event, StereoFrame):
+            self._filter.propagate(event)
+            self._begun = True
+
+    def pose_at(self, time_ns: int) -> FloatArray:
+        """The pose (4, 4) of the body at a frame, which may not be older than the last one."""
+        if not self._begun:  # at its start, as velocities may begin after the images
+            return np.eye(4)
+        self._filter.advance(time_ns)
+        return self._filter.estimate().T_world_imu

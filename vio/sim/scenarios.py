@@ -21,10 +21,12 @@ from threadpoolctl import threadpool_limits
 from vio.errors import DataError
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts
+from vio.protocols import Progress
 from vio.records import NS_PER_S, Image, ImuRecord, IntArray
 from vio.setting import setting
 from vio.sim.effects import CLEAN, SensorEffects
 from vio.sim.errors import SimulationError
+from vio.sim.export import export_kitti
 from vio.sim.imu import ImuNoise, VelocityNoise
 from vio.sim.miscalibration import CalibrationErrors, CalibrationSigmas
 from vio.sim.motion import (
@@ -472,3 +474,28 @@ def flight_files(folder: Path) -> tuple[Path, Path | None, Path | None]:
 
 SCENES: tuple[str, ...] = get_args(SceneName)
 READY_MOTIONS: tuple[str, ...] = get_args(ReadyMotion)
+
+
+_RATE_HZ = 10.0
+_DURATION_S = 14.0
+_WIDTH_PX = 800
+_START_M = 12.0  # the drive then covers a straight, a corner and another straight
+
+
+def write_demo_recording(out: Path, progress: Progress | None = None) -> Path:
+    """Render the demo's recording as a KITTI folder with ground truth, velocities and extrinsics; return the folder.
+
+    Raises:
+        VioError: the folder cannot be written, or holds foreign files.
+    """
+    simulation = simulate(
+        street(seed=4),
+        kitti_like_rig(_WIDTH_PX),
+        car_loop(duration_s=_DURATION_S, start_m=_START_M, seed=4),
+        rate_hz=_RATE_HZ,
+        velocity=VelocityNoise(),
+        effects=SensorEffects(read_noise=1.5, vignetting=0.2),
+        seed=4,
+    )
+    export_kitti(SimulatedRecording(simulation), out, replace=True, progress=progress)
+    return out

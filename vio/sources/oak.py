@@ -16,8 +16,7 @@ from vio.errors import DataError, MissingDependencyError
 from vio.geometry.distortion import CameraModel
 from vio.live.pairing import Pairing
 from vio.records import Image
-from vio.sources.interpolated import ImuInterpolation
-from vio.sources.source import SourceEvent, SourceFrame
+from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame
 
 _WIDTH, _HEIGHT, _RATE_HZ = 640, 400, 20.0
 _IMU_HZ = 200

@@ -18,8 +18,7 @@ from vio.errors import DataError, MissingDependencyError
 from vio.geometry.lie import FloatArray, se3_from_parts
 from vio.live.pairing import Pairing
 from vio.records import Image
-from vio.sources.interpolated import ImuInterpolation
-from vio.sources.source import SourceEvent, SourceFrame
+from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame
 
 log = logging.getLogger(__name__)
 

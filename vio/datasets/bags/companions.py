@@ -12,8 +12,8 @@ from vio.datasets.bags.index import BagIndex, index_bag, info_topic
 from vio.datasets.bags.pictures import white_of
 from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import Roles, choose
+from vio.datasets.companions import check_overlap
 from vio.datasets.images import UnreadableImageError, decode_gray
-from vio.datasets.overlap import check_overlap
 from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.rigs.camera_info import rig_from_camera_infos
 from vio.datasets.samples import imu_samples, in_time_order

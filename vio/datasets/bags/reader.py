@@ -19,10 +19,10 @@ from vio.datasets.bags.pictures import gray_of
 from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import COMPRESSED
 from vio.datasets.common import blank_frames, chosen_frames, merge_events, naming
+from vio.datasets.companions import reference_of_body
+from vio.datasets.frame_times import PAIRED_NS, pair_stamps
 from vio.datasets.image_pairs import BadFrame, ImageSize, readable_frames
 from vio.datasets.images import UnreadableImageError
-from vio.datasets.overlap import reference_of_body
-from vio.datasets.pairing import PAIRED_NS, pair_stamps
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
 from vio.records import Event, ImuDensities, IntArray, MotionSample, Observations, Recording, StereoFrame

@@ -9,6 +9,7 @@ import pycolmap
 from vio.calibration.stereo import RayMatches
 from vio.geometry.lie import FloatArray
 from vio.offline.colmap import HALF_PX, SEED, SIFT_FEATURES
+from vio.offline.colmap.adjustment import adjustment_config, solve, solver_options
 from vio.offline.colmap.model import (
     LEFT,
     RIGHT,
@@ -22,7 +23,6 @@ from vio.offline.colmap.model import (
     rig_model,
     without_scale,
 )
-from vio.offline.colmap.solver import adjustment_config, solve, solver_options
 from vio.records import BoolArray, Image
 
 _RATIO = 0.8  # of the distances to the best and the second best descriptor
