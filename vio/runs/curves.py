@@ -9,8 +9,8 @@ import numpy as np
 
 from vio.evaluation.alignment import align_poses, settle_rotation
 from vio.evaluation.trajectories import Evaluation
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, transform_points
 from vio.files.tables import Rows
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.upright import attitude_deg, rotated, upright_view
 from vio.records import RIGHT_TERMS, Trajectory
 from vio.runs.finished import FinishedRun
@@ -158,9 +158,7 @@ def binned(seconds: FloatArray, values: FloatArray, bins: int) -> tuple[FloatArr
     return np.array([seconds[g].mean() for g in groups]), np.array([np.median(values[g]) for g in groups])
 
 
-def _mapped(
-    run: FinishedRun, drawn: DrawnRun, T_view_world: FloatArray, view_ref: FloatArray | None
-) -> Mapped | None:
+def _mapped(run: FinishedRun, drawn: DrawnRun, T_view_world: FloatArray, view_ref: FloatArray | None) -> Mapped | None:
     """Return a run in its map: aligned with the reference as the run itself is, else so that the first poses agree."""
     if run.mapped is None:
         return None

@@ -15,16 +15,15 @@ import numpy as np
 from vio.config import Config, describe, load_config
 from vio.errors import ConfigError, DataError, EvaluationError
 from vio.evaluation.trajectories import Evaluation, evaluate
-from vio.geometry.lie import FloatArray
 from vio.files.inputs import read_input
-from vio.runs.mapped import read_keyframes, read_loops
-from vio.records import LoopEvent, MapKeyframes
-from vio.records import Trajectory
-from vio.runs.folder import read_metrics
-from vio.runs.files import RunFile
-from vio.runs.tables import ESTIMATE
 from vio.files.tables import Rows
 from vio.files.trajectories import read_trajectory
+from vio.geometry.lie import FloatArray
+from vio.records import LoopEvent, MapKeyframes, Trajectory
+from vio.runs.files import RunFile
+from vio.runs.folder import read_metrics
+from vio.runs.mapped import read_keyframes, read_loops
+from vio.runs.tables import ESTIMATE
 
 log = logging.getLogger(__name__)
 

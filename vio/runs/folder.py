@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from vio._version import __version__
-from vio.files.atomic import atomic_folder, check_own
 from vio.calibration.severity import StereoError
 from vio.calibration.stereo_field import PARAMETERS
 from vio.config import Config, describe, to_yaml
@@ -26,18 +25,19 @@ from vio.datasets.common import checked_transform
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, DataError, EvaluationError
 from vio.evaluation.trajectories import Evaluation, error_statistics, evaluate, path_length_m
-from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
+from vio.files.atomic import atomic_folder, check_own
 from vio.files.inputs import read_input
+from vio.files.printable import json_text, printable
+from vio.files.tables import Records
+from vio.files.trajectories import in_first_cam0, read_trajectory, write_kitti, write_tum
+from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
+from vio.protocols import Dataset
+from vio.records import IMU_ENTRIES, Landmarks, Trajectory
 from vio.runs.files import FILES, REQUEST, RunFile
 from vio.runs.mapped import MappedRun, write_keyframes, write_loops
 from vio.runs.pipeline import STAGES, FrameLog, RunResult, given_rig
-from vio.files.printable import json_text, printable
-from vio.protocols import Dataset
-from vio.records import IMU_ENTRIES, Landmarks, Trajectory
 from vio.runs.recorder import GrowingFolder
 from vio.runs.tables import frames_csv
-from vio.files.tables import Records
-from vio.files.trajectories import in_first_cam0, read_trajectory, write_kitti, write_tum
 
 if TYPE_CHECKING:
     from vio.runs.picture import RunPicture
@@ -393,7 +393,7 @@ def final_scale_sigma(result: RunResult) -> float | None:
 
 
 def rig_scale_sigma(result: RunResult) -> float | None:
-    """Return the standard deviation of the scale by the calibration, over it; None: it is estimated, or not considered."""
+    """Return the standard deviation of the scale by the calibration, over it; None: it is estimated or left out."""
     settings, camera = result.config.msckf, result.recording.camera
     if result.config.backend != "msckf" or camera.kind == "mono" or result.estimates[-1].stereo_scale is not None:
         return None

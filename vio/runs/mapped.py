@@ -118,7 +118,9 @@ def write_keyframes(folder: Path, keyframes: MapKeyframes) -> None:
     columns = (keyframes.keyframe, keyframes.frame, keyframes.time_ns, keyframes.own.astype(np.int64))
     numbers = np.stack(columns, axis=1).tolist()
     lines = [",".join(map(str, [*row, *pose])) for row, pose in zip(numbers, poses, strict=True)]
-    (folder / RunFile.MAP_KEYFRAMES).write_text("\n".join([",".join(_KEYFRAME_COLUMNS), *lines]) + "\n", encoding="utf-8")
+    (folder / RunFile.MAP_KEYFRAMES).write_text(
+        "\n".join([",".join(_KEYFRAME_COLUMNS), *lines]) + "\n", encoding="utf-8"
+    )
 
 
 def read_loops(folder: Path) -> tuple[LoopEvent, ...]:

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from vio.evaluation.trajectories import Evaluation, metres_text
-from vio.records import STAGES
-from vio.geometry.lie import FloatArray
-from vio.runs.curves import SIGMAS, STAGE_COLOURS, Curves, DrawnRun, binned, draw, stereo_curves
-from vio.runs.pipeline import RunResult
 from vio.files.printable import printable
 from vio.files.tables import Rows
+from vio.geometry.lie import FloatArray
+from vio.records import STAGES
+from vio.runs.curves import SIGMAS, STAGE_COLOURS, Curves, DrawnRun, binned, draw, stereo_curves
+from vio.runs.pipeline import RunResult
 
 log = logging.getLogger(__name__)
 

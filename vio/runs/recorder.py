@@ -18,13 +18,14 @@ from typing import Any, overload
 
 import numpy as np
 
-from vio.files.atomic import atomic_write_text, check_own, open_own
-from vio.runs.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
 from vio.errors import DataError
-from vio.records import FrameLog, FrameResult
+from vio.files.atomic import atomic_write_text, check_own, open_own
+from vio.files.tables import Records, Rows, Table, check_table
+from vio.files.trajectories import tum_text
 from vio.geometry.lie import FloatArray
 from vio.protocols import Dataset
-from vio.records import BodyFrame, Estimate, Landmarks, MotionSample, Observations
+from vio.records import BodyFrame, Estimate, FrameLog, FrameResult, Landmarks, MotionSample, Observations
+from vio.runs.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
 from vio.runs.files import CHECKPOINT, RunFile
 from vio.runs.tables import (
     ESTIMATE,
@@ -43,8 +44,6 @@ from vio.runs.tables import (
     sample_of,
     sample_row,
 )
-from vio.files.tables import Records, Rows, Table, check_table
-from vio.files.trajectories import tum_text
 
 log = logging.getLogger(__name__)
 
@@ -329,11 +328,12 @@ class RunRecorder:
             with self._writing():
                 self._folder.path.mkdir(parents=True, exist_ok=True)
                 texts = self._folder.texts
-                for name in [name for name in texts if not name.startswith(RunFile.UNFINISHED)]:  # they say whose folder it is
+                early = [name for name in texts if not name.startswith(RunFile.UNFINISHED)]
+                for name in early:  # they say whose folder it is
                     atomic_write_text(self._folder.path / name, texts[name])
                 _remove(self._folder.path, [RunFile.UNFINISHED, *(n for n in self._folder.replaces if n not in texts)])
                 self._unfinished.mkdir()
-                for name in [name for name in texts if name.startswith(RunFile.UNFINISHED)]:
+                for name in sorted(texts.keys() - early):
                     atomic_write_text(self._folder.path / name, texts[name])
                 self._tables = {name: Table(dtype, self._unfinished / f"{name}.npy") for name, dtype in _TABLES.items()}
         for row in self._early:

@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from vio.records import FrameLog
+from vio.files.tables import Rows
 from vio.geometry.lie import FloatArray
 from vio.records import (
     Estimate,
+    FrameLog,
     ImuSample,
     MotionSample,
     Observations,
@@ -24,7 +25,6 @@ from vio.records import (
     StereoScaleEstimate,
     VelocitySample,
 )
-from vio.files.tables import Rows
 
 # Optional fields of an estimate, with their shapes.
 _KEPT = {field.name: field.metadata["shape"] for field in dataclasses.fields(Estimate) if "shape" in field.metadata}
