@@ -22,11 +22,12 @@ from vio.errors import ConfigError, DataError, VioError
 from vio.geometry.lie import se3_exp
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
-from vio.mapping import map_store
+from vio.mapping import map_database
 from vio.mapping.builder import MapBuilder
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.files import check_map, merge_maps
-from vio.mapping.map_store import VERSION, KeyframeRow, LoopRow, MapStore, SessionRow
+from vio.mapping.map_database import VERSION
+from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 
 CAMERA = StereoCamera(400.0, 401.0, 319.5, 179.5, 0.12, 640, 360)
 
@@ -166,13 +167,13 @@ def test_a_map_of_another_version_is_refused(tmp_path: Path) -> None:
 def _make_older(path: Path, version: int) -> None:
     """Make a map as earlier versions wrote it."""
     with contextlib.closing(sqlite3.connect(path)) as database:
-        database.create_function("row_crc32", -1, map_store._row_crc32, deterministic=True)
-        for table in map_store._KEYS:
-            if map_store._SINCE.get(table, 1) > version:
+        database.create_function("row_crc32", -1, map_database._row_crc32, deterministic=True)
+        for table in map_database.KEYS:
+            if map_database.SINCE.get(table, 1) > version:
                 database.execute(f"DROP TABLE {table}")
                 continue
             columns = [name for (name,) in database.execute("SELECT name FROM pragma_table_info(?)", (table,))]
-            newer = [name for name in columns if map_store._SINCE.get(name, 1) > version]
+            newer = [name for name in columns if map_database.SINCE.get(name, 1) > version]
             for column in newer:
                 database.execute(f"ALTER TABLE {table} DROP COLUMN {column}")
             if "crc32" not in newer:
@@ -370,7 +371,7 @@ def test_a_long_step_ends_with_a_signal_and_with_its_time(tmp_path: Path, monkey
         signal.setitimer(signal.ITIMER_REAL, 0.2)
         with pytest.raises(KeyboardInterrupt), store._errors():
             store._db.execute(f"SELECT count(*) FROM ({ENDLESS})").fetchone()
-        monkeypatch.setattr("vio.mapping.map_store._MOST_S", 0.2)
+        monkeypatch.setattr("vio.mapping.map_database._MOST_S", 0.2)
         with pytest.raises(DataError, match="a step took more than"), store._errors():
             store._db.execute(f"SELECT count(*) FROM ({ENDLESS})").fetchone()
     finally:

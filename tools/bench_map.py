@@ -22,9 +22,10 @@ import numpy as np
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, project
-from vio.mapping.builder import FoundPlace, Keyframe, MapBuilder
+from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.features import MOST_FEATURES, KeyframeFeatures
 from vio.mapping.map_store import KeyframeRow, MapStore
+from vio.mapping.place_finder import FoundPlace
 
 CAMERA = StereoCamera(400.0, 400.0, 319.5, 179.5, 0.12, 640, 360)
 QUERIES = 20
@@ -49,7 +50,7 @@ def fill(path: Path, begin: int, end: int) -> None:
     """Add keyframes to a map without looking for loops."""
     store = MapStore(path, create=True)
     builder = MapBuilder(store, "simulated", CAMERA, upright=False, localise=False)
-    builder.find = lambda number, features: None  # type: ignore[method-assign]
+    builder.places.find = lambda number, features: None  # type: ignore[method-assign]
     T: FloatArray = np.eye(4)
     for k in range(begin, end):
         builder.add(Keyframe(k, k, T, MOTION if k > begin else None, None, 0.0), features(k))
@@ -72,7 +73,7 @@ def measure(path: Path, size: int) -> dict[str, float]:
         own = len(builder.graph.sessions) - 1
         builder.graph.append(KeyframeRow(own, k, k, np.eye(4), np.eye(4), drift, path_m, None, 0.0))
         start = time.process_time()
-        found += builder.find(len(builder.graph) - 1, query) is not None
+        found += builder.places.find(len(builder.graph) - 1, query) is not None
         spent.append(1e3 * (time.process_time() - start))
     return {
         "keyframes": size,
@@ -81,8 +82,8 @@ def measure(path: Path, size: int) -> dict[str, float]:
         "found": found / QUERIES,
         **followed(path),
         "open_s": opened,
-        "index_MB": builder.index_bytes / 1e6,
-        "overlap_MB": builder.overlap_bytes / 1e6,
+        "index_MB": builder.places.index_bytes / 1e6,
+        "overlap_MB": builder.places.overlap_bytes / 1e6,
         "file_MB": path.stat().st_size / 1e6,
         "memory_MB": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e3,
     }
@@ -91,7 +92,7 @@ def measure(path: Path, size: int) -> dict[str, float]:
 def followed(path: Path) -> dict[str, float]:
     """Localise a session that follows the map's first path, and time queries once it has its place."""
     builder = MapBuilder(MapStore(path, read_only=True), "query", CAMERA, upright=False, localise=True)
-    find, spent, found = builder.find, list[float](), list[bool]()
+    find, spent, found = builder.places.find, list[float](), list[bool]()
 
     def timed(number: int, seen: KeyframeFeatures) -> FoundPlace | None:
         known, start = builder.is_joined, time.process_time()
@@ -101,7 +102,7 @@ def followed(path: Path) -> dict[str, float]:
             found.append(place is not None)
         return place
 
-    builder.find = timed  # type: ignore[assignment, method-assign]
+    builder.places.find = timed  # type: ignore[assignment, method-assign]
     T: FloatArray = np.eye(4)
     for k in range(QUERIES):
         keyframe = Keyframe(k, k, T, None if k == 0 else MOTION, None, 0.0)

@@ -16,7 +16,8 @@ from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.relative_pose import RelativePose
 from vio.mapping.builder import Keyframe, MapBuilder
-from vio.mapping.map_store import MapStore, SessionRow, check_path
+from vio.mapping.map_database import check_path
+from vio.mapping.map_store import MapStore, SessionRow
 from vio.records import BoolArray, IntArray
 
 _M_PER_RAD = 2.0  # a turn of a radian shows as much that is new as a step of so many metres
