@@ -49,7 +49,6 @@ class FrontendReport:
     reused_ids: int  # ids that came back after their feature was lost; must be 0
 
     def __str__(self) -> str:
-        """Return one line a figure."""
         return "\n".join(f"{f.name:<20} {_shown(getattr(self, f.name))}" for f in fields(self))
 
 

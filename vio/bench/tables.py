@@ -196,7 +196,6 @@ class Notes:
     """Why figures are undefined, numbered as they are asked for."""
 
     def __init__(self) -> None:
-        """Begin without a note."""
         self._numbers: dict[str, int] = {}
 
     def dash(self, row: Row, metric: Metric) -> str:

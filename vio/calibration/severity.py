@@ -47,7 +47,6 @@ class StereoError:
         return max(rows_grade(self.rows_px), length_grade(certain), key=get_args(Grade).index)
 
     def __str__(self) -> str:
-        """Return grade and sizes."""
         text = f"{self.grade}: rows off by {self.rows_px:.2f} px (rms)"
         if self.seen_px < 0:
             return f"{text}, most disparities are negative"

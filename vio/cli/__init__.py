@@ -1,5 +1,7 @@
 """The command `vio`: subcommands, one file each; nothing heavy is imported before a command runs.
 
+Such a file has `add_parser`, which adds its options, and `execute`, which runs it and returns the exit status.
+
 Exit status: 0 success, 1 an expected error, reported in one line, 2 wrong usage, 130 interrupted by Ctrl-C, 143 ended
 by SIGTERM, 129 by SIGHUP; the last three leave no unfinished files behind.
 """
@@ -117,6 +119,8 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in _COMMANDS:
         module.add_parser(commands)
+    for parser_of_one, module in zip(commands.choices.values(), _COMMANDS, strict=True):
+        parser_of_one.set_defaults(execute=module.execute)
     return parser
 
 

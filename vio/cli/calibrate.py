@@ -27,7 +27,6 @@ _Part = TypeVar("_Part")
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "calibrate",
         help="measure and check a calibration",
@@ -48,11 +47,9 @@ def add_parser(commands: Any) -> None:
         "--frames", type=int, default=_FRAMES, metavar="N", help=f"frames tracked for the IMU (default {_FRAMES})"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     from vio.cli.output import ProgressBar, print_result
     from vio.cli.running import free_folder
     from vio.errors import ConfigError

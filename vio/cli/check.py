@@ -16,7 +16,6 @@ KEYFRAMES = 40
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "check",
         help="check a run without ground truth",
@@ -41,12 +40,9 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="default 1: repeatable")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
-
     from vio.cli.output import ProgressBar, print_result
     from vio.errors import ConfigError
     from vio.files.atomic import atomic_folder

@@ -9,7 +9,6 @@ _SHELLS = ("bash", "zsh", "tcsh")
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "completion",
         help="print a script that completes commands and options in a shell",
@@ -17,11 +16,9 @@ def add_parser(commands: Any) -> None:
         '`eval "$(vio completion bash)"` into ~/.bashrc; zsh: `vio completion zsh > DIR/_vio` for a DIR of $fpath.',
     )
     parser.add_argument("shell", choices=_SHELLS)
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     import shtab
 
     from vio.cli import build_parser

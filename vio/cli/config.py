@@ -13,14 +13,12 @@ if TYPE_CHECKING:
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "config", help="show or check settings", description="Show the settings, or check and print a configuration."
     )
     parser.add_argument("--show", action="store_true", help="the basic settings: value, unit, meaning")
     parser.add_argument("--all", action="store_true", help="every setting, in groups")
     add_config_arguments(parser)
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:

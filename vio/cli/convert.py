@@ -14,7 +14,6 @@ _TRAJECTORIES = ("tum", "kitti", "euroc")
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "convert",
         help="write a recording or a trajectory in another format",
@@ -30,11 +29,9 @@ def add_parser(commands: Any) -> None:
     add_span_arguments(parser)
     add_config_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     from vio.files.trajectories import is_trajectory_file
 
     if args.to == "tum" or is_trajectory_file(Path(args.source)):

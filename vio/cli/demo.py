@@ -8,7 +8,6 @@ from typing import Any
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "demo",
         help="render a small recording and process it",
@@ -16,11 +15,9 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="folder (default demo)")
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     from vio.cli.output import ProgressBar, print_result
     from vio.cli.running import check_out, metric_rows, process
     from vio.config import load_config

@@ -29,7 +29,6 @@ _ALIGNMENTS = {
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "eval",
         help="compare trajectories with a reference",
@@ -70,11 +69,9 @@ def add_parser(commands: Any) -> None:
         "--plot", nargs="?", const=Path("eval.png"), type=Path, metavar="F", help="draw paths and errors (eval.png)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object; of several by their names")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     from vio.cli.output import print_result
     from vio.files.atomic import check_new_file
 

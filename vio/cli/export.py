@@ -11,7 +11,6 @@ MARKER = "export.json"
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "export",
         help="write a run for COLMAP and nerfstudio, or for RViz and Foxglove",
@@ -29,11 +28,9 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--no-images", action="store_true", help="do not write the rectified images")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     return _colmap(args) if args.form == "colmap" else _bag(args)
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "georeference",
         help="place a run or a map on the earth by GNSS positions",
@@ -35,11 +34,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--topic", metavar="T", help="of a bag with several topics of NavSatFix")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default RUN/earth or MAP.earth)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     import logging
     import math
 

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "inspect",
         help="examine a recording before a run",
@@ -27,11 +26,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--pairs", type=int, default=12, metavar="N", help="frames looked at (default 12)")
     parser.add_argument("--frames", type=int, default=60, metavar="N", help="frames tracked (default 60; 0: none)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     from vio.cli.output import ProgressBar, print_result
     from vio.datasets import open_dataset
     from vio.errors import ConfigError

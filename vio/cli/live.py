@@ -10,7 +10,6 @@ from vio.cli.arguments import add_settings_arguments, config_from
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "live",
         help="odometry from a camera",
@@ -35,11 +34,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--localise", action="store_true", help="find poses in --map, and leave it as it is")
     parser.add_argument("--view", nargs="?", const="spawn", metavar="WHERE", help="show it in rerun (extra view)")
     parser.add_argument("--drop", choices=("oldest", "none", "block"), default="oldest", help="of frames that wait")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     import sys
 
     from vio.cli.stopping import StopRequest

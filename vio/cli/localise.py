@@ -10,7 +10,6 @@ from vio.cli.arguments import add_config_arguments, add_span_arguments, config_f
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "localise",
         help="find a recording's poses in a map",
@@ -25,11 +24,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     from vio.cli.output import print_result
     from vio.cli.running import metric_rows, process
 

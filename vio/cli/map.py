@@ -26,7 +26,6 @@ def parse_point(text: str) -> tuple[float, float, float]:
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "map",
         help="show, check, merge and prune maps",
@@ -59,11 +58,9 @@ def add_parser(commands: Any) -> None:
     extract.add_argument("--out", type=Path, required=True, metavar="MAP", help="a new file")
     for action in (show, merge, check, drop, prune, extract):
         action.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     from vio.cli.output import print_result
     from vio.errors import ConfigError
     from vio.mapping import files

@@ -13,7 +13,6 @@ _MIB = 1 << 20
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "mesh",
         help="reconstruct a coloured mesh and a floor plan",
@@ -33,11 +32,9 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default RUN/mesh)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     import time
 
     from vio.cli.output import ProgressBar, print_result

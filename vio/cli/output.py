@@ -28,7 +28,6 @@ class ProgressBar:
     """A tqdm bar on stderr for work whose total may become known only during it; silent where stderr is no terminal."""
 
     def __init__(self, label: str, total: int | None = None, *, unit: str = "steps") -> None:
-        """Start at zero."""
         from tqdm import tqdm
 
         hidden = not sys.stderr.isatty()
@@ -48,11 +47,9 @@ class ProgressBar:
         self._bar.close()
 
     def __enter__(self) -> ProgressBar:
-        """Return the bar."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the bar, whatever happened."""
         self.close()

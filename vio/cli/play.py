@@ -9,7 +9,6 @@ from vio.cli.ros2 import add_transport_arguments
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "play",
         help="publish a recording to ROS 2 (extra ros2)",
@@ -27,11 +26,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--stop", type=int, metavar="N", help="frame after the last one")
     parser.add_argument("--now", action="store_true", help="do not wait for a subscriber")
     add_transport_arguments(parser, "waits for slow subscribers")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     import contextlib
 
     from vio.cli.stopping import StopRequest

@@ -10,7 +10,6 @@ MARKER = "rectification.json"
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "rectify",
         help="write a rectified folder",
@@ -27,11 +26,9 @@ def add_parser(commands: Any) -> None:
         help="interpolation between pixels (default linear, as in vio run)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     import logging
 
     from vio.cli.output import NOTE, ProgressBar, print_result

@@ -14,7 +14,6 @@ FOLDER = "refined"
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "refine",
         help="bundle-adjust a run",
@@ -32,11 +31,9 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of the solver (default 1: repeatable)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     import time
 
     from vio.cli.output import ProgressBar, print_result

@@ -13,7 +13,6 @@ _EFFECTS = "clean exposure gain gain-high blur noise dark bare-wall moving dropp
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "render",
         help="render a recording with ground truth",
@@ -78,11 +77,9 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default up to 2); the images are the same")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     import time
 
     from vio.cli.output import ProgressBar, print_result

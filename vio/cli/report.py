@@ -9,7 +9,6 @@ from typing import Any
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "report",
         help="write a page about one or several runs",
@@ -21,11 +20,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--reference", type=Path, metavar="F", help="ground truth in place of that of the runs")
     parser.add_argument("--out", type=Path, metavar="F", help="the page (default report.html in the first RUN)")
     parser.add_argument("--open", action="store_true", help="show it in the browser")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     print(write(args.runs, args.reference, args.out, shown=args.open))
     return 0
 

@@ -8,7 +8,6 @@ from typing import Any
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "reproduce",
         help="repeat the paper's experiment",
@@ -18,12 +17,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("files", nargs="+", metavar="FILE[=REF]", help="an .npz file, with its ground truth after '='")
     parser.add_argument("--out", type=Path, default=Path("reproduce"), metavar="DIR", help="folder (default reproduce)")
     parser.add_argument("--json", action="store_true", help="print the table as one JSON object")
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
-
     from vio.files.printable import json_text
     from vio.offline.reproduce import reproduce
 

@@ -10,7 +10,6 @@ from vio.cli.arguments import add_settings_arguments, config_from
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "ros2",
         help="odometry as a ROS 2 node (extra ros2)",
@@ -30,7 +29,6 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--no-tf", action="store_true", help="do not publish /tf")
     parser.add_argument("--drop", choices=("oldest", "none", "block"), default="oldest", help="of frames that wait")
     add_transport_arguments(parser, "needs reliable publishers, and loses nothing")
-    parser.set_defaults(execute=execute)
 
 
 def add_transport_arguments(parser: argparse.ArgumentParser, reliable: str) -> None:
@@ -41,7 +39,6 @@ def add_transport_arguments(parser: argparse.ArgumentParser, reliable: str) -> N
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     import contextlib
     import sys
 

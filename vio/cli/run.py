@@ -11,7 +11,6 @@ from vio.cli.arguments import add_config_arguments, add_lengths_argument, add_sp
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "run",
         help="process a recording",
@@ -49,7 +48,6 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--open", action="store_true", help="with --report: show it in the browser")
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    parser.set_defaults(execute=execute)
 
 
 _OF_A_NEW_RUN = (
@@ -75,7 +73,6 @@ _OF_A_NEW_RUN = (
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     from vio.cli.output import print_result
     from vio.cli.running import metric_rows, process, resume
     from vio.errors import ConfigError

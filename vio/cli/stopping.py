@@ -24,7 +24,6 @@ class StopRequest:
         return "interrupted" if self.number == signal.SIGINT else f"ended by {signal.Signals(self.number).name}"
 
     def __enter__(self) -> StopRequest:
-        """Begin to take notice."""
         if threading.current_thread() is threading.main_thread():
             for number in _SIGNALS:
                 before = signal.getsignal(number)
@@ -36,7 +35,6 @@ class StopRequest:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Put the earlier handlers back."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
 

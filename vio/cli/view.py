@@ -8,7 +8,6 @@ from typing import Any
 
 
 def add_parser(commands: Any) -> None:
-    """Add the subcommand."""
     parser = commands.add_parser(
         "view",
         help="show a finished run in rerun",
@@ -19,11 +18,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "where", nargs="?", default="spawn", metavar="WHERE", help="web, or a file *.rrd (default: a window)"
     )
-    parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand."""
     from vio.runs.finished import read_finished_run
     from vio.view.finished import show_finished_run
     from vio.view.stream import open_stream, wait_for_interrupt

@@ -25,7 +25,6 @@ class ImageFiles(Sequence[Path]):
     names: tuple[str, ...]
 
     def __len__(self) -> int:
-        """Number of files."""
         return len(self.names)
 
     @overload
@@ -35,7 +34,6 @@ class ImageFiles(Sequence[Path]):
     def __getitem__(self, index: slice) -> ImageFiles: ...
 
     def __getitem__(self, index: int | slice) -> Path | ImageFiles:
-        """One file, or some."""
         if isinstance(index, slice):
             return ImageFiles(self.folder, self.names[index])
         return self.folder / self.names[index]
@@ -53,7 +51,6 @@ class FilePairs(Sequence[tuple[Path, Path]]):
     right: Sequence[Path]
 
     def __len__(self) -> int:
-        """Number of pairs."""
         return len(self.left)
 
     @overload
@@ -63,7 +60,6 @@ class FilePairs(Sequence[tuple[Path, Path]]):
     def __getitem__(self, index: slice) -> FilePairs: ...
 
     def __getitem__(self, index: int | slice) -> tuple[Path, Path] | FilePairs:
-        """One pair, or some."""
         if isinstance(index, slice):
             return FilePairs(self.left[index], self.right[index])
         return self.left[index], self.right[index]

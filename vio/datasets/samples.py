@@ -31,7 +31,6 @@ class MotionSamples(Sequence[Sample_co]):
             self[0]
 
     def __len__(self) -> int:
-        """Number of samples."""
         return len(self.times_ns)
 
     @overload
@@ -41,14 +40,12 @@ class MotionSamples(Sequence[Sample_co]):
     def __getitem__(self, index: slice) -> MotionSamples[Sample_co]: ...
 
     def __getitem__(self, index: int | slice) -> Sample_co | MotionSamples[Sample_co]:
-        """One sample, or some."""
         if isinstance(index, slice):
             return self.take(index)
         k = range(len(self))[index]
         return self._sample(int(self.times_ns[k]), self.values[k], bool(self.is_imu[k]))
 
     def __iter__(self) -> Iterator[Sample_co]:
-        """Yield all samples."""
         for time_ns, values, is_imu in zip(self.times_ns, self.values, self.is_imu, strict=True):
             yield self._sample(int(time_ns), values, bool(is_imu))
 

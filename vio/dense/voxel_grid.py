@@ -67,17 +67,14 @@ class VoxelGrid:
         self._file = tempfile.TemporaryFile(prefix="vio-mesh-")  # noqa: SIM115  # closed by `close`
 
     def __len__(self) -> int:
-        """Number of blocks."""
         return len(self._slot.keys() | self._kept.keys())
 
     def __enter__(self) -> VoxelGrid:
-        """Return the grid."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Delete the file."""
         self._file.close()
 
     def fuse(

@@ -27,7 +27,6 @@ class GnssFixes:
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
-        """Number of positions."""
         return len(self.times_ns)
 
 

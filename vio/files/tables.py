@@ -65,7 +65,6 @@ class Table:
         np.lib.format.write_array_header_1_0(self._file, header)
 
     def __len__(self) -> int:
-        """Number of rows."""
         return self._count
 
     def append(self, rows: Rows) -> None:
@@ -173,7 +172,6 @@ class Records(Sequence[_Record], Generic[_Record]):
         self._table, self._decode = table, decode
 
     def __len__(self) -> int:
-        """Number of records."""
         return len(self._table)
 
     @overload
@@ -183,13 +181,11 @@ class Records(Sequence[_Record], Generic[_Record]):
     def __getitem__(self, index: slice) -> list[_Record]: ...
 
     def __getitem__(self, index: int | slice) -> _Record | list[_Record]:
-        """One record, or a list of some."""
         if isinstance(index, slice):
             return [self._decode(row) for row in self._table.rows()[index]]
         return self._decode(self._table.rows()[range(len(self))[index]])
 
     def __iter__(self) -> Iterator[_Record]:
-        """Yield all records."""
         for row in self._table.rows():
             yield self._decode(row)
 

@@ -41,7 +41,6 @@ class FramePipeline:
         use_prior: bool,
         trial: ImuTrial | None = None,
     ) -> None:
-        """Connect the parts."""
         self.frontend, self.selector, self.backend = frontend, selector, backend
         self.monitor = RunMonitor(camera, T_cam0_body, imu=motion == "imu")
         self._motion = motion

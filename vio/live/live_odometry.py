@@ -246,7 +246,6 @@ class LiveOdometry(EventInputs[None]):
         return newest_points([*self._points, self._odometry.landmarks()])
 
     def __enter__(self) -> LiveOdometry:
-        """Return itself."""
         return self
 
     def __exit__(

@@ -282,7 +282,6 @@ class Odometry(EventInputs["Estimate | None"]):
             return self._processor.smoothed(frame_index)
 
     def __enter__(self) -> Odometry:
-        """Return itself."""
         return self
 
     def __exit__(

@@ -50,7 +50,6 @@ class MapGraph:
     """Sessions, keyframes, odometry and loops; keyframes are numbered in the order in which they came."""
 
     def __init__(self, store: MapStore) -> None:
-        """Read a map."""
         self.sessions: list[SessionRow] = store.sessions()
         self.T_map_cam, self.T_odom_cam, self._drift = Rows(4, 4), Rows(4, 4), Rows(6, 6)
         self.path_m, self._session, self._frame = Rows(), Rows(), Rows()
@@ -66,7 +65,6 @@ class MapGraph:
             self.append(row)
 
     def __len__(self) -> int:
-        """Number of keyframes."""
         return len(self.path_m.rows)
 
     @property

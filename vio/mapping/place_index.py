@@ -88,7 +88,6 @@ class PlaceIndex:
         self._unsaved: list[Words] = []  # of the keyframes since the last full segment
 
     def __len__(self) -> int:
-        """Number of keyframes."""
         return len(self._sizes)
 
     @property

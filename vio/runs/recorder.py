@@ -188,7 +188,6 @@ class RunRecorder:
     # What comes out
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self._tables["frames"]) if self._tables else 0
 
     @property
@@ -371,7 +370,6 @@ class SeenFrames(Sequence[Observations]):
         self._offsets = np.concatenate([[0], np.cumsum(self._seen["count"])])
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self._seen)
 
     @overload
@@ -381,7 +379,6 @@ class SeenFrames(Sequence[Observations]):
     def __getitem__(self, index: slice) -> list[Observations]: ...
 
     def __getitem__(self, index: int | slice) -> Observations | list[Observations]:
-        """Observations of one frame, or of some."""
         if isinstance(index, slice):
             return [self[k] for k in range(len(self))[index]]
         k = range(len(self))[index]

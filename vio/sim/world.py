@@ -107,7 +107,6 @@ class TextureStore:
         self._lock = threading.Lock()
 
     def __getitem__(self, surface: int) -> MipTexture:
-        """Return the texture of one surface."""
         found = self._painted.get(surface)
         if found is None:
             with self._lock:

@@ -63,7 +63,6 @@ class Bag:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the files."""
         if self._reader is not None and self._reader.stack is not None:
             self._reader.close()
 
