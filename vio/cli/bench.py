@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from vio.cli.output import ProgressBar, print_result
+from vio.errors import ConfigError, StoppedError
+from vio.files.printable import printable
 
 
 def add_parser(commands: Any) -> None:
@@ -59,8 +65,6 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.errors import ConfigError
-
     if args.suite == "compare":
         if len(args.folders) != 2 and not (args.between and len(args.folders) == 1):
             raise ConfigError(
@@ -73,14 +77,9 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _bench(args: argparse.Namespace) -> int:
-    import sys
-    from dataclasses import replace
-
     from vio.bench.bench import Place, bench
     from vio.bench.revision import revision_folder, run_in_turns
     from vio.bench.suite import SHIPPED, chosen, read_suite
-    from vio.cli.output import ProgressBar
-    from vio.errors import ConfigError, StoppedError
 
     if args.workers is not None and not 1 <= args.workers <= 1024:
         raise ConfigError(f"--workers takes 1 to 1024 processes, got {args.workers}")
@@ -119,7 +118,6 @@ def _bench(args: argparse.Namespace) -> int:
 def _list(suite: Any, data: Path, args: argparse.Namespace) -> int:
     """Print what is there and what is missing; the status is 1 where something is."""
     from vio.bench.tasks import inputs_of
-    from vio.cli.output import print_result
 
     missing = {s.name: [str(p) for p in inputs_of(s, data) if not p.exists()] for s in suite.sequences}
     lines = [(name, "there" if not paths else f"missing: {', '.join(paths)}") for name, paths in missing.items()]
@@ -134,11 +132,7 @@ def _list(suite: Any, data: Path, args: argparse.Namespace) -> int:
 
 def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
     """Print the result; the status is 1 where a run has none."""
-    import sys
-
     from vio.bench.tables import METRICS, number, summary_of, summary_rows
-    from vio.cli.output import print_result
-    from vio.files.printable import printable
 
     summary = summary_of(summary_rows(result.outcomes))
     lines = []
@@ -158,7 +152,6 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
 def _compare(args: argparse.Namespace) -> int:
     """Print what changed; the status is 1 where something became worse, 3 where that is undecided."""
     from vio.bench.compare import EXIT_STATUS, compare, comparison_lines
-    from vio.cli.output import print_result
 
     a, b = args.folders[0], args.folders[-1]
     between = None if args.between is None else tuple(args.between)
@@ -175,10 +168,6 @@ def _names(text: str) -> list[str]:
 
 
 def _with_seeds(suite: Any, text: str) -> Any:
-    from dataclasses import replace
-
-    from vio.errors import ConfigError
-
     try:
         seeds = tuple(int(part) for part in text.split(","))
     except ValueError as error:

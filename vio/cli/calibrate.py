@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import math
 import shlex
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+from vio.cli.output import ProgressBar, print_result
+from vio.errors import ConfigError
+from vio.files.printable import json_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -50,11 +56,8 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.output import ProgressBar, print_result
     from vio.cli.running import free_folder
-    from vio.errors import ConfigError
     from vio.files.atomic import atomic_folder, check_replaceable, check_writable
-    from vio.files.printable import json_text
     from vio.numerics.threads import one_blas_thread
     from vio.offline.calibrate import measure
     from vio.offline.calibration_files import CAMCHAIN, write_calibration_report
@@ -105,8 +108,6 @@ def _facts(report: CalibrationReport) -> dict[str, Any]:
 
 def _plain(record: Any) -> dict[str, Any]:
     """Return a result as plain JSON types."""
-    from dataclasses import asdict
-
     import numpy as np
 
     from vio.calibration.findings import NotObservable
@@ -131,8 +132,6 @@ def _parameters(found: SelfCalibration) -> dict[str, Any]:
 
 def _finite(values: Any) -> Any:
     """Return nested lists of numbers with None for non-finite values: JSON has no NaN."""
-    import math
-
     if isinstance(values, list):
         return [_finite(value) for value in values]
     return values if math.isfinite(values) else None

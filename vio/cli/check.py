@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from vio.cli.output import ProgressBar, print_result
+from vio.errors import ConfigError
+from vio.files.printable import json_text
 
 if TYPE_CHECKING:
     from vio.offline.colmap.reconstruction import Mapper
@@ -43,10 +48,7 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.output import ProgressBar, print_result
-    from vio.errors import ConfigError
     from vio.files.atomic import atomic_folder
-    from vio.files.printable import json_text
     from vio.offline.check import check_run
     from vio.offline.colmap import quiet
     from vio.offline.saved_run import read_saved_run
@@ -83,8 +85,6 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _facts(result: MapperResult) -> dict[str, Any]:
-    from dataclasses import asdict
-
     from vio.offline.colmap.reconstruction import LEAST_SHARED
 
     if result.found is None:

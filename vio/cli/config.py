@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -40,8 +41,6 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _print_rows(rows: Iterable[SettingInfo]) -> None:
-    import textwrap
-
     for row in rows:
         value = f"{row.default:g}" if isinstance(row.default, float) else str(row.default)
         unit = f" {row.unit}" if row.unit else ""

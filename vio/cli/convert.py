@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import json
+import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from vio.cli.arguments import add_config_arguments, add_span_arguments, config_from
+from vio.cli.output import NOTE, ProgressBar, print_result
+from vio.errors import ConfigError
 
 MARKER = "conversion.json"
 _FORMS = ("euroc", "kitti", "plain", "rosbag2", "mcap")
@@ -41,9 +46,7 @@ def execute(args: argparse.Namespace) -> int:
 
 def _trajectory(args: argparse.Namespace) -> int:
     """Write a trajectory, or the ground truth of a recording."""
-    from vio.cli.output import print_result
     from vio.datasets import open_dataset
-    from vio.errors import ConfigError
     from vio.files.atomic import check_new_file
     from vio.files.trajectories import is_trajectory_file
     from vio.offline.convert_trajectory import convert_trajectory, write_reference
@@ -66,11 +69,6 @@ def _trajectory(args: argparse.Namespace) -> int:
 
 def _recording(args: argparse.Namespace) -> int:
     """Write a recording."""
-    import json
-    import logging
-    from dataclasses import replace
-
-    from vio.cli.output import NOTE, ProgressBar, print_result
     from vio.datasets import open_dataset
     from vio.datasets.frame_times import frames_between
     from vio.files.atomic import atomic_folder, check_spares
@@ -108,8 +106,6 @@ def _recording(args: argparse.Namespace) -> int:
 
 def _written(out: Path) -> list[str] | None:
     """Return the names that an earlier conversion wrote into a folder; None: there is none, or it is not known."""
-    import json
-
     try:
         files = json.loads((out / MARKER).read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError):

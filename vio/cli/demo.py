@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from vio.cli.output import ProgressBar, print_result
+
 
 def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
@@ -18,7 +20,6 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.output import ProgressBar, print_result
     from vio.cli.running import check_out, metric_rows, process
     from vio.config import load_config
     from vio.sim.scenarios import write_demo_recording

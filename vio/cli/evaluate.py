@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vio.cli.arguments import add_lengths_argument
+from vio.cli.output import print_result
+from vio.errors import DataError, EvaluationError
 from vio.files.printable import printable
 
 if TYPE_CHECKING:
@@ -72,7 +74,6 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.output import print_result
     from vio.files.atomic import check_new_file
 
     if args.plot is not None:
@@ -102,13 +103,11 @@ def _evaluated(
     reference: tuple[Trajectory, FloatArray | None],
 ) -> Evaluation:
     """Compare one trajectory with the reference, both with their extrinsics."""
-    from vio.errors import EvaluationError
     from vio.evaluation.trajectories import LEAST_POSES, evaluate
 
     T_cam0_imu = estimate[1]
     if args.extrinsics is not None:
         from vio.datasets.kitti import read_extrinsics
-        from vio.errors import DataError
 
         T_cam0_imu = read_extrinsics(args.extrinsics)
         if T_cam0_imu is None:
@@ -199,7 +198,6 @@ def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
 def _truth_of(path: Path) -> tuple[Trajectory, FloatArray | None]:
     """Return the ground truth of a recording, with its extrinsics."""
     from vio.datasets import open_dataset
-    from vio.errors import DataError
 
     try:
         recording = open_dataset(path).recording

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+from vio.cli.output import ProgressBar, print_result
+from vio.errors import ConfigError
+from vio.files.printable import json_text
 
 MARKER = "export.json"
 
@@ -35,12 +40,7 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _bag(args: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
-    from vio.cli.output import print_result
-    from vio.errors import ConfigError
     from vio.files.atomic import atomic_folder
-    from vio.files.printable import json_text
     from vio.offline.export_bag import export_bag
 
     if args.refined or args.keyframes is not None or args.source is not None or args.no_images:
@@ -55,12 +55,7 @@ def _bag(args: argparse.Namespace) -> int:
 
 
 def _colmap(args: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
-    from vio.cli.output import ProgressBar, print_result
-    from vio.errors import ConfigError
     from vio.files.atomic import atomic_folder
-    from vio.files.printable import json_text
     from vio.numerics.threads import one_blas_thread
     from vio.offline.colmap import quiet
     from vio.offline.export import export_colmap

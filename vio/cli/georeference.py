@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import logging
+import math
 from pathlib import Path
 from typing import Any
+
+from vio.cli.output import NOTE, print_result
+from vio.errors import ConfigError
+from vio.files.printable import json_text
 
 
 def add_parser(commands: Any) -> None:
@@ -37,16 +43,10 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    import logging
-    import math
-
     import numpy as np
 
-    from vio.cli.output import NOTE, print_result
     from vio.datasets.gnss import read_gnss
-    from vio.errors import ConfigError
     from vio.files.atomic import atomic_folder
-    from vio.files.printable import json_text
     from vio.mapping.map_store import is_map
     from vio.numerics.threads import one_blas_thread
     from vio.offline.georeference import FACTS, keep_in_map, place_by_map, place_on_earth, placed

@@ -8,6 +8,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from vio.cli.arguments import add_config_arguments, config_from
+from vio.cli.output import ProgressBar, print_result
+from vio.errors import ConfigError
 
 if TYPE_CHECKING:
     from vio.inspection.finding import Inspection
@@ -29,9 +31,7 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.output import ProgressBar, print_result
     from vio.datasets import open_dataset
-    from vio.errors import ConfigError
     from vio.frontend import build_frontend
     from vio.inspection.inspect import inspect_recording
     from vio.numerics.threads import one_blas_thread

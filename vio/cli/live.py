@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
 from vio.cli.arguments import add_settings_arguments, config_from
+from vio.cli.stopping import StopRequest
+from vio.errors import ConfigError
 
 
 def add_parser(commands: Any) -> None:
@@ -37,11 +40,7 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    import sys
-
-    from vio.cli.stopping import StopRequest
     from vio.datasets.rigs import load_rig
-    from vio.errors import ConfigError
     from vio.live.build import MapUse
     from vio.sources.run import run_source
     from vio.sources.source import open_source

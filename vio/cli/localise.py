@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vio.cli.arguments import add_config_arguments, add_span_arguments, config_from
+from vio.cli.output import print_result
 
 
 def add_parser(commands: Any) -> None:
@@ -27,7 +28,6 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.output import print_result
     from vio.cli.running import metric_rows, process
 
     metrics = process(

@@ -7,6 +7,9 @@ import math
 from pathlib import Path
 from typing import Any
 
+from vio.cli.output import print_result
+from vio.errors import ConfigError
+
 DENSITY = 10
 
 
@@ -61,8 +64,6 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.output import print_result
-    from vio.errors import ConfigError
     from vio.mapping import files
 
     if args.action == "prune" and args.density < 1:

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from vio.cli.output import ProgressBar, print_result
+from vio.cli.stopping import StopRequest
+from vio.errors import ConfigError
+from vio.files.printable import json_text
 
 if TYPE_CHECKING:
     from vio.offline.mesh import DenseMap
@@ -35,14 +41,8 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    import time
-
-    from vio.cli.output import ProgressBar, print_result
-    from vio.cli.stopping import StopRequest
     from vio.dense.voxel_grid import BLOCK
-    from vio.errors import ConfigError
     from vio.files.atomic import atomic_folder, check_replaceable, check_writable
-    from vio.files.printable import json_text
     from vio.offline.mesh import build_mesh, facts_of, mesh_source
     from vio.runs.files import MeshFile
 

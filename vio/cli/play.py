@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from typing import Any
 
 from vio.cli.ros2 import add_transport_arguments
+from vio.cli.stopping import StopRequest
+from vio.errors import ConfigError
 
 
 def add_parser(commands: Any) -> None:
@@ -29,9 +32,6 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    import contextlib
-
-    from vio.cli.stopping import StopRequest
     from vio.datasets import open_dataset
     from vio.ros2.play import play
     from vio.ros2.sensors import SensorTopics
@@ -56,8 +56,6 @@ def execute(args: argparse.Namespace) -> int:
 
 def _rate(text: str) -> float | None:
     """Return a rate over real time; None: as fast as it goes."""
-    from vio.errors import ConfigError
-
     if text == "max":
         return None
     try:

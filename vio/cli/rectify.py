@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from pathlib import Path
 from typing import Any
+
+from vio.cli.output import NOTE, ProgressBar, print_result
+from vio.errors import DataError
+from vio.files.printable import json_text
 
 MARKER = "rectification.json"
 
@@ -29,16 +34,11 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    import logging
-
-    from vio.cli.output import NOTE, ProgressBar, print_result
     from vio.datasets import DatasetSettings, open_dataset
     from vio.datasets.euroc import write_rectified_euroc
     from vio.datasets.kitti_raw import write_rectified_kitti
     from vio.datasets.rectified import RectifiedDataset, check_not_rectified
-    from vio.errors import DataError
     from vio.files.atomic import atomic_folder, check_spares
-    from vio.files.printable import json_text
     from vio.files.text import write_text
     from vio.records import need_stereo
 

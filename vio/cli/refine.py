@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from vio.cli.output import ProgressBar, print_result
+from vio.errors import ConfigError
+from vio.files.printable import json_text
 
 if TYPE_CHECKING:
     from vio.offline.refine import Refinement
@@ -34,10 +39,6 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    import time
-
-    from vio.cli.output import ProgressBar, print_result
-    from vio.errors import ConfigError
     from vio.numerics.threads import one_blas_thread
     from vio.offline.colmap import quiet
     from vio.offline.refine import STEPS, refine_run
@@ -91,9 +92,7 @@ def _facts(run: SavedRun, done: Refinement) -> dict[str, Any]:
 
 def _write(out: Path, run: SavedRun, done: Refinement, metrics: dict[str, Any]) -> None:
     """Write a folder that `vio eval` and `vio export` read like a run's."""
-
     from vio.files.atomic import atomic_folder
-    from vio.files.printable import json_text
     from vio.files.trajectories import write_tum
     from vio.runs.files import RunFile
     from vio.runs.folder import write_landmarks_ply

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from vio.cli.output import ProgressBar, print_result
+from vio.errors import ConfigError
 
 if TYPE_CHECKING:
     from vio.sim.scenarios import Conditions, Scenario
@@ -80,10 +84,6 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    import time
-
-    from vio.cli.output import ProgressBar, print_result
-    from vio.errors import ConfigError
     from vio.numerics.threads import one_blas_thread
     from vio.sim.export import export_euroc, export_kitti, export_rgbd
     from vio.sim.scenarios import ParallelRecording, default_workers, plan
@@ -154,7 +154,6 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
     Raises:
         VioError: arguments contradict each other, or name what does not exist.
     """
-    from vio.errors import ConfigError
     from vio.sim.scenarios import READY_MOTIONS, Scenario, flight_files
 
     car = args.trajectory == "car"

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from vio.errors import DataError
+
 
 def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
@@ -31,7 +33,6 @@ def write(
     folders: Sequence[Path], reference: Path | None = None, out: Path | None = None, *, shown: bool = False
 ) -> Path:
     """Write the page about runs and return its path; `shown`: also show it in the browser."""
-    from vio.errors import DataError
     from vio.files.atomic import check_new_file
     from vio.runs.files import RunFile
     from vio.runs.finished import read_finished_run, with_distinct_names

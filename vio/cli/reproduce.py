@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from vio.files.printable import json_text
+
 
 def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
@@ -20,7 +22,6 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.files.printable import json_text
     from vio.offline.reproduce import reproduce
 
     tables = [reproduce(*_split(text), args.out) for text in args.files]

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import sys
 from pathlib import Path
 from typing import Any
 
 from vio.cli.arguments import add_settings_arguments, config_from
+from vio.cli.stopping import StopRequest
+from vio.errors import ConfigError
 
 
 def add_parser(commands: Any) -> None:
@@ -39,12 +43,7 @@ def add_transport_arguments(parser: argparse.ArgumentParser, reliable: str) -> N
 
 
 def execute(args: argparse.Namespace) -> int:
-    import contextlib
-    import sys
-
-    from vio.cli.stopping import StopRequest
     from vio.datasets.rigs import load_rig
-    from vio.errors import ConfigError
     from vio.live.build import MapUse
     from vio.ros2.node import NodeSettings, run_node
     from vio.ros2.outputs import FrameNames

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from vio.cli.arguments import add_config_arguments, add_lengths_argument, add_span_arguments, config_from
+from vio.cli.output import print_result
+from vio.errors import ConfigError
 
 
 def add_parser(commands: Any) -> None:
@@ -73,9 +75,7 @@ _OF_A_NEW_RUN = (
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.output import print_result
     from vio.cli.running import metric_rows, process, resume
-    from vio.errors import ConfigError
 
     if args.open and not args.report:
         raise ConfigError("--open shows the page of --report; give both")
