@@ -461,7 +461,7 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "an IMU of another time": (
         _shift_clock("imu0", 10**12),
         DataError,
-        r"no IMU sample is within the time of the images",
+        r"no sample is within the time of the images",
     ),
     "IMU noise of zero": (
         _edit("imu0/sensor.yaml", "accelerometer_random_walk: 3.0000e-3", "accelerometer_random_walk: 0"),

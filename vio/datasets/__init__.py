@@ -6,7 +6,7 @@ import difflib
 import os
 import zipfile
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -75,9 +75,9 @@ def in_colour(dataset: Dataset) -> Dataset:
 
     No front end takes such frames: they are for those who show images or write them.
     """
-    if is_dataclass(dataset) and any(f.name == "colour" for f in fields(dataset)):
-        return replace(dataset, colour=True)
-    return dataset
+    from vio.datasets.image_pairs import ImageRecording
+
+    return replace(dataset, colour=True) if isinstance(dataset, ImageRecording) else dataset
 
 
 def _for_settings(kind: str, path: Path, settings: DatasetSettings) -> str:

@@ -13,7 +13,7 @@ from vio.datasets.common import naming
 from vio.datasets.image_pairs import ImageSize
 from vio.datasets.kitti import read_extrinsics
 from vio.datasets.rigs import find_calibration
-from vio.datasets.samples import imu_samples, in_time_order
+from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import read_imu_table, read_velocity_table
 from vio.datasets.unused import Layout, unused_note
@@ -21,7 +21,7 @@ from vio.errors import CalibrationError, DataError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.imu.clocks import judge_clocks
-from vio.records import NS_PER_S, IntArray, MotionSample, Recording, Trajectory
+from vio.records import NS_PER_S, ImuRecord, ImuSample, IntArray, MotionSample, Recording, Trajectory
 
 IMU_FILES = ("imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv")
 _REFERENCES = (
@@ -151,14 +151,10 @@ def _read_motion(
     parts: list[Sequence[MotionSample]] = []
     notes: list[str] = []
     if imu is not None:
-        record, found = read_imu_table(imu)
-        shift_ns = round(rig.time_offset_s * NS_PER_S)
-        record = replace(record, times_ns=record.times_ns - shift_ns)
-        notes += found
-        if shift_ns:
-            notes.append(f"the IMU's stamps are moved by {-1e3 * rig.time_offset_s:+.3f} ms, as the calibration states")
-        check_overlap(times_ns, record.times_ns, imu)
-        parts.append(imu_samples(record))
+        record, notes_read = read_imu_table(imu)
+        samples, notes_moved = imu_on_camera_clock(record, rig, times_ns, imu)
+        notes += [*notes_read, *notes_moved]
+        parts.append(samples)
     if velocity.is_file():
         speeds = read_velocity_table(velocity)
         check_overlap(times_ns, speeds.times_ns, velocity)
@@ -181,6 +177,21 @@ def _read_reference(
         truth = replace(truth, times_ns=times_ns[: len(truth)], frame_indices=np.arange(len(truth)))
     with naming(file):
         return reference_of_body(truth, rig, rectifier), file
+
+
+def imu_on_camera_clock(
+    record: ImuRecord, rig: Rig, frame_times_ns: IntArray, where: Path | str
+) -> tuple[MotionSamples[ImuSample], list[str]]:
+    """Return samples whose stamps are moved by the calibration's time offset, and a note where that is not zero.
+
+    Raises:
+        DataError: no sample is within the time of the images.
+    """
+    shift_ns = round(rig.time_offset_s * NS_PER_S)
+    record = replace(record, times_ns=record.times_ns - shift_ns)
+    check_overlap(frame_times_ns, record.times_ns, where)
+    moved = f"the IMU's stamps are moved by {-1e3 * rig.time_offset_s:+.3f} ms, as the calibration states"
+    return imu_samples(record), [moved] if shift_ns else []
 
 
 def check_overlap(frame_times_ns: IntArray, times_ns: IntArray, where: Path | str) -> None:

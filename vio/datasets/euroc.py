@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.datasets.companions import check_overlap
 from vio.datasets.euroc_files import (
     STATE_CSV,
     TUM_FILE,
@@ -44,7 +45,6 @@ from vio.files.text import write_text
 from vio.files.trajectories import read_trajectory
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.imu.clocks import judge_clocks
 from vio.protocols import Progress
 from vio.records import ImuDensities, ImuSample, IntArray, MotionSource, Recording, StereoFrame, Trajectory
 
@@ -92,12 +92,8 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     rectifier = make_rectifier(rig, settings.interpolation, mav, settings.projection)
     of_left, of_right, notes = _pair(left, right, mav)
     times_ns = left.times_ns[of_left]
-    if imu.samples and (imu.samples[-1].time_ns < times_ns[0] or imu.samples[0].time_ns > times_ns[-1]):
-        (finding,) = judge_clocks(times_ns, imu.samples.times_ns)
-        raise DataError(
-            f"{mav / 'imu0' / 'data.csv'}: no IMU sample is within the time of the images; {finding.message}; or "
-            "remove imu0"
-        )
+    if imu.samples:
+        check_overlap(times_ns, imu.samples.times_ns, mav / "imu0")
     motion: frozenset[MotionSource] = frozenset({"imu"}) if imu.samples else frozenset()
     pairs = FilePairs(left.files.take(of_left.tolist()), right.files.take(of_right.tolist()))
     white, depth_notes = full_scale(pairs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -145,15 +146,13 @@ class ImageSize:
 
 
 @dataclass(frozen=True, slots=True)
-class ImageDataset:
-    """Implements `vio.protocols.Dataset` over image files that are rectified."""
+class ImageRecording(ABC):
+    """Implements `vio.protocols.Dataset` over images, which a subclass reads."""
 
     recording: Recording
-    pairs: ImagePairs
-    motion: Sequence[MotionSample]  # in time order
-    sizes: tuple[ImageSize, ...]  # of the left and the right files; one of one camera
+    motion: Sequence[MotionSample] = field(repr=False)  # in time order
+    sizes: tuple[ImageSize, ...]  # of the left and the right images; one of one camera
     settings: DatasetSettings
-    white: int = field(default=WHITE_16, kw_only=True)  # level of white of 16-bit files, from `full_scale`
     colour: bool = field(default=False, kw_only=True)  # see `in_colour`
 
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
@@ -165,16 +164,31 @@ class ImageDataset:
             DataError: the range holds no frame, or none that can be used, or more are unusable than the settings allow.
         """
         chosen = chosen_frames(self.recording, start, stop, self.settings.max_frame_rate)
-        frames = readable_frames(self._load, chosen, self.settings) if images else blank_frames(self.recording, chosen)
+        frames = self._frames(chosen) if images else blank_frames(self.recording, chosen)
         return merge_events(self.recording, chosen, self.motion, frames)
 
     def observations(self, index: int) -> Observations | None:
         """Return None: the recording holds images only."""
         return None
 
+    @abstractmethod
+    def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
+        """Yield the chosen frames that can be used."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImageDataset(ImageRecording):
+    """Implements `vio.protocols.Dataset` over image files that are rectified."""
+
+    pairs: ImagePairs
+    white: int = field(default=WHITE_16, kw_only=True)  # level of white of 16-bit files, from `full_scale`
+
     def frame(self, index: int, left: Image, right: Image | None = None) -> StereoFrame:
         """Return a frame of images as read from the files (H, W each), which are rectified."""
         return StereoFrame(index, int(self.recording.frame_times_ns[index]), left, right)
+
+    def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
+        return readable_frames(self._load, chosen, self.settings)
 
     def _load(self, index: int) -> StereoFrame | BadFrame:
         """Read one frame; runs in the prefetch thread."""

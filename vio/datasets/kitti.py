@@ -82,7 +82,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
         reference=None if poses is None else _read_reference(poses, times_ns, calibration.T_left_cam0),
         notes=tuple(notes),
     )
-    return ImageDataset(recording, pairs, motion, (size, size), settings, white=white)
+    return ImageDataset(recording, motion, (size, size), settings, pairs, white=white)
 
 
 def is_kitti_folder(path: Path) -> bool:

@@ -100,7 +100,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         notes=(*time_notes, *imu_notes, *depth_notes, *rectifier.notes, *unused),
     )
     sizes = rig_sizes(rectifier.rig, (calibration_path, calibration_path))
-    return RectifiedDataset(recording, pairs, (), sizes, settings, rectifier, white=white)
+    return RectifiedDataset(recording, (), sizes, settings, pairs, rectifier, white=white)
 
 
 def _find(path: Path, name: str) -> Path | None:

@@ -209,10 +209,10 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
     )
     return RectifiedDataset(
         found.recording,
-        images.pairs,
         found.motion,
         found.sizes,
         settings,
+        images.pairs,
         found.rectifier,
         rig.imu_noise,
         images.depths,

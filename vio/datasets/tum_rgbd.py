@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.cameras.rig import Rig
+from vio.datasets.frame_times import nearest
 from vio.datasets.tables import parse_stamps
 from vio.errors import DataError
 from vio.files.text import text_lines
@@ -41,11 +42,8 @@ def associated_images(path: Path) -> tuple[list[Path], list[Path], IntArray, tup
         DataError: a list cannot be read, or no depth image is near an image.
     """
     (times_ns, files), (depth_ns, depths) = (_read_list(path / name) for name in LISTS)
-    after = np.clip(np.searchsorted(depth_ns, times_ns), 1, max(len(depth_ns) - 1, 1))
-    before = np.maximum(after - 1, 0)
-    after = np.minimum(after, len(depth_ns) - 1)
-    nearest = np.where(np.abs(depth_ns[after] - times_ns) < np.abs(times_ns - depth_ns[before]), after, before)
-    near = np.abs(depth_ns[nearest] - times_ns) <= _ASSOCIATED_NS
+    rows_of = nearest(times_ns, depth_ns)
+    near = np.abs(depth_ns[rows_of] - times_ns) <= _ASSOCIATED_NS
     if not near.any():
         raise DataError(
             f"{path / 'depth.txt'}: no depth is within {_ASSOCIATED_NS / 1e6:g} ms of an image of rgb.txt; both must "
@@ -54,7 +52,7 @@ def associated_images(path: Path) -> tuple[list[Path], list[Path], IntArray, tup
     alone = int((~near).sum())
     notes = (f"{alone} images have no depth within {_ASSOCIATED_NS / 1e6:g} ms and are skipped",) if alone else ()
     rows = np.flatnonzero(near)
-    return [files[k] for k in rows], [depths[k] for k in nearest[rows]], times_ns[near], notes
+    return [files[k] for k in rows], [depths[k] for k in rows_of[rows]], times_ns[near], notes
 
 
 def _read_list(file: Path) -> tuple[IntArray, list[Path]]:

@@ -7,17 +7,16 @@ in compressed video is not exact. Times come from `times.txt`, else from the fra
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vio.cameras.rig import Rectifier
-from vio.datasets.common import blank_frames, chosen_frames, merge_events
 from vio.datasets.companions import find_calibration_of, read_companions
-from vio.datasets.image_pairs import ImageSize
+from vio.datasets.image_pairs import ImageRecording
 from vio.datasets.images import prefetch
 from vio.datasets.plain import times_of
 from vio.datasets.rigs import load_rig
@@ -26,13 +25,9 @@ from vio.datasets.unused import Layout
 from vio.errors import DataError
 from vio.records import (
     NS_PER_S,
-    Event,
     Image,
     ImuDensities,
     IntArray,
-    MotionSample,
-    Observations,
-    Recording,
     StereoFrame,
 )
 
@@ -80,7 +75,7 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
     if left.count != right.count:
         notes.append(f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the shorter counts")
     found = read_companions("video", layout, (file, rig), settings, (times_ns, times_file), notes, files)
-    return VideoDataset(found.recording, files, found.motion, found.sizes, settings, found.rectifier, rig.imu_noise)
+    return VideoDataset(found.recording, found.motion, found.sizes, settings, files, found.rectifier, rig.imu_noise)
 
 
 def _facts(file: Path) -> _Facts:
@@ -111,31 +106,12 @@ def _times(path: Path, files: tuple[Path, Path], count: int, rate_hz: float) -> 
 
 
 @dataclass(frozen=True, slots=True)
-class VideoDataset:
-    """Implements `vio.protocols.Dataset` over two video files."""
+class VideoDataset(ImageRecording):
+    """Implements `vio.protocols.Dataset` over two video files; a frame that cannot be decoded is an error."""
 
-    recording: Recording
     files: tuple[Path, Path]
-    motion: Sequence[MotionSample] = field(repr=False)
-    sizes: tuple[ImageSize, ...]
-    settings: DatasetSettings
     rectifier: Rectifier
     imu_noise: ImuDensities | None = None
-    colour: bool = False  # see `in_colour`
-
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
-        """Yield events of the frames `start <= index < stop` in time order.
-
-        Raises:
-            DataError: the range holds no frame, or a frame cannot be decoded.
-        """
-        chosen = chosen_frames(self.recording, start, stop, self.settings.max_frame_rate)
-        frames = self._frames(chosen) if images else blank_frames(self.recording, chosen)
-        return merge_events(self.recording, chosen, self.motion, frames)
-
-    def observations(self, index: int) -> Observations | None:
-        """Return None: the recording holds images only."""
-        return None
 
     def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
         """Decode in order; the prefetch thread is the only one that uses the decoders."""

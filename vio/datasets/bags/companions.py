@@ -12,15 +12,15 @@ from vio.datasets.bags.index import BagIndex, index_bag, info_topic
 from vio.datasets.bags.pictures import white_of
 from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import Roles, choose
-from vio.datasets.companions import check_overlap
+from vio.datasets.companions import check_overlap, imu_on_camera_clock
 from vio.datasets.images import UnreadableImageError, decode_gray
 from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.rigs.camera_info import rig_from_camera_infos
-from vio.datasets.samples import imu_samples, in_time_order
+from vio.datasets.samples import in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import imu_notes
 from vio.errors import CalibrationError
-from vio.records import NS_PER_S, IntArray, MotionSample, MotionSource
+from vio.records import IntArray, MotionSample, MotionSource
 
 Size = tuple[int, int]
 
@@ -152,13 +152,9 @@ def motion_of(
         )
         return (), frozenset(), notes
     if record is not None and roles.imu is not None:
-        shift_ns = round(rig.time_offset_s * NS_PER_S)
-        record = replace(record, times_ns=record.times_ns - shift_ns)
-        if shift_ns:
-            notes.append(f"the IMU's stamps are moved by {-1e3 * rig.time_offset_s:+.3f} ms, as the calibration states")
-        check_overlap(times_ns, record.times_ns, f"{found.path}, {roles.imu.name}")
-        notes += imu_notes(record.times_ns, roles.imu.name)
-        parts.append(imu_samples(record))
+        samples, moved = imu_on_camera_clock(record, rig, times_ns, f"{found.path}, {roles.imu.name}")
+        notes += [*moved, *imu_notes(record.times_ns, roles.imu.name)]
+        parts.append(samples)
         sources.add("imu")
     if roles.velocity is not None and (speeds := index.velocity_samples()):
         check_overlap(times_ns, speeds.times_ns, roles.velocity.name)

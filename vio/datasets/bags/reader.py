@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -18,54 +18,32 @@ from vio.datasets.bags.index import Stamps, stamp_of
 from vio.datasets.bags.pictures import gray_of
 from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import COMPRESSED
-from vio.datasets.common import blank_frames, chosen_frames, merge_events, naming
+from vio.datasets.common import naming
 from vio.datasets.companions import reference_of_body
 from vio.datasets.frame_times import PAIRED_NS, pair_stamps
-from vio.datasets.image_pairs import BadFrame, ImageSize, readable_frames
+from vio.datasets.image_pairs import BadFrame, ImageRecording, ImageSize, readable_frames
 from vio.datasets.images import UnreadableImageError
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
-from vio.records import Event, ImuDensities, IntArray, MotionSample, Observations, Recording, StereoFrame
+from vio.records import ImuDensities, IntArray, Recording, StereoFrame
 
 _Messages = tuple[int, list[Any]]  # of a frame: its number, and the image of each camera, decoded but for its pixels
 
 
 @dataclass(frozen=True, slots=True)
-class BagDataset:
+class BagDataset(ImageRecording):
     """Implements `vio.protocols.Dataset` over the images of one or two topics; every pass streams the bag again."""
 
-    recording: Recording
     topics: tuple[Topic, ...]  # of the images: left, and right where there is one
     stamps_ns: tuple[IntArray, ...]  # (F,) stamps of the images of each topic, of a pair in one row
     logged_ns: IntArray  # (F,) when the bag received the first image of each frame
-    motion: Sequence[MotionSample] = field(repr=False)
-    sizes: tuple[ImageSize, ...]
-    settings: DatasetSettings
     rectifier: Rectifier
     white: int  # level of white of 16-bit images
     unstamped: tuple[bool, ...]  # of each topic: the headers have no stamps, the times of logging serve
     imu_noise: ImuDensities | None = None
-    colour: bool = False  # see `in_colour`
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
-        """Yield events of the frames `start <= index < stop` in time order.
-
-        A frame whose image does not decode or has another size is skipped with a warning, as the settings allow.
-
-        Raises:
-            DataError: the range holds no frame, or none that can be used, or the bag is damaged.
-        """
-        chosen = chosen_frames(self.recording, start, stop, self.settings.max_frame_rate)
-        frames = (
-            readable_frames(self._load, self._messages(chosen), self.settings)
-            if images
-            else blank_frames(self.recording, chosen)
-        )
-        return merge_events(self.recording, chosen, self.motion, frames)
-
-    def observations(self, index: int) -> Observations | None:
-        """Return None: the recording holds images only."""
-        return None
+    def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
+        return readable_frames(self._load, self._messages(chosen), self.settings)
 
     def _messages(self, chosen: Sequence[int]) -> Generator[_Messages]:
         """Yield the chosen frames' messages in the order of frames, however they were recorded."""
@@ -145,15 +123,15 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
     )
     return BagDataset(
         recording,
-        roles.cameras,
-        stamps_ns,
-        logged_ns,
         motion,
         tuple(
             ImageSize(camera.width, camera.height, Path(file or info or path))
             for camera, info in zip(rig.cameras, found.infos, strict=True)
         ),
         settings,
+        roles.cameras,
+        stamps_ns,
+        logged_ns,
         rectifier,
         white,
         tuple(images.unstamped for images in stamps),
