@@ -337,7 +337,7 @@ BAD = [
     (
         _replace("velocity.csv", ",0.0,", ",nan,"),
         DataError,
-        r"velocity\.csv, line 2: a velocity is not finite \(1 line",
+        r"velocity\.csv, line 2: a reading is not a finite number .*1 lines in all",
     ),
     (_replace("velocity.csv", "\n0.200000,", "\n0.100000,"), DataError, r"velocity\.csv, line 4: the clock repeats"),
     (_replace("velocity.csv", "\n0.200000,", "\n0.010000,"), DataError, r"velocity\.csv, line 4: the clock runs back"),

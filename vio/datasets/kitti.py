@@ -18,8 +18,8 @@ import numpy as np
 
 from vio.datasets.common import check_intrinsics, checked_transform, clock_ns, naming, numbers_in
 from vio.datasets.image_pairs import ImageDataset, ImageSize, measured_images, pair_images
-from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings
+from vio.datasets.tables import VELOCITY_HEADER, read_velocity_table
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
 from vio.files.text import exact_text, read_numbers, seconds_text, text_lines, write_text
@@ -28,7 +28,6 @@ from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, Recording, Trajectory, VelocitySample
 
-VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
 _GRAY, _COLOUR = (0, 1), (2, 3)
 _RECTIFIED = 0.02  # allowed offset of the right camera from the left one's x axis, as a share of the baseline
 _OFF_AXIS_NOTE_M = 1e-3  # an offset from that axis above this is noted
@@ -156,22 +155,12 @@ def _read_times(path: Path, folder: Path, count: int) -> IntArray:
 def _read_velocity(path: Path, frame_times_ns: IntArray) -> Sequence[VelocitySample]:
     if not path.is_file():
         return ()
-    lines = text_lines(path)
-    if not lines or lines[0][1].replace(" ", "") != VELOCITY_HEADER:
-        raise DataError(f"{path}, line 1: expected the header {VELOCITY_HEADER}")
-    table = read_numbers(path, 7, separator=",", skip=1)
-    bad = ~np.isfinite(table[:, 1:]).all(axis=1)
-    if bad.any():
-        raise DataError(
-            f"{path}, line {int(np.argmax(bad)) + 2}: a velocity is not finite ({int(bad.sum())} lines in all); remove "
-            "or repair them"
-        )
-    times_ns = clock_ns(table[:, 0], lambda k: f"{path}, line {k + 2}")
-    if not len(times_ns) or times_ns[-1] < frame_times_ns[0] or times_ns[0] > frame_times_ns[-1]:
+    samples = read_velocity_table(path)
+    if samples.times_ns[-1] < frame_times_ns[0] or samples.times_ns[0] > frame_times_ns[-1]:
         raise DataError(
             f"{path}: no velocity is within the time of the images (times.txt); use the same clock for both"
         )
-    return velocity_samples(times_ns, table[:, 1:4], table[:, 4:])
+    return samples
 
 
 def read_extrinsics(path: Path) -> FloatArray | None:

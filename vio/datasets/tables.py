@@ -21,7 +21,7 @@ from vio.records import NS_PER_S, ImuRecord, IntArray, VelocitySample
 _UNITS = {"s": 9, "sec": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanoseconds
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
-_VELOCITY_FORM = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
+VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
 _LEAST_IMU_HZ = 50.0  # below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
 
 
@@ -193,9 +193,9 @@ def read_velocity_table(path: Path) -> MotionSamples[VelocitySample]:
     Raises:
         DataError: the header or a line is another one, or the clock does not increase.
     """
-    table = read_table(path, 7, _VELOCITY_FORM)
-    if ",".join(table.header) != _VELOCITY_FORM:
-        raise DataError(f"{path}, line 1: expected the header {_VELOCITY_FORM}")
+    table = read_table(path, 7, VELOCITY_HEADER)
+    if ",".join(table.header) != VELOCITY_HEADER:
+        raise DataError(f"{path}, line 1: expected the header {VELOCITY_HEADER}")
     times_ns, values = stamps_ns(table), _finite(table)
     return velocity_samples(times_ns, values[:, :3], values[:, 3:])
 

@@ -58,15 +58,15 @@ def _split_lines(text: str) -> Iterator[str]:
         start = end
 
 
-def read_numbers(path: Path, columns: int, *, separator: str | None = None, skip: int = 0) -> FloatArray:
-    """Read a text table of numbers (N, columns), skipping the first `skip` lines and blank ones at the end.
+def read_numbers(path: Path, columns: int) -> FloatArray:
+    """Read a text table of numbers (N, columns) between white space, without blank lines at the end.
 
     Raises:
         DataError: the file cannot be read, or a line holds something else; the message names the line.
     """
     rows: list[list[float]] = []
-    for number, line in text_lines(path)[skip:]:
-        fields = line.split(separator)
+    for number, line in text_lines(path):
+        fields = line.split()
         if len(fields) != columns:
             raise DataError(f"{path}, line {number}: {len(fields)} values instead of {columns}; correct that line")
         try:
