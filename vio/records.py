@@ -477,6 +477,12 @@ class Trajectory:
         """Positions (N, 3) in the world frame, metres."""
         return self.T_world_body[:, :3, 3]
 
+    def numbered(self) -> Trajectory:
+        """Return a trajectory without times numbered by frame: pose k belongs to frame k of the recording."""
+        if self.times_ns is not None or self.frame_indices is not None:
+            return self
+        return replace(self, frame_indices=np.arange(len(self), dtype=np.int64))
+
     def in_cam0(self, T_cam0_imu: FloatArray) -> Trajectory:
         """Return the same motion described by the left camera; unchanged if it already is."""
         if self.body == "cam0":

@@ -146,13 +146,6 @@ def error_curve(evaluation: Evaluation, times_ns: IntArray | None) -> dict[str, 
     }
 
 
-def numbered(reference: Trajectory) -> Trajectory:
-    """Number a reference without times by frame: pose k belongs to frame k of the recording."""
-    if reference.times_ns is not None or reference.frame_indices is not None:
-        return reference
-    return replace(reference, frame_indices=np.arange(len(reference), dtype=np.int64))
-
-
 def between(trajectory: Trajectory, first_ns: int, last_ns: int) -> Trajectory:
     """Return the poses within a span of time, 10 ms at each end included."""
     if trajectory.times_ns is None:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, numbered, pose_nees
+from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, pose_nees
 from vio.bench.identity import code_digest, package_versions
 from vio.config import Config, merge
 from vio.datasets import open_dataset
@@ -198,7 +198,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             record["curve"] = error_curve(score, trajectory.times_ns)
             record["notes"] = list(score.notes)
             if result.mapped is not None and result.stopped is None:
-                figures |= map_figures(result, score, numbered(truth.reference), store if job["map"] else None)
+                figures |= map_figures(result, score, truth.reference.numbered(), store if job["map"] else None)
         assert trajectory.times_ns is not None
         text = tum_text(
             trajectory.times_ns, trajectory.T_world_body, body=trajectory.body, frames=trajectory.frame_indices
@@ -276,7 +276,7 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
 
 
 def _evaluate(job: dict[str, Any], trajectory: Trajectory, reference: Trajectory, T_cam0_imu: Any) -> Evaluation:
-    return evaluate(trajectory, numbered(reference), T_cam0_imu=T_cam0_imu, lengths_m=job["lengths_m"])
+    return evaluate(trajectory, reference.numbered(), T_cam0_imu=T_cam0_imu, lengths_m=job["lengths_m"])
 
 
 def _peak_memory_mib() -> float | None:

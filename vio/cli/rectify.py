@@ -36,10 +36,10 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets import DatasetSettings, open_dataset
     from vio.datasets.euroc import write_rectified_euroc
-    from vio.datasets.kitti_raw import write_rectified_kitti
     from vio.datasets.rectified import RectifiedDataset, check_not_rectified
     from vio.files.atomic import atomic_folder, check_spares
     from vio.files.text import write_text
+    from vio.offline.convert import convert
     from vio.records import need_stereo
 
     dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation, projection="pinhole"))
@@ -47,13 +47,12 @@ def execute(args: argparse.Namespace) -> int:
     need_stereo(recording, "vio rectify")
     for note in recording.notes:
         logging.getLogger(__name__).log(NOTE, "%s", note)
-    writers = {"euroc": write_rectified_euroc, "kitti_raw": write_rectified_kitti}
     if recording.kind in ("plain", "bag", "video"):
         raise DataError(f"{recording.path} is of kind {recording.kind}; rectify it with vio convert --to euroc")
     if not isinstance(dataset, RectifiedDataset):
         raise DataError(
             f"{recording.path} is of kind {recording.kind}, which is rectified already: there is nothing to do; the "
-            f"kinds that may need it are {', '.join(writers)}"
+            f"kinds that may need it are euroc, kitti_raw"
         )
     check_not_rectified(dataset)
     camera = recording.camera
@@ -69,7 +68,10 @@ def execute(args: argparse.Namespace) -> int:
     check_spares(recording.path, args.out)
     with atomic_folder(args.out, replace=True, marker=MARKER) as folder:
         with ProgressBar(f"rectify {recording.path.name}") as bar:
-            frames = writers[recording.kind](dataset, folder, bar.update)
+            if recording.kind == "euroc":
+                frames = write_rectified_euroc(dataset, folder, bar.update)
+            else:
+                frames = convert(dataset, folder, "kitti", progress=bar.update).frames
         facts["frames"] = frames
         write_text(folder / MARKER, json_text(facts, indent=2) + "\n")
     rows = (

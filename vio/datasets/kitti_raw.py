@@ -22,8 +22,7 @@ import numpy as np
 from vio.cameras.rig import Rectifier
 from vio.datasets.common import check_intrinsics, checked_transform, image_size, naming, numbers_in
 from vio.datasets.image_pairs import ImagePairs, first_readable, full_scale, pair_images
-from vio.datasets.kitti import write_calibration, write_times
-from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
+from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import drive_times
 from vio.datasets.unused import Layout, unused_note
@@ -31,8 +30,7 @@ from vio.errors import CalibrationError, DataError
 from vio.files.text import text_lines
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
-from vio.protocols import Progress
-from vio.records import IntArray, Recording, StereoFrame
+from vio.records import IntArray, Recording
 
 CAMERAS = "calib_cam_to_cam.txt"
 VELO = "calib_velo_to_cam.txt"
@@ -253,28 +251,3 @@ def _read_times(path: Path, numbers: IntArray) -> tuple[IntArray, tuple[str, ...
         note = f"{path} is missing; times follow from the frame numbers at 10 Hz"
         return numbers * _FRAME_NS, (note,)
     return drive_times(path, numbers), ()
-
-
-# --- writing --------------------------------------------------------------------------------------------------------
-
-
-def write_rectified_kitti(dataset: RectifiedDataset, out: Path, progress: Progress) -> int:
-    """Write a drive as a KITTI odometry folder: `image_0 image_1 calib.txt times.txt` and `T_cam0_imu.txt`.
-
-    Returns:
-        The number of frames written.
-
-    Raises:
-        DataError: too many images are unreadable.
-    """
-    folders = [out / name for name in ("image_0", "image_1")]
-    for folder in folders:
-        folder.mkdir()
-
-    def name(frame: StereoFrame, count: int) -> tuple[Path, Path]:
-        return folders[0] / f"{count:06d}.png", folders[1] / f"{count:06d}.png"
-
-    times_ns = write_frames(dataset, name, progress)
-    write_calibration(out, dataset.recording.camera, dataset.recording.T_cam0_imu)
-    write_times(out, times_ns)
-    return len(times_ns)

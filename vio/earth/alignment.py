@@ -28,6 +28,7 @@ from vio.geometry.lie import (
     se3_log,
     so3_hat,
 )
+from vio.numerics.robust import truncated_weights
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 
@@ -219,7 +220,7 @@ class _Problem:
             if mu is None:
                 worst = (squared / limits * (weight > 0)).max(axis=0)
                 mu = 1 / np.maximum(2 * worst - 1, 1e-3)
-            weight = _gnc_weight(squared, mu, limits) * known
+            weight = truncated_weights(squared, mu, limits) * known
             moved = 0.0
             for _ in range(2):
                 T, log_scale, moved = self._step(T, log_scale, weight)
@@ -326,15 +327,6 @@ class _Factors:
         first = self._rest.solve(np.ascontiguousarray(right[:-1]))
         last = (right[-1:] - self._border.T @ first) / self._last
         return np.concatenate([first - self._solved @ last, last])
-
-
-def _gnc_weight(squared: FloatArray, mu: FloatArray, limit: FloatArray) -> FloatArray:
-    """Weights (N, 2) of truncated least squares, Yang et al. (2020), equation (14)."""
-    middle = np.sqrt(limit * mu * (mu + 1) / np.maximum(squared, 1e-12)) - mu
-    out: FloatArray = np.where(
-        squared >= limit * (mu + 1) / mu, 0.0, np.where(squared <= limit * mu / (mu + 1), 1.0, middle)
-    )
-    return out
 
 
 def _start(p: FloatArray, measured: FloatArray, up: FloatArray) -> FloatArray:

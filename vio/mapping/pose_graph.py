@@ -16,6 +16,7 @@ from scipy.sparse.linalg import splu
 
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, se3_left_jacobian, se3_log, so3_hat
 from vio.geometry.relative_pose import RelativePose
+from vio.numerics.robust import truncated_weights
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 
@@ -97,7 +98,7 @@ def optimise(
     if worst > limit:  # else every loop fits with full weight, and there is nothing to decide
         mu = limit / (2 * worst - limit)
         for _ in range(_MOST_GNC_STEPS):
-            weight = _gnc_weight(squared, mu, limit)
+            weight = truncated_weights(squared, mu, limit)
             T = _descend(T, odometry, loops, weight, up_directions, free, 2)
             squared = _squared(T, loops)
             if ((weight == 0) | (weight == 1)).all() and mu > 1:
@@ -106,15 +107,6 @@ def optimise(
         weight = (squared < limit).astype(np.float64)
         T = _descend(T, odometry, loops, weight, up_directions, free, _MOST_STEPS)
     return Optimum(T, weight > 0.5, weight)
-
-
-def _gnc_weight(squared: FloatArray, mu: float, limit: float) -> FloatArray:
-    """Weights (L,) of truncated least squares, Yang et al. (2020), equation (14)."""
-    middle = np.sqrt(limit * mu * (mu + 1) / np.maximum(squared, 1e-12)) - mu
-    out: FloatArray = np.where(
-        squared >= limit * (mu + 1) / mu, 0.0, np.where(squared <= limit * mu / (mu + 1), 1.0, middle)
-    )
-    return out
 
 
 def _squared(T: FloatArray, edges: Edges) -> FloatArray:

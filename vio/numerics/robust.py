@@ -40,3 +40,15 @@ def jackknife(values: npt.ArrayLike) -> FloatArray:
     estimates = np.asarray(values, dtype=np.float64)
     out: FloatArray = np.sqrt((len(estimates) - 1) * np.mean((estimates - estimates.mean(axis=0)) ** 2, axis=0))
     return out
+
+
+def truncated_weights(squared: FloatArray, mu: FloatArray | float, limit: FloatArray | float) -> FloatArray:
+    """Compute weights (...) of truncated least squares of squared errors (...) by graduated non-convexity.
+
+    Reference: Yang et al. (2020), equation (14); `mu` grows from 0 (convex) on, `limit` is the largest squared error.
+    """
+    middle = np.sqrt(limit * mu * (mu + 1) / np.maximum(squared, 1e-12)) - mu
+    out: FloatArray = np.where(
+        squared >= limit * (mu + 1) / mu, 0.0, np.where(squared <= limit * mu / (mu + 1), 1.0, middle)
+    )
+    return out

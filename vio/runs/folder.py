@@ -258,7 +258,7 @@ def score(
     if reference is None:
         return None, None
     try:
-        truth = _with_times(reference, result)
+        truth = reference.numbered()
         poses = result.trajectory
         poses = poses if T_world_body is None else replace(poses, T_world_body=T_world_body)
         own = evaluate(poses, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
@@ -539,13 +539,6 @@ def _write_frames(path: Path, frames: Records[FrameLog]) -> None:
     with path.open("w", encoding="utf-8", newline="\n") as stream:
         for start in range(0, len(frames), _CHUNK_FRAMES):
             stream.write(frames_csv(frames[start : start + _CHUNK_FRAMES], stages, header=start == 0))
-
-
-def _with_times(reference: Trajectory, result: RunResult) -> Trajectory:
-    """Number a reference without times by frame: pose k belongs to frame k of the recording."""
-    if reference.times_ns is not None or reference.frame_indices is not None:
-        return reference
-    return replace(reference, frame_indices=np.arange(len(reference), dtype=np.int64))
 
 
 def _write_observations(path: Path, result: RunResult) -> None:
