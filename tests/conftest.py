@@ -21,6 +21,9 @@ LONGEST = (
     "test_bench", "test_ros2", "test_course", "test_faults", "test_map_builder", "test_bench_maps",
 )  # fmt: skip
 
+# Files whose tests look at the picture of a run. All others write an empty one: drawing takes longer than a short run.
+DRAWN = ("test_plotting", "test_tutorials", "test_docs")
+
 settings.register_profile("vio", deadline=None)  # no test judges a machine by its speed
 # For tools/mutate.py: the same examples each time, and a failure is not made simpler.
 settings.register_profile("once", deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
@@ -59,6 +62,15 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
     assert main(["render", "--out", str(folder), "--json", *arguments]) == 0
     return folder
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _no_picture(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Write an empty picture of each run, see `DRAWN`."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.stem not in DRAWN:
+            patch.setattr("vio.runs.picture.RunPicture.write", lambda picture, path: path.write_bytes(b"\x89PNG"))
+        yield
 
 
 @pytest.fixture(autouse=True)
