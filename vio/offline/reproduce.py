@@ -91,52 +91,25 @@ VARIANTS = (
 
 
 @dataclass(frozen=True, slots=True)
-class VariantResult:
-    """The results of one variant."""
-
-    name: str
-    used_per_frame: float
-    landmarks: int
-    innovation_median_px: float | None
-    ms_per_frame: float
-    evaluation: Evaluation | None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the row for JSON; null where there is no reference."""
-        scores = None if self.evaluation is None else self.evaluation.as_dict()
-        return {
-            "name": self.name,
-            "ate_m": None if scores is None else scores["ate_m"],
-            "t_err_percent": None if scores is None else scores["t_err_percent"],
-            "r_err_deg_per_100m": None if scores is None else scores["r_err_deg_per_100m"],
-            "used_per_frame": self.used_per_frame,
-            "landmarks": self.landmarks,
-            "innovation_median_px": self.innovation_median_px,
-            "ms_per_frame": self.ms_per_frame,
-        }
-
-
-@dataclass(frozen=True, slots=True)
 class ReproducedTable:
     """The experiment on one drive."""
 
     drive: str
     out: Path
-    rows: tuple[VariantResult, ...]
+    rows: tuple[dict[str, Any], ...]  # values of JSON; None where there is no reference
 
     def as_dict(self) -> dict[str, Any]:
         """Return the table for JSON."""
-        return {"drive": self.drive, "out": str(self.out), "rows": [row.as_dict() for row in self.rows]}
+        return {"drive": self.drive, "out": str(self.out), "rows": list(self.rows)}
 
     def as_text(self) -> str:
         """Return the table in Markdown."""
         head = "| setting | ATE m | t % | deg/100 m | used a frame | landmarks | innovation px | ms a frame |"
         lines = [f"### {self.drive}", "", head, "|---" + "|---:" * 7 + "|"]
-        for row in self.rows:
-            d = row.as_dict()
+        for d in self.rows:
             cells = [_number(d["ate_m"], 2), _number(d["t_err_percent"], 2), _number(d["r_err_deg_per_100m"], 2)]
             cells += [_number(d["used_per_frame"], 1), str(d["landmarks"]), _number(d["innovation_median_px"], 2)]
-            lines.append(f"| {row.name} | {' | '.join(cells)} | {_number(d['ms_per_frame'], 1)} |")
+            lines.append(f"| {d['name']} | {' | '.join(cells)} | {_number(d['ms_per_frame'], 1)} |")
         return "\n".join(lines) + "\n"
 
 
@@ -166,17 +139,18 @@ def reproduce(file: Path, reference: Path | None, out: Path) -> ReproducedTable:
     return table
 
 
-def _row(variant: Variant, result: RunResult, score: Evaluation | None) -> VariantResult:
+def _row(variant: Variant, result: RunResult, score: Evaluation | None) -> dict[str, Any]:
     frames = result.frames
     innovations = [f.innovation_median_px for f in frames if f.innovation_median_px is not None]
-    return VariantResult(
-        name=variant.name,
-        used_per_frame=float(np.mean([f.used for f in frames])),
-        landmarks=len(result.landmarks.ids),
-        innovation_median_px=float(np.median(innovations)) if innovations else None,
-        ms_per_frame=float(np.mean([f.total_ms for f in frames])),
-        evaluation=score,
-    )
+    scores = {} if score is None else score.as_dict()
+    return {
+        "name": variant.name,
+        **{name: scores.get(name) for name in ("ate_m", "t_err_percent", "r_err_deg_per_100m")},
+        "used_per_frame": float(np.mean([f.used for f in frames])),
+        "landmarks": len(result.landmarks.ids),
+        "innovation_median_px": float(np.median(innovations)) if innovations else None,
+        "ms_per_frame": float(np.mean([f.total_ms for f in frames])),
+    }
 
 
 def _figure(drive: str, results: list[tuple[Variant, RunResult, Evaluation | None]]) -> Any:
