@@ -35,17 +35,8 @@ from vio.sim.sequence import SimulatedRecording, Simulation, views
 from vio.sim.world import Surfaces, surfaces_at
 
 SHOWN_EFFECTS = (
-    "exposure",
-    "gain",
-    "gain-high",
-    "blur",
-    "noise",
-    "dark",
-    "bare-wall",
-    "moving",
-    "dropped",
-    "duplicated",
-)
+    "exposure", "gain", "gain-high", "blur", "noise", "dark", "bare-wall", "moving", "dropped", "duplicated",
+)  # fmt: skip
 
 _OUTLIER_PX = 1.0
 _CROSSED_PX = 1.5  # error above which a track at another depth than its point has moved to another surface

@@ -35,27 +35,12 @@ else:
 MotionName = Literal["auto", "imu", "velocity", "none"]
 # The settings that a user may want to change first; `vio config --show` hides the others.
 BASIC = (
-    "motion",
-    "backend",
-    "lag_frames",
-    "frontend.name",
-    "frontend.features",
-    "frontend.grid.target_features",
-    "frontend.disparity.max_disparity",
-    "frontend.klt.mask",
-    "frontend.klt.equalise",
-    "selector.name",
-    "selector.budget",
-    "msckf.clones",
-    "msckf.max_landmarks",
-    "msckf.gravity_mps2",
-    "msckf.gyro_noise_density",
-    "msckf.accel_noise_density",
-    "msckf.gyro_bias_walk",
-    "msckf.accel_bias_walk",
-    "msckf.calibrate_camera_imu",
+    "motion", "backend", "lag_frames", "frontend.name", "frontend.features", "frontend.grid.target_features",
+    "frontend.disparity.max_disparity", "frontend.klt.mask", "frontend.klt.equalise", "selector.name",
+    "selector.budget", "msckf.clones", "msckf.max_landmarks", "msckf.gravity_mps2", "msckf.gyro_noise_density",
+    "msckf.accel_noise_density", "msckf.gyro_bias_walk", "msckf.accel_bias_walk", "msckf.calibrate_camera_imu",
     "msckf.calibrate_stereo",
-)
+)  # fmt: skip
 # Former settings, for the message on an unknown one: renamed, and constants of the code today.
 _RENAMED = {"msckf.calibrate": "msckf.calibrate_camera_imu"}
 _FIXED = {

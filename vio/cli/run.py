@@ -53,25 +53,9 @@ def add_parser(commands: Any) -> None:
 
 
 _OF_A_NEW_RUN = (
-    "reference",
-    "start",
-    "stop",
-    "lengths",
-    "out",
-    "save_observations",
-    "save_calibration",
-    "map",
-    "view",
-    "no_plot",
-    "set",
-    "config",
-    "motion",
-    "backend",
-    "frontend",
-    "calibration",
-    "camera",
-    "topics",
-)
+    "reference", "start", "stop", "lengths", "out", "save_observations", "save_calibration", "map", "view", "no_plot",
+    "set", "config", "motion", "backend", "frontend", "calibration", "camera", "topics",
+)  # fmt: skip
 
 
 def execute(args: argparse.Namespace) -> int:

@@ -25,16 +25,9 @@ from vio.records import NS_PER_S, ImuRecord, ImuSample, IntArray, MotionSample, 
 
 IMU_FILES = ("imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv")
 _REFERENCES = (
-    "reference.tum",
-    "reference.txt",
-    "groundtruth.tum",
-    "groundtruth_tum.txt",
-    "groundtruth.txt",
-    "gt_imu.csv",
-    "mocap0/data.csv",
-    "state_groundtruth_estimate0/data.csv",
-    "poses.txt",
-)
+    "reference.tum", "reference.txt", "groundtruth.tum", "groundtruth_tum.txt", "groundtruth.txt", "gt_imu.csv",
+    "mocap0/data.csv", "state_groundtruth_estimate0/data.csv", "poses.txt",
+)  # fmt: skip
 _CALIBRATION_FOLDERS = ("", "dso", "calibration", "calib")
 
 

@@ -33,20 +33,10 @@ KNOWN = (
 )
 # File names looked for in a folder, in this order; the content decides what they are.
 _IN_FOLDER = (
-    "calibration.yaml",
-    "calibration.yml",
-    "camchain-imucam*.yaml",
-    "*camchain-imucam*.yaml",
-    "camchain*.yaml",
-    "*camchain*.yaml",
-    "calib_cam_to_cam.txt",
-    "calib.txt",
-    "left.y*ml",
-    "stereo*.y*ml",
-    "intrinsics.y*ml",
-    "stereo*.xml",
-    "calibration.xml",
-)
+    "calibration.yaml", "calibration.yml", "camchain-imucam*.yaml", "*camchain-imucam*.yaml", "camchain*.yaml",
+    "*camchain*.yaml", "calib_cam_to_cam.txt", "calib.txt", "left.y*ml", "stereo*.y*ml", "intrinsics.y*ml",
+    "stereo*.xml", "calibration.xml",
+)  # fmt: skip
 
 
 def load_rig(
