@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from tests.true_world import TrueWorld
 from vio.filters import imu_start, navigation
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
@@ -90,21 +91,21 @@ class Run:
 
     filter: Msckf
     course: Course
-    T_world_estimated: FloatArray = field(default_factory=lambda: np.eye(4))  # the estimate's world in the true one
+    T_world_estimated: list[FloatArray] = field(default_factory=list)  # (4, 4) of each frame's world in the true one
     estimates: list[Estimate] = field(default_factory=list)
     reports: list[UpdateReport] = field(default_factory=list)
     navigation: list[FloatArray] = field(default_factory=list)  # (15, 15) covariances
 
     def error(self, k: int, estimate: Estimate | None = None) -> FloatArray:
         """Pose error (6,) of frame k on the body's side, as `Estimate` defines it."""
-        T = self.T_world_estimated @ (estimate or self.estimates[k]).T_world_imu
+        T = self.T_world_estimated[k] @ (estimate or self.estimates[k]).T_world_imu
         return se3_log(se3_inverse(self.course.pose(k / self.course.hz)) @ T)
 
     def velocity_error(self, k: int, estimate: Estimate | None = None) -> FloatArray:
         """Velocity error (3,) of frame k, world."""
         v = (estimate or self.estimates[k]).velocity_world
         assert v is not None
-        return np.asarray(self.T_world_estimated[:3, :3] @ v - self.course.velocity)
+        return np.asarray(self.T_world_estimated[k][:3, :3] @ v - self.course.velocity)
 
 
 def fly(
@@ -117,11 +118,11 @@ def fly(
 ) -> Run:
     """Drive the filter along a course.
 
-    The estimate's world is put where the first pose says: with an IMU by position and yaw, as the first tilt is an
-    estimate like any other.
+    The estimate's world is put where the first pose says, see `TrueWorld`.
     """
     rng_imu, rng = np.random.default_rng(1000 + seed), np.random.default_rng(seed)
     run, fed = Run(Msckf(CAMERA, T_CAM0_IMU, settings, motion=motion), course), 0
+    world = TrueWorld(run.filter, upright=motion == "imu")
     for k in range(course.frames):
         while motion == "imu" and fed * course.hz <= (k + 1) * _IMU_HZ:
             run.filter.propagate(course.imu(fed, settings, rng_imu))
@@ -129,12 +130,8 @@ def fly(
         seen = course.observe(k, rng)
         run.reports.append(run.filter.update(seen if spoil is None else spoil(k, seen)))
         estimate = run.filter.estimate()
-        if k == 0:
-            shift = course.pose(0) @ se3_inverse(estimate.T_world_imu)
-            if motion == "imu":
-                yaw = np.arctan2(shift[1, 0] - shift[0, 1], shift[0, 0] + shift[1, 1])
-                shift = se3_from_parts(so3_exp([0, 0, yaw]), np.zeros(3))
-            run.T_world_estimated = shift
+        world.meet(k, course.pose(k / course.hz))
+        run.T_world_estimated.append(world.T)
         run.estimates.append(estimate)
         run.navigation.append(run.filter._propagation.posterior.own[:15, :15].copy())
         if each is not None:

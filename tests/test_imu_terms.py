@@ -243,8 +243,9 @@ def test_predicted_motions_are_as_uncertain_as_the_terms() -> None:
     step = filt._propagation.step_to(filt._started(), 20 * STEP_NS)
     assert step.Phi_imu is not None
     grown = filt._propagation.grown(filt._started(), step.nav, NO_STEP.then(step))
-    np.testing.assert_array_equal(grown[:DIM], np.concatenate([step.Phi, step.Phi_imu], axis=1))
-    np.testing.assert_array_equal(grown[DIM:], np.eye(15, DIM + 15, DIM))
+    np.testing.assert_array_equal(grown[:DIM, : DIM + 15], np.concatenate([step.Phi, step.Phi_imu], axis=1))
+    np.testing.assert_array_equal(grown[:DIM, DIM + 15 :], 0.0)  # of the first attitude
+    np.testing.assert_array_equal(grown[DIM:], np.eye(18, DIM + 18, DIM))
 
 
 def test_standstill_shows_what_gravity_tells_and_no_more() -> None:

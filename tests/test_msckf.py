@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.numerics import numeric_jacobian
+from tests.true_world import TrueWorld
 from vio.errors import ConfigError, DataError, DivergedError, EstimationError
 from vio.evaluation.trajectories import nees, nees_bounds
 from vio.filters import imu_start
@@ -493,15 +494,14 @@ class Flight:
     ) -> tuple[FloatArray, FloatArray, Msckf]:
         """Return pose errors xi (frames, 6) and covariances (frames, 6, 6), as `Estimate` defines them, and the filter.
 
-        The estimate's world is moved onto the truth by the first pose, which the filter takes as known; with an IMU by
-        its position and yaw alone, as the world is then upright and the first tilt is an estimate like any other.
+        The estimate's world is put onto the truth as `TrueWorld` does.
         """
         noise = np.random.default_rng(seed)
         filt = filter_class(CAMERA, T_CAM0_IMU, settings, motion=motion)  # type: ignore[arg-type]
         samples = self.imu(noise, settings, np.zeros(6) if bias is None else bias) if motion == "imu" else []
         errors, covariances = [], []
         fed = 0
-        T_shift = np.eye(4)
+        world = TrueWorld(filt, upright=motion == "imu")
         for k in range(self.frames):
             while fed < len(samples) and samples[fed].time_ns <= k * STEP_NS:
                 filt.propagate(samples[fed])
@@ -513,13 +513,8 @@ class Flight:
             seen = self.observe(k, sigma, noise, limit)
             filt.update(seen if spoil is None else spoil(k, seen, noise))  # type: ignore[operator]
             estimate = filt.estimate()
-            if k == 0:
-                T_shift = self.T_world_imu(0) @ se3_inverse(estimate.T_world_imu)
-                if motion == "imu":
-                    R = T_shift[:3, :3]
-                    yaw = np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
-                    T_shift = se3_from_parts(so3_exp([0, 0, yaw]), self.T_world_imu(0)[:3, 3])
-            error = se3_log(se3_inverse(self.T_world_imu(k)) @ T_shift @ estimate.T_world_imu)
+            T_true = self.T_world_imu(k)
+            error = se3_log(se3_inverse(T_true) @ world.meet(k, T_true))
             errors.append(error)
             covariances.append(estimate.covariance)
         return np.array(errors), np.array(covariances), filt
@@ -552,6 +547,35 @@ def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion:
 
     J = numeric_jacobian(on_the_body, np.zeros(6))
     np.testing.assert_allclose(estimate.covariance, J @ P[:6, :6] @ J.T, rtol=1e-4, atol=1e-5 * np.abs(P[:6, :6]).max())
+
+
+def test_the_world_stays_where_the_first_window_left_it_while_gravity_becomes_known_better() -> None:
+    """An accelerometer bias passes for a tilt until the body turns; learning it moves gravity, not the path (N14)."""
+    flight, settings = Flight(frames=140), replace(EXACT_RIG, clones=5, calibrate_camera_imu="none")
+    bias = np.array([0.0, 0, 0, 0.25, -0.2, 0.1])
+    errors, covariances, filt = flight.run(settings, "imu", bias=bias)
+    estimate, window = filt.estimate(), filt._window
+    assert window is not None
+    R = window.calibration.R_upright_world
+    learned_deg = np.degrees(np.linalg.norm(so3_log(R)))
+    assert learned_deg > 0.3, learned_deg  # else there is nothing to see
+    np.testing.assert_allclose(estimate.T_world_imu[:3, 3], R.T @ window.nav.T_world_imu[:3, 3], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(estimate.gravity_world), settings.gravity_mps2)
+
+    # Gravity, seen from the body, is what it is, within its standard deviation.
+    down = estimate.T_world_imu[:3, :3].T @ estimate.gravity_world / settings.gravity_mps2
+    tilt = np.linalg.norm(np.cross(down, flight.state((flight.frames - 1) * 0.05)[0].T @ [0.0, 0, -1]))
+    assert estimate.tilt_sigma_rad is not None
+    assert tilt < 3.5 * estimate.tilt_sigma_rad, (tilt, estimate.tilt_sigma_rad)
+
+    # The path since is as exact as it is said to be, and does not turn with gravity.
+    values = nees(errors[6:], covariances[6:])
+    assert values.mean() < 12, values
+    smoothed = filt.smoothed(flight.frames - 3)
+    assert smoothed is not None
+    moved = se3_log(se3_inverse(smoothed.T_world_imu) @ estimate.T_world_imu)
+    true = se3_log(se3_inverse(flight.T_world_imu(flight.frames - 3)) @ flight.T_world_imu(flight.frames - 1))
+    np.testing.assert_allclose(moved, true, atol=0.02)
 
 
 def test_tracks_have_their_say_when_the_oldest_clone_leaves_and_not_before() -> None:

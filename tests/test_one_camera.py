@@ -17,6 +17,7 @@ import vio
 from tests.test_frontend_scene import CAMERA as WALL_CAMERA
 from tests.test_frontend_scene import SLANTED
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
+from tests.true_world import TrueWorld
 from vio.cameras.rig import Rig, with_virtual_baseline
 from vio.config import Config
 from vio.datasets import DatasetSettings, open_dataset
@@ -77,6 +78,7 @@ class Flown:
         self.filter = MonoMsckf(LEFT, T_CAM0_IMU, SETTINGS)
         samples = flight.imu(rng, SETTINGS, bias)
         self.begun: int | None = None
+        world = TrueWorld(self.filter, upright=True)
         rows: list[list[float]] = []
         for k in range(flight.frames):
             while samples and samples[0].time_ns <= k * STEP_NS:
@@ -86,11 +88,10 @@ class Flown:
             estimate = self.filter.estimate()
             R, p, v, *_ = flight.state(k * 0.05)
             if self.begun is None:
-                self.begun, origin = k, p
-                turn = R @ estimate.T_world_imu[:3, :3].T
-                yaw = so3_exp([0, 0, np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])])
-            off_v = yaw.T @ v - estimate.velocity_world
-            off_p = estimate.T_world_imu[:3, :3].T @ (yaw.T @ (p - origin) - estimate.T_world_imu[:3, 3])
+                self.begun = k
+            T = world.meet(k, se3_from_parts(R, p))
+            off_v = world.T[:3, :3].T @ v - estimate.velocity_world
+            off_p = T[:3, :3].T @ (p - T[:3, 3])
             assert estimate.velocity_covariance is not None
             C = estimate.covariance[:3, :3] + 1e-12 * np.eye(3)
             rows.append(

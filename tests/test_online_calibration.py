@@ -10,6 +10,7 @@ import pytest
 
 from tests.numerics import numeric_jacobian
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight, _world_points
+from tests.true_world import TrueWorld
 from vio.errors import ConfigError
 from vio.filters import online_calibration
 from vio.filters.msckf import Msckf
@@ -107,7 +108,7 @@ def fly_with(
 ) -> tuple[list[Estimate], FloatArray]:
     """Feed a filter with a flight; return its estimates and the errors of their positions (frames, 3), m."""
     estimates: list[Estimate] = []
-    positions, fed = [], 0
+    positions, fed, world = [], 0, TrueWorld(filt, upright=True)
     for k in range(flight.frames):
         # As in the pipeline: with the sample at or after the exposure, by the offset estimated so far.
         exposed_ns = k * STEP_NS + round(1e9 * max((estimates[-1].time_offset_s or 0.0) if estimates else 0.0, 0.0))
@@ -116,13 +117,9 @@ def fly_with(
             fed += 1
         filt.update(flight.observe(k, sigma, noise, 40))
         e = filt.estimate()
-        if k == 0:  # the world begins at the first exposure
-            R, p, *_ = flight.state(0.0)
-            turn = R @ e.T_world_imu[:3, :3].T
-            yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-            T_shift = se3_from_parts(so3_exp([0, 0, yaw]), p)
         estimates.append(e)
-        positions.append((T_shift @ e.T_world_imu)[:3, 3] - flight.T_world_imu(k)[:3, 3])
+        T_true = flight.T_world_imu(k)
+        positions.append((world.meet(k, T_true) - T_true)[:3, 3])
     return estimates, np.array(positions)
 
 

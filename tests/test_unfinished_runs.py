@@ -217,7 +217,7 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
     field = StereoFieldEstimate(rng.normal(size=8), rng.normal(size=(8, 8)), 0.3, rows, rows_P)
     scale = StereoScaleEstimate(rng.normal(size=2), rng.normal(size=(2, 2)))
     values |= {"time_ns": 2**60 + 1, "time_offset_s": 0.1, "time_offset_sigma_s": 0.2, "scale_sigma": 0.02}
-    values |= {"stereo_field": field, "stereo_scale": scale}
+    values |= {"tilt_sigma_rad": 0.01, "stereo_field": field, "stereo_scale": scale}
     back = estimate_of(estimate_row(0, Estimate(**values))[0])
     for name, value in values.items():
         if name not in ("stereo_field", "stereo_scale"):

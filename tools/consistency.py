@@ -43,6 +43,7 @@ from vio.filters.window import Clone, Window
 from vio.filters.window_tracks import WindowTracks
 from vio.geometry.lie import (
     FloatArray,
+    se3_adjoint,
     se3_exp,
     se3_from_parts,
     se3_inverse,
@@ -301,6 +302,9 @@ class Ablation(Msckf):
             self._begun = True
         super()._measure()
 
+    def _keep_first_attitude(self, window: Window) -> None:
+        """The errors are judged in the world that gravity keeps upright."""
+
     @property
     def nav(self) -> NavState:
         """The navigation state."""
@@ -491,7 +495,7 @@ def _fly(job: Job, learn: bool) -> Record:
     position_sigma, yaw_sigma = _START[job.start]
     start[:3], start[5] = noise.normal(0, position_sigma, 3), noise.normal(0, yaw_sigma)
 
-    navs, covariances, poses, fed_ns = [], [], [], -1
+    navs, covariances, fed_ns = [], [], -1
     for k in range(scenario.frames):
         # As in the pipeline, a frame waits for the first IMU sample at or after its exposure.
         while samples and fed_ns < k * _FRAME_NS:
@@ -500,10 +504,9 @@ def _fly(job: Job, learn: bool) -> Record:
         filt.update(flight.frame(k, T[k], scenario, noise))
         navs.append(filt.nav)
         covariances.append(filt.nav_covariance)
-        poses.append(filt.estimate())
     shift = se3_exp(start) @ _start_shift(T[0], navs[0].T_world_imu, upright=job.motion == "imu")
     T, v = shift @ T, v @ shift[:3, :3].T
-    return _record(job, T, v, bias, navs, np.array(covariances), np.array([e.covariance for e in poses]), filt.nis)
+    return _record(job, T, v, bias, navs, np.array(covariances), filt.nis)
 
 
 def _start_shift(T_true: FloatArray, T_estimate: FloatArray, *, upright: bool) -> FloatArray:
@@ -524,11 +527,12 @@ def _record(
     bias: FloatArray,
     navs: list[NavState],
     P: FloatArray,
-    pose_covariance: FloatArray,
     nis: list[float],
 ) -> Record:
-    """Errors against what the filter said of them; P (F, 15, 15), pose_covariance as in `Estimate`."""
+    """Errors against what the filter said of them, P (F, 15, 15), in the world that gravity keeps upright."""
     T_hat = np.array([n.T_world_imu for n in navs])
+    to_body = se3_adjoint(se3_inverse(T_hat))
+    pose_covariance = to_body @ P[:, :6, :6] @ np.swapaxes(to_body, 1, 2)
     xi = se3_log(se3_inverse(T) @ T_hat)
     world = se3_log(T @ se3_inverse(T_hat))
     values = {

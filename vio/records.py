@@ -411,8 +411,11 @@ class Estimate:
     accel_bias: FloatArray | None = field(default=None, metadata=_kept(3))  # m/s^2
     # Standard deviations, m/s^2; zero where it is not estimated.
     accel_bias_sigma: FloatArray | None = field(default=None, metadata=_kept(3))
-    # m/s^2, where the world is not upright (an IMU that began late).
+    # m/s^2, where the world is not that of the vertical known at present: it stays that of the first seconds, or of the
+    # images before an IMU that began late. None: along -z.
     gravity_world: FloatArray | None = field(default=None, metadata=_kept(3))
+    # Standard deviation of the vertical seen from the body, rad, each horizontal axis; None: no IMU has shown it.
+    tilt_sigma_rad: float | None = field(default=None, metadata=_kept())
     # The calibration, where the filter estimates it.
     T_cam0_imu: FloatArray | None = field(default=None, metadata=_kept(4, 4))
     # Of xi in T_cam0_imu = T_hat exp(xi), [rho; phi], m and rad.

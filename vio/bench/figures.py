@@ -12,7 +12,7 @@ import numpy.typing as npt
 from vio.errors import EvaluationError
 from vio.evaluation.trajectories import Evaluation, associate_times, nees
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
-from vio.records import NS_PER_S, IntArray, Trajectory
+from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
 _OF_REFERENCE = ("ate_sim3_m", "scale_error_percent", "rpe_m", "drift_percent", "drift_deg_per_100m", "nees")
 _OF_PLACES = ("map_nees", "map_nees_50", "map_nees_95")
@@ -62,24 +62,29 @@ def pose_nees(
     covariances: FloatArray,
     T_cam0_imu: FloatArray,
     *,
-    upright: bool,
+    upright: BoolArray | bool,
 ) -> FloatArray | None:
     """Return the NEES (M,) of the poses, 6 in the mean for a consistent filter; None: no covariance can be inverted.
 
-    The world frames are identified at the first matched pose: all of it where the filter's world is its first frame,
-    position and yaw where both worlds are upright, as the filter then estimates the inclination of its first pose.
+    The world frames are identified at the first matched pose: all of it where the filter's world is that of its first
+    frame, position and yaw where both worlds are upright, as the first inclination is then estimated like any other.
 
     Args:
         evaluation: which poses match which of the reference.
         T_world_imu: (N, 4, 4) all estimated poses.
         covariances: (N, 6, 6) of xi in T_imu_world = exp(xi) T_imu_world_hat.
         T_cam0_imu: (4, 4) extrinsics.
-        upright: both worlds have z up.
+        upright: (N,) whether both worlds have z up; where that ends, they are identified anew.
     """
     truth = evaluation.reference.in_imu(T_cam0_imu).T_world_body
     T, P = T_world_imu[evaluation.rows], covariances[evaluation.rows]
-    T_world_true = _yaw_and_position(T[0], truth[0]) if upright else T[0] @ se3_inverse(truth[0])
-    errors = se3_log(se3_inverse(T_world_true @ truth) @ T)
+    upright = np.broadcast_to(upright, len(T_world_imu))[evaluation.rows]
+    errors = np.empty((len(T), 6))
+    for rows in (np.flatnonzero(upright), np.flatnonzero(~upright)):
+        if len(rows):
+            a, b = T[rows[0]], truth[rows[0]]
+            T_world_true = _yaw_and_position(a, b) if upright[rows[0]] else a @ se3_inverse(b)
+            errors[rows] = se3_log(se3_inverse(T_world_true @ truth[rows]) @ T[rows])
     invertible = np.linalg.cond(P) < _MOST_CONDITION
     if not invertible.any():
         return None

@@ -170,7 +170,7 @@ class FrameUpdate:
         if kept.all():
             return
         gone, covariances = ~kept, self._rig.landmark_covariances(window)
-        self._points.store(window.landmark_ids[gone], window.landmarks[gone], covariances[gone])
+        self._points.store(window, window.landmark_ids[gone], window.landmarks[gone], covariances[gone])
         window.keep_landmarks(kept)
 
     def _linearise(self, window: Window, rows: IntArray, steps: int) -> LinearTracks:
@@ -386,7 +386,7 @@ class FrameUpdate:
             of_points = tracks.information.point_D_clones(done) @ V[window.state.clones]
             of_points += joint.point_D_stereo(tracks.information, done)[..., -CONSIDERED:]
             covariance = covariance + self._rig.uncertainty(window, of_points)
-        self._points.store(table.ids(tracks.rows[done]), table.points[tracks.rows[done]], covariance)
+        self._points.store(window, table.ids(tracks.rows[done]), table.points[tracks.rows[done]], covariance)
         spent = leaving & ~lost
         spent[promoted] = False
         self.tracks.end_frame(spent=tracks.rows[spent], promoted=tracks.rows[promoted], newest=newest)

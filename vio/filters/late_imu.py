@@ -18,6 +18,8 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate, Landmarks, Observations, Prediction, UpdateReport, no_landmarks
 
+_DOWN = np.array([0.0, 0.0, -1.0])
+
 
 class LateImuMsckf(Msckf):
     """A sliding-window filter with an IMU, which images alone stand in for until its first sample."""
@@ -139,5 +141,6 @@ class LateImuMsckf(Msckf):
             covariance=own.covariance + A @ by_images.covariance @ A.T,
             velocity_world=None if own.velocity_world is None else R @ own.velocity_world,
             velocity_covariance=None if own.velocity_covariance is None else R @ own.velocity_covariance @ R.T,
-            gravity_world=R @ np.array([0.0, 0.0, -self._settings.gravity_mps2]),
+            gravity_world=R @ (_DOWN * self._settings.gravity_mps2 if own.gravity_world is None else own.gravity_world),
+            tilt_sigma_rad=None,
         )

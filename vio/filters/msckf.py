@@ -10,7 +10,7 @@ consistency (2017); Barrau & Bonnabel (2017).
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -28,7 +28,7 @@ from vio.filters.restart import GoodState, restarted
 from vio.filters.rig_calibration import RigCalibration
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Clone, Window
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, so3_exp, so3_log
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, so3_exp, so3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.protocols import Backend
@@ -198,6 +198,7 @@ class Msckf(Backend):
             window.compare_clocks(observations.time_ns, late_s, twist)
             exposure = window.camera_D_own(late_s, twist)
         window.add_clone(observations.frame_index, observations.time_ns, exposure)
+        self._keep_first_attitude(window)
         before = window.clones[len(window.clones) > self._settings.clones]  # the oldest that stays
         try:
             report = self._frame.update(window, seen, expected)
@@ -272,20 +273,34 @@ class Msckf(Backend):
         T, covariance = propagation.exposed(window, own)
         # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error is its negative.
         A = se3_adjoint(se3_inverse(T))
-        known = motion.uncertainty(window.nav, own[:DIM, :DIM])
+        M = np.eye(DIM, len(own))
+        M[:6] = window.since_first(M[:6])
+        known = motion.uncertainty(window.nav, M @ own @ M.T)
+        R = window.calibration.R_upright_world.T
         estimate = Estimate(
             propagation.time_ns,
-            T,
+            se3_from_parts(R, np.zeros(3)) @ T,
             A @ covariance @ A.T,
-            velocity_world=motion.velocity_world(window.nav),
-            velocity_covariance=known.velocity_covariance,
+            velocity_world=R @ motion.velocity_world(window.nav),
+            velocity_covariance=R @ known.velocity_covariance @ R.T,
             gyro_bias=window.nav.gyro_bias,
             gyro_bias_sigma=known.gyro_bias_sigma,
             accel_bias=window.nav.accel_bias,
             accel_bias_sigma=known.accel_bias_sigma,
+            **self._vertical(own),
             **window.calibration.report(window.state, window.nav, own),
         )
         return self._rig.report(window, estimate)
+
+    def _vertical(self, own: FloatArray) -> dict[str, Any]:
+        """The fields of `Estimate` that say where gravity points, by the upright covariance (15 + C, 15 + C)."""
+        window = self._started()
+        if self._source != "imu":
+            return {}
+        out: dict[str, Any] = {"tilt_sigma_rad": float(np.sqrt(np.linalg.eigvalsh(own[3:5, 3:5])[-1]))}
+        if "first_attitude" in window.state:
+            out["gravity_world"] = window.calibration.R_upright_world.T @ [0.0, 0.0, -self._settings.gravity_mps2]
+        return out
 
     def imu_terms_covariance(self) -> FloatArray:
         """Return the covariance (15, 15) of the errors of `Estimate.imu_terms`; zero where a term is not estimated."""
@@ -340,6 +355,12 @@ class Msckf(Backend):
 
     def _measure(self) -> None:
         self._propagation.measure(self._started())
+
+    def _keep_first_attitude(self, window: Window) -> None:
+        """Let the world that is reported stay where the first frames have put it, once the first one leaves: (N14)."""
+        leaving = len(window.clones) > self._settings.clones and window.clones[0].time_ns == self._began_ns
+        if self._source == "imu" and leaving and "first_attitude" not in window.state:
+            window.keep_first_attitude(window.calibration.estimating("first_attitude", self._settings))
 
     def _keep_first_yaw(self, window: Window, before: Clone) -> None:
         """Keep the world's yaw that of the start while the first tilt is corrected, equation (N13).

@@ -22,7 +22,7 @@ from vio.cameras.rectification_error import TERMS
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
 from vio.filters.navigation import DIM, Growth, NavState, Transition
 from vio.filters.settings import MsckfSettings
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, so3_exp
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import FIELD_TERMS, IntArray, MotionSource, StereoFieldEstimate, StereoScaleEstimate
 
@@ -87,6 +87,8 @@ class Calibration:
     T_cam0_imu: FloatArray  # (4, 4)
     time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock
     stereo: FloatArray = field(default_factory=lambda: np.zeros(TERMS))  # (10,) coefficients of (R3) and (R4)
+    # (3, 3) from the world of the first seconds to that of the present estimate, which gravity keeps upright
+    R_upright_world: FloatArray = field(default_factory=lambda: np.eye(3))
     estimated: dict[str, int] = field(default_factory=dict)  # names and sizes of the blocks, in the order of the table
 
     @property
@@ -325,7 +327,33 @@ class _TimeOffsetBlock(CalibrationBlock):
         return None if twist is None else (se3_adjoint(T_exposed) @ twist.significant())[:, None]
 
 
-_ALL = _ImuTermsBlock(), _StereoFieldBlock(), _StereoScaleBlock(), _ExtrinsicsBlock(), _TimeOffsetBlock()
+class _FirstAttitudeBlock(CalibrationBlock):
+    """The attitude of the first frame, which defines the world that is reported, after it has left the window."""
+
+    name = "first_attitude"
+    enters = "camera"  # behind all others; nothing depends on it
+
+    def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
+        return False
+
+    def sigmas(self, settings: MsckfSettings) -> FloatArray:
+        return np.zeros(3)
+
+    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
+        return replace(calibration, R_upright_world=so3_exp(error) @ calibration.R_upright_world)
+
+    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+        return {}
+
+
+_ALL = (
+    _ImuTermsBlock(),
+    _StereoFieldBlock(),
+    _StereoScaleBlock(),
+    _ExtrinsicsBlock(),
+    _TimeOffsetBlock(),
+    _FirstAttitudeBlock(),
+)
 # In the order of the error vector: what enters in the motion, in pixels, in the camera's pose.
 BLOCKS: dict[str, CalibrationBlock] = {block.name: block for block in _ALL}
 

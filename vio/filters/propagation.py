@@ -205,7 +205,10 @@ class Propagation:
         return (self.body_ns - self.time_ns) * 1e-9
 
     def own_covariance(self, window: Window) -> FloatArray:
-        """Covariance (15 + C, 15 + C) of navigation state and calibration at the time of the last event, reported."""
+        """Covariance (15 + C, 15 + C) of navigation state and calibration at the time of the last event, reported.
+
+        It is upright: errors against the world that gravity shows at present.
+        """
         if not self.blind:
             return self.reported.own
         grow = self.grown(window, window.nav, self.since_frame)
@@ -214,17 +217,24 @@ class Propagation:
         return out
 
     def exposed(self, window: Window, own: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pose (4, 4) of the body at the newest exposure and its covariance (6, 6), by `own_covariance`."""
+        """Upright pose (4, 4) of the body at the newest exposure, and the covariance (6, 6) of the reported one.
+
+        Args:
+            window: the window.
+            own: `own_covariance`.
+        """
         if "time_offset" not in window.state:
-            return window.nav.T_world_imu, own[:6, :6]
+            J = window.since_first(np.eye(6, len(own)))
+            return window.nav.T_world_imu, J @ own @ J.T
         if not self.blind:
             with_newest = self.reported.with_newest
             J = np.eye(6, len(with_newest), len(own))  # of the camera, and back to the body
-            J[:, : len(own)] += window.body_D_error()[-6:, : len(own)]
+            J[:, : len(own)] += window.since_first(window.body_D_error()[-6:])[:, : len(own)]
             return window.clones[-1].T_world_imu, J @ with_newest @ J.T
         T, J, noise = window.camera_D_own(self.late_s, self.twist(window, window.nav, self.since_frame))
         if "extrinsics" in window.state:
             J[:, window.state["extrinsics"]] = 0.0  # of the body
+        J = window.since_first(J)
         return T, J @ own @ J.T + noise
 
 

@@ -157,6 +157,27 @@ class Window:
         self._lay_out()
         self.prior.insert(self.state[name].start, covariance)
 
+    def keep_first_attitude(self, calibration: Calibration) -> None:
+        """Make a state of the oldest clone's attitude, which stays when the clone is dropped, equation (N14).
+
+        Args:
+            calibration: that estimates the block `first_attitude`.
+        """
+        first = self.state.clone(0)
+        phi = slice(first.start + 3, first.stop)
+        J = np.eye(3, first.stop, phi.start)
+        self.calibration = calibration
+        self.prior.insert_dependent(first.start, J, np.zeros((3, 3)), self.prior.error_D_constants[phi, 0])
+        self._lay_out()
+
+    def since_first(self, out_D_error: FloatArray) -> FloatArray:
+        """Turn Jacobians (6k, D) of poses into those of the same in the world that is reported, equation (N14)."""
+        if "first_attitude" in self.state:
+            out_D_error = out_D_error.copy()
+            rows = out_D_error.reshape(-1, 6, out_D_error.shape[1])
+            rows[:, 3:, self.state["first_attitude"]] -= np.eye(3)
+        return out_D_error
+
     def inflate_process_noise(self, extra: FloatArray) -> None:
         """Add noise (15, 15) to the last step, as if its motion had been known less; the newest clone ends it."""
         J = np.zeros((self.state.size, DIM))

@@ -27,6 +27,7 @@ class WindowPosterior:
     gyro_bias: FloatArray  # (3,) rad/s, of the newest frame
     accel_bias: FloatArray  # (3,) m/s^2, of the newest frame
     has_imu: bool  # whether the clones' velocities are smoothed, too
+    R_upright_world: FloatArray  # (3, 3) as in Calibration; P and the clones are upright, `reported` and `estimate` not
 
     @classmethod
     def of(cls, window: Window, P: FloatArray, reported: FloatArray | None = None) -> WindowPosterior:
@@ -34,11 +35,12 @@ class WindowPosterior:
         reported = P if reported is None else reported
         rows = window.state.clones
         own = P[rows, rows], reported[rows, rows]
-        if "extrinsics" in window.state:
+        if "extrinsics" in window.state or "first_attitude" in window.state:
             J = window.body_D_error()
-            own = J @ P @ J.T, J @ reported @ J.T
-        has_imu = isinstance(window.motion, ImuMotion)
-        return cls(tuple(window.clones), *own, window.nav.gyro_bias, window.nav.accel_bias, has_imu)
+            J_reported = window.since_first(J)
+            own = J @ P @ J.T, J_reported @ reported @ J_reported.T
+        has_imu, R = isinstance(window.motion, ImuMotion), window.calibration.R_upright_world
+        return cls(tuple(window.clones), *own, window.nav.gyro_bias, window.nav.accel_bias, has_imu, R)
 
     def rotated(self, R: FloatArray) -> WindowPosterior:
         """Return the same in a world that is turned by R (3, 3)."""
@@ -54,11 +56,12 @@ class WindowPosterior:
             return None
         clone, rows = self.clones[index], slice(6 * index, 6 * index + 6)
         A = se3_adjoint(se3_inverse(clone.T_world_imu))
+        R = self.R_upright_world.T
         return Estimate(
             clone.time_ns,
-            clone.T_world_imu,
+            se3_from_parts(R, np.zeros(3)) @ clone.T_world_imu,
             A @ self.reported[rows, rows] @ A.T,
-            velocity_world=clone.velocity if self.has_imu else self._velocities()[index],
+            velocity_world=R @ (clone.velocity if self.has_imu else self._velocities()[index]),
             gyro_bias=self.gyro_bias,
             accel_bias=self.accel_bias,
         )

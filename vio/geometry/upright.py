@@ -55,8 +55,8 @@ def up_of(motion: str | None, gravity_world: FloatArray | None) -> FloatArray | 
     """Return the up direction (3,) of a run's world frame; None where only an IMU could tell and there was none.
 
     Args:
-        motion: the run's motion input; with an IMU the world is upright, z up.
-        gravity_world: (3,) of the newest estimate, where the IMU began late and the world is not upright.
+        motion: the run's motion input; with an IMU the world began upright, z up.
+        gravity_world: (3,) of the newest estimate, where gravity is known better than that.
     """
     if gravity_world is not None and np.isfinite(gravity_world).all():
         return -np.asarray(gravity_world, dtype=np.float64)

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from vio.calibration.stereo_field import DisplacementField
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate, check_camera
@@ -291,16 +291,14 @@ class MapSession:
         self._newest = frame.index, RelativePose(np.eye(4), np.zeros((6, 6))), T_odom_cam
 
     def _vertical(self, estimate: Estimate) -> tuple[FloatArray | None, float]:
-        """Direction against gravity in the camera (3,) and its standard deviation; None where it is not known.
-
-        With `T_imu_world = exp(xi) T_hat`, phi moves the direction u in the body by `phi x u`.
-        """
-        if not self._imu or estimate.gravity_world is not None:
+        """Direction against gravity in the camera (3,) and its standard deviation; None where it is not known."""
+        if not self._imu or estimate.tilt_sigma_rad is None:
             return None, 0.0
         up_body = estimate.T_world_imu[2, :3]
-        D = so3_hat(up_body)
-        sigma = float(np.sqrt(np.linalg.eigvalsh(D @ estimate.covariance[3:, 3:] @ D.T)[-1]))
-        return self._T_cam_body[:3, :3] @ up_body, max(sigma, _LEAST_UP_SIGMA_RAD)
+        if estimate.gravity_world is not None:
+            up_world = -estimate.gravity_world / np.linalg.norm(estimate.gravity_world)
+            up_body = estimate.T_world_imu[:3, :3].T @ up_world
+        return self._T_cam_body[:3, :3] @ up_body, max(estimate.tilt_sigma_rad, _LEAST_UP_SIGMA_RAD)
 
     # Results
 
