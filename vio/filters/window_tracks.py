@@ -221,7 +221,8 @@ class WindowTracks:
 
     def agree(self, at: Residuals) -> bool:
         """Whether nearly all views of the newest clone fit: only then may they contradict the motion model."""
-        squares, pixels = (x[:, -1] for x in squared_residuals(at))
+        of_views, counts = squared_residuals(at)
+        squares, pixels = of_views[:, -1], counts[:, -1]
         used, limits = pixels > 0, chi_square_table(_VIEW_PROBABILITY)[pixels]
         return bool(used.any() and np.mean(squares[used] < self.variance * limits[used]) > _AGREEMENT)
 
@@ -231,8 +232,8 @@ class WindowTracks:
         Returns:
             Mask (F,) of those that pass, their normalised squared residuals (F,), and the degrees of freedom (F,).
         """
-        squares, pixels = (x.sum(axis=1) for x in squared_residuals(at))
-        dof, squares = np.clip(pixels - 3, 1, _MOST_DOF), squares / self.variance
+        of_views, counts = squared_residuals(at)
+        dof, squares = np.clip(counts.sum(axis=1) - 3, 1, _MOST_DOF), of_views.sum(axis=1) / self.variance
         limits = chi_square_table(self._settings.gate_probability)[dof] * _common_noise(squares, dof)
         passed: BoolArray = squares <= limits
         return passed, squares, dof
