@@ -15,7 +15,7 @@ from vio.filters.multiview import (
     point_D_pose,
 )
 from vio.filters.navigation import _free_flow
-from vio.filters.stereo_calibration import StereoColumns, StereoInformation
+from vio.filters.stereo_calibration import StereoColumns
 from vio.frontend.align import FLAT_RMS, Templates, offsets
 from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
@@ -327,13 +327,17 @@ def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: Floa
     by_q = np.swapaxes(p_D_q, 1, 2) @ np.swapaxes(by_point, 1, 2).reshape(F, 3, N * S)
     A, b = np.einsum("fnas,fnat->fst", WH, H), np.einsum("fnas,fna->fs", WH, at.r)
     by_view = np.swapaxes(by_q.reshape(F, 3, N, S), 1, 2)
-    return StereoColumns(by_view, by_view.sum(axis=1), A, b)
+    return StereoColumns(by_view, np.swapaxes(by_view.sum(axis=1), 1, 2), A, b)
 
 
-def eliminate_points_from_columns(
+def eliminate_columns(
     columns: StereoColumns, info: TrackInformation, chosen: BoolArray
-) -> StereoInformation:
-    """Take the points of the chosen tracks out of the coefficients' part of the normal equations, as (M4) does."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Take the points of the chosen tracks out of the coefficients' part of the normal equations, as (M4) does.
+
+    Returns:
+        Information about the coefficients (S, S), that with the clones (S, 6N), and the vector (S,).
+    """
     by_point = columns.by_point[chosen]
     F, N, _, S = by_point.shape
     G = by_point.sum(axis=1)  # (F, 3, S)
@@ -345,7 +349,7 @@ def eliminate_points_from_columns(
     cross = (B.T @ per_view).reshape(6, N, S).transpose(1, 0, 2).reshape(6 * N, S)
     cross = cross - np.swapaxes(info.G[chosen], 1, 2).reshape(3 * F, 6 * N).T @ flat_CG
     b = columns.b[chosen].sum(axis=0) - flat_CG.T @ info.point_gradient[chosen].reshape(-1)
-    return StereoInformation(A, cross.T, b)
+    return A, cross.T, b
 
 
 # --- poses of the window, and the IMU's samples ------------------------------------------------------------------

@@ -30,6 +30,7 @@ from vio.frontend.stereo_fit import _triangulate
 from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import (
     FloatArray,
+    circledot,
     se3_adjoint,
     se3_exp,
     se3_from_parts,
@@ -238,7 +239,8 @@ def test_tracks_are_linearised_and_eliminated_as_in_numpy(camera: StereoCamera) 
     ours = multiview.track_information(camera, T, at, p, weight)
     _same(ours, numpy_twins.track_information(camera, T, at, p, weight))
     chosen = np.arange(len(p)) % 3 > 0
-    for a, b in zip(multiview.eliminate_points(ours, chosen), numpy_twins.eliminate_points(ours, chosen), strict=True):
+    found, expected = stereo_calibration.eliminate_points(ours, chosen), numpy_twins.eliminate_points(ours, chosen)
+    for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(b).max())
 
 
@@ -282,13 +284,19 @@ def test_middle_is_the_median(count: int) -> None:
 def test_landmarks_are_added_as_in_numpy() -> None:
     rng = np.random.default_rng(16)
     r, J, w = rng.normal(size=(7, 4)), rng.normal(size=(7, 4, 3)), rng.uniform(size=7)
-    A, b = np.zeros((30, 30)), np.zeros(30)
-    track_loops.add_landmarks(r, J, w, 3, 9, A, b)
-    H = np.zeros((7, 4, 30))
+    by_terms, precision = rng.normal(size=(7, 4, 5)), rng.uniform(0.5, 2.0, (7, 4))
+    J[2, 1] = r[2, 1] = 0.0  # not measured
+    A, b, considered = np.zeros((33, 33)), np.zeros(33), np.zeros((33, 2))
+    track_loops.add_landmarks(r, J, by_terms, precision, w, 6, 12, 3, A, b, considered)
+    H = np.zeros((7, 4, 35))
     for k in range(7):
-        H[k, :, 9 + 3 * k : 12 + 3 * k], H[k, :, 3:6] = J[k], -J[k]
-    np.testing.assert_allclose(A, np.einsum("k,kai,kaj->ij", w, H, H), atol=1e-12)
-    np.testing.assert_allclose(b, np.einsum("k,kai,ka->i", w, H, r), atol=1e-12)
+        H[k, :, 12 + 3 * k : 15 + 3 * k], H[k, :, 6:9] = J[k], -J[k]
+    measured = (precision * np.any(J, axis=2))[..., None]
+    H[..., 3:6], H[..., 33:] = by_terms[..., :3] * measured, by_terms[..., 3:] * measured
+    joint = np.einsum("k,kai,kaj->ij", w, H, H)
+    np.testing.assert_allclose(A, joint[:33, :33], atol=1e-12)
+    np.testing.assert_allclose(considered, joint[:33, 33:], atol=1e-12)
+    np.testing.assert_allclose(b, np.einsum("k,kai,ka->i", w, H, r)[:33], atol=1e-12)
 
 
 def test_poses_and_velocities_move_as_in_numpy() -> None:
@@ -359,10 +367,51 @@ def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     ours = stereo_calibration.stereo_columns(at, H, info.q.p_D_q, weight)
     _same(ours, numpy_twins.stereo_columns(at, H, info.q.p_D_q, weight))
     chosen = np.arange(len(p)) % 3 > 0
-    _same(
-        stereo_calibration.eliminate_points_from_columns(ours, info, chosen),
-        numpy_twins.eliminate_points_from_columns(ours, info, chosen),
-    )
+    A, b = stereo_calibration.eliminate_points(info, chosen, ours)
+    twin = numpy_twins.eliminate_columns(ours, info, chosen)
+    size = 6 * len(T)
+    for found, expected in zip((A[size:, size:], A[size:, :size], b[size:]), twin, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(A, A.T, rtol=1e-9, atol=1e-9 * np.abs(A).max())
+    clones = stereo_calibration.eliminate_points(info, chosen)
+    np.testing.assert_allclose(A[:size, :size], clones[0], rtol=1e-9, atol=1e-9 * np.abs(clones[0]).max())
+    np.testing.assert_allclose(b[:size], clones[1], rtol=1e-9, atol=1e-9 * np.abs(clones[1]).max())
+    rows = np.flatnonzero(chosen)
+    scores, information = np.empty((len(rows), 10)), np.empty((len(rows), 10))
+    track_loops.score_terms(rows, info.C, info.point_gradient, ours.G, ours.A, ours.b, 0.5, scores, information)
+    np.testing.assert_allclose(2 * b[size:], scores.sum(axis=0), rtol=1e-9, atol=1e-9 * np.abs(b).max())
+    np.testing.assert_allclose(2 * np.diag(A)[size:], information.sum(axis=0), rtol=1e-9)
+    solved = np.linalg.solve(info.C[rows], np.swapaxes(ours.G[rows], 1, 2))
+    np.testing.assert_allclose(ours.point_D_stereo(info, rows), -info.q.p_D_q[rows] @ solved, rtol=1e-9, atol=1e-12)
+    covariance = info.q.p_D_q[rows] @ np.linalg.inv(info.C[rows]) @ np.swapaxes(info.q.p_D_q[rows], 1, 2)
+    np.testing.assert_allclose(info.point_covariance(rows), covariance, rtol=1e-9, atol=1e-12)
+
+
+def test_noise_is_taken_off_and_rows_are_weighed_as_in_numpy() -> None:
+    rng = np.random.default_rng(21)
+    root, mean = rng.normal(size=(6, 6)), rng.normal(size=6) * [5.0, 5.0, 5.0, 1.0, 1.0, 1.0]
+    C, shrunk = root @ root.T, mean.copy()
+    pose_loops.shrink_by_noise(C, 0.7, shrunk)
+    for part in (slice(0, 3), slice(3, 6)):
+        squared = mean[part] @ np.linalg.solve(C[part, part], mean[part])
+        np.testing.assert_allclose(shrunk[part], mean[part] * np.sqrt(max(1 - 0.7 / squared, 0.0)), rtol=1e-9)
+    residual, weight = rng.normal(1.0, 2.0, 41), np.empty(41)
+    track_loops.weigh_rows(residual, 3.0, weight)
+    centred = residual - np.median(residual)
+    np.testing.assert_allclose(weight, 1 / (1 + (centred / (3 * 1.48 * np.median(np.abs(centred)))) ** 2))
+
+
+def test_innovations_are_those_of_numpy() -> None:
+    T, p, views = _scene()
+    at = multiview.residuals(CAMERA, T, p, views)
+    root = np.random.default_rng(20).normal(0, 0.01, (6, 6))
+    squared, pixels = np.empty(len(p)), np.empty(len(p), np.int64)
+    track_loops.innovations(at.r, at.z_D_p, p, root @ root.T, 0.3, squared, pixels)
+    J = at.z_D_p[:, -1] @ circledot(p)[:, :3]
+    S = J @ (root @ root.T) @ np.swapaxes(J, 1, 2) + 0.3 * np.eye(4)
+    expected = np.einsum("fi,fi->f", at.r[:, -1], np.linalg.solve(S, at.r[:, -1, :, None])[..., 0])
+    np.testing.assert_allclose(squared, expected, rtol=1e-9)
+    assert pixels.tolist() == np.any(at.z_D_p[:, -1], axis=2).sum(axis=1).tolist()
 
 
 MODULE = (

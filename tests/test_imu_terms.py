@@ -240,7 +240,7 @@ def test_predicted_motions_are_as_uncertain_as_the_terms() -> None:
     assert len(squared) == 11
     assert 0.5 < np.mean(squared) < 4.5
 
-    step = filt._propagation.step_to(filt._started(), 20 * STEP_NS)
+    step = filt._propagation.coming(filt._started(), 20 * STEP_NS).step
     assert step.Phi_imu is not None
     grown = filt._propagation.grown(filt._started(), step.nav, NO_STEP.then(step))
     np.testing.assert_array_equal(grown[:DIM, : DIM + 15], np.concatenate([step.Phi, step.Phi_imu], axis=1))

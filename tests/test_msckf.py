@@ -16,7 +16,6 @@ from vio.filters.msckf import Msckf
 from vio.filters.multiview import (
     Residuals,
     Views,
-    eliminate_points,
     first_points,
     point_D_pose,
     refine_points,
@@ -27,6 +26,7 @@ from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.prior import posterior
 from vio.filters.restart import restarted
 from vio.filters.settings import MsckfSettings
+from vio.filters.stereo_calibration import eliminate_points
 from vio.filters.tracks import TrackTable, precision, rows_of
 from vio.filters.window import Window
 from vio.geometry.lie import (

@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from tests.numerics import numeric_jacobian
-from tests.numpy_twins import moved
+from tests.numpy_twins import inverse_depth, moved
 from vio.filters.multiview import (
     CAUCHY,
     Residuals,
     Views,
-    eliminate_points,
     first_points,
-    inverse_depth,
     point_D_pose,
     refine_points,
     residuals,
@@ -21,6 +19,7 @@ from vio.filters.multiview import (
     track_information,
     usable_points,
 )
+from vio.filters.stereo_calibration import eliminate_points
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
 
@@ -194,7 +193,7 @@ def test_elimination_holds_whatever_the_parallax(spread_m: float, depth_m: float
 @pytest.mark.parametrize("left_only", [False, True])
 def test_coordinates_of_a_point_equal_central_differences(left_only: bool) -> None:
     T, p, at = _sideways(0.5, 5.0, left_only)
-    q = inverse_depth(CAMERA, T, p, at.z_D_p[:, :, 1].any(axis=2))
+    q = track_information(CAMERA, T, at, p, np.ones(at.r.shape[:2])).q
     assert q.anchor.tolist() == [0] * 8
     T_0 = T[0]
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from vio.filters.multiview import Residuals, eliminate_points, point_D_pose
+from vio.filters.multiview import Residuals, point_D_pose
 from vio.filters.settings import MsckfSettings
+from vio.filters.stereo_calibration import eliminate_points
 from vio.filters.window_tracks import LEAST_PIXEL_SIGMA_PX, WindowTracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project

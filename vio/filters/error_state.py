@@ -18,7 +18,6 @@ import numpy as np
 
 from vio.filters.navigation import DIM
 from vio.filters.online_calibration import BLOCKS
-from vio.filters.stereo_calibration import StereoInformation
 from vio.geometry.lie import FloatArray
 
 
@@ -82,21 +81,30 @@ class ErrorState:
         return out
 
     def information(
-        self, A: FloatArray, b: FloatArray, stereo: StereoInformation | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Turn information about clones into that about the error vector, matrix (D, D) and vector (D,).
+        self, A: FloatArray, b: FloatArray, considered: int = 0
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Turn information about clones and stereo coefficients into that about the error vector.
 
         Args:
-            A: information matrix (6N, 6N).
-            b: information vector (6N,).
-            stereo: the part that concerns the stereo calibration, where it is estimated, beside clones and landmarks.
+            A: information matrix (6N + S, 6N + S); of the clones alone, S is zero.
+            b: information vector (6N + S,).
+            considered: how many of the coefficients, the last ones, have no errors here.
+
+        Returns:
+            Matrix (D, D), vector (D,), and the information of all errors with the coefficients considered (D, C).
         """
-        out, vector = np.zeros((self.size, self.size)), np.zeros(self.size)
-        first = self.clones.start
-        clones = slice(first, first + len(b))
-        out[clones, clones], vector[clones] = A, b
-        if stereo is not None:
-            rows = self.stereo
-            out[rows, first:], out[first:, rows] = stereo.cross, stereo.cross.T
-            out[rows, rows], vector[rows] = stereo.A, stereo.b
-        return out, vector
+        out, vector, by_considered = (
+            np.zeros((self.size, self.size)),
+            np.zeros(self.size),
+            np.zeros((self.size, considered)),
+        )
+        last = len(b) - considered
+        size = min(self.clones.stop - self.clones.start, last)
+        clones, stereo = slice(self.clones.start, self.clones.start + size), self.stereo
+        out[clones, clones], vector[clones] = A[:size, :size], b[:size]
+        if last > size:
+            out[clones, stereo], out[stereo, clones] = A[:size, size:last], A[size:last, :size]
+            out[stereo, stereo], vector[stereo] = A[size:last, size:last], b[size:last]
+        if considered:
+            by_considered[clones], by_considered[stereo] = A[:size, last:], A[size:last, last:]
+        return out, vector, by_considered

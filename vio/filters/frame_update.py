@@ -16,7 +16,6 @@ from vio.filters.multiview import (
     MIN_DEPTH,
     LandmarkResiduals,
     Views,
-    eliminate_points,
     landmark_residuals,
     relative_stereo_sigma,
     unweighted,
@@ -32,9 +31,7 @@ from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
     StereoColumns,
     StereoCorrection,
-    StereoInformation,
-    eliminate_points_from_columns,
-    landmark_columns,
+    eliminate_points,
     stereo_columns,
 )
 from vio.filters.tracks import precision, rows_of
@@ -268,49 +265,34 @@ class FrameUpdate:
         Returns:
             Its matrix (D, D) and vector (D,), and that of all errors with what is considered (D, 4).
         """
-        variance, field, state = self._variance, self._rig.field(window), window.state
-        b = np.zeros(6 * len(window.clones))
-        A = np.zeros((len(b), len(b)))
-        columns, S = tracks.stereo if joint is None else joint, state.stereo.stop - state.stereo.start
-        stereo = None
-        if columns is not None:
-            stereo = StereoInformation.none(columns.b.shape[1], state.size - state.clones.start)
-        if chosen.any():
-            A, b = eliminate_points(tracks.information, chosen)
-            if stereo is not None and columns is not None:
-                stereo = stereo + eliminate_points_from_columns(columns, tracks.information, chosen)
-        at = self._landmark_residuals(window, pixels) if pixels is not None and len(pixels.z) else None
-        if at is not None and pixels is not None and stereo is not None:
-            z = unweighted(pixels.z, at.r, at.precision)
-            H = self._joint_jacobian(field, z, considered=joint is not None)
-            stereo = stereo + landmark_columns(at, H, len(window.clones))
-        scaled = None if stereo is None else stereo.scaled(1 / variance)
-        of_estimated = None if scaled is None else scaled.of_first(S)
-        A, b = state.information(A / variance, b / variance, of_estimated)
-        if at is not None:
+        field, state = self._rig.field(window), window.state
+        considered = 0 if joint is None else CONSIDERED
+        A, b = eliminate_points(tracks.information, chosen, tracks.stereo if joint is None else joint)
+        A /= self._variance
+        b /= self._variance
+        A, b, by_considered = state.information(A, b, considered)
+        if pixels is not None and len(pixels.z):
+            at, H = self._landmark_residuals(window, pixels), np.empty((len(pixels.z), 4, 0))
+            if field is not None or considered:
+                H = self._joint_jacobian(field, unweighted(pixels.z, at.r, at.precision), considered)
             # In their anchor, the newest clone: dp = xi_f - xi_rho.
-            rows = state.clone(-1).start, state.landmarks.start
-            track_loops.add_landmarks(at.r, at.J, at.weight / variance, *rows, A, b)
-        if joint is None or scaled is None:
-            return A, b, None
-        by_considered = np.zeros((state.size, CONSIDERED))
-        by_considered[state.stereo] = scaled.A[:S, S:]
-        by_considered[state.clones.start :] = scaled.cross[S:].T
-        return A, b, by_considered
+            rows = state.clone(-1).start, state.landmarks.start, state.stereo.start
+            weight = at.weight / self._variance
+            track_loops.add_landmarks(at.r, at.J, H, at.precision, weight, *rows, A, b, by_considered)
+        return A, b, None if joint is None else by_considered
 
     def _joint_columns(self, window: Window, tracks: LinearTracks) -> StereoColumns | None:
         """The tracks' columns of the coefficients estimated and of those considered; None: none is considered."""
         if not self._rig.considered_sigmas(window).any():
             return None
-        H = self._joint_jacobian(tracks.field, tracks.z, considered=True)
+        H = self._joint_jacobian(tracks.field, tracks.z, CONSIDERED)
         return stereo_columns(tracks.at, H, tracks.information.q.p_D_q, tracks.weight)
 
-    def _joint_jacobian(self, field: StereoCorrection | None, z: FloatArray, *, considered: bool) -> FloatArray:
-        """Derivatives (..., 4, S + 4) of predicted pixels by the coefficients estimated, and by those considered."""
-        parts = [] if field is None else [field.jacobian(z)]
-        if considered:
-            parts.append(error_jacobian(self._rig.camera, z, FIELD_TERMS, CONSIDERED))
-        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
+    def _joint_jacobian(self, field: StereoCorrection | None, z: FloatArray, considered: int) -> FloatArray:
+        """Derivatives (..., 4, S + C) of predicted pixels by the coefficients estimated, and by the C considered."""
+        if field is None:
+            return error_jacobian(self._rig.camera, z, FIELD_TERMS, considered)
+        return field.jacobian(z, considered)
 
     def _landmark_residuals(self, window: Window, pixels: Views) -> LandmarkResiduals:
         """Residuals of the landmarks' pixels in the newest exposure."""
@@ -357,8 +339,7 @@ class FrameUpdate:
         lost, leaving = ~seen[:, newest], seen[:, 0] & full
         ending = lost | leaving
         ended, joint = np.flatnonzero(ending & good), self._joint_columns(window, tracks)
-        estimated = window.state.stereo.stop - window.state.stereo.start
-        columns = tracks.stereo if joint is None else joint.of_first(estimated)
+        columns = tracks.stereo if joint is None else joint
         if len(ended):
             self._overdispersion.add(table.ids(tracks.rows[ended]), *self.tracks.field_scores(tracks, columns, ended))
         # Errors that neighbours share are not in the factor, and the field takes them in with every frame.
@@ -367,7 +348,7 @@ class FrameUpdate:
         window.absorb(A, b, repeated=repeated, considered=considered)
         depth_sigma = np.sqrt(self.tracks.variance) * tracks.information.relative_depth_sigma()
         candidates = leaving & good & seen[:, newest]
-        promoted = self._promote(window, tracks, columns, joint, candidates, depth_sigma, stereo)
+        promoted = self._promote(window, tracks, columns, candidates, depth_sigma, stereo)
 
         A, b, considered = self._information(window, tracks, good & ~ending, None, joint)
         size = window.state.clones.stop
@@ -400,7 +381,6 @@ class FrameUpdate:
         window: Window,
         tracks: LinearTracks,
         columns: StereoColumns | None,
-        joint: StereoColumns | None,
         candidates: BoolArray,
         depth_sigma: FloatArray,
         stereo: bool,
@@ -410,8 +390,7 @@ class FrameUpdate:
         Args:
             window: receives the landmarks.
             tracks: linearised at its means.
-            columns: theirs of the coefficients estimated; None: there are none.
-            joint: of these and of those considered.
+            columns: theirs of the coefficients estimated and of those considered; None: there are none.
             candidates: mask (F,) of the tracks that may become landmarks.
             depth_sigma: (F,) standard deviation of each inverse depth, over itself.
             stereo: whether this frame has right pixels, from which the next tracks will get their depths.
@@ -439,15 +418,14 @@ class FrameUpdate:
         chosen, covariance = chosen[best], covariance[best]
         p, point_D_poses = tracks.p_world[chosen], tracks.information.point_D_clones(chosen)
         point_D_poses[:, :, -3:] += so3_hat(p)  # the anchor: rotation of the newest exposure
-        point_D_stereo = None
+        ids, point_D_stereo, by_considered = table.ids(tracks.rows[chosen]), None, None
         if columns is not None:
-            point_D_stereo = columns.point_D_stereo(tracks.information, chosen)
+            estimated = window.state.stereo.stop - window.state.stereo.start
+            point_D_terms = columns.point_D_stereo(tracks.information, chosen)
+            point_D_stereo = point_D_terms[..., :estimated]
+            if point_D_terms.shape[2] > estimated:
+                by_considered = point_D_terms[..., estimated:].reshape(-1, CONSIDERED)
         A = window.state.jacobian(point_D_poses, point_D_stereo)
-        ids = table.ids(tracks.rows[chosen])
-        by_considered = None
-        if joint is not None:
-            points = joint.point_D_stereo(tracks.information, chosen)
-            by_considered = points[..., -CONSIDERED:].reshape(-1, CONSIDERED)
         window.add_landmarks(ids, p, A.reshape(-1, window.state.size), covariance, by_considered)
         return chosen
 

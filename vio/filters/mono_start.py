@@ -18,7 +18,6 @@ import numpy as np
 
 from vio.filters.alignment import Bearings, FreeMotion, VisualInertialAlignment, align_visual_inertial, gyro_bias
 from vio.filters.imu_start import imu_start
-from vio.filters.multiview import eliminate_points
 from vio.filters.navigation import (
     DIM,
     NO_STEP,
@@ -30,6 +29,7 @@ from vio.filters.navigation import (
 )
 from vio.filters.online_calibration import Calibration
 from vio.filters.settings import MsckfSettings
+from vio.filters.stereo_calibration import eliminate_points
 from vio.filters.window import Window
 from vio.filters.window_posterior import WindowPosterior, scale_sigma
 from vio.filters.window_tracks import LinearTracks, WindowTracks, chi_square_table
@@ -199,7 +199,7 @@ class MonoStarter:
                     return None
                 self._follow_noise(tracks, lin)
                 A, b = eliminate_points(lin.information, np.ones(len(lin.rows), dtype=np.bool_))
-                A, b = window.state.information(A / tracks.variance, b / tracks.variance)
+                A, b, _ = window.state.information(A / tracks.variance, b / tracks.variance)
                 try:
                     fitted, error = window.optimum(A, b, len(A))
                 except np.linalg.LinAlgError:

@@ -46,6 +46,7 @@ from vio.records import (
     no_landmarks,
 )
 
+_SAMPLES = {"imu": ImuSample, "velocity": VelocitySample}  # of each motion source
 _MOST_SPEED_MPS = 100.0  # with an IMU, whose scale is metric: beyond it the filter has diverged
 
 
@@ -125,12 +126,11 @@ class Msckf(Backend):
             ConfigError: the sample is not of the kind that was announced.
             DataError: it is out of order or not finite; the filter is unchanged.
         """
-        expected = {"imu": ImuSample, "velocity": VelocitySample}.get(self._source or "")
-        if expected is None or not isinstance(sample, expected):
+        if self._source is None or not isinstance(sample, _SAMPLES[self._source]):
             raise ConfigError(f"msckf was built for motion {self._source or 'none'}, got a {type(sample).__name__}")
         self._order.sample(sample)
         self._propagation.take(sample)
-        if isinstance(sample, VelocitySample) and self._window is not None:
+        if self._source == "velocity" and self._window is not None:
             self._propagation.advance(self._window, sample.time_ns)
             self._measure()
 

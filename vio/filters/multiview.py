@@ -84,14 +84,16 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
 
 def unweighted(z: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArray:
     """Pixels (..., 4) that are expected where z was seen, of residuals times weights."""
-    return np.asarray(z - np.divide(r, weight, out=np.zeros_like(r), where=weight > 0))
-
-
-def measured_pixels(at: Residuals) -> BoolArray:
-    """Which pixel coordinates (F, N, 4) of tracks were measured."""
-    out: BoolArray = np.empty(at.r.shape, dtype=np.bool_)
-    loops.mark_measured(at.z_D_p, out)
+    out: FloatArray = np.empty(z.shape)
+    loops.expected_pixels(z.reshape(-1, 4), r.reshape(-1, 4), weight.reshape(-1, 4), out.reshape(-1, 4))
     return out
+
+
+def squared_residuals(at: Residuals) -> tuple[FloatArray, IntArray]:
+    """Squared residuals (F, N) of views, and how many pixel coordinates (F, N) of each were measured."""
+    squares, count = np.empty(at.r.shape[:2]), np.empty(at.r.shape[:2], dtype=np.int64)
+    loops.square_views(at.r, at.z_D_p, squares, count)
+    return squares, count
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,25 +113,6 @@ class InverseDepth:
         """Return the points of rows (K,)."""
         q = self
         return InverseDepth(q.anchor[rows], q.centre[rows], q.disparity[rows], q.p_D_q[rows], q.q_D_p[rows])
-
-
-def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, seen: BoolArray) -> InverseDepth:
-    """Return the coordinates (M5) of points (F, 3) that lie ahead of the first camera that saw them.
-
-    Args:
-        camera: rectified pair.
-        T_cam0_world: (N, 4, 4).
-        p_world: (F, 3).
-        seen: (F, N) which camera saw which point.
-    """
-    F = len(p_world)
-    q = InverseDepth(
-        np.empty(F, dtype=np.int64), np.empty((F, 3)), np.empty(F), np.empty((F, 3, 3)), np.empty((F, 3, 3))
-    )
-    least = MIN_DEPTH * camera.baseline_m
-    columns = q.anchor, q.centre, q.disparity, q.p_D_q, q.q_D_p
-    loops.anchor_points(camera_args(camera), least, T_cam0_world, p_world, np.ascontiguousarray(seen), *columns)
-    return q
 
 
 def first_points(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -> tuple[FloatArray, BoolArray]:
@@ -194,14 +177,9 @@ def refine_points(
 
     Steps are taken in the coordinates (M5), damped by their prior, and end ahead of all cameras that saw the point.
     """
-    lens, least, T = camera_args(camera), MIN_DEPTH * camera.baseline_m, T_cam0_world
-    p, seen, dq = p_world.copy(), views.weight[..., 0] > 0, np.empty((len(p_world), 3))
-    for _ in range(steps):
-        loops.put_ahead(lens, least, LEAST_DISPARITY_PX, T, views.z, views.weight, p)
-        at, q = residuals(camera, T, p, views), inverse_depth(camera, T, p, seen)
-        loops.step_points(at.r, at.z_D_p, q.p_D_q, scale_px**2, _TINY, _PRIOR, dq)
-        point = q.centre, q.p_D_q, q.disparity
-        loops.step_inverse_depths(lens, least, LEAST_DISPARITY_PX, T, views.weight, *point, dq, p)
+    p, lens, least = p_world.copy(), camera_args(camera), MIN_DEPTH * camera.baseline_m
+    views_of = T_cam0_world, views.z, views.weight
+    loops.refine(lens, least, LEAST_DISPARITY_PX, *views_of, steps, scale_px**2, _TINY, _PRIOR, p)
     return p
 
 
@@ -279,14 +257,14 @@ class TrackInformation:
 
     def point_D_clones(self, chosen: IntArray) -> FloatArray:
         """How the estimated points of tracks (K,) follow errors of the clones (K, 3, 6N), world: `-C^-1 G'`."""
-        G = np.swapaxes(self.G[chosen], 1, 2)
-        out: FloatArray = -self.q.p_D_q[chosen] @ np.linalg.solve(self.C[chosen], G)
+        out: FloatArray = np.empty((len(chosen), 3, self.G.shape[1]))
+        loops.points_by_others(chosen, self.C, self.q.p_D_q, self.G, out)
         return out
 
     def point_covariance(self, chosen: IntArray) -> FloatArray:
         """Covariance (K, 3, 3) of the points of tracks (K,) given the clones, world, for one pixel of noise."""
-        p_D_q = self.q.p_D_q[chosen]
-        out: FloatArray = p_D_q @ np.linalg.inv(self.C[chosen]) @ np.swapaxes(p_D_q, 1, 2)
+        out: FloatArray = np.empty((len(chosen), 3, 3))
+        loops.point_covariances(chosen, self.C, self.q.p_D_q, out)
         return out
 
     def relative_depth_sigma(self) -> FloatArray:
@@ -317,13 +295,13 @@ def track_information(
         weight: (F, N) robust weight of each view.
     """
     F, N = at.r.shape[:2]
-    seen: BoolArray = np.empty((F, N), dtype=np.bool_)
-    loops.mark_views(at.z_D_p, seen)
-    q = inverse_depth(camera, T_cam0_world, p_world, seen)
-    B, G, C = np.empty((F, 3, 6)), np.empty((F, 6 * N, 3)), np.empty((F, 3, 3))
-    info = TrackInformation(q, G, C, B, np.empty((F, 6 * N)), np.empty((F, 3)))
-    point = p_world, q.p_D_q, q.q_D_p, q.anchor, _PRIOR
-    loops.collect_tracks(at.r, at.z_D_p, weight, *point, B, G, C, info.gradient, info.point_gradient)
+    q = InverseDepth(np.empty(F, np.int64), np.empty((F, 3)), np.empty(F), np.empty((F, 3, 3)), np.empty((F, 3, 3)))
+    of_clones, B, C = np.empty((F, 6 * N, 3)), np.empty((F, 3, 6)), np.empty((F, 3, 3))
+    info = TrackInformation(q, of_clones, C, B, np.empty((F, 6 * N)), np.empty((F, 3)))
+    place = q.anchor, q.centre, q.disparity, q.p_D_q, q.q_D_p
+    out = *place, info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient
+    least = MIN_DEPTH * camera.baseline_m
+    loops.collect_tracks(camera_args(camera), least, T_cam0_world, at.r, at.z_D_p, weight, p_world, _PRIOR, *out)
     return info
 
 
@@ -332,7 +310,7 @@ def relative_stereo_sigma(at: Residuals, q: InverseDepth) -> FloatArray:
 
     Infinite without a right view.
     """
-    views = measured_pixels(at)[:, :, 2].sum(axis=1)
+    views = np.any(at.z_D_p[:, :, 2], axis=2).sum(axis=1)
     out: FloatArray = np.sqrt(np.divide(_STEREO_VARIANCE, views, out=np.full(len(views), np.inf), where=views > 0))
     return out / q.disparity
 
@@ -346,27 +324,11 @@ def usable_points(
     depth follows the noise, and its Jacobian by the clones' translations with it: information that is not there, and a
     scale that shrinks. Of one camera, whose unit of length is arbitrary, the depth must be known relative to itself.
     """
-    keep = at.ahead & np.isfinite(p_world).all(axis=1)
-    left_only = np.flatnonzero(keep & ~np.any(views.weight[..., 2] > 0, axis=1))
-    if len(left_only):
-        q = inverse_depth(camera, T_cam0_world, p_world[left_only], views.weight[left_only, :, 0] > 0)
-        J = at.z_D_p[left_only].reshape(len(left_only), -1, 3) @ q.p_D_q
-        C = np.swapaxes(J, 1, 2) @ J + np.diag([_TINY, _TINY, _PRIOR])
-        relative = camera.kind == "mono"
-        limit = (_MONO_DEPTH_SIGMA * q.disparity) ** 2 if relative else _STEREO_VARIANCE
-        keep[left_only] = np.linalg.inv(C)[:, 2, 2] < limit
+    keep: BoolArray = np.empty(len(p_world), dtype=np.bool_)
+    limits = (0.0, _MONO_DEPTH_SIGMA**2) if camera.kind == "mono" else (_STEREO_VARIANCE, 0.0)
+    seen = T_cam0_world, p_world, views.weight, at.z_D_p, at.ahead
+    loops.mark_usable(camera_args(camera), MIN_DEPTH * camera.baseline_m, *seen, _TINY, _PRIOR, limits, keep)
     return keep
-
-
-def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Information matrix (6N, 6N) and vector (6N,) about the clones of the chosen tracks, equation (M4).
-
-    `sum_f blkdiag(D_f) - G_f C_f^-1 G_f'`: exact elimination of each point.
-    """
-    rows, size = np.flatnonzero(chosen), info.G.shape[1]
-    V, A, b = np.empty((3 * len(rows), size)), np.zeros((size, size)), np.zeros(size)
-    loops.eliminate_tracks(rows, info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient, V, A, b)
-    return A - V.T @ V, b
 
 
 def point_D_pose(p_world: FloatArray) -> FloatArray:

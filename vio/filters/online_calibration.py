@@ -12,13 +12,13 @@ Reference: Li & Mourikis, Online temporal calibration for camera-IMU systems (20
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
 from vio.cameras.rectification_error import TERMS
+from vio.filters import pose_loops as loops
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
 from vio.filters.navigation import DIM, Growth, NavState, Transition
 from vio.filters.settings import MsckfSettings
@@ -29,7 +29,6 @@ from vio.records import FIELD_TERMS, IntArray, MotionSource, StereoFieldEstimate
 if TYPE_CHECKING:
     from vio.filters.error_state import ErrorState
 
-_PARTS = slice(0, 3), slice(3, 6)  # of a twist
 _NOISE_ONLY = float(chi_square_quantile(0.999, 3))  # squared half of a twist in its standard deviations at standstill
 # Random walks of a mount that gives and of clocks that drift, each per root second.
 _EXTRINSIC_ROTATION_WALK_DEG = 2.0e-3
@@ -64,12 +63,9 @@ class Twist:
 
         An estimated twist that is noise alone would pass for a motion, from which the time offset is learned.
         """
-        halves, out = self.mean.reshape(2, 3), np.empty((2, 3))
-        covariances = np.array([self.covariance[part, part] for part in _PARTS]) + 1e-18 * np.eye(3)
-        for k, whitened in enumerate(np.linalg.solve(covariances, halves[..., None])[..., 0]):
-            squared = float(halves[k] @ whitened)
-            out[k] = halves[k] * math.sqrt(max(1 - _NOISE_ONLY / max(squared, 1e-9), 0.0))
-        return out.reshape(6)
+        out: FloatArray = self.mean.copy()
+        loops.shrink_by_noise(self.covariance, _NOISE_ONLY, out)
+        return out
 
 
 NO_TWIST = Twist(np.zeros(6), np.zeros((6, 6)))

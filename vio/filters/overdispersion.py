@@ -17,6 +17,7 @@ from vio.records import FIELD_TERMS, IntArray
 
 _PRIOR_TRACKS = 30.0  # as many ended tracks count for a factor of one
 _MOST_SCORES = 4096  # features whose scores are kept: far more than are seen at once
+_NO_SCORE: FloatArray = np.zeros(FIELD_TERMS)
 
 
 class Overdispersion:
@@ -36,10 +37,11 @@ class Overdispersion:
             scores: (K, 8) by the terms of the field, in the noise that the filter believes.
             information: (K, 8) likewise, their expected squares.
         """
-        for feature, score in zip(ids.tolist(), scores, strict=True):
-            before = self._scores.pop(feature, 0.0)
-            self._squares += score * (score + 2 * before)
-            self._scores[feature] = score + before
+        features = ids.tolist()
+        before = np.array([self._scores.pop(feature, _NO_SCORE) for feature in features])
+        together = scores + before
+        self._squares += np.sum(scores * (together + before), axis=0)
+        self._scores.update(zip(features, together, strict=True))
         self._information += information.sum(axis=0)
         self._tracks += len(ids)
         while len(self._scores) > _MOST_SCORES:

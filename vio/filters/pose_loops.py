@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from vio.geometry.lie import FloatArray
-from vio.numerics.compiled import compiled
+from vio.numerics.compiled import compiled, solve_positive
 from vio.records import IntArray
 
 
@@ -98,6 +98,25 @@ def move_earlier_velocities(
             by_bias = R[n, i, 0] * error[12] + R[n, i, 1] * error[13] + R[n, i, 2] * error[14]
             xi[n, i] = error[6 + i] + ages[n] * (by_bias - _cross(gravity, error[3:6], i))
     move_points(error[3:6], xi, velocities)
+
+
+@compiled
+def shrink_by_noise(covariance: FloatArray, noise_only: float, halves: FloatArray) -> None:
+    """Shrink each half (3,) of a vector (6,) by the part of its squared length that noise alone may make, (C3).
+
+    The length is in standard deviations of its covariance (6, 6); noise makes `noise_only` of it.
+    """
+    C, y = np.empty((3, 3)), np.empty(3)
+    for first in (0, 3):
+        for i in range(3):
+            y[i] = halves[first + i]
+            for j in range(3):
+                C[i, j] = covariance[first + i, first + j]
+            C[i, i] += 1e-18
+        solve_positive(C, y)
+        squared = halves[first] * y[0] + halves[first + 1] * y[1] + halves[first + 2] * y[2]
+        for i in range(3):
+            halves[first + i] *= np.sqrt(max(1.0 - noise_only / max(squared, 1e-9), 0.0))
 
 
 @compiled

@@ -43,9 +43,12 @@ class FramePosterior:
     @classmethod
     def of(cls, window: Window, P: FloatArray) -> FramePosterior:
         """Take over the part of the covariance P (k, k) of a window's errors."""
-        state = window.state
-        rows = np.r_[state.own, state.clone(-1)]
-        return cls(P[state.own, state.own], P[np.ix_(rows, rows)], window.nav.T_world_imu)
+        own, newest = window.state.own, window.state.clone(-1)
+        D = own.stop
+        with_newest = np.empty((D + 6, D + 6))
+        with_newest[:D, :D], with_newest[:D, D:] = P[own, own], P[own, newest]
+        with_newest[D:, :D], with_newest[D:, D:] = P[newest, own], P[newest, newest]
+        return cls(with_newest[:D, :D], with_newest, window.nav.T_world_imu)
 
     def transformed(self, window: Window, M: FloatArray) -> FramePosterior:
         """Return the covariances after `Window.turn_world`, which returned M."""
@@ -54,6 +57,15 @@ class FramePosterior:
         return FramePosterior(
             M[own, own] @ self.own @ M[own, own].T, turn @ self.with_newest @ turn.T, window.nav.T_world_imu
         )
+
+
+@dataclass(frozen=True, slots=True)
+class _Coming:
+    """A step that begins where the navigation state is."""
+
+    body_ns: int  # its end
+    step: Transition
+    growth: Growth  # since the last frame, with it
 
 
 _NOTHING = FramePosterior(np.zeros((DIM, DIM)), np.zeros((DIM + 6, DIM + 6)), np.eye(4))
@@ -75,7 +87,8 @@ class Propagation:
         self.reported = _NOTHING  # the same with the uncertainty of the rig's scale, which corrects nothing
         self.since_frame = NO_STEP  # how the error has grown since then
         self.gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
-        self._predicted_step: tuple[int, Transition] | None = None  # integrated by `predict`, with its end
+        self._coming: _Coming | None = None  # the step that `predict` has integrated
+        self._twist: tuple[NavState, Growth, Twist] | None = None  # the last one, and of what
 
     def unknown_noise(self) -> MotionNoise:
         """The motion model's noise where nothing was learned of it."""
@@ -90,33 +103,34 @@ class Propagation:
     def forget(self) -> None:
         """Forget the last frame and the steps since."""
         self.gyro, self.blind = None, False
-        self.since_frame, self._predicted_step = NO_STEP, None
+        self.since_frame, self._coming = NO_STEP, None
 
     def take(self, sample: MotionSample) -> None:
         """Take a motion sample, which may change what the next step looks like."""
         self.motion.take(sample)
-        self._predicted_step = None
+        self._coming = None
 
     def advance(self, window: Window, time_ns: int) -> None:
         """Carry the navigation state on to a frame or sample."""
         body_ns = self.body_time(window, time_ns)
         if body_ns > self.body_ns:
-            step = self.step_to(window, body_ns)
+            coming = self.coming(window, body_ns)
+            step = coming.step
             self.motion.forget_before(body_ns)
             walk = window.calibration.variances(self.walk) * ((body_ns - self.body_ns) * 1e-9)
             window.propagate(step, walk)
-            self.since_frame = self.since_frame.then(step)
+            self.since_frame = coming.growth
             self.gyro = step.gyro
             self.body_ns = body_ns
-        self._predicted_step = None
+        self._coming = None
         self.time_ns = time_ns
 
-    def step_to(self, window: Window, body_ns: int) -> Transition:
+    def coming(self, window: Window, body_ns: int) -> _Coming:
         """The motion model's step from the present state; what `predict` has integrated is not integrated again."""
-        if self._predicted_step is None or self._predicted_step[0] != body_ns:
+        if self._coming is None or self._coming.body_ns != body_ns:
             step = self.motion.advance(window.nav, self.body_ns, body_ns, self.noise.factors)
-            self._predicted_step = body_ns, step
-        return self._predicted_step[1]
+            self._coming = _Coming(body_ns, step, self.since_frame.then(step))
+        return self._coming
 
     def body_time(self, window: Window, time_ns: int) -> int:
         """The time on the IMU's clock to which the navigation state is carried for a frame."""
@@ -140,10 +154,10 @@ class Propagation:
         body_ns = self.body_time(window, time_ns)
         if body_ns > self.body_ns:
             try:
-                step = self.step_to(window, body_ns)
+                coming = self.coming(window, body_ns)
             except EstimationError:  # the update will say it
                 return None
-            nav, growth = step.nav, growth.then(step)
+            nav, growth = coming.step.nav, coming.growth
         T_cam0_imu, late_s = window.calibration.T_cam0_imu, (body_ns - time_ns) * 1e-9
         T_world_imu, *camera_D_own = window.camera_D_own(late_s, self.twist(window, nav, growth), nav)
         T_cam0_world = T_cam0_imu @ se3_inverse(T_world_imu)
@@ -188,6 +202,8 @@ class Propagation:
         """The body's twist, and how well it is known; equation (C3)."""
         if not isinstance(self.motion, ImuMotion) or "time_offset" not in window.state:
             return NO_TWIST
+        if self._twist is not None and self._twist[0] is nav and self._twist[1] is growth:
+            return self._twist[2]
         R = nav.T_world_imu[:3, :3]
         own, rate_D_error = window.state.motion, self.motion.rate_D_error(nav)
         Phi = growth.Phi if own.stop == DIM else self.grown(window, nav, growth)[own, own]
@@ -197,7 +213,9 @@ class Propagation:
         covariance[:3, :3] = R.T @ P[6:9, 6:9] @ R  # v = exp(phi) v_hat + xi_v, seen from the body turned by phi
         by_gyro = np.eye(3) * self.motion.rate_variance(self.noise.factors)
         covariance[3:, 3:] = rate_D_error @ P @ rate_D_error.T + by_gyro
-        return Twist(body_twist(nav.T_world_imu, nav.velocity, nav.rate), covariance)
+        twist = Twist(body_twist(nav.T_world_imu, nav.velocity, nav.rate), covariance)
+        self._twist = nav, growth, twist
+        return twist
 
     @property
     def late_s(self) -> float:

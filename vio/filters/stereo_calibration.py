@@ -17,15 +17,16 @@ import numpy as np
 
 from vio.cameras.rectification_error import TERMS, corrected_pixels, error_jacobian, vertical_disparity_terms
 from vio.filters import track_loops as loops
-from vio.filters.multiview import CAUCHY, LandmarkResiduals, Residuals, TrackInformation, Views
+from vio.filters.multiview import CAUCHY, Residuals, TrackInformation, Views
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, project
-from vio.numerics.robust import median
+from vio.numerics.compiled import invert_positive, solve_positive
 from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS, BoolArray, IntArray, Observations
 
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
 _ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the first frame, over the noise of a row
+_ROW_PRIOR: FloatArray = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
 
 
 class VerticalDisparityModel:
@@ -33,8 +34,9 @@ class VerticalDisparityModel:
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
-        self._A: FloatArray = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
+        self._A: FloatArray = _ROW_PRIOR.copy()
         self._b: FloatArray = np.zeros(ROW_TERMS)
+        self._inverse: FloatArray = np.linalg.inv(2 * _ROW_PRIOR)  # of A with the prior
         # Right sides if the rows were those of k1, k2, q1, q2 alone.
         self._common: FloatArray = np.zeros((ROW_TERMS, FIELD_TERMS - RIGHT_TERMS))
         self._squares = self._count = 0.0  # of the rows' residuals, in the same memory
@@ -51,34 +53,34 @@ class VerticalDisparityModel:
         basis, common = vertical_disparity_terms(camera, z)
         rows = z[:, 3] - z[:, 1]
         # The median is taken out, as in the first frames the field itself is not yet known.
-        residual = _centred(rows - camera.fv * (basis @ self.coefficients))
-        scale = max(1.48 * median(np.abs(residual)), 1e-3)
-        weight: FloatArray = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
+        weight = np.empty(len(z))
+        loops.weigh_rows(rows - camera.fv * (basis @ self.coefficients), CAUCHY, weight)
         weighted = (basis * weight[:, None]).T
         self._A = _ROW_MEMORY * self._A + weighted @ basis
         self._b = _ROW_MEMORY * self._b + weighted @ rows
         self._common = _ROW_MEMORY * self._common + weighted @ common
-        prior = (1 - _ROW_MEMORY) * np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
-        solution = np.asarray(np.linalg.solve(self._A + prior, self._b), dtype=np.float64)
+        solution = self._b.copy()
+        solve_positive(self._A + (1 - _ROW_MEMORY) * _ROW_PRIOR, solution)
+        self._inverse = np.empty(self._A.shape)
+        invert_positive(self._A + _ROW_PRIOR, self._inverse)
         self.coefficients = solution / camera.fv
         field, self._matches = basis @ solution, len(z)
-        self._squares = _ROW_MEMORY * self._squares + float(weight @ (rows - field) ** 2)
+        misfit = rows - field
+        self._squares = _ROW_MEMORY * self._squares + float(weight @ (misfit * misfit))
         self._count = _ROW_MEMORY * self._count + float(weight.sum())
-        self.rms_px = float(np.sqrt(np.mean(field**2)))
+        self.rms_px = float(np.sqrt(field @ field / len(field)))
 
     def without_common(self, stereo: FloatArray) -> FloatArray:
         """Return the coefficients (7,) without what the distortion of both lenses, in (8,) of (R3), does to rows.
 
         Both lenses bend a near point differently, as it lies at different places in the two images.
         """
-        prior, common = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2, self._common @ stereo[RIGHT_TERMS:FIELD_TERMS]
-        return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, common))
+        return np.asarray(self.coefficients - self._inverse @ (self._common @ stereo[RIGHT_TERMS:FIELD_TERMS]))
 
     @property
     def rows_D_common(self) -> FloatArray:
         """What k1, k2, q1 and q2 of (R3) add to the coefficients (7, 4) of the rows of the features seen."""
-        prior = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
-        return np.asarray(np.linalg.solve(self._A + prior, self._common), dtype=np.float64)
+        return np.asarray(self._inverse @ self._common, dtype=np.float64)
 
     @property
     def covariance(self) -> FloatArray:
@@ -86,9 +88,7 @@ class VerticalDisparityModel:
         # Rows of one feature share their error from frame to frame, so only the features of one frame count as many.
         shared = max(self._count / max(self._matches, 1), 1.0)
         noise = self._squares / max(self._count, 1.0) if self._count else 1.0
-        prior = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
-        P = noise * shared * np.linalg.inv(self._A + prior)
-        return np.asarray(P / self._camera.fv**2, dtype=np.float64)
+        return np.asarray(noise * shared / self._camera.fv**2 * self._inverse, dtype=np.float64)
 
     @property
     def offset_px(self) -> float | None:
@@ -98,10 +98,6 @@ class VerticalDisparityModel:
         # The features of one frame count, as in the covariance.
         by_noise = ROW_TERMS * self._squares / max(self._count, 1.0) / self._matches
         return float(np.sqrt(max(self.rms_px**2 - by_noise, 0.0)))
-
-
-def _centred(values: FloatArray) -> FloatArray:
-    return np.asarray(values - median(values), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,13 +111,22 @@ class StereoCorrection:
     # (7, 4) what k1, k2, q1, q2 have taken off `rows`, which were learned with them; None: nothing
     rows_D_common: FloatArray | None = None
 
-    def jacobian(self, z: FloatArray) -> FloatArray:
-        """Derivatives of pixels (..., 4) by the coefficients that are estimated (..., 4, S)."""
-        out = error_jacobian(self.camera, z, int(self.terms[0]), len(self.terms))
-        if self.rows_D_common is not None and self.terms[0] == 0:
+    def jacobian(self, z: FloatArray, considered: int = 0) -> FloatArray:
+        """Derivatives of pixels (..., 4) by the coefficients that are estimated (..., 4, S), then by those considered.
+
+        Args:
+            z: pixels.
+            considered: how many are considered; zero, or four (baseline, focal length, principal point).
+        """
+        first, terms = int(self.terms[0]), len(self.terms)
+        follow = first + terms == FIELD_TERMS  # those considered come next
+        out = error_jacobian(self.camera, z, first, terms + considered * follow)
+        if self.rows_D_common is not None and first == 0:
             for k, rows in enumerate(self.rows_D_common.T):
                 out[..., 2, RIGHT_TERMS + k] -= self._right_columns(z, rows)
-        return out
+        if follow or not considered:
+            return out
+        return np.concatenate([out, error_jacobian(self.camera, z, FIELD_TERMS, considered)], axis=-1)
 
     def depth_sigma(self, p_cam: FloatArray, P: FloatArray) -> FloatArray:
         """Standard deviations (M,) of stereo depths, over them, by errors of the coefficients of covariance P (S, S).
@@ -162,24 +167,14 @@ class StereoColumns:
     """The part of the tracks' normal equations that concerns the field's S coefficients; pixel noise is one pixel."""
 
     by_point: FloatArray  # (F, N, 3, S) `J' W H` of each view, the point in the coordinates (M5)
-    G: FloatArray  # (F, 3, S) its sum over the views, the cross information of point and coefficients
+    G: FloatArray  # (F, S, 3) its sum over the views, transposed: the cross information of coefficients and point
     A: FloatArray  # (F, S, S) information about the coefficients before the points are eliminated
     b: FloatArray  # (F, S) its vector
 
-    def take(self, rows: IntArray) -> StereoColumns:
-        """Return the columns of tracks (K,)."""
-        return StereoColumns(self.by_point[rows], self.G[rows], self.A[rows], self.b[rows])
-
-    def of_first(self, terms: int) -> StereoColumns | None:
-        """Return the columns of the first coefficients; None: of none."""
-        if not terms:
-            return None
-        columns = self.by_point[..., :terms], self.G[..., :terms], self.A[:, :terms, :terms], self.b[:, :terms]
-        return StereoColumns(*columns)
-
     def point_D_stereo(self, info: TrackInformation, chosen: IntArray) -> FloatArray:
         """How the estimated points of tracks (K,) follow errors of the coefficients (K, 3, S), world: `-C^-1 G`."""
-        out: FloatArray = -info.q.p_D_q[chosen] @ np.linalg.solve(info.C[chosen], self.G[chosen])
+        out: FloatArray = np.empty((len(chosen), 3, self.G.shape[1]))
+        loops.points_by_others(chosen, info.C, info.q.p_D_q, self.G, out)
         return out
 
 
@@ -193,66 +188,29 @@ def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: Floa
         weight: robust weights (F, N).
     """
     F, N, _, S = H.shape
-    columns = StereoColumns(np.empty((F, N, 3, S)), np.empty((F, 3, S)), np.empty((F, S, S)), np.empty((F, S)))
+    columns = StereoColumns(np.empty((F, N, 3, S)), np.empty((F, S, 3)), np.empty((F, S, S)), np.empty((F, S)))
     loops.collect_columns(
         at.r, at.z_D_p, H, at.weight, weight, p_D_q, columns.by_point, columns.G, columns.A, columns.b
     )
     return columns
 
 
-@dataclass(frozen=True, slots=True)
-class StereoInformation:
-    """Information about the field's S coefficients, beside that about n entries of poses and landmarks."""
+def eliminate_points(
+    info: TrackInformation, chosen: BoolArray, columns: StereoColumns | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Information matrix (6N + S, 6N + S) and vector about clones and coefficients of the chosen tracks, (M4).
 
-    A: FloatArray  # (S, S)
-    cross: FloatArray  # (S, n)
-    b: FloatArray  # (S,)
-
-    @classmethod
-    def none(cls, terms: int, size: int) -> StereoInformation:
-        """No information about some coefficients, beside `size` entries of poses and landmarks."""
-        return cls(np.zeros((terms, terms)), np.zeros((terms, size)), np.zeros(terms))
-
-    def __add__(self, other: StereoInformation) -> StereoInformation:
-        """Add information; the other may concern the first of the poses and landmarks only."""
-        cross = self.cross.copy()
-        cross[:, : other.cross.shape[1]] += other.cross
-        return StereoInformation(self.A + other.A, cross, self.b + other.b)
-
-    def scaled(self, factor: float) -> StereoInformation:
-        """Return the information times a factor."""
-        return StereoInformation(self.A * factor, self.cross * factor, self.b * factor)
-
-    def of_first(self, terms: int) -> StereoInformation | None:
-        """Return the information about the first coefficients; None: about none."""
-        return StereoInformation(self.A[:terms, :terms], self.cross[:terms], self.b[:terms]) if terms else None
-
-
-def eliminate_points_from_columns(
-    columns: StereoColumns, info: TrackInformation, chosen: BoolArray
-) -> StereoInformation:
-    """Take the points of the chosen tracks out of the coefficients' part of the normal equations, as (M4) does."""
-    size, S = info.G.shape[1], columns.A.shape[2]
-    A, cross, b = np.zeros((S, S)), np.zeros((size, S)), np.zeros(S)
-    points = info.G, info.C, info.q_D_clone, info.point_gradient
-    own = columns.by_point, columns.G, columns.A, columns.b
-    loops.eliminate_columns(np.flatnonzero(chosen), *own, *points, A, cross, b)
-    return StereoInformation(A, cross.T, b)
-
-
-def landmark_columns(at: LandmarkResiduals, H: FloatArray, clones: int) -> StereoInformation:
-    """Collect what the landmarks' pixels in the newest exposure say of the coefficients, `dp = xi_f - xi_rho`.
-
-    Args:
-        at: residuals of all M landmarks.
-        H: derivatives of their pixels by the coefficients (M, 4, S).
-        clones: N, how many exposures there are.
+    `sum_f M_f - G_f C_f^-1 G_f'`: exact elimination of each point. Without columns, S is zero.
     """
-    M, _, S = H.shape
-    H = H * (at.precision * np.any(at.J, axis=2))[..., None]
-    WH = H * at.weight[:, None, None]
-    by_point = np.swapaxes(WH, 1, 2) @ at.J  # (M, S, 3)
-    cross = np.zeros((S, 6 * clones + 3 * M))
-    cross[:, 6 * clones :] = np.swapaxes(by_point, 0, 1).reshape(S, 3 * M)
-    cross[:, 6 * clones - 6 : 6 * clones - 3] = -by_point.sum(axis=0)
-    return StereoInformation(WH.reshape(-1, S).T @ H.reshape(-1, S), cross, np.einsum("mas,ma->s", WH, at.r))
+    rows, F, size = np.flatnonzero(chosen), len(info.G), info.G.shape[1]
+    if columns is None:
+        columns = StereoColumns(
+            np.empty((F, size // 6, 3, 0)), np.empty((F, 0, 3)), np.empty((F, 0, 0)), np.empty((F, 0))
+        )
+    D = size + columns.b.shape[1]
+    V, A, b = np.empty((3 * len(rows), D)), np.zeros((D, D)), np.zeros(D)
+    points = info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient
+    loops.eliminate_tracks(rows, *points, columns.by_point, columns.G, columns.A, columns.b, V, A, b)
+    A[size:, :size] = A[:size, size:].T
+    A -= V.T @ V
+    return A, b

@@ -72,7 +72,7 @@ def _is_measured(J: FloatArray, f: int, n: int) -> bool:
 
 
 @compiled
-def mark_views(J: FloatArray, out: BoolArray) -> None:
+def _mark_views(J: FloatArray, out: BoolArray) -> None:
     """Write which views (F, N) of tracks were measured."""
     for f in range(J.shape[0]):
         for n in range(J.shape[1]):
@@ -80,12 +80,14 @@ def mark_views(J: FloatArray, out: BoolArray) -> None:
 
 
 @compiled
-def mark_measured(J: FloatArray, out: BoolArray) -> None:
-    """Write which pixel coordinates (F, N, 4) have a Jacobian (F, N, 4, 3) other than zero."""
+def square_views(r: FloatArray, J: FloatArray, squares: FloatArray, count: IntArray) -> None:
+    """Write squared residuals (F, N) of views, and how many of their pixel coordinates were measured."""
     for f in range(J.shape[0]):
         for n in range(J.shape[1]):
+            squares[f, n], count[f, n] = 0.0, 0
             for a in range(4):
-                out[f, n, a] = J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
+                squares[f, n] += r[f, n, a] ** 2
+                count[f, n] += J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
 
 
 @compiled
@@ -152,6 +154,18 @@ def middle(values: FloatArray) -> float:
     for i in range(1, k):
         below = max(below, values[i])
     return 0.5 * (below + values[k])
+
+
+@compiled
+def weigh_rows(residual: FloatArray, cauchy: float, weight: FloatArray) -> None:
+    """Write Cauchy weights (M,) of residuals (M,) from their median, in standard deviations by its absolute values."""
+    values = residual.copy()
+    centre = middle(values)
+    for m in range(len(residual)):
+        values[m] = abs(residual[m] - centre)
+    scale = cauchy * max(1.48 * middle(values), 1e-3)
+    for m in range(len(residual)):
+        weight[m] = 1.0 / (1.0 + ((residual[m] - centre) / scale) ** 2)
 
 
 @compiled
@@ -308,6 +322,102 @@ def step_inverse_depths(
 
 
 @compiled
+def refine(
+    camera: CameraArgs,
+    least_depth: float,
+    least_disparity: float,
+    T: FloatArray,
+    z: FloatArray,
+    weight: FloatArray,
+    steps: int,
+    scale2: float,
+    tiny: float,
+    prior: float,
+    p: FloatArray,
+) -> None:
+    """Move points (F, 3) by Gauss-Newton steps in the coordinates (M5), each after what is behind was put ahead."""
+    F, N = weight.shape[:2]
+    r, J, ahead = np.empty((F, N, 4)), np.empty((F, N, 4, 3)), np.empty(F, np.bool_)
+    seen, anchor, centre, disparity = np.empty((F, N), np.bool_), np.empty(F, np.int64), np.empty((F, 3)), np.empty(F)
+    p_D_q, q_D_p, dq = np.empty((F, 3, 3)), np.empty((F, 3, 3)), np.empty((F, 3))
+    _mark_seen(weight, seen)
+    for _ in range(steps):
+        put_ahead(camera, least_depth, least_disparity, T, z, weight, p)
+        compare_views(camera, least_depth, T, p, z, weight, r, J, ahead)
+        anchor_points(camera, least_depth, T, p, seen, anchor, centre, disparity, p_D_q, q_D_p)
+        step_points(r, J, p_D_q, scale2, tiny, prior, dq)
+        step_inverse_depths(camera, least_depth, least_disparity, T, weight, centre, p_D_q, disparity, dq, p)
+
+
+@compiled
+def _mark_seen(weight: FloatArray, out: BoolArray) -> None:
+    """Write which clones (F, N) showed a track."""
+    for f in range(out.shape[0]):
+        for n in range(out.shape[1]):
+            out[f, n] = weight[f, n, 0] > 0.0
+
+
+@compiled
+def mark_usable(
+    camera: CameraArgs,
+    least_depth: float,
+    T: FloatArray,
+    p: FloatArray,
+    weight: FloatArray,
+    J: FloatArray,
+    ahead: BoolArray,
+    tiny: float,
+    prior: float,
+    limits: tuple[float, float],
+    keep: BoolArray,
+) -> None:
+    """Write which points (F, 3) are finite, ahead of their cameras and, without a right view, fixed by parallax.
+
+    The variance of their disparity, for one pixel of noise, is below the first limit, in px^2, plus the second one
+    times the squared disparity.
+    """
+    F, N = weight.shape[:2]
+    seen, anchor, centre, disparity = np.empty((1, N), np.bool_), np.empty(1, np.int64), np.empty((1, 3)), np.empty(1)
+    p_D_q, q_D_p, C, L, row = np.empty((1, 3, 3)), np.empty((1, 3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    for f in range(F):
+        keep[f] = ahead[f] and np.isfinite(p[f, 0]) and np.isfinite(p[f, 1]) and np.isfinite(p[f, 2])
+        by_right = False
+        for n in range(N):
+            by_right = by_right or weight[f, n, 2] > 0.0
+        if by_right or not keep[f]:
+            continue
+        _mark_seen(weight[f : f + 1], seen)
+        anchor_points(camera, least_depth, T, p[f : f + 1], seen, anchor, centre, disparity, p_D_q, q_D_p)
+        for i in range(3):
+            for j in range(3):
+                C[i, j] = 0.0
+        C[0, 0], C[1, 1], C[2, 2] = tiny, tiny, prior
+        for n in range(N):
+            for a in range(4):
+                _by_point(J[f, n, a], p_D_q[0], row)
+                for i in range(3):
+                    for j in range(i + 1):
+                        C[i, j] += row[i] * row[j]
+        _factor(C, L)
+        keep[f] = 1.0 / L[2, 2] ** 2 < limits[0] + limits[1] * disparity[0] ** 2
+
+
+@compiled
+def _by_point(J: FloatArray, p_D_q: FloatArray, row: FloatArray) -> None:
+    """Write a pixel's Jacobian (3,) by the coordinates (M5), from that by the point (3,)."""
+    for i in range(3):
+        row[i] = J[0] * p_D_q[0, i] + J[1] * p_D_q[1, i] + J[2] * p_D_q[2, i]
+
+
+@compiled
+def expected_pixels(z: FloatArray, r: FloatArray, weight: FloatArray, out: FloatArray) -> None:
+    """Write the pixels (M, 4) that are expected where z was seen, of residuals times weights."""
+    for m in range(len(z)):
+        for a in range(4):
+            out[m, a] = z[m, a] - r[m, a] / weight[m, a] if weight[m, a] > 0.0 else z[m, a]
+
+
+@compiled
 def weigh_views(r: FloatArray, J: FloatArray, sigma2: float, median: float, cauchy: float, weights: FloatArray) -> None:
     """Write Cauchy weights (F, N) of views, zero where not measured; the scale is each clone's own.
 
@@ -330,32 +440,70 @@ def weigh_views(r: FloatArray, J: FloatArray, sigma2: float, median: float, cauc
 
 @compiled
 def add_landmarks(
-    r: FloatArray, J: FloatArray, weight: FloatArray, exposure: int, first: int, A: FloatArray, b: FloatArray
+    r: FloatArray,
+    J: FloatArray,
+    H: FloatArray,
+    precision: FloatArray,
+    weight: FloatArray,
+    exposure: int,
+    first: int,
+    stereo: int,
+    A: FloatArray,
+    b: FloatArray,
+    considered: FloatArray,
 ) -> None:
-    """Add what landmarks' pixels say of `dp = xi_f - xi_rho` to A (D, D) and b (D,).
+    """Add what landmarks' pixels say of `dp = xi_f - xi_rho` and of S coefficients to A (D, D) and b (D,).
 
     Args:
         r: residuals (K, 4).
-        J: their Jacobians by dp (K, 4, 3).
+        J: their Jacobians by dp (K, 4, 3), times the precision as r is.
+        H: by the coefficients (K, 4, S), not times the precision; S may be zero.
+        precision: (K, 4).
         weight: (K,) over the pixels' variance.
         exposure: first row of xi_rho.
         first: row of the first landmark.
+        stereo: row of the first coefficient.
         A: information about all errors.
         b: its vector.
+        considered: of all errors with the last of the coefficients (D, C), which have no rows in A.
     """
+    terms = H.shape[2]
+    estimated = terms - considered.shape[1]
+    h = np.empty(terms)
     for k in range(len(r)):
         own = first + 3 * k
-        for i in range(3):
-            for a in range(4):
-                wJ = weight[k] * J[k, a, i]
+        for a in range(4):
+            row = J[k, a]
+            if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
+                continue
+            for s in range(terms):
+                h[s] = precision[k, a] * H[k, a, s]
+            for i in range(3):
+                wJ = weight[k] * row[i]
                 b[own + i] += wJ * r[k, a]
                 b[exposure + i] -= wJ * r[k, a]
                 for j in range(3):
-                    C = wJ * J[k, a, j]
+                    C = wJ * row[j]
                     A[own + i, own + j] += C
                     A[exposure + i, exposure + j] += C
                     A[own + i, exposure + j] -= C
                     A[exposure + i, own + j] -= C
+                for s in range(estimated):
+                    C = wJ * h[s]
+                    A[own + i, stereo + s] += C
+                    A[stereo + s, own + i] += C
+                    A[exposure + i, stereo + s] -= C
+                    A[stereo + s, exposure + i] -= C
+                for s in range(estimated, terms):
+                    considered[own + i, s - estimated] += wJ * h[s]
+                    considered[exposure + i, s - estimated] -= wJ * h[s]
+            for s in range(estimated):
+                wh = weight[k] * h[s]
+                b[stereo + s] += wh * r[k, a]
+                for t in range(estimated):
+                    A[stereo + s, stereo + t] += wh * h[t]
+                for t in range(estimated, terms):
+                    considered[stereo + s, t - estimated] += wh * h[t]
 
 
 @compiled
@@ -388,22 +536,30 @@ def substitute_back(
 
 @compiled
 def collect_tracks(
+    camera: CameraArgs,
+    least_depth: float,
+    T: FloatArray,
     r: FloatArray,
     J: FloatArray,
     weight: FloatArray,
     p: FloatArray,
+    prior: float,
+    anchor: IntArray,
+    centre: FloatArray,
+    disparity: FloatArray,
     p_D_q: FloatArray,
     q_D_p: FloatArray,
-    anchor: IntArray,
-    prior: float,
-    B: FloatArray,
     G: FloatArray,
     C: FloatArray,
+    B: FloatArray,
     gradient: FloatArray,
     point_gradient: FloatArray,
 ) -> None:
     """Write the normal equations of tracks, (M2), (M3), (M5), (M6): the columns of `TrackInformation`."""
     C_i, g_i, row = np.empty((3, 3)), np.empty(3), np.empty(3)
+    seen = np.empty(weight.shape, np.bool_)
+    _mark_views(J, seen)
+    anchor_points(camera, least_depth, T, p, seen, anchor, centre, disparity, p_D_q, q_D_p)
     for f in range(len(r)):
         _point_D_pose(q_D_p[f], p[f], B[f])
         for i in range(3):
@@ -480,35 +636,131 @@ def eliminate_tracks(
     B: FloatArray,
     gradient: FloatArray,
     point_gradient: FloatArray,
+    by_point: FloatArray,
+    own: FloatArray,
+    own_A: FloatArray,
+    own_b: FloatArray,
     V: FloatArray,
     A: FloatArray,
     b: FloatArray,
 ) -> None:
-    """Write `V` (3F, 6N), whose `V' V` is what the points of the chosen tracks take away, equation (M4).
+    """Write `V` (3K, 6N + S), whose `V' V` is what the points of the chosen tracks take away, equation (M4).
 
-    The blocks of the clones on the diagonal are added to A (6N, 6N), and the vector to b (6N,).
+    What they say of clones and coefficients but for that is added to A (6N + S, 6N + S), its triangle of the clones'
+    rows and that of the coefficients, and the vector with the points taken out to b (6N + S,). `by_point`, `own`,
+    `own_A` and `own_b` are the columns of `StereoColumns`.
     """
     L, y = np.empty((3, 3)), np.empty(3)
-    size, takes_part = G.shape[1], True
+    clones, terms = G.shape[1] // 6, own.shape[1]
+    size = 6 * clones
     for c, f in enumerate(chosen):
         _factor(C[f], L)
         y[0] = point_gradient[f, 0] / L[0, 0]
         y[1] = (point_gradient[f, 1] - L[1, 0] * y[0]) / L[1, 1]
         y[2] = (point_gradient[f, 2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
-        for k in range(size):
-            if k % 6 == 0:
-                takes_part = _has_part(G, f, k // 6)
-            if not takes_part:
-                V[3 * c, k] = V[3 * c + 1, k] = V[3 * c + 2, k] = 0.0
-                continue
-            v0 = G[f, k, 0] / L[0, 0]
-            v1 = (G[f, k, 1] - L[1, 0] * v0) / L[1, 1]
-            v2 = (G[f, k, 2] - L[2, 0] * v0 - L[2, 1] * v1) / L[2, 2]
-            V[3 * c, k], V[3 * c + 1, k], V[3 * c + 2, k] = v0, v1, v2
-            b[k] += gradient[f, k] - v0 * y[0] - v1 * y[1] - v2 * y[2]
-            first = k - k % 6
+        for n in range(clones):
+            takes_part = _has_part(G, f, n)
+            for k in range(6 * n, 6 * n + 6):
+                if not takes_part:
+                    V[3 * c, k] = V[3 * c + 1, k] = V[3 * c + 2, k] = 0.0
+                    continue
+                b[k] += gradient[f, k] - _whiten(L, G[f, k], y, V, c, k)
+                g0, g1, g2 = G[f, k, 0], G[f, k, 1], G[f, k, 2]
+                for j in range(6):
+                    A[k, 6 * n + j] += g0 * B[f, 0, j] + g1 * B[f, 1, j] + g2 * B[f, 2, j]
+                b0, b1, b2 = B[f, 0, k - 6 * n], B[f, 1, k - 6 * n], B[f, 2, k - 6 * n]
+                for s in range(terms):
+                    A[k, size + s] += b0 * by_point[f, n, 0, s] + b1 * by_point[f, n, 1, s] + b2 * by_point[f, n, 2, s]
+        for s in range(terms):
+            b[size + s] += own_b[f, s] - _whiten(L, own[f, s], y, V, c, size + s)
+            for t in range(terms):
+                A[size + s, size + t] += own_A[f, s, t]
+
+
+@compiled
+def _whiten(L: FloatArray, g: FloatArray, y: FloatArray, V: FloatArray, c: int, k: int) -> float:
+    """Write column k of `L^-1 g` into the rows of point c of V, and return its product with y (3,)."""
+    v0 = g[0] / L[0, 0]
+    v1 = (g[1] - L[1, 0] * v0) / L[1, 1]
+    v2 = (g[2] - L[2, 0] * v0 - L[2, 1] * v1) / L[2, 2]
+    V[3 * c, k], V[3 * c + 1, k], V[3 * c + 2, k] = v0, v1, v2
+    return v0 * y[0] + v1 * y[1] + v2 * y[2]
+
+
+@compiled
+def points_by_others(rows: IntArray, C: FloatArray, p_D_q: FloatArray, G: FloatArray, out: FloatArray) -> None:
+    """Write how the estimated points of tracks (K,) follow n other errors (K, 3, n), world: `-C^-1 G'`, G (F, n, 3)."""
+    L = np.empty((3, 3))
+    for k, f in enumerate(rows):
+        _factor(C[f], L)
+        for s in range(G.shape[1]):
+            y0, y1, y2 = _solved(L, -G[f, s, 0], -G[f, s, 1], -G[f, s, 2])
+            for i in range(3):
+                out[k, i, s] = p_D_q[f, i, 0] * y0 + p_D_q[f, i, 1] * y1 + p_D_q[f, i, 2] * y2
+
+
+@compiled
+def _solved(L: FloatArray, y0: float, y1: float, y2: float) -> tuple[float, float, float]:
+    """Solve `L L' x = y` for three values."""
+    y0 = y0 / L[0, 0]
+    y1 = (y1 - L[1, 0] * y0) / L[1, 1]
+    y2 = (y2 - L[2, 0] * y0 - L[2, 1] * y1) / L[2, 2] ** 2
+    y1 = (y1 - L[2, 1] * y2) / L[1, 1]
+    return (y0 - L[1, 0] * y1 - L[2, 0] * y2) / L[0, 0], y1, y2
+
+
+@compiled
+def point_covariances(rows: IntArray, C: FloatArray, p_D_q: FloatArray, out: FloatArray) -> None:
+    """Write the covariance (K, 3, 3) of the points of tracks (K,) given all else, world: `p_D_q C^-1 p_D_q'`."""
+    L = np.empty((3, 3))
+    for k, f in enumerate(rows):
+        _factor(C[f], L)
+        for i in range(3):
+            y0, y1, y2 = _solved(L, p_D_q[f, i, 0], p_D_q[f, i, 1], p_D_q[f, i, 2])
+            for j in range(i + 1):
+                out[k, i, j] = out[k, j, i] = p_D_q[f, j, 0] * y0 + p_D_q[f, j, 1] * y1 + p_D_q[f, j, 2] * y2
+
+
+@compiled
+def innovations(
+    r: FloatArray,
+    J: FloatArray,
+    p: FloatArray,
+    moved: FloatArray,
+    variance: float,
+    squared: FloatArray,
+    count: IntArray,
+) -> None:
+    """Write `r' S^-1 r` (F,) of the newest clone's residuals, `S = B moved B' + variance`, and how many pixels (F,).
+
+    `moved` is the covariance (6, 6) of its motion `[rho; phi]` on the world's side, and `B = J [I, -p^]`.
+    """
+    last = r.shape[1] - 1
+    B, BM, S, y = np.empty((4, 6)), np.empty((4, 6)), np.empty((4, 4)), np.empty(4)
+    for f in range(len(r)):
+        count[f] = 0
+        for a in range(4):
+            x = J[f, last, a]
+            count[f] += x[0] != 0.0 or x[1] != 0.0 or x[2] != 0.0
+            B[a, 0], B[a, 1], B[a, 2] = x[0], x[1], x[2]
+            B[a, 3] = p[f, 1] * x[2] - p[f, 2] * x[1]
+            B[a, 4] = p[f, 2] * x[0] - p[f, 0] * x[2]
+            B[a, 5] = p[f, 0] * x[1] - p[f, 1] * x[0]
+            y[a] = r[f, last, a]
+        for a in range(4):
             for j in range(6):
-                A[k, first + j] += G[f, k, 0] * B[f, 0, j] + G[f, k, 1] * B[f, 1, j] + G[f, k, 2] * B[f, 2, j]
+                BM[a, j] = 0.0
+                for i in range(6):
+                    BM[a, j] += B[a, i] * moved[i, j]
+            for b in range(a + 1):
+                S[a, b] = variance if a == b else 0.0
+                for j in range(6):
+                    S[a, b] += BM[a, j] * B[b, j]
+        solve_positive(S, y)
+        total = 0.0
+        for a in range(4):
+            total += r[f, last, a] * y[a]
+        squared[f] = total if total > 0.0 else 0.0  # not a number where the covariances have lost all digits
 
 
 @compiled
@@ -524,15 +776,15 @@ def collect_columns(
     A: FloatArray,
     b: FloatArray,
 ) -> None:
-    """Write `J' W H` (F, N, 3, S) of each view, and G (F, 3, S), its sum over the views of each track.
+    """Write `J' W H` (F, N, 3, S) of each view, and G (F, S, 3), its sum over the views of each track, transposed.
 
     And `H' W H` (F, S, S) and `H' W r` (F, S) of each track. H (F, N, 4, S) are the derivatives of the pixels, of which
     those count that were measured; right rows do not depend on them. r and J are times the precision (F, N, 4), H not.
     """
-    terms, wH = H.shape[3], np.empty(H.shape[3])
+    terms, h, by_q = H.shape[3], np.empty(H.shape[3]), np.empty(3)
     for f in range(len(J)):
         for s in range(terms):
-            b[f, s] = G[f, 0, s] = G[f, 1, s] = G[f, 2, s] = 0.0
+            b[f, s] = G[f, s, 0] = G[f, s, 1] = G[f, s, 2] = 0.0
             for t in range(terms):
                 A[f, s, t] = 0.0
         for n in range(J.shape[1]):
@@ -545,64 +797,43 @@ def collect_columns(
                 row = J[f, n, a]
                 if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
                     continue
+                _by_point(row, p_D_q[f], by_q)
                 for s in range(terms):
-                    wH[s] = weight[f, n] * precision[f, n, a] * H[f, n, a, s]
-                    b[f, s] += wH[s] * r[f, n, a]
+                    h[s] = precision[f, n, a] * H[f, n, a, s]
                 for s in range(terms):
+                    if h[s] == 0.0:  # left pixels do not depend on the right camera
+                        continue
+                    wh = weight[f, n] * h[s]
+                    b[f, s] += wh * r[f, n, a]
                     for t in range(s + 1):
-                        A[f, s, t] += wH[s] * precision[f, n, a] * H[f, n, a, t]
-                for i in range(3):
-                    by_q = row[0] * p_D_q[f, 0, i] + row[1] * p_D_q[f, 1, i] + row[2] * p_D_q[f, 2, i]
-                    for s in range(terms):
-                        by_point[f, n, i, s] += by_q * wH[s]
-            for i in range(3):
-                for s in range(terms):
-                    G[f, i, s] += by_point[f, n, i, s]
+                        A[f, s, t] += wh * h[t]
+                    for i in range(3):
+                        by_point[f, n, i, s] += by_q[i] * wh
+                        G[f, s, i] += by_q[i] * wh
         for s in range(terms):
             for t in range(s):
                 A[f, t, s] = A[f, s, t]
 
 
 @compiled
-def eliminate_columns(
-    chosen: IntArray,
-    by_point: FloatArray,
-    own: FloatArray,
-    own_A: FloatArray,
-    own_b: FloatArray,
-    G: FloatArray,
+def score_terms(
+    rows: IntArray,
     C: FloatArray,
-    B: FloatArray,
     point_gradient: FloatArray,
+    G: FloatArray,
     A: FloatArray,
-    cross: FloatArray,
     b: FloatArray,
+    variance: float,
+    scores: FloatArray,
+    information: FloatArray,
 ) -> None:
-    """Add to A (S, S), cross (6N, S) and b (S,) what is left of the chosen tracks once their points are eliminated."""
-    clones, terms = by_point.shape[1], by_point.shape[3]
-    L, CG = np.empty((3, 3)), np.empty((3, terms))
-    for f in chosen:
+    """Write scores and information (K, S) of tracks by the first coefficients, their points eliminated as in (M4)."""
+    L = np.empty((3, 3))
+    for k, f in enumerate(rows):
         _factor(C[f], L)
-        for s in range(terms):  # CG = C^-1 own
-            y0 = own[f, 0, s] / L[0, 0]
-            y1 = (own[f, 1, s] - L[1, 0] * y0) / L[1, 1]
-            y2 = (own[f, 2, s] - L[2, 0] * y0 - L[2, 1] * y1) / L[2, 2]
-            CG[2, s] = y2 / L[2, 2]
-            CG[1, s] = (y1 - L[2, 1] * CG[2, s]) / L[1, 1]
-            CG[0, s] = (y0 - L[1, 0] * CG[1, s] - L[2, 0] * CG[2, s]) / L[0, 0]
-            b[s] += own_b[f, s]
-            for i in range(3):
-                b[s] -= CG[i, s] * point_gradient[f, i]
-        for s in range(terms):
-            g0, g1, g2 = own[f, 0, s], own[f, 1, s], own[f, 2, s]
-            for t in range(terms):
-                A[s, t] += own_A[f, s, t] - g0 * CG[0, t] - g1 * CG[1, t] - g2 * CG[2, t]
-        for n in range(clones):
-            if not _has_part(G, f, n):
-                continue
-            for k in range(6):
-                g, add = G[f, 6 * n + k], cross[6 * n + k]
-                for i in range(3):
-                    by_pose = B[f, i, k]
-                    for s in range(terms):
-                        add[s] += by_pose * by_point[f, n, i, s] - g[i] * CG[i, s]
+        y = point_gradient[f]
+        for s in range(scores.shape[1]):
+            g = G[f, s]
+            x0, x1, x2 = _solved(L, g[0], g[1], g[2])
+            scores[k, s] = (b[f, s] - x0 * y[0] - x1 * y[1] - x2 * y[2]) / variance
+            information[k, s] = (A[f, s, s] - x0 * g[0] - x1 * g[1] - x2 * g[2]) / variance

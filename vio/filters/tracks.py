@@ -32,8 +32,9 @@ class TrackTable:
     def add_frame(self, column: int, seen: Observations) -> None:
         """Write the observations of one frame into a column; unknown ids become new tracks."""
         ids, row_of = seen.ids.tolist(), self._row_of
-        rows = np.array([row_of[i] if i in row_of else self._new_row(i) for i in ids], dtype=np.int64)
-        if len(rows):
+        self._add([track for track in ids if track not in row_of])
+        if ids:
+            rows = np.array([row_of[track] for track in ids])
             self._z[rows, column] = seen.z
             self._weight[rows, column] = precision(seen)
 
@@ -77,19 +78,22 @@ class TrackTable:
         if not len(rows):
             return
         self._rows = None
-        for row in rows.tolist():
-            del self._row_of[int(self._ids[row])]
-            self._free.append(row)
+        for track in self._ids[rows].tolist():
+            del self._row_of[track]
+        self._free += rows.tolist()
         self._weight[rows] = 0.0
         self.has_point[rows] = False
 
-    def _new_row(self, track: int) -> int:
-        if not self._free:
+    def _add(self, tracks: list[int]) -> None:
+        """Give new tracks free rows."""
+        if not tracks:
+            return
+        while len(tracks) > len(self._free):
             self._grow(2 * len(self._ids))
-        row = self._free.pop()
-        self._row_of[track], self._rows = row, None
-        self._ids[row] = track
-        return row
+        rows = self._free[: -len(tracks) - 1 : -1]
+        del self._free[-len(tracks) :]
+        self._row_of.update(zip(tracks, rows, strict=True))
+        self._ids[rows], self._rows = tracks, None
 
     def _grow(self, size: int) -> None:
         old = len(self._ids)

@@ -7,6 +7,7 @@ covariance.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,7 +65,7 @@ class Window:
         self.motion = motion
         self.nav = nav
         self.calibration = calibration
-        self.clones: list[Clone] = []
+        self.clones = ()
         self.landmark_ids: IntArray = np.zeros(0, dtype=np.int64)
         self.landmarks: FloatArray = np.zeros((0, 3))
         self.prior = Prior(P)
@@ -75,13 +76,25 @@ class Window:
         """Find the rows of all errors, after a change of which there are."""
         self.state = ErrorState(self.calibration.estimated, len(self.clones), len(self.landmarks))
 
+    @property
+    def clones(self) -> Sequence[Clone]:
+        """The body at the frames of the window, oldest first."""
+        return self._clones
+
+    @clones.setter
+    def clones(self, clones: Sequence[Clone]) -> None:
+        self._clones = tuple(clones)
+        self._exposures: FloatArray | None = None  # their poses in one array
+
     def exposures(self) -> FloatArray:
-        """Poses (N, 4, 4) of the body when the frames were exposed."""
-        return np.array([c.T_world_imu for c in self.clones])
+        """Poses (N, 4, 4) of the body when the frames were exposed; not to be changed."""
+        if self._exposures is None:
+            self._exposures = np.array([c.T_world_imu for c in self._clones])
+        return self._exposures
 
     def T_cam0_world(self, first: int = 0) -> FloatArray:
         """Camera poses (N, 4, 4) at the exposures from one on."""
-        T = np.array([c.T_world_imu for c in self.clones[first:]])
+        T = self.exposures()[first:]
         out: FloatArray = np.empty(T.shape)
         loops.camera_poses(self.calibration.T_cam0_imu, T, out)
         return out
@@ -223,7 +236,7 @@ class Window:
         of_scale[:DIM] += scaled_nav(self.nav, self.calibration.T_cam0_imu)
         scaled_clone = scaled_nav(replace(self.nav, T_world_imu=T), self.calibration.T_cam0_imu)[:6]
         self.prior.insert_dependent(self.state.clones.stop, camera_D_own, noise, camera_D_own @ of_scale - scaled_clone)
-        self.clones.append(Clone(frame_index, time_ns, T, self.nav.velocity))
+        self.clones = (*self.clones, Clone(frame_index, time_ns, T, self.nav.velocity))
         self._lay_out()
         if len(self.landmarks):
             self._anchor_to_newest(self.state.clone(-2).start + 3)
@@ -348,7 +361,7 @@ class Window:
         """Move the means by an error vector (D,); the prior stays where it is."""
         state = self.state
         of_clones = error[state.clones]
-        T, moves = self.exposures(), of_clones.reshape(-1, 6).copy()
+        T, moves = self.exposures().copy(), of_clones.reshape(-1, 6).copy()
         if "extrinsics" in state:
             loops.add_extrinsic_moves(T, self.nav.T_world_imu, error[state["extrinsics"]], moves)
         move_poses(moves, T)
@@ -364,6 +377,7 @@ class Window:
             Clone(c.frame_index, c.time_ns, pose, velocity)
             for c, pose, velocity in zip(self.clones, T, velocities, strict=True)
         ]
+        self._exposures = T
         if self.calibration.estimated:
             self.calibration = self.calibration.corrected(error[state.calibration], self.nav.T_world_imu)
         self.nav = self.motion.corrected(self.nav, error[state.motion])

@@ -11,23 +11,24 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from vio.cameras.rectification_error import TERMS
+from vio.filters import track_loops as loops
 from vio.filters.multiview import (
     CAUCHY,
     Residuals,
     TrackInformation,
     Views,
     first_points,
-    measured_pixels,
     refine_points,
     residuals,
     robust_weights,
+    squared_residuals,
     track_information,
     usable_points,
 )
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import StereoColumns, StereoCorrection, stereo_columns
 from vio.filters.tracks import TrackTable
-from vio.geometry.lie import FloatArray, circledot
+from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile
@@ -53,7 +54,8 @@ class LinearTracks:
     rows: IntArray  # (F,) in the table
     p_world: FloatArray  # (F, 3)
     at: Residuals
-    z: FloatArray  # (F, N, 4) pixels as they are predicted
+    # (F, N, 4) pixels as they are predicted: those seen share their noise with the residuals, which biases coefficients
+    z: FloatArray
     weight: FloatArray  # (F, N) robust weight of each view
     information: TrackInformation
     field: StereoCorrection | None  # what was taken out of the pixels; None: the rectification error is not estimated
@@ -67,7 +69,7 @@ class LinearTracks:
 
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
-        r, used = self.at.r[:, -1], measured_pixels(self.at)[:, -1]
+        r, used = self.at.r[:, -1], np.any(self.at.z_D_p[:, -1], axis=2)
         return median(np.abs(r[used])) if used.any() else None
 
 
@@ -118,27 +120,21 @@ class WindowTracks:
         table.points[rows], table.has_point[rows] = p, keep
         if not keep.all():
             rows, p, at, views = rows[keep], p[keep], at.take(keep), views.take(keep)
-        return self._linear(T, rows, p, at, field, views.z)
+        return self._linear(T, rows, p, at, field, at.predicted(views.z))
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
         """Drop single views that contradict the rest of their track permanently, and linearise what is left."""
-        limits = chi_square_table(_VIEW_PROBABILITY)[measured_pixels(tracks.at).sum(axis=2)]
-        wrong: BoolArray = np.sum(tracks.at.r**2, axis=2) > self.variance * limits
+        squares, pixels = squared_residuals(tracks.at)
+        wrong: BoolArray = squares > self.variance * chi_square_table(_VIEW_PROBABILITY)[pixels]
         if not wrong.any():
             return tracks
         self.table.drop_views(tracks.rows, wrong)
         kept = ~wrong
-        at = Residuals(
-            tracks.at.r * kept[..., None],
-            tracks.at.z_D_p * kept[..., None, None],
-            np.ones(len(wrong), dtype=np.bool_),
-            tracks.at.weight,
-        )
-        enough = np.any(at.z_D_p[:, :, 1, :], axis=2).sum(axis=1) >= 2
-        T = tracks.T_cam0_world
-        rows = tracks.rows[enough]
-        z = self._views(rows, len(T), tracks.field).z
-        return self._linear(T, rows, tracks.p_world[enough], at.take(enough), tracks.field, z)
+        r, z_D_p = tracks.at.r * kept[..., None], tracks.at.z_D_p * kept[..., None, None]
+        at = Residuals(r, z_D_p, np.ones(len(wrong), dtype=np.bool_), tracks.at.weight)
+        enough = np.count_nonzero((pixels > 0) & kept, axis=1) >= 2
+        rows, p, z = tracks.rows[enough], tracks.p_world[enough], tracks.z[enough]
+        return self._linear(tracks.T_cam0_world, rows, p, at.take(enough), tracks.field, z)
 
     def innovations(self, predicted: LinearTracks, moved: FloatArray) -> tuple[FloatArray, IntArray]:
         """Squared innovations (F,) in the newest clone over their covariance, and how many pixels (F,) each has.
@@ -147,11 +143,9 @@ class WindowTracks:
             predicted: tracks linearised where the motion model has the newest clone.
             moved: covariance (6, 6) of its motion since the clone before, `[rho; phi]` on the world's side.
         """
-        at, used = predicted.at, measured_pixels(predicted.at)[:, -1]
-        J = at.z_D_p[:, -1] @ circledot(predicted.p_world)[:, :3]
-        S = J @ moved @ np.swapaxes(J, 1, 2) + self.variance * np.eye(4)
-        squared = np.einsum("fi,fi->f", at.r[:, -1], np.linalg.solve(S, at.r[:, -1, :, None])[..., 0])
-        return squared, used.sum(axis=1)
+        at, squared, pixels = predicted.at, np.empty(len(predicted.rows)), np.empty(len(predicted.rows), np.int64)
+        loops.innovations(at.r, at.z_D_p, predicted.p_world, moved, self.variance, squared, pixels)
+        return squared, pixels
 
     def innovation_ratio(self, predicted: LinearTracks, moved: FloatArray) -> float | None:
         """Median innovation in the newest clone over its standard deviation; None where nothing is seen in it."""
@@ -159,8 +153,7 @@ class WindowTracks:
         used = pixels > 0
         if not used.any():
             return None
-        # Below zero where the covariances have lost all digits.
-        return float(np.sqrt(max(median(squared[used] / chi_square_table(0.5)[pixels[used]]), 0.0)))
+        return float(np.sqrt(median(squared[used] / chi_square_table(0.5)[pixels[used]])))
 
     def drop_unpredicted(self, predicted: LinearTracks, moved: FloatArray) -> bool:
         """Drop views of the newest clone that contradict the predicted motion permanently.
@@ -190,8 +183,7 @@ class WindowTracks:
     ) -> LinearTracks:
         weight = robust_weights(at, self.variance)
         information = track_information(self._camera, T_cam0_world, at, p_world, weight)
-        # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
-        return LinearTracks(T_cam0_world, rows, p_world, at, at.predicted(z), weight, information, field)
+        return LinearTracks(T_cam0_world, rows, p_world, at, z, weight, information, field)
 
     def field_scores(
         self, tracks: LinearTracks, columns: StereoColumns | None, chosen: IntArray
@@ -199,19 +191,17 @@ class WindowTracks:
         """Scores and information (K, 8) of tracks (K,) by the terms of (R3), their points eliminated, the poses known.
 
         In the believed noise, where the expected square of a score is its information. `columns` are the tracks' own of
-        the coefficients estimated, None where there are none.
+        the coefficients estimated first, None where there are none.
         """
-        info = tracks.information.take(chosen)
+        rows, info = chosen, tracks.information
         if columns is None or tracks.field is None or tracks.field.terms[0] > 0:
             none = StereoCorrection(self._camera, np.zeros(ROW_TERMS), np.zeros(TERMS), np.arange(FIELD_TERMS))
-            at = tracks.at.take(chosen)
+            rows, info, at = np.arange(len(chosen)), info.take(chosen), tracks.at.take(chosen)
             columns = stereo_columns(at, none.jacobian(tracks.z[chosen]), info.q.p_D_q, tracks.weight[chosen])
-        else:
-            columns = columns.take(chosen)
-        G, A, b = (x[..., :FIELD_TERMS] for x in (columns.G, np.einsum("fss->fs", columns.A), columns.b))
-        X = np.linalg.solve(info.C, G)
-        score = b - np.einsum("fas,fa->fs", X, info.point_gradient)
-        return score / self.variance, (A - np.einsum("fas,fas->fs", G, X)) / self.variance
+        scores, information = np.empty((len(chosen), FIELD_TERMS)), np.empty((len(chosen), FIELD_TERMS))
+        of_terms = columns.G, columns.A, columns.b
+        loops.score_terms(rows, info.C, info.point_gradient, *of_terms, self.variance, scores, information)
+        return scores, information
 
     def _views(self, rows: IntArray, clones: int, field: StereoCorrection | None) -> Views:
         """What rows showed, without the rectification error."""
@@ -226,12 +216,13 @@ class WindowTracks:
         stereo_errors: FloatArray,
     ) -> None:
         """Move each point as its own normal equations say once the clones (6N,) and the field (S,) have moved."""
-        other = 0.0 if columns is None else np.einsum("fks,s->fk", columns.G, stereo_errors)
+        other = 0.0 if columns is None else stereo_errors @ columns.G[:, : len(stereo_errors)]
         self.table.points[tracks.rows] = tracks.information.moved_points(exposure_errors, other)
 
     def agree(self, at: Residuals) -> bool:
         """Whether nearly all views of the newest clone fit: only then may they contradict the motion model."""
-        squares, pixels = np.sum(at.r[:, -1] ** 2, axis=1), measured_pixels(at)[:, -1].sum(axis=1)
+        of_views, counts = squared_residuals(at)
+        squares, pixels = of_views[:, -1], counts[:, -1]
         used, limits = pixels > 0, chi_square_table(_VIEW_PROBABILITY)[pixels]
         return bool(used.any() and np.mean(squares[used] < self.variance * limits[used]) > _AGREEMENT)
 
@@ -241,8 +232,8 @@ class WindowTracks:
         Returns:
             Mask (F,) of those that pass, their normalised squared residuals (F,), and the degrees of freedom (F,).
         """
-        dof = np.clip(measured_pixels(at).sum(axis=(1, 2)) - 3, 1, _MOST_DOF)
-        squares = np.sum(at.r**2, axis=(1, 2)) / self.variance
+        of_views, counts = squared_residuals(at)
+        dof, squares = np.clip(counts.sum(axis=1) - 3, 1, _MOST_DOF), of_views.sum(axis=1) / self.variance
         limits = chi_square_table(self._settings.gate_probability)[dof] * _common_noise(squares, dof)
         passed: BoolArray = squares <= limits
         return passed, squares, dof
