@@ -709,3 +709,12 @@ def test_a_render_that_fails_is_a_failed_row_and_one_that_works_is_made_once(
 def test_wrong_arguments_are_named(argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", *argv]) == 1
     assert message.lower() in capsys.readouterr().err.lower()
+
+
+def test_wrong_options_of_a_render_are_named_before_anything_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "s.yaml").write_text("sequences: {a: {render: --rig small}, b: {render: --rigg small}}\n")
+    assert main(["bench", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "out")]) == 1
+    assert "s, sequence b: vio render: unrecognized arguments: --rigg small" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
