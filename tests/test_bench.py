@@ -477,7 +477,7 @@ def _workers(folder: Path) -> list[str]:
     return found
 
 
-def _wait_for(holds: Callable[[], bool], seconds: float = 60.0) -> None:
+def _wait_for(holds: Callable[[], bool], seconds: float = 600.0) -> None:
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end, "it did not happen in time"
