@@ -6,10 +6,16 @@ mapped here instead.
 
 from pathlib import Path
 
-from setuptools import find_packages, setup
+from setuptools import find_namespace_packages, setup
+
+
+def found(name: str) -> list[str]:
+    """Packages of a folder, those of YAML files among them."""
+    return find_namespace_packages(include=[name, f"{name}.*"], exclude=["*__pycache__*"])
+
 
 if Path("vio/frontend").is_dir():
-    setup(packages=find_packages(include=["vio", "vio.*"]))
+    setup(packages=found("vio"))
 else:
-    mapped = [f"vio.{name}" for name in find_packages(include=["frontend", "frontend.*"])]
-    setup(packages=[*find_packages(include=["vio", "vio.*"]), *mapped], package_dir={"vio.frontend": "frontend"})
+    mapped = [f"vio.{name}" for name in found("frontend")]
+    setup(packages=[*found("vio"), *mapped], package_dir={"vio.frontend": "frontend"})

@@ -476,7 +476,7 @@ def _workers(folder: Path) -> list[str]:
     return found
 
 
-def _wait_for(holds: Callable[[], bool], seconds: float = 60.0) -> None:
+def _wait_for(holds: Callable[[], bool], seconds: float = 600.0) -> None:
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end, "it did not happen in time"
@@ -708,3 +708,12 @@ def test_a_render_that_fails_is_a_failed_row_and_one_that_works_is_made_once(
 def test_wrong_arguments_are_named(argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", *argv]) == 1
     assert message.lower() in capsys.readouterr().err.lower()
+
+
+def test_wrong_options_of_a_render_are_named_before_anything_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "s.yaml").write_text("sequences: {a: {render: --rig small}, b: {render: --rigg small}}\n")
+    assert main(["bench", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "out")]) == 1
+    assert "s, sequence b: vio render: unrecognized arguments: --rigg small" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -25,7 +25,7 @@ from vio.bench.tasks import tasks_of
 from vio.bench.worker import perform
 from vio.errors import VioError
 
-pytest.importorskip("distributed", reason="needs the extra cluster")
+distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 
 
 class Cluster:
@@ -47,6 +47,11 @@ class Cluster:
         """Start a worker for one task at a time."""
         options = ("--no-nanny", "--nthreads", "1", "--no-dashboard", "--local-directory", str(self._folder))
         return self._start("worker", self.address, *options)
+
+    def wait_for_workers(self, number: int) -> None:
+        """Return when the scheduler knows so many."""
+        with distributed.Client(self.address, timeout=_PATIENCE_S, set_as_default=False) as client:
+            client.wait_for_workers(number, timeout=_PATIENCE_S)
 
     def _start(self, *words: str) -> subprocess.Popen[bytes]:
         environment = os.environ | {"PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": "false"}
@@ -77,7 +82,10 @@ class _Closing:
         self.cluster.stop()
 
 
-def _wait_for(holds: Callable[[], bool], seconds: float = 90.0) -> None:
+_PATIENCE_S = 600.0  # ends a test that hangs; beside other work each process may take half a minute to start
+
+
+def _wait_for(holds: Callable[[], bool], seconds: float = _PATIENCE_S) -> None:
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end, "it did not happen in time"
@@ -98,6 +106,7 @@ def test_lost_workers_and_a_lost_scheduler_cost_no_row(cluster: Cluster, tmp_pat
     suite = suite_from(given, tmp_path / "suite.yaml")
     scheduler = cluster.scheduler()
     workers = [cluster.worker(), cluster.worker()]
+    cluster.wait_for_workers(2)  # else the first may do all tasks before the second has come
     cache = tmp_path / "cache"
     place = Place(data=tmp_path, out=tmp_path / "out", cache=cache, scheduler=cluster.address)
     found: list[Result] = []
@@ -109,7 +118,7 @@ def test_lost_workers_and_a_lost_scheduler_cost_no_row(cluster: Cluster, tmp_pat
     os.kill(scheduler.pid, signal.SIGKILL)
     cluster.scheduler()
     cluster.worker()
-    driver.join(120.0)
+    driver.join(_PATIENCE_S)
     assert found, (tmp_path / "dask.log").read_text(errors="replace")[-2000:]
     outcomes = {o.sequence: o for o in found[0].outcomes}
     assert [o.sequence for o in found[0].failures] == ["corrupt"]

@@ -199,7 +199,13 @@ def test_a_path_with_a_colon_is_a_path_when_it_exists(tmp_path: Path, monkeypatc
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("nowhere", "nowhere does not exist; give a KITTI folder"),
+        ("nowhere", "nowhere does not exist; check the path"),
+        ("no/where", "no/where does not exist, nor does no; check"),
+        ("empti", "empti does not exist; did you mean empty"),
+        ("holiday", "holiday: holds images, but not in folders; put those of a stereo camera into left and right"),
+        ("holiday/IMG_1.JPG", r"IMG_1\.JPG: is one image; give a folder with left and right"),
+        ("film.mp4", r"film\.mp4: is one video; give a folder with left\.mp4, right\.mp4"),
+        ("half", "half: holds images in right but none of a left camera; add them"),
         ("kiti:nowhere", "'kiti' in 'kiti:nowhere' is no kind of recording; .*did you mean 'kitti'"),
         ("kitti:nowhere", "nowhere does not exist"),
         ("kitti:", "names no path; write kitti:PATH"),
@@ -217,7 +223,9 @@ def test_rejects_unknown_sources_with_one_line_error(
     monkeypatch.chdir(tmp_path)
     for name in ("empty", "other/stuff", "root/sequences/00"):
         (tmp_path / name).mkdir(parents=True)
-    (tmp_path / "text.txt").write_text("hello\n")
+    for name in ("text.txt", "film.mp4", "holiday/IMG_1.JPG", "half/right/0.png", "half/calib.txt"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("hello\n")
     (tmp_path / "half.npz").write_bytes(make_source("ece276a", tmp_path).read_bytes()[:2000])
     with pytest.raises(DataError, match=message) as caught:
         open_dataset(source)

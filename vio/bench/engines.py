@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, as_completed
 from typing import Any
 
 from vio.bench.execute import end_processes, failed, perform_job
@@ -118,14 +118,15 @@ def _session(client: Any, jobs: Mapping[str, Job], cache: str, perform: Perform)
             time.sleep(_POLL_S)
         for future in done:
             key = futures.pop(future)
-            if future.status == "cancelled":  # as all are when the scheduler is lost
-                return
             try:
-                yield key, future.result()
+                record = future.result()
+            except CancelledError:  # as all are when the scheduler is lost
+                return
             except KilledWorker as error:
-                yield key, failed(" ".join(str(error).split()), keep=False)
+                record = failed(" ".join(str(error).split()), keep=False)
             except ImportError as error:
                 raise VioError(
                     f"a Dask worker cannot import stereo-vio ({error}); install it there, the same version"
                 ) from error
             future.release()
+            yield key, record

@@ -7,7 +7,7 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from vio.cli.output import ProgressBar, print_result
 from vio.errors import ConfigError, StoppedError
@@ -84,6 +84,7 @@ def _bench(args: argparse.Namespace) -> int:
     if args.workers is not None and not 1 <= args.workers <= 1024:
         raise ConfigError(f"--workers takes 1 to 1024 processes, got {args.workers}")
     suite = chosen(read_suite(args.suite), _names(args.only), _names(args.configurations))
+    _check_renders(suite)
     if args.seeds is not None:
         suite = _with_seeds(suite, args.seeds)
     if args.time_limit is not None:
@@ -165,6 +166,24 @@ def _compare(args: argparse.Namespace) -> int:
 
 def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _check_renders(suite: Any) -> None:
+    """Name options that `vio render` does not take, before anything is rendered."""
+    from vio.cli import render
+    from vio.errors import ConfigError
+
+    class Parser(argparse.ArgumentParser):  # of the subcommand, too
+        def error(self, message: str) -> NoReturn:
+            raise ConfigError(message)
+
+    parser = Parser()
+    render.add_parser(parser.add_subparsers())
+    for sequence in suite.sequences:
+        try:
+            parser.parse_args(["render", *sequence.render, "--out", "."])  # one without a render passes
+        except ConfigError as error:
+            raise ConfigError(f"{suite.name}, sequence {sequence.name}: vio render: {error}") from error
 
 
 def _with_seeds(suite: Any, text: str) -> Any:

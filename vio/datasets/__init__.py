@@ -57,7 +57,7 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
     if path.is_symlink() and not path.exists():
         raise DataError(f"{path} is a link to {os.readlink(path)}, which leads nowhere; give {_LOOKED_FOR}")
     if not path.exists():
-        raise DataError(f"{path} does not exist; give {_LOOKED_FOR}")
+        raise DataError(_missing(path))
     settings = options or DatasetSettings()
     module, reader = READERS[_for_settings(kind or _detect(path), path, settings)].split(":")
     read: Callable[[Path, DatasetSettings], Dataset] = getattr(import_module(f"vio.datasets.{module}"), reader)
@@ -115,17 +115,39 @@ def _detect(path: Path) -> str:
     return kind
 
 
-def _unknown(path: Path) -> str:
-    """Say what is missing where a folder holds images, else what was looked for."""
-    from vio.datasets.plain import images_of_one_camera
+def _missing(path: Path) -> str:
+    """Say that a path does not exist, and from where on it is wrong."""
+    folder = path.parent
+    if not folder.is_dir():
+        return f"{path} does not exist, nor does {folder}; check the path"
+    near = difflib.get_close_matches(path.name, os.listdir(folder) if os.access(folder, os.R_OK) else (), 1, 0.75)
+    hint = f"did you mean {folder / near[0]}?" if near else "check the path"
+    return f"{path} does not exist; {hint}"
 
-    images = images_of_one_camera(path) if path.is_dir() else None
-    if images is None:
-        return f"{path}: no known recording; looked for {_LOOKED_FOR}"
-    return (
-        f"{path}: holds images in {images.name} but no right camera's and no calibration; add the right images, "
-        "or for one camera a calibration.yaml (Kalibr's camchain with cam0) and imu.csv"
-    )
+
+def _unknown(path: Path) -> str:
+    """Say what is missing where there are images or a video, else what was looked for."""
+    from vio.datasets import images, videos
+    from vio.datasets.plain import ALONE, images_of_one_camera
+
+    if path.is_dir() and (found := images_of_one_camera(path)) is not None:
+        if found == path:
+            return (
+                f"{path}: holds images, but not in folders; put those of a stereo camera into left and right, with "
+                "its calibration beside them, or those of one camera into left, with calibration.yaml and imu.csv"
+            )
+        name = found.relative_to(path)
+        if not set(name.parts) & set(ALONE):
+            return f"{path}: holds images in {name} but none of a left camera; add them"
+        return (
+            f"{path}: holds images in {name} but no right camera's and no calibration; add the right images, "
+            "or for one camera a calibration.yaml (Kalibr's camchain with cam0) and imu.csv"
+        )
+    if path.suffix.lower() in images.SUFFIXES:
+        return f"{path}: is one image; give a folder with left and right images and the calibration of the pair"
+    if path.suffix.lower() in videos.SUFFIXES:
+        return f"{path}: is one video; give a folder with left.mp4, right.mp4 and the calibration of the pair"
+    return f"{path}: no known recording; looked for {_LOOKED_FOR}"
 
 
 def _folder_kind(path: Path) -> str | None:

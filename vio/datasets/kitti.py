@@ -86,7 +86,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
 
 def is_kitti_folder(path: Path) -> bool:
     """Return whether a folder looks like a KITTI sequence."""
-    return (path / "image_0").is_dir() or (path / "image_2").is_dir() or (path / "calib.txt").is_file()
+    return any((path / f"image_{k}").is_dir() for k in range(4))
 
 
 def _choose_cameras(path: Path, colour: bool | None) -> tuple[int, int]:

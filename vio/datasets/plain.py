@@ -50,7 +50,7 @@ _PAIRS: tuple[tuple[str, ...], ...] = (
     ("image_lcam_front", "image_rcam_front"),
     ("infra1", "infra2"),
 )
-_ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
+ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
 _INSIDE = ("data", "images", "")
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 
@@ -64,7 +64,7 @@ def holds_more_than_kitti(path: Path) -> bool:
     """Return whether a folder with KITTI's names has an IMU, or another calibration that goes before `calib.txt`."""
     if not is_plain_folder(path):
         return False
-    if any((path / name).is_file() for name in IMU_FILES) or not any((path / f"image_{k}").is_dir() for k in (0, 2)):
+    if any((path / name).is_file() for name in IMU_FILES):
         return True
     return find_calibration(path) not in (None, path / "calib.txt")
 
@@ -78,9 +78,9 @@ def lacks_sensor_yaml(path: Path) -> bool:
 
 
 def images_of_one_camera(path: Path) -> Path | None:
-    """Return the folder of images that a folder holds, whether or not anything else identifies them."""
-    layout = _layout_of_one(path)
-    return None if layout is None else layout.left
+    """Return the folder of images that a folder holds or is, whether or not anything else identifies them."""
+    layout = _layout_of_one(path) or _layout(path, [(names[-1],) for names in _PAIRS])
+    return layout.left if layout is not None else path if _holds_images(path) else None
 
 
 def is_mono_folder(path: Path) -> bool:
@@ -106,7 +106,7 @@ def _layout(path: Path, choices: Sequence[tuple[str, ...]] = _PAIRS) -> Layout |
 
 
 def _layout_of_one(path: Path) -> Layout | None:
-    return _layout(path, [(name,) for name in _ALONE])
+    return _layout(path, [(name,) for name in ALONE])
 
 
 def _holds_images(folder: Path) -> bool:
@@ -147,7 +147,7 @@ def read_mono(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     """
     layout = _layout_of_one(path)
     if layout is None:
-        raise DataError(f"{path}: holds no folder of images ({', '.join(_ALONE[:4])} or others); give one with left/")
+        raise DataError(f"{path}: holds no folder of images ({', '.join(ALONE[:4])} or others); give one with left/")
     files = list_images(layout.left)
     return _read("mono", layout, _Images(FilePairs(files, files)), settings)
 
