@@ -305,7 +305,7 @@ class MapBuilder:
         The prior is the odometry, as for a new loop. A loop's first measurement is none: of the pairs around it those
         that agree with it would be chosen, right or wrong.
         """
-        graph = self.graph
+        graph, again = self.graph, dict[int, LoopRow]()
         for n, loop in enumerate(graph.loops):
             i, k = loop.first, loop.second
             if k < self.first:
@@ -314,10 +314,9 @@ class MapBuilder:
             views = place_points(self._views(i, i))
             seen = search(views, self._camera, self._features(k), loop.pose if prior is None else prior, prior)
             if seen is not None:
-                graph.loops[n] = replace(loop, pose=seen.pose, inliers=seen.inliers)
-                self._waiting += 1
-        if self._waiting:
-            self._store.set_loops(graph.loops)
+                again[n] = graph.loops[n] = replace(loop, pose=seen.pose, inliers=seen.inliers)
+        self._waiting += len(again)
+        self._store.set_loops(again)
 
     def _remember(self, camera: StereoCamera, features: KeyframeFeatures) -> None:
         """Let the next keyframe be found again."""

@@ -385,21 +385,20 @@ class MapStore:
 
     def set_poses(self, T_map_cam: Mapping[int, FloatArray]) -> None:
         """Replace poses (4, 4) of keyframes."""
-        self._set("keyframes", "T_map_cam", {k: _blob(T) for k, T in T_map_cam.items()})
+        self._set("keyframes", ("T_map_cam",), {k: (_blob(T),) for k, T in T_map_cam.items()})
 
     def set_kept(self, kept: Mapping[int, bool]) -> None:
         """Say of loops whether they agree with the others."""
-        self._set("loops", "kept", kept)
+        self._set("loops", ("kept",), {n: (value,) for n, value in kept.items()})
 
     def set_parts(self, parts: list[int]) -> None:
         """Replace the part of each session."""
-        self._set("sessions", "part", dict(enumerate(parts)))
+        self._set("sessions", ("part",), {n: (part,) for n, part in enumerate(parts)})
 
-    def set_loops(self, rows: Sequence[LoopRow]) -> None:
-        """Replace what is measured of each loop."""
-        self._set("loops", "T_i_j", {n: _blob(row.pose.T_i_j) for n, row in enumerate(rows)})
-        self._set("loops", "covariance", {n: _blob(row.pose.covariance) for n, row in enumerate(rows)})
-        self._set("loops", "inliers", {n: row.inliers for n, row in enumerate(rows)})
+    def set_loops(self, rows: Mapping[int, LoopRow]) -> None:
+        """Replace what is measured of loops, by their numbers."""
+        values = {n: (_blob(o.pose.T_i_j), _blob(o.pose.covariance), o.inliers) for n, o in rows.items()}
+        self._set("loops", ("T_i_j", "covariance", "inliers"), values)
 
     def set_field(self, session: int, field: DisplacementField | None) -> None:
         """Replace what a session found its stereo calibration to be off by."""
@@ -422,10 +421,12 @@ class MapStore:
             self._db.execute(f"INSERT INTO {table} VALUES ({'?,' * len(values)}0)", values)
             self._sign(table, f"WHERE {_KEYS[table]} = {int(values[0])}")
 
-    def _set(self, table: str, column: str, values: Mapping[int, Any]) -> None:
-        """Replace a value of the rows of some numbers."""
+    def _set(self, table: str, columns: tuple[str, ...], values: Mapping[int, tuple[Any, ...]]) -> None:
+        """Replace values of the rows of some numbers."""
         with self._changes():
-            self._db.executemany(f"UPDATE {table} SET {column} = ? WHERE id = ?", ((v, n) for n, v in values.items()))
+            assigned = ", ".join(f"{column} = ?" for column in columns)
+            rows = ((*row, n) for n, row in values.items())
+            self._db.executemany(f"UPDATE {table} SET {assigned} WHERE id = ?", rows)
             signed = ", ".join(self._columns(table)[:-1])
             update = f"UPDATE {table} SET crc32 = row_crc32({signed}) WHERE id = ?"
             self._db.executemany(update, ((n,) for n in values))
