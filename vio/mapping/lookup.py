@@ -7,6 +7,7 @@ must show as many corners as a place that is believed at once.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,24 +44,22 @@ class MapLookup:
             session: whose rig made the images that will be looked for; None: the newest one's.
 
         Raises:
-            DataError: the map cannot be used, has no keyframes or no such session.
+            DataError: the map cannot be used, or has no such session.
         """
-        store = MapStore(path, read_only=True)
-        try:
+        with contextlib.ExitStack() as undo:
+            store = MapStore(path, read_only=True)
+            undo.callback(store.close)
             sessions = store.sessions()
             if not sessions:
                 raise DataError(f"{path}: holds no session; vio run --map {path} makes one")
             if session is not None and not 0 <= session < len(sessions):
                 raise DataError(f"{path}: has sessions 0 to {len(sessions) - 1}; name one of them")
             rig = sessions[-1 if session is None else session]
-            self.camera: StereoCamera = rig.camera
-            self._field, self._lock = rig.field, threading.Lock()
             self._builder = MapBuilder(store, "lookup", rig.camera, upright=False, localise=True)
-        except BaseException:
-            store.close()
-            raise
+            undo.pop_all()
+        self.camera: StereoCamera = rig.camera
         self.keyframes = self._builder.first
-        self._home = sessions[0].part
+        self._field, self._home, self._lock = rig.field, sessions[0].part, threading.Lock()
         # A keyframe of which nothing is known stands for each query.
         self._builder.add(Keyframe(0, 0, np.eye(4), None, None, 0.0), no_keyframe_features())
 
