@@ -28,7 +28,7 @@ from vio.offline.comparison import GroundTruth, KeyframeComparison, compare_keyf
 from vio.offline.keyframes import TrackedPath, choose_keyframes
 from vio.offline.loop_tracks import loop_rows
 from vio.offline.points import build_tracks, landmarks_of, reprojection, triangulate_tracks
-from vio.offline.refine import align_to_points, position_covariances
+from vio.offline.refine import align_to_points, position_covariances, refine_run
 from vio.offline.saved_run import read_saved_run, with_poses
 from vio.records import Estimate, LoopEvent, LoopMatches
 from vio.runs.folder import write_run_folder
@@ -264,6 +264,15 @@ def test_refine_lowers_the_error_and_does_not_change_the_run(folder: Path, capsy
     assert _contents(folder)["refined/trajectory.tum"] == after["refined/trajectory.tum"]
     scores = _json(capsys, "eval", str(folder / "refined"), str(folder))
     assert 0 < float(str(scores["ate_m"])) < 2 * first["ate_before_m"]
+
+
+def test_refine_warns_where_it_is_further_off_than_the_run_says(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run = read_saved_run(folder)
+    for sigma_m in (1.0, 1e-6):
+        caplog.clear()
+        sure = replace(run, tracked=replace(run.tracked, sigmas=np.full((len(run.tracked.frames), 2), sigma_m)))
+        refine_run(sure, most=5, priors=False, threads=1, progress=lambda done: None)
+        assert ("times its standard deviation" in caplog.text) == (sigma_m < 1e-3)
 
 
 def test_refine_uses_the_matches_of_loops(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

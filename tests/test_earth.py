@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,7 +27,8 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, s
 from vio.mapping.files import describe_map, extract_map
 from vio.mapping.map_store import MapStore, SessionRow
 from vio.offline.georeference import placed
-from vio.records import LoopEvent, Trajectory
+from vio.records import LoopEvent, MapKeyframes, Trajectory
+from vio.runs.mapped import write_keyframes
 
 ORIGIN = np.array([49.0, 8.4, 115.0])
 LEVER_M = np.array([1.0, 0.5, 1.5])
@@ -287,6 +289,14 @@ def _map_of(path: Path, drive: Drive) -> Path:
     return path
 
 
+def _keep_earth(file: Path, of: Path) -> None:
+    """Place a map where another one is."""
+    with closing(MapStore(file)) as store, closing(MapStore(of, read_only=True)) as other:
+        earth = other.earth()
+        assert earth is not None
+        store.set_earth(earth)
+
+
 def test_places_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = _drive(seed=0, poses=300)
     file, gnss = _map_of(tmp_path / "a.map", drive), _csv(tmp_path / "gnss.csv", drive.fixes)
@@ -307,12 +317,23 @@ def test_places_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     (run / "landmarks.ply").write_bytes(b"ply\nend_header\n")
     metrics = {"T_cam0_imu": np.eye(4).tolist(), "motion": "imu", "map": {"joined": True}}
     (run / "metrics.json").write_text(json.dumps(metrics))
+    own, T = np.arange(0, 300, 10), drive.path.T_map_body
+    write_keyframes(run, MapKeyframes(own // 10, own, drive.path.times_ns[own], own < 0, T[own]))
     assert main(["georeference", str(run), str(file)]) == 0
     assert "GNSS" not in capsys.readouterr().out
     placed_run = read_trajectory(run / "earth" / "trajectory_enu.tum").T_world_body
     np.testing.assert_allclose(placed_run, np.array(saved["T_enu_map"]) @ track.T_world_body, atol=1e-5)
     extract_map(file, tmp_path / "part.map", tuple(drive.path.T_map_body[0, :3, 3]), 50.0)
     assert describe_map(tmp_path / "part.map")["earth"] == after["earth"]
+    # The same map in another frame, as of a merge, and a map of another path with the same frames and times.
+    moved, other = se3_exp([40.0, -7.0, 2.0, 0.0, 0.0, 1.0]), tmp_path / "other.map"
+    _keep_earth(_map_of(tmp_path / "moved.map", replace(drive, path=replace(drive.path, T_map_body=moved @ T))), file)
+    assert main(["georeference", str(run), str(tmp_path / "moved.map")]) == 0
+    found = read_trajectory(run / "earth" / "trajectory_enu.tum").T_world_body
+    np.testing.assert_allclose(found, np.array(saved["T_enu_map"]) @ moved @ T, atol=1e-4)
+    _keep_earth(_map_of(other, replace(drive, path=replace(drive.path, T_map_body=T[::-1]))), file)
+    assert main(["georeference", str(run), str(other)]) == 1
+    assert "was localised in another map than" in capsys.readouterr().err
     (run / "metrics.json").write_text(json.dumps({**metrics, "map": None}))
     for arguments, message in (
         ([str(run), str(file)], "is no run that found its place in a map"),

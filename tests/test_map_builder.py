@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +19,8 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import project, triangulate
 from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.features import KeyframeFeatures, extract
-from vio.mapping.map_store import MapStore
+from vio.mapping.files import merge_maps
+from vio.mapping.map_store import EarthRow, MapStore
 from vio.protocols import Dataset
 from vio.records import LoopEvent
 from vio.runs.checkpoint import load_checkpoint, save_checkpoint
@@ -354,3 +356,36 @@ def test_a_loop_that_was_measured_wrong_is_right_at_the_end(room_walk: Walk, tmp
     E = se3_inverse(loop.pose.T_i_j) @ se3_inverse(room_walk.T[loop.first]) @ room_walk.T[loop.second]
     assert np.linalg.norm(E[:3, 3]) < 0.03
     assert loop.kept
+
+
+def test_a_merge_keeps_where_the_later_map_is_on_the_earth(
+    room_walk: Walk, first_round: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The later map's keyframes stay where they are on the earth, although the frame is that of the first map."""
+    first, later = tmp_path / "first.map", tmp_path / "later.map"
+    shutil.copy(first_round, first)
+    builder = _map(room_walk, later, seed=1, rows=slice(25, None))
+    builder.finish()
+    builder.close()
+    earth = EarthRow((49.0, 8.4, 115.0), se3_exp([5.0, 6.0, 7.0, 0.1, 0.2, 2.0]), 1e-4 * np.eye(6))
+    with closing(MapStore(later)) as store:
+        store.set_earth(earth)
+        before = [row.T_map_cam for row in store.keyframes()]
+    merge_maps(first, later, tmp_path / "both.map")
+    with closing(MapStore(tmp_path / "both.map", read_only=True)) as store:
+        found, rows = store.earth(), store.keyframes()
+    assert found is not None
+    assert found.origin == earth.origin
+    assert np.linalg.norm(found.T_enu_map[:3, 3] - earth.T_enu_map[:3, 3]) > 0.2, "the frame is another one"
+    now = np.array([row.T_map_cam for row in rows[-len(before) :]])
+    gap = se3_log(se3_inverse(earth.T_enu_map @ before) @ found.T_enu_map @ now)
+    assert np.linalg.norm(gap[:, :3], axis=1).max() < 0.05
+    assert np.linalg.eigvalsh(found.covariance - 1e-9 * np.eye(6))[0] > 0
+    with closing(MapStore(first)) as store:
+        store.set_earth(earth)
+    merge_maps(first, later, tmp_path / "two.map")
+    assert "that recorded first is kept" in caplog.text
+    with closing(MapStore(tmp_path / "two.map", read_only=True)) as store:
+        kept = store.earth()
+    assert kept is not None
+    np.testing.assert_array_equal(kept.T_enu_map, earth.T_enu_map)

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
 
 from tests.numerics import numeric_jacobian, right_retract
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
-from vio.mapping.map_graph import MapGraph
+from vio.mapping.map_graph import MapGraph, _nearest
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.pose_graph import (
     Edges,
@@ -263,3 +265,29 @@ def test_a_loop_in_a_piece_without_the_first_keyframe_is_settled(
     moved = (graph.T_map_cam.rows - before)[:, :3, 3]
     np.testing.assert_array_equal(moved[:100], 0.0)
     np.testing.assert_allclose(moved[100:], [[0.0, 0.1 * (k >= 20), 0.0] for k in range(40)], atol=1e-6)
+
+
+@pytest.mark.parametrize("ends", [[(20, 900)], [(5, 1990), (400, 700)], [(700, 705)]])
+def test_the_keyframes_near_new_loops_are_those_of_a_search_of_the_whole_map(
+    ends: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A chain of 2000 keyframes with 100 loops, motions of all sizes, and a piece that nothing joins to it."""
+    monkeypatch.setattr("vio.mapping.map_graph._WINDOW", 80)
+    rng, count = np.random.default_rng(len(ends)), 2000
+    chain = np.delete(np.stack([np.arange(count - 1), np.arange(1, count)], axis=1), 1899, axis=0)
+    pairs = np.concatenate([chain, np.sort(rng.integers(0, 1900, (100, 2)), axis=1)])
+    links = coo_matrix((rng.uniform(0.1, 1.0, len(pairs)), pairs.T), shape=(count, count)).tocsr()
+    rows = rng.random(count) < 0.9
+    new = [LoopRow(i, j, RelativePose(np.eye(4), np.eye(6)), 50, True) for i, j in ends]
+    away = dijkstra(links, directed=False, indices=np.ravel(ends))
+    cycle = away[::2] + away[1::2]
+    joined = np.isfinite(cycle.min(axis=1))
+    detour = np.where(np.isfinite(cycle), cycle, np.minimum(away[::2], away[1::2]))
+    detour[joined] -= cycle[joined].min(axis=1, keepdims=True)
+    on_cycle = int((detour[joined] <= 1e-9).any(axis=0).sum())
+    least = np.where(rows, detour.min(axis=0), np.inf)
+    expected = np.sort(least)[: 80 + on_cycle]
+    found = _nearest(links, new, rows)
+    assert len(set(found.tolist())) == len(found)
+    # All keyframes of another way between two of the cycle have one detour, so that which of them is taken is open.
+    np.testing.assert_allclose(np.sort(least[found]), expected[np.isfinite(expected)], atol=1e-9)

@@ -1,4 +1,4 @@
-"""`vio map`: show and check what a map holds, make one of two, take parts out of one."""
+"""`vio map`: show and check what a map holds, make one of two, take parts out of one, serve one."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from vio.cli.output import print_result
 from vio.errors import ConfigError
 
 DENSITY = 10
+_POLL_S = 0.2  # between two looks at whether to stop
 
 
 def parse_point(text: str) -> tuple[float, float, float]:
@@ -31,7 +32,7 @@ def parse_point(text: str) -> tuple[float, float, float]:
 def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "map",
-        help="show, check, merge and prune maps",
+        help="show, check, merge, prune and serve maps",
         description="Show what a map holds, check it, merge two maps that show places in common, or keep a part of "
         "one. `vio run --map` makes maps.",
     )
@@ -59,6 +60,11 @@ def add_parser(commands: Any) -> None:
     )
     extract.add_argument("--radius", type=float, required=True, metavar="M", help="m")
     extract.add_argument("--out", type=Path, required=True, metavar="MAP", help="a new file")
+    serve = actions.add_parser("serve", help="find image pairs of clients in a map, over HTTP, until Ctrl-C")
+    serve.add_argument("map", type=Path, metavar="MAP", help="a map's file; it stays as it is")
+    serve.add_argument("--host", default="127.0.0.1", help="address to listen at (default 127.0.0.1, this machine)")
+    serve.add_argument("--port", type=int, default=8734, help="port (default 8734)")
+    serve.add_argument("--session", type=int, metavar="N", help="whose rig the clients have (default the newest)")
     for action in (show, merge, check, drop, prune, extract):
         action.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -66,6 +72,8 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     from vio.mapping import files
 
+    if args.action == "serve":
+        return _serve(args)
     if args.action == "prune" and args.density < 1:
         raise ConfigError("--density must be at least 1")
     actions = {
@@ -78,6 +86,31 @@ def execute(args: argparse.Namespace) -> int:
     }
     facts = actions[args.action]()
     return print_result(facts, _rows(facts), as_json=args.json)
+
+
+def _serve(args: argparse.Namespace) -> int:
+    """Answer clients until a signal."""
+    import sys
+    import threading
+    import time
+
+    from vio.cli.stopping import StopRequest
+    from vio.live.map_service import MapServer
+    from vio.mapping.lookup import MapLookup
+    from vio.numerics.threads import one_blas_thread
+
+    with one_blas_thread(), StopRequest() as asked:
+        lookup = MapLookup(args.map, args.session)
+        server = MapServer(lookup, args.host, args.port)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        host, port = server.server_address[:2]
+        print(f"serving {lookup.keyframes} keyframes at http://{host!s}:{port}", file=sys.stderr, flush=True)
+        while asked.reason() is None:
+            time.sleep(_POLL_S)
+        server.shutdown()
+        server.server_close()
+        lookup.close()
+    return 0
 
 
 def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:

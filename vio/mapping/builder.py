@@ -247,13 +247,12 @@ class MapBuilder:
 
     def _measure_again(self) -> None:
         """Measure the loops of this session once more, from where the map has its keyframes now."""
-        loops = self.graph.loops
+        loops, again = self.graph.loops, dict[int, LoopRow]()
         for n, loop in enumerate(loops):
-            if loop.second >= self.first and (again := self.places.measured_again(loop)) is not None:
-                loops[n] = again
-                self._waiting += 1
-        if self._waiting:
-            self._store.set_loops(loops)
+            if loop.second >= self.first and (measured := self.places.measured_again(loop)) is not None:
+                loops[n] = again[n] = measured
+        self._waiting += len(again)
+        self._store.set_loops(again)
 
     def _update(self, events: tuple[LoopEvent, ...]) -> MapUpdate:
         if not self.is_joined:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import shutil
 import uuid
@@ -13,12 +14,14 @@ from typing import Any
 import numpy as np
 
 from vio.errors import DataError
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.map_database import check_path
 from vio.mapping.map_store import MapStore, SessionRow
 from vio.records import BoolArray, IntArray
+
+log = logging.getLogger(__name__)
 
 _M_PER_RAD = 2.0  # a turn of a radian shows as much that is new as a step of so many metres
 
@@ -63,7 +66,8 @@ def merge_maps(first: Path, second: Path, out: Path) -> dict[str, Any]:
 
     Nothing is written where they hold the same recording, or show no place in common. The keyframes of the second map
     are taken up again one after the other, so that its loops are found anew, and those with the first map beside them.
-    The order of the two does not matter: that which was recorded first is continued, and its frame is kept.
+    The order of the two does not matter: that which was recorded first is continued, and its frame is kept. Where only
+    the other one is on the earth, its place is brought into that frame; of two places, that of the frame's map is kept.
 
     Raises:
         DataError: a file is no map, both hold the same recording or no common place, or `out` exists or cannot be
@@ -88,11 +92,11 @@ def merge_maps(first: Path, second: Path, out: Path) -> dict[str, Any]:
                     "vio map drop takes a session out of one"
                 )
             before = len(store.sessions())
-            for number in range(len(other.sessions())):
-                _take_up(other, number, store)
+            taken = [k for number in range(len(other.sessions())) for k in _take_up(other, number, store)]
             parts = [s.part for s in store.sessions()]
             if not set(parts[before:]) & set(parts[:before]):
                 raise DataError(f"{second}: shows no place of {first}; keep two maps, or record a way between them")
+            _merge_earth(store, other, taken)
         os.replace(partial, out)
     except OSError as error:
         raise DataError(f"{out}: cannot be written ({error.strerror or error}); check the folder") from error
@@ -241,16 +245,54 @@ def _copy_rows(source: MapStore, store: MapStore, kept: BoolArray) -> None:
             store.add_loop(replace(loop, first=number[loop.first], second=number[loop.second]))
 
 
-def _take_up(other: MapStore, number: int, store: MapStore) -> None:
-    """Add a session of one map to another."""
+def _merge_earth(store: MapStore, other: MapStore, taken: list[int]) -> None:
+    """Give a merged map the place on the earth of the map that was taken up, where it has none of its own.
+
+    Each keyframe k of both says how the frames lie, `T_store_k T_other_k^-1`. That of the one in the middle is taken,
+    and the mean square of the others' difference from it is added to the covariance.
+
+    Args:
+        store: the merged map.
+        other: the map that was taken up.
+        taken: its keyframes, in the order of the last ones of the merged map.
+    """
+    earth = other.earth()
+    if earth is None:
+        return
+    if store.earth() is not None:
+        log.warning("%s: both maps are on the earth; the place of that recorded first is kept", store.path)
+        return
+    rows, before, sessions = store.keyframes(), other.keyframes(), store.sessions()
+    home, home_before = sessions[0].part, other.sessions()[0].part
+    first = len(rows) - len(taken)
+    pairs = [
+        (rows[first + n].T_map_cam, before[k].T_map_cam)
+        for n, k in enumerate(taken)
+        if sessions[rows[first + n].session].part == home and other.sessions()[before[k].session].part == home_before
+    ]
+    if not pairs:
+        log.warning("%s: what was on the earth is not joined to the first session; its place is left out", store.path)
+        return
+    T_now, T_before = (np.array(T) for T in zip(*pairs, strict=True))
+    middle = int(np.argmin(np.linalg.norm(T_now[:, :3, 3] - np.median(T_now[:, :3, 3], axis=0), axis=1)))
+    T_other_store = T_before @ se3_inverse(T_now)
+    # In the frame of the keyframe in the middle, in which a rotation moves least.
+    xi = se3_log(se3_inverse(T_now[middle]) @ se3_inverse(T_other_store[middle]) @ T_other_store @ T_now[middle])
+    A, B = se3_adjoint(se3_inverse(T_other_store[middle])), se3_adjoint(T_now[middle])
+    covariance = A @ earth.covariance @ A.T + B @ (xi.T @ xi / len(xi)) @ B.T
+    store.set_earth(replace(earth, T_enu_map=earth.T_enu_map @ T_other_store[middle], covariance=covariance))
+
+
+def _take_up(other: MapStore, number: int, store: MapStore) -> list[int]:
+    """Add a session of one map to another; return its keyframes."""
     session = other.sessions()[number]
     motions = {second: motion for _, second, motion in other.odometry()}
     builder = MapBuilder(store, session.source, session.camera, upright=session.upright, localise=False)
-    for k, row in enumerate(other.keyframes()):
-        if row.session == number:
-            motion = motions.get(k)
-            keyframe = Keyframe(
-                row.frame, row.time_ns, row.T_odom_cam, motion, row.up_cam, row.up_sigma_rad, session.field
-            )
-            builder.add(keyframe, other.features(k))
+    rows = other.keyframes()
+    taken = [k for k, row in enumerate(rows) if row.session == number]
+    for k in taken:
+        row = rows[k]
+        seen = row.T_odom_cam, motions.get(k), row.up_cam, row.up_sigma_rad, session.field
+        builder.add(Keyframe(row.frame, row.time_ns, *seen), other.features(k))
     builder.finish()
+    return taken

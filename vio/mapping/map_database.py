@@ -256,10 +256,12 @@ class MapDatabase(ABC):
             self._db.execute(f"INSERT INTO {table} VALUES ({'?,' * len(values)}0)", values)
             self._sign(table, f"WHERE {KEYS[table]} = {int(values[0])}")
 
-    def _set(self, table: str, column: str, values: Mapping[int, Any]) -> None:
-        """Replace a value of the rows of some numbers."""
+    def _set(self, table: str, columns: tuple[str, ...], values: Mapping[int, tuple[Any, ...]]) -> None:
+        """Replace values of the rows of some numbers."""
         with self._changes():
-            self._db.executemany(f"UPDATE {table} SET {column} = ? WHERE id = ?", ((v, n) for n, v in values.items()))
+            assigned = ", ".join(f"{column} = ?" for column in columns)
+            rows = ((*row, n) for n, row in values.items())
+            self._db.executemany(f"UPDATE {table} SET {assigned} WHERE id = ?", rows)
             signed = ", ".join(self._columns(table)[:-1])
             update = f"UPDATE {table} SET crc32 = row_crc32({signed}) WHERE id = ?"
             self._db.executemany(update, ((n,) for n in values))

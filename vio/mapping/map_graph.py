@@ -19,6 +19,7 @@ from vio.records import BoolArray, IntArray
 # What the odometry may be off by beyond its own covariance, since errors of the calibration add up along the path:
 # 1 % and 0.5 deg/100 m; peers reach 1.2 % and 0.3 deg/100 m with stereo on KITTI.
 _DRIFT_SHARE, _DRIFT_RAD_PER_M = 0.01, float(np.radians(0.005))
+_FIRST_REACH, _FURTHER = 30.0, 2.0  # of the search for them, in mean variances of a motion; and from try to try
 _WINDOW = 1000  # keyframes that are optimised for a new loop, beside those of its cycle
 UNKNOWN = 1e6  # variance of the motion from one session to the next, m^2 and rad^2: nothing is known of it
 
@@ -164,18 +165,8 @@ class MapGraph:
             self.optimise_part(part)
             return True
         seen, new = self.loops[:-newest], self.loops[-newest:]
-        ends = [k for o in new for k in (o.first, o.second)]
-        away = dijkstra(self._linked([o for o in seen if o.kept]), directed=False, indices=ends)
-        cycle = away[::2] + away[1::2]  # (L, K) length of the shortest cycle of each loop by each keyframe
-        least = cycle.min(axis=1, keepdims=True)
-        joined = np.isfinite(least[:, 0])  # others are of two pieces, which the loops are the first to join
-        detour = np.where(np.isfinite(cycle), cycle, np.minimum(away[::2], away[1::2]))
-        detour[joined] -= least[joined]
-        nearest = np.where(rows, detour.min(axis=0), np.inf)
-        on_cycle = int((detour[joined] <= 1e-9 * least[joined]).any(axis=0).sum())
-        chosen = np.argsort(nearest, kind="stable")[: _WINDOW + on_cycle]
         free = np.zeros(len(self), dtype=np.bool_)
-        free[chosen[np.isfinite(nearest[chosen])]] = True
+        free[_nearest(self._linked([o for o in seen if o.kept]), new, rows)] = True
         free[int(np.argmax(rows))] = False
         pairs = self._linked(self.loops)
         around = (pairs + pairs.T) @ free.astype(np.float64) > 0
@@ -242,3 +233,31 @@ class MapGraph:
     def _is_upright(self, rows: BoolArray) -> bool:
         """Whether z is up in the frame of these keyframes: it is that of the first one's session."""
         return self.sessions[int(self._session.rows[int(np.argmax(rows))])].upright
+
+
+def _nearest(links: coo_matrix, new: Sequence[LoopRow], rows: BoolArray) -> IntArray:
+    """Return the keyframes of the shortest cycles that new loops close, and those with the smallest detour from them.
+
+    The search goes no further than it must, since it holds the interpreter: what lies beyond `reach` of an end has a
+    detour of more than `2 (reach - least)`, where `least` is the length of the cycle.
+
+    Args:
+        links: (K, K) variances of the motions known before.
+        new: the loops.
+        rows: (K,) keyframes that may be taken.
+    """
+    ends = [k for o in new for k in (o.first, o.second)]
+    reach, both = _FIRST_REACH * float(links.data.mean()), (links + links.T).tocsr()
+    while True:
+        away = np.stack([dijkstra(both, indices=k, limit=reach) for k in ends])
+        cycle = away[::2] + away[1::2]  # (L, K) length of the shortest cycle of each loop by each keyframe
+        least = cycle.min(axis=1, keepdims=True)
+        joined = np.isfinite(least[:, 0])  # others are of two pieces, which the loops are the first to join
+        detour = np.where(joined[:, None], cycle, np.minimum(away[::2], away[1::2]))
+        detour[joined] -= least[joined]
+        nearest = np.where(rows, detour.min(axis=0), np.inf)
+        on_cycle = int((detour[joined] <= 1e-9 * least[joined]).any(axis=0).sum())
+        chosen = np.argsort(nearest, kind="stable")[: _WINDOW + on_cycle]
+        if reach == np.inf or (joined.all() and nearest[chosen[-1]] <= 2 * (reach - float(least.max()))):
+            return chosen[np.isfinite(nearest[chosen])]
+        reach = _FURTHER * reach if reach < links.data.sum() else np.inf

@@ -156,21 +156,20 @@ class MapStore(MapDatabase):
 
     def set_poses(self, T_map_cam: Mapping[int, FloatArray]) -> None:
         """Replace poses (4, 4) of keyframes."""
-        self._set("keyframes", "T_map_cam", {k: _blob(T) for k, T in T_map_cam.items()})
+        self._set("keyframes", ("T_map_cam",), {k: (_blob(T),) for k, T in T_map_cam.items()})
 
     def set_kept(self, kept: Mapping[int, bool]) -> None:
         """Say of loops whether they agree with the others."""
-        self._set("loops", "kept", kept)
+        self._set("loops", ("kept",), {n: (value,) for n, value in kept.items()})
 
     def set_parts(self, parts: list[int]) -> None:
         """Replace the part of each session."""
-        self._set("sessions", "part", dict(enumerate(parts)))
+        self._set("sessions", ("part",), {n: (part,) for n, part in enumerate(parts)})
 
-    def set_loops(self, rows: Sequence[LoopRow]) -> None:
-        """Replace what is measured of each loop."""
-        self._set("loops", "T_i_j", {n: _blob(row.pose.T_i_j) for n, row in enumerate(rows)})
-        self._set("loops", "covariance", {n: _blob(row.pose.covariance) for n, row in enumerate(rows)})
-        self._set("loops", "inliers", {n: row.inliers for n, row in enumerate(rows)})
+    def set_loops(self, rows: Mapping[int, LoopRow]) -> None:
+        """Replace what is measured of loops, by their numbers."""
+        values = {n: (_blob(o.pose.T_i_j), _blob(o.pose.covariance), o.inliers) for n, o in rows.items()}
+        self._set("loops", ("T_i_j", "covariance", "inliers"), values)
 
     def set_field(self, session: int, field: DisplacementField | None) -> None:
         """Replace what a session found its stereo calibration to be off by."""

@@ -55,6 +55,11 @@ class FoundPlace:
     seen: Verified
     needed: int  # other keyframes that must confirm it
 
+    @property
+    def is_sure(self) -> bool:
+        """Whether it shows enough to need one confirmation alone where nothing else is known of the place."""
+        return self.seen.inliers >= _SURE_INLIERS
+
 
 class PlaceFinder:
     """What finds the keyframes of a map again, made of their features."""

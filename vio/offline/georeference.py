@@ -15,16 +15,18 @@ from vio.earth.geodesy import LocalFrame
 from vio.earth.gnss import GnssFixes
 from vio.errors import DataError
 from vio.files.trajectories import write_tum
-from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.lie import FloatArray, se3_inverse, se3_log
 from vio.geometry.upright import up_in, up_of
 from vio.mapping.map_store import EarthRow, MapStore
 from vio.records import BoolArray, Trajectory
 from vio.runs.finished import point_positions
 from vio.runs.folder import read_metrics
-from vio.runs.mapped import read_loops, read_trajectories
+from vio.runs.mapped import read_keyframes, read_loops, read_trajectories
 
 FACTS = "earth.json"
 _UP_RAD, _MOUNT_RAD = float(np.radians(0.3)), float(np.radians(5.0))  # of an IMU's vertical; of an upright camera's
+_LEAST_COMMON = 3  # keyframes that run and map share
+_SAME, _SAME_SHARE = 0.05, 0.1  # by which a motion between two of them may differ, m and rad, and share of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +121,15 @@ def place_on_earth(
 def place_by_map(of: Placed, run: FilePath, file: FilePath, folder: FilePath) -> dict[str, Any]:
     """Place a run on the earth where the map is that it was localised in; as `place_on_earth`.
 
+    The map may have changed since, or be a part of that map, or a merge of it: each pose moves with the nearest of the
+    keyframes that the run found.
+
     Raises:
-        DataError: the map is nowhere on the earth, or the run is not in its frame.
+        DataError: the map is nowhere on the earth, or the run was not localised in it.
     """
     store = MapStore(file, read_only=True)
     try:
-        earth = store.earth()
+        earth, rows, sessions = store.earth(), store.keyframes(), store.sessions()
     finally:
         store.close()
     if earth is None:
@@ -134,10 +139,39 @@ def place_by_map(of: Placed, run: FilePath, file: FilePath, folder: FilePath) ->
         raise DataError(
             f"{run}: is no run that found its place in a map; vio localise RECORDING --map {file} makes one"
         )
+    home = {(row.frame, row.time_ns): row.T_map_cam for row in rows if sessions[row.session].part == sessions[0].part}
+    before, now = _common(run, home)
+    if len(before) < _LEAST_COMMON or not _is_one_path(before, now):
+        raise DataError(
+            f"{run}: was localised in another map than {file}; give the map that the run found its place in"
+        )
+    _, nearest = cKDTree(before[:, :3, 3]).query(of.path.T_map_body[:, :3, 3])
+    of = replace(of, path=replace(of.path, T_map_body=(now @ se3_inverse(before))[nearest] @ of.path.T_map_body))
     frame = LocalFrame(np.array(earth.origin))
     none = np.zeros((0, 3)), np.zeros(0, dtype=np.bool_)
     epsg = _write(folder, of, frame, earth.T_enu_map @ of.path.T_map_body, 1.0, *none)
     return _where(frame, earth.T_enu_map, earth.covariance) | {"crs": epsg}
+
+
+def _common(run: FilePath, home: dict[tuple[int, int], FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return the poses (K, 4, 4) of a run's keyframes that a map holds, as the run has them and as the map has them.
+
+    Args:
+        run: its folder.
+        home: poses of the map's keyframes by frame and time.
+    """
+    keyframes, (_, T_cam0_body) = read_keyframes(run), read_metrics(run)
+    keys = list(zip(keyframes.frame.tolist(), keyframes.time_ns.tolist(), strict=True))
+    shared = [n for n, key in enumerate(keys) if key in home]
+    T = keyframes.T_map_body[shared] @ se3_inverse(T_cam0_body)
+    return T, np.array([home[keys[n]] for n in shared]).reshape(-1, 4, 4)
+
+
+def _is_one_path(before: FloatArray, now: FloatArray) -> bool:
+    """Whether most motions between neighbours of two series of poses (K, 4, 4) agree, as those of two maps do not."""
+    a, b = (se3_log(se3_inverse(T[:-1]) @ T[1:]) for T in (before, now))
+    apart = np.linalg.norm(a - b, axis=1)
+    return float(np.median(apart - _SAME_SHARE * np.linalg.norm(a, axis=1))) < _SAME
 
 
 def keep_in_map(file: FilePath, facts: dict[str, Any]) -> None:

@@ -28,6 +28,7 @@ from vio.runs.pipeline import run as process
 log = logging.getLogger(__name__)
 
 STEPS = 4  # that `progress` counts
+_MOST_SIGMAS = 3.0  # by which refined poses and the run's may differ
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +82,17 @@ def refine_run(
     progress(STEPS)
     refined = replace(path.trajectory, T_world_body=poses)
     before, after = _scores(run, refined)
+    moved_rms_m = position_difference_m(path.trajectory, refined)
+    if path.sigmas is not None:
+        sigma_m = float(np.sqrt(np.mean(path.sigmas[:, 0] ** 2)))
+        if moved_rms_m > _MOST_SIGMAS * sigma_m:
+            log.warning(
+                "the refined poses are %.2g m (rms) from the run's, %.1f times its standard deviation of %.2g m: "
+                "images that show little do not hold poses alone, as an IMU does; compare both before you use them",
+                moved_rms_m,
+                moved_rms_m / sigma_m,
+                sigma_m,
+            )
     return Refinement(
         trajectory=refined,
         landmarks=landmarks_of(path.camera, done.T_world_cam0, done.tracks, done.sigma_px),
@@ -89,7 +101,7 @@ def refine_run(
         loops=len(loop_pairs(path.loops, path.frames[keyframes])),
         aligned=aligned,
         with_priors=held is not None,
-        moved_rms_m=position_difference_m(path.trajectory, refined),
+        moved_rms_m=moved_rms_m,
         ate_before_m=before,
         ate_m=after,
     )
