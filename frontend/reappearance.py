@@ -19,8 +19,8 @@ from vio.frontend.tracks import PreviousFrame
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import depth_of, left_rays
 
-_LEAST_POINTS = 20  # that must agree on the motion …
-_LEAST_SHARE = 0.3  # … and of all matches with depths
+_LEAST_POINTS = 15  # that must agree on the motion …
+_LEAST_SHARE = 0.4  # … and of all matches with depths
 _DEPTHS_AGREE = 0.5  # share of these whose new disparity must be that of the moved point
 _DISPARITY_PX = 2.0  # as far as whole pixels at half resolution tell
 
@@ -45,9 +45,9 @@ def motion_across(
     """
     assert previous.right_half is not None
     camera, extract = problem.camera, sift_extractor(MatchSettings())
-    before, now = extract(previous.left.half), extract(left.half)
+    before, now = extract(previous.left.full), extract(left.full)
     pairs = MutualNearest()(before, now, np.ones((len(before), len(now)), dtype=np.bool_))
-    a, b = 2.0 * before.pixels[pairs[:, 0]], 2.0 * now.pixels[pairs[:, 1]]
+    a, b = before.pixels[pairs[:, 0]], now.pixels[pairs[:, 1]]
     d_before, known = stereo.search(previous.left.half, previous.right_half, a)
     known &= d_before > 0.0
     a, b, d_before = a[known], b[known], d_before[known]
