@@ -109,7 +109,7 @@ def _count_matches(images: FrameImages) -> MatchCounts:
     tracks = images.previous.tracks
     points = np.where(tracks.has_right[:, None], tracks.right, tracks.left)
     points = points[inside(left.full, points, 0.0)][:_POINTS]
-    positive = int(images.stereo.search(left, right, points)[1].sum())
+    positive = int(images.stereo.search(left.half, right.half, points)[1].sum())
     return MatchCounts(len(points), positive, images.stereo.count_mirrored(left, right, points))
 
 

@@ -21,6 +21,8 @@ from vio.frontend.one_camera import with_depths, with_prior_depths
 from vio.frontend.outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
 from vio.frontend.patches import ImageLevels, half_image
 from vio.frontend.prediction import guessed_pixels, prior_rows, usable_prior
+from vio.frontend.reappearance import motion_across
+from vio.frontend.right_alone import RightAlone
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.right_delay import RightDelay
 from vio.frontend.right_match import RightMatcher
@@ -69,6 +71,7 @@ class KltFrontend:
         self._new_features = NewFeatures(camera, self._grid, self._bank)
         self._matcher = RightMatcher(camera, self._right, self._delay)
         self._previous: PreviousFrame | None = None
+        self._alone: RightAlone | None = None  # while the left camera is frozen
         self._setup: tuple[StereoFit, BoolArray | None] | None = None  # made with the image size of the first frame
         self._next_id = 0
         self._rested = False  # whether the last frame was one in which no corners were detected
@@ -87,7 +90,8 @@ class KltFrontend:
         for check in self._checks:
             checked = check.inspect(images)
             if checked is None:
-                return make_output(frame, no_tracks(), 0, watch, self._take_lines())
+                alone = self._follow_in_right(images, usable_prior(prior)) if self._right.left_frozen else no_tracks()
+                return make_output(frame, alone, len(alone), watch, self._take_lines())
             images = checked
         left, right = images.left, images.right
         watch.lap("prepare")
@@ -143,6 +147,19 @@ class KltFrontend:
             self._setup = stereo, allowed
         return self._setup
 
+    def _follow_in_right(self, images: FrameImages, prior: TrackPrior | None) -> Tracks:
+        """The features of the last good pair, by the right image of a frame whose left one is frozen."""
+        frame, right = images.frame, images.right
+        if self._previous is None or right is None or not self._right.usable or self._delay.frames != 0.0:
+            return no_tracks()
+        last = self._alone or RightAlone.after(self._camera, self._previous)
+        problem = RansacProblem(self._camera, INLIER_PX, np.random.default_rng((self._seed, frame.index)))
+        alone = last.next(frame.time_ns, problem, self._bank, right, prior, self._settings.pyramid_levels)
+        if alone is None:
+            return no_tracks()
+        self._alone = alone
+        return alone.in_left(self._camera, images.stereo)
+
     def _store(self, images: FrameImages, tracks: Tracks, motion: Consensus | None) -> None:
         """Store the state that the next frame needs."""
         frame, left, right = images.frame, images.left, images.right
@@ -154,6 +171,7 @@ class KltFrontend:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
         left = ImageLevels(left.full.copy(), left.half)  # a reader may reuse its buffer
         right_half = None if right is None else right.half
+        self._alone = None
         self._previous = PreviousFrame(frame.time_ns, left, right_half, tracks, twist, motion is not None)
 
     def _track(
@@ -166,10 +184,18 @@ class KltFrontend:
         frame, left, right, stereo = images.frame, images.left, images.right, images.stereo
         stereo.forget_offset()
         previous = self._previous
-        if previous is None or len(previous.tracks) == 0 or (prior is None and self._after_gap(frame)):
+        if previous is None or len(previous.tracks) == 0:
             return no_tracks(), None
         old, levels = previous.tracks, self._settings.pyramid_levels
         expected = se3_exp(previous.twist_per_s * ((frame.time_ns - previous.time_ns) * 1e-9))
+        if prior is not None and self._alone is not None:  # its motion is that since the last right image
+            prior = replace(prior, R_cam_prev=None, motion=None)
+        if self._after_gap(frame):
+            again = self._found_again(images, previous, expected)
+            if again is not None:
+                expected, prior = again, None
+            elif prior is None:
+                return no_tracks(), None
         guess = guessed_pixels(self._camera, old, prior, expected, left.full)
         trusted = prior is not None or previous.trusted
         found, seen = track_with_retries(previous.left.half, left, old.left, guess, trusted, levels)
@@ -186,6 +212,15 @@ class KltFrontend:
             tracks = self._matcher.match(frame, previous, tracks, left, right, prior, stereo, motion)
         watch.lap("stereo")
         return tracks, motion
+
+    def _found_again(self, images: FrameImages, previous: PreviousFrame, expected: FloatArray) -> FloatArray | None:
+        """The motion (4, 4) since the last good pair by key points of both pairs; None: none is proved."""
+        right = images.right
+        if right is None or previous.right_half is None or not self._right.usable or self._delay.frames != 0.0:
+            return None
+        rng = np.random.default_rng((self._seed, images.frame.index))
+        problem = RansacProblem(self._camera, 2 * INLIER_PX, rng)
+        return motion_across(problem, images.stereo, previous, images.left, right, np.stack([expected, np.eye(4)]))
 
     def _after_gap(self, frame: StereoFrame) -> bool:
         """Whether so many frames are missing that similar patches are no evidence of the same points."""

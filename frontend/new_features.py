@@ -95,7 +95,7 @@ class NewFeatures:
         rows = unmatched.nonzero()[0]
         if not len(rows) + len(corners):
             return self._without_old_left_only(tracks), *nothing
-        disparity, unique = stereo.search(left, right, np.concatenate([tracks.left[rows], corners]))
+        disparity, unique = stereo.search(left.half, right.half, np.concatenate([tracks.left[rows], corners]))
         disparity_old, disparity_new = np.split(disparity, [len(rows)])
         known, unique = np.split(unique, [len(rows)])
         tracks = stereo.match_near(tracks, right, rows[known], disparity_old[known])

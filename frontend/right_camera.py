@@ -79,6 +79,11 @@ class RightCamera(ImageCheck):
         """Whether the right image of the last frame was used."""
         return self._cause is None
 
+    @property
+    def left_frozen(self) -> bool:
+        """Whether the left image of the last frame was a frozen camera's."""
+        return self._left_frozen > 0
+
     def explained(self) -> None:
         """Trust the right image again at once: another cause was found and taken out. What is not yet logged is not."""
         self._lines = []
@@ -89,7 +94,7 @@ class RightCamera(ImageCheck):
         self._count = self._agreeing = self._untested = 0
 
     def inspect(self, images: FrameImages) -> FrameImages | None:
-        """Skip frames whose left image is frozen, and mark those whose right image is frozen or dark."""
+        """Return None for a frozen left image, and mark frames whose right image is frozen or dark."""
         left, right = images.views
         if self.left_is_frozen(images.frame.index, left.half, right.half):
             return None
@@ -185,7 +190,7 @@ class RightCamera(ImageCheck):
         if self._left_frozen == _FRAMES:
             self._lines.append(
                 f"frame {index}: the left camera is frozen: its image does not change since frame {since} while the "
-                "right one does; its frames are skipped"
+                "right one does; the right images alone follow what the last pair has seen"
             )
 
 

@@ -110,7 +110,7 @@ class RightMatcher:
         delay = self._delay.frames
         then = stereo.track_right(at_exposure(tracks, flow, T, delay), right, True)
         rows = np.flatnonzero(~then.has_right & ~then.has_point)
-        disparity, unique = stereo.search(previous.left, right, (tracks.left - flow)[rows])
+        disparity, unique = stereo.search(previous.left.half, right.half, (tracks.left - flow)[rows])
         then = stereo.match_near(then, right, rows[unique], disparity[unique])
         stereo.update_rows(then)
         return at_present(self._camera, tracks, then, T, delay)

@@ -93,7 +93,7 @@ class StereoFit:
                 less well.
         """
         rows, expected = self._expected(tracks)
-        coarse, unique = self.search(left, right, tracks.left[rows])
+        coarse, unique = self.search(left.half, right.half, tracks.left[rows])
         rows, expected, known = rows[unique], expected[unique], take(tracks, rows[unique])
         pixels, skew, valid = self._fit(known, right, coarse[unique])
         rows, expected, pixels, skew = rows[valid], expected[valid], pixels[valid], skew[valid]
@@ -126,22 +126,22 @@ class StereoFit:
         pixels, skew, valid = self._fit(take(tracks, rows), right, disparity)
         return self._with_right_pixels(tracks, rows, pixels, skew, valid.nonzero()[0])
 
-    def search(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> tuple[FloatArray, BoolArray]:
+    def search(self, left_half: Image, right_half: Image, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Coarse disparities (N,) of left pixels (N, 2), and a mask (N,) of those that are unique."""
         offset = round(self._rows.offset_px / 2)
         if self._unmatched % _ROW_SEARCH_FRAMES == 1:
-            offset = self._best_offset(left, right, points, offset)
+            offset = self._best_offset(left_half, right_half, points, offset)
         correlation = _MIN_CORRELATION - _COARSE_SLACK
-        return self._search(left.half, shifted_rows(right.half, offset), points, correlation)
+        return self._search(left_half, shifted_rows(right_half, offset), points, correlation)
 
-    def _best_offset(self, left: ImageLevels, right: ImageLevels, points: FloatArray, offset: int) -> int:
+    def _best_offset(self, left_half: Image, right_half: Image, points: FloatArray, offset: int) -> int:
         """Row difference, in pixels at half resolution, at which most points match well; the present one if in doubt.
 
         Rows may be far apart where the right camera has been pitched since it was calibrated.
         """
         tried = range(-_MAX_ROWS_HALF, _MAX_ROWS_HALF + 1)
         counts = [
-            int(self._search(left.half, shifted_rows(right.half, rows), points, _GOOD_MATCH)[1].sum()) for rows in tried
+            int(self._search(left_half, shifted_rows(right_half, rows), points, _GOOD_MATCH)[1].sum()) for rows in tried
         ]
         best = int(np.argmax(counts))
         if counts[best] < max(_LEAST_POINTS, 2 * counts[offset + _MAX_ROWS_HALF]):
@@ -173,6 +173,10 @@ class StereoFit:
     def rows_are_off(self) -> bool:
         """Whether the rows of the matches differ by a smooth field: the calibration is off, and so are the depths."""
         return self._rows.rms_px >= _ROWS_OFF_PX
+
+    def row_differences(self, left: FloatArray) -> FloatArray:
+        """Right minus left rows (N,) that are expected at left pixels (N, 2)."""
+        return self._rows.rows(left) - left[:, 1]
 
     def restart_rows(self) -> None:
         """Forget the row differences."""

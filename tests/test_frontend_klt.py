@@ -298,16 +298,45 @@ def test_last_motion_is_scaled_by_time(monkeypatch: pytest.MonkeyPatch) -> None:
     assert outputs[-1].tracked > 0.7 * outputs[-2].tracked
 
 
-def test_features_are_not_followed_across_a_long_gap_without_a_prediction() -> None:
-    """Three seconds without frames: similar patches are no evidence then, unless a filter predicts where they are."""
-    late = replace(FRAMES[3], time_ns=FRAMES[2].time_ns + 3_000_000_000)
-    outputs = run([*FRAMES[:3], late])
-    assert outputs[-1].tracked == 0
-    assert not np.isin(outputs[-1].observations.ids, outputs[-2].observations.ids).any()
-    assert run([*FRAMES[:3], replace(late, time_ns=FRAMES[2].time_ns + 600_000_000)])[-1].tracked > 100
+def after_gap(wall: Wall, right_wall: Wall, pose: FloatArray) -> FrontendOutput:
+    """What is seen three seconds after three frames, the filter predicting nothing."""
+    late = replace(stereo_frame(3, pose, wall), time_ns=FRAMES[2].time_ns + 3_000_000_000)
+    return run([*FRAMES[:3], replace(late, right=stereo_frame(3, pose, right_wall).right)])[-1]
+
+
+def test_features_are_found_again_after_a_long_gap(outputs: list[FrontendOutput]) -> None:
+    """The camera has come nearer by 0.5 m and turned by 5 degrees; nothing predicts where the features are."""
+    pose = POSES[2] @ se3_exp(np.array([0.3, -0.1, 0.5, 0.03, -0.06, 0.06]))
+    again = after_gap(SLANTED, SLANTED, pose)
+    error = track_errors(outputs[2], again, POSES[2], pose)
+    assert len(error) > 80
+    assert np.median(error) < 0.1
+    assert np.mean(error > 1.0) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("wall", "right_wall"),
+    [
+        (replace(SLANTED, seed=77), replace(SLANTED, seed=77)),
+        (SLANTED, replace(SLANTED, offset=5.0)),
+        (SLANTED, replace(SLANTED, seed=77)),
+    ],
+    ids=["another scene", "the left scene at another depth", "a right camera that shows something else"],
+)
+def test_similar_patches_after_a_long_gap_are_no_evidence(wall: Wall, right_wall: Wall) -> None:
+    """Where one of the cameras does not show the same scene at its depths, features begin anew."""
+    again = after_gap(wall, right_wall, POSES[3])
+    assert again.tracked == 0
+    assert len(again.observations) > 20
+    assert not np.isin(again.observations.ids, run(FRAMES[:3])[-1].observations.ids).any()
+
+
+def test_a_prediction_bridges_a_long_gap() -> None:
+    assert run([*FRAMES[:3], replace(FRAMES[3], time_ns=FRAMES[2].time_ns + 600_000_000)])[-1].tracked > 100
     frontend = KltFrontend(CAMERA, SETTINGS)
     seen = [frontend.process(frame) for frame in FRAMES[:3]][-1].observations
     prior = TrackPrior(seen.ids, truth(SLANTED, POSES[2], seen.z[:, :2], POSES[3]))
+    late = replace(FRAMES[3], time_ns=FRAMES[2].time_ns + 3_000_000_000)
     assert frontend.process(late, prior).tracked > 100
 
 

@@ -109,9 +109,9 @@ def test_two_gaps_without_features_are_two_events() -> None:
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"x": 400.0}, "the estimate moves at"),
-        ({"gyro_bias": np.array([0.0, 0.9, 0.0])}, "gyro bias is estimated as 0.9 rad/s"),
-        ({"accel_bias": np.array([0.0, 0.0, -6.0])}, "accelerometer bias is estimated as 6 m/s^2"),
+        ({"x": 400.0}, "m/s: the filter has diverged"),
+        ({"gyro_bias": np.array([0.0, 0.9, 0.0])}, "gyro bias is estimated as 0.9 rad/s, which no working sensor has"),
+        ({"accel_bias": np.array([0.0, 0.0, -6.0])}, "accelerometer bias is estimated as 6 m/s^2, which no"),
     ],
 )
 def test_reports_an_implausible_state_once(more: dict[str, object], message: str) -> None:
@@ -119,5 +119,5 @@ def test_reports_an_implausible_state_once(more: dict[str, object], message: str
     assert health.frame(0, GOOD, _estimate(0)) == ()
     (line,) = health.frame(1, GOOD, _estimate(1, **more))  # type: ignore[arg-type]
     assert message in line
-    assert "diverged" in line
+    assert line.endswith("calibration, units and clocks")
     assert health.frame(2, GOOD, _estimate(2, **more)) == ()  # type: ignore[arg-type]

@@ -87,7 +87,7 @@ def test_a_single_repeated_right_image_is_not_used_and_not_an_event() -> None:
     assert lines == []
 
 
-def test_a_frozen_left_image_is_skipped_and_named_once() -> None:
+def test_a_frozen_left_image_is_known_and_named_once() -> None:
     frames = [pair(k) for k in range(12)]
     for k in FROZEN:
         frames[k] = frames[2][0], frames[k][1]
@@ -145,12 +145,11 @@ def test_prior_gives_the_depth_of_the_features_that_it_names() -> None:
     assert depth[4] == pytest.approx(CAMERA.fu * CAMERA.baseline_m / 20.0)
 
 
-@pytest.fixture(scope="module")
-def frozen_run() -> tuple[list[StereoFrame], list[FrontendOutput]]:
-    """A flight whose right camera is frozen in some frames; the prior knows the true pixels, as a filter does."""
+def run_frozen(camera: str) -> tuple[list[StereoFrame], list[FrontendOutput]]:
+    """A flight with a camera that is frozen in some frames; the prior knows the true pixels, as a filter does."""
     poses = flight(FRAMES)
     frames = [stereo_frame(k, pose) for k, pose in enumerate(poses)]
-    frames = [replace(frame, right=frames[2].right) if frame.index in FROZEN else frame for frame in frames]
+    frames = [replace(f, **{camera: getattr(frames[2], camera)}) if f.index in FROZEN else f for f in frames]
     frontend = KltFrontend(CAMERA, SETTINGS)
     outputs: list[FrontendOutput] = []
     for k, frame in enumerate(frames):
@@ -160,6 +159,27 @@ def frozen_run() -> tuple[list[StereoFrame], list[FrontendOutput]]:
             prior = TrackPrior(seen.ids, truth(SLANTED, poses[k - 1], seen.z[:, :2], poses[k]))
         outputs.append(frontend.process(frame, prior))
     return frames, outputs
+
+
+@pytest.fixture(scope="module")
+def frozen_run() -> tuple[list[StereoFrame], list[FrontendOutput]]:
+    return run_frozen("right")
+
+
+def test_the_right_images_carry_the_features_of_a_frozen_left_camera() -> None:
+    """They are output at the left pixels where that camera would see them, and go on in it afterwards."""
+    poses, (_, outputs) = flight(FRAMES), run_frozen("left")
+    first = outputs[2].observations
+    for k in [*FROZEN, 8]:
+        seen = outputs[k].observations
+        _, a, b = np.intersect1d(first.ids, seen.ids, return_indices=True)
+        error = seen.z[b, :2] - truth(SLANTED, poses[2], first.z[a, :2], poses[k])[:, :2]
+        assert len(error) > 60
+        assert np.median(np.abs(error)) < 0.1
+        assert np.mean(np.abs(error) > 1.0) < 0.01
+        assert seen.has_right.any() == (k == 8)
+    (line,) = [line for output in outputs for line in output.warnings]
+    assert "the left camera is frozen" in line
 
 
 @pytest.mark.parametrize("camera", ["left", "right"])

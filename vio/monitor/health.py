@@ -146,7 +146,8 @@ class RunHealth:
         position = estimate.T_world_imu[:3, 3].copy()
         if self._last is not None and estimate.time_ns > self._last[0]:
             speed = float(np.linalg.norm(position - self._last[1])) / ((estimate.time_ns - self._last[0]) * 1e-9)
-            lines += self._once("speed", speed, _MAX_SPEED_MPS, f"frame {index}: the estimate moves at {speed:.0f} m/s")
+            line = f"frame {index}: the estimate moves at {speed:.0f} m/s: the filter has diverged"
+            lines += self._once("speed", speed, _MAX_SPEED_MPS, line)
         self._last = estimate.time_ns, position
         for name, bias, limit, unit in (
             ("gyro bias", estimate.gyro_bias, _MAX_GYRO_BIAS_RADPS, "rad/s"),
@@ -154,11 +155,12 @@ class RunHealth:
         ):
             if bias is not None:
                 size = float(np.linalg.norm(bias))
-                lines += self._once(name, size, limit, f"frame {index}: the {name} is estimated as {size:.2g} {unit}")
+                line = f"frame {index}: the {name} is estimated as {size:.2g} {unit}, which no working sensor has"
+                lines += self._once(name, size, limit, line)
         return lines
 
     def _once(self, what: str, value: float, limit: float, line: str) -> list[str]:
         if value <= limit or what in self._reported:
             return []
         self._reported.add(what)
-        return [f"{line}: the filter has diverged; check calibration, units and clocks"]
+        return [f"{line}; check the order of the images, calibration, units and clocks"]

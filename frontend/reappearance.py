@@ -1,0 +1,66 @@
+"""The camera's motion across a time without usable images: key points of the last good pair, found again after it.
+
+A tracker's patches prove nothing once the prediction is off by many pixels. Key points of the whole image are matched
+by descriptor, and the motion that they show must hold in both cameras: it brings the points of the last pair to their
+pixels in the left image, and to the depths that the new pair measures.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.frontend.columns import share_of
+from vio.frontend.descriptors import MutualNearest, sift_extractor
+from vio.frontend.outliers import RansacProblem, best_motion
+from vio.frontend.patches import ImageLevels
+from vio.frontend.settings import MatchSettings
+from vio.frontend.stereo_fit import StereoFit
+from vio.frontend.tracks import PreviousFrame
+from vio.geometry.lie import FloatArray, transform_points
+from vio.geometry.stereo import depth_of, left_rays
+
+_LEAST_POINTS = 15  # that must agree on the motion …
+_LEAST_SHARE = 0.4  # … and of all matches with depths
+_DEPTHS_AGREE = 0.5  # share of these whose new disparity must be that of the moved point
+_DISPARITY_PX = 2.0  # as far as whole pixels at half resolution tell
+
+
+def motion_across(
+    problem: RansacProblem,
+    stereo: StereoFit,
+    previous: PreviousFrame,
+    left: ImageLevels,
+    right: ImageLevels,
+    starts: FloatArray,
+) -> FloatArray | None:
+    """Return the camera's motion (4, 4) `T_curr_prev` since the last good pair; None: none is proved.
+
+    Args:
+        problem: camera, inlier threshold for key points, and random generator.
+        stereo: finds the disparities of both pairs.
+        previous: the last good pair.
+        left: the present left image.
+        right: the present right image.
+        starts: motions (S, 4, 4) to try, beside those of minimal sets of points.
+    """
+    assert previous.right_half is not None
+    camera, extract = problem.camera, sift_extractor(MatchSettings())
+    before, now = extract(previous.left.full), extract(left.full)
+    pairs = MutualNearest()(before, now, np.ones((len(before), len(now)), dtype=np.bool_))
+    a, b = before.pixels[pairs[:, 0]], now.pixels[pairs[:, 1]]
+    d_before, known = stereo.search(previous.left.half, previous.right_half, a)
+    known &= d_before > 0.0
+    a, b, d_before = a[known], b[known], d_before[known]
+    if len(a) < _LEAST_POINTS:
+        return None
+    f_baseline = camera.fu * camera.baseline_m
+    points = left_rays(camera, a) * (f_baseline / d_before)[:, None]
+    T, agree = best_motion(problem, points, b, starts)
+    if agree.sum() < max(_LEAST_POINTS, _LEAST_SHARE * len(agree)):
+        return None
+    d_now, known = stereo.search(left.half, right.half, b[agree])
+    depth = depth_of(camera, transform_points(T, points[agree]))
+    same = np.abs(d_now - f_baseline / np.maximum(depth, 1e-3)) <= _DISPARITY_PX
+    if known.sum() < _LEAST_POINTS or share_of(same[known]) < _DEPTHS_AGREE:
+        return None
+    return T
