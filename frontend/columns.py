@@ -47,5 +47,6 @@ def _columns(record: Any) -> tuple[Any, ...]:
     kind = type(record)
     if kind not in _readers:
         names = tuple(column.name for column in fields(kind))
-        _readers[kind] = names, attrgetter(*names)
+        read = attrgetter(*names)
+        _readers[kind] = names, read if len(names) > 1 else lambda one: (read(one),)
     return _readers[kind][1](record)
