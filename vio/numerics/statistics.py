@@ -18,11 +18,11 @@ def _without_numpy_tools() -> Iterator[None]:
     """Hide NumPy's tools, which SciPy would load as it copies NumPy's names: a third of its time and memory."""
     names, listed = np.__all__, np.__dir__
     np.__all__ = [name for name in names if name not in _NUMPY_TOOLS]
-    np.__dir__ = lambda: [name for name in listed() if name not in _NUMPY_TOOLS]
+    np.__dir__ = lambda: [name for name in listed() if name not in _NUMPY_TOOLS]  # type: ignore[method-assign]
     try:
         yield
     finally:
-        np.__all__, np.__dir__ = names, listed
+        np.__all__, np.__dir__ = names, listed  # type: ignore[method-assign]
 
 
 with _without_numpy_tools():
