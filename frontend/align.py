@@ -377,6 +377,12 @@ def on_peak(pixels: FloatArray, start: FloatArray) -> BoolArray:
     return moved[:, 0] & moved[:, 1]
 
 
+@compiled
+def is_on_peak(du: float, dv: float) -> bool:
+    """Whether one fitted pixel is near its start, as `on_peak` says."""
+    return abs(du) <= _MAX_MOVE_PX and abs(dv) <= _MAX_MOVE_PX
+
+
 def template_points(warp: FloatArray, offset: FloatArray) -> FloatArray:
     """Image points (N, 2) of template points, given as offsets (N, 2) from the centre, under warps (N, 2, 3)."""
     return np.asarray(warp[:, :, 2] + (warp[:, :, :2] @ offset[:, :, None])[:, :, 0])

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from vio.frontend.align import align, on_peak, rounded, scale_change, shift_warps, template_points
-from vio.frontend.columns import take
+from vio.frontend.columns import changed, take
 from vio.frontend.detect import min_distance_px
 from vio.frontend.outliers import Consensus, pixel_errors
 from vio.frontend.patches import ImageLevels, inside
@@ -83,12 +83,15 @@ class AnchorFit:
             has_point[rows[deviates]] = False  # its depth was propagated without a measurement, and was wrong
         rescaled = good & (change > np.log(_MAX_SCALE))
         kept_rows = kept.nonzero()[0]
+        height, width = left.full.shape
+        apart = _spaced(warp[kept_rows, :, 2], 0.5 * min_distance_px(width, height, self._grid))
+        kept_rows = kept_rows[apart]
         rows, warp, rescaled = rows[kept_rows], warp.take(kept_rows, axis=0), rescaled[kept_rows]
         if rescaled.any():
             centres = rounded(warp[rescaled, :, 2])
             self._bank.replace(old.slot[rows[rescaled]], left.full, centres)
             warp[rescaled] = shift_warps(centres)
-        now = replace(
+        return changed(
             take(old, rows),
             left=warp[:, :, 2].copy(),
             warp=warp,
@@ -97,8 +100,6 @@ class AnchorFit:
             age=old.age[rows] + 1,
             has_right=np.zeros(len(rows), dtype=np.bool_),
         )
-        height, width = left.full.shape
-        return take(now, _spaced(now.left, 0.5 * min_distance_px(width, height, self._grid)))
 
     def _start(
         self, old: Tracks, left: ImageLevels, found: FloatArray, seen: BoolArray, motion: Consensus | None

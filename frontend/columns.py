@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,7 +13,8 @@ from vio.records import BoolArray, IntArray
 
 Record = TypeVar("Record")
 
-_names: dict[type, tuple[str, ...]] = {}  # of the columns of each kind: to find them takes as long as to index them
+# Of each kind of record, its columns' names and what returns them: to find these takes as long as to index them.
+_readers: dict[type, tuple[tuple[str, ...], Callable[[Any], tuple[Any, ...]]]] = {}
 
 
 def take(record: Record, index: BoolArray | IntArray) -> Record:
@@ -20,8 +23,13 @@ def take(record: Record, index: BoolArray | IntArray) -> Record:
         if index.all():
             return record
         index = index.nonzero()[0]
-    columns = _columns(record)
-    return type(record)(*[c.take(index, axis=0) if isinstance(c, np.ndarray) else take(c, index) for c in columns])
+    return type(record)(*[c.take(index, 0) if type(c) is np.ndarray else take(c, index) for c in _columns(record)])
+
+
+def changed(record: Record, **columns: Any) -> Record:
+    """Copy a record with some columns replaced, as `dataclasses.replace` does, in a third of the time."""
+    kept = _columns(record)
+    return type(record)(**(dict(zip(_readers[type(record)][0], kept, strict=True)) | columns))
 
 
 def share_of(mask: BoolArray) -> float:
@@ -32,11 +40,13 @@ def share_of(mask: BoolArray) -> float:
 def joined(first: Record, second: Record) -> Record:
     """Concatenate the rows of two records."""
     pairs = zip(_columns(first), _columns(second), strict=True)
-    return type(first)(*[np.concatenate([a, b]) if isinstance(a, np.ndarray) else joined(a, b) for a, b in pairs])
+    return type(first)(*[np.concatenate((a, b)) if type(a) is np.ndarray else joined(a, b) for a, b in pairs])
 
 
-def _columns(record: Any) -> list[Any]:
+def _columns(record: Any) -> tuple[Any, ...]:
     kind = type(record)
-    if kind not in _names:
-        _names[kind] = tuple(column.name for column in fields(kind))
-    return [getattr(record, name) for name in _names[kind]]
+    if kind not in _readers:
+        names = tuple(column.name for column in fields(kind))
+        read = attrgetter(*names)
+        _readers[kind] = names, read if len(names) > 1 else lambda one: (read(one),)
+    return _readers[kind][1](record)

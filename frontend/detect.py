@@ -54,8 +54,8 @@ def grid_shape(width: int, height: int, grid: GridSettings) -> tuple[int, int]:
 def cell_index(points: FloatArray, width: int, height: int, shape: tuple[int, int]) -> IntArray:
     """Index (N,) of the grid cell, in row-major order, that contains each point (N, 2)."""
     rows, columns = shape
-    column = np.clip((points[:, 0] * columns / width).astype(np.int64), 0, columns - 1)
-    row = np.clip((points[:, 1] * rows / height).astype(np.int64), 0, rows - 1)
+    column, row = (points * [columns / width, rows / height]).astype(np.int64).T
+    column, row = (np.minimum(np.maximum(at, 0), n - 1) for at, n in ((column, columns), (row, rows)))
     return row * columns + column
 
 

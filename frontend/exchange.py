@@ -53,8 +53,9 @@ class ExchangeDetector(ImageCheck):
             return images
         left, right = images.views
         suspicious = not images.right_trusted
+        exchanged = self._since is not None
         order = self.order(
-            images.frame.index, left.half, right.half, lambda: _count_matches(images), suspicious=suspicious
+            images.frame.index, left.half, right.half, lambda: _count_matches(images, exchanged), suspicious=suspicious
         )
         if order == "refused":
             return None
@@ -101,16 +102,22 @@ class ExchangeDetector(ImageCheck):
             )
 
 
-def _count_matches(images: FrameImages) -> MatchCounts:
-    """Count matches of either sign, at the points that the other camera saw last."""
+def _count_matches(images: FrameImages, exchanged: bool) -> MatchCounts:
+    """Count matches of either sign, at the points that the other camera saw last.
+
+    Those with a positive disparity are not counted where those with a negative one decide: while the images were not
+    `exchanged` in the last frame, too few of these leave them in order.
+    """
     if images.previous is None:
         return MatchCounts(0, 0, 0)
     left, right = images.views
     tracks = images.previous.tracks
     points = np.where(tracks.has_right[:, None], tracks.right, tracks.left)
     points = points[inside(left.full, points, 0.0)][:_POINTS]
-    positive = int(images.stereo.search(left.half, right.half, points)[1].sum())
-    return MatchCounts(len(points), positive, images.stereo.count_mirrored(left, right, points))
+    negative = images.stereo.count_mirrored(left, right, points)
+    if not exchanged and negative < _SOME * len(points):
+        return MatchCounts(len(points), 0, negative)  # no exchange, however many match with a positive one
+    return MatchCounts(len(points), int(images.stereo.search(left.half, right.half, points)[1].sum()), negative)
 
 
 def _thumbnail(image: Image) -> Image:

@@ -7,6 +7,8 @@ they have been seen, each image's smoothed row means are replaced by the image's
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 
@@ -50,9 +52,9 @@ class BandRemoval(ImageCheck):
         return _flattened(left, _smoothed(rows_left)), _flattened(right, _smoothed(rows_right))
 
     def _detect(self, index: int, difference: FloatArray) -> None:
-        centred = difference - difference.mean()
+        centred = difference - _mean(difference)
         if self._last is not None and self._last.shape == centred.shape:
-            change = float(np.sqrt(np.mean((centred - self._last) ** 2)))
+            change = math.sqrt(_mean((centred - self._last) ** 2))
             self._changed = [k for k in self._changed if index - k < _MEMORY] + [index] * (change > _CHANGE)
         self._last = centred
         if len(self._changed) >= _FRAMES:
@@ -72,8 +74,13 @@ def _row_means(image: Image) -> FloatArray:
 
 def _without_gain(left: FloatArray, right: FloatArray) -> FloatArray:
     """Difference (H, 1) of row means at one mean gray level: cameras that set their exposure alone make no bands."""
-    a, b = max(float(left.mean()), 1.0), max(float(right.mean()), 1.0)
+    a, b = max(_mean(left), 1.0), max(_mean(right), 1.0)
     return (left / a - right / b) * ((a + b) / 2)
+
+
+def _mean(values: FloatArray) -> float:
+    """Mean (), as NumPy takes it, with a fifth of its calls."""
+    return float(np.add.reduce(values, axis=None)) / values.size
 
 
 def _smoothed(rows: FloatArray) -> FloatArray:
@@ -83,5 +90,5 @@ def _smoothed(rows: FloatArray) -> FloatArray:
 
 def _flattened(image: Image, rows: FloatArray) -> Image:
     """The image with rows of equal mean."""
-    off = (rows - rows.mean()).astype(np.float32)
+    off = (rows - _mean(rows)).astype(np.float32)
     return np.clip(np.rint(image.astype(np.float32) - off[:, None]), 0, 255).astype(np.uint8)

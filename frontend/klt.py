@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from vio.frontend.anchor_fit import AnchorFit
+from vio.frontend.columns import changed
 from vio.frontend.contrast import LostContrast
 from vio.frontend.detect import detect_corners, half_mask, load_mask
 from vio.frontend.exchange import ExchangeDetector
@@ -288,4 +289,4 @@ class KltFrontend:
         ids, first = tracks.ids.copy(), proven & ~tracks.shown
         ids[first] = np.arange(int(first.sum())) + self._next_id
         self._next_id += int(first.sum())
-        return replace(tracks, ids=ids, shown=proven)
+        return changed(tracks, ids=ids, shown=proven)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from vio.frontend.align import rounded
-from vio.frontend.columns import joined, take
+from vio.frontend.columns import changed, joined, take
 from vio.frontend.outliers import Consensus
 from vio.frontend.patches import ImageLevels, inside
 from vio.frontend.settings import GridSettings
@@ -62,7 +60,7 @@ class NewFeatures:
         new = new_tracks(centres, self._bank.add(left.full, centres))
         if right is not None:
             new = stereo.match_near(new, right, np.arange(with_depth), disparity_new[chosen[:with_depth]])
-        new = replace(new, left_only_frames=np.where(new.has_right, 0, 1))
+        new = changed(new, left_only_frames=np.where(new.has_right, 0, 1))
         room = max(0, self._grid.target_features - len(tracks))
         good = (new.has_right | (len(chosen) > with_depth)).nonzero()[0]
         return joined(tracks, take(new, good[np.argsort(~new.has_right[good], kind="stable")][:room]))
@@ -96,14 +94,13 @@ class NewFeatures:
         if not len(rows) + len(corners):
             return self._without_old_left_only(tracks), *nothing
         disparity, unique = stereo.search(left.half, right.half, np.concatenate([tracks.left[rows], corners]))
-        disparity_old, disparity_new = np.split(disparity, [len(rows)])
-        known, unique = np.split(unique, [len(rows)])
-        tracks = stereo.match_near(tracks, right, rows[known], disparity_old[known])
-        return self._without_old_left_only(tracks), disparity_new, unique
+        old, known = len(rows), unique[: len(rows)]
+        tracks = stereo.match_near(tracks, right, rows[known], disparity[:old][known])
+        return self._without_old_left_only(tracks), disparity[old:], unique[old:]
 
     def _without_old_left_only(self, tracks: Tracks) -> Tracks:
         """Count frames without a right match, and drop the features that had none for too long."""
-        tracks = replace(tracks, left_only_frames=np.where(tracks.has_right, 0, tracks.left_only_frames + 1))
+        tracks = changed(tracks, left_only_frames=np.where(tracks.has_right, 0, tracks.left_only_frames + 1))
         return take(tracks, tracks.left_only_frames <= _MAX_LEFT_ONLY_FRAMES)
 
     def _select_corners(

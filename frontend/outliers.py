@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vio.cameras.projection import CameraArgs, camera_args, moved_pixel, turn_to
+from vio.cameras.projection import CameraArgs, camera_args, moved_pixel, point_at, turn_to
 from vio.frontend.columns import share_of
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, facing, left_rays, project
@@ -235,7 +235,9 @@ def best_motion(
 def _best_start(camera: StereoCamera, starts: FloatArray, p_prev: FloatArray, pixels: FloatArray, limit: float) -> int:
     """Return the index of the start with the smallest median error; errors far beyond the limit are clipped."""
     errors = np.minimum(pixel_errors(camera, starts, p_prev, pixels), 1e3 * limit)
-    return int(np.argmin([median(error) for error in errors]))
+    errors.sort(axis=1)
+    count = errors.shape[1]
+    return int(np.argmin(errors[:, (count - 1) // 2] + errors[:, count // 2]))  # twice the medians
 
 
 def static_tracks(
@@ -363,16 +365,37 @@ def epipolar_distance(
     `previous` and `current` are left pixels (N, 2). Unlike the epipolar line, the segment stays defined when the
     camera only turns or stands still: it shrinks to a point.
     """
-    rays = left_rays(camera, previous)
-    ends, seen = [], facing(camera, current, rays)[0]
-    for moved in (rays @ T_curr_prev[:3, :3].T, transform_points(T_curr_prev, rays * near_m)):
-        p = facing(camera, current, moved)[1]
-        depth = np.maximum(p[:, 2:], 1e-3)
-        ends.append(p[:, :2] / depth * [camera.fu, camera.fv] + [camera.cu, camera.cv])
-    far, along = ends[0], ends[1] - ends[0]
-    length2 = np.maximum((along**2).sum(axis=1), 1e-12)
-    position = np.clip(((seen - far) * along).sum(axis=1) / length2, 0.0, 1.0)
-    return np.linalg.norm(seen - far - position[:, None] * along, axis=1)
+    out = np.empty(len(previous))
+    T = np.ascontiguousarray(T_curr_prev)
+    before, after = np.ascontiguousarray(previous), np.ascontiguousarray(current)
+    _epipolar_distances(camera_args(camera), T, before, after, near_m, out)
+    return out
+
+
+@compiled
+def _epipolar_distances(
+    camera: CameraArgs, T: FloatArray, before: FloatArray, after: FloatArray, near_m: float, out: FloatArray
+) -> None:
+    """Write the distances (N,) of `epipolar_distance`."""
+    fu, fv, cu, cv, _, cylinder = camera
+    end = np.empty((2, 2))  # pixels of the point at infinity and of the nearest one
+    for n in range(len(out)):
+        x, y, z = point_at(camera, before[n, 0], before[n, 1], 1.0)
+        u, v, s, c = after[n, 0], after[n, 1], 0.0, 1.0
+        if cylinder:  # turned as by `vio.geometry.stereo.facing`
+            s, c, v = np.sin((v - cv) / fv), np.cos((v - cv) / fv), cv
+        for i in range(2):
+            length, moved = (1.0, 0.0) if i == 0 else (near_m, 1.0)
+            across = length * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z) + moved * T[0, 3]
+            down = length * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z) + moved * T[1, 3]
+            ahead = length * (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z) + moved * T[2, 3]
+            depth = max(s * down + c * ahead, 1e-3)
+            end[i, 0], end[i, 1] = fu * across / depth + cu, fv * (c * down - s * ahead) / depth + cv
+        off_u, off_v = u - end[0, 0], v - end[0, 1]
+        along_u, along_v = end[1, 0] - end[0, 0], end[1, 1] - end[0, 1]
+        position = (off_u * along_u + off_v * along_v) / max(along_u * along_u + along_v * along_v, 1e-12)
+        position = min(max(position, 0.0), 1.0)
+        out[n] = np.sqrt((off_u - position * along_u) ** 2 + (off_v - position * along_v) ** 2)
 
 
 def predicted_motion(

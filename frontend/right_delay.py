@@ -84,7 +84,7 @@ class RightDelay(ImageCheck):
             return False
         camera = self._camera
         x, y = (left[:, 0] - camera.cu) / camera.fu, (left[:, 1] - camera.cv) / camera.fv
-        terms = np.column_stack([np.ones(len(x)), x, y, x * y, x * x, y * y, flow[:, 1]])
+        terms = np.array([np.ones(len(x)), x, y, x * y, x * x, y * y, flow[:, 1]]).T.copy()
         self._normal, self._moment = _MEMORY * self._normal, _MEMORY * self._moment
         sigma = _ROW_SIGMA_PX if self._frames else np.inf
         count, square = add_equations(terms, rows, self._solution, sigma, self._normal, self._moment)

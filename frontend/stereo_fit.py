@@ -6,13 +6,11 @@ The alignment starts at the disparity of a known depth, else at the result of a 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args, point_at
-from vio.frontend.align import align, on_peak
-from vio.frontend.columns import share_of, take
+from vio.frontend.align import align, is_on_peak
+from vio.frontend.columns import changed, share_of
 from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import DisparitySettings
 from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX, EpipolarRowModel, match_rows, shifted_rows
@@ -71,10 +69,9 @@ class StereoFit:
             moved: whether the depths were propagated with a consensus motion.
         """
         rows, expected = self._expected(tracks)
-        known = take(tracks, rows)
-        pixels, skew, valid = self._fit(known, right, expected)
+        pixels, skew, valid = self._fit(tracks, rows, right, expected)
         if moved:
-            valid &= np.abs(known.left[:, 0] - pixels[:, 0] - expected) <= INLIER_PX
+            valid &= np.abs(tracks.left[rows, 0] - pixels[:, 0] - expected) <= INLIER_PX
         return self._with_right_pixels(tracks, rows, pixels, skew, valid.nonzero()[0])
 
     def track_off_right(self, tracks: Tracks, left: ImageLevels, right: ImageLevels, *, by_motion: bool) -> Tracks:
@@ -94,8 +91,8 @@ class StereoFit:
         """
         rows, expected = self._expected(tracks)
         coarse, unique = self.search(left.half, right.half, tracks.left[rows])
-        rows, expected, known = rows[unique], expected[unique], take(tracks, rows[unique])
-        pixels, skew, valid = self._fit(known, right, coarse[unique])
+        rows, expected = rows[unique], expected[unique]
+        pixels, skew, valid = self._fit(tracks, rows, right, coarse[unique])
         rows, expected, pixels, skew = rows[valid], expected[valid], pixels[valid], skew[valid]
         off, grows = tracks.left[rows, 0] - pixels[:, 0] - expected, self._offset_growth(tracks.left[rows])
         if len(off) < _LEAST_POINTS:
@@ -123,7 +120,7 @@ class StereoFit:
         """Match the given rows (K,) near their disparities (K,)."""
         if not len(rows):
             return tracks
-        pixels, skew, valid = self._fit(take(tracks, rows), right, disparity)
+        pixels, skew, valid = self._fit(tracks, rows, right, disparity)
         return self._with_right_pixels(tracks, rows, pixels, skew, valid.nonzero()[0])
 
     def search(self, left_half: Image, right_half: Image, points: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -194,31 +191,22 @@ class StereoFit:
         return match_rows(left_half, right_half, points, self.max_disparity_px, min_correlation, _MIN_PEAK_MARGIN)
 
     def _fit(
-        self, tracks: Tracks, right: ImageLevels, disparity: FloatArray
+        self, tracks: Tracks, rows: IntArray, right: ImageLevels, disparity: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Align anchors with the right image near expected disparities (N,).
+        """Align anchors of rows (K,) with the right image near expected disparities (K,).
 
         Returns:
-            Right pixels (N, 2), the change of the warp's linear part (N, 2, 2), and a mask (N,) of the good ones.
+            Right pixels (K, 2), the change of the warp's linear part (K, 2, 2), and a mask (K,) of the good ones.
         """
-        rows = self._rows.rows(tracks.left)
-        warp = tracks.warp.copy()
-        warp[:, :, :2] += tracks.skew
-        warp[:, 0, 2] -= disparity
-        warp[:, 1, 2] = rows
-        start = warp[:, :, 2].copy()
-        warp, score = align(self._bank.store, tracks.slot, right.full, warp, _ITERATIONS, rows)
-        pixels, skew = warp[:, :, 2], warp[:, :, :2] - tracks.warp[:, :, :2]
-        found = tracks.left[:, 0] - pixels[:, 0]
-        valid = (
-            (score >= _MIN_CORRELATION)
-            & on_peak(pixels, start)
-            & (np.abs(skew).max(axis=(1, 2)) <= _MAX_SKEW)
-            & (np.abs(rows - pixels[:, 1]) <= _MAX_ROW_DIFFERENCE_PX)
-            & (found >= MIN_MATCH_DISPARITY_PX)
-            & (found <= self.max_disparity_px)
-        )
-        return pixels, skew, valid
+        left, before = tracks.left.take(rows, 0), tracks.warp.take(rows, 0)
+        expected, start = self._rows.rows(left), before.copy()
+        start[:, :, :2] += tracks.skew.take(rows, 0)
+        start[:, 0, 2] -= disparity
+        start[:, 1, 2] = expected
+        warp, score = align(self._bank.store, tracks.slot.take(rows), right.full, start, _ITERATIONS, expected)
+        skew, valid = warp[:, :, :2] - before[:, :, :2], score >= _MIN_CORRELATION
+        _reject(left, start, expected, warp, skew, self.max_disparity_px, valid)
+        return warp[:, :, 2], skew, valid
 
     def _with_right_pixels(
         self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray, good: IntArray
@@ -234,7 +222,30 @@ class StereoFit:
         point, has_point = tracks.point.copy(), tracks.has_point.copy()
         f_baseline = self._camera.fu * self._camera.baseline_m
         _triangulate(camera_args(self._camera), f_baseline, tracks.left, rows, pixels, point, has_point)
-        return replace(tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point)
+        return changed(tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point)
+
+
+@compiled
+def _reject(
+    left: FloatArray,
+    start: FloatArray,
+    rows: FloatArray,
+    warp: FloatArray,
+    skew: FloatArray,
+    max_disparity: float,
+    valid: BoolArray,
+) -> None:
+    """Clear the mask (K,) of matches that no point ahead of the camera has.
+
+    They are given by left pixels (K, 2), warps (K, 2, 3) before and after the alignment, expected rows (K,) and skews
+    (K, 2, 2).
+    """
+    for k in range(len(valid)):
+        u, v, disparity = warp[k, 0, 2], warp[k, 1, 2], left[k, 0] - warp[k, 0, 2]
+        steep = max(max(abs(skew[k, 0, 0]), abs(skew[k, 0, 1])), max(abs(skew[k, 1, 0]), abs(skew[k, 1, 1])))
+        valid[k] &= is_on_peak(u - start[k, 0, 2], v - start[k, 1, 2]) and steep <= _MAX_SKEW
+        valid[k] &= abs(rows[k] - v) <= _MAX_ROW_DIFFERENCE_PX
+        valid[k] &= MIN_MATCH_DISPARITY_PX <= disparity <= max_disparity
 
 
 def common_offset(expected: FloatArray, off: FloatArray) -> tuple[float, float]:

@@ -166,21 +166,29 @@ def _sum_windows(values: Scores, side: int) -> None:
         running -= first
 
 
+@compiled
 def _search(
-    source: Image, target: Image, points: FloatArray, low: int, high: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+    source: Image, target: Image, points: FloatArray, low: int, high: int, shift: FloatArray, top: FloatArray
+) -> None:
     """Search shifts `low..high` along the row for points (N, 2).
 
-    Returns:
-        The best shift (N,), sub-pixel; its score (N,), -1 too close to the border; the best score outside its peak.
+    Writes the best shift (N,), sub-pixel, and into `top` (2, N) its score, -1 too close to the border, and the best
+    score outside its peak.
     """
-    centres = np.rint(points).astype(np.int64)
-    safe = np.clip(centres, _RADIUS, np.array([source.shape[1], source.shape[0]]) - _RADIUS - 1)
-    score = row_correlation(source, target, safe, safe[:, 0] + low, high - low + 1, _RADIUS)
-    offset, top, second = np.empty((3, len(points)))
-    _peaks(score, offset, top, second)
-    # The patches were cut at whole pixels; the shift carries over to the sub-pixel point.
-    return low + offset, np.where((safe == centres).all(axis=1), top, -1.0), second
+    height, width = source.shape
+    centres, first = np.empty((len(points), 2), np.int64), np.empty(len(points), np.int64)
+    for n in range(len(points)):
+        centres[n, 0] = min(max(int(np.rint(points[n, 0])), _RADIUS), width - _RADIUS - 1)
+        centres[n, 1] = min(max(int(np.rint(points[n, 1])), _RADIUS), height - _RADIUS - 1)
+        first[n] = centres[n, 0] + low
+    score = np.empty((len(points), high - low + 1), np.float32)
+    _correlate(source, target, centres, first, _RADIUS, score)
+    _peaks(score, shift, top[0], top[1])
+    for n in range(len(points)):
+        # The patches were cut at whole pixels; the shift carries over to the sub-pixel point.
+        shift[n] += low
+        if centres[n, 0] != np.rint(points[n, 0]) or centres[n, 1] != np.rint(points[n, 1]):
+            top[0, n] = -1.0
 
 
 @compiled
@@ -221,14 +229,37 @@ def match_rows(
         Disparities (N,) in pixels of the full image, and a mask (N,) of those with sufficient correlation, unique,
         and confirmed by the reverse search.
     """
-    if len(points) == 0:
-        return np.zeros(0), np.zeros(0, dtype=np.bool_)
-    reach = int(np.ceil(max_disparity / 2))
-    shift, score, second = _search(left_half, right_half, points / 2, -reach, 1)
-    valid = (score >= min_correlation) & (score - second >= margin)
-    rows = valid.nonzero()[0]
-    if len(rows):
-        there = points.take(rows, axis=0) / 2 + np.stack([shift[rows], np.zeros(len(rows))], axis=1)
-        back, _, _ = _search(right_half, left_half, there, -1, reach)
-        valid[rows] = np.abs(shift[rows] + back) <= 1.0
-    return -2 * shift, valid
+    disparity, valid = np.empty(len(points)), np.empty(len(points), dtype=np.bool_)
+    images = np.ascontiguousarray(left_half), np.ascontiguousarray(right_half)
+    _match(*images, points / 2, math.ceil(max_disparity / 2), min_correlation, margin, disparity, valid)
+    return disparity, valid
+
+
+@compiled
+def _match(
+    left: Image,
+    right: Image,
+    points: FloatArray,
+    reach: int,
+    min_correlation: float,
+    margin: float,
+    disparity: FloatArray,
+    valid: BoolArray,
+) -> None:
+    """Write what `match_rows` returns, for points (N, 2) in pixels of the half image."""
+    count = 0
+    shift, top, there = np.empty(len(points)), np.empty((2, len(points))), np.empty((len(points), 2))
+    backward, low, high = -reach, int(np.int64(-1)), int(np.int64(1))  # no literals: see `vio.numerics.compiled`
+    _search(left, right, points, backward, high, shift, top)
+    for n in range(len(points)):
+        disparity[n] = -2.0 * shift[n]
+        valid[n] = top[0, n] >= min_correlation and top[0, n] - top[1, n] >= margin
+        if valid[n]:
+            there[count, 0], there[count, 1] = points[n, 0] + shift[n], points[n, 1]
+            count += 1
+    _search(right, left, there[:count], low, reach, shift, top)
+    count = 0
+    for n in range(len(points)):
+        if valid[n]:
+            valid[n] = abs(0.5 * disparity[n] - shift[count]) <= 1.0
+            count += 1

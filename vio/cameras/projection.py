@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -14,6 +15,7 @@ from vio.numerics.compiled import compiled
 CameraArgs: TypeAlias = tuple[float, float, float, float, float, bool]
 
 
+@lru_cache(maxsize=8)
 def camera_args(camera: StereoCamera) -> CameraArgs:
     """Return the intrinsics of both rectified images, as compiled functions take them."""
     fu, fv, cu, cv = float(camera.fu), float(camera.fv), float(camera.cu), float(camera.cv)

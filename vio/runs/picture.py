@@ -71,7 +71,7 @@ def write_picture(path: Path, draw: Callable[[], Any]) -> None:
         stream = io.BytesIO()
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # another script
-            draw().savefig(stream, format="png")
+            draw().savefig(stream, format="png", pil_kwargs={"compress_level": 1})  # a tenth larger, sooner
         path.write_bytes(stream.getvalue())
     except Exception as error:
         log.warning("%s was not drawn (%s: %s)", path.name, type(error).__name__, " ".join(str(error).split()))
