@@ -19,7 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -230,7 +230,7 @@ def _at_means(window: Window) -> StandardErrors:
     return StandardErrors(window.motion, window.nav, np.eye(DIM))
 
 
-def _positions(clones: list[Clone]) -> FloatArray:
+def _positions(clones: Sequence[Clone]) -> FloatArray:
     """Positions (N, 3) of clones."""
     return np.array([c.T_world_imu[:3, 3] for c in clones]).reshape(-1, 3)
 

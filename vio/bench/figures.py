@@ -74,7 +74,7 @@ def pose_nees(
         T_world_imu: (N, 4, 4) all estimated poses.
         covariances: (N, 6, 6) of xi in T_imu_world = exp(xi) T_imu_world_hat.
         T_cam0_imu: (4, 4) extrinsics.
-        upright: (N,) whether both worlds have z up; where that ends, they are identified anew.
+        upright: (N,) or one for all, whether both worlds have z up; where that ends, they are identified anew.
     """
     truth = evaluation.reference.in_imu(T_cam0_imu).T_world_body
     T, P = T_world_imu[evaluation.rows], covariances[evaluation.rows]

@@ -30,7 +30,7 @@ from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
 from vio.protocols import Dataset
-from vio.records import IntArray, Trajectory
+from vio.records import BoolArray, IntArray, Trajectory
 
 if TYPE_CHECKING:
     from vio.records import FrameResult
@@ -241,7 +241,7 @@ def _nees(result: RunResult, score: Evaluation) -> dict[str, float | None]:
     T_world_imu, covariances = (np.array(rows.column(name)) for name in ("T_world_imu", "covariance"))
     # With an IMU, the world stays that of the first seconds while gravity is known better, and says where it points.
     stays = np.isfinite(np.array(rows.column("gravity_world"))).all(axis=1)
-    upright = ~stays if result.motion == "imu" else False
+    upright: BoolArray = ~stays & np.full(len(stays), result.motion == "imu")
     values = pose_nees(score, T_world_imu, covariances, result.T_cam0_body, upright=upright)
     if values is None:
         return {"nees": None}

@@ -36,7 +36,7 @@ class VerticalDisparityModel:
         self._camera = camera
         self._A: FloatArray = _ROW_PRIOR.copy()
         self._b: FloatArray = np.zeros(ROW_TERMS)
-        self._inverse: FloatArray = np.linalg.inv(2 * _ROW_PRIOR)  # of A with the prior
+        self._inverse: FloatArray = np.asarray(np.linalg.inv(2 * _ROW_PRIOR), dtype=np.float64)  # of A with the prior
         # Right sides if the rows were those of k1, k2, q1, q2 alone.
         self._common: FloatArray = np.zeros((ROW_TERMS, FIELD_TERMS - RIGHT_TERMS))
         self._squares = self._count = 0.0  # of the rows' residuals, in the same memory

@@ -2,31 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 import numpy.typing as npt
+from scipy.special import gammainc, gammaincinv
 
 from vio.geometry.lie import FloatArray
-
-_NUMPY_TOOLS = {"f2py", "testing", "test"}  # to build and to test packages
-
-
-@contextmanager
-def _without_numpy_tools() -> Iterator[None]:
-    """Hide NumPy's tools, which SciPy would load as it copies NumPy's names: a third of its time and memory."""
-    names, listed = np.__all__, np.__dir__
-    np.__all__ = [name for name in names if name not in _NUMPY_TOOLS]
-    np.__dir__ = lambda: [name for name in listed() if name not in _NUMPY_TOOLS]  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        np.__all__, np.__dir__ = names, listed  # type: ignore[method-assign]
-
-
-with _without_numpy_tools():
-    from scipy.special import gammainc, gammaincinv
 
 
 def chi_square_quantile(probability: npt.ArrayLike, dof: npt.ArrayLike) -> FloatArray:
