@@ -240,8 +240,8 @@ def _nees(result: RunResult, score: Evaluation) -> dict[str, float | None]:
     rows = result.estimates
     T_world_imu, covariances = (np.array(rows.column(name)) for name in ("T_world_imu", "covariance"))
     # With an IMU, the world stays that of the first seconds while gravity is known better, and says where it points.
-    stays: BoolArray = np.isfinite(np.array(rows.column("gravity_world"))).all(axis=1)
-    upright = np.zeros_like(stays) if result.motion != "imu" else ~stays
+    stays = np.isfinite(np.array(rows.column("gravity_world"))).all(axis=1)
+    upright: BoolArray = np.asarray(~stays if result.motion == "imu" else np.zeros_like(stays), dtype=np.bool_)
     values = pose_nees(score, T_world_imu, covariances, result.T_cam0_body, upright=upright)
     if values is None:
         return {"nees": None}
