@@ -160,4 +160,4 @@ def test_preset_is_found_by_its_name_and_is_packaged(tmp_path: Path, monkeypatch
         load_config(Path("quick"))
     Path("fast").write_text("lag_frames: 2\n")  # a file of the user's goes first
     assert load_config(Path("fast")) == replace(default, lag_frames=2)
-    assert '"presets/*.yaml"' in (ROOT / "pyproject.toml").read_text()
+    assert '"*" = ["py.typed", "*.yaml"]' in (ROOT / "pyproject.toml").read_text()

@@ -40,12 +40,12 @@ def test_the_covariance_says_how_the_pose_follows_the_rig(motion: MotionSource |
     settings = replace(ON, calibrate_stereo=field)
     known = replace(settings, stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
     run, exact = fly(ROUND, motion, settings), fly(ROUND, motion, known)
-    T = run.estimates[-1].T_world_imu
-    np.testing.assert_array_equal(T, exact.estimates[-1].T_world_imu)
+    T = run.last_pose
+    np.testing.assert_array_equal(T, exact.last_pose)
     expected = np.zeros((6, 6))
     for constant, sigma in SIGMAS.items():
         of_rig = fly(ROUND, motion, known, spoil=lambda k, seen, c=constant: _seen_by(c, OFF, seen))  # type: ignore[misc]
-        moved = se3_log(se3_inverse(T) @ of_rig.estimates[-1].T_world_imu) / OFF * sigma
+        moved = se3_log(se3_inverse(T) @ of_rig.last_pose) / OFF * sigma
         expected += np.outer(moved, moved)
     added = run.estimates[-1].covariance - exact.estimates[-1].covariance
     scale = np.sqrt(np.diag(expected))

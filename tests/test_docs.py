@@ -323,9 +323,23 @@ def test_inertial_check_runs(simulation: dict[str, object], caplog: pytest.LogCa
     assert not caplog.records
 
 
+def test_client_of_a_served_map_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The names are those of an answer; `test_map_service` asks a server."""
+    from vio.mapping.lookup import FoundPose
+
+    images = np.zeros((2, 20, 30), dtype=np.uint8)
+    found = FoundPose(np.eye(4), np.eye(6), 80, 3)
+    monkeypatch.setattr("vio.live.map_service.ask", lambda url, left, right: found)
+    scope: dict[str, object] = {"left": images[0], "right": images[1]}
+    (block,) = [block for block in _blocks("docs/maps.md") if block.language == "python"]
+    _execute("docs/maps.md", block, scope)
+    assert scope["found"] is found
+
+
 def test_every_python_block_is_run_by_one_of_the_tests_above() -> None:
     counts = {name: sum(block.language == "python" for block in _blocks(name)) for name in DOCS}
-    tested = {README: 1, "docs/live.md": 2, "docs/simulation.md": 2, "docs/inertial.md": 1, "docs/conventions.md": 8}
+    tested = {README: 1, "docs/live.md": 2, "docs/simulation.md": 2, "docs/inertial.md": 1, "docs/maps.md": 1}
+    tested["docs/conventions.md"] = 8
     assert {name: count for name, count in counts.items() if count} == tested
 
 

@@ -96,6 +96,11 @@ class Run:
     reports: list[UpdateReport] = field(default_factory=list)
     navigation: list[FloatArray] = field(default_factory=list)  # (15, 15) covariances
 
+    @property
+    def last_pose(self) -> FloatArray:
+        """The last estimated pose (4, 4) in the true world."""
+        return np.asarray(self.T_world_estimated[-1] @ self.estimates[-1].T_world_imu)
+
     def error(self, k: int, estimate: Estimate | None = None) -> FloatArray:
         """Pose error (6,) of frame k on the body's side, as `Estimate` defines it."""
         T = self.T_world_estimated[k] @ (estimate or self.estimates[k]).T_world_imu
