@@ -91,7 +91,8 @@ class KltFrontend:
         for check in self._checks:
             checked = check.inspect(images)
             if checked is None:
-                alone = self._follow_in_right(images, usable_prior(prior)) if self._right.left_frozen else no_tracks()
+                left_frozen = check is self._right
+                alone = self._follow_in_right(images, usable_prior(prior)) if left_frozen else no_tracks()
                 return make_output(frame, alone, len(alone), watch, self._take_lines())
             images = checked
         left, right = images.left, images.right

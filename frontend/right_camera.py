@@ -79,11 +79,6 @@ class RightCamera(ImageCheck):
         """Whether the right image of the last frame was used."""
         return self._cause is None
 
-    @property
-    def left_frozen(self) -> bool:
-        """Whether the left image of the last frame was a frozen camera's."""
-        return self._left_frozen > 0
-
     def explained(self) -> None:
         """Trust the right image again at once: another cause was found and taken out. What is not yet logged is not."""
         self._lines = []

@@ -27,8 +27,9 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, s
 from vio.mapping.files import describe_map, extract_map
 from vio.mapping.map_store import MapStore, SessionRow
 from vio.offline.georeference import placed
-from vio.records import LoopEvent, MapKeyframes, Trajectory
+from vio.records import Estimate, LoopEvent, MapKeyframes, Trajectory
 from vio.runs.mapped import write_keyframes
+from vio.runs.tables import estimate_row
 
 ORIGIN = np.array([49.0, 8.4, 115.0])
 LEVER_M = np.array([1.0, 0.5, 1.5])
@@ -278,12 +279,14 @@ def test_reads_navsatfix_of_a_bag(tmp_path: Path, storage: str) -> None:
 # --- the command ----------------------------------------------------------------------------------------------------
 
 
-def _map_of(path: Path, drive: Drive) -> Path:
-    """Write a map with a keyframe every second of a drive, in its frame."""
+def _map_of(path: Path, drive: Drive, up_map: FloatArray | None = None) -> Path:
+    """Write a map with a keyframe every second of a drive, in its frame; `up_map` (3,) is the vertical, if known."""
     store = MapStore(path, create=True)
     store.add_session(SessionRow("a drive", CAMERA, True, 0))
     for k in range(0, len(drive.T_enu), 10):
-        row = replace(_row(1), frame=k, time_ns=int(drive.path.times_ns[k]), T_map_cam=drive.path.T_map_body[k])
+        T = drive.path.T_map_body[k]
+        up = None if up_map is None else T[:3, :3].T @ up_map
+        row = replace(_row(1), frame=k, time_ns=int(drive.path.times_ns[k]), T_map_cam=T, up_cam=up)
         store.add_keyframe(row, _features(k))
     store.close()
     return path
@@ -399,6 +402,15 @@ def test_landmarks_and_vertical_of_a_run_are_in_its_map(tmp_path: Path) -> None:
     of = placed(tmp_path)
     np.testing.assert_allclose(of.points, [[101, 50, 10]], atol=1e-6)
     np.testing.assert_allclose(of.path.up_map, M[:3, 2], atol=1e-9)
+    g = np.array([0.981, 0.0, -9.76])  # better known than at the start
+    np.save(tmp_path / "estimates.npy", estimate_row(49, Estimate(0, T[-1], np.eye(6), gravity_world=g)))
+    np.testing.assert_allclose(placed(tmp_path).path.up_map, -M[:3, :3] @ g / np.linalg.norm(g), atol=1e-9)
+
+
+def test_keyframes_say_what_is_up_in_a_map_without_loops(tmp_path: Path) -> None:
+    drive, up = _drive(seed=0, poses=300), np.array([0.6, 0.0, 0.8])
+    assert placed(_map_of(tmp_path / "a.map", drive)).path.up_map.tolist() == [0, 0, 1]
+    np.testing.assert_allclose(placed(_map_of(tmp_path / "b.map", drive, up)).path.up_map, up, atol=1e-9)
 
 
 def test_a_drive_that_never_moves_is_refused_in_words() -> None:

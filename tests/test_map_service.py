@@ -109,6 +109,7 @@ def test_bad_requests_are_one_line_and_the_server_goes_on(server: MapServer) -> 
         ("/localise", {"left": good, "right": good}, 200, ""),
         ("/localise", {"left": good, "right": good, "camera": {"baseline_m": 0.5}}, 409, "camera: baseline_m is 0.5"),
         ("/localise", {"left": good, "right": good, "camera": {"fu": "wide"}}, 400, "give JSON"),
+        ("/localise", {"left": good, "right": good, "camera": {"fu": 10**400}}, 400, "give JSON"),
         ("/localise", {"left": good, "right": _png(gray[:90])}, 409, "right: is of 320x90 pixels"),
         ("/localise", {"left": damaged, "right": good}, 400, "left"),
         ("/localise", {"left": "", "right": good}, 400, "left"),
@@ -157,8 +158,9 @@ def test_what_cannot_be_served_is_said(server: MapServer, path: Path, tmp_path: 
     with pytest.raises(VioError, match="cannot listen at"):
         MapServer(lookup, "127.0.0.1", server.server_address[1])
     lookup.close()
-    with pytest.raises(VioError, match="vio map serve MAP starts a server"):
-        ask("http://127.0.0.1:1", np.zeros((4, 4), np.uint8), np.zeros((4, 4), np.uint8), timeout_s=2)
+    for url in ("http://127.0.0.1:1", "no address"):
+        with pytest.raises(VioError, match="vio map serve MAP starts a server"):
+            ask(url, np.zeros((4, 4), np.uint8), np.zeros((4, 4), np.uint8), timeout_s=2)
 
 
 def test_the_command_serves_until_it_is_ended(path: Path) -> None:

@@ -573,6 +573,7 @@ def test_the_world_stays_where_the_first_window_left_it_while_gravity_becomes_kn
     assert values.mean() < 12, values
     smoothed = filt.smoothed(flight.frames - 3)
     assert smoothed is not None
+    np.testing.assert_array_equal(smoothed.gravity_world, estimate.gravity_world)
     moved = se3_log(se3_inverse(smoothed.T_world_imu) @ estimate.T_world_imu)
     true = se3_log(se3_inverse(flight.T_world_imu(flight.frames - 3)) @ flight.T_world_imu(flight.frames - 1))
     np.testing.assert_allclose(moved, true, atol=0.02)

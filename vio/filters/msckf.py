@@ -175,7 +175,7 @@ class Msckf(Backend):
                 to_tilt = np.eye(state.size)
                 to_tilt[3:6, state["imu_terms"]] = propagation.motion.tilt_D_terms(nav)  # (A4)
                 self._window.prior.transform(to_tilt)
-            self._began_ns = observations.time_ns
+            self._began_ns, self._tilted = observations.time_ns, np.eye(3)  # one camera begins anew after a divergence
             propagation.begin(self._window, observations.time_ns, observations.time_ns)
             self._measure()
         else:
@@ -297,9 +297,14 @@ class Msckf(Backend):
         window = self._started()
         if self._source != "imu":
             return {}
-        out: dict[str, Any] = {"tilt_sigma_rad": float(np.sqrt(np.linalg.eigvalsh(own[3:5, 3:5])[-1]))}
-        if "first_attitude" in window.state:
-            out["gravity_world"] = window.calibration.R_upright_world.T @ [0.0, 0.0, -self._settings.gravity_mps2]
+        sigma = float(np.sqrt(np.linalg.eigvalsh(own[3:5, 3:5])[-1]))
+        return {"tilt_sigma_rad": sigma, "gravity_world": self._gravity(window)}
+
+    def _gravity(self, window: Window) -> FloatArray | None:
+        """Gravity (3,) in the world that is reported, m/s^2; None: along -z."""
+        if "first_attitude" not in window.state:
+            return None
+        out: FloatArray = window.calibration.R_upright_world.T @ [0.0, 0.0, -self._settings.gravity_mps2]
         return out
 
     def imu_terms_covariance(self) -> FloatArray:
@@ -316,7 +321,9 @@ class Msckf(Backend):
 
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since; None where it has left the window."""
-        return None if self._frame.smoothed is None else self._frame.smoothed.estimate(frame_index)
+        window, smoothed = self._window, self._frame.smoothed
+        found = None if smoothed is None else smoothed.estimate(frame_index)
+        return found if found is None or window is None else replace(found, gravity_world=self._gravity(window))
 
     def relative(self, older: int, newer: int) -> RelativePose | None:
         """Return the body's motion between two frames of the window, by numbers, with all frames since.

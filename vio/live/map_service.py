@@ -9,9 +9,10 @@ used gets a status 4xx and `{"error": …}` in one line.
 from __future__ import annotations
 
 import base64
-import binascii
+import http.client
 import json
 import os
+import sys
 import threading
 import urllib.error
 import urllib.request
@@ -60,6 +61,11 @@ class MapServer(ThreadingHTTPServer):
         except (OSError, OverflowError) as error:
             raise VioError(f"cannot listen at {host}:{port} ({error}); give another --host or --port") from error
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Report what went wrong with a connection, unless the client has closed it."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)
+
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"  # a client keeps its connection
@@ -79,9 +85,9 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             if self.path != "/localise":
                 raise _RefusedError(HTTPStatus.NOT_FOUND, "GET / and POST /localise are served")
-            pair = _pair(self._body(), self.server.lookup.camera)
-            with self.server.free:
-                found = self.server.lookup.find(*pair)
+            body, lookup = self._body(), self.server.lookup
+            with self.server.free:  # images take more memory than their files
+                found = lookup.find(*_pair(body, lookup.camera))
         except _RefusedError as error:
             self.close_connection = True  # its body may be unread
             self._answer(error.status, {"error": " ".join(str(error).split())})
@@ -127,22 +133,24 @@ def _pair(body: bytes, camera: StereoCamera) -> tuple[Image, Image]:
         texts = [request["left"], request["right"]]
         data = [base64.b64decode(text, validate=True) for text in texts]
         given = {name: float(value) for name, value in (request.get("camera") or {}).items() if name in _CAMERA}
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, binascii.Error) as error:
+    except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:
         reason = 'give JSON with "left" and "right", image files in base64'
         raise _RefusedError(HTTPStatus.BAD_REQUEST, f"{reason} ({type(error).__name__})") from None
     own = _camera_values(camera)
     for name, value in given.items():
         if not abs(value - own[name]) <= _SAME * abs(own[name]):
             raise _RefusedError(HTTPStatus.CONFLICT, f"camera: {name} is {value:g}, that of the map {own[name]:g}")
-    images = []
+    images: list[Image] = []
+    shape: tuple[int | None, ...] | None = None if camera.width is None else (camera.height, camera.width)
     for name, content in zip(("left", "right"), data, strict=True):
         try:
             image, _ = decode_gray(content, name)
         except UnreadableImageError as error:
             raise _RefusedError(HTTPStatus.BAD_REQUEST, str(error)) from None
-        if camera.width is not None and image.shape != (camera.height, camera.width):
-            size, wanted = f"{image.shape[1]}x{image.shape[0]}", f"{camera.width}x{camera.height}"
+        if shape is not None and image.shape != shape:
+            size, wanted = f"{image.shape[1]}x{image.shape[0]}", f"{shape[1]}x{shape[0]}"
             raise _RefusedError(HTTPStatus.CONFLICT, f"{name}: is of {size} pixels, the map's camera of {wanted}")
+        shape = image.shape  # a map of bare features does not say it
         images.append(image)
     return images[0], images[1]
 
@@ -174,16 +182,24 @@ def ask(url: str, left: Image, right: Image, *, timeout_s: float = 30.0) -> Foun
         name: base64.b64encode(cv2.imencode(".png", image)[1].tobytes()).decode()
         for name, image in (("left", left), ("right", right))
     }
-    request = urllib.request.Request(f"{url.rstrip('/')}/localise", json.dumps(files).encode(), method="POST")
     try:
+        request = urllib.request.Request(f"{url.rstrip('/')}/localise", json.dumps(files).encode(), method="POST")
         with urllib.request.urlopen(request, timeout=timeout_s) as answer:
             facts = json.load(answer)
+        if not facts["found"]:
+            return None
+        T, P = np.array(facts["T_map_cam0"]), np.array(facts["covariance"])
+        return FoundPose(T, P, facts["matches"], facts["keyframe"])
     except urllib.error.HTTPError as error:
         with error:
-            raise VioError(f"{url}: {json.load(error)['error']}") from None
-    except OSError as error:
+            raise VioError(f"{url}: {_reason(error)}") from None
+    except (OSError, ValueError, LookupError, TypeError, http.client.HTTPException) as error:
         raise VioError(f"{url}: does not answer ({error}); vio map serve MAP starts a server") from error
-    if not facts["found"]:
-        return None
-    T, P = np.array(facts["T_map_cam0"]), np.array(facts["covariance"])
-    return FoundPose(T, P, facts["matches"], facts["keyframe"])
+
+
+def _reason(error: urllib.error.HTTPError) -> str:
+    """What a server says of a refusal, or its status where another program answers."""
+    try:
+        return str(json.load(error)["error"])
+    except (OSError, ValueError, LookupError, TypeError):
+        return f"{error.code} {error.reason}"

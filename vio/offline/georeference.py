@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any
@@ -16,10 +17,10 @@ from vio.earth.gnss import GnssFixes
 from vio.errors import DataError
 from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log
-from vio.geometry.upright import up_in, up_of
-from vio.mapping.map_store import EarthRow, MapStore
+from vio.geometry.upright import up_in
+from vio.mapping.map_store import EarthRow, KeyframeRow, MapStore
 from vio.records import BoolArray, Trajectory
-from vio.runs.finished import point_positions
+from vio.runs.finished import point_positions, up_of_odometry
 from vio.runs.folder import read_metrics
 from vio.runs.mapped import read_keyframes, read_loops, read_trajectories
 
@@ -58,7 +59,7 @@ def _of_run(folder: FilePath) -> Placed:
     loops = [(place.get(o.keyframe_frame), place.get(o.frame)) for o in kept]  # type: ignore[arg-type]
     known = [(i, j) for i, j in loops if i is not None and j is not None and i < j - 1]
     # The landmarks and the vertical are those of the odometry's world.
-    up = up_of(metrics.get("motion"), None)
+    up = up_of_odometry(folder, metrics)
     if up is not None:
         up = up_in(trajectory.T_world_body, odometry.T_world_body, up)
     camera = trajectory.in_cam0(T_cam0_imu).T_world_body
@@ -85,10 +86,27 @@ def _of_map(file: FilePath) -> Placed:
     T = np.array([rows[k].T_map_cam for k in kept])
     trajectory = Trajectory(T, np.array([rows[k].time_ns for k in kept], dtype=np.int64), "cam0")
     upright = sessions[0].upright
-    up = np.array([0.0, 0.0, 1.0]) if upright else -T[0, :3, 1]
+    up = _up_of_map(T, [rows[k] for k in kept]) if upright else -T[0, :3, 1]
     path = _path(trajectory, known, up, _UP_RAD if upright else _MOUNT_RAD)
     breaks = np.flatnonzero(np.diff([rows[k].session for k in kept])) + 1
     return Placed(file.stem, replace(path, breaks=breaks), trajectory, np.zeros((0, 3)))
+
+
+def _up_of_map(T_map_cam: FloatArray, rows: Sequence[KeyframeRow]) -> FloatArray:
+    """Return the direction (3,) that is up in a map of upright sessions: the mean by its keyframes; z where none says.
+
+    A map without loops has the world of its odometry, whose first seconds may have been wrong about the vertical.
+    """
+    seen = [
+        (T[:3, :3] @ row.up_cam, row.up_sigma_rad)
+        for T, row in zip(T_map_cam, rows, strict=True)
+        if row.up_cam is not None
+    ]
+    if not seen:
+        return np.array([0.0, 0.0, 1.0])
+    up, sigma = (np.array(values) for values in zip(*seen, strict=True))
+    total: FloatArray = (up / np.maximum(sigma, 1e-6)[:, None] ** 2).sum(axis=0)
+    return total / np.linalg.norm(total)
 
 
 def _path(trajectory: Trajectory, loops: list[tuple[int, int]], up: FloatArray, sigma_rad: float) -> Path:

@@ -18,12 +18,12 @@ from vio.errors import DataError
 from vio.evaluation.trajectories import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera
-from vio.geometry.upright import up_in, up_of, upright_axes
+from vio.geometry.upright import up_in, upright_axes
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import MapStore
 from vio.offline.run_images import RunImages, run_images
 from vio.records import Image, IntArray, StereoFrame, Trajectory
-from vio.runs.finished import point_positions
+from vio.runs.finished import point_positions, up_of_odometry
 from vio.runs.folder import read_metrics
 from vio.runs.mapped import corrected, read_trajectories
 
@@ -90,7 +90,7 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
     depth_m = _landmark_depth_m(folder, T_odom, None if voxel_m is None else voxel_m / _VOXEL_SHARE)
     voxel_m = _voxel_m(images.camera, depth_m) if voxel_m is None else voxel_m
     chosen = _spread(T, _STEP_SHARE * depth_m)
-    up = up_of(metrics.get("motion"), None)
+    up = up_of_odometry(folder, metrics)
     if up is not None:
         up = up_in(T, T_odom, up)
     poses = "map" if mapped or map_file is not None else "odometry"

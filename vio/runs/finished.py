@@ -19,6 +19,7 @@ from vio.files.inputs import read_input
 from vio.files.tables import Rows
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray
+from vio.geometry.upright import up_of
 from vio.records import LoopEvent, MapKeyframes, Trajectory
 from vio.runs.files import RunFile
 from vio.runs.folder import read_metrics
@@ -165,6 +166,17 @@ def point_positions(folder: Path) -> FloatArray:
     points = read_points(folder / RunFile.LANDMARKS)
     p = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
     return p[np.isfinite(p).all(axis=1)]
+
+
+def up_of_odometry(folder: Path, metrics: dict[str, Any]) -> FloatArray | None:
+    """Return the direction (3,) that is up in the world of a run's odometry, as its end knows it, see `up_of`.
+
+    Raises:
+        DataError: the file of the estimates is damaged.
+    """
+    path = folder / RunFile.ESTIMATES
+    gravity = np.array(read_estimates(path)["gravity_world"][-1]) if path.is_file() else None
+    return up_of(metrics.get("motion"), gravity)
 
 
 def _evaluation(
