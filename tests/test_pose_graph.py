@@ -291,3 +291,21 @@ def test_the_keyframes_near_new_loops_are_those_of_a_search_of_the_whole_map(
     assert len(set(found.tolist())) == len(found)
     # All keyframes of another way between two of the cycle have one detour, so that which of them is taken is open.
     np.testing.assert_allclose(np.sort(least[found]), expected[np.isfinite(expected)], atol=1e-9)
+
+
+def test_verticals_do_not_pull_at_a_map_whose_z_is_not_up(tmp_path: Path) -> None:
+    """A new session in a map that no loop has levelled yet: by its world of the first seconds, up is 2 deg off z."""
+    graph, step = MapGraph(MapStore(tmp_path / "a.map", create=True)), se3_exp([1.0, 0, 0, 0, 0, 0.1])
+    graph.sessions = [SessionRow("tilted", StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360), True, 0)]
+    up, T = np.array([np.sin(np.radians(2.0)), 0.0, np.cos(np.radians(2.0))]), np.eye(4)
+    for k in range(30):
+        if k:
+            graph.add_motion(k - 1, k, RelativePose(step, 1e-4 * np.eye(6)))
+            T = T @ step
+        graph.append(KeyframeRow(0, k, k, T, T, np.eye(6), 0.0, T[:3, :3].T @ up, np.radians(0.1)))
+    before = graph.T_map_cam.rows.copy()
+    graph.loops = [LoopRow(3, 25, RelativePose(se3_inverse(before[3]) @ before[25], 1e-4 * np.eye(6)), 50, True)]
+    graph.optimise_end(20)
+    np.testing.assert_allclose(graph.T_map_cam.rows, before, atol=1e-9)
+    graph.optimise_part(0)  # the whole may be levelled
+    np.testing.assert_allclose(graph.T_map_cam.rows[-1, :3, :3] @ (T[:3, :3].T @ up), [0.0, 0.0, 1.0], atol=1e-6)

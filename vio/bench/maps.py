@@ -77,7 +77,7 @@ def _causal_figures(result: RunResult, mapped: MappedRun, reference: Trajectory)
     figures["map_causal_ate_m"] = score.ate_m.rmse
     known = np.isfinite(P[score.rows]).all(axis=(1, 2))
     part = replace(score, rows=score.rows[known], reference=_rows(score.reference, known))
-    values = pose_nees(part, T, P, result.T_cam0_body, upright=result.motion == "imu") if known.any() else None
+    values = pose_nees(part, T, P, result.T_cam0_body, upright=False) if known.any() else None
     if values is None:
         return figures
     quantiles = {f"map_nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.relative_pose import RelativePose
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.pose_graph import Edges, UpDirections, optimise
@@ -210,15 +210,16 @@ class MapGraph:
         inside = [n for n, o in enumerate(self.loops) if rows[o.first] and rows[o.second]]
         loops = [(int(place[o.first]), int(place[o.second]), o.pose) for o in (self.loops[n] for n in inside)]
         up_directions = self._up_directions(rows, place)
+        T_upright_map = se3_from_parts(self._level_of(fixed), np.zeros(3))
         best = optimise(
-            self.T_map_cam.rows[rows],
+            T_upright_map @ self.T_map_cam.rows[rows],
             Edges.of(scaled),
             Edges.of(loops),
             up_directions,
             fixed[rows],
             levelled=0 if level and len(up_directions.pose) else None,
         )
-        self.T_map_cam.rows[rows] = best.T_map_cam
+        self.T_map_cam.rows[rows] = se3_inverse(T_upright_map) @ best.T_map_cam
         for n, kept in zip(inside, best.kept.tolist(), strict=True):
             self.loops[n] = replace(self.loops[n], kept=kept)
 
@@ -229,6 +230,20 @@ class MapGraph:
             np.array([up for _, up, _ in ups]).reshape(-1, 3),
             np.array([sigma for _, _, sigma in ups]),
         )
+
+    def _level_of(self, fixed: BoolArray) -> FloatArray:
+        """Rotation (3, 3) that turns up the mean vertical of keyframes that stay; the identity where they say nothing.
+
+        Until a part is optimised as a whole, its frame is that of its odometry, whose first seconds may have been wrong
+        about the vertical.
+        """
+        ups = [(self.T_map_cam[k][:3, :3] @ up, sigma) for k, up, sigma in self._ups if fixed[k]]
+        if not ups or not self._is_upright(fixed):
+            return np.eye(3)
+        up = np.sum([direction / sigma**2 for direction, sigma in ups], axis=0)
+        axis = np.cross(up, [0.0, 0.0, 1.0])
+        length = float(np.linalg.norm(axis))
+        return so3_exp(axis * (np.arctan2(length, up[2]) / length)) if length > 0 else np.eye(3)
 
     def _is_upright(self, rows: BoolArray) -> bool:
         """Whether z is up in the frame of these keyframes: it is that of the first one's session."""
