@@ -22,7 +22,7 @@ from vio.frontend.one_camera import with_depths, with_prior_depths
 from vio.frontend.outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
 from vio.frontend.patches import ImageLevels, half_image
 from vio.frontend.prediction import guessed_pixels, prior_rows, usable_prior
-from vio.frontend.reappearance import motion_across
+from vio.frontend.reappearance import contradicts_gyro, motion_across
 from vio.frontend.right_alone import RightAlone
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.right_delay import RightDelay
@@ -193,7 +193,7 @@ class KltFrontend:
         if prior is not None and self._alone is not None:  # its motion is that since the last right image
             prior = replace(prior, R_cam_prev=None, motion=None)
         if self._after_gap(frame):
-            again = self._found_again(images, previous, expected)
+            again = self._found_again(images, previous, expected, prior)
             if again is not None:
                 expected, prior = again, None
             elif prior is None:
@@ -215,14 +215,20 @@ class KltFrontend:
         watch.lap("stereo")
         return tracks, motion
 
-    def _found_again(self, images: FrameImages, previous: PreviousFrame, expected: FloatArray) -> FloatArray | None:
-        """The motion (4, 4) since the last good pair by key points of both pairs; None: none is proved."""
+    def _found_again(
+        self, images: FrameImages, previous: PreviousFrame, expected: FloatArray, prior: TrackPrior | None
+    ) -> FloatArray | None:
+        """The motion (4, 4) since the last good pair by key points of both pairs; None: none is proved.
+
+        A facade repeats itself at the same depth; a gyro that contradicts tells.
+        """
         right = images.right
         if right is None or previous.right_half is None or not self._right.usable or self._delay.frames != 0.0:
             return None
         rng = np.random.default_rng((self._seed, images.frame.index))
         problem = RansacProblem(self._camera, 2 * INLIER_PX, rng)
-        return motion_across(problem, images.stereo, previous, images.left, right, np.stack([expected, np.eye(4)]))
+        T = motion_across(problem, images.stereo, previous, images.left, right, np.stack([expected, np.eye(4)]))
+        return None if T is None or (prior is not None and contradicts_gyro(T, prior.motion)) else T
 
     def _after_gap(self, frame: StereoFrame) -> bool:
         """Whether so many frames are missing that similar patches are no evidence of the same points."""

@@ -16,13 +16,26 @@ from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import MatchSettings
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import PreviousFrame
-from vio.geometry.lie import FloatArray, transform_points
+from vio.geometry.lie import FloatArray, so3_log, transform_points
 from vio.geometry.stereo import depth_of, left_rays
+from vio.numerics.statistics import chi_square_quantile
+from vio.records import MotionPrior
 
 _LEAST_POINTS = 15  # that must agree on the motion …
 _LEAST_SHARE = 0.4  # … and of all matches with depths
 _DEPTHS_AGREE = 0.5  # share of these whose new disparity must be that of the moved point
+_ROTATION_SIGMA_DEG = 0.3  # of a motion by key points
+_ROTATION_PROBABILITY = 0.9999  # of a rotation measured beside it
 _DISPARITY_PX = 2.0  # as far as whole pixels at half resolution tell
+
+
+def contradicts_gyro(T_curr_prev: FloatArray, predicted: MotionPrior | None) -> bool:
+    """Whether the rotation of a motion (4, 4) is not the one that a motion sensor has measured, where there is one."""
+    if predicted is None or not predicted.measured:
+        return False
+    phi = so3_log(T_curr_prev[:3, :3] @ predicted.T_curr_prev[:3, :3].T)
+    covariance = predicted.covariance[3:, 3:] + np.radians(_ROTATION_SIGMA_DEG) ** 2 * np.eye(3)
+    return bool(phi @ np.linalg.solve(covariance, phi) > chi_square_quantile(_ROTATION_PROBABILITY, 3))
 
 
 def motion_across(

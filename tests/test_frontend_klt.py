@@ -17,11 +17,12 @@ from vio.frontend.detect import cell_index, grid_shape, min_distance_px
 from vio.frontend.klt import KltFrontend
 from vio.frontend.outliers import _refine
 from vio.frontend.patches import half_image
+from vio.frontend.reappearance import contradicts_gyro
 from vio.frontend.settings import FrontendSettings, GridSettings, KltSettings
 from vio.frontend.tracks import INLIER_PX
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
-from vio.records import FrontendOutput, StereoFrame, TrackPrior
+from vio.records import FrontendOutput, MotionPrior, StereoFrame, TrackPrior
 
 GRID = GridSettings(target_features=200)
 SETTINGS = FrontendSettings(grid=GRID)
@@ -329,6 +330,15 @@ def test_similar_patches_after_a_long_gap_are_no_evidence(wall: Wall, right_wall
     assert again.tracked == 0
     assert len(again.observations) > 20
     assert not np.isin(again.observations.ids, run(FRAMES[:3])[-1].observations.ids).any()
+
+
+@pytest.mark.parametrize(
+    ("off_deg", "measured", "refused"), [(3.0, True, True), (0.1, True, False), (3.0, False, False)]
+)
+def test_a_motion_across_a_gap_must_not_contradict_the_gyro(off_deg: float, measured: bool, refused: bool) -> None:
+    moved, off = se3_exp([0.3, 0.0, 0.2, 0.0, 0.1, 0.0]), se3_exp([0, 0, 0, 0, np.radians(off_deg), 0])
+    assert contradicts_gyro(moved, MotionPrior(off @ moved, 1e-6 * np.eye(6), measured)) is refused
+    assert not contradicts_gyro(moved, None)
 
 
 def test_a_prediction_bridges_a_long_gap() -> None:
