@@ -21,11 +21,12 @@ from vio.filters import imu_terms
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, accel_D_terms, gyro_D_terms, significant
 from vio.filters.late_imu import LateImuMsckf
 from vio.filters.msckf import Msckf
-from vio.filters.navigation import DIM, NO_STEP, ImuMotion, NavState, rotation_to_up
+from vio.filters.navigation import DIM, NO_STEP, ImuMotion, NavState
 from vio.filters.online_calibration import STEREO_YAW_SIGMA_DEG
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_log
 from vio.geometry.stereo import CameraKind
+from vio.geometry.upright import rotation_to_up
 from vio.live.build import build_backend
 from vio.live.prediction import PosePredictor
 from vio.records import Estimate, ImuSample, MotionSource, imu_matrices

@@ -25,7 +25,6 @@ from vio.filters.navigation import (
     ZERO_VELOCITY_SIGMA_MPS,
     ImuMotion,
     NavState,
-    rotation_to_up,
 )
 from vio.filters.online_calibration import Calibration
 from vio.filters.settings import MsckfSettings
@@ -35,6 +34,7 @@ from vio.filters.window_posterior import WindowPosterior, scale_sigma
 from vio.filters.window_tracks import LinearTracks, WindowTracks, chi_square_table
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera, left_rays
+from vio.geometry.upright import rotation_to_up
 from vio.imu.standstill import STANDSTILL_S
 from vio.records import ImuSample, Observations
 

@@ -37,9 +37,9 @@ from vio.geometry.lie import (
     se3_exp,
     se3_from_parts,
     se3_left_jacobian,
-    so3_exp,
     so3_hat,
 )
+from vio.geometry.upright import rotation_to_up
 from vio.imu.faults import ImuSampleCheck, readings_of
 from vio.numerics.compiled import move_by_twist
 from vio.records import ImuSample, IntArray, MotionSample, VelocitySample
@@ -468,12 +468,3 @@ def _yaw_sigma(tilt_sigma: float, known_sigma: float) -> float:
     size of the tilt that is known by then, and their second order `x^2 / 2` stays.
     """
     return float(np.hypot(tilt_sigma**4 / 24, known_sigma**2 / 2))
-
-
-def rotation_to_up(up_imu: FloatArray) -> FloatArray:
-    """A rotation R_world_imu (3, 3) that takes a direction of the IMU to the world's z axis, by the shortest turn."""
-    axis = np.cross(up_imu, [0.0, 0.0, 1.0])
-    s, c = float(np.linalg.norm(axis)), float(up_imu[2])
-    if s < 1e-9:
-        return np.eye(3) if c > 0 else so3_exp([np.pi, 0.0, 0.0])
-    return so3_exp(axis / s * np.arctan2(s, c))

@@ -38,7 +38,8 @@ class WindowPosterior:
         if "extrinsics" in window.state or "first_attitude" in window.state:
             J = window.body_D_error()
             J_reported = window.since_first(J)
-            own = J @ P @ J.T, J_reported @ reported @ J_reported.T
+            of_body = J @ P @ J.T if "extrinsics" in window.state else own[0]
+            own = of_body, J_reported @ reported @ J_reported.T
         has_imu, R = isinstance(window.motion, ImuMotion), window.calibration.R_upright_world
         return cls(tuple(window.clones), *own, window.nav.gyro_bias, window.nav.accel_bias, has_imu, R)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 
 _LEVEL = 0.1  # horizontal part of the first optical axis below which the camera looks up or down: the path then leads
 
@@ -73,6 +73,21 @@ def attitude_deg(R_view_cam0: FloatArray) -> FloatArray:
     pitch = np.arcsin(np.clip(ahead[:, 2], -1, 1))
     roll = np.arctan2(-right[:, 2], up[:, 2])
     return np.degrees(np.stack([heading, pitch, roll], axis=1))
+
+
+def rotation_to_up(up: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) that takes a unit vector (3,) to the z axis, by the shortest turn."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    s, c = float(np.linalg.norm(axis)), float(up[2])
+    if s < 1e-9:
+        return np.eye(3) if c > 0 else so3_exp([np.pi, 0.0, 0.0])
+    return so3_exp(axis / s * np.arctan2(s, c))
+
+
+def mean_up(up: FloatArray, sigma_rad: FloatArray) -> FloatArray:
+    """Return the direction (3,) that verticals (N, 3) with standard deviations (N,) say in the mean."""
+    total: FloatArray = (up / np.maximum(sigma_rad, 1e-6)[:, None] ** 2).sum(axis=0)
+    return total / np.linalg.norm(total)
 
 
 def up_in(T_map: FloatArray, T_world: FloatArray, up_world: FloatArray) -> FloatArray:

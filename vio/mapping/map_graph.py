@@ -10,8 +10,9 @@ import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, so3_exp
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse
 from vio.geometry.relative_pose import RelativePose
+from vio.geometry.upright import mean_up, rotation_to_up
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.pose_graph import Edges, UpDirections, optimise
 from vio.records import BoolArray, IntArray
@@ -240,10 +241,8 @@ class MapGraph:
         ups = [(self.T_map_cam[k][:3, :3] @ up, sigma) for k, up, sigma in self._ups if fixed[k]]
         if not ups or not self._is_upright(fixed):
             return np.eye(3)
-        up = np.sum([direction / sigma**2 for direction, sigma in ups], axis=0)
-        axis = np.cross(up, [0.0, 0.0, 1.0])
-        length = float(np.linalg.norm(axis))
-        return so3_exp(axis * (np.arctan2(length, up[2]) / length)) if length > 0 else np.eye(3)
+        up, sigma = (np.array(values) for values in zip(*ups, strict=True))
+        return rotation_to_up(mean_up(up, sigma))
 
     def _is_upright(self, rows: BoolArray) -> bool:
         """Whether z is up in the frame of these keyframes: it is that of the first one's session."""

@@ -17,7 +17,7 @@ from vio.earth.gnss import GnssFixes
 from vio.errors import DataError
 from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log
-from vio.geometry.upright import up_in
+from vio.geometry.upright import mean_up, up_in
 from vio.mapping.map_store import EarthRow, KeyframeRow, MapStore
 from vio.records import BoolArray, Trajectory
 from vio.runs.finished import point_positions, up_of_odometry
@@ -105,8 +105,7 @@ def _up_of_map(T_map_cam: FloatArray, rows: Sequence[KeyframeRow]) -> FloatArray
     if not seen:
         return np.array([0.0, 0.0, 1.0])
     up, sigma = (np.array(values) for values in zip(*seen, strict=True))
-    total: FloatArray = (up / np.maximum(sigma, 1e-6)[:, None] ** 2).sum(axis=0)
-    return total / np.linalg.norm(total)
+    return mean_up(up, sigma)
 
 
 def _path(trajectory: Trajectory, loops: list[tuple[int, int]], up: FloatArray, sigma_rad: float) -> Path:
