@@ -17,7 +17,7 @@ from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU
 from tests.test_online_calibration import Shaking, _samples
 from vio.cli import main
 from vio.datasets.observation_log import write_observation_log
-from vio.evaluation.trajectories import rotation_angle_deg
+from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.records import Recording

@@ -22,7 +22,7 @@ from vio.calibration.stereo import (
 )
 from vio.calibration.verdicts import judge_exchange, judge_imu, judge_stereo
 from vio.errors import EstimationError
-from vio.evaluation.trajectories import rotation_angle_deg
+from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.records import ImuSample, feature_tracks

@@ -16,7 +16,7 @@ from vio.cli import main
 from vio.config import Config
 from vio.datasets import open_dataset
 from vio.errors import DataError, EstimationError
-from vio.evaluation.trajectories import rotation_angle_deg
+from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp, transform_points
 from vio.geometry.stereo import project

@@ -9,7 +9,7 @@ import pytest
 
 from tests.numerics import numeric_jacobian
 from tools.consistency import FirstEstimates, Flight, Job, Motion, Record, Scenario, StandardErrors, Variant, fly
-from vio.evaluation.trajectories import nees_bounds
+from vio.evaluation.consistency import nees_bounds
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window

@@ -19,20 +19,17 @@ from scipy.spatial.transform import Rotation
 from vio.cli import main
 from vio.errors import EvaluationError
 from vio.evaluation.alignment import AlignMode, align_poses, apply_alignment, settle_rotation
-from vio.evaluation.trajectories import (
+from vio.evaluation.association import associate, associate_times
+from vio.evaluation.consistency import nees, nees_bounds
+from vio.evaluation.errors_along_path import (
     KITTI_LENGTHS_M,
-    associate,
-    associate_times,
-    evaluate,
     kitti_error,
-    lengths_text,
-    nees,
-    nees_bounds,
     path_length_m,
     relative_error_distance,
     relative_error_frames,
     rotation_angle_deg,
 )
+from vio.evaluation.trajectories import evaluate, lengths_text
 from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import (
     FloatArray,

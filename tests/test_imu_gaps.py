@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
-from vio.evaluation.trajectories import nees, nees_bounds
+from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters.msckf import Msckf
 from vio.filters.navigation import ImuMotion, NavState
 from vio.filters.settings import MsckfSettings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.test_msckf import Flight
-from vio.evaluation.trajectories import nees_bounds
+from vio.evaluation.consistency import nees_bounds
 from vio.filters.imu_start import imu_start
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings

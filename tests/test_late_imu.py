@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.test_msckf import CAMERA, EXACT_RIG, STEP_NS, T_CAM0_IMU, Flight
-from vio.evaluation.trajectories import nees, nees_bounds
+from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters.late_imu import LateImuMsckf
 from vio.geometry.lie import se3_inverse, se3_log, transform_points
 

@@ -10,7 +10,7 @@ import pytest
 from tests.numerics import numeric_jacobian
 from tests.true_world import TrueWorld
 from vio.errors import ConfigError, DataError, DivergedError, EstimationError
-from vio.evaluation.trajectories import nees, nees_bounds
+from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters import imu_start
 from vio.filters.msckf import Msckf
 from vio.filters.multiview import (

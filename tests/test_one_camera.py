@@ -23,7 +23,7 @@ from vio.config import Config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, ConfigError, DataError
-from vio.evaluation.trajectories import nees_bounds
+from vio.evaluation.consistency import nees_bounds
 from vio.filters.alignment import Bearings, FreeMotion, align_visual_inertial, gyro_bias
 from vio.filters.mono_msckf import MonoMsckf
 from vio.filters.settings import MsckfSettings

@@ -21,7 +21,7 @@ from vio.config import Config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
-from vio.evaluation.trajectories import nees, nees_bounds
+from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters import multiview
 from vio.filters.multiview import Views
 from vio.filters.settings import MsckfSettings

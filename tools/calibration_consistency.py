@@ -27,7 +27,7 @@ import numpy as np
 
 from tools.consistency import CAMERA, T_CAM0_IMU, Flight, Scenario
 from vio.errors import VioError
-from vio.evaluation.trajectories import nees, nees_bounds
+from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
 from vio.filters.msckf import Msckf
 from vio.filters.online_calibration import STEREO_YAW_SIGMA_DEG

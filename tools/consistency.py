@@ -31,7 +31,7 @@ from unittest.mock import patch
 import numpy as np
 
 from vio.errors import VioError
-from vio.evaluation.trajectories import nees, nees_bounds
+from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters import imu_start, navigation, window_tracks
 from vio.filters.frame_update import FrameUpdate
 from vio.filters.msckf import Msckf

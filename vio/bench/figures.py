@@ -10,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import EvaluationError
-from vio.evaluation.trajectories import Evaluation, associate_times, nees
+from vio.evaluation.association import associate_times
+from vio.evaluation.consistency import nees
+from vio.evaluation.trajectories import Evaluation
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 

@@ -11,7 +11,7 @@ from vio.calibration.gyro import TIME_OFFSET_S
 from vio.calibration.inertial import ImuAlignment, Rates
 from vio.calibration.lever_arm import LeverArm, judge_lever_arms
 from vio.calibration.stereo import RayMatches, StereoEstimate, epipolar_spread, too_few
-from vio.evaluation.trajectories import rotation_angle_deg
+from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, so3_log
 from vio.geometry.stereo import StereoCamera
 from vio.records import FeatureTracks, IntArray

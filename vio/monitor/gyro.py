@@ -8,7 +8,7 @@ from itertools import chain
 
 import numpy as np
 
-from vio.evaluation.trajectories import rotation_angle_deg
+from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, nearest_rotation
 from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import AXES_WORSE

@@ -8,7 +8,8 @@ import numpy as np
 
 from vio.errors import EvaluationError
 from vio.evaluation.alignment import align_poses, apply_alignment
-from vio.evaluation.trajectories import evaluate, rotation_angle_deg
+from vio.evaluation.errors_along_path import rotation_angle_deg
+from vio.evaluation.trajectories import evaluate
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_inverse
 from vio.numerics.robust import robust_sigma
 from vio.offline.keyframes import TrackedPath

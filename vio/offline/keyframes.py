@@ -10,7 +10,7 @@ import numpy as np
 
 from vio.calibration.egomotion import CameraMotion
 from vio.errors import DataError, EstimationError
-from vio.evaluation.trajectories import rotation_angle_deg
+from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.offline.loop_tracks import loop_pairs

@@ -15,7 +15,7 @@ from vio.dense.stereo_depth import DepthImage, StereoMatcher, depth_sigma_m, far
 from vio.dense.surface import Mesh, extract_surface
 from vio.dense.voxel_grid import TRUNCATION, VoxelGrid
 from vio.errors import DataError
-from vio.evaluation.trajectories import rotation_angle_deg
+from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera
 from vio.geometry.upright import up_in, upright_axes

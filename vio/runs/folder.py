@@ -24,7 +24,8 @@ from vio.config import Config, describe, to_yaml
 from vio.datasets.common import checked_transform
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, DataError, EvaluationError
-from vio.evaluation.trajectories import Evaluation, error_statistics, evaluate, path_length_m
+from vio.evaluation.errors_along_path import error_statistics, path_length_m
+from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.files.atomic import atomic_folder, check_own
 from vio.files.inputs import read_input
 from vio.files.printable import json_text, printable

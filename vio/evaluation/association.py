@@ -1,0 +1,131 @@
+"""Pair the poses of two trajectories, by nearest time or by frame number, one to one, without interpolation."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.errors import EvaluationError
+from vio.records import NS_PER_S, IntArray, Trajectory
+
+AssociationMode: TypeAlias = Literal["time", "frame"]
+_LONGEST_S = 1e9  # fits integer nanoseconds
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """The compared share of estimate and reference."""
+
+    estimate: float  # fraction of the estimate's poses that had a reference
+    reference_span: float | None  # fraction of the reference's time (or frame) span between first and last match
+    longest_gap_s: float | None  # between matched poses; None: one pose, or association by frame
+
+
+def associate(
+    estimate: Trajectory, reference: Trajectory, *, max_time_difference_s: float = 0.01
+) -> tuple[AssociationMode, IntArray, IntArray]:
+    """Pair poses one to one: the mode, rows of the estimate (M,) and rows of the reference (M,), M >= 1.
+
+    By time where both have times, else by frame number: row k of a trajectory without frame numbers is frame k.
+
+    Raises:
+        EvaluationError: no poses match.
+    """
+    if len(estimate) == 0 or len(reference) == 0:
+        raise EvaluationError(f"cannot compare {len(estimate)} estimated poses with {len(reference)} reference poses")
+    if estimate.times_ns is not None and reference.times_ns is not None:
+        rows, reference_rows = associate_times(
+            estimate.times_ns, reference.times_ns, max_difference_ns=_max_difference_ns(max_time_difference_s)
+        )
+        if len(rows) == 0:
+            raise EvaluationError(_no_common_time(estimate.times_ns, reference.times_ns, max_time_difference_s))
+        return "time", rows, reference_rows
+    if reference.times_ns is not None and reference.frame_indices is None and len(estimate) != len(reference):
+        raise EvaluationError(
+            f"the estimate has {len(estimate)} poses without times and the reference {len(reference)} poses with times "
+            "but no frame numbers; give the estimate with times (TUM form)"
+        )
+    frames, reference_frames = _frames(estimate), _frames(reference)
+    _, rows, reference_rows = np.intersect1d(frames, reference_frames, assume_unique=True, return_indices=True)
+    if len(rows) == 0:
+        raise EvaluationError(
+            f"no common frame: the estimate has frames {frames[0]} to {frames[-1]}, the reference "
+            f"{reference_frames[0]} to {reference_frames[-1]}; give the reference of this recording"
+        )
+    return "frame", rows.astype(np.int64), reference_rows.astype(np.int64)
+
+
+def associate_times(
+    times_a_ns: npt.ArrayLike, times_b_ns: npt.ArrayLike, *, max_difference_ns: int
+) -> tuple[IntArray, IntArray]:
+    """Pair two increasing clocks one to one and in order, closest pairs first; return row indices (M,) into each.
+
+    A pair is at most `max_difference_ns` apart. Of equally close pairs the earlier one is chosen.
+    """
+    a, b = np.asarray(times_a_ns, dtype=np.int64), np.asarray(times_b_ns, dtype=np.int64)
+    low = np.searchsorted(b, a - max_difference_ns, side="left")
+    count = np.searchsorted(b, a + max_difference_ns, side="right") - low
+    i = np.repeat(np.arange(len(a)), count)
+    j = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(low, count)
+    order = np.lexsort((j, i, np.abs(a[i] - b[j])))
+    left: list[int] = []  # both stay ascending
+    right: list[int] = []
+    for row_a, row_b in zip(i[order].tolist(), j[order].tolist(), strict=True):
+        k = bisect_left(left, row_a)
+        free = k == len(left) or (left[k] != row_a and right[k] > row_b)
+        if free and (k == 0 or right[k - 1] < row_b):
+            left.insert(k, row_a)
+            right.insert(k, row_b)
+    return np.array(left, dtype=np.int64), np.array(right, dtype=np.int64)
+
+
+def coverage(
+    estimate: Trajectory, reference: Trajectory, mode: AssociationMode, rows: IntArray, reference_rows: IntArray
+) -> Coverage:
+    """Return which part of both trajectories the matched rows (M,) of both are."""
+    clock = reference.times_ns if mode == "time" and reference.times_ns is not None else _frames(reference)
+    span = int(clock[-1] - clock[0])
+    gaps = None if estimate.times_ns is None else np.diff(estimate.times_ns[rows])
+    return Coverage(
+        estimate=len(rows) / len(estimate),
+        reference_span=int(clock[reference_rows[-1]] - clock[reference_rows[0]]) / span if span else None,
+        longest_gap_s=None if gaps is None or len(gaps) == 0 else int(gaps.max()) / NS_PER_S,
+    )
+
+
+def _max_difference_ns(seconds: float) -> int:
+    if not 0 <= seconds <= _LONGEST_S:
+        raise EvaluationError(f"the largest time difference is 0 to {_LONGEST_S:g} s, got {seconds:g} s")
+    return round(seconds * NS_PER_S)
+
+
+def _no_common_time(estimate_ns: IntArray, reference_ns: IntArray, limit_s: float) -> str:
+    """Format how the two clocks relate to each other."""
+    after = np.searchsorted(reference_ns, estimate_ns)
+    left, right = np.clip(after - 1, 0, None), np.clip(after, None, len(reference_ns) - 1)
+    nearest = np.minimum(np.abs(estimate_ns - reference_ns[left]), np.abs(estimate_ns - reference_ns[right]))
+    spans = [f"{t[0] / NS_PER_S:.3f} to {t[-1] / NS_PER_S:.3f} s" for t in (estimate_ns, reference_ns)]
+    return (
+        f"no poses within {limit_s:g} s of each other: the estimate covers {spans[0]}, the reference {spans[1]}, "
+        f"closest pair {nearest.min() / NS_PER_S:.6g} s; check the clocks or allow a larger difference"
+    )
+
+
+def _frames(trajectory: Trajectory) -> IntArray:
+    if trajectory.frame_indices is not None:
+        return trajectory.frame_indices
+    return np.arange(len(trajectory), dtype=np.int64)
+
+
+def take(trajectory: Trajectory, rows: IntArray) -> Trajectory:
+    """Return rows (M,) of a trajectory."""
+    return replace(
+        trajectory,
+        T_world_body=trajectory.T_world_body[rows],
+        times_ns=None if trajectory.times_ns is None else trajectory.times_ns[rows],
+        frame_indices=_frames(trajectory)[rows],
+    )
