@@ -16,7 +16,6 @@ TESTED_JACOBIANS = {
     "vio.filters.imu_terms.accel_D_terms",
     "vio.filters.imu_terms.gyro_D_terms",
     "vio.filters.multiview.point_D_clones",
-    "vio.filters.multiview.point_D_pose",
     "vio.filters.navigation.rate_D_error",
     "vio.filters.navigation.tilt_D_terms",
     "vio.filters.window.body_D_error",

@@ -12,7 +12,6 @@ from vio.filters.multiview import (
     Residuals,
     TrackInformation,
     Views,
-    point_D_pose,
 )
 from vio.filters.navigation import _free_flow
 from vio.filters.stereo_calibration import StereoColumns
@@ -394,3 +393,11 @@ def integrated(
     variance = densities[:, None] ** 2 * dt + hidden
     Q = [np.einsum("k,kij,klj->il", s, M, M) for s, M in zip(variance, (moved[:, :, 3:], moved[:, :, :3]), strict=True)]
     return R, p, v, np.einsum("kij,k->ij", moved, dt), np.array(Q)
+
+
+def point_D_pose(p_world: FloatArray) -> FloatArray:
+    """`B = [-I, p^]` (F, 3, 6): how a clone's error `[rho; phi]` moves a point as that clone sees it."""
+    B = np.zeros((len(p_world), 3, 6))
+    B[:, :, :3] = -np.eye(3)
+    B[:, :, 3:] = so3_hat(p_world)
+    return B

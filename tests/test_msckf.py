@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.numerics import numeric_jacobian
+from tests.numpy_twins import point_D_pose
 from tests.true_world import TrueWorld
 from vio.errors import ConfigError, DataError, DivergedError, EstimationError
 from vio.evaluation.consistency import nees, nees_bounds
@@ -17,7 +18,6 @@ from vio.filters.multiview import (
     Residuals,
     Views,
     first_points,
-    point_D_pose,
     refine_points,
     residuals,
     track_information,

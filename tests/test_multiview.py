@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from tests.numerics import numeric_jacobian
-from tests.numpy_twins import inverse_depth, moved
+from tests.numpy_twins import inverse_depth, moved, point_D_pose
 from vio.filters.multiview import (
     CAUCHY,
     Residuals,
     Views,
     first_points,
-    point_D_pose,
     refine_points,
     residuals,
     robust_weights,

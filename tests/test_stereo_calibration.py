@@ -15,6 +15,7 @@ from scipy.stats import chi2
 
 from tests import test_filter_truth
 from tests.numerics import numeric_jacobian
+from tests.numpy_twins import point_D_pose
 from tests.test_filter_truth import SETTINGS, Course, Run, Spoil, fly
 from tests.test_multiview import T_CAM0_WORLD
 from vio.cameras.rectification_error import (
@@ -29,7 +30,6 @@ from vio.filters.multiview import (
     Residuals,
     TrackInformation,
     Views,
-    point_D_pose,
     refine_points,
     residuals,
     track_information,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from vio.filters.multiview import Residuals, point_D_pose
+from tests.numpy_twins import point_D_pose
+from vio.filters.multiview import Residuals
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import eliminate_points
 from vio.filters.window_tracks import LEAST_PIXEL_SIGMA_PX, WindowTracks

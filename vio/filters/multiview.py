@@ -14,7 +14,7 @@ import numpy as np
 
 from vio.cameras.projection import camera_args
 from vio.filters import track_loops as loops
-from vio.geometry.lie import FloatArray, so3_hat
+from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, left_rays
 from vio.records import BoolArray, IntArray
 
@@ -329,11 +329,3 @@ def usable_points(
     seen = T_cam0_world, p_world, views.weight, at.z_D_p, at.ahead
     loops.mark_usable(camera_args(camera), MIN_DEPTH * camera.baseline_m, *seen, _TINY, _PRIOR, limits, keep)
     return keep
-
-
-def point_D_pose(p_world: FloatArray) -> FloatArray:
-    """`B = [-I, p^]` (F, 3, 6): how a clone's error `[rho; phi]` moves a point as that clone sees it."""
-    B = np.zeros((len(p_world), 3, 6))
-    B[:, :, :3] = -np.eye(3)
-    B[:, :, 3:] = so3_hat(p_world)
-    return B
