@@ -434,6 +434,9 @@ def test_a_run_that_dies_after_its_checkpoint_goes_on_with_estimates_that_were_s
 ) -> None:
     config, folder = replace(Config(), lag_frames=4), GrowingFolder(tmp_path / "run", {})
     whole = run(open_dataset(flight_log), config)
+    gravity = whole.estimates.column("gravity_world")[-4:]
+    np.testing.assert_array_equal(gravity, gravity[-1:].repeat(4, axis=0))  # as known at the end, as are the poses
+    assert np.isfinite(gravity).all()
     stop = Stop(350)
 
     def died() -> str | None:

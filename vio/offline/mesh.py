@@ -30,7 +30,7 @@ from vio.runs.mapped import corrected, read_trajectories
 _VOXEL_SHARE = 1 / 250  # of the landmarks' depth, at least
 _STEP_SHARE, _STEP_DEG = 0.02, 4.0  # of the landmarks' depth: motion from one image that is used to the next; or turn
 _NEAR_QUANTILE = 0.25  # of the depths of landmarks
-_LEVEL = 0.99  # z of the upward direction above which a map's z is taken for up
+_LEVEL = 0.9998  # z of the upward direction, 1.1 degrees, above which a map's z is taken for up
 _SIGMA_VOXELS = float(TRUNCATION)  # of a depth, beyond which it is not used
 
 

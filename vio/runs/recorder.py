@@ -157,6 +157,7 @@ class RunRecorder:
                     velocity_world=late.velocity_world,
                     gyro_bias=late.gyro_bias,
                     accel_bias=late.accel_bias,
+                    gravity_world=late.gravity_world,
                 )
                 estimates.replace(k, estimate_row(int(row["index"]), now))
 
