@@ -319,6 +319,7 @@ def test_a_feature_of_several_loops_is_one_point() -> None:
 def test_priors_need_a_filter_that_reproduces_the_run(
     folder: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
+    assert "--imu takes a run with an IMU" in _error(capsys, "refine", str(folder), "--imu")
     held = _json(capsys, "refine", str(folder), "--priors", "filter", "--keyframes", "12")
     assert held["priors"] == "filter"
     free = _json(capsys, "refine", str(folder), "--keyframes", "12")

@@ -34,6 +34,9 @@ def add_parser(commands: Any) -> None:
         default="none",
         help="use the filter's camera positions and covariances as priors (replays the filter; default none)",
     )
+    parser.add_argument(
+        "--imu", action="store_true", help="take in the IMU, and find what the rig is off by, scale included"
+    )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of the solver (default 1: repeatable)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -57,6 +60,7 @@ def execute(args: argparse.Namespace) -> int:
             priors=args.priors == "filter",
             threads=args.threads,
             progress=lambda step: bar.update(step, STEPS + 1),
+            imu=args.imu,
         )
         metrics = {
             "out": str(args.run / FOLDER),
@@ -83,6 +87,7 @@ def _facts(run: SavedRun, done: Refinement) -> dict[str, Any]:
         "rms_before_px": done.adjustment.rms_before_px,
         "rms_after_px": done.adjustment.rms_after_px,
         "sigma_px": done.adjustment.sigma_px,
+        "imu": done.with_imu,
         "priors": "filter" if done.with_priors else "none",
         "moved_rms_m": done.moved_rms_m,
         "ate_before_m": done.ate_before_m,
@@ -108,8 +113,8 @@ def _rows(m: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
         (
             "keyframes",
-            f"{m['keyframes']} of {m['frames']} frames; {m['frames_aligned_to_points']} more aligned to the refined "
-            "points",
+            f"{m['keyframes']} of {m['frames']} frames; "
+            + ("with the IMU" if m["imu"] else f"{m['frames_aligned_to_points']} more aligned to the refined points"),
         ),
         ("points", f"{m['points']} from {m['rows']} stereo rows, {m['rows_dropped']} dropped as outliers"),
         ("residual", f"{m['rms_before_px']:.3f} px before, {m['rms_after_px']:.3f} px after"),

@@ -29,8 +29,8 @@ from vio.records import (
     StereoScaleEstimate,
 )
 
-_PRINCIPAL_POINT = 1 / 3  # standard deviation of its coordinates, in focal lengths, over that of the focal length
-_COLUMNS_BY_ROWS = 3.0  # of the standard deviation of a lens term, over the root mean square of the rows' field
+PRINCIPAL_POINT = 1 / 3  # standard deviation of its coordinates, in focal lengths, over that of the focal length
+COLUMNS_BY_ROWS = 3.0  # of the standard deviation of a lens term, over the root mean square of the rows' field
 _ROWS_MOVED = 2.0  # how much larger the rows' field must become for what was learned of the columns to be in doubt
 
 
@@ -43,7 +43,7 @@ class RigCalibration:
         self.rotation: RotationComparison | None = ROTATION_NOT_COMPARABLE  # as others compared them; None: they will
         self._rows = VerticalDisparityModel(camera)
         self._field_variances = prior_variances(settings)["stereo_field"]  # (8,) before anything was seen of it
-        self._rows_off = LEAST_FIELD_SIGMA / _COLUMNS_BY_ROWS  # size of the rows' field that gave them, focal lengths
+        self._rows_off = LEAST_FIELD_SIGMA / COLUMNS_BY_ROWS  # size of the rows' field that gave them, focal lengths
         self._field: tuple[Calibration, StereoCorrection | None] | None = None  # at a calibration, by the present rows
 
     def first_covariance(self, calibration: Calibration, T_world_imu: FloatArray) -> FloatArray:
@@ -73,7 +73,7 @@ class RigCalibration:
         begins = "stereo_field" not in window.state
         if not begins and off <= _ROWS_MOVED * self._rows_off:
             return
-        sigma = float(np.clip(_COLUMNS_BY_ROWS * off, LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA))
+        sigma = float(np.clip(COLUMNS_BY_ROWS * off, LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA))
         variances = stereo_field_sigmas(sigma, self._rows.offset_px / self.camera.fu) ** 2
         if begins:
             calibration = window.calibration.estimating("stereo_field", self.settings)
@@ -95,7 +95,7 @@ class RigCalibration:
         The baseline's is over its length, the others are over the focal length.
         """
         s = self.settings
-        centre = _PRINCIPAL_POINT * s.stereo_focal_sigma
+        centre = PRINCIPAL_POINT * s.stereo_focal_sigma
         sigmas = np.array([s.stereo_baseline_sigma, s.stereo_focal_sigma, centre, centre])
         if "stereo_scale" in window.state:
             sigmas[:2] = 0.0

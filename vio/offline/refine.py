@@ -18,11 +18,13 @@ from vio.files.yaml_text import MOST_BYTES, read_yaml
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.offline.colmap.adjustment import Adjustment, PositionPriors, adjust
+from vio.offline.inertial_refinement import adjust_with_imu, can_use_imu, inertial_keyframes
 from vio.offline.keyframes import TrackedPath, choose_keyframes
 from vio.offline.loop_tracks import loop_pairs
 from vio.offline.points import MIN_DEPTH_M, PointTracks, build_tracks, landmarks_of
 from vio.offline.saved_run import SavedRun
 from vio.records import BoolArray, Estimate, IntArray, Landmarks, Trajectory
+from vio.runs.mapped import corrected
 from vio.runs.pipeline import run as process
 
 log = logging.getLogger(__name__)
@@ -42,15 +44,18 @@ class Refinement:
     loops: int  # whose matches took part
     aligned: int  # frames between keyframes that were aligned to the refined points
     with_priors: bool
+    with_imu: bool
     moved_rms_m: float  # RMS displacement from the run, or from its poses in the map, after SE(3) alignment
     ate_before_m: float | None  # against the reference in the recording; None without one
     ate_m: float | None  # likewise, after refinement
 
 
 def refine_run(
-    run: SavedRun, *, most: int | None, priors: bool, threads: int, progress: Callable[[int], None]
+    run: SavedRun, *, most: int | None, priors: bool, threads: int, progress: Callable[[int], None], imu: bool = False
 ) -> Refinement:
-    """Bundle-adjust the keyframes of a run under its stereo rig, and align the other frames to the refined points.
+    """Bundle-adjust the keyframes of a run under its stereo rig, and take the other frames along.
+
+    Without IMU they are aligned to the refined points; with one, they keep the odometry's motion between keyframes.
 
     The features that agree with the loops of a run with a map are points across the loop, and the poses to begin with
     are those in the map.
@@ -61,24 +66,35 @@ def refine_run(
         priors: use the filter's camera positions and covariances as priors, if the filter reproduces the run.
         threads: of the solver; one makes the result repeatable.
         progress: called with the number of steps done.
+        imu: take in the IMU, and find what the rig is off by.
 
     Raises:
-        ConfigError: priors were asked for of a run that closed loops.
+        ConfigError: priors were asked for of a run that closed loops, or the IMU of one that used none.
         VioError: the run has too few views or no consistent track, or the solver failed.
     """
     path = run.tracked
     if priors and path.loops:
         raise ConfigError(f"{path.where}: its loops moved the poses away from the filter's; leave --priors out")
-    keyframes = choose_keyframes(path, most=most)
-    T_world_cam0 = path.trajectory.T_world_body[keyframes]
-    tracks = build_tracks(path, keyframes, T_world_cam0)
-    held = _priors(run, keyframes) if priors else None
-    progress(1)
+    if imu and (priors or not can_use_imu(run)):
+        raise ConfigError(f"{path.where}: --imu takes a run with an IMU and a pinhole pair, and no --priors filter")
     rounds = iter((2, 3))
-    done = adjust(
-        path.camera, T_world_cam0, tracks, priors=held, threads=threads, progress=lambda: progress(next(rounds))
-    )
-    poses, aligned = fill_between(path, keyframes, done.T_world_cam0, done.tracks)
+    held = None
+    if imu:
+        keyframes = inertial_keyframes(path, most)
+        settings = _estimator_settings(path.where / "config.yaml").msckf
+        done = adjust_with_imu(run, settings, keyframes, lambda: progress(next(rounds)))
+        T, number = path.trajectory.T_world_body, np.arange(len(path.frames))
+        poses, aligned = corrected(T, number, keyframes, done.T_world_cam0, T[keyframes]), 0
+    else:
+        keyframes = choose_keyframes(path, most=most)
+        T_world_cam0 = path.trajectory.T_world_body[keyframes]
+        tracks = build_tracks(path, keyframes, T_world_cam0)
+        held = _priors(run, keyframes) if priors else None
+        progress(1)
+        done = adjust(
+            path.camera, T_world_cam0, tracks, priors=held, threads=threads, progress=lambda: progress(next(rounds))
+        )
+        poses, aligned = fill_between(path, keyframes, done.T_world_cam0, done.tracks)
     progress(STEPS)
     refined = replace(path.trajectory, T_world_body=poses)
     before, after = _scores(run, refined)
@@ -101,6 +117,7 @@ def refine_run(
         loops=len(loop_pairs(path.loops, path.frames[keyframes])),
         aligned=aligned,
         with_priors=held is not None,
+        with_imu=imu,
         moved_rms_m=moved_rms_m,
         ate_before_m=before,
         ate_m=after,

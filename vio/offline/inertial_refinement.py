@@ -1,0 +1,130 @@
+"""What the adjustment of a saved run with an IMU begins with: keyframes, states, noise, and the priors of its rig."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from vio.filters.imu_terms import term_sigmas
+from vio.filters.online_calibration import LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA, stereo_field_sigmas
+from vio.filters.rig_calibration import COLUMNS_BY_ROWS, PRINCIPAL_POINT
+from vio.filters.settings import MsckfSettings
+from vio.geometry.lie import FloatArray
+from vio.imu.preintegration import BodyStates, Readings
+from vio.numerics.robust import robust_sigma
+from vio.offline.colmap.adjustment import Adjustment
+from vio.offline.inertial_adjustment import InertialAdjustment, RigPrior
+from vio.offline.keyframes import TrackedPath
+from vio.offline.loop_tracks import loop_pairs
+from vio.offline.points import PointTracks, build_tracks, reprojection
+from vio.offline.saved_run import SavedRun
+from vio.records import FIELD_TERMS, ROW_TERMS, ImuDensities, ImuSample, IntArray
+from vio.runs.files import RunFile
+from vio.runs.finished import read_estimates
+
+_EVERY_S = 0.25  # from keyframe to keyframe
+_LEAST_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
+_TINY = 1e-7  # focal lengths: of coefficients that are known
+
+
+def can_use_imu(run: SavedRun) -> bool:
+    """Whether a run has what an adjustment with an IMU needs: that sensor in use, and a pinhole pair."""
+    estimates = (run.tracked.where / RunFile.ESTIMATES).is_file()
+    return run.metrics.get("motion") == "imu" and not run.dataset.recording.camera.is_cylinder and estimates
+
+
+def inertial_keyframes(path: TrackedPath, most: int | None) -> IntArray:
+    """Return rows (K,) of the trajectory, a quarter of a second apart or as `most` allows, and both ends of loops."""
+    seconds = 1e-9 * (path.trajectory.times_ns - path.trajectory.times_ns[0])
+    ends = np.unique(loop_pairs(path.loops, path.frames))
+    count = int(np.ceil(seconds[-1] / _EVERY_S)) + 1
+    if most is not None:
+        count = max(min(count, most - len(ends)), 2)
+    near = np.searchsorted(seconds, np.linspace(0, seconds[-1], count) - 1e-6)
+    return np.union1d(near, ends)
+
+
+def adjust_with_imu(
+    run: SavedRun, settings: MsckfSettings, keyframes: IntArray, progress: Callable[[], None]
+) -> Adjustment:
+    """Adjust the keyframes of a run with its IMU, from the run's poses, biases and velocities.
+
+    Raises:
+        VioError: the run has too few views or no consistent track.
+    """
+    path, known = run.tracked, read_estimates(run.tracked.where / RunFile.ESTIMATES)
+    T = path.trajectory.T_world_body[keyframes]
+    tracks = build_tracks(path, keyframes, T)
+    progress()
+    here, last = known[keyframes], known[-1]
+    T_cam0_imu = last["T_cam0_imu"] if np.isfinite(last["T_cam0_imu"]).all() else run.T_cam0_imu
+    late_s = float(np.nan_to_num(last["time_offset_s"]))
+    T_world_imu = T @ T_cam0_imu
+    # The map may have turned the world.
+    turned = T_world_imu[:, :3, :3] @ np.swapaxes(here["T_world_imu"][:, :3, :3], 1, 2)
+    velocity = np.einsum("kij,kj->ki", turned, here["velocity_world"])
+    bias = np.nan_to_num(np.concatenate([here["gyro_bias"], here["accel_bias"]], axis=1))
+    motion = [x for x in run.dataset.motion if isinstance(x, ImuSample)]
+    values = np.array([[*x.gyro, *x.accel] for x in motion])
+    s = settings
+    densities = ImuDensities(s.gyro_noise_density, s.gyro_bias_walk, s.accel_noise_density, s.accel_bias_walk)
+    problem = InertialAdjustment(
+        path.camera,
+        tracks,
+        1e-9 * path.trajectory.times_ns[keyframes] + late_s,
+        Readings(1e-9 * np.array([x.time_ns for x in motion]), values[:, :3], values[:, 3:], densities),
+        T_cam0_imu,
+        _rig_prior(run, settings, last),
+        _row_sigmas(path, T, tracks),
+        np.repeat([s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2], 3),
+        s.gravity_mps2,
+    )
+    fit, _, _ = problem.solve(BodyStates(T_world_imu, velocity, bias))
+    progress()
+    found = replace(tracks, p_world=fit.p_world, z=problem.corrected_pixels(fit))
+    poses = problem.cameras(fit)
+    before, after = (reprojection(path.camera, *at)[0] for at in ((T, tracks), (poses, found)))
+    return Adjustment(
+        T_world_cam0=poses,
+        tracks=found,
+        rms_before_px=float(np.sqrt(np.mean(before[:, :3] ** 2))),
+        rms_after_px=float(np.sqrt(np.mean(after[:, :3] ** 2))),
+        rows_dropped=0,
+        sigma_px=robust_sigma(after[~tracks.by_loop][:, :3]),
+    )
+
+
+def _row_sigmas(path: TrackedPath, T_world_cam0: FloatArray, tracks: PointTracks) -> FloatArray:
+    """Robust standard deviations (R,) of a row's pixel coordinates: one of tracks, one of points that loops join."""
+    r = reprojection(path.camera, T_world_cam0, tracks)[0][:, :3]
+    out = np.ones(len(r))
+    for group in (tracks.by_loop, ~tracks.by_loop):
+        seen = group & tracks.has_right
+        if seen.any():
+            out[group] = max(robust_sigma(r[seen]), _LEAST_SIGMA_PX)
+    return out
+
+
+def _rig_prior(run: SavedRun, settings: MsckfSettings, last: np.void) -> RigPrior:
+    """What the rig may be off by before the run's tracks were seen; its rows, which are no pixels here, as it ended."""
+    s, camera = settings, run.tracked.camera
+    field, at_start = _TINY * np.eye(FIELD_TERMS + ROW_TERMS), np.zeros(FIELD_TERMS + ROW_TERMS)
+    if run.field is not None:
+        off = float(np.hypot(last["stereo_rows_rms_px"], camera.residual_px)) / camera.fu
+        sigma = float(np.clip(COLUMNS_BY_ROWS * off, LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA))
+        sigmas = stereo_field_sigmas(sigma, float(last["stereo_rows_rms_px"]) / camera.fu)
+        field[:FIELD_TERMS, :FIELD_TERMS] = np.diag(sigmas)
+        at_start[:FIELD_TERMS] = run.field.coefficients[:FIELD_TERMS] / sigmas
+        rows = last["stereo_rows_covariance"]
+        field[FIELD_TERMS:, FIELD_TERMS:] = np.linalg.cholesky(rows + _TINY**2 * np.eye(ROW_TERMS))
+    centre = PRINCIPAL_POINT * s.stereo_focal_sigma
+    return RigPrior(
+        field,
+        at_start,
+        np.array([s.stereo_baseline_sigma, s.stereo_focal_sigma, centre, centre]),
+        np.repeat([s.extrinsic_translation_sigma_m, np.radians(s.extrinsic_rotation_sigma_deg)], 3),
+        s.time_offset_sigma_s,
+        float(term_sigmas()[0]),
+    )
