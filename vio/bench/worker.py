@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import sys
 import tempfile
 import threading
@@ -25,8 +26,8 @@ from vio.bench.identity import code_digest, package_versions
 from vio.config import Config, merge
 from vio.datasets import open_dataset
 from vio.datasets.frame_times import frames_between, parse_bound, used_frames
-from vio.errors import DataError, VioError
-from vio.evaluation.trajectories import Evaluation, evaluate
+from vio.errors import DataError, EvaluationError, VioError
+from vio.evaluation.trajectories import LEAST_POSES, Evaluation, associate, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
 from vio.protocols import Dataset
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 _WARM_FRAMES = 8  # in which compiled functions are loaded: left out of the CPU time a frame, as its wall times
 _MOST_WARNINGS = 5
 JOB, RESULT = "job.json", "result.json"
+_BODY = re.compile(r"^#\s*body:\s*(\S+)", re.MULTILINE)
 
 
 class _CpuTimer:
@@ -113,6 +115,36 @@ def _truth(job: dict[str, Any], config: Config) -> _Truth:
     own = dataset.recording.reference
     reference = own if job["reference"] is None else read_trajectory(Path(job["reference"]))
     return _Truth(dataset, reference, first, total if end is None else min(end, total))
+
+
+def reference_fault(job: dict[str, Any]) -> str | None:
+    """Return why a run's ground truth cannot be that of its recording, by times and body; None: it may be.
+
+    Nothing is run. A recording that cannot be opened is left to its task.
+    """
+    try:
+        truth = _truth(job, merge(Config(), job["config"], where="the suite"))
+    except VioError:
+        return None
+    if truth.reference is None:
+        return None
+    recording, times_ns = truth.dataset.recording, truth.frame_times_ns
+    name = f"the ground truth {job['reference'] or f'in {recording.path}'} is not that of the recording"
+    if job["reference"] is not None and _stated_body(Path(job["reference"])) == "imu" and recording.T_cam0_imu is None:
+        return f"{name}: it describes the IMU, whose place on the rig (T_cam0_imu) the recording does not know"
+    poses = np.broadcast_to(np.eye(4), (len(times_ns), 4, 4))
+    frames = Trajectory(poses, times_ns, truth.reference.body, np.arange(truth.first, truth.end))
+    try:
+        matched = len(associate(frames, truth.reference.numbered())[1])
+    except EvaluationError as error:
+        return f"{name}: {str(error).replace('the estimate', 'the recording')}"
+    return f"{name}: it has poses of {matched} of {len(frames)} frames" if matched < LEAST_POSES else None
+
+
+def _stated_body(path: Path) -> str | None:
+    """Return which frame a trajectory's file says it describes, by its comment."""
+    found = _BODY.search(path.read_text(encoding="utf-8", errors="replace"))
+    return None if found is None else found[1]
 
 
 def _measured(timer: _CpuTimer, began: float) -> dict[str, Any]:
@@ -259,7 +291,7 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
         raise DataError(f"{recording.path}: no ground truth; name one with reference: in the suite")
     path = Path(job["trajectory"])
     trajectory = read_trajectory(path)
-    if "# body:" not in path.read_text(encoding="utf-8", errors="replace"):
+    if _stated_body(path) is None:
         trajectory = read_trajectory(path, body=truth.reference.body)
     times_ns = truth.frame_times_ns
     trajectory = between(trajectory, int(times_ns[0]), int(times_ns[-1]))
