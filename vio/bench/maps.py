@@ -141,9 +141,9 @@ def _causal_figures(
     if T_ref_map is not None:
         T_true = score.reference.in_imu(T_cam0_body).T_world_body
         figures["placed_wrong"] = wrong_share(T_ref_map @ causal.T_world_body[score.rows], T_true)
-    # The first pose in another session's map is no more certain than the others, which are not to have its error.
-    fitted = None if T_ref_map is None else se3_inverse(score.T_ref_est)
-    values = pose_nees(score, causal.T_world_body, covariances, T_cam0_body, upright=False, T_world_true=fitted)
+    # A map is turned upright, and another session's is entered anywhere: its world is not that of the first pose.
+    world = se3_inverse(score.T_ref_est if T_ref_map is None else T_ref_map)
+    values = pose_nees(score, causal.T_world_body, covariances, T_cam0_body, upright=False, T_world_true=world)
     if values is None:
         return figures
     quantiles = {f"map_nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}
