@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.dataset_makers import make_drive, make_mat, utias_arrays
+from tests.dataset_makers import FRAME_S, make_drive, make_kitti, make_mat, utias_arrays
 from vio.bench import execute
 from vio.bench.bench import Place, bench, has_succeeded, read_bench
 from vio.bench.engines import _check_workers, run_here
@@ -33,6 +33,7 @@ from vio.bench.tables import BY_NAME, METRICS, Outcome, cell_text, markdown, num
 from vio.bench.tasks import tasks_of
 from vio.bench.worker import perform
 from vio.cli import main
+from vio.datasets import open_dataset
 from vio.errors import ConfigError, VioError
 from vio.evaluation.trajectories import evaluate
 from vio.files.trajectories import read_trajectory, write_tum
@@ -503,8 +504,6 @@ def test_another_systems_trajectory_joins_the_table(data: Path, tmp_path: Path) 
     """It is evaluated as our runs are; a part of the recording is a coverage below one, a wrong file says why."""
     drive = make_drive(14, seed=0, pixel_sigma=0.3)
     suite = _suite(tmp_path, sequences={"first": {"source": "drive0.mat", "lengths_m": [3]}})
-    from vio.datasets import open_dataset
-
     recording = open_dataset(str(data / "drive0.mat")).recording
     peers = tmp_path / "peers"
     peers.mkdir()
@@ -559,22 +558,43 @@ def test_what_cannot_be_run_is_named_before_the_first_task(
 ) -> None:
     (tmp_path / "truth.tum").write_text("1 2 3\n")
     shutil.copy(data / "drive0.mat", tmp_path)
+    make_kitti(tmp_path / "kitti", 6)
+    for name in ("T_cam0_imu.txt", "velocity.csv"):
+        (tmp_path / "kitti" / name).unlink()
+    times_ns = open_dataset(str(data / "drive0.mat")).recording.frame_times_ns
+    poses = np.tile(np.eye(4), (14, 1, 1))
+    write_tum(tmp_path / "elsewhere.tum", Trajectory(poses, times_ns + 10**15, "imu"))
+    write_tum(tmp_path / "few.tum", Trajectory(poses, np.r_[times_ns[:2], times_ns[2:] + 10**15], "imu"))
+    write_tum(tmp_path / "imu.tum", Trajectory(poses[:6], np.arange(6) * round(1e9 * FRAME_S), "imu"))
     sequences = {
         "gone": "gone.mat",
         "damaged": {"source": "drive0.mat", "reference": "truth.tum"},
         "fine": "drive0.mat",
+        "elsewhere": {"source": "drive0.mat", "reference": "elsewhere.tum"},
+        "few": {"source": "drive0.mat", "reference": "few.tum"},
+        "other_body": {"source": "kitti", "reference": "imu.tum"},
     }
     named: list[str] = []
+    ready: list[str] = []
 
     def run(jobs: Any, cache: str, *, workers: int) -> Any:
-        named.extend(record.getMessage() for record in caplog.records)
+        named.extend(record.getMessage() for record in caplog.records if " cannot be run: " in record.getMessage())
+        ready.extend(jobs)
         yield from ()
 
     monkeypatch.setattr("vio.bench.bench.run_here", run)
-    bench(_suite(tmp_path, sequences=sequences), Place(tmp_path, tmp_path / "out", tmp_path / "cache"))
-    assert [line.partition(" cannot be run: ")[0] for line in named] == ["gone", "damaged"]
-    assert "gone.mat does not exist" in named[0]
-    assert "3 columns fit no known format" in named[1]
+    result = bench(_suite(tmp_path, sequences=sequences), Place(tmp_path, tmp_path / "out", tmp_path / "cache"))
+    lines = {name: why for name, _, why in (line.partition(" cannot be run: ") for line in named)}
+    assert list(lines) == ["gone", "damaged", "elsewhere", "few", "other_body"]
+    assert ready == [o.key for o in result.outcomes if o.sequence == "fine"]
+    assert "gone.mat does not exist" in lines["gone"]
+    assert "3 columns fit no known format" in lines["damaged"]
+    assert "is not that of the recording: no poses within 0.01 s of each other" in lines["elsewhere"]
+    assert "it has poses of 2 of 14 frames" in lines["few"]
+    assert (
+        "it describes the IMU, whose place on the rig (T_cam0_imu) the recording does not know" in lines["other_body"]
+    )
+    assert {o.failure for o in result.failures if o.sequence != "fine"} == set(lines.values())
 
 
 def test_ground_truth_of_another_body_is_doubted(data: Path, tmp_path: Path) -> None:
@@ -583,8 +603,6 @@ def test_ground_truth_of_another_body_is_doubted(data: Path, tmp_path: Path) -> 
     text = markdown(_suite(tmp_path), summary_rows(runs), runs, {"version": "1", "packages": {}})
     assert text.count("- a, x: the reference looks wrong") == 1
     poses = make_drive(14, seed=0, pixel_sigma=0.3).T_world_imu @ se3_exp([0.0, 0.0, 0.0, 1.2, 0.0, 0.0])
-    from vio.datasets import open_dataset
-
     times_ns = open_dataset(str(data / "drive0.mat")).recording.frame_times_ns
     write_tum(tmp_path / "turned.tum", Trajectory(poses, times_ns, "imu"))
     shutil.copy(data / "drive0.mat", tmp_path)

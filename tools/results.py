@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from vio.bench.bench import has_succeeded, read_bench
-from vio.bench.suite import SUCCESS_PERCENT
+from vio.bench.suite import SUCCESS_PERCENT, read_suite
 from vio.bench.tables import BY_NAME, Outcome, Row, full_table, matrix, provenance, summary_rows
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -48,7 +48,7 @@ SUITES: Mapping[str, tuple[str, ...]] = {  # by name: what `vio bench` is called
     "maps": (str(OWN / "maps.yaml"),),
     "speed": (str(OWN / "speed.yaml"), "--workers", "1"),
 }
-PEERS = ("real", "real_imu", "flights")  # suites beside trajectories of other systems
+PEERS = ("real", "real_imu", "flights", "maps")  # suites beside trajectories of other systems, where there are any
 _KEPT = ("suite", "version", "commit", "machine", "written", "packages", "titles")
 _DIGITS = 6  # significant, of figures in the file
 _TABLE = re.compile(r"(<!-- suite: (\w+)((?: \w+=\S+)+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -170,7 +170,9 @@ def run_suite(name: str, args: argparse.Namespace) -> dict[str, Any]:
     """
     out = args.work / name
     words = [*SUITES[name], "--data", str(args.data), "--out", str(out), "--cache", str(args.work / "cache")]
-    words += ["--peers", str(args.peers)] if args.peers is not None and name in PEERS else []
+    names = {s.name for s in read_suite(SUITES[name][0]).sequences if name in PEERS}
+    if args.peers is not None and any(path.name.split(".")[0] in names for path in args.peers.glob("*.tum")):
+        words += ["--peers", str(args.peers)]
     words += ["--workers", str(args.workers)] if args.workers is not None and "--workers" not in words else []
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     (out / "bench.json").unlink(missing_ok=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,22 @@ from typing import Any
 from vio._version import __version__
 from vio.bench.engines import run_here, run_on_dask
 from vio.bench.execute import failed
-from vio.bench.identity import ROOT, Identity, InputDigests, code_digest, commit_of, machine, package_versions
+from vio.bench.identity import (
+    ROOT,
+    Identity,
+    InputDigests,
+    code_digest,
+    commit_of,
+    digest_of,
+    machine,
+    package_versions,
+)
 from vio.bench.report import latex_of, write_bench_report
 from vio.bench.store import Record, Store
 from vio.bench.suite import Suite
 from vio.bench.tables import SUCCESS_COVERAGE, Outcome, csv_of_rows, csv_of_runs, markdown, summary_rows
 from vio.bench.tasks import Task, tasks_of
+from vio.bench.worker import reference_fault
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text, check_writable, locked_folder
 from vio.files.inputs import read_input
@@ -73,8 +83,6 @@ def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: N
     digests = InputDigests(place.cache / "inputs.json", place.identity)
     tasks = tasks_of(suite, place.data, digests, place.peers)
     digests.save()
-    for sequence, why in {task.sequence: task.failure for task in tasks if task.failure is not None}.items():
-        log.warning("%s cannot be run: %s", sequence, why)
     with locked_folder(place.out):
         records: dict[str, Record] = {}
         missing: dict[str, dict[str, Any]] = {}
@@ -86,6 +94,11 @@ def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: N
                 else:
                     records[task.key] = _without_poses(record)
         reused = len(records)
+        wrong = _wrong_references(missing)
+        missing = {key: job for key, job in missing.items() if key not in wrong}
+        tasks = [replace(task, failure=wrong.get(task.key, task.failure)) for task in tasks]
+        for sequence, why in {task.sequence: task.failure for task in tasks if task.failure is not None}.items():
+            log.warning("%s cannot be run: %s", sequence, why)
         progress(len(tasks) - len(missing), len(tasks))
         for key, record in _results(missing, place):
             if record.pop("keep", True):
@@ -117,6 +130,20 @@ def _results(jobs: Mapping[str, dict[str, Any]], place: Place) -> Iterator[tuple
     if place.scheduler is not None and jobs:
         return run_on_dask(jobs, cache, address=place.scheduler)
     return run_here(jobs, cache, workers=place.workers)
+
+
+def _wrong_references(jobs: Mapping[str, dict[str, Any]]) -> dict[str, str]:
+    """Return why the ground truth of some tasks cannot be that of their recording; each is read once."""
+    faults: dict[str, str | None] = {}
+    wrong = {}
+    for key, job in jobs.items():
+        if job["source"] is not None and job["kind"] == "run":
+            inputs = digest_of([job[name] for name in ("source", "reference", "start", "stop")])
+            if inputs not in faults:
+                faults[inputs] = reference_fault(job)
+            if (why := faults[inputs]) is not None:
+                wrong[key] = why
+    return wrong
 
 
 def _without_poses(record: Record) -> Record:

@@ -17,7 +17,10 @@ from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, s
 from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
 _OF_REFERENCE = ("ate_sim3_m", "scale_error_percent", "rpe_m", "drift_percent", "drift_deg_per_100m", "nees")
-_OF_PLACES = ("map_nees", "map_nees_50", "map_nees_95")
+_OF_LOOPS = ("loops", "loops_false", "loop_error_m", "loop_recall")
+_OF_PLACES = ("placed", "place_s", "map_causal_ate_m", "map_nees", "map_nees_50", "map_nees_95")
+_OF_COVERS = ("again_s", "placed_again")
+_OF_MAPS = ("map_ate_m", "placed_wrong", *_OF_LOOPS, *_OF_PLACES, *_OF_COVERS)
 _CURVE = 240  # points of the error over time that are kept; a report shows no more
 _QUANTILES = (0, 5, 25, 50, 75, 95, 100)
 _FRAME_NS = 10_000_000  # a pose within 10 ms of a frame is that frame's, as in `vio eval`
@@ -65,6 +68,7 @@ def pose_nees(
     T_cam0_imu: FloatArray,
     *,
     upright: BoolArray | bool,
+    T_world_true: FloatArray | None = None,
 ) -> FloatArray | None:
     """Return the NEES (M,) of the poses, 6 in the mean for a consistent filter; None: no covariance can be inverted.
 
@@ -77,6 +81,7 @@ def pose_nees(
         covariances: (N, 6, 6) of xi in T_imu_world = exp(xi) T_imu_world_hat.
         T_cam0_imu: (4, 4) extrinsics.
         upright: (N,) or one for all, whether both worlds have z up; where that ends, they are identified anew.
+        T_world_true: (4, 4) of the reference's world in the filter's; None: as said above.
     """
     truth = evaluation.reference.in_imu(T_cam0_imu).T_world_body
     T, P = T_world_imu[evaluation.rows], covariances[evaluation.rows]
@@ -85,8 +90,9 @@ def pose_nees(
     for rows in (np.flatnonzero(upright), np.flatnonzero(~upright)):
         if len(rows):
             a, b = T[rows[0]], truth[rows[0]]
-            T_world_true = _yaw_and_position(a, b) if upright[rows[0]] else a @ se3_inverse(b)
-            errors[rows] = se3_log(se3_inverse(T_world_true @ truth[rows]) @ T[rows])
+            first = _yaw_and_position(a, b) if upright[rows[0]] else a @ se3_inverse(b)
+            world = first if T_world_true is None else T_world_true
+            errors[rows] = se3_log(se3_inverse(world @ truth[rows]) @ T[rows])
     invertible = np.linalg.cond(P) < _MOST_CONDITION
     if not invertible.any():
         return None
@@ -123,15 +129,20 @@ def absent_reasons(
         "landmarks_m": "there are no surveyed landmarks",
         **dict.fromkeys(("innovation_px", "innovation_ratio"), "no observation was used"),
         "map_ate_m": "there was no map",
-        **dict.fromkeys(("loops", "loops_false", "loop_error_m", "loop_recall"), "no map was built"),
-        **dict.fromkeys(("placed", "place_s", "map_causal_ate_m", *_OF_PLACES), "no place was found in a map"),
+        **dict.fromkeys(_OF_LOOPS, "no map was built"),
+        **dict.fromkeys(_OF_PLACES, "no place was found in a map"),
+        "placed_wrong": "places are compared in the map of another session",
+        **dict.fromkeys(_OF_COVERS, "nothing covered the cameras"),
     }
+    if figures.get("placed_again") is not None:
+        why["again_s"] = "the place was not found again"
     if figures.get("loops") is not None:
         why |= {"loop_error_m": "there is no loop", "loop_recall": "no place was seen again"}
     if peer:
-        why |= dict.fromkeys(
-            ("nees", "refused_share", "cpu_ms", "memory_mib"), "a trajectory of another system does not say"
-        )
+        own = ("nees", "refused_share", "cpu_ms", "memory_mib", *_OF_MAPS)
+        why |= dict.fromkeys(own, "a trajectory of another system does not say")
+        if figures.get("ate_m") is None:
+            why |= dict.fromkeys(("ate_m", *_OF_REFERENCE), "its poses are those in a map")
     why |= dict.fromkeys(("nees_50", "nees_95"), why["nees"])
     return {name: text for name, text in why.items() if figures.get(name) is None}
 

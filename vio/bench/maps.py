@@ -1,7 +1,8 @@
-"""The figures of a map: errors in it, its loops against ground truth, and how soon a place is found."""
+"""The figures of a map: errors in it, its loops against ground truth, how soon a place is found, and found again."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,16 +11,42 @@ import numpy as np
 
 from vio.bench.figures import pose_nees
 from vio.errors import EvaluationError
-from vio.evaluation.trajectories import Evaluation, evaluate
+from vio.evaluation.trajectories import Evaluation, evaluate, rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
 from vio.mapping.map_store import MapStore
-from vio.records import NS_PER_S, IntArray, Trajectory
-from vio.runs.mapped import MappedRun
+from vio.protocols import Dataset
+from vio.records import NS_PER_S, BoolArray, Event, IntArray, Observations, Recording, StereoFrame, Trajectory
 from vio.runs.pipeline import RunResult
 
 # A keyframe is at a place seen before where a keyframe of an earlier visit is so near and looks the same way.
 _REVISIT_M, _REVISIT_DEG, _REVISIT_NS = 3.0, 30.0, 10 * NS_PER_S
-_FALSE_M, _FALSE_DEG = 0.5, 5.0  # error of a loop's motion from which it is false
+_FALSE_M, _FALSE_DEG = 0.5, 5.0  # error of a loop's motion, or of a place, from which it is false
+_PLACED_M = 1.0  # stated standard deviation of a position beyond which a frame is not localised
+
+
+@dataclass(frozen=True, slots=True)
+class Covered:
+    """A recording whose cameras are covered for a while: black images, and a motion sensor that goes on."""
+
+    source: Dataset
+    spans: tuple[tuple[int, int], ...]  # first frame, and the one after the last
+
+    @property
+    def recording(self) -> Recording:
+        """That of the source."""
+        return self.source.recording
+
+    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+        """Yield the events of some frames."""
+        for event in self.source.events(start, stop, images=images):
+            if isinstance(event, StereoFrame) and any(first <= event.index < end for first, end in self.spans):
+                left, right = (None if image is None else np.zeros_like(image) for image in (event.left, event.right))
+                event = replace(event, left=left, right=right)
+            yield event
+
+    def observations(self, index: int) -> Observations | None:
+        """Return nothing: it is images that are covered."""
+        return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +59,15 @@ class LoopScore:
     recall: float | None  # share of the keyframes at a place seen before of which a loop was kept; None: there is none
 
 
-def map_figures(result: RunResult, truth: Evaluation, reference: Trajectory, store: Path | None) -> dict[str, Any]:
+def map_figures(
+    result: RunResult,
+    truth: Evaluation,
+    reference: Trajectory,
+    *,
+    store: Path | None,
+    T_ref_map: FloatArray | None,
+    covered: Sequence[tuple[int, int]],
+) -> dict[str, Any]:
     """Return the figures of a run with a map by name; those that are undefined are left out.
 
     Args:
@@ -40,6 +75,8 @@ def map_figures(result: RunResult, truth: Evaluation, reference: Trajectory, sto
         truth: its odometry against the reference.
         reference: ground truth.
         store: the map that the run built; None: it was localised in one of another session.
+        T_ref_map: (4, 4) world of the reference from the map of another session; None: not known.
+        covered: first frame, and the one after the last, of each time that the cameras were covered.
 
     Raises:
         VioError: the poses in the map cannot be compared, or the map's file is damaged.
@@ -47,12 +84,15 @@ def map_figures(result: RunResult, truth: Evaluation, reference: Trajectory, sto
     mapped = result.mapped
     assert mapped is not None
     final = replace(result.trajectory, T_world_body=mapped.T_map_body)
-    frames = np.array(result.estimates.column("index"))
-    figures: dict[str, Any] = {
-        "map_ate_m": evaluate(final, reference, T_cam0_imu=result.T_cam0_body).ate_m.rmse,
-        "placed": len(mapped.causal) / len(frames),
-    }
-    figures |= _causal_figures(result, mapped, reference)
+    figures: dict[str, Any] = {"map_ate_m": evaluate(final, reference, T_cam0_imu=result.T_cam0_body).ate_m.rmse}
+    known = np.trace(mapped.causal["covariance"][:, :3, :3], axis1=1, axis2=2) < _PLACED_M**2
+    for first, end in covered:  # where the cameras show nothing, a pose is no place
+        known &= (mapped.causal["index"] < first) | (mapped.causal["index"] >= end)
+    placed = mapped.causal[known]
+    frames, times_ns = (np.array(result.estimates.column(name)) for name in ("index", "time_ns"))
+    figures |= placement_figures(frames, times_ns, np.isin(frames, placed["index"]), covered)
+    causal = Trajectory(np.array(placed["T_map_body"]), np.array(placed["time_ns"]), result.body)
+    figures |= _causal_figures(causal, np.array(placed["covariance"]), reference, result.T_cam0_body, T_ref_map)
     if store is not None:
         T_true = truth.reference.in_imu(result.T_cam0_body).T_world_body
         score = loop_score(store, frames[truth.rows], T_true, result.T_cam0_body)
@@ -61,37 +101,59 @@ def map_figures(result: RunResult, truth: Evaluation, reference: Trajectory, sto
     return {name: value for name, value in figures.items() if value is not None}
 
 
-def _causal_figures(result: RunResult, mapped: MappedRun, reference: Trajectory) -> dict[str, float]:
-    """Return when the first place was known, and the error and NEES of the poses in the map as known at the time."""
-    causal = mapped.causal
-    if not len(causal):
-        return {}
-    times_ns = np.array(causal["time_ns"])
-    T, P = np.array(causal["T_map_body"]), np.array(causal["covariance"])
-    began_ns = int(np.asarray(result.estimates.column("time_ns"))[0])
-    figures = {"place_s": (int(times_ns[0]) - began_ns) / NS_PER_S}
+def placement_figures(
+    frames: IntArray, times_ns: IntArray, placed: BoolArray, covered: Sequence[tuple[int, int]]
+) -> dict[str, float | None]:
+    """Return how many frames are localised, how soon the first is, and the same after the cameras were covered.
+
+    Args:
+        frames: (N,) numbers of the frames with an estimate.
+        times_ns: (N,) their times.
+        placed: (N,) which of them are localised at the time.
+        covered: first frame, and the one after the last, of each time that the cameras were covered.
+    """
+    figures: dict[str, float | None] = {"placed": float(placed.mean())}
+    if placed.any():
+        figures["place_s"] = float(times_ns[placed][0] - times_ns[0]) / NS_PER_S
+    ends = [first for first, _ in covered[1:]] + [int(frames[-1]) + 1]
+    spans = zip([end for _, end in covered], ends, strict=False)
+    after = [seen for end, until in spans if (seen := (frames >= end) & (frames < until)).any()]
+    if after:
+        figures["placed_again"] = float(placed[np.any(after, axis=0)].mean())
+        if all(placed[seen].any() for seen in after):  # of several, the longest
+            figures["again_s"] = max(float(times_ns[seen & placed][0] - times_ns[seen][0]) for seen in after) / NS_PER_S
+    return figures
+
+
+def _causal_figures(
+    causal: Trajectory,
+    covariances: FloatArray,
+    reference: Trajectory,
+    T_cam0_body: FloatArray,
+    T_ref_map: FloatArray | None,
+) -> dict[str, float]:
+    """Return error and NEES of the localised poses as known at the time, and the share of wrong places."""
     try:
-        score = evaluate(Trajectory(T, times_ns, result.body), reference, T_cam0_imu=result.T_cam0_body)
+        score = evaluate(causal, reference, T_cam0_imu=T_cam0_body)
     except EvaluationError:  # known for too short a time
-        return figures
-    figures["map_causal_ate_m"] = score.ate_m.rmse
-    known = np.isfinite(P[score.rows]).all(axis=(1, 2))
-    part = replace(score, rows=score.rows[known], reference=_rows(score.reference, known))
-    values = pose_nees(part, T, P, result.T_cam0_body, upright=False) if known.any() else None
+        return {}
+    figures = {"map_causal_ate_m": score.ate_m.rmse}
+    if T_ref_map is not None:
+        T_true = score.reference.in_imu(T_cam0_body).T_world_body
+        figures["placed_wrong"] = wrong_share(T_ref_map @ causal.T_world_body[score.rows], T_true)
+    # A map is turned upright, and another session's is entered anywhere: its world is not that of the first pose.
+    world = se3_inverse(score.T_ref_est if T_ref_map is None else T_ref_map)
+    values = pose_nees(score, causal.T_world_body, covariances, T_cam0_body, upright=False, T_world_true=world)
     if values is None:
         return figures
     quantiles = {f"map_nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}
     return {**figures, "map_nees": float(values.mean()), **quantiles}
 
 
-def _rows(trajectory: Trajectory, chosen: Any) -> Trajectory:
-    times_ns, indices = trajectory.times_ns, trajectory.frame_indices
-    return replace(
-        trajectory,
-        T_world_body=trajectory.T_world_body[chosen],
-        times_ns=None if times_ns is None else times_ns[chosen],
-        frame_indices=None if indices is None else indices[chosen],
-    )
+def wrong_share(T: FloatArray, T_true: FloatArray) -> float:
+    """Return the share of poses (M, 4, 4) that are false, as a loop is."""
+    E = se3_inverse(T_true) @ T
+    return float(np.mean((np.linalg.norm(E[:, :3, 3], axis=1) > _FALSE_M) | (rotation_angle_deg(E) > _FALSE_DEG)))
 
 
 def loop_score(store: Path, frames: IntArray, T_world_body: FloatArray, T_cam0_body: FloatArray) -> LoopScore:

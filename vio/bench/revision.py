@@ -91,7 +91,8 @@ def _as_yaml(suite: Suite) -> dict[str, Any]:
         values: dict[str, Any] = {"source": s.source, "reference": s.reference, "stop": s.stop, "settings": s.settings}
         values |= {"render": list(s.render) or None, "lengths_m": None if s.lengths_m is None else list(s.lengths_m)}
         values |= {name: getattr(s, name) for name in ("render_each_seed", "positions_only", "exact_truth", "start")}
-        values |= {"map": s.map or None, "map_of": s.map_of}  # older revisions do not know all keys
+        # Older revisions do not know all keys.
+        values |= {"map": s.map or None, "map_of": s.map_of, "covered": [list(span) for span in s.covered] or None}
         sequences[s.name] = {name: value for name, value in values.items() if value is not None}
     configurations = {
         name: {**values, **({"config": str(suite.folder / str(values["config"]))} if values.get("config") else {})}

@@ -44,6 +44,7 @@ class Sequence:
     settings: Mapping[str, Any] | None = None  # over those of the configuration
     map: bool = False  # build a map, and score it
     map_of: str | None = None  # the sequence in whose map this one is localised, built beforehand in the same task
+    covered: tuple[tuple[str, str], ...] = ()  # from, to: the images are black meanwhile, and the rig is moved
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,12 +204,16 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
             if given.get(key) is not None:
                 given[key] = str(given[key])
                 parse_bound(given[key])
+        given["covered"] = tuple((str(begin), str(end)) for begin, end in given.get("covered") or ())
+        for bound in (bound for span in given["covered"] for bound in span):
+            parse_bound(bound)
         if given.get("lengths_m") is not None:
             given["lengths_m"] = tuple(float(v) for v in given["lengths_m"])
             if not given["lengths_m"] or any(not 0 < v < float("inf") for v in given["lengths_m"]):
                 raise ValueError(f"lengths_m {given['lengths_m']}")
     except (ValueError, TypeError) as error:
-        raise ConfigError(f"{place}: start and stop are frames or times as 12s, lengths_m metres ({error})") from error
+        text = "start and stop are frames or times as 12s, covered pairs of them, lengths_m metres"
+        raise ConfigError(f"{place}: {text} ({error})") from error
     for key in ("render_each_seed", "positions_only", "exact_truth", "map"):
         if not isinstance(given.get(key, False), bool):
             raise ConfigError(f"{place}: {key} takes true or false, got {given[key]!r}")

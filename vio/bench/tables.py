@@ -52,10 +52,19 @@ MORE_METRICS = (
     Metric("innovation_ratio", "innovation over its sigma", 2),
     Metric("reference_m", "length m", 3),
     Metric("frames", "frames", 6),
+    Metric("wall_ms", "wall ms", 3, measured=True),
+    Metric("wall_95_ms", "wall ms, 95 %", 3, measured=True),
+    Metric("frontend_ms", "front end ms", 3, measured=True),
+    Metric("filter_ms", "filter ms", 3, measured=True),
+)
+OF_MAPS = (
     Metric("map_ate_m", "ATE m in the map", 3),
     Metric("map_causal_ate_m", "causal ATE m in the map", 3),
     Metric("placed", "frames localised", 3, larger_is_better=True),
     Metric("place_s", "first localised s", 3),
+    Metric("placed_wrong", "wrong places", 3),
+    Metric("again_s", "localised again s", 3),
+    Metric("placed_again", "frames localised again", 3, larger_is_better=True),
     Metric("loops", "loops", 4),
     Metric("loops_false", "false loops", 3),
     Metric("loop_error_m", "loop error m", 3),
@@ -63,12 +72,8 @@ MORE_METRICS = (
     Metric("map_nees", "NEES in the map", 3),
     Metric("map_nees_50", "NEES in the map, median", 3),
     Metric("map_nees_95", "NEES in the map, 95 %", 3),
-    Metric("wall_ms", "wall ms", 3, measured=True),
-    Metric("wall_95_ms", "wall ms, 95 %", 3, measured=True),
-    Metric("frontend_ms", "front end ms", 3, measured=True),
-    Metric("filter_ms", "filter ms", 3, measured=True),
 )
-BY_NAME = {metric.name: metric for metric in (*METRICS, *MORE_METRICS)}
+BY_NAME = {metric.name: metric for metric in (*METRICS, *MORE_METRICS, *OF_MAPS)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,6 +237,8 @@ def markdown(suite: Suite, rows: Sequence[Row], outcomes: Sequence[Outcome], fac
         "## Systems\n\nMedian and worst over the sequences of the medians over seeds; n in brackets.\n\n"
         + "\n".join(system_table(rows)),
     ]
+    if mapped := [row for row in rows if any(metric.name in row.cells for metric in OF_MAPS)]:
+        parts.append("## Maps\n\n" + "\n".join(full_table(mapped, OF_MAPS)))
     if reasons := list(failure_lines(outcomes)):
         parts.append("## Without a result\n\n" + "\n".join(reasons))
     if noted := dict.fromkeys((o.sequence, o.system, note) for o in outcomes for note in o.notes):

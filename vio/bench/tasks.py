@@ -130,6 +130,7 @@ def _common(sequence: Sequence, data: Path, digests: InputDigests, seed: int) ->
         "positions_only": sequence.positions_only,
         "exact_truth": _has_exact_truth(sequence),
         "map": sequence.map,
+        "covered": [list(span) for span in sequence.covered],
         "code": code_digest(),
         "packages": package_versions(),
     }

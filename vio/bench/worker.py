@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,12 +26,12 @@ from vio.bench.identity import code_digest, package_versions
 from vio.config import Config, merge
 from vio.datasets import open_dataset
 from vio.datasets.frame_times import frames_between, parse_bound, used_frames
-from vio.errors import DataError, VioError
-from vio.evaluation.trajectories import Evaluation, evaluate
+from vio.errors import DataError, EvaluationError, VioError
+from vio.evaluation.trajectories import LEAST_POSES, Evaluation, associate, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
 from vio.protocols import Dataset
-from vio.records import BoolArray, IntArray, Trajectory
+from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
 if TYPE_CHECKING:
     from vio.records import FrameResult
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
 _WARM_FRAMES = 8  # in which compiled functions are loaded: left out of the CPU time a frame, as its wall times
 _MOST_WARNINGS = 5
 JOB, RESULT = "job.json", "result.json"
+_BODY = re.compile(r"^#\s*body:\s*(\S+)", re.MULTILINE)
+# Poses of a SLAM system in its map, as known at the end or at the time of their frame; else of its odometry.
+_POSES = re.compile(r"^#\s*map:\s*(final|causal)\s*$", re.MULTILINE)
 
 
 class _CpuTimer:
@@ -75,6 +79,7 @@ class _Truth:
     reference: Trajectory | None
     first: int
     end: int
+    covered: tuple[tuple[int, int], ...] = ()  # likewise, of each time that the cameras are covered
 
     @property
     def frame_times_ns(self) -> Any:
@@ -110,9 +115,47 @@ def _truth(job: dict[str, Any], config: Config) -> _Truth:
     dataset = open_dataset(job["source"], config.dataset)
     first, end = frames_between(dataset.recording, parse_bound(job["start"]), _stop(job))
     total = len(dataset.recording.frame_times_ns)
+    covered = [frames_between(dataset.recording, *map(parse_bound, span)) for span in job["covered"]]
+    spans = tuple(sorted((begin, total if last is None else last) for begin, last in covered))
+    if any(begin >= last for begin, last in spans):
+        raise DataError(f"{dataset.recording.path}: a part that is covered ends before it begins")
     own = dataset.recording.reference
     reference = own if job["reference"] is None else read_trajectory(Path(job["reference"]))
-    return _Truth(dataset, reference, first, total if end is None else min(end, total))
+    if spans:
+        from vio.bench.maps import Covered
+
+        dataset = Covered(dataset, spans)
+    return _Truth(dataset, reference, first, total if end is None else min(end, total), spans)
+
+
+def reference_fault(job: dict[str, Any]) -> str | None:
+    """Return why a run's ground truth cannot be that of its recording, by times and body; None: it may be.
+
+    Nothing is run. A recording that cannot be opened is left to its task.
+    """
+    try:
+        truth = _truth(job, merge(Config(), job["config"], where="the suite"))
+    except VioError:
+        return None
+    if truth.reference is None:
+        return None
+    recording, times_ns = truth.dataset.recording, truth.frame_times_ns
+    name = f"the ground truth {job['reference'] or f'in {recording.path}'} is not that of the recording"
+    if job["reference"] is not None and _stated_body(Path(job["reference"])) == "imu" and recording.T_cam0_imu is None:
+        return f"{name}: it describes the IMU, whose place on the rig (T_cam0_imu) the recording does not know"
+    poses = np.broadcast_to(np.eye(4), (len(times_ns), 4, 4))
+    frames = Trajectory(poses, times_ns, truth.reference.body, np.arange(truth.first, truth.end))
+    try:
+        matched = len(associate(frames, truth.reference.numbered())[1])
+    except EvaluationError as error:
+        return f"{name}: {str(error).replace('the estimate', 'the recording')}"
+    return f"{name}: it has poses of {matched} of {len(frames)} frames" if matched < LEAST_POSES else None
+
+
+def _stated_body(path: Path) -> str | None:
+    """Return which frame a trajectory's file says it describes, by its comment."""
+    found = _BODY.search(path.read_text(encoding="utf-8", errors="replace"))
+    return None if found is None else found[1]
 
 
 def _measured(timer: _CpuTimer, began: float) -> dict[str, Any]:
@@ -170,11 +213,12 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         growing = growing_folder(Path(folder) / "run", truth.dataset, config, {"source": "", "start": truth.first})
         control = RunControl(growing)
         store = Path(folder) / "map.db"
-        use = MapUse(store) if job["map"] else None
+        use, T_ref_map = MapUse(store) if job["map"] else None, None
         if job["first"] is not None:
             built = merge(Config(), job["first"]["config"], where="the suite")
             before, use = _truth(job["first"], built), MapUse(store, localise=True)
-            run(before.dataset, built, start=before.first, stop=before.end, map=MapUse(store))
+            made = run(before.dataset, built, start=before.first, stop=before.end, map=MapUse(store))
+            T_ref_map = None if before.reference is None else _world_of_map(made, before.reference)
         first, end = truth.first, truth.end
         result = run(truth.dataset, config, start=first, stop=end, viewer=timer, map=use, control=control)
         trajectory = result.trajectory
@@ -198,7 +242,10 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             record["curve"] = error_curve(score, trajectory.times_ns)
             record["notes"] = list(score.notes)
             if result.mapped is not None and result.stopped is None:
-                figures |= map_figures(result, score, truth.reference.numbered(), store if job["map"] else None)
+                own = store if job["map"] else None
+                figures |= map_figures(
+                    result, score, truth.reference.numbered(), store=own, T_ref_map=T_ref_map, covered=truth.covered
+                )
         assert trajectory.times_ns is not None
         text = tum_text(
             trajectory.times_ns, trajectory.T_world_body, body=trajectory.body, frames=trajectory.frame_indices
@@ -206,6 +253,13 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         record["trajectory"] = text.splitlines()  # JSON of ours holds printable text only
     record["absent"] = _absent(job, figures, truth)
     return record
+
+
+def _world_of_map(result: RunResult, reference: Trajectory) -> Any:
+    """Return the world of the reference (4, 4) from the map that a run has built."""
+    assert result.mapped is not None
+    final = replace(result.trajectory, T_world_body=result.mapped.T_map_body)
+    return evaluate(final, reference.numbered(), T_cam0_imu=result.T_cam0_body).T_ref_est
 
 
 def _absent(job: dict[str, Any], figures: dict[str, Any], truth: _Truth) -> dict[str, str]:
@@ -259,19 +313,23 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
         raise DataError(f"{recording.path}: no ground truth; name one with reference: in the suite")
     path = Path(job["trajectory"])
     trajectory = read_trajectory(path)
-    if "# body:" not in path.read_text(encoding="utf-8", errors="replace"):
+    if _stated_body(path) is None:
         trajectory = read_trajectory(path, body=truth.reference.body)
     times_ns = truth.frame_times_ns
     trajectory = between(trajectory, int(times_ns[0]), int(times_ns[-1]))
     T_cam0_imu = recording.T_cam0_body
     score = _evaluate(job, trajectory, truth.reference, T_cam0_imu)
-    figures: dict[str, Any] = {
-        "frames": len(trajectory),
-        "path_m": score.path_length_m,
-        "coverage": coverage(times_ns, trajectory),
-        **figures_of(score, positions_only=job["positions_only"]),
-        "nees": None,
-    }
+    covered = coverage(times_ns, trajectory)
+    figures: dict[str, Any] = {"frames": len(trajectory), "path_m": score.path_length_m, "coverage": covered}
+    kind = _POSES.search(path.read_text(encoding="utf-8", errors="replace"))
+    if kind is None:
+        figures |= figures_of(score, positions_only=job["positions_only"])
+    elif kind[1] == "final":
+        figures["map_ate_m"] = score.ate_m.rmse
+    else:
+        figures |= {"map_causal_ate_m": score.ate_m.rmse, "placed": covered}
+        if trajectory.times_ns is not None:
+            figures["place_s"] = float(trajectory.times_ns[0] - times_ns[0]) / NS_PER_S
     curve = error_curve(score, trajectory.times_ns)
     absent = _absent(job, figures, truth)
     return {"figures": figures, "curve": curve, "absent": absent, "notes": list(score.notes)}
