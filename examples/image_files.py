@@ -17,6 +17,8 @@ rig = vio.load_rig(calibration)
 odometry = vio.Odometry(rig, vio.load_config(overrides=["motion=none"]))
 
 names = sorted({p.name for p in left.iterdir()} & {p.name for p in right.iterdir()})
+if not names:
+    sys.exit(f"no image of {left} has the name of one of {right}")
 for k, name in enumerate(names):
     pair = [cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) for folder in (left, right)]
     if any(image is None for image in pair):

@@ -32,7 +32,14 @@ def frames_of(path: Path) -> list[StereoFrame]:
 
 @pytest.mark.parametrize(
     "folders",
-    [("left", "right"), ("image_0", "image_1"), ("cam0/images", "cam1/images"), ("image_00/data", "image_01/data")],
+    [
+        ("left", "right"),
+        ("image_0", "image_1"),
+        ("cam0/images", "cam1/images"),
+        ("image_00/data", "image_01/data"),
+        ("L", "R"),
+        ("camera_left", "camera_right"),
+    ],
     ids=lambda f: f[0],
 )
 def test_usual_folder_names_are_found(folders: tuple[str, str], tmp_path: Path) -> None:
@@ -333,6 +340,10 @@ BAD = {
     "an IMU with a NaN": (_edit("imu.csv", "9.81", "nan"), "line 2: a reading is not a finite number"),
     "an IMU with other names": (_edit("imu.csv", "wx,wy,wz", "mx,my,mz"), "does not name gyro and accel"),
     "an empty IMU": (_write("imu.csv", "#timestamp,wx,wy,wz,ax,ay,az\n"), "holds no line of data"),
+    "an IMU with decimal commas": (
+        _write("imu.csv", "time;wx;wy;wz;ax;ay;az\n1700000000;0,1;0,1;0,1;0,1;9,8;0,1\n"),
+        r"line 2, '1700000000;0,1;0,1;0,1;0,1;9,8;0,1', does not begin with a number \(decimals need a point\)",
+    ),
     "gravity among the gyro's columns": (
         _write("imu.csv", "".join(f"{1700000000 + k / 200:.3f},0,0,9.8,0,0,0.1\n" for k in range(40))),
         "gravity is in the columns 2 to 4",

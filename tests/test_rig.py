@@ -302,6 +302,11 @@ def test_opencv_names_of_other_scripts_and_two_files(tmp_path: Path) -> None:
     np.testing.assert_allclose(vio.load_rig(tmp_path / "orb.yaml").T_cam1_cam0, T_CAM1_CAM0, atol=1e-9)
 
 
+def test_a_folder_with_calib_yml_has_a_calibration(tmp_path: Path) -> None:
+    write_storage(tmp_path / "calib.yml", opencv_matrices(), (64, 48))
+    assert vio.load_rig(tmp_path).cam1 is not None
+
+
 def test_opencv_rectified_matrices_alone_and_a_board_in_millimetres(tmp_path: Path) -> None:
     whole = opencv_matrices()
     path = write_storage(tmp_path / "r.yml", {k: whole[k] for k in ("P1", "P2")}, (64, 48))
@@ -448,6 +453,7 @@ BAD = {
         _camchain(lambda c: c["cam0"].update(intrinsics=[0, 400, 320, 240])),
         "focal lengths and image size must be positive",
     ),
+    "notes as .txt": (_text("notes.txt", "fx=458 b=0.11\n"), "and KITTI's calib.txt has one; give that file"),
     "OpenCV without T": (_storage(T=None, R2=None), "has no entry R2"),
     "OpenCV with a rotation vector": (_storage(R=np.zeros((3, 1))), "R holds 3 numbers"),
     "OpenCV with six coefficients": (

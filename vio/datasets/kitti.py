@@ -133,7 +133,10 @@ def _projection(path: Path, name: str) -> FloatArray:
     """Read one projection matrix (3, 4) `K [I | t]`."""
     found = [(number, line.split(":", 1)[1]) for number, line in text_lines(path) if line.startswith(f"{name}:")]
     if len(found) != 1:
-        raise CalibrationError(f"{path}: {len(found)} lines begin with '{name}:'; exactly one must")
+        raise CalibrationError(
+            f"{path}: {len(found)} lines begin with '{name}:', and KITTI's calib.txt has one; give that file, or the "
+            "calibration of another tool as .yaml or .xml"
+        )
     number, values = found[0]
     where = f"{path}, line {number}: {name}"
     P = numbers_in(values, 12, where).reshape(3, 4)

@@ -47,6 +47,8 @@ _PAIRS: tuple[tuple[str, ...], ...] = (
     ("images_left", "images_right"),
     ("image_left", "image_right"),
     ("left_images", "right_images"),
+    ("camera_left", "camera_right"),
+    ("L", "R"),
     ("image_lcam_front", "image_rcam_front"),
     ("infra1", "infra2"),
 )

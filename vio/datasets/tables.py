@@ -53,10 +53,13 @@ def read_table(path: Path, columns: int, form: str) -> TextTable:
     header: tuple[str, ...] = ()
     rows: list[tuple[str, ...]] = []
     lines: list[int] = []
+    unread = ""
     for number, line in text_lines(path):
         text = line.strip()
         fields = tuple(_split(text.lstrip("#")))
         if not text or text.startswith("#") or (not rows and not _NUMBER.fullmatch(fields[0])):
+            if header and text and not text.startswith("#"):
+                unread = f"; line {number}, {text[:40]!r}, does not begin with a number (decimals need a point)"
             if not rows and len(fields) == columns:
                 header = tuple(field.lower() for field in fields)
             continue
@@ -65,7 +68,7 @@ def read_table(path: Path, columns: int, form: str) -> TextTable:
         rows.append(fields)
         lines.append(number)
     if not rows:
-        raise DataError(f"{path}: holds no line of data ({form}); copy it again, or remove it")
+        raise DataError(f"{path}: holds no line of data ({form}){unread}; copy it again, or remove it")
     return TextTable(path, header, tuple(rows), tuple(lines))
 
 

@@ -77,7 +77,7 @@ def _legend(width: int, low: float, high: float) -> np.ndarray:
     bar = np.full((_BAR_PX, width, 3), 255, np.uint8)
     scale = slice(width // 2, width - 90)
     bar[6:-6, scale] = _coloured(np.linspace(0, 1, scale.stop - scale.start))
-    texts = ((8, "disparity of the features (strokes: to scale)"), (scale.start - 60, f"{low:.1f} px"))
+    texts = ((8, "disparity (strokes: to scale)"), (scale.start - 60, f"{low:.1f} px"))
     for x, text in (*texts, (scale.stop + 8, f"{high:.0f} px")):
         cv2.putText(bar, text, (x, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
     return bar

@@ -35,7 +35,7 @@ KNOWN = (
 _IN_FOLDER = (
     "calibration.yaml", "calibration.yml", "camchain-imucam*.yaml", "*camchain-imucam*.yaml", "camchain*.yaml",
     "*camchain*.yaml", "calib_cam_to_cam.txt", "calib.txt", "left.y*ml", "stereo*.y*ml", "intrinsics.y*ml",
-    "stereo*.xml", "calibration.xml",
+    "stereo*.xml", "calibration.xml", "calib.y*ml",
 )  # fmt: skip
 
 
