@@ -15,8 +15,7 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.records import FIELD_TERMS, IntArray
 
-_PRIOR_FACTOR = 3.0  # before any track has ended: 1 for white noise, 1 to 4.3 of front ends on real recordings
-_PRIOR_TRACKS = 30.0  # as many ended tracks count for it
+_PRIOR_TRACKS = 30.0  # as many ended tracks count for a factor of one
 _MOST_SCORES = 4096  # features whose scores are kept: far more than are seen at once
 _NO_SCORE: FloatArray = np.zeros(FIELD_TERMS)
 
@@ -28,7 +27,7 @@ class Overdispersion:
         self._scores: dict[int, FloatArray] = {}  # of features, by id, in the order in which they ended last
         self._squares, self._information = np.zeros(FIELD_TERMS), np.zeros(FIELD_TERMS)
         self._tracks = 0
-        self.factor = _PRIOR_FACTOR  # by how much too often the information of pixels is counted, at least one
+        self.factor = 1.0  # by how much too often the information of pixels is counted, at least one
 
     def add(self, ids: IntArray, scores: FloatArray, information: FloatArray) -> None:
         """Take in tracks that ended.
@@ -50,6 +49,4 @@ class Overdispersion:
         known = self._information > 0
         if known.any():
             ratio = float(np.mean(self._squares[known] / self._information[known]))
-            self.factor = max(
-                (_PRIOR_TRACKS * _PRIOR_FACTOR + self._tracks * ratio) / (_PRIOR_TRACKS + self._tracks), 1.0
-            )
+            self.factor = max((_PRIOR_TRACKS + self._tracks * ratio) / (_PRIOR_TRACKS + self._tracks), 1.0)

@@ -39,9 +39,7 @@ LEAST_PIXEL_SIGMA_PX = 0.03  # lower bound of the estimated noise of one pixel c
 # Pixels of a track share errors that its residuals do not show, and no right image bounds what they make of the scale
 # (docs/notes/design_decisions.md, pixel noise of one camera).
 _LEAST_MONO_PX = 0.1
-_NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals in the end
-_PRIOR_FRAMES = 0.1  # the noise at the start may be off by a factor of four, that of frames differs by one and a half
-_MOST_CHANGE = 4.0  # of the variance from frame to frame that is believed in the end
+_NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals
 _VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
 _MOST_DOF = 199
@@ -82,7 +80,6 @@ class WindowTracks:
         self._camera, self._settings = camera, settings
         self.table = TrackTable(settings.clones + 1)
         self._least_px = _LEAST_MONO_PX if camera.kind == "mono" else LEAST_PIXEL_SIGMA_PX
-        self._frames = 0  # from which the noise was learned
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
 
     def choose(self, clones: int) -> IntArray:
@@ -242,19 +239,13 @@ class WindowTracks:
         return passed, squares, dof
 
     def update_pixel_noise(self, squares: FloatArray, dof: IntArray) -> None:
-        """Let the pixel noise follow the median of squared residuals (F,) over that of chi-square, robustly.
-
-        Its logarithm is the mean over the frames so far, then follows slowly. At the start it is hardly known: if half a
-        pixel is believed in place of a tenth, what moves by a pixel passes for noise.
-        """
+        """Let the pixel noise follow the median of squared residuals (F,) over that of chi-square, robustly, slowly."""
         if len(squares) < MIN_TRACKS_FOR_NOISE:
             return
-        self._frames += 1
-        gain = max(1 / (self._frames + _PRIOR_FRAMES), _NOISE_GAIN)
-        most = _MOST_CHANGE ** (gain / _NOISE_GAIN)
-        ratio = min(max(median(squares / chi_square_table(0.5)[dof]), 1 / most), most)
-        variance = max(self.variance * ratio**gain, self._least_px**2)
-        self.variance = min(variance, self._settings.pixel_sigma_max_px**2)
+        s = self._settings
+        ratio = min(max(median(squares / chi_square_table(0.5)[dof]), 0.25), 4.0)
+        variance = max(self.variance * ratio**_NOISE_GAIN, self._least_px**2)
+        self.variance = min(variance, s.pixel_sigma_max_px**2)
 
     def end_frame(self, *, spent: IntArray, promoted: IntArray, newest: int) -> None:
         """Remove what has been absorbed and what has ended.
