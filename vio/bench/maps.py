@@ -11,7 +11,8 @@ import numpy as np
 
 from vio.bench.figures import pose_nees
 from vio.errors import EvaluationError
-from vio.evaluation.trajectories import Evaluation, evaluate, rotation_angle_deg
+from vio.evaluation.errors_along_path import rotation_angle_deg
+from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
 from vio.mapping.map_store import MapStore
 from vio.protocols import Dataset

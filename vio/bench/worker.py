@@ -27,7 +27,8 @@ from vio.config import Config, merge
 from vio.datasets import open_dataset
 from vio.datasets.frame_times import frames_between, parse_bound, used_frames
 from vio.errors import DataError, EvaluationError, VioError
-from vio.evaluation.trajectories import LEAST_POSES, Evaluation, associate, evaluate
+from vio.evaluation.association import associate
+from vio.evaluation.trajectories import LEAST_POSES, Evaluation, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
 from vio.protocols import Dataset

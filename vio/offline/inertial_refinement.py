@@ -37,7 +37,8 @@ def can_use_imu(run: SavedRun) -> bool:
 
 def inertial_keyframes(path: TrackedPath, most: int | None) -> IntArray:
     """Return rows (K,) of the trajectory, a quarter of a second apart or as `most` allows, and both ends of loops."""
-    seconds = 1e-9 * (path.trajectory.times_ns - path.trajectory.times_ns[0])
+    seconds = _seconds(path)
+    seconds = seconds - seconds[0]
     ends = np.unique(loop_pairs(path.loops, path.frames))
     count = int(np.ceil(seconds[-1] / _EVERY_S)) + 1
     if most is not None:
@@ -73,7 +74,7 @@ def adjust_with_imu(
     problem = InertialAdjustment(
         path.camera,
         tracks,
-        1e-9 * path.trajectory.times_ns[keyframes] + late_s,
+        _seconds(path)[keyframes] + late_s,
         Readings(1e-9 * np.array([x.time_ns for x in motion]), values[:, :3], values[:, 3:], densities),
         T_cam0_imu,
         _rig_prior(run, settings, last),
@@ -94,6 +95,13 @@ def adjust_with_imu(
         rows_dropped=0,
         sigma_px=robust_sigma(after[~tracks.by_loop][:, :3]),
     )
+
+
+def _seconds(path: TrackedPath) -> FloatArray:
+    """Times (N,) of a run with an IMU."""
+    times_ns = path.trajectory.times_ns
+    assert times_ns is not None
+    return np.asarray(1e-9 * times_ns, dtype=np.float64)
 
 
 def _row_sigmas(path: TrackedPath, T_world_cam0: FloatArray, tracks: PointTracks) -> FloatArray:
