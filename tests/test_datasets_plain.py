@@ -175,6 +175,13 @@ def test_times_may_name_the_images(tmp_path: Path) -> None:
     assert np.diff(open_dataset(folder).recording.frame_times_ns).tolist() == [50_000_000] * 3
 
 
+def test_times_in_milliseconds_since_the_start_are_doubted(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, times=False, imu=False, reference=False)
+    (folder / "times.txt").write_text("0\n50\n100\n150\n")
+    (note,) = open_dataset(folder).recording.notes
+    assert note.endswith("frames are 50 s apart, as its times are taken for seconds; if they are not, write seconds")
+
+
 def test_without_times_images_alone_are_read_and_it_is_said(tmp_path: Path) -> None:
     recording = open_dataset(make_plain(tmp_path, times=False, imu=False, reference=False)).recording
     assert np.diff(recording.frame_times_ns).tolist() == [100_000_000] * 3

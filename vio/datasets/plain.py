@@ -54,6 +54,7 @@ _PAIRS: tuple[tuple[str, ...], ...] = (
 )
 ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
 _INSIDE = ("data", "images", "")
+_SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 
 
@@ -288,7 +289,8 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
     for folder in dict.fromkeys((layout.base, layout.root, layout.left, layout.left.parent)):
         for name in ("times.txt", "timestamps.txt"):
             if (file := folder / name).is_file():
-                return times_of(file, pairs), file, ()
+                times_ns = times_of(file, pairs)
+                return times_ns, file, _slow_note(file, times_ns)
     stems = [left.stem for left, _ in pairs]
     has_list = (file := layout.left.parent / "data.csv").is_file()
     missing = _missing_note(file, pairs) if has_list else ()
@@ -301,6 +303,16 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
         "write one time an image (seconds or nanoseconds) into times.txt"
     )
     return np.arange(len(pairs), dtype=np.int64) * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
+
+
+def _slow_note(file: Path, times_ns: IntArray) -> tuple[str, ...]:
+    """Doubt the unit of times that are further apart than those of any camera that moves."""
+    apart_s = float(np.median(np.diff(times_ns))) / NS_PER_S if len(times_ns) > 1 else 0.0
+    if apart_s <= _SLOWEST_S:
+        return ()
+    return (
+        f"{file}: frames are {apart_s:g} s apart, as its times are taken for seconds; if they are not, write seconds",
+    )
 
 
 def _missing_note(file: Path, pairs: ImagePairs) -> tuple[str, ...]:
