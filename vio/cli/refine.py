@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from vio.cli.output import ProgressBar, print_result
 from vio.errors import ConfigError
-from vio.evaluation.trajectories import metres_text
 from vio.files.printable import json_text
 
 if TYPE_CHECKING:
@@ -124,5 +123,7 @@ def _rows(m: dict[str, Any]) -> list[tuple[str, str]]:
     if m["loops"]:
         rows.insert(1, ("loops", f"{m['loops']}, whose matches are points; poses began in the map"))
     if m["ate_m"] is not None:
+        from vio.evaluation.trajectories import metres_text
+
         rows.append(("ATE", f"{metres_text(m['ate_before_m'])} before, {metres_text(m['ate_m'])} after"))
     return [*rows, ("time", f"{m['seconds']:.1f} s"), ("results", m["out"])]
