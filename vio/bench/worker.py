@@ -142,7 +142,8 @@ def reference_fault(job: dict[str, Any]) -> str | None:
         return None
     recording, times_ns = truth.dataset.recording, truth.frame_times_ns
     name = f"the ground truth {job['reference'] or f'in {recording.path}'} is not that of the recording"
-    if job["reference"] is not None and _stated_body(Path(job["reference"])) == "imu" and recording.T_cam0_imu is None:
+    stated = None if job["reference"] is None else _stated_body(_text(Path(job["reference"])))
+    if stated == "imu" and recording.T_cam0_imu is None:
         return f"{name}: it describes the IMU, whose place on the rig (T_cam0_imu) the recording does not know"
     poses = np.broadcast_to(np.eye(4), (len(times_ns), 4, 4))
     frames = Trajectory(poses, times_ns, truth.reference.body, np.arange(truth.first, truth.end))
@@ -153,9 +154,13 @@ def reference_fault(job: dict[str, Any]) -> str | None:
     return f"{name}: it has poses of {matched} of {len(frames)} frames" if matched < LEAST_POSES else None
 
 
-def _stated_body(path: Path) -> str | None:
-    """Return which frame a trajectory's file says it describes, by its comment."""
-    found = _BODY.search(path.read_text(encoding="utf-8", errors="replace"))
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace")
+
+
+def _stated_body(text: str) -> str | None:
+    """Return which frame the text of a trajectory's file says it describes, by its comment."""
+    found = _BODY.search(text)
     return None if found is None else found[1]
 
 
@@ -313,8 +318,8 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
     if truth.reference is None:
         raise DataError(f"{recording.path}: no ground truth; name one with reference: in the suite")
     path = Path(job["trajectory"])
-    trajectory = read_trajectory(path)
-    if _stated_body(path) is None:
+    trajectory, text = read_trajectory(path), _text(path)
+    if _stated_body(text) is None:
         trajectory = read_trajectory(path, body=truth.reference.body)
     times_ns = truth.frame_times_ns
     trajectory = between(trajectory, int(times_ns[0]), int(times_ns[-1]))
@@ -322,7 +327,7 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
     score = _evaluate(job, trajectory, truth.reference, T_cam0_imu)
     covered = coverage(times_ns, trajectory)
     figures: dict[str, Any] = {"frames": len(trajectory), "path_m": score.path_length_m, "coverage": covered}
-    kind = _POSES.search(path.read_text(encoding="utf-8", errors="replace"))
+    kind = _POSES.search(text)
     if kind is None:
         figures |= figures_of(score, positions_only=job["positions_only"])
     elif kind[1] == "final":

@@ -29,9 +29,33 @@ from vio.records import (
     StereoScaleEstimate,
 )
 
-PRINCIPAL_POINT = 1 / 3  # standard deviation of its coordinates, in focal lengths, over that of the focal length
-COLUMNS_BY_ROWS = 3.0  # of the standard deviation of a lens term, over the root mean square of the rows' field
+_PRINCIPAL_POINT = 1 / 3  # standard deviation of its coordinates, in focal lengths, over that of the focal length
+_COLUMNS_BY_ROWS = 3.0  # of the standard deviation of a lens term, over the root mean square of the rows' field
 _ROWS_MOVED = 2.0  # how much larger the rows' field must become for what was learned of the columns to be in doubt
+
+
+def rows_off(camera: StereoCamera, offset_px: float) -> float:
+    """Size of the rows' field in focal lengths: its root mean square, and what a saved calibration left."""
+    return float(np.hypot(offset_px, camera.residual_px)) / camera.fu
+
+
+def field_sigmas(camera: StereoCamera, offset_px: float) -> FloatArray:
+    """Standard deviations (8,) of the right columns' field, in focal lengths, by the rows' root mean square.
+
+    An error of turn or lens moves rows and columns alike, so the size of the rows' field is an estimate of the
+    standard deviation of the columns' (empirical Bayes).
+    """
+    sigma = float(np.clip(_COLUMNS_BY_ROWS * rows_off(camera, offset_px), LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA))
+    return stereo_field_sigmas(sigma, offset_px / camera.fu)
+
+
+def constant_sigmas(settings: MsckfSettings) -> FloatArray:
+    """Standard deviations (4,) of baseline, focal length and principal point (u, v).
+
+    The baseline's is over its length, the others are over the focal length.
+    """
+    centre = _PRINCIPAL_POINT * settings.stereo_focal_sigma
+    return np.array([settings.stereo_baseline_sigma, settings.stereo_focal_sigma, centre, centre])
 
 
 class RigCalibration:
@@ -43,7 +67,7 @@ class RigCalibration:
         self.rotation: RotationComparison | None = ROTATION_NOT_COMPARABLE  # as others compared them; None: they will
         self._rows = VerticalDisparityModel(camera)
         self._field_variances = prior_variances(settings)["stereo_field"]  # (8,) before anything was seen of it
-        self._rows_off = LEAST_FIELD_SIGMA / COLUMNS_BY_ROWS  # size of the rows' field that gave them, focal lengths
+        self._rows_off = LEAST_FIELD_SIGMA / _COLUMNS_BY_ROWS  # size of the rows' field that gave them, focal lengths
         self._field: tuple[Calibration, StereoCorrection | None] | None = None  # at a calibration, by the present rows
 
     def first_covariance(self, calibration: Calibration, T_world_imu: FloatArray) -> FloatArray:
@@ -59,9 +83,8 @@ class RigCalibration:
     def learn_rows(self, window: Window, seen: Observations) -> None:
         """Learn the rows of a frame; the first ones say how far off the lenses may be, and begin to estimate the field.
 
-        An error of turn or lens moves rows and columns alike, so the size of the rows' field is an estimate of the
-        standard deviation of the columns' (empirical Bayes). Where it grows much later, as a camera has been moved in
-        its mount or the first matches were wrong ones, the columns are in doubt again.
+        Where the rows' field grows much later, as a camera has been moved in its mount or the first matches were wrong
+        ones, the columns are in doubt again.
         """
         if self.settings.calibrate_stereo == "off" or self.camera.kind != "stereo":
             return
@@ -69,12 +92,11 @@ class RigCalibration:
         self._field = None
         if self._rows.offset_px is None:
             return
-        off = float(np.hypot(self._rows.offset_px, self.camera.residual_px)) / self.camera.fu
+        off = rows_off(self.camera, self._rows.offset_px)
         begins = "stereo_field" not in window.state
         if not begins and off <= _ROWS_MOVED * self._rows_off:
             return
-        sigma = float(np.clip(COLUMNS_BY_ROWS * off, LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA))
-        variances = stereo_field_sigmas(sigma, self._rows.offset_px / self.camera.fu) ** 2
+        variances = field_sigmas(self.camera, self._rows.offset_px) ** 2
         if begins:
             calibration = window.calibration.estimating("stereo_field", self.settings)
             window.estimate_block("stereo_field", calibration, np.diag(variances))
@@ -90,13 +112,8 @@ class RigCalibration:
             window.prior.scale_test.end_frame()
 
     def considered_sigmas(self, window: Window) -> FloatArray:
-        """Standard deviations (4,) of baseline, focal length and principal point (u, v); zero where one is estimated.
-
-        The baseline's is over its length, the others are over the focal length.
-        """
-        s = self.settings
-        centre = PRINCIPAL_POINT * s.stereo_focal_sigma
-        sigmas = np.array([s.stereo_baseline_sigma, s.stereo_focal_sigma, centre, centre])
+        """Standard deviations (4,) as `constant_sigmas` returns them; zero where one is estimated."""
+        sigmas = constant_sigmas(self.settings)
         if "stereo_scale" in window.state:
             sigmas[:2] = 0.0
         return sigmas

@@ -116,6 +116,7 @@ def preintegrate(readings: Readings, start_s: FloatArray, end_s: FloatArray, bia
     R, v, p = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros((count, 3))
     P, D = np.zeros((count, 9, 9)), np.zeros((count, 9, 6))
     spacing = np.concatenate([[np.inf], np.diff(t), [np.inf]])
+    lacks_samples = spacing > _LONG_PERIODS * np.median(spacing[1:-1])
     white = np.repeat(np.square([readings.densities.gyro, readings.densities.accel]), 3)
     first, last = np.searchsorted(t, start_s, side="right"), np.searchsorted(t, end_s, side="left")
     for n in range(int((last - first).max(initial=-1)) + 1):
@@ -129,12 +130,13 @@ def preintegrate(readings: Readings, start_s: FloatArray, end_s: FloatArray, bia
         reading = np.stack([np.interp(middle, t, values[:, k]) for k in range(6)], axis=1) - bias
         gyro, force = reading[:, :3], reading[:, 3:]
         h = dt[:, None]
-        R_mid, turn = R @ so3_exp(0.5 * h * gyro), so3_exp(h * gyro)
+        half_turn, turn = so3_exp(0.5 * h * gyro), so3_exp(h * gyro)
+        R_mid = R @ half_turn
         acceleration = np.einsum("fij,fj->fi", R_mid, force)
         H = h[:, :, None]
         A = np.tile(np.eye(9), (count, 1, 1))
         A[:, :3, :3] = np.swapaxes(turn, 1, 2)
-        lever = -R @ so3_hat(np.einsum("fij,fj->fi", so3_exp(0.5 * h * gyro), force))
+        lever = -R @ so3_hat(np.einsum("fij,fj->fi", half_turn, force))
         A[:, 3:6, :3], A[:, 6:, :3], A[:, 6:, 3:6] = lever * H, 0.5 * lever * H**2, np.eye(3) * H
         # How the step follows the reading; half a step's turn acts on the force, too.
         N = np.zeros((count, 9, 6))
@@ -143,8 +145,8 @@ def preintegrate(readings: Readings, start_s: FloatArray, end_s: FloatArray, bia
         N[:, 3:6, :3], N[:, 6:, :3] = half * H, 0.5 * half * H**2
         N[:, 3:6, 3:], N[:, 6:, 3:] = R_mid * H, 0.5 * R_mid * H**2
         after = np.searchsorted(t, middle)
-        gap = spacing[after] > _LONG_PERIODS * np.median(spacing[1:-1])
-        variance = white / np.maximum(h, 1e-12) + np.where(gap[:, None], _UNKNOWN, 0.0)  # of the mean over the step
+        gap = lacks_samples[after, None]
+        variance = white / np.maximum(h, 1e-12) + np.where(gap, _UNKNOWN, 0.0)  # of the mean over the step
         P = A @ P @ np.swapaxes(A, 1, 2) + (N * variance[:, None, :]) @ np.swapaxes(N, 1, 2)
         D = A @ D - N
         p, v, R = p + v * h + 0.5 * acceleration * h**2, v + acceleration * h, R @ turn

@@ -81,7 +81,7 @@ class InertialAdjustment:
         """Return the optimum, and the mean squared errors of pixels and of IMU there (1 expected each)."""
         at, steps = self._descend(body)
         squared, _ = self._squared(at)
-        r, _ = self._inertial_residual(at, steps)
+        r = self._inertial_residual(at, steps)
         return at, float(np.mean(squared[squared < _WIDTH**2])) / 3, float(np.mean(r**2))
 
     def _descend(self, body: BodyStates) -> tuple[Fit, Preintegrated]:
@@ -163,12 +163,11 @@ class InertialAdjustment:
 
     # IMU
 
-    def _inertial_residual(self, at: Fit, steps: Preintegrated) -> tuple[FloatArray, FloatArray]:
-        """Whitened residuals (F, 9), and what whitens them (F, 9, 9)."""
+    def _inertial_residual(self, at: Fit, steps: Preintegrated) -> FloatArray:
+        """Whitened residuals (F, 9)."""
         i, j = at.body.take(slice(None, -1)), at.body.take(slice(1, None))
-        scaled = self._scaled(at, steps)
-        W = np.linalg.inv(np.linalg.cholesky(steps.covariance + 1e-14 * np.eye(9)))
-        return np.einsum("fij,fj->fi", W, scaled.residual(i, j, self.gravity_mps2)), W
+        r = self._scaled(at, steps).residual(i, j, self.gravity_mps2)
+        return np.asarray(np.einsum("fij,fj->fi", _whitening(steps), r))
 
     def _scaled(self, at: Fit, steps: Preintegrated) -> Preintegrated:
         factor = 1 + self.prior.accel_scale * at.rig[-1]
@@ -182,7 +181,7 @@ class InertialAdjustment:
         squared, _ = self._squared(at)
         limit = 3 * width**2
         cost = float(np.sum(squared / (1 + squared / limit)))
-        cost += float(np.sum(self._inertial_residual(at, steps)[0] ** 2))
+        cost += float(np.sum(self._inertial_residual(at, steps) ** 2))
         cost += float(np.sum((np.diff(at.body.bias, axis=0) / self._walk_sigmas()) ** 2))
         cost += float(np.sum((at.body.bias[0] / self.bias_sigma) ** 2))
         return cost + float(np.sum((self.prior.at_start + at.rig) ** 2))
@@ -222,14 +221,14 @@ class InertialAdjustment:
         """Jacobian and residuals of IMU, walks, priors and what fixes the world, whitened."""
         K, F = len(self.seconds), len(self.seconds) - 1
         i, j = at.body.take(slice(None, -1)), at.body.take(slice(1, None))
-        r, W = self._inertial_residual(at, steps)
-        _, A, B = self._scaled(at, steps).linearised(i, j, self.gravity_mps2)
+        r, A, B = self._scaled(at, steps).linearised(i, j, self.gravity_mps2)
+        W = _whitening(steps)
         n, own = np.arange(F), _OWN * K
         S = np.zeros((F, 9, _SHARED))
         S[:, 3:6, -1], S[:, 6:, -1] = -self.prior.accel_scale * steps.v, -self.prior.accel_scale * steps.p
         imu = _blocks(n, n, W @ A, F, K) + _blocks(n, n + 1, W @ B, F, K)
         parts = [hstack([imu, csr_matrix((W @ S).reshape(9 * F, _SHARED))])]
-        errors = [r.ravel()]
+        errors = [np.einsum("fij,fj->fi", W, r).ravel()]
         walk = np.zeros((F, 6, _OWN))
         walk[:, np.arange(6), 9 + np.arange(6)] = 1 / self._walk_sigmas()
         walks = _blocks(n, n + 1, walk, F, K) - _blocks(n, n, walk, F, K)
@@ -299,6 +298,11 @@ class _System:
         by_poses = (by_point.T @ own[:, :6].ravel()).reshape(M, 3)
         p = -np.einsum("mij,mj->mi", V_inverse, V_e + by_poses + W_rig @ s)
         return own, p, s
+
+
+def _whitening(steps: Preintegrated) -> FloatArray:
+    """What whitens the residuals of motions (F, 9, 9)."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(steps.covariance + 1e-14 * np.eye(9))))
 
 
 def _sums(groups: IntArray, values: FloatArray, count: int) -> FloatArray:

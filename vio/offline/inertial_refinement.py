@@ -8,16 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from vio.filters.imu_terms import term_sigmas
-from vio.filters.online_calibration import LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA, stereo_field_sigmas
-from vio.filters.rig_calibration import COLUMNS_BY_ROWS, PRINCIPAL_POINT
+from vio.filters.rig_calibration import constant_sigmas, field_sigmas
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray
 from vio.imu.preintegration import BodyStates, Readings
 from vio.numerics.robust import robust_sigma
 from vio.offline.colmap.adjustment import Adjustment
 from vio.offline.inertial_adjustment import InertialAdjustment, RigPrior
-from vio.offline.keyframes import TrackedPath
-from vio.offline.loop_tracks import loop_pairs
+from vio.offline.keyframes import TrackedPath, loop_ends
 from vio.offline.points import PointTracks, build_tracks, reprojection
 from vio.offline.saved_run import SavedRun
 from vio.records import FIELD_TERMS, ROW_TERMS, ImuDensities, ImuSample, IntArray
@@ -39,7 +37,7 @@ def inertial_keyframes(path: TrackedPath, most: int | None) -> IntArray:
     """Return rows (K,) of the trajectory, a quarter of a second apart or as `most` allows, and both ends of loops."""
     seconds = _seconds(path)
     seconds = seconds - seconds[0]
-    ends = np.unique(loop_pairs(path.loops, path.frames))
+    ends = loop_ends(path, most)
     count = int(np.ceil(seconds[-1] / _EVERY_S)) + 1
     if most is not None:
         count = max(min(count, most - len(ends)), 2)
@@ -117,21 +115,18 @@ def _row_sigmas(path: TrackedPath, T_world_cam0: FloatArray, tracks: PointTracks
 
 def _rig_prior(run: SavedRun, settings: MsckfSettings, last: np.void) -> RigPrior:
     """What the rig may be off by before the run's tracks were seen; its rows, which are no pixels here, as it ended."""
-    s, camera = settings, run.tracked.camera
+    s = settings
     field, at_start = _TINY * np.eye(FIELD_TERMS + ROW_TERMS), np.zeros(FIELD_TERMS + ROW_TERMS)
     if run.field is not None:
-        off = float(np.hypot(last["stereo_rows_rms_px"], camera.residual_px)) / camera.fu
-        sigma = float(np.clip(COLUMNS_BY_ROWS * off, LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA))
-        sigmas = stereo_field_sigmas(sigma, float(last["stereo_rows_rms_px"]) / camera.fu)
+        sigmas = field_sigmas(run.tracked.camera, float(last["stereo_rows_rms_px"]))
         field[:FIELD_TERMS, :FIELD_TERMS] = np.diag(sigmas)
         at_start[:FIELD_TERMS] = run.field.coefficients[:FIELD_TERMS] / sigmas
         rows = last["stereo_rows_covariance"]
         field[FIELD_TERMS:, FIELD_TERMS:] = np.linalg.cholesky(rows + _TINY**2 * np.eye(ROW_TERMS))
-    centre = PRINCIPAL_POINT * s.stereo_focal_sigma
     return RigPrior(
         field,
         at_start,
-        np.array([s.stereo_baseline_sigma, s.stereo_focal_sigma, centre, centre]),
+        constant_sigmas(s),
         np.repeat([s.extrinsic_translation_sigma_m, np.radians(s.extrinsic_rotation_sigma_deg)], 3),
         s.time_offset_sigma_s,
         float(term_sigmas()[0]),

@@ -66,7 +66,7 @@ def choose_keyframes(run: TrackedPath, *, most: int | None = None) -> IntArray:
     step_m = _SCENE_SHARE * _median_depth_m(run)
     if len(T) <= (_ALL_FRAMES if most is None else most):
         return np.arange(len(T))
-    ends = _loop_ends(run, most)
+    ends = loop_ends(run, most)
     factor = 1.0
     while True:
         chosen = [0]
@@ -96,7 +96,7 @@ def keyframes_by_overlap(run: TrackedPath, *, most: int) -> IntArray:
     _median_depth_m(run)
     if len(run.frames) <= most:
         return np.arange(len(run.frames))
-    ends = _loop_ends(run, most)
+    ends = loop_ends(run, most)
     ids = [run.fresh(k).ids for k in range(len(run.frames))]
     shown = [k for k in range(len(ids)) if k in (0, len(ids) - 1) or len(ids[k]) >= _LEAST_SEEN]
     lost = [1 - np.isin(ids[a], ids[b]).mean() if len(ids[a]) else 0.0 for a, b in itertools.pairwise(shown)]
@@ -106,7 +106,7 @@ def keyframes_by_overlap(run: TrackedPath, *, most: int) -> IntArray:
     return np.union1d(np.array(shown)[np.append(chosen, len(shown) - 1)], ends)
 
 
-def _loop_ends(run: TrackedPath, most: int | None) -> IntArray:
+def loop_ends(run: TrackedPath, most: int | None) -> IntArray:
     """Return the rows (E,) of the trajectory at which loops begin and end, at most a third of `most`."""
     pairs = loop_pairs(run.loops, run.frames)
     if most is not None:
