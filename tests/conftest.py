@@ -78,3 +78,9 @@ def _no_make_around_us(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where `make` runs the tests, a `make` that a test runs must not take itself for a part of that one."""
     for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "MAKEOVERRIDES"):
         monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def white_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the filter begin with what is true of simulated pixels: their errors are independent."""
+    monkeypatch.setattr("vio.filters.overdispersion.PRIOR_FACTOR", 1.0)

@@ -36,6 +36,7 @@ from vio.geometry.lie import (
     se3_from_parts,
     se3_inverse,
     so3_exp,
+    so3_hat,
     so3_left_jacobian,
     transform_points,
 )
@@ -377,10 +378,24 @@ def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     np.testing.assert_allclose(A[:size, :size], clones[0], rtol=1e-9, atol=1e-9 * np.abs(clones[0]).max())
     np.testing.assert_allclose(b[:size], clones[1], rtol=1e-9, atol=1e-9 * np.abs(clones[1]).max())
     rows = np.flatnonzero(chosen)
-    scores, information = np.empty((len(rows), 10)), np.empty((len(rows), 10))
-    track_loops.score_terms(rows, info.C, info.point_gradient, ours.G, ours.A, ours.b, 0.5, scores, information)
-    np.testing.assert_allclose(2 * b[size:], scores.sum(axis=0), rtol=1e-9, atol=1e-9 * np.abs(b).max())
-    np.testing.assert_allclose(2 * np.diag(A)[size:], information.sum(axis=0), rtol=1e-9)
+    scores, information = np.empty((2, len(rows), 6))
+    of_tracks = info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient
+    centre = np.array([0.3, -0.2, 0.5])
+    track_loops.score_drifts(rows, *of_tracks, centre, 0.5, scores, information)
+    for k, row in enumerate(rows):
+        views = np.flatnonzero(np.any(info.G[row].reshape(len(T), 18), axis=1))
+        drift = np.zeros((len(T), 6, 6))
+        drift[:] = np.eye(6)
+        drift[:, :3, 3:] = so3_hat(centre)
+        along = (np.arange(len(T)) - views[0]) / max(views[-1] - views[0], 1) - 0.5
+        drift *= np.where((np.arange(len(T)) >= views[0]) & (np.arange(len(T)) <= views[-1]), along, 0.0)[:, None, None]
+        alone = np.arange(len(p)) == row
+        A_one, b_one = stereo_calibration.eliminate_points(info, alone)
+        M = drift.reshape(-1, 6)
+        np.testing.assert_allclose(scores[k], 2 * M.T @ b_one, rtol=1e-7, atol=1e-8 * np.abs(b_one).max())
+        np.testing.assert_allclose(
+            information[k], 2 * np.diag(M.T @ A_one @ M), rtol=1e-7, atol=1e-9 * np.abs(A_one).max()
+        )
     solved = np.linalg.solve(info.C[rows], np.swapaxes(ours.G[rows], 1, 2))
     np.testing.assert_allclose(ours.point_D_stereo(info, rows), -info.q.p_D_q[rows] @ solved, rtol=1e-9, atol=1e-12)
     covariance = info.q.p_D_q[rows] @ np.linalg.inv(info.C[rows]) @ np.swapaxes(info.q.p_D_q[rows], 1, 2)

@@ -17,7 +17,7 @@ from vio.records import MotionSource, Observations
 ROUND = Course(20, 2.0, velocity=(0.4, 0.5, 0.0), yaw_rate=0.2, depth=(2.0, 8.0), features=80)
 SIGMAS = {"baseline": 0.005, "focal": 0.003, "u": 0.001, "v": 0.001}
 ON = replace(SETTINGS, stereo_baseline_sigma=SIGMAS["baseline"], stereo_focal_sigma=SIGMAS["focal"])
-OFF = 1e-4  # small enough for gates and weights to stay as they are
+OFF = 1e-6  # small enough for gates and weights to stay as they are
 
 
 def _seen_by(constant: str, off: float, seen: Observations) -> Observations:

@@ -333,6 +333,7 @@ def test_says_what_it_needs(kind: CameraKind, motion: MotionSource | None, why: 
         build_backend(replace(CAMERA, kind=kind), T_CAM0_IMU, Config(msckf=FULL), motion)
 
 
+@pytest.mark.usefixtures("white_noise")
 def test_survives_a_late_imu_a_gap_a_checkpoint_and_a_restart(tmp_path: Path) -> None:
     """Images alone stand in for a late IMU; after a restart the terms stay, with the first covariance."""
     noise, flight = np.random.default_rng(0), Shaking(60)

@@ -641,6 +641,7 @@ def test_flight_that_starts_in_motion_is_followed(motion: str | None) -> None:
     assert np.linalg.norm(errors[5:, 3:], axis=1).max() < 0.03
 
 
+@pytest.mark.usefixtures("white_noise")
 @pytest.mark.parametrize("motion", [None, "velocity", "imu"])
 def test_covariance_can_be_believed(motion: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """NEES of the pose over 20 seeded runs: inside its 95 % band in at least 90 % of the steps.
@@ -828,6 +829,7 @@ def _start_in_flight(monkeypatch: pytest.MonkeyPatch, flight: Flight, seed: int)
     monkeypatch.setattr(ImuMotion, "start", moving)
 
 
+@pytest.mark.usefixtures("white_noise")
 @pytest.mark.parametrize("world", ["left images alone", "far away, 5 cm baseline"])
 def test_covariance_can_be_believed_where_depth_is_hard_to_tell(world: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """NEES over 20 runs of 1.5 s with an IMU: parallax alone gives depth, or most points have none."""

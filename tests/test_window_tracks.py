@@ -101,12 +101,31 @@ def test_what_moves_slowly_is_no_blur() -> None:
 def test_pixel_noise_follows_the_median_slowly(ratio: float, count: int, change: float, dof: int) -> None:
     """By the twentieth root of its ratio to the median of chi-square, at most four; not where few tracks tell."""
     tracks = WindowTracks(CAMERA, SETTINGS)
+    for _ in range(20):
+        tracks.update_pixel_noise(np.full(600, chi2.ppf(0.5, 45)), np.full(600, 45), -3.0)
     before = tracks.variance
+    np.testing.assert_allclose(before, SETTINGS.pixel_sigma_px**2)
     values = np.full(count, ratio * chi2.ppf(0.5, dof))
     values[:6] = 1e6  # wrong tracks below half
     values = np.append(values, np.full(6, 0.0)) if count >= 15 else values
-    tracks.update_pixel_noise(values, np.full(len(values), dof))
+    tracks.update_pixel_noise(values, np.full(len(values), dof), -3.0)
     np.testing.assert_allclose(tracks.variance, before * change**0.05)
+
+
+def test_pixel_noise_is_learned_in_the_first_frame() -> None:
+    tracks, dof = WindowTracks(CAMERA, SETTINGS), np.full(200, 3)
+    truth = (0.2 * SETTINGS.pixel_sigma_px) ** 2
+    tracks.update_pixel_noise(np.full(200, chi2.ppf(0.5, 3)) * 0.2**2, dof, 0.0)
+    np.testing.assert_allclose(np.sqrt(tracks.variance / truth), 1.0, rtol=0.2)
+
+
+@pytest.mark.parametrize("spent", [0, 30, 1000])
+def test_pixel_noise_counts_what_was_spent_on_the_poses(spent: float) -> None:
+    """60 tracks, 180 degrees of freedom; three go to the noise itself, at most three in four are believed spent."""
+    tracks = WindowTracks(CAMERA, SETTINGS)
+    tracks.update_pixel_noise(np.full(60, chi2.ppf(0.5, 3)), np.full(60, 3), spent)
+    change = 180 / max(180 - 3 - spent, 45)
+    np.testing.assert_allclose(tracks.variance, SETTINGS.pixel_sigma_px**2 * change ** (1 / 1.1))
 
 
 @pytest.mark.parametrize("dofs", [(3, 3), (4, 8), (45, 45), (3, 45)])
@@ -119,7 +138,7 @@ def test_pixel_noise_is_learned_without_bias_whatever_the_degrees_of_freedom(dof
     tracks, rng, values = WindowTracks(CAMERA, SETTINGS), np.random.default_rng(0), []
     for _ in range(800):
         dof = rng.integers(dofs[0], dofs[1] + 1, 60)
-        tracks.update_pixel_noise(0.4**2 * rng.chisquare(dof) / tracks.variance, dof)
+        tracks.update_pixel_noise(0.4**2 * rng.chisquare(dof) / tracks.variance, dof, -3.0)
         values.append(tracks.variance)
     np.testing.assert_allclose(np.mean(values[200:]), 0.4**2, rtol=0.02)
 
@@ -127,10 +146,10 @@ def test_pixel_noise_is_learned_without_bias_whatever_the_degrees_of_freedom(dof
 def test_pixel_noise_stays_in_its_bounds() -> None:
     tracks = WindowTracks(CAMERA, SETTINGS)
     for _ in range(200):
-        tracks.update_pixel_noise(np.full(20, 100.0), np.full(20, 5))
+        tracks.update_pixel_noise(np.full(20, 100.0), np.full(20, 5), 0.0)
     assert tracks.variance == SETTINGS.pixel_sigma_max_px**2
     for _ in range(500):
-        tracks.update_pixel_noise(np.zeros(20), np.full(20, 5))
+        tracks.update_pixel_noise(np.zeros(20), np.full(20, 5), 0.0)
     assert tracks.variance == LEAST_PIXEL_SIGMA_PX**2
 
 

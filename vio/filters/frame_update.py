@@ -146,10 +146,10 @@ class FrameUpdate:
         tracks = self.tracks.without_wrong_views(tracks)
         good, nis, dof = self.tracks.gate(tracks.at)
         gated_ids = self.tracks.table.ids(tracks.rows[~good])
-        self.tracks.update_pixel_noise(nis, dof)
         pixels, rejected = self._gate_landmarks(window, pixels, fitted)
         gated_ids = np.concatenate([gated_ids, rejected])
-        created = self._marginalise(window, tracks, good, pixels, bool(seen.has_right.any()))
+        created, spent = self._marginalise(window, tracks, good, pixels, bool(seen.has_right.any()))
+        self.tracks.update_pixel_noise(nis, dof, spent)
         return UpdateReport(
             used=int(good.sum()) + int((pixels.weight[:, 0] > 0).sum()),
             gated=len(gated_ids),
@@ -324,14 +324,17 @@ class FrameUpdate:
         weight = pixels.weight * used[:, None]
         return Views(pixels.z[~dropped], weight[~dropped]), rejected
 
-    def _marginalise(self, window: Window, tracks: LinearTracks, good: BoolArray, pixels: Views, stereo: bool) -> int:
+    def _marginalise(
+        self, window: Window, tracks: LinearTracks, good: BoolArray, pixels: Views, stereo: bool
+    ) -> tuple[int, float]:
         """Absorb what ends in this frame into the prior, estimate with all that is good, and make room.
 
         Only tracks and landmarks that passed their gates steer the estimate: the means move to the optimum of the
         prior, the landmarks' pixels and the good tracks, also those that go on.
 
         Returns:
-            How many landmarks are new.
+            How many landmarks are new, and how many degrees of freedom the tracks that go on have spent on the errors
+            that they share.
         """
         table, newest = self.tracks.table, len(window.clones) - 1
         full = len(window.clones) > self._settings.clones
@@ -341,7 +344,9 @@ class FrameUpdate:
         ended, joint = np.flatnonzero(ending & good), self._joint_columns(window, tracks)
         columns = tracks.stereo if joint is None else joint
         if len(ended):
-            self._overdispersion.add(table.ids(tracks.rows[ended]), *self.tracks.field_scores(tracks, columns, ended))
+            x, y, z = transform_points(window.T_cam0_world(-1)[0], tracks.p_world[ended]).T
+            angles = np.column_stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))])
+            self._overdispersion.add(table.ids(tracks.rows[ended]), angles, *self.tracks.drift_scores(tracks, ended))
         # Errors that neighbours share are not in the factor, and the field takes them in with every frame.
         repeated = self._overdispersion.factor
         A, b, considered = self._information(window, tracks, ending & good, pixels, joint)
@@ -353,6 +358,7 @@ class FrameUpdate:
         A, b, considered = self._information(window, tracks, good & ~ending, None, joint)
         size = window.state.clones.stop
         P = self._move_to_optimum(window, tracks, columns, A, b, size).covariance()  # without landmarks
+        fitted = float(np.sum(A[:size, :size] * P))
         V = window.prior.error_D_constants[:size, 1:]
         if considered is not None:
             V = V - P @ (A[:size, :size] @ V + considered[:size])
@@ -374,7 +380,7 @@ class FrameUpdate:
         if full:
             window.drop_oldest_clone()
             table.shift()
-        return len(promoted)
+        return len(promoted), fitted
 
     def _promote(
         self,

@@ -1,11 +1,11 @@
 """How much larger the errors of tracks are together than the filter believes: learned while running.
 
-The filter counts all pixels of a track as independent. Those of a front end are not: an error lasts along a track, and
-comes back when the track begins again under its id. So the score of a feature, `sum H' R^-1 r` over its life with its
-point eliminated, varies more than its information `sum H' R^-1 H` says. The ratio of the two, over all features, is the
-factor by which information is counted too often (quasi-likelihood: Wedderburn 1974; clusters: Liang & Zeger,
-Longitudinal data analysis using generalized linear models, 1986). Scores are taken by the rectification terms,
-(R3) of docs/math.md, which stay the same while poses change.
+The filter counts all pixels as independent. Those of a front end are not: an error lasts along a track, comes back when
+the track begins again under its id, and neighbours share it. So the score of a cluster of features, the sum of
+`H' R^-1 r` over their lives with their points eliminated, varies more than its information, the sum of `H' R^-1 H`,
+says. Over all clusters, the ratio of the two is the factor by which information is counted too often (quasi-likelihood:
+Wedderburn 1974; clusters: Liang & Zeger, Longitudinal data analysis using generalized linear models, 1986). Scores are
+taken by a drift of the poses, (R7) of docs/math.md: what lasts along a track moves the poses as a drift does.
 """
 
 from __future__ import annotations
@@ -13,40 +13,50 @@ from __future__ import annotations
 import numpy as np
 
 from vio.geometry.lie import FloatArray
-from vio.records import FIELD_TERMS, IntArray
+from vio.records import IntArray
 
-_PRIOR_TRACKS = 30.0  # as many ended tracks count for a factor of one
-_MOST_SCORES = 4096  # features whose scores are kept: far more than are seen at once
-_NO_SCORE: FloatArray = np.zeros(FIELD_TERMS)
+PRIOR_FACTOR = 2.5  # before any track has ended: white noise has 1, front ends on real images 2 to 7
+_PRIOR_TRACKS = 30.0  # as many ended tracks count for it
+_MOST_FEATURES = 4096  # whose clusters are kept: far more than are seen at once
+_CELL_RAD = 0.2  # side of the cells of directions in which features are neighbours
+_FRAMES = 10  # in which neighbours' tracks end that are one cluster
 
 
 class Overdispersion:
-    """The ratio of squared scores to information, clustered by feature."""
+    """The ratio of squared scores to information, clustered by feature, direction and time."""
 
     def __init__(self) -> None:
-        self._scores: dict[int, FloatArray] = {}  # of features, by id, in the order in which they ended last
-        self._squares, self._information = np.zeros(FIELD_TERMS), np.zeros(FIELD_TERMS)
-        self._tracks = 0
-        self.factor = 1.0  # by how much too often the information of pixels is counted, at least one
+        self._cluster: dict[int, tuple[int, int, int]] = {}  # of features, by id, in the order in which they ended last
+        self._scores: dict[tuple[int, int, int], FloatArray] = {}  # of clusters
+        self._squares, self._information = np.zeros(6), np.zeros(6)
+        self._tracks, self._calls = 0, 0
+        self.factor = PRIOR_FACTOR  # by how much too often the information of pixels is counted, at least one
 
-    def add(self, ids: IntArray, scores: FloatArray, information: FloatArray) -> None:
-        """Take in tracks that ended.
+    def add(self, ids: IntArray, directions: FloatArray, scores: FloatArray, information: FloatArray) -> None:
+        """Take in tracks that ended in a frame.
 
         Args:
             ids: of their features (K,).
-            scores: (K, 8) by the terms of the field, in the noise that the filter believes.
-            information: (K, 8) likewise, their expected squares.
+            directions: (K, 2) in which the camera sees them, azimuth and elevation, rad.
+            scores: (K, 6) by a drift of the poses, in the noise that the filter believes.
+            information: (K, 6) likewise, their expected squares.
         """
-        features = ids.tolist()
-        before = np.array([self._scores.pop(feature, _NO_SCORE) for feature in features])
-        together = scores + before
-        self._squares += np.sum(scores * (together + before), axis=0)
-        self._scores.update(zip(features, together, strict=True))
+        cells = np.floor(directions / _CELL_RAD).astype(np.int64).tolist()
+        for feature, (x, y), score in zip(ids.tolist(), cells, scores, strict=True):
+            cluster = self._cluster.pop(feature, (x, y, self._calls // _FRAMES))
+            self._cluster[feature] = cluster  # a feature that began again stays in its cluster
+            before = self._scores.pop(cluster, None)
+            together = score if before is None else score + before
+            self._squares += score * score if before is None else score * (together + before)
+            self._scores[cluster] = together
+        self._calls += 1
         self._information += information.sum(axis=0)
         self._tracks += len(ids)
-        while len(self._scores) > _MOST_SCORES:
-            self._scores.pop(next(iter(self._scores)))
+        for kept in (self._cluster, self._scores):
+            while len(kept) > _MOST_FEATURES:
+                kept.pop(next(iter(kept)))  # type: ignore[call-overload]
         known = self._information > 0
         if known.any():
             ratio = float(np.mean(self._squares[known] / self._information[known]))
-            self.factor = max((_PRIOR_TRACKS + self._tracks * ratio) / (_PRIOR_TRACKS + self._tracks), 1.0)
+            learned = (_PRIOR_TRACKS * PRIOR_FACTOR + self._tracks * ratio) / (_PRIOR_TRACKS + self._tracks)
+            self.factor = max(learned, 1.0)

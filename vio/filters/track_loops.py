@@ -816,24 +816,60 @@ def collect_columns(
 
 
 @compiled
-def score_terms(
+def score_drifts(
     rows: IntArray,
-    C: FloatArray,
-    point_gradient: FloatArray,
     G: FloatArray,
-    A: FloatArray,
-    b: FloatArray,
+    C: FloatArray,
+    q_D_clone: FloatArray,
+    gradient: FloatArray,
+    point_gradient: FloatArray,
+    centre: FloatArray,
     variance: float,
     scores: FloatArray,
     information: FloatArray,
 ) -> None:
-    """Write scores and information (K, S) of tracks by the first coefficients, their points eliminated as in (M4)."""
-    L = np.empty((3, 3))
+    """Write scores and information (K, 6) of tracks by a drift of the poses, their points eliminated as in (M4).
+
+    The drift is a motion `[rho; phi]` of the clones along the world's axes, about `centre` (3,), that grows linearly
+    from -1/2 in a track's first view to 1/2 in its last one.
+    """
+    L, sums, own, g = np.empty((3, 3)), np.empty((6, 3)), np.empty((6, 6)), np.empty(6)
+    B = np.zeros((6, 6))
+    for i in range(6):
+        B[i, i] = 1.0
+    B[0, 4], B[0, 5], B[1, 3] = -centre[2], centre[1], centre[2]
+    B[1, 5], B[2, 3], B[2, 4] = -centre[0], -centre[1], centre[0]
     for k, f in enumerate(rows):
+        first, last, N = -1, -1, G.shape[1] // 6
+        for n in range(N):
+            if G[f, 6 * n, 0] != 0.0 or G[f, 6 * n + 1, 1] != 0.0:
+                last = n
+                if first < 0:
+                    first = n
+        sums[:], own[:], g[:] = 0.0, 0.0, 0.0
+        for n in range(first, last + 1):
+            w = (n - first) / max(last - first, 1) - 0.5
+            for i in range(6):
+                g[i] += w * gradient[f, 6 * n + i]
+                for j in range(3):
+                    Gij = G[f, 6 * n + i, j]
+                    sums[i, j] += w * Gij
+                    for m in range(6):
+                        own[i, m] += w * w * Gij * q_D_clone[f, j, m]
         _factor(C[f], L)
         y = point_gradient[f]
-        for s in range(scores.shape[1]):
-            g = G[f, s]
-            x0, x1, x2 = _solved(L, g[0], g[1], g[2])
-            scores[k, s] = (b[f, s] - x0 * y[0] - x1 * y[1] - x2 * y[2]) / variance
-            information[k, s] = (A[f, s, s] - x0 * g[0] - x1 * g[1] - x2 * g[2]) / variance
+        for s in range(6):
+            g0, g1, g2, score, A = 0.0, 0.0, 0.0, 0.0, 0.0
+            for i in range(6):
+                b = B[i, s]
+                if b == 0.0:
+                    continue
+                g0 += b * sums[i, 0]
+                g1 += b * sums[i, 1]
+                g2 += b * sums[i, 2]
+                score += b * g[i]
+                for j in range(6):
+                    A += b * own[i, j] * B[j, s]
+            x0, x1, x2 = _solved(L, g0, g1, g2)
+            scores[k, s] = (score - x0 * y[0] - x1 * y[1] - x2 * y[2]) / variance
+            information[k, s] = (A - x0 * g0 - x1 * g1 - x2 * g2) / variance

@@ -10,7 +10,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from vio.cameras.rectification_error import TERMS
 from vio.filters import track_loops as loops
 from vio.filters.multiview import (
     CAUCHY,
@@ -32,14 +31,19 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import FIELD_TERMS, ROW_TERMS, BoolArray, IntArray
+from vio.records import BoolArray, IntArray
 
 MIN_TRACKS_FOR_NOISE = 15  # with fewer, neither the pixel noise nor the process noise is adapted
 LEAST_PIXEL_SIGMA_PX = 0.03  # lower bound of the estimated noise of one pixel coordinate
 # Pixels of a track share errors that its residuals do not show, and no right image bounds what they make of the scale
 # (docs/notes/design_decisions.md, pixel noise of one camera).
 _LEAST_MONO_PX = 0.1
-_NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals
+_NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals in the end
+_PRIOR_FRAMES = 0.1  # the noise at the start may be off by a factor of four, that of frames differs by one and a half
+_MOST_CHANGE = 4.0  # of the variance from frame to frame that is believed in the end
+_SPENT_ON_NOISE = (
+    3.0  # degrees of freedom: 2 for the mean of an inverse chi-square, over the median's efficiency of 0.64
+)
 _VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
 _MOST_DOF = 199
@@ -80,6 +84,7 @@ class WindowTracks:
         self._camera, self._settings = camera, settings
         self.table = TrackTable(settings.clones + 1)
         self._least_px = _LEAST_MONO_PX if camera.kind == "mono" else LEAST_PIXEL_SIGMA_PX
+        self._frames = 0  # from which the noise was learned
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
 
     def choose(self, clones: int) -> IntArray:
@@ -185,22 +190,15 @@ class WindowTracks:
         information = track_information(self._camera, T_cam0_world, at, p_world, weight)
         return LinearTracks(T_cam0_world, rows, p_world, at, z, weight, information, field)
 
-    def field_scores(
-        self, tracks: LinearTracks, columns: StereoColumns | None, chosen: IntArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Scores and information (K, 8) of tracks (K,) by the terms of (R3), their points eliminated, the poses known.
+    def drift_scores(self, tracks: LinearTracks, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Scores and information (K, 6) of tracks (K,) by a drift of the poses about the newest one, points eliminated.
 
-        In the believed noise, where the expected square of a score is its information. `columns` are the tracks' own of
-        the coefficients estimated first, None where there are none.
+        In the believed noise, where the expected square of a score is its information.
         """
-        rows, info = chosen, tracks.information
-        if columns is None or tracks.field is None or tracks.field.terms[0] > 0:
-            none = StereoCorrection(self._camera, np.zeros(ROW_TERMS), np.zeros(TERMS), np.arange(FIELD_TERMS))
-            rows, info, at = np.arange(len(chosen)), info.take(chosen), tracks.at.take(chosen)
-            columns = stereo_columns(at, none.jacobian(tracks.z[chosen]), info.q.p_D_q, tracks.weight[chosen])
-        scores, information = np.empty((len(chosen), FIELD_TERMS)), np.empty((len(chosen), FIELD_TERMS))
-        of_terms = columns.G, columns.A, columns.b
-        loops.score_terms(rows, info.C, info.point_gradient, *of_terms, self.variance, scores, information)
+        info, T = tracks.information, tracks.T_cam0_world[-1]
+        scores, information = np.empty((2, len(chosen), 6))
+        of_tracks = info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient
+        loops.score_drifts(chosen, *of_tracks, -T[:3, :3].T @ T[:3, 3], self.variance, scores, information)
         return scores, information
 
     def _views(self, rows: IntArray, clones: int, field: StereoCorrection | None) -> Views:
@@ -238,14 +236,28 @@ class WindowTracks:
         passed: BoolArray = squares <= limits
         return passed, squares, dof
 
-    def update_pixel_noise(self, squares: FloatArray, dof: IntArray) -> None:
-        """Let the pixel noise follow the median of squared residuals (F,) over that of chi-square, robustly, slowly."""
+    def update_pixel_noise(self, squares: FloatArray, dof: IntArray, fitted: float) -> None:
+        """Let the pixel noise follow the median of squared residuals over that of chi-square, robustly.
+
+        Its logarithm is the mean over the frames so far, then follows slowly. At the start it is hardly known: if half
+        a pixel is believed in place of a tenth, what moves by a pixel passes for noise.
+
+        Args:
+            squares: (F,) of tracks, over the variance believed.
+            dof: (F,) their degrees of freedom, the poses known.
+            fitted: degrees of freedom that were spent on the poses and all else that tracks have in common.
+        """
         if len(squares) < MIN_TRACKS_FOR_NOISE:
             return
-        s = self._settings
-        ratio = min(max(median(squares / chi_square_table(0.5)[dof]), 0.25), 4.0)
-        variance = max(self.variance * ratio**_NOISE_GAIN, self._least_px**2)
-        self.variance = min(variance, s.pixel_sigma_max_px**2)
+        self._frames += 1
+        gain = max(1 / (self._frames + _PRIOR_FRAMES), _NOISE_GAIN)
+        most = _MOST_CHANGE ** (gain / _NOISE_GAIN)
+        # The mean of 1 / variance is that of the noise itself, where its estimate has about two degrees less.
+        total = float(dof.sum())
+        left = max(total - fitted - _SPENT_ON_NOISE, 0.25 * total)
+        ratio = min(max(total / left * median(squares / chi_square_table(0.5)[dof]), 1 / most), most)
+        variance = max(self.variance * ratio**gain, self._least_px**2)
+        self.variance = min(variance, self._settings.pixel_sigma_max_px**2)
 
     def end_frame(self, *, spent: IntArray, promoted: IntArray, newest: int) -> None:
         """Remove what has been absorbed and what has ended.
