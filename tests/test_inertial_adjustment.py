@@ -116,10 +116,30 @@ def test_derivatives_match_finite_differences() -> None:
     np.testing.assert_allclose(by_others[:gauge], ((o1 - o0) / (2 * h))[:gauge], rtol=1e-4, atol=2e-2)
 
 
+def test_covariance_is_that_of_all_that_is_unknown() -> None:
+    problem, at, _ = _flight(range(12, 12), 0.0)
+    system = problem._system(at, problem._preintegrated(at.body), 3.0)
+    K, M, (R, n) = len(problem.seconds), len(at.p_world), system.e.shape
+    J = np.zeros((R, n, 15 * K + 27 + 3 * M))
+    for r, (k, m) in enumerate(zip(problem.tracks.keyframe, problem.tracks.point, strict=True)):
+        J[r, :, 15 * k : 15 * k + 6], J[r, :, 15 * K : 15 * K + 27] = system.own[r], system.rig[r]
+        J[r, :, 15 * K + 27 + 3 * m :][:, :3] = system.points[r]
+    J = J.reshape(R * n, -1)
+    N = J.T @ J
+    N[: 15 * K + 27, : 15 * K + 27] += (system.others.T @ system.others).toarray()
+    scale = 1 / np.sqrt(np.diag(N))
+    P = np.linalg.inv(N * scale * scale[:, None]) * scale * scale[:, None]
+    found = system.covariance(np.array([3, 20]))
+    for k, own in zip((3, 20), found, strict=True):
+        np.testing.assert_allclose(own, P[15 * k : 15 * k + 6, 15 * k : 15 * k + 6], rtol=1e-3, atol=1e-9)
+
+
 @pytest.mark.parametrize("longer", [0.0, 0.008])
 def test_finds_poses_across_a_blind_stretch_and_the_baseline(longer: float) -> None:
     problem, start, truth = _flight(range(11, 14), longer)
-    fit, pixels, inertial = problem.solve(start.body)
+    best = problem.solve(start.body)
+    fit, pixels, inertial = best.at, best.pixels, best.inertial
+    assert best.converged
     assert 0.6 < pixels < 1.1
     assert 0.1 < inertial < 1.1
     found = problem.cameras(fit)
@@ -136,7 +156,7 @@ def test_noise_of_the_pixels_makes_no_longer_baseline() -> None:
     rng = np.random.default_rng(3)
     noisy = problem.tracks.z + rng.normal(0, 1.0, problem.tracks.z.shape)
     weak = replace(problem, tracks=replace(problem.tracks, z=noisy), sigma_px=np.full(len(noisy), 1.0))
-    fit, _, _ = weak.solve(start.body)
+    fit = weak.solve(start.body).at
     assert abs(fit.rig[15]) < 1.5
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -19,18 +20,21 @@ from vio.cli import main
 from vio.config import Config
 from vio.datasets import open_dataset
 from vio.errors import ConfigError, DataError
+from vio.evaluation.trajectories import evaluate
 from vio.files.trajectories import read_trajectory
 from vio.filters.msckf import Msckf
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.live.build import MapUse
 from vio.mapping.builder import MapBuilder, MapUpdate
-from vio.mapping.map_store import MapStore
+from vio.mapping.map_graph import MapGraph
+from vio.mapping.map_store import LoopRow, MapStore
 from vio.mapping.session import HANDOVER_FRAMES, MapSession
+from vio.offline.map_adjustment import adjust_map
 from vio.records import Estimate, FrameResult, LoopEvent, LoopMatches, Observations, StereoFrame, observations
 from vio.runs.finished import read_finished_run
 from vio.runs.mapped import corrected, read_loops, write_loops
-from vio.runs.pipeline import RunControl, run
+from vio.runs.pipeline import RunControl, RunResult, run
 from vio.runs.recorder import GrowingFolder
 
 
@@ -410,3 +414,150 @@ def test_corrections_are_spread_between_keyframes() -> None:
         )
     jumps = [se3_log(se3_inverse(T_odom[k]) @ T_odom[k + 1] @ se3_inverse(out[k + 1]) @ out[k]) for k in range(2, 6)]
     assert np.linalg.norm(jumps, axis=1).max() < 0.4, "no frame takes the whole correction"
+
+
+# --- adjustment with the IMU ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def looped(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, Path]:
+    """A run with an IMU, whose first and last keyframe a loop joins, and its map."""
+    path = tmp_path_factory.mktemp("looped") / "yard.map"
+    result = run(open_dataset(flight), Config(), map=MapUse(path), keep_observations=True)
+    assert result.mapped is not None
+    assert result.observations is not None
+    assert result.mapped.adjustment is None
+    frames = result.mapped.in_map.frame.tolist()
+    first, last = (result.observations[k] for k in (frames[0], frames[-1]))
+    shared = np.intersect1d(first.ids[first.has_right], last.ids[last.has_right])
+    assert len(shared) > 20
+    a, b = (o.take(np.isin(o.ids, shared)) for o in (first, last))
+    matches = LoopMatches(a.z, b.z, a.has_right, b.has_right)
+    loop = LoopEvent(frames[-1], last.time_ns, 0, first.time_ns, len(shared), 0.01, False, frames[0], True, matches)
+    with closing(MapStore(path)) as store:
+        T = result.mapped.in_map.T_map_body @ se3_inverse(result.T_cam0_body)
+        pose = RelativePose(se3_inverse(T[0]) @ T[-1], 1e-4 * np.eye(6))
+        store.add_loop(LoopRow(0, len(frames) - 1, pose, len(shared), kept=True))
+        store.commit()
+    return replace(result, mapped=replace(result.mapped, loops=(loop,))), path
+
+
+def _copied(looped: tuple[RunResult, Path], tmp_path: Path) -> tuple[RunResult, Path]:
+    return looped[0], Path(shutil.copy(looped[1], tmp_path / "yard.map"))
+
+
+def _poses(path: Path) -> FloatArray:
+    with closing(MapStore(path, read_only=True)) as store:
+        return np.array([row.T_map_cam for row in store.keyframes()])
+
+
+def test_a_map_with_loops_is_adjusted_with_the_imu(looped: tuple[RunResult, Path], tmp_path: Path) -> None:
+    result, path = _copied(looped, tmp_path)
+    before = _poses(path)
+    done = adjust_map(result, path).mapped
+    assert done is not None
+    assert done.adjustment is not None
+    assert done.adjustment.startswith("with the IMU at ")
+    in_map = done.in_map
+    np.testing.assert_allclose(_poses(path) @ result.T_cam0_body, in_map.T_map_body, atol=1e-12)
+    assert np.abs(_poses(path) - before).max() > 1e-5
+    np.testing.assert_allclose(done.T_map_body[np.searchsorted(result.estimates.column("index"), in_map.frame)],
+                               in_map.T_map_body, atol=1e-12)  # fmt: skip
+    sigma = np.sqrt(np.trace(in_map.covariance[:, :3, :3], axis1=1, axis2=2))
+    assert (sigma[1:] > 1e-5).all()
+    assert sigma.max() < 0.1
+    truth = result.recording.reference
+    assert truth is not None
+    errors = [evaluate(replace(result.trajectory, T_world_body=T), truth, T_cam0_imu=result.T_cam0_body).ate_m.rmse
+              for T in (result.mapped.T_map_body, done.T_map_body)]  # type: ignore[union-attr]  # fmt: skip
+    assert errors[1] < max(1.5 * errors[0], 0.003)
+    # A later session that optimises the map leaves it where it is.
+    with closing(MapStore(path, read_only=True)) as store:
+        graph = MapGraph(store)
+    graph.optimise_part(0)
+    np.testing.assert_allclose(graph.T_map_cam.rows, _poses(path), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("interrupted", "not with the IMU: interrupted"),
+        ("keyframes", "it would need 10 keyframes, 3 at most"),
+        ("others", "the map has keyframes of other sessions"),
+        ("certain", "of the map's standard deviations: one of them is wrong"),
+        ("unobserved", "the run has not kept what it observed"),
+        ("no optimum", "it did not converge"),
+    ],
+)
+def test_a_map_that_is_not_adjusted_stays_as_it_is(
+    what: str, words: str, looped: tuple[RunResult, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result, path = _copied(looped, tmp_path)
+    mapped = result.mapped
+    assert mapped is not None
+    before = _poses(path)
+    asked = iter([None] * 3)
+    reason = {"interrupted": lambda: next(asked, "interrupted")}.get(what, lambda: None)
+    in_map = mapped.in_map
+    if what == "others":
+        mapped = replace(mapped, in_map=replace(in_map, own=np.arange(len(in_map.own)) > 0))
+    if what == "certain":
+        mapped = replace(mapped, in_map=replace(in_map, covariance=1e-6 * in_map.covariance))
+    if what == "keyframes":
+        monkeypatch.setattr("vio.offline.map_adjustment.MOST_KEYFRAMES", 3)
+    if what == "no optimum":
+        monkeypatch.setattr("vio.offline.inertial_adjustment._STEPS", 3)
+    result = replace(result, mapped=mapped, observations=None if what == "unobserved" else result.observations)
+    done = adjust_map(result, path, reason).mapped
+    assert done is not None
+    assert words in (done.adjustment or "")
+    assert done.T_map_body is mapped.T_map_body
+    np.testing.assert_array_equal(_poses(path), before)
+
+
+@pytest.mark.parametrize("change", ["no loop", "images alone", "ended early"])
+def test_without_loops_or_imu_there_is_nothing_to_adjust(
+    change: str, looped: tuple[RunResult, Path], tmp_path: Path
+) -> None:
+    result, path = _copied(looped, tmp_path)
+    before = path.read_bytes()
+    assert result.mapped is not None
+    changed = {
+        "no loop": replace(result, mapped=replace(result.mapped, loops=())),
+        "images alone": replace(result, motion=None),
+        "ended early": replace(result, stopped="interrupted"),
+    }[change]
+    assert adjust_map(changed, path) is changed
+    assert path.read_bytes() == before
+
+
+def test_a_run_says_in_its_summary_what_became_of_the_adjustment(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def adjusted(result: RunResult, path: Path, should_stop: Callable[[], str | None]) -> RunResult:
+        assert result.mapped is not None
+        assert result.observations is not None
+        assert should_stop() is None
+        assert path == tmp_path / "yard.map"
+        return replace(result, mapped=replace(result.mapped, adjustment="in jest"))
+
+    monkeypatch.setattr("vio.offline.map_adjustment.adjust_map", adjusted)
+    arguments = ["--map", str(tmp_path / "yard.map"), "--out", str(tmp_path / "run"), "--quiet", "--no-plot"]
+    assert main(["run", str(flight), "--stop", "8", *arguments]) == 0
+    assert "adjusted in jest" in capsys.readouterr().out
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["map"]["adjustment"] == "in jest"
+    assert not (tmp_path / "run" / "observations.npz").exists()
+
+
+def test_the_covariance_of_a_map_has_the_scale_that_its_rig_leaves_open(mapped: Path) -> None:
+    keyframes = read_finished_run(mapped).map_keyframes
+    T = keyframes.T_map_body
+    away = np.linalg.norm(T[:, :3, 3] - T[0, :3, 3], axis=1)
+    sigma = np.sqrt(np.linalg.eigvalsh(keyframes.covariance[:, :3, :3])[:, -1])
+    assert (sigma >= 0.99 * np.hypot(0.005, 0.003) * away).all()  # those of the baseline and of the focal length
+    (mapped / "map_keyframes_covariance.npy").rename(mapped / "moved.npy")
+    assert np.isnan(read_finished_run(mapped).map_keyframes.covariance).all()  # as of an older version
+    np.save(mapped / "map_keyframes_covariance.npy", np.zeros(3))
+    with pytest.raises(DataError, match="is damaged"):
+        read_finished_run(mapped)
+    (mapped / "moved.npy").rename(mapped / "map_keyframes_covariance.npy")

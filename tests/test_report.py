@@ -94,7 +94,7 @@ def test_a_run_with_a_map_is_drawn_in_it_with_its_loops(runs: tuple[Path, Path])
     run = replace(
         plain,
         mapped=replace(plain.trajectory, T_world_body=T_map),
-        map_keyframes=MapKeyframes(frames[:1], frames[:1], frames[:1], np.array([True]), T_map[:1]),
+        map_keyframes=MapKeyframes(*3 * (frames[:1],), np.array([True]), T_map[:1], np.zeros((1, 6, 6))),
         loops=(loop, replace(loop, kept=False), replace(loop, keyframe_frame=None)),
     )
     for shown in (run, replace(run, evaluation=None)):

@@ -567,12 +567,13 @@ class MapKeyframes:
     time_ns: IntArray  # (K,)
     own: BoolArray  # (K,) whether it is of this run
     T_map_body: FloatArray  # (K, 4, 4) pose in the map of this run's body with its left camera at the keyframe's
+    covariance: FloatArray  # (K, 6, 6) of xi in `T_map_body exp(xi)`, relative to the first one
 
 
 def no_map_keyframes() -> MapKeyframes:
     """Return none, as of a run without a map."""
     none = np.zeros(0, dtype=np.int64)
-    return MapKeyframes(none, none, none, np.zeros(0, dtype=np.bool_), np.zeros((0, 4, 4)))
+    return MapKeyframes(none, none, none, np.zeros(0, dtype=np.bool_), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
 
 
 STAGES = ("read", "frontend", "monitor", "select", "filter")  # of a frame's wall time

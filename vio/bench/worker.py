@@ -10,6 +10,7 @@ import json
 import os
 import platform
 import re
+import shutil
 import sys
 import tempfile
 import threading
@@ -211,6 +212,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
 
     from vio.bench.maps import map_figures
     from vio.live.build import MapUse
+    from vio.offline.map_adjustment import adjust_map
     from vio.runs.folder import growing_folder, landmark_error, refused_share
     from vio.runs.pipeline import RunControl, run  # loads compiled functions: not for what cannot be opened
 
@@ -223,10 +225,17 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         if job["first"] is not None:
             built = merge(Config(), job["first"]["config"], where="the suite")
             before, use = _truth(job["first"], built), MapUse(store, localise=True)
-            made = run(before.dataset, built, start=before.first, stop=before.end, map=MapUse(store))
+            begin, to = before.first, before.end
+            made = run(before.dataset, built, start=begin, stop=to, map=MapUse(store), keep_observations=True)
+            made = adjust_map(made, store)
             T_ref_map = None if before.reference is None else _world_of_map(made, before.reference)
         first, end = truth.first, truth.end
-        result = run(truth.dataset, config, start=first, stop=end, viewer=timer, map=use, control=control)
+        kept = bool(job["map"])
+        result = run(
+            truth.dataset, config, start=first, stop=end, viewer=timer, map=use, control=control, keep_observations=kept
+        )
+        if kept:  # in a copy: loops are scored as they were measured
+            result = adjust_map(result, Path(shutil.copy(store, Path(folder) / "adjusted.db")))
         trajectory = result.trajectory
         figures: dict[str, Any] = {
             "frames": len(result.frames),

@@ -181,6 +181,7 @@ def _process(
     truth = recording.reference if reference is None else read_trajectory(Path(reference))
     start, stop, save_observations = request["start"], request["stop"], request["save_observations"]
     frames = int((used_frames(recording.frame_times_ns[:stop], config.dataset.max_frame_rate) >= start).sum())
+    builds_map = bool(request.get("map")) and not request.get("localise", False)
     annotated = AnnotatedImage(frames)
     viewers: list[Viewer] = [ProgressViewer(frames, recording.path.name)] if progress else []
     viewers.append(annotated)
@@ -203,11 +204,15 @@ def _process(
                 config,
                 start=start,
                 stop=stop,
-                keep_observations=save_observations,
+                keep_observations=save_observations or builds_map,  # which its adjustment takes
                 viewer=Viewers(viewers),
                 map=MapUse(Path(request["map"]), request.get("localise", False)) if request.get("map") else None,
                 control=RunControl(growing_folder(folder, dataset, config, request), resume, asked.reason),
             )
+            if builds_map:
+                from vio.offline.map_adjustment import adjust_map
+
+                result = adjust_map(result, Path(request["map"]), asked.reason)
             file = request.get("save_calibration")  # unfinished runs of earlier versions have none
             calibration = None if file is None else _calibration_or_fault(result)
             metrics = finish_run_folder(
@@ -358,6 +363,8 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
         rows.append(("drift", f"{metrics['t_err_percent']:.2f} %, {turned} over {over}"))
     if metrics.get("map") is not None:
         rows.append(("map", _map_row(metrics["map"])))
+        if metrics["map"].get("adjustment") is not None:
+            rows.append(("", f"adjusted {metrics['map']['adjustment']}"))
     if metrics["landmark_error"] is not None:
         score = metrics["landmark_error"]
         rows.append(

@@ -261,9 +261,9 @@ class MapDatabase(ABC):
         with self._changes():
             assigned = ", ".join(f"{column} = ?" for column in columns)
             rows = ((*row, n) for n, row in values.items())
-            self._db.executemany(f"UPDATE {table} SET {assigned} WHERE id = ?", rows)
+            self._db.executemany(f"UPDATE {table} SET {assigned} WHERE {KEYS[table]} = ?", rows)
             signed = ", ".join(self._columns(table)[:-1])
-            update = f"UPDATE {table} SET crc32 = row_crc32({signed}) WHERE id = ?"
+            update = f"UPDATE {table} SET crc32 = row_crc32({signed}) WHERE {KEYS[table]} = ?"
             self._db.executemany(update, ((n,) for n in values))
 
     def _sign(self, table: str, which: str = "") -> None:

@@ -14,7 +14,7 @@ from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_invers
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.upright import mean_up, rotation_to_up
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
-from vio.mapping.pose_graph import Edges, UpDirections, optimise
+from vio.mapping.pose_graph import Edges, UpDirections, marginals, optimise
 from vio.records import BoolArray, IntArray
 
 # What the odometry may be off by beyond its own covariance, since errors of the calibration add up along the path:
@@ -22,6 +22,7 @@ from vio.records import BoolArray, IntArray
 _DRIFT_SHARE, _DRIFT_RAD_PER_M = 0.01, float(np.radians(0.005))
 _FIRST_REACH, _FURTHER = 30.0, 2.0  # of the search for them, in mean variances of a motion; and from try to try
 _WINDOW = 1000  # keyframes that are optimised for a new loop, beside those of its cycle
+_MOST_EXACT = 200  # keyframes whose covariance is computed, beside the first of each session
 UNKNOWN = 1e6  # variance of the motion from one session to the next, m^2 and rad^2: nothing is known of it
 
 
@@ -174,6 +175,28 @@ class MapGraph:
         self._optimise(free | around, around & ~free)
         return False
 
+    def covariances(self, part: int) -> FloatArray:
+        """Covariances (K, 6, 6) of xi in `T_map_cam exp(xi)` of the keyframes of a part, relative to its first one.
+
+        Of many, those of some: the others have that of one before them, grown by the odometry since.
+        """
+        rows = self.part == part
+        numbers = np.flatnonzero(rows)
+        if not len(numbers):
+            return np.zeros((0, 6, 6))
+        begins = np.unique(self.session[numbers], return_index=True)[1]
+        few = np.linspace(0, len(numbers) - 1, min(_MOST_EXACT, len(numbers))).astype(np.int64)
+        exact = np.union1d(begins, few)
+        inside = [n for n, o in enumerate(self.loops) if o.kept and rows[o.first] and rows[o.second]]
+        ups, T = self._up_directions(rows), self.T_map_cam.rows[rows]
+        levelled = 0 if len(ups.pose) else None
+        P = marginals(T, *self._edges(rows, inside), ups, np.zeros(len(T), dtype=np.bool_), exact, levelled=levelled)
+        before = np.searchsorted(exact, np.arange(len(T)), side="right") - 1
+        i = exact[before]
+        A = se3_adjoint(se3_inverse(T) @ T[i])
+        grown = self.odometry_scale * self.drift(numbers[i], numbers, systematic=0.0)
+        return np.asarray(A @ P[before] @ np.swapaxes(A, 1, 2) + grown)
+
     def _linked(self, loops: Sequence[LoopRow]) -> coo_matrix:
         """Return the variances of the motions (K, K) between keyframes, by the odometry and by loops."""
         covariance = np.array([o.pose.covariance for o in loops]).reshape(-1, 6, 6)
@@ -201,21 +224,12 @@ class MapGraph:
             fixed: (K,) those of them that stay.
             level: let the roll and pitch of the first one follow the verticals, if there are any.
         """
-        place = np.cumsum(rows) - 1
-        ends = self._links.rows[:, :2].astype(np.int64)
-        near = [self.odometry[n] for n in np.flatnonzero(rows[ends].all(axis=1)).tolist()]
-        scaled = [
-            (int(place[i]), int(place[j]), RelativePose(m.T_i_j, self.odometry_scale * m.covariance))
-            for i, j, m in near
-        ]
         inside = [n for n, o in enumerate(self.loops) if rows[o.first] and rows[o.second]]
-        loops = [(int(place[o.first]), int(place[o.second]), o.pose) for o in (self.loops[n] for n in inside)]
-        up_directions = self._up_directions(rows, place)
+        up_directions = self._up_directions(rows)
         T_upright_map = se3_from_parts(self._level_of(fixed), np.zeros(3))
         best = optimise(
             T_upright_map @ self.T_map_cam.rows[rows],
-            Edges.of(scaled),
-            Edges.of(loops),
+            *self._edges(rows, inside),
             up_directions,
             fixed[rows],
             levelled=0 if level and len(up_directions.pose) else None,
@@ -224,7 +238,20 @@ class MapGraph:
         for n, kept in zip(inside, best.kept.tolist(), strict=True):
             self.loops[n] = replace(self.loops[n], kept=kept)
 
-    def _up_directions(self, rows: BoolArray, place: IntArray) -> UpDirections:
+    def _edges(self, rows: BoolArray, inside: Sequence[int]) -> tuple[Edges, Edges]:
+        """Return the odometry between the keyframes of a mask (K,), and some loops, by their places among them."""
+        place = np.cumsum(rows) - 1
+        ends = self._links.rows[:, :2].astype(np.int64)
+        near = [self.odometry[n] for n in np.flatnonzero(rows[ends].all(axis=1)).tolist()]
+        scaled = [
+            (int(place[i]), int(place[j]), RelativePose(m.T_i_j, self.odometry_scale * m.covariance))
+            for i, j, m in near
+        ]
+        loops = [(int(place[o.first]), int(place[o.second]), o.pose) for o in (self.loops[n] for n in inside)]
+        return Edges.of(scaled), Edges.of(loops)
+
+    def _up_directions(self, rows: BoolArray) -> UpDirections:
+        place = np.cumsum(rows) - 1
         ups = [up for up in self._ups if rows[up[0]]] if self._is_upright(rows) else []
         return UpDirections(
             np.array([place[k] for k, _, _ in ups], dtype=np.int64),

@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vio.calibration.stereo_field import TERMS, DisplacementField
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures
@@ -157,6 +157,24 @@ class MapStore(MapDatabase):
     def set_poses(self, T_map_cam: Mapping[int, FloatArray]) -> None:
         """Replace poses (4, 4) of keyframes."""
         self._set("keyframes", ("T_map_cam",), {k: (_blob(T),) for k, T in T_map_cam.items()})
+
+    def set_adjusted(self, T_map_cam: Mapping[int, FloatArray]) -> None:
+        """Replace the poses (4, 4) of keyframes, and what motions, loops kept and verticals measured by what these say.
+
+        So the poses are the optimum of the graph, too. Covariances stay, which measured more than the poses need.
+        """
+
+        def between(first: int, second: int, pose: RelativePose) -> RelativePose:
+            return RelativePose(se3_inverse(T_map_cam[first]) @ T_map_cam[second], pose.covariance)
+
+        upright = {k: row.up_cam is not None for k, row in enumerate(self.keyframes())}
+        ups = {k: (_blob(T[2, :3]),) for k, T in T_map_cam.items() if upright[k]}
+        motions = [row for row in self.odometry() if row[0] in T_map_cam and row[1] in T_map_cam]
+        loops = {n: o for n, o in enumerate(self.loops()) if o.kept and o.first in T_map_cam and o.second in T_map_cam}
+        self.set_poses(T_map_cam)
+        self._set("keyframes", ("up_cam",), ups)
+        self._set("odometry", ("T_i_j",), {row[1]: (_blob(between(*row).T_i_j),) for row in motions})
+        self.set_loops({n: replace(o, pose=between(o.first, o.second, o.pose)) for n, o in loops.items()})
 
     def set_kept(self, kept: Mapping[int, bool]) -> None:
         """Say of loops whether they agree with the others."""

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, se3_left_jacobian, se3_log, so3_hat
 from vio.geometry.relative_pose import RelativePose
+from vio.numerics import sparse
 from vio.numerics.robust import truncated_weights
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
@@ -189,6 +189,34 @@ def _step(
     T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, up_directions: UpDirections, free: _Free
 ) -> FloatArray:
     """Solve the normal equations (G4) for xi (K, 6)."""
+    H, gradient, P = _normal(T, odometry, loops, weight, up_directions, free)
+    return np.asarray(P @ sparse.factors(H).solve(P.T @ gradient)).reshape(len(T), 6)
+
+
+def marginals(
+    T: FloatArray,
+    odometry: Edges,
+    loops: Edges,
+    up_directions: UpDirections,
+    fixed: BoolArray,
+    poses: IntArray,
+    *,
+    levelled: int | None = None,
+) -> FloatArray:
+    """Return the covariances (C, 6, 6) of xi in `T exp(xi)` of some poses (C,) of an optimum (K, 4, 4), by (G4).
+
+    The other arguments are those of `optimise`; all loops count, and what stays is exact.
+    """
+    weight = np.ones(len(loops))
+    free = _Free(_anchored(fixed, odometry, loops, weight), levelled)
+    H, _, P = _normal(T, odometry, loops, weight, up_directions, free)
+    return sparse.marginals(H, P.tocsr()[(6 * poses[:, None] + np.arange(6)).ravel()], 6)
+
+
+def _normal(
+    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, up_directions: UpDirections, free: _Free
+) -> tuple[csc_matrix, FloatArray, csc_matrix]:
+    """Return the normal matrix (F, F) of (G4) for what is free, the right-hand side (6K,) of all, and the columns."""
     count = len(T)
     blocks: list[tuple[IntArray, IntArray, FloatArray]] = []
     gradient = np.zeros((count, 6))
@@ -210,11 +238,7 @@ def _step(
         blocks.append((up_directions.pose, up_directions.pose, np.swapaxes(D, 1, 2) @ D))
         np.add.at(gradient, up_directions.pose, -np.einsum("eji,ej->ei", D, r))
     P = free.directions(T)
-    H = (P.T @ _sparse(blocks, count) @ P).tocsc()
-    # Ordered and pivoted as a symmetric matrix, its factors have a tenth of the entries.
-    factors = splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    xi = P @ factors.solve(P.T @ gradient.ravel())
-    return np.asarray(xi).reshape(count, 6)
+    return (P.T @ _sparse(blocks, count) @ P).tocsc(), gradient.ravel(), P
 
 
 def _sparse(blocks: list[tuple[IntArray, IntArray, FloatArray]], count: int) -> coo_matrix:

@@ -22,7 +22,16 @@ from vio.geometry.stereo import StereoCamera
 from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate, check_camera
 from vio.mapping.features import extract
 from vio.mapping.map_store import MapStore
-from vio.records import Estimate, Image, IntArray, LoopEvent, MapKeyframes, Observations, StereoFrame
+from vio.records import (
+    Estimate,
+    Image,
+    IntArray,
+    LoopEvent,
+    MapKeyframes,
+    Observations,
+    StereoFrame,
+    no_map_keyframes,
+)
 
 Relative: TypeAlias = Callable[[int, int], "RelativePose | None"]
 
@@ -170,13 +179,20 @@ class MapSession:
         return frames, graph.T_map_cam[own] @ self._T_cam_body, graph.T_odom_cam[own] @ self._T_cam_body
 
     def map_keyframes(self) -> MapKeyframes:
-        """Return all keyframes of the map that are in the frame of this session's poses."""
+        """Return all keyframes of the map that are in the frame of this session's poses.
+
+        Their covariance is that of odometry, verticals and loops.
+        """
         graph, first = self._builder.graph, self._builder.first
-        rows = np.flatnonzero(graph.part == graph.part[first]) if len(graph) > first else np.zeros(0, dtype=np.int64)
+        if len(graph) <= first:
+            return no_map_keyframes()
+        part, A = graph.part[first], se3_adjoint(self._T_body_cam)
+        rows = np.flatnonzero(graph.part == part)
         frames, times = (
             np.array([of(k) for k in rows.tolist()], dtype=np.int64) for of in (graph.frame, graph.time_ns)
         )
-        return MapKeyframes(rows, frames, times, rows >= first, graph.T_map_cam[rows] @ self._T_cam_body)
+        P = A @ graph.covariances(part) @ A.T
+        return MapKeyframes(rows, frames, times, rows >= first, graph.T_map_cam[rows] @ self._T_cam_body, P)
 
     def settled_loops(self) -> tuple[LoopEvent, ...]:
         """Return the loops so far, each with what the newest optimisation said of it."""

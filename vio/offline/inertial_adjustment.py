@@ -10,16 +10,17 @@ Reference: Triggs et al., Bundle adjustment: a modern synthesis (2000).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import block_array, bsr_matrix, coo_matrix, csr_matrix, diags_array, hstack, vstack
-from scipy.sparse.linalg import splu
+from scipy.sparse import block_array, bsr_matrix, coo_matrix, csc_matrix, csr_matrix, diags_array, hstack, vstack
 
 from vio.cameras.rectification_error import METRIC_TERMS, error_basis, error_jacobian
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_hat
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.imu.preintegration import BodyStates, Preintegrated, Readings, preintegrate
+from vio.numerics import sparse
 from vio.offline.points import MIN_DEPTH_M, PointTracks
 from vio.records import FIELD_TERMS, ROW_TERMS, IntArray
 
@@ -32,7 +33,7 @@ _STEPS = 25
 _WIDTH = 3.0  # standard deviations at which a row's weight is a quarter …
 _WIDER = 2  # … doubled in so many first steps, once each
 _SETTLED = 7  # steps after which neither width nor preintegration change
-_CONVERGED = 3e-5  # of the cost, from step to step
+_CONVERGED = 1e-4  # of the cost, from step to step: what goes on is rows that turn into outliers, and moves no pose
 _MOST_DAMPING = 1e3
 _GAUGE = 1e4  # inverse standard deviation, 1/m and 1/rad, of position and heading of the first keyframe
 
@@ -64,6 +65,17 @@ class Fit:
 
 
 @dataclass(frozen=True, slots=True)
+class Optimum:
+    """Where an adjustment ended."""
+
+    at: Fit
+    converged: bool
+    pixels: float  # mean squared error of the pixels that agree, 1 expected
+    inertial: float  # likewise of the IMU's motions
+    covariance: FloatArray  # (C, 6, 6) of xi in `T_world_imu exp(xi)` of the keyframes asked for, since the first one
+
+
+@dataclass(frozen=True, slots=True)
 class InertialAdjustment:
     """What is adjusted: keyframes with their rows of pixels, and the IMU between them."""
 
@@ -77,17 +89,31 @@ class InertialAdjustment:
     bias_sigma: FloatArray  # (6,) of the biases at the first keyframe, rad/s and m/s^2
     gravity_mps2: float
 
-    def solve(self, body: BodyStates) -> tuple[Fit, float, float]:
-        """Return the optimum, and the mean squared errors of pixels and of IMU there (1 expected each)."""
-        at, steps = self._descend(body)
+    def solve(
+        self, body: BodyStates, covariance_of: IntArray | None = None, progress: Callable[[], None] = lambda: None
+    ) -> Optimum:
+        """Return the optimum from some states on.
+
+        Args:
+            body: states of the keyframes to begin with.
+            covariance_of: (C,) keyframes whose covariance is wanted.
+            progress: called before each step; what it raises ends the adjustment.
+        """
+        at, steps, converged = self._descend(body, progress)
         squared, _ = self._squared(at)
         r = self._inertial_residual(at, steps)
-        return at, float(np.mean(squared[squared < _WIDTH**2])) / 3, float(np.mean(r**2))
+        covariance = np.zeros((0, 6, 6))
+        if covariance_of is not None:
+            progress()
+            covariance = self._system(at, steps, _WIDTH).covariance(covariance_of)
+        pixels = float(np.mean(squared[squared < _WIDTH**2])) / 3
+        return Optimum(at, converged, pixels, float(np.mean(r**2)), covariance)
 
-    def _descend(self, body: BodyStates) -> tuple[Fit, Preintegrated]:
+    def _descend(self, body: BodyStates, progress: Callable[[], None]) -> tuple[Fit, Preintegrated, bool]:
         at = Fit(body, self.tracks.p_world, np.zeros(_SHARED))
         damping, steps = 1e-6, self._preintegrated(body)
         for n in range(_STEPS):
+            progress()
             width = _WIDTH * 2.0 ** max(_WIDER - n, 0)
             if n in (1, 3, 6):
                 steps = self._preintegrated(at.body)
@@ -101,11 +127,11 @@ class InertialAdjustment:
                     break
                 damping *= 10
                 if damping > _MOST_DAMPING:
-                    return at, steps
+                    return at, steps, n > _SETTLED  # no step is shorter: rounding is all that is left
             at, damping = new, max(damping / 10, 1e-9)
             if n > _SETTLED and before - after < _CONVERGED * before:
-                break
-        return at, steps
+                return at, steps, True
+        return at, steps, False
 
     def corrected_pixels(self, at: Fit) -> FloatArray:
         """Return the rows' pixels (R, 4) without what the rig is off by; right rows stay as they are."""
@@ -249,6 +275,16 @@ class InertialAdjustment:
 
 
 @dataclass(frozen=True, slots=True)
+class _Points:
+    """Normal equations of the points, of which `V p = -(e + by_pose' xi + by_rig s)`."""
+
+    V_inverse: FloatArray  # (M, 3, 3)
+    e: FloatArray  # (M, 3)
+    by_pose: bsr_matrix  # (6K, 3M)
+    by_rig: FloatArray  # (M, 3, 27)
+
+
+@dataclass(frozen=True, slots=True)
 class _System:
     """A linearised problem: rows of pixels `own xi + points p + rig s + e`, and `others x + other_e` beside them."""
 
@@ -263,6 +299,22 @@ class _System:
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the changes of the keyframes (K, 15), points (M, 3) and rig (27,)."""
+        N, g, points = self._reduced(damping)
+        x = -sparse.factors(N).solve(g)
+        own, s = x[: _OWN * self.keyframes].reshape(-1, _OWN), x[_OWN * self.keyframes :]
+        by_poses = (points.by_pose.T @ own[:, :6].ravel()).reshape(-1, 3)
+        p = -np.einsum("mij,mj->mi", points.V_inverse, points.e + by_poses + points.by_rig @ s)
+        return own, p, s
+
+    def covariance(self, keyframes: IntArray) -> FloatArray:
+        """Covariances (C, 6, 6) of the poses of some keyframes, with all else unknown."""
+        N, _, _ = self._reduced(0.0)
+        rows = (_OWN * keyframes[:, None] + np.arange(6)).ravel()
+        pick = csr_matrix((np.ones(len(rows)), (np.arange(len(rows)), rows)), shape=(len(rows), N.shape[0]))
+        return sparse.marginals(N, pick, 6)
+
+    def _reduced(self, damping: float) -> tuple[csc_matrix, FloatArray, _Points]:
+        """Return normal matrix and gradient of keyframes and rig without the points, and what gives those."""
         point, keyframe, K, M = self.tracks.point, self.tracks.keyframe, self.keyframes, len(self.tracks.ids)
         own_T, points_T = np.swapaxes(self.own, 1, 2), np.swapaxes(self.points, 1, 2)
         V = _sums(point, points_T @ self.points, M)
@@ -293,11 +345,7 @@ class _System:
         N = coo_matrix((seen.data, (places[seen.row], places[seen.col])), shape=(len(g), len(g))).tocsc()
         N = N + (self.others.T @ self.others).tocsc()
         N = N + damping * diags_array(N.diagonal(), format="csc")
-        x = -splu(N, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve(g)
-        own, s = x[: _OWN * K].reshape(K, _OWN), x[_OWN * K :]
-        by_poses = (by_point.T @ own[:, :6].ravel()).reshape(M, 3)
-        p = -np.einsum("mij,mj->mi", V_inverse, V_e + by_poses + W_rig @ s)
-        return own, p, s
+        return N, g, _Points(V_inverse, V_e, by_point, W_rig)
 
 
 def _whitening(steps: Preintegrated) -> FloatArray:

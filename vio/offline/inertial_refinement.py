@@ -1,36 +1,53 @@
-"""What the adjustment of a saved run with an IMU begins with: keyframes, states, noise, and the priors of its rig."""
+"""What the adjustment of a run with an IMU begins with: keyframes, states, noise, and the priors of its rig."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vio.calibration.stereo_field import DisplacementField
+from vio.files.tables import Rows
 from vio.filters.imu_terms import term_sigmas
 from vio.filters.rig_calibration import constant_sigmas, field_sigmas
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray
 from vio.imu.preintegration import BodyStates, Readings
 from vio.numerics.robust import robust_sigma
-from vio.offline.colmap.adjustment import Adjustment
-from vio.offline.inertial_adjustment import InertialAdjustment, RigPrior
+from vio.offline.inertial_adjustment import InertialAdjustment, Optimum, RigPrior
 from vio.offline.keyframes import TrackedPath, loop_ends
 from vio.offline.points import PointTracks, build_tracks, reprojection
-from vio.offline.saved_run import SavedRun
-from vio.records import FIELD_TERMS, ROW_TERMS, ImuDensities, ImuSample, IntArray
-from vio.runs.files import RunFile
-from vio.runs.finished import read_estimates
+from vio.records import FIELD_TERMS, ROW_TERMS, ImuDensities, ImuSample, IntArray, MotionSample
 
 _EVERY_S = 0.25  # from keyframe to keyframe
+# On the standard deviations of pixels: errors of a track last longer than from keyframe to keyframe. The same as on the
+# motions of a map's odometry, where it was measured.
+_LASTING = 2.0
 _LEAST_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
 _TINY = 1e-7  # focal lengths: of coefficients that are known
 
 
-def can_use_imu(run: SavedRun) -> bool:
-    """Whether a run has what an adjustment with an IMU needs: that sensor in use, and a pinhole pair."""
-    estimates = (run.tracked.where / RunFile.ESTIMATES).is_file()
-    return run.metrics.get("motion") == "imu" and not run.dataset.recording.camera.is_cylinder and estimates
+@dataclass(frozen=True, slots=True)
+class InertialRun:
+    """What the adjustment takes from a run."""
+
+    path: TrackedPath
+    known: Rows  # rows of `vio.runs.tables.ESTIMATE` of the path's frames
+    samples: Sequence[MotionSample]
+    T_cam0_imu: FloatArray  # (4, 4) as given
+    field: DisplacementField | None  # what was taken out of the path's pixels
+    settings: MsckfSettings
+
+
+@dataclass(frozen=True, slots=True)
+class InertialRefinement:
+    """The keyframes of a run after the adjustment."""
+
+    T_world_cam0: FloatArray  # (K, 4, 4)
+    before: PointTracks  # as triangulated from the run's poses
+    after: PointTracks  # adjusted, without what the rig is off by
+    best: Optimum
 
 
 def inertial_keyframes(path: TrackedPath, most: int | None) -> IntArray:
@@ -46,18 +63,23 @@ def inertial_keyframes(path: TrackedPath, most: int | None) -> IntArray:
 
 
 def adjust_with_imu(
-    run: SavedRun, settings: MsckfSettings, keyframes: IntArray, progress: Callable[[], None]
-) -> Adjustment:
+    run: InertialRun,
+    keyframes: IntArray,
+    *,
+    covariance_of: IntArray | None = None,
+    progress: Callable[[], None] = lambda: None,
+) -> InertialRefinement:
     """Adjust the keyframes of a run with its IMU, from the run's poses, biases and velocities.
+
+    `covariance_of` and `progress` are those of `InertialAdjustment.solve`.
 
     Raises:
         VioError: the run has too few views or no consistent track.
     """
-    path, known = run.tracked, read_estimates(run.tracked.where / RunFile.ESTIMATES)
+    path, s = run.path, run.settings
     T = path.trajectory.T_world_body[keyframes]
     tracks = build_tracks(path, keyframes, T)
-    progress()
-    here, last = known[keyframes], known[-1]
+    here, last = run.known[keyframes], run.known[-1]
     T_cam0_imu = last["T_cam0_imu"] if np.isfinite(last["T_cam0_imu"]).all() else run.T_cam0_imu
     late_s = float(np.nan_to_num(last["time_offset_s"]))
     T_world_imu = T @ T_cam0_imu
@@ -65,9 +87,8 @@ def adjust_with_imu(
     turned = T_world_imu[:, :3, :3] @ np.swapaxes(here["T_world_imu"][:, :3, :3], 1, 2)
     velocity = np.einsum("kij,kj->ki", turned, here["velocity_world"])
     bias = np.nan_to_num(np.concatenate([here["gyro_bias"], here["accel_bias"]], axis=1))
-    motion = [x for x in run.dataset.motion if isinstance(x, ImuSample)]
+    motion = [x for x in run.samples if isinstance(x, ImuSample)]
     values = np.array([[*x.gyro, *x.accel] for x in motion])
-    s = settings
     densities = ImuDensities(s.gyro_noise_density, s.gyro_bias_walk, s.accel_noise_density, s.accel_bias_walk)
     problem = InertialAdjustment(
         path.camera,
@@ -75,24 +96,14 @@ def adjust_with_imu(
         _seconds(path)[keyframes] + late_s,
         Readings(1e-9 * np.array([x.time_ns for x in motion]), values[:, :3], values[:, 3:], densities),
         T_cam0_imu,
-        _rig_prior(run, settings, last),
+        _rig_prior(run, last),
         _row_sigmas(path, T, tracks),
         np.repeat([s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2], 3),
         s.gravity_mps2,
     )
-    fit, _, _ = problem.solve(BodyStates(T_world_imu, velocity, bias))
-    progress()
-    found = replace(tracks, p_world=fit.p_world, z=problem.corrected_pixels(fit))
-    poses = problem.cameras(fit)
-    before, after = (reprojection(path.camera, *at)[0] for at in ((T, tracks), (poses, found)))
-    return Adjustment(
-        T_world_cam0=poses,
-        tracks=found,
-        rms_before_px=float(np.sqrt(np.mean(before[:, :3] ** 2))),
-        rms_after_px=float(np.sqrt(np.mean(after[:, :3] ** 2))),
-        rows_dropped=0,
-        sigma_px=robust_sigma(after[~tracks.by_loop][:, :3]),
-    )
+    best = problem.solve(BodyStates(T_world_imu, velocity, bias), covariance_of, progress)
+    found = replace(tracks, p_world=best.at.p_world, z=problem.corrected_pixels(best.at))
+    return InertialRefinement(problem.cameras(best.at), tracks, found, best)
 
 
 def _seconds(path: TrackedPath) -> FloatArray:
@@ -103,22 +114,22 @@ def _seconds(path: TrackedPath) -> FloatArray:
 
 
 def _row_sigmas(path: TrackedPath, T_world_cam0: FloatArray, tracks: PointTracks) -> FloatArray:
-    """Robust standard deviations (R,) of a row's pixel coordinates: one of tracks, one of points that loops join."""
+    """Standard deviations (R,) of a row's pixel coordinates, robust: one of tracks, one of points that loops join."""
     r = reprojection(path.camera, T_world_cam0, tracks)[0][:, :3]
     out = np.ones(len(r))
     for group in (tracks.by_loop, ~tracks.by_loop):
         seen = group & tracks.has_right
         if seen.any():
-            out[group] = max(robust_sigma(r[seen]), _LEAST_SIGMA_PX)
+            out[group] = _LASTING * max(robust_sigma(r[seen]), _LEAST_SIGMA_PX)
     return out
 
 
-def _rig_prior(run: SavedRun, settings: MsckfSettings, last: np.void) -> RigPrior:
+def _rig_prior(run: InertialRun, last: np.void) -> RigPrior:
     """What the rig may be off by before the run's tracks were seen; its rows, which are no pixels here, as it ended."""
-    s = settings
+    s = run.settings
     field, at_start = _TINY * np.eye(FIELD_TERMS + ROW_TERMS), np.zeros(FIELD_TERMS + ROW_TERMS)
     if run.field is not None:
-        sigmas = field_sigmas(run.tracked.camera, float(last["stereo_rows_rms_px"]))
+        sigmas = field_sigmas(run.path.camera, float(last["stereo_rows_rms_px"]))
         field[:FIELD_TERMS, :FIELD_TERMS] = np.diag(sigmas)
         at_start[:FIELD_TERMS] = run.field.coefficients[:FIELD_TERMS] / sigmas
         rows = last["stereo_rows_covariance"]

@@ -17,13 +17,16 @@ from vio.files.inputs import read_input
 from vio.files.yaml_text import MOST_BYTES, read_yaml
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
+from vio.numerics.robust import robust_sigma
 from vio.offline.colmap.adjustment import Adjustment, PositionPriors, adjust
-from vio.offline.inertial_refinement import adjust_with_imu, can_use_imu, inertial_keyframes
+from vio.offline.inertial_refinement import InertialRun, adjust_with_imu, inertial_keyframes
 from vio.offline.keyframes import TrackedPath, choose_keyframes
 from vio.offline.loop_tracks import loop_pairs
-from vio.offline.points import MIN_DEPTH_M, PointTracks, build_tracks, landmarks_of
+from vio.offline.points import MIN_DEPTH_M, PointTracks, build_tracks, landmarks_of, reprojection
 from vio.offline.saved_run import SavedRun
 from vio.records import BoolArray, Estimate, IntArray, Landmarks, Trajectory
+from vio.runs.files import RunFile
+from vio.runs.finished import read_estimates
 from vio.runs.mapped import corrected
 from vio.runs.pipeline import run as process
 
@@ -75,14 +78,15 @@ def refine_run(
     path = run.tracked
     if priors and path.loops:
         raise ConfigError(f"{path.where}: its loops moved the poses away from the filter's; leave --priors out")
-    if imu and (priors or not can_use_imu(run)):
+    if imu and (priors or not _can_use_imu(run)):
         raise ConfigError(f"{path.where}: --imu takes a run with an IMU and a pinhole pair, and no --priors filter")
     rounds = iter((2, 3))
     held = None
     if imu:
         keyframes = inertial_keyframes(path, most)
-        settings = _estimator_settings(path.where / "config.yaml").msckf
-        done = adjust_with_imu(run, settings, keyframes, lambda: progress(next(rounds)))
+        progress(1)
+        done = _adjusted_with_imu(run, keyframes)
+        progress(3)
         T, number = path.trajectory.T_world_body, np.arange(len(path.frames))
         poses, aligned = corrected(T, number, keyframes, done.T_world_cam0, T[keyframes]), 0
     else:
@@ -121,6 +125,29 @@ def refine_run(
         moved_rms_m=moved_rms_m,
         ate_before_m=before,
         ate_m=after,
+    )
+
+
+def _can_use_imu(run: SavedRun) -> bool:
+    """Whether a run has what an adjustment with an IMU needs: that sensor in use, and a pinhole pair."""
+    estimates = (run.tracked.where / RunFile.ESTIMATES).is_file()
+    return run.metrics.get("motion") == "imu" and not run.dataset.recording.camera.is_cylinder and estimates
+
+
+def _adjusted_with_imu(run: SavedRun, keyframes: IntArray) -> Adjustment:
+    path = run.tracked
+    known, settings = read_estimates(path.where / RunFile.ESTIMATES), _estimator_settings(path.where / "config.yaml")
+    taken = InertialRun(path, known, run.dataset.motion, run.T_cam0_imu, run.field, settings.msckf)
+    done = adjust_with_imu(taken, keyframes)
+    T = path.trajectory.T_world_body[keyframes], done.T_world_cam0
+    before, after = (reprojection(path.camera, *at)[0] for at in zip(T, (done.before, done.after), strict=True))
+    return Adjustment(
+        T_world_cam0=done.T_world_cam0,
+        tracks=done.after,
+        rms_before_px=float(np.sqrt(np.mean(before[:, :3] ** 2))),
+        rms_after_px=float(np.sqrt(np.mean(after[:, :3] ** 2))),
+        rows_dropped=0,
+        sigma_px=robust_sigma(after[~done.after.by_loop][:, :3]),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,7 @@ def read_saved_run(folder: Path) -> SavedRun:
         raise DataError(f"{folder} has no {RunFile.OBSERVATIONS}; repeat its run with --save-observations")
     dataset = read_observation_log(log)
     need_stereo(replace(dataset.recording, path=folder), "checking, refining or exporting a run")
-    loops = tuple(o for o in read_loops(folder) if o.kept and o.keyframe_frame is not None and o.matches is not None)
+    loops = closing_loops(read_loops(folder))
     poses = RunFile.MAP_TRAJECTORY if loops else RunFile.TRAJECTORY
     trajectory = read_trajectory(folder / poses)
     frames = trajectory.frame_indices
@@ -86,11 +87,22 @@ def read_saved_run(folder: Path) -> SavedRun:
         camera, tracks = _in_pinhole(camera, tracks, coefficients)
     elif coefficients is not None:
         field = DisplacementField(camera, coefficients)
-        tracks = replace(tracks, z=field.without(tracks.z, tracks.has_right))
-        loops = tuple(_without(field, o) for o in loops)
     sigmas = _sigmas(folder / RunFile.ESTIMATES, T_cam0_imu)
     tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks, loops, sigmas)
+    if field is not None:
+        tracked = without_field(tracked, field)
     return SavedRun(tracked, original_source(log), dataset, T_cam0_imu, metrics, field)
+
+
+def closing_loops(loops: Sequence[LoopEvent]) -> tuple[LoopEvent, ...]:
+    """Return the loops between frames of the run itself that agree with the others, with features."""
+    return tuple(o for o in loops if o.kept and o.keyframe_frame is not None and o.matches is not None)
+
+
+def without_field(path: TrackedPath, field: DisplacementField) -> TrackedPath:
+    """Return a path with the pixels of a rectified pair without the field, in its tracks and its loops."""
+    tracks = replace(path.tracks, z=field.without(path.tracks.z, path.tracks.has_right))
+    return replace(path, tracks=tracks, loops=tuple(_without(field, o) for o in path.loops))
 
 
 def _sigmas(path: Path, T_cam0_imu: FloatArray) -> FloatArray | None:

@@ -20,6 +20,7 @@ class RunFile:
     MAP_CAUSAL = "map_causal.tum"
     MAP_COVARIANCE = "map_covariance.npy"
     MAP_KEYFRAMES = "map_keyframes.csv"
+    MAP_KEYFRAMES_COVARIANCE = "map_keyframes_covariance.npy"
     LOOPS = "loops.csv"
     LOOP_MATCHES = "loop_matches.npz"
     FEATURES = "features.jpg"  # one image with its features

@@ -241,6 +241,7 @@ def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference:
         "loops": len(mapped.loops),
         "placed": len(causal) / len(final),
         "ate_m": None if evaluation is None else evaluation.as_dict()["ate_m"],
+        "adjustment": mapped.adjustment,
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,14 +46,32 @@ class MappedRun:
     keyframes: int  # of this run
     loops: tuple[LoopEvent, ...]
     in_map: MapKeyframes  # all keyframes that share the frame of `T_map_body`
+    adjustment: str | None = None  # what became of the adjustment with the IMU; None: there was nothing to adjust
 
 
-def mapped_run(session: MapSession, estimates: Records[Estimate], causal: Rows) -> MappedRun:
-    """Return the poses of all frames in the map; `causal` are those known at the time."""
+def mapped_run(session: MapSession, estimates: Records[Estimate], causal: Rows, scale_sigma: float) -> MappedRun:
+    """Return the poses of all frames in the map.
+
+    Args:
+        session: of the run.
+        estimates: of all frames.
+        causal: poses in the map as known at the time.
+        scale_sigma: standard deviation of the scale by the rig's calibration, over it.
+    """
     T_odom_body, index = (np.array(estimates.column(name)) for name in ("T_world_imu", "index"))
     frames, T_map, T_odom = session.keyframes()
     T = corrected(T_odom_body, index, frames, T_map, T_odom)
-    return MappedRun(T, causal, session.is_joined, len(frames), session.settled_loops(), session.map_keyframes())
+    in_map = _with_scale(session.map_keyframes(), scale_sigma)
+    return MappedRun(T, causal, session.is_joined, len(frames), session.settled_loops(), in_map)
+
+
+def _with_scale(in_map: MapKeyframes, sigma: float) -> MapKeyframes:
+    """Return keyframes with a scale in their covariance that none of their motions and loops knows: (G6)."""
+    T = in_map.T_map_body
+    xi_D_scale = np.zeros((len(T), 6))
+    xi_D_scale[:, :3] = np.einsum("kji,kj->ki", T[:, :3, :3], T[:, :3, 3] - T[:1, :3, 3])
+    considered = sigma**2 * xi_D_scale[:, :, None] * xi_D_scale[:, None, :]
+    return replace(in_map, covariance=in_map.covariance + considered)
 
 
 def corrected(
@@ -112,7 +130,8 @@ def write_loops(folder: Path, loops: Sequence[LoopEvent]) -> None:
 
 
 def write_keyframes(folder: Path, keyframes: MapKeyframes) -> None:
-    """Write the keyframes of a map, one a line."""
+    """Write the keyframes of a map, one a line, and their covariances."""
+    np.save(folder / RunFile.MAP_KEYFRAMES_COVARIANCE, keyframes.covariance)
     T = keyframes.T_map_body
     poses = np.concatenate([T[:, :3, 3], quat_xyzw_from_rotation(T[:, :3, :3])], axis=1).tolist()
     columns = (keyframes.keyframe, keyframes.frame, keyframes.time_ns, keyframes.own.astype(np.int64))
@@ -172,10 +191,24 @@ def read_keyframes(folder: Path) -> MapKeyframes:
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
     poses = np.array(values).reshape(-1, 7)
+    P = _read_covariances(folder / RunFile.MAP_KEYFRAMES_COVARIANCE, len(poses))
     if not np.isfinite(poses).all() or (np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) > 1e-3).any():
         raise DataError(f"{path}: is damaged (a pose is none); repeat the run")
     T = se3_from_parts(rotation_from_quat_xyzw(poses[:, 3:]), poses[:, :3])
-    return MapKeyframes(keyframe, frame, time_ns, own > 0, T)
+    return MapKeyframes(keyframe, frame, time_ns, own > 0, T, P)
+
+
+def _read_covariances(path: Path, count: int) -> FloatArray:
+    """Read matrices (K, 6, 6); NaN where an older version wrote none."""
+    if not path.is_file():
+        return np.full((count, 6, 6), np.nan)
+    try:
+        P = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DataError(f"{path}: cannot be read ({error}); repeat the run") from error
+    if P.shape != (count, 6, 6) or P.dtype != np.float64:
+        raise DataError(f"{path}: is damaged; repeat the run")
+    return P
 
 
 def _read_rows(path: Path) -> list[dict[str, str]]:

@@ -201,8 +201,16 @@ def run(
             wall_s=time.perf_counter() - began,
             stopped=stopped,
             rig=given_rig(dataset),
-            mapped=None if session is None else mapped_run(session, recorder.estimates, recorder.mapped),
+            mapped=None if session is None else _mapped(session, recorder, config),
         )
+
+
+def _mapped(session: MapSession, recorder: RunRecorder, config: Config) -> MappedRun:
+    """Return what the map made of a run; its scale is known as the calibration, or as the run found it to be."""
+    scale, s = recorder.estimates[-1].stereo_scale, config.msckf
+    considered = float(np.hypot(s.stereo_baseline_sigma, s.stereo_focal_sigma))
+    sigma = considered if scale is None else float(np.sqrt(scale.covariance.sum()))
+    return mapped_run(session, recorder.estimates, recorder.mapped, sigma)
 
 
 def given_rig(dataset: Dataset) -> Rig | None:

@@ -1,0 +1,123 @@
+"""The map of a run at its end: its poses adjusted with the IMU, where loops hold them."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from vio.calibration.stereo_field import DisplacementField
+from vio.errors import VioError
+from vio.evaluation.trajectories import metres_text
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
+from vio.mapping.map_store import MapStore
+from vio.offline.inertial_refinement import InertialRun, adjust_with_imu, inertial_keyframes
+from vio.offline.keyframes import TrackedPath
+from vio.offline.saved_run import closing_loops, without_field
+from vio.records import MapKeyframes, feature_tracks
+from vio.runs.mapped import MappedRun, corrected
+from vio.runs.pipeline import RunResult
+
+MOST_KEYFRAMES = 1500  # of the adjustment, four a second: its time and memory grow with them
+_MOST_SIGMAS = 3.0  # by which it may move the map, by the map's covariance
+
+
+def adjust_map(result: RunResult, map_file: Path, should_stop: Callable[[], str | None] = lambda: None) -> RunResult:
+    """Return a run with the poses of its map adjusted with the IMU, and write them to the map's file.
+
+    Without an IMU or loops of the run's own, and of a run that ended early, nothing changes. Where the adjustment does
+    not converge or contradicts the map, the map stays as it is, and `MappedRun.adjustment` says so.
+
+    Args:
+        result: a run with a map and its observations.
+        map_file: that map.
+        should_stop: asked before each step; a reason ends the adjustment.
+
+    Raises:
+        DataError: the map's file cannot be written.
+    """
+    mapped = result.mapped
+    if mapped is None or result.motion != "imu" or result.stopped is not None or not closing_loops(mapped.loops):
+        return result
+    try:
+        adjusted = _adjusted(result, mapped, should_stop)
+    except VioError as error:
+        return replace(result, mapped=replace(mapped, adjustment=f"not with the IMU: {error}"))
+    own = adjusted.in_map.own
+    T_cam = adjusted.in_map.T_map_body[own] @ se3_inverse(result.T_cam0_body)
+    with contextlib.closing(MapStore(map_file)) as store:
+        store.set_adjusted(dict(zip(adjusted.in_map.keyframe[own].tolist(), T_cam, strict=True)))
+        store.commit()
+    return replace(result, mapped=adjusted)
+
+
+def _adjusted(result: RunResult, mapped: MappedRun, should_stop: Callable[[], str | None]) -> MappedRun:
+    """Return the adjusted map; raise VioError with the reason why there is none."""
+    began, in_map = time.perf_counter(), mapped.in_map
+    if result.observations is None or result.motion_samples is None:
+        raise VioError("the run has not kept what it observed")
+    if not in_map.own.all():
+        raise VioError("the map has keyframes of other sessions, which it does not know")
+    path, T_cam0_body = _path(result, mapped), result.T_cam0_body
+    keyframes = inertial_keyframes(path, None)
+    if len(keyframes) > MOST_KEYFRAMES:
+        raise VioError(f"it would need {len(keyframes)} keyframes, {MOST_KEYFRAMES} at most")
+    seen = feature_tracks(
+        {o.frame_index: o for o in (result.observations[int(k)] for k in keyframes)},
+        len(result.recording.frame_times_ns),
+    )
+    stereo_field, field = result.estimates[-1].stereo_field, None
+    path = replace(path, tracks=seen)
+    if stereo_field is not None:
+        field = DisplacementField.of(path.camera, stereo_field)
+        path = without_field(path, field)
+    # A keyframe of the map is less than a quarter of a second after one of the adjustment.
+    rows = np.searchsorted(path.frames, in_map.frame)
+    near, of_near = np.unique(np.searchsorted(keyframes, rows, side="right") - 1, return_inverse=True)
+    run = InertialRun(path, result.estimates.rows, result.motion_samples, T_cam0_body, field, result.config.msckf)
+
+    def go_on() -> None:
+        if (reason := should_stop()) is not None:
+            raise VioError(reason)
+
+    try:
+        done = adjust_with_imu(run, keyframes, covariance_of=near, progress=go_on)
+    except (RuntimeError, np.linalg.LinAlgError) as error:  # of a matrix without an inverse
+        raise VioError(f"it has no optimum ({error})") from error
+    if not done.best.converged:
+        raise VioError("it did not converge")
+    T, number = path.trajectory.T_world_body, np.arange(len(path.frames))
+    T_map_body = corrected(T, number, keyframes, done.T_world_cam0, T[keyframes]) @ T_cam0_body
+    T_near = done.T_world_cam0[near][of_near] @ T_cam0_body
+    A = se3_adjoint(se3_inverse(T_map_body[rows]) @ T_near)
+    P = A @ done.best.covariance[of_near] @ np.swapaxes(A, 1, 2)
+    moved = se3_log(se3_inverse(in_map.T_map_body) @ T_map_body[rows])
+    sigmas = _sigmas_moved(moved, in_map)
+    moved_m = float(np.sqrt(np.mean(np.sum((T_map_body - mapped.T_map_body)[:, :3, 3] ** 2, axis=1))))
+    size = f"by {metres_text(moved_m)} (rms), {sigmas:.1f} of the map's standard deviations"
+    if sigmas > _MOST_SIGMAS:
+        raise VioError(f"it would move the map {size}: one of them is wrong")
+    text = f"with the IMU at {len(keyframes)} keyframes, in {time.perf_counter() - began:.0f} s; moved {size}"
+    return replace(
+        mapped,
+        T_map_body=T_map_body,
+        in_map=replace(in_map, T_map_body=T_map_body[rows], covariance=P),
+        adjustment=text,
+    )
+
+
+def _path(result: RunResult, mapped: MappedRun) -> TrackedPath:
+    """Return the path of a run in its map, without what it observed."""
+    trajectory = replace(result.trajectory, T_world_body=mapped.T_map_body).in_cam0(result.T_cam0_body)
+    camera = result.recording.camera
+    return TrackedPath(result.recording.path, camera, trajectory, feature_tracks({}, 0), closing_loops(mapped.loops))
+
+
+def _sigmas_moved(xi: FloatArray, in_map: MapKeyframes) -> float:
+    """By how many standard deviations of the map its keyframes but the first move by xi (K, 6), in the median."""
+    squared = np.einsum("ki,ki->k", xi[1:], np.linalg.solve(in_map.covariance[1:], xi[1:, :, None])[:, :, 0])
+    return float(np.sqrt(np.median(squared) / 6))
