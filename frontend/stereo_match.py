@@ -89,24 +89,16 @@ def shifted_rows(image: Image, rows: int) -> Image:
     return np.ascontiguousarray(image[chosen])
 
 
-def row_correlation(
-    source: Image, target: Image, centres: IntArray, first_column: IntArray, count: int, radius: int
-) -> Scores:
-    """Normalised correlation (N, count) of source patches with the target patches of the same row.
-
-    Candidate k of point n is centred at column `first_column[n] + k`. Candidates whose patch leaves the image, and
-    patches without contrast, score -1. The source patches must lie inside the source image.
-    """
-    out = np.empty((len(centres), count), dtype=np.float32)
-    _correlate(np.ascontiguousarray(source), np.ascontiguousarray(target), centres, first_column, radius, out)
-    return out
-
-
 @compiled
-def _correlate(
+def correlate(
     source: Image, target: Image, centres: IntArray, first_column: IntArray, radius: int, out: Scores
 ) -> None:
-    """Write the correlations (N, count); sums of products of 81 pairs of gray levels are exact in 32 bits of float."""
+    """Write the normalised correlations (N, count) of source patches with the target patches of the same row.
+
+    Candidate k of point n is centred at column `first_column[n] + k`. Candidates whose patch leaves the image, and
+    patches without contrast, score -1. The source patches must lie inside the source image. Sums of products of 81
+    pairs of gray levels are exact in 32 bits of float.
+    """
     width, count, side = target.shape[1], out.shape[1], 2 * radius + 1
     size, flat = side * side, FLAT_RMS**2 * side * side
     strip, product = np.empty(count + side - 1, np.float32), np.empty(count, np.float32)
@@ -182,7 +174,7 @@ def _search(
         centres[n, 1] = min(max(int(np.rint(points[n, 1])), _RADIUS), height - _RADIUS - 1)
         first[n] = centres[n, 0] + low
     score = np.empty((len(points), high - low + 1), np.float32)
-    _correlate(source, target, centres, first, _RADIUS, score)
+    correlate(source, target, centres, first, _RADIUS, score)
     _peaks(score, shift, top[0], top[1])
     for n in range(len(points)):
         # The patches were cut at whole pixels; the shift carries over to the sub-pixel point.

@@ -93,10 +93,22 @@ def test_a_range_of_frames_is_compared_with_its_own_reference(
     recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     args = ("run", str(recording), "--reference", str(truth), "--out", str(tmp_path / "out"))
-    metrics = _json(capsys, *args, "--start", "6", "--stop", "22")
+    metrics = _json(capsys, *args, "--start", "6", "--stop", "22", "--save-observations")
     assert metrics["frames"] == 16
     assert (metrics["first_frame"], metrics["last_frame"]) == (6, 21)
     assert metrics["ate_m"] < 0.05
+    replayed = _json(capsys, "run", str(tmp_path / "out" / "observations.npz"), "--out", str(tmp_path / "replayed"))
+    assert replayed["frames"] == 16
+    assert not [line for line in replayed["warnings"] if "could not be read" in line]
+
+
+def test_slow_frames_count_as_compiling_only_where_loops_were_compiled(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vio.runs.folder._SLOW", 1.0)
+    for compiled in (True, False):
+        monkeypatch.setattr("vio.runs.folder.has_compiled", lambda compiled=compiled: compiled)
+        assert (_json(capsys, "run", str(recording), "--out", str(tmp_path / "out"))["start_s"] > 0) == compiled
 
 
 def test_a_shorter_reference_evaluates_the_frames_it_covers(

@@ -24,7 +24,7 @@ from vio.frontend.detect import (
 from vio.frontend.patches import half_image, inside
 from vio.frontend.prediction import moved_pixels, prior_pixels
 from vio.frontend.settings import GridSettings
-from vio.frontend.stereo_match import EpipolarRowModel, match_rows, row_correlation
+from vio.frontend.stereo_match import EpipolarRowModel, correlate, match_rows
 from vio.frontend.tracks import AnchorBank
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.geometry.stereo import StereoCamera
@@ -158,10 +158,17 @@ def test_expected_row_resolves_the_aperture_problem() -> None:
     assert np.abs(held[:, 0, 2] - on_edge[:, 0] - 12).max() < 0.25
 
 
+def row_correlation(target: Image, centres: list[list[int]], first: list[int], count: int) -> FloatArray:
+    """Correlations (N, count) of patches of PLAIN, 7 x 7."""
+    score = np.empty((len(centres), count), np.float32)
+    correlate(PLAIN, target, np.array(centres), np.array(first), 3, score)
+    return score
+
+
 def test_row_correlation_equals_numpy() -> None:
     other = picture(np.eye(3), seed=1)
-    centres = np.array([[50, 60], [120, 100]])
-    score = row_correlation(PLAIN, other, centres, np.array([40, 110]), 9, 3)
+    centres = [[50, 60], [120, 100]]
+    score = row_correlation(other, centres, [40, 110], 9)
     for n in range(2):
         u, v = centres[n]
         a = PLAIN[v - 3 : v + 4, u - 3 : u + 4].ravel().astype(np.float64)
@@ -172,7 +179,7 @@ def test_row_correlation_equals_numpy() -> None:
 
 
 def test_row_correlation_beyond_the_image_is_minus_one() -> None:
-    score = row_correlation(PLAIN, PLAIN, np.array([[5, 60]]), np.array([-6]), 10, 3)
+    score = row_correlation(PLAIN, [[5, 60]], [-6], 10)
     np.testing.assert_array_equal(score[0, :9], -1.0)
     assert score[0, 9] > -1.0
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.dataset_makers import FRAME_S, make_kitti
 from vio.cli import main
 from vio.geometry.lie import so3_exp
 from vio.inspection.inertial import allan_deviation, noise_part, rest_part
@@ -41,6 +42,13 @@ def test_a_sound_recording(flight: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert parts["rest"]["force_norm_mps2"] == pytest.approx(9.8, abs=0.5)
     assert parts["tracking"]["tracked_median"] > 50
     assert parts["missing"]["missing"] == []
+
+
+def test_the_clock_of_velocities_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, facts = inspect(make_kitti(tmp_path / "kitti", frames=6), capsys)
+    velocity = facts["parts"]["velocity"]
+    assert (velocity["count"], velocity["covered"]) == (6, 1.0)
+    assert velocity["rate_hz"] == pytest.approx(1 / FRAME_S, rel=1e-3)
 
 
 def _turn_right_camera(folder: Path, w_deg: list[float]) -> None:

@@ -456,6 +456,10 @@ BAD = {
     "notes as .txt": (_text("notes.txt", "fx=458 b=0.11\n"), "and KITTI's calib.txt has one; give that file"),
     "OpenCV without T": (_storage(T=None, R2=None), "has no entry R2"),
     "OpenCV with a rotation vector": (_storage(R=np.zeros((3, 1))), "R holds 3 numbers"),
+    "OpenCV of larger images": (
+        _storage(M2=np.array([[400.0, 0, 70], [0, 400, 24], [0, 0, 1]])),
+        "the principal point 70, 24 lies outside images of 64 x 48 pixels; it is the calibration of images of another",
+    ),
     "OpenCV with six coefficients": (
         _storage(D1=np.ones(6)),
         "6 distortion coefficients; OpenCV has 4, 5",

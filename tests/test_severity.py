@@ -24,6 +24,7 @@ from vio.calibration.severity import Grade, StereoError, length_grade, rows_grad
             "by +0.50 ± 0.01 px, which costs 2.5 ± 0.05 m per 100 m",
         ),
         (StereoError(0.05, 20.0, 3.0), "unusable", "disparities by +3.00 px, which costs 15 m per 100 m"),
+        (StereoError(0.05, 2.0, 3.84, 0.68), "unusable", "which costs 190 ± 34 m per 100 m"),
         (StereoError(4.0, 20.0, 0.0, 0.01), "unusable", "unusable: rows off by 4.00 px (rms), disparities by +0.00"),
         (StereoError(0.1, -20.0), "unusable", "most disparities are negative"),
         (StereoError(0.3, 0.0), "worth calibrating", "worth calibrating: rows off by 0.30 px (rms)"),

@@ -54,12 +54,12 @@ class StereoError:
             sigma_px, sigma_m = "", ""
             if self.disparity_sigma_px is not None:
                 sigma_px = f" ± {self.disparity_sigma_px:.2f}"
-                sigma_m = f" ± {100 * self.disparity_sigma_px / self.seen_px:.2g}"
-            cost = f"which costs {self.per_100_m:.2g}{sigma_m} m per 100 m"
+                sigma_m = f" ± {_short(100 * self.disparity_sigma_px / self.seen_px)}"
+            cost = f"which costs {_short(self.per_100_m)}{sigma_m} m per 100 m"
             return f"{text}, disparities by {self.disparity_px:+.2f}{sigma_px} px, {cost}"
         if self.grade == "negligible" or self.seen_px <= 0:
             return text
-        return f"{text}; disparities off by as much would cost {100 * self.rows_px / self.seen_px:.2g} m per 100 m"
+        return f"{text}; disparities off by as much would cost {_short(100 * self.rows_px / self.seen_px)} m per 100 m"
 
 
 def rows_grade(rows_px: float) -> Grade:
@@ -74,3 +74,8 @@ def length_grade(per_100_m: float) -> Grade:
 
 def _graded(size: float, negligible: float, unusable: float) -> Grade:
     return "negligible" if size <= negligible else "unusable" if size > unusable else "worth calibrating"
+
+
+def _short(value: float) -> str:
+    """Write two significant digits without an exponent."""
+    return f"{float(f'{value:.2g}'):g}"

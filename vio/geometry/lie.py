@@ -219,14 +219,6 @@ def se3_inverse(T: npt.ArrayLike) -> FloatArray:
     return se3_from_parts(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
 
-def se3_hat(xi: npt.ArrayLike) -> FloatArray:
-    """The paper's hat operator: twists (..., 6) to the algebra se(3) as (..., 4, 4) matrices."""
-    xi = np.asarray(xi, dtype=np.float64)
-    out = np.zeros((*xi.shape[:-1], 4, 4))
-    out[..., :3, :3], out[..., :3, 3] = so3_hat(xi[..., 3:]), xi[..., :3]
-    return out
-
-
 def se3_curly_hat(xi: npt.ArrayLike) -> FloatArray:
     """The adjoint of the algebra: twists (..., 6) to (..., 6, 6), `exp(curly_hat(xi)) = Ad(exp(xi))`."""
     xi = np.asarray(xi, dtype=np.float64)

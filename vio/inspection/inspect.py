@@ -15,7 +15,7 @@ from vio.inspection.pictures import depths_part, images_part, rows_parts
 from vio.monitor.inertial import InertialCheck
 from vio.numerics.robust import robust_sigma
 from vio.protocols import Dataset, Frontend
-from vio.records import NS_PER_S, ImuRecord, ImuSample, IntArray, Recording, StereoFrame
+from vio.records import NS_PER_S, ImuRecord, ImuSample, IntArray, Recording, StereoFrame, VelocitySample
 
 PAIRS = 12  # or single images looked at, spread over the recording
 TRACKED = 60  # frames tracked to compare the IMU with the images' motion
@@ -42,7 +42,7 @@ def inspect_recording(
         parts.append(images_part(frames))
         if recording.camera.kind != "mono":
             parts += rows_parts(frames) if recording.camera.kind == "stereo" else [depths_part(frames)]
-    parts += _imu_parts(dataset)
+    parts += _motion_parts(dataset)
     if recording.has_images and tracked > 1:
         parts += _tracking_parts(dataset, build_frontend, min(tracked, len(recording.frame_times_ns)), progress)
     parts += [_reference_part(recording), _missing_part(recording)]
@@ -87,17 +87,21 @@ def _spread(dataset: Dataset, pairs: int, progress: Callable[[int, int], None]) 
     return frames
 
 
-def _imu_parts(dataset: Dataset) -> list[Part]:
+def _motion_parts(dataset: Dataset) -> list[Part]:
+    """Describe the samples of velocity sensor and IMU."""
     recording = dataset.recording
-    samples = [event for event in dataset.events(images=False) if isinstance(event, ImuSample)]
+    events = list(dataset.events(images=False))
+    velocities = [event.time_ns for event in events if isinstance(event, VelocitySample)]
+    parts = [clock_part("velocity", recording, np.array(velocities, dtype=np.int64))] if velocities else []
+    samples = [event for event in events if isinstance(event, ImuSample)]
     if not samples:
-        return []
+        return parts
     record = ImuRecord(
         np.array([s.time_ns for s in samples], dtype=np.int64),
         np.array([s.gyro for s in samples]),
         np.array([s.accel for s in samples]),
     )
-    parts = [imu_clock_part(recording, record.times_ns)]
+    parts.append(clock_part("IMU", recording, record.times_ns))
     if len(samples) > 1:
         noise = noise_part(record, getattr(dataset, "imu_noise", None))
         parts += [rest_part(record, recording.T_cam0_imu), *([noise] if noise is not None else [])]
@@ -194,19 +198,20 @@ def frames_part(recording: Recording) -> Part:
     return Part("frames", text, facts, faults)
 
 
-def imu_clock_part(recording: Recording, times_ns: IntArray) -> Part:
-    """Describe the IMU's stamps, and how they cover the frames."""
+def clock_part(name: str, recording: Recording, times_ns: IntArray) -> Part:
+    """Describe the stamps of a motion sensor, and how they cover the frames."""
     facts = clock_facts(times_ns)
     faults = []
-    if facts["rate_hz"] is not None and facts["rate_hz"] < _LEAST_IMU_HZ:
+    if name == "IMU" and facts["rate_hz"] is not None and facts["rate_hz"] < _LEAST_IMU_HZ:
         faults.append(
             f"{facts['rate_hz']:.3g} Hz are too few to integrate the motion between images; record at least "
             f"{_LEAST_IMU_HZ:g} Hz, or use --motion none"
         )
-    overlap = [finding.message for finding in judge_clocks(recording.frame_times_ns, times_ns)]
+    if name == "IMU":
+        faults += [finding.message for finding in judge_clocks(recording.frame_times_ns, times_ns)]
     inside = (recording.frame_times_ns >= times_ns[0]) & (recording.frame_times_ns <= times_ns[-1])
     text = f"{len(times_ns)} samples{_text(facts)}; they cover {100 * float(inside.mean()):.0f} % of the frames"
-    return Part("IMU", text, {**facts, "covered": float(inside.mean())}, [*faults, *overlap])
+    return Part(name, text, {**facts, "covered": float(inside.mean())}, faults)
 
 
 def clock_facts(times_ns: IntArray) -> dict[str, float | int | None]:

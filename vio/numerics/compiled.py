@@ -26,6 +26,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Without the entry for callers in C, which nothing here uses, a function compiles in a tenth less time.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
+_LOOPS: list[Any] = []
 
 
 def compiled(function: Function) -> Function:
@@ -48,10 +49,17 @@ def compiled_sums(function: Function) -> Function:
 
 def _compiled(function: Function, **options: Any) -> Function:
     try:
-        return attach(numba.njit(function, cache=True, **_OPTIONS, **options))
+        loop = numba.njit(function, cache=True, **_OPTIONS, **options)
     except RuntimeError:  # numba found no folder that it may write to
         log.debug("no folder for numba's cache is writable: %s is compiled in each process", function.__qualname__)
-        return attach(numba.njit(function, **_OPTIONS, **options))
+        loop = numba.njit(function, **_OPTIONS, **options)
+    _LOOPS.append(loop)
+    return attach(loop)
+
+
+def has_compiled() -> bool:
+    """Return whether this process has compiled any loop, rather than loaded all from the cache."""
+    return any(loop.stats.cache_misses for loop in _LOOPS if hasattr(loop, "stats"))  # without: NUMBA_DISABLE_JIT
 
 
 @compiled

@@ -14,6 +14,7 @@ import numpy as np
 from vio.calibration.stereo_field import CalibratedRig, estimated_rig
 from vio.cameras.rig import Rig, rig_of_rectified
 from vio.config import Config
+from vio.datasets.features import FeatureDataset
 from vio.datasets.frame_times import used_frames
 from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.files.tables import Records
@@ -172,7 +173,7 @@ def run(
         contextlib.closing(viewer or NullViewer()) as shown,
         contextlib.closing(processor),
     ):
-        loop = _Loop(state, recorder, shown, _taken_frames(recording, config, start, stop))
+        loop = _Loop(state, recorder, shown, _taken_frames(dataset, config, start, stop))
         try:
             with _opencv_threads(dataset, config, parts.frontend):
                 images = _needs_images(dataset, config) or processor.map is not None
@@ -349,11 +350,12 @@ def _check_range(recording: Recording, start: int, stop: int | None) -> None:
         raise ConfigError(f"--start {start} lies past the last frame, {len(recording.frame_times_ns) - 1}")
 
 
-def _taken_frames(recording: Recording, config: Config, start: int, stop: int | None) -> set[int]:
-    """Numbers of the frames of a recording that a run is to take."""
-    most_hz, times_ns = config.dataset.max_frame_rate, recording.frame_times_ns
+def _taken_frames(dataset: Dataset, config: Config, start: int, stop: int | None) -> set[int]:
+    """Numbers of the frames of a recording that a run is to take; of features, those that the recording has."""
+    most_hz, times_ns = config.dataset.max_frame_rate, dataset.recording.frame_times_ns
     indices = range(len(times_ns)) if most_hz is None else used_frames(times_ns, most_hz).tolist()
-    return {index for index in indices if index >= start and (stop is None or index < stop)}
+    present = range(len(times_ns)) if not isinstance(dataset, FeatureDataset) else set(dataset.present.tolist())
+    return {index for index in indices if index >= start and (stop is None or index < stop) and index in present}
 
 
 def _unread_line(unread: list[int], frames: int) -> str:

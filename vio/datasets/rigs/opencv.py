@@ -92,10 +92,13 @@ def rig_from_opencv(entries: Entries, where: str, image_size: tuple[int, int] | 
         CalibrationError: a matrix is missing or impossible, or no image size is known.
     """
     width, height = _size(entries, where, image_size)
-    if _find(entries, "K0") is None:
-        rig = _rectified(entries, where, width, height)
-    else:
-        rig = _raw(entries, where, width, height)
+    rig = (_rectified if _find(entries, "K0") is None else _raw)(entries, where, width, height)
+    for camera in rig.cameras:
+        if not (0 < camera.cu < width and 0 < camera.cv < height):
+            raise CalibrationError(
+                f"{where}: the principal point {camera.cu:.0f}, {camera.cv:.0f} lies outside images of {width} x "
+                f"{height} pixels; it is the calibration of images of another size: scale it, or calibrate with these"
+            )
     baseline = float(np.linalg.norm(rig.right[1][:3, 3]))
     if baseline <= _TOO_WIDE_M:
         return rig
