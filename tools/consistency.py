@@ -257,7 +257,7 @@ class JudgedTracks(WindowTracks):
 class AblationUpdate(FrameUpdate):
     """Reports the covariance of right-invariant errors, whatever the window's own are."""
 
-    def _marginalise(self, window: Window, *rest: Any) -> int:
+    def _marginalise(self, window: Window, *rest: Any) -> tuple[int, float]:
         new = super()._marginalise(window, *rest)
         if isinstance(window, StandardErrors):
             posterior = self._propagation.posterior
