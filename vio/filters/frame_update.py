@@ -347,7 +347,7 @@ class FrameUpdate:
             x, y, z = transform_points(window.T_cam0_world(-1)[0], tracks.p_world[ended]).T
             angles = np.column_stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))])
             self._overdispersion.add(table.ids(tracks.rows[ended]), angles, *self.tracks.drift_scores(tracks, ended))
-        # Errors that neighbours share are not in the factor, and the field takes them in with every frame.
+        # Errors that last stay in one place of the image, too, and the field takes them in with every frame.
         repeated = self._overdispersion.factor
         A, b, considered = self._information(window, tracks, ending & good, pixels, joint)
         window.absorb(A, b, repeated=repeated, considered=considered)
