@@ -321,7 +321,7 @@ def test_places_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     metrics = {"T_cam0_imu": np.eye(4).tolist(), "motion": "imu", "map": {"joined": True}}
     (run / "metrics.json").write_text(json.dumps(metrics))
     own, T = np.arange(0, 300, 10), drive.path.T_map_body
-    write_keyframes(run, MapKeyframes(own // 10, own, drive.path.times_ns[own], own < 0, T[own]))
+    write_keyframes(run, MapKeyframes(own // 10, own, drive.path.times_ns[own], own < 0, T[own], np.zeros((30, 6, 6))))
     assert main(["georeference", str(run), str(file)]) == 0
     assert "GNSS" not in capsys.readouterr().out
     placed_run = read_trajectory(run / "earth" / "trajectory_enu.tum").T_world_body
