@@ -30,8 +30,17 @@ from vio.mapping.builder import MapBuilder, MapUpdate
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import LoopRow, MapStore
 from vio.mapping.session import HANDOVER_FRAMES, MapSession
-from vio.offline.map_adjustment import adjust_map
-from vio.records import Estimate, FrameResult, LoopEvent, LoopMatches, Observations, StereoFrame, observations
+from vio.offline.map_adjustment import _sigmas_moved, adjust_map
+from vio.records import (
+    Estimate,
+    FrameResult,
+    LoopEvent,
+    LoopMatches,
+    MapKeyframes,
+    Observations,
+    StereoFrame,
+    observations,
+)
 from vio.runs.finished import read_finished_run
 from vio.runs.mapped import corrected, read_loops, write_loops
 from vio.runs.pipeline import RunControl, RunResult, run
@@ -451,11 +460,7 @@ def _poses(path: Path) -> FloatArray:
         return np.array([row.T_map_cam for row in store.keyframes()])
 
 
-def test_a_map_with_loops_is_adjusted_with_the_imu(
-    looped: tuple[RunResult, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A short flight, whose odometry states tenths of a millimetre: the limit of the moves has a test of its own."""
-    monkeypatch.setattr("vio.offline.map_adjustment._MOST_SIGMAS", 30.0)
+def test_a_map_with_loops_is_adjusted_with_the_imu(looped: tuple[RunResult, Path], tmp_path: Path) -> None:
     result, path = _copied(looped, tmp_path)
     before = _poses(path)
     done = adjust_map(result, path).mapped
@@ -480,6 +485,17 @@ def test_a_map_with_loops_is_adjusted_with_the_imu(
         graph = MapGraph(store)
     graph.optimise_part(0)
     np.testing.assert_allclose(graph.T_map_cam.rows, _poses(path), atol=1e-6)
+
+
+def test_a_map_that_turns_as_a_whole_has_not_moved() -> None:
+    """Its covariance is relative to the first keyframe: one centimetre since that one is a standard deviation."""
+    T = se3_exp(np.random.default_rng(0).normal(0, 1, (5, 6)))
+    P = np.broadcast_to(1e-4 / 6 * np.eye(6), (5, 6, 6))
+    in_map = MapKeyframes(*3 * (np.arange(5),), np.ones(5, dtype=np.bool_), T, P)
+    turned = se3_exp([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]) @ T
+    assert _sigmas_moved(in_map, turned) < 1e-9
+    turned[1:] = turned[1:] @ se3_exp([0.01, 0, 0, 0, 0, 0])
+    np.testing.assert_allclose(_sigmas_moved(in_map, turned), 1.0)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,8 @@ PRIOR_FACTOR = 2.5  # before any track has ended: white noise has 1, front ends 
 _PRIOR_TRACKS = 30.0  # as many ended tracks count for it
 _MOST_FEATURES = 4096  # whose clusters are kept: far more than are seen at once
 _CELL_RAD = 0.2  # side of the cells of directions in which features are neighbours
-_FRAMES = 10  # in which neighbours' tracks end that are one cluster
+_FRAMES = 10  # of those in which tracks end, in which neighbours' are one cluster
+_NO_SCORE: FloatArray = np.zeros(6)
 
 
 class Overdispersion:
@@ -45,9 +46,9 @@ class Overdispersion:
         for feature, (x, y), score in zip(ids.tolist(), cells, scores, strict=True):
             cluster = self._cluster.pop(feature, (x, y, self._calls // _FRAMES))
             self._cluster[feature] = cluster  # a feature that began again stays in its cluster
-            before = self._scores.pop(cluster, None)
-            together = score if before is None else score + before
-            self._squares += score * score if before is None else score * (together + before)
+            before = self._scores.pop(cluster, _NO_SCORE)
+            together = score + before
+            self._squares += score * (together + before)
             self._scores[cluster] = together
         self._calls += 1
         self._information += information.sum(axis=0)

@@ -41,9 +41,8 @@ _LEAST_MONO_PX = 0.1
 _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals in the end
 _PRIOR_FRAMES = 0.1  # the noise at the start may be off by a factor of four, that of frames differs by one and a half
 _MOST_CHANGE = 4.0  # of the variance from frame to frame that is believed in the end
-_SPENT_ON_NOISE = (
-    3.0  # degrees of freedom: 2 for the mean of an inverse chi-square, over the median's efficiency of 0.64
-)
+# Degrees of freedom: 2 for the mean of an inverse chi-square, over the efficiency of a median, 0.64.
+_SPENT_ON_NOISE = 3.0
 _VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
 _MOST_DOF = 199

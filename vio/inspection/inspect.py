@@ -202,12 +202,12 @@ def clock_part(name: str, recording: Recording, times_ns: IntArray) -> Part:
     """Describe the stamps of a motion sensor, and how they cover the frames."""
     facts = clock_facts(times_ns)
     faults = []
-    if name == "IMU" and facts["rate_hz"] is not None and facts["rate_hz"] < _LEAST_IMU_HZ:
-        faults.append(
-            f"{facts['rate_hz']:.3g} Hz are too few to integrate the motion between images; record at least "
-            f"{_LEAST_IMU_HZ:g} Hz, or use --motion none"
-        )
     if name == "IMU":
+        if facts["rate_hz"] is not None and facts["rate_hz"] < _LEAST_IMU_HZ:
+            faults.append(
+                f"{facts['rate_hz']:.3g} Hz are too few to integrate the motion between images; record at least "
+                f"{_LEAST_IMU_HZ:g} Hz, or use --motion none"
+            )
         faults += [finding.message for finding in judge_clocks(recording.frame_times_ns, times_ns)]
     inside = (recording.frame_times_ns >= times_ns[0]) & (recording.frame_times_ns <= times_ns[-1])
     text = f"{len(times_ns)} samples{_text(facts)}; they cover {100 * float(inside.mean()):.0f} % of the frames"

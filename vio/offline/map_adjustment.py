@@ -95,8 +95,7 @@ def _adjusted(result: RunResult, mapped: MappedRun, should_stop: Callable[[], st
     T_near = done.T_world_cam0[near][of_near] @ T_cam0_body
     A = se3_adjoint(se3_inverse(T_map_body[rows]) @ T_near)
     P = A @ done.best.covariance[of_near] @ np.swapaxes(A, 1, 2)
-    moved = se3_log(se3_inverse(in_map.T_map_body) @ T_map_body[rows])
-    sigmas = _sigmas_moved(moved, in_map)
+    sigmas = _sigmas_moved(in_map, T_map_body[rows])
     moved_m = float(np.sqrt(np.mean(np.sum((T_map_body - mapped.T_map_body)[:, :3, 3] ** 2, axis=1))))
     size = f"by {metres_text(moved_m)} (rms), {sigmas:.1f} of the map's standard deviations"
     if sigmas > _MOST_SIGMAS:
@@ -117,7 +116,12 @@ def _path(result: RunResult, mapped: MappedRun) -> TrackedPath:
     return TrackedPath(result.recording.path, camera, trajectory, feature_tracks({}, 0), closing_loops(mapped.loops))
 
 
-def _sigmas_moved(xi: FloatArray, in_map: MapKeyframes) -> float:
-    """By how many standard deviations of the map its keyframes but the first move by xi (K, 6), in the median."""
-    squared = np.einsum("ki,ki->k", xi[1:], np.linalg.solve(in_map.covariance[1:], xi[1:, :, None])[:, :, 0])
+def _sigmas_moved(in_map: MapKeyframes, T_map_body: FloatArray) -> float:
+    """By how many standard deviations of the map its keyframes but the first move to poses (K, 4, 4), in the median.
+
+    Both are taken since the first keyframe, as the covariance is: the adjustment may turn the whole map.
+    """
+    before, after = (se3_inverse(T[0]) @ T[1:] for T in (in_map.T_map_body, T_map_body))
+    xi = se3_log(se3_inverse(before) @ after)
+    squared = np.einsum("ki,ki->k", xi, np.linalg.solve(in_map.covariance[1:], xi[:, :, None])[:, :, 0])
     return float(np.sqrt(np.median(squared) / 6))
