@@ -41,7 +41,8 @@ def test_the_covariance_says_how_the_pose_follows_the_rig(motion: MotionSource |
     known = replace(settings, stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
     run, exact = fly(ROUND, motion, settings), fly(ROUND, motion, known)
     T = run.last_pose
-    np.testing.assert_array_equal(T, exact.last_pose)
+    # Not to the bit: BLAS may round products that also have the constants' columns in another way.
+    np.testing.assert_allclose(T, exact.last_pose, rtol=0, atol=1e-9)
     expected = np.zeros((6, 6))
     for constant, sigma in SIGMAS.items():
         of_rig = fly(ROUND, motion, known, spoil=lambda k, seen, c=constant: _seen_by(c, OFF, seen))  # type: ignore[misc]
