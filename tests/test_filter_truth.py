@@ -432,3 +432,25 @@ def test_the_newest_smoothed_estimate_is_the_causal_one(walked: Run) -> None:
     np.testing.assert_allclose(newest.T_world_imu, causal.T_world_imu, atol=1e-12)
     # The causal covariance is the prior's and that of the tracks that go on, in the same frame.
     np.testing.assert_allclose(newest.covariance, causal.covariance, rtol=1e-6, atol=1e-15)
+
+
+# Frames that are noisier than the others
+
+
+@pytest.mark.usefixtures("white_noise")
+def test_blurred_frames_count_less() -> None:
+    """Twelve frames with five times the variance that the first thirty have taught: errors as their covariance says.
+
+    With the information of sharp frames their NEES is 14 of 6.
+    """
+    course = Course(20, 2.0, (0.4, 0.5, 0.0), yaw_rate=0.2, depth=(2.0, 8.0), pixel_sigma_px=0.1)
+    values = []
+    for seed in range(12):
+        blur = np.random.default_rng(77 + seed).normal(0.0, 0.2, (12, 400, 4))
+
+        def spoil(k: int, seen: Observations, blur: FloatArray = blur) -> Observations:
+            return replace(seen, z=seen.z + blur[k - 30, : len(seen)]) if 30 <= k < 42 else seen
+
+        run = fly(course, None, seed=seed, spoil=spoil)
+        values.append(squared(run.error(38), run.estimates[38].covariance))
+    assert np.mean(values) < chi2.ppf(0.999, 6 * len(values)) / len(values)

@@ -358,7 +358,7 @@ def test_survives_a_late_imu_a_gap_a_checkpoint_and_a_restart(tmp_path: Path) ->
     after = filters[0].estimate()
     assert before.imu_terms_sigma is not None
     assert after.imu_terms_sigma is not None
-    assert before.imu_terms_sigma[6:9].max() < 0.005 < after.imu_terms_sigma[6:9].min()
+    assert before.imu_terms_sigma[6:9].max() < 0.6 * after.imu_terms_sigma[6:9].min()
     np.testing.assert_allclose(after.imu_terms, before.imu_terms, atol=1e-3)
 
 

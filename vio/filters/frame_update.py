@@ -75,8 +75,8 @@ class FrameUpdate:
 
     @property
     def _variance(self) -> float:
-        """Variance of one pixel coordinate that counts as if all of them were independent, px^2."""
-        return self.tracks.variance * self._overdispersion.factor
+        """Variance of one pixel coordinate in this frame that counts as if all of them were independent, px^2."""
+        return self.tracks.variance * self.tracks.common_noise * self._overdispersion.factor
 
     def expected_tracks(self, window: Window, T_cam0_world: FloatArray, motion: MotionPrior) -> TrackPrior:
         """Predict the pixels of all tracks with a point from a camera pose (4, 4) at a coming frame."""

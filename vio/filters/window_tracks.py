@@ -85,6 +85,7 @@ class WindowTracks:
         self._least_px = _LEAST_MONO_PX if camera.kind == "mono" else LEAST_PIXEL_SIGMA_PX
         self._frames = 0  # from which the noise was learned
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
+        self.common_noise = 1.0  # variance of all tracks' pixels over it in the last frame, at least 1
 
     def choose(self, clones: int) -> IntArray:
         """Rows of the tracks that constrain the poses: two views or more, the most informative first if too many."""
@@ -226,12 +227,15 @@ class WindowTracks:
     def gate(self, at: Residuals) -> tuple[BoolArray, FloatArray, IntArray]:
         """Test the tracks against the chi-square quantile of the settings, relative to how well all of them fit.
 
+        How well they fit, `common_noise`, is kept: it divides the information of this frame's pixels, too.
+
         Returns:
             Mask (F,) of those that pass, their normalised squared residuals (F,), and the degrees of freedom (F,).
         """
         of_views, counts = squared_residuals(at)
         dof, squares = np.clip(counts.sum(axis=1) - 3, 1, _MOST_DOF), of_views.sum(axis=1) / self.variance
-        limits = chi_square_table(self._settings.gate_probability)[dof] * _common_noise(squares, dof)
+        self.common_noise = _common_noise(squares, dof)
+        limits = chi_square_table(self._settings.gate_probability)[dof] * self.common_noise
         passed: BoolArray = squares <= limits
         return passed, squares, dof
 
