@@ -142,20 +142,16 @@ def _surface_matrices(surfaces: Surfaces, T_world_cam: FloatArray) -> tuple[Floa
     return G, front
 
 
-def cast(surfaces: Surfaces, T_world_cam: npt.ArrayLike, rays: npt.ArrayLike, *, among: IntArray | None = None) -> Hits:
+def cast(surfaces: Surfaces, T_world_cam: npt.ArrayLike, rays: npt.ArrayLike) -> Hits:
     """Intersect unit rays (N, 3) of the camera frame with the nearest surface, exactly.
 
     Args:
         surfaces: the scene at one time.
         T_world_cam: pose (4, 4) of the camera.
         rays: unit rays (N, 3), camera frame.
-        among: indices of the surfaces to test; None: all.
     """
     d = np.asarray(rays, dtype=np.float64).reshape(-1, 3)
     G, index = _surface_matrices(surfaces, np.asarray(T_world_cam, dtype=np.float64))
-    if among is not None:
-        keep = np.isin(index, among)
-        G, index = G[keep], index[keep]
     size = surfaces.size[index]
     rows = max(1, _CAST_PAIRS // max(1, len(index)))
     parts = [_cast_block(G, index, size, d[i : i + rows]) for i in range(0, max(len(d), 1), rows)]

@@ -96,9 +96,7 @@ def simulate(
     rate_hz: float = 20.0,
     frame_times_ns: npt.ArrayLike | None = None,
     imu: ImuNoise | ImuRecord | None = None,
-    imu_rate_hz: float = 200.0,
     velocity: VelocityNoise | None = None,
-    velocity_rate_hz: float | None = None,
     effects: SensorEffects | None = None,
     faults: FrameFaults | None = None,
     calibration_errors: CalibrationErrors | None = None,
@@ -113,10 +111,8 @@ def simulate(
         motion: motion of the body.
         rate_hz: frames per second.
         frame_times_ns: true times (F,) of the frames instead of a fixed rate; those outside the motion are left out.
-        imu: noise of a simulated IMU, or a recorded IMU to use with the images; None: no IMU.
-        imu_rate_hz: rate of the simulated IMU.
-        velocity: noise of the paper's velocity sensor; None: no such sensor.
-        velocity_rate_hz: its rate; None: that of the frames.
+        imu: noise of a simulated IMU of 200 Hz, or a recorded IMU to use with the images; None: no IMU.
+        velocity: noise of the paper's velocity sensor, at the rate of the frames; None: no such sensor.
         effects: camera effects; None: the defaults of `SensorEffects`.
         faults: dropped and repeated frames, clock offset.
         calibration_errors: how far the true cameras are from `rig`; None: not at all.
@@ -133,10 +129,10 @@ def simulate(
     times = _frame_times(motion, rate_hz, frame_times_ns, effects, faults)
     _check_cameras(world, true_rig, motion, times)
     taken, stamps = _apply_faults(times, faults, seed)
-    record = simulate_imu(motion, rate_hz=imu_rate_hz, noise=imu, seed=seed) if isinstance(imu, ImuNoise) else imu
+    record = simulate_imu(motion, noise=imu, seed=seed) if isinstance(imu, ImuNoise) else imu
     samples: Sequence[VelocitySample] = ()
     if velocity is not None:
-        samples = simulate_velocity(motion, rate_hz=velocity_rate_hz or rate_hz, noise=velocity, seed=seed)
+        samples = simulate_velocity(motion, rate_hz=rate_hz, noise=velocity, seed=seed)
     exposures = None
     if effects.auto_exposure:
         exposures = plan_exposures(world, true_rig, motion, taken, effects, seed=seed)
@@ -412,21 +408,18 @@ class RecordedFlight:
     imu: ImuRecord | None = field(default=None)
 
 
-def read_flight(
-    groundtruth: Path, image_times: Path | None = None, imu_csv: Path | None = None, *, knot_s: float = 0.1
-) -> RecordedFlight:
+def read_flight(groundtruth: Path, image_times: Path | None = None, imu_csv: Path | None = None) -> RecordedFlight:
     """Read a recorded flight, to render images along it.
 
     Args:
         groundtruth: TUM file of the IMU's poses.
         image_times: one integer of nanoseconds a line; None: 20 Hz.
         imu_csv: the real IMU record of that flight in EuRoC's form; None: none.
-        knot_s: knot spacing of the smoothing spline.
 
     Raises:
         DataError: a file cannot be used; the message names it.
     """
-    motion, fit = recorded_motion(groundtruth, knot_s=knot_s)
+    motion, fit = recorded_motion(groundtruth)
     if image_times is None:
         times = np.arange(motion.start_ns, motion.end_ns, 50_000_000)
     else:
@@ -437,13 +430,11 @@ def read_flight(
     return RecordedFlight(motion, fit, times, None if imu_csv is None else read_imu_csv(imu_csv))
 
 
-def room_around(
-    motion: MotionSpline, *, seed: int = 0, margin_m: float = _WALL_MARGIN_M, texel_m: float | None = None
-) -> World:
+def room_around(motion: MotionSpline, *, seed: int = 0, texel_m: float | None = None) -> World:
     """Build a room around a motion; its furniture keeps clear of the path."""
     times = np.arange(motion.start_ns, motion.end_ns, _CLEARANCE_STEP_NS)
     p = motion_at(motion, times).T_world_imu[:, :3, 3]
-    low, high = p.min(axis=0) - margin_m, p.max(axis=0) + margin_m
+    low, high = p.min(axis=0) - _WALL_MARGIN_M, p.max(axis=0) + _WALL_MARGIN_M
     area = float(np.prod((high - low)[:2]))
     return room(
         seed,

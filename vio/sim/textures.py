@@ -135,23 +135,16 @@ def lit(texture: Image, light: FloatArray, rng: np.random.Generator) -> tuple[Im
 
 
 def octave_noise(
-    width: int,
-    height: int,
-    rng: np.random.Generator,
-    *,
-    coarsest_texels: float,
-    finest_texels: float = 1.0,
-    falloff: float = 0.8,
+    width: int, height: int, rng: np.random.Generator, *, coarsest_texels: float, falloff: float = 0.8
 ) -> _Canvas:
     """Zero-mean value noise (height, width) of about unit standard deviation, summed over octaves.
 
     Args:
         coarsest_texels: wavelength of the first octave.
-        finest_texels: wavelength where the octaves end.
         falloff: amplitude of an octave relative to the one before.
     """
     wavelengths = [max(coarsest_texels, 1.0)]
-    while wavelengths[-1] / 2 >= max(finest_texels, 1.0):
+    while wavelengths[-1] / 2 >= 1.0:
         wavelengths.append(wavelengths[-1] / 2)
     noise: _Canvas | None = None
     amplitude, power = 1.0, 0.0
