@@ -158,9 +158,12 @@ def test_raw_rig_from_matrices_is_rectified_as_a_recording_of_these_cameras() ->
         (lambda: Rig.raw(np.eye(4), np.eye(3), np.eye(4), 640, 480), "K0 is no intrinsic matrix"),
         (lambda: Rig.raw(np.eye(3).T * 400, np.eye(3), np.eye(4), 640, 480), "K0 is no intrinsic matrix"),
         (lambda: Rig.raw([[400, 3, 320], [0, 400, 240], [0, 0, 1]], np.eye(3), np.eye(4), 640, 480), "a skew of 3 px"),
-        (lambda: Rig.rectified(400, 400, 320, 240, 0.1, 640, 480, np.eye(3)), "T_cam0_imu is no finite 4x4"),
-        (lambda: Rig.rectified(400, 400, 320, 240, 0.1, 640, 480, 2 * np.eye(4)), "T_cam0_imu is no finite 4x4"),
-        (lambda: replace(RIG, T_cam1_cam0=np.diag([1.0, 1, -1, 1])), "T_cam1_cam0: its 3x3 part is no rotation"),
+        (lambda: Rig.rectified(400, 400, 320, 240, 0.1, 640, 480, np.eye(3)), "T_cam0_imu: not a finite 3x4 or 4x4"),
+        (
+            lambda: Rig.rectified(400, 400, 320, 240, 0.1, 640, 480, 2 * np.eye(4)),
+            "T_cam0_imu: the last row of the transform is",
+        ),
+        (lambda: replace(RIG, T_cam1_cam0=np.diag([1.0, 1, -1, 1])), "T_cam1_cam0: not a rotation but a reflection"),
         (lambda: replace(RIG, time_offset_s=float("nan")), "give finite seconds"),
     ],
 )

@@ -18,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.cameras.rig import rectifier_of
+from vio.datasets.common import naming
 from vio.datasets.companions import check_overlap
 from vio.datasets.euroc_files import (
     STATE_CSV,
@@ -34,9 +36,9 @@ from vio.datasets.euroc_files import (
 )
 from vio.datasets.frame_times import PAIRED_NS, pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
-from vio.datasets.image_pairs import full_scale
+from vio.datasets.image_pairs import ImageSize, full_scale
 from vio.datasets.images import list_images
-from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
+from vio.datasets.rectified import RectifiedDataset, write_frames
 from vio.datasets.samples import MotionSamples, imu_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout, unused_note
@@ -89,7 +91,8 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     imu = _read_imu(mav / "imu0")
     T_imu_body = se3_inverse(imu.T_body_imu)
     rig = StereoRig(left.model, right.model, T_imu_body @ left.T_body_cam, T_imu_body @ right.T_body_cam)
-    rectifier = make_rectifier(rig, settings.interpolation, mav, settings.projection)
+    with naming(mav):
+        rectifier = rectifier_of(rig, settings.interpolation, settings.projection)
     of_left, of_right, notes = _pair(left, right, mav)
     times_ns = left.times_ns[of_left]
     if imu.samples:
@@ -115,7 +118,10 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         pairs=pairs,
         motion=imu.samples,
         rectifier=rectifier,
-        sizes=rig_sizes(rig, (mav / "cam0" / "sensor.yaml", mav / "cam1" / "sensor.yaml")),
+        sizes=tuple(
+            ImageSize(camera.width, camera.height, mav / name / "sensor.yaml")
+            for name, camera in (("cam0", rig.cam0), ("cam1", rig.cam1))
+        ),
         settings=settings,
         imu_noise=imu.noise,
         white=white,

@@ -19,17 +19,17 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.cameras.rig import Rectifier
-from vio.datasets.common import check_intrinsics, checked_transform, image_size, naming, numbers_in
-from vio.datasets.image_pairs import ImagePairs, first_readable, full_scale, pair_images
-from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes
+from vio.cameras.rig import Rectifier, rectifier_of
+from vio.datasets.common import check_intrinsics, image_size, naming, numbers_in
+from vio.datasets.image_pairs import ImagePairs, ImageSize, first_readable, full_scale, pair_images
+from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import drive_times
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
 from vio.files.text import text_lines
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, se3_inverse
 from vio.records import IntArray, Recording
 
 CAMERAS = "calib_cam_to_cam.txt"
@@ -97,7 +97,8 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         reference=None,
         notes=(*time_notes, *imu_notes, *depth_notes, *rectifier.notes, *unused),
     )
-    sizes = rig_sizes(rectifier.rig, (calibration_path, calibration_path))
+    cameras = (rectifier.rig.cam0, rectifier.rig.cam1)
+    sizes = tuple(ImageSize(camera.width, camera.height, calibration_path) for camera in cameras)
     return RectifiedDataset(recording, (), sizes, settings, pairs, rectifier, white=white)
 
 
@@ -130,7 +131,8 @@ def _rectifier(
             f"{pairs[0][0].parent}: images are {size[0]} x {size[1]} pixels but {where} is for {raw[0]} x {raw[1]} "
             f"(raw) or {rectified[0]} x {rectified[1]} (rectified); give the calibration of these images"
         )
-    return make_rectifier(rig, settings.interpolation, where, settings.projection)
+    with naming(where):
+        return rectifier_of(rig, settings.interpolation, settings.projection)
 
 
 # --- calibration ----------------------------------------------------------------------------------------------------

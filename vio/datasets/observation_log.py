@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.cameras.rig import Rig
-from vio.datasets.common import checked_transform, read_npz, shape_text
+from vio.datasets.common import read_npz, shape_text
 from vio.datasets.features import FeatureDataset
 from vio.datasets.samples import MotionSamples, motion_samples
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_bytes
 from vio.files.text import check_increasing
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, checked_transform
 from vio.geometry.stereo import CameraKind, Projection, StereoCamera
 from vio.records import (
     BodyFrame,

@@ -8,34 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.cameras.rig import Rectifier, rectifier_of
-from vio.datasets.common import naming
-from vio.datasets.image_pairs import ImageDataset, ImageSize
+from vio.cameras.rig import Rectifier
+from vio.datasets.image_pairs import ImageDataset
 from vio.datasets.images import UnreadableImageError, load_depth, write_png
 from vio.errors import DataError
-from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray
-from vio.geometry.rectify import Interpolation, ProjectionMode
 from vio.protocols import Progress
 from vio.records import Image, ImuDensities, IntArray, StereoFrame
-
-
-def make_rectifier(
-    rig: StereoRig, interpolation: Interpolation, where: Path, projection: ProjectionMode = "pinhole"
-) -> Rectifier:
-    """Prepare the rectification of a rig; a rig that is rectified already passes images through unchanged.
-
-    Raises:
-        CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
-    """
-    with naming(where):
-        return rectifier_of(rig, interpolation, projection)
-
-
-def rig_sizes(rig: StereoRig, calibrated_in: tuple[Path, Path]) -> tuple[ImageSize, ...]:
-    """Return the calibrated sizes of left and right images, and the files that specify them."""
-    left, right = calibrated_in
-    return ImageSize(rig.cam0.width, rig.cam0.height, left), ImageSize(rig.cam1.width, rig.cam1.height, right)
 
 
 @dataclass(frozen=True, slots=True)

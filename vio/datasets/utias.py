@@ -16,7 +16,6 @@ import numpy as np
 
 from vio.datasets.common import (
     check_array_bytes,
-    checked_transform,
     clock_ns,
     finite_rows,
     naming,
@@ -28,7 +27,7 @@ from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
 from vio.errors import DataError
 from vio.files.inputs import check_regular
-from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
+from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, so3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, Landmarks, Recording, Trajectory
 

@@ -12,8 +12,11 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from vio.errors import CalibrationError
+
 FloatArray = npt.NDArray[np.float64]
 
+_EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 # Below this angle the closed forms suffer from cancellation and the Taylor series is exact to rounding.
 _SMALL_ANGLE_RAD = 1e-2
 
@@ -302,3 +305,23 @@ def rigid_fault(T: FloatArray) -> str | None:
     if np.linalg.det(R) < 0:
         return "not a rotation but a reflection (determinant -1); check the axes' order"
     return None
+
+
+def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
+    """Return a rigid transform (4, 4) whose rotation is orthonormal to rounding.
+
+    Args:
+        T: (4, 4) or its first three rows.
+        where: names it (a file and its entry) in the message.
+
+    Raises:
+        CalibrationError: entries are not finite, or the rotation part is not a rotation.
+    """
+    T_ = np.asarray(T, dtype=np.float64)
+    if T_.shape not in ((3, 4), (4, 4)) or not np.isfinite(T_).all():
+        raise CalibrationError(f"{where}: not a finite 3x4 or 4x4 transform (shape {T_.shape}); check the calibration")
+    if fault := rigid_fault(T_):
+        raise CalibrationError(f"{where}: {fault}")
+    R = T_[:3, :3]
+    deviation = float(np.abs(R.T @ R - np.eye(3)).max())
+    return se3_from_parts(R if deviation <= _EXACT else nearest_rotation(R), T_[:3, 3])

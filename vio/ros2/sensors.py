@@ -12,9 +12,9 @@ import numpy as np
 
 from vio.datasets.bags.cdr import decoded
 from vio.datasets.bags.index import stamp_of
-from vio.datasets.bags.pictures import compressed_pixels, gray_of, raw_gray, white_of
+from vio.datasets.bags.pictures import compressed_pixels, gray_of, raw_gray
 from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
-from vio.datasets.images import WHITE_16, UnreadableImageError
+from vio.datasets.images import WHITE_16, UnreadableImageError, brightest, white_of
 from vio.errors import DataError, OrderError
 from vio.geometry.lie import FloatArray
 from vio.live.live_odometry import LiveOdometry
@@ -27,7 +27,6 @@ log = logging.getLogger(__name__)
 SILENT_S = 5.0  # without a message, before it is said
 _BACK_NS = 500_000_000  # a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
 _WHITE_IMAGES = 8  # of 16 bits, looked at for the level of white
-_WHITE_SHARE = 0.999  # of their pixels are no brighter
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +140,8 @@ class Sensors:
             pixels = compressed_pixels(fields, where) if kind == COMPRESSED else raw_gray(fields, where)
             if pixels.dtype != np.uint16:
                 return WHITE_16
-            self._levels.append(float(np.quantile(pixels, _WHITE_SHARE)))
-        return white_of(max(self._levels)) if self._levels else WHITE_16
+            self._levels.append(brightest(pixels))
+        return white_of(max(self._levels, default=0.0))
 
     def _refuse(self, why: str) -> None:
         self.refused += 1

@@ -14,11 +14,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
-from vio.datasets.common import checked_transform, naming
+from vio.datasets.common import naming
 from vio.datasets.yaml_files import Entries, as_number, matrix, read_yaml_file
 from vio.errors import CalibrationError
 from vio.geometry.distortion import DistortionModel
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, checked_transform
 
 _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
     "K0": ("M1", "K1", "cameraMatrix1", "camera_matrix_1", "cameraMatrixL", "K_left", "left_camera_matrix", "LEFT.K",
