@@ -201,10 +201,7 @@ def _stereo_rows(stereo: StereoEstimate) -> _Rows:
             f"{x:+.4f} {y:+.4f} {z:+.4f} deg (cam0 to cam1), sigma {stereo.rotation_sigma_deg:.4f}",
         ),
         ("baseline direction", f"{u:+.5f} {v:+.5f} {w:+.5f} in cam0, sigma {stereo.direction_sigma_deg:.3f} deg"),
-        (
-            "matches",
-            f"{stereo.matches} in {stereo.pairs} pairs, epipolar spread {60 * stereo.residual_deg:.2f} arcmin",
-        ),
+        ("matches", f"{stereo.matches} in {stereo.pairs} pairs, epipolar spread {60 * stereo.residual_deg:.2f} arcmin"),
     ]
 
 

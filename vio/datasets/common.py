@@ -21,15 +21,7 @@ from vio.errors import CalibrationError, DataError
 from vio.files.inputs import check_regular
 from vio.files.text import check_increasing
 from vio.geometry.lie import FloatArray
-from vio.records import (
-    NS_PER_S,
-    BoolArray,
-    Event,
-    IntArray,
-    MotionSample,
-    Recording,
-    StereoFrame,
-)
+from vio.records import NS_PER_S, BoolArray, Event, IntArray, MotionSample, Recording, StereoFrame
 
 _GRAVITY, _GRAVITY_OFF = 9.81, 1.5  # m/s^2; by what accelerations and biases move the median of a motion's readings
 _MOST_ARRAY_BYTES = 2**31  # the largest published course file takes 140 MB; a bomb of kilobytes claims terabytes

@@ -18,15 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.calibration.lever_arm import LeverArmVerdict, judge_lever_arms
-from vio.datasets.common import (
-    check_intrinsics,
-    clock_ns,
-    finite_rows,
-    naming,
-    npz_names,
-    read_npz,
-    shape_text,
-)
+from vio.datasets.common import check_intrinsics, clock_ns, finite_rows, naming, npz_names, read_npz, shape_text
 from vio.datasets.features import FeatureDataset
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings, ExtrinsicsMode

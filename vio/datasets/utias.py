@@ -14,13 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import (
-    check_array_bytes,
-    clock_ns,
-    finite_rows,
-    naming,
-    shape_text,
-)
+from vio.datasets.common import check_array_bytes, clock_ns, finite_rows, naming, shape_text
 from vio.datasets.features import FeatureDataset, SensorVariances
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings

@@ -216,10 +216,7 @@ def _radtan(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
     if (divisor := _divisor(coefficients, r2)) is not None:
         radial = radial / divisor[0]
     return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
+        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
         axis=-1,
     )
 

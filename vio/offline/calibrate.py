@@ -299,10 +299,7 @@ def _no_imu(why: str) -> ImuReport:
 
 
 def _measure_imu(
-    recording: Recording,
-    tracks: FeatureTracks,
-    samples: Sequence[MotionSample],
-    motion: CameraMotion | NotObservable,
+    recording: Recording, tracks: FeatureTracks, samples: Sequence[MotionSample], motion: CameraMotion | NotObservable
 ) -> ImuReport:
     if not samples:
         return _no_imu("the recording contains no motion sensor")

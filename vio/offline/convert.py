@@ -32,15 +32,7 @@ from vio.files.text import exact_text, seconds_text, write_text
 from vio.files.trajectories import in_first_cam0, write_tum
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.protocols import Dataset, Progress
-from vio.records import (
-    Event,
-    ImuDensities,
-    ImuRecord,
-    ImuSample,
-    Recording,
-    StereoFrame,
-    VelocitySample,
-)
+from vio.records import Event, ImuDensities, ImuRecord, ImuSample, Recording, StereoFrame, VelocitySample
 
 Folder: TypeAlias = Literal["euroc", "kitti", "plain"]
 Form: TypeAlias = Literal["euroc", "kitti", "plain", "rosbag2", "mcap"]

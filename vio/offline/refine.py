@@ -199,11 +199,7 @@ _LEAST_SIGMA_M = 1e-4  # of a prior: the first pose of a filter has no uncertain
 
 
 def align_to_points(
-    camera: StereoCamera,
-    T_world_cam0: FloatArray,
-    p_world: FloatArray,
-    z: FloatArray,
-    has_right: BoolArray,
+    camera: StereoCamera, T_world_cam0: FloatArray, p_world: FloatArray, z: FloatArray, has_right: BoolArray
 ) -> FloatArray | None:
     """Estimate one frame's pose (4, 4) from known points (P, 3) and pixels (P, 4); None: too few of them fit.
 

@@ -90,11 +90,7 @@ def _walk(rng: np.random.Generator, n: int, rate_hz: float, density: float, star
 
 
 def simulate_velocity(
-    spline: MotionSpline,
-    *,
-    rate_hz: float = 10.0,
-    noise: VelocityNoise | None = None,
-    seed: int = 0,
+    spline: MotionSpline, *, rate_hz: float = 10.0, noise: VelocityNoise | None = None, seed: int = 0
 ) -> Sequence[VelocitySample]:
     """Simulate the paper's control input `u = [v; omega]` along a motion, in the imu frame, with the paper's noise."""
     noise = VelocityNoise() if noise is None else noise

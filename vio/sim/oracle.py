@@ -122,13 +122,7 @@ class OracleFrontend:
         return z, seen_left & seen_right & within & (depth < self._settings.max_depth_m)
 
     def _detect(
-        self,
-        surfaces: Surfaces,
-        left: View,
-        right: View,
-        occupied: FloatArray,
-        wanted: int,
-        rng: np.random.Generator,
+        self, surfaces: Surfaces, left: View, right: View, occupied: FloatArray, wanted: int, rng: np.random.Generator
     ) -> tuple[IntArray, FloatArray]:
         """Create up to `wanted` features, first in the image cells (`_CELL_PX`) with the fewest."""
         if wanted <= 0:

@@ -492,11 +492,7 @@ def _shade_edges(scene: _Scene, candidates: BoolArray, rays: CameraRays, pixels:
 
 
 def _sample_points(
-    scene: _Scene,
-    k: int,
-    d: npt.NDArray[np.float32],
-    du: npt.NDArray[np.float32],
-    dv: npt.NDArray[np.float32],
+    scene: _Scene, k: int, d: npt.NDArray[np.float32], du: npt.NDArray[np.float32], dv: npt.NDArray[np.float32]
 ) -> Radiance:
     """Texture (n,) of surface k along rays d (3, n) with pixel steps du and dv (3, n)."""
     texture, G = scene.textures[k], scene.G[k]

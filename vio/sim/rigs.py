@@ -38,13 +38,7 @@ def kitti_like_rig(width: int = 1242) -> StereoRig:
     scale = width / 1242
     f = 721.5377 * scale
     camera = StereoCamera(
-        f,
-        f,
-        (609.5593 + 0.5) * scale - 0.5,
-        (172.854 + 0.5) * scale - 0.5,
-        0.5371657,
-        width,
-        round(375 * scale),
+        f, f, (609.5593 + 0.5) * scale - 0.5, (172.854 + 0.5) * scale - 0.5, 0.5371657, width, round(375 * scale)
     )
     return rig_from_rectified(camera, _forward_T_cam0_imu((1.0891, -0.3141, 0.7195)))
 

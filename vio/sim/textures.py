@@ -107,9 +107,7 @@ def _pack(levels: list[Image]) -> MipTexture:
     for level, (top, left) in zip(levels, places, strict=True):
         padded = cv2.copyMakeBorder(level, _GUTTER, _GUTTER, _GUTTER, _GUTTER, cv2.BORDER_REPLICATE)
         page[top : top + padded.shape[0], left : left + padded.shape[1]] = padded
-        rows.append(
-            (level.shape[1] / width, level.shape[0] / height, left + _GUTTER - 0.5, top + _GUTTER - 0.5),
-        )
+        rows.append((level.shape[1] / width, level.shape[0] / height, left + _GUTTER - 0.5, top + _GUTTER - 0.5))
     return MipTexture(page, (width, height), np.array(rows, dtype=np.float32))
 
 

@@ -190,10 +190,7 @@ def add_frame(
             image_id=image_id(keyframe, camera_id),
             points2D=pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in uv + HALF_PX]),
         )
-        for name, camera_id, uv in (
-            (names.left[keyframe], LEFT, left),
-            (names.right[keyframe], RIGHT, right),
-        )
+        for name, camera_id, uv in ((names.left[keyframe], LEFT, left), (names.right[keyframe], RIGHT, right))
     ]
     frame = pycolmap.Frame(frame_id=frame_id(keyframe), rig_id=RIG)
     for image in images:
