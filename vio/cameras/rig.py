@@ -17,8 +17,8 @@ from vio.geometry.rectify import (
     MapArray,
     ProjectionMode,
     field_of_view,
+    lookup,
     rectified_cameras,
-    rectify,
     undistorted,
 )
 from vio.geometry.stereo import StereoCamera, one_camera
@@ -105,8 +105,9 @@ def rectifier_of(
     """
     if (pair := rectified_pair(rig)) is not None:
         return Rectifier(rig, pair, se3_inverse(rig.T_imu_cam0), None, interpolation)
-    done = rectify(rig, projection)
-    maps = fixed_point(done.map0), fixed_point(done.map1)
+    done = rectified_cameras(rig, projection)
+    turned = ((rig.cam0, done.R_rect_cam0), (rig.cam1, done.R_rect_cam1))
+    maps = tuple(fixed_point(lookup(done.camera, lens, R_rect_cam)) for lens, R_rect_cam in turned)
     return Rectifier(rig, done.camera, done.T_rect0_imu, maps, interpolation)
 
 

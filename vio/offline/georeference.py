@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
@@ -72,11 +73,8 @@ def _of_run(folder: FilePath) -> Placed:
 
 
 def _of_map(file: FilePath) -> Placed:
-    store = MapStore(file, read_only=True)
-    try:
+    with contextlib.closing(MapStore(file, read_only=True)) as store:
         sessions, rows, loops = store.sessions(), store.keyframes(), store.loops()
-    finally:
-        store.close()
     home = sessions[0].part if sessions else 0
     kept = [k for k, row in enumerate(rows) if sessions[row.session].part == home]
     if len(kept) < 2:
@@ -144,11 +142,8 @@ def place_by_map(of: Placed, run: FilePath, file: FilePath, folder: FilePath) ->
     Raises:
         DataError: the map is nowhere on the earth, or the run was not localised in it.
     """
-    store = MapStore(file, read_only=True)
-    try:
+    with contextlib.closing(MapStore(file, read_only=True)) as store:
         earth, rows, sessions = store.earth(), store.keyframes(), store.sessions()
-    finally:
-        store.close()
     if earth is None:
         raise DataError(f"{file}: nothing says where it is on the earth; vio georeference {file} GNSS does")
     of_map = read_metrics(run)[0].get("map") if run.is_dir() else None
@@ -199,11 +194,8 @@ def keep_in_map(file: FilePath, facts: dict[str, Any]) -> None:
     """
     origin = facts["origin"]
     where = origin["latitude_deg"], origin["longitude_deg"], origin["height_m"]
-    store = MapStore(file)
-    try:
+    with contextlib.closing(MapStore(file)) as store:
         store.set_earth(EarthRow(where, np.array(facts["T_enu_map"]), np.array(facts["covariance"])))
-    finally:
-        store.close()
 
 
 def _write(

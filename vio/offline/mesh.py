@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -171,11 +172,8 @@ def _poses_in_map(file: Path, run: Trajectory) -> FloatArray:
     Raises:
         DataError: no session of the map has the run's keyframes.
     """
-    store = MapStore(file, read_only=True)
-    try:
+    with contextlib.closing(MapStore(file, read_only=True)) as store:
         graph, rows = MapGraph(store), store.keyframes()
-    finally:
-        store.close()
     assert run.times_ns is not None
     assert run.frame_indices is not None
     place = {int(t): k for k, t in enumerate(run.times_ns.tolist())}

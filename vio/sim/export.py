@@ -35,7 +35,7 @@ from vio.records import ImuDensities
 from vio.sim.errors import SimulationError
 from vio.sim.imu import ADIS16448, sample_times
 from vio.sim.motion import motion_at
-from vio.sim.sequence import SimulatedRecording
+from vio.sim.sequence import SimulatedRecording, true_biases
 
 MARKER = "simulation.json"
 _TRUTH_HZ = 200.0
@@ -136,13 +136,9 @@ def _truth_csv(recording: SimulatedRecording) -> str:
     simulation = recording.simulation
     times = sample_times(simulation.motion, _TRUTH_HZ)
     state = motion_at(simulation.motion, times)
-    biases = np.zeros((len(times), 6))
-    record = simulation.imu
-    if record is not None and record.gyro_bias is not None and record.accel_bias is not None:
-        known = np.hstack([record.gyro_bias, record.accel_bias])
-        elapsed, at = (record.times_ns - times[0]).astype(np.float64), (times - times[0]).astype(np.float64)
-        biases = np.stack([np.interp(at, elapsed, known[:, i]) for i in range(6)], axis=1)
-    return state_csv(times, state.T_world_imu, state.velocity_world, biases)
+    biases = true_biases(simulation.imu, times)
+    zero = np.zeros((len(times), 6))
+    return state_csv(times, state.T_world_imu, state.velocity_world, zero if biases is None else biases)
 
 
 def description(recording: SimulatedRecording) -> str:

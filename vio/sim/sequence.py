@@ -180,24 +180,14 @@ def _check_cameras(world: World, rig: StereoRig, motion: MotionSpline, times: In
         check_clear(world, (T @ T_imu_cam)[:, :3, 3], what=name)
 
 
-def true_state(simulation: Simulation, time_ns: int) -> TrueState:
-    """Return the true state at any time within the motion.
-
-    Raises:
-        SimulationError: the time is outside the motion.
-    """
-    state = motion_at(simulation.motion, time_ns)
-    biases: list[FloatArray | None] = [None, None]
-    record = simulation.imu
-    if record is not None and record.gyro_bias is not None and record.accel_bias is not None:
-        elapsed = (record.times_ns - record.times_ns[0]).astype(np.float64)
-        at = float(time_ns - record.times_ns[0])
-        biases = [
-            np.array([np.interp(at, elapsed, b[:, i]) for i in range(3)]) for b in (record.gyro_bias, record.accel_bias)
-        ]
-    return TrueState(
-        time_ns, state.T_world_imu[0], state.velocity_world[0], state.angular_velocity[0], biases[0], biases[1]
-    )
+def true_biases(record: ImuRecord | None, times_ns: npt.ArrayLike) -> FloatArray | None:
+    """Return biases (..., 6) of gyroscope and accelerometer at times (...); None: there is no simulated IMU."""
+    if record is None or record.gyro_bias is None or record.accel_bias is None:
+        return None
+    known = np.hstack([record.gyro_bias, record.accel_bias])
+    elapsed = (record.times_ns - record.times_ns[0]).astype(np.float64)
+    at = np.asarray(times_ns - record.times_ns[0], dtype=np.float64)
+    return np.stack([np.interp(at, elapsed, known[:, i]) for i in range(6)], axis=-1)
 
 
 def views(simulation: Simulation, time_ns: int) -> tuple[View, View]:
@@ -375,8 +365,14 @@ class SimulatedRecording:
         return depth_map(self.simulation.world, self.rays[camera], view.T_world_cam, time_ns)
 
     def true_state(self, time_ns: int) -> TrueState:
-        """Return the true state at any time within the motion."""
-        return true_state(self.simulation, time_ns)
+        """Return the true state at any time within the motion.
+
+        Raises:
+            SimulationError: the time is outside the motion.
+        """
+        state, biases = motion_at(self.simulation.motion, time_ns), true_biases(self.simulation.imu, time_ns)
+        gyro, accel = (None, None) if biases is None else (biases[:3], biases[3:])
+        return TrueState(time_ns, state.T_world_imu[0], state.velocity_world[0], state.angular_velocity[0], gyro, accel)
 
 
 def _dense(grid: FloatArray, width: int, height: int) -> FloatArray:

@@ -39,13 +39,8 @@ SourceEvent: TypeAlias = "SourceFrame | SourceSample"
 class LiveSource(Protocol):
     """A camera, with or without an IMU."""
 
-    @property
-    def rig(self) -> Rig | None:
-        """The calibration that the device has stored; None: it has none, and the user gives one."""
-
-    @property
-    def has_imu(self) -> bool:
-        """Whether samples come."""
+    rig: Rig | None  # the calibration that the device has stored; None: it has none, and the user gives one
+    has_imu: bool  # whether samples come
 
     def events(self) -> Iterator[SourceEvent | None]:
         """Yield frames and samples as they come, each kind in order of time; None at least each second without any.
