@@ -102,7 +102,8 @@ def refine_stereo(
         R, d = _fit_stereo(inliers, R, d, max(spread, 1e-6))
     spread = robust_sigma(epipolar_angles(R, d, inliers))
     refits = [_fit_stereo(inliers.take(~block), R, d, max(spread, 1e-6)) for block in _blocks(inliers.pair)]
-    rotation_sigma, direction_sigma = (_jackknife_norm(v) for v in _deviations(R, d, refits))
+    turns, swings = np.array([so3_log(Rk @ R.T) for Rk, _ in refits]), np.array([np.cross(d, dk) for _, dk in refits])
+    rotation_sigma, direction_sigma = (_jackknife_norm(v) for v in (turns, swings))
     if rotation_sigma > np.radians(_STEREO_ROTATION_DEG) or direction_sigma > np.radians(_STEREO_DIRECTION_DEG):
         return NotObservable(
             "left-right extrinsics",
@@ -218,11 +219,6 @@ def _blocks(labels: IntArray) -> list[BoolArray]:
     names = np.unique(labels)
     parts = np.array_split(names, min(_BLOCKS, len(names)))
     return [np.isin(labels, part) for part in parts]
-
-
-def _deviations(R: FloatArray, d: FloatArray, others: Sequence[_Pose]) -> tuple[FloatArray, FloatArray]:
-    """Return rotation vectors (n, 3), radians, by which other rotations and directions differ from one."""
-    return np.array([so3_log(Rk @ R.T) for Rk, _ in others]), np.array([np.cross(d, dk) for _, dk in others])
 
 
 def _jackknife_norm(values: FloatArray) -> float:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.cameras.rectification_error import error_basis
-from vio.cameras.rig import Rig
+from vio.cameras.rig import Rig, rig_of_rectified
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, project_point, rectified_pair
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
@@ -209,10 +209,8 @@ def _scaled(rig: Rig, baseline: float, focal: float) -> Rig:
 
 def field_of(camera: StereoCamera, parameters: FloatArray) -> DisplacementField:
     """Return the field of a rectified pair, with image size, that is off by parameters (14,)."""
-    assert camera.width is not None
-    assert camera.height is not None
-    c = camera
-    given = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height)
+    given = rig_of_rectified(camera, None)
+    assert given is not None
     return DisplacementField(camera, _Frame.of(given).coefficients(parameters))
 
 

@@ -129,17 +129,11 @@ def _rows(result: MapperResult) -> list[tuple[str, str]]:
         rows.insert(1, ("loops", f"{joined} of {len(model.shared)} in the model, with {LEAST_SHARED} points or more"))
     if comparison.scale is not None and comparison.scale_sigma is not None:
         percent, sigma = 100 * (comparison.scale - 1), 100 * comparison.scale_sigma
-        rows.append(
-            ("scale", f"{percent:+.3f} +- {sigma:.3f} % (COLMAP relative to the run, both by the known baseline)")
-        )
+        text = f"{percent:+.3f} +- {sigma:.3f} % (COLMAP relative to the run, both by the known baseline)"
+        rows.append(("scale", text))
     for segment in comparison.segments:
-        rows.append(
-            (
-                "segment",
-                f"frames {segment.first_frame} to {segment.last_frame}: motions differ by "
-                f"{1e3 * segment.difference_m:.1f} mm, {segment.difference_deg:.3f} deg",
-            )
-        )
+        where, apart_mm = f"frames {segment.first_frame} to {segment.last_frame}", 1e3 * segment.difference_m
+        rows.append(("segment", f"{where}: motions differ by {apart_mm:.1f} mm, {segment.difference_deg:.3f} deg"))
     if comparison.reference_ate_m is not None and comparison.run_reference_ate_m is not None:
         rows.append(
             (

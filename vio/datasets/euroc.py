@@ -100,7 +100,11 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     motion: frozenset[MotionSource] = frozenset({"imu"}) if imu.samples else frozenset()
     pairs = FilePairs(left.files.take(of_left.tolist()), right.files.take(of_right.tolist()))
     white, depth_notes = full_scale(pairs)
-    truth = _reference_file(mav)
+    candidates = (mav / STATE_CSV, mav.absolute().parent / TUM_FILE)
+    truth = next((file for file in candidates if file.is_file()), None)
+    read = [mav / name / file for name in ("cam0", "cam1", "imu0") for file in ("sensor.yaml", "data.csv")]
+    layout = Layout(path, mav, mav / "cam0" / "data", mav / "cam1" / "data")
+    unused = unused_note(layout, read if truth is None else [*read, truth])
     recording = Recording(
         kind="euroc",
         path=path,
@@ -110,7 +114,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         has_images=True,
         motion=motion,
         reference=None if truth is None else _read_reference(truth, imu.T_body_imu, rig.T_imu_cam0),
-        notes=(*notes, *imu.notes, *depth_notes, *rectifier.notes, *_unused(path, mav, truth)),
+        notes=(*notes, *imu.notes, *depth_notes, *rectifier.notes, *unused),
         motion_notes=imu.notes,
     )
     return RectifiedDataset(
@@ -220,12 +224,6 @@ def _read_imu(folder: Path) -> _Imu:
     return _Imu(T_body_imu, noise, samples, (*notes, *cut))
 
 
-def _reference_file(mav: Path) -> Path | None:
-    """Return the file of the ground truth; None: there is none."""
-    candidates = (mav / STATE_CSV, mav.absolute().parent / TUM_FILE)
-    return next((file for file in candidates if file.is_file()), None)
-
-
 def _read_reference(file: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -> Trajectory:
     """Read the ground truth of the IMU. EuRoC's describes the body; a TUM file may describe the (raw) cam0."""
     euroc = file.name == STATE_CSV.name
@@ -233,13 +231,6 @@ def _read_reference(file: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) 
     if truth.body == "cam0":
         return truth.in_imu(se3_inverse(T_imu_cam0))
     return replace(truth, T_world_body=truth.T_world_body @ T_body_imu)
-
-
-def _unused(path: Path, mav: Path, truth: Path | None) -> list[str]:
-    """Name what lies in the folder and was not read."""
-    sensors = [mav / name / file for name in ("cam0", "cam1", "imu0") for file in ("sensor.yaml", "data.csv")]
-    layout = Layout(path, mav, mav / "cam0" / "data", mav / "cam1" / "data")
-    return unused_note(layout, sensors if truth is None else [*sensors, truth])
 
 
 # --- writing --------------------------------------------------------------------------------------------------------

@@ -18,7 +18,8 @@ import numpy.typing as npt
 from vio.cameras.rig import Rig
 from vio.datasets.common import read_npz, shape_text
 from vio.datasets.features import FeatureDataset
-from vio.datasets.samples import MotionSamples, motion_samples
+from vio.datasets.samples import MotionSamples
+from vio.datasets.samples import motion_samples as as_arrays
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_bytes
@@ -108,7 +109,7 @@ def write_observation_log(
     times_ns = np.array([o.time_ns for o in observations], dtype=np.int64)
     if (np.diff(frames) <= 0).any() or not np.array_equal(times_ns, recording.frame_times_ns[frames]):
         raise ValueError("the observations are not in the order of the recording's frames, or have other times")
-    camera, sigma = recording.camera, joined_sigmas(observations)
+    camera, sigma, motion = recording.camera, joined_sigmas(observations), as_arrays(motion_samples)
     arrays: dict[str, np.ndarray] = {
         "format": np.array(FORMAT),
         "version": np.array(VERSION, dtype=np.int64),
@@ -124,7 +125,9 @@ def write_observation_log(
         "z": _joined([o.z for o in observations], np.zeros((0, 4))),
         "has_right": _joined([o.has_right for o in observations], np.zeros(0, dtype=np.bool_)),
         "stale": _joined([o.stale for o in observations], np.zeros(0, dtype=np.bool_)),
-        **_motion_arrays(motion_samples),
+        "motion_times_ns": motion.times_ns,
+        "motion_is_imu": motion.is_imu,
+        "motion_values": motion.values,
         **_optional_arrays(recording),
         **({} if run_motion is None else {"run_motion": np.array(run_motion)}),
         **({} if camera.kind == "stereo" else {"camera_kind": np.array(camera.kind)}),
@@ -181,11 +184,6 @@ def write_observations(
 
 def _joined(parts: list[np.ndarray], empty: np.ndarray) -> np.ndarray:
     return np.concatenate([empty, *parts])
-
-
-def _motion_arrays(samples: Sequence[MotionSample]) -> dict[str, np.ndarray]:
-    arrays = motion_samples(samples)
-    return {"motion_times_ns": arrays.times_ns, "motion_is_imu": arrays.is_imu, "motion_values": arrays.values}
 
 
 def _optional_arrays(recording: Recording) -> dict[str, np.ndarray]:

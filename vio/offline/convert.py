@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from vio.cameras.rig import Rig
+from vio.cameras.rig import rig_of_rectified
 from vio.datasets.bags.writer import BagWriter, Storage, bag_writer
 from vio.datasets.euroc_files import TUM_FILE as EUROC_TUM
 from vio.datasets.euroc_files import (
@@ -112,18 +112,13 @@ def _check_frames(count: int, recording: Recording) -> None:
         raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
 
 
-def _folders(out: Path, form: Folder) -> tuple[Path, Path]:
-    names = {"euroc": ("mav0/cam0/data", "mav0/cam1/data"), "kitti": ("image_0", "image_1"), "plain": ("left", "right")}
-    left, right = (out / name for name in names[form])
-    return left, right
-
-
 def _write_images(
     dataset: Dataset, out: Path, form: Folder, start: int, stop: int | None, progress: Progress
 ) -> _Written:
     """Write the images of a range, and collect its samples."""
     written = _Written()
-    folders = _folders(out, form)
+    names = {"euroc": ("mav0/cam0/data", "mav0/cam1/data"), "kitti": ("image_0", "image_1"), "plain": ("left", "right")}
+    folders = [out / name for name in names[form]]
     for folder in folders:
         folder.mkdir(parents=True)
     total = _frames_in(dataset, start, stop)
@@ -208,11 +203,8 @@ def _finish_plain(out: Path, recording: Recording, written: _Written, noise: Imu
 
 def _write_kalibr(out: Path, recording: Recording, noise: ImuDensities | None) -> None:
     """Write the rectified rig as Kalibr's camchain, and the IMU's noise beside it."""
-    c = recording.camera
-    assert c.width is not None
-    assert c.height is not None
-    rig = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, c.width, c.height, recording.T_cam0_imu)
-    imu = recording.T_cam0_imu is not None
+    rig, imu = rig_of_rectified(recording.camera, recording.T_cam0_imu), recording.T_cam0_imu is not None
+    assert rig is not None
     write_text(out / ("camchain-imucam.yaml" if imu else "camchain.yaml"), kalibr_text(rig))
     if noise is not None:
         write_text(out / "imu.yaml", densities_text(noise, units=False))

@@ -78,7 +78,8 @@ def refine_run(
     path = run.tracked
     if priors and path.loops:
         raise ConfigError(f"{path.where}: its loops moved the poses away from the filter's; leave --priors out")
-    if imu and (priors or not _can_use_imu(run)):
+    has_imu = run.metrics.get("motion") == "imu" and (path.where / RunFile.ESTIMATES).is_file()
+    if imu and (priors or not has_imu or run.dataset.recording.camera.is_cylinder):
         raise ConfigError(f"{path.where}: --imu takes a run with an IMU and a pinhole pair, and no --priors filter")
     rounds = iter((2, 3))
     held = None
@@ -126,12 +127,6 @@ def refine_run(
         ate_before_m=before,
         ate_m=after,
     )
-
-
-def _can_use_imu(run: SavedRun) -> bool:
-    """Whether a run has what an adjustment with an IMU needs: that sensor in use, and a pinhole pair."""
-    estimates = (run.tracked.where / RunFile.ESTIMATES).is_file()
-    return run.metrics.get("motion") == "imu" and not run.dataset.recording.camera.is_cylinder and estimates
 
 
 def _adjusted_with_imu(run: SavedRun, keyframes: IntArray) -> Adjustment:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import time
 from collections.abc import Mapping
@@ -62,12 +63,9 @@ class Sensors:
         self.received = dict.fromkeys(topics.kinds, 0)  # messages
         self.refused = 0
         for side, name in enumerate(topics.cameras):
-            transport.subscribe(name, topics.kinds[name], self._image_taker(name, side), quality)
+            transport.subscribe(name, topics.kinds[name], functools.partial(self._image, name, side), quality)
         if topics.imu is not None:
             transport.subscribe(topics.imu, IMU, self._imu, quality)
-
-    def _image_taker(self, topic: str, side: int) -> Any:
-        return lambda data: self._image(topic, side, data)
 
     def _image(self, topic: str, side: int, data: bytes) -> None:
         kind = self._topics.kinds[topic]

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from vio.datasets.common import frame_range, merge_events
+from vio.datasets.common import blank_frames, frame_range, merge_events
 from vio.datasets.euroc_files import read_imu_csv, stamped_rows
-from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
+from vio.datasets.samples import imu_samples, in_time_order
 from vio.errors import CalibrationError, DataError
 from vio.files.text import check_increasing
 from vio.geometry.distortion import StereoRig, rectified_camera
@@ -23,7 +23,6 @@ from vio.records import (
     Image,
     ImuRecord,
     IntArray,
-    MotionSample,
     MotionSource,
     Observations,
     Recording,
@@ -266,15 +265,9 @@ class SimulatedRecording:
         """
         recording = self.recording
         chosen = frame_range(recording, start, stop)
-        times_ns = recording.frame_times_ns
-        frames = (self.frame(k) if images else StereoFrame(k, int(times_ns[k]), None, None) for k in chosen)
-        return merge_events(recording, chosen, self._motion_samples(), frames)
-
-    def _motion_samples(self) -> MotionSamples[MotionSample]:
-        """All samples in time order."""
-        simulation = self.simulation
-        inertial = () if simulation.imu is None else imu_samples(simulation.imu)
-        return in_time_order(simulation.velocity, inertial)
+        frames = (self.frame(k) for k in chosen) if images else blank_frames(recording, chosen)
+        inertial = () if self.simulation.imu is None else imu_samples(self.simulation.imu)
+        return merge_events(recording, chosen, in_time_order(self.simulation.velocity, inertial), frames)
 
     def observations(self, index: int) -> Observations | None:
         """Return None: a simulated recording holds images."""
@@ -357,7 +350,9 @@ class SimulatedRecording:
         u, v = np.linspace(0, width - 1, width // step_px + 2), np.linspace(0, height - 1, height // step_px + 2)
         grid = np.stack(np.meshgrid(u, v), axis=-1)
         there, _ = correspondence(self.simulation.world, view, other, grid.reshape(-1, 2))
-        return _dense(there.reshape(grid.shape) - grid, width, height)
+        # Bilinear between the nodes, of which the outer ones are at the image's outer pixels.
+        shift, down, across = there.reshape(grid.shape) - grid, _weights(len(v), height), _weights(len(u), width)
+        return np.stack([down @ shift[..., k] @ across.T for k in (0, 1)], axis=-1)
 
     def depth(self, camera: int, time_ns: int) -> tuple[FloatArray, IntArray]:
         """Exact depth (H, W) in metres and the surface (H, W) seen by one camera at a true time."""
@@ -373,12 +368,6 @@ class SimulatedRecording:
         state, biases = motion_at(self.simulation.motion, time_ns), true_biases(self.simulation.imu, time_ns)
         gyro, accel = (None, None) if biases is None else (biases[:3], biases[3:])
         return TrueState(time_ns, state.T_world_imu[0], state.velocity_world[0], state.angular_velocity[0], gyro, accel)
-
-
-def _dense(grid: FloatArray, width: int, height: int) -> FloatArray:
-    """Bilinear interpolation of a grid (R, C, 2) whose outer rows and columns are at the image's outer pixels."""
-    down, across = _weights(grid.shape[0], height), _weights(grid.shape[1], width)
-    return np.stack([down @ grid[..., k] @ across.T for k in (0, 1)], axis=-1)
 
 
 @functools.lru_cache(maxsize=8)
