@@ -119,12 +119,14 @@ def build_mesh(
         DataError: the images are not available, or show no surface.
     """
     images, voxel_m, done = made_from.images, made_from.voxel_m, 0
-    depth_of = _DepthOf(images.camera)
+    matcher: StereoMatcher | None = None
     with VoxelGrid(voxel_m, most_blocks=most_blocks) as grid:
         found = images.frames(made_from.frames, source, colour=True)
         for frame, T_world_cam0 in zip(found, made_from.T_world_cam0, strict=True):
             assert frame.left is not None
-            grid.fuse(depth_of(frame), frame.left, images.camera, T_world_cam0, made_from.far_m)
+            if frame.depth is None and matcher is None:
+                matcher = StereoMatcher(images.camera, frame.left.shape[1])
+            grid.fuse(_depth_of(frame, matcher), frame.left, images.camera, T_world_cam0, made_from.far_m)
             done += 1
             progress(done, len(made_from.frames))
             if stop():
@@ -143,21 +145,14 @@ def build_mesh(
     return DenseMap(mesh, occupancy_grid(mesh, R, voxel_m), picture, R, done, blocks)
 
 
-class _DepthOf:
-    """Depth of frames: that of the pair, or of the depth image."""
-
-    def __init__(self, camera: StereoCamera) -> None:
-        self._camera = camera
-        self._matcher: StereoMatcher | None = None
-
-    def __call__(self, frame: StereoFrame) -> DepthImage:
-        if frame.depth is not None:
-            return frame.depth.astype(np.float32)
-        assert frame.left is not None
-        assert frame.right is not None
-        if self._matcher is None:
-            self._matcher = StereoMatcher(self._camera, frame.left.shape[1])
-        return self._matcher.depth(_gray(frame.left), _gray(frame.right))
+def _depth_of(frame: StereoFrame, matcher: StereoMatcher | None) -> DepthImage:
+    """Return the depth of a frame: that of the depth image, or of the pair."""
+    if frame.depth is not None:
+        return frame.depth.astype(np.float32)
+    assert frame.left is not None
+    assert frame.right is not None
+    assert matcher is not None
+    return matcher.depth(_gray(frame.left), _gray(frame.right))
 
 
 def _gray(image: Image) -> Image:

@@ -137,8 +137,9 @@ def _cameras(
     pairs = []
     for a, b in _SIDES:
         for left in images:
-            right = by_name.get(_replaced_last(left.name, a, b))
-            if a in left.name and right is not None and right != left and right.kind == left.kind:
+            head, found, tail = left.name.rpartition(a)
+            right = by_name.get(f"{head}{b}{tail}") if found else None
+            if right is not None and right != left and right.kind == left.kind:
                 pairs.append((left, right))
         if pairs:
             break
@@ -162,11 +163,6 @@ def _one_camera(images: Sequence[Topic]) -> tuple[Topic | None, list[str]]:
     most = max(t.count for t in images)
     best = min((t for t in images if t.count > _WHOLE * most), key=_rank)
     return best, [t.name for t in images if t != best]
-
-
-def _replaced_last(name: str, a: str, b: str) -> str:
-    head, found, tail = name.rpartition(a)
-    return f"{head}{b}{tail}" if found else name
 
 
 def _rank(topic: Topic) -> tuple[int, int, int]:

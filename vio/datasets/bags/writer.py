@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
-from vio.datasets.bags.store import MISSING
-from vio.errors import DataError, MissingDependencyError
+from vio.datasets.bags.store import ros2_types
+from vio.errors import DataError
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
 from vio.geometry.stereo import StereoCamera
 from vio.records import NS_PER_S, Image, ImuSample, Trajectory, VelocitySample
@@ -45,10 +45,7 @@ class BagWriter:
     """
 
     def __init__(self, writer: Writer | MessageSink, latched: Sequence[str] = ()) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self._writer = writer
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._writer, self._store = writer, ros2_types()
         self._connections: dict[str, Any] = {}
         self._latched = (*_LATCHED, *latched)
 
@@ -214,11 +211,10 @@ def bag_writer(folder: Path, storage: Storage, *, latched: Sequence[str] = ()) -
         MissingDependencyError: rosbags is not installed.
         DataError: the storage cannot be written.
     """
-    try:
-        import apsw
-        from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
-    except ImportError as error:
-        raise MissingDependencyError(MISSING.format("writing")) from error
+    ros2_types()  # raises where rosbags is not installed
+    import apsw
+    from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     inner = folder / _NAME  # the library makes a folder of its own, which names the file
     try:

@@ -187,7 +187,14 @@ def kalibr_text(rig: Rig) -> str:
 
 
 def _camera_sheet(camera: CameraModel) -> dict[str, Any]:
-    kind, bend, leading, coefficients = _kalibr_names(camera)
+    """Return a camera's entries; the parameters of the sphere models are before the focal lengths."""
+    kind, bend = "pinhole", "none" if camera.model == "pinhole" else camera.model
+    leading, coefficients = list[float](), camera.coefficients
+    if camera.model == "double_sphere":
+        kind, bend, leading, coefficients = "ds", "none", [float(x) for x in coefficients], ()
+    elif camera.model == "unified":
+        kind, bend, leading = "omni", "radtan" if len(coefficients) > 1 else "none", [float(coefficients[0])]
+        coefficients = coefficients[1:]
     return {
         "camera_model": kind,
         "distortion_model": bend,
@@ -195,13 +202,3 @@ def _camera_sheet(camera: CameraModel) -> dict[str, Any]:
         "intrinsics": [*leading, camera.fu, camera.fv, camera.cu, camera.cv],
         "resolution": [camera.width, camera.height],
     }
-
-
-def _kalibr_names(camera: CameraModel) -> tuple[str, str, list[float], tuple[float, ...]]:
-    """Kalibr's names of projection and distortion, the parameters before the focal lengths, and the coefficients."""
-    c = camera.coefficients
-    if camera.model == "double_sphere":
-        return "ds", "none", [float(x) for x in c], ()
-    if camera.model == "unified":
-        return "omni", "radtan" if len(c) > 1 else "none", [float(c[0])], c[1:]
-    return "pinhole", "none" if camera.model == "pinhole" else camera.model, [], c

@@ -52,10 +52,6 @@ _MODELS: dict[str, DistortionModel] = {
 _TOO_WIDE_M = 5.0  # a longer baseline is taken for millimetres, or squares of the board, and said
 
 
-class CoefficientsError(CalibrationError):
-    """Distortion coefficients beyond those of the models here."""
-
-
 def is_opencv(entries: Entries) -> bool:
     """Return whether entries hold matrices of a stereo calibration, raw or rectified."""
     return all(_find(entries, key) is not None for key in ("K0", "K1")) or _is_rectified(entries)
@@ -166,14 +162,12 @@ def trimmed_coefficients(D: Sequence[float]) -> tuple[float, ...]:
     """Return OpenCV's `k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 .. s4 [tx ty]]]]` without the part that is zero.
 
     Raises:
-        CoefficientsError: thin-prism or tilt terms are used, or the count is none of OpenCV's.
+        CalibrationError: thin-prism or tilt terms are used, or the count is none of OpenCV's.
     """
     if len(D) not in (0, 4, 5, 8, 12, 14):
-        raise CoefficientsError(f"{len(D)} distortion coefficients; OpenCV has 4, 5, 8, 12 or 14")
+        raise CalibrationError(f"{len(D)} distortion coefficients; OpenCV has 4, 5, 8, 12 or 14")
     if any(D[8:]):
-        raise CoefficientsError(
-            "thin-prism or tilt coefficients are not read; calibrate without CALIB_THIN_PRISM_MODEL"
-        )
+        raise CalibrationError("thin-prism or tilt coefficients are not read; calibrate without CALIB_THIN_PRISM_MODEL")
     kept = D[:8] if any(D[5:8]) else D[:5]
     return tuple(float(d) for d in kept)
 
