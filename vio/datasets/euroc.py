@@ -11,7 +11,6 @@ Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,31 +23,24 @@ from vio.datasets.companions import check_overlap
 from vio.datasets.euroc_files import (
     STATE_CSV,
     TUM_FILE,
-    camera_yaml,
-    image_list_csv,
-    image_name,
-    median_rate_hz,
     read_camera_yaml,
     read_imu_csv,
     read_imu_yaml,
-    rig_read_as,
     stamped_rows,
 )
 from vio.datasets.frame_times import PAIRED_NS, pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImageSize, full_scale
 from vio.datasets.images import list_images
-from vio.datasets.rectified import RectifiedDataset, write_frames
+from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.samples import MotionSamples, imu_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
-from vio.files.text import write_text
 from vio.files.trajectories import read_trajectory
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.protocols import Progress
-from vio.records import ImuDensities, ImuSample, IntArray, MotionSource, Recording, StereoFrame, Trajectory
+from vio.records import ImuDensities, ImuSample, IntArray, MotionSource, Recording, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +78,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         DataError: files are missing, lists and clocks are wrong, or no images match; the message names the remedy.
         CalibrationError: a `sensor.yaml` is missing or invalid.
     """
-    mav = _mav(path)
+    mav = euroc_base(path)
     left, right = (_read_camera(mav / name) for name in ("cam0", "cam1"))
     imu = _read_imu(mav / "imu0")
     T_imu_body = se3_inverse(imu.T_body_imu)
@@ -132,7 +124,8 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     )
 
 
-def _mav(path: Path) -> Path:
+def euroc_base(path: Path) -> Path:
+    """Return the folder of an EuRoC recording that holds cam0 and cam1."""
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     missing = [name for name in ("cam0", "cam1") if not (mav / name).is_dir()]
     if missing:
@@ -231,51 +224,3 @@ def _read_reference(file: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) 
     if truth.body == "cam0":
         return truth.in_imu(se3_inverse(T_imu_cam0))
     return replace(truth, T_world_body=truth.T_world_body @ T_body_imu)
-
-
-# --- writing --------------------------------------------------------------------------------------------------------
-
-
-def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progress) -> int:
-    """Write a recording as an EuRoC folder of rectified images; the IMU and the ground truth are copied as they are.
-
-    Returns:
-        The number of frames written.
-
-    Raises:
-        DataError: too many images are unreadable, or a file cannot be copied.
-    """
-    source, mav = _mav(dataset.recording.path), out / "mav0"
-    rig = rig_read_as(dataset.recording.camera, dataset.rectifier.T_rect0_imu)
-    imu_yaml_path = source / "imu0" / "sensor.yaml"
-    T_body_imu = read_imu_yaml(imu_yaml_path)[0] if imu_yaml_path.is_file() else np.eye(4)
-    folders = [mav / name for name in ("cam0", "cam1")]
-    for folder in folders:
-        (folder / "data").mkdir(parents=True)
-
-    last_ns = int(dataset.recording.frame_times_ns[-1])
-
-    def name(frame: StereoFrame, count: int) -> tuple[Path, Path]:
-        file = image_name(frame.time_ns, last_ns)
-        return folders[0] / "data" / file, folders[1] / "data" / file
-
-    times_ns = write_frames(dataset, name, progress)
-    for folder, model, T_imu_cam in zip(folders, (rig.cam0, rig.cam1), (rig.T_imu_cam0, rig.T_imu_cam1), strict=True):
-        comment, rate_hz = f"rectified {folder.name}", median_rate_hz(times_ns)
-        write_text(folder / "sensor.yaml", camera_yaml(model, T_body_imu @ T_imu_cam, comment=comment, rate_hz=rate_hz))
-        write_text(folder / "data.csv", image_list_csv(times_ns, last_ns))
-    for part in (Path("imu0", "sensor.yaml"), Path("imu0", "data.csv"), STATE_CSV):
-        _copy(source / part, mav / part)
-    _copy(source.absolute().parent / TUM_FILE, out / TUM_FILE)
-    return len(times_ns)
-
-
-def _copy(source: Path, target: Path) -> None:
-    """Copy a file if it exists."""
-    if not source.is_file():
-        return
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        shutil.copyfile(source, target)
-    except shutil.SameFileError as error:
-        raise DataError(f"{source}: cannot be copied onto itself; choose another folder") from error

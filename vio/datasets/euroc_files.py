@@ -19,7 +19,7 @@ import numpy as np
 from vio.datasets.common import check_gravity_column, image_size, naming
 from vio.datasets.yaml_files import as_number, densities_text, imu_densities, numbers, read_yaml_file
 from vio.errors import CalibrationError, DataError
-from vio.files.text import INT64_MAX, check_increasing, exact_text, lines_of
+from vio.files.text import INT64_MAX, check_increasing, exact_text, lines_of, write_text
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair, rig_from_rectified
 from vio.geometry.lie import FloatArray, checked_transform, quat_xyzw_from_rotation, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
@@ -173,6 +173,26 @@ def _neighbours(t: FloatArray) -> list[FloatArray]:
     return [t + np.array(step) * np.spacing(np.abs(t)) for step in steps]
 
 
+def write_cameras(
+    mav: Path, rig: StereoRig, times_ns: IntArray, last_ns: int, *, kind: str, T_body_imu: FloatArray | None = None
+) -> None:
+    """Write `sensor.yaml` and `data.csv` of both cameras.
+
+    Args:
+        mav: the folder of `cam0` and `cam1`, which exist.
+        rig: the cameras.
+        times_ns: (N,) of their images.
+        last_ns: by whose digits images are named.
+        kind: of the images, for comments.
+        T_body_imu: (4, 4); None: the body is the IMU.
+    """
+    for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
+        T = T_imu_cam if T_body_imu is None else T_body_imu @ T_imu_cam
+        text = camera_yaml(camera, T, comment=f"{kind} {name}", rate_hz=median_rate_hz(times_ns))
+        write_text(mav / name / "sensor.yaml", text)
+        write_text(mav / name / "data.csv", image_list_csv(times_ns, last_ns))
+
+
 # --- data.csv -------------------------------------------------------------------------------------------------------
 
 
@@ -181,9 +201,8 @@ def image_name(time_ns: int, last_ns: int) -> str:
     return f"{time_ns:0{len(str(last_ns))}d}.png"
 
 
-def image_list_csv(times_ns: IntArray, last_ns: int | None = None) -> str:
+def image_list_csv(times_ns: IntArray, last_ns: int) -> str:
     """The text of a camera's `data.csv` for images named by their times (N,) and the last one, nanoseconds."""
-    last_ns = int(times_ns[-1]) if last_ns is None else last_ns
     return "\n".join([_IMAGES_HEADER, *(f"{t},{image_name(t, last_ns)}" for t in times_ns.tolist())]) + "\n"
 
 

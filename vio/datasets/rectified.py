@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from vio.cameras.rig import Rectifier
 from vio.datasets.image_pairs import ImageDataset
-from vio.datasets.images import UnreadableImageError, load_depth, write_png
+from vio.datasets.images import UnreadableImageError, load_depth
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
-from vio.protocols import Progress
-from vio.records import Image, ImuDensities, IntArray, StereoFrame
+from vio.records import Image, ImuDensities, StereoFrame
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,29 +51,3 @@ def check_not_rectified(dataset: RectifiedDataset) -> None:
             f"{dataset.recording.path} is rectified already (equal pinhole cameras, rows aligned): there is nothing to "
             "do; use it as it is"
         )
-
-
-def write_frames(
-    dataset: RectifiedDataset, name: Callable[[StereoFrame, int], tuple[Path, Path]], progress: Progress
-) -> IntArray:
-    """Write every readable frame as two PNG files; return the times (N,) of those written.
-
-    Args:
-        dataset: the recording to rectify.
-        name: the two files of a frame, given the frame and how many were written before it; folders must exist.
-        progress: called after each frame.
-
-    Raises:
-        DataError: too many images are unreadable, or one has the wrong size.
-    """
-    times: list[int] = []
-    for frame in (event for event in dataset.events() if isinstance(event, StereoFrame)):
-        assert frame.left is not None
-        assert frame.right is not None
-        for path, image in zip(name(frame, len(times)), (frame.left, frame.right), strict=True):
-            write_png(path, image)
-        times.append(frame.time_ns)
-        progress(len(times), len(dataset.recording.frame_times_ns))
-    if not times:
-        raise DataError(f"{dataset.recording.path}: no frame could be read; see the warnings above")
-    return np.array(times, dtype=np.int64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,18 +13,21 @@ import numpy as np
 
 from vio.cameras.rig import rig_of_rectified
 from vio.datasets.bags.writer import BagWriter, Storage, bag_writer
-from vio.datasets.euroc_files import TUM_FILE as EUROC_TUM
+from vio.datasets.euroc import euroc_base
 from vio.datasets.euroc_files import (
-    camera_yaml,
-    image_list_csv,
+    STATE_CSV,
     image_name,
     imu_csv,
     imu_yaml,
     median_rate_hz,
+    read_imu_yaml,
     rig_read_as,
+    write_cameras,
 )
+from vio.datasets.euroc_files import TUM_FILE as EUROC_TUM
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
+from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.samples import motion_samples
 from vio.datasets.yaml_files import densities_text
@@ -102,6 +106,36 @@ def convert(
     return Converted(len(written.times_ns), len(written.imu), len(written.velocities), tuple(lacking))
 
 
+def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progress) -> int:
+    """Write an EuRoC recording as a folder of rectified images; the IMU and the ground truth are copied as they are.
+
+    Returns:
+        The number of frames written.
+
+    Raises:
+        DataError: too many images are unreadable, or a file cannot be copied.
+    """
+    source, mav = euroc_base(dataset.recording.path), out / "mav0"
+    rig = rig_read_as(dataset.recording.camera, dataset.rectifier.T_rect0_imu)
+    sensor = source / "imu0" / "sensor.yaml"
+    T_body_imu = read_imu_yaml(sensor)[0] if sensor.is_file() else np.eye(4)
+    written = _write_images(dataset, out, "euroc", 0, None, progress)
+    _check_frames(len(written.times_ns), dataset.recording)
+    times = np.array(written.times_ns, dtype=np.int64)
+    write_cameras(mav, rig, times, written.last_ns, kind="rectified", T_body_imu=T_body_imu)
+    copied = [
+        (source / part, mav / part) for part in (Path("imu0", "sensor.yaml"), Path("imu0", "data.csv"), STATE_CSV)
+    ]
+    for file, target in (*copied, (source.absolute().parent / EUROC_TUM, out / EUROC_TUM)):
+        if file.is_file():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                shutil.copyfile(file, target)
+            except shutil.SameFileError as error:
+                raise DataError(f"{file}: cannot be copied onto itself; choose another folder") from error
+    return len(times)
+
+
 def _frames_in(dataset: Dataset, start: int, stop: int | None) -> int:
     count = len(dataset.recording.frame_times_ns)
     return (count if stop is None else min(stop, count)) - start
@@ -141,12 +175,8 @@ def _write_images(
 
 def _finish_euroc(out: Path, recording: Recording, written: _Written, noise: ImuDensities | None) -> list[str]:
     times = np.array(written.times_ns, dtype=np.int64)
-    T_cam0_imu = recording.T_cam0_body
-    rig, mav = rig_read_as(recording.camera, T_cam0_imu), out / "mav0"
-    for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
-        text = camera_yaml(camera, T_imu_cam, comment=f"rectified {name}", rate_hz=median_rate_hz(times))
-        write_text(mav / name / "sensor.yaml", text)
-        write_text(mav / name / "data.csv", image_list_csv(times, written.last_ns))
+    rig, mav = rig_read_as(recording.camera, recording.T_cam0_body), out / "mav0"
+    write_cameras(mav, rig, times, written.last_ns, kind="rectified")
     notes = []
     if written.imu:
         samples = motion_samples(written.imu)

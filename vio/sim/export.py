@@ -13,13 +13,12 @@ import numpy as np
 from vio.cameras.rig import Rig
 from vio.datasets.euroc_files import (
     STATE_CSV,
-    camera_yaml,
-    image_list_csv,
     image_name,
     imu_csv,
     imu_yaml,
     median_rate_hz,
     state_csv,
+    write_cameras,
 )
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
@@ -63,15 +62,13 @@ def export_euroc(
     record = simulation.imu
     if record is None:
         raise SimulationError("an EuRoC folder needs an IMU; simulate with imu=ImuNoise() or with a recorded one")
-    rig, stamps = simulation.calibration, simulation.stamps_ns
+    stamps = simulation.stamps_ns
     origin = "recorded" if record.gyro_bias is None else "simulated"
     with atomic_folder(out, replace=replace, marker=MARKER) as folder:
         mav = folder / "mav0"
-        for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
+        for name in ("cam0", "cam1"):
             (mav / name / "data").mkdir(parents=True)
-            calibration = camera_yaml(camera, T_imu_cam, comment=f"simulated {name}", rate_hz=median_rate_hz(stamps))
-            write_text(mav / name / "sensor.yaml", calibration)
-            write_text(mav / name / "data.csv", image_list_csv(stamps))
+        write_cameras(mav, simulation.calibration, stamps, int(stamps[-1]), kind="simulated")
         for name, text in (("imu0", imu_csv(record)), (STATE_CSV.parent.name, _truth_csv(recording))):
             (mav / name).mkdir()
             write_text(mav / name / "data.csv", text)
