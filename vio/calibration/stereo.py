@@ -170,8 +170,7 @@ def _bends(rays: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _angles(rays: FloatArray) -> FloatArray:
     """Return angles (N, 2) off the optical axis along x and y, radians, of unit rays (N, 3)."""
     radius = np.linalg.norm(rays[:, :2], axis=1, keepdims=True)
-    out: FloatArray = rays[:, :2] / np.maximum(radius, 1e-12) * np.arctan2(radius, rays[:, 2:])
-    return out
+    return rays[:, :2] / np.maximum(radius, 1e-12) * np.arctan2(radius, rays[:, 2:])
 
 
 def _bent(rays: FloatArray, bend: FloatArray) -> FloatArray:
@@ -210,8 +209,7 @@ def _fit_stereo(matches: RayMatches, R: FloatArray, d: FloatArray, spread: float
 
 def _tangents(d: FloatArray) -> FloatArray:
     """Return two unit vectors (3, 2) perpendicular to a direction and to each other."""
-    out: FloatArray = np.linalg.svd(d[None, :])[2][1:].T
-    return out
+    return np.linalg.svd(d[None, :])[2][1:].T
 
 
 def _blocks(labels: IntArray) -> list[BoolArray]:

@@ -90,8 +90,7 @@ class DisplacementField:
 
     def at(self, z: FloatArray) -> FloatArray:
         """Return how far pixels `[ul vl ur vr]` (N, 4) are off, (N, 4) pixels."""
-        out: FloatArray = error_basis(self.camera, z) @ self.coefficients
-        return out
+        return error_basis(self.camera, z) @ self.coefficients
 
     def without(self, z: FloatArray, has_right: BoolArray) -> FloatArray:
         """Return pixels (N, 4) without the field; right pixels stay as they are where `has_right` (N,) is False."""
@@ -104,8 +103,7 @@ class DisplacementField:
         if self.covariance is None:
             return np.zeros((*z.shape, TERMS))
         variances, V = np.linalg.eigh(self.covariance)
-        out: FloatArray = error_basis(self.camera, z) @ (V * np.sqrt(np.maximum(variances, 0.0)))
-        return out
+        return error_basis(self.camera, z) @ (V * np.sqrt(np.maximum(variances, 0.0)))
 
     def maps(self) -> tuple[tuple[MapArray, MapArray], tuple[MapArray, MapArray]]:
         """Return where each pixel of the left and right images without the field lies in the images as they are.

@@ -230,8 +230,7 @@ def judge_velocity_lever_arm(
 
 
 def _unit(v: FloatArray) -> FloatArray:
-    out: FloatArray = v / np.linalg.norm(v)
-    return out
+    return v / np.linalg.norm(v)
 
 
 def _between_deg(a: FloatArray, b: FloatArray) -> float:

@@ -84,8 +84,7 @@ class Rectifier:
             return depth_m
         u, v = (np.rint(m).astype(np.int64) for m in self.maps[0])
         inside = (u >= 0) & (v >= 0) & (u < depth_m.shape[1]) & (v < depth_m.shape[0])
-        out: FloatArray = np.where(inside, depth_m[np.where(inside, v, 0), np.where(inside, u, 0)], 0.0)
-        return out
+        return np.where(inside, depth_m[np.where(inside, v, 0), np.where(inside, u, 0)], 0.0)
 
     def frame(
         self, index: int, time_ns: int, left: Image, right: Image | None = None, *, depth_m: FloatArray | None = None

@@ -103,8 +103,7 @@ class StereoRig:
     @property
     def T_cam0_cam1(self) -> FloatArray:
         """Pose (4, 4) of the right camera in the left one; its translation is the baseline."""
-        out: FloatArray = se3_inverse(self.T_imu_cam0) @ self.T_imu_cam1
-        return out
+        return se3_inverse(self.T_imu_cam0) @ self.T_imu_cam1
 
 
 def rectified_pair(rig: StereoRig) -> StereoCamera | None:

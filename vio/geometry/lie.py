@@ -151,8 +151,7 @@ def so3_log(R: npt.ArrayLike) -> FloatArray:
     s = np.linalg.norm(vector, axis=-1)
     small = s < 1e-7
     angle_over_s = np.where(small, 2.0, 2 * np.arctan2(s, w) / np.where(small, 1.0, s))
-    out: FloatArray = angle_over_s[..., None] * vector
-    return out
+    return angle_over_s[..., None] * vector
 
 
 def so3_left_jacobian(phi: npt.ArrayLike) -> FloatArray:
@@ -277,16 +276,14 @@ def circledot(p: npt.ArrayLike) -> FloatArray:
 def transform_points(T_a_b: npt.ArrayLike, p_b: npt.ArrayLike) -> FloatArray:
     """Map points (N, 3) or (3,) from frame b to frame a with one transform (4, 4)."""
     T_a_b, p_b = np.asarray(T_a_b, dtype=np.float64), np.asarray(p_b, dtype=np.float64)
-    out: FloatArray = p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
-    return out
+    return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def nearest_rotation(R: npt.ArrayLike) -> FloatArray:
     """The rotations (..., 3, 3) closest to given matrices in the Frobenius norm (by SVD)."""
     U, _, Vt = np.linalg.svd(np.asarray(R, dtype=np.float64))
     U[..., :, -1] *= np.sign(np.linalg.det(U @ Vt))[..., None]
-    out: FloatArray = U @ Vt
-    return out
+    return U @ Vt
 
 
 _ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I accepted as rounding

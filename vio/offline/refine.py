@@ -259,8 +259,7 @@ def position_covariances(estimates: Sequence[Estimate], T_cam0_imu: FloatArray) 
     R = np.array([e.T_world_imu[:3, :3] for e in estimates])
     P = np.array([e.covariance for e in estimates])
     J = R @ p_D_xi
-    out: FloatArray = J @ P @ np.swapaxes(J, 1, 2) + _LEAST_SIGMA_M**2 * np.eye(3)
-    return out
+    return J @ P @ np.swapaxes(J, 1, 2) + _LEAST_SIGMA_M**2 * np.eye(3)
 
 
 def position_difference_m(one: Trajectory, other: Trajectory) -> float:

@@ -96,8 +96,7 @@ def _weights(u: FloatArray, derivative: int) -> FloatArray:
     powers = np.zeros((len(u), _K))
     for n in range(derivative, _K):
         powers[:, n] = factorial(n) / factorial(n - derivative) * u ** (n - derivative)
-    out: FloatArray = powers @ _blending().T
-    return out
+    return powers @ _blending().T
 
 
 def _locate(spline: MotionSpline, times_ns: npt.ArrayLike) -> tuple[IntArray, IntArray, FloatArray]:
@@ -331,8 +330,7 @@ def _smooth_periodic(values: FloatArray, width: float) -> FloatArray:
     n = max(3, int(width) | 1)
     kernel = np.hanning(n + 2)[1:-1]
     padded = np.concatenate([values[-n:], values, values[:n]])
-    out: FloatArray = np.convolve(padded, kernel / kernel.sum(), mode="same")[n:-n]
-    return out
+    return np.convolve(padded, kernel / kernel.sum(), mode="same")[n:-n]
 
 
 def _limit_acceleration(speed: FloatArray, step: float) -> FloatArray:

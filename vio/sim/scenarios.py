@@ -296,8 +296,7 @@ def _walk(duration_s: float, seed: int) -> MotionSpline:
 
 def _regular(start_ns: int, duration_s: float, rate_hz: float, *, first: int = 0) -> IntArray:
     count = max(1, int(duration_s * rate_hz + 1e-6))
-    times: IntArray = start_ns + np.round(np.arange(first, first + count) * (NS_PER_S / rate_hz)).astype(np.int64)
-    return times
+    return start_ns + np.round(np.arange(first, first + count) * (NS_PER_S / rate_hz)).astype(np.int64)
 
 
 # --- scenes ---------------------------------------------------------------------------------------------------------
