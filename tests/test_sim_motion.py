@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from vio.datasets.euroc_files import read_imu_csv
-from vio.errors import DataError
+from vio.errors import DataError, SimulationError
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log
-from vio.sim.errors import SimulationError
 from vio.sim.imu import (
     GRAVITY_MPS2,
     GRAVITY_WORLD,

@@ -71,10 +71,6 @@ class CameraModel:
                 f"the {self.model} model takes {expected[0]} distortion coefficients"
                 f"{''.join(f' or {n}' for n in expected[1:])}, got {len(self.coefficients)}"
             )
-        self._check_spheres()
-
-    def _check_spheres(self) -> None:
-        """Raise CalibrationError unless the sphere models' parameters are in their range."""
         if self.model == "unified" and self.coefficients[0] < 0:
             raise CalibrationError(f"the unified model's xi must not be negative, got {self.coefficients[0]:g}")
         if self.model == "double_sphere":

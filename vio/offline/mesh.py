@@ -16,12 +16,12 @@ from vio.dense.stereo_depth import DepthImage, StereoMatcher, depth_sigma_m, far
 from vio.dense.surface import Mesh, extract_surface
 from vio.dense.voxel_grid import TRUNCATION, VoxelGrid
 from vio.errors import DataError
-from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera
 from vio.geometry.upright import up_in, upright_axes
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import MapStore
+from vio.offline.keyframes import after_motion
 from vio.offline.run_images import RunImages, run_images
 from vio.records import Image, IntArray, StereoFrame, Trajectory
 from vio.runs.finished import point_positions, up_of_odometry
@@ -90,7 +90,7 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
     T = trajectory.in_cam0(T_cam0_imu).T_world_body if map_file is None else _poses_in_map(map_file, by_odometry)
     depth_m = _landmark_depth_m(folder, T_odom, None if voxel_m is None else voxel_m / _VOXEL_SHARE)
     voxel_m = _voxel_m(images.camera, depth_m) if voxel_m is None else voxel_m
-    chosen = _spread(T, _STEP_SHARE * depth_m)
+    chosen = np.array(after_motion(T, _STEP_SHARE * depth_m, _STEP_DEG), dtype=np.int64)
     up = up_of_odometry(folder, metrics)
     if up is not None:
         up = up_in(T, T_odom, up)
@@ -198,17 +198,6 @@ def _voxel_m(camera: StereoCamera, depth_m: float) -> float:
     length_m = max(_VOXEL_SHARE * depth_m, depth_sigma_m(camera, 2 * depth_m) / _SIGMA_VOXELS)
     power = 10.0 ** np.floor(np.log10(length_m))
     return float(power * max(m for m in (1, 2, 5) if m * power <= length_m * (1 + 1e-9)))
-
-
-def _spread(T: FloatArray, step_m: float) -> IntArray:
-    """Return the rows of poses (N, 4, 4) after enough motion or turn."""
-    chosen = [0]
-    for k in range(1, len(T)):
-        last = T[chosen[-1]]
-        moved = float(np.linalg.norm(T[k, :3, 3] - last[:3, 3]))
-        if moved >= step_m or float(rotation_angle_deg(last[:3, :3].T @ T[k, :3, :3])) >= _STEP_DEG:
-            chosen.append(k)
-    return np.array(chosen, dtype=np.int64)
 
 
 def facts_of(made_from: MeshSource, done: DenseMap) -> dict[str, Any]:

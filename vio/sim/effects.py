@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.errors import SimulationError
 from vio.geometry.lie import FloatArray
 from vio.records import Image
 from vio.setting import setting
-from vio.sim.errors import SimulationError
 from vio.sim.render import Radiance
 
 _FULL_SCALE = 255.0

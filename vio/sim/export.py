@@ -23,15 +23,14 @@ from vio.datasets.euroc_files import (
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.datasets.rigs.kalibr import kalibr_text
-from vio.errors import CalibrationError
+from vio.errors import SimulationError
 from vio.files.atomic import atomic_folder
 from vio.files.text import exact_text, seconds_text, write_text
 from vio.files.trajectories import in_first_cam0, write_tum
-from vio.geometry.distortion import StereoRig, rectified_camera
+from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.protocols import Progress
 from vio.records import ImuDensities
-from vio.sim.errors import SimulationError
 from vio.sim.imu import ADIS16448, sample_times
 from vio.sim.motion import motion_at
 from vio.sim.sequence import SimulatedRecording, true_biases
@@ -93,10 +92,7 @@ def export_kitti(
         VioError: `out` exists and may not be replaced, or cannot be written.
     """
     simulation = recording.simulation
-    try:
-        camera = rectified_camera(simulation.calibration)
-    except CalibrationError as error:
-        raise SimulationError("a KITTI folder needs a rectified rig; export this one as an EuRoC folder") from error
+    camera = simulation.rectified_camera("a KITTI folder needs a rectified rig; export this one as an EuRoC folder")
     stamps = simulation.stamps_ns
     T_cam0_imu = se3_inverse(simulation.calibration.T_imu_cam0)
     poses = in_first_cam0(recording.reference, T_cam0_imu).T_world_body

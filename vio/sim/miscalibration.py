@@ -6,10 +6,10 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
+from vio.errors import SimulationError
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.setting import setting
-from vio.sim.errors import SimulationError
 
 
 @dataclass(frozen=True, slots=True)

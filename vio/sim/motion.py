@@ -18,12 +18,11 @@ import numpy.typing as npt
 import scipy.sparse
 import scipy.sparse.linalg
 
-from vio.errors import DataError
+from vio.errors import DataError, SimulationError
 from vio.files.text import check_increasing
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log
 from vio.records import BoolArray, IntArray
-from vio.sim.errors import SimulationError
 
 logger = logging.getLogger(__name__)
 

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.errors import SimulationError
 from vio.geometry.distortion import CameraModel, DistortionModel, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.records import BoolArray, IntArray
-from vio.sim.errors import SimulationError
 from vio.sim.textures import LEVELS_PER_OCTAVE, MipTexture
 from vio.sim.world import Surfaces, World, surfaces_at
 

@@ -17,14 +17,13 @@ import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from vio.errors import DataError
+from vio.errors import DataError, SimulationError
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts
 from vio.protocols import Progress
 from vio.records import NS_PER_S, Image, ImuRecord, IntArray
 from vio.setting import setting
 from vio.sim.effects import CLEAN, SensorEffects
-from vio.sim.errors import SimulationError
 from vio.sim.export import export_kitti
 from vio.sim.imu import ImuNoise, VelocityNoise
 from vio.sim.miscalibration import CalibrationErrors, CalibrationSigmas

@@ -14,10 +14,11 @@ import numpy.typing as npt
 from vio.datasets.common import blank_frames, frame_range, merge_events
 from vio.datasets.euroc_files import read_imu_csv, stamped_rows
 from vio.datasets.samples import imu_samples, in_time_order
-from vio.errors import CalibrationError, DataError
+from vio.errors import DataError, SimulationError
 from vio.files.text import check_increasing
-from vio.geometry.distortion import StereoRig, rectified_camera
+from vio.geometry.distortion import StereoRig, rectified_pair
 from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.stereo import StereoCamera
 from vio.records import (
     Event,
     Image,
@@ -31,7 +32,6 @@ from vio.records import (
     VelocitySample,
 )
 from vio.sim.effects import Exposure, SensorEffects, apply_effects, average_exposures, blur_along_flow
-from vio.sim.errors import SimulationError
 from vio.sim.exposure import ExposurePlan, plan_exposures
 from vio.sim.glare import glare
 from vio.sim.imu import ImuNoise, VelocityNoise, simulate_imu, simulate_velocity
@@ -73,6 +73,12 @@ class Simulation:
     seed: int
     calibration: StereoRig  # as calibrated, which is what is written and read; `rig` is the true one
     exposures: ExposurePlan | None = None  # of exposure control; None: it is off
+
+    def rectified_camera(self, why_not: str) -> StereoCamera:
+        """Return the rectified pair as calibrated; raise SimulationError, which says `why_not`, where it is none."""
+        if (camera := rectified_pair(self.calibration)) is None:
+            raise SimulationError(why_not)
+        return camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,18 +208,15 @@ class SimulatedRecording:
     def __init__(self, simulation: Simulation) -> None:
         """Store the plan; frames are rendered on request."""
         self.simulation = simulation
-        self._rays: tuple[CameraRays, CameraRays] | None = None
 
-    @property
+    @functools.cached_property
     def rays(self) -> tuple[CameraRays, CameraRays]:
         """The tabulated rays of both cameras.
 
         Raises:
             SimulationError: the rig's distortion does not reach every pixel.
         """
-        if self._rays is None:
-            self._rays = camera_rays(self.simulation.rig.cam0), camera_rays(self.simulation.rig.cam1)
-        return self._rays
+        return camera_rays(self.simulation.rig.cam0), camera_rays(self.simulation.rig.cam1)
 
     @property
     def recording(self) -> Recording:
@@ -223,13 +226,8 @@ class SimulatedRecording:
             SimulationError: the rig is not rectified.
         """
         simulation = self.simulation
-        try:
-            camera = rectified_camera(simulation.calibration)
-        except CalibrationError as error:
-            raise SimulationError(
-                "an unrectified rig has no rectified recording; export it as an EuRoC folder and read that"
-            ) from error
-        stamps = simulation.stamps_ns
+        why_not = "an unrectified rig has no rectified recording; export it as an EuRoC folder and read that"
+        camera, stamps = simulation.rectified_camera(why_not), simulation.stamps_ns
         motion: set[MotionSource] = set()
         if simulation.imu is not None:
             motion.add("imu")

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.errors import SimulationError
 from vio.geometry.lie import FloatArray
 from vio.records import Image
-from vio.sim.errors import SimulationError
 
 TextureKind: TypeAlias = Literal[
     "wall",

@@ -14,9 +14,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from vio.errors import SimulationError
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.records import IntArray
-from vio.sim.errors import SimulationError
 from vio.sim.lighting import Light, Lighting, illumination, sun, window
 from vio.sim.textures import MipTexture, TextureKind, build_mips, lit, paint
 
@@ -112,20 +112,15 @@ class TextureStore:
         self._lock = threading.Lock()
 
     def __getitem__(self, surface: int) -> MipTexture:
-        found = self._painted.get(surface)
-        if found is None:
-            with self._lock:
-                found = self._painted.get(surface)
-                if found is None:
-                    patch = self._patches[surface]
-                    twin = surface
-                    if patch.twins is not None:
-                        twin = next(k for k, other in enumerate(self._patches) if other.twins == patch.twins)
-                    found = self._painted.get(twin)
-                    if found is None:
-                        found = self._paint(twin)
-                    self._painted[twin] = self._painted[surface] = found
-        return found
+        with self._lock:
+            if surface not in self._painted:
+                twins, twin = self._patches[surface].twins, surface
+                if twins is not None:
+                    twin = next(k for k, other in enumerate(self._patches) if other.twins == twins)
+                if twin not in self._painted:
+                    self._painted[twin] = self._paint(twin)
+                self._painted[surface] = self._painted[twin]
+            return self._painted[surface]
 
     def _paint(self, surface: int) -> MipTexture:
         patch = self._patches[surface]
