@@ -166,12 +166,7 @@ def place_by_map(of: Placed, run: FilePath, file: FilePath, folder: FilePath) ->
 
 
 def _common(run: FilePath, home: dict[tuple[int, int], FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return the poses (K, 4, 4) of a run's keyframes that a map holds, as the run has them and as the map has them.
-
-    Args:
-        run: its folder.
-        home: poses of the map's keyframes by frame and time.
-    """
+    """Return the poses (K, 4, 4) of a run's keyframes that a map, by frame and time, holds: of the run, of the map."""
     keyframes, (_, T_cam0_body) = read_keyframes(run), read_metrics(run)
     keys = list(zip(keyframes.frame.tolist(), keyframes.time_ns.tolist(), strict=True))
     shared = [n for n, key in enumerate(keys) if key in home]
