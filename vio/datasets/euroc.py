@@ -40,7 +40,7 @@ from vio.errors import DataError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.records import ImuDensities, ImuSample, IntArray, MotionSource, Recording, Trajectory
+from vio.records import ImuDensities, ImuSample, IntArray, Recording, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,16 +54,6 @@ class _Camera:
     renamed: int  # number of images whose extension differs from their list
     unlisted: int  # number of images that the list does not name
     missing: int  # number of images at the end of the list that are not there
-
-
-@dataclass(frozen=True, slots=True)
-class _Imu:
-    """The contents of the IMU's folder."""
-
-    T_body_imu: FloatArray  # (4, 4)
-    noise: ImuDensities | None
-    samples: MotionSamples[ImuSample] | tuple[()]
-    notes: tuple[str, ...]
 
 
 def is_euroc_folder(path: Path) -> bool:
@@ -80,16 +70,15 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     """
     mav = euroc_base(path)
     left, right = (_read_camera(mav / name) for name in ("cam0", "cam1"))
-    imu = _read_imu(mav / "imu0")
-    T_imu_body = se3_inverse(imu.T_body_imu)
+    T_body_imu, noise, samples, imu_notes = _read_imu(mav / "imu0")
+    T_imu_body = se3_inverse(T_body_imu)
     rig = StereoRig(left.model, right.model, T_imu_body @ left.T_body_cam, T_imu_body @ right.T_body_cam)
     with naming(mav):
         rectifier = rectifier_of(rig, settings.interpolation, settings.projection)
     of_left, of_right, notes = _pair(left, right, mav)
     times_ns = left.times_ns[of_left]
-    if imu.samples:
-        check_overlap(times_ns, imu.samples.times_ns, mav / "imu0")
-    motion: frozenset[MotionSource] = frozenset({"imu"}) if imu.samples else frozenset()
+    if samples:
+        check_overlap(times_ns, samples.times_ns, mav / "imu0")
     pairs = FilePairs(left.files.take(of_left.tolist()), right.files.take(of_right.tolist()))
     white, depth_notes = full_scale(pairs)
     candidates = (mav / STATE_CSV, mav.absolute().parent / TUM_FILE)
@@ -104,22 +93,22 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         T_cam0_imu=rectifier.T_rect0_imu,
         frame_times_ns=times_ns,
         has_images=True,
-        motion=motion,
-        reference=None if truth is None else _read_reference(truth, imu.T_body_imu, rig.T_imu_cam0),
-        notes=(*notes, *imu.notes, *depth_notes, *rectifier.notes, *unused),
-        motion_notes=imu.notes,
+        motion=frozenset({"imu"}) if samples else frozenset(),
+        reference=None if truth is None else _read_reference(truth, T_body_imu, rig.T_imu_cam0),
+        notes=(*notes, *imu_notes, *depth_notes, *rectifier.notes, *unused),
+        motion_notes=imu_notes,
     )
     return RectifiedDataset(
         recording=recording,
         pairs=pairs,
-        motion=imu.samples,
+        motion=samples,
         rectifier=rectifier,
         sizes=tuple(
             ImageSize(camera.width, camera.height, mav / name / "sensor.yaml")
             for name, camera in (("cam0", rig.cam0), ("cam1", rig.cam1))
         ),
         settings=settings,
-        imu_noise=imu.noise,
+        imu_noise=noise,
         white=white,
     )
 
@@ -203,18 +192,19 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
 # --- inertial record and ground truth -------------------------------------------------------------------------------
 
 
-def _read_imu(folder: Path) -> _Imu:
+def _read_imu(
+    folder: Path,
+) -> tuple[FloatArray, ImuDensities | None, MotionSamples[ImuSample] | tuple[()], tuple[str, ...]]:
+    """Return `T_body_imu` (4, 4), noise, samples and notes; the body is the IMU where there is no folder of one."""
+    T_body_imu, noise, notes = np.eye(4), None, list[str]()
     if not folder.is_dir():
-        return _Imu(np.eye(4), None, (), ())
-    notes: tuple[str, ...] = ()
-    T_body_imu, noise = np.eye(4), None
+        return T_body_imu, noise, (), ()
     if (path := folder / "sensor.yaml").is_file():
         T_body_imu, noise = read_imu_yaml(path)
     else:
-        notes = (f"{path} is missing; the IMU is assumed to be the body frame, its noise is unknown",)
-    cut: list[str] = []
-    samples = imu_samples(read_imu_csv(folder / "data.csv", cut))
-    return _Imu(T_body_imu, noise, samples, (*notes, *cut))
+        notes.append(f"{path} is missing; the IMU is assumed to be the body frame, its noise is unknown")
+    samples = imu_samples(read_imu_csv(folder / "data.csv", notes))
+    return T_body_imu, noise, samples, tuple(notes)
 
 
 def _read_reference(file: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -> Trajectory:

@@ -16,7 +16,7 @@ from vio.errors import DataError, MissingDependencyError
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-_MISSING = "ROS bags need the package rosbags; install it with: pip install rosbags"
+MISSING = "ROS bags need the package rosbags; install it with: pip install rosbags"
 
 
 @functools.cache
@@ -29,7 +29,7 @@ def ros2_types() -> Any:
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise MissingDependencyError(_MISSING) from error
+        raise MissingDependencyError(MISSING) from error
     return get_typestore(Stores.ROS2_HUMBLE)
 
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
-from vio.datasets.bags.store import ros2_types
-from vio.errors import DataError
+from vio.datasets.bags.store import MISSING, ros2_types
+from vio.errors import DataError, MissingDependencyError
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
 from vio.geometry.stereo import StereoCamera
 from vio.records import NS_PER_S, Image, ImuSample, Trajectory, VelocitySample
@@ -211,9 +211,11 @@ def bag_writer(folder: Path, storage: Storage, *, latched: Sequence[str] = ()) -
         MissingDependencyError: rosbags is not installed.
         DataError: the storage cannot be written.
     """
-    ros2_types()  # raises where rosbags is not installed
-    import apsw
-    from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+    try:
+        import apsw
+        from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+    except ImportError as error:
+        raise MissingDependencyError(MISSING) from error
 
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     inner = folder / _NAME  # the library makes a folder of its own, which names the file
