@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import multiprocessing
@@ -394,7 +395,7 @@ def _traffic(motion: MotionSpline, seed: int) -> tuple[MovingBox, ...]:
 # --- rendering in several processes ---------------------------------------------------------------------------------
 
 
-class ParallelRecording(SimulatedRecording):
+class ParallelRecording(SimulatedRecording, contextlib.AbstractContextManager["ParallelRecording"]):
     """A scenario's recording, rendered ahead by other processes; the images equal those of one process to the bit.
 
     Use it as a context manager, and request frames in order. Every process plans the scenario itself, from the
@@ -408,9 +409,6 @@ class ParallelRecording(SimulatedRecording):
         self._workers = workers
         self._pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
         self._waiting: dict[int, Future[tuple[Image, Image]]] = {}
-
-    def __enter__(self) -> ParallelRecording:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
