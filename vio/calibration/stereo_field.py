@@ -280,13 +280,8 @@ class _Frame:
         given, named = self.given, dict(zip(PARAMETERS, x.tolist(), strict=True))
         k, k2, q1, q2 = (named[name] for name in _BOTH)
         b, T_cam1_cam0 = given.right
-        b = replace(
-            b,
-            cu=b.cu + b.fu * named["cu"],
-            cv=b.cv + b.fv * named["cv"],
-            fu=b.fu * (1 + named["fu"]),
-            fv=b.fv * (1 + named["fv"]),
-        )
+        b = replace(b, cu=b.cu + b.fu * named["cu"], cv=b.cv + b.fv * named["cv"])
+        b = replace(b, fu=b.fu * (1 + named["fu"]), fv=b.fv * (1 + named["fv"]))
         cam0, cam1 = _bent(given.cam0, (k, k2), q1, q2), _bent(b, (k, k2), q1 + named["p1"], q2 + named["p2"])
         R = self.R_rect_cam1.T @ so3_exp(x[:3]) @ self.R_rect_cam0
         centre = se3_inverse(T_cam1_cam0)[:3, 3]

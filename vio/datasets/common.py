@@ -26,16 +26,7 @@ from vio.records import NS_PER_S, BoolArray, Event, IntArray, MotionSample, Reco
 _GRAVITY, _GRAVITY_OFF = 9.81, 1.5  # m/s^2; by what accelerations and biases move the median of a motion's readings
 _MOST_ARRAY_BYTES = 2**31  # the largest published course file takes 140 MB; a bomb of kilobytes claims terabytes
 # What a damaged or encrypted archive also raises: an unknown compression, a header that is no literal.
-_DAMAGE = (
-    NotImplementedError,
-    RuntimeError,
-    MemoryError,
-    TypeError,
-    SyntaxError,
-    TokenError,
-    lzma.LZMAError,
-    struct.error,
-)
+_DAMAGE = (RuntimeError, MemoryError, TypeError, SyntaxError, TokenError, lzma.LZMAError, struct.error)
 _EXACT_ENTRY = 1e-8  # tolerance of the zeros and the one of an intrinsic matrix
 
 

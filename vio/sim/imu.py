@@ -72,13 +72,9 @@ def simulate_imu(
     R = state.T_world_imu[:, :3, :3]
     accel = np.einsum("nji,nj->ni", R, state.acceleration_world - GRAVITY_WORLD) + accel_bias
     accel = accel + noise.densities.accel * np.sqrt(rate_hz) * accel_rng.standard_normal((n, 3))
-    return ImuRecord(
-        times,
-        np.clip(gyro, -noise.gyro_limit, noise.gyro_limit),
-        np.clip(accel, -noise.accel_limit, noise.accel_limit),
-        gyro_bias,
-        accel_bias,
-    )
+    gyro = np.clip(gyro, -noise.gyro_limit, noise.gyro_limit)
+    accel = np.clip(accel, -noise.accel_limit, noise.accel_limit)
+    return ImuRecord(times, gyro, accel, gyro_bias, accel_bias)
 
 
 def _walk(rng: np.random.Generator, n: int, rate_hz: float, density: float, start_sigma: float) -> FloatArray:

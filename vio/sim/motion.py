@@ -176,15 +176,8 @@ def fit_spline(
         p_control, R_control = _fit(design, T, keep)
         distance, angle = residuals()
     spline = MotionSpline(int(t[0]), step, p_control, R_control)
-    report = FitReport(
-        len(t),
-        int((~keep).sum()),
-        float(np.sqrt(np.mean(distance[keep] ** 2))),
-        float(distance[keep].max()),
-        float(np.sqrt(np.mean(angle[keep] ** 2))),
-        float(angle[keep].max()),
-    )
-    return spline, report
+    left = [(float(np.sqrt(np.mean(r[keep] ** 2))), float(r[keep].max())) for r in (distance, angle)]
+    return spline, FitReport(len(t), int((~keep).sum()), *left[0], *left[1])
 
 
 def _check_record(times_ns: npt.ArrayLike, T_world_imu: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
@@ -420,12 +413,6 @@ def recorded_motion(path: Path) -> tuple[MotionSpline, FitReport]:
     if gap_s > 0.5:
         logger.warning("%s has a gap of %.2f s; the motion is interpolated there", path, gap_s)
     spline, report = fit_spline(times, truth.T_world_body, robust=True)
-    logger.info(
-        "%s: spline within %.1f mm and %.2f mrad rms, %d of %d poses rejected",
-        path,
-        1e3 * report.position_rms_m,
-        1e3 * report.rotation_rms_rad,
-        report.rejected,
-        report.samples,
-    )
+    within = f"{1e3 * report.position_rms_m:.1f} mm and {1e3 * report.rotation_rms_rad:.2f} mrad rms"
+    logger.info("%s: spline within %s, %d of %d poses rejected", path, within, report.rejected, report.samples)
     return spline, report

@@ -113,12 +113,7 @@ def _cones(corner: FloatArray, tile: int) -> FloatArray:
             a, b, depth = block @ x, block @ y, block @ z
             (a0, a1), (b0, b1) = ((float((q / depth).min()), float((q / depth).max())) for q in (a, b))
             slack = 1e-6
-            spans = [
-                (a0 - slack, b0 - slack),
-                (a1 + slack, b0 - slack),
-                (a0 - slack, b1 + slack),
-                (a1 + slack, b1 + slack),
-            ]
+            spans = [(p, q) for q in (b0 - slack, b1 + slack) for p in (a0 - slack, a1 + slack)]
             out[r, c] = [p * x + q * y + z for p, q in spans]
     return out
 

@@ -282,20 +282,13 @@ class SimulatedRecording:
         time_ns = int(simulation.taken_ns[index])
         # A repeated frame is identical to the bit, so its noise is seeded by the frame it repeats.
         source = int(np.searchsorted(simulation.taken_ns, time_ns))
+        sensor = functools.partial(apply_effects, time_ns=time_ns, frame_index=source, seed=simulation.seed)
         exposures = [self.exposure(index, camera) for camera in (0, 1)]
-        images = [
-            apply_effects(
-                self._seen(camera, time_ns, exposure),
-                simulation.effects,
-                time_ns=time_ns,
-                frame_index=source,
-                camera=camera,
-                seed=simulation.seed,
-                exposure=exposure,
-            )
+        left, right = (
+            sensor(self._seen(camera, time_ns, exposure), simulation.effects, camera=camera, exposure=exposure)
             for camera, exposure in enumerate(exposures)
-        ]
-        return images[0], images[1]
+        )
+        return left, right
 
     def exposure(self, index: int, camera: int) -> Exposure | None:
         """Exposure of one image as the camera's control has set it; None where there is no control."""

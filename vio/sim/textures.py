@@ -19,22 +19,9 @@ from vio.geometry.lie import FloatArray
 from vio.records import Image
 
 TextureKind: TypeAlias = Literal[
-    "wall",
-    "bare",
-    "plaster",
-    "floor",
-    "ceiling",
-    "wood",
-    "picture",
-    "crate",
-    "facade",
-    "asphalt",
-    "sky",
-    "skyline",
-    "window",
-    "clothes",
-    "skin",
-]
+    "wall", "bare", "plaster", "floor", "ceiling", "wood", "picture", "crate", "facade", "asphalt", "sky",
+    "skyline", "window", "clothes", "skin",
+]  # fmt: skip
 _Canvas: TypeAlias = npt.NDArray[np.float32]
 
 _GUTTER = 3  # texels of repeated border around each level, for the interpolation kernel

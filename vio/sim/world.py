@@ -41,13 +41,8 @@ _ROOM_AMBIENT, _STREET_AMBIENT = 0.22, 0.4
 _SUN_ELEVATION_RAD = 0.3
 _BARE_HOUSES = 3  # one house in so many has a blank wall
 _FACES: dict[str, tuple[int, int]] = {
-    "+x": (0, 1),
-    "-x": (0, -1),
-    "+y": (1, 1),
-    "-y": (1, -1),
-    "+z": (2, 1),
-    "-z": (2, -1),
-}
+    "+x": (0, 1), "-x": (0, -1), "+y": (1, 1), "-y": (1, -1), "+z": (2, 1), "-z": (2, -1),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

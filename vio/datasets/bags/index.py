@@ -256,13 +256,5 @@ def _info(index: BagIndex, fields: Any, message: Message) -> None:
 def camera_info_of(fields: Any, topic: str) -> CameraInfo:
     """Return a sensor_msgs/CameraInfo; ROS 1 and ROS 2 write its matrices in capitals and in small letters."""
     D, K, R, P = (np.array(getattr(fields, n, getattr(fields, n.upper(), None)), dtype=np.float64) for n in "dkrp")
-    return CameraInfo(
-        topic,
-        int(fields.width),
-        int(fields.height),
-        str(fields.distortion_model),
-        tuple(D.tolist()),
-        K.reshape(3, 3),
-        R.reshape(3, 3),
-        P.reshape(3, 4),
-    )
+    size, matrices = (int(fields.width), int(fields.height)), (K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4))
+    return CameraInfo(topic, *size, str(fields.distortion_model), tuple(D.tolist()), *matrices)

@@ -121,22 +121,12 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
             *(*white_note(white), *rig_notes, *found.notes),
         ),
     )
-    return BagDataset(
-        recording,
-        motion,
-        tuple(
-            ImageSize(camera.width, camera.height, Path(file or info or path))
-            for camera, info in zip(rig.cameras, found.infos, strict=True)
-        ),
-        settings,
-        roles.cameras,
-        stamps_ns,
-        logged_ns,
-        rectifier,
-        white,
-        tuple(images.unstamped for images in stamps),
-        rig.imu_noise,
+    sizes = tuple(
+        ImageSize(camera.width, camera.height, Path(file or info or path))
+        for camera, info in zip(rig.cameras, found.infos, strict=True)
     )
+    images = roles.cameras, stamps_ns, logged_ns, rectifier, white, tuple(each.unstamped for each in stamps)
+    return BagDataset(recording, motion, sizes, settings, *images, rig.imu_noise)
 
 
 def _frames(

@@ -28,18 +28,10 @@ _ROLES: dict[str, tuple[str, ...]] = {
 }
 # What distinguishes the two cameras of a pair in topics' names, left first.
 _SIDES = (
-    ("left", "right"),
-    ("Left", "Right"),
-    ("cam0", "cam1"),
-    ("camera0", "camera1"),
-    ("camera_0", "camera_1"),
-    ("infra1", "infra2"),
-    ("fisheye1", "fisheye2"),
-    ("cam_0", "cam_1"),
-    ("cam1", "cam2"),
-    ("image_0", "image_1"),
-    ("0", "1"),
-)
+    ("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("camera0", "camera1"), ("camera_0", "camera_1"),
+    ("infra1", "infra2"), ("fisheye1", "fisheye2"), ("cam_0", "cam_1"), ("cam1", "cam2"),
+    ("image_0", "image_1"), ("0", "1"),
+)  # fmt: skip
 _TRANSPORT = "/compressed"  # what image_transport appends to the topic of the raw images
 _WHOLE = 0.9  # share of the other's messages that raw images must have, to be taken in the place of compressed ones
 _NO_GRAY = re.compile(r"depth|disparity|mask|label|semantic|thermal|theora|confidence|points", re.IGNORECASE)

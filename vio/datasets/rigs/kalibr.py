@@ -54,6 +54,7 @@ def read_camchain(path: Path) -> Rig:
     blocks = [section(entries, name, str(path)) for name in names]
     where = [f"{path}, {name}" for name in names]
     cameras = [_camera(*of_one) for of_one in zip(blocks, where, strict=True)]
+    cam1 = cameras[1] if "cam1" in names else None
     T_cam0_imu = _pose(blocks[0], "T_cam_imu", where[0])
     notes: list[str] = []
     T_cam1_cam0 = _stereo_pose(blocks[1], T_cam0_imu, path, notes) if "cam1" in names else None
@@ -63,17 +64,8 @@ def read_camchain(path: Path) -> Rig:
     offset_s, residual_px = _time_shift(blocks, where), _residual(blocks[-1], where[-1])
     factor = numbers(blocks[0], "depth_factor", where[0], 1)[0] if "depth_factor" in blocks[0] else None
     with naming(path):
-        return Rig(
-            cameras[0],
-            cameras[1] if "cam1" in names else None,
-            T_cam1_cam0,
-            T_cam0_imu,
-            noise,
-            offset_s,
-            (*notes, *imu_notes),
-            residual_px,
-            factor,
-        )
+        notes += imu_notes
+        return Rig(cameras[0], cam1, T_cam1_cam0, T_cam0_imu, noise, offset_s, tuple(notes), residual_px, factor)
 
 
 def _stereo_pose(right: Mapping[str, Any], T_cam0_imu: FloatArray | None, path: Path, notes: list[str]) -> FloatArray:
