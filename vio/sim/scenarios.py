@@ -465,7 +465,6 @@ def flight_files(folder: Path) -> tuple[Path, Path | None, Path | None]:
     return truth, times if times.is_file() else None, imu if imu.is_file() else None
 
 
-SCENES: tuple[str, ...] = get_args(SceneName)
 READY_MOTIONS: tuple[str, ...] = get_args(ReadyMotion)
 
 
