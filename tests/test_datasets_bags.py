@@ -15,8 +15,9 @@ from tests.bag_maker import Script, noise_frames, of_stereo  # noqa: E402
 from tests.same_events import assert_same_events  # noqa: E402
 from vio.cameras.rig import Rig  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
-from vio.datasets.bags.pictures import raw_gray, white_of  # noqa: E402
+from vio.datasets.bags.pictures import raw_gray  # noqa: E402
 from vio.datasets.bags.reader import BagDataset  # noqa: E402
+from vio.datasets.images import white_of  # noqa: E402
 from vio.datasets.rigs.kalibr import kalibr_text  # noqa: E402
 from vio.errors import CalibrationError, DataError, VioError  # noqa: E402
 from vio.geometry.lie import se3_exp, se3_inverse  # noqa: E402

@@ -24,9 +24,10 @@ from tests.dataset_makers import (
     utias_arrays,
 )
 from vio.datasets import READERS, DatasetSettings, open_dataset
-from vio.datasets.common import checked_transform, clock_ns, merge_events, read_npz, seconds_to_ns
+from vio.datasets.common import clock_ns, merge_events, read_npz, seconds_to_ns
 from vio.datasets.observation_log import write_observation_log
 from vio.errors import CalibrationError, ConfigError, DataError
+from vio.geometry.lie import checked_transform
 from vio.records import ImuSample, Recording, StereoFrame, VelocitySample
 
 SOURCES = ("kitti", "ece276a", "ece276a_new", "utias", "log")

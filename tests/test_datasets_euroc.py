@@ -41,7 +41,7 @@ from vio.datasets.rectified import RectifiedDataset
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, so3_exp
-from vio.geometry.rectify import rectify, rectifying_rotations
+from vio.geometry.rectify import rectified_cameras, rectifying_rotations
 from vio.geometry.stereo import StereoCamera
 from vio.records import ImuDensities, ImuSample, Recording, StereoFrame
 from vio.sim.rigs import euroc_like_rig
@@ -57,7 +57,7 @@ def _frames(dataset: RectifiedDataset) -> list[StereoFrame]:
 
 def test_calibration_clock_and_truth_are_read(tmp_path: Path) -> None:
     dataset = _read(make_euroc(tmp_path))
-    recording, expected = dataset.recording, rectify(RADTAN_RIG)
+    recording, expected = dataset.recording, rectified_cameras(RADTAN_RIG)
     assert recording.kind == "euroc"
     assert recording.camera == expected.camera
     assert recording.T_cam0_imu is not None
@@ -105,7 +105,7 @@ def test_events_are_in_time_order_with_imu_samples_first(tmp_path: Path) -> None
 
 def _opencv_maps(rig: StereoRig) -> list[tuple[np.ndarray, np.ndarray]]:
     """Lookup maps from OpenCV's undistortion, with this package's rotations and rectified camera."""
-    camera = rectify(rig).camera
+    camera = rectified_cameras(rig).camera
     rotations = rectifying_rotations(rig)[:2]
     maps = []
     for model, R in zip((rig.cam0, rig.cam1), rotations, strict=True):
@@ -176,7 +176,7 @@ def test_the_imu_frame_is_the_body_frame(tmp_path: Path) -> None:
     recording = _read(tmp_path).recording
     assert recording.T_cam0_imu is not None
     assert recording.reference is not None
-    np.testing.assert_allclose(recording.T_cam0_imu, rectify(RADTAN_RIG).T_rect0_imu, atol=1e-9)
+    np.testing.assert_allclose(recording.T_cam0_imu, rectified_cameras(RADTAN_RIG).T_rect0_imu, atol=1e-9)
     np.testing.assert_allclose(recording.reference.T_world_body, truth_poses(4) @ T_body_imu, atol=1e-9)
 
 
@@ -568,7 +568,7 @@ def test_real_stationary_start_measures_gravity(data_dir: Path) -> None:
 
 def test_a_rectified_pair_is_read_from_its_poses_to_the_last_bit() -> None:
     """EuRoC's calibration, whose printed rotation is one to 13 digits only: inverting twice moved it by 2e-14 m."""
-    pair = rectify(euroc_like_rig())
+    pair = rectified_cameras(euroc_like_rig())
     again = rectifier_of(rig_read_as(pair.camera, pair.T_rect0_imu))
     assert again.camera == pair.camera
     np.testing.assert_array_equal(again.T_rect0_imu, pair.T_rect0_imu)

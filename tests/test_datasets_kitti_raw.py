@@ -21,7 +21,7 @@ from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point
 from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, so3_log
-from vio.geometry.rectify import rectify, rectifying_rotations
+from vio.geometry.rectify import rectified_cameras, rectifying_rotations
 from vio.records import StereoFrame
 
 
@@ -37,7 +37,7 @@ def _frames(dataset: RectifiedDataset) -> list[StereoFrame]:
 def test_calibration_is_read(above: bool, tmp_path: Path) -> None:
     path = make_kitti_raw(tmp_path, above=above)
     recording = open_dataset(path).recording
-    expected = rectify(replace(KITTI_RIG, T_imu_cam0=np.eye(4), T_imu_cam1=KITTI_RIG.T_cam0_cam1))
+    expected = rectified_cameras(replace(KITTI_RIG, T_imu_cam0=np.eye(4), T_imu_cam1=KITTI_RIG.T_cam0_cam1))
     assert recording.kind == "kitti_raw"
     assert recording.motion == frozenset()
     assert recording.reference is None

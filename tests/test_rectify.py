@@ -13,11 +13,12 @@ from vio.errors import CalibrationError
 from vio.geometry.distortion import StereoRig, project_point
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, so3_exp, transform_points
 from vio.geometry.rectify import (
+    lookup,
     pinhole_maps,
     pinhole_pixels,
     pinhole_within,
     projection_of,
-    rectify,
+    rectified_cameras,
     rectify_pixels,
     rectifying_rotations,
 )
@@ -40,7 +41,7 @@ def _points_imu(rig: StereoRig, n: int, *, around: bool = False) -> np.ndarray:
 def test_rectified_raw_pixels_equal_the_rectified_projection(name: str) -> None:
     """The whole chain against the stereo model: distort, undistort, rotate; rows agree and so does the disparity."""
     rig = RIGS[name]()
-    done = rectify(rig, "auto")
+    done = rectified_cameras(rig, "auto")
     points = _points_imu(rig, 300, around=name == "cylinder")
     expected = project(done.camera, transform_points(done.T_rect0_imu, points))
     for camera, T_imu_cam, R, columns in (
@@ -56,8 +57,9 @@ def test_rectified_raw_pixels_equal_the_rectified_projection(name: str) -> None:
 @pytest.mark.parametrize("name", RIGS)
 def test_maps_are_the_inverse_of_rectifying_pixels(name: str) -> None:
     rig = RIGS[name]()
-    done = rectify(rig, "auto")
-    for camera, R, (map_u, map_v) in ((rig.cam0, done.R_rect_cam0, done.map0), (rig.cam1, done.R_rect_cam1, done.map1)):
+    done = rectified_cameras(rig, "auto")
+    for camera, R in ((rig.cam0, done.R_rect_cam0), (rig.cam1, done.R_rect_cam1)):
+        map_u, map_v = lookup(done.camera, camera, R)
         assert map_u.min() > -0.6, "pixels from outside the image"
         assert map_u.max() < camera.width - 0.4
         assert map_v.min() > -0.6
@@ -71,7 +73,7 @@ def test_maps_are_the_inverse_of_rectifying_pixels(name: str) -> None:
 
 def test_a_rectified_rig_is_unchanged() -> None:
     rig = small_rig()
-    done = rectify(rig)
+    done = rectified_cameras(rig)
     np.testing.assert_allclose(done.R_rect_cam0, np.eye(3), atol=1e-12)
     assert done.camera.fu == pytest.approx(rig.cam0.fu)
     assert done.camera.cu == pytest.approx(rig.cam0.cu)
@@ -104,15 +106,15 @@ def test_rejects_invalid_rigs() -> None:
     rig = euroc_like_rig()
     swapped = replace(rig, T_imu_cam0=rig.T_imu_cam1, T_imu_cam1=rig.T_imu_cam0)
     with pytest.raises(CalibrationError, match="swapped"):
-        rectify(swapped)
+        rectified_cameras(swapped)
     with pytest.raises(CalibrationError, match="baseline is zero"):
-        rectify(replace(rig, T_imu_cam1=rig.T_imu_cam0))
+        rectified_cameras(replace(rig, T_imu_cam1=rig.T_imu_cam0))
     behind = rig.T_imu_cam0 @ se3_from_parts(so3_exp([0, np.pi, 0]), [0.1, 0, 0])
     with pytest.raises(CalibrationError, match=r"opposite directions|rotate the"):
-        rectify(replace(rig, T_imu_cam1=behind))
+        rectified_cameras(replace(rig, T_imu_cam1=behind))
     aside = rig.T_imu_cam0 @ se3_exp([0.1, 0, 0, 0, 1.4, 0])
     with pytest.raises(CalibrationError, match=r"share no field of view|rotate the"):
-        rectify(replace(rig, T_imu_cam1=aside))
+        rectified_cameras(replace(rig, T_imu_cam1=aside))
 
 
 @pytest.mark.parametrize(
@@ -128,13 +130,13 @@ def test_only_lenses_that_a_pinhole_would_crop_above_and_below_get_a_cylinder(
     rig: Callable[[], StereoRig], expected: Projection
 ) -> None:
     assert projection_of(rig()) == expected
-    assert rectify(rig(), "auto").camera.projection == expected
-    assert rectify(rig()).camera.projection == "pinhole"
+    assert rectified_cameras(rig(), "auto").camera.projection == expected
+    assert rectified_cameras(rig()).camera.projection == "pinhole"
 
 
 def test_a_cylinder_keeps_more_of_a_wide_lens_at_no_lower_resolution() -> None:
     rig = wide_rig()
-    pinhole, cylinder = rectify(rig, "pinhole").camera, rectify(rig, "cylinder").camera
+    pinhole, cylinder = rectified_cameras(rig, "pinhole").camera, rectified_cameras(rig, "cylinder").camera
     assert (cylinder.width, cylinder.height) == (rig.cam0.width, rig.cam0.height)
     assert cylinder.fu >= max(pinhole.fu, rig.cam0.fu)
     up, down = (left_rays(cylinder, [[cylinder.cu, v]])[0] for v in (0.0, 511.0))
@@ -144,7 +146,7 @@ def test_a_cylinder_keeps_more_of_a_wide_lens_at_no_lower_resolution() -> None:
 
 def test_a_cylinder_becomes_the_pinhole_inside_it() -> None:
     """For programs that know no cylinder: pixels and images of a pinhole of the same pose, nothing from outside."""
-    cylinder = rectify(wide_rig(), "cylinder").camera
+    cylinder = rectified_cameras(wide_rig(), "cylinder").camera
     pinhole = pinhole_within(cylinder)
     assert pinhole.projection == "pinhole"
     points = _points_imu(wide_rig(), 300, around=True)

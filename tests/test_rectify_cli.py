@@ -17,7 +17,7 @@ from vio.cli.rectify import MARKER
 from vio.datasets import open_dataset
 from vio.datasets.rectified import RectifiedDataset
 from vio.geometry.distortion import StereoRig, rig_from_rectified
-from vio.geometry.rectify import rectify
+from vio.geometry.rectify import rectified_cameras
 from vio.protocols import Dataset
 from vio.records import StereoFrame
 from vio.sim.export import export_euroc
@@ -216,7 +216,7 @@ def test_a_rendered_folder_reads_as_the_rectified_cameras_would_see_it(
     """The whole chain (renderer, yaml, maps, resampling) against images rendered by the rectified cameras."""
     dataset = open_dataset(folder)
     simulation = flight.simulation
-    done = rectify(simulation.rig)
+    done = rectified_cameras(simulation.rig)
     assert dataset.recording.camera.fu == pytest.approx(done.camera.fu, rel=1e-9)
     assert dataset.recording.motion == {"imu"}
     ideal = replace(simulation, rig=rig_from_rectified(done.camera, done.T_rect0_imu))

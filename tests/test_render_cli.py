@@ -20,9 +20,9 @@ from tests.conftest import ROOT
 from vio.cli import build_parser, main
 from vio.cli.render import scenario_from
 from vio.datasets import DatasetSettings, open_dataset
+from vio.errors import SimulationError
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
 from vio.records import ImuSample, IntArray, StereoFrame, VelocitySample
-from vio.sim.errors import SimulationError
 from vio.sim.motion import hand_held, motion_at, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU
 from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_of, plan

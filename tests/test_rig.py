@@ -20,7 +20,7 @@ from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp
-from vio.geometry.rectify import rectify
+from vio.geometry.rectify import lookup, rectified_cameras
 from vio.geometry.sphere_models import double_sphere, unified
 from vio.records import ImuDensities
 
@@ -139,13 +139,20 @@ def test_raw_rig_from_matrices_is_rectified_as_a_recording_of_these_cameras() ->
     assert not rig.is_rectified
     rectifier = rig.rectifier()
     assert rectifier.camera == rig.camera
-    expected = rectify(StereoRig(a, b, np.eye(4), se3_inverse(T_CAM1_CAM0)))
+    expected = rectified_cameras(StereoRig(a, b, np.eye(4), se3_inverse(T_CAM1_CAM0)))
+    sides = ((a, expected.R_rect_cam0), (b, expected.R_rect_cam1))
+    both = [lookup(expected.camera, lens, R) for lens, R in sides]
     assert rectifier.maps is not None
     assert rig.T_rect0_imu is None
     raw = np.random.default_rng(0).integers(0, 256, (2, 480, 640)).astype(np.uint8)
     for interpolation in ("linear", "cubic", "lanczos4"):
         rectified = replace(rectifier, interpolation=interpolation)(*raw)
-        for image, done, maps in zip(raw, rectified, (expected.map0, expected.map1), strict=True):
+        for image, done, maps in zip(
+            raw,
+            rectified,
+            both,
+            strict=True,
+        ):
             again = remap(image, maps, interpolation)  # by maps of floats, which OpenCV 5 does not round to 1/32 px
             np.testing.assert_allclose(done.astype(int), again, rtol=0, atol=0 if cv2.__version__ < "5" else 8)
 
@@ -158,9 +165,12 @@ def test_raw_rig_from_matrices_is_rectified_as_a_recording_of_these_cameras() ->
         (lambda: Rig.raw(np.eye(4), np.eye(3), np.eye(4), 640, 480), "K0 is no intrinsic matrix"),
         (lambda: Rig.raw(np.eye(3).T * 400, np.eye(3), np.eye(4), 640, 480), "K0 is no intrinsic matrix"),
         (lambda: Rig.raw([[400, 3, 320], [0, 400, 240], [0, 0, 1]], np.eye(3), np.eye(4), 640, 480), "a skew of 3 px"),
-        (lambda: Rig.rectified(400, 400, 320, 240, 0.1, 640, 480, np.eye(3)), "T_cam0_imu is no finite 4x4"),
-        (lambda: Rig.rectified(400, 400, 320, 240, 0.1, 640, 480, 2 * np.eye(4)), "T_cam0_imu is no finite 4x4"),
-        (lambda: replace(RIG, T_cam1_cam0=np.diag([1.0, 1, -1, 1])), "T_cam1_cam0: its 3x3 part is no rotation"),
+        (lambda: Rig.rectified(400, 400, 320, 240, 0.1, 640, 480, np.eye(3)), "T_cam0_imu: not a finite 3x4 or 4x4"),
+        (
+            lambda: Rig.rectified(400, 400, 320, 240, 0.1, 640, 480, 2 * np.eye(4)),
+            "T_cam0_imu: the last row of the transform is",
+        ),
+        (lambda: replace(RIG, T_cam1_cam0=np.diag([1.0, 1, -1, 1])), "T_cam1_cam0: not a rotation but a reflection"),
         (lambda: replace(RIG, time_offset_s=float("nan")), "give finite seconds"),
     ],
 )

@@ -27,7 +27,6 @@ def _with_hole() -> np.ndarray:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: fit_spline(TIMES, POSES, degree=4), "spline degree must be 3 or 5, got 4"),
         (lambda: fit_spline(TIMES[:5], POSES), "5 times for poses of shape"),
         (lambda: fit_spline(TIMES[:1], POSES[:1]), "needs at least two poses, got 1"),
         (lambda: fit_spline(TIMES, _with_hole()), "pose 7 of the trajectory is not finite"),

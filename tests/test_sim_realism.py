@@ -14,12 +14,12 @@ from vio.cli import build_parser, main
 from vio.cli.render import scenario_from
 from vio.config import Config
 from vio.datasets.euroc_files import read_camera_yaml
+from vio.errors import SimulationError
 from vio.evaluation.trajectories import evaluate
 from vio.geometry.distortion import StereoRig, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
 from vio.runs.pipeline import run
 from vio.sim.effects import Exposure, SensorEffects, apply_effects, average_exposures
-from vio.sim.errors import SimulationError
 from vio.sim.exposure import _control
 from vio.sim.glare import glare
 from vio.sim.lighting import Light, Lighting, illumination, sun, window

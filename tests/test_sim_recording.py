@@ -14,12 +14,11 @@ import yaml
 
 from vio.datasets.kitti import read_kitti
 from vio.datasets.settings import DatasetSettings
-from vio.errors import DataError, VioError
+from vio.errors import DataError, SimulationError, VioError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_inverse, transform_points
 from vio.geometry.stereo import project
 from vio.records import FrontendOutput, ImuSample, StereoFrame, VelocitySample
 from vio.sim.effects import CLEAN, SensorEffects, apply_effects, average_exposures
-from vio.sim.errors import SimulationError
 from vio.sim.export import export_euroc, export_kitti
 from vio.sim.imu import ImuNoise, VelocityNoise
 from vio.sim.motion import car_loop, hand_held, rotate_body_axes

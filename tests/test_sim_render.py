@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from vio.errors import SimulationError
 from vio.geometry.distortion import CameraModel, StereoRig, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
-from vio.sim.errors import SimulationError
 from vio.sim.motion import car_loop, hand_held, look_rotation
 from vio.sim.render import (
     CameraRays,

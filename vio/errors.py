@@ -35,6 +35,10 @@ class EvaluationError(VioError):
     """Two trajectories cannot be compared."""
 
 
+class SimulationError(VioError):
+    """A scene, trajectory or setting cannot be simulated as requested."""
+
+
 class MissingDependencyError(VioError):
     """An optional package is needed; the message names the extra to install."""
 

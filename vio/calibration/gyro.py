@@ -132,8 +132,7 @@ class _GyroProblem:
                 diff_step=1e-5,
             )
             start = found.x
-        out: FloatArray = start
-        return out
+        return start
 
     def spread(self, x: FloatArray, keep: BoolArray) -> float:
         """Return the robust standard deviation of one residual."""

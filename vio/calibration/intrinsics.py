@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vio.calibration.findings import Finding, NotObservable
+from vio.calibration.findings import Fault, Finding, NotObservable
 from vio.geometry.stereo import StereoCamera
 
 # Standard deviations of what is left of a lens beyond its model, beside those of the estimate: on four real drives with
@@ -63,23 +63,17 @@ def judge_intrinsics(found: Intrinsics | NotObservable) -> tuple[Finding, ...]:
     """Return the faults of the given intrinsics."""
     if isinstance(found, NotObservable):
         return ()
-    out = []
+    out: dict[Fault, str] = {}
     if abs(found.focal_off) > _NAMED_SIGMAS * found.focal_sigma:
-        out.append(
-            Finding(
-                "focal length wrong",
-                f"off by {100 * found.focal_off:+.1f} % (standard deviation {100 * found.focal_sigma:.1f} %): "
-                f"{found.focal_px * (1 + found.focal_off):.0f} px in place of {found.focal_px:.0f}; calibrate the "
-                "lenses again, and check that the images were not resized",
-            )
+        out["focal length wrong"] = (
+            f"off by {100 * found.focal_off:+.1f} % (standard deviation {100 * found.focal_sigma:.1f} %): "
+            f"{found.focal_px * (1 + found.focal_off):.0f} px in place of {found.focal_px:.0f}; calibrate the lenses "
+            "again, and check that the images were not resized"
         )
     if any(abs(o) > _NAMED_SIGMAS * s for o, s in zip(found.centre_off_px, found.centre_sigma_px, strict=True)):
         (u, v), (su, sv) = found.centre_off_px, found.centre_sigma_px
-        out.append(
-            Finding(
-                "principal point wrong",
-                f"off by {u:+.0f} {v:+.0f} px along u v (standard deviations {su:.0f} {sv:.0f}); calibrate the lenses "
-                "again, and check that the images were not cropped",
-            )
+        out["principal point wrong"] = (
+            f"off by {u:+.0f} {v:+.0f} px along u v (standard deviations {su:.0f} {sv:.0f}); calibrate the lenses "
+            "again, and check that the images were not cropped"
         )
-    return tuple(out)
+    return tuple(Finding(*each) for each in out.items())

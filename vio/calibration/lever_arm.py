@@ -63,8 +63,7 @@ def estimate_lever_arm(motion: CameraMotion, rates: Rates, alignment: ImuAlignme
     if sigma.max() > _MAX_SIGMA_M:
         axis = "xyz"[int(np.argmax(sigma))]
         return NotObservable(
-            what,
-            f"the camera rotates too little: the standard deviation is {sigma.max():.3f} m along {axis} of cam0",
+            what, f"the camera rotates too little: the standard deviation is {sigma.max():.3f} m along {axis} of cam0"
         )
     return LeverArm(x[:3], sigma, len(blocks))
 

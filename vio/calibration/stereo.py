@@ -102,7 +102,8 @@ def refine_stereo(
         R, d = _fit_stereo(inliers, R, d, max(spread, 1e-6))
     spread = robust_sigma(epipolar_angles(R, d, inliers))
     refits = [_fit_stereo(inliers.take(~block), R, d, max(spread, 1e-6)) for block in _blocks(inliers.pair)]
-    rotation_sigma, direction_sigma = (_jackknife_norm(v) for v in _deviations(R, d, refits))
+    turns, swings = np.array([so3_log(Rk @ R.T) for Rk, _ in refits]), np.array([np.cross(d, dk) for _, dk in refits])
+    rotation_sigma, direction_sigma = (_jackknife_norm(v) for v in (turns, swings))
     if rotation_sigma > np.radians(_STEREO_ROTATION_DEG) or direction_sigma > np.radians(_STEREO_DIRECTION_DEG):
         return NotObservable(
             "left-right extrinsics",
@@ -169,8 +170,7 @@ def _bends(rays: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _angles(rays: FloatArray) -> FloatArray:
     """Return angles (N, 2) off the optical axis along x and y, radians, of unit rays (N, 3)."""
     radius = np.linalg.norm(rays[:, :2], axis=1, keepdims=True)
-    out: FloatArray = rays[:, :2] / np.maximum(radius, 1e-12) * np.arctan2(radius, rays[:, 2:])
-    return out
+    return rays[:, :2] / np.maximum(radius, 1e-12) * np.arctan2(radius, rays[:, 2:])
 
 
 def _bent(rays: FloatArray, bend: FloatArray) -> FloatArray:
@@ -209,8 +209,7 @@ def _fit_stereo(matches: RayMatches, R: FloatArray, d: FloatArray, spread: float
 
 def _tangents(d: FloatArray) -> FloatArray:
     """Return two unit vectors (3, 2) perpendicular to a direction and to each other."""
-    out: FloatArray = np.linalg.svd(d[None, :])[2][1:].T
-    return out
+    return np.linalg.svd(d[None, :])[2][1:].T
 
 
 def _blocks(labels: IntArray) -> list[BoolArray]:
@@ -218,11 +217,6 @@ def _blocks(labels: IntArray) -> list[BoolArray]:
     names = np.unique(labels)
     parts = np.array_split(names, min(_BLOCKS, len(names)))
     return [np.isin(labels, part) for part in parts]
-
-
-def _deviations(R: FloatArray, d: FloatArray, others: Sequence[_Pose]) -> tuple[FloatArray, FloatArray]:
-    """Return rotation vectors (n, 3), radians, by which other rotations and directions differ from one."""
-    return np.array([so3_log(Rk @ R.T) for Rk, _ in others]), np.array([np.cross(d, dk) for _, dk in others])
 
 
 def _jackknife_norm(values: FloatArray) -> float:

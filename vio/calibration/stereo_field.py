@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.cameras.rectification_error import error_basis
-from vio.cameras.rig import Rig
+from vio.cameras.rig import Rig, rig_of_rectified
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, project_point, rectified_pair
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
@@ -90,8 +90,7 @@ class DisplacementField:
 
     def at(self, z: FloatArray) -> FloatArray:
         """Return how far pixels `[ul vl ur vr]` (N, 4) are off, (N, 4) pixels."""
-        out: FloatArray = error_basis(self.camera, z) @ self.coefficients
-        return out
+        return error_basis(self.camera, z) @ self.coefficients
 
     def without(self, z: FloatArray, has_right: BoolArray) -> FloatArray:
         """Return pixels (N, 4) without the field; right pixels stay as they are where `has_right` (N,) is False."""
@@ -104,8 +103,7 @@ class DisplacementField:
         if self.covariance is None:
             return np.zeros((*z.shape, TERMS))
         variances, V = np.linalg.eigh(self.covariance)
-        out: FloatArray = error_basis(self.camera, z) @ (V * np.sqrt(np.maximum(variances, 0.0)))
-        return out
+        return error_basis(self.camera, z) @ (V * np.sqrt(np.maximum(variances, 0.0)))
 
     def maps(self) -> tuple[tuple[MapArray, MapArray], tuple[MapArray, MapArray]]:
         """Return where each pixel of the left and right images without the field lies in the images as they are.
@@ -209,10 +207,8 @@ def _scaled(rig: Rig, baseline: float, focal: float) -> Rig:
 
 def field_of(camera: StereoCamera, parameters: FloatArray) -> DisplacementField:
     """Return the field of a rectified pair, with image size, that is off by parameters (14,)."""
-    assert camera.width is not None
-    assert camera.height is not None
-    c = camera
-    given = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height)
+    given = rig_of_rectified(camera, None)
+    assert given is not None
     return DisplacementField(camera, _Frame.of(given).coefficients(parameters))
 
 
@@ -284,13 +280,8 @@ class _Frame:
         given, named = self.given, dict(zip(PARAMETERS, x.tolist(), strict=True))
         k, k2, q1, q2 = (named[name] for name in _BOTH)
         b, T_cam1_cam0 = given.right
-        b = replace(
-            b,
-            cu=b.cu + b.fu * named["cu"],
-            cv=b.cv + b.fv * named["cv"],
-            fu=b.fu * (1 + named["fu"]),
-            fv=b.fv * (1 + named["fv"]),
-        )
+        b = replace(b, cu=b.cu + b.fu * named["cu"], cv=b.cv + b.fv * named["cv"])
+        b = replace(b, fu=b.fu * (1 + named["fu"]), fv=b.fv * (1 + named["fv"]))
         cam0, cam1 = _bent(given.cam0, (k, k2), q1, q2), _bent(b, (k, k2), q1 + named["p1"], q2 + named["p2"])
         R = self.R_rect_cam1.T @ so3_exp(x[:3]) @ self.R_rect_cam0
         centre = se3_inverse(T_cam1_cam0)[:3, 3]

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vio.calibration.findings import Finding, NotObservable
+from vio.calibration.findings import Fault, Finding, NotObservable
 from vio.calibration.gyro import TIME_OFFSET_S
 from vio.calibration.inertial import ImuAlignment, Rates
 from vio.calibration.lever_arm import LeverArm, judge_lever_arms
@@ -47,35 +47,25 @@ def judge_stereo(estimate: StereoEstimate, T_cam0_cam1: FloatArray, inliers: Ray
         epipolar_spread(R_given, given, inliers)
         > _CLEARLY_WORSE * epipolar_spread(estimate.R_cam1_cam0, estimate.direction, inliers)
     )
-    found: list[Finding] = []
+    found: dict[Fault, str] = {}
     swing_deg = _between_deg(estimate.direction, given)
     if _opposite(estimate, given):
-        found.append(
-            Finding(
-                "baseline translation inverted",
-                f"the calibration puts cam1 at {_triple(given)}, the images at {_triple(estimate.direction)} (unit "
-                "vectors in cam0); the translation has the wrong sign, or the transform is the inverse one",
-            )
+        found["baseline translation inverted"] = (
+            f"the calibration puts cam1 at {_triple(given)}, the images at {_triple(estimate.direction)} (unit vectors "
+            "in cam0); the translation has the wrong sign, or the transform is the inverse one"
         )
     elif swing_deg > _swing_limit_deg(estimate) and clear:
-        found.append(
-            Finding(
-                "baseline direction wrong",
-                f"off by {swing_deg:.2f} deg (standard deviation {estimate.direction_sigma_deg:.2f})",
-            )
-        )
+        sigma_deg = estimate.direction_sigma_deg
+        found["baseline direction wrong"] = f"off by {swing_deg:.2f} deg (standard deviation {sigma_deg:.2f})"
     turn = so3_log(estimate.R_cam1_cam0 @ R_given.T)
     turn_deg = float(np.degrees(np.linalg.norm(turn)))
     if turn_deg > _turn_limit_deg(estimate) and clear:
         x, y, z = np.degrees(turn)
-        found.append(
-            Finding(
-                "left-right rotation wrong",
-                f"off by {turn_deg:.2f} deg ({x:+.2f} {y:+.2f} {z:+.2f} about x y z of cam1; standard deviation "
-                f"{estimate.rotation_sigma_deg:.3f})",
-            )
+        found["left-right rotation wrong"] = (
+            f"off by {turn_deg:.2f} deg ({x:+.2f} {y:+.2f} {z:+.2f} about x y z of cam1; standard deviation "
+            f"{estimate.rotation_sigma_deg:.3f})"
         )
-    return tuple(found)
+    return tuple(Finding(*each) for each in found.items())
 
 
 def _judge_order(estimate: StereoEstimate, R_given: FloatArray, given: FloatArray) -> Finding | None:
@@ -145,13 +135,8 @@ def judge_imu(
         found += _judge_translation(lever_arm, T_cam0_imu)
     limit_s = max(_NAMED_OFFSET_S, _NAMED_SIGMAS * alignment.time_offset_sigma_s)
     if alignment.time_offset_sigma_s < TIME_OFFSET_S and abs(alignment.time_offset_s) > limit_s:
-        found.append(
-            Finding(
-                "clocks apart",
-                f"IMU minus camera {1e3 * alignment.time_offset_s:+.2f} ms (standard deviation "
-                f"{1e3 * alignment.time_offset_sigma_s:.2f})",
-            )
-        )
+        off_ms, sigma_ms = 1e3 * alignment.time_offset_s, 1e3 * alignment.time_offset_sigma_s
+        found.append(Finding("clocks apart", f"IMU minus camera {off_ms:+.2f} ms (standard deviation {sigma_ms:.2f})"))
     return tuple(found)
 
 
@@ -230,8 +215,7 @@ def judge_velocity_lever_arm(
 
 
 def _unit(v: FloatArray) -> FloatArray:
-    out: FloatArray = v / np.linalg.norm(v)
-    return out
+    return v / np.linalg.norm(v)
 
 
 def _between_deg(a: FloatArray, b: FloatArray) -> float:

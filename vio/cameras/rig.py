@@ -10,22 +10,20 @@ import numpy.typing as npt
 
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair
-from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts, se3_inverse
+from vio.geometry.lie import FloatArray, checked_transform, rigid_fault, se3_from_parts, se3_inverse
 from vio.geometry.rectify import (
     PINHOLE_REACH,
     Interpolation,
     MapArray,
     ProjectionMode,
     field_of_view,
+    lookup,
     rectified_cameras,
-    rectify,
     undistorted,
 )
 from vio.geometry.stereo import StereoCamera, one_camera
 from vio.records import Image, ImuDensities, StereoFrame
 
-_ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I accepted as rounding
-_EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _PARTS = 32  # of a pixel, in which OpenCV's remap counts
 # Standard deviation of a virtual disparity over that of the pixels of a track, which are those of two exposures.
 _DISPARITY_SIGMAS = 2**0.5
@@ -86,8 +84,7 @@ class Rectifier:
             return depth_m
         u, v = (np.rint(m).astype(np.int64) for m in self.maps[0])
         inside = (u >= 0) & (v >= 0) & (u < depth_m.shape[1]) & (v < depth_m.shape[0])
-        out: FloatArray = np.where(inside, depth_m[np.where(inside, v, 0), np.where(inside, u, 0)], 0.0)
-        return out
+        return np.where(inside, depth_m[np.where(inside, v, 0), np.where(inside, u, 0)], 0.0)
 
     def frame(
         self, index: int, time_ns: int, left: Image, right: Image | None = None, *, depth_m: FloatArray | None = None
@@ -107,8 +104,9 @@ def rectifier_of(
     """
     if (pair := rectified_pair(rig)) is not None:
         return Rectifier(rig, pair, se3_inverse(rig.T_imu_cam0), None, interpolation)
-    done = rectify(rig, projection)
-    maps = fixed_point(done.map0), fixed_point(done.map1)
+    done = rectified_cameras(rig, projection)
+    turned = ((rig.cam0, done.R_rect_cam0), (rig.cam1, done.R_rect_cam1))
+    maps = tuple(fixed_point(lookup(done.camera, lens, R_rect_cam)) for lens, R_rect_cam in turned)
     return Rectifier(rig, done.camera, done.T_rect0_imu, maps, interpolation)
 
 
@@ -170,8 +168,8 @@ class Rig:
         if (self.cam1 is None) != (self.T_cam1_cam0 is None):
             raise CalibrationError("give both cam1 and T_cam1_cam0 or, for one camera, neither")
         for name, T in (("T_cam1_cam0", self.T_cam1_cam0), ("T_cam0_imu", self.T_cam0_imu)):
-            if T is not None:
-                _check_rigid(T, name)
+            if T is not None and (fault := "not 4x4" if np.shape(T) != (4, 4) else rigid_fault(T)):
+                raise CalibrationError(f"{name}: {fault}")
         if self.depth_factor is not None and not self.depth_factor > 0:
             raise CalibrationError(f"the depth factor is {self.depth_factor:g}; give levels per metre, such as 1000")
         if not np.isfinite(self.time_offset_s):
@@ -212,7 +210,8 @@ class Rig:
         StereoCamera(fu, fv, cu, cv, baseline_m, width, height)  # checks baseline and focal lengths
         one = CameraModel(fu, fv, cu, cv, width, height)
         T_cam1_cam0 = se3_from_parts(np.eye(3), [-baseline_m, 0.0, 0.0])
-        return cls(one, one, T_cam1_cam0, _rigid(T_cam0_imu, "T_cam0_imu"), imu_noise, time_offset_s)
+        T = None if T_cam0_imu is None else checked_transform(T_cam0_imu, "T_cam0_imu")
+        return cls(one, one, T_cam1_cam0, T, imu_noise, time_offset_s)
 
     @classmethod
     def raw(
@@ -252,9 +251,8 @@ class Rig:
             camera_from_matrix(K, width, height, model, distortion, name)
             for K, distortion, name in ((K0, distortion0, "K0"), (K1, distortion1, "K1"))
         )
-        T = _rigid(T_cam1_cam0, "T_cam1_cam0")
-        assert T is not None
-        return cls(cam0, cam1, T, _rigid(T_cam0_imu, "T_cam0_imu"), imu_noise, time_offset_s)
+        T_imu = None if T_cam0_imu is None else checked_transform(T_cam0_imu, "T_cam0_imu")
+        return cls(cam0, cam1, checked_transform(T_cam1_cam0, "T_cam1_cam0"), T_imu, imu_noise, time_offset_s)
 
     @property
     def cameras(self) -> tuple[CameraModel, ...]:
@@ -389,27 +387,6 @@ def camera_from_matrix(
         model, values = "pinhole", ()
     fu, fv, cu, cv = M[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     return CameraModel(fu, fv, cu, cv, int(width), int(height), model, values)
-
-
-def _rigid(T: npt.ArrayLike | None, name: str) -> FloatArray | None:
-    """Return a transform (4, 4) from (4, 4) or (3, 4), its rotation orthonormal."""
-    if T is None:
-        return None
-    M = np.asarray(T, dtype=np.float64)
-    if M.shape == (3, 4):
-        M = np.vstack([M, [0.0, 0.0, 0.0, 1.0]])
-    _check_rigid(M, name)
-    R = M[:3, :3]
-    exact = np.abs(R.T @ R - np.eye(3)).max() <= _EXACT
-    return se3_from_parts(R if exact else nearest_rotation(R), M[:3, 3])
-
-
-def _check_rigid(T: FloatArray, name: str) -> None:
-    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1], atol=1e-9):
-        raise CalibrationError(f"{name} is no finite 4x4 rigid transform (shape {T.shape}); check the calibration")
-    R = T[:3, :3]
-    if np.abs(R.T @ R - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
-        raise CalibrationError(f"{name}: its 3x3 part is no rotation; check the order of the numbers")
 
 
 def rig_of_rectified(camera: StereoCamera, T_cam0_imu: FloatArray | None) -> Rig | None:

@@ -170,11 +170,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except StoppedError as stop:
         print(printable(" ".join(str(stop).split())), file=sys.stderr)
         return stop.status
-    except VioError as error:
-        if args.debug:
-            raise
-        print("error:", printable(" ".join(str(error).split())), file=sys.stderr)
-        return 1
     except _Terminated as stop:
         print(f"ended by {signal.Signals(stop.number).name}; nothing was written", file=sys.stderr)
         return 128 + stop.number
@@ -185,22 +180,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of the output closed the pipe (`vio config --show | head`): not an error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except OSError as error:
+    except (VioError, OSError, MemoryError) as error:
         if args.debug:
             raise
-        # A path that no check foresaw: too long a name, a folder that may not be entered, a disk that fails.
-        where = (
-            "cannot write the output" if error.filename is None else f"cannot use {str(error.filename)[:_MOST_SHOWN]}"
-        )
-        print("error:", printable(f"{where}: {error.strerror or error}"), file=sys.stderr)
-        if error.filename is None:
+        print("error:", printable(" ".join(_message(error).split())), file=sys.stderr)
+        if isinstance(error, OSError) and error.filename is None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except MemoryError as error:
-        if args.debug:
-            raise
-        print(
-            f"error: out of memory ({str(error)[:_MOST_SHOWN] or 'no details'}); process less at once", file=sys.stderr
-        )
-        return 1
     return status
+
+
+def _message(error: VioError | OSError | MemoryError) -> str:
+    """Return what an expected error says."""
+    if isinstance(error, MemoryError):
+        return f"out of memory ({str(error)[:_MOST_SHOWN] or 'no details'}); process less at once"
+    if isinstance(error, VioError):
+        return str(error)
+    # A path that no check foresaw: too long a name, a folder that may not be entered, a disk that fails.
+    file = error.filename
+    where = "cannot write the output" if file is None else f"cannot use {str(file)[:_MOST_SHOWN]}"
+    return f"{where}: {error.strerror or error}"

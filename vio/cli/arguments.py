@@ -6,9 +6,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vio.errors import ConfigError
+
 if TYPE_CHECKING:
     from vio.config import Config
     from vio.datasets.frame_times import Seconds
+    from vio.live.build import MapUse
 
 
 def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +46,23 @@ def add_span_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stop", "--end", type=bound, metavar="N", help="frame after the last one, or time such as 60s"
     )
+
+
+def add_map_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the map and the folder of results of a live odometry."""
+    parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map")
+    parser.add_argument("--localise", action="store_true", help="find poses in --map, and leave it as it is")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write trajectory and calibration there at the end")
+    parser.add_argument("--drop", choices=("oldest", "none", "block"), default="oldest", help="of frames that wait")
+
+
+def map_from(args: argparse.Namespace) -> MapUse | None:
+    """Return the use of the map that the arguments name; None: there is none."""
+    from vio.live.build import MapUse
+
+    if args.localise and args.map is None:
+        raise ConfigError("--localise needs --map FILE")
+    return None if args.map is None else MapUse(args.map, args.localise)
 
 
 def bound(text: str) -> int | Seconds:

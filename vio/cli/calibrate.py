@@ -161,12 +161,9 @@ def _observed(name: str, found: _Part | NotObservable, rows: Callable[[_Part], _
 
 def _intrinsics_rows(found: Intrinsics) -> _Rows:
     (u, v), (su, sv) = found.centre_off_px, found.centre_sigma_px
+    off, sigma = 100 * found.focal_off, 100 * found.focal_sigma
     return [
-        (
-            "focal length",
-            f"off by {100 * found.focal_off:+.1f} %, sigma {100 * found.focal_sigma:.1f} "
-            f"(given {found.focal_px:.1f} px)",
-        ),
+        ("focal length", f"off by {off:+.1f} %, sigma {sigma:.1f} (given {found.focal_px:.1f} px)"),
         ("principal point", f"off by {u:+.1f} {v:+.1f} px, sigma {su:.1f} {sv:.1f}"),
     ]
 
@@ -194,17 +191,11 @@ def _stereo_rows(stereo: StereoEstimate) -> _Rows:
     from vio.geometry.lie import so3_log
 
     x, y, z = np.degrees(so3_log(stereo.R_cam1_cam0))
-    u, v, w = stereo.direction
+    (u, v, w), sigma_deg = stereo.direction, stereo.rotation_sigma_deg
     return [
-        (
-            "left-right rotation",
-            f"{x:+.4f} {y:+.4f} {z:+.4f} deg (cam0 to cam1), sigma {stereo.rotation_sigma_deg:.4f}",
-        ),
+        ("left-right rotation", f"{x:+.4f} {y:+.4f} {z:+.4f} deg (cam0 to cam1), sigma {sigma_deg:.4f}"),
         ("baseline direction", f"{u:+.5f} {v:+.5f} {w:+.5f} in cam0, sigma {stereo.direction_sigma_deg:.3f} deg"),
-        (
-            "matches",
-            f"{stereo.matches} in {stereo.pairs} pairs, epipolar spread {60 * stereo.residual_deg:.2f} arcmin",
-        ),
+        ("matches", f"{stereo.matches} in {stereo.pairs} pairs, epipolar spread {60 * stereo.residual_deg:.2f} arcmin"),
     ]
 
 

@@ -113,40 +113,28 @@ def _rows(result: MapperResult) -> list[tuple[str, str]]:
     from vio.offline.colmap.reconstruction import LEAST_SHARED
 
     model, comparison = result.found
+    apart = f"{comparison.end_m:.4f} m and {comparison.end_deg:.3f} deg"
+    expected = f"{comparison.expected_end_m:.3g} m and {comparison.expected_end_deg:.3g} deg"
     whole = int(comparison.piece.sum()) == len(comparison.piece)
     in_one = "" if whole else f", {int(comparison.piece.sum())} of them in one piece, which is compared below"
     rows = [
         ("keyframes", f"{len(model.keyframes)} of {result.total} connected{in_one}, {model.points} points"),
         ("ATE", f"{comparison.ate_m:.4f} m to the run after SE(3) alignment, {comparison.ate_deg:.3f} deg"),
-        (
-            "end",
-            f"{comparison.end_m:.4f} m and {comparison.end_deg:.3f} deg apart at the end; up to "
-            f"{comparison.expected_end_m:.3g} m and {comparison.expected_end_deg:.3g} deg expected",
-        ),
+        ("end", f"{apart} apart at the end; up to {expected} expected"),
     ]
     if len(model.shared):
         joined = int((model.shared >= LEAST_SHARED).sum())
         rows.insert(1, ("loops", f"{joined} of {len(model.shared)} in the model, with {LEAST_SHARED} points or more"))
     if comparison.scale is not None and comparison.scale_sigma is not None:
         percent, sigma = 100 * (comparison.scale - 1), 100 * comparison.scale_sigma
-        rows.append(
-            ("scale", f"{percent:+.3f} +- {sigma:.3f} % (COLMAP relative to the run, both by the known baseline)")
-        )
+        text = f"{percent:+.3f} +- {sigma:.3f} % (COLMAP relative to the run, both by the known baseline)"
+        rows.append(("scale", text))
     for segment in comparison.segments:
-        rows.append(
-            (
-                "segment",
-                f"frames {segment.first_frame} to {segment.last_frame}: motions differ by "
-                f"{1e3 * segment.difference_m:.1f} mm, {segment.difference_deg:.3f} deg",
-            )
-        )
+        where, apart_mm = f"frames {segment.first_frame} to {segment.last_frame}", 1e3 * segment.difference_m
+        rows.append(("segment", f"{where}: motions differ by {apart_mm:.1f} mm, {segment.difference_deg:.3f} deg"))
     if comparison.reference_ate_m is not None and comparison.run_reference_ate_m is not None:
-        rows.append(
-            (
-                "reference",
-                f"COLMAP {comparison.reference_ate_m:.4f} m, the run {comparison.run_reference_ate_m:.4f} m from it at "
-                f"these keyframes; COLMAP's scale {100 * ((comparison.reference_scale or 1) - 1):+.3f} %",
-            )
-        )
+        own, percent = comparison.run_reference_ate_m, 100 * ((comparison.reference_scale or 1) - 1)
+        text = f"COLMAP {comparison.reference_ate_m:.4f} m, the run {own:.4f} m from it at these keyframes"
+        rows.append(("reference", f"{text}; COLMAP's scale {percent:+.3f} %"))
     rows.append(("result", result.verdict))
     return rows

@@ -39,11 +39,7 @@ def add_parser(commands: Any) -> None:
         "numbered, is associated by frame number, others by time.",
     )
     parser.add_argument(
-        "estimates",
-        type=Path,
-        nargs="+",
-        metavar="EST",
-        help="trajectory files or runs' folders, side by side",
+        "estimates", type=Path, nargs="+", metavar="EST", help="trajectory files or runs' folders, side by side"
     )
     parser.add_argument(
         "reference",

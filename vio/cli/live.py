@@ -7,9 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vio.cli.arguments import add_settings_arguments, config_from
+from vio.cli.arguments import add_map_arguments, add_settings_arguments, config_from, map_from
 from vio.cli.stopping import StopRequest
-from vio.errors import ConfigError
 
 
 def add_parser(commands: Any) -> None:
@@ -32,22 +31,16 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--record-as", choices=("plain", "rosbag2", "mcap"), default="plain", help="folder or ROS 2 bag (default plain)"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write trajectory and calibration there at the end")
-    parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map")
-    parser.add_argument("--localise", action="store_true", help="find poses in --map, and leave it as it is")
+    add_map_arguments(parser)
     parser.add_argument("--view", nargs="?", const="spawn", metavar="WHERE", help="show it in rerun (extra view)")
-    parser.add_argument("--drop", choices=("oldest", "none", "block"), default="oldest", help="of frames that wait")
 
 
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets.rigs import load_rig
-    from vio.live.build import MapUse
     from vio.sources.run import run_source
     from vio.sources.source import open_source
 
-    config = config_from(args)
-    if args.localise and args.map is None:
-        raise ConfigError("--localise needs --map FILE")
+    config, map_use = config_from(args), map_from(args)
     rig = None
     if args.calibration is not None:
         rig = load_rig(args.calibration, cameras=1 if args.layout == "single" else 2)
@@ -76,7 +69,7 @@ def execute(args: argparse.Namespace) -> int:
             out=args.out,
             record=args.record,
             record_as=args.record_as,
-            map=None if args.map is None else MapUse(args.map, args.localise),
+            map=map_use,
             drop=args.drop,
             on_start=show,
         )

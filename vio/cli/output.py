@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Iterable, Mapping
-from types import TracebackType
 from typing import Any
 
 from vio.files.printable import json_text, printable
@@ -24,7 +24,7 @@ def print_result(
     return 0
 
 
-class ProgressBar:
+class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
     """A tqdm bar on stderr for work whose total may become known only during it; silent where stderr is no terminal."""
 
     def __init__(self, label: str, total: int | None = None, *, unit: str = "steps") -> None:
@@ -46,10 +46,5 @@ class ProgressBar:
         """Keep the bar as it is, and move the cursor below it."""
         self._bar.close()
 
-    def __enter__(self) -> ProgressBar:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -35,11 +35,10 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets import DatasetSettings, open_dataset
-    from vio.datasets.euroc import write_rectified_euroc
     from vio.datasets.rectified import RectifiedDataset, check_not_rectified
     from vio.files.atomic import atomic_folder, check_spares
     from vio.files.text import write_text
-    from vio.offline.convert import convert
+    from vio.offline.convert import convert, write_rectified_euroc
     from vio.records import need_stereo
 
     dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation, projection="pinhole"))

@@ -110,12 +110,9 @@ def _write(out: Path, run: SavedRun, done: Refinement, metrics: dict[str, Any]) 
 
 
 def _rows(m: dict[str, Any]) -> list[tuple[str, str]]:
+    others = "with the IMU" if m["imu"] else f"{m['frames_aligned_to_points']} more aligned to the refined points"
     rows = [
-        (
-            "keyframes",
-            f"{m['keyframes']} of {m['frames']} frames; "
-            + ("with the IMU" if m["imu"] else f"{m['frames_aligned_to_points']} more aligned to the refined points"),
-        ),
+        ("keyframes", f"{m['keyframes']} of {m['frames']} frames; {others}"),
         ("points", f"{m['points']} from {m['rows']} stereo rows, {m['rows_dropped']} dropped as outliers"),
         ("residual", f"{m['rms_before_px']:.3f} px before, {m['rms_after_px']:.3f} px after"),
         ("moved", f"{1e3 * m['moved_rms_m']:.1f} mm rms after SE(3) alignment"),

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vio.cli.arguments import add_settings_arguments, config_from
+from vio.cli.arguments import add_map_arguments, add_settings_arguments, config_from, map_from
 from vio.cli.stopping import StopRequest
 from vio.errors import ConfigError
 
@@ -25,13 +25,10 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--imu", metavar="TOPIC", help="IMU; without it, images alone")
     parser.add_argument("--calibration", type=Path, metavar="FILE", help="default: CameraInfo and /tf_static")
     add_settings_arguments(parser)
-    parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map")
-    parser.add_argument("--localise", action="store_true", help="find poses in --map, and leave it as it is")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write trajectory and calibration there at the end")
+    add_map_arguments(parser)
     parser.add_argument("--prefix", default="/vio", help="of the published topics (default /vio)")
     parser.add_argument("--frames", default="map,odom,base_link", metavar="A,B,C", help="(default map,odom,base_link)")
     parser.add_argument("--no-tf", action="store_true", help="do not publish /tf")
-    parser.add_argument("--drop", choices=("oldest", "none", "block"), default="oldest", help="of frames that wait")
     add_transport_arguments(parser, "needs reliable publishers, and loses nothing")
 
 
@@ -44,18 +41,15 @@ def add_transport_arguments(parser: argparse.ArgumentParser, reliable: str) -> N
 
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets.rigs import load_rig
-    from vio.live.build import MapUse
     from vio.ros2.node import NodeSettings, run_node
     from vio.ros2.outputs import FrameNames
     from vio.ros2.sensors import SensorTopics
     from vio.ros2.transport import open_transport
 
-    config = config_from(args)
+    config, map_use = config_from(args), map_from(args)
     names = args.frames.split(",")
     if len(names) != 3 or not all(names):
         raise ConfigError(f"--frames {args.frames}: give three names, map,odom,base")
-    if args.localise and args.map is None:
-        raise ConfigError("--localise needs --map FILE")
     if args.right is None and args.imu is None:
         raise ConfigError("one camera needs an IMU; give --imu TOPIC, or --right TOPIC")
     rig = None if args.calibration is None else load_rig(args.calibration, cameras=1 if args.right is None else 2)
@@ -67,7 +61,7 @@ def execute(args: argparse.Namespace) -> int:
         args.drop,
         not args.no_tf,
         args.out,
-        None if args.map is None else MapUse(args.map, args.localise),
+        map_use,
     )
 
     def say(line: str) -> None:

@@ -32,12 +32,7 @@ from vio.protocols import Dataset, Viewer
 from vio.records import FrameResult, Trajectory
 from vio.report.words import camera_imu_findings
 from vio.runs.files import CHECKPOINT, FILES, RunFile
-from vio.runs.folder import (
-    calibration_text,
-    finish_run_folder,
-    growing_folder,
-    read_request,
-)
+from vio.runs.folder import calibration_text, finish_run_folder, growing_folder, read_request
 from vio.runs.pipeline import RunControl, RunResult, given_rig, run
 from vio.view.annotated import AnnotatedImage
 

@@ -20,31 +20,13 @@ from vio.datasets.samples import MotionSamples, motion_samples
 from vio.errors import CalibrationError, DataError
 from vio.files.inputs import check_regular
 from vio.files.text import check_increasing
-from vio.geometry.lie import FloatArray, nearest_rotation, rigid_fault, se3_from_parts
-from vio.records import (
-    NS_PER_S,
-    BoolArray,
-    Event,
-    IntArray,
-    MotionSample,
-    Recording,
-    StereoFrame,
-)
+from vio.geometry.lie import FloatArray
+from vio.records import NS_PER_S, BoolArray, Event, IntArray, MotionSample, Recording, StereoFrame
 
 _GRAVITY, _GRAVITY_OFF = 9.81, 1.5  # m/s^2; by what accelerations and biases move the median of a motion's readings
-_EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _MOST_ARRAY_BYTES = 2**31  # the largest published course file takes 140 MB; a bomb of kilobytes claims terabytes
 # What a damaged or encrypted archive also raises: an unknown compression, a header that is no literal.
-_DAMAGE = (
-    NotImplementedError,
-    RuntimeError,
-    MemoryError,
-    TypeError,
-    SyntaxError,
-    TokenError,
-    lzma.LZMAError,
-    struct.error,
-)
+_DAMAGE = (RuntimeError, MemoryError, TypeError, SyntaxError, TokenError, lzma.LZMAError, struct.error)
 _EXACT_ENTRY = 1e-8  # tolerance of the zeros and the one of an intrinsic matrix
 
 
@@ -87,26 +69,6 @@ def clock_ns(seconds: npt.ArrayLike, where: Callable[[int], str]) -> IntArray:
         k = int(np.argmax(bad))
         raise DataError(f"{where(k)}: the time {s[k]:g} is not a time in seconds; write a finite number there")
     return check_increasing(seconds_to_ns(s), where)
-
-
-def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
-    """Return a rigid transform (4, 4) whose rotation is orthonormal to rounding.
-
-    Args:
-        T: (4, 4) or its first three rows.
-        where: names the file and the entry, for the message.
-
-    Raises:
-        CalibrationError: entries are not finite, or the rotation part is not a rotation.
-    """
-    T_ = np.asarray(T, dtype=np.float64)
-    if T_.shape not in ((3, 4), (4, 4)) or not np.isfinite(T_).all():
-        raise CalibrationError(f"{where}: not a finite 3x4 or 4x4 transform (shape {T_.shape}); check the calibration")
-    if fault := rigid_fault(T_):
-        raise CalibrationError(f"{where}: {fault}")
-    R = T_[:3, :3]
-    deviation = float(np.abs(R.T @ R - np.eye(3)).max())
-    return se3_from_parts(R if deviation <= _EXACT else nearest_rotation(R), T_[:3, 3])
 
 
 def numbers_in(text: str, count: int, where: str) -> FloatArray:

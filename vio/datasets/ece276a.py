@@ -18,22 +18,13 @@ from pathlib import Path
 import numpy as np
 
 from vio.calibration.lever_arm import LeverArmVerdict, judge_lever_arms
-from vio.datasets.common import (
-    check_intrinsics,
-    checked_transform,
-    clock_ns,
-    finite_rows,
-    naming,
-    npz_names,
-    read_npz,
-    shape_text,
-)
+from vio.datasets.common import check_intrinsics, clock_ns, finite_rows, naming, npz_names, read_npz, shape_text
 from vio.datasets.features import FeatureDataset
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings, ExtrinsicsMode
 from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
 from vio.errors import CalibrationError, DataError
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.records import FeatureTracks, IntArray, Recording
 

@@ -11,42 +11,36 @@ Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from vio.cameras.rig import rectifier_of
+from vio.datasets.common import naming
 from vio.datasets.companions import check_overlap
 from vio.datasets.euroc_files import (
     STATE_CSV,
     TUM_FILE,
-    camera_yaml,
-    image_list_csv,
-    image_name,
-    median_rate_hz,
     read_camera_yaml,
     read_imu_csv,
     read_imu_yaml,
-    rig_read_as,
     stamped_rows,
 )
 from vio.datasets.frame_times import PAIRED_NS, pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
-from vio.datasets.image_pairs import full_scale
+from vio.datasets.image_pairs import ImageSize, full_scale
 from vio.datasets.images import list_images
-from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
+from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.samples import MotionSamples, imu_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
-from vio.files.text import write_text
 from vio.files.trajectories import read_trajectory
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.protocols import Progress
-from vio.records import ImuDensities, ImuSample, IntArray, MotionSource, Recording, StereoFrame, Trajectory
+from vio.records import ImuDensities, ImuSample, IntArray, Recording, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,16 +56,6 @@ class _Camera:
     missing: int  # number of images at the end of the list that are not there
 
 
-@dataclass(frozen=True, slots=True)
-class _Imu:
-    """The contents of the IMU's folder."""
-
-    T_body_imu: FloatArray  # (4, 4)
-    noise: ImuDensities | None
-    samples: MotionSamples[ImuSample] | tuple[()]
-    notes: tuple[str, ...]
-
-
 def is_euroc_folder(path: Path) -> bool:
     """Return whether a folder holds `mav0`, or is one."""
     return (path / "mav0").is_dir() or any((path / "cam0" / name).is_file() for name in ("sensor.yaml", "data.csv"))
@@ -84,20 +68,24 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         DataError: files are missing, lists and clocks are wrong, or no images match; the message names the remedy.
         CalibrationError: a `sensor.yaml` is missing or invalid.
     """
-    mav = _mav(path)
+    mav = euroc_base(path)
     left, right = (_read_camera(mav / name) for name in ("cam0", "cam1"))
-    imu = _read_imu(mav / "imu0")
-    T_imu_body = se3_inverse(imu.T_body_imu)
+    T_body_imu, noise, samples, imu_notes = _read_imu(mav / "imu0")
+    T_imu_body = se3_inverse(T_body_imu)
     rig = StereoRig(left.model, right.model, T_imu_body @ left.T_body_cam, T_imu_body @ right.T_body_cam)
-    rectifier = make_rectifier(rig, settings.interpolation, mav, settings.projection)
+    with naming(mav):
+        rectifier = rectifier_of(rig, settings.interpolation, settings.projection)
     of_left, of_right, notes = _pair(left, right, mav)
     times_ns = left.times_ns[of_left]
-    if imu.samples:
-        check_overlap(times_ns, imu.samples.times_ns, mav / "imu0")
-    motion: frozenset[MotionSource] = frozenset({"imu"}) if imu.samples else frozenset()
+    if samples:
+        check_overlap(times_ns, samples.times_ns, mav / "imu0")
     pairs = FilePairs(left.files.take(of_left.tolist()), right.files.take(of_right.tolist()))
     white, depth_notes = full_scale(pairs)
-    truth = _reference_file(mav)
+    candidates = (mav / STATE_CSV, mav.absolute().parent / TUM_FILE)
+    truth = next((file for file in candidates if file.is_file()), None)
+    read = [mav / name / file for name in ("cam0", "cam1", "imu0") for file in ("sensor.yaml", "data.csv")]
+    layout = Layout(path, mav, mav / "cam0" / "data", mav / "cam1" / "data")
+    unused = unused_note(layout, read if truth is None else [*read, truth])
     recording = Recording(
         kind="euroc",
         path=path,
@@ -105,24 +93,28 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         T_cam0_imu=rectifier.T_rect0_imu,
         frame_times_ns=times_ns,
         has_images=True,
-        motion=motion,
-        reference=None if truth is None else _read_reference(truth, imu.T_body_imu, rig.T_imu_cam0),
-        notes=(*notes, *imu.notes, *depth_notes, *rectifier.notes, *_unused(path, mav, truth)),
-        motion_notes=imu.notes,
+        motion=frozenset({"imu"}) if samples else frozenset(),
+        reference=None if truth is None else _read_reference(truth, T_body_imu, rig.T_imu_cam0),
+        notes=(*notes, *imu_notes, *depth_notes, *rectifier.notes, *unused),
+        motion_notes=imu_notes,
     )
     return RectifiedDataset(
         recording=recording,
         pairs=pairs,
-        motion=imu.samples,
+        motion=samples,
         rectifier=rectifier,
-        sizes=rig_sizes(rig, (mav / "cam0" / "sensor.yaml", mav / "cam1" / "sensor.yaml")),
+        sizes=tuple(
+            ImageSize(camera.width, camera.height, mav / name / "sensor.yaml")
+            for name, camera in (("cam0", rig.cam0), ("cam1", rig.cam1))
+        ),
         settings=settings,
-        imu_noise=imu.noise,
+        imu_noise=noise,
         white=white,
     )
 
 
-def _mav(path: Path) -> Path:
+def euroc_base(path: Path) -> Path:
+    """Return the folder of an EuRoC recording that holds cam0 and cam1."""
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     missing = [name for name in ("cam0", "cam1") if not (mav / name).is_dir()]
     if missing:
@@ -200,24 +192,19 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
 # --- inertial record and ground truth -------------------------------------------------------------------------------
 
 
-def _read_imu(folder: Path) -> _Imu:
+def _read_imu(
+    folder: Path,
+) -> tuple[FloatArray, ImuDensities | None, MotionSamples[ImuSample] | tuple[()], tuple[str, ...]]:
+    """Return `T_body_imu` (4, 4), noise, samples and notes; the body is the IMU where there is no folder of one."""
+    T_body_imu, noise, notes = np.eye(4), None, list[str]()
     if not folder.is_dir():
-        return _Imu(np.eye(4), None, (), ())
-    notes: tuple[str, ...] = ()
-    T_body_imu, noise = np.eye(4), None
+        return T_body_imu, noise, (), ()
     if (path := folder / "sensor.yaml").is_file():
         T_body_imu, noise = read_imu_yaml(path)
     else:
-        notes = (f"{path} is missing; the IMU is assumed to be the body frame, its noise is unknown",)
-    cut: list[str] = []
-    samples = imu_samples(read_imu_csv(folder / "data.csv", cut))
-    return _Imu(T_body_imu, noise, samples, (*notes, *cut))
-
-
-def _reference_file(mav: Path) -> Path | None:
-    """Return the file of the ground truth; None: there is none."""
-    candidates = (mav / STATE_CSV, mav.absolute().parent / TUM_FILE)
-    return next((file for file in candidates if file.is_file()), None)
+        notes.append(f"{path} is missing; the IMU is assumed to be the body frame, its noise is unknown")
+    samples = imu_samples(read_imu_csv(folder / "data.csv", notes))
+    return T_body_imu, noise, samples, tuple(notes)
 
 
 def _read_reference(file: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -> Trajectory:
@@ -227,58 +214,3 @@ def _read_reference(file: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) 
     if truth.body == "cam0":
         return truth.in_imu(se3_inverse(T_imu_cam0))
     return replace(truth, T_world_body=truth.T_world_body @ T_body_imu)
-
-
-def _unused(path: Path, mav: Path, truth: Path | None) -> list[str]:
-    """Name what lies in the folder and was not read."""
-    sensors = [mav / name / file for name in ("cam0", "cam1", "imu0") for file in ("sensor.yaml", "data.csv")]
-    layout = Layout(path, mav, mav / "cam0" / "data", mav / "cam1" / "data")
-    return unused_note(layout, sensors if truth is None else [*sensors, truth])
-
-
-# --- writing --------------------------------------------------------------------------------------------------------
-
-
-def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progress) -> int:
-    """Write a recording as an EuRoC folder of rectified images; the IMU and the ground truth are copied as they are.
-
-    Returns:
-        The number of frames written.
-
-    Raises:
-        DataError: too many images are unreadable, or a file cannot be copied.
-    """
-    source, mav = _mav(dataset.recording.path), out / "mav0"
-    rig = rig_read_as(dataset.recording.camera, dataset.rectifier.T_rect0_imu)
-    imu_yaml_path = source / "imu0" / "sensor.yaml"
-    T_body_imu = read_imu_yaml(imu_yaml_path)[0] if imu_yaml_path.is_file() else np.eye(4)
-    folders = [mav / name for name in ("cam0", "cam1")]
-    for folder in folders:
-        (folder / "data").mkdir(parents=True)
-
-    last_ns = int(dataset.recording.frame_times_ns[-1])
-
-    def name(frame: StereoFrame, count: int) -> tuple[Path, Path]:
-        file = image_name(frame.time_ns, last_ns)
-        return folders[0] / "data" / file, folders[1] / "data" / file
-
-    times_ns = write_frames(dataset, name, progress)
-    for folder, model, T_imu_cam in zip(folders, (rig.cam0, rig.cam1), (rig.T_imu_cam0, rig.T_imu_cam1), strict=True):
-        comment, rate_hz = f"rectified {folder.name}", median_rate_hz(times_ns)
-        write_text(folder / "sensor.yaml", camera_yaml(model, T_body_imu @ T_imu_cam, comment=comment, rate_hz=rate_hz))
-        write_text(folder / "data.csv", image_list_csv(times_ns, last_ns))
-    for part in (Path("imu0", "sensor.yaml"), Path("imu0", "data.csv"), STATE_CSV):
-        _copy(source / part, mav / part)
-    _copy(source.absolute().parent / TUM_FILE, out / TUM_FILE)
-    return len(times_ns)
-
-
-def _copy(source: Path, target: Path) -> None:
-    """Copy a file if it exists."""
-    if not source.is_file():
-        return
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        shutil.copyfile(source, target)
-    except shutil.SameFileError as error:
-        raise DataError(f"{source}: cannot be copied onto itself; choose another folder") from error

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import check_gravity_column, checked_transform, image_size, naming
-from vio.datasets.yaml_files import as_number, numbers, read_yaml_file
+from vio.datasets.common import check_gravity_column, image_size, naming
+from vio.datasets.yaml_files import as_number, densities_text, imu_densities, numbers, read_yaml_file
 from vio.errors import CalibrationError, DataError
-from vio.files.text import INT64_MAX, check_increasing, exact_text, lines_of
+from vio.files.text import INT64_MAX, check_increasing, exact_text, lines_of, write_text
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair, rig_from_rectified
-from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, se3_from_parts, se3_inverse
+from vio.geometry.lie import FloatArray, checked_transform, quat_xyzw_from_rotation, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
 
@@ -36,12 +36,6 @@ SENSOR_YAML_MODELS: tuple[DistortionModel, ...] = ("pinhole", "radtan", "equidis
 STATE_CSV = Path("state_groundtruth_estimate0", "data.csv")  # ground truth, within mav0
 TUM_FILE = "groundtruth_tum.txt"  # ground truth beside mav0
 _ULPS = 2  # units in the last place within which a translation is looked for that is read back as it was
-_NOISE = {  # entries of the IMU's sensor.yaml, and their units
-    "gyroscope_noise_density": "rad / s / sqrt(Hz)",
-    "gyroscope_random_walk": "rad / s^2 / sqrt(Hz)",
-    "accelerometer_noise_density": "m / s^2 / sqrt(Hz)",
-    "accelerometer_random_walk": "m / s^3 / sqrt(Hz)",
-}
 _IMAGES_HEADER = "#timestamp [ns],filename"
 _STAMP = re.compile(r"\d{1,19}")
 _IMU_HEADER = (
@@ -109,27 +103,14 @@ def read_imu_yaml(path: Path) -> tuple[FloatArray, ImuDensities | None]:
         CalibrationError: the file is missing, lacks an entry, or holds an impossible one.
     """
     entries = read_yaml_file(path)
-    return _T_BS(entries, path), _noise(entries, path)
-
-
-def _noise(entries: Mapping[str, object], path: Path) -> ImuDensities | None:
-    """Return the noise densities; None where none is given."""
-    if not any(key in entries for key in _NOISE):
-        return None
-    values = [numbers(entries, key, path, 1)[0] for key in _NOISE]
-    for key, value in zip(_NOISE, values, strict=True):
-        if not value > 0:
-            raise CalibrationError(f"{path}: {key} is {value:g}; a noise density must be positive")
-    return ImuDensities(*values)
+    return _T_BS(entries, path), imu_densities(entries, path)
 
 
 def imu_yaml(T_body_imu: FloatArray, noise: ImuDensities, *, comment: str, rate_hz: float) -> str:
     """The text of the IMU's `sensor.yaml`, with all digits; `T_body_imu` (4, 4) becomes its `T_BS`."""
-    values = (noise.gyro, noise.gyro_walk, noise.accel, noise.accel_walk)
-    stated = (f"{key}: {value!r}  # [ {unit} ]\n" for (key, unit), value in zip(_NOISE.items(), values, strict=True))
     return (
         f"%YAML:1.0\nsensor_type: imu\ncomment: {comment}\n\n"
-        f"{_T_BS_yaml(T_body_imu)}\nrate_hz: {rate_hz:.6g}\n{''.join(stated)}"
+        f"{_T_BS_yaml(T_body_imu)}\nrate_hz: {rate_hz:.6g}\n{densities_text(noise, units=True)}"
     )
 
 
@@ -192,6 +173,26 @@ def _neighbours(t: FloatArray) -> list[FloatArray]:
     return [t + np.array(step) * np.spacing(np.abs(t)) for step in steps]
 
 
+def write_cameras(
+    mav: Path, rig: StereoRig, times_ns: IntArray, last_ns: int, *, kind: str, T_body_imu: FloatArray | None = None
+) -> None:
+    """Write `sensor.yaml` and `data.csv` of both cameras.
+
+    Args:
+        mav: the folder of `cam0` and `cam1`, which exist.
+        rig: the cameras.
+        times_ns: (N,) of their images.
+        last_ns: by whose digits images are named.
+        kind: of the images, for comments.
+        T_body_imu: (4, 4); None: the body is the IMU.
+    """
+    for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
+        T = T_imu_cam if T_body_imu is None else T_body_imu @ T_imu_cam
+        text = camera_yaml(camera, T, comment=f"{kind} {name}", rate_hz=median_rate_hz(times_ns))
+        write_text(mav / name / "sensor.yaml", text)
+        write_text(mav / name / "data.csv", image_list_csv(times_ns, last_ns))
+
+
 # --- data.csv -------------------------------------------------------------------------------------------------------
 
 
@@ -200,9 +201,8 @@ def image_name(time_ns: int, last_ns: int) -> str:
     return f"{time_ns:0{len(str(last_ns))}d}.png"
 
 
-def image_list_csv(times_ns: IntArray, last_ns: int | None = None) -> str:
+def image_list_csv(times_ns: IntArray, last_ns: int) -> str:
     """The text of a camera's `data.csv` for images named by their times (N,) and the last one, nanoseconds."""
-    last_ns = int(times_ns[-1]) if last_ns is None else last_ns
     return "\n".join([_IMAGES_HEADER, *(f"{t},{image_name(t, last_ns)}" for t in times_ns.tolist())]) + "\n"
 
 

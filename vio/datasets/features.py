@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vio.datasets.common import frame_range, merge_events
+from vio.datasets.common import blank_frames, frame_range, merge_events
 from vio.geometry.lie import FloatArray
-from vio.records import BoolArray, Event, FeatureTracks, IntArray, MotionSample, Observations, Recording, StereoFrame
+from vio.records import BoolArray, Event, FeatureTracks, IntArray, MotionSample, Observations, Recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +40,7 @@ class FeatureDataset:
         """
         chosen = frame_range(self.recording, start, stop)
         low, high = np.searchsorted(self.present, [chosen.start, chosen.stop])
-        times_ns = self.recording.frame_times_ns
-        frames = (StereoFrame(k, int(times_ns[k]), None, None) for k in self.present[low:high].tolist())
+        frames = blank_frames(self.recording, self.present[low:high].tolist())
         return merge_events(self.recording, chosen, self.motion, frames)
 
     def observations(self, index: int) -> Observations | None:

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from vio.datasets.bags import is_bag
-from vio.datasets.bags.gnss import read_navsatfix
+from vio.datasets.bags.index import stamp_of
+from vio.datasets.bags.store import Bag
 from vio.datasets.tables import drive_times, numbers_of, read_table, stamps_ns
 from vio.earth.gnss import UP_SHARE, GnssFixes, checked_fixes
 from vio.errors import DataError
@@ -17,6 +18,8 @@ _FORM = "time_s,latitude_deg,longitude_deg,height_m,sigma_east_m,sigma_north_m,s
 _OXTS_COLUMNS = 30
 _OXTS_ACCURACY = 23  # column of pos_accuracy, m
 _OXTS_LEAST_M = 0.02
+_NAVSATFIX = "sensor_msgs/msg/NavSatFix"
+_NO_FIX, _UNKNOWN = -1, 0  # of status.status and of position_covariance_type
 
 
 def read_gnss(path: Path, topic: str | None = None) -> GnssFixes:
@@ -29,7 +32,7 @@ def read_gnss(path: Path, topic: str | None = None) -> GnssFixes:
     if (oxts / "data").is_dir():
         return _read_oxts(oxts)
     if path.exists() and is_bag(path):
-        return read_navsatfix(path, topic)
+        return _read_navsatfix(path, topic)
     if not path.is_file():
         raise DataError(f"{path}: holds no GNSS positions; give a table {_FORM}, a drive with oxts/data, or a bag")
     return _read_csv(path)
@@ -68,3 +71,34 @@ def _read_oxts(folder: Path) -> GnssFixes:
     times_ns = drive_times(folder / "timestamps.txt", np.array([int(file.stem) for file in files], dtype=np.int64))
     sigma = np.maximum(values[:, _OXTS_ACCURACY], _OXTS_LEAST_M)
     return checked_fixes(times_ns, values[:, :3], sigma[:, None, None] ** 2 * np.eye(3), str(folder))
+
+
+def _read_navsatfix(path: Path, topic: str | None) -> GnssFixes:
+    """Read the positions of a bag's only topic of NavSatFix, or of the one named.
+
+    Raises:
+        DataError: there is no such topic, or several, or the bag is damaged.
+    """
+    times, positions, covariances, lost = [], [], [], 0
+    with Bag(path) as bag:
+        found = [t.name for t in bag.topics if t.kind == _NAVSATFIX and t.count and topic in (None, t.name)]
+        if len(found) != 1:
+            names = ", ".join(found) or "none"
+            raise DataError(f"{path}: topics of NavSatFix: {names}; name one with --topic, or give another bag")
+        for message in bag.messages(found):
+            fix = bag.decoded(message)
+            if int(fix.status.status) <= _NO_FIX:
+                lost += 1
+                continue
+            known = int(fix.position_covariance_type) != _UNKNOWN
+            times.append(stamp_of(fix) or message.logged_ns)
+            positions.append([float(fix.latitude), float(fix.longitude), float(fix.altitude)])
+            covariances.append(
+                np.array(fix.position_covariance, dtype=np.float64).reshape(3, 3) if known else np.full((3, 3), np.nan)
+            )
+    notes = (f"{lost} messages of {found[0]} say that there is no fix",) if lost else ()
+    if not times:
+        raise DataError(f"{path}: {found[0]} holds no position; give a record with a fix")
+    return checked_fixes(
+        np.array(times, dtype=np.int64), np.array(positions), np.array(covariances), f"{path}, {found[0]}", notes
+    )

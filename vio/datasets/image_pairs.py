@@ -12,7 +12,15 @@ from typing import TypeVar
 
 from vio.datasets.common import blank_frames, chosen_frames, merge_events
 from vio.datasets.image_files import FilePairs, stem_of
-from vio.datasets.images import WHITE_16, UnreadableImageError, list_images, load_gray, prefetch, white_level
+from vio.datasets.images import (
+    WHITE_16,
+    UnreadableImageError,
+    list_images,
+    load_gray,
+    prefetch,
+    white_level,
+    white_note,
+)
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.records import Event, Image, MotionSample, Observations, Recording, StereoFrame
@@ -96,10 +104,7 @@ def full_scale(pairs: ImagePairs) -> tuple[int, tuple[str, ...]]:
     """Return the level of white of a recording's 16-bit images, for `load_gray`, with a note where it is not 65535."""
     chosen = {(len(pairs) - 1) * k // (_WHITE_FRAMES - 1) for k in range(_WHITE_FRAMES)} if pairs else set()
     white = white_level([path for k in sorted(chosen) for path in pairs[k]])
-    if white == WHITE_16:
-        return white, ()
-    note = f"the images have 16 bits but use {white.bit_length()}: the levels 0 to {white} are scaled to 8 bits"
-    return white, (note,)
+    return white, white_note(white)
 
 
 def first_readable(pairs: ImagePairs) -> tuple[Path, Image, int]:

@@ -66,20 +66,20 @@ def load_gray(path: Path, white: int = WHITE_16, *, colour: bool = False) -> tup
     Raises:
         UnreadableImageError: the file cannot be read, is truncated or too large, or does not decode.
     """
-    return _as_8_bits(_load(path, colour=colour), white)
+    pixels = _load(path, colour=colour)
+    return to_8_bits(pixels, white), pixels.dtype.itemsize * 8
 
 
-def decode_gray(data: bytes, path: Path | str, white: int = WHITE_16, *, colour: bool = False) -> tuple[Image, int]:
-    """Decode an image file in memory as `load_gray` does; `path` names it in messages."""
-    return _as_8_bits(_decoded(data, path, colour=colour), white)
+def decode_gray(data: bytes, path: Path | str, *, colour: bool = False) -> Image:
+    """Decode an image file in memory as `load_gray` does, 16 bits by full scale; `path` names it in messages."""
+    return to_8_bits(_decoded(data, path, colour=colour), WHITE_16)
 
 
-def _as_8_bits(pixels: npt.NDArray[Any], white: int) -> tuple[Image, int]:
-    bits = pixels.dtype.itemsize * 8
-    if bits == 16:
+def to_8_bits(pixels: npt.NDArray[Any], white: int) -> Image:
+    """Return pixels of 8 or 16 bits as uint8; of 16 bits, the level `white` becomes 255."""
+    if pixels.dtype.itemsize == 2:
         pixels = np.minimum(np.rint(pixels / (white / 255)), 255)
-    image: Image = np.ascontiguousarray(pixels, dtype=np.uint8)
-    return image, bits
+    return np.ascontiguousarray(pixels, dtype=np.uint8)
 
 
 def white_level(paths: Sequence[Path]) -> int:
@@ -98,9 +98,26 @@ def white_level(paths: Sequence[Path]) -> int:
             with path.open("rb") as stream:
                 start = stream.read(25)
             if start.startswith(_PNG_START) and start[24:] == b"\x10":  # the depth in the header
-                level = max(level, float(np.quantile(_load(path), _WHITE_SHARE)))
+                level = max(level, brightest(_load(path)))
+    return white_of(level)
+
+
+def brightest(pixels: npt.NDArray[Any]) -> float:
+    """Return the level that hardly any pixel exceeds."""
+    return float(np.quantile(pixels, _WHITE_SHARE))
+
+
+def white_of(level: float) -> int:
+    """Return the level of white of 16-bit images whose brightest pixels have `level`; 0: it is not known."""
     fitting = (2**bits - 1 for bits in _SENSOR_BITS if level <= 2**bits - 1)
     return next(fitting, WHITE_16) if level > 0 else WHITE_16
+
+
+def white_note(white: int) -> tuple[str, ...]:
+    """Return a note on the level of white of 16-bit images where it is not full scale."""
+    if white == WHITE_16:
+        return ()
+    return (f"the images have 16 bits but use {white.bit_length()}: the levels 0 to {white} are scaled to 8 bits",)
 
 
 def _load(path: Path, *, colour: bool = False) -> npt.NDArray[Any]:

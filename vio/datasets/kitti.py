@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import check_intrinsics, checked_transform, clock_ns, naming, numbers_in
+from vio.datasets.common import check_intrinsics, clock_ns, naming, numbers_in
 from vio.datasets.image_pairs import ImageDataset, ImageSize, measured_images, pair_images
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import VELOCITY_HEADER, read_velocity_table
@@ -24,7 +24,7 @@ from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
 from vio.files.text import exact_text, read_numbers, seconds_text, text_lines, write_text
 from vio.files.trajectories import read_trajectory
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, Recording, Trajectory, VelocitySample
 

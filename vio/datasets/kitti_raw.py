@@ -19,17 +19,17 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.cameras.rig import Rectifier
-from vio.datasets.common import check_intrinsics, checked_transform, image_size, naming, numbers_in
-from vio.datasets.image_pairs import ImagePairs, first_readable, full_scale, pair_images
-from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes
+from vio.cameras.rig import Rectifier, rectifier_of
+from vio.datasets.common import check_intrinsics, image_size, naming, numbers_in
+from vio.datasets.image_pairs import ImagePairs, ImageSize, first_readable, full_scale, pair_images
+from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import drive_times
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
 from vio.files.text import text_lines
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, se3_inverse
 from vio.records import IntArray, Recording
 
 CAMERAS = "calib_cam_to_cam.txt"
@@ -97,7 +97,8 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         reference=None,
         notes=(*time_notes, *imu_notes, *depth_notes, *rectifier.notes, *unused),
     )
-    sizes = rig_sizes(rectifier.rig, (calibration_path, calibration_path))
+    cameras = (rectifier.rig.cam0, rectifier.rig.cam1)
+    sizes = tuple(ImageSize(camera.width, camera.height, calibration_path) for camera in cameras)
     return RectifiedDataset(recording, (), sizes, settings, pairs, rectifier, white=white)
 
 
@@ -130,7 +131,8 @@ def _rectifier(
             f"{pairs[0][0].parent}: images are {size[0]} x {size[1]} pixels but {where} is for {raw[0]} x {raw[1]} "
             f"(raw) or {rectified[0]} x {rectified[1]} (rectified); give the calibration of these images"
         )
-    return make_rectifier(rig, settings.interpolation, where, settings.projection)
+    with naming(where):
+        return rectifier_of(rig, settings.interpolation, settings.projection)
 
 
 # --- calibration ----------------------------------------------------------------------------------------------------
@@ -143,7 +145,7 @@ def read_cam_to_cam(path: Path) -> KittiRawCalibration:
         CalibrationError: an entry is missing, malformed or impossible.
     """
     entries = _read_entries(path)
-    raw, rect = [], []
+    raw, rect, offsets = [], [], []
     for k in ("00", "01"):
         size = _size(entries, f"S_{k}", path)
         K = _entry(entries, f"K_{k}", 9, path)
@@ -152,19 +154,16 @@ def read_cam_to_cam(path: Path) -> KittiRawCalibration:
         size = _size(entries, f"S_rect_{k}", path)
         P = _entry(entries, f"P_rect_{k}", 12, path).reshape(3, 4)
         rect.append(_camera(P[:, :3], size, (), f"{path}, P_rect_{k}"))
-    offsets = [
-        np.linalg.solve(P[:, :3], P[:, 3])
-        for P in (_entry(entries, f"P_rect_{k}", 12, path).reshape(3, 4) for k in ("00", "01"))
-    ]
+        offsets.append(np.linalg.solve(P[:, :3], P[:, 3]))
     return KittiRawCalibration(
         cam0=raw[0],
         cam1=raw[1],
-        T_cam1_cam0=_rigid(entries, "01", path) @ se3_inverse(_rigid(entries, "00", path)),
+        T_cam1_cam0=_transform(entries, path, "R_01", "T_01") @ se3_inverse(_transform(entries, path, "R_00", "T_00")),
         rect0=rect[0],
         rect1=rect[1],
         T_rect1_rect0=se3_from_parts(np.eye(3), offsets[1] - offsets[0]),
-        R_rect_cam0=_rotation(entries, "R_rect_00", path),
-        R_rect_cam1=_rotation(entries, "R_rect_01", path),
+        R_rect_cam0=_transform(entries, path, "R_rect_00")[:3, :3],
+        R_rect_cam1=_transform(entries, path, "R_rect_01")[:3, :3],
     )
 
 
@@ -180,15 +179,11 @@ def _size(entries: Mapping[str, str], name: str, path: Path) -> tuple[int, int]:
     return image_size(_entry(entries, name, 2, path).tolist(), f"{path}, {name}")
 
 
-def _rigid(entries: Mapping[str, str], k: str, path: Path) -> FloatArray:
-    """`R_k T_k`: from the coordinates of camera 0 to those of camera k."""
-    R, t = _entry(entries, f"R_{k}", 9, path).reshape(3, 3), _entry(entries, f"T_{k}", 3, path)
-    return checked_transform(np.column_stack([R, t]), f"{path}, R_{k}")
-
-
-def _rotation(entries: Mapping[str, str], name: str, path: Path) -> FloatArray:
-    R = _entry(entries, name, 9, path).reshape(3, 3)
-    return checked_transform(np.column_stack([R, np.zeros(3)]), f"{path}, {name}")[:3, :3]
+def _transform(entries: Mapping[str, str], path: Path, rotation: str, translation: str | None = None) -> FloatArray:
+    """Return the transform (4, 4) of two entries, or of a rotation alone."""
+    R = _entry(entries, rotation, 9, path).reshape(3, 3)
+    t = np.zeros(3) if translation is None else _entry(entries, translation, 3, path)
+    return checked_transform(np.column_stack([R, t]), f"{path}, {rotation}")
 
 
 def read_imu_pose(path: Path) -> tuple[FloatArray | None, tuple[str, ...]]:
@@ -197,14 +192,8 @@ def read_imu_pose(path: Path) -> tuple[FloatArray | None, tuple[str, ...]]:
     if velo is None or imu is None:
         lacking = " and ".join(name for name, found in ((VELO, velo), (IMU, imu)) if found is None)
         return None, (f"{path}: {lacking} not found; the pose of the IMU is unknown, and poses describe the camera",)
-    T_cam0_velo, T_velo_imu = (_read_rigid(file) for file in (velo, imu))
+    T_cam0_velo, T_velo_imu = (_transform(_read_entries(file), file, "R", "T") for file in (velo, imu))
     return T_cam0_velo @ T_velo_imu, ()
-
-
-def _read_rigid(path: Path) -> FloatArray:
-    entries = _read_entries(path)
-    R, t = _entry(entries, "R", 9, path).reshape(3, 3), _entry(entries, "T", 3, path)
-    return checked_transform(np.column_stack([R, t]), f"{path}, R")
 
 
 def _read_entries(path: Path) -> dict[str, str]:

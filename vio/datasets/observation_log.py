@@ -16,14 +16,15 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.cameras.rig import Rig
-from vio.datasets.common import checked_transform, read_npz, shape_text
+from vio.datasets.common import read_npz, shape_text
 from vio.datasets.features import FeatureDataset
-from vio.datasets.samples import MotionSamples, motion_samples
+from vio.datasets.samples import MotionSamples
+from vio.datasets.samples import motion_samples as as_arrays
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_bytes
 from vio.files.text import check_increasing
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, checked_transform
 from vio.geometry.stereo import CameraKind, Projection, StereoCamera
 from vio.records import (
     BodyFrame,
@@ -108,29 +109,40 @@ def write_observation_log(
     times_ns = np.array([o.time_ns for o in observations], dtype=np.int64)
     if (np.diff(frames) <= 0).any() or not np.array_equal(times_ns, recording.frame_times_ns[frames]):
         raise ValueError("the observations are not in the order of the recording's frames, or have other times")
-    camera, sigma = recording.camera, joined_sigmas(observations)
-    arrays: dict[str, np.ndarray] = {
-        "format": np.array(FORMAT),
-        "version": np.array(VERSION, dtype=np.int64),
-        "source": np.array(f"{recording.kind}:{recording.path}"),
+    camera, sigma, motion = recording.camera, joined_sigmas(observations), as_arrays(motion_samples)
+    reference, landmarks = recording.reference, recording.landmarks_reference
+    entries: dict[str, npt.ArrayLike | None] = {  # None: absent
+        "format": FORMAT,
+        "version": np.int64(VERSION),
+        "source": f"{recording.kind}:{recording.path}",
         "notes": np.array(recording.notes, dtype=np.str_),
         "intrinsics": np.array([camera.fu, camera.fv, camera.cu, camera.cv, camera.baseline_m], dtype=np.float64),
         "image_size": np.array([k for k in (camera.width, camera.height) if k is not None], dtype=np.int64),
-        **({} if camera.projection == "pinhole" else {"projection": np.array(camera.projection)}),
+        "projection": None if camera.projection == "pinhole" else camera.projection,
         "frame_times_ns": recording.frame_times_ns,
         "frame_indices": frames,
         "offsets": np.cumsum([0, *(len(o) for o in observations)], dtype=np.int64),
-        "ids": _joined([o.ids for o in observations], np.zeros(0, dtype=np.int64)),
-        "z": _joined([o.z for o in observations], np.zeros((0, 4))),
-        "has_right": _joined([o.has_right for o in observations], np.zeros(0, dtype=np.bool_)),
-        "stale": _joined([o.stale for o in observations], np.zeros(0, dtype=np.bool_)),
-        **_motion_arrays(motion_samples),
-        **_optional_arrays(recording),
-        **({} if run_motion is None else {"run_motion": np.array(run_motion)}),
-        **({} if camera.kind == "stereo" else {"camera_kind": np.array(camera.kind)}),
-        **({"residual_px": np.array(camera.residual_px)} if camera.residual_px else {}),
-        **({} if sigma is None or not sigma.any() else {"sigma": sigma}),
+        "ids": np.concatenate([np.zeros(0, dtype=np.int64), *(o.ids for o in observations)]),
+        "z": np.concatenate([np.zeros((0, 4)), *(o.z for o in observations)]),
+        "has_right": np.concatenate([np.zeros(0, dtype=np.bool_), *(o.has_right for o in observations)]),
+        "stale": np.concatenate([np.zeros(0, dtype=np.bool_), *(o.stale for o in observations)]),
+        "motion_times_ns": motion.times_ns,
+        "motion_is_imu": motion.is_imu,
+        "motion_values": motion.values,
+        "T_cam0_imu": recording.T_cam0_imu,
+        "reference_T_world_body": None if reference is None else reference.T_world_body,
+        "reference_body": None if reference is None else reference.body,
+        "reference_times_ns": None if reference is None else reference.times_ns,
+        "reference_frame_indices": None if reference is None else reference.frame_indices,
+        "landmark_ids": None if landmarks is None else landmarks.ids,
+        "landmark_p_world": None if landmarks is None else landmarks.p_world,
+        "landmark_covariance": None if landmarks is None else landmarks.covariance,
+        "run_motion": run_motion,
+        "camera_kind": None if camera.kind == "stereo" else camera.kind,
+        "residual_px": camera.residual_px or None,
+        "sigma": None if sigma is None or not sigma.any() else sigma,
     }
+    arrays = {key: np.asarray(value) for key, value in entries.items() if value is not None}
     stream = io.BytesIO()
     np.savez(stream, **arrays)  # type: ignore[arg-type] # the stubs take every keyword for allow_pickle
     atomic_write_bytes(path, stream.getvalue())
@@ -177,33 +189,6 @@ def write_observations(
     kinds: set[MotionSource] = {"imu" if isinstance(sample, ImuSample) else "velocity" for sample in motion}
     recording = Recording("features", Path(path), camera, T, times_ns, False, frozenset(kinds), reference)
     write_observation_log(Path(path), recording, seen, motion)
-
-
-def _joined(parts: list[np.ndarray], empty: np.ndarray) -> np.ndarray:
-    return np.concatenate([empty, *parts])
-
-
-def _motion_arrays(samples: Sequence[MotionSample]) -> dict[str, np.ndarray]:
-    arrays = motion_samples(samples)
-    return {"motion_times_ns": arrays.times_ns, "motion_is_imu": arrays.is_imu, "motion_values": arrays.values}
-
-
-def _optional_arrays(recording: Recording) -> dict[str, np.ndarray]:
-    out: dict[str, np.ndarray] = {}
-    if recording.T_cam0_imu is not None:
-        out["T_cam0_imu"] = recording.T_cam0_imu
-    if (reference := recording.reference) is not None:
-        out["reference_T_world_body"] = reference.T_world_body
-        out["reference_body"] = np.array(reference.body)
-        if reference.times_ns is not None:
-            out["reference_times_ns"] = reference.times_ns
-        if reference.frame_indices is not None:
-            out["reference_frame_indices"] = reference.frame_indices
-    if (landmarks := recording.landmarks_reference) is not None:
-        out["landmark_ids"] = landmarks.ids
-        out["landmark_p_world"] = landmarks.p_world
-        out["landmark_covariance"] = landmarks.covariance
-    return out
 
 
 def is_observation_log(names: Sequence[str]) -> bool:
@@ -303,12 +288,9 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
     for first, group in _GROUPS.items():
         if first in arrays and any(key not in arrays for key in group):
             return f"{first} lacks {' '.join(key for key in group if key not in arrays)}"
-    if "projection" in arrays and str(arrays["projection"]) not in get_args(Projection):
-        return f"projection is {str(arrays['projection'])!r}, none of {', '.join(get_args(Projection))}"
-    if "run_motion" in arrays and str(arrays["run_motion"]) not in get_args(RunMotion):
-        return f"run_motion is {str(arrays['run_motion'])!r}, none of {', '.join(get_args(RunMotion))}"
-    if "camera_kind" in arrays and str(arrays["camera_kind"]) not in get_args(CameraKind):
-        return f"camera_kind is {str(arrays['camera_kind'])!r}, none of {', '.join(get_args(CameraKind))}"
+    for key, names in (("projection", Projection), ("run_motion", RunMotion), ("camera_kind", CameraKind)):
+        if key in arrays and str(arrays[key]) not in get_args(names):
+            return f"{key} is {str(arrays[key])!r}, none of {', '.join(get_args(names))}"
     residual = arrays.get("residual_px", np.zeros(()))
     if not 0 <= residual < np.inf:
         return f"residual_px is {residual.tolist()!r}, no number of pixels"

@@ -37,21 +37,11 @@ from vio.files.text import text_lines
 from vio.records import NS_PER_S, IntArray
 
 _PAIRS: tuple[tuple[str, ...], ...] = (
-    ("left", "right"),
-    ("Left", "Right"),
-    ("cam0", "cam1"),
-    ("image_0", "image_1"),
-    ("image_00", "image_01"),
-    ("image_2", "image_3"),
-    ("image_02", "image_03"),
-    ("images_left", "images_right"),
-    ("image_left", "image_right"),
-    ("left_images", "right_images"),
-    ("camera_left", "camera_right"),
-    ("L", "R"),
-    ("image_lcam_front", "image_rcam_front"),
-    ("infra1", "infra2"),
-)
+    ("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_00", "image_01"),
+    ("image_2", "image_3"), ("image_02", "image_03"), ("images_left", "images_right"),
+    ("image_left", "image_right"), ("left_images", "right_images"), ("camera_left", "camera_right"), ("L", "R"),
+    ("image_lcam_front", "image_rcam_front"), ("infra1", "infra2"),
+)  # fmt: skip
 ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
 _INSIDE = ("data", "images", "")
 _SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
@@ -200,28 +190,10 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
         times_ns, times_file = images.listed_ns, layout.root / LISTS[0]
     if kind != "plain" and times_file == layout.left:  # EuRoC's list repeats the times that the images are named by
         used.append(layout.left.parent / "data.csv")
-    found = read_companions(
-        kind,
-        layout,
-        (file, rig),
-        settings,
-        (times_ns, times_file),
-        (*images.notes, *notes),
-        used,
-        has_depths=images.depths is not None,
-    )
-    return RectifiedDataset(
-        found.recording,
-        found.motion,
-        found.sizes,
-        settings,
-        images.pairs,
-        found.rectifier,
-        rig.imu_noise,
-        images.depths,
-        depth_factor,
-        white=white,
-    )
+    times, notes, has_depths = (times_ns, times_file), (*images.notes, *notes), images.depths is not None
+    found = read_companions(kind, layout, (file, rig), settings, times, notes, used, has_depths=has_depths)
+    common = found.recording, found.motion, found.sizes, settings, images.pairs, found.rectifier
+    return RectifiedDataset(*common, rig.imu_noise, images.depths, depth_factor, white=white)
 
 
 def _depth_factor(rig: Rig, settings: DatasetSettings, where: Path) -> tuple[float, tuple[str, ...]]:

@@ -2,40 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from vio.cameras.rig import Rectifier, rectifier_of
-from vio.datasets.common import naming
-from vio.datasets.image_pairs import ImageDataset, ImageSize
-from vio.datasets.images import UnreadableImageError, load_depth, write_png
+from vio.cameras.rig import Rectifier
+from vio.datasets.image_pairs import ImageDataset
+from vio.datasets.images import UnreadableImageError, load_depth
 from vio.errors import DataError
-from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray
-from vio.geometry.rectify import Interpolation, ProjectionMode
-from vio.protocols import Progress
-from vio.records import Image, ImuDensities, IntArray, StereoFrame
-
-
-def make_rectifier(
-    rig: StereoRig, interpolation: Interpolation, where: Path, projection: ProjectionMode = "pinhole"
-) -> Rectifier:
-    """Prepare the rectification of a rig; a rig that is rectified already passes images through unchanged.
-
-    Raises:
-        CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
-    """
-    with naming(where):
-        return rectifier_of(rig, interpolation, projection)
-
-
-def rig_sizes(rig: StereoRig, calibrated_in: tuple[Path, Path]) -> tuple[ImageSize, ...]:
-    """Return the calibrated sizes of left and right images, and the files that specify them."""
-    left, right = calibrated_in
-    return ImageSize(rig.cam0.width, rig.cam0.height, left), ImageSize(rig.cam1.width, rig.cam1.height, right)
+from vio.records import Image, ImuDensities, StereoFrame
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,29 +51,3 @@ def check_not_rectified(dataset: RectifiedDataset) -> None:
             f"{dataset.recording.path} is rectified already (equal pinhole cameras, rows aligned): there is nothing to "
             "do; use it as it is"
         )
-
-
-def write_frames(
-    dataset: RectifiedDataset, name: Callable[[StereoFrame, int], tuple[Path, Path]], progress: Progress
-) -> IntArray:
-    """Write every readable frame as two PNG files; return the times (N,) of those written.
-
-    Args:
-        dataset: the recording to rectify.
-        name: the two files of a frame, given the frame and how many were written before it; folders must exist.
-        progress: called after each frame.
-
-    Raises:
-        DataError: too many images are unreadable, or one has the wrong size.
-    """
-    times: list[int] = []
-    for frame in (event for event in dataset.events() if isinstance(event, StereoFrame)):
-        assert frame.left is not None
-        assert frame.right is not None
-        for path, image in zip(name(frame, len(times)), (frame.left, frame.right), strict=True):
-            write_png(path, image)
-        times.append(frame.time_ns)
-        progress(len(times), len(dataset.recording.frame_times_ns))
-    if not times:
-        raise DataError(f"{dataset.recording.path}: no frame could be read; see the warnings above")
-    return np.array(times, dtype=np.int64)

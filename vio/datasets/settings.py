@@ -20,8 +20,7 @@ class DatasetSettings(Section):
     section: ClassVar[str] = "dataset"
 
     colour: bool | None = setting(
-        None,
-        "KITTI folders: use image_2/image_3 (true) or image_0/image_1 (false); null: gray where there is any",
+        None, "KITTI folders: use image_2/image_3 (true) or image_0/image_1 (false); null: gray where there is any"
     )
     extrinsics: ExtrinsicsMode = setting(
         "auto",
@@ -35,8 +34,7 @@ class DatasetSettings(Section):
         "motion of the pixels afterwards whether the track switched to another point (auto: split if so, else flag)",
     )
     calibration: Path | None = setting(
-        None,
-        "plain folders, bags and videos: the calibration file, in the place of the recording's own",
+        None, "plain folders, bags and videos: the calibration file, in the place of the recording's own"
     )
     camera: Literal["both", "left"] = setting(
         "both", "stereo recordings: use both cameras, or the left one alone, which needs an IMU for the scale"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta, timezone
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -16,9 +15,11 @@ from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.files.text import INT64_MAX, check_increasing, text_lines
 from vio.geometry.lie import FloatArray
-from vio.records import NS_PER_S, ImuRecord, IntArray, VelocitySample
+from vio.records import ImuRecord, IntArray, VelocitySample
 
 _UNITS = {"s": 9, "sec": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanoseconds
+# Stamps of 1973 and later in ns, us and ms; smaller ones are seconds from any zero.
+_NS_SINCE, _US_SINCE, _MS_SINCE = Decimal("1e17"), Decimal("1e14"), Decimal("1e11")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
@@ -111,20 +112,14 @@ def parse_stamps(texts: Sequence[str], where: Callable[[int], str], unit: str | 
         if not value.is_finite():
             raise DataError(f"{where(k)}: {text!r} is no time; remove or correct that entry")
         values.append(value)
-    power = _UNITS[unit] if unit is not None else _power(values[0])
+    size = values[0].copy_abs()
+    by_size = 0 if size >= _NS_SINCE else 3 if size >= _US_SINCE else 6 if size >= _MS_SINCE else 9
+    power = _UNITS[unit] if unit is not None else by_size
     limit = Decimal(INT64_MAX).scaleb(-power)
     for k, value in enumerate(values):
         if value.copy_abs() > limit:  # abs() would round, which no context can do with an exponent of any size
             raise DataError(f"{where(k)}: {texts[k]!r} is out of range for a time; state its unit in the header ([ns])")
     return check_increasing([int(value.scaleb(power).to_integral_value()) for value in values], where)
-
-
-def _power(first: Decimal) -> int:
-    """Return the power of ten to nanoseconds by the size of a stamp: 2001 and later, or seconds from any zero."""
-    for limit, power in ((Decimal("1e17"), 0), (Decimal("1e14"), 3), (Decimal("1e11"), 6)):
-        if first.copy_abs() >= limit:
-            return power
-    return 9
 
 
 def read_imu_table(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
@@ -225,8 +220,7 @@ def _number(text: str) -> float:
     return float(text) if _NUMBER.fullmatch(text) else float("nan")
 
 
-_EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
-_MAX_SINCE = timedelta(days=100_000)  # so that nanoseconds fit 64 bits
+_DATE = re.compile(r"(19|20|21)\d\d-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{0,9})?")  # whose nanoseconds fit 64 bits
 
 
 def is_date(text: str) -> bool:
@@ -258,13 +252,11 @@ def drive_times(path: Path, numbers: IntArray) -> IntArray:
 
 def _parse_date(text: str, path: Path, number: int) -> int:
     """Parse '2011-09-26 14:02:25.951199337' as UTC, to nanoseconds since 1970."""
-    whole, _, fraction = text.strip().partition(".")
     try:
-        since = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc) - _EPOCH
-        if not re.fullmatch(r"\d{0,9}", fraction) or abs(since) > _MAX_SINCE:
+        if not _DATE.fullmatch(text.strip()):
             raise ValueError(text)
+        return int(np.datetime64(text.strip().rstrip("."), "ns").astype(np.int64))
     except ValueError as error:
         raise DataError(
             f"{path}, line {number}: {text.strip()[:40]!r} is no time of the form '2011-09-26 14:02:25.951199337'"
         ) from error
-    return since // timedelta(seconds=1) * NS_PER_S + int(fraction.ljust(9, "0") or 0)

@@ -84,8 +84,7 @@ def _differs_from_zero(values: FloatArray, min_speed: float) -> BoolArray:
     mean = (total[high] - total[low]) / n
     scatter = np.maximum((squares[high] - squares[low]) / n - mean**2, 0.0)
     error = np.sqrt(scatter / n)
-    out: BoolArray = (np.abs(mean) > np.maximum(min_speed, _SIGNIFICANCE * error)).any(axis=1)
-    return out
+    return (np.abs(mean) > np.maximum(min_speed, _SIGNIFICANCE * error)).any(axis=1)
 
 
 @dataclass(frozen=True, slots=True)

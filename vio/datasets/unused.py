@@ -11,7 +11,7 @@ from vio.datasets.images import SUFFIXES
 
 _SILENT = ("readme*", "license*", "*.md", "simulation.json", "rectification.json", "conversion.json")  # no data
 _PHOTOMETRIC = ("pcalib*.txt", "vignette*.png")  # of DSO and TUM-VI
-_NAMED = 12  # unused files listed by name
+_NAMED = 12  # of a list
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +52,14 @@ def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
     notes = []
     if photometric:
         why = "photometric calibration is not applied, as the tracks gain nothing by it"
-        notes.append(f"{why}: {_listed(photometric)}")
-    return [*notes, f"not used: {_listed(others)}"] if others else notes
+        notes.append(f"{why}: {listed(photometric)}")
+    return [*notes, f"not used: {listed(others)}"] if others else notes
 
 
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
+def listed(names: Sequence[str]) -> str:
+    """Return the first names, and how many more there are."""
+    shown = ", ".join(names[:_NAMED]) or "none"
+    return f"{shown} and {len(names) - _NAMED} more" if len(names) > _NAMED else shown
 
 
 def _belongs(other: Path, calibration: Path) -> bool:

@@ -14,21 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import (
-    check_array_bytes,
-    checked_transform,
-    clock_ns,
-    finite_rows,
-    naming,
-    shape_text,
-)
+from vio.datasets.common import check_array_bytes, clock_ns, finite_rows, naming, shape_text
 from vio.datasets.features import FeatureDataset, SensorVariances
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
 from vio.errors import DataError
 from vio.files.inputs import check_regular
-from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
+from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, so3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, Landmarks, Recording, Trajectory
 

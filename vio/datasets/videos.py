@@ -23,13 +23,7 @@ from vio.datasets.rigs import load_rig
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout
 from vio.errors import DataError
-from vio.records import (
-    NS_PER_S,
-    Image,
-    ImuDensities,
-    IntArray,
-    StereoFrame,
-)
+from vio.records import NS_PER_S, Image, ImuDensities, IntArray, StereoFrame
 
 SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
 _NAMES = (("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("image_0", "image_1"), ("video_0", "video_1"))

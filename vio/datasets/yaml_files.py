@@ -12,9 +12,16 @@ from vio.errors import CalibrationError
 from vio.files.text import text_lines
 from vio.files.yaml_text import read_yaml as read_yaml_text
 from vio.geometry.lie import FloatArray
+from vio.records import ImuDensities
 
 Entries: TypeAlias = Mapping[str, object]
 
+NOISE_UNITS = {  # entries of an IMU's noise, as EuRoC and Kalibr name them, in the order of `ImuDensities`
+    "gyroscope_noise_density": "rad / s / sqrt(Hz)",
+    "gyroscope_random_walk": "rad / s^2 / sqrt(Hz)",
+    "accelerometer_noise_density": "m / s^2 / sqrt(Hz)",
+    "accelerometer_random_walk": "m / s^3 / sqrt(Hz)",
+}
 _MAX_BYTES = 1_000_000  # a calibration is some kilobytes; a larger file is another one
 
 
@@ -75,6 +82,28 @@ def numbers(entries: Entries, key: str, where: Path | str, count: int | None = N
         wanted = "finite numbers" if count is None else f"{count} finite number{'s' * (count > 1)}"
         raise CalibrationError(f"{where}: '{key}' is {value!r} instead of {wanted}")
     return found
+
+
+def imu_densities(entries: Entries, where: Path | str) -> ImuDensities | None:
+    """Return the noise densities of an IMU; None where none is given.
+
+    Raises:
+        CalibrationError: some are missing, or not positive.
+    """
+    if not any(key in entries for key in NOISE_UNITS):
+        return None
+    values = [numbers(entries, key, where, 1)[0] for key in NOISE_UNITS]
+    for key, value in zip(NOISE_UNITS, values, strict=True):
+        if not value > 0:
+            raise CalibrationError(f"{where}: {key} is {value:g}; a noise density must be positive")
+    return ImuDensities(*values)
+
+
+def densities_text(noise: ImuDensities, *, units: bool) -> str:
+    """Return the entries of an IMU's noise, with all digits, and `units` as comments."""
+    values = (noise.gyro, noise.gyro_walk, noise.accel, noise.accel_walk)
+    lines = zip(NOISE_UNITS.items(), values, strict=True)
+    return "".join(f"{key}: {value!r}{f'  # [ {unit} ]' if units else ''}\n" for (key, unit), value in lines)
 
 
 def matrix(value: object, shape: tuple[int, int] | None, where: str) -> FloatArray:

@@ -92,7 +92,7 @@ def read_trajectory(
     _check_columns(table, kind)
     if kind == "kitti":
         return Trajectory(_kitti_poses(table), None, body or _DEFAULT_BODY[kind])
-    times_ns = _times_ns(table, kind)
+    times_ns = check_increasing([_time_ns(table, row, kind) for row in range(len(table.rows))], table.where)
     poses = _quaternion_poses(table, kind)
     header_body = _header(table, r"body:\s*(\S+)") if kind == "tum" else None
     frames = _header(table, r"frames:\s*(.*\S)") if kind == "tum" else None
@@ -250,13 +250,8 @@ def _floats(table: _Table, first: int, last: int) -> FloatArray:
     return out
 
 
-def _times_ns(table: _Table, kind: TrajectoryFormat) -> IntArray:
-    """The first column as strictly increasing integer nanoseconds (N,)."""
-    times = [_time_ns(table, row, kind) for row in range(len(table.rows))]
-    return check_increasing(times, table.where)
-
-
 def _time_ns(table: _Table, row: int, kind: TrajectoryFormat) -> int:
+    """The first field of a row as integer nanoseconds."""
     text = table.fields(row, 1)[0].strip()
     if kind == "euroc":
         if not _STAMP.fullmatch(text) or abs(int(text)) > INT64_MAX:

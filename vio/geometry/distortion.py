@@ -71,10 +71,6 @@ class CameraModel:
                 f"the {self.model} model takes {expected[0]} distortion coefficients"
                 f"{''.join(f' or {n}' for n in expected[1:])}, got {len(self.coefficients)}"
             )
-        self._check_spheres()
-
-    def _check_spheres(self) -> None:
-        """Raise CalibrationError unless the sphere models' parameters are in their range."""
         if self.model == "unified" and self.coefficients[0] < 0:
             raise CalibrationError(f"the unified model's xi must not be negative, got {self.coefficients[0]:g}")
         if self.model == "double_sphere":
@@ -103,8 +99,7 @@ class StereoRig:
     @property
     def T_cam0_cam1(self) -> FloatArray:
         """Pose (4, 4) of the right camera in the left one; its translation is the baseline."""
-        out: FloatArray = se3_inverse(self.T_imu_cam0) @ self.T_imu_cam1
-        return out
+        return se3_inverse(self.T_imu_cam0) @ self.T_imu_cam1
 
 
 def rectified_pair(rig: StereoRig) -> StereoCamera | None:
@@ -216,10 +211,7 @@ def _radtan(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
     if (divisor := _divisor(coefficients, r2)) is not None:
         radial = radial / divisor[0]
     return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
+        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
         axis=-1,
     )
 

@@ -12,8 +12,11 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from vio.errors import CalibrationError
+
 FloatArray = npt.NDArray[np.float64]
 
+_EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 # Below this angle the closed forms suffer from cancellation and the Taylor series is exact to rounding.
 _SMALL_ANGLE_RAD = 1e-2
 
@@ -148,8 +151,7 @@ def so3_log(R: npt.ArrayLike) -> FloatArray:
     s = np.linalg.norm(vector, axis=-1)
     small = s < 1e-7
     angle_over_s = np.where(small, 2.0, 2 * np.arctan2(s, w) / np.where(small, 1.0, s))
-    out: FloatArray = angle_over_s[..., None] * vector
-    return out
+    return angle_over_s[..., None] * vector
 
 
 def so3_left_jacobian(phi: npt.ArrayLike) -> FloatArray:
@@ -274,16 +276,14 @@ def circledot(p: npt.ArrayLike) -> FloatArray:
 def transform_points(T_a_b: npt.ArrayLike, p_b: npt.ArrayLike) -> FloatArray:
     """Map points (N, 3) or (3,) from frame b to frame a with one transform (4, 4)."""
     T_a_b, p_b = np.asarray(T_a_b, dtype=np.float64), np.asarray(p_b, dtype=np.float64)
-    out: FloatArray = p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
-    return out
+    return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def nearest_rotation(R: npt.ArrayLike) -> FloatArray:
     """The rotations (..., 3, 3) closest to given matrices in the Frobenius norm (by SVD)."""
     U, _, Vt = np.linalg.svd(np.asarray(R, dtype=np.float64))
     U[..., :, -1] *= np.sign(np.linalg.det(U @ Vt))[..., None]
-    out: FloatArray = U @ Vt
-    return out
+    return U @ Vt
 
 
 _ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I accepted as rounding
@@ -302,3 +302,23 @@ def rigid_fault(T: FloatArray) -> str | None:
     if np.linalg.det(R) < 0:
         return "not a rotation but a reflection (determinant -1); check the axes' order"
     return None
+
+
+def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
+    """Return a rigid transform (4, 4) whose rotation is orthonormal to rounding.
+
+    Args:
+        T: (4, 4) or its first three rows.
+        where: names it (a file and its entry) in the message.
+
+    Raises:
+        CalibrationError: entries are not finite, or the rotation part is not a rotation.
+    """
+    T_ = np.asarray(T, dtype=np.float64)
+    if T_.shape not in ((3, 4), (4, 4)) or not np.isfinite(T_).all():
+        raise CalibrationError(f"{where}: not a finite 3x4 or 4x4 transform (shape {T_.shape}); check the calibration")
+    if fault := rigid_fault(T_):
+        raise CalibrationError(f"{where}: {fault}")
+    R = T_[:3, :3]
+    deviation = float(np.abs(R.T @ R - np.eye(3)).max())
+    return se3_from_parts(R if deviation <= _EXACT else nearest_rotation(R), T_[:3, 3])

@@ -42,31 +42,6 @@ class RectifiedPair:
     T_rect0_imu: FloatArray  # (4, 4) extrinsics of the rectified left camera
 
 
-@dataclass(frozen=True, slots=True)
-class Rectification(RectifiedPair):
-    """The rectified cameras of a rig, and the maps of its images."""
-
-    map0: tuple[MapArray, MapArray]  # (H, W) each: source u and v of every rectified pixel, for cv2.remap
-    map1: tuple[MapArray, MapArray]
-
-
-def rectify(rig: StereoRig, projection: ProjectionMode = "pinhole") -> Rectification:
-    """Find the rectified pair of a rig and its maps; its images have the size of the left one and no invalid border.
-
-    Raises:
-        CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
-    """
-    pair = rectified_cameras(rig, projection)
-    return Rectification(
-        camera=pair.camera,
-        R_rect_cam0=pair.R_rect_cam0,
-        R_rect_cam1=pair.R_rect_cam1,
-        T_rect0_imu=pair.T_rect0_imu,
-        map0=_lookup(pair.camera, rig.cam0, pair.R_rect_cam0),
-        map1=_lookup(pair.camera, rig.cam1, pair.R_rect_cam1),
-    )
-
-
 def projection_of(rig: StereoRig) -> Projection:
     """Return the projection that keeps most of what a rig sees: a cylinder where a pinhole would crop rows.
 
@@ -74,7 +49,7 @@ def projection_of(rig: StereoRig) -> Projection:
     lenses that see further than that above and below, in both images, have anything to gain.
 
     Raises:
-        CalibrationError: as `rectify`.
+        CalibrationError: as `rectified_cameras`.
     """
     R0, R1, _ = rectifying_rotations(rig)
     low, high = _common_rectangle(rig, R0, R1, "cylinder")
@@ -82,10 +57,10 @@ def projection_of(rig: StereoRig) -> Projection:
 
 
 def rectified_cameras(rig: StereoRig, projection: ProjectionMode = "pinhole") -> RectifiedPair:
-    """Find the rectified pair of a rig, without the maps of its images.
+    """Find the rectified pair of a rig; its images have the size of the left one and no invalid border.
 
     Raises:
-        CalibrationError: as `rectify`.
+        CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
     """
     R_rect_cam0, R_rect_cam1, baseline_m = rectifying_rotations(rig)
     chosen = projection_of(rig) if projection == "auto" else projection
@@ -266,7 +241,8 @@ def _inner_rectangle(
     return np.maximum(low, -most), np.minimum(high, most)
 
 
-def _lookup(rectified: StereoCamera, camera: CameraModel, R_rect_cam: FloatArray) -> tuple[MapArray, MapArray]:
+def lookup(rectified: StereoCamera, camera: CameraModel, R_rect_cam: FloatArray) -> tuple[MapArray, MapArray]:
+    """Return source u and v (H, W) of each pixel of a rectified image in that of its raw camera, for cv2.remap."""
     assert rectified.width is not None
     assert rectified.height is not None
     u, v = np.empty((2, rectified.height, rectified.width), dtype=np.float32)
@@ -288,4 +264,4 @@ def undistorted(camera: CameraModel) -> tuple[StereoCamera, tuple[MapArray, MapA
     f = float(max((camera.width - 1) / (high - low)[0], (camera.height - 1) / (high - low)[1]))
     cu, cv = np.array([camera.width - 1, camera.height - 1]) / 2 - f * (low + high) / 2
     out = one_camera(f, f, float(cu), float(cv), camera.width, camera.height)
-    return out, _lookup(out, camera, np.eye(3))
+    return out, lookup(out, camera, np.eye(3))

@@ -148,8 +148,7 @@ class StereoCamera:
         """The paper's stereo calibration matrix (4, 4) of a pinhole: `z = M pi(q)`."""
         fu, fv, cu, cv = self.fu, self.fv, self.cu, self.cv
         return np.array(
-            [[fu, 0, cu, 0], [0, fv, cv, 0], [fu, 0, cu, -fu * self.baseline_m], [0, fv, cv, 0]],
-            dtype=np.float64,
+            [[fu, 0, cu, 0], [0, fv, cv, 0], [fu, 0, cu, -fu * self.baseline_m], [0, fv, cv, 0]], dtype=np.float64
         )
 
     @property

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from vio.datasets.samples import motion_samples
 from vio.geometry.rectify import field_of_view
 from vio.imu.clocks import judge_clocks
 from vio.imu.findings import InertialFinding
@@ -96,11 +97,8 @@ def _motion_parts(dataset: Dataset) -> list[Part]:
     samples = [event for event in events if isinstance(event, ImuSample)]
     if not samples:
         return parts
-    record = ImuRecord(
-        np.array([s.time_ns for s in samples], dtype=np.int64),
-        np.array([s.gyro for s in samples]),
-        np.array([s.accel for s in samples]),
-    )
+    arrays = motion_samples(samples)
+    record = ImuRecord(arrays.times_ns, arrays.values[:, :3], arrays.values[:, 3:])
     parts.append(clock_part("IMU", recording, record.times_ns))
     if len(samples) > 1:
         noise = noise_part(record, getattr(dataset, "imu_noise", None))

@@ -143,7 +143,10 @@ def measure(
         why = "the left-right calibration must be corrected first: it determines the positions and depths of features"
         return CalibrationReport(source, stereo, rows, _no_imu(why), findings, notes)
     described = row_residuals(matches.z, *source.image_size(matches.z))
-    if _unusable(described, findings):
+    misaligned = isinstance(described, RowResiduals) and (
+        abs(described.median_px) + described.spread_px > _MAX_ROW_OFFSET_PX
+    )
+    if misaligned or any(f.fault in _UNUSABLE for f in findings):  # features may not be of the same point
         why = f"{findings[0].fault if findings else 'image rows do not match'}: correct that first, then measure again"
         return CalibrationReport(source, stereo, described, _no_imu(why), findings, notes)
     recording = source.dataset.recording
@@ -156,12 +159,6 @@ def measure(
     motion = camera_motion(recording.camera, tracks, recording.frame_times_ns)
     imu = _measure_imu(recording, tracks, samples, motion)
     return CalibrationReport(source, stereo, described, imu, findings, notes, intrinsics, in_motion)
-
-
-def _unusable(rows: RowResiduals | NotObservable, findings: tuple[Finding, ...]) -> bool:
-    """Return whether features of the two images may not be of the same point."""
-    misaligned = isinstance(rows, RowResiduals) and abs(rows.median_px) + rows.spread_px > _MAX_ROW_OFFSET_PX
-    return misaligned or any(f.fault in _UNUSABLE for f in findings)
 
 
 # --- left and right -------------------------------------------------------------------------------------------------
@@ -243,7 +240,8 @@ def _measure_in_motion(
     off: FloatArray = np.zeros(len(PARAMETERS))
     try:
         for _ in range(_ROUNDS):
-            pieces = _segments(source, camera, _corrected(camera, tracks, off), recording.frame_times_ns)
+            z = field_of(camera, off).without(tracks.z, tracks.has_right) if np.any(off) else tracks.z
+            pieces = _segments(source, camera, replace(tracks, z=z), recording.frame_times_ns)
             if not pieces:
                 return stereo, NotObservable(_INTRINSICS, "there are no 20 frames in a row whose motion is known"), None
             step = self_calibrate(camera, pieces, intrinsics=False)
@@ -270,11 +268,6 @@ def _measure_in_motion(
     return found, intrinsics_of(camera, free), held
 
 
-def _corrected(camera: StereoCamera, tracks: FeatureTracks, off: FloatArray) -> FeatureTracks:
-    """Return tracks without the field of a pair that is off by parameters (14,)."""
-    return replace(tracks, z=field_of(camera, off).without(tracks.z, tracks.has_right)) if np.any(off) else tracks
-
-
 def _segments(
     source: CalibrationSource, camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray
 ) -> list[Segment]:
@@ -299,10 +292,7 @@ def _no_imu(why: str) -> ImuReport:
 
 
 def _measure_imu(
-    recording: Recording,
-    tracks: FeatureTracks,
-    samples: Sequence[MotionSample],
-    motion: CameraMotion | NotObservable,
+    recording: Recording, tracks: FeatureTracks, samples: Sequence[MotionSample], motion: CameraMotion | NotObservable
 ) -> ImuReport:
     if not samples:
         return _no_imu("the recording contains no motion sensor")

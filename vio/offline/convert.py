@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,37 +11,32 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from vio.cameras.rig import Rig
+from vio.cameras.rig import rig_of_rectified
 from vio.datasets.bags.writer import BagWriter, Storage, bag_writer
-from vio.datasets.euroc_files import TUM_FILE as EUROC_TUM
+from vio.datasets.euroc import euroc_base
 from vio.datasets.euroc_files import (
-    camera_yaml,
-    image_list_csv,
+    STATE_CSV,
     image_name,
     imu_csv,
     imu_yaml,
     median_rate_hz,
+    read_imu_yaml,
     rig_read_as,
+    write_cameras,
 )
+from vio.datasets.euroc_files import TUM_FILE as EUROC_TUM
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
-from vio.datasets.rigs.kalibr import NOISE_KEYS, kalibr_text
+from vio.datasets.rectified import RectifiedDataset
+from vio.datasets.rigs.kalibr import kalibr_text
+from vio.datasets.samples import motion_samples
+from vio.datasets.yaml_files import densities_text
 from vio.errors import DataError
 from vio.files.text import exact_text, seconds_text, write_text
 from vio.files.trajectories import in_first_cam0, write_tum
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.protocols import Dataset, Progress
-from vio.records import (
-    Event,
-    ImuDensities,
-    ImuRecord,
-    ImuSample,
-    IntArray,
-    Recording,
-    StereoFrame,
-    Trajectory,
-    VelocitySample,
-)
+from vio.records import Event, ImuDensities, ImuRecord, ImuSample, Recording, StereoFrame, VelocitySample
 
 Folder: TypeAlias = Literal["euroc", "kitti", "plain"]
 Form: TypeAlias = Literal["euroc", "kitti", "plain", "rosbag2", "mcap"]
@@ -58,12 +54,12 @@ class _Written:
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """The counts of a conversion, and what the form could not hold."""
+    """The counts of a conversion, and what the form could not hold or a reader must be given."""
 
     frames: int
     imu_samples: int
     velocities: int
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 def convert(
@@ -95,11 +91,10 @@ def convert(
         raise DataError(f"{recording.path}: holds no images, so there is nothing to convert")
     noise: ImuDensities | None = getattr(dataset, "imu_noise", None)
     if form == "rosbag2" or form == "mcap":  # mypy narrows the type by these
-        counts = write_bag(dataset, out, form, start, stop, progress)
-        _check_frames(counts.frames, recording)
-        _write_kalibr(out, recording, noise if counts.imu_samples else None)
-        notes = tuple(counts.notes(recording))
-        return Converted(counts.frames, counts.imu_samples, counts.velocities, notes)
+        done = _write_bag(dataset, out, form, start, stop, progress)
+        _check_frames(done.frames, recording)
+        _write_kalibr(out, recording, noise if done.imu_samples else None)
+        return replace(done, notes=_bag_notes(done, recording))
     written = _write_images(dataset, out, form, start, stop, progress)
     _check_frames(len(written.times_ns), recording)
     writers: dict[Folder, Callable[[Path, Recording, _Written, ImuDensities | None], list[str]]] = {
@@ -111,15 +106,44 @@ def convert(
     return Converted(len(written.times_ns), len(written.imu), len(written.velocities), tuple(lacking))
 
 
+def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progress) -> int:
+    """Write an EuRoC recording as a folder of rectified images; the IMU and the ground truth are copied as they are.
+
+    Returns:
+        The number of frames written.
+
+    Raises:
+        DataError: too many images are unreadable, or a file cannot be copied.
+    """
+    source, mav = euroc_base(dataset.recording.path), out / "mav0"
+    rig = rig_read_as(dataset.recording.camera, dataset.rectifier.T_rect0_imu)
+    sensor = source / "imu0" / "sensor.yaml"
+    T_body_imu = read_imu_yaml(sensor)[0] if sensor.is_file() else np.eye(4)
+    written = _write_images(dataset, out, "euroc", 0, None, progress)
+    _check_frames(len(written.times_ns), dataset.recording)
+    times = np.array(written.times_ns, dtype=np.int64)
+    write_cameras(mav, rig, times, written.last_ns, kind="rectified", T_body_imu=T_body_imu)
+    copied = [
+        (source / part, mav / part) for part in (Path("imu0", "sensor.yaml"), Path("imu0", "data.csv"), STATE_CSV)
+    ]
+    for file, target in (*copied, (source.absolute().parent / EUROC_TUM, out / EUROC_TUM)):
+        if file.is_file():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                shutil.copyfile(file, target)
+            except shutil.SameFileError as error:
+                raise DataError(f"{file}: cannot be copied onto itself; choose another folder") from error
+    return len(times)
+
+
+def _frames_in(dataset: Dataset, start: int, stop: int | None) -> int:
+    count = len(dataset.recording.frame_times_ns)
+    return (count if stop is None else min(stop, count)) - start
+
+
 def _check_frames(count: int, recording: Recording) -> None:
     if not count:
         raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
-
-
-def _folders(out: Path, form: Folder) -> tuple[Path, Path]:
-    names = {"euroc": ("mav0/cam0/data", "mav0/cam1/data"), "kitti": ("image_0", "image_1"), "plain": ("left", "right")}
-    left, right = (out / name for name in names[form])
-    return left, right
 
 
 def _write_images(
@@ -127,11 +151,11 @@ def _write_images(
 ) -> _Written:
     """Write the images of a range, and collect its samples."""
     written = _Written()
-    folders = _folders(out, form)
+    names = {"euroc": ("mav0/cam0/data", "mav0/cam1/data"), "kitti": ("image_0", "image_1"), "plain": ("left", "right")}
+    folders = [out / name for name in names[form]]
     for folder in folders:
         folder.mkdir(parents=True)
-    count = len(dataset.recording.frame_times_ns)
-    total = (count if stop is None else min(stop, count)) - start
+    total = _frames_in(dataset, start, stop)
     written.last_ns = int(dataset.recording.frame_times_ns[total + start - 1])
     for event in dataset.events(start, stop):
         if isinstance(event, ImuSample):
@@ -151,15 +175,12 @@ def _write_images(
 
 def _finish_euroc(out: Path, recording: Recording, written: _Written, noise: ImuDensities | None) -> list[str]:
     times = np.array(written.times_ns, dtype=np.int64)
-    T_cam0_imu = recording.T_cam0_body
-    rig, mav = rig_read_as(recording.camera, T_cam0_imu), out / "mav0"
-    for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
-        text = camera_yaml(camera, T_imu_cam, comment=f"rectified {name}", rate_hz=median_rate_hz(times))
-        write_text(mav / name / "sensor.yaml", text)
-        write_text(mav / name / "data.csv", image_list_csv(times, written.last_ns))
+    rig, mav = rig_read_as(recording.camera, recording.T_cam0_body), out / "mav0"
+    write_cameras(mav, rig, times, written.last_ns, kind="rectified")
     notes = []
     if written.imu:
-        record = _record(written.imu)
+        samples = motion_samples(written.imu)
+        record = ImuRecord(samples.times_ns, samples.values[:, :3], samples.values[:, 3:])
         (mav / "imu0").mkdir()
         write_text(mav / "imu0" / "data.csv", imu_csv(record))
         if noise is not None:
@@ -181,8 +202,7 @@ def _finish_kitti(out: Path, recording: Recording, written: _Written, noise: Imu
         write_velocity(out, written.velocities, first_ns)
     notes = []
     if written.imu:
-        record = _record(written.imu)
-        write_text(out / "imu.csv", _imu_text(replace(record, times_ns=record.times_ns - first_ns)))
+        write_text(out / "imu.csv", _imu_text(written.imu, first_ns))
         notes.append("KITTI's form has no IMU: imu.csv is beside it, and makes the folder one of kind plain")
     truth = recording.reference
     if truth is None or truth.times_ns is None:
@@ -194,7 +214,7 @@ def _finish_kitti(out: Path, recording: Recording, written: _Written, noise: Imu
         rows = in_first_cam0(here, T_cam0_imu).T_world_body[:, :3].reshape(-1, 12)
         write_text(out / "poses.txt", "".join(f"{exact_text(row)}\n" for row in rows))
     else:
-        write_tum(out / "reference.tum", _shifted(truth, first_ns))
+        write_tum(out / "reference.tum", replace(truth, times_ns=truth.times_ns - first_ns))
         notes.append("the ground truth is not at the frames' times: it is in reference.tum, not in poses.txt")
     return notes
 
@@ -203,7 +223,7 @@ def _finish_plain(out: Path, recording: Recording, written: _Written, noise: Imu
     _write_kalibr(out, recording, noise if written.imu else None)
     write_text(out / "times.txt", "".join(f"{seconds_text(t)}\n" for t in written.times_ns))
     if written.imu:
-        write_text(out / "imu.csv", _imu_text(_record(written.imu)))
+        write_text(out / "imu.csv", _imu_text(written.imu, 0))
     if written.velocities:
         write_velocity(out, written.velocities, 0)
     if recording.reference is not None and recording.reference.times_ns is not None:
@@ -213,59 +233,31 @@ def _finish_plain(out: Path, recording: Recording, written: _Written, noise: Imu
 
 def _write_kalibr(out: Path, recording: Recording, noise: ImuDensities | None) -> None:
     """Write the rectified rig as Kalibr's camchain, and the IMU's noise beside it."""
-    c = recording.camera
-    assert c.width is not None
-    assert c.height is not None
-    rig = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, c.width, c.height, recording.T_cam0_imu)
-    imu = recording.T_cam0_imu is not None
+    rig, imu = rig_of_rectified(recording.camera, recording.T_cam0_imu), recording.T_cam0_imu is not None
+    assert rig is not None
     write_text(out / ("camchain-imucam.yaml" if imu else "camchain.yaml"), kalibr_text(rig))
     if noise is not None:
-        values = (noise.gyro, noise.gyro_walk, noise.accel, noise.accel_walk)
-        text = "".join(f"{key}: {value!r}\n" for key, value in zip(NOISE_KEYS, values, strict=True))
-        write_text(out / "imu.yaml", text)
+        write_text(out / "imu.yaml", densities_text(noise, units=False))
 
 
-def _record(samples: list[ImuSample]) -> ImuRecord:
-    times: IntArray = np.array([s.time_ns for s in samples], dtype=np.int64)
-    return ImuRecord(times, np.array([s.gyro for s in samples]), np.array([s.accel for s in samples]))
-
-
-def _imu_text(record: ImuRecord) -> str:
+def _imu_text(samples: list[ImuSample], first_ns: int) -> str:
     """Return `imu.csv` of a plain folder, with all digits."""
-    rows = _rows(record)
+    rows = (f"{s.time_ns - first_ns},{exact_text([*s.gyro, *s.accel], ',')}" for s in samples)
     return "\n".join(["timestamp [ns],wx,wy,wz,ax,ay,az", *rows]) + "\n"
-
-
-def _rows(record: ImuRecord) -> Iterator[str]:
-    for time_ns, gyro, accel in zip(record.times_ns.tolist(), record.gyro, record.accel, strict=True):
-        yield f"{time_ns},{exact_text([*gyro, *accel], ',')}"
-
-
-def _shifted(truth: Trajectory, first_ns: int) -> Trajectory:
-    assert truth.times_ns is not None
-    return replace(truth, times_ns=truth.times_ns - first_ns)
 
 
 _WORLD, _LEFT, _RIGHT, _IMU = "world", "cam0", "cam1", "imu"
 
 
-@dataclass(slots=True)
-class BagCounts:
-    """What went into the bag."""
-
-    frames: int = 0
-    imu_samples: int = 0
-    velocities: int = 0
-
-    def notes(self, recording: Recording) -> list[str]:
-        """Return what a reader of the bag must be given."""
-        if not self.velocities:
-            return []
-        if recording.T_cam0_imu is None:
-            return ["velocities need the pose of their sensor in the camera, which this recording does not have"]
-        if self.imu_samples:
-            return ["a run reads the IMU alone; for the velocities as well: --topics velocity=/velocity"]
-        return []
+def _bag_notes(done: Converted, recording: Recording) -> tuple[str, ...]:
+    """Return what a reader of a bag must be given."""
+    if not done.velocities:
+        return ()
+    if recording.T_cam0_imu is None:
+        return ("velocities need the pose of their sensor in the camera, which this recording does not have",)
+    if done.imu_samples:
+        return ("a run reads the IMU alone; for the velocities as well: --topics velocity=/velocity",)
+    return ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,53 +268,43 @@ class _Pose:
     T_world_body: FloatArray  # (4, 4)
 
 
-def write_bag(
+def _write_bag(
     dataset: Dataset, out: Path, storage: Storage, start: int, stop: int | None, progress: Progress
-) -> BagCounts:
+) -> Converted:
     """Write a range of a recording as a bag; the arguments are those of `convert`.
 
     Topics: /left/image_rect, /right/image_rect and their camera_info, /imu, /velocity, /ground_truth, /tf_static.
-
-    Raises:
-        MissingDependencyError: rosbags is not installed.
-        DataError: too many images are unreadable, or the bag cannot be written.
     """
-    recording, counts = dataset.recording, BagCounts()
-    count = len(recording.frame_times_ns)
-    total = (count if stop is None else min(stop, count)) - start
+    recording, total = dataset.recording, _frames_in(dataset, start, stop)
+    frames = samples = velocities = 0
+    in_order: Iterator[Event | _Pose]
+    in_order = heapq.merge(dataset.events(start, stop), _poses(recording), key=lambda x: x.time_ns)
     with bag_writer(out, storage) as bag:
-        for k, event in enumerate(_in_order(dataset, start, stop)):
+        for k, event in enumerate(in_order):
             if k == 0:
                 bag.static_transforms(event.time_ns, _frames(recording))
             if isinstance(event, StereoFrame):
                 _write_frame(bag, recording, event)
-                counts.frames += 1
-                progress(counts.frames, total)
+                frames += 1
+                progress(frames, total)
             elif isinstance(event, ImuSample):
                 bag.imu("/imu", _IMU, event)
-                counts.imu_samples += 1
+                samples += 1
             elif isinstance(event, VelocitySample):
                 bag.twist("/velocity", _IMU, event)
-                counts.velocities += 1
+                velocities += 1
             else:
                 bag.pose("/ground_truth", _WORLD, event.time_ns, event.T_world_body)
-    return counts
+    return Converted(frames, samples, velocities)
 
 
-def _in_order(dataset: Dataset, start: int, stop: int | None) -> Iterator[Event | _Pose]:
-    """Yield the events of a range and all poses of the ground truth in time order."""
-    return heapq.merge(dataset.events(start, stop), _poses(dataset.recording), key=lambda x: x.time_ns)
-
-
-def _poses(recording: Recording) -> Iterator[_Pose]:
-    """Yield the ground truth: that of the IMU, or of the left camera where there is none."""
-    truth = recording.reference
+def _poses(recording: Recording) -> list[_Pose]:
+    """Return the ground truth: that of the IMU, or of the left camera where there is none."""
+    truth, T = recording.reference, recording.T_cam0_imu
     if truth is None or truth.times_ns is None:
-        return
-    T = recording.T_cam0_imu
-    here: Trajectory = truth if T is None else truth.in_imu(T)
-    for time_ns, T_world_body in zip(here.times_ns.tolist(), here.T_world_body, strict=True):  # type: ignore[union-attr]
-        yield _Pose(time_ns, T_world_body)
+        return []
+    poses = truth.T_world_body if T is None else truth.in_imu(T).T_world_body
+    return [_Pose(time_ns, T_world_body) for time_ns, T_world_body in zip(truth.times_ns.tolist(), poses, strict=True)]
 
 
 def _frames(recording: Recording) -> list[tuple[str, str, FloatArray]]:

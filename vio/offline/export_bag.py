@@ -71,8 +71,7 @@ def ros_covariance(T_world_body: FloatArray, covariance: FloatArray) -> FloatArr
     rotation of T_world_body.
     """
     turn = np.kron(np.eye(2), T_world_body[:3, :3])
-    out: FloatArray = turn @ covariance @ turn.T
-    return out
+    return turn @ covariance @ turn.T
 
 
 def _reference(run: FinishedRun) -> Trajectory | None:

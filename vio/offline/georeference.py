@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
@@ -72,11 +73,8 @@ def _of_run(folder: FilePath) -> Placed:
 
 
 def _of_map(file: FilePath) -> Placed:
-    store = MapStore(file, read_only=True)
-    try:
+    with contextlib.closing(MapStore(file, read_only=True)) as store:
         sessions, rows, loops = store.sessions(), store.keyframes(), store.loops()
-    finally:
-        store.close()
     home = sessions[0].part if sessions else 0
     kept = [k for k, row in enumerate(rows) if sessions[row.session].part == home]
     if len(kept) < 2:
@@ -144,11 +142,8 @@ def place_by_map(of: Placed, run: FilePath, file: FilePath, folder: FilePath) ->
     Raises:
         DataError: the map is nowhere on the earth, or the run was not localised in it.
     """
-    store = MapStore(file, read_only=True)
-    try:
+    with contextlib.closing(MapStore(file, read_only=True)) as store:
         earth, rows, sessions = store.earth(), store.keyframes(), store.sessions()
-    finally:
-        store.close()
     if earth is None:
         raise DataError(f"{file}: nothing says where it is on the earth; vio georeference {file} GNSS does")
     of_map = read_metrics(run)[0].get("map") if run.is_dir() else None
@@ -171,12 +166,7 @@ def place_by_map(of: Placed, run: FilePath, file: FilePath, folder: FilePath) ->
 
 
 def _common(run: FilePath, home: dict[tuple[int, int], FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return the poses (K, 4, 4) of a run's keyframes that a map holds, as the run has them and as the map has them.
-
-    Args:
-        run: its folder.
-        home: poses of the map's keyframes by frame and time.
-    """
+    """Return the poses (K, 4, 4) of a run's keyframes that a map, by frame and time, holds: of the run, of the map."""
     keyframes, (_, T_cam0_body) = read_keyframes(run), read_metrics(run)
     keys = list(zip(keyframes.frame.tolist(), keyframes.time_ns.tolist(), strict=True))
     shared = [n for n, key in enumerate(keys) if key in home]
@@ -199,11 +189,8 @@ def keep_in_map(file: FilePath, facts: dict[str, Any]) -> None:
     """
     origin = facts["origin"]
     where = origin["latitude_deg"], origin["longitude_deg"], origin["height_m"]
-    store = MapStore(file)
-    try:
+    with contextlib.closing(MapStore(file)) as store:
         store.set_earth(EarthRow(where, np.array(facts["T_enu_map"]), np.array(facts["covariance"])))
-    finally:
-        store.close()
 
 
 def _write(

@@ -26,9 +26,8 @@ from vio.records import FIELD_TERMS, ROW_TERMS, IntArray
 
 _OWN = 15  # states of a keyframe: xi of its pose, velocity, biases of gyro and accelerometer
 _FIELD = FIELD_TERMS + ROW_TERMS
-_SHARED = (
-    _FIELD + METRIC_TERMS + 2 + 6 + 1 + 1
-)  # field, baseline, focal length, centre, extrinsics, time, accelerometer
+# Field, baseline, focal length, centre, extrinsics, time, accelerometer.
+_SHARED = _FIELD + METRIC_TERMS + 2 + 6 + 1 + 1
 _STEPS = 25
 _WIDTH = 3.0  # standard deviations at which a row's weight is a quarter …
 _WIDER = 2  # … doubled in so many first steps, once each
@@ -229,15 +228,8 @@ class InertialAdjustment:
         T_cam_world = se3_inverse(self.cameras(at))[tracks.keyframe]
         r_D_point = r_D_q @ T_cam_world[:, :3, :3] * weight[:, None, None]
         twist = self._twists(at)[tracks.keyframe]
-        shared = np.concatenate(
-            [
-                r_D_rig,
-                -r_D_xi * self.prior.extrinsics,
-                (r_D_xi @ twist[:, :, None]) * self.prior.time_s,
-                np.zeros((count, 3, 1)),
-            ],
-            axis=2,
-        )
+        late = (r_D_xi @ twist[:, :, None]) * self.prior.time_s
+        shared = np.concatenate([r_D_rig, -r_D_xi * self.prior.extrinsics, late, np.zeros((count, 3, 1))], axis=2)
         # Velocity and gyro bias act on a pixel by the twist alone, to second order: left out.
         e, own = r * weight[:, None], r_D_xi * weight[:, None, None]
         others, other_e = self._other_rows(at, steps, columns)

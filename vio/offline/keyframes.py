@@ -69,17 +69,23 @@ def choose_keyframes(run: TrackedPath, *, most: int | None = None) -> IntArray:
     ends = loop_ends(run, most)
     factor = 1.0
     while True:
-        chosen = [0]
-        for k in range(1, len(T)):
-            moved = float(np.linalg.norm(T[k, :3, 3] - T[chosen[-1], :3, 3]))
-            turned = float(rotation_angle_deg(T[chosen[-1], :3, :3].T @ T[k, :3, :3]))
-            if moved >= factor * step_m or turned >= factor * _TURN_DEG:
-                chosen.append(k)
+        chosen = after_motion(T, factor * step_m, factor * _TURN_DEG)
         if chosen[-1] != len(T) - 1:
             chosen.append(len(T) - 1)
         if most is None or len(chosen) + len(ends) <= max(most, 2):
             return np.union1d(np.array(chosen, dtype=np.int64), ends)
         factor *= _SPARSER
+
+
+def after_motion(T: FloatArray, step_m: float, turn_deg: float) -> list[int]:
+    """Return the rows of poses (N, 4, 4) after enough motion, or turn, since the row before; the first one too."""
+    chosen = [0]
+    for k in range(1, len(T)):
+        last = T[chosen[-1]]
+        moved = float(np.linalg.norm(T[k, :3, 3] - last[:3, 3]))
+        if moved >= step_m or float(rotation_angle_deg(last[:3, :3].T @ T[k, :3, :3])) >= turn_deg:
+            chosen.append(k)
+    return chosen
 
 
 def keyframes_by_overlap(run: TrackedPath, *, most: int) -> IntArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +16,12 @@ from vio.dense.stereo_depth import DepthImage, StereoMatcher, depth_sigma_m, far
 from vio.dense.surface import Mesh, extract_surface
 from vio.dense.voxel_grid import TRUNCATION, VoxelGrid
 from vio.errors import DataError
-from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera
 from vio.geometry.upright import up_in, upright_axes
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import MapStore
+from vio.offline.keyframes import after_motion
 from vio.offline.run_images import RunImages, run_images
 from vio.records import Image, IntArray, StereoFrame, Trajectory
 from vio.runs.finished import point_positions, up_of_odometry
@@ -89,7 +90,7 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
     T = trajectory.in_cam0(T_cam0_imu).T_world_body if map_file is None else _poses_in_map(map_file, by_odometry)
     depth_m = _landmark_depth_m(folder, T_odom, None if voxel_m is None else voxel_m / _VOXEL_SHARE)
     voxel_m = _voxel_m(images.camera, depth_m) if voxel_m is None else voxel_m
-    chosen = _spread(T, _STEP_SHARE * depth_m)
+    chosen = np.array(after_motion(T, _STEP_SHARE * depth_m, _STEP_DEG), dtype=np.int64)
     up = up_of_odometry(folder, metrics)
     if up is not None:
         up = up_in(T, T_odom, up)
@@ -118,12 +119,14 @@ def build_mesh(
         DataError: the images are not available, or show no surface.
     """
     images, voxel_m, done = made_from.images, made_from.voxel_m, 0
-    depth_of = _DepthOf(images.camera)
+    matcher: StereoMatcher | None = None
     with VoxelGrid(voxel_m, most_blocks=most_blocks) as grid:
         found = images.frames(made_from.frames, source, colour=True)
         for frame, T_world_cam0 in zip(found, made_from.T_world_cam0, strict=True):
             assert frame.left is not None
-            grid.fuse(depth_of(frame), frame.left, images.camera, T_world_cam0, made_from.far_m)
+            if frame.depth is None and matcher is None:
+                matcher = StereoMatcher(images.camera, frame.left.shape[1])
+            grid.fuse(_depth_of(frame, matcher), frame.left, images.camera, T_world_cam0, made_from.far_m)
             done += 1
             progress(done, len(made_from.frames))
             if stop():
@@ -142,21 +145,14 @@ def build_mesh(
     return DenseMap(mesh, occupancy_grid(mesh, R, voxel_m), picture, R, done, blocks)
 
 
-class _DepthOf:
-    """Depth of frames: that of the pair, or of the depth image."""
-
-    def __init__(self, camera: StereoCamera) -> None:
-        self._camera = camera
-        self._matcher: StereoMatcher | None = None
-
-    def __call__(self, frame: StereoFrame) -> DepthImage:
-        if frame.depth is not None:
-            return frame.depth.astype(np.float32)
-        assert frame.left is not None
-        assert frame.right is not None
-        if self._matcher is None:
-            self._matcher = StereoMatcher(self._camera, frame.left.shape[1])
-        return self._matcher.depth(_gray(frame.left), _gray(frame.right))
+def _depth_of(frame: StereoFrame, matcher: StereoMatcher | None) -> DepthImage:
+    """Return the depth of a frame: that of the depth image, or of the pair."""
+    if frame.depth is not None:
+        return frame.depth.astype(np.float32)
+    assert frame.left is not None
+    assert frame.right is not None
+    assert matcher is not None
+    return matcher.depth(_gray(frame.left), _gray(frame.right))
 
 
 def _gray(image: Image) -> Image:
@@ -171,11 +167,8 @@ def _poses_in_map(file: Path, run: Trajectory) -> FloatArray:
     Raises:
         DataError: no session of the map has the run's keyframes.
     """
-    store = MapStore(file, read_only=True)
-    try:
+    with contextlib.closing(MapStore(file, read_only=True)) as store:
         graph, rows = MapGraph(store), store.keyframes()
-    finally:
-        store.close()
     assert run.times_ns is not None
     assert run.frame_indices is not None
     place = {int(t): k for k, t in enumerate(run.times_ns.tolist())}
@@ -205,17 +198,6 @@ def _voxel_m(camera: StereoCamera, depth_m: float) -> float:
     length_m = max(_VOXEL_SHARE * depth_m, depth_sigma_m(camera, 2 * depth_m) / _SIGMA_VOXELS)
     power = 10.0 ** np.floor(np.log10(length_m))
     return float(power * max(m for m in (1, 2, 5) if m * power <= length_m * (1 + 1e-9)))
-
-
-def _spread(T: FloatArray, step_m: float) -> IntArray:
-    """Return the rows of poses (N, 4, 4) after enough motion or turn."""
-    chosen = [0]
-    for k in range(1, len(T)):
-        last = T[chosen[-1]]
-        moved = float(np.linalg.norm(T[k, :3, 3] - last[:3, 3]))
-        if moved >= step_m or float(rotation_angle_deg(last[:3, :3].T @ T[k, :3, :3])) >= _STEP_DEG:
-            chosen.append(k)
-    return np.array(chosen, dtype=np.int64)
 
 
 def facts_of(made_from: MeshSource, done: DenseMap) -> dict[str, Any]:

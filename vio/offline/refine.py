@@ -78,7 +78,8 @@ def refine_run(
     path = run.tracked
     if priors and path.loops:
         raise ConfigError(f"{path.where}: its loops moved the poses away from the filter's; leave --priors out")
-    if imu and (priors or not _can_use_imu(run)):
+    has_imu = run.metrics.get("motion") == "imu" and (path.where / RunFile.ESTIMATES).is_file()
+    if imu and (priors or not has_imu or run.dataset.recording.camera.is_cylinder):
         raise ConfigError(f"{path.where}: --imu takes a run with an IMU and a pinhole pair, and no --priors filter")
     rounds = iter((2, 3))
     held = None
@@ -126,12 +127,6 @@ def refine_run(
         ate_before_m=before,
         ate_m=after,
     )
-
-
-def _can_use_imu(run: SavedRun) -> bool:
-    """Whether a run has what an adjustment with an IMU needs: that sensor in use, and a pinhole pair."""
-    estimates = (run.tracked.where / RunFile.ESTIMATES).is_file()
-    return run.metrics.get("motion") == "imu" and not run.dataset.recording.camera.is_cylinder and estimates
 
 
 def _adjusted_with_imu(run: SavedRun, keyframes: IntArray) -> Adjustment:
@@ -199,11 +194,7 @@ _LEAST_SIGMA_M = 1e-4  # of a prior: the first pose of a filter has no uncertain
 
 
 def align_to_points(
-    camera: StereoCamera,
-    T_world_cam0: FloatArray,
-    p_world: FloatArray,
-    z: FloatArray,
-    has_right: BoolArray,
+    camera: StereoCamera, T_world_cam0: FloatArray, p_world: FloatArray, z: FloatArray, has_right: BoolArray
 ) -> FloatArray | None:
     """Estimate one frame's pose (4, 4) from known points (P, 3) and pixels (P, 4); None: too few of them fit.
 
@@ -268,8 +259,7 @@ def position_covariances(estimates: Sequence[Estimate], T_cam0_imu: FloatArray) 
     R = np.array([e.T_world_imu[:3, :3] for e in estimates])
     P = np.array([e.covariance for e in estimates])
     J = R @ p_D_xi
-    out: FloatArray = J @ P @ np.swapaxes(J, 1, 2) + _LEAST_SIGMA_M**2 * np.eye(3)
-    return out
+    return J @ P @ np.swapaxes(J, 1, 2) + _LEAST_SIGMA_M**2 * np.eye(3)
 
 
 def position_difference_m(one: Trajectory, other: Trajectory) -> float:

@@ -53,11 +53,7 @@ class Variant:
     def config(self) -> Config:
         """The configuration of the row."""
         return Config(
-            backend=self.backend,
-            motion=self.motion,
-            dataset=self.dataset,
-            selector=self.selector,
-            vislam=self.vislam,
+            backend=self.backend, motion=self.motion, dataset=self.dataset, selector=self.selector, vislam=self.vislam
         )
 
 

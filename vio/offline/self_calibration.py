@@ -242,8 +242,7 @@ def _larger(A: FloatArray, B: FloatArray) -> FloatArray:
     L = np.linalg.cholesky(B)
     values, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, A).T))
     W = L @ vectors
-    out: FloatArray = (W * np.maximum(values, 1.0)) @ W.T
-    return out
+    return (W * np.maximum(values, 1.0)) @ W.T
 
 
 def _residuals(camera: StereoCamera, x: FloatArray, piece: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:

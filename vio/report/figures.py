@@ -41,15 +41,12 @@ def sections(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Repo
         _position(runs, curves),
         _attitude(runs, curves),
     ]
-    found += [f(runs, curves) for f in (_velocity, _errors) if _applies(f, curves)]
+    if any(np.isfinite(c.velocity).any() for c in curves):
+        found.append(_velocity(runs, curves))
+    if any(c.truth is not None for c in curves):
+        found.append(_errors(runs, curves))
     found += [_features(runs), _innovations(runs), *_biases(runs), _timing(runs), *_stereo(runs)]
     return found
-
-
-def _applies(section: Any, curves: Sequence[Curves]) -> bool:
-    if section is _velocity:
-        return any(np.isfinite(c.velocity).any() for c in curves)
-    return any(c.truth is not None for c in curves)
 
 
 def _paths(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:

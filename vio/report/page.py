@@ -51,7 +51,9 @@ def page(runs: Sequence[FinishedRun]) -> str:
 
     title = _text(", ".join(run.name for run in runs))
     path, *figures = (_figure(section, number) for number, section in enumerate(sections(runs, curves_of(runs))))
-    parts = [_words(runs), _warnings(runs), path, _table(runs), _calibration(runs), _images(runs), *figures]
+    warnings = _lists("Warnings", runs, [[str(line) for line in run.metrics.get("warnings") or []] for run in runs])
+    calibration = _lists("Calibration", runs, [calibration_findings(run.metrics) for run in runs])
+    parts = [_words(runs), warnings, path, _table(runs), calibration, _images(runs), *figures]
     parts.append(_settings(runs))
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
@@ -94,16 +96,15 @@ def _pictures(runs: Sequence[FinishedRun], name: Path, kind: str) -> str:
     return "".join(shown)
 
 
-def _calibration(runs: Sequence[FinishedRun]) -> str:
-    """List what the runs found the calibration to be off by."""
-    found = [(run, calibration_findings(run.metrics)) for run in runs]
+def _lists(title: str, runs: Sequence[FinishedRun], lines: Sequence[Sequence[str]]) -> str:
+    """Return a section with the lines of each run that has any; nothing where none has."""
     lists = [
         (f"<p>{_text(run.name)}</p>" if len(runs) > 1 else "")
-        + f"<ul>{''.join(f'<li>{_text(line)}</li>' for line in lines)}</ul>"
-        for run, lines in found
-        if lines
+        + f"<ul>{''.join(f'<li>{_text(line)}</li>' for line in found)}</ul>"
+        for run, found in zip(runs, lines, strict=True)
+        if found
     ]
-    return f"<section><h2>Calibration</h2>{''.join(lists)}</section>" if lists else ""
+    return f"<section><h2>{title}</h2>{''.join(lists)}</section>" if lists else ""
 
 
 def _table(runs: Sequence[FinishedRun]) -> str:
@@ -113,16 +114,6 @@ def _table(runs: Sequence[FinishedRun]) -> str:
     rows = "".join(f"<tr><th>{_text(name)}</th>{cell}</tr>" for name, cell in cells.items())
     table = f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{rows}</tbody></table>"
     return f'<section><h2>Figures</h2><div class="scroll">{table}</div></section>'
-
-
-def _warnings(runs: Sequence[FinishedRun]) -> str:
-    lists = []
-    for run in runs:
-        found = run.metrics.get("warnings") or []
-        if found:
-            head = f"<p>{_text(run.name)}</p>" if len(runs) > 1 else ""
-            lists.append(f"{head}<ul>{''.join(f'<li>{_text(str(line))}</li>' for line in found)}</ul>")
-    return f"<section><h2>Warnings</h2>{''.join(lists)}</section>" if lists else ""
 
 
 def _settings(runs: Sequence[FinishedRun]) -> str:

@@ -69,12 +69,7 @@ def run_node(
         odometry.warm_up()
         sensors = Sensors(transport, topics, odometry, settings.quality)
         outputs = Outputs(
-            transport,
-            odometry,
-            sensors,
-            frames=settings.frames,
-            prefix=settings.prefix,
-            with_tf=settings.with_tf,
+            transport, odometry, sensors, frames=settings.frames, prefix=settings.prefix, with_tf=settings.with_tf
         )
         transport.subscribe(f"{settings.prefix}/{RESET}", _EMPTY, lambda _: odometry.reset(), "reliable")
         transport.subscribe(f"{settings.prefix}/{SAVE}", _EMPTY, lambda _: _save(outputs, settings), "reliable")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from vio.datasets.bags.topics import CAMERA_INFO, IMAGE, IMU
@@ -63,9 +63,7 @@ def play(
         sensors = [*cameras] if imu is None else [*cameras, imu]
         _wait_for_subscribers(transport, sensors, lambda: _publish_infos(out, cameras, recording), should_stop)
     frames = samples = 0
-    clock = _Clock(rate)
-    for event in dataset.events(0, stop):
-        clock.wait_for(event)
+    for event in _in_time(dataset.events(0, stop), rate):
         if should_stop():
             break
         if isinstance(event, StereoFrame):
@@ -108,17 +106,12 @@ def _publish_frame(out: BagWriter, cameras: tuple[str, ...], recording: Recordin
             out.image(name, body, frame.time_ns, image)
 
 
-class _Clock:
-    """Holds events back until their time has come."""
-
-    def __init__(self, rate: float | None) -> None:
-        self._rate = rate
-        self._start: tuple[int, float] | None = None  # of the recording, ns, and of this computer, s
-
-    def wait_for(self, event: Event) -> None:
-        if self._rate is None:
-            return
-        if self._start is None:
-            self._start = event.time_ns, time.monotonic()
-        due = self._start[1] + (event.time_ns - self._start[0]) * 1e-9 / self._rate
-        time.sleep(max(0.0, due - time.monotonic()))
+def _in_time(events: Iterator[Event], rate: float | None) -> Iterator[Event]:
+    """Yield events when their time has come; the first one at once."""
+    start: tuple[int, float] | None = None  # of the recording, ns, and of this computer, s
+    for event in events:
+        start = start or (event.time_ns, time.monotonic())
+        if rate is not None:
+            due = start[1] + (event.time_ns - start[0]) * 1e-9 / rate
+            time.sleep(max(0.0, due - time.monotonic()))
+        yield event

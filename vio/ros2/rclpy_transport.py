@@ -42,8 +42,7 @@ class RclpyTransport:
         """Return the function that publishes on a topic."""
         publisher = self._node.create_publisher(_type(kind), topic, _qos(quality))
         self._publishers[topic] = publisher
-        publish: Callable[[bytes], None] = publisher.publish
-        return publish
+        return publisher.publish
 
     def subscribers(self, topic: str) -> int:
         """Return how many receive a topic that was advertised here."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import time
 from collections.abc import Mapping
@@ -12,9 +13,9 @@ import numpy as np
 
 from vio.datasets.bags.cdr import decoded
 from vio.datasets.bags.index import stamp_of
-from vio.datasets.bags.pictures import compressed_pixels, gray_of, raw_gray, white_of
+from vio.datasets.bags.pictures import compressed_pixels, gray_of, raw_gray
 from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
-from vio.datasets.images import WHITE_16, UnreadableImageError
+from vio.datasets.images import WHITE_16, UnreadableImageError, brightest, white_of
 from vio.errors import DataError, OrderError
 from vio.geometry.lie import FloatArray
 from vio.live.live_odometry import LiveOdometry
@@ -27,7 +28,6 @@ log = logging.getLogger(__name__)
 SILENT_S = 5.0  # without a message, before it is said
 _BACK_NS = 500_000_000  # a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
 _WHITE_IMAGES = 8  # of 16 bits, looked at for the level of white
-_WHITE_SHARE = 0.999  # of their pixels are no brighter
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +63,9 @@ class Sensors:
         self.received = dict.fromkeys(topics.kinds, 0)  # messages
         self.refused = 0
         for side, name in enumerate(topics.cameras):
-            transport.subscribe(name, topics.kinds[name], self._image_taker(name, side), quality)
+            transport.subscribe(name, topics.kinds[name], functools.partial(self._image, name, side), quality)
         if topics.imu is not None:
             transport.subscribe(topics.imu, IMU, self._imu, quality)
-
-    def _image_taker(self, topic: str, side: int) -> Any:
-        return lambda data: self._image(topic, side, data)
 
     def _image(self, topic: str, side: int, data: bytes) -> None:
         kind = self._topics.kinds[topic]
@@ -141,8 +138,8 @@ class Sensors:
             pixels = compressed_pixels(fields, where) if kind == COMPRESSED else raw_gray(fields, where)
             if pixels.dtype != np.uint16:
                 return WHITE_16
-            self._levels.append(float(np.quantile(pixels, _WHITE_SHARE)))
-        return white_of(max(self._levels)) if self._levels else WHITE_16
+            self._levels.append(brightest(pixels))
+        return white_of(max(self._levels, default=0.0))
 
     def _refuse(self, why: str) -> None:
         self.refused += 1

@@ -21,7 +21,6 @@ from vio._version import __version__
 from vio.calibration.severity import StereoError
 from vio.calibration.stereo_field import PARAMETERS
 from vio.config import Config, describe, to_yaml
-from vio.datasets.common import checked_transform
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, DataError, EvaluationError
 from vio.evaluation.errors_along_path import error_statistics, path_length_m
@@ -31,7 +30,7 @@ from vio.files.inputs import read_input
 from vio.files.printable import json_text, printable
 from vio.files.tables import Records
 from vio.files.trajectories import in_first_cam0, read_trajectory, write_kitti, write_tum
-from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
+from vio.geometry.lie import FloatArray, checked_transform, se3_inverse, se3_log, transform_points
 from vio.numerics.compiled import has_compiled
 from vio.protocols import Dataset
 from vio.records import IMU_ENTRIES, Landmarks, Trajectory

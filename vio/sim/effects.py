@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.errors import SimulationError
 from vio.geometry.lie import FloatArray
 from vio.records import Image
 from vio.setting import setting
-from vio.sim.errors import SimulationError
 from vio.sim.render import Radiance
 
 _FULL_SCALE = 255.0
@@ -123,8 +123,7 @@ def apply_effects(
         signal = _FULL_SCALE * (np.clip(signal, 0, _FULL_SCALE) / np.float32(_FULL_SCALE)) ** np.float32(
             1 / effects.gamma
         )
-    out: Image = np.clip(signal + np.float32(0.5), 0, 255).astype(np.uint8)
-    return out
+    return np.clip(signal + np.float32(0.5), 0, 255).astype(np.uint8)
 
 
 def _vignette(shape: tuple[int, ...], effects: SensorEffects, camera: int, seed: int) -> npt.NDArray[np.float32]:
@@ -149,8 +148,7 @@ def average_exposures(render_at: Callable[[int], Radiance], time_ns: int, shutte
     total = render_at(time_ns + int(offsets[0])).astype(np.float32)
     for offset in offsets[1:]:
         total = total + render_at(time_ns + int(offset))
-    out: Radiance = total / np.float32(len(offsets))
-    return out
+    return total / np.float32(len(offsets))
 
 
 def blur_along_flow(sharp: Radiance, flow_before: FloatArray, flow_after: FloatArray, taps: int) -> Radiance:

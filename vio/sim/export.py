@@ -13,29 +13,27 @@ import numpy as np
 from vio.cameras.rig import Rig
 from vio.datasets.euroc_files import (
     STATE_CSV,
-    camera_yaml,
-    image_list_csv,
     image_name,
     imu_csv,
     imu_yaml,
     median_rate_hz,
     state_csv,
+    write_cameras,
 )
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.datasets.rigs.kalibr import kalibr_text
-from vio.errors import CalibrationError
+from vio.errors import SimulationError
 from vio.files.atomic import atomic_folder
 from vio.files.text import exact_text, seconds_text, write_text
 from vio.files.trajectories import in_first_cam0, write_tum
-from vio.geometry.distortion import StereoRig, rectified_camera
+from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.protocols import Progress
 from vio.records import ImuDensities
-from vio.sim.errors import SimulationError
 from vio.sim.imu import ADIS16448, sample_times
 from vio.sim.motion import motion_at
-from vio.sim.sequence import SimulatedRecording
+from vio.sim.sequence import SimulatedRecording, true_biases
 
 MARKER = "simulation.json"
 _TRUTH_HZ = 200.0
@@ -63,15 +61,13 @@ def export_euroc(
     record = simulation.imu
     if record is None:
         raise SimulationError("an EuRoC folder needs an IMU; simulate with imu=ImuNoise() or with a recorded one")
-    rig, stamps = simulation.calibration, simulation.stamps_ns
+    stamps = simulation.stamps_ns
     origin = "recorded" if record.gyro_bias is None else "simulated"
     with atomic_folder(out, replace=replace, marker=MARKER) as folder:
         mav = folder / "mav0"
-        for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
+        for name in ("cam0", "cam1"):
             (mav / name / "data").mkdir(parents=True)
-            calibration = camera_yaml(camera, T_imu_cam, comment=f"simulated {name}", rate_hz=median_rate_hz(stamps))
-            write_text(mav / name / "sensor.yaml", calibration)
-            write_text(mav / name / "data.csv", image_list_csv(stamps))
+        write_cameras(mav, simulation.calibration, stamps, int(stamps[-1]), kind="simulated")
         for name, text in (("imu0", imu_csv(record)), (STATE_CSV.parent.name, _truth_csv(recording))):
             (mav / name).mkdir()
             write_text(mav / name / "data.csv", text)
@@ -96,10 +92,7 @@ def export_kitti(
         VioError: `out` exists and may not be replaced, or cannot be written.
     """
     simulation = recording.simulation
-    try:
-        camera = rectified_camera(simulation.calibration)
-    except CalibrationError as error:
-        raise SimulationError("a KITTI folder needs a rectified rig; export this one as an EuRoC folder") from error
+    camera = simulation.rectified_camera("a KITTI folder needs a rectified rig; export this one as an EuRoC folder")
     stamps = simulation.stamps_ns
     T_cam0_imu = se3_inverse(simulation.calibration.T_imu_cam0)
     poses = in_first_cam0(recording.reference, T_cam0_imu).T_world_body
@@ -136,13 +129,9 @@ def _truth_csv(recording: SimulatedRecording) -> str:
     simulation = recording.simulation
     times = sample_times(simulation.motion, _TRUTH_HZ)
     state = motion_at(simulation.motion, times)
-    biases = np.zeros((len(times), 6))
-    record = simulation.imu
-    if record is not None and record.gyro_bias is not None and record.accel_bias is not None:
-        known = np.hstack([record.gyro_bias, record.accel_bias])
-        elapsed, at = (record.times_ns - times[0]).astype(np.float64), (times - times[0]).astype(np.float64)
-        biases = np.stack([np.interp(at, elapsed, known[:, i]) for i in range(6)], axis=1)
-    return state_csv(times, state.T_world_imu, state.velocity_world, biases)
+    biases = true_biases(simulation.imu, times)
+    zero = np.zeros((len(times), 6))
+    return state_csv(times, state.T_world_imu, state.velocity_world, zero if biases is None else biases)
 
 
 def description(recording: SimulatedRecording) -> str:

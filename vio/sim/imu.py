@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from vio.datasets.samples import velocity_samples
 from vio.geometry.lie import FloatArray
@@ -22,8 +21,6 @@ from vio.sim.motion import MotionSpline, motion_at
 GRAVITY_MPS2 = 9.81
 GRAVITY_WORLD = np.array([0.0, 0.0, -GRAVITY_MPS2])
 _S_PER_NS = 1e-9
-
-
 ADIS16448 = ImuDensities(gyro=1.6968e-4, gyro_walk=1.9393e-5, accel=2.0e-3, accel_walk=3.0e-3)  # EuRoC's figures
 
 
@@ -49,11 +46,10 @@ class VelocityNoise:
     angular_sigma: float = setting(0.05, "standard deviation of the angular rate, each axis", unit="rad/s")
 
 
-def sample_times(spline: MotionSpline, rate_hz: float, start_ns: int | None = None) -> IntArray:
-    """Times (N,) at a fixed rate from `start_ns` (None: the motion's start) to the motion's end."""
-    first = spline.start_ns if start_ns is None else start_ns
-    count = int((spline.end_ns - first) * _S_PER_NS * rate_hz + 1e-9) + 1
-    times = first + np.round(np.arange(max(count, 0)) * (1e9 / rate_hz)).astype(np.int64)
+def sample_times(spline: MotionSpline, rate_hz: float) -> IntArray:
+    """Times (N,) at a fixed rate from the motion's start to its end."""
+    count = int((spline.end_ns - spline.start_ns) * _S_PER_NS * rate_hz + 1e-9) + 1
+    times = spline.start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
     return times[times <= spline.end_ns]
 
 
@@ -76,13 +72,9 @@ def simulate_imu(
     R = state.T_world_imu[:, :3, :3]
     accel = np.einsum("nji,nj->ni", R, state.acceleration_world - GRAVITY_WORLD) + accel_bias
     accel = accel + noise.densities.accel * np.sqrt(rate_hz) * accel_rng.standard_normal((n, 3))
-    return ImuRecord(
-        times,
-        np.clip(gyro, -noise.gyro_limit, noise.gyro_limit),
-        np.clip(accel, -noise.accel_limit, noise.accel_limit),
-        gyro_bias,
-        accel_bias,
-    )
+    gyro = np.clip(gyro, -noise.gyro_limit, noise.gyro_limit)
+    accel = np.clip(accel, -noise.accel_limit, noise.accel_limit)
+    return ImuRecord(times, gyro, accel, gyro_bias, accel_bias)
 
 
 def _walk(rng: np.random.Generator, n: int, rate_hz: float, density: float, start_sigma: float) -> FloatArray:
@@ -94,19 +86,11 @@ def _walk(rng: np.random.Generator, n: int, rate_hz: float, density: float, star
 
 
 def simulate_velocity(
-    spline: MotionSpline,
-    *,
-    rate_hz: float = 10.0,
-    noise: VelocityNoise | None = None,
-    seed: int = 0,
-    times_ns: npt.ArrayLike | None = None,
+    spline: MotionSpline, *, rate_hz: float = 10.0, noise: VelocityNoise | None = None, seed: int = 0
 ) -> Sequence[VelocitySample]:
-    """Simulate the paper's control input `u = [v; omega]` along a motion, in the imu frame, with the paper's noise.
-
-    `times_ns` (N,) overrides the rate.
-    """
+    """Simulate the paper's control input `u = [v; omega]` along a motion, in the imu frame, with the paper's noise."""
     noise = VelocityNoise() if noise is None else noise
-    times = sample_times(spline, rate_hz) if times_ns is None else np.asarray(times_ns, dtype=np.int64)
+    times = sample_times(spline, rate_hz)
     state = motion_at(spline, times)
     rng = np.random.default_rng([seed, 23])
     linear = np.einsum("nji,nj->ni", state.T_world_imu[:, :3, :3], state.velocity_world)

@@ -6,10 +6,10 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
+from vio.errors import SimulationError
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.setting import setting
-from vio.sim.errors import SimulationError
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,10 +92,7 @@ def miscalibrated(calibrated: StereoRig, errors: CalibrationErrors, *, seed: int
     longer = rng.choice([-1.0, 1.0]) * errors.scale * errors.baseline_mm * 1e-3
     t = T[:3, 3] * (1 + longer / np.linalg.norm(T[:3, 3]))
     return replace(
-        calibrated,
-        cam0=cam0,
-        cam1=cam1,
-        T_imu_cam1=calibrated.T_imu_cam0 @ se3_from_parts(T[:3, :3] @ turn, t),
+        calibrated, cam0=cam0, cam1=cam1, T_imu_cam1=calibrated.T_imu_cam0 @ se3_from_parts(T[:3, :3] @ turn, t)
     )
 
 

@@ -1,15 +1,15 @@
 """Continuous motion: a B-spline for the position and a cumulative B-spline on SO(3) for the attitude.
 
-Degree 3 or 5 with uniform knots, so velocity, acceleration, angular rate and angular acceleration are analytic.
+Degree 5 with uniform knots, so velocity, acceleration and angular rate are analytic.
 Reference: Sommer, Usenko, Schubert, Demmel, Cremers, Efficient derivative computation for cumulative B-splines on Lie
-groups (2020): cumulative basis, and the recurrences of angular rate and acceleration.
+groups (2020): cumulative basis, and the recurrence of the angular rate.
 """
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache
 from math import comb, factorial
 from pathlib import Path
 
@@ -18,16 +18,18 @@ import numpy.typing as npt
 import scipy.sparse
 import scipy.sparse.linalg
 
-from vio.errors import DataError
+from vio.errors import DataError, SimulationError
 from vio.files.text import check_increasing
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log
 from vio.records import BoolArray, IntArray
-from vio.sim.errors import SimulationError
 
 logger = logging.getLogger(__name__)
 
 _S_PER_NS = 1e-9
+_DEGREE = 5
+_K = _DEGREE + 1  # control points that a pose depends on
+_SPEED_MPS = 10.0  # of a car on straights
 _ACCELERATION_MPS2 = 2.0  # of a car along the road, at most
 _RAMP_S = 2.0  # from standstill to full speed of a hand-held rig
 _ROBUST_ROUNDS = 8
@@ -39,18 +41,17 @@ _ROTATION_TOLERANCE_RAD = 1e-10
 
 @dataclass(frozen=True, slots=True)
 class MotionSpline:
-    """A body's motion: uniform B-splines of one degree, defined from `start_ns` to `end_ns`."""
+    """A body's motion: uniform B-splines, defined from `start_ns` to `end_ns`."""
 
     start_ns: int
     knot_s: float  # seconds between knots
-    degree: int  # 3 or 5
     p_control: FloatArray  # (M, 3) control positions, world, m
     R_control: FloatArray  # (M, 3, 3) control attitudes R_world_imu
 
     @property
     def end_ns(self) -> int:
         """Last nanosecond at which the motion is defined."""
-        return self.start_ns + int(np.floor((len(self.p_control) - self.degree) * self.knot_s / _S_PER_NS))
+        return self.start_ns + int(np.floor((len(self.p_control) - _DEGREE) * self.knot_s / _S_PER_NS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,6 @@ class MotionState:
     velocity_world: FloatArray  # (N, 3) m/s
     acceleration_world: FloatArray  # (N, 3) m/s^2, without gravity
     angular_velocity: FloatArray  # (N, 3) rad/s, imu frame
-    angular_acceleration: FloatArray  # (N, 3) rad/s^2, imu frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,29 +77,25 @@ class FitReport:
     rotation_max_rad: float
 
 
-@lru_cache(maxsize=8)
-def _blending(degree: int) -> FloatArray:
-    """Matrix (k, k) of the uniform B-spline: row i, column j is the factor of u^j in the weight of control point i.
+@cache
+def _blending() -> FloatArray:
+    """Matrix (6, 6) of the uniform B-spline: row i, column j is the factor of u^j in the weight of control point i.
 
     Reference: Qin, General matrix representations for B-splines (1998), as given by Sommer et al.
     """
-    k = degree + 1
-    out = np.zeros((k, k))
-    for s in range(k):
-        for n in range(k):
-            total = sum((-1.0) ** (i - s) * comb(k, i - s) * float(k - 1 - i) ** (k - 1 - n) for i in range(s, k))
-            out[s, n] = comb(k - 1, n) / factorial(k - 1) * total
+    out = np.zeros((_K, _K))
+    for s, n in np.ndindex(_K, _K):
+        total = sum((-1.0) ** (i - s) * comb(_K, i - s) * float(_K - 1 - i) ** (_K - 1 - n) for i in range(s, _K))
+        out[s, n] = comb(_K - 1, n) / factorial(_K - 1) * total
     return out
 
 
-def _weights(degree: int, u: FloatArray, derivative: int) -> FloatArray:
-    """Weights (N, k) of the k control points at fractions u (N,) of a knot interval, or their derivative in u."""
-    k = degree + 1
-    powers = np.zeros((len(u), k))
-    for n in range(derivative, k):
+def _weights(u: FloatArray, derivative: int) -> FloatArray:
+    """Weights (N, 6) of the control points at fractions u (N,) of a knot interval, or their derivative in u."""
+    powers = np.zeros((len(u), _K))
+    for n in range(derivative, _K):
         powers[:, n] = factorial(n) / factorial(n - derivative) * u ** (n - derivative)
-    out: FloatArray = powers @ _blending(degree).T
-    return out
+    return powers @ _blending().T
 
 
 def _locate(spline: MotionSpline, times_ns: npt.ArrayLike) -> tuple[IntArray, IntArray, FloatArray]:
@@ -111,44 +107,37 @@ def _locate(spline: MotionSpline, times_ns: npt.ArrayLike) -> tuple[IntArray, In
             f"requested {t.min()} to {t.max()}: shorten the request or lengthen the trajectory"
         )
     position: FloatArray = np.multiply(t - spline.start_ns, _S_PER_NS / spline.knot_s, dtype=np.float64)
-    segments = len(spline.p_control) - spline.degree
+    segments = len(spline.p_control) - _DEGREE
     first = np.clip(np.floor(position).astype(np.int64), 0, segments - 1)
     return t, first, position - first
 
 
 def motion_at(spline: MotionSpline, times_ns: npt.ArrayLike) -> MotionState:
-    """Pose and its first two derivatives at times (N,) in nanoseconds.
+    """Pose, velocities and acceleration at times (N,) in nanoseconds.
 
     Raises:
         SimulationError: a time is outside the motion.
     """
     t, first, u = _locate(spline, times_ns)
-    k, rate = spline.degree + 1, 1 / spline.knot_s
-    index = first[:, None] + np.arange(k)
-    weights = [_weights(spline.degree, u, derivative) * rate**derivative for derivative in range(3)]
+    index = first[:, None] + np.arange(_K)
+    rate = 1 / spline.knot_s
+    weights = [_weights(u, derivative) * rate**derivative for derivative in range(3)]
     p, v, a = (np.einsum("nk,nki->ni", w, spline.p_control[index]) for w in weights)
     # Cumulative weights: the sum of the weights from j on.
-    b, b1, b2 = (np.cumsum(w[:, ::-1], axis=1)[:, ::-1] for w in weights)
+    b, b1 = (np.cumsum(w[:, ::-1], axis=1)[:, ::-1] for w in weights[:2])
     R_control = spline.R_control[index]
     R = R_control[:, 0]
-    omega, alpha = np.zeros((len(t), 3)), np.zeros((len(t), 3))
-    for j in range(1, k):
+    omega = np.zeros((len(t), 3))
+    for j in range(1, _K):
         d = so3_log(np.swapaxes(R_control[:, j - 1], 1, 2) @ R_control[:, j])
         A = so3_exp(b[:, j, None] * d)
         R = R @ A
-        At = np.swapaxes(A, 1, 2)
-        omega = (At @ omega[..., None])[..., 0] + b1[:, j, None] * d
-        alpha = (At @ alpha[..., None])[..., 0] + b1[:, j, None] * np.cross(omega, d) + b2[:, j, None] * d
-    return MotionState(t, se3_from_parts(R, p), v, a, omega, alpha)
+        omega = (np.swapaxes(A, 1, 2) @ omega[..., None])[..., 0] + b1[:, j, None] * d
+    return MotionState(t, se3_from_parts(R, p), v, a, omega)
 
 
 def fit_spline(
-    times_ns: npt.ArrayLike,
-    T_world_imu: npt.ArrayLike,
-    *,
-    knot_s: float = 0.1,
-    degree: int = 5,
-    robust: bool = False,
+    times_ns: npt.ArrayLike, T_world_imu: npt.ArrayLike, *, knot_s: float = 0.1, robust: bool = False
 ) -> tuple[MotionSpline, FitReport]:
     """Fit a spline to poses (N, 4, 4) at strictly increasing times (N,) by least squares.
 
@@ -159,38 +148,39 @@ def fit_spline(
     Raises:
         DataError: times do not increase, values are not finite, or there are too few poses.
     """
-    t, T = _check_record(times_ns, T_world_imu, degree)
+    t, T = _check_record(times_ns, T_world_imu)
     span = (t[-1] - t[0]) * _S_PER_NS
     segments = max(1, int(np.ceil(span / knot_s - 1e-9)))
     step = span / segments * (1 + 1e-12)
     position = np.minimum((t - t[0]) * _S_PER_NS / step, segments - 1e-9)
     first = np.floor(position).astype(np.int64)
-    design = _design(first, position - first, segments, degree)
+    weights = _weights(position - first, 0)
+    columns = (first[:, None] + np.arange(_K)).ravel()
+    places = np.repeat(np.arange(len(t)), _K), columns
+    design = scipy.sparse.csr_matrix((weights.ravel(), places), shape=(len(t), segments + _DEGREE))
     keep = np.ones(len(t), dtype=np.bool_)
-    p_control, R_control = _fit(design, T, keep, step)
+    p_control, R_control = _fit(design, T, keep)
+
+    def residuals() -> tuple[FloatArray, FloatArray]:
+        """Distances (N,) in metres and angles (N,) in radians between spline and samples."""
+        R = _attitude(R_control, first, weights)
+        distance = np.linalg.norm(design @ p_control - T[:, :3, 3], axis=1)
+        return distance, np.linalg.norm(so3_log(np.swapaxes(R, 1, 2) @ T[:, :3, :3]), axis=1)
+
+    distance, angle = residuals()
     for _ in range(_ROBUST_ROUNDS if robust else 0):
-        distance, angle = _residuals(design, p_control, R_control, T, first, degree, position)
         good = (distance < _limit(distance[keep], _OUTLIER_FLOOR[0])) & (angle < _limit(angle[keep], _OUTLIER_FLOOR[1]))
         if np.array_equal(good, keep):
             break
         keep = good
-        p_control, R_control = _fit(design, T, keep, step)
-    distance, angle = _residuals(design, p_control, R_control, T, first, degree, position)
-    spline = MotionSpline(int(t[0]), step, degree, p_control, R_control)
-    report = FitReport(
-        len(t),
-        int((~keep).sum()),
-        float(np.sqrt(np.mean(distance[keep] ** 2))),
-        float(distance[keep].max()),
-        float(np.sqrt(np.mean(angle[keep] ** 2))),
-        float(angle[keep].max()),
-    )
-    return spline, report
+        p_control, R_control = _fit(design, T, keep)
+        distance, angle = residuals()
+    spline = MotionSpline(int(t[0]), step, p_control, R_control)
+    left = [(float(np.sqrt(np.mean(r[keep] ** 2))), float(r[keep].max())) for r in (distance, angle)]
+    return spline, FitReport(len(t), int((~keep).sum()), *left[0], *left[1])
 
 
-def _check_record(times_ns: npt.ArrayLike, T_world_imu: npt.ArrayLike, degree: int) -> tuple[IntArray, FloatArray]:
-    if degree not in (3, 5):
-        raise SimulationError(f"spline degree must be 3 or 5, got {degree}")
+def _check_record(times_ns: npt.ArrayLike, T_world_imu: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
     t, T = np.asarray(times_ns, dtype=np.int64).reshape(-1), np.asarray(T_world_imu, dtype=np.float64)
     if T.shape != (len(t), 4, 4):
         raise DataError(f"{len(t)} times for poses of shape {T.shape}; give one 4x4 pose for each time")
@@ -201,40 +191,23 @@ def _check_record(times_ns: npt.ArrayLike, T_world_imu: npt.ArrayLike, degree: i
     return check_increasing(t, lambda k: f"pose {k} of the trajectory"), T
 
 
-def _design(first: IntArray, u: FloatArray, segments: int, degree: int) -> scipy.sparse.csr_matrix:
-    k = degree + 1
-    rows = np.repeat(np.arange(len(first)), k)
-    columns = (first[:, None] + np.arange(k)).ravel()
-    return scipy.sparse.csr_matrix(
-        (_weights(degree, u, 0).ravel(), (rows, columns)), shape=(len(first), segments + degree)
-    )
-
-
-def _solver(design: scipy.sparse.csr_matrix, keep: BoolArray) -> tuple[scipy.sparse.csr_matrix, object]:
-    """Normal equations with a small curvature penalty, which determines control points within gaps."""
-    A = design[keep]
+def _fit(design: scipy.sparse.csr_matrix, T: FloatArray, keep: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Control positions (M, 3) and attitudes (M, 3, 3); a small curvature penalty determines them within gaps."""
+    A, p, R = design[keep], T[keep, :3, 3], T[keep, :3, :3]
     m = A.shape[1]
     curvature = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(m - 2, m))
     normal = A.T @ A + 1e-7 * (curvature.T @ curvature) + 1e-12 * scipy.sparse.identity(m)
-    return A, scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(normal))
-
-
-def _fit(design: scipy.sparse.csr_matrix, T: FloatArray, keep: BoolArray, step: float) -> tuple[FloatArray, FloatArray]:
-    A, factor = _solver(design, keep)
-    p = T[keep, :3, 3]
+    factor = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(normal))
     middle = p.mean(axis=0)
-    p_control = factor.solve(A.T @ (p - middle)) + middle  # type: ignore[attr-defined]
-    R = T[keep, :3, :3]
-    m, degree = design.shape[1], int(np.diff(design.indptr)[0]) - 1
+    p_control = factor.solve(A.T @ (p - middle)) + middle
     # Initialise each control point from the sample nearest to its largest weight.
     sample = np.asarray(A @ np.arange(m, dtype=np.float64)).ravel()
     nearest = np.abs(np.interp(np.arange(m), sample, np.arange(len(sample)))).round().astype(np.int64)
     R_control: FloatArray = R[nearest]
-    first = A.indices.reshape(-1, degree + 1)[:, 0]
-    weights = A.data.reshape(-1, degree + 1)
+    first, weights = A.indices.reshape(-1, _K)[:, 0], A.data.reshape(-1, _K)
     for _ in range(_ROTATION_ROUNDS):
         residual = so3_log(np.swapaxes(_attitude(R_control, first, weights), 1, 2) @ R)
-        delta = factor.solve(A.T @ residual)  # type: ignore[attr-defined]
+        delta = factor.solve(A.T @ residual)
         R_control = R_control @ so3_exp(delta)
         if np.abs(delta).max() < _ROTATION_TOLERANCE_RAD:
             break
@@ -251,29 +224,12 @@ def _attitude(R_control: FloatArray, first: IntArray, weights: FloatArray) -> Fl
     return R
 
 
-def _residuals(
-    design: scipy.sparse.csr_matrix,
-    p_control: FloatArray,
-    R_control: FloatArray,
-    T: FloatArray,
-    first: IntArray,
-    degree: int,
-    position: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Distances (N,) in metres and angles (N,) in radians between spline and samples."""
-    R = _attitude(R_control, first, _weights(degree, position - first, 0))
-    distance = np.linalg.norm(design @ p_control - T[:, :3, 3], axis=1)
-    return distance, np.linalg.norm(so3_log(np.swapaxes(R, 1, 2) @ T[:, :3, :3]), axis=1)
-
-
 def _limit(kept: FloatArray, floor: float) -> float:
     """Largest residual that still counts as noise."""
     return max(floor, float(_OUTLIER_SIGMAS * 1.4826 * np.median(kept)))
 
 
-def spline_from_waypoints(
-    T_world_imu: npt.ArrayLike, interval_s: float, *, start_ns: int = 0, degree: int = 5
-) -> MotionSpline:
+def spline_from_waypoints(T_world_imu: npt.ArrayLike, interval_s: float, *, start_ns: int = 0) -> MotionSpline:
     """Return a smooth motion through waypoints (N, 4, 4) at equal intervals.
 
     Raises:
@@ -281,7 +237,7 @@ def spline_from_waypoints(
     """
     T = np.asarray(T_world_imu, dtype=np.float64)
     times = start_ns + np.round(np.arange(len(T)) * (interval_s / _S_PER_NS)).astype(np.int64)
-    spline, report = fit_spline(times, T, knot_s=interval_s, degree=degree)
+    spline, report = fit_spline(times, T, knot_s=interval_s)
     logger.debug("waypoints met within %.2g m, %.2g rad", report.position_max_m, report.rotation_max_rad)
     return spline
 
@@ -307,7 +263,6 @@ def car_loop(
     *,
     loop_m: tuple[float, float] = (110.0, 70.0),
     corner_m: float = 7.0,
-    speed_mps: float = 10.0,
     duration_s: float | None = None,
     height_m: float = 0.93,
     start_m: float = 0.0,
@@ -316,10 +271,11 @@ def car_loop(
 ) -> MotionSpline:
     """Drive counter-clockwise along a rectangle with rounded corners, slower in them, with small suspension motion.
 
+    It drives 10 m/s on the straights; the lateral acceleration in corners is at most 2.5 m/s^2.
+
     Args:
         loop_m: extent of the centre line along x and y, about the origin; the same as `street`'s.
         corner_m: radius of the corners.
-        speed_mps: speed on the straights; lateral acceleration in corners is at most 2.5 m/s^2.
         duration_s: length of the record; None drives one loop.
         height_m: height of the body above the ground; 0.93 puts `kitti_like_rig`'s cameras at 1.65.
         start_m: where on the loop to start, from the middle of the lower side.
@@ -337,7 +293,7 @@ def car_loop(
     for side in (straight[1], straight[0], straight[1], straight[0] / 2):
         curvature[(s >= edge) & (s < edge + np.pi / 2 * corner_m)] = 1 / corner_m
         edge += np.pi / 2 * corner_m + side
-    speed = np.minimum(speed_mps, np.sqrt(2.5 / np.maximum(curvature, 1e-6)))
+    speed = np.minimum(_SPEED_MPS, np.sqrt(2.5 / np.maximum(curvature, 1e-6)))
     speed = _smooth_periodic(_limit_acceleration(speed, step), 6.0 / step)
     curvature = _smooth_periodic(curvature, 2.0 / step)
     heading = np.cumsum(curvature) * step
@@ -366,8 +322,7 @@ def _smooth_periodic(values: FloatArray, width: float) -> FloatArray:
     n = max(3, int(width) | 1)
     kernel = np.hanning(n + 2)[1:-1]
     padded = np.concatenate([values[-n:], values, values[:n]])
-    out: FloatArray = np.convolve(padded, kernel / kernel.sum(), mode="same")[n:-n]
-    return out
+    return np.convolve(padded, kernel / kernel.sum(), mode="same")[n:-n]
 
 
 def _limit_acceleration(speed: FloatArray, step: float) -> FloatArray:
@@ -444,7 +399,7 @@ def _ramped_time(t: FloatArray) -> FloatArray:
 # --- recorded motion ------------------------------------------------------------------------------------------------
 
 
-def recorded_motion(path: Path, *, knot_s: float = 0.1, degree: int = 5) -> tuple[MotionSpline, FitReport]:
+def recorded_motion(path: Path) -> tuple[MotionSpline, FitReport]:
     """Smooth a recorded ground truth (TUM file of the IMU's poses) so that it is twice differentiable.
 
     Raises:
@@ -455,15 +410,9 @@ def recorded_motion(path: Path, *, knot_s: float = 0.1, degree: int = 5) -> tupl
         raise DataError(f"{path}: describes {len(truth)} poses of {truth.body}; give two or more of the IMU")
     times = truth.times_ns
     gap_s = float(np.diff(times).max()) * _S_PER_NS
-    if gap_s > 5 * knot_s:
+    if gap_s > 0.5:
         logger.warning("%s has a gap of %.2f s; the motion is interpolated there", path, gap_s)
-    spline, report = fit_spline(times, truth.T_world_body, knot_s=knot_s, degree=degree, robust=True)
-    logger.info(
-        "%s: spline within %.1f mm and %.2f mrad rms, %d of %d poses rejected",
-        path,
-        1e3 * report.position_rms_m,
-        1e3 * report.rotation_rms_rad,
-        report.rejected,
-        report.samples,
-    )
+    spline, report = fit_spline(times, truth.T_world_body, robust=True)
+    within = f"{1e3 * report.position_rms_m:.1f} mm and {1e3 * report.rotation_rms_rad:.2f} mrad rms"
+    logger.info("%s: spline within %s, %d of %d poses rejected", path, within, report.rejected, report.samples)
     return spline, report

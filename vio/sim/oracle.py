@@ -11,12 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from vio.errors import CalibrationError
-from vio.geometry.distortion import rectified_camera, unproject_pixel
+from vio.errors import SimulationError
+from vio.geometry.distortion import unproject_pixel
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, FrontendOutput, IntArray, StereoFrame, TrackPrior, observations
 from vio.setting import setting
-from vio.sim.errors import SimulationError
 from vio.sim.render import View, cast, observe, surface_points
 from vio.sim.sequence import Simulation, views
 from vio.sim.world import Surfaces, surfaces_at
@@ -57,10 +56,7 @@ class OracleFrontend:
         Raises:
             SimulationError: the rig is not rectified.
         """
-        try:
-            self._camera = rectified_camera(simulation.calibration)
-        except CalibrationError as error:
-            raise SimulationError("the oracle outputs rectified pixels and needs a rectified rig") from error
+        simulation.rectified_camera("the oracle outputs rectified pixels and needs a rectified rig")
         self._simulation = simulation
         self._settings = OracleSettings() if settings is None else settings
         self._seed = seed
@@ -122,13 +118,7 @@ class OracleFrontend:
         return z, seen_left & seen_right & within & (depth < self._settings.max_depth_m)
 
     def _detect(
-        self,
-        surfaces: Surfaces,
-        left: View,
-        right: View,
-        occupied: FloatArray,
-        wanted: int,
-        rng: np.random.Generator,
+        self, surfaces: Surfaces, left: View, right: View, occupied: FloatArray, wanted: int, rng: np.random.Generator
     ) -> tuple[IntArray, FloatArray]:
         """Create up to `wanted` features, first in the image cells (`_CELL_PX`) with the fewest."""
         if wanted <= 0:

@@ -129,10 +129,7 @@ def _body(walk: Walk, rng: np.random.Generator) -> Sequence[MovingBox]:
     scale = rng.uniform(0.92, 1.06)
 
     def part(height: float) -> ObjectMotion:
-        def pose(time_ns: int) -> FloatArray:
-            return _step(walk, time_ns) @ se3_from_parts(np.eye(3), [0.0, 0.0, height * scale])
-
-        return pose
+        return lambda time_ns: _step(walk, time_ns) @ se3_from_parts(np.eye(3), [0.0, 0.0, height * scale])
 
     def size(depth: float, width: float, height: float) -> FloatArray:
         return scale * np.array([depth, width, height])

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.errors import SimulationError
 from vio.geometry.distortion import CameraModel, DistortionModel, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.records import BoolArray, IntArray
-from vio.sim.errors import SimulationError
 from vio.sim.textures import LEVELS_PER_OCTAVE, MipTexture
 from vio.sim.world import Surfaces, World, surfaces_at
 
@@ -113,12 +113,7 @@ def _cones(corner: FloatArray, tile: int) -> FloatArray:
             a, b, depth = block @ x, block @ y, block @ z
             (a0, a1), (b0, b1) = ((float((q / depth).min()), float((q / depth).max())) for q in (a, b))
             slack = 1e-6
-            spans = [
-                (a0 - slack, b0 - slack),
-                (a1 + slack, b0 - slack),
-                (a0 - slack, b1 + slack),
-                (a1 + slack, b1 + slack),
-            ]
+            spans = [(p, q) for q in (b0 - slack, b1 + slack) for p in (a0 - slack, a1 + slack)]
             out[r, c] = [p * x + q * y + z for p, q in spans]
     return out
 
@@ -142,20 +137,16 @@ def _surface_matrices(surfaces: Surfaces, T_world_cam: FloatArray) -> tuple[Floa
     return G, front
 
 
-def cast(surfaces: Surfaces, T_world_cam: npt.ArrayLike, rays: npt.ArrayLike, *, among: IntArray | None = None) -> Hits:
+def cast(surfaces: Surfaces, T_world_cam: npt.ArrayLike, rays: npt.ArrayLike) -> Hits:
     """Intersect unit rays (N, 3) of the camera frame with the nearest surface, exactly.
 
     Args:
         surfaces: the scene at one time.
         T_world_cam: pose (4, 4) of the camera.
         rays: unit rays (N, 3), camera frame.
-        among: indices of the surfaces to test; None: all.
     """
     d = np.asarray(rays, dtype=np.float64).reshape(-1, 3)
     G, index = _surface_matrices(surfaces, np.asarray(T_world_cam, dtype=np.float64))
-    if among is not None:
-        keep = np.isin(index, among)
-        G, index = G[keep], index[keep]
     size = surfaces.size[index]
     rows = max(1, _CAST_PAIRS // max(1, len(index)))
     parts = [_cast_block(G, index, size, d[i : i + rows]) for i in range(0, max(len(d), 1), rows)]
@@ -496,11 +487,7 @@ def _shade_edges(scene: _Scene, candidates: BoolArray, rays: CameraRays, pixels:
 
 
 def _sample_points(
-    scene: _Scene,
-    k: int,
-    d: npt.NDArray[np.float32],
-    du: npt.NDArray[np.float32],
-    dv: npt.NDArray[np.float32],
+    scene: _Scene, k: int, d: npt.NDArray[np.float32], du: npt.NDArray[np.float32], dv: npt.NDArray[np.float32]
 ) -> Radiance:
     """Texture (n,) of surface k along rays d (3, n) with pixel steps du and dv (3, n)."""
     texture, G = scene.textures[k], scene.G[k]

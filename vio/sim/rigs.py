@@ -38,13 +38,7 @@ def kitti_like_rig(width: int = 1242) -> StereoRig:
     scale = width / 1242
     f = 721.5377 * scale
     camera = StereoCamera(
-        f,
-        f,
-        (609.5593 + 0.5) * scale - 0.5,
-        (172.854 + 0.5) * scale - 0.5,
-        0.5371657,
-        width,
-        round(375 * scale),
+        f, f, (609.5593 + 0.5) * scale - 0.5, (172.854 + 0.5) * scale - 0.5, 0.5371657, width, round(375 * scale)
     )
     return rig_from_rectified(camera, _forward_T_cam0_imu((1.0891, -0.3141, 0.7195)))
 
@@ -72,30 +66,11 @@ def euroc_like_rig() -> StereoRig:
     )
     for T in (T_imu_cam0, T_imu_cam1):
         T[:3, :3] = nearest_rotation(T[:3, :3])
-    return StereoRig(
-        CameraModel(
-            458.654,
-            457.296,
-            367.215,
-            248.375,
-            752,
-            480,
-            "radtan",
-            (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
-        ),
-        CameraModel(
-            457.587,
-            456.134,
-            379.999,
-            255.238,
-            752,
-            480,
-            "radtan",
-            (-0.28368365, 0.07451284, -0.00010473, -3.555907e-05),
-        ),
-        T_imu_cam0,
-        T_imu_cam1,
-    )
+    lens0 = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
+    lens1 = (-0.28368365, 0.07451284, -0.00010473, -3.555907e-05)
+    cam0 = CameraModel(458.654, 457.296, 367.215, 248.375, 752, 480, "radtan", lens0)
+    cam1 = CameraModel(457.587, 456.134, 379.999, 255.238, 752, 480, "radtan", lens1)
+    return StereoRig(cam0, cam1, T_imu_cam0, T_imu_cam1)
 
 
 def euroc_rectified_rig() -> StereoRig:
@@ -109,19 +84,10 @@ def euroc_rectified_rig() -> StereoRig:
 def fisheye_rig(width: int = 640, height: int = 480) -> StereoRig:
     """Unrectified equidistant (fisheye) pair, about 130 degrees wide, slightly toed, IMU axes forward, left, up."""
     f = 0.44 * width
-    cam0 = CameraModel(
-        f, f, 0.49 * width, 0.505 * height, width, height, "equidistant", (-0.012, 0.006, -0.004, 0.0006)
-    )
-    cam1 = CameraModel(
-        f * 1.003,
-        f * 1.002,
-        0.503 * width,
-        0.497 * height,
-        width,
-        height,
-        "equidistant",
-        (-0.013, 0.007, -0.004, 0.0005),
-    )
+    lens0, lens1 = (-0.012, 0.006, -0.004, 0.0006), (-0.013, 0.007, -0.004, 0.0005)
+    cam0 = CameraModel(f, f, 0.49 * width, 0.505 * height, width, height, "equidistant", lens0)
+    centre1 = 0.503 * width, 0.497 * height
+    cam1 = CameraModel(f * 1.003, f * 1.002, *centre1, width, height, "equidistant", lens1)
     T_imu_cam0 = se3_inverse(_forward_T_cam0_imu((0.04, 0.055, 0.01)))
     toe = 0.01
     T_cam0_cam1 = np.eye(4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import multiprocessing
@@ -11,21 +12,19 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, TypeAlias, get_args
 
 import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from vio.errors import DataError
+from vio.errors import DataError, SimulationError
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts
 from vio.protocols import Progress
 from vio.records import NS_PER_S, Image, ImuRecord, IntArray
 from vio.setting import setting
 from vio.sim.effects import CLEAN, SensorEffects
-from vio.sim.errors import SimulationError
 from vio.sim.export import export_kitti
 from vio.sim.imu import ImuNoise, VelocityNoise
 from vio.sim.miscalibration import CalibrationErrors, CalibrationSigmas
@@ -297,8 +296,7 @@ def _walk(duration_s: float, seed: int) -> MotionSpline:
 
 def _regular(start_ns: int, duration_s: float, rate_hz: float, *, first: int = 0) -> IntArray:
     count = max(1, int(duration_s * rate_hz + 1e-6))
-    times: IntArray = start_ns + np.round(np.arange(first, first + count) * (NS_PER_S / rate_hz)).astype(np.int64)
-    return times
+    return start_ns + np.round(np.arange(first, first + count) * (NS_PER_S / rate_hz)).astype(np.int64)
 
 
 # --- scenes ---------------------------------------------------------------------------------------------------------
@@ -397,7 +395,7 @@ def _traffic(motion: MotionSpline, seed: int) -> tuple[MovingBox, ...]:
 # --- rendering in several processes ---------------------------------------------------------------------------------
 
 
-class ParallelRecording(SimulatedRecording):
+class ParallelRecording(SimulatedRecording, contextlib.AbstractContextManager["ParallelRecording"]):
     """A scenario's recording, rendered ahead by other processes; the images equal those of one process to the bit.
 
     Use it as a context manager, and request frames in order. Every process plans the scenario itself, from the
@@ -412,12 +410,7 @@ class ParallelRecording(SimulatedRecording):
         self._pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
         self._waiting: dict[int, Future[tuple[Image, Image]]] = {}
 
-    def __enter__(self) -> ParallelRecording:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def images(self, index: int) -> tuple[Image, Image]:
@@ -472,7 +465,6 @@ def flight_files(folder: Path) -> tuple[Path, Path | None, Path | None]:
     return truth, times if times.is_file() else None, imu if imu.is_file() else None
 
 
-SCENES: tuple[str, ...] = get_args(SceneName)
 READY_MOTIONS: tuple[str, ...] = get_args(ReadyMotion)
 
 

@@ -11,19 +11,19 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from vio.datasets.common import frame_range, merge_events
+from vio.datasets.common import blank_frames, frame_range, merge_events
 from vio.datasets.euroc_files import read_imu_csv, stamped_rows
-from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
-from vio.errors import CalibrationError, DataError
+from vio.datasets.samples import imu_samples, in_time_order
+from vio.errors import DataError, SimulationError
 from vio.files.text import check_increasing
-from vio.geometry.distortion import StereoRig, rectified_camera
+from vio.geometry.distortion import StereoRig, rectified_pair
 from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.stereo import StereoCamera
 from vio.records import (
     Event,
     Image,
     ImuRecord,
     IntArray,
-    MotionSample,
     MotionSource,
     Observations,
     Recording,
@@ -32,7 +32,6 @@ from vio.records import (
     VelocitySample,
 )
 from vio.sim.effects import Exposure, SensorEffects, apply_effects, average_exposures, blur_along_flow
-from vio.sim.errors import SimulationError
 from vio.sim.exposure import ExposurePlan, plan_exposures
 from vio.sim.glare import glare
 from vio.sim.imu import ImuNoise, VelocityNoise, simulate_imu, simulate_velocity
@@ -75,6 +74,12 @@ class Simulation:
     calibration: StereoRig  # as calibrated, which is what is written and read; `rig` is the true one
     exposures: ExposurePlan | None = None  # of exposure control; None: it is off
 
+    def rectified_camera(self, why_not: str) -> StereoCamera:
+        """Return the rectified pair as calibrated; raise SimulationError, which says `why_not`, where it is none."""
+        if (camera := rectified_pair(self.calibration)) is None:
+            raise SimulationError(why_not)
+        return camera
+
 
 @dataclass(frozen=True, slots=True)
 class TrueState:
@@ -96,9 +101,7 @@ def simulate(
     rate_hz: float = 20.0,
     frame_times_ns: npt.ArrayLike | None = None,
     imu: ImuNoise | ImuRecord | None = None,
-    imu_rate_hz: float = 200.0,
     velocity: VelocityNoise | None = None,
-    velocity_rate_hz: float | None = None,
     effects: SensorEffects | None = None,
     faults: FrameFaults | None = None,
     calibration_errors: CalibrationErrors | None = None,
@@ -113,10 +116,8 @@ def simulate(
         motion: motion of the body.
         rate_hz: frames per second.
         frame_times_ns: true times (F,) of the frames instead of a fixed rate; those outside the motion are left out.
-        imu: noise of a simulated IMU, or a recorded IMU to use with the images; None: no IMU.
-        imu_rate_hz: rate of the simulated IMU.
-        velocity: noise of the paper's velocity sensor; None: no such sensor.
-        velocity_rate_hz: its rate; None: that of the frames.
+        imu: noise of a simulated IMU of 200 Hz, or a recorded IMU to use with the images; None: no IMU.
+        velocity: noise of the paper's velocity sensor, at the rate of the frames; None: no such sensor.
         effects: camera effects; None: the defaults of `SensorEffects`.
         faults: dropped and repeated frames, clock offset.
         calibration_errors: how far the true cameras are from `rig`; None: not at all.
@@ -133,10 +134,10 @@ def simulate(
     times = _frame_times(motion, rate_hz, frame_times_ns, effects, faults)
     _check_cameras(world, true_rig, motion, times)
     taken, stamps = _apply_faults(times, faults, seed)
-    record = simulate_imu(motion, rate_hz=imu_rate_hz, noise=imu, seed=seed) if isinstance(imu, ImuNoise) else imu
+    record = simulate_imu(motion, noise=imu, seed=seed) if isinstance(imu, ImuNoise) else imu
     samples: Sequence[VelocitySample] = ()
     if velocity is not None:
-        samples = simulate_velocity(motion, rate_hz=velocity_rate_hz or rate_hz, noise=velocity, seed=seed)
+        samples = simulate_velocity(motion, rate_hz=rate_hz, noise=velocity, seed=seed)
     exposures = None
     if effects.auto_exposure:
         exposures = plan_exposures(world, true_rig, motion, taken, effects, seed=seed)
@@ -184,24 +185,14 @@ def _check_cameras(world: World, rig: StereoRig, motion: MotionSpline, times: In
         check_clear(world, (T @ T_imu_cam)[:, :3, 3], what=name)
 
 
-def true_state(simulation: Simulation, time_ns: int) -> TrueState:
-    """Return the true state at any time within the motion.
-
-    Raises:
-        SimulationError: the time is outside the motion.
-    """
-    state = motion_at(simulation.motion, time_ns)
-    biases: list[FloatArray | None] = [None, None]
-    record = simulation.imu
-    if record is not None and record.gyro_bias is not None and record.accel_bias is not None:
-        elapsed = (record.times_ns - record.times_ns[0]).astype(np.float64)
-        at = float(time_ns - record.times_ns[0])
-        biases = [
-            np.array([np.interp(at, elapsed, b[:, i]) for i in range(3)]) for b in (record.gyro_bias, record.accel_bias)
-        ]
-    return TrueState(
-        time_ns, state.T_world_imu[0], state.velocity_world[0], state.angular_velocity[0], biases[0], biases[1]
-    )
+def true_biases(record: ImuRecord | None, times_ns: npt.ArrayLike) -> FloatArray | None:
+    """Return biases (..., 6) of gyroscope and accelerometer at times (...); None: there is no simulated IMU."""
+    if record is None or record.gyro_bias is None or record.accel_bias is None:
+        return None
+    known = np.hstack([record.gyro_bias, record.accel_bias])
+    elapsed = (record.times_ns - record.times_ns[0]).astype(np.float64)
+    at = np.asarray(times_ns - record.times_ns[0], dtype=np.float64)
+    return np.stack([np.interp(at, elapsed, known[:, i]) for i in range(6)], axis=-1)
 
 
 def views(simulation: Simulation, time_ns: int) -> tuple[View, View]:
@@ -217,18 +208,15 @@ class SimulatedRecording:
     def __init__(self, simulation: Simulation) -> None:
         """Store the plan; frames are rendered on request."""
         self.simulation = simulation
-        self._rays: tuple[CameraRays, CameraRays] | None = None
 
-    @property
+    @functools.cached_property
     def rays(self) -> tuple[CameraRays, CameraRays]:
         """The tabulated rays of both cameras.
 
         Raises:
             SimulationError: the rig's distortion does not reach every pixel.
         """
-        if self._rays is None:
-            self._rays = camera_rays(self.simulation.rig.cam0), camera_rays(self.simulation.rig.cam1)
-        return self._rays
+        return camera_rays(self.simulation.rig.cam0), camera_rays(self.simulation.rig.cam1)
 
     @property
     def recording(self) -> Recording:
@@ -238,13 +226,8 @@ class SimulatedRecording:
             SimulationError: the rig is not rectified.
         """
         simulation = self.simulation
-        try:
-            camera = rectified_camera(simulation.calibration)
-        except CalibrationError as error:
-            raise SimulationError(
-                "an unrectified rig has no rectified recording; export it as an EuRoC folder and read that"
-            ) from error
-        stamps = simulation.stamps_ns
+        why_not = "an unrectified rig has no rectified recording; export it as an EuRoC folder and read that"
+        camera, stamps = simulation.rectified_camera(why_not), simulation.stamps_ns
         motion: set[MotionSource] = set()
         if simulation.imu is not None:
             motion.add("imu")
@@ -280,15 +263,9 @@ class SimulatedRecording:
         """
         recording = self.recording
         chosen = frame_range(recording, start, stop)
-        times_ns = recording.frame_times_ns
-        frames = (self.frame(k) if images else StereoFrame(k, int(times_ns[k]), None, None) for k in chosen)
-        return merge_events(recording, chosen, self._motion_samples(), frames)
-
-    def _motion_samples(self) -> MotionSamples[MotionSample]:
-        """All samples in time order."""
-        simulation = self.simulation
-        inertial = () if simulation.imu is None else imu_samples(simulation.imu)
-        return in_time_order(simulation.velocity, inertial)
+        frames = (self.frame(k) for k in chosen) if images else blank_frames(recording, chosen)
+        inertial = () if self.simulation.imu is None else imu_samples(self.simulation.imu)
+        return merge_events(recording, chosen, in_time_order(self.simulation.velocity, inertial), frames)
 
     def observations(self, index: int) -> Observations | None:
         """Return None: a simulated recording holds images."""
@@ -305,20 +282,13 @@ class SimulatedRecording:
         time_ns = int(simulation.taken_ns[index])
         # A repeated frame is identical to the bit, so its noise is seeded by the frame it repeats.
         source = int(np.searchsorted(simulation.taken_ns, time_ns))
+        sensor = functools.partial(apply_effects, time_ns=time_ns, frame_index=source, seed=simulation.seed)
         exposures = [self.exposure(index, camera) for camera in (0, 1)]
-        images = [
-            apply_effects(
-                self._seen(camera, time_ns, exposure),
-                simulation.effects,
-                time_ns=time_ns,
-                frame_index=source,
-                camera=camera,
-                seed=simulation.seed,
-                exposure=exposure,
-            )
+        left, right = (
+            sensor(self._seen(camera, time_ns, exposure), simulation.effects, camera=camera, exposure=exposure)
             for camera, exposure in enumerate(exposures)
-        ]
-        return images[0], images[1]
+        )
+        return left, right
 
     def exposure(self, index: int, camera: int) -> Exposure | None:
         """Exposure of one image as the camera's control has set it; None where there is no control."""
@@ -371,7 +341,9 @@ class SimulatedRecording:
         u, v = np.linspace(0, width - 1, width // step_px + 2), np.linspace(0, height - 1, height // step_px + 2)
         grid = np.stack(np.meshgrid(u, v), axis=-1)
         there, _ = correspondence(self.simulation.world, view, other, grid.reshape(-1, 2))
-        return _dense(there.reshape(grid.shape) - grid, width, height)
+        # Bilinear between the nodes, of which the outer ones are at the image's outer pixels.
+        shift, down, across = there.reshape(grid.shape) - grid, _weights(len(v), height), _weights(len(u), width)
+        return np.stack([down @ shift[..., k] @ across.T for k in (0, 1)], axis=-1)
 
     def depth(self, camera: int, time_ns: int) -> tuple[FloatArray, IntArray]:
         """Exact depth (H, W) in metres and the surface (H, W) seen by one camera at a true time."""
@@ -379,14 +351,14 @@ class SimulatedRecording:
         return depth_map(self.simulation.world, self.rays[camera], view.T_world_cam, time_ns)
 
     def true_state(self, time_ns: int) -> TrueState:
-        """Return the true state at any time within the motion."""
-        return true_state(self.simulation, time_ns)
+        """Return the true state at any time within the motion.
 
-
-def _dense(grid: FloatArray, width: int, height: int) -> FloatArray:
-    """Bilinear interpolation of a grid (R, C, 2) whose outer rows and columns are at the image's outer pixels."""
-    down, across = _weights(grid.shape[0], height), _weights(grid.shape[1], width)
-    return np.stack([down @ grid[..., k] @ across.T for k in (0, 1)], axis=-1)
+        Raises:
+            SimulationError: the time is outside the motion.
+        """
+        state, biases = motion_at(self.simulation.motion, time_ns), true_biases(self.simulation.imu, time_ns)
+        gyro, accel = (None, None) if biases is None else (biases[:3], biases[3:])
+        return TrueState(time_ns, state.T_world_imu[0], state.velocity_world[0], state.angular_velocity[0], gyro, accel)
 
 
 @functools.lru_cache(maxsize=8)
@@ -412,21 +384,18 @@ class RecordedFlight:
     imu: ImuRecord | None = field(default=None)
 
 
-def read_flight(
-    groundtruth: Path, image_times: Path | None = None, imu_csv: Path | None = None, *, knot_s: float = 0.1
-) -> RecordedFlight:
+def read_flight(groundtruth: Path, image_times: Path | None = None, imu_csv: Path | None = None) -> RecordedFlight:
     """Read a recorded flight, to render images along it.
 
     Args:
         groundtruth: TUM file of the IMU's poses.
         image_times: one integer of nanoseconds a line; None: 20 Hz.
         imu_csv: the real IMU record of that flight in EuRoC's form; None: none.
-        knot_s: knot spacing of the smoothing spline.
 
     Raises:
         DataError: a file cannot be used; the message names it.
     """
-    motion, fit = recorded_motion(groundtruth, knot_s=knot_s)
+    motion, fit = recorded_motion(groundtruth)
     if image_times is None:
         times = np.arange(motion.start_ns, motion.end_ns, 50_000_000)
     else:
@@ -437,13 +406,11 @@ def read_flight(
     return RecordedFlight(motion, fit, times, None if imu_csv is None else read_imu_csv(imu_csv))
 
 
-def room_around(
-    motion: MotionSpline, *, seed: int = 0, margin_m: float = _WALL_MARGIN_M, texel_m: float | None = None
-) -> World:
+def room_around(motion: MotionSpline, *, seed: int = 0, texel_m: float | None = None) -> World:
     """Build a room around a motion; its furniture keeps clear of the path."""
     times = np.arange(motion.start_ns, motion.end_ns, _CLEARANCE_STEP_NS)
     p = motion_at(motion, times).T_world_imu[:, :3, 3]
-    low, high = p.min(axis=0) - margin_m, p.max(axis=0) + margin_m
+    low, high = p.min(axis=0) - _WALL_MARGIN_M, p.max(axis=0) + _WALL_MARGIN_M
     area = float(np.prod((high - low)[:2]))
     return room(
         seed,

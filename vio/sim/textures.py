@@ -14,27 +14,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.errors import SimulationError
 from vio.geometry.lie import FloatArray
 from vio.records import Image
-from vio.sim.errors import SimulationError
 
 TextureKind: TypeAlias = Literal[
-    "wall",
-    "bare",
-    "plaster",
-    "floor",
-    "ceiling",
-    "wood",
-    "picture",
-    "crate",
-    "facade",
-    "asphalt",
-    "sky",
-    "skyline",
-    "window",
-    "clothes",
-    "skin",
-]
+    "wall", "bare", "plaster", "floor", "ceiling", "wood", "picture", "crate", "facade", "asphalt", "sky",
+    "skyline", "window", "clothes", "skin",
+]  # fmt: skip
 _Canvas: TypeAlias = npt.NDArray[np.float32]
 
 _GUTTER = 3  # texels of repeated border around each level, for the interpolation kernel
@@ -107,9 +94,7 @@ def _pack(levels: list[Image]) -> MipTexture:
     for level, (top, left) in zip(levels, places, strict=True):
         padded = cv2.copyMakeBorder(level, _GUTTER, _GUTTER, _GUTTER, _GUTTER, cv2.BORDER_REPLICATE)
         page[top : top + padded.shape[0], left : left + padded.shape[1]] = padded
-        rows.append(
-            (level.shape[1] / width, level.shape[0] / height, left + _GUTTER - 0.5, top + _GUTTER - 0.5),
-        )
+        rows.append((level.shape[1] / width, level.shape[0] / height, left + _GUTTER - 0.5, top + _GUTTER - 0.5))
     return MipTexture(page, (width, height), np.array(rows, dtype=np.float32))
 
 
@@ -135,23 +120,16 @@ def lit(texture: Image, light: FloatArray, rng: np.random.Generator) -> tuple[Im
 
 
 def octave_noise(
-    width: int,
-    height: int,
-    rng: np.random.Generator,
-    *,
-    coarsest_texels: float,
-    finest_texels: float = 1.0,
-    falloff: float = 0.8,
+    width: int, height: int, rng: np.random.Generator, *, coarsest_texels: float, falloff: float = 0.8
 ) -> _Canvas:
     """Zero-mean value noise (height, width) of about unit standard deviation, summed over octaves.
 
     Args:
         coarsest_texels: wavelength of the first octave.
-        finest_texels: wavelength where the octaves end.
         falloff: amplitude of an octave relative to the one before.
     """
     wavelengths = [max(coarsest_texels, 1.0)]
-    while wavelengths[-1] / 2 >= max(finest_texels, 1.0):
+    while wavelengths[-1] / 2 >= 1.0:
         wavelengths.append(wavelengths[-1] / 2)
     noise: _Canvas | None = None
     amplitude, power = 1.0, 0.0

@@ -14,9 +14,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from vio.errors import SimulationError
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.records import IntArray
-from vio.sim.errors import SimulationError
 from vio.sim.lighting import Light, Lighting, illumination, sun, window
 from vio.sim.textures import MipTexture, TextureKind, build_mips, lit, paint
 
@@ -24,6 +24,11 @@ SceneName: TypeAlias = Literal["room", "street", "corridor", "doors"]
 ObjectMotion: TypeAlias = Callable[[int], FloatArray]  # time_ns to T_world_object (4, 4)
 
 _OF_WOOD: tuple[TextureKind, ...] = ("wood", "crate")
+_CLEAR_M = 0.05  # of a camera from what it may not be in
+_CORRIDOR_M = np.array([30.0, 2.6, 2.7])  # length, width, height
+_DOORS, _DOOR_M = 10, 3.0  # of a corridor of equal doors, and from one to the next
+_STREET_M = 15.0  # width
+_PARKED = 36  # boxes
 _ONWARD_M = 80.0  # length of the streets beyond the block
 _CORNER_FREE_M = 13.0  # no parked box this close to a corner, which cars cut
 # Radiance over the texture's own gray levels, of what is bright by itself: nine stops of a room's light and a window
@@ -36,13 +41,8 @@ _ROOM_AMBIENT, _STREET_AMBIENT = 0.22, 0.4
 _SUN_ELEVATION_RAD = 0.3
 _BARE_HOUSES = 3  # one house in so many has a blank wall
 _FACES: dict[str, tuple[int, int]] = {
-    "+x": (0, 1),
-    "-x": (0, -1),
-    "+y": (1, 1),
-    "-y": (1, -1),
-    "+z": (2, 1),
-    "-z": (2, -1),
-}
+    "+x": (0, 1), "-x": (0, -1), "+y": (1, 1), "-y": (1, -1), "+z": (2, 1), "-z": (2, -1),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,20 +107,15 @@ class TextureStore:
         self._lock = threading.Lock()
 
     def __getitem__(self, surface: int) -> MipTexture:
-        found = self._painted.get(surface)
-        if found is None:
-            with self._lock:
-                found = self._painted.get(surface)
-                if found is None:
-                    patch = self._patches[surface]
-                    twin = surface
-                    if patch.twins is not None:
-                        twin = next(k for k, other in enumerate(self._patches) if other.twins == patch.twins)
-                    found = self._painted.get(twin)
-                    if found is None:
-                        found = self._paint(twin)
-                    self._painted[twin] = self._painted[surface] = found
-        return found
+        with self._lock:
+            if surface not in self._painted:
+                twins, twin = self._patches[surface].twins, surface
+                if twins is not None:
+                    twin = next(k for k, other in enumerate(self._patches) if other.twins == twins)
+                if twin not in self._painted:
+                    self._painted[twin] = self._paint(twin)
+                self._painted[surface] = self._painted[twin]
+            return self._painted[surface]
 
     def _paint(self, surface: int) -> MipTexture:
         patch = self._patches[surface]
@@ -169,14 +164,15 @@ def surfaces_at(world: World, time_ns: int) -> Surfaces:
     return replace(fixed, origin=origin, axis_s=axis_s, axis_t=axis_t)
 
 
-def check_clear(world: World, positions: npt.ArrayLike, *, margin_m: float = 0.05, what: str = "the camera") -> None:
+def check_clear(world: World, positions: npt.ArrayLike, what: str = "the camera") -> None:
     """Check that positions (N, 3) are inside the scene and in no box.
 
     Raises:
         SimulationError: a position is not; the message names the first one.
     """
     p = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
-    outside = ((p < world.bounds[0] + margin_m) | (p > world.bounds[1] - margin_m)).any(axis=1) | ~np.isfinite(p).all(1)
+    low, high = world.bounds[0] + _CLEAR_M, world.bounds[1] - _CLEAR_M
+    outside = ((p < low) | (p > high)).any(axis=1) | ~np.isfinite(p).all(1)
     if outside.any():
         i = int(np.flatnonzero(outside)[0])
         raise SimulationError(
@@ -186,7 +182,7 @@ def check_clear(world: World, positions: npt.ArrayLike, *, margin_m: float = 0.0
         )
     for number, solid in enumerate(world.solids):
         local = (p - solid.T_world_box[:3, 3]) @ solid.T_world_box[:3, :3]
-        inside = (np.abs(local) < solid.half_size + margin_m).all(axis=1)
+        inside = (np.abs(local) < solid.half_size + _CLEAR_M).all(axis=1)
         if inside.any():
             i = int(np.flatnonzero(inside)[0])
             raise SimulationError(
@@ -277,15 +273,13 @@ def _windows(box: FloatArray, count: int, seed: int, scale: float) -> tuple[tupl
 def corridor(
     seed: int = 0,
     *,
-    length_m: float = 30.0,
-    width_m: float = 2.6,
-    height_m: float = 2.7,
     bare_walls: tuple[str, ...] = ("+y",),
     bare_kind: TextureKind = "bare",
     moving: Sequence[MovingBox] = (),
     texel_m: float = 0.003,
 ) -> World:
     """Build a corridor along x whose left wall (`bare_walls`) is bare, with cupboards along the right one."""
+    length_m, width_m, height_m = _CORRIDOR_M
     box = np.array([[0.0, -width_m / 2, 0.0], [length_m, width_m / 2, height_m]])
     rng = np.random.default_rng([seed, 2])
     patches = _shell(box, bare_walls, texel_m, bare_kind)
@@ -305,36 +299,29 @@ def corridor(
     return _build("corridor", patches, solids, box, seed, moving)
 
 
-def equal_doors(
-    seed: int = 0,
-    *,
-    doors: int = 10,
-    spacing_m: float = 3.0,
-    width_m: float = 2.6,
-    height_m: float = 2.7,
-    texel_m: float = 0.003,
-) -> World:
+def equal_doors(seed: int = 0, *, texel_m: float = 0.003) -> World:
     """Build a corridor along x that repeats to the texel from door to door: walls, floor, ceiling, doors, pictures.
 
     Only its two end walls differ. Whoever recognises places by their looks alone takes one door for another.
     """
-    box = np.array([[0.0, -width_m / 2, 0.0], [doors * spacing_m, width_m / 2, height_m]])
+    _, width_m, height_m = _CORRIDOR_M
+    box = np.array([[0.0, -width_m / 2, 0.0], [_DOORS * _DOOR_M, width_m / 2, height_m]])
     ends: dict[str, TextureKind] = {"+x": "wall", "-x": "wall"}
     centre = _pose((box[0] + box[1]) / 2, 0.0)
     patches = _axis_rectangles(centre, (box[1] - box[0]) / 2, ends, texel_m, inwards=True)
     kinds: dict[str, TextureKind] = {"+y": "wall", "-y": "wall", "-z": "floor", "+z": "ceiling"}
-    half = np.array([spacing_m, width_m, height_m]) / 2
+    half = np.array([_DOOR_M, width_m, height_m]) / 2
     rng = np.random.default_rng([seed, 4])
-    places = [(side * (width_m / 2 - 0.02), rng.uniform(0.5, spacing_m - 0.5)) for side in (-1, 1) for _ in range(2)]
+    places = [(side * (width_m / 2 - 0.02), rng.uniform(0.5, _DOOR_M - 0.5)) for side in (-1, 1) for _ in range(2)]
     solids: list[Solid] = []
-    for number in range(doors):
-        middle = np.array([(number + 0.5) * spacing_m, 0.0, height_m / 2])
+    for number in range(_DOORS):
+        middle = np.array([(number + 0.5) * _DOOR_M, 0.0, height_m / 2])
         cell = _axis_rectangles(_pose(middle, 0.0), half, kinds, texel_m, inwards=True)
         door = Solid(_pose((middle[0], -width_m / 2 + 0.03, 1.0), 0.0), np.array([0.45, 0.03, 1.0]))
         solids.append(door)
         cell += _box_patches(door, "wood", texel_m, hidden=("-z",))
         for y, along in places:
-            picture = Solid(_pose((number * spacing_m + along, y, 1.6), 0.0), np.array([0.3, 0.02, 0.25]))
+            picture = Solid(_pose((number * _DOOR_M + along, y, 1.6), 0.0), np.array([0.3, 0.02, 0.25]))
             solids.append(picture)
             cell += _box_patches(picture, "picture", texel_m)
         patches += [replace(patch, twins=k) for k, patch in enumerate(cell)]
@@ -345,8 +332,6 @@ def street(
     seed: int = 0,
     *,
     loop_m: tuple[float, float] = (110.0, 70.0),
-    width_m: float = 15.0,
-    parked: int = 36,
     moving: Sequence[MovingBox] = (),
     sunlit: bool = False,
     bare_houses: bool = False,
@@ -360,19 +345,19 @@ def street(
     """
     rng = np.random.default_rng([seed, 3])
     half = np.array(loop_m) / 2
-    if min(loop_m) < 2.5 * width_m:
-        raise SimulationError(f"a street {width_m:g} m wide needs loop_m of at least {2.5 * width_m:g} m each way")
-    inner, outer = half - width_m / 2, half + width_m / 2
+    if min(loop_m) < 2.5 * _STREET_M:
+        raise SimulationError(f"a street {_STREET_M:g} m wide needs loop_m of at least {2.5 * _STREET_M:g} m each way")
+    inner, outer = half - _STREET_M / 2, half + _STREET_M / 2
     patches: list[Patch] = []
     solids: list[Solid] = []
-    houses = [*_house_row(inner, width_m, rng, outwards=True), *_house_row(outer, width_m, rng, outwards=False)]
+    houses = [*_house_row(inner, rng, outwards=True), *_house_row(outer, rng, outwards=False)]
     for number, (solid, back) in enumerate(houses):
         solids.append(solid)
         onward = bool(abs(solid.T_world_box[0, 3]) > outer[0] + 10)
         kind: TextureKind = "plaster" if bare_houses and number % _BARE_HOUSES == 0 else "facade"
         patches += _box_patches(solid, kind, (2 if onward else 1) * texel_m, hidden=("-z", "+z", back))
     patches += _road(inner, outer, 0.8 * texel_m)
-    for solid in _roadside(half, width_m, parked, rng):
+    for solid in _roadside(half, rng):
         solids.append(solid)
         patches += _box_patches(solid, "crate", 0.6 * texel_m, hidden=("-z",))
     reach = float(max(outer)) + 250.0
@@ -541,14 +526,14 @@ def _hang_picture(box: FloatArray, rng: np.random.Generator, scale: float, bare_
     return Solid(_pose(centre, 0.0), half)
 
 
-def _house_row(rim: FloatArray, width_m: float, rng: np.random.Generator, *, outwards: bool) -> list[tuple[Solid, str]]:
+def _house_row(rim: FloatArray, rng: np.random.Generator, *, outwards: bool) -> list[tuple[Solid, str]]:
     """Houses along a rectangle of half size `rim`, each with its hidden face: inside it facing out, or around it."""
     houses = []
     depth = 8.0
     for axis in (0, 1):
         for sign in (-1, 1):
             # The streets along x continue beyond the block, towards the skyline.
-            extent = rim[axis] if outwards else (rim[0] + _ONWARD_M if axis == 0 else rim[1] - width_m)
+            extent = rim[axis] if outwards else (rim[0] + _ONWARD_M if axis == 0 else rim[1] - _STREET_M)
             x = -extent
             while x < extent - 3:
                 width = min(rng.uniform(9.0, 18.0), extent - x)
@@ -584,18 +569,18 @@ def _road(inner: FloatArray, outer: FloatArray, texel_m: float) -> list[Patch]:
     return out
 
 
-def _roadside(half: FloatArray, width_m: float, parked: int, rng: np.random.Generator) -> list[Solid]:
+def _roadside(half: FloatArray, rng: np.random.Generator) -> list[Solid]:
     """Parked boxes the size of cars and vans, and poles, at both sides of the middle line."""
     out: list[Solid] = []
     perimeter = 4 * float(half.sum())
-    for number in range(parked + parked // 2):
-        is_pole = number >= parked
+    for number in range(_PARKED + _PARKED // 2):
+        is_pole = number >= _PARKED
         for _ in range(20):
             place = rng.uniform(0, perimeter)
             point, heading, to_corner = _on_rectangle(half, place)
             if to_corner < _CORNER_FREE_M:
                 continue
-            side = rng.choice([-1.0, 1.0]) * (width_m / 2 - (0.7 if is_pole else rng.uniform(1.5, 1.9)))
+            side = rng.choice([-1.0, 1.0]) * (_STREET_M / 2 - (0.7 if is_pole else rng.uniform(1.5, 1.9)))
             normal = np.array([-np.sin(heading), np.cos(heading)])
             size = (
                 np.array([0.22, 0.22, rng.uniform(3, 6)]) if is_pole else rng.uniform((3.4, 1.6, 1.3), (5.2, 2.0, 2.4))

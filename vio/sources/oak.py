@@ -78,7 +78,8 @@ class OakSource:
             self._imu = node.out.createOutputQueue()
             T_cam0_imu = _metres(stored.getImuToCameraExtrinsics(sockets[0]))
         lenses = [self._lens(stored, socket) for socket in sockets]
-        self._rig = Rig(lenses[0], lenses[1], _metres(stored.getCameraExtrinsics(*sockets)), T_cam0_imu)
+        self.has_imu = self._imu is not None
+        self.rig: Rig | None = Rig(lenses[0], lenses[1], _metres(stored.getCameraExtrinsics(*sockets)), T_cam0_imu)
         self._pipeline.start()
 
     def _lens(self, stored: Any, socket: Any) -> CameraModel:
@@ -89,16 +90,6 @@ class OakSource:
         if any(values[_COEFFICIENTS:]):
             raise DataError(f"{self._name}: its lens model has thin prisms or tilt; give --calibration FILE")
         return camera_from_matrix(K, _WIDTH, _HEIGHT, "radtan", values[:_COEFFICIENTS], self._name)
-
-    @property
-    def rig(self) -> Rig | None:
-        """The calibration of the device."""
-        return self._rig
-
-    @property
-    def has_imu(self) -> bool:
-        """Whether the device has one."""
-        return self._imu is not None
 
     def events(self) -> Iterator[SourceEvent | None]:
         """Yield pairs and samples.

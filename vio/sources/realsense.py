@@ -58,8 +58,8 @@ class RealSenseSource:
         try:
             self._device = self._opened(name)
             profiles = self._chosen_profiles()
-            self._has_imu = {"gyro", "accel"} <= set(profiles)
-            self._rig = self._calibration(profiles)
+            self.has_imu = {"gyro", "accel"} <= set(profiles)  # D435i, D455
+            self.rig: Rig | None = self._calibration(profiles)
             self._start(profiles)
         except RuntimeError as error:
             self.close()
@@ -131,7 +131,7 @@ class RealSenseSource:
         """Return the rig that the device has stored."""
         left, right = (profiles[name][1] for name in ("left", "right"))
         T_cam0_imu = None
-        if self._has_imu:
+        if self.has_imu:
             try:
                 T_cam0_imu = _transform(profiles["accel"][1].get_extrinsics_to(left))
             except RuntimeError as error:
@@ -149,16 +149,6 @@ class RealSenseSource:
                 raise DataError(f"realsense:{self._name}: its distortion {name} is not known; give --calibration FILE")
         model, number = _MODELS[name], {"none": 0, "kannala_brandt4": 4}.get(name, 5)
         return camera_from_matrix(K, found.width, found.height, model, found.coeffs[:number], self._name)
-
-    @property
-    def rig(self) -> Rig | None:
-        """The factory calibration."""
-        return self._rig
-
-    @property
-    def has_imu(self) -> bool:
-        """Whether the camera has one (D435i, D455)."""
-        return self._has_imu
 
     # Frames
 

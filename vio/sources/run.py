@@ -85,11 +85,9 @@ def run_source(
             odometry.warm_up()
             watcher = on_start(odometry, rig)
             with contextlib.ExitStack() as stack:
-                recorder = (
-                    None
-                    if record is None
-                    else stack.enter_context(contextlib.closing(Recorder(record, rig, record_as)))
-                )
+                recorder = None if record is None else Recorder(record, rig, record_as)
+                if recorder is not None:
+                    stack.callback(recorder.close)
                 say("ready")
                 for event in source.events():
                     if should_stop():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Literal, Protocol, TypeAlias
 
 from vio.cameras.rig import Rig
@@ -39,13 +40,8 @@ SourceEvent: TypeAlias = "SourceFrame | SourceSample"
 class LiveSource(Protocol):
     """A camera, with or without an IMU."""
 
-    @property
-    def rig(self) -> Rig | None:
-        """The calibration that the device has stored; None: it has none, and the user gives one."""
-
-    @property
-    def has_imu(self) -> bool:
-        """Whether samples come."""
+    rig: Rig | None  # the calibration that the device has stored; None: it has none, and the user gives one
+    has_imu: bool  # whether samples come
 
     def events(self) -> Iterator[SourceEvent | None]:
         """Yield frames and samples as they come, each kind in order of time; None at least each second without any.
@@ -60,34 +56,12 @@ class LiveSource(Protocol):
         """Let the device go."""
 
 
-def _video(rest: str, layout: Layout) -> LiveSource:
-    from vio.sources.video import VideoSource
-
-    return VideoSource(rest, layout)
-
-
-def _network(scheme: str) -> Callable[[str, Layout], LiveSource]:
-    return lambda rest, layout: _video(f"{scheme}:{rest}", layout)
-
-
-def _realsense(rest: str, layout: Layout) -> LiveSource:
-    from vio.sources.realsense import RealSenseSource
-
-    return RealSenseSource(rest)
-
-
-def _oak(rest: str, layout: Layout) -> LiveSource:
-    from vio.sources.oak import OakSource
-
-    return OakSource(rest)
-
-
-SOURCES: dict[str, Callable[[str, Layout], LiveSource]] = {
-    "v4l2": _video,
-    "video": _video,
-    **{scheme: _network(scheme) for scheme in ("rtsp", "http", "https", "udp", "tcp")},
-    "realsense": _realsense,
-    "oak": _oak,
+_NETWORK = ("rtsp", "http", "https", "udp", "tcp")
+# Module and class of each kind, imported when it is needed.
+SOURCES = {
+    **dict.fromkeys(("v4l2", "video", *_NETWORK), "video:VideoSource"),
+    "realsense": "realsense:RealSenseSource",
+    "oak": "oak:OakSource",
 }
 
 
@@ -107,7 +81,11 @@ def open_source(name: str, layout: Layout = "side-by-side") -> LiveSource:
     scheme, colon, rest = name.partition(":")
     if not colon or scheme not in SOURCES:
         raise ConfigError(f"{name!r} is no live source; give one of {', '.join(f'{known}:' for known in SOURCES)}")
-    return SOURCES[scheme](rest, layout)
+    module, kind = SOURCES[scheme].split(":")
+    made: Callable[..., LiveSource] = getattr(import_module(f"vio.sources.{module}"), kind)
+    if module == "video":
+        return made(name if scheme in _NETWORK else rest, layout)
+    return made(rest)
 
 
 class ImuInterpolation:

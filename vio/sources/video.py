@@ -25,6 +25,9 @@ class VideoSource:
     time at which they arrived, on the computer's monotonic clock.
     """
 
+    rig: Rig | None = None  # a video has no calibration
+    has_imu = False
+
     def __init__(self, name: str, layout: Layout) -> None:
         """Open it.
 
@@ -45,16 +48,6 @@ class VideoSource:
         self._video = cv2.VideoCapture(where, cv2.CAP_V4L2) if device else cv2.VideoCapture(where)
         if not self._video.isOpened():
             raise DataError(f"{name}: OpenCV cannot open it; check the name, and that no other program uses it")
-
-    @property
-    def rig(self) -> Rig | None:
-        """None: a video has no calibration."""
-        return None
-
-    @property
-    def has_imu(self) -> bool:
-        """False."""
-        return False
 
     def events(self) -> Iterator[SourceEvent | None]:
         """Yield frames until the file ends.

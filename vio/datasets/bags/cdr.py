@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from vio.datasets.bags.store import MISSING, named_damage
-from vio.errors import MissingDependencyError
+from vio.datasets.bags.store import named_damage, ros2_types
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,15 +18,6 @@ class Field:
     length: int = 0  # of an array; of a sequence the most elements, 0: any number
 
 
-@functools.cache
-def _store() -> Any:
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise MissingDependencyError(MISSING.format("reading")) from error
-    return get_typestore(Stores.ROS2_HUMBLE)
-
-
 def decoded(data: bytes, kind: str, where: str) -> Any:
     """Return the fields of a message.
 
@@ -36,12 +25,12 @@ def decoded(data: bytes, kind: str, where: str) -> Any:
         DataError: the message does not fit its type.
     """
     with named_damage(where):
-        return _store().deserialize_cdr(data, kind)
+        return ros2_types().deserialize_cdr(data, kind)
 
 
 def is_message(kind: str) -> bool:
     """Return whether a message type is known."""
-    return kind in _store().fielddefs
+    return kind in ros2_types().fielddefs
 
 
 def fields_of(kind: str) -> tuple[Field, ...]:
@@ -49,7 +38,7 @@ def fields_of(kind: str) -> tuple[Field, ...]:
     from rosbags.interfaces import Nodetype
 
     found = []
-    for name, (node, value) in _store().fielddefs[kind][1]:
+    for name, (node, value) in ros2_types().fielddefs[kind][1]:
         if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
             (inner, of), length = value
             many: Literal["array", "sequence"] = "array" if node == Nodetype.ARRAY else "sequence"

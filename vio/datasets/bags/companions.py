@@ -9,7 +9,6 @@ from pathlib import Path
 from vio.cameras.rig import Rig
 from vio.datasets.bags import bag_files
 from vio.datasets.bags.index import BagIndex, index_bag, info_topic
-from vio.datasets.bags.pictures import white_of
 from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import Roles, choose
 from vio.datasets.companions import check_overlap, imu_on_camera_clock
@@ -74,7 +73,7 @@ def _compressed_size(bag: Bag, topic: Topic) -> tuple[int, int] | None:
     """Return width and height of the first compressed image that decodes; None: none of the first few does."""
     for count, message in enumerate(bag.messages([topic.name])):
         try:
-            image, _ = decode_gray(bytes(bag.decoded(message).data), topic.name)
+            image = decode_gray(bytes(bag.decoded(message).data), topic.name)
         except UnreadableImageError:
             if count > 4:
                 return None
@@ -162,14 +161,3 @@ def motion_of(
         parts.append(speeds)
         sources.add("velocity")
     return in_time_order(*parts), frozenset(sources), notes
-
-
-def bag_white_level(index: BagIndex) -> tuple[int, list[str]]:
-    """Return the level of white of 16-bit images, and a note where it is not that of 16 bits."""
-    full = white_of(65535)
-    white = white_of(max(index.left.white, index.right.white)) if index.left.white else full
-    if white == full:
-        return white, []
-    return white, [
-        f"the images have 16 bits but use {white.bit_length()}: the levels 0 to {white} are scaled to 8 bits"
-    ]

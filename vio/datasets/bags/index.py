@@ -15,7 +15,7 @@ import numpy as np
 from vio.datasets.bags.pictures import raw_gray
 from vio.datasets.bags.store import Bag, Message, Topic
 from vio.datasets.bags.topics import CAMERA_INFO, COMPRESSED, IMAGE, TF, Roles
-from vio.datasets.images import UnreadableImageError
+from vio.datasets.images import UnreadableImageError, brightest
 from vio.datasets.rigs.camera_info import CameraInfo
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
@@ -25,7 +25,6 @@ from vio.records import NS_PER_S, ImuRecord, IntArray, Trajectory, VelocitySampl
 __all__ = ["BagIndex", "Stamps", "camera_info_of", "index_bag", "info_topic", "stamp_of"]
 
 _WHITE_SAMPLES = 8  # images looked at for the level of white, spread over the recording
-_WHITE_SHARE = 0.999  # of their pixels are no brighter than that level
 
 
 @dataclass(slots=True)
@@ -203,7 +202,7 @@ def _image(bag: Bag, stamps: Stamps, topic: Topic, fields: Any, message: Message
             pixels = raw_gray(fields, f"{bag.path}, {topic.name}")
         except UnreadableImageError:
             return  # the reader skips it and says so
-        stamps.white = max(stamps.white, float(np.quantile(pixels, _WHITE_SHARE)))
+        stamps.white = max(stamps.white, brightest(pixels))
 
 
 def _late(index: BagIndex, rows: list[tuple[int, tuple[float, ...]]], topic: str, time_ns: int) -> None:
@@ -257,13 +256,5 @@ def _info(index: BagIndex, fields: Any, message: Message) -> None:
 def camera_info_of(fields: Any, topic: str) -> CameraInfo:
     """Return a sensor_msgs/CameraInfo; ROS 1 and ROS 2 write its matrices in capitals and in small letters."""
     D, K, R, P = (np.array(getattr(fields, n, getattr(fields, n.upper(), None)), dtype=np.float64) for n in "dkrp")
-    return CameraInfo(
-        topic,
-        int(fields.width),
-        int(fields.height),
-        str(fields.distortion_model),
-        tuple(D.tolist()),
-        K.reshape(3, 3),
-        R.reshape(3, 3),
-        P.reshape(3, 4),
-    )
+    size, matrices = (int(fields.width), int(fields.height)), (K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4))
+    return CameraInfo(topic, *size, str(fields.distortion_model), tuple(D.tolist()), *matrices)

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vio.datasets.images import WHITE_16, UnreadableImageError, decode_gray
+from vio.datasets.images import WHITE_16, UnreadableImageError, decode_gray, to_8_bits
 from vio.errors import DataError
 from vio.records import Image
 
 # OpenCV names a Bayer pattern by its second row and column; ROS by its first pixels.
 _BAYER = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
 _YUV = {"yuv422": "UYVY", "uyvy": "UYVY", "yuv422_yuy2": "YUY2", "yuyv": "YUY2"}
-_SENSOR_BITS = (10, 12, 14)  # of cameras whose pixels are stored in the low bits of 16
 
 
 def gray_of(fields: Any, where: str, *, compressed: bool, white: int = WHITE_16, colour: bool = False) -> Image:
@@ -32,15 +31,12 @@ def gray_of(fields: Any, where: str, *, compressed: bool, white: int = WHITE_16,
         DataError: the encoding is not read.
     """
     read = compressed_pixels if compressed else raw_gray
-    pixels = read(fields, where, colour=colour)
-    if pixels.dtype == np.uint16:
-        pixels = np.minimum(np.rint(pixels / (white / 255)), 255).astype(np.uint8)
-    return np.ascontiguousarray(pixels, dtype=np.uint8)
+    return to_8_bits(read(fields, where, colour=colour), white)
 
 
 def compressed_pixels(fields: Any, where: str, *, colour: bool = False) -> npt.NDArray[Any]:
     """Decode a CompressedImage: gray (H, W) or colour (H, W, 3), 8 bits; of 16-bit files by full scale."""
-    return decode_gray(bytes(fields.data), where, colour=colour)[0]
+    return decode_gray(bytes(fields.data), where, colour=colour)
 
 
 def raw_gray(fields: Any, where: str, *, colour: bool = False) -> npt.NDArray[Any]:
@@ -85,8 +81,3 @@ def _form(encoding: str, where: str, *, bayer: bool, yuv: str | None) -> tuple[s
         if encoding.startswith(f"{bits}UC") and encoding[len(f"{bits}UC") :] in ("1", "3", "4"):
             return f"u{bits // 8}", int(encoding[-1])
     raise DataError(f"{where}: images of encoding {encoding!r} are not read; use mono8, mono16, bgr8, rgb8 or bayer_*8")
-
-
-def white_of(level: float) -> int:
-    """Return the level of white of 16-bit images whose brightest pixels have `level`: that of 10, 12, 14 or 16 bits."""
-    return next((2**bits - 1 for bits in _SENSOR_BITS if level <= 2**bits - 1), WHITE_16)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vio.cameras.rig import Rectifier
-from vio.datasets.bags.companions import bag_white_level, chosen_rig, contents, motion_of
+from vio.datasets.bags.companions import chosen_rig, contents, motion_of
 from vio.datasets.bags.index import Stamps, stamp_of
 from vio.datasets.bags.pictures import gray_of
 from vio.datasets.bags.store import Bag, Topic
@@ -22,7 +22,7 @@ from vio.datasets.common import naming
 from vio.datasets.companions import reference_of_body
 from vio.datasets.frame_times import PAIRED_NS, pair_stamps
 from vio.datasets.image_pairs import BadFrame, ImageRecording, ImageSize, readable_frames
-from vio.datasets.images import UnreadableImageError
+from vio.datasets.images import UnreadableImageError, white_note, white_of
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
 from vio.records import ImuDensities, IntArray, Recording, StereoFrame
@@ -106,7 +106,7 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         rectifier = rig.rectifier(settings.interpolation, settings.projection)
     motion, sources, motion_notes = motion_of(found, rig, stamps_ns[0])
     truth = index.reference(imu=rig.T_cam0_imu is not None)
-    white, white_notes = bag_white_level(index)
+    white = white_of(max(index.left.white, index.right.white))
     recording = Recording(
         kind="bag",
         path=path,
@@ -118,25 +118,15 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         reference=None if truth is None else reference_of_body(truth, rig, rectifier),
         notes=(
             *(*rig.notes, *rectifier.notes, *image_notes, *motion_notes),
-            *(*white_notes, *rig_notes, *found.notes),
+            *(*white_note(white), *rig_notes, *found.notes),
         ),
     )
-    return BagDataset(
-        recording,
-        motion,
-        tuple(
-            ImageSize(camera.width, camera.height, Path(file or info or path))
-            for camera, info in zip(rig.cameras, found.infos, strict=True)
-        ),
-        settings,
-        roles.cameras,
-        stamps_ns,
-        logged_ns,
-        rectifier,
-        white,
-        tuple(images.unstamped for images in stamps),
-        rig.imu_noise,
+    sizes = tuple(
+        ImageSize(camera.width, camera.height, Path(file or info or path))
+        for camera, info in zip(rig.cameras, found.infos, strict=True)
     )
+    images = roles.cameras, stamps_ns, logged_ns, rectifier, white, tuple(each.unstamped for each in stamps)
+    return BagDataset(recording, motion, sizes, settings, *images, rig.imu_noise)
 
 
 def _frames(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -15,7 +16,21 @@ from vio.errors import DataError, MissingDependencyError
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-MISSING = "{} ROS bags needs the package rosbags; install it with: pip install rosbags"
+MISSING = "ROS bags need the package rosbags; install it with: pip install rosbags"
+
+
+@functools.cache
+def ros2_types() -> Any:
+    """Return the message types of ROS 2.
+
+    Raises:
+        MissingDependencyError: rosbags is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise MissingDependencyError(MISSING) from error
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +66,12 @@ class Bag:
             MissingDependencyError: rosbags is not installed.
             DataError: a file is missing, truncated or damaged.
         """
-        try:
-            from rosbags.highlevel import AnyReader
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise MissingDependencyError(MISSING.format("reading")) from error
+        typestore = ros2_types()
+        from rosbags.highlevel import AnyReader
+
         with named_damage(self.path):
             # ROS 2 bags of before Iron carry no definitions; those of its usual types have not changed since.
-            self._reader = AnyReader(bag_files(self.path), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            self._reader = AnyReader(bag_files(self.path), default_typestore=typestore)
             self._reader.open()
         return self
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vio.datasets.bags.store import Topic
+from vio.datasets.unused import listed
 from vio.errors import DataError
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -27,18 +28,10 @@ _ROLES: dict[str, tuple[str, ...]] = {
 }
 # What distinguishes the two cameras of a pair in topics' names, left first.
 _SIDES = (
-    ("left", "right"),
-    ("Left", "Right"),
-    ("cam0", "cam1"),
-    ("camera0", "camera1"),
-    ("camera_0", "camera_1"),
-    ("infra1", "infra2"),
-    ("fisheye1", "fisheye2"),
-    ("cam_0", "cam_1"),
-    ("cam1", "cam2"),
-    ("image_0", "image_1"),
-    ("0", "1"),
-)
+    ("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("camera0", "camera1"), ("camera_0", "camera_1"),
+    ("infra1", "infra2"), ("fisheye1", "fisheye2"), ("cam_0", "cam_1"), ("cam1", "cam2"),
+    ("image_0", "image_1"), ("0", "1"),
+)  # fmt: skip
 _TRANSPORT = "/compressed"  # what image_transport appends to the topic of the raw images
 _WHOLE = 0.9  # share of the other's messages that raw images must have, to be taken in the place of compressed ones
 _NO_GRAY = re.compile(r"depth|disparity|mask|label|semantic|thermal|theora|confidence|points", re.IGNORECASE)
@@ -105,7 +98,7 @@ def _named(topics: Sequence[Topic], named: str | None, where: str) -> dict[str, 
         topic = by_name.get(name) or by_name.get(f"/{name}")
         if topic is None:
             fit = [t.name for t in topics if t.kind in _ROLES[role] and t.count]
-            raise DataError(f"{where}: holds no topic {name!r} for {role}; those of its type are {_list(fit)}")
+            raise DataError(f"{where}: holds no topic {name!r} for {role}; those of its type are {listed(fit)}")
         if topic.kind not in _ROLES[role]:
             raise DataError(f"{where}: {name} holds {topic.kind}, not {' or '.join(_ROLES[role])} as {role} must")
         if not topic.count:
@@ -124,21 +117,22 @@ def _cameras(
     alone, others = _one_camera(cameras)
     if alone is not None and given.get("right") is None:
         if others and left_named is None:
-            same = f"{alone.name} is taken; {_list(others)} shows the same camera"
+            same = f"{alone.name} is taken; {listed(others)} shows the same camera"
             notes.append(f"{same} (choose with --topics left=/NAME)")
         return left_named or alone, None
     if "right" in given and given["right"] is None:
-        raise DataError(f"{where}: of {_list([t.name for t in images])}, name the camera: --topics left=/A,right=none")
+        raise DataError(f"{where}: of {listed([t.name for t in images])}, name the camera: --topics left=/A,right=none")
     if len(images) < 2:
-        have = _list([t.name for t in images])
+        have = listed([t.name for t in images])
         needed = "stereo needs two" if images else "one camera needs one, stereo two"
         raise DataError(f"{where}: holds {len(images)} image topics with messages ({have}); {needed}")
     by_name = {t.name: t for t in images}
     pairs = []
     for a, b in _SIDES:
         for left in images:
-            right = by_name.get(_replaced_last(left.name, a, b))
-            if a in left.name and right is not None and right != left and right.kind == left.kind:
+            head, found, tail = left.name.rpartition(a)
+            right = by_name.get(f"{head}{b}{tail}") if found else None
+            if right is not None and right != left and right.kind == left.kind:
                 pairs.append((left, right))
         if pairs:
             break
@@ -150,7 +144,7 @@ def _cameras(
         pairs = [p for p in pairs if _rank(p[0]) == best]
     if len(pairs) != 1:
         what = "several topics could be the pair" if pairs else "no two topics are named as left and right"
-        names = _list([t.name for t in images])
+        names = listed([t.name for t in images])
         raise DataError(f"{where}: {what} ({names}); name them with --topics left=/A,right=/B")
     return pairs[0]
 
@@ -164,11 +158,6 @@ def _one_camera(images: Sequence[Topic]) -> tuple[Topic | None, list[str]]:
     return best, [t.name for t in images if t != best]
 
 
-def _replaced_last(name: str, a: str, b: str) -> str:
-    head, found, tail = name.rpartition(a)
-    return f"{head}{b}{tail}" if found else name
-
-
 def _rank(topic: Topic) -> tuple[int, int, int]:
     """Raw images before rectified ones, uncompressed before compressed, gray before colour."""
     return int("rect" in topic.name), int(topic.kind == COMPRESSED), int("color" in topic.name or "rgb" in topic.name)
@@ -180,7 +169,7 @@ def _single(filled: Sequence[Topic], kinds: tuple[str, ...], role: str, left: To
     if len(found) < 2:
         return found[0] if found else None
     best = max(found, key=lambda t: (_shared(t.name, left.name), t.count))
-    others = _list([t.name for t in found if t != best])
+    others = listed([t.name for t in found if t != best])
     notes.append(f"{best.name} is taken as {role}; others are {others} (choose with --topics {role}=/NAME)")
     return best
 
@@ -198,7 +187,7 @@ def _reference(filled: Sequence[Topic], notes: list[str]) -> Topic | None:
     if named:
         return named[0]
     if poses:
-        notes.append(f"{_list([t.name for t in poses])} may be ground truth: if so, give --topics reference=/NAME")
+        notes.append(f"{listed([t.name for t in poses])} may be ground truth: if so, give --topics reference=/NAME")
     return None
 
 
@@ -206,10 +195,5 @@ def _not_used(topics: Sequence[Topic], roles: Roles) -> list[str]:
     used = {roles.left, roles.right, roles.imu, roles.velocity, roles.reference}
     empty = [t.name for t in topics if not t.count]
     others = [t.name for t in topics if t.count and t not in used and t.kind not in (CAMERA_INFO, TF)]
-    notes = [f"topics without a message: {_list(empty)}"] if empty else []
-    return [*notes, f"not used: {_list(others)}"] if others else notes
-
-
-def _list(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:12]) or "none"
-    return f"{shown} and {len(names) - 12} more" if len(names) > 12 else shown
+    notes = [f"topics without a message: {listed(empty)}"] if empty else []
+    return [*notes, f"not used: {listed(others)}"] if others else notes

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
-from vio.datasets.bags.store import MISSING
+from vio.datasets.bags.store import MISSING, ros2_types
 from vio.errors import DataError, MissingDependencyError
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
 from vio.geometry.stereo import StereoCamera
@@ -45,10 +45,7 @@ class BagWriter:
     """
 
     def __init__(self, writer: Writer | MessageSink, latched: Sequence[str] = ()) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self._writer = writer
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._writer, self._store = writer, ros2_types()
         self._connections: dict[str, Any] = {}
         self._latched = (*_LATCHED, *latched)
 
@@ -188,17 +185,8 @@ def _latched_qos() -> Any:
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     forever = QosTime(2147483647, 4294967295)
-    return Qos(
-        QosHistory.KEEP_LAST,
-        1,
-        QosReliability.RELIABLE,
-        QosDurability.TRANSIENT_LOCAL,
-        forever,
-        forever,
-        QosLiveliness.AUTOMATIC,
-        forever,
-        False,
-    )
+    last = QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL
+    return Qos(*last, forever, forever, QosLiveliness.AUTOMATIC, forever, False)
 
 
 @contextlib.contextmanager
@@ -218,7 +206,8 @@ def bag_writer(folder: Path, storage: Storage, *, latched: Sequence[str] = ()) -
         import apsw
         from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
     except ImportError as error:
-        raise MissingDependencyError(MISSING.format("writing")) from error
+        raise MissingDependencyError(MISSING) from error
+
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     inner = folder / _NAME  # the library makes a folder of its own, which names the file
     try:

@@ -8,12 +8,12 @@ from xml.etree import ElementTree
 import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
-from vio.datasets.common import checked_transform, image_size, naming
+from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.opencv import read_xml
 from vio.datasets.yaml_files import as_number
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel
-from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
 
 _ROOT = "StereoParameters"
 

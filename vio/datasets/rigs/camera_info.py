@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
-from vio.datasets.common import checked_transform, image_size, naming
-from vio.datasets.rigs.opencv import CoefficientsError, trimmed_coefficients
+from vio.datasets.common import image_size, naming
+from vio.datasets.rigs.opencv import trimmed_coefficients
 from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml_file, section
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel
-from vio.geometry.lie import FloatArray, se3_from_parts
+from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts
 
 _MODELS: dict[str, DistortionModel] = {
     "": "radtan",
@@ -147,7 +147,5 @@ def _lens(info: CameraInfo) -> tuple[DistortionModel, tuple[float, ...]]:
         return "pinhole", ()
     if model == "equidistant":
         return model, info.D[:4]
-    try:
+    with naming(info.where):
         return model, trimmed_coefficients(info.D)
-    except CoefficientsError as error:
-        raise CalibrationError(f"{info.where}: {error}") from error

@@ -15,11 +15,11 @@ import numpy as np
 import yaml
 
 from vio.cameras.rig import Rig
-from vio.datasets.common import checked_transform, image_size, naming
-from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml_file, section
+from vio.datasets.common import image_size, naming
+from vio.datasets.yaml_files import Entries, imu_densities, matrix, numbers, read_yaml_file, section
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel
-from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
 from vio.records import ImuDensities
 
 _BENDS: dict[str, DistortionModel] = {
@@ -30,12 +30,6 @@ _BENDS: dict[str, DistortionModel] = {
     "equidistant": "equidistant",
 }
 _LEADING = {"pinhole": 0, "omni": 1, "ds": 2}  # parameters of the projection before fu fv cu cv
-NOISE_KEYS = (
-    "gyroscope_noise_density",
-    "gyroscope_random_walk",
-    "accelerometer_noise_density",
-    "accelerometer_random_walk",
-)
 _SAME_M, _SAME_RAD = 2e-3, 5e-3  # how far the two statements of the stereo pose may be apart before it is said
 
 
@@ -43,11 +37,6 @@ def is_camchain(entries: Entries) -> bool:
     """Return whether entries are those of a camchain, of one camera or more."""
     cameras = [entries.get("cam0"), *([entries["cam1"]] if "cam1" in entries else [])]
     return all(isinstance(camera, dict) and "intrinsics" in camera for camera in cameras)
-
-
-def is_imu_sheet(entries: Entries) -> bool:
-    """Return whether entries are those of Kalibr's IMU file, plain or with a block for each IMU."""
-    return any(key in _imu_block(entries) for key in NOISE_KEYS)
 
 
 def read_camchain(path: Path) -> Rig:
@@ -65,6 +54,7 @@ def read_camchain(path: Path) -> Rig:
     blocks = [section(entries, name, str(path)) for name in names]
     where = [f"{path}, {name}" for name in names]
     cameras = [_camera(*of_one) for of_one in zip(blocks, where, strict=True)]
+    cam1 = cameras[1] if "cam1" in names else None
     T_cam0_imu = _pose(blocks[0], "T_cam_imu", where[0])
     notes: list[str] = []
     T_cam1_cam0 = _stereo_pose(blocks[1], T_cam0_imu, path, notes) if "cam1" in names else None
@@ -74,17 +64,8 @@ def read_camchain(path: Path) -> Rig:
     offset_s, residual_px = _time_shift(blocks, where), _residual(blocks[-1], where[-1])
     factor = numbers(blocks[0], "depth_factor", where[0], 1)[0] if "depth_factor" in blocks[0] else None
     with naming(path):
-        return Rig(
-            cameras[0],
-            cameras[1] if "cam1" in names else None,
-            T_cam1_cam0,
-            T_cam0_imu,
-            noise,
-            offset_s,
-            (*notes, *imu_notes),
-            residual_px,
-            factor,
-        )
+        notes += imu_notes
+        return Rig(cameras[0], cam1, T_cam1_cam0, T_cam0_imu, noise, offset_s, tuple(notes), residual_px, factor)
 
 
 def _stereo_pose(right: Mapping[str, Any], T_cam0_imu: FloatArray | None, path: Path, notes: list[str]) -> FloatArray:
@@ -164,31 +145,14 @@ def _imu_beside(path: Path) -> tuple[ImuDensities | None, tuple[str, ...]]:
         if "camchain" in file.name or file == path or not file.is_file():
             continue
         entries = read_yaml_file(file, "Kalibr's IMU noise")
-        if is_imu_sheet(entries):
-            found.append((file, read_noise(entries, file)))
+        block = entries.get("imu0")  # plain, or a block for each IMU
+        noise = imu_densities({str(k): v for k, v in block.items()} if isinstance(block, dict) else entries, file)
+        if noise is not None:
+            found.append((file, noise))
     if not found:
         return None, ()
     names = ", ".join(file.name for file, _ in found)
     return found[0][1], (f"of {names} the first gives the IMU's noise",) if len(found) > 1 else ()
-
-
-def read_noise(entries: Entries, path: Path) -> ImuDensities:
-    """Read the noise densities of Kalibr's IMU file.
-
-    Raises:
-        CalibrationError: a density is missing or not positive.
-    """
-    block = _imu_block(entries)
-    values = [numbers(block, key, path, 1)[0] for key in NOISE_KEYS]
-    for key, value in zip(NOISE_KEYS, values, strict=True):
-        if not value > 0:
-            raise CalibrationError(f"{path}: {key} is {value:g}; a noise density must be positive")
-    return ImuDensities(*values)
-
-
-def _imu_block(entries: Entries) -> Entries:
-    nested = entries.get("imu0")
-    return {str(k): v for k, v in nested.items()} if isinstance(nested, dict) else entries
 
 
 def kalibr_text(rig: Rig) -> str:
@@ -215,7 +179,14 @@ def kalibr_text(rig: Rig) -> str:
 
 
 def _camera_sheet(camera: CameraModel) -> dict[str, Any]:
-    kind, bend, leading, coefficients = _kalibr_names(camera)
+    """Return a camera's entries; the parameters of the sphere models are before the focal lengths."""
+    kind, bend = "pinhole", "none" if camera.model == "pinhole" else camera.model
+    leading, coefficients = list[float](), camera.coefficients
+    if camera.model == "double_sphere":
+        kind, bend, leading, coefficients = "ds", "none", [float(x) for x in coefficients], ()
+    elif camera.model == "unified":
+        kind, bend, leading = "omni", "radtan" if len(coefficients) > 1 else "none", [float(coefficients[0])]
+        coefficients = coefficients[1:]
     return {
         "camera_model": kind,
         "distortion_model": bend,
@@ -223,13 +194,3 @@ def _camera_sheet(camera: CameraModel) -> dict[str, Any]:
         "intrinsics": [*leading, camera.fu, camera.fv, camera.cu, camera.cv],
         "resolution": [camera.width, camera.height],
     }
-
-
-def _kalibr_names(camera: CameraModel) -> tuple[str, str, list[float], tuple[float, ...]]:
-    """Kalibr's names of projection and distortion, the parameters before the focal lengths, and the coefficients."""
-    c = camera.coefficients
-    if camera.model == "double_sphere":
-        return "ds", "none", [float(x) for x in c], ()
-    if camera.model == "unified":
-        return "omni", "radtan" if len(c) > 1 else "none", [float(c[0])], c[1:]
-    return "pinhole", "none" if camera.model == "pinhole" else camera.model, [], c

@@ -14,11 +14,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
-from vio.datasets.common import checked_transform, naming
+from vio.datasets.common import naming
 from vio.datasets.yaml_files import Entries, as_number, matrix, read_yaml_file
 from vio.errors import CalibrationError
 from vio.geometry.distortion import DistortionModel
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, checked_transform
 
 _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
     "K0": ("M1", "K1", "cameraMatrix1", "camera_matrix_1", "cameraMatrixL", "K_left", "left_camera_matrix", "LEFT.K",
@@ -50,10 +50,6 @@ _MODELS: dict[str, DistortionModel] = {
     "kannala_brandt": "equidistant",
 }
 _TOO_WIDE_M = 5.0  # a longer baseline is taken for millimetres, or squares of the board, and said
-
-
-class CoefficientsError(CalibrationError):
-    """Distortion coefficients beyond those of the models here."""
 
 
 def is_opencv(entries: Entries) -> bool:
@@ -166,14 +162,12 @@ def trimmed_coefficients(D: Sequence[float]) -> tuple[float, ...]:
     """Return OpenCV's `k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 .. s4 [tx ty]]]]` without the part that is zero.
 
     Raises:
-        CoefficientsError: thin-prism or tilt terms are used, or the count is none of OpenCV's.
+        CalibrationError: thin-prism or tilt terms are used, or the count is none of OpenCV's.
     """
     if len(D) not in (0, 4, 5, 8, 12, 14):
-        raise CoefficientsError(f"{len(D)} distortion coefficients; OpenCV has 4, 5, 8, 12 or 14")
+        raise CalibrationError(f"{len(D)} distortion coefficients; OpenCV has 4, 5, 8, 12 or 14")
     if any(D[8:]):
-        raise CoefficientsError(
-            "thin-prism or tilt coefficients are not read; calibrate without CALIB_THIN_PRISM_MODEL"
-        )
+        raise CalibrationError("thin-prism or tilt coefficients are not read; calibrate without CALIB_THIN_PRISM_MODEL")
     kept = D[:8] if any(D[5:8]) else D[:5]
     return tuple(float(d) for d in kept)
 

@@ -74,11 +74,6 @@ def rig_model(
     return model
 
 
-def rig_geometry(model: pycolmap.Reconstruction) -> tuple[FloatArray, FloatArray]:
-    """Return rotation `R_cam1_cam0` (3, 3) and unit direction (3,) from cam0 to cam1 in cam0, of a model."""
-    return without_scale(pose_rows(model.rig(RIG).sensor_from_rig(model.camera(RIGHT).sensor_id)))
-
-
 def without_scale(T_cam1_cam0: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return rotation `R_cam1_cam0` (3, 3) and unit direction (3,) from cam0 to cam1 in cam0, of a transform (4, 4)."""
     R = T_cam1_cam0[:3, :3]
@@ -190,24 +185,17 @@ def add_frame(
             image_id=image_id(keyframe, camera_id),
             points2D=pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in uv + HALF_PX]),
         )
-        for name, camera_id, uv in (
-            (names.left[keyframe], LEFT, left),
-            (names.right[keyframe], RIGHT, right),
-        )
+        for name, camera_id, uv in ((names.left[keyframe], LEFT, left), (names.right[keyframe], RIGHT, right))
     ]
     frame = pycolmap.Frame(frame_id=frame_id(keyframe), rig_id=RIG)
     for image in images:
         image.frame_id = frame.frame_id
         frame.add_data_id(image.data_id)
-    frame.rig_from_world = _rigid(T_cam0_world)
+    frame.rig_from_world = pycolmap.Rigid3d(np.ascontiguousarray(T_cam0_world[:3]))
     model.add_frame(frame)
     for image in images:
         model.add_image(image)
     model.register_frame(frame.frame_id)
-
-
-def _rigid(T: FloatArray) -> pycolmap.Rigid3d:
-    return pycolmap.Rigid3d(np.ascontiguousarray(T[:3]))
 
 
 def pose_rows(T: pycolmap.Rigid3d | None) -> FloatArray:

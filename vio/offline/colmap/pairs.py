@@ -12,6 +12,7 @@ from vio.offline.colmap import HALF_PX, SEED, SIFT_FEATURES
 from vio.offline.colmap.adjustment import adjustment_config, solve, solver_options
 from vio.offline.colmap.model import (
     LEFT,
+    RIG,
     RIGHT,
     add_frame,
     frame_id,
@@ -19,7 +20,6 @@ from vio.offline.colmap.model import (
     numbered_images,
     pinhole,
     pose_rows,
-    rig_geometry,
     rig_model,
     without_scale,
 )
@@ -97,7 +97,7 @@ def adjust_rig(matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArr
     options.refine_sensor_from_rig = True
     options.refine_rig_from_world = False
     solve(pycolmap.create_default_bundle_adjuster(options, config, model))
-    return rig_geometry(model)
+    return without_scale(pose_rows(model.rig(RIG).sensor_from_rig(model.camera(RIGHT).sensor_id)))
 
 
 def _virtual_pixels(matches: RayMatches) -> tuple[FloatArray, FloatArray]:

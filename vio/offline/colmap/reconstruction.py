@@ -106,14 +106,7 @@ def pairs_to_match(names: ModelImages, loops: IntArray) -> list[tuple[str, str]]
 
 
 def reconstruct(
-    database: Path,
-    images: Path,
-    names: ModelImages,
-    mapper: Mapper,
-    out: Path,
-    loops: IntArray,
-    *,
-    threads: int = 1,
+    database: Path, images: Path, names: ModelImages, mapper: Mapper, out: Path, loops: IntArray, *, threads: int = 1
 ) -> Reconstructed | None:
     """Reconstruct keyframes from a database of matches, with fixed rig and intrinsics; None: not successful.
 

@@ -31,7 +31,9 @@ def read_colmap_trajectory(folder: Path) -> Trajectory:
     try:
         model = pycolmap.Reconstruction(place)
     except (ValueError, RuntimeError, OSError, IndexError, MemoryError) as error:
-        raise DataError(f"{place}: pycolmap cannot read the model ({_one_line(error)}); export it again") from error
+        raise DataError(
+            f"{place}: pycolmap cannot read the model ({' '.join(str(error).split())[:160]}); export it again"
+        ) from error
     images = [image for image in model.images.values() if image.has_pose and _is_reference(model, image)]
     if not images:
         raise DataError(f"{place}: the model contains no image with a pose")
@@ -64,7 +66,3 @@ def _number(name: str, place: Path) -> int:
     if not found:
         raise DataError(f"{place}: the image name {name!r} contains no frame number or time; name images by number")
     return int(found[-1])
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:160]
