@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix
-from scipy.sparse.linalg import splu
 
 from vio.earth.geodesy import LocalFrame
 from vio.earth.gnss import GnssFixes
@@ -29,6 +28,7 @@ from vio.geometry.lie import (
     so3_hat,
 )
 from vio.numerics.robust import truncated_weights
+from vio.numerics.sparse import factors
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 
@@ -116,11 +116,8 @@ def georeference(path: Path, fixes: GnssFixes, lever_arm_m: FloatArray, time_off
     )
     T, log_scale, weight = problem.solve()
     normal = problem.factorised(T, log_scale, weight)
-    used, used_height, residuals = (
-        np.zeros(len(fixes), dtype=np.bool_),
-        np.zeros(len(fixes), dtype=np.bool_),
-        np.full((len(fixes), 3), np.nan),
-    )
+    used, used_height = (np.zeros(len(fixes), dtype=np.bool_) for _ in range(2))
+    residuals = np.full((len(fixes), 3), np.nan)
     used[inside], used_height[inside] = weight[:, 0] > 0.5, weight[:, 1] > 0.5
     if int(used.sum()) < _LEAST_FIXES:
         raise EstimationError(f"only {int(used.sum())} of {int(inside.sum())} GNSS positions agree with the trajectory")
@@ -311,9 +308,7 @@ class _Factors:
     def __init__(self, H: csc_matrix) -> None:
         unknown = "the GNSS positions do not determine where the trajectory is; drive farther, with a turn"
         try:
-            self._rest = splu(
-                H[:-1, :-1], permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
+            self._rest = factors(H[:-1, :-1])
         except RuntimeError as error:  # exactly singular
             raise EstimationError(unknown) from error
         self._border = H[:-1, -1:].toarray()

@@ -108,7 +108,7 @@ class FramePipeline:
         )
 
     def usable(self, sample: MotionSample) -> MotionSample | None:
-        """Return a sample as the back end takes it; None: it does not."""
+        """Return a sample as the back end takes it; None: it does not, as the sensor was found to be wrong."""
         return corrected(sample, self._imu)
 
     def begin_again(self, index: int) -> None:
@@ -123,17 +123,25 @@ class FramePipeline:
         again = trial.again(verdict)
         if again is None:
             return
-        self.backend, self._revised, self._imu = again.backend, again.estimates, verdict
-        self.monitor.begun_again(index, verdict, len(again.estimates))
+        self.backend, self._revised = again
+        self._imu = verdict
+        self.monitor.begun_again(index, verdict, len(self._revised))
 
     def newest(self, index: int, estimate: Estimate | None) -> Estimate | None:
         """Return the estimate of a frame, or the one that has replaced it and was not taken yet."""
         return self._revised.get(index, estimate)
 
     def take_revised(self) -> dict[int, Estimate]:
-        """Return the estimates, by frame number, that replace earlier ones, and forget them."""
+        """Return the estimates, by frame number, that replace earlier ones, and forget them.
+
+        There are some where the IMU was found to be wrong, once, in the first minute.
+        """
         revised, self._revised = self._revised, {}
         return revised
+
+    def smoothed(self, frame_index: int) -> Estimate | None:
+        """Return the estimate at a past frame with all frames since; None where the window does not hold it."""
+        return self.backend.smoothed(frame_index)
 
     def _update(self, seen: Observations) -> UpdateReport:
         """Update with a frame; a back end that diverges is restarted."""

@@ -194,11 +194,11 @@ def run(
             T_cam0_body=source.T_cam0_body,
             estimates=recorder.estimates,
             dead_reckoning=_trajectory(recorder.dead_reckoned(), recorder, body) if reckoned else None,
-            landmarks=recorder.landmarks(processor.landmarks()),
+            landmarks=recorder.landmarks(processor.pipeline.backend.landmarks()),
             frames=recorder.frames,
             observations=recorder.observations,
             motion_samples=recorder.samples,
-            warnings=processor.warnings,
+            warnings=tuple(processor.pipeline.monitor.lines),
             wall_s=time.perf_counter() - began,
             stopped=stopped,
             rig=given_rig(dataset),
@@ -242,8 +242,8 @@ def _nothing_done(recording: Recording, processor: EventProcessor, stopped: str 
     """Say why a run has no frame."""
     if stopped is not None:
         raise StoppedError(f"{stopped} before the first frame was done; nothing was written", status=130)
-    if processor.frames_waiting:
-        waited = f"none of the {processor.frames_waiting} frames has a pose"
+    if waiting := processor.pipeline.monitor.frames_waiting:
+        waited = f"none of the {waiting} frames has a pose"
         raise DataError(f"{recording.path}: {waited}; see the warnings above")
     raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
 
@@ -284,7 +284,7 @@ class _Loop:
     def run(self, events: Iterable[Event], dataset: Dataset, should_stop: Callable[[], str | None]) -> str | None:
         """Take events to their end; return why they ended before."""
         state, recorder, processor = self._state, self._recorder, self._state.processor
-        stopped = None
+        monitor, stopped = processor.pipeline.monitor, None
         resumed = state.frame_ns is not None
         for event in self._reading.timed(events):
             if resumed and not state.is_new(event):
@@ -293,11 +293,11 @@ class _Loop:
                 state.unread += self._between(state.next_frame + (state.frame_ns is not None), event.index)
             self._take(event)
             state.note(event)
-            if _LEAST_REFUSED <= processor.frames_refused > len(recorder):
+            if _LEAST_REFUSED <= monitor.frames_refused > len(recorder):
                 break
             stopped = should_stop()
             if recorder.is_save_due or (stopped and recorder.can_save):
-                recorder.save(state, dataset, processor.take_landmarks())
+                recorder.save(state, dataset, processor.pipeline.backend.take_landmarks())
             if stopped:
                 break
         else:
@@ -305,11 +305,11 @@ class _Loop:
                 state.unread += self._between(state.next_frame + 1, self._end)
         if state.unread:
             last = max(state.next_frame, *state.unread)
-            processor.say(_unread_line(state.unread, sum(index <= last for index in self._frames)))
+            monitor.say(_unread_line(state.unread, sum(index <= last for index in self._frames)))
         self._record(processor.finish())
-        recorder.revise(processor.smoothed)
-        if processor.frames_refused > len(recorder):
-            raise DataError(f"most frames were refused: {processor.refusal}")
+        recorder.revise(processor.pipeline.smoothed)
+        if monitor.frames_refused > len(recorder):
+            raise DataError(f"most frames were refused: {monitor.refusal}")
         return stopped
 
     def _between(self, first: int, end: int) -> list[int]:
@@ -327,11 +327,11 @@ class _Loop:
     def _record(self, results: list[FrameResult]) -> None:
         state = self._state
         for result in results:
-            self._recorder.frame(result, self._reading.take_ms(), state.processor.smoothed)
+            self._recorder.frame(result, self._reading.take_ms(), state.processor.pipeline.smoothed)
             if state.dead_reckoning is not None:
                 self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))
             self._viewer.frame(result)
-        self._recorder.replace(state.processor.take_revised())
+        self._recorder.replace(state.processor.pipeline.take_revised())
 
 
 def _skipped(viewer: Viewer | None, frames: int) -> Viewer | None:
