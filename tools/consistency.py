@@ -76,6 +76,7 @@ Variant = Literal["standard", "first estimates", "right-invariant", "right-invar
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
 _FRAME_NS, _IMU_NS = 50_000_000, 5_000_000
+SAMPLES = _FRAME_NS // _IMU_NS  # of the IMU in a frame
 # Standard deviations of the first position, m, and of the first yaw, rad.
 _START: dict[Start, tuple[float, float]] = {"uncertain": (0.05, np.radians(1.0)), "known": (0.0, 0.0)}
 _MOTIONS: tuple[Motion, ...] = ("imu", "none", "velocity")
@@ -398,22 +399,27 @@ class Flight:
         return omega, (np.swapaxes(R, 1, 2) @ a[..., None])[..., 0]
 
     def imu(
-        self, frames: int, noise: np.random.Generator, s: MsckfSettings, offset_s: float = 0.0
+        self, samples: range, noise: np.random.Generator, s: MsckfSettings, offset_s: float = 0.0, clock_s: float = 0.0
     ) -> tuple[list[ImuSample], FloatArray]:
-        """Samples at 200 Hz, and the biases (K, 6) in them: drawn from the prior, then walking."""
-        n, dt = frames * (_FRAME_NS // _IMU_NS) + 1, _IMU_NS * 1e-9
+        """Samples at 200 Hz, and the biases (K, 6) in them: drawn from the prior, then walking.
+
+        Args:
+            samples: their numbers; 0 is at the first frame.
+            noise: of sensor and biases.
+            s: what they are drawn from.
+            offset_s: of the samples against the frames.
+            clock_s: by which their stamps are ahead of the frames' clock.
+        """
+        k, n, dt = np.array(samples), len(samples), _IMU_NS * 1e-9
         walk = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) * np.sqrt(dt)
         steps = noise.normal(0, 1, (n, 6)) * walk
         steps[0] = noise.normal(0, np.repeat([s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2], 3))
         bias = np.cumsum(steps, axis=0)
         white = np.repeat([s.gyro_noise_density, s.accel_noise_density], 3) / np.sqrt(dt)
-        read = (
-            np.concatenate(self.rates(np.arange(n, dtype=np.float64) * dt + offset_s), axis=1)
-            + bias
-            + noise.normal(0, 1, (n, 6)) * white
-        )
-        offset_ns = round(offset_s * 1e9)
-        return [ImuSample(k * _IMU_NS + offset_ns, x[:3], x[3:]) for k, x in enumerate(read)], bias
+        exact = np.concatenate(self.rates(k.astype(np.float64) * dt + offset_s), axis=1)
+        read = exact + bias + noise.normal(0, 1, (n, 6)) * white
+        stamps = k * _IMU_NS + round(1e9 * offset_s) + round(1e9 * clock_s)
+        return [ImuSample(t, x[:3], x[3:]) for t, x in zip(stamps.tolist(), read, strict=True)], bias
 
     def velocities(self, frames: int, noise: np.random.Generator, s: MsckfSettings) -> list[VelocitySample]:
         """Samples at the frames, with white noise and a constant bias of the rate."""
@@ -487,8 +493,8 @@ def _fly(job: Job, learn: bool) -> Record:
     samples: list[MotionSample] = []
     bias: FloatArray = np.zeros((scenario.frames, 6))
     if job.motion == "imu":
-        imu, walked = flight.imu(scenario.frames, noise, settings, scenario.imu_offset_s)
-        samples, bias = list(imu), walked[:: _FRAME_NS // _IMU_NS][: scenario.frames]
+        imu, walked = flight.imu(range(SAMPLES * scenario.frames + 1), noise, settings, scenario.imu_offset_s)
+        samples, bias = list(imu), walked[::SAMPLES][: scenario.frames]
     elif job.motion == "velocity":
         samples = list(flight.velocities(scenario.frames, noise, settings))
     start = np.zeros(6)

@@ -70,6 +70,10 @@ def run_on_dask(
                 for key, record in _session(client, pending, cache, perform):
                     del pending[key]
                     yield key, record
+        except ImportError as error:
+            raise VioError(
+                f"a Dask worker cannot import stereo-vio ({error}); install it there, the same version"
+            ) from error
         except (OSError, TimeoutError, ValueError) as error:
             if first or time.monotonic() - last_s > wait_s:
                 raise VioError(
@@ -90,12 +94,7 @@ def _check_workers(client: Any, jobs: Mapping[str, Job]) -> None:
     wanted = next(((job["code"], job["packages"]) for job in jobs.values() if "code" in job), None)
     if wanted is None:
         return
-    try:
-        found: dict[str, tuple[str, dict[str, str]]] = client.run(code_and_packages)
-    except ImportError as error:
-        raise VioError(
-            f"a Dask worker cannot import stereo-vio ({error}); install it there, the same version"
-        ) from error
+    found: dict[str, tuple[str, dict[str, str]]] = client.run(code_and_packages)
     for address, (code, packages) in found.items():
         differ = [
             f"{name} {packages.get(name)}" for name, version in wanted[1].items() if packages.get(name) != version
@@ -124,9 +123,5 @@ def _session(client: Any, jobs: Mapping[str, Job], cache: str, perform: Perform)
                 return
             except KilledWorker as error:
                 record = failed(" ".join(str(error).split()), keep=False)
-            except ImportError as error:
-                raise VioError(
-                    f"a Dask worker cannot import stereo-vio ({error}); install it there, the same version"
-                ) from error
             future.release()
             yield key, record

@@ -42,9 +42,10 @@ def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict
     """
     try:
         Path(cache).mkdir(parents=True, exist_ok=True)
-        job = _with_render(job, Path(cache))
-        if job.get("first") is not None:
-            job["first"] = _with_render(job["first"], Path(cache))
+        job = {**job, "first": job.get("first") and dict(job["first"])}
+        for part in (job, job["first"]):
+            if part is not None and part["render"] is not None:
+                part["source"] = str(_rendered(part["render"], Path(cache)))
         lost = 0
         while True:
             record, number = _in_process(job, Path(cache))
@@ -98,10 +99,6 @@ def _in_process(job: dict[str, Any], cache: Path) -> tuple[dict[str, Any] | None
     return failed(f"the program failed, please report it: {last}", keep=False), 0
 
 
-def _with_render(job: dict[str, Any], cache: Path) -> dict[str, Any]:
-    return job if job["render"] is None else {**job, "source": str(_rendered(job["render"], cache))}
-
-
 def _rendered(render: dict[str, Any], cache: Path) -> Path:
     """Return the folder of a rendered recording, made now unless it is there.
 
@@ -149,8 +146,10 @@ def _call(command: list[str], limit_s: float | None = None) -> tuple[int, str]:
 @contextlib.contextmanager
 def _task_folder(cache: Path) -> Iterator[Path]:
     """A folder for one task, locked meanwhile; those without a lock, which killed processes left, are removed."""
-    for left in cache.glob("task-*"):
-        _remove_unlocked(left)
+    for left in cache.glob("task-*") if fcntl is not None else ():
+        if (taken := lock_path(left)) is not None:
+            shutil.rmtree(left, ignore_errors=True)
+            os.close(taken)
     while True:
         folder = Path(tempfile.mkdtemp(prefix="task-", dir=cache))
         lock = lock_path(folder)
@@ -162,13 +161,6 @@ def _task_folder(cache: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
         if lock is not None:
             os.close(lock)
-
-
-def _remove_unlocked(folder: Path) -> None:
-    lock = lock_path(folder) if fcntl is not None else None
-    if lock is not None:
-        shutil.rmtree(folder, ignore_errors=True)
-        os.close(lock)
 
 
 @contextlib.contextmanager

@@ -170,14 +170,10 @@ class _StageTimer:
         self._last = now
 
 
-def _median_disparity(seen: Observations) -> float | None:
-    z = seen.z[seen.has_right]
-    return median(z[:, 0] - z[:, 2]) if len(z) else None
-
-
 def _frame_log(
     frame: StereoFrame, ms: dict[str, float], output: FrontendOutput, selection: Selection, report: UpdateReport
 ) -> FrameLog:
+    z = output.observations.z[output.observations.has_right]
     return FrameLog(
         index=frame.index,
         time_ns=frame.time_ns,
@@ -196,7 +192,7 @@ def _frame_log(
         landmarks=report.landmarks,
         innovation_median_px=report.innovation_median_px,
         nis_per_dof=report.nis_per_dof,
-        disparity_median_px=_median_disparity(output.observations),
+        disparity_median_px=median(z[:, 0] - z[:, 2]) if len(z) else None,
         innovation_ratio=report.innovation_ratio,
         stages_ms=output.stages_ms,
     )

@@ -14,8 +14,7 @@ from vio.calibration.verdicts import judge_imu
 from vio.geometry.lie import FloatArray
 from vio.imu.findings import InertialFinding
 from vio.monitor.axes import axes_text, signed_permutations
-from vio.monitor.evidence import Evidence
-from vio.monitor.force_fit import LEAST_WINDOWS, WINDOW_S, ForceFit
+from vio.monitor.force_fit import LEAST_WINDOWS, WINDOW_S, Evidence, ForceFit
 from vio.monitor.gyro_fit import GyroFit
 from vio.monitor.motion import Record
 from vio.monitor.samples import Size, gravity_removed

@@ -13,6 +13,7 @@ from vio.monitor.motion import Record
 from vio.numerics.robust import jackknife
 from vio.records import BoolArray
 
+FIRST_EVALUATION = 60  # intervals before the first evaluation; there are fewer only at the end of a short run
 WINDOW_S = 2.0
 LEAST_WINDOWS = 3  # for all but axes that are clearly wrong
 _FEWEST_WINDOWS = 2
@@ -59,6 +60,24 @@ class ForceFit:
             N, h, _ = self.reduced(every != left_out)
             values.append(float(h @ a) / max(float(a @ N @ a), 1e-300))
         return values[0], float(jackknife(values[1:]))
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """The fits of gyro and accelerometer to the images, and the state of the check."""
+
+    R_cam0_imu: FloatArray  # (3, 3) as given
+    gyro_fit: GyroFit
+    force: ForceFit | None  # None: too few windows without tracking loss, or the readings have no unit
+    early_force: ForceFit | None  # likewise, from fewer windows: enough for axes that are clearly wrong
+    force_final: bool  # `force` will not improve: what it leaves undecided is judged without it
+    clipped: bool  # readings at the end of the range were found, which make rotations appear smaller
+    last: bool  # no later evaluation will follow
+
+    @property
+    def brief(self) -> bool:
+        """Whether there are fewer intervals than in any evaluation during a run."""
+        return self.gyro_fit.count < FIRST_EVALUATION
 
 
 @dataclass(frozen=True, slots=True)

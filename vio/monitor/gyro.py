@@ -13,7 +13,7 @@ from vio.geometry.lie import FloatArray, nearest_rotation
 from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import AXES_WORSE
 from vio.monitor.axes import axes_text, matrix_text, signed_permutations, triple_text
-from vio.monitor.evidence import Evidence
+from vio.monitor.force_fit import Evidence
 from vio.monitor.gyro_fit import AGREES, FAR_OFFSETS_S, GyroFit
 
 _DISAGREES = 0.5  # share of the rotation that the best linear map leaves unexplained

@@ -18,8 +18,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.imu.clocks import SampleCoverage
 from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import judge_force, judge_lever_arm, judge_up, resolve_size
-from vio.monitor.evidence import FIRST_EVALUATION, Evidence
-from vio.monitor.force_fit import LEAST_WINDOWS, fit_force
+from vio.monitor.force_fit import FIRST_EVALUATION, LEAST_WINDOWS, Evidence, fit_force
 from vio.monitor.gyro import judge_gyro
 from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of

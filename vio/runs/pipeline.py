@@ -159,7 +159,9 @@ def run(
     if control.resume:
         state = recorder.restore(features)
         _reopen_map(state.processor.map, map)
-        viewer = _skipped(viewer, len(recorder))
+        skip = getattr(viewer, "skip", None)
+        if skip is not None:  # a viewer that knows of frames that an earlier process has done
+            skip(len(recorder))
     else:
         reckoned = source.motion == "velocity"
         state = _RunState(
@@ -177,7 +179,7 @@ def run(
         try:
             with _opencv_threads(dataset, config, parts.frontend):
                 images = _needs_images(dataset, config) or processor.map is not None
-                events = _limited(dataset.events(state.next_frame, stop, images=images), recording, config)
+                events = dataset.events(state.next_frame, stop, images=images)
                 stopped = loop.run(events, features, control.should_stop)
         except VioError as error:
             if folder is None or not len(recorder):
@@ -193,7 +195,7 @@ def run(
             body=body,
             T_cam0_body=source.T_cam0_body,
             estimates=recorder.estimates,
-            dead_reckoning=_trajectory(recorder.dead_reckoned(), recorder, body) if reckoned else None,
+            dead_reckoning=_dead_reckoned(recorder, body) if reckoned else None,
             landmarks=recorder.landmarks(processor.pipeline.backend.landmarks()),
             frames=recorder.frames,
             observations=recorder.observations,
@@ -202,16 +204,17 @@ def run(
             wall_s=time.perf_counter() - began,
             stopped=stopped,
             rig=given_rig(dataset),
-            mapped=None if session is None else _mapped(session, recorder, config),
+            mapped=None
+            if session is None
+            else mapped_run(session, recorder.estimates, recorder.mapped, _scale_sigma(recorder.estimates[-1], config)),
         )
 
 
-def _mapped(session: MapSession, recorder: RunRecorder, config: Config) -> MappedRun:
-    """Return what the map made of a run; its scale is known as the calibration, or as the run found it to be."""
-    scale, s = recorder.estimates[-1].stereo_scale, config.msckf
+def _scale_sigma(last: Estimate, config: Config) -> float:
+    """Return the standard deviation of a run's scale, over it: that of the calibration, or as the run found it."""
+    scale, s = last.stereo_scale, config.msckf
     considered = float(np.hypot(s.stereo_baseline_sigma, s.stereo_focal_sigma))
-    sigma = considered if scale is None else float(np.sqrt(scale.covariance.sum()))
-    return mapped_run(session, recorder.estimates, recorder.mapped, sigma)
+    return considered if scale is None else float(np.sqrt(scale.covariance.sum()))
 
 
 def given_rig(dataset: Dataset) -> Rig | None:
@@ -290,6 +293,8 @@ class _Loop:
             if resumed and not state.is_new(event):
                 continue
             if isinstance(event, StereoFrame):
+                if event.index not in self._frames:
+                    continue
                 state.unread += self._between(state.next_frame + (state.frame_ns is not None), event.index)
             self._take(event)
             state.note(event)
@@ -334,14 +339,6 @@ class _Loop:
         self._recorder.replace(state.processor.pipeline.take_revised())
 
 
-def _skipped(viewer: Viewer | None, frames: int) -> Viewer | None:
-    """Tell a viewer that knows it of frames that an earlier process has done."""
-    skip = getattr(viewer, "skip", None)
-    if skip is not None:
-        skip(frames)
-    return viewer
-
-
 def _check_range(recording: Recording, start: int, stop: int | None) -> None:
     """Raise ConfigError where a range of frames is empty."""
     if start < 0 or (stop is not None and stop <= start):
@@ -362,15 +359,6 @@ def _unread_line(unread: list[int], frames: int) -> str:
     """The line on frames that could not be read."""
     named = ", ".join(map(str, unread[:_MOST_NAMED])) + (", …" if len(unread) > _MOST_NAMED else "")
     return f"{len(unread)} of {frames} frames could not be read and were skipped: {named}"
-
-
-def _limited(events: Iterable[Event], recording: Recording, config: Config) -> Iterable[Event]:
-    """The events without the frames that the limit on the frame rate leaves out, counted from the first of all."""
-    most_hz = config.dataset.max_frame_rate
-    if most_hz is None:
-        return events
-    used = set(used_frames(recording.frame_times_ns, most_hz).tolist())
-    return (event for event in events if not isinstance(event, StereoFrame) or event.index in used)
 
 
 class _ReadTimer:
@@ -408,10 +396,11 @@ def _needs_images(dataset: Dataset, config: Config) -> bool:
     return dataset.recording.has_images and front.name != "precomputed" and front.features is None
 
 
-def _trajectory(T_world_body: FloatArray, rows: RunRecorder, body: BodyFrame) -> Trajectory:
-    """Return poses (N, 4, 4) of the first N frames with an estimate; a run that an error ends may have one less."""
-    times_ns, indices = (np.asarray(rows.estimates.column(name))[: len(T_world_body)] for name in ("time_ns", "index"))
-    return Trajectory(T_world_body=T_world_body, times_ns=times_ns, body=body, frame_indices=indices)
+def _dead_reckoned(rows: RunRecorder, body: BodyFrame) -> Trajectory:
+    """Return the poses by dead reckoning of the frames with an estimate; a run that an error ends may have one less."""
+    T = rows.dead_reckoned()
+    times_ns, indices = (np.asarray(rows.estimates.column(name))[: len(T)] for name in ("time_ns", "index"))
+    return Trajectory(T, times_ns, body, indices)
 
 
 class DeadReckoning:

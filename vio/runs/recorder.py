@@ -298,9 +298,8 @@ class RunRecorder:
         paths = {name: self._unfinished / f"{name}.npy" for name in _TABLES}
         for name, dtype in _TABLES.items():
             check_table(paths[name], dtype, *own["tables"][name])
-        for name, dtype in _TABLES.items():
-            keep, summed = own["tables"][name]
-            self._tables[name] = Table(dtype, paths[name], keep=keep, summed=summed)
+        for name, (keep, summed) in own["tables"].items():
+            self._tables[name] = Table(_TABLES[name], paths[name], keep=keep, summed=summed)
         estimates = self._tables["estimates"]
         for k, row in enumerate(own["late"], start=len(estimates) - len(own["late"])):
             estimates.replace(k, row[None])
@@ -331,7 +330,11 @@ class RunRecorder:
                 early = [name for name in texts if not name.startswith(RunFile.UNFINISHED)]
                 for name in early:  # they say whose folder it is
                     atomic_write_text(self._folder.path / name, texts[name])
-                _remove(self._folder.path, [RunFile.UNFINISHED, *(n for n in self._folder.replaces if n not in texts)])
+                for name in (RunFile.UNFINISHED, *(n for n in self._folder.replaces if n not in texts)):
+                    if (old := self._folder.path / name).is_dir() and not old.is_symlink():
+                        shutil.rmtree(old)
+                    else:
+                        old.unlink(missing_ok=True)
                 self._unfinished.mkdir()
                 for name in sorted(texts.keys() - early):
                     atomic_write_text(self._folder.path / name, texts[name])
@@ -386,12 +389,3 @@ class SeenFrames(Sequence[Observations]):
         rows = self._rows.rows(int(self._offsets[k]), int(self._offsets[k + 1]))
         columns = (np.array(rows[name]) for name in ("id", "z", "has_right", "stale", "sigma"))
         return Observations(int(self._seen["index"][k]), int(self._seen["time_ns"][k]), *columns)
-
-
-def _remove(folder: Path, names: Sequence[str]) -> None:
-    for name in names:
-        path = folder / name
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)

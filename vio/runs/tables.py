@@ -44,6 +44,15 @@ ESTIMATE = np.dtype(
         ("stereo_scale_covariance", "<f8", (2, 2)),
     ]
 )
+# Columns of an estimate's records, by their fields there.
+_FIELD = {
+    "stereo_field": "coefficients",
+    "stereo_field_covariance": "covariance",
+    "stereo_rows_rms_px": "rows_rms_px",
+    "stereo_rows": "rows",
+    "stereo_rows_covariance": "rows_covariance",
+}
+_SCALE = {"stereo_scale": "logs", "stereo_scale_covariance": "covariance"}
 _STAGES = 16  # of the front end, at most
 _COUNTS = ("detected", "tracked", "matched", "selected", "stale", "used", "gated", "landmarks")
 _TIMES = ("read_ms", "frontend_ms", "monitor_ms", "select_ms", "filter_ms")
@@ -82,16 +91,10 @@ def estimate_row(index: int, estimate: Estimate) -> Rows:
     for name in _KEPT:
         value = getattr(estimate, name)
         row[name] = np.nan if value is None else value
-    field = estimate.stereo_field
-    row["stereo_field"] = np.nan if field is None else field.coefficients
-    row["stereo_field_covariance"] = np.nan if field is None else field.covariance
-    row["stereo_rows_rms_px"] = np.nan if field is None else field.rows_rms_px
-    row["stereo_rows"] = np.nan if field is None or field.rows is None else field.rows
-    P = None if field is None else field.rows_covariance
-    row["stereo_rows_covariance"] = np.nan if P is None else P
-    scale = estimate.stereo_scale
-    row["stereo_scale"] = np.nan if scale is None else scale.logs
-    row["stereo_scale_covariance"] = np.nan if scale is None else scale.covariance
+    for record, columns in ((estimate.stereo_field, _FIELD), (estimate.stereo_scale, _SCALE)):
+        for column, name in columns.items():
+            value = getattr(record, name, None)
+            row[column] = np.nan if value is None else value
     return row
 
 
