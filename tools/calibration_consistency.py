@@ -219,10 +219,9 @@ def _mean_text(values: list[float]) -> str:
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=min(len(values) - 1, 1)) / np.sqrt(len(values)):.2f}"
 
 
+@one_blas_thread()
 def _fly_alone(job: tuple[Rig, Start, int, float, float]) -> list[dict[str, float]]:
-    rig, start, seed, seconds, pixel_sigma_px = job
-    with one_blas_thread():
-        return fly(rig, start, seed, seconds=seconds, pixel_sigma_px=pixel_sigma_px)
+    return fly(*job[:3], seconds=job[3], pixel_sigma_px=job[4])
 
 
 def main() -> int:

@@ -6,7 +6,7 @@
 
 Monte-Carlo flights through exact points, with exact noise: pixels, IMU and its biases, velocities, and the place and
 yaw of the start are drawn from the very distributions that the filter assumes. Each flight is flown once by every
-variant, with the same noise. Writes FOLDER/table.md (also printed), FOLDER/figures.json and FOLDER/consistency.png.
+variant, with the same noise. Writes FOLDER/table.md (also printed) and FOLDER/consistency.png.
 docs/notes/consistency.md says what the variants are; its equation numbers are cited here.
 """
 
@@ -17,15 +17,14 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 from unittest.mock import patch
 
 import numpy as np
@@ -79,19 +78,9 @@ _FRAME_NS, _IMU_NS = 50_000_000, 5_000_000
 SAMPLES = _FRAME_NS // _IMU_NS  # of the IMU in a frame
 # Standard deviations of the first position, m, and of the first yaw, rad.
 _START: dict[Start, tuple[float, float]] = {"uncertain": (0.05, np.radians(1.0)), "known": (0.0, 0.0)}
-_MOTIONS: tuple[Motion, ...] = ("imu", "none", "velocity")
-_VARIANTS: tuple[Variant, ...] = (
-    "standard",
-    "first estimates",
-    "right-invariant",
-    "right-invariant, noise learned",
-)
-_COLOURS = {
-    "standard": "#c44e52",
-    "first estimates": "#d9822b",
-    "right-invariant": "#1f5fbf",
-    "right-invariant, noise learned": "#111111",
-}
+_MOTIONS: tuple[Motion, ...] = get_args(Motion)
+_VARIANTS: tuple[Variant, ...] = get_args(Variant)
+_COLOURS = dict(zip(_VARIANTS, ("#c44e52", "#d9822b", "#1f5fbf", "#111111"), strict=True))
 _MEASURES = {"pose": 6, "position": 3, "orientation": 3, "yaw": 1, "velocity": 3, "gyro bias": 3, "accel bias": 3}
 
 
@@ -570,7 +559,7 @@ def _record(
 
 
 def main() -> int:
-    """Fly everything and write the tables, the figures of all groups and the picture."""
+    """Fly everything and write the tables and the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     usual = Scenario()
     parser.add_argument("--out", type=Path, required=True, help="folder for the results")
@@ -599,8 +588,6 @@ def main() -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     table = _tables(summaries)
     (args.out / "table.md").write_text(table, encoding="utf-8")
-    plain = json.dumps([asdict(s) for s in summaries], default=lambda a: np.round(a, 5).tolist())
-    (args.out / "figures.json").write_text(plain + "\n", encoding="utf-8")
     _plot(args.out / "consistency.png", summaries)
     print(table)
     return 0
@@ -646,9 +633,9 @@ def _fly_all(jobs: list[Job], processes: int) -> list[Record]:
     return records
 
 
+@one_blas_thread()
 def _fly_alone(job: Job) -> Record:
-    with one_blas_thread():
-        return fly(job)
+    return fly(job)
 
 
 def _summary(records: list[Record]) -> Summary:

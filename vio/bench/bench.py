@@ -70,11 +70,6 @@ class Result:
 def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: None) -> Result:
     """Run all tasks of a suite that have no result yet, and write tables and report.
 
-    Args:
-        suite: what to run.
-        place: where.
-        progress: called with the number of tasks done and of all tasks.
-
     Raises:
         VioError: the folders cannot be written, or the scheduler is missing.
     """

@@ -36,17 +36,10 @@ def run_here(
 def run_on_dask(
     jobs: Mapping[str, Job], cache: str, *, address: str, wait_s: float = 300.0, perform: Perform = perform_job
 ) -> Iterator[tuple[str, Record]]:
-    """Yield key and record of each job as it is done by the workers of a Dask scheduler.
+    """Yield key and record of each job as it is done by the workers of the Dask scheduler at an address.
 
-    A worker that is lost costs its tasks a repetition. A scheduler that is lost is waited for, and what has not come
-    back is sent again.
-
-    Args:
-        jobs: by key.
-        cache: folder on the workers for rendered recordings and temporary files.
-        address: of the scheduler, such as tcp://10.0.0.1:8786.
-        wait_s: how long a lost scheduler is waited for.
-        perform: what a worker does with a job.
+    A worker that is lost costs its tasks a repetition. A scheduler that is lost is waited for, `wait_s` at most, and
+    what has not come back is sent again. `cache` is a folder on the workers.
 
     Raises:
         MissingDependencyError: Dask is not installed.

@@ -33,13 +33,7 @@ _lock = threading.Lock()
 
 
 def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict[str, Any]:
-    """Do one task in a process of its own and return its record; a failure is part of the record.
-
-    Args:
-        job: of `vio.bench.tasks`.
-        cache: folder for rendered recordings and temporary files on this machine.
-        retries: how often a process that was killed is started again.
-    """
+    """Do one task in a process of its own, again where that is killed; return its record, which may be a failure."""
     try:
         Path(cache).mkdir(parents=True, exist_ok=True)
         job = {**job, "first": job.get("first") and dict(job["first"])}
@@ -64,11 +58,9 @@ def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict
 
 
 def failed(reason: str, *, keep: bool) -> dict[str, Any]:
-    """Return the record of a task that has no result.
+    """Return the record of a task that has no result, for a reason in one line.
 
-    Args:
-        reason: one line.
-        keep: whether the same would happen again, so that the task need not be repeated.
+    `keep`: the same would happen again, so that the task need not be repeated.
     """
     return {"figures": {}, "measured": {}, "failure": reason, "keep": keep, "curve": None, "trajectory": None}
 

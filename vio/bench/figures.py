@@ -31,9 +31,7 @@ _MOST_CONDITION = 1e14
 def figures_of(evaluation: Evaluation, *, positions_only: bool) -> dict[str, Any]:
     """Return the figures of an evaluation by name; None where they are undefined.
 
-    Args:
-        evaluation: of the trajectory.
-        positions_only: the reference has no orientations; then all that needs them is None.
+    With `positions_only` the reference has no orientations, and all that needs them is None.
     """
     scores, truth_m, scale_free = evaluation.as_dict(), evaluation.reference_path_length_m, evaluation.scale_free
     rpe, kitti = (None, None) if positions_only else (evaluation.rpe, evaluation.kitti)
@@ -150,9 +148,7 @@ def absent_reasons(
 def error_curve(evaluation: Evaluation, times_ns: IntArray | None) -> dict[str, list[float]]:
     """Return the position error over time and its quantiles, for plots.
 
-    Args:
-        evaluation: of the trajectory.
-        times_ns: (N,) of its poses; None: frames stand for seconds.
+    `times_ns` (N,) are those of the trajectory's poses; None: frames stand for seconds.
     """
     rows = evaluation.rows
     seconds = rows.astype(float) if times_ns is None else (times_ns[rows] - times_ns[rows[0]]) / NS_PER_S

@@ -267,11 +267,7 @@ def matrix(
 ) -> Iterator[str]:
     """Yield the table of one figure: sequences down, systems across; the smallest of a line in bold.
 
-    Args:
-        rows: of the suite.
-        metric: the figure.
-        systems: the columns; none: all, ours first.
-        titles: of sequences and systems, by name.
+    `systems` are the columns; none: all, ours first. `titles` are those of sequences and systems, by name.
     """
     named = titles or {}
     known = list(dict.fromkeys(row.system for row in sorted(rows, key=lambda row: row.is_peer)))
@@ -333,12 +329,7 @@ def full_table(
 ) -> Iterator[str]:
     """Yield the table of all figures: a line for each sequence and system.
 
-    Args:
-        rows: of the suite.
-        metrics: the columns.
-        titles: of sequences and systems, by name.
-        for_documents: leave out runs and success, and sequence or system where there is one alone.
-        success: for documents, too.
+    `for_documents` leaves out runs and success (unless asked for), and sequence or system where there is one alone.
     """
     named, notes = titles or {}, Notes()
     names = ["sequence", "system"]

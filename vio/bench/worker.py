@@ -33,7 +33,7 @@ from vio.evaluation.trajectories import LEAST_POSES, Evaluation, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
 from vio.protocols import Dataset
-from vio.records import NS_PER_S, BoolArray, Trajectory
+from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
 if TYPE_CHECKING:
     from vio.records import FrameResult
@@ -189,6 +189,13 @@ def _check_place(job: dict[str, Any]) -> None:
             )
 
 
+def _used(truth: _Truth, config: Config) -> IntArray:
+    """Times (G,) of the frames of the sequence that the limit on the frame rate lets through."""
+    times_ns = truth.dataset.recording.frame_times_ns
+    used = used_frames(times_ns[: truth.end], config.dataset.max_frame_rate)
+    return times_ns[used[used >= truth.first]]
+
+
 def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -> dict[str, Any]:
     """Run the odometry as `vio run` does, with one thread of OpenCV, in a folder that is removed."""
     import cv2
@@ -219,12 +226,11 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         )
         if kept:  # in a copy: loops are scored as they were measured
             result = adjust_map(result, Path(shutil.copy(store, Path(folder) / "adjusted.db")))
-        trajectory, times_ns = result.trajectory, truth.dataset.recording.frame_times_ns
-        used = used_frames(times_ns[:end], config.dataset.max_frame_rate)
+        trajectory = result.trajectory
         figures: dict[str, Any] = {
             "frames": len(result.frames),
             "path_m": float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()),
-            "coverage": coverage(times_ns[used[used >= first]], trajectory),
+            "coverage": coverage(_used(truth, config), trajectory),
             "refused_share": refused_share(result.frames.column("used"), result.frames.column("gated")),
             "used_per_frame": float(np.mean(np.asarray(result.frames.column("used"), dtype=np.float64))),
             "landmarks": len(result.landmarks.ids),

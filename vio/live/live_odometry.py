@@ -60,15 +60,10 @@ class LiveOdometry(EventInputs[None]):
     ) -> None:
         """Start the worker; the first frame begins the trajectory.
 
+        Arguments that are not named here are those of `Odometry`; a map never makes a frame wait.
+
         Args:
-            rig: as of `Odometry`, like `config`, `T_cam0_imu`, `parts`, `map` and `localise`; a map never makes
-                a frame wait.
-            config: likewise.
-            T_cam0_imu: likewise.
-            parts: likewise.
             on_frame: called with the result of each frame, by the worker: what takes long in it delays the next frame.
-            map: likewise.
-            localise: likewise.
             drop: what happens where `queue_frames` wait already: "oldest" leaves out the frame that has waited longest,
                 so that latency is bounded; "none" leaves out none; "block" makes the call wait, for recordings.
             queue_frames: that may wait.

@@ -27,11 +27,7 @@ class EventOrder:
     """
 
     def __init__(self, *, wait_for_imu: bool) -> None:
-        """Create an empty queue.
-
-        Args:
-            wait_for_imu: whether a frame waits for the first sample at or after it; False: it passes at once.
-        """
+        """Create an empty queue; with `wait_for_imu`, a frame waits for the first sample at or after it."""
         self._wait = wait_for_imu
         self._frames: deque[StereoFrame] = deque()
         self._samples: deque[MotionSample] = deque(maxlen=_MOST_SAMPLES)
@@ -104,13 +100,7 @@ class EventProcessor:
     """Takes events through the pipeline and, where there is one, into the map."""
 
     def __init__(self, pipeline: FramePipeline, *, wait_for_imu: bool, map: MapSession | None) -> None:
-        """Begin a trajectory.
-
-        Args:
-            pipeline: processes one event at a time.
-            wait_for_imu: whether a frame waits for the first sample at or after it.
-            map: the trajectory's part of a map; None: no map.
-        """
+        """Begin a trajectory, and its part of a map where there is one; `wait_for_imu` as of `EventOrder`."""
         self.pipeline, self._order, self.map = pipeline, EventOrder(wait_for_imu=wait_for_imu), map
         self.estimate: Estimate | None = None  # newest; None before the first
         self._last_index = 0  # of the frame that it is of

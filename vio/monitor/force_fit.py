@@ -93,10 +93,8 @@ class _Window:
 def fit_force(record: Record, gyro_fit: GyroFit, lever_arm: FloatArray) -> ForceFit | None:
     """Fit over whole windows; None: too few of them are without tracking loss.
 
-    Args:
-        record: intervals and samples.
-        gyro_fit: the gyro's fit; it gives the camera's rotation where it explains the images.
-        lever_arm: (3,) given position of the IMU in cam0, metres; a correction to it is fitted.
+    The gyro's fit gives the camera's rotation where it explains the images. A correction to the given position of the
+    IMU in cam0, `lever_arm` (3,) in metres, is fitted, too.
     """
     blocks = [_normal_equations(window, lever_arm) for window in _windows(record, gyro_fit)]
     if len(blocks) < _FEWEST_WINDOWS:
@@ -154,12 +152,7 @@ def _rotations(window: _Window) -> FloatArray:
 
 
 def _double_integrals(window: _Window, R: FloatArray) -> FloatArray:
-    """Return the Jacobian (n, 3, 12) of the IMU's position at the intervals' ends w.r.t. A by rows and b.
-
-    Args:
-        window: the intervals.
-        R: (n, 3, 3) rotations at their starts.
-    """
+    """Return the Jacobian (n, 3, 12) of the IMU's positions at the intervals' ends by A's rows and b; R at their starts."""
     n, dt = len(window.dt), window.dt[:, None, None]
     middle = R @ so3_exp(window.dt[:, None] / 2 * window.omega)
     of_map = np.einsum("nij,nl->nijl", middle, window.force).reshape(n, 3, 9)

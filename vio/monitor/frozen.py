@@ -74,9 +74,8 @@ class FrozenImages:
     def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
         """Return which frame a pair repeats; None: it shows something new, or a rig at standstill.
 
-        Args:
-            frame: the pair, with or without images; frames come in time order.
-            expected: the back end's prediction of this frame, its motion since the last frame with features.
+        Frames come in time order, with or without images, each with the back end's prediction, whose motion is that
+        since the last frame with features.
         """
         self._expected, self._repeating = expected, self._compare(frame, expected)
         if self._repeating is None:

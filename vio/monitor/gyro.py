@@ -32,12 +32,7 @@ class _Explanation:
 
 
 def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
-    """Compare the gyro's rates, mapped by the given rotation, with those of the camera.
-
-    Args:
-        evidence: the fits.
-        unit: factor that makes the accelerometer's readings m/s^2.
-    """
+    """Compare the gyro's rates, mapped by the given rotation, with the camera's; forces times `unit` are m/s^2."""
     gyro_fit, R, brief = evidence.gyro_fit, evidence.R_cam0_imu, evidence.brief
     if gyro_fit.unexplained > _DISAGREES:
         return [] if brief else [_disagreement(gyro_fit)]

@@ -41,12 +41,7 @@ class InertialCheck:
     """
 
     def __init__(self, camera: StereoCamera, T_cam0_imu: FloatArray) -> None:
-        """Create the check.
-
-        Args:
-            camera: rectified pair that the observations belong to.
-            T_cam0_imu: (4, 4) as the run uses it.
-        """
+        """Create the check, for observations of a rectified pair and `T_cam0_imu` (4, 4) as the run uses it."""
         self._stereo, self._T = camera, np.array(T_cam0_imu, dtype=np.float64)
         self._reported: set[str] = set()
         self._samples = Samples()

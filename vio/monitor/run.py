@@ -44,13 +44,7 @@ class RunMonitor:
     """
 
     def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, *, imu: bool) -> None:
-        """Create the monitors.
-
-        Args:
-            camera: rectified pair.
-            T_cam0_body: (4, 4) as the run uses it.
-            imu: whether the run propagates with raw IMU samples.
-        """
+        """Create the monitors of a rectified pair; extrinsics (4, 4); `imu`: raw samples propagate the pose."""
         self._health, self._refusals = RunHealth(), RefusalReport(imu=imu)
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
@@ -109,9 +103,7 @@ class RunMonitor:
     def repeats(self, frame: StereoFrame, expected: Prediction | None) -> bool:
         """Return whether a frame shows an earlier exposure again and must not be used; called before `observations`.
 
-        Args:
-            frame: in time order.
-            expected: the back end's prediction of it.
+        Frames come in time order, each with the back end's prediction of it.
         """
         self._index, self._index_before = frame.index, self._index
         self._take_new()

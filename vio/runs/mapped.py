@@ -53,11 +53,8 @@ class MappedRun:
 def mapped_run(session: MapSession, estimates: Records[Estimate], causal: Rows, scale_sigma: float) -> MappedRun:
     """Return the poses of all frames in the map.
 
-    Args:
-        session: of the run.
-        estimates: of all frames.
-        causal: poses in the map as known at the time.
-        scale_sigma: standard deviation of the scale by the rig's calibration, over it.
+    `causal` are those known at the time; `scale_sigma` is the standard deviation of the scale by the calibration, over
+    it.
     """
     T_odom_body, index = (np.array(estimates.column(name)) for name in ("T_world_imu", "index"))
     frames, T_map, T_odom = session.keyframes()

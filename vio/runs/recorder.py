@@ -81,13 +81,9 @@ class RunRecorder:
     def __init__(
         self, body: BodyFrame, *, lag_frames: int, keep_observations: bool, folder: GrowingFolder | None = None
     ) -> None:
-        """Prepare; files begin with the first frame.
+        """Prepare; files begin with the first frame. Without a folder everything stays in memory.
 
-        Args:
-            body: what the poses describe.
-            lag_frames: frames after which an estimate is final, smoothed by those.
-            keep_observations: whether observations and motion samples are kept.
-            folder: the run's folder; None: everything stays in memory.
+        After `lag_frames` an estimate is final, smoothed by those; `keep_observations` keeps motion samples, too.
         """
         self._body, self._lag, self._keep, self._folder = body, lag_frames, keep_observations, folder
         self._rows = FrameRows()
@@ -254,12 +250,9 @@ class RunRecorder:
         return self.can_save and time.monotonic() - self._saved_s > _CHECKPOINT_S
 
     def save(self, state: Any, dataset: Dataset, finished: Landmarks) -> None:
-        """Write a checkpoint, where `can_save` says so.
+        """Write a checkpoint of a run's state, less the recording, where `can_save` says so.
 
-        Args:
-            state: of the run, beside the recorder's own.
-            dataset: the recording, which is left out of it.
-            finished: points of the map that will not change any more, and that the state no longer has.
+        `finished` are points of the map that will not change any more, and that the state no longer has.
         """
         assert self._folder is not None
         with self._writing():

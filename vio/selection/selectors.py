@@ -147,10 +147,8 @@ def build_selector(
 ) -> Selector:
     """Build the selector named in the settings.
 
-    Args:
-        settings: the selector's section of the configuration.
-        whole_record: yields all observations of the record; None where they are not available in advance.
-        camera: the rectified pair, which the information selector needs.
+    `whole_record` yields all observations of the record, None where they are not available in advance; the information
+    selector needs the camera.
 
     Raises:
         ConfigError: the recording lacks data that the selector needs.
