@@ -42,7 +42,7 @@ def resolve_size(size: Size, evidence: Evidence) -> Size:
 
 
 def judge_force(evidence: Evidence, unit: float) -> tuple[list[InertialFinding], bool]:
-    """Judge axes and sign of the accelerometer, in m/s^2 times `unit`; return whether the sign was measured, too."""
+    """Judge axes and sign of the accelerometer, whose readings times `unit` are m/s^2; and if the sign is known."""
     gyro_fit, force, R = evidence.gyro_fit, evidence.force, evidence.R_cam0_imu
     readings = gyro_fit.force[gyro_fit.covered]
     if evidence.early_force is not None:

@@ -152,7 +152,7 @@ def _rotations(window: _Window) -> FloatArray:
 
 
 def _double_integrals(window: _Window, R: FloatArray) -> FloatArray:
-    """Return the Jacobian (n, 3, 12) of the IMU's positions at the intervals' ends by A's rows and b; R at their starts."""
+    """Return the Jacobian (n, 3, 12) of the IMU's positions at the intervals' ends by A and b; R at their starts."""
     n, dt = len(window.dt), window.dt[:, None, None]
     middle = R @ so3_exp(window.dt[:, None] / 2 * window.omega)
     of_map = np.einsum("nij,nl->nijl", middle, window.force).reshape(n, 3, 9)
