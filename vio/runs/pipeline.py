@@ -282,14 +282,14 @@ class _Loop:
         """Prepare; `frames` are the numbers of the recording's frames that the run is to take."""
         self._state, self._recorder, self._viewer, self._frames = state, recorder, viewer, frames
         self._end = 1 + max(frames, default=-1)
-        self._reading = _ReadTimer()
+        self._read_ms = 0.0  # that the recording took to give its events since the last result
 
     def run(self, events: Iterable[Event], dataset: Dataset, should_stop: Callable[[], str | None]) -> str | None:
         """Take events to their end; return why they ended before."""
         state, recorder, processor = self._state, self._recorder, self._state.processor
         monitor, stopped = processor.pipeline.monitor, None
         resumed = state.frame_ns is not None
-        for event in self._reading.timed(events):
+        for event in self._timed(events):
             if resumed and not state.is_new(event):
                 continue
             if isinstance(event, StereoFrame):
@@ -317,6 +317,17 @@ class _Loop:
             raise DataError(f"most frames were refused: {monitor.refusal}")
         return stopped
 
+    def _timed(self, events: Iterable[Event]) -> Iterator[Event]:
+        """Yield the events, and note how long each took to come."""
+        iterator = iter(events)
+        while True:
+            start = time.perf_counter()
+            event = next(iterator, None)
+            self._read_ms += 1e3 * (time.perf_counter() - start)
+            if event is None:
+                return
+            yield event
+
     def _between(self, first: int, end: int) -> list[int]:
         """Frames `first <= index < end` that the run is to take."""
         return [index for index in range(first, end) if index in self._frames]
@@ -332,7 +343,8 @@ class _Loop:
     def _record(self, results: list[FrameResult]) -> None:
         state = self._state
         for result in results:
-            self._recorder.frame(result, self._reading.take_ms(), state.processor.pipeline.smoothed)
+            self._recorder.frame(result, self._read_ms, state.processor.pipeline.smoothed)
+            self._read_ms = 0.0
             if state.dead_reckoning is not None:
                 self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))
             self._viewer.frame(result)
@@ -359,29 +371,6 @@ def _unread_line(unread: list[int], frames: int) -> str:
     """The line on frames that could not be read."""
     named = ", ".join(map(str, unread[:_MOST_NAMED])) + (", …" if len(unread) > _MOST_NAMED else "")
     return f"{len(unread)} of {frames} frames could not be read and were skipped: {named}"
-
-
-class _ReadTimer:
-    """Wall time that the recording takes to give its events."""
-
-    def __init__(self) -> None:
-        self._ms = 0.0
-
-    def timed(self, events: Iterable[Event]) -> Iterator[Event]:
-        """Yield the events, and note how long each took to come."""
-        iterator = iter(events)
-        while True:
-            start = time.perf_counter()
-            event = next(iterator, None)
-            self._ms += 1e3 * (time.perf_counter() - start)
-            if event is None:
-                return
-            yield event
-
-    def take_ms(self) -> float:
-        """Return the time since the last call, and begin anew."""
-        taken, self._ms = self._ms, 0.0
-        return taken
 
 
 def _opencv_threads(dataset: Dataset, config: Config, given: Frontend | None) -> AbstractContextManager[None]:

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +41,7 @@ from vio.runs.tables import (
     frames_csv,
     mapped_row,
     observation_rows,
+    observations_of,
     sample_of,
     sample_row,
 )
@@ -203,9 +204,13 @@ class RunRecorder:
         return self._tables["mapped"].rows()
 
     @property
-    def observations(self) -> Sequence[Observations] | None:
+    def observations(self) -> Records[Observations] | None:
         """Observations of all frames; None: not kept."""
-        return SeenFrames(self._tables["seen"], self._tables["observations"]) if self._keep else None
+        if not self._keep:
+            return None
+        seen, rows = self._tables["seen"], self._tables["observations"]
+        ends = dict(zip(seen.rows()["index"].tolist(), np.cumsum(seen.rows()["count"]).tolist(), strict=True))
+        return Records(seen, lambda row: observations_of(row, rows, ends[int(row["index"])]))
 
     @property
     def samples(self) -> Records[MotionSample] | None:
@@ -357,28 +362,3 @@ class RunRecorder:
                 stream.write(text.encode())
                 stream.flush()
                 os.fsync(stream.fileno())
-
-
-class SeenFrames(Sequence[Observations]):
-    """The observations of all frames in two tables."""
-
-    def __init__(self, seen: Table, rows: Table) -> None:
-        self._seen, self._rows = seen.rows(), rows
-        self._offsets = np.concatenate([[0], np.cumsum(self._seen["count"])])
-
-    def __len__(self) -> int:
-        return len(self._seen)
-
-    @overload
-    def __getitem__(self, index: int) -> Observations: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Observations]: ...
-
-    def __getitem__(self, index: int | slice) -> Observations | list[Observations]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(len(self))[index]]
-        k = range(len(self))[index]
-        rows = self._rows.rows(int(self._offsets[k]), int(self._offsets[k + 1]))
-        columns = (np.array(rows[name]) for name in ("id", "z", "has_right", "stale", "sigma"))
-        return Observations(int(self._seen["index"][k]), int(self._seen["time_ns"][k]), *columns)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.files.tables import Rows
+from vio.files.tables import Rows, Table
 from vio.geometry.lie import FloatArray
 from vio.records import (
     Estimate,
@@ -157,6 +157,13 @@ def observation_rows(seen: Observations) -> Rows:
     rows["id"], rows["z"], rows["has_right"], rows["stale"] = seen.ids, seen.z, seen.has_right, seen.stale
     rows["sigma"] = 0.0 if seen.sigma is None else seen.sigma
     return rows
+
+
+def observations_of(row: np.void, table: Table, end: int) -> Observations:
+    """Return the observations of a frame by its row in the table of frames; `end` is that of its rows in `table`."""
+    own = table.rows(end - int(row["count"]), end)
+    columns = (np.array(own[name]) for name in ("id", "z", "has_right", "stale", "sigma"))
+    return Observations(int(row["index"]), int(row["time_ns"]), *columns)
 
 
 def sample_row(sample: MotionSample) -> Rows:
