@@ -98,7 +98,10 @@ def _rendered(render: dict[str, Any], cache: Path) -> Path:
         DataError: it cannot be rendered; the message is that of `vio render`.
     """
     folder = cache / "renders" / render["key"]
-    with _locked(cache / "renders", render["key"]):
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with folder.with_name(f".{folder.name}.lock").open("w") as stream:
+        if fcntl is not None:  # another process of this machine that has it is waited for
+            fcntl.flock(stream, fcntl.LOCK_EX)
         if not folder.is_dir():
             command = [sys.executable, "-m", "vio", "render", *render["words"], "--workers", "1", "--out", str(folder)]
             status, words = _call([*command, "--json"])
@@ -153,13 +156,3 @@ def _task_folder(cache: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
         if lock is not None:
             os.close(lock)
-
-
-@contextlib.contextmanager
-def _locked(folder: Path, name: str) -> Iterator[None]:
-    """Hold a lock of this machine; another process that has it is waited for."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / f".{name}.lock").open("w") as stream:
-        if fcntl is not None:
-            fcntl.flock(stream, fcntl.LOCK_EX)
-        yield

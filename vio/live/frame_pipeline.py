@@ -152,7 +152,8 @@ class FramePipeline:
             if report.started:
                 self.monitor.restarted(seen.frame_index, str(error), self.backend.estimate())
             else:
-                self.monitor.lost(seen.frame_index, str(error))
+                lost = f"{error}; there are no poses until the scale is observable again"
+                self.monitor.say(f"frame {seen.frame_index}: {lost}")
             return report
 
 

@@ -216,14 +216,11 @@ class LiveOdometry(EventInputs[None]):
         Raises:
             DataError: no frame has a pose yet.
         """
-        return self._worker.ask(self._landmarks)
+        return self._worker.ask(lambda: newest_points([*self._points, self._odometry.landmarks()]))
 
     def calibrated_rig(self) -> CalibratedRig:
         """Return the rig with what the estimate says that its calibration is off by, see `Odometry.calibrated_rig`."""
         return self._odometry.calibrated_rig()
-
-    def _landmarks(self) -> Landmarks:
-        return newest_points([*self._points, self._odometry.landmarks()])
 
     def __enter__(self) -> LiveOdometry:
         return self

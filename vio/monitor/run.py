@@ -201,10 +201,6 @@ class RunMonitor:
             ]
         )
 
-    def lost(self, index: int, why: str) -> None:
-        """Report that the back end diverged in a frame and has no estimate until its start is observable again."""
-        self._report([f"frame {index}: {why}; there are no poses until the scale is observable again"])
-
     def restarted(self, index: int, why: str, estimate: Estimate) -> None:
         """Report that the back end diverged in a frame and was started again; repeats within a second are one event."""
         self._report(self._health.restarted(index, why, estimate))
