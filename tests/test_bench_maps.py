@@ -10,7 +10,7 @@ import pytest
 from tests.dataset_makers import make_drive, make_mat, utias_arrays
 from vio.bench.bench import Place, bench
 from vio.bench.identity import InputDigests
-from vio.bench.maps import LoopScore, loop_score, placement_figures, wrong_share
+from vio.bench.maps import loop_figures, placement_figures, wrong_share
 from vio.bench.suite import chosen, suite_from
 from vio.bench.tasks import tasks_of
 from vio.bench.worker import perform
@@ -57,19 +57,19 @@ def test_loops_are_scored_against_the_true_poses(tmp_path: Path) -> None:
     """Keyframes 2 and 4 are at places seen before; 3 is, too, but looks the other way."""
     frames, T_world_body = np.arange(0, 50, 10), _cameras() @ T_CAM0_BODY
 
-    def score(*loops: tuple[int, int, float, bool]) -> LoopScore:
+    def score(*loops: tuple[int, int, float, bool]) -> tuple[float | None, ...]:
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}.map"
-        return loop_score(_store(path, list(loops)), frames, T_world_body, T_CAM0_BODY)
+        return tuple(loop_figures(_store(path, list(loops)), frames, T_world_body, T_CAM0_BODY).values())
 
-    assert score() == LoopScore(0, 0, None, 0.0)
-    assert score((0, 2, 0.1, True)) == LoopScore(1, 0, pytest.approx(0.1), 0.5)
-    assert score((0, 2, 0.1, True), (1, 4, 2.0, True)) == LoopScore(2, 1, pytest.approx(1.05), 1.0)
-    assert score((0, 2, 0.1, True), (1, 4, 2.0, False)) == LoopScore(1, 0, pytest.approx(0.1), 0.5), "it was dropped"
+    assert score() == (0, 0, None, 0.0)
+    assert score((0, 2, 0.1, True)) == (1, 0, pytest.approx(0.1), 0.5)
+    assert score((0, 2, 0.1, True), (1, 4, 2.0, True)) == (2, 1, pytest.approx(1.05), 1.0)
+    assert score((0, 2, 0.1, True), (1, 4, 2.0, False)) == (1, 0, pytest.approx(0.1), 0.5), "it was dropped"
 
 
 def test_recall_is_undefined_where_no_place_is_seen_again(tmp_path: Path) -> None:
     frames, T_world_body = np.array([0, 10]), _cameras()[:2] @ T_CAM0_BODY
-    assert loop_score(_store(tmp_path / "a.map", []), frames, T_world_body, T_CAM0_BODY).recall is None
+    assert loop_figures(_store(tmp_path / "a.map", []), frames, T_world_body, T_CAM0_BODY)["loop_recall"] is None
 
 
 @pytest.mark.parametrize("wrong", [{"map_of": "other"}, {"map_of": "a", "map": True}, {"map": 3}])

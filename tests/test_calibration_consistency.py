@@ -11,7 +11,6 @@ from tools.calibration_consistency import (
     _seen,
     calibration_nees,
     fly,
-    imu_samples,
     walked_terms,
 )
 from tools.consistency import CAMERA, T_CAM0_IMU, Flight
@@ -31,7 +30,7 @@ QUIET = MsckfSettings(
 
 def test_the_flight_from_standstill_and_its_imu_agree() -> None:
     flight, motion = FromStandstill(), ImuMotion(QUIET)
-    for sample in imu_samples(flight, 40, QUIET, 0.0, np.random.default_rng(0)):
+    for sample in flight.imu(range(401), np.random.default_rng(0), QUIET)[0]:
         motion.take(sample)
     R, p, v = flight.state(np.array([0.0, 2.0]))
     assert not v[0].any()
@@ -42,7 +41,7 @@ def test_the_flight_from_standstill_and_its_imu_agree() -> None:
 
 
 def test_samples_are_stamped_by_the_clock_of_the_imu() -> None:
-    early, late = (imu_samples(Flight(), 2, QUIET, s, np.random.default_rng(0)) for s in (0.0, 0.003))
+    early, late = (Flight().imu(range(20), np.random.default_rng(0), QUIET, clock_s=s)[0] for s in (0.0, 0.003))
     assert {b.time_ns - a.time_ns for a, b in zip(early, late, strict=True)} == {3_000_000}
 
 
@@ -69,7 +68,7 @@ def test_a_misread_sample_is_the_perfect_one_to_the_filter_that_knows_the_terms(
     off = Off(np.zeros(6), 0.0, np.zeros(3), 0.0, np.linspace(-0.02, 0.02, IMU_TERMS))
     walked = walked_terms(off, 50, QUIET, np.random.default_rng(0))
     assert 0 < np.abs(walked[-1] - off.imu).max() < 1e-4  # 1 % times 0.005, over the root of a quarter of a second
-    perfect = imu_samples(Flight(), 2, QUIET, 0.0, np.random.default_rng(0))[40]
+    perfect = Flight().imu(range(-100, 20), np.random.default_rng(0), QUIET)[0][40]
     read = _misread(perfect, walked[40])
     got = calibrated(np.concatenate([read.gyro, read.accel]), walked[40])
     np.testing.assert_allclose(got, np.concatenate([perfect.gyro, perfect.accel]), atol=1e-12)

@@ -115,7 +115,7 @@ def test_flight_and_its_imu_agree() -> None:
         gyro_bias_walk=0, accel_bias_walk=0,
     )  # fmt: skip
     motion = ImuMotion(quiet)
-    samples, bias = flight.imu(40, rng, quiet)
+    samples, bias = flight.imu(range(401), rng, quiet)
     assert not bias.any()
     for sample in samples:
         motion.take(sample)

@@ -16,7 +16,7 @@ from tests.numerics import numeric_jacobian
 from tests.test_map_store import CAMERA, _features, _row
 from vio.cli import main
 from vio.datasets.gnss import read_gnss
-from vio.earth.alignment import Georeference, _Between, _Problem, georeference, heading_deg
+from vio.earth.alignment import Georeference, _between, _Problem, georeference, heading_deg
 from vio.earth.alignment import Path as GraphPath
 from vio.earth.exports import write_utm
 from vio.earth.geodesy import LocalFrame, ecef, geodetic_of, utm, utm_zone
@@ -163,10 +163,11 @@ def test_covariance_of_the_rigid_transform_covers_it() -> None:
 def test_normal_matrix_is_the_jacobian_of_the_gradient_without_residuals() -> None:
     drive = _drive(seed=3, poses=24)
     path = replace(drive.path, first=np.array([1]), second=np.array([20]))
-    between = _Between.of(path, drive.fixes.times_ns)
+    before, share, _ = _between(path, drive.fixes.times_ns)
     C, has_height = drive.fixes.covariance, drive.fixes.has_height
-    measured = _Problem(path, between, np.zeros((len(C), 3)), C, has_height, LEVER_M).antenna(path.T_map_body)
-    problem, weight = _Problem(path, between, measured, C, has_height, LEVER_M), np.ones((len(C), 2))
+    nowhere = np.zeros((len(C), 3))
+    measured = _Problem(path, before, share, nowhere, C, has_height, LEVER_M).antenna(path.T_map_body)
+    problem, weight = _Problem(path, before, share, measured, C, has_height, LEVER_M), np.ones((len(C), 2))
     H, g = problem._normal(path.T_map_body, 0.0, weight)
     assert np.abs(g).max() < 1e-6
 

@@ -74,7 +74,7 @@ def test_faulty_samples_do_not_move_the_poses(fault: Change) -> None:
 def _passed(samples: list[ImuSample]) -> tuple[list[int], list[str]]:
     """Numbers of the samples that pass, and the kinds of the faults."""
     check = ImuSampleCheck()
-    usable = [u.time_ns // 5_000_000 for x in samples for u in check.take(x)]
+    usable = [u.time_ns // 5_000_000 for x in samples for u in check.take_all([x])]
     return usable, [f.kind for f in check.finish()]
 
 
@@ -92,7 +92,7 @@ def _noise(count: int, scale: float = 0.01) -> FloatArray:
 
 def test_clean_samples_pass_at_once() -> None:
     check = ImuSampleCheck()
-    assert all(check.take(x) == (x,) for x in _samples(_noise(1000)))
+    assert all(check.take_all([x]) == [x] for x in _samples(_noise(1000)))
     assert check.finish() == ()
 
 
@@ -207,7 +207,7 @@ def test_samples_that_are_missing_for_seconds_are_no_matter_of_clocks() -> None:
 def test_samples_of_a_frame_at_once_are_judged_as_one_by_one(fault: Change) -> None:
     samples = Faulty(fault).imu(np.random.default_rng(3), MsckfSettings(), np.zeros(6))
     single, at_once = ImuSampleCheck(), ImuSampleCheck()
-    expected = [x.time_ns for sample in samples for x in single.take(sample)]
+    expected = [x.time_ns for sample in samples for x in single.take_all([sample])]
     cuts = np.cumsum(np.random.default_rng(4).integers(0, 25, len(samples)))
     parts = np.split(np.arange(len(samples)), cuts[cuts < len(samples)])
     got = [x.time_ns for part in parts for x in at_once.take_all([samples[k] for k in part])]

@@ -52,7 +52,7 @@ def test_a_frame_waits_for_the_sample_after_its_exposure_by_the_estimated_offset
     order.exposed_after_ns = 12
     assert [e.time_ns for k in (10, 20, 30) for e in order.add(_sample(k))] == []
     assert [e.time_ns for e in order.add(_frame(1, 15))] == [10, 20, 30, 15]
-    assert order.add(_frame(2, 19)) == []
+    assert list(order.add(_frame(2, 19))) == []
     assert [e.time_ns for e in order.add(_sample(40))] == [40, 19]
 
 
@@ -69,15 +69,15 @@ def test_a_frame_waits_no_longer_than_to_the_end() -> None:
 
 def test_a_frame_with_a_sample_at_its_own_time_does_not_wait() -> None:
     order = EventOrder(wait_for_imu=True)
-    assert order.add(_sample(10)) == []
+    assert list(order.add(_sample(10))) == []
     assert [type(event) for event in order.add(_frame(1, 10))] == [ImuSample, StereoFrame]
 
 
 def test_without_an_imu_a_frame_passes_at_once() -> None:
     order = EventOrder(wait_for_imu=False)
     velocities = [VelocitySample(k, np.zeros(3), np.zeros(3)) for k in (10, 15, 20)]
-    assert [order.add(velocity) for velocity in velocities] == [[], [], []]
-    assert order.add(frame := _frame(1, 15)) == [*velocities[:2], frame]
+    assert [list(order.add(velocity)) for velocity in velocities] == [[], [], []]
+    assert list(order.add(frame := _frame(1, 15))) == [*velocities[:2], frame]
     assert order.flush() == velocities[2:]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -24,21 +26,20 @@ def _frame(index: int, ids: list[int], seed: int = 0) -> Observations:
     return observations(index, index * 10**8, ids, z, rng.random(len(ids)) < 0.9)
 
 
-def _build(
-    name: str,
-    record: list[Observations],
-    fraction: float = 0.3,
-    minimum: int = 2,
-    budget: int | None = None,
-) -> Selector:
+@pytest.fixture(autouse=True, scope="module")
+def least_kept() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(selectors, "_LEAST_KEPT", 2)
+        yield
+
+
+def _build(name: str, record: list[Observations], fraction: float = 0.3, budget: int | None = None) -> Selector:
     settings = SelectorSettings(
         name=name,  # type: ignore[arg-type]
         keep_fraction=fraction,
         budget=budget,
     )
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(selectors, "_LEAST_KEPT", minimum)
-        return build_selector(settings, whole_record=lambda: record, camera=CAMERA)
+    return build_selector(settings, whole_record=lambda: record, camera=CAMERA)
 
 
 def _scene(frames: int, points: int = 120, seed: int = 0) -> list[Observations]:
@@ -73,9 +74,10 @@ def test_contract(name: str, seen: list[list[int]]) -> None:
             assert a.chosen.all()
 
 
-def test_causal_visibility_prefers_the_most_observed_features() -> None:
+def test_causal_visibility_prefers_the_most_observed_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(selectors, "_LEAST_KEPT", 1)
     record = [_frame(0, [1, 2]), _frame(1, [2, 3]), _frame(2, [1, 2, 3, 4])]
-    selector = _build("visibility", record, fraction=0.25, minimum=1)
+    selector = _build("visibility", record, fraction=0.25)
     chosen = [frame.ids[selector.select(frame).chosen].tolist() for frame in record]
     assert chosen[0] == [1]  # a tie goes to the older feature
     assert chosen[2] == [2]

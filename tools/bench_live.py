@@ -130,18 +130,11 @@ def soak(args: argparse.Namespace) -> None:
         stages.append(result.log.frontend_ms + result.log.monitor_ms + result.log.filter_ms)
 
     pauses = Pauses()
-    names = (
-        "simulated",
-        "resident MiB",
-        "points",
-        "CPU ms a frame",
-        "ms a frame, median",
-        "95 %",
-        "worst",
-        "longest gc pause, ms",
+    head = (
+        "simulated | resident MiB | points | CPU ms a frame | ms a frame, median | 95 % | worst | longest gc pause, ms"
     )
-    print("|", " | ".join((*names, "collections")), "|")
-    print("|", " | ".join(["---"] * (len(names) + 1)), "|")
+    print("|", head, "| collections |")
+    print("|" + " --- |" * (head.count("|") + 2))
     with vio.LiveOdometry(pair, on_frame=on_frame, drop="block", keep_landmarks=args.keep_landmarks) as live:
         live.warm_up()
         pauses.ms.clear()
@@ -161,14 +154,9 @@ def soak(args: argparse.Namespace) -> None:
                 resident = int(stream.read().split()[1]) * resource.getpagesize() / 2**20
             used_ms = 1e3 * (time.process_time() - began_s) * _PARTS / args.frames
             shown = np.percentile(stages, [50, 95, 100])
-            cells = [
-                f"{(frame + 1) * _STEP_NS * 1e-9 / 60:.1f} min",
-                f"{resident:.0f}",
-                f"{points}",
-                f"{used_ms:.1f}",
-                *(f"{v:.1f}" for v in shown),
-            ]
-            print("|", " | ".join([*cells, f"{max(pauses.ms, default=0):.1f}", f"{len(pauses.ms)}"]), "|", flush=True)
+            cells = [f"{(frame + 1) * _STEP_NS * 1e-9 / 60:.1f} min", f"{resident:.0f}", f"{points}", f"{used_ms:.1f}"]
+            cells += [*(f"{v:.1f}" for v in shown), f"{max(pauses.ms, default=0):.1f}", f"{len(pauses.ms)}"]
+            print("|", " | ".join(cells), "|", flush=True)
             stages.clear()
             pauses.ms.clear()
     for line in live.warnings:

@@ -1,6 +1,6 @@
 """What a query of the map costs against its size: simulated keyframes, their index and file, one query after the other.
 
-    python tools/bench_map.py [--sizes 500,2000,8000,20000] [--json FILE] [--png FILE]
+    python tools/bench_map.py [--sizes 500,2000,8000,20000]
 
 Descriptors are random bits; a query is a keyframe of the map with a tenth of its bits wrong, so that its words, the
 candidates and their geometric verification cost what a real one costs. Times are CPU milliseconds of one thread: where
@@ -10,12 +10,10 @@ nothing is known of the place, and where a session that found its place goes on 
 from __future__ import annotations
 
 import argparse
-import json
 import resource
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -112,45 +110,17 @@ def followed(path: Path) -> dict[str, float]:
     return {"followed_ms": float(np.median(spent)), "followed": float(np.mean(found))}
 
 
-def draw(rows: list[dict[str, float]]) -> Any:
-    """Time and memory against the number of keyframes."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 2.8), dpi=80, layout="constrained")
-    x = [row["keyframes"] for row in rows]
-    panels: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
-        ("CPU ms a query", (("query_ms", "place not known"),)),
-        ("memory, MB", (("index_MB", "words"), ("overlap_MB", "points"))),
-    )
-    for k, (label, lines) in enumerate(panels):
-        axes = figure.add_subplot(1, 2, k + 1)
-        for (name, text), color in zip(lines, ("#1f5fbf", "#c25b00"), strict=False):
-            axes.plot(x, [row[name] for row in rows], "o-", color=color, markersize=4, label=text)
-        axes.set(xlabel="keyframes", ylabel=label, xlim=(0, None), ylim=(0, None))
-        axes.grid(alpha=0.3)
-        axes.legend(frameon=False, fontsize=8)
-    return figure
-
-
 def main() -> None:
     """Measure all sizes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", default="500,2000,8000,20000")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--png", type=Path)
-    arguments = parser.parse_args()
-    rows, filled = [], 0
+    filled = 0
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "simulated.map"
-        for size in sorted(int(text) for text in arguments.sizes.split(",")):
+        for size in sorted(int(text) for text in parser.parse_args().sizes.split(",")):
             fill(path, filled, size)
             filled = size
-            rows.append(measure(path, size))
-            print("  ".join(f"{name} {value:.4g}" for name, value in rows[-1].items()), flush=True)
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
-    if arguments.png is not None:
-        draw(rows).savefig(arguments.png, format="png")
+            print("  ".join(f"{name} {value:.4g}" for name, value in measure(path, size).items()), flush=True)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from tools.consistency import CAMERA, T_CAM0_IMU, Flight, Scenario
+from tools.consistency import CAMERA, SAMPLES, T_CAM0_IMU, Flight, Scenario
 from vio.errors import VioError
 from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
@@ -114,7 +114,8 @@ def _fly(rig: Rig, start: Start, seed: int, scenario: Scenario) -> list[dict[str
     filt = Msckf(CAMERA, T_CAM0_IMU @ se3_inverse(se3_exp(off.xi)), settings, motion="imu")
     R, p, _ = flight.state(np.arange(scenario.frames, dtype=np.float64) * 1e-9 * _FRAME_NS)
     T = se3_from_parts(R, p)
-    samples = imu_samples(flight, scenario.frames, settings, off.offset_s, noise)
+    numbers = range(-SAMPLES * _BEFORE, SAMPLES * (scenario.frames + _AFTER))
+    samples, _ = flight.imu(numbers, noise, settings, clock_s=off.offset_s)
     terms = walked_terms(off, len(samples), settings, np.random.default_rng(20_000 + seed))
     samples = [_misread(sample, own) for sample, own in zip(samples, terms, strict=True)]
     fed_ns, ahead_s = -1_000_000_000, 0.0
@@ -128,28 +129,9 @@ def _fly(rig: Rig, start: Start, seed: int, scenario: Scenario) -> list[dict[str
         estimate = filt.estimate()
         ahead_s = estimate.time_offset_s or 0.0
         if k + 1 in (scenario.frames // 2, scenario.frames):
-            now = terms[min((k + _BEFORE) * (_FRAME_NS // _IMU_NS), len(terms) - 1)]
+            now = terms[min(SAMPLES * (k + _BEFORE), len(terms) - 1)]
             halves.append(calibration_nees(estimate, off) | imu_nees(filt, now))
     return halves
-
-
-def imu_samples(
-    flight: Flight, frames: int, settings: MsckfSettings, offset_s: float, noise: np.random.Generator
-) -> list[ImuSample]:
-    """Return samples at 200 Hz from before the first frame to after the last, stamped `offset_s` ahead of the frames.
-
-    Biases are drawn from the prior, and then walk.
-    """
-    s, per_frame = settings, _FRAME_NS // _IMU_NS
-    k = np.arange(-_BEFORE * per_frame, (frames + _AFTER) * per_frame)
-    dt = 1e-9 * _IMU_NS
-    steps = noise.normal(0, 1, (len(k), 6)) * np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) * np.sqrt(dt)
-    steps[0] = noise.normal(0, np.repeat([s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2], 3))
-    white = np.repeat([s.gyro_noise_density, s.accel_noise_density], 3) / np.sqrt(dt)
-    exact = np.concatenate(flight.rates(np.asarray(k * dt, dtype=np.float64)), axis=1)
-    read = exact + np.cumsum(steps, axis=0) + noise.normal(0, 1, (len(k), 6)) * white
-    stamps = _IMU_NS * k + round(1e9 * offset_s)
-    return [ImuSample(t, x[:3], x[3:]) for t, x in zip(stamps.tolist(), read, strict=True)]
 
 
 def walked_terms(off: Off, count: int, settings: MsckfSettings, noise: np.random.Generator) -> FloatArray:
@@ -237,10 +219,9 @@ def _mean_text(values: list[float]) -> str:
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=min(len(values) - 1, 1)) / np.sqrt(len(values)):.2f}"
 
 
+@one_blas_thread()
 def _fly_alone(job: tuple[Rig, Start, int, float, float]) -> list[dict[str, float]]:
-    rig, start, seed, seconds, pixel_sigma_px = job
-    with one_blas_thread():
-        return fly(rig, start, seed, seconds=seconds, pixel_sigma_px=pixel_sigma_px)
+    return fly(*job[:3], seconds=job[3], pixel_sigma_px=job[4])
 
 
 def main() -> int:

@@ -6,7 +6,7 @@
 
 Monte-Carlo flights through exact points, with exact noise: pixels, IMU and its biases, velocities, and the place and
 yaw of the start are drawn from the very distributions that the filter assumes. Each flight is flown once by every
-variant, with the same noise. Writes FOLDER/table.md (also printed), FOLDER/figures.json and FOLDER/consistency.png.
+variant, with the same noise. Writes FOLDER/table.md (also printed) and FOLDER/consistency.png.
 docs/notes/consistency.md says what the variants are; its equation numbers are cited here.
 """
 
@@ -17,15 +17,14 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 from unittest.mock import patch
 
 import numpy as np
@@ -76,21 +75,12 @@ Variant = Literal["standard", "first estimates", "right-invariant", "right-invar
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
 _FRAME_NS, _IMU_NS = 50_000_000, 5_000_000
+SAMPLES = _FRAME_NS // _IMU_NS  # of the IMU in a frame
 # Standard deviations of the first position, m, and of the first yaw, rad.
 _START: dict[Start, tuple[float, float]] = {"uncertain": (0.05, np.radians(1.0)), "known": (0.0, 0.0)}
-_MOTIONS: tuple[Motion, ...] = ("imu", "none", "velocity")
-_VARIANTS: tuple[Variant, ...] = (
-    "standard",
-    "first estimates",
-    "right-invariant",
-    "right-invariant, noise learned",
-)
-_COLOURS = {
-    "standard": "#c44e52",
-    "first estimates": "#d9822b",
-    "right-invariant": "#1f5fbf",
-    "right-invariant, noise learned": "#111111",
-}
+_MOTIONS: tuple[Motion, ...] = get_args(Motion)
+_VARIANTS: tuple[Variant, ...] = get_args(Variant)
+_COLOURS = dict(zip(_VARIANTS, ("#c44e52", "#d9822b", "#1f5fbf", "#111111"), strict=True))
 _MEASURES = {"pose": 6, "position": 3, "orientation": 3, "yaw": 1, "velocity": 3, "gyro bias": 3, "accel bias": 3}
 
 
@@ -398,22 +388,27 @@ class Flight:
         return omega, (np.swapaxes(R, 1, 2) @ a[..., None])[..., 0]
 
     def imu(
-        self, frames: int, noise: np.random.Generator, s: MsckfSettings, offset_s: float = 0.0
+        self, samples: range, noise: np.random.Generator, s: MsckfSettings, offset_s: float = 0.0, clock_s: float = 0.0
     ) -> tuple[list[ImuSample], FloatArray]:
-        """Samples at 200 Hz, and the biases (K, 6) in them: drawn from the prior, then walking."""
-        n, dt = frames * (_FRAME_NS // _IMU_NS) + 1, _IMU_NS * 1e-9
+        """Samples at 200 Hz, and the biases (K, 6) in them: drawn from the prior, then walking.
+
+        Args:
+            samples: their numbers; 0 is at the first frame.
+            noise: of sensor and biases.
+            s: what they are drawn from.
+            offset_s: of the samples against the frames.
+            clock_s: by which their stamps are ahead of the frames' clock.
+        """
+        k, n, dt = np.array(samples), len(samples), _IMU_NS * 1e-9
         walk = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) * np.sqrt(dt)
         steps = noise.normal(0, 1, (n, 6)) * walk
         steps[0] = noise.normal(0, np.repeat([s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2], 3))
         bias = np.cumsum(steps, axis=0)
         white = np.repeat([s.gyro_noise_density, s.accel_noise_density], 3) / np.sqrt(dt)
-        read = (
-            np.concatenate(self.rates(np.arange(n, dtype=np.float64) * dt + offset_s), axis=1)
-            + bias
-            + noise.normal(0, 1, (n, 6)) * white
-        )
-        offset_ns = round(offset_s * 1e9)
-        return [ImuSample(k * _IMU_NS + offset_ns, x[:3], x[3:]) for k, x in enumerate(read)], bias
+        exact = np.concatenate(self.rates(k.astype(np.float64) * dt + offset_s), axis=1)
+        read = exact + bias + noise.normal(0, 1, (n, 6)) * white
+        stamps = k * _IMU_NS + round(1e9 * offset_s) + round(1e9 * clock_s)
+        return [ImuSample(t, x[:3], x[3:]) for t, x in zip(stamps.tolist(), read, strict=True)], bias
 
     def velocities(self, frames: int, noise: np.random.Generator, s: MsckfSettings) -> list[VelocitySample]:
         """Samples at the frames, with white noise and a constant bias of the rate."""
@@ -487,8 +482,8 @@ def _fly(job: Job, learn: bool) -> Record:
     samples: list[MotionSample] = []
     bias: FloatArray = np.zeros((scenario.frames, 6))
     if job.motion == "imu":
-        imu, walked = flight.imu(scenario.frames, noise, settings, scenario.imu_offset_s)
-        samples, bias = list(imu), walked[:: _FRAME_NS // _IMU_NS][: scenario.frames]
+        imu, walked = flight.imu(range(SAMPLES * scenario.frames + 1), noise, settings, scenario.imu_offset_s)
+        samples, bias = list(imu), walked[::SAMPLES][: scenario.frames]
     elif job.motion == "velocity":
         samples = list(flight.velocities(scenario.frames, noise, settings))
     start = np.zeros(6)
@@ -564,7 +559,7 @@ def _record(
 
 
 def main() -> int:
-    """Fly everything and write the tables, the figures of all groups and the picture."""
+    """Fly everything and write the tables and the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     usual = Scenario()
     parser.add_argument("--out", type=Path, required=True, help="folder for the results")
@@ -593,8 +588,6 @@ def main() -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     table = _tables(summaries)
     (args.out / "table.md").write_text(table, encoding="utf-8")
-    plain = json.dumps([asdict(s) for s in summaries], default=lambda a: np.round(a, 5).tolist())
-    (args.out / "figures.json").write_text(plain + "\n", encoding="utf-8")
     _plot(args.out / "consistency.png", summaries)
     print(table)
     return 0
@@ -640,9 +633,9 @@ def _fly_all(jobs: list[Job], processes: int) -> list[Record]:
     return records
 
 
+@one_blas_thread()
 def _fly_alone(job: Job) -> Record:
-    with one_blas_thread():
-        return fly(job)
+    return fly(job)
 
 
 def _summary(records: list[Record]) -> Summary:

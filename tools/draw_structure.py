@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -49,10 +50,9 @@ def read_packages(root: Path) -> dict[str, Package]:
     packages = {}
     for name, paths in files.items():
         texts = [path.read_text(encoding="utf-8") for path in paths]
-        imported = {_package_of(module) for text in texts for module in _imports(text)} & set(files)
-        packages[name] = Package(
-            name, sum(len(t.splitlines()) for t in texts), len(paths), frozenset(imported - {name})
-        )
+        imported = frozenset({_package_of(module) for text in texts for module in _imports(text)} & set(files))
+        lines = sum(len(text.splitlines()) for text in texts)
+        packages[name] = Package(name, lines, len(paths), imported - {name})
     return packages
 
 
@@ -127,27 +127,14 @@ def draw(packages: Mapping[str, Package], path: Path) -> None:
     for name, other in [*drawn_arrows(straight), *closing]:
         colour = _CLOSING if (name, other) in closing else "#8a93a0"
         (x0, y0), (x1, y1) = place[name], place[other]
-        axes.annotate(
-            "",
-            xy=(x1 + _WIDTH / 2, y1 + _HEIGHT),
-            xytext=(x0 + _WIDTH / 2, y0),
-            # A long way goes around the packages between.
-            arrowprops={
-                "connectionstyle": f"arc3,rad={0.12 if y0 - y1 > 1.5 else 0}",
-                "arrowstyle": "-|>",
-                "color": colour,
-                "lw": 0.9,
-                "shrinkA": 0,
-                "shrinkB": 0,
-            },
-            zorder=1,
-        )
+        rad = 0.12 if y0 - y1 > 1.5 else 0  # a long way goes around the packages between
+        style: dict[str, Any] = {"connectionstyle": f"arc3,rad={rad}", "arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0}
+        end, start = (x1 + _WIDTH / 2, y1 + _HEIGHT), (x0 + _WIDTH / 2, y0)
+        axes.annotate("", end, start, arrowprops={**style, "color": colour, "lw": 0.9}, zorder=1)
     for name, (x, y) in place.items():
         colour = _GROUND if name in FOUNDATION else _COLOURS.get(name, _PLAIN)
-        box = FancyBboxPatch(
-            (x, y), _WIDTH, _HEIGHT, boxstyle="round,pad=0,rounding_size=0.06", fc=colour, ec="#55606e"
-        )
-        axes.add_patch(box)
+        corners = "round,pad=0,rounding_size=0.06"
+        axes.add_patch(FancyBboxPatch((x, y), _WIDTH, _HEIGHT, boxstyle=corners, fc=colour, ec="#55606e"))
         package = packages[name]
         label = name.removeprefix("vio.") + ("/" if package.files > 1 else "")
         axes.text(x + _WIDTH / 2, y + 0.39, label, ha="center", va="center", fontsize=9, weight="bold")

@@ -7,14 +7,8 @@ import subprocess
 import sys
 
 INSTALLERS = {"pip", "wheel"}  # not the project's business
-EXTRAS = (
-    "pytest",
-    "torch",
-    "kornia",
-    "distributed",
-    "cyclonedds",
-    "pyrealsense2",
-)  # one package, at least, of each extra
+# One package, at least, of each extra.
+EXTRAS = ("pytest", "torch", "kornia", "distributed", "cyclonedds", "pyrealsense2")
 
 
 def main() -> int:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +27,7 @@ from vio.geometry.distortion import rectified_camera, unproject_pixel
 from vio.geometry.lie import FloatArray
 from vio.numerics.threads import one_blas_thread
 from vio.protocols import Frontend
-from vio.records import FrontendOutput, Image, IntArray, Observations, StereoFrame
+from vio.records import Image, IntArray, Observations, StereoFrame
 from vio.sim.render import View, cast, correspondence, inside_image, observe, surface_points
 from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_of, default_workers, plan
 from vio.sim.sequence import SimulatedRecording, Simulation, views
@@ -59,20 +58,16 @@ class Tally:
     age: list[IntArray] = field(default_factory=list)  # (N,) frames since birth, beside `since_birth`
     disparity: list[FloatArray] = field(default_factory=list)  # (N,) px
     row: list[FloatArray] = field(default_factory=list)  # (N,) px, right row minus true
-    order: list[FloatArray] = field(default_factory=list)  # (N,) ul - ur
     features: list[int] = field(default_factory=list)  # features in each frame
     matched: list[int] = field(default_factory=list)  # features with a right match in each frame
     frames_of: dict[int, int] = field(default_factory=dict)  # number of frames of each feature
-    crossed: dict[int, int] = field(
-        default_factory=dict
-    )  # largest number of consecutive frames of each feature on another surface
+    # Largest number of consecutive frames of each feature on another surface.
+    crossed: dict[int, int] = field(default_factory=dict)
     trackable: int = 0  # features whose point is visible in the next frame
     tracked: int = 0  # of these, tracked there within _OUTLIER_PX
-    kept: int = 0  # of these, tracked there at any error
     corners: int = 0  # repeatable corners
     corners_covered: int = 0  # of these, covered by one track in both images
     reused: int = 0  # ids that reappeared after they were lost
-    ms: list[float] = field(default_factory=list)
 
 
 @dataclass
@@ -91,12 +86,14 @@ def evaluate(simulation: Simulation, frames: Iterable[StereoFrame], frontend: Fr
     before: Observations | None = None
     image_before: Image | None = None
     for frame in frames:
-        start = time.perf_counter()
-        output = frontend.process(frame)
-        tally.ms.append(1e3 * (time.perf_counter() - start))
-        now = output.observations
+        now = frontend.process(frame).observations
         now = now.take(~now.stale)
-        _count(tally, output, now, before)
+        tally.features.append(len(now))
+        tally.matched.append(int(now.has_right.sum()))
+        alive = set() if before is None else set(before.ids.tolist())
+        for name in now.ids.tolist():
+            tally.reused += name in tally.frames_of and name not in alive
+            tally.frames_of[name] = tally.frames_of.get(name, 0) + 1
         left, right = views(simulation, int(simulation.taken_ns[frame.index]))
         _evaluate_stereo(tally, simulation, now, left, right)
         _evaluate_life(tally, birth, beyond, simulation, now, left, frame.index)
@@ -109,22 +106,12 @@ def evaluate(simulation: Simulation, frames: Iterable[StereoFrame], frontend: Fr
     return tally
 
 
-def _count(tally: Tally, output: FrontendOutput, now: Observations, before: Observations | None) -> None:
-    tally.features.append(len(now))
-    tally.matched.append(int(now.has_right.sum()))
-    alive = set() if before is None else set(before.ids.tolist())
-    for name in now.ids.tolist():
-        tally.reused += name in tally.frames_of and name not in alive
-        tally.frames_of[name] = tally.frames_of.get(name, 0) + 1
-
-
 def _evaluate_stereo(tally: Tally, simulation: Simulation, now: Observations, left: View, right: View) -> None:
     seen = now.take(now.has_right)
     true, visible = correspondence(simulation.world, left, right, seen.z[:, :2])
     error = seen.z[:, 2:] - true
     tally.disparity.append(-error[visible, 0])
     tally.row.append(error[visible, 1])
-    tally.order.append(seen.z[:, 0] - seen.z[:, 2])
 
 
 def _evaluate_step(
@@ -136,7 +123,6 @@ def _evaluate_step(
     tally.step.append(error[visible[i]])
     trackable = visible & inside_image(left.camera, true, margin_px=_MARGIN_PX)
     tally.trackable += int(trackable.sum())
-    tally.kept += int(trackable[i].sum())
     tally.tracked += int((trackable[i] & (np.linalg.norm(error, axis=1) <= _OUTLIER_PX)).sum())
 
 
@@ -245,43 +231,29 @@ def figures(tally: Tally) -> dict[str, Any]:
     lives = np.array(list(tally.frames_of.values()) or [0])
     tracked = int((lives > 1).sum())
     crossed = np.array(list(tally.crossed.values()), dtype=int)
-    order = _joined(tally.order, 1)
     return {
         "frames": len(tally.features),
         "features_median": float(np.median(tally.features)),
         "features_least": int(min(tally.features)),
         "stereo_median": float(np.median(tally.matched)),
         "stereo_least": int(min(tally.matched)),
-        "step": _errors(_joined(tally.step, 2)),
-        "since_birth": _errors(_joined(tally.since_birth, 2)),
-        "disparity": _errors(_joined(tally.disparity, 1)),
-        "row": _errors(_joined(tally.row, 1)),
-        "least_disparity_px": float(order.min()) if len(order) else None,
-        "tracks": len(tally.frames_of),
+        "step": _errors(tally.step),
+        "since_birth": _errors(tally.since_birth),
+        "disparity": _errors(tally.disparity),
+        "row": _errors(tally.row),
         "life_mean": float(lives.mean()),
-        "life_median": float(np.median(lives)),
-        "life_95": float(np.percentile(lives, 95)),
-        "life_of_an_observation": float((lives**2).sum() / max(lives.sum(), 1)),
-        "survival": tally.kept / tally.trackable if tally.trackable else None,
         "recall": tally.tracked / tally.trackable if tally.trackable else None,
         "corner_recall": tally.corners_covered / tally.corners if tally.corners else None,
         "crossed": len(crossed) / tracked if tracked else None,
         "crossed_and_kept": int((crossed > _CROSSED_FRAMES).sum()) / tracked if tracked else None,
-        "ids_reused": tally.reused,
-        "ms_median": float(np.median(tally.ms)),
     }
 
 
-def _joined(parts: Sequence[FloatArray], columns: int) -> FloatArray:
-    if columns == 1:
-        return np.concatenate([np.zeros(0), *parts])
-    return np.concatenate([np.zeros((0, columns)), *parts])
-
-
-def _errors(error: FloatArray) -> dict[str, Any] | None:
-    """Median, 95 % and outlier share of the absolute errors (N,) or (N, 2), and their signed median."""
-    if len(error) == 0:
+def _errors(parts: Sequence[FloatArray]) -> dict[str, Any] | None:
+    """Median, 95 % and outlier share of the absolute errors (N,) or (N, 2) of all frames, and their signed median."""
+    if not any(map(len, parts)):
         return None
+    error = np.concatenate(parts)
     size = np.abs(error) if error.ndim == 1 else np.linalg.norm(error, axis=1)
     bias = np.median(error, axis=0)
     return {

@@ -59,6 +59,7 @@ _FIXED = {
     "imu_scale_sigma imu_misalignment_sigma_deg extrinsic_rotation_walk extrinsic_translation_walk time_offset_walk",
 }
 _PRESETS = Path(__file__).parent / "presets"  # packaged configurations, by name
+_TYPES = {float: "a number", int: "a whole number", bool: "true or false", str: "text", Path: "a path"}
 _MOST_NAMED = 8  # settings in the message on an unknown one
 _MOST_SHOWN = 200  # characters of a wrong value in a message
 
@@ -163,9 +164,8 @@ def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: s
         current = getattr(section, key)
         if is_dataclass(current):
             if not isinstance(value, Mapping):
-                raise ConfigError(
-                    f"{where}: '{path}' is a section; give its settings, such as {path}.{_first(current)}"
-                )
+                example = f"{path}.{fields(current)[0].name}"
+                raise ConfigError(f"{where}: '{path}' is a section; give its settings, such as {example}")
             changes[key] = merge(current, value, where=where, prefix=f"{path}.", root=root)
         else:
             changes[key] = _checked(value, hints[key], path, where)
@@ -260,7 +260,8 @@ def _checked(value: Any, hint: Any, path: str, where: str) -> Any:
         if hint is float and value != value:
             raise ConfigError(f"{where}: {path} must be a number, got nan")
         return value
-    raise ConfigError(f"{where}: {path} takes {_type_name(hint)}, got {_short(repr(value))}{_number_hint(value, hint)}")
+    got = f"{_short(repr(value))}{_number_hint(value, hint)}"
+    raise ConfigError(f"{where}: {path} takes {_TYPES.get(hint, hint)}, got {got}")
 
 
 def _number_hint(value: Any, hint: Any) -> str:
@@ -273,12 +274,6 @@ def _number_hint(value: Any, hint: Any) -> str:
             plain = yaml.safe_dump(number).split()[0]  # 1.0e+300, where Python writes 1e+300
             return f" (to YAML 1.1 this is text; write {plain})"
     return ""
-
-
-def _type_name(hint: Any) -> str:
-    return {float: "a number", int: "a whole number", bool: "true or false", str: "text", Path: "a path"}.get(
-        hint, str(hint)
-    )
 
 
 def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
@@ -298,10 +293,6 @@ def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
             return f"; did you mean '{found[0]}'?"
     more = f" and {len(names) - _MOST_NAMED} more, see vio config --all" if len(names) > _MOST_NAMED else ""
     return f"; valid here: {', '.join(prefix + name for name in names[:_MOST_NAMED])}{more}"
-
-
-def _first(section: Any) -> str:
-    return fields(section)[0].name
 
 
 def _plain(value: Any) -> Any:

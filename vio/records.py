@@ -183,28 +183,18 @@ def observations(
         given = np.asarray(ids).reshape(-1)
         if given.size and given.dtype.kind not in "iu":
             raise DataError(f"frame {frame_index}: ids are whole numbers, got {given.dtype}")
-        return _observations(frame_index, time_ns, given.astype(np.int64), z, has_right, stale)
+        ids_, n = given.astype(np.int64), given.size
+        z_ = np.asarray(z, dtype=np.float64).reshape(-1, 4)
+        right = np.ones(n, dtype=np.bool_) if has_right is None else np.asarray(has_right, dtype=np.bool_)
+        old = np.zeros(n, dtype=np.bool_) if stale is None else np.asarray(stale, dtype=np.bool_)
+        index, stamp_ns = int(frame_index), int(time_ns)
     except (ValueError, TypeError, OverflowError) as error:
         raise DataError(f"frame {frame_index}: no observations can be made of this ({error})") from error
-
-
-def _observations(
-    frame_index: int,
-    time_ns: int,
-    ids_: IntArray,
-    z: npt.ArrayLike,
-    has_right: npt.ArrayLike | None,
-    stale: npt.ArrayLike | None,
-) -> Observations:
-    n = len(ids_)
-    z_ = np.asarray(z, dtype=np.float64).reshape(-1, 4)
-    right = np.ones(n, dtype=np.bool_) if has_right is None else np.asarray(has_right, dtype=np.bool_)
-    old = np.zeros(n, dtype=np.bool_) if stale is None else np.asarray(stale, dtype=np.bool_)
     if not (len(z_) == n and right.shape == (n,) and old.shape == (n,)):
         raise DataError(f"observations disagree in length: {n} ids, {len(z_)} z, {right.shape}, {old.shape} masks")
     if len(np.unique(ids_)) != n:
         raise DataError(f"frame {frame_index}: an id occurs twice among {n} observations")
-    return Observations(int(frame_index), int(time_ns), ids_, z_, right, old)
+    return Observations(index, stamp_ns, ids_, z_, right, old)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin,
 from vio.errors import ConfigError
 
 T = TypeVar("T")
+_hints = cache(get_type_hints)
 
 # No setting means anything beyond these sizes, in its unit; their squares would overflow, vanish or fill the memory.
 _LARGEST, _SMALLEST = 10**6, 1e-9
@@ -83,11 +84,6 @@ class Section:
             _check(f"{self.section}.{f.name}".lstrip("."), getattr(self, f.name), f.metadata.get("range", Range()))
 
 
-@cache
-def _hints(section: type) -> dict[str, Any]:
-    return get_type_hints(section)
-
-
 def _fits(value: Any, hint: Any) -> bool:
     """Return whether a value is of a setting's type; a whole number is a number, and NumPy's numbers are."""
     if get_origin(hint) in (Union, UnionType):
@@ -104,9 +100,8 @@ def _wanted(hint: Any) -> str:
         return " or ".join(_wanted(member) for member in get_args(hint))
     if get_origin(hint) is Literal:
         return f"one of {', '.join(get_args(hint))}"
-    return {int: "a whole number", float: "a number", bool: "True or False", type(None): "None"}.get(
-        hint, hint.__name__
-    )
+    names = {int: "a whole number", float: "a number", bool: "True or False", type(None): "None"}
+    return names.get(hint, hint.__name__)
 
 
 def _check(key: str, value: Any, allowed: Range) -> None:

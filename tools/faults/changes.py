@@ -88,9 +88,14 @@ def with_pairs(change: PairChange) -> EventChange:
     return changed
 
 
+def pairs(make: Callable[..., PairChange], *args: Any, **options: Any) -> Variant:
+    """The pairs changed by what `make(dataset, period, …)` returns for a recording."""
+    return lambda dataset, period: with_events(dataset, with_pairs(make(dataset, period, *args, **options)))
+
+
 def every_pair(change: PairChange) -> Variant:
     """Every pair changed."""
-    return lambda dataset, period: with_events(dataset, with_pairs(change))
+    return pairs(lambda dataset, period: change)
 
 
 def every_image(change: Callable[[Image], Image]) -> Variant:
@@ -105,14 +110,9 @@ def seeded(variant: Callable[[np.random.Generator], Variant]) -> Variant:
 
 def pairs_during(change: PairChange) -> Variant:
     """The pairs of the fault's period changed."""
-
-    def variant(dataset: Dataset, period: Period) -> Changed:
-        def within(frame: StereoFrame, left: Image, right: Image) -> Pair:
-            return change(frame, left, right) if period.holds(frame.time_ns) else (left, right)
-
-        return with_events(dataset, with_pairs(within))
-
-    return variant
+    return pairs(
+        lambda dataset, period: lambda frame, *pair: change(frame, *pair) if period.holds(frame.time_ns) else pair
+    )
 
 
 def imu_samples(change: SampleChange, *, during: bool = False, after: bool = False) -> Variant:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -12,7 +12,6 @@ import numpy as np
 from tools.faults.changes import (
     Changed,
     Pair,
-    PairChange,
     Period,
     Variant,
     blurred,
@@ -105,28 +104,22 @@ def _every_second(dataset: Dataset, period: Period) -> Changed:
     return with_frames(dataset, np.arange(len(dataset.recording.frame_times_ns)) % 2 == 0)
 
 
-def _night(rng: np.random.Generator) -> Callable[[Image], Image]:
-    return lambda image: to_gray(0.3 * image + rng.normal(0.0, 3.0, image.shape))
+def _night(rng: np.random.Generator, image: Image) -> Image:
+    return to_gray(0.3 * image + rng.normal(0.0, 3.0, image.shape))
 
 
-def _rain(rng: np.random.Generator) -> Callable[[Image], Image]:
-    def streaks(image: Image) -> Image:
-        out = image.copy()
-        for u, v, du, dv, gray in _places(rng, image, 250, [(-2, 3), (4, 16), (180, 256)]):
-            cv2.line(out, (u, v), (u + du, v + dv), gray)
-        return out
-
-    return streaks
+def _rain(rng: np.random.Generator, image: Image) -> Image:
+    out = image.copy()
+    for u, v, du, dv, gray in _places(rng, image, 250, [(-2, 3), (4, 16), (180, 256)]):
+        cv2.line(out, (u, v), (u + du, v + dv), gray)
+    return out
 
 
-def _snow(rng: np.random.Generator) -> Callable[[Image], Image]:
-    def flakes(image: Image) -> Image:
-        out = image.copy()
-        for u, v, radius, gray in _places(rng, image, 150, [(1, 5), (200, 256)]):
-            cv2.circle(out, (u, v), radius, gray, -1)
-        return out
-
-    return flakes
+def _snow(rng: np.random.Generator, image: Image) -> Image:
+    out = image.copy()
+    for u, v, radius, gray in _places(rng, image, 150, [(1, 5), (200, 256)]):
+        cv2.circle(out, (u, v), radius, gray, -1)
+    return out
 
 
 def _places(rng: np.random.Generator, image: Image, count: int, ranges: list[tuple[int, int]]) -> list[list[int]]:
@@ -166,11 +159,8 @@ def _jumping_gains(frame: StereoFrame, left: Image, right: Image) -> Pair:
     return with_gain(next(gains))(left), with_gain(next(gains))(right)
 
 
-def _random_gains(rng: np.random.Generator) -> PairChange:
-    return lambda frame, left, right: (
-        with_gain(rng.uniform(0.35, 1.4))(left),
-        with_gain(rng.uniform(0.35, 1.4))(right),
-    )
+def _random_gains(rng: np.random.Generator, frame: StereoFrame, left: Image, right: Image) -> Pair:
+    return with_gain(rng.uniform(0.35, 1.4))(left), with_gain(rng.uniform(0.35, 1.4))(right)
 
 
 HEALTHY: dict[str, Variant] = {
@@ -179,18 +169,18 @@ HEALTHY: dict[str, Variant] = {
     "reverse": _reverse,
     "half": _half,
     "every 2nd": _every_second,
-    "night": seeded(lambda rng: every_image(_night(rng))),
+    "night": seeded(lambda rng: every_image(partial(_night, rng))),
     "contrast 0.5": every_image(with_gain(0.5, 64.0)),
     "contrast 1.6": every_image(with_gain(1.6, -76.8)),
     "fog": every_image(with_gain(0.25, 118.0)),
     "blur": every_image(partial(blurred, sigma_px=2.0)),
     "JPEG 15": every_image(_jpeg),
-    "rain": seeded(lambda rng: every_image(_rain(rng))),
-    "snow": seeded(lambda rng: every_image(_snow(rng))),
+    "rain": seeded(lambda rng: every_image(partial(_rain, rng))),
+    "snow": seeded(lambda rng: every_image(partial(_snow, rng))),
     "hood": every_image(_hood),
     "dirty right": every_pair(lambda frame, left, right: (left, _dirty(right))),
     "right gain": every_pair(lambda frame, left, right: (left, with_gain(0.55, 10.0)(right))),
     "swinging gains": every_pair(_swinging_gains),
     "jumping gains": every_pair(_jumping_gains),
-    "random gains": seeded(lambda rng: every_pair(_random_gains(rng))),
+    "random gains": seeded(lambda rng: every_pair(partial(_random_gains, rng))),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -33,11 +33,11 @@ from vio.errors import DataError
 from vio.files.atomic import atomic_write_text, check_writable, locked_folder
 from vio.files.inputs import read_input
 from vio.files.printable import json_text
+from vio.protocols import Progress
 
 log = logging.getLogger(__name__)
 RESULTS = "bench.json"
 FILES = (RESULTS, "tables.md", "tables.tex", "table.csv", "runs.csv", "report.html")
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +70,6 @@ class Result:
 def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: None) -> Result:
     """Run all tasks of a suite that have no result yet, and write tables and report.
 
-    Args:
-        suite: what to run.
-        place: where.
-        progress: called with the number of tasks done and of all tasks.
-
     Raises:
         VioError: the folders cannot be written, or the scheduler is missing.
     """
@@ -100,7 +95,12 @@ def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: N
         for sequence, why in {task.sequence: task.failure for task in tasks if task.failure is not None}.items():
             log.warning("%s cannot be run: %s", sequence, why)
         progress(len(tasks) - len(missing), len(tasks))
-        for key, record in _results(missing, place):
+        cache = str(place.cache.absolute())
+        if place.scheduler is not None and missing:
+            results = run_on_dask(missing, cache, address=place.scheduler)
+        else:
+            results = run_here(missing, cache, workers=place.workers)
+        for key, record in results:
             if record.pop("keep", True):
                 store.put(key, record)
             records[key] = _without_poses(record)
@@ -123,13 +123,6 @@ def read_bench(folder: Path) -> tuple[tuple[Outcome, ...], dict[str, Any]]:
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise DataError(f"{path}: is damaged ({error}); repeat the bench, finished tasks are not run again") from error
     return outcomes, facts
-
-
-def _results(jobs: Mapping[str, dict[str, Any]], place: Place) -> Iterator[tuple[str, Record]]:
-    cache = str(place.cache.absolute())
-    if place.scheduler is not None and jobs:
-        return run_on_dask(jobs, cache, address=place.scheduler)
-    return run_here(jobs, cache, workers=place.workers)
 
 
 def _wrong_references(jobs: Mapping[str, dict[str, Any]]) -> dict[str, str]:

@@ -36,17 +36,10 @@ def run_here(
 def run_on_dask(
     jobs: Mapping[str, Job], cache: str, *, address: str, wait_s: float = 300.0, perform: Perform = perform_job
 ) -> Iterator[tuple[str, Record]]:
-    """Yield key and record of each job as it is done by the workers of a Dask scheduler.
+    """Yield key and record of each job as it is done by the workers of the Dask scheduler at an address.
 
-    A worker that is lost costs its tasks a repetition. A scheduler that is lost is waited for, and what has not come
-    back is sent again.
-
-    Args:
-        jobs: by key.
-        cache: folder on the workers for rendered recordings and temporary files.
-        address: of the scheduler, such as tcp://10.0.0.1:8786.
-        wait_s: how long a lost scheduler is waited for.
-        perform: what a worker does with a job.
+    A worker that is lost costs its tasks a repetition. A scheduler that is lost is waited for, `wait_s` at most, and
+    what has not come back is sent again. `cache` is a folder on the workers.
 
     Raises:
         MissingDependencyError: Dask is not installed.
@@ -70,6 +63,10 @@ def run_on_dask(
                 for key, record in _session(client, pending, cache, perform):
                     del pending[key]
                     yield key, record
+        except ImportError as error:
+            raise VioError(
+                f"a Dask worker cannot import stereo-vio ({error}); install it there, the same version"
+            ) from error
         except (OSError, TimeoutError, ValueError) as error:
             if first or time.monotonic() - last_s > wait_s:
                 raise VioError(
@@ -90,12 +87,7 @@ def _check_workers(client: Any, jobs: Mapping[str, Job]) -> None:
     wanted = next(((job["code"], job["packages"]) for job in jobs.values() if "code" in job), None)
     if wanted is None:
         return
-    try:
-        found: dict[str, tuple[str, dict[str, str]]] = client.run(code_and_packages)
-    except ImportError as error:
-        raise VioError(
-            f"a Dask worker cannot import stereo-vio ({error}); install it there, the same version"
-        ) from error
+    found: dict[str, tuple[str, dict[str, str]]] = client.run(code_and_packages)
     for address, (code, packages) in found.items():
         differ = [
             f"{name} {packages.get(name)}" for name, version in wanted[1].items() if packages.get(name) != version
@@ -124,9 +116,5 @@ def _session(client: Any, jobs: Mapping[str, Job], cache: str, perform: Perform)
                 return
             except KilledWorker as error:
                 record = failed(" ".join(str(error).split()), keep=False)
-            except ImportError as error:
-                raise VioError(
-                    f"a Dask worker cannot import stereo-vio ({error}); install it there, the same version"
-                ) from error
             future.release()
             yield key, record

@@ -33,18 +33,13 @@ _lock = threading.Lock()
 
 
 def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict[str, Any]:
-    """Do one task in a process of its own and return its record; a failure is part of the record.
-
-    Args:
-        job: of `vio.bench.tasks`.
-        cache: folder for rendered recordings and temporary files on this machine.
-        retries: how often a process that was killed is started again.
-    """
+    """Do one task in a process of its own, again where that is killed; return its record, which may be a failure."""
     try:
         Path(cache).mkdir(parents=True, exist_ok=True)
-        job = _with_render(job, Path(cache))
-        if job.get("first") is not None:
-            job["first"] = _with_render(job["first"], Path(cache))
+        job = {**job, "first": job.get("first") and dict(job["first"])}
+        for part in (job, job["first"]):
+            if part is not None and part["render"] is not None:
+                part["source"] = str(_rendered(part["render"], Path(cache)))
         lost = 0
         while True:
             record, number = _in_process(job, Path(cache))
@@ -63,11 +58,9 @@ def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict
 
 
 def failed(reason: str, *, keep: bool) -> dict[str, Any]:
-    """Return the record of a task that has no result.
+    """Return the record of a task that has no result, for a reason in one line.
 
-    Args:
-        reason: one line.
-        keep: whether the same would happen again, so that the task need not be repeated.
+    `keep`: the same would happen again, so that the task need not be repeated.
     """
     return {"figures": {}, "measured": {}, "failure": reason, "keep": keep, "curve": None, "trajectory": None}
 
@@ -98,10 +91,6 @@ def _in_process(job: dict[str, Any], cache: Path) -> tuple[dict[str, Any] | None
     return failed(f"the program failed, please report it: {last}", keep=False), 0
 
 
-def _with_render(job: dict[str, Any], cache: Path) -> dict[str, Any]:
-    return job if job["render"] is None else {**job, "source": str(_rendered(job["render"], cache))}
-
-
 def _rendered(render: dict[str, Any], cache: Path) -> Path:
     """Return the folder of a rendered recording, made now unless it is there.
 
@@ -109,7 +98,10 @@ def _rendered(render: dict[str, Any], cache: Path) -> Path:
         DataError: it cannot be rendered; the message is that of `vio render`.
     """
     folder = cache / "renders" / render["key"]
-    with _locked(cache / "renders", render["key"]):
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with folder.with_name(f".{folder.name}.lock").open("w") as stream:
+        if fcntl is not None:  # another process of this machine that has it is waited for
+            fcntl.flock(stream, fcntl.LOCK_EX)
         if not folder.is_dir():
             command = [sys.executable, "-m", "vio", "render", *render["words"], "--workers", "1", "--out", str(folder)]
             status, words = _call([*command, "--json"])
@@ -149,8 +141,10 @@ def _call(command: list[str], limit_s: float | None = None) -> tuple[int, str]:
 @contextlib.contextmanager
 def _task_folder(cache: Path) -> Iterator[Path]:
     """A folder for one task, locked meanwhile; those without a lock, which killed processes left, are removed."""
-    for left in cache.glob("task-*"):
-        _remove_unlocked(left)
+    for left in cache.glob("task-*") if fcntl is not None else ():
+        if (taken := lock_path(left)) is not None:
+            shutil.rmtree(left, ignore_errors=True)
+            os.close(taken)
     while True:
         folder = Path(tempfile.mkdtemp(prefix="task-", dir=cache))
         lock = lock_path(folder)
@@ -162,20 +156,3 @@ def _task_folder(cache: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
         if lock is not None:
             os.close(lock)
-
-
-def _remove_unlocked(folder: Path) -> None:
-    lock = lock_path(folder) if fcntl is not None else None
-    if lock is not None:
-        shutil.rmtree(folder, ignore_errors=True)
-        os.close(lock)
-
-
-@contextlib.contextmanager
-def _locked(folder: Path, name: str) -> Iterator[None]:
-    """Hold a lock of this machine; another process that has it is waited for."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / f".{name}.lock").open("w") as stream:
-        if fcntl is not None:
-            fcntl.flock(stream, fcntl.LOCK_EX)
-        yield

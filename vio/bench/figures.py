@@ -31,25 +31,23 @@ _MOST_CONDITION = 1e14
 def figures_of(evaluation: Evaluation, *, positions_only: bool) -> dict[str, Any]:
     """Return the figures of an evaluation by name; None where they are undefined.
 
-    Args:
-        evaluation: of the trajectory.
-        positions_only: the reference has no orientations; then all that needs them is None.
+    With `positions_only` the reference has no orientations, and all that needs them is None.
     """
-    scores = evaluation.as_dict()
+    scores, truth_m, scale_free = evaluation.as_dict(), evaluation.reference_path_length_m, evaluation.scale_free
     rpe, kitti = (None, None) if positions_only else (evaluation.rpe, evaluation.kitti)
     return {
         "ate_m": scores["ate_m"],
         "ate_max_m": evaluation.ate_m.max,
-        "ate_sim3_m": None if evaluation.scale_free is None else evaluation.scale_free.ate_m,
-        "scale_error_percent": None if evaluation.scale_free is None else 100 * abs(evaluation.scale_free.scale - 1),
+        "ate_sim3_m": None if scale_free is None else scale_free.ate_m,
+        "scale_error_percent": None if scale_free is None else 100 * abs(scale_free.scale - 1),
         "ate_deg": None if positions_only else scores["ate_deg"],
         "rpe_m": None if rpe is None else rpe.trans_rmse_m,
         "rpe_deg": None if rpe is None else rpe.rot_rmse_deg,
         "drift_percent": None if kitti is None else kitti.t_err_percent,
         "drift_deg_per_100m": None if kitti is None else kitti.r_err_deg_per_100m,
-        "length_ratio": _ratio(evaluation.matched_path_length_m, evaluation.reference_path_length_m),
+        "length_ratio": None if not truth_m > 0 else evaluation.matched_path_length_m / truth_m,
         "matched": evaluation.matched,
-        "reference_m": evaluation.reference_path_length_m,
+        "reference_m": truth_m,
     }
 
 
@@ -150,9 +148,7 @@ def absent_reasons(
 def error_curve(evaluation: Evaluation, times_ns: IntArray | None) -> dict[str, list[float]]:
     """Return the position error over time and its quantiles, for plots.
 
-    Args:
-        evaluation: of the trajectory.
-        times_ns: (N,) of its poses; None: frames stand for seconds.
+    `times_ns` (N,) are those of the trajectory's poses; None: frames stand for seconds.
     """
     rows = evaluation.rows
     seconds = rows.astype(float) if times_ns is None else (times_ns[rows] - times_ns[rows[0]]) / NS_PER_S
@@ -176,10 +172,6 @@ def between(trajectory: Trajectory, first_ns: int, last_ns: int) -> Trajectory:
         times_ns=trajectory.times_ns[inside],
         frame_indices=None if indices is None else indices[inside],
     )
-
-
-def _ratio(estimate_m: float, reference_m: float) -> float | None:
-    return estimate_m / reference_m if reference_m > 0 else None
 
 
 def _rounded(values: npt.ArrayLike, digits: int) -> list[float]:

@@ -44,11 +44,8 @@ def render_code_digest() -> str:
 def imported_code(root: str, later: tuple[str, ...]) -> list[str]:
     """Return our files that a module imports, and those that these import, relative to the installation.
 
-    Of the command line only the module itself counts.
-
-    Args:
-        root: name of the module.
-        later: prefixes of the names of modules whose imports inside functions count too.
+    Of the command line only the module itself counts. Imports inside functions count in modules whose names begin as
+    one of `later`.
     """
     found, names = set[str](), [root]
     while names:
@@ -119,11 +116,9 @@ class InputDigests:
     """Digests of recordings, remembered with sizes and times of change so that each content is read once."""
 
     def __init__(self, file: Path, identity: Identity = "content") -> None:
-        """Read what is remembered.
+        """Read what is remembered in a JSON file.
 
-        Args:
-            file: where digests are remembered, JSON.
-            identity: what a recording is known by: the bytes of its files, or their names, sizes and times of change.
+        A recording is known by the bytes of its files (content), or by their names, sizes and times of change (stat).
         """
         self._file, self._identity = file, identity
         self._known: dict[str, list[str]] = {}

@@ -50,16 +50,6 @@ class Covered:
         return None
 
 
-@dataclass(frozen=True, slots=True)
-class LoopScore:
-    """The loops of a map against the true poses of its keyframes."""
-
-    loops: int  # kept
-    false: int
-    error_m: float | None  # median over the loops
-    recall: float | None  # share of the keyframes at a place seen before of which a loop was kept; None: there is none
-
-
 def map_figures(
     result: RunResult,
     truth: Evaluation,
@@ -96,9 +86,7 @@ def map_figures(
     figures |= _causal_figures(causal, np.array(placed["covariance"]), reference, result.T_cam0_body, T_ref_map)
     if store is not None:
         T_true = truth.reference.in_imu(result.T_cam0_body).T_world_body
-        score = loop_score(store, frames[truth.rows], T_true, result.T_cam0_body)
-        figures |= {"loops": score.loops, "loops_false": score.false}
-        figures |= {"loop_error_m": score.error_m, "loop_recall": score.recall}
+        figures |= loop_figures(store, frames[truth.rows], T_true, result.T_cam0_body)
     return {name: value for name, value in figures.items() if value is not None}
 
 
@@ -157,14 +145,13 @@ def wrong_share(T: FloatArray, T_true: FloatArray) -> float:
     return float(np.mean((np.linalg.norm(E[:, :3, 3], axis=1) > _FALSE_M) | (rotation_angle_deg(E) > _FALSE_DEG)))
 
 
-def loop_score(store: Path, frames: IntArray, T_world_body: FloatArray, T_cam0_body: FloatArray) -> LoopScore:
-    """Score the loops of a map of one session.
+def loop_figures(
+    store: Path, frames: IntArray, T_world_body: FloatArray, T_cam0_body: FloatArray
+) -> dict[str, float | None]:
+    """Return figures of the loops that a map of one session kept, against the true poses (M, 4, 4) of frames (M,).
 
-    Args:
-        store: the map's file.
-        frames: (M,) numbers of the frames with a true pose.
-        T_world_body: (M, 4, 4) these poses.
-        T_cam0_body: (4, 4) extrinsics.
+    The error is the median over the loops; recall the share of the keyframes at a place seen before of which a loop was
+    kept, None where there is none. Extrinsics are (4, 4).
 
     Raises:
         DataError: the file is damaged.
@@ -185,12 +172,12 @@ def loop_score(store: Path, frames: IntArray, T_world_body: FloatArray, T_cam0_b
     times_ns = np.array([row.time_ns for row in keyframes], dtype=np.int64)
     revisits = _revisits(true, times_ns)
     found = {loop.second for loop in loops}
-    return LoopScore(
-        loops=len(loops),
-        false=false,
-        error_m=float(np.median([metres for metres, _ in errors])) if errors else None,
-        recall=len(revisits & found) / len(revisits) if revisits else None,
-    )
+    return {
+        "loops": len(loops),
+        "loops_false": false,
+        "loop_error_m": float(np.median([metres for metres, _ in errors])) if errors else None,
+        "loop_recall": len(revisits & found) / len(revisits) if revisits else None,
+    }
 
 
 def _revisits(T_world_cam: dict[int, FloatArray], times_ns: IntArray) -> set[int]:

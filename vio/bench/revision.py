@@ -27,11 +27,7 @@ def revision_folder(place: Place, revision: str) -> Path:
 def run_in_turns(suite: Suite, place: Place, revision: str, say: Callable[[str], None] = lambda text: None) -> None:
     """Run each sequence with the revision's code, then with ours; at last write the tables of both.
 
-    Args:
-        suite: what to run; its published figures are left out.
-        place: where; the revision's results are beside `out`.
-        revision: of the repository that this code is a checkout of.
-        say: called with the sequence that is run.
+    The revision's results are beside `place.out`; published figures are left out. `say` is called with what is run.
 
     Raises:
         ConfigError: this is no checkout, or it has no such revision.

@@ -38,9 +38,7 @@ class Sequence:
     stop: str | None = None
     lengths_m: tuple[float, ...] | None = None  # path lengths of the drift; None: KITTI's
     positions_only: bool = False  # the reference's orientations mean nothing: no relative errors, no NEES
-    exact_truth: bool | None = (
-        None  # far more accurate than the estimate, so that NEES says something; None: if rendered
-    )
+    exact_truth: bool | None = None  # so much better than the estimate that NEES says something; None: if rendered
     settings: Mapping[str, Any] | None = None  # over those of the configuration
     map: bool = False  # build a map, and score it
     map_of: str | None = None  # the sequence in whose map this one is localised, built beforehand in the same task
@@ -123,6 +121,7 @@ def suite_from(values: Any, path: Path) -> Suite:
             raise ConfigError(f"{where}: '{name}' is no name; use letters, digits and . _ + -")
     if not sequences:
         raise ConfigError(f"{where}: no sequences; name at least one")
+    limit = given.get("time_limit_s")
     suite = Suite(
         name=str(given.get("name", path.stem)),
         folder=path.resolve().parent,
@@ -133,15 +132,12 @@ def suite_from(values: Any, path: Path) -> Suite:
         titles={str(k): str(v) for k, v in _mapping(given.get("titles") or {}, where, "'titles'").items()},
         publisher=None if given.get("publisher") is None else str(given["publisher"]),
         success_percent=_positive(given.get("success_percent", SUCCESS_PERCENT), "success_percent", where),
-        time_limit_s=None
-        if given.get("time_limit_s") is None
-        else _positive(given["time_limit_s"], "time_limit_s", where),
+        time_limit_s=None if limit is None else _positive(limit, "time_limit_s", where),
     )
     for sequence in suite.sequences:
         if sequence.map_of is not None and (sequence.map or sequence.map_of not in sequences):
-            raise ConfigError(
-                f"{where}: map_of of {sequence.name} names another sequence of the suite, without map: true"
-            )
+            names = f"map_of of {sequence.name} names another sequence of the suite"
+            raise ConfigError(f"{where}: {names}, without map: true")
     for configuration in suite.configurations:
         for sequence in suite.sequences:
             config_of(suite, sequence, configuration, suite.seeds[0])
@@ -187,13 +183,13 @@ def chosen(suite: Suite, only: Iterable[str], configurations: Iterable[str]) -> 
 
 
 def _sequence(name: str, value: Any, where: str) -> Sequence:
-    given: dict[str, Any] = (
-        {"source": value} if isinstance(value, str) else dict(_mapping(value, where, f"sequence {name}"))
-    )
-    _only_keys(given, [f.name for f in fields(Sequence) if f.name != "name"], f"{where}, sequence {name}")
-    if ("source" in given) == ("render" in given):
-        raise ConfigError(f"{where}, sequence {name}: give either source or render")
     place = f"{where}, sequence {name}"
+    given: dict[str, Any] = {"source": value}
+    if not isinstance(value, str):
+        given = dict(_mapping(value, where, f"sequence {name}"))
+    _only_keys(given, [f.name for f in fields(Sequence) if f.name != "name"], place)
+    if ("source" in given) == ("render" in given):
+        raise ConfigError(f"{place}: give either source or render")
     if "render" in given:
         words = given["render"]
         given["render"] = tuple(shlex.split(words) if isinstance(words, str) else map(str, words))
@@ -233,9 +229,8 @@ def _published(value: Any, where: str, sequences: Iterable[str]) -> Published:
     if not conditions["sensors"] or conditions["alignment"] not in (None, "SE3", "Sim3"):
         raise ConfigError(f"{where}: {system} needs sensors, and as alignment SE3, Sim3 or none")
     if any(conditions[name] not in (None, True, False) for name in ("causal", "loops")):
-        raise ConfigError(
-            f"{where}: causal and loops of {system} take true, false or, where the source is silent, none"
-        )
+        takes = "true, false or, where the source is silent, none"
+        raise ConfigError(f"{where}: causal and loops of {system} take {takes}")
     figures = {}
     for name, of_sequences in given.items():
         if name not in _PUBLISHED_FIGURES:

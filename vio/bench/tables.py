@@ -172,12 +172,9 @@ def summary_of(rows: Iterable[Row]) -> dict[str, tuple[int, int, dict[str, Cell]
         by_system.setdefault(row.system, []).append(row)
     out = {}
     for system, own in by_system.items():
-        medians = {
-            metric.name: cell
-            for metric in BY_NAME.values()
-            if (cell := cell_of((r.cells[metric.name].median for r in own if metric.name in r.cells), metric))
-        }
-        out[system] = (sum(row.failed == 0 for row in own), len(own), medians)
+        medians = {name: [r.cells[name].median for r in own if name in r.cells] for name in BY_NAME}
+        cells = {name: cell for name, known in medians.items() if (cell := cell_of(known, BY_NAME[name]))}
+        out[system] = (sum(row.failed == 0 for row in own), len(own), cells)
     return out
 
 
@@ -239,8 +236,10 @@ def markdown(suite: Suite, rows: Sequence[Row], outcomes: Sequence[Outcome], fac
     ]
     if mapped := [row for row in rows if any(metric.name in row.cells for metric in OF_MAPS)]:
         parts.append("## Maps\n\n" + "\n".join(full_table(mapped, OF_MAPS)))
-    if reasons := list(failure_lines(outcomes)):
-        parts.append("## Without a result\n\n" + "\n".join(reasons))
+    if failed := [o for o in outcomes if o.failure is not None]:
+        runs = [f"{o.sequence}, {o.system}" + ("" if o.seed is None else f", seed {o.seed}") for o in failed]
+        lines = [f"- {run}: {printable(o.failure)}" for run, o in zip(runs, failed, strict=True)]
+        parts.append("## Without a result\n\n" + "\n".join(lines))
     if noted := dict.fromkeys((o.sequence, o.system, note) for o in outcomes for note in o.notes):
         lines = [f"- {sequence}, {system}: {printable(note)}" for sequence, system, note in noted]
         parts.append("## Doubts about the ground truth\n\n" + "\n".join(lines))
@@ -268,11 +267,7 @@ def matrix(
 ) -> Iterator[str]:
     """Yield the table of one figure: sequences down, systems across; the smallest of a line in bold.
 
-    Args:
-        rows: of the suite.
-        metric: the figure.
-        systems: the columns; none: all, ours first.
-        titles: of sequences and systems, by name.
+    `systems` are the columns; none: all, ours first. `titles` are those of sequences and systems, by name.
     """
     named = titles or {}
     known = list(dict.fromkeys(row.system for row in sorted(rows, key=lambda row: row.is_peer)))
@@ -334,12 +329,7 @@ def full_table(
 ) -> Iterator[str]:
     """Yield the table of all figures: a line for each sequence and system.
 
-    Args:
-        rows: of the suite.
-        metrics: the columns.
-        titles: of sequences and systems, by name.
-        for_documents: leave out runs and success, and sequence or system where there is one alone.
-        success: for documents, too.
+    `for_documents` leaves out runs and success (unless asked for), and sequence or system where there is one alone.
     """
     named, notes = titles or {}, Notes()
     names = ["sequence", "system"]
@@ -375,14 +365,6 @@ def system_table(rows: Sequence[Row]) -> Iterator[str]:
         yield _line(
             [system, f"{done} of {count}", *texts, f"{100 * succeeded / runs:.0f} % of {runs}" if runs else "–"]
         )
-
-
-def failure_lines(outcomes: Iterable[Outcome]) -> Iterator[str]:
-    """Yield one line for each run without a result: why."""
-    for o in outcomes:
-        if o.failure is not None:
-            seed = "" if o.seed is None else f", seed {o.seed}"
-            yield f"- {o.sequence}, {o.system}{seed}: {printable(o.failure)}"
 
 
 def csv_of_rows(rows: Iterable[Row]) -> str:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,12 @@ def tasks_of(suite: Suite, data: Path, digests: InputDigests, peers: Path | None
     Raises:
         ConfigError: the folder of other systems' trajectories does not exist or holds none of a sequence of the suite.
     """
-    tasks = [*_runs(suite, data, digests), *(() if peers is None else _peers(suite, data, digests, peers))]
+    tasks = [  # of one configuration all sequences first, so that renders are made side by side
+        _task(suite, sequence, name, seed, data, digests)
+        for name, sequence, seed in product(suite.configurations, suite.sequences, suite.seeds)
+    ]
+    if peers is not None:
+        tasks += _peers(suite, data, digests, peers)
     for task in tasks:
         task.job["time_limit_s"] = suite.time_limit_s  # no part of the key: a result does not depend on it
     return tasks
@@ -51,12 +57,8 @@ def tasks_of(suite: Suite, data: Path, digests: InputDigests, peers: Path | None
 
 def inputs_of(sequence: Sequence, data: Path) -> list[Path]:
     """Return what a sequence reads: its recording or the files of its render, and its ground truth."""
-    words = sequence.render
     paths = [] if sequence.source is None else [_source(sequence.source, data)[1]]
-    for k, word in enumerate(words):
-        option, equals, value = word.rpartition("=") if word.startswith("--") else ("", "", word)
-        if (equals or not word.startswith("-")) and _takes_a_path(list(words), k, option) and value not in _NO_FILES:
-            paths.append(data / value)
+    paths += [data / value for head, value in _render_words(sequence) if head is not None and value not in _NO_FILES]
     return paths + ([] if sequence.reference is None else [data / sequence.reference])
 
 
@@ -66,30 +68,27 @@ def render_of(sequence: Sequence, data: Path, digests: InputDigests, seed: int) 
     Raises:
         DataError: a file that it reads cannot be read.
     """
-    words, known = list(sequence.render), []
-    for k, word in enumerate(words):
-        option, equals, value = word.rpartition("=") if word.startswith("--") else ("", "", word)
-        path = data / value
-        if value and not value.startswith("-") and path.exists() and _takes_a_path(words, k, option):
-            words[k] = f"{option}{equals}{path.absolute()}"
-            known.append([f"{option}{equals}", digests.of(path)])
+    words, known = [], []
+    for head, value in _render_words(sequence):
+        if head is not None and value and not value.startswith("-") and (data / value).exists():
+            words.append(f"{head}{(data / value).absolute()}")
+            known.append([head, digests.of(data / value)])
         else:
-            known.append([words[k]])
+            words.append(f"{head or ''}{value}")
+            known.append([words[-1]])
     words += ["--seed", str(seed)]
     key = digest_of([_FORM, known, seed, render_code_digest(), package_versions()])
     return {"words": words, "key": key}
 
 
-def _takes_a_path(words: list[str], k: int, option: str) -> bool:
-    return (option or (words[k - 1] if k else "")) in ("--trajectory", "--imu", "--frame-times")
-
-
-def _runs(suite: Suite, data: Path, digests: InputDigests) -> Iterator[Task]:
-    """Yield the runs; of one configuration all sequences first, so that renders are made side by side."""
-    for name in suite.configurations:
-        for sequence in suite.sequences:
-            for seed in suite.seeds:
-                yield _task(suite, sequence, name, seed, data, digests)
+def _render_words(sequence: Sequence) -> Iterator[tuple[str | None, str]]:
+    """Yield the words of a render in two parts: of a path what stands before it, maybe nothing; of others None."""
+    before = ""
+    for word in sequence.render:
+        option, equals, value = word.rpartition("=") if word.startswith("--") else ("", "", word)
+        takes_path = (option or before) in ("--trajectory", "--imu", "--frame-times")
+        yield (f"{option}{equals}", value) if takes_path and (equals or not word.startswith("-")) else (None, word)
+        before = word
 
 
 def _task(suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, digests: InputDigests) -> Task:
@@ -112,23 +111,20 @@ def _settings(
     suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, digests: InputDigests
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the settings of a run, and the part of them that the result depends on: files by their content."""
-    config = as_dict(config_of(suite, sequence, name, seed))
-    files: dict[str, str] = {}
-    for setting, holder, key in _file_settings(config):
-        holder[key] = str((data / holder[key]).absolute())
-        files[setting] = digests.of(Path(holder[key]))
-    return config, {**_without(config, files), "files": files}
+    config, files = as_dict(config_of(suite, sequence, name, seed)), dict[str, str]()
+    return config, {**_without_files(config, data, digests, files), "files": files}
 
 
 def _common(sequence: Sequence, data: Path, digests: InputDigests, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return what a worker needs for a sequence, and the part of it that the result depends on."""
     job: dict[str, Any] = {"source": None, "render": None, "reference": None, "scratch": None, "first": None}
+    exact = bool(sequence.render) if sequence.exact_truth is None else sequence.exact_truth
     shared: dict[str, Any] = {
         "start": sequence.start,
         "stop": sequence.stop,
         "lengths_m": None if sequence.lengths_m is None else list(sequence.lengths_m),
         "positions_only": sequence.positions_only,
-        "exact_truth": _has_exact_truth(sequence),
+        "exact_truth": exact and not sequence.positions_only,
         "map": sequence.map,
         "covered": [list(span) for span in sequence.covered],
         "code": code_digest(),
@@ -151,11 +147,6 @@ def _common(sequence: Sequence, data: Path, digests: InputDigests, seed: int) ->
     return {**job, **shared}, {**identity, **shared}
 
 
-def _has_exact_truth(sequence: Sequence) -> bool:
-    exact = bool(sequence.render) if sequence.exact_truth is None else sequence.exact_truth
-    return exact and not sequence.positions_only
-
-
 def _source(text: str, data: Path) -> tuple[str, Path]:
     """Split `kind:path` into `kind:` (or nothing) and an absolute path."""
     head, colon, tail = text.partition(":")
@@ -164,26 +155,24 @@ def _source(text: str, data: Path) -> tuple[str, Path]:
     return "", (data / text).absolute()
 
 
-def _file_settings(config: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
-    """Yield settings that name a file: their path a.b.c, and where the value is."""
+def _without_files(
+    config: dict[str, Any], data: Path, digests: InputDigests, files: dict[str, str], prefix: str = ""
+) -> dict[str, Any]:
+    """Return settings without those that name files: where a file lies does not matter, what is in it does.
 
-    def walk(section: dict[str, Any], prefix: str) -> Iterator[tuple[str, dict[str, Any], str]]:
-        for key, value in section.items():
-            if isinstance(value, dict):
-                yield from walk(value, f"{prefix}{key}.")
-            elif isinstance(value, str) and _FILE_SETTINGS.fullmatch(f"{prefix}{key}"):
-                yield f"{prefix}{key}", section, key
-
-    return walk(config, "")
-
-
-def _without(config: dict[str, Any], settings: Iterable[str], prefix: str = "") -> dict[str, Any]:
-    """Return nested settings without some, by their paths: where a file lies does not matter, what is in it does."""
-    return {
-        key: _without(value, settings, f"{prefix}{key}.") if isinstance(value, dict) else value
-        for key, value in config.items()
-        if f"{prefix}{key}" not in settings
-    }
+    In `config` these become absolute paths; `files` takes their digests by the settings' names.
+    """
+    others = {}
+    for key, value in config.items():
+        setting = f"{prefix}{key}"
+        if isinstance(value, dict):
+            others[key] = _without_files(value, data, digests, files, f"{setting}.")
+        elif isinstance(value, str) and _FILE_SETTINGS.fullmatch(setting):
+            config[key] = str((data / value).absolute())
+            files[setting] = digests.of(Path(config[key]))
+        else:
+            others[key] = value
+    return others
 
 
 def _peers(suite: Suite, data: Path, digests: InputDigests, folder: Path) -> Iterator[Task]:

@@ -100,8 +100,10 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
         truth = _truth(job, config)
         record |= _peer(job, truth) if job["kind"] == "peer" else _run(job, config, truth, timer)
     except VioError as error:
-        record["failure"] = " ".join(str(error).split())
-        record["keep"] = not (_of_the_system(error.__cause__) or isinstance(error, _WrongPlaceError))
+        record["failure"], cause = " ".join(str(error).split()), error.__cause__
+        # What comes from the system, such as a full disk, may not come again; parsers set no number.
+        from_system = isinstance(cause, OSError) and cause.errno is not None
+        record["keep"] = not (from_system or isinstance(error, _WrongPlaceError))
     except MemoryError:
         record |= {"failure": "out of memory", "keep": False}
     record["measured"] = {} if job["kind"] == "peer" else _measured(timer, began)
@@ -115,7 +117,8 @@ def _truth(job: dict[str, Any], config: Config) -> _Truth:
         VioError: it cannot be used, or its reference cannot be read.
     """
     dataset = open_dataset(job["source"], config.dataset)
-    first, end = frames_between(dataset.recording, parse_bound(job["start"]), _stop(job))
+    stop = None if job["stop"] is None else parse_bound(job["stop"])
+    first, end = frames_between(dataset.recording, parse_bound(job["start"]), stop)
     total = len(dataset.recording.frame_times_ns)
     covered = [frames_between(dataset.recording, *map(parse_bound, span)) for span in job["covered"]]
     spans = tuple(sorted((begin, total if last is None else last) for begin, last in covered))
@@ -143,7 +146,7 @@ def reference_fault(job: dict[str, Any]) -> str | None:
         return None
     recording, times_ns = truth.dataset.recording, truth.frame_times_ns
     name = f"the ground truth {job['reference'] or f'in {recording.path}'} is not that of the recording"
-    stated = None if job["reference"] is None else _stated_body(_text(Path(job["reference"])))
+    stated = job["reference"] and _stated(_BODY, Path(job["reference"]))
     if stated == "imu" and recording.T_cam0_imu is None:
         return f"{name}: it describes the IMU, whose place on the rig (T_cam0_imu) the recording does not know"
     poses = np.broadcast_to(np.eye(4), (len(times_ns), 4, 4))
@@ -155,13 +158,9 @@ def reference_fault(job: dict[str, Any]) -> str | None:
     return f"{name}: it has poses of {matched} of {len(frames)} frames" if matched < LEAST_POSES else None
 
 
-def _text(path: Path) -> str:
-    return path.read_text(encoding="utf-8", errors="replace")
-
-
-def _stated_body(text: str) -> str | None:
-    """Return which frame the text of a trajectory's file says it describes, by its comment."""
-    found = _BODY.search(text)
+def _stated(pattern: re.Pattern[str], path: Path) -> str | None:
+    """Return what a comment of a trajectory's file states; None: there is none of that kind."""
+    found = pattern.search(path.read_text(encoding="utf-8", errors="replace"))
     return None if found is None else found[1]
 
 
@@ -177,11 +176,6 @@ def _measured(timer: _CpuTimer, began: float) -> dict[str, Any]:
     }
 
 
-def _of_the_system(cause: BaseException | None) -> bool:
-    """Whether an error comes from the system, such as a full disk, and may not come again; parsers set no number."""
-    return isinstance(cause, OSError) and cause.errno is not None
-
-
 class _WrongPlaceError(DataError):
     """The task was sent where its result would be another."""
 
@@ -193,10 +187,6 @@ def _check_place(job: dict[str, Any]) -> None:
                 f"the worker on {platform.node()} has other {what} than the command that sent the task: install the "
                 "same versions there; if the code was edited meanwhile, repeat the bench"
             )
-
-
-def _stop(job: dict[str, Any]) -> Any:
-    return None if job["stop"] is None else parse_bound(job["stop"])
 
 
 def _used(truth: _Truth, config: Config) -> IntArray:
@@ -254,8 +244,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             figures |= figures_of(score, positions_only=job["positions_only"])
             figures |= _nees(result, score) if job["exact_truth"] else {"nees": None}
             figures["landmarks_m"] = (landmark_error(result, score) or {}).get("rmse_m")
-            record["curve"] = error_curve(score, trajectory.times_ns)
-            record["notes"] = list(score.notes)
+            record |= {"curve": error_curve(score, trajectory.times_ns), "notes": list(score.notes)}
             if result.mapped is not None and result.stopped is None:
                 own = store if job["map"] else None
                 figures |= map_figures(
@@ -327,27 +316,25 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
     if truth.reference is None:
         raise DataError(f"{recording.path}: no ground truth; name one with reference: in the suite")
     path = Path(job["trajectory"])
-    trajectory, text = read_trajectory(path), _text(path)
-    if _stated_body(text) is None:
-        trajectory = read_trajectory(path, body=truth.reference.body)
+    trajectory = read_trajectory(path)
+    if _stated(_BODY, path) is None:
+        trajectory = replace(trajectory, body=truth.reference.body)
     times_ns = truth.frame_times_ns
     trajectory = between(trajectory, int(times_ns[0]), int(times_ns[-1]))
-    T_cam0_imu = recording.T_cam0_body
-    score = _evaluate(job, trajectory, truth.reference, T_cam0_imu)
+    score = _evaluate(job, trajectory, truth.reference, recording.T_cam0_body)
     covered = coverage(times_ns, trajectory)
     figures: dict[str, Any] = {"frames": len(trajectory), "path_m": score.path_length_m, "coverage": covered}
-    kind = _POSES.search(text)
+    kind = _stated(_POSES, path)
     if kind is None:
         figures |= figures_of(score, positions_only=job["positions_only"])
-    elif kind[1] == "final":
+    elif kind == "final":
         figures["map_ate_m"] = score.ate_m.rmse
     else:
         figures |= {"map_causal_ate_m": score.ate_m.rmse, "placed": covered}
         if trajectory.times_ns is not None:
             figures["place_s"] = float(trajectory.times_ns[0] - times_ns[0]) / NS_PER_S
     curve = error_curve(score, trajectory.times_ns)
-    absent = _absent(job, figures, truth)
-    return {"figures": figures, "curve": curve, "absent": absent, "notes": list(score.notes)}
+    return {"figures": figures, "curve": curve, "absent": _absent(job, figures, truth), "notes": list(score.notes)}
 
 
 def _evaluate(job: dict[str, Any], trajectory: Trajectory, reference: Trajectory, T_cam0_imu: Any) -> Evaluation:

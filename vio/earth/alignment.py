@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix
-from scipy.sparse.linalg import splu
 
 from vio.earth.geodesy import LocalFrame
 from vio.earth.gnss import GnssFixes
@@ -29,6 +28,7 @@ from vio.geometry.lie import (
     so3_hat,
 )
 from vio.numerics.robust import truncated_weights
+from vio.numerics.sparse import factors
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 
@@ -100,8 +100,7 @@ def georeference(path: Path, fixes: GnssFixes, lever_arm_m: FloatArray, time_off
     Raises:
         EstimationError: fewer than three positions are within the trajectory's time, or they determine nothing.
     """
-    between = _Between.of(path, fixes.times_ns + time_offset_ns)
-    inside = between.inside
+    before, share, inside = _between(path, fixes.times_ns + time_offset_ns)
     if int(inside.sum()) < _LEAST_FIXES:
         own_ns = fixes.times_ns + time_offset_ns
         spans = [f"{t[0] * 1e-9:.3f} to {t[-1] * 1e-9:.3f} s" for t in (own_ns, path.times_ns)]
@@ -111,16 +110,12 @@ def georeference(path: Path, fixes: GnssFixes, lever_arm_m: FloatArray, time_off
         )
     frame = LocalFrame(fixes.geodetic[int(np.argmax(inside))].copy())
     measured = frame.enu(fixes.geodetic)[inside]
-    problem = _Problem(
-        path, between.chosen(), measured, fixes.covariance[inside], fixes.has_height[inside], lever_arm_m
-    )
+    of_fixes = before[inside], share[inside], measured, fixes.covariance[inside], fixes.has_height[inside]
+    problem = _Problem(path, *of_fixes, lever_arm_m)
     T, log_scale, weight = problem.solve()
     normal = problem.factorised(T, log_scale, weight)
-    used, used_height, residuals = (
-        np.zeros(len(fixes), dtype=np.bool_),
-        np.zeros(len(fixes), dtype=np.bool_),
-        np.full((len(fixes), 3), np.nan),
-    )
+    used, used_height = (np.zeros(len(fixes), dtype=np.bool_) for _ in range(2))
+    residuals = np.full((len(fixes), 3), np.nan)
     used[inside], used_height[inside] = weight[:, 0] > 0.5, weight[:, 1] > 0.5
     if int(used.sum()) < _LEAST_FIXES:
         raise EstimationError(f"only {int(used.sum())} of {int(inside.sum())} GNSS positions agree with the trajectory")
@@ -144,32 +139,21 @@ def georeference(path: Path, fixes: GnssFixes, lever_arm_m: FloatArray, time_off
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Between:
-    """The two poses that each position lies between."""
-
-    before: IntArray  # (N,)
-    share: FloatArray  # (N,) of the way to the next one
-    inside: BoolArray  # (N,)
-
-    @classmethod
-    def of(cls, path: Path, times_ns: IntArray) -> _Between:
-        starts = np.concatenate([[0], path.breaks, [len(path.times_ns)]]).astype(np.int64)
-        before, share = np.zeros(len(times_ns), dtype=np.int64), np.zeros(len(times_ns))
-        inside = np.zeros(len(times_ns), dtype=np.bool_)
-        for start, stop in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
-            own = path.times_ns[start:stop]
-            if len(own) < 2:
-                continue
-            here = (times_ns >= own[0]) & (times_ns <= own[-1]) & ~inside
-            k = np.clip(np.searchsorted(own, times_ns[here], side="right") - 1, 0, len(own) - 2)
-            before[here] = start + k
-            share[here] = (times_ns[here] - own[k]) / (own[k + 1] - own[k])
-            inside |= here
-        return cls(before, share, inside)
-
-    def chosen(self) -> _Between:
-        return _Between(self.before[self.inside], self.share[self.inside], self.inside[self.inside])
+def _between(path: Path, times_ns: IntArray) -> tuple[IntArray, FloatArray, BoolArray]:
+    """Return the pose before each time (N,), its share of the way to the next one, and whether it is between two."""
+    starts = np.concatenate([[0], path.breaks, [len(path.times_ns)]]).astype(np.int64)
+    before, share = np.zeros(len(times_ns), dtype=np.int64), np.zeros(len(times_ns))
+    inside = np.zeros(len(times_ns), dtype=np.bool_)
+    for start, stop in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+        own = path.times_ns[start:stop]
+        if len(own) < 2:
+            continue
+        here = (times_ns >= own[0]) & (times_ns <= own[-1]) & ~inside
+        k = np.clip(np.searchsorted(own, times_ns[here], side="right") - 1, 0, len(own) - 2)
+        before[here] = start + k
+        share[here] = (times_ns[here] - own[k]) / (own[k + 1] - own[k])
+        inside |= here
+    return before, share, inside
 
 
 class _Problem:
@@ -178,14 +162,15 @@ class _Problem:
     def __init__(
         self,
         path: Path,
-        between: _Between,
+        before: IntArray,
+        share: FloatArray,
         measured: FloatArray,
         covariance: FloatArray,
         has_height: BoolArray,
         lever_arm_m: FloatArray,
     ) -> None:
-        self._path, self._between, self._measured, self._lever = path, between, measured, lever_arm_m
-        self._has_height = has_height
+        self._path, self._before, self._share = path, before, share
+        self._measured, self._has_height, self._lever = measured, has_height, lever_arm_m
         k = np.arange(len(path.times_ns) - 1)
         self._i = np.concatenate([k, path.first])
         self._j = np.concatenate([k + 1, path.second])
@@ -198,14 +183,14 @@ class _Problem:
         covariance = covariance + _TIMING_M**2 * np.eye(3)
         self._horizontal = np.linalg.inv(covariance[:, :2, :2])
         self._vertical = 1 / covariance[:, 2, 2]
-        times = (1 - between.share) * path.times_ns[between.before] + between.share * path.times_ns[between.before + 1]
+        times = (1 - share) * path.times_ns[before] + share * path.times_ns[before + 1]
         gap_s = float(np.median(np.diff(times))) * 1e-9 if len(times) > 1 else _CORRELATED_S
         self._independent = float(np.clip(gap_s / _CORRELATED_S, 1e-3, 1.0))  # share of information
 
     def antenna(self, T: FloatArray) -> FloatArray:
         """Return where the antenna is (N, 3) at the times of the positions."""
-        b, a = self._between, T[:, :3, :3] @ self._lever + T[:, :3, 3]
-        out: FloatArray = a[b.before] + b.share[:, None] * (a[b.before + 1] - a[b.before])
+        k, a = self._before, T[:, :3, :3] @ self._lever + T[:, :3, 3]
+        out: FloatArray = a[k] + self._share[:, None] * (a[k + 1] - a[k])
         return out
 
     def solve(self) -> tuple[FloatArray, float, FloatArray]:
@@ -279,14 +264,14 @@ class _Problem:
         r_D_scale = np.linalg.inv(se3_left_jacobian(r)) @ r_D_scale
         last = np.full(len(r), 6 * count)
         add([6 * self._i, 6 * self._j, last], [r_D_i, r_D_j, r_D_scale], r, self._edge_weight[:, :, None] * np.eye(6))
-        b = self._between
+        k, share = self._before, self._share[:, None, None]
         p = self._measured - self.antenna(T)
         W = np.zeros((len(p), 3, 3))
         W[:, :2, :2] = self._horizontal * weight[:, 0, None, None]
         W[:, 2, 2] = self._vertical * weight[:, 1]
         move = T[:, :3, :3] @ np.concatenate([np.eye(3), -so3_hat(self._lever)], axis=1)
-        J = [-(1 - b.share)[:, None, None] * move[b.before], -b.share[:, None, None] * move[b.before + 1]]
-        add([6 * b.before, 6 * b.before + 6], J, p, self._independent * W)
+        J = [-(1 - share) * move[k], -share * move[k + 1]]
+        add([6 * k, 6 * k + 6], J, p, self._independent * W)
         up = T[:, 2, :3]
         D = np.zeros((count, 3, 6))
         D[:, :, 3:] = so3_hat(up)
@@ -311,9 +296,7 @@ class _Factors:
     def __init__(self, H: csc_matrix) -> None:
         unknown = "the GNSS positions do not determine where the trajectory is; drive farther, with a turn"
         try:
-            self._rest = splu(
-                H[:-1, :-1], permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
+            self._rest = factors(H[:-1, :-1])
         except RuntimeError as error:  # exactly singular
             raise EstimationError(unknown) from error
         self._border = H[:-1, -1:].toarray()

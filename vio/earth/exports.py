@@ -18,28 +18,24 @@ def _positions(geodetic: FloatArray) -> list[list[float]]:
     return [[round(lon, 9), round(lat, 9), round(h, 4)] for lat, lon, h in geodetic.tolist()]
 
 
+def _feature(kind: str, geodetic: FloatArray, **properties: str) -> dict[str, Any]:
+    geometry = {"type": kind, "coordinates": _positions(geodetic)}
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
 def write_geojson(path: Path, name: str, track: FloatArray, fixes: FloatArray, used: BoolArray) -> None:
     """Write a track (K, 3), and the GNSS positions (N, 3) with whether they were used (N,), as GeoJSON (RFC 7946)."""
 
-    def feature(kind: str, coordinates: Any, **properties: Any) -> dict[str, Any]:
-        return {
-            "type": "Feature",
-            "geometry": {"type": kind, "coordinates": coordinates},
-            "properties": {"name": name, **properties},
-        }
-
-    features = [feature("LineString", _positions(track), what="trajectory")]
+    features = [_feature("LineString", track, name=name, what="trajectory")]
     for what, rows in (("GNSS positions used", used), ("GNSS positions refused", ~used)):
         if rows.any():
-            features.append(feature("MultiPoint", _positions(fixes[rows]), what=what))
+            features.append(_feature("MultiPoint", fixes[rows], name=name, what=what))
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features}) + "\n", encoding="utf-8")
 
 
 def write_points_geojson(path: Path, name: str, points: FloatArray) -> None:
     """Write points (M, 3) as one feature."""
-    geometry = {"type": "MultiPoint", "coordinates": _positions(points)}
-    document = {"type": "Feature", "geometry": geometry, "properties": {"name": name}}
-    path.write_text(json.dumps(document) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(_feature("MultiPoint", points, name=name)) + "\n", encoding="utf-8")
 
 
 def write_kml(path: Path, name: str, track: FloatArray) -> None:

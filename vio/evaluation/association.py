@@ -38,9 +38,11 @@ def associate(
     if len(estimate) == 0 or len(reference) == 0:
         raise EvaluationError(f"cannot compare {len(estimate)} estimated poses with {len(reference)} reference poses")
     if estimate.times_ns is not None and reference.times_ns is not None:
-        rows, reference_rows = associate_times(
-            estimate.times_ns, reference.times_ns, max_difference_ns=_max_difference_ns(max_time_difference_s)
-        )
+        if not 0 <= max_time_difference_s <= _LONGEST_S:
+            limit = f"the largest time difference is 0 to {_LONGEST_S:g} s"
+            raise EvaluationError(f"{limit}, got {max_time_difference_s:g} s")
+        most_ns = round(max_time_difference_s * NS_PER_S)
+        rows, reference_rows = associate_times(estimate.times_ns, reference.times_ns, max_difference_ns=most_ns)
         if len(rows) == 0:
             raise EvaluationError(_no_common_time(estimate.times_ns, reference.times_ns, max_time_difference_s))
         return "time", rows, reference_rows
@@ -95,12 +97,6 @@ def coverage(
         reference_span=int(clock[reference_rows[-1]] - clock[reference_rows[0]]) / span if span else None,
         longest_gap_s=None if gaps is None or len(gaps) == 0 else int(gaps.max()) / NS_PER_S,
     )
-
-
-def _max_difference_ns(seconds: float) -> int:
-    if not 0 <= seconds <= _LONGEST_S:
-        raise EvaluationError(f"the largest time difference is 0 to {_LONGEST_S:g} s, got {seconds:g} s")
-    return round(seconds * NS_PER_S)
 
 
 def _no_common_time(estimate_ns: IntArray, reference_ns: IntArray, limit_s: float) -> str:

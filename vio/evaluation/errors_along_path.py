@@ -130,15 +130,8 @@ def kitti_error(
         trans_m, rot_deg = _motion_errors(T_est, T_ref, first, last)
         all_trans.append(100 * trans_m / length)
         all_rot.append(100 * rot_deg / length)
-        found = len(first) > 0
-        per_length.append(
-            LengthError(
-                float(length),
-                len(first),
-                float(all_trans[-1].mean()) if found else None,
-                float(all_rot[-1].mean()) if found else None,
-            )
-        )
+        means = [float(errors[-1].mean()) if len(first) else None for errors in (all_trans, all_rot)]
+        per_length.append(LengthError(float(length), len(first), *means))
     segments = sum(row.segments for row in per_length)
     if segments == 0:
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, nearest_rotation, quat_xyzw_from_rotation, rotation_from_quat_xyzw, so3_log
 
 _LARGE_DEG = 20.0  # median attitude error that no odometry has whose positions agree; other axes are 90 deg off or more
@@ -22,7 +23,7 @@ def attitude_note(R_est: FloatArray, R_ref: FloatArray, sigma_rad: float) -> str
         R_ref: (M, 3, 3) world from body, by the reference.
         sigma_rad: standard deviation of the alignment's rotation about the path.
     """
-    off_deg = float(np.median(_angles_deg(np.swapaxes(R_ref, 1, 2) @ R_est)))
+    off_deg = float(np.median(rotation_angle_deg(np.swapaxes(R_ref, 1, 2) @ R_est)))
     if off_deg < max(_LARGE_DEG, _SIGMAS * float(np.degrees(sigma_rad))):
         return None
     head = f"the attitudes differ by {off_deg:.0f} deg (median)"
@@ -49,13 +50,9 @@ def attitude_note(R_est: FloatArray, R_ref: FloatArray, sigma_rad: float) -> str
     )
 
 
-def _angles_deg(R: FloatArray) -> FloatArray:
-    return np.degrees(np.linalg.norm(so3_log(R), axis=-1))
-
-
 def _varies_deg(R: FloatArray) -> float:
     """Return the largest angle of rotations (M, 3, 3) from the first one."""
-    return float(_angles_deg(R[0].T @ R).max())
+    return float(rotation_angle_deg(R[0].T @ R).max())
 
 
 def _mean(R: FloatArray) -> FloatArray:
@@ -65,13 +62,13 @@ def _mean(R: FloatArray) -> FloatArray:
 
 def _spread_deg(R: FloatArray) -> float:
     """Return the median angle of rotations (M, 3, 3) from their mean."""
-    return float(np.median(_angles_deg(_mean(R).T @ R)))
+    return float(np.median(rotation_angle_deg(_mean(R).T @ R)))
 
 
 def _name(R: FloatArray) -> str:
     """Return a rotation in words: whole axes where it exchanges them, else its angle and axis."""
     axes = np.rint(R)
-    if np.array_equal(np.abs(axes).sum(axis=0), np.ones(3)) and float(_angles_deg(axes.T @ R)) < _AXES_DEG:
+    if np.array_equal(np.abs(axes).sum(axis=0), np.ones(3)) and float(rotation_angle_deg(axes.T @ R)) < _AXES_DEG:
         signed = (("-" if row.sum() < 0 else "+") + "xyz"[int(np.argmax(np.abs(row)))] for row in axes)
         return f"its x, y, z are the estimate's {' '.join(signed)}"
     phi = np.degrees(so3_log(R))

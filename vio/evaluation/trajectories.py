@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from typing import Any, get_args
 
 import numpy as np
@@ -44,6 +44,12 @@ _UNIT_SHARE = 0.1  # a ratio of path lengths so near one of these is no chance; 
 _PATH_LEAST_M = 1.0  # paths below this may consist of noise
 _MATCHED_SHARE = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
 _MATCHED_ESTIMATE = 0.2  # span of the matched poses, of the estimate; below, the figures are those of a part
+_FARTHEST_M = 1e12  # of a position from the origin: farther than the sun, and squares do not overflow
+# Of an evaluation, as it holds them.
+_FIGURES = (
+    *("align", "association", "body", "matched", "coverage", "path_length_m", "matched_path_length_m"),
+    *("reference_path_length_m", "scale", "rotation_from"),
+)
 LEAST_POSES = 3  # that determine a scale, and make a figure
 
 
@@ -85,29 +91,21 @@ class Evaluation:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON: `ate_m` is the RMSE, undefined metrics are None, arrays are omitted."""
+        kitti = self.kitti
         return {
-            "align": self.align,
-            "association": self.association,
-            "body": self.body,
-            "matched": self.matched,
-            "coverage": _as_plain_dict(self.coverage),
-            "path_length_m": self.path_length_m,
-            "matched_path_length_m": self.matched_path_length_m,
-            "reference_path_length_m": self.reference_path_length_m,
-            "scale": self.scale,
-            "rotation_from": self.rotation_from,
+            **{name: _plain(getattr(self, name)) for name in _FIGURES},
             "ate_m": self.ate_m.rmse,
             "ate_deg": self.ate_deg.rmse,
-            "scale_free": _as_plain_dict(self.scale_free),
-            "ate_statistics_m": _as_plain_dict(self.ate_m),
-            "ate_statistics_deg": _as_plain_dict(self.ate_deg),
-            "rpe": _as_plain_dict(self.rpe),
-            "rpe_distance": _as_plain_dict(self.rpe_distance),
-            "t_err_percent": None if self.kitti is None else self.kitti.t_err_percent,
-            "r_err_deg_per_100m": None if self.kitti is None else self.kitti.r_err_deg_per_100m,
-            "drift_lengths_m": [] if self.kitti is None else list(self.kitti.lengths_m),
-            "kitti_segments": 0 if self.kitti is None else self.kitti.segments,
-            "kitti_per_length": [] if self.kitti is None else [_as_plain_dict(row) for row in self.kitti.per_length],
+            "scale_free": _plain(self.scale_free),
+            "ate_statistics_m": asdict(self.ate_m),
+            "ate_statistics_deg": asdict(self.ate_deg),
+            "rpe": _plain(self.rpe),
+            "rpe_distance": _plain(self.rpe_distance),
+            "t_err_percent": None if kitti is None else kitti.t_err_percent,
+            "r_err_deg_per_100m": None if kitti is None else kitti.r_err_deg_per_100m,
+            "drift_lengths_m": [] if kitti is None else list(kitti.lengths_m),
+            "kitti_segments": 0 if kitti is None else kitti.segments,
+            "kitti_per_length": [] if kitti is None else [asdict(row) for row in kitti.per_length],
             "notes": list(self.notes),
         }
 
@@ -221,12 +219,9 @@ def rotation_drift_text(deg_per_100m: float, lengths_m: Sequence[float], digits:
     return f"{deg_per_100m:.{digits}f} deg/100 m"
 
 
-def _as_plain_dict(record: Any) -> Any:
-    """Convert a flat record of numbers to a dict; None stays None."""
-    return {f.name: getattr(record, f.name) for f in fields(record)} if is_dataclass(record) else record
-
-
-_FARTHEST_M = 1e12  # of a position from the origin: farther than the sun, and squares do not overflow
+def _plain(value: Any) -> Any:
+    """Return a record as a dictionary, and anything else as it is."""
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
 
 
 def _require_finite(name: str, trajectory: Trajectory) -> None:

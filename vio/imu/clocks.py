@@ -15,12 +15,7 @@ _NS = 1e-9
 
 
 def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[InertialFinding, ...]:
-    """Check whether the IMU's stamps cover those of the frames, and explain it if they do not.
-
-    Args:
-        frame_times_ns: (F,) increasing.
-        imu_times_ns: (S,) increasing.
-    """
+    """Check whether the IMU's stamps (S,) cover those of the frames (F,), both increasing, and explain it if not."""
     if not len(frame_times_ns):
         return ()
     frames = int(frame_times_ns[0]), int(frame_times_ns[-1])

@@ -70,12 +70,8 @@ class ImuSampleCheck:
         self._held: list[ImuSample] = []  # repetitions of the last sample that passed
         self._faults: list[ImuFault] = []
 
-    def take(self, sample: ImuSample) -> tuple[ImuSample, ...]:
-        """Take a sample; return those that may be used now, in time order."""
-        return tuple(self.take_all([sample]))
-
     def take_all(self, samples: Sequence[ImuSample]) -> list[ImuSample]:
-        """Take samples in order of time, as `take` does one by one; return those that may be used now."""
+        """Take samples in order of time, one or more at once; return those that may be used now."""
         if not samples:
             return []
         times = np.array([x.time_ns for x in samples], dtype=np.int64)

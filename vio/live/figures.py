@@ -31,11 +31,7 @@ class LiveMonitor:
     """Measures latency and counts frames that are left out. Frames are noted by one thread, results by another."""
 
     def __init__(self, *, judges_latency: bool) -> None:
-        """Begin.
-
-        Args:
-            judges_latency: whether frames come at a camera's rate, so that late results mean a slow computer.
-        """
+        """Begin; latency is judged where frames come at a camera's rate, so that late results mean a slow computer."""
         self._judges = judges_latency
         self._arrived: deque[tuple[int, float]] = deque()  # time of the frame, ns, and of its arrival, s
         self._latencies_s: deque[float] = deque(maxlen=_KEPT)

@@ -108,7 +108,7 @@ class FramePipeline:
         )
 
     def usable(self, sample: MotionSample) -> MotionSample | None:
-        """Return a sample as the back end takes it; None: it does not."""
+        """Return a sample as the back end takes it; None: it does not, as the sensor was found to be wrong."""
         return corrected(sample, self._imu)
 
     def begin_again(self, index: int) -> None:
@@ -123,17 +123,25 @@ class FramePipeline:
         again = trial.again(verdict)
         if again is None:
             return
-        self.backend, self._revised, self._imu = again.backend, again.estimates, verdict
-        self.monitor.begun_again(index, verdict, len(again.estimates))
+        self.backend, self._revised = again
+        self._imu = verdict
+        self.monitor.begun_again(index, verdict, len(self._revised))
 
     def newest(self, index: int, estimate: Estimate | None) -> Estimate | None:
         """Return the estimate of a frame, or the one that has replaced it and was not taken yet."""
         return self._revised.get(index, estimate)
 
     def take_revised(self) -> dict[int, Estimate]:
-        """Return the estimates, by frame number, that replace earlier ones, and forget them."""
+        """Return the estimates, by frame number, that replace earlier ones, and forget them.
+
+        There are some where the IMU was found to be wrong, once, in the first minute.
+        """
         revised, self._revised = self._revised, {}
         return revised
+
+    def smoothed(self, frame_index: int) -> Estimate | None:
+        """Return the estimate at a past frame with all frames since; None where the window does not hold it."""
+        return self.backend.smoothed(frame_index)
 
     def _update(self, seen: Observations) -> UpdateReport:
         """Update with a frame; a back end that diverges is restarted."""
@@ -144,7 +152,8 @@ class FramePipeline:
             if report.started:
                 self.monitor.restarted(seen.frame_index, str(error), self.backend.estimate())
             else:
-                self.monitor.lost(seen.frame_index, str(error))
+                lost = f"{error}; there are no poses until the scale is observable again"
+                self.monitor.say(f"frame {seen.frame_index}: {lost}")
             return report
 
 
@@ -162,14 +171,10 @@ class _StageTimer:
         self._last = now
 
 
-def _median_disparity(seen: Observations) -> float | None:
-    z = seen.z[seen.has_right]
-    return median(z[:, 0] - z[:, 2]) if len(z) else None
-
-
 def _frame_log(
     frame: StereoFrame, ms: dict[str, float], output: FrontendOutput, selection: Selection, report: UpdateReport
 ) -> FrameLog:
+    z = output.observations.z[output.observations.has_right]
     return FrameLog(
         index=frame.index,
         time_ns=frame.time_ns,
@@ -188,7 +193,7 @@ def _frame_log(
         landmarks=report.landmarks,
         innovation_median_px=report.innovation_median_px,
         nis_per_dof=report.nis_per_dof,
-        disparity_median_px=_median_disparity(output.observations),
+        disparity_median_px=median(z[:, 0] - z[:, 2]) if len(z) else None,
         innovation_ratio=report.innovation_ratio,
         stages_ms=output.stages_ms,
     )

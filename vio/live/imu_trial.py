@@ -9,7 +9,7 @@ prediction, so they are not extracted again.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from vio.errors import DivergedError, EstimationError
 from vio.imu.findings import ImuVerdict
@@ -18,14 +18,6 @@ from vio.records import Estimate, ImuSample, MotionSample, Observations
 
 _MOST_FRAMES = 600  # that are kept
 AS_GIVEN = ImuVerdict()
-
-
-@dataclass(frozen=True, slots=True)
-class Replayed:
-    """A back end that has taken everything again, and its estimates by frame number."""
-
-    backend: Backend
-    estimates: dict[int, Estimate]
 
 
 class ImuTrial:
@@ -55,16 +47,16 @@ class ImuTrial:
         if self._frames > _MOST_FRAMES:
             self.close()
 
-    def again(self, verdict: ImuVerdict) -> Replayed | None:
+    def again(self, verdict: ImuVerdict) -> tuple[Backend, dict[int, Estimate]] | None:
         """Give everything to a new back end, with the IMU that a verdict leaves; nothing can be taken again then.
 
-        None: that one is lost, too.
+        Return that back end and its estimates by frame number; None: it is lost, too.
         """
         backend, taken = self._fresh, self._taken
         assert backend is not None
         self.close()
         try:
-            return Replayed(backend, _estimates(backend, taken, verdict))
+            return backend, _estimates(backend, taken, verdict)
         except EstimationError:
             return None
 

@@ -112,8 +112,11 @@ class Inputs:
         numbered = self._numbered(t_ns, "images")
         if numbered is None:
             return None
-        taken = [_copied(i) if copy or not (i.flags.carray and i.flags.owndata) else i for i in images]
-        return GivenFrame(*numbered, tuple(taken), depth)
+        for k, image in enumerate(images):
+            if copy or not (image.flags.carray and image.flags.owndata):
+                # Without letting another thread run, which would give way after 5 ms only.
+                images[k] = np.frombuffer(bytearray(image.data), dtype=np.uint8).reshape(image.shape)
+        return GivenFrame(*numbered, tuple(images), depth)
 
     def observations(
         self, t_ns: Any, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None
@@ -290,11 +293,6 @@ def _checked_image(image: npt.ArrayLike, name: str, shape: tuple[int, int] | Non
             f"{shape[1]}x{shape[0]}; check that calibration and camera belong together"
         )
     return array
-
-
-def _copied(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return a copy of an image, made without letting another thread run, which would give way after 5 ms only."""
-    return np.frombuffer(bytearray(image.data), dtype=np.uint8).reshape(image.shape)
 
 
 def gray(image: npt.NDArray[np.uint8]) -> Image:

@@ -28,7 +28,7 @@ from vio.live.prediction import PredictedPose, SharedPredictor
 from vio.live.stream import EstimateStream
 from vio.live.warm_up import warm_up
 from vio.live.worker import QuietCollector, Worker
-from vio.records import Estimate, FrameResult, Landmarks, MotionSample, MotionSource
+from vio.records import Estimate, FrameResult, Landmarks, MotionSample
 
 log = logging.getLogger(__name__)
 
@@ -60,15 +60,10 @@ class LiveOdometry(EventInputs[None]):
     ) -> None:
         """Start the worker; the first frame begins the trajectory.
 
+        Arguments that are not named here are those of `Odometry`; a map never makes a frame wait.
+
         Args:
-            rig: as of `Odometry`, like `config`, `T_cam0_imu`, `parts`, `map` and `localise`; a map never makes
-                a frame wait.
-            config: likewise.
-            T_cam0_imu: likewise.
-            parts: likewise.
             on_frame: called with the result of each frame, by the worker: what takes long in it delays the next frame.
-            map: likewise.
-            localise: likewise.
             drop: what happens where `queue_frames` wait already: "oldest" leaves out the frame that has waited longest,
                 so that latency is bounded; "none" leaves out none; "block" makes the call wait, for recordings.
             queue_frames: that may wait.
@@ -92,6 +87,8 @@ class LiveOdometry(EventInputs[None]):
             on_frame=self._take_result,
             map=None if use is None else replace(use, wait=False),
         )
+        odometry = self._odometry
+        self.camera, self.T_cam0_body, self.motion = odometry.camera, odometry.T_cam0_body, odometry.motion
         self._on_frame, self._with_map = on_frame, use is not None
         if isinstance(rig, Rig):
             self._T_cam0_imu = rig.T_rect0_imu
@@ -117,10 +114,8 @@ class LiveOdometry(EventInputs[None]):
         self._worker.ask(self._warm_up)
 
     def _warm_up(self) -> None:
-        odometry = self._odometry
-        warm_up(odometry.camera, self._T_cam0_imu, self._config, with_map=self._with_map)
-        if odometry.camera.width is not None:
-            odometry.prepare()
+        warm_up(self.camera, self._T_cam0_imu, self._config, with_map=self._with_map)
+        self._odometry.prepare()
         self._collector.hold()
 
     # What goes in
@@ -215,35 +210,17 @@ class LiveOdometry(EventInputs[None]):
         """What the checks have found so far, and whether the computer falls behind, one line each."""
         return (*self._odometry.warnings, *self._lines)
 
-    @property
-    def camera(self) -> StereoCamera:
-        """The rectified camera."""
-        return self._odometry.camera
-
-    @property
-    def T_cam0_body(self) -> FloatArray:
-        """Extrinsics (4, 4) of the body whose pose is estimated, in the rectified left camera."""
-        return self._odometry.T_cam0_body
-
-    @property
-    def motion(self) -> MotionSource | None:
-        """What propagates the pose between frames; None: images alone."""
-        return self._odometry.motion
-
     def landmarks(self) -> Landmarks:
         """Return the points of the map so far, of those that do not change any more the newest; waits for a frame.
 
         Raises:
             DataError: no frame has a pose yet.
         """
-        return self._worker.ask(self._landmarks)
+        return self._worker.ask(lambda: newest_points([*self._points, self._odometry.landmarks()]))
 
     def calibrated_rig(self) -> CalibratedRig:
         """Return the rig with what the estimate says that its calibration is off by, see `Odometry.calibrated_rig`."""
         return self._odometry.calibrated_rig()
-
-    def _landmarks(self) -> Landmarks:
-        return newest_points([*self._points, self._odometry.landmarks()])
 
     def __enter__(self) -> LiveOdometry:
         return self

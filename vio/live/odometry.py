@@ -36,7 +36,6 @@ from vio.records import (
     Landmarks,
     LoopEvent,
     MotionSample,
-    MotionSource,
     Observations,
     StereoFrame,
     TrackPrior,
@@ -104,6 +103,9 @@ class Odometry(EventInputs["Estimate | None"]):
             T_cam0_imu = rig.T_rect0_imu
             self._offset_ns = round(1e9 * rig.time_offset_s)
         self._source = live_source(self.camera, T_cam0_imu, self._config)
+        # Extrinsics (4, 4) of the estimated body in the rectified left camera, and what propagates its pose between
+        # frames; None: images alone.
+        self.T_cam0_body, self.motion = self._source.T_cam0_body, self._source.motion
         self._parts = parts
         self._map = MapUse(Path(map), localise) if isinstance(map, (str, Path)) else map
         self._on_frame = on_frame
@@ -135,7 +137,7 @@ class Odometry(EventInputs["Estimate | None"]):
             self.motion,
             self._offset_ns,
             self._config.dataset.max_frame_rate,
-            self._processor.say,
+            self._processor.pipeline.monitor.say,
         )
 
     # What goes in
@@ -157,7 +159,7 @@ class Odometry(EventInputs["Estimate | None"]):
                 results = self._add(self._frame(given))
                 return results[-1].estimate if results else None
             for sample in given:
-                if (usable := self._processor.usable(sample)) is not None:
+                if (usable := self._processor.pipeline.usable(sample)) is not None:
                     self._predictor.sample(usable)
                 self._add(sample)
             return None
@@ -193,11 +195,6 @@ class Odometry(EventInputs["Estimate | None"]):
     # What comes out
 
     @property
-    def T_cam0_body(self) -> FloatArray:
-        """Extrinsics (4, 4) of the body whose pose is estimated, in the rectified left camera."""
-        return self._source.T_cam0_body
-
-    @property
     def estimate(self) -> Estimate | None:
         """The newest estimate; None before the first."""
         return self._processor.estimate
@@ -213,17 +210,12 @@ class Odometry(EventInputs["Estimate | None"]):
         estimate = self.estimate
         if estimate is None:
             raise DataError("there is no calibration before the first frame")
-        rig = self._rig or rig_of_rectified(self.camera, None if self.motion is None else self._source.T_cam0_body)
+        rig = self._rig or rig_of_rectified(self.camera, None if self.motion is None else self.T_cam0_body)
         if rig is None:
             if self.camera.is_cylinder:
                 raise DataError("no lens model holds a cylinder; give Odometry the rig of the raw cameras")
             raise DataError("the rectified camera has no image size; give StereoCamera its width and height")
         return estimated_rig(rig, estimate, self.camera, "live images")
-
-    @property
-    def motion(self) -> MotionSource | None:
-        """What propagates the pose between frames; None: images alone."""
-        return self._source.motion
 
     @property
     def loops(self) -> tuple[LoopEvent, ...]:
@@ -234,17 +226,17 @@ class Odometry(EventInputs["Estimate | None"]):
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the checks have found so far, one line each."""
-        return self._processor.warnings
+        return tuple(self._processor.pipeline.monitor.lines)
 
     @property
     def frames_refused(self) -> int:
         """Number of frames that the front end refused."""
-        return self._processor.frames_refused
+        return self._processor.pipeline.monitor.frames_refused
 
     @property
     def frames_waiting(self) -> int:
         """Number of frames without a pose, as the scale of one camera was not observable yet."""
-        return self._processor.frames_waiting
+        return self._processor.pipeline.monitor.frames_waiting
 
     def predict(self, t_ns: int) -> PredictedPose:
         """Return the pose at a time at or after the newest estimate, from the samples added since.
@@ -266,7 +258,7 @@ class Odometry(EventInputs["Estimate | None"]):
         with self._lock:
             if self.estimate is None:
                 raise DataError("there is no map before the first frame")
-            return self._processor.landmarks()
+            return self._processor.pipeline.backend.landmarks()
 
     def take_landmarks(self) -> Landmarks:
         """Return the points of the map that will not change any more, and forget them, so that memory stays flat.
@@ -274,12 +266,12 @@ class Odometry(EventInputs["Estimate | None"]):
         `landmarks` then returns the others.
         """
         with self._lock:
-            return self._processor.take_landmarks()
+            return self._processor.pipeline.backend.take_landmarks()
 
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since; None where the window no longer holds it."""
         with self._lock:
-            return self._processor.smoothed(frame_index)
+            return self._processor.pipeline.smoothed(frame_index)
 
     def __enter__(self) -> Odometry:
         return self

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from vio.live.frame_pipeline import FramePipeline
-from vio.records import Estimate, Event, FrameResult, Landmarks, MotionSample, StereoFrame
+from vio.records import Estimate, Event, FrameResult, MotionSample, StereoFrame
 
 if TYPE_CHECKING:
     from vio.mapping.session import MapSession
@@ -26,11 +27,7 @@ class EventOrder:
     """
 
     def __init__(self, *, wait_for_imu: bool) -> None:
-        """Create an empty queue.
-
-        Args:
-            wait_for_imu: whether a frame waits for the first sample at or after it; False: it passes at once.
-        """
+        """Create an empty queue; with `wait_for_imu`, a frame waits for the first sample at or after it."""
         self._wait = wait_for_imu
         self._frames: deque[StereoFrame] = deque()
         self._samples: deque[MotionSample] = deque(maxlen=_MOST_SAMPLES)
@@ -38,31 +35,19 @@ class EventOrder:
         self._released_ns: int | None = None  # newest sample that was released
         self.exposed_after_ns = 0  # from a frame's stamp to its exposure on the IMU's clock, 0 or more, as estimated
 
-    def add(self, event: Event) -> list[Event]:
-        """Take an event, and return what can be processed now, in order.
+    def add(self, event: Event) -> Iterator[Event]:
+        """Take an event, and yield what can be processed now, in order.
 
-        Frames come in order of time, and samples do; a frame may come before or after its samples.
+        Frames come in order of time, and samples do; a frame may come before or after its samples. Whether a second
+        frame is due may depend on the time offset that was estimated with the first, so take one after the other.
         """
-        self.put(event)
-        ready: list[Event] = []
-        while events := self.due():
-            ready += events
-        return ready
-
-    def put(self, event: Event) -> None:
-        """Take an event."""
         if isinstance(event, StereoFrame):
             self._frames.append(event)
         else:
             self._samples.append(event)
             self._newest_ns = event.time_ns
-
-    def due(self) -> list[Event]:
-        """The next frame that can be processed now, after its samples; empty where there is none.
-
-        Whether a second frame is due may depend on the time offset that was estimated with the first.
-        """
-        return self._release() if self._frames and self._is_due(self._frames[0]) else []
+        while self._frames and self._is_due(self._frames[0]):
+            yield from self._release()
 
     def flush(self) -> list[Event]:
         """Return all that is held, in order; what has not come will not come."""
@@ -115,32 +100,22 @@ class EventProcessor:
     """Takes events through the pipeline and, where there is one, into the map."""
 
     def __init__(self, pipeline: FramePipeline, *, wait_for_imu: bool, map: MapSession | None) -> None:
-        """Begin a trajectory.
-
-        Args:
-            pipeline: processes one event at a time.
-            wait_for_imu: whether a frame waits for the first sample at or after it.
-            map: the trajectory's part of a map; None: no map.
-        """
-        self._pipeline, self._order, self.map = pipeline, EventOrder(wait_for_imu=wait_for_imu), map
+        """Begin a trajectory, and its part of a map where there is one; `wait_for_imu` as of `EventOrder`."""
+        self.pipeline, self._order, self.map = pipeline, EventOrder(wait_for_imu=wait_for_imu), map
         self.estimate: Estimate | None = None  # newest; None before the first
         self._last_index = 0  # of the frame that it is of
 
     def add(self, event: Event) -> list[FrameResult]:
         """Take an event, whose image is rectified, and return the results of the frames that it completed."""
-        self._order.put(event)
-        results: list[FrameResult] = []
-        while events := self._order.due():
-            results += self._process(events)
-        return results
+        return self._process(self._order.add(event))
 
     def finish(self) -> list[FrameResult]:
         """Process the frames that still wait, and let the checks report what they have not yet reported."""
         results = self._process(self._order.flush())
-        self._pipeline.monitor.close()
+        self.pipeline.monitor.close()
         if self.estimate is not None:
-            self._pipeline.begin_again(self._last_index)
-        self.estimate = self._pipeline.newest(self._last_index, self.estimate)
+            self.pipeline.begin_again(self._last_index)
+        self.estimate = self.pipeline.newest(self._last_index, self.estimate)
         if self.map is not None:
             self.map.finish()
         return results
@@ -150,61 +125,14 @@ class EventProcessor:
         if self.map is not None:
             self.map.close()
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What the checks have found so far, one line each."""
-        return tuple(self._pipeline.monitor.lines)
-
-    def say(self, line: str) -> None:
-        """Log a line on the events, and add it to the warnings."""
-        self._pipeline.monitor.say(line)
-
-    @property
-    def frames_refused(self) -> int:
-        """Number of frames that the front end refused."""
-        return self._pipeline.monitor.frames_refused
-
-    @property
-    def refusal(self) -> str:
-        """Why the last frame of those was refused."""
-        return self._pipeline.monitor.refusal
-
-    @property
-    def frames_waiting(self) -> int:
-        """Number of frames without a pose, as the back end could not be initialised yet."""
-        return self._pipeline.monitor.frames_waiting
-
-    def landmarks(self) -> Landmarks:
-        """Return the points of the map so far, after the first frame with a pose."""
-        return self._pipeline.backend.landmarks()
-
-    def take_landmarks(self) -> Landmarks:
-        """Return the points that will not change any more, and forget them; `landmarks` has the others."""
-        return self._pipeline.backend.take_landmarks()
-
-    def usable(self, sample: MotionSample) -> MotionSample | None:
-        """Return a motion sample as the estimator takes it; None: it does not, as the sensor was found to be wrong."""
-        return self._pipeline.usable(sample)
-
-    def take_revised(self) -> dict[int, Estimate]:
-        """Return the estimates, by frame number, that replace earlier ones, and forget them.
-
-        There are some where the IMU was found to be wrong, once, in the first minute.
-        """
-        return self._pipeline.take_revised()
-
-    def smoothed(self, frame_index: int) -> Estimate | None:
-        """Return the estimate at a past frame with all frames since; None where the window does not hold it."""
-        return self._pipeline.backend.smoothed(frame_index)
-
-    def _process(self, events: list[Event]) -> list[FrameResult]:
+    def _process(self, events: Iterable[Event]) -> list[FrameResult]:
         """Give events that are due to the pipeline."""
         results: list[FrameResult] = []
         for event in events:
             if not isinstance(event, StereoFrame):
-                self._pipeline.sample(event)
+                self.pipeline.sample(event)
                 continue
-            result = self._pipeline.frame(event)
+            result = self.pipeline.frame(event)
             if result is not None:
                 results.append(self._in_map(event, result))
                 self.estimate, self._last_index = results[-1].estimate, event.index
@@ -215,7 +143,7 @@ class EventProcessor:
         """Add what the map says of a frame."""
         if self.map is None:
             return result
-        loops = self.map.frame(frame, result.output.observations, result.estimate, self._pipeline.backend.relative)
+        loops = self.map.frame(frame, result.output.observations, result.estimate, self.pipeline.backend.relative)
         T = self.map.T_map_odom
         if T is not None:
             T_map_body, covariance = T @ result.estimate.T_world_imu, self.map.covariance

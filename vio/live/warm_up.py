@@ -26,11 +26,7 @@ _SMOOTH_PX = 1.5
 def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config, *, with_map: bool) -> None:
     """Run an odometry of its own over a camera that sways sideways in front of two walls.
 
-    Args:
-        camera: rectified, with its image size.
-        T_cam0_imu: (4, 4); None: no IMU.
-        config: every setting.
-        with_map: whether features of keyframes are extracted, too.
+    `T_cam0_imu` is (4, 4), None without an IMU; `with_map` extracts features of keyframes, too.
 
     Raises:
         DataError: the camera has no image size.
@@ -80,13 +76,7 @@ class SwayingCamera:
     """
 
     def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, gravity_mps2: float) -> None:
-        """Make the walls.
-
-        Args:
-            camera: rectified, with its image size.
-            T_cam0_body: (4, 4) extrinsics of the IMU.
-            gravity_mps2: the camera looks at the horizon.
-        """
+        """Make the walls of a rectified camera, which has an image size and looks at the horizon; extrinsics (4, 4)."""
         import cv2
 
         assert camera.width is not None

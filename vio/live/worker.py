@@ -20,13 +20,10 @@ class Worker:
     def __init__(
         self, most_frames: int, drop: Drop, *, finish: Callable[[], object], close: Callable[[], object]
     ) -> None:
-        """Start the thread.
+        """Start the thread; `most_frames` and `drop` are those of `EventQueue`.
 
-        Args:
-            most_frames: that wait, see `EventQueue`.
-            drop: likewise.
-            finish: called after the last call, unless the worker failed or was asked to forget what waits.
-            close: called last, in any case.
+        `finish` is called after the last call, unless the worker failed or was asked to forget what waits; `close`
+        last, in any case.
         """
         self._queue = EventQueue(most_frames, drop)
         self._finish, self._close = finish, close

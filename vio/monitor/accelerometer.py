@@ -14,8 +14,7 @@ from vio.calibration.verdicts import judge_imu
 from vio.geometry.lie import FloatArray
 from vio.imu.findings import InertialFinding
 from vio.monitor.axes import axes_text, signed_permutations
-from vio.monitor.evidence import Evidence
-from vio.monitor.force_fit import LEAST_WINDOWS, WINDOW_S, ForceFit
+from vio.monitor.force_fit import LEAST_WINDOWS, WINDOW_S, Evidence, ForceFit
 from vio.monitor.gyro_fit import GyroFit
 from vio.monitor.motion import Record
 from vio.monitor.samples import Size, gravity_removed
@@ -43,12 +42,7 @@ def resolve_size(size: Size, evidence: Evidence) -> Size:
 
 
 def judge_force(evidence: Evidence, unit: float) -> tuple[list[InertialFinding], bool]:
-    """Judge axes and sign of the accelerometer, and return whether its sign was measured.
-
-    Args:
-        evidence: the fits.
-        unit: factor that makes the readings m/s^2.
-    """
+    """Judge axes and sign of the accelerometer, whose readings times `unit` are m/s^2; and if the sign is known."""
     gyro_fit, force, R = evidence.gyro_fit, evidence.force, evidence.R_cam0_imu
     readings = gyro_fit.force[gyro_fit.covered]
     if evidence.early_force is not None:
@@ -121,11 +115,7 @@ def judge_up(force: FloatArray, R_cam0_imu: FloatArray, *, measured: bool) -> li
 def judge_lever_arm(record: Record, gyro_fit: GyroFit, T_cam0_imu: FloatArray, rates: Rates) -> list[InertialFinding]:
     """Report an inverted lever arm by the fit of `vio calibrate`; nothing if the motion does not determine it.
 
-    Args:
-        record: intervals and samples.
-        gyro_fit: the gyro's fit; it must agree with the given rotation.
-        T_cam0_imu: (4, 4) as given.
-        rates: the samples.
+    `T_cam0_imu` (4, 4) is as given; the gyro must agree with its rotation.
     """
     times_ns = record.origin_ns + np.round(np.concatenate([record.begin, record.end[-1:]]) / _NS).astype(np.int64)
     frames = np.flatnonzero(np.append(record.joined[1:], True))  # whose interval ends where the next frame is

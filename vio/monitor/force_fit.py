@@ -13,6 +13,7 @@ from vio.monitor.motion import Record
 from vio.numerics.robust import jackknife
 from vio.records import BoolArray
 
+FIRST_EVALUATION = 60  # intervals before the first evaluation; there are fewer only at the end of a short run
 WINDOW_S = 2.0
 LEAST_WINDOWS = 3  # for all but axes that are clearly wrong
 _FEWEST_WINDOWS = 2
@@ -62,6 +63,24 @@ class ForceFit:
 
 
 @dataclass(frozen=True, slots=True)
+class Evidence:
+    """The fits of gyro and accelerometer to the images, and the state of the check."""
+
+    R_cam0_imu: FloatArray  # (3, 3) as given
+    gyro_fit: GyroFit
+    force: ForceFit | None  # None: too few windows without tracking loss, or the readings have no unit
+    early_force: ForceFit | None  # likewise, from fewer windows: enough for axes that are clearly wrong
+    force_final: bool  # `force` will not improve: what it leaves undecided is judged without it
+    clipped: bool  # readings at the end of the range were found, which make rotations appear smaller
+    last: bool  # no later evaluation will follow
+
+    @property
+    def brief(self) -> bool:
+        """Whether there are fewer intervals than in any evaluation during a run."""
+        return self.gyro_fit.count < FIRST_EVALUATION
+
+
+@dataclass(frozen=True, slots=True)
 class _Window:
     """Consecutive intervals without tracking loss, as long as a window."""
 
@@ -74,10 +93,8 @@ class _Window:
 def fit_force(record: Record, gyro_fit: GyroFit, lever_arm: FloatArray) -> ForceFit | None:
     """Fit over whole windows; None: too few of them are without tracking loss.
 
-    Args:
-        record: intervals and samples.
-        gyro_fit: the gyro's fit; it gives the camera's rotation where it explains the images.
-        lever_arm: (3,) given position of the IMU in cam0, metres; a correction to it is fitted.
+    The gyro's fit gives the camera's rotation where it explains the images. A correction to the given position of the
+    IMU in cam0, `lever_arm` (3,) in metres, is fitted, too.
     """
     blocks = [_normal_equations(window, lever_arm) for window in _windows(record, gyro_fit)]
     if len(blocks) < _FEWEST_WINDOWS:
@@ -135,12 +152,7 @@ def _rotations(window: _Window) -> FloatArray:
 
 
 def _double_integrals(window: _Window, R: FloatArray) -> FloatArray:
-    """Return the Jacobian (n, 3, 12) of the IMU's position at the intervals' ends w.r.t. A by rows and b.
-
-    Args:
-        window: the intervals.
-        R: (n, 3, 3) rotations at their starts.
-    """
+    """Return the Jacobian (n, 3, 12) of the IMU's positions at the intervals' ends by A and b; R at their starts."""
     n, dt = len(window.dt), window.dt[:, None, None]
     middle = R @ so3_exp(window.dt[:, None] / 2 * window.omega)
     of_map = np.einsum("nij,nl->nijl", middle, window.force).reshape(n, 3, 9)

@@ -74,9 +74,8 @@ class FrozenImages:
     def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
         """Return which frame a pair repeats; None: it shows something new, or a rig at standstill.
 
-        Args:
-            frame: the pair, with or without images; frames come in time order.
-            expected: the back end's prediction of this frame, its motion since the last frame with features.
+        Frames come in time order, with or without images, each with the back end's prediction, whose motion is that
+        since the last frame with features.
         """
         self._expected, self._repeating = expected, self._compare(frame, expected)
         if self._repeating is None:
@@ -164,11 +163,6 @@ def _images(frame: StereoFrame) -> list[Image]:
     return [image for image in (frame.left, frame.right) if image is not None]
 
 
-def _is_blank(frame: StereoFrame) -> bool:
-    """Whether the images of a frame are of one gray value: black, or blown out."""
-    return all(image.min() == image.max() for image in _images(frame))
-
-
 def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
     """Whether features have not moved since they were seen, in both images."""
     of_images = seen.z[:_CORNERS, :2], seen.z[seen.has_right][:_CORNERS, 2:]
@@ -217,16 +211,17 @@ class RepeatReport:
 
     def frame(self, frame: StereoFrame, repeated: Repeated | None) -> list[str]:
         """Take a frame and what it repeats; return the lines that follow from it."""
-        lines = self._ended(frame) if repeated is None else []
         if repeated is None:
-            self._row = []
-            return lines
+            row, self._row = self._row, []
+            seconds = (frame.time_ns - row[0].time_ns) * _NS if row else 0.0
+            after = f"after {len(row)} repetitions ({seconds:.2f} s)"
+            return [f"frame {frame.index}: the {self._words.what} change again, {after}"] if len(row) > 1 else []
         self._row.append(frame)
         self._total += 1
         if len(self._row) > 1 or self._reported >= _MOST_LINES:
-            return lines
+            return []
         self._reported += 1
-        if _is_blank(frame):
+        if all(image.min() == image.max() for image in _images(frame)):  # black, or blown out
             return [
                 f"frame {frame.index}: the {self._words.what} have one gray value everywhere, as those of frame "
                 f"{repeated.of_index}: the lens is covered, the exposure failed, or the images were not delivered; "
@@ -244,13 +239,6 @@ class RepeatReport:
         what, effect = self._words.what, self._words.summary
         still = [f"the {what} stayed the same from frame {self._row[0].index} to the end"] if self._row else []
         return [*still, f"{self._total} frames {effect}"] if self._total > 1 else still
-
-    def _ended(self, frame: StereoFrame) -> list[str]:
-        if len(self._row) < 2:
-            return []
-        seconds = (frame.time_ns - self._row[0].time_ns) * _NS
-        row = f"{len(self._row)} repetitions ({seconds:.2f} s)"
-        return [f"frame {frame.index}: the {self._words.what} change again, after {row}"]
 
 
 def corner_flow(before: Image, after: Image, pixels: FloatArray) -> FloatArray:

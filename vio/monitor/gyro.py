@@ -13,7 +13,7 @@ from vio.geometry.lie import FloatArray, nearest_rotation
 from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import AXES_WORSE
 from vio.monitor.axes import axes_text, matrix_text, signed_permutations, triple_text
-from vio.monitor.evidence import Evidence
+from vio.monitor.force_fit import Evidence
 from vio.monitor.gyro_fit import AGREES, FAR_OFFSETS_S, GyroFit
 
 _DISAGREES = 0.5  # share of the rotation that the best linear map leaves unexplained
@@ -32,12 +32,7 @@ class _Explanation:
 
 
 def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
-    """Compare the gyro's rates, mapped by the given rotation, with those of the camera.
-
-    Args:
-        evidence: the fits.
-        unit: factor that makes the accelerometer's readings m/s^2.
-    """
+    """Compare the gyro's rates, mapped by the given rotation, with the camera's; forces times `unit` are m/s^2."""
     gyro_fit, R, brief = evidence.gyro_fit, evidence.R_cam0_imu, evidence.brief
     if gyro_fit.unexplained > _DISAGREES:
         return [] if brief else [_disagreement(gyro_fit)]

@@ -36,13 +36,7 @@ class RunHealth:
         self._restarted_ns: int | None = None  # time of the last restart
 
     def restarted(self, index: int, why: str, estimate: Estimate) -> tuple[str, ...]:
-        """Return the line on a restart after a divergence; none if the last one was less than a second before.
-
-        Args:
-            index: frame number.
-            why: what the estimator said.
-            estimate: the state that it goes on from.
-        """
+        """Return the line on a restart from an estimate, with the reason; none within a second of the last one."""
         last_ns, self._restarted_ns = self._restarted_ns, estimate.time_ns
         self._last = estimate.time_ns, estimate.T_world_imu[:3, 3].copy()
         if last_ns is not None and (estimate.time_ns - last_ns) * 1e-9 < _RESTART_EVENT_S:
@@ -54,13 +48,7 @@ class RunHealth:
         )
 
     def frame(self, index: int, report: UpdateReport, estimate: Estimate) -> tuple[str, ...]:
-        """Return the warnings of this frame.
-
-        Args:
-            index: frame number.
-            report: what the update did.
-            estimate: the state estimate after it.
-        """
+        """Return the warnings of a frame, by what its update did and the estimate after it."""
         lines = [*self._gap(index, estimate), *self._features(index, report, estimate)]
         lines += self._stereo(index, estimate)
         lines += self._implausible(index, estimate)

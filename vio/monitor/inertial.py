@@ -18,8 +18,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.imu.clocks import SampleCoverage
 from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import judge_force, judge_lever_arm, judge_up, resolve_size
-from vio.monitor.evidence import FIRST_EVALUATION, Evidence
-from vio.monitor.force_fit import LEAST_WINDOWS, fit_force
+from vio.monitor.force_fit import FIRST_EVALUATION, LEAST_WINDOWS, Evidence, fit_force
 from vio.monitor.gyro import judge_gyro
 from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
@@ -42,12 +41,7 @@ class InertialCheck:
     """
 
     def __init__(self, camera: StereoCamera, T_cam0_imu: FloatArray) -> None:
-        """Create the check.
-
-        Args:
-            camera: rectified pair that the observations belong to.
-            T_cam0_imu: (4, 4) as the run uses it.
-        """
+        """Create the check, for observations of a rectified pair and `T_cam0_imu` (4, 4) as the run uses it."""
         self._stereo, self._T = camera, np.array(T_cam0_imu, dtype=np.float64)
         self._reported: set[str] = set()
         self._samples = Samples()

@@ -38,13 +38,7 @@ class RefusalReport:
         self._frames: deque[_Frame] = deque()
 
     def frame(self, seen: Observations, report: UpdateReport, estimate: Estimate) -> list[str]:
-        """Add a frame; return the line to report, if any.
-
-        Args:
-            seen: its features.
-            report: what the filter did with them.
-            estimate: after it.
-        """
+        """Add the features of a frame and what the filter did with them; return the line to report, if any."""
         if self._reported:
             return []
         refused = np.isin(seen.ids, report.gated_ids)

@@ -18,10 +18,7 @@ _IMAGE, _OPTICAL = [0, 1], [2]  # the camera's axes
 def compare_rotations(record: Record, fit: GyroFit, R_cam0_imu: FloatArray) -> RotationComparison:
     """Compare the rates of camera and gyro about the axes of the image, and about the optical axis; equation (I5).
 
-    Args:
-        record: the camera's motions.
-        fit: the gyro's rates at the best clock offset.
-        R_cam0_imu: (3, 3) as given.
+    The gyro's rates are those at the best clock offset, and `R_cam0_imu` (3, 3) is as given.
     """
     used = fit.covered
     if fit.unexplained > AGREES or not fit.fits(R_cam0_imu) or not used.any():

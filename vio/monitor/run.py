@@ -44,13 +44,7 @@ class RunMonitor:
     """
 
     def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, *, imu: bool) -> None:
-        """Create the monitors.
-
-        Args:
-            camera: rectified pair.
-            T_cam0_body: (4, 4) as the run uses it.
-            imu: whether the run propagates with raw IMU samples.
-        """
+        """Create the monitors of a rectified pair; extrinsics (4, 4); `imu`: raw samples propagate the pose."""
         self._health, self._refusals = RunHealth(), RefusalReport(imu=imu)
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
@@ -109,9 +103,7 @@ class RunMonitor:
     def repeats(self, frame: StereoFrame, expected: Prediction | None) -> bool:
         """Return whether a frame shows an earlier exposure again and must not be used; called before `observations`.
 
-        Args:
-            frame: in time order.
-            expected: the back end's prediction of it.
+        Frames come in time order, each with the back end's prediction of it.
         """
         self._index, self._index_before = frame.index, self._index
         self._take_new()
@@ -208,10 +200,6 @@ class RunMonitor:
                 f"{(frame.time_ns - since) * 1e-9:.1f} s before have no pose"
             ]
         )
-
-    def lost(self, index: int, why: str) -> None:
-        """Report that the back end diverged in a frame and has no estimate until its start is observable again."""
-        self._report([f"frame {index}: {why}; there are no poses until the scale is observable again"])
 
     def restarted(self, index: int, why: str, estimate: Estimate) -> None:
         """Report that the back end diverged in a frame and was started again; repeats within a second are one event."""

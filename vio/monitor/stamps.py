@@ -20,9 +20,6 @@ def judge_stamps(record: Record) -> InertialFinding | None:
 
     Over an interval of stamps `dt` the gyro turns at a mean rate `w`; the images show an angle `a`, so the exposures
     lay `a / w` apart. Where `a / w - dt` is the negative of `dt - median(dt)`, the stamps are wrong, not the exposures.
-
-    Args:
-        record: the camera's motions between frames, and the IMU's readings.
     """
     means, covered = record.means(np.zeros(1))
     gyro = np.linalg.norm(means[0, :, :3], axis=1)

@@ -46,11 +46,8 @@ class NotSavableError(Exception):
 def save_checkpoint(path: Path, state: Any, dataset: Dataset, inputs: Mapping[str, Any] | None = None) -> None:
     """Write a state atomically; the recording itself, where the state refers to it, is left out.
 
-    Args:
-        path: the file.
-        state: plain values, arrays, containers and objects of this package's classes.
-        dataset: the recording.
-        inputs: what the results depend on, as JSON values by name; they must be the same when the run goes on.
+    A state is made of plain values, arrays, containers and objects of this package's classes. `inputs` is what the
+    results depend on, as JSON values by name; they must be the same when the run goes on.
 
     Raises:
         NotSavableError: a part of the state cannot be saved.

@@ -110,12 +110,9 @@ def curves_of(runs: Sequence[FinishedRun]) -> list[Curves]:
 
 
 def draw(run: DrawnRun, view_ref: FloatArray | None, *, most: int | None = None) -> Curves:
-    """Return the curves of one run.
+    """Return the curves of one run, with at most `most` samples each (None: all).
 
-    Args:
-        run: the run.
-        view_ref: transform (4, 4) from its reference's world; None: its own view.
-        most: samples of a curve; None: all.
+    `view_ref` is the transform (4, 4) from its reference's world; None: its own view.
     """
     T_view_world = run.view()
     if run.evaluation is not None and view_ref is not None:
@@ -195,9 +192,7 @@ def _truth(run: DrawnRun, evaluation: Evaluation, view_ref: FloatArray, most: in
 def _attitude_sigma(R_view_cam0: FloatArray, P: FloatArray) -> FloatArray:
     """Return the standard deviations (N, 3) of rotations about the vertical, the camera's right and its optical axis.
 
-    Args:
-        R_view_cam0: attitudes (N, 3, 3).
-        P: covariance (N, 3, 3) of rotations in the upright frame, rad^2.
+    P (N, 3, 3) is the covariance of rotations in the upright frame, rad^2, in which the attitudes (N, 3, 3) are.
     """
     up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), R_view_cam0[:, :, 0].shape)
     axes = np.stack([up, R_view_cam0[:, :, 0], R_view_cam0[:, :, 2]], axis=1)  # (N, axis, 3)

@@ -71,7 +71,6 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
     if not (folder / RunFile.ESTIMATES).is_file() and (folder / RunFile.UNFINISHED).is_dir():
         raise DataError(f"{folder}: this run was ended before its end; `vio run --resume {folder}` goes on with it")
     estimates = read_estimates(folder / RunFile.ESTIMATES)
-    frames = _read_frames(folder / RunFile.FRAMES, len(estimates))
     points = read_points(folder / RunFile.LANDMARKS)
     trajectory = Trajectory(
         np.array(estimates["T_world_imu"]),
@@ -85,8 +84,8 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
         name=folder.resolve().name,
         metrics=metrics,
         estimates=estimates,
-        frames=frames,
-        points=np.stack([points[name] for name in ("x", "y", "z")], axis=1).astype(np.float64),
+        frames=_read_frames(folder / RunFile.FRAMES, len(estimates)),
+        points=_positions(points),
         point_sigmas=points["sigma"].astype(np.float64),
         trajectory=trajectory,
         evaluation=_evaluation(folder, trajectory, reference, T_cam0_body),
@@ -163,9 +162,12 @@ def point_positions(folder: Path) -> FloatArray:
     Raises:
         DataError: the file cannot be used.
     """
-    points = read_points(folder / RunFile.LANDMARKS)
-    p = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
+    p = _positions(read_points(folder / RunFile.LANDMARKS))
     return p[np.isfinite(p).all(axis=1)]
+
+
+def _positions(points: np.ndarray[Any, Any]) -> FloatArray:
+    return np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
 
 
 def up_of_odometry(folder: Path, metrics: dict[str, Any]) -> FloatArray | None:
@@ -186,11 +188,8 @@ def _evaluation(
     path = folder / RunFile.REFERENCE if reference is None else reference
     if reference is None and not path.is_file():
         return None
-    truth = read_trajectory(path)
-    if truth.times_ns is None and truth.frame_indices is None:
-        truth = replace(truth, frame_indices=np.arange(len(truth), dtype=np.int64))
     try:
-        return evaluate(trajectory, truth, T_cam0_imu=T_cam0_body)
+        return evaluate(trajectory, read_trajectory(path).numbered(), T_cam0_imu=T_cam0_body)
     except EvaluationError as error:
         log.warning("%s: the reference was not used: %s", path, error)
         return None

@@ -28,7 +28,6 @@ from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.files.atomic import atomic_folder, check_own
 from vio.files.inputs import read_input
 from vio.files.printable import json_text, printable
-from vio.files.tables import Records
 from vio.files.trajectories import in_first_cam0, read_trajectory, write_kitti, write_tum
 from vio.geometry.lie import FloatArray, checked_transform, se3_inverse, se3_log, transform_points
 from vio.numerics.compiled import has_compiled
@@ -36,7 +35,7 @@ from vio.protocols import Dataset
 from vio.records import IMU_ENTRIES, Landmarks, Trajectory
 from vio.runs.files import FILES, REQUEST, RunFile
 from vio.runs.mapped import MappedRun, write_keyframes, write_loops
-from vio.runs.pipeline import STAGES, FrameLog, RunResult, given_rig
+from vio.runs.pipeline import STAGES, RunResult, given_rig
 from vio.runs.recorder import GrowingFolder
 from vio.runs.tables import frames_csv
 
@@ -216,9 +215,18 @@ def _write_files(
     if result.mapped is not None:
         metrics["map"] = _write_mapped(target, result, result.mapped, reference)
     write_landmarks_ply(target / RunFile.LANDMARKS, result.landmarks)
-    _write_frames(target / RunFile.FRAMES, result.frames)
+    frames, stages = result.frames, sorted({name for frame in result.frames for name in frame.stages_ms})
+    with (target / RunFile.FRAMES).open("w", encoding="utf-8", newline="\n") as stream:
+        for start in range(0, len(frames), _CHUNK_FRAMES):
+            stream.write(frames_csv(frames[start : start + _CHUNK_FRAMES], stages, header=start == 0))
     if save_observations:
-        _write_observations(target / RunFile.OBSERVATIONS, result)
+        from vio.datasets.observation_log import write_observation_log
+
+        seen, samples = result.observations, result.motion_samples
+        assert seen is not None
+        assert samples is not None
+        run_motion = result.motion or "none"
+        write_observation_log(target / RunFile.OBSERVATIONS, result.recording, seen, samples, run_motion=run_motion)
     (target / RunFile.METRICS).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
     return metrics, RunPicture.of(result, evaluation, dead_reckoning)
 
@@ -267,9 +275,9 @@ def score(
         for note in own.notes:
             log.warning("%s", note)
         other = result.dead_reckoning
-        return own, None if other is None else evaluate(
-            other, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m
-        )
+        if other is None:
+            return own, None
+        return own, evaluate(other, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
     except EvaluationError as error:
         log.warning("the reference was not used: %s", error)
         return None, None
@@ -297,7 +305,7 @@ def metrics_of(
     frames = result.frames
     work_ms = np.array([f.total_ms for f in frames])
     innovations = np.asarray(frames.column("innovation_ratio"), dtype=np.float64)
-    scores = None if evaluation is None else evaluation.as_dict()
+    scores = {} if evaluation is None else evaluation.as_dict()
     return {
         "out": str(folder),
         "complete": result.stopped is None,
@@ -322,12 +330,10 @@ def metrics_of(
         "refused_share": refused_share(frames.column("used"), frames.column("gated")),
         "innovation_ratio": None if np.isnan(innovations).all() else float(np.nanmedian(innovations)),
         "landmarks": len(result.landmarks.ids),
-        "ate_m": None if scores is None else scores["ate_m"],
-        "rpe": None if scores is None else scores["rpe"],
-        "drift_lengths_m": [] if scores is None else scores["drift_lengths_m"],
-        "t_err_percent": None if scores is None else scores["t_err_percent"],
-        "r_err_deg_per_100m": None if scores is None else scores["r_err_deg_per_100m"],
-        "evaluation": scores,
+        **{name: scores.get(name) for name in ("ate_m", "rpe")},
+        "drift_lengths_m": scores.get("drift_lengths_m", []),
+        **{name: scores.get(name) for name in ("t_err_percent", "r_err_deg_per_100m")},
+        "evaluation": scores or None,
         "dead_reckoning": None if dead_reckoning is None else dead_reckoning.as_dict(),
         "landmark_error": landmark_error(result, evaluation),
         "warnings": list(result.warnings),
@@ -517,37 +523,15 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
 
 def write_landmarks_ply(path: Path, landmarks: Landmarks) -> None:
     """Write the map as a binary PLY: x y z in metres, and the largest standard deviation of any direction."""
-    count = len(landmarks.ids)
-    header = (
-        f"ply\nformat binary_little_endian 1.0\ncomment landmarks in the world frame, metres\n"
-        f"element vertex {count}\n"
-        + "".join(f"property float {name}\n" for name in ("x", "y", "z", "sigma"))
-        + "end_header\n"
-    )
+    count, names = len(landmarks.ids), ("x", "y", "z", "sigma")
+    header = "ply\nformat binary_little_endian 1.0\ncomment landmarks in the world frame, metres\n"
+    header += f"element vertex {count}\n" + "".join(f"property float {name}\n" for name in names) + "end_header\n"
     with path.open("wb") as stream:
         stream.write(header.encode("ascii"))
         for start in range(0, count, _CHUNK):
             part = slice(start, start + _CHUNK)
-            points = np.zeros(min(_CHUNK, count - start), dtype=[(name, "<f4") for name in ("x", "y", "z", "sigma")])
+            points = np.zeros(min(_CHUNK, count - start), dtype=[(name, "<f4") for name in names])
             points["x"], points["y"], points["z"] = landmarks.p_world[part].T
             largest = np.linalg.eigvalsh(landmarks.covariance[part])[:, -1]
             points["sigma"] = np.sqrt(np.maximum(largest, 0.0))
             stream.write(points.tobytes())
-
-
-def _write_frames(path: Path, frames: Records[FrameLog]) -> None:
-    """Write the log of all frames as CSV; the front end's stages are the last columns."""
-    stages = sorted({name for frame in frames for name in frame.stages_ms})
-    with path.open("w", encoding="utf-8", newline="\n") as stream:
-        for start in range(0, len(frames), _CHUNK_FRAMES):
-            stream.write(frames_csv(frames[start : start + _CHUNK_FRAMES], stages, header=start == 0))
-
-
-def _write_observations(path: Path, result: RunResult) -> None:
-    from vio.datasets.observation_log import write_observation_log
-
-    assert result.observations is not None
-    assert result.motion_samples is not None
-    write_observation_log(
-        path, result.recording, result.observations, result.motion_samples, run_motion=result.motion or "none"
-    )

@@ -6,7 +6,7 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 _LOOP_COLUMNS = (
     *("frame", "time_ns", "keyframe", "keyframe_time_ns", "inliers", "gap_m", "joined", "keyframe_frame", "kept"),
 )
+_MATCH_COLUMNS = ("z_keyframe", "z_frame", "has_right_keyframe", "has_right_frame")
 _KEYFRAME_COLUMNS = ("keyframe", "frame", "time_ns", "own", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
@@ -52,11 +53,8 @@ class MappedRun:
 def mapped_run(session: MapSession, estimates: Records[Estimate], causal: Rows, scale_sigma: float) -> MappedRun:
     """Return the poses of all frames in the map.
 
-    Args:
-        session: of the run.
-        estimates: of all frames.
-        causal: poses in the map as known at the time.
-        scale_sigma: standard deviation of the scale by the rig's calibration, over it.
+    `causal` are those known at the time; `scale_sigma` is the standard deviation of the scale by the calibration, over
+    it.
     """
     T_odom_body, index = (np.array(estimates.column(name)) for name in ("T_world_imu", "index"))
     frames, T_map, T_odom = session.keyframes()
@@ -119,14 +117,13 @@ def write_loops(folder: Path, loops: Sequence[LoopEvent]) -> None:
     lines = [",".join("" if value is None else str(value) for value in row) for row in rows]
     (folder / RunFile.LOOPS).write_text("\n".join([",".join(_LOOP_COLUMNS), *lines]) + "\n", encoding="utf-8")
     known = [(n, o.matches) for n, o in enumerate(loops) if o.matches is not None]
-    np.savez_compressed(
-        folder / RunFile.LOOP_MATCHES,
-        loop=np.repeat([n for n, _ in known], [len(m) for _, m in known]).astype(np.int64),
-        z_keyframe=np.concatenate([np.zeros((0, 4)), *(m.z_keyframe for _, m in known)]),
-        z_frame=np.concatenate([np.zeros((0, 4)), *(m.z_frame for _, m in known)]),
-        has_right_keyframe=np.concatenate([np.zeros(0, dtype=np.bool_), *(m.has_right_keyframe for _, m in known)]),
-        has_right_frame=np.concatenate([np.zeros(0, dtype=np.bool_), *(m.has_right_frame for _, m in known)]),
-    )
+    of_loop = np.repeat([n for n, _ in known], [len(m) for _, m in known]).astype(np.int64)
+    none = np.zeros((0, 4)), np.zeros(0, dtype=np.bool_)
+    columns: dict[str, Any] = {
+        name: np.concatenate([none[name.startswith("has")], *(getattr(m, name) for _, m in known)])
+        for name in _MATCH_COLUMNS
+    }
+    np.savez_compressed(folder / RunFile.LOOP_MATCHES, loop=of_loop, **columns)
 
 
 def write_keyframes(folder: Path, keyframes: MapKeyframes) -> None:
@@ -156,11 +153,7 @@ def read_loops(folder: Path) -> tuple[LoopEvent, ...]:
         rows = _read_rows(path)
         return tuple(
             LoopEvent(
-                frame=int(row["frame"]),
-                time_ns=int(row["time_ns"]),
-                keyframe=int(row["keyframe"]),
-                keyframe_time_ns=int(row["keyframe_time_ns"]),
-                inliers=int(row["inliers"]),
+                **{name: int(row[name]) for name in _LOOP_COLUMNS[:5]},
                 gap_m=float(row["gap_m"]),
                 joined=row["joined"] == "True",
                 keyframe_frame=int(row["keyframe_frame"]) if row.get("keyframe_frame") else None,
@@ -224,9 +217,8 @@ def _read_matches(path: Path) -> dict[int, LoopMatches]:
     if not path.is_file():
         return {}
     held = read_npz(path)
-    names = ("z_keyframe", "z_frame", "has_right_keyframe", "has_right_frame")
-    shapes = [held[name].shape for name in names if name in held]
+    shapes = [held[name].shape for name in _MATCH_COLUMNS if name in held]
     loop = held.get("loop")
     if loop is None or shapes != [(len(loop), 4), (len(loop), 4), (len(loop),), (len(loop),)]:
         raise DataError(f"{path}: is damaged; repeat the run")
-    return {int(n): LoopMatches(*(held[name][loop == n] for name in names)) for n in np.unique(loop)}
+    return {int(n): LoopMatches(*(held[name][loop == n] for name in _MATCH_COLUMNS)) for n in np.unique(loop)}

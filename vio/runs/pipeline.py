@@ -159,7 +159,9 @@ def run(
     if control.resume:
         state = recorder.restore(features)
         _reopen_map(state.processor.map, map)
-        viewer = _skipped(viewer, len(recorder))
+        skip = getattr(viewer, "skip", None)
+        if skip is not None:  # a viewer that knows of frames that an earlier process has done
+            skip(len(recorder))
     else:
         reckoned = source.motion == "velocity"
         state = _RunState(
@@ -177,7 +179,7 @@ def run(
         try:
             with _opencv_threads(dataset, config, parts.frontend):
                 images = _needs_images(dataset, config) or processor.map is not None
-                events = _limited(dataset.events(state.next_frame, stop, images=images), recording, config)
+                events = dataset.events(state.next_frame, stop, images=images)
                 stopped = loop.run(events, features, control.should_stop)
         except VioError as error:
             if folder is None or not len(recorder):
@@ -193,25 +195,26 @@ def run(
             body=body,
             T_cam0_body=source.T_cam0_body,
             estimates=recorder.estimates,
-            dead_reckoning=_trajectory(recorder.dead_reckoned(), recorder, body) if reckoned else None,
-            landmarks=recorder.landmarks(processor.landmarks()),
+            dead_reckoning=_dead_reckoned(recorder, body) if reckoned else None,
+            landmarks=recorder.landmarks(processor.pipeline.backend.landmarks()),
             frames=recorder.frames,
             observations=recorder.observations,
             motion_samples=recorder.samples,
-            warnings=processor.warnings,
+            warnings=tuple(processor.pipeline.monitor.lines),
             wall_s=time.perf_counter() - began,
             stopped=stopped,
             rig=given_rig(dataset),
-            mapped=None if session is None else _mapped(session, recorder, config),
+            mapped=None
+            if session is None
+            else mapped_run(session, recorder.estimates, recorder.mapped, _scale_sigma(recorder.estimates[-1], config)),
         )
 
 
-def _mapped(session: MapSession, recorder: RunRecorder, config: Config) -> MappedRun:
-    """Return what the map made of a run; its scale is known as the calibration, or as the run found it to be."""
-    scale, s = recorder.estimates[-1].stereo_scale, config.msckf
+def _scale_sigma(last: Estimate, config: Config) -> float:
+    """Return the standard deviation of a run's scale, over it: that of the calibration, or as the run found it."""
+    scale, s = last.stereo_scale, config.msckf
     considered = float(np.hypot(s.stereo_baseline_sigma, s.stereo_focal_sigma))
-    sigma = considered if scale is None else float(np.sqrt(scale.covariance.sum()))
-    return mapped_run(session, recorder.estimates, recorder.mapped, sigma)
+    return considered if scale is None else float(np.sqrt(scale.covariance.sum()))
 
 
 def given_rig(dataset: Dataset) -> Rig | None:
@@ -242,8 +245,8 @@ def _nothing_done(recording: Recording, processor: EventProcessor, stopped: str 
     """Say why a run has no frame."""
     if stopped is not None:
         raise StoppedError(f"{stopped} before the first frame was done; nothing was written", status=130)
-    if processor.frames_waiting:
-        waited = f"none of the {processor.frames_waiting} frames has a pose"
+    if waiting := processor.pipeline.monitor.frames_waiting:
+        waited = f"none of the {waiting} frames has a pose"
         raise DataError(f"{recording.path}: {waited}; see the warnings above")
     raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
 
@@ -279,25 +282,27 @@ class _Loop:
         """Prepare; `frames` are the numbers of the recording's frames that the run is to take."""
         self._state, self._recorder, self._viewer, self._frames = state, recorder, viewer, frames
         self._end = 1 + max(frames, default=-1)
-        self._reading = _ReadTimer()
+        self._read_ms = 0.0  # that the recording took to give its events since the last result
 
     def run(self, events: Iterable[Event], dataset: Dataset, should_stop: Callable[[], str | None]) -> str | None:
         """Take events to their end; return why they ended before."""
         state, recorder, processor = self._state, self._recorder, self._state.processor
-        stopped = None
+        monitor, stopped = processor.pipeline.monitor, None
         resumed = state.frame_ns is not None
-        for event in self._reading.timed(events):
+        for event in self._timed(events):
             if resumed and not state.is_new(event):
                 continue
             if isinstance(event, StereoFrame):
+                if event.index not in self._frames:
+                    continue
                 state.unread += self._between(state.next_frame + (state.frame_ns is not None), event.index)
             self._take(event)
             state.note(event)
-            if _LEAST_REFUSED <= processor.frames_refused > len(recorder):
+            if _LEAST_REFUSED <= monitor.frames_refused > len(recorder):
                 break
             stopped = should_stop()
             if recorder.is_save_due or (stopped and recorder.can_save):
-                recorder.save(state, dataset, processor.take_landmarks())
+                recorder.save(state, dataset, processor.pipeline.backend.take_landmarks())
             if stopped:
                 break
         else:
@@ -305,12 +310,23 @@ class _Loop:
                 state.unread += self._between(state.next_frame + 1, self._end)
         if state.unread:
             last = max(state.next_frame, *state.unread)
-            processor.say(_unread_line(state.unread, sum(index <= last for index in self._frames)))
+            monitor.say(_unread_line(state.unread, sum(index <= last for index in self._frames)))
         self._record(processor.finish())
-        recorder.revise(processor.smoothed)
-        if processor.frames_refused > len(recorder):
-            raise DataError(f"most frames were refused: {processor.refusal}")
+        recorder.revise(processor.pipeline.smoothed)
+        if monitor.frames_refused > len(recorder):
+            raise DataError(f"most frames were refused: {monitor.refusal}")
         return stopped
+
+    def _timed(self, events: Iterable[Event]) -> Iterator[Event]:
+        """Yield the events, and note how long each took to come."""
+        iterator = iter(events)
+        while True:
+            start = time.perf_counter()
+            event = next(iterator, None)
+            self._read_ms += 1e3 * (time.perf_counter() - start)
+            if event is None:
+                return
+            yield event
 
     def _between(self, first: int, end: int) -> list[int]:
         """Frames `first <= index < end` that the run is to take."""
@@ -327,19 +343,12 @@ class _Loop:
     def _record(self, results: list[FrameResult]) -> None:
         state = self._state
         for result in results:
-            self._recorder.frame(result, self._reading.take_ms(), state.processor.smoothed)
+            self._recorder.frame(result, self._read_ms, state.processor.pipeline.smoothed)
+            self._read_ms = 0.0
             if state.dead_reckoning is not None:
                 self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))
             self._viewer.frame(result)
-        self._recorder.replace(state.processor.take_revised())
-
-
-def _skipped(viewer: Viewer | None, frames: int) -> Viewer | None:
-    """Tell a viewer that knows it of frames that an earlier process has done."""
-    skip = getattr(viewer, "skip", None)
-    if skip is not None:
-        skip(frames)
-    return viewer
+        self._recorder.replace(state.processor.pipeline.take_revised())
 
 
 def _check_range(recording: Recording, start: int, stop: int | None) -> None:
@@ -364,38 +373,6 @@ def _unread_line(unread: list[int], frames: int) -> str:
     return f"{len(unread)} of {frames} frames could not be read and were skipped: {named}"
 
 
-def _limited(events: Iterable[Event], recording: Recording, config: Config) -> Iterable[Event]:
-    """The events without the frames that the limit on the frame rate leaves out, counted from the first of all."""
-    most_hz = config.dataset.max_frame_rate
-    if most_hz is None:
-        return events
-    used = set(used_frames(recording.frame_times_ns, most_hz).tolist())
-    return (event for event in events if not isinstance(event, StereoFrame) or event.index in used)
-
-
-class _ReadTimer:
-    """Wall time that the recording takes to give its events."""
-
-    def __init__(self) -> None:
-        self._ms = 0.0
-
-    def timed(self, events: Iterable[Event]) -> Iterator[Event]:
-        """Yield the events, and note how long each took to come."""
-        iterator = iter(events)
-        while True:
-            start = time.perf_counter()
-            event = next(iterator, None)
-            self._ms += 1e3 * (time.perf_counter() - start)
-            if event is None:
-                return
-            yield event
-
-    def take_ms(self) -> float:
-        """Return the time since the last call, and begin anew."""
-        taken, self._ms = self._ms, 0.0
-        return taken
-
-
 def _opencv_threads(dataset: Dataset, config: Config, given: Frontend | None) -> AbstractContextManager[None]:
     """Limit OpenCV to one thread where the front end is `klt`, whose steps are too short for more."""
     if given is not None or config.frontend.name not in ("auto", "klt") or not _needs_images(dataset, config):
@@ -408,10 +385,11 @@ def _needs_images(dataset: Dataset, config: Config) -> bool:
     return dataset.recording.has_images and front.name != "precomputed" and front.features is None
 
 
-def _trajectory(T_world_body: FloatArray, rows: RunRecorder, body: BodyFrame) -> Trajectory:
-    """Return poses (N, 4, 4) of the first N frames with an estimate; a run that an error ends may have one less."""
-    times_ns, indices = (np.asarray(rows.estimates.column(name))[: len(T_world_body)] for name in ("time_ns", "index"))
-    return Trajectory(T_world_body=T_world_body, times_ns=times_ns, body=body, frame_indices=indices)
+def _dead_reckoned(rows: RunRecorder, body: BodyFrame) -> Trajectory:
+    """Return the poses by dead reckoning of the frames with an estimate; a run that an error ends may have one less."""
+    T = rows.dead_reckoned()
+    times_ns, indices = (np.asarray(rows.estimates.column(name))[: len(T)] for name in ("time_ns", "index"))
+    return Trajectory(T, times_ns, body, indices)
 
 
 class DeadReckoning:

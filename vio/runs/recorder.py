@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +41,7 @@ from vio.runs.tables import (
     frames_csv,
     mapped_row,
     observation_rows,
+    observations_of,
     sample_of,
     sample_row,
 )
@@ -81,13 +82,9 @@ class RunRecorder:
     def __init__(
         self, body: BodyFrame, *, lag_frames: int, keep_observations: bool, folder: GrowingFolder | None = None
     ) -> None:
-        """Prepare; files begin with the first frame.
+        """Prepare; files begin with the first frame. Without a folder everything stays in memory.
 
-        Args:
-            body: what the poses describe.
-            lag_frames: frames after which an estimate is final, smoothed by those.
-            keep_observations: whether observations and motion samples are kept.
-            folder: the run's folder; None: everything stays in memory.
+        After `lag_frames` an estimate is final, smoothed by those; `keep_observations` keeps motion samples, too.
         """
         self._body, self._lag, self._keep, self._folder = body, lag_frames, keep_observations, folder
         self._rows = FrameRows()
@@ -207,9 +204,13 @@ class RunRecorder:
         return self._tables["mapped"].rows()
 
     @property
-    def observations(self) -> Sequence[Observations] | None:
+    def observations(self) -> Records[Observations] | None:
         """Observations of all frames; None: not kept."""
-        return SeenFrames(self._tables["seen"], self._tables["observations"]) if self._keep else None
+        if not self._keep:
+            return None
+        seen, rows = self._tables["seen"], self._tables["observations"]
+        ends = dict(zip(seen.rows()["index"].tolist(), np.cumsum(seen.rows()["count"]).tolist(), strict=True))
+        return Records(seen, lambda row: observations_of(row, rows, ends[int(row["index"])]))
 
     @property
     def samples(self) -> Records[MotionSample] | None:
@@ -254,12 +255,9 @@ class RunRecorder:
         return self.can_save and time.monotonic() - self._saved_s > _CHECKPOINT_S
 
     def save(self, state: Any, dataset: Dataset, finished: Landmarks) -> None:
-        """Write a checkpoint, where `can_save` says so.
+        """Write a checkpoint of a run's state, less the recording, where `can_save` says so.
 
-        Args:
-            state: of the run, beside the recorder's own.
-            dataset: the recording, which is left out of it.
-            finished: points of the map that will not change any more, and that the state no longer has.
+        `finished` are points of the map that will not change any more, and that the state no longer has.
         """
         assert self._folder is not None
         with self._writing():
@@ -298,9 +296,8 @@ class RunRecorder:
         paths = {name: self._unfinished / f"{name}.npy" for name in _TABLES}
         for name, dtype in _TABLES.items():
             check_table(paths[name], dtype, *own["tables"][name])
-        for name, dtype in _TABLES.items():
-            keep, summed = own["tables"][name]
-            self._tables[name] = Table(dtype, paths[name], keep=keep, summed=summed)
+        for name, (keep, summed) in own["tables"].items():
+            self._tables[name] = Table(_TABLES[name], paths[name], keep=keep, summed=summed)
         estimates = self._tables["estimates"]
         for k, row in enumerate(own["late"], start=len(estimates) - len(own["late"])):
             estimates.replace(k, row[None])
@@ -331,7 +328,11 @@ class RunRecorder:
                 early = [name for name in texts if not name.startswith(RunFile.UNFINISHED)]
                 for name in early:  # they say whose folder it is
                     atomic_write_text(self._folder.path / name, texts[name])
-                _remove(self._folder.path, [RunFile.UNFINISHED, *(n for n in self._folder.replaces if n not in texts)])
+                for name in (RunFile.UNFINISHED, *(n for n in self._folder.replaces if n not in texts)):
+                    if (old := self._folder.path / name).is_dir() and not old.is_symlink():
+                        shutil.rmtree(old)
+                    else:
+                        old.unlink(missing_ok=True)
                 self._unfinished.mkdir()
                 for name in sorted(texts.keys() - early):
                     atomic_write_text(self._folder.path / name, texts[name])
@@ -361,37 +362,3 @@ class RunRecorder:
                 stream.write(text.encode())
                 stream.flush()
                 os.fsync(stream.fileno())
-
-
-class SeenFrames(Sequence[Observations]):
-    """The observations of all frames in two tables."""
-
-    def __init__(self, seen: Table, rows: Table) -> None:
-        self._seen, self._rows = seen.rows(), rows
-        self._offsets = np.concatenate([[0], np.cumsum(self._seen["count"])])
-
-    def __len__(self) -> int:
-        return len(self._seen)
-
-    @overload
-    def __getitem__(self, index: int) -> Observations: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Observations]: ...
-
-    def __getitem__(self, index: int | slice) -> Observations | list[Observations]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(len(self))[index]]
-        k = range(len(self))[index]
-        rows = self._rows.rows(int(self._offsets[k]), int(self._offsets[k + 1]))
-        columns = (np.array(rows[name]) for name in ("id", "z", "has_right", "stale", "sigma"))
-        return Observations(int(self._seen["index"][k]), int(self._seen["time_ns"][k]), *columns)
-
-
-def _remove(folder: Path, names: Sequence[str]) -> None:
-    for name in names:
-        path = folder / name
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.files.tables import Rows
+from vio.files.tables import Rows, Table
 from vio.geometry.lie import FloatArray
 from vio.records import (
     Estimate,
@@ -44,6 +44,15 @@ ESTIMATE = np.dtype(
         ("stereo_scale_covariance", "<f8", (2, 2)),
     ]
 )
+# Columns of an estimate's records, by their fields there.
+_FIELD = {
+    "stereo_field": "coefficients",
+    "stereo_field_covariance": "covariance",
+    "stereo_rows_rms_px": "rows_rms_px",
+    "stereo_rows": "rows",
+    "stereo_rows_covariance": "rows_covariance",
+}
+_SCALE = {"stereo_scale": "logs", "stereo_scale_covariance": "covariance"}
 _STAGES = 16  # of the front end, at most
 _COUNTS = ("detected", "tracked", "matched", "selected", "stale", "used", "gated", "landmarks")
 _TIMES = ("read_ms", "frontend_ms", "monitor_ms", "select_ms", "filter_ms")
@@ -82,16 +91,10 @@ def estimate_row(index: int, estimate: Estimate) -> Rows:
     for name in _KEPT:
         value = getattr(estimate, name)
         row[name] = np.nan if value is None else value
-    field = estimate.stereo_field
-    row["stereo_field"] = np.nan if field is None else field.coefficients
-    row["stereo_field_covariance"] = np.nan if field is None else field.covariance
-    row["stereo_rows_rms_px"] = np.nan if field is None else field.rows_rms_px
-    row["stereo_rows"] = np.nan if field is None or field.rows is None else field.rows
-    P = None if field is None else field.rows_covariance
-    row["stereo_rows_covariance"] = np.nan if P is None else P
-    scale = estimate.stereo_scale
-    row["stereo_scale"] = np.nan if scale is None else scale.logs
-    row["stereo_scale_covariance"] = np.nan if scale is None else scale.covariance
+    for record, columns in ((estimate.stereo_field, _FIELD), (estimate.stereo_scale, _SCALE)):
+        for column, name in columns.items():
+            value = getattr(record, name, None)
+            row[column] = np.nan if value is None else value
     return row
 
 
@@ -154,6 +157,13 @@ def observation_rows(seen: Observations) -> Rows:
     rows["id"], rows["z"], rows["has_right"], rows["stale"] = seen.ids, seen.z, seen.has_right, seen.stale
     rows["sigma"] = 0.0 if seen.sigma is None else seen.sigma
     return rows
+
+
+def observations_of(row: np.void, table: Table, end: int) -> Observations:
+    """Return the observations of a frame by its row in the table of frames; `end` is that of its rows in `table`."""
+    own = table.rows(end - int(row["count"]), end)
+    columns = (np.array(own[name]) for name in ("id", "z", "has_right", "stale", "sigma"))
+    return Observations(int(row["index"]), int(row["time_ns"]), *columns)
 
 
 def sample_row(sample: MotionSample) -> Rows:

@@ -62,22 +62,16 @@ class _VisibilityCount:
         return [i for i, _ in sorted(self._count.items(), key=lambda item: (-item[1], item[0]))]
 
 
-class _Budget:
-    """The number of rows to choose."""
+def _budget(s: SelectorSettings, n: int) -> int:
+    """Return how many of n rows may be chosen."""
+    return min(n, max(int(np.ceil(n * s.keep_fraction)), _LEAST_KEPT) if s.budget is None else s.budget)
 
-    def __init__(self, settings: SelectorSettings) -> None:
-        self._settings, self._least = settings, _LEAST_KEPT
 
-    def rows(self, n: int) -> int:
-        """Return how many of n rows may be chosen."""
-        s = self._settings
-        return min(n, max(int(np.ceil(n * s.keep_fraction)), self._least) if s.budget is None else s.budget)
-
-    def best(self, score: FloatArray, ids: IntArray) -> BoolArray:
-        """Choose the rows of largest score; ties go to the smaller id."""
-        chosen = np.zeros(len(score), dtype=np.bool_)
-        chosen[np.lexsort((ids, -score))[: self.rows(len(score))]] = True
-        return chosen
+def _best(settings: SelectorSettings, score: FloatArray, ids: IntArray) -> BoolArray:
+    """Choose the rows of largest score; ties go to the smaller id."""
+    chosen = np.zeros(len(score), dtype=np.bool_)
+    chosen[np.lexsort((ids, -score))[: _budget(settings, len(score))]] = True
+    return chosen
 
 
 class KeepAll:
@@ -93,12 +87,12 @@ class CausalVisibility:
     """Ranks the features of each frame by their number of observations so far."""
 
     def __init__(self, settings: SelectorSettings) -> None:
-        self._seen, self._budget = _VisibilityCount(), _Budget(settings)
+        self._seen, self._settings = _VisibilityCount(), settings
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose the most often observed rows; ties go to the older feature."""
         score = self._seen.add(observations.ids)
-        chosen = self._budget.best(score, observations.ids)
+        chosen = _best(self._settings, score, observations.ids)
         return Selection(chosen, score, f"most seen so far, {chosen.sum()} of {len(score)}")
 
 
@@ -114,14 +108,13 @@ class WholeRecordVisibility:
             counts.add(frame.ids)
         ranked = counts.ranked_ids()
         self._rank = {feature: position for position, feature in enumerate(ranked)}
-        self._kept = int(len(ranked) * settings.keep_fraction)
-        self._budget = None if settings.budget is None else _Budget(settings)
+        self._kept, self._settings = int(len(ranked) * settings.keep_fraction), settings
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose the rows whose feature is in the kept share of the whole record, or the best-ranked ones."""
         rank = np.array([self._rank[i] for i in observations.ids.tolist()], dtype=np.float64)
-        if self._budget is not None:
-            chosen = self._budget.best(-rank, observations.ids)
+        if self._settings.budget is not None:
+            chosen = _best(self._settings, -rank, observations.ids)
             return Selection(chosen, -rank, f"most seen in the record, {chosen.sum()} of {len(rank)}")
         return Selection(rank < self._kept, -rank, f"most seen in the record, {self._kept} of {len(self._rank)}")
 
@@ -130,7 +123,7 @@ class InformationGain:
     """The features with the largest joint information on the last and the coming motions (docs/notes/selection.md)."""
 
     def __init__(self, settings: SelectorSettings, camera: StereoCamera) -> None:
-        self._budget = _Budget(settings)
+        self._settings = settings
         self._model = MotionInformation(camera, _HORIZON_FRAMES, _PIXEL_SIGMA_PX)
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
@@ -138,7 +131,7 @@ class InformationGain:
         ids = observations.ids
         L = self._model.add_frame(observations, motion)
         prior = np.repeat(prior_information(motion)[None], L.shape[1], axis=0)
-        greedy = lazy_greedy(prior, L, ids, self._budget.rows(len(ids)))
+        greedy = lazy_greedy(prior, L, ids, _budget(self._settings, len(ids)))
         chosen = np.zeros(len(ids), dtype=np.bool_)
         chosen[greedy.order] = True
         self._model.mark_used(observations, chosen)
@@ -154,10 +147,8 @@ def build_selector(
 ) -> Selector:
     """Build the selector named in the settings.
 
-    Args:
-        settings: the selector's section of the configuration.
-        whole_record: yields all observations of the record; None where they are not available in advance.
-        camera: the rectified pair, which the information selector needs.
+    `whole_record` yields all observations of the record, None where they are not available in advance; the information
+    selector needs the camera.
 
     Raises:
         ConfigError: the recording lacks data that the selector needs.
