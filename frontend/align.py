@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from vio.frontend.patches import Patches, inside
+from vio.frontend.patches import Patches
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled, compiled_sums, invert_positive
 from vio.records import BoolArray, Image, IntArray
@@ -36,6 +36,7 @@ FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
 
 Pixels = npt.NDArray[np.float32]  # gray levels and what is computed from them
 Pairs = npt.NDArray[np.uint16]  # of neighbouring pixels
+_PAIR = np.dtype("<u2")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +76,7 @@ def warped_patches(image: Image, warp: FloatArray, radius: int) -> Pixels:
 
 def _pairs(image: Image) -> Pairs:
     """Each pixel of an image (H, W), row by row, and the next one, as one number; shares the image's memory."""
-    return np.ndarray(image.size - 1, np.dtype("<u2"), image, strides=(1,))
+    return np.ndarray(image.size - 1, _PAIR, image, strides=(1,))
 
 
 @compiled
@@ -116,10 +117,10 @@ def _sample(
         part[0, k], part[1, k] = u - np.float32(i), v - np.float32(j)
         at[k] = np.int32(j * row) + i
     # Unsigned indices are not checked for being negative.
-    pixels, down = pairs[first_v * width + first_u :], np.uint32(width)
+    pixels, below_them = pairs[first_v * width + first_u :], pairs[(first_v + 1) * width + first_u :]
     for k in range(len(at)):  # the four pixels in one number
         p = np.uint32(at[k])
-        at[k] = np.int32(pixels[p]) | np.int32(pixels[np.uint32(p + down)]) << np.int32(16)
+        at[k] = np.int32(pixels[p]) | np.int32(below_them[p]) << np.int32(16)
     byte = np.int32(255)
     for k in range(len(at)):
         four = at[k]
@@ -257,13 +258,13 @@ def align(
         deviations then, equation (F1).
     """
     radius = int(store.patch.shape[1] ** 0.5) // 2
-    warp, score = warp.copy(), np.full(len(warp), -1.0)
+    warp, score = warp.copy(), np.empty(len(warp))
     inverse, row_weight = (store.inverse, 0.0) if rows is None else (store.row_inverse, _ROW_WEIGHT)
-    expected = np.zeros(len(warp)) if rows is None else np.ascontiguousarray(rows)
+    expected = score if rows is None else rows  # not read without a weight
     columns = store.patch, store.gradient, store.energy, inverse, offsets(radius)
     image = np.ascontiguousarray(image)
     _refine(*columns, slots, image, _pairs(image), warp, expected, row_weight, iterations, score, store.sigma)
-    return warp, np.where(inside(image, warp[:, :, 2], radius + 1), score, -1.0)
+    return warp, score
 
 
 @compiled
@@ -285,11 +286,13 @@ def _refine(
 ) -> None:
     """Refine the warps (N, 2, 3) in place; write the correlations (N,) into `score` and rows (N,) of `sigma` (M, 3)."""
     size, parameters = patch.shape[1], inverse.shape[1]
+    margin, last_u, last_v = 1.0 - xy[0, 0], image.shape[1] - 1.0, image.shape[0] - 1.0
     at, part, view = np.empty(size, np.int32), np.empty((2, size), np.float32), np.empty(size, np.float32)
     moments, fit = np.empty(_PARAMETERS, np.float32), np.empty(_PARAMETERS)
     for i in range(_PARAMETERS):
         fit[i] = 0.0
     for n, slot in enumerate(slots):
+        score[n] = -1.0
         for _ in range(iterations):
             _sample(image, pairs, warp[n], xy, at, part, view)
             square = _moments(patch[slot], gradient[slot], view, xy, moments)
@@ -314,6 +317,9 @@ def _refine(
             sigma[slot, 2] = np.sqrt(gray2 * inverse[slot, 0, 0])
         else:
             sigma[slot, 0], sigma[slot, 1] = np.sqrt(gray2 * inverse[slot, 0, 0]), np.sqrt(gray2 * inverse[slot, 1, 1])
+        u, v = warp[n, 0, 2], warp[n, 1, 2]
+        if not (margin <= u <= last_u - margin and margin <= v <= last_v - margin):
+            score[n] = -1.0
 
 
 @compiled_sums

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from vio.cameras.projection import CameraArgs, camera_args, moved_pixel, turn_to
 from vio.frontend.align import align, on_peak, rounded, scale_change, shift_warps, template_points
-from vio.frontend.columns import changed, take
 from vio.frontend.detect import min_distance_px
-from vio.frontend.outliers import Consensus, pixel_errors
-from vio.frontend.patches import ImageLevels, inside
-from vio.frontend.prediction import moved_pixels
+from vio.frontend.outliers import Consensus
+from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import GridSettings
 from vio.frontend.tracks import ANCHOR_RADIUS_PX, INLIER_PX, AnchorBank, Tracks
 from vio.geometry.lie import FloatArray, transform_points
-from vio.geometry.stereo import StereoCamera, depth_of
+from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
 from vio.records import BoolArray, IntArray
 
@@ -23,16 +20,8 @@ _ITERATIONS = 5
 _MIN_CORRELATION = 0.8  # normalised, with the anchor; below, the anchor is replaced
 _ANCHOR_LOST = 0.5  # below, the feature is lost
 _MAX_SCALE = 1.25  # change of scale at which the anchor is replaced
-
-
-@dataclass(frozen=True, slots=True)
-class _Start:
-    """Start of the alignment of the previous frame's features with their anchors."""
-
-    pixels: FloatArray  # (N, 2) left pixels
-    scale: FloatArray  # (N,) predicted change of scale since the previous frame
-    point: FloatArray  # (N, 3) moved by the camera motion where it is known, cam0 frame, metres
-    tried: BoolArray  # (N,) to be aligned
+_MIN_DEPTH_M = 0.1  # after the motion, of a point whose pixel and scale are predicted
+_NEAREST_M = 0.05  # of a point that has a pixel to compare with
 
 
 class AnchorFit:
@@ -64,87 +53,153 @@ class AnchorFit:
             seen: mask (N,) of the static features that it found.
             motion: consensus motion since the previous frame, if there is one.
         """
-        start = self._start(old, left, found, seen, motion)
-        rows = start.tried.nonzero()[0]
-        warp, pixels, point = old.warp.take(rows, axis=0), start.pixels.take(rows, axis=0), old.point.take(rows, axis=0)
-        warp[:, :, :2] *= start.scale[rows, None, None]
-        warp[:, :, 2] = pixels
-        warp, score = align(self._bank.store, old.slot[rows], left.full, warp, _ITERATIONS)
-        change = np.abs(np.log(scale_change(warp)))
-        good = (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], pixels)
-        good &= change <= np.log(2 * _MAX_SCALE)
+        camera, (height, width) = camera_args(self._camera), left.full.shape
+        T = np.eye(4) if motion is None else motion.T_curr_prev
+        point = old.point if motion is None else transform_points(T, old.point)
+        rows, start, scale = np.empty(len(old), np.int64), np.empty((len(old), 2)), np.empty(len(old))
+        view = old.left, old.point, old.has_point, point, found, seen
+        count = _begin(camera, T, motion is not None, width, height, *view, rows, start, scale)
+        rows, start, scale = rows[:count], start[:count], scale[:count]
+        warp, slots = old.warp.take(rows, axis=0), old.slot.take(rows)
+        warp[:, :, :2] *= scale[:, None, None]
+        warp[:, :, 2] = start
+        warp, score = align(self._bank.store, slots, left.full, warp, _ITERATIONS)
+        change = scale_change(warp)
+        change = np.maximum(change, 1.0 / change)
+        good = (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start) & (change <= 2 * _MAX_SCALE)
         kept, has_point = good.copy(), old.has_point.copy()
         retry = (~good & seen[rows] & (score >= _ANCHOR_LOST)).nonzero()[0]
         if len(retry):
-            warp[retry], kept[retry] = self._realign(old, before, left, rows[retry], start)
+            again = old.left.take(rows[retry], axis=0), slots[retry], start[retry], scale[retry]
+            warp[retry], kept[retry] = self._realign(before, left, *again)
+        distance = 0.5 * min_distance_px(width, height, self._grid)
         if motion is not None:
-            deviates = pixel_errors(self._camera, motion.T_curr_prev, point, warp[:, :, 2]) > INLIER_PX
-            kept &= ~(deviates & old.has_point[rows] & old.has_right[rows])
-            has_point[rows[deviates]] = False  # its depth was propagated without a measurement, and was wrong
-        rescaled = good & (change > np.log(_MAX_SCALE))
-        kept_rows = kept.nonzero()[0]
-        height, width = left.full.shape
-        apart = _spaced(warp[kept_rows, :, 2], 0.5 * min_distance_px(width, height, self._grid))
-        kept_rows = kept_rows[apart]
-        rows, warp, rescaled = rows[kept_rows], warp.take(kept_rows, axis=0), rescaled[kept_rows]
+            _reject_deviating(camera, T, old.point, old.has_right, rows, warp, has_point, kept)
+        _reject_crowded(warp, distance, kept)
+        chosen = kept.nonzero()[0]
+        rows, slots, warp = rows[chosen], slots[chosen], warp.take(chosen, axis=0)
+        rescaled = (good & (change > _MAX_SCALE))[chosen]
         if rescaled.any():
             centres = rounded(warp[rescaled, :, 2])
-            self._bank.replace(old.slot[rows[rescaled]], left.full, centres)
+            self._bank.replace(slots[rescaled], left.full, centres)
             warp[rescaled] = shift_warps(centres)
-        return changed(
-            take(old, rows),
+        return Tracks(
+            ids=old.ids.take(rows),
             left=warp[:, :, 2].copy(),
-            warp=warp,
-            point=start.point.take(rows, axis=0),
-            has_point=has_point[rows],
-            age=old.age[rows] + 1,
+            right=old.right.take(rows, axis=0),
             has_right=np.zeros(len(rows), dtype=np.bool_),
-        )
-
-    def _start(
-        self, old: Tracks, left: ImageLevels, found: FloatArray, seen: BoolArray, motion: Consensus | None
-    ) -> _Start:
-        """Start the alignment at the pixel found by Lucas-Kanade, else at the pixel predicted by the motion."""
-        if motion is None:
-            return _Start(found, np.ones(len(old)), old.point, seen)
-        point = transform_points(motion.T_curr_prev, old.point)
-        predicted = moved_pixels(self._camera, motion.T_curr_prev, old.point, old.left)
-        margin = ANCHOR_RADIUS_PX + 2.0
-        depth, before = depth_of(self._camera, point), depth_of(self._camera, old.point)
-        ahead = old.has_point & (depth > 0.1)
-        return _Start(
-            np.where(seen[:, None], found, predicted),
-            np.where(ahead, before / np.where(ahead, depth, 1.0), 1.0),
-            point,
-            seen | (old.has_point & inside(left.full, predicted, margin)),
+            left_only_frames=old.left_only_frames.take(rows),
+            age=old.age.take(rows) + 1,
+            shown=old.shown.take(rows),
+            point=point.take(rows, axis=0),
+            has_point=has_point.take(rows),
+            slot=slots,
+            warp=warp,
+            skew=old.skew.take(rows, axis=0),
         )
 
     def _realign(
-        self, old: Tracks, before: ImageLevels, left: ImageLevels, rows: IntArray, start: _Start
+        self,
+        before: ImageLevels,
+        left: ImageLevels,
+        pixels: FloatArray,
+        slots: IntArray,
+        start: FloatArray,
+        scale: FloatArray,
     ) -> tuple[FloatArray, BoolArray]:
-        """Align features with a new anchor from the previous frame; return warps (N, 2, 3) and a mask (N,)."""
-        centres = rounded(old.left[rows])
-        self._bank.replace(old.slot[rows], before.full, centres)
-        warp = shift_warps(start.pixels[rows] + centres - old.left[rows])
-        warp[:, :, :2] *= start.scale[rows, None, None]
-        warp, score = align(self._bank.store, old.slot[rows], left.full, warp, _ITERATIONS)
+        """Align features with a new anchor from the previous frame; return warps (N, 2, 3) and a mask (N,).
+
+        Args:
+            before: left image of the previous frame.
+            left: that of this frame.
+            pixels: features (N, 2) in the former.
+            slots: their anchors (N,), which are replaced.
+            start: pixels (N, 2) in the latter to start from.
+            scale: predicted change of scale (N,).
+        """
+        centres = rounded(pixels)
+        self._bank.replace(slots, before.full, centres)
+        warp = shift_warps(start + centres - pixels)
+        warp[:, :, :2] *= scale[:, None, None]
+        warp, score = align(self._bank.store, slots, left.full, warp, _ITERATIONS)
         # The anchor was cut at a rounded pixel; correct the offset to the feature.
-        warp[:, :, 2] = template_points(warp, old.left[rows] - centres)
-        return warp, (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start.pixels[rows])
-
-
-def _spaced(points: FloatArray, distance: float) -> BoolArray:
-    """Mask (N,) of points (N, 2) without an earlier point closer than `distance` in the maximum norm."""
-    out = np.ones(len(points), dtype=np.bool_)
-    _mark_crowded(points, distance, out)
-    return out
+        warp[:, :, 2] = template_points(warp, pixels - centres)
+        return warp, (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start)
 
 
 @compiled
-def _mark_crowded(points: FloatArray, distance: float, apart: BoolArray) -> None:
-    for n in range(len(points)):
-        for m in range(n):
-            du, dv = points[n, 0] - points[m, 0], points[n, 1] - points[m, 1]
-            if abs(du) < distance and abs(dv) < distance:
-                apart[n] = False
+def _begin(
+    camera: CameraArgs,
+    T: FloatArray,
+    moved: bool,
+    width: int,
+    height: int,
+    left: FloatArray,
+    old_point: FloatArray,
+    has_point: BoolArray,
+    point: FloatArray,
+    found: FloatArray,
+    seen: BoolArray,
+    rows: IntArray,
+    start: FloatArray,
+    scale: FloatArray,
+) -> int:
+    """Write which of the previous frame's features are aligned, and return their number K.
+
+    Written are their rows (K,), the left pixels (K, 2) to start from, and the predicted changes of scale (K,). These
+    are `found` (N, 2) where `seen`; with a consensus motion T (4, 4) (`moved`), others with a point are at the pixels
+    where it takes that. Points (N, 3) are those before and after the motion.
+    """
+    count, margin = 0, ANCHOR_RADIUS_PX + 2.0
+    for n in range(len(left)):
+        u, v, change = found[n, 0], found[n, 1], 1.0
+        if moved and has_point[n]:
+            depth = turn_to(camera, point[n, 1], point[n, 2])[4]
+            if depth > _MIN_DEPTH_M:
+                change = turn_to(camera, old_point[n, 1], old_point[n, 2])[4] / depth
+        if not seen[n]:
+            if not (moved and has_point[n]):
+                continue
+            u, v, depth = moved_pixel(camera, T, old_point[n, 0], old_point[n, 1], old_point[n, 2])
+            if not depth > _MIN_DEPTH_M:
+                u, v = left[n, 0], left[n, 1]
+            if not (margin <= u <= width - 1 - margin and margin <= v <= height - 1 - margin):
+                continue
+        rows[count], start[count, 0], start[count, 1], scale[count] = n, u, v, change
+        count += 1
+    return count
+
+
+@compiled
+def _reject_deviating(
+    camera: CameraArgs,
+    T: FloatArray,
+    point: FloatArray,
+    has_right: BoolArray,
+    rows: IntArray,
+    warp: FloatArray,
+    has_point: BoolArray,
+    kept: BoolArray,
+) -> None:
+    """Clear the mask (K,) of aligned features that are not where a motion (4, 4) takes their points (N, 3).
+
+    A point whose depth was propagated without a measurement is dropped in place of its feature: `has_point` (N,).
+    """
+    for k, n in enumerate(rows):
+        u, v, depth = moved_pixel(camera, T, point[n, 0], point[n, 1], point[n, 2])
+        du, dv = u - warp[k, 0, 2], v - warp[k, 1, 2]
+        if not depth > _NEAREST_M or np.sqrt(du * du + dv * dv) > INLIER_PX:
+            kept[k] &= not (has_point[n] and has_right[n])
+            has_point[n] = False
+
+
+@compiled
+def _reject_crowded(warp: FloatArray, distance: float, kept: BoolArray) -> None:
+    """Clear the mask (K,) of features closer than a distance, in the maximum norm, to an earlier one that has it."""
+    given = kept.copy()
+    for n in range(len(kept)):
+        for m in range(n if given[n] else 0):
+            du, dv = warp[n, 0, 2] - warp[m, 0, 2], warp[n, 1, 2] - warp[m, 1, 2]
+            if given[m] and abs(du) < distance and abs(dv) < distance:
+                kept[n] = False
                 break

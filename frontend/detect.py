@@ -25,10 +25,6 @@ _MIN_RELATIVE_GRADIENT = 0.15  # the same, over that of the strongest corner of 
 _MIN_GRADIENT_OVER_NOISE = 5.0  # where corners are few: down to so many times the gradient of the image noise
 # The outermost pixels of the half image have no corners: their anchor would not fit into the full image.
 _BORDER_PX = ANCHOR_RADIUS_PX // 2 + 2
-_BLOCK_PX = 3
-_GRADIENT_PX = 3
-# cornerMinEigenVal takes gray levels as fractions of 255 and makes the Sobel derivative twice the gradient.
-_EIGENVALUE_OF_UNIT_GRADIENT = (2.0 / 255.0) ** 2
 _CURVATURE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)  # zero on planes and straight edges
 _CURVATURE_OF_UNIT_NOISE = 6.0 * math.sqrt(2.0 / math.pi)  # mean absolute value; the norm of the kernel is 6
 _ROUNDING_NOISE = 1.0 / math.sqrt(12.0)  # of whole gray levels
@@ -53,20 +49,58 @@ def grid_shape(width: int, height: int, grid: GridSettings) -> tuple[int, int]:
 
 def cell_index(points: FloatArray, width: int, height: int, shape: tuple[int, int]) -> IntArray:
     """Index (N,) of the grid cell, in row-major order, that contains each point (N, 2)."""
+    out = np.empty(len(points), dtype=np.int64)
+    _cells(np.ascontiguousarray(points, dtype=np.float64), shape, shape[1] / width, shape[0] / height, out)
+    return out
+
+
+@compiled
+def _cells(points: FloatArray, shape: tuple[int, int], per_u: float, per_v: float, out: IntArray) -> None:
+    """Write the cells (N,) of `cell_index`; `per_u` and `per_v` are cells a pixel."""
     rows, columns = shape
-    column, row = (points * [columns / width, rows / height]).astype(np.int64).T
-    column, row = (np.minimum(np.maximum(at, 0), n - 1) for at, n in ((column, columns), (row, rows)))
-    return row * columns + column
+    for n in range(len(points)):
+        column, row = int(points[n, 0] * per_u), int(points[n, 1] * per_v)
+        out[n] = min(max(row, 0), rows - 1) * columns + min(max(column, 0), columns - 1)
 
 
 def corner_response(image: Image) -> Response:
     """Smaller eigenvalue (H, W) of the structure tensor, as mean squared gradient in the weakest direction.
 
-    Unit: squared gray levels per squared pixel. Reference: Shi & Tomasi, Good features to track, CVPR (1994).
+    Gradients are Sobel's, and the mean is over 3x3 pixels; the outermost two pixels are zero. Unit: squared gray levels
+    per squared pixel. Reference: Shi & Tomasi, Good features to track, CVPR (1994).
     """
-    response = np.asarray(cv2.cornerMinEigenVal(image, _BLOCK_PX, ksize=_GRADIENT_PX), dtype=np.float32)
-    response /= np.float32(_EIGENVALUE_OF_UNIT_GRADIENT)
+    response = np.zeros(image.shape, dtype=np.float32)
+    _write_response(np.ascontiguousarray(image), response)
     return response
+
+
+@compiled
+def _write_response(image: Image, out: Response) -> None:
+    """Write `corner_response` inside the outermost two pixels. All sums are whole numbers below 2^24, and so exact."""
+    height, width = image.shape
+    inner, unit, two, four = width - 2, np.float32(1.0 / (2.0 * 9.0 * 64.0)), np.float32(2.0), np.float32(4.0)
+    uu, uv, vv = np.empty((3, inner), np.float32), np.empty((3, inner), np.float32), np.empty((3, inner), np.float32)
+    sums = np.empty((3, inner), np.float32)
+    for y in range(1, height - 1):
+        above, here, below, row = image[y - 1], image[y], image[y + 1], y % 3
+        above_1, above_2, here_2, below_1, below_2 = above[1:], above[2:], here[2:], below[1:], below[2:]
+        for x in range(inner):
+            a, b, c = np.float32(above[x]), np.float32(above_1[x]), np.float32(above_2[x])
+            d, e, f = np.float32(below[x]), np.float32(below_1[x]), np.float32(below_2[x])
+            along_u = (c - a) + two * (np.float32(here_2[x]) - np.float32(here[x])) + (f - d)
+            along_v = (d - a) + two * (e - b) + (f - c)
+            uu[row, x], uv[row, x], vv[row, x] = along_u * along_u, along_u * along_v, along_v * along_v
+        if y < 3:
+            continue
+        for x in range(inner):
+            sums[0, x] = uu[0, x] + uu[1, x] + uu[2, x]
+            sums[1, x] = uv[0, x] + uv[1, x] + uv[2, x]
+            sums[2, x] = vv[0, x] + vv[1, x] + vv[2, x]
+        line, p, q, r = out[y - 1, 2:], sums[0], sums[1], sums[2]
+        p_1, p_2, q_1, q_2, r_1, r_2 = p[1:], p[2:], q[1:], q[2:], r[1:], r[2:]
+        for x in range(inner - 2):
+            a, b, c = p[x] + p_1[x] + p_2[x], q[x] + q_1[x] + q_2[x], r[x] + r_1[x] + r_2[x]
+            line[x] = unit * ((a + c) - np.sqrt((a - c) * (a - c) + four * b * b))
 
 
 def noise_gradient(image: Image) -> float:
@@ -168,16 +202,27 @@ def detect_corners(
     shape = grid_shape(2 * width, 2 * height, grid)
     cell = cell_index(2 * corners.astype(np.float64), 2 * width, 2 * height, shape)
     strength = response[corners[:, 1], corners[:, 0]]
-    strongest = np.zeros(shape[0] * shape[1], dtype=np.float32)
-    np.maximum.at(strongest, cell, strength)
-    kept = (strength >= _MIN_RELATIVE_GRADIENT**2 * strongest[cell]).nonzero()[0]
+    share, kept = np.float32(_MIN_RELATIVE_GRADIENT**2), np.empty(len(cell), dtype=np.bool_)
+    _keep_strong(strength, cell, share, np.zeros(shape[0] * shape[1], dtype=np.float32), kept)
+    rows = kept.nonzero()[0]
     # Ties are ordered by cell, then row by row, so that equal images give equal corners.
     place = (cell * height + corners[:, 1]) * width + corners[:, 0]
-    kept = kept[np.lexsort((place[kept], -strength[kept]))]
-    level = _filling(cell[kept], cell_index(occupied, 2 * width, 2 * height, shape), len(strongest))
+    rows = rows[np.lexsort((place[rows], -strength[rows]))]
+    level = _filling(cell[rows], cell_index(occupied, 2 * width, 2 * height, shape), shape[0] * shape[1])
     order = np.argsort(level, kind="stable")
-    chosen = corners[kept[order[level[order] < 2 * _CELL_FEATURES][:wanted]]]
-    return 2.0 * (chosen + _peak_offset(response, chosen))
+    chosen = corners[rows[order[level[order] < 2 * _CELL_FEATURES][:wanted]]]
+    peaks = np.empty((len(chosen), 2))
+    _refine_peaks(response, chosen, peaks)
+    return 2.0 * peaks
+
+
+@compiled
+def _keep_strong(strength: Response, cell: IntArray, share: np.float32, strongest: Response, kept: BoolArray) -> None:
+    """Write the mask (K,) of corners with a share of the strength of the strongest in their cell; (C,) are zeros."""
+    for k in range(len(cell)):
+        strongest[cell[k]] = max(strongest[cell[k]], strength[k])
+    for k in range(len(cell)):
+        kept[k] = strength[k] >= share * strongest[cell[k]]
 
 
 def _candidates(half: Image, response: Response, occupied: FloatArray, grid: GridSettings) -> IntArray:
@@ -205,11 +250,17 @@ def _filling(cell: IntArray, occupied: IntArray, cells: int) -> IntArray:
         occupied: index of the cell (M,) of each existing feature.
         cells: number of cells.
     """
-    order = np.argsort(cell, kind="stable")
-    first = np.searchsorted(cell[order], np.arange(cells))
-    filled = np.empty(len(cell), dtype=np.int64)
-    filled[order] = np.arange(len(order)) - first[cell[order]] + np.bincount(occupied, minlength=cells)[cell[order]]
+    filled, held = np.empty(len(cell), dtype=np.int64), np.bincount(occupied, minlength=cells)
+    _fill(cell, held, filled)
     return filled
+
+
+@compiled
+def _fill(cell: IntArray, held: IntArray, filled: IntArray) -> None:
+    """Write the numbers (N,) of `_filling`; those of features in the cells (C,) are counted up."""
+    for n in range(len(cell)):
+        filled[n] = held[cell[n]]
+        held[cell[n]] += 1
 
 
 def spread_evenly(points: FloatArray, occupied: FloatArray, size: tuple[int, int], grid: GridSettings) -> IntArray:
@@ -266,13 +317,18 @@ def half_mask(mask: Image, shape: tuple[int, ...]) -> BoolArray:
     return np.asarray(solid[::2, ::2] > 0)
 
 
-def _peak_offset(response: Response, pixels: IntArray) -> FloatArray:
-    """Sub-pixel offset (K, 2) of each response peak, by a parabola through its neighbours in each direction."""
-    u, v = pixels[:, 0], pixels[:, 1]
-    centre = response[v, u].astype(np.float64)
-    offsets = []
-    for before, after in ((response[v, u - 1], response[v, u + 1]), (response[v - 1, u], response[v + 1, u])):
-        curvature = before.astype(np.float64) - 2 * centre + after
-        slope = (before.astype(np.float64) - after) / 2
-        offsets.append(np.where(curvature < 0, slope / np.where(curvature < 0, curvature, 1.0), 0.0))
-    return np.clip(np.stack(offsets, axis=1), -0.5, 0.5)
+@compiled
+def _refine_peaks(response: Response, pixels: IntArray, out: FloatArray) -> None:
+    """Write the peaks (K, 2) of a response, sub-pixel by a parabola through the pixels next to these (K, 2)."""
+    for k in range(len(pixels)):
+        u, v = pixels[k, 0], pixels[k, 1]
+        out[k, 0] = u + _vertex(response[v, u - 1], response[v, u], response[v, u + 1])
+        out[k, 1] = v + _vertex(response[v - 1, u], response[v, u], response[v + 1, u])
+
+
+@compiled
+def _vertex(before: np.float32, centre: np.float32, after: np.float32) -> float:
+    """Offset of the largest value of a parabola from the middle one of three, at most half a step."""
+    first, last = np.float64(before), np.float64(after)
+    curvature = first - 2.0 * np.float64(centre) + last
+    return min(max((first - last) / 2.0 / curvature, -0.5), 0.5) if curvature < 0.0 else 0.0

@@ -66,14 +66,14 @@ class BandRemoval(ImageCheck):
 
 
 def _row_means(image: Image) -> FloatArray:
-    """Mean gray level (H, 1) of each row."""
+    """Mean gray level (H,) of each row."""
     # Sums of integers are vectorised: a twentieth of the time of means, which OpenCV takes as these, times 1 / width.
     sums = np.asarray(cv2.reduce(image, 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S))
-    return sums * (1.0 / image.shape[1])
+    return sums.ravel() * (1.0 / image.shape[1])
 
 
 def _without_gain(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Difference (H, 1) of row means at one mean gray level: cameras that set their exposure alone make no bands."""
+    """Difference (H,) of row means at one mean gray level: cameras that set their exposure alone make no bands."""
     a, b = max(_mean(left), 1.0), max(_mean(right), 1.0)
     return (left / a - right / b) * ((a + b) / 2)
 
@@ -84,8 +84,9 @@ def _mean(values: FloatArray) -> float:
 
 
 def _smoothed(rows: FloatArray) -> FloatArray:
-    """Values (H,) of rows (H, 1), smoothed over a few rows."""
-    return np.asarray(cv2.GaussianBlur(rows, (1, 0), sigmaX=1.0, sigmaY=_SMOOTH_ROWS), dtype=np.float64)[:, 0]
+    """Values (H,) of rows, smoothed over a few of them."""
+    line = rows[None]  # filtered in a tenth of the time that a column takes
+    return np.asarray(cv2.GaussianBlur(line, (0, 1), sigmaX=_SMOOTH_ROWS, sigmaY=1.0), dtype=np.float64)[0]
 
 
 def _flattened(image: Image, rows: FloatArray) -> Image:

@@ -8,6 +8,7 @@ import numpy as np
 from vio.frontend.patches import ImageLevels, inside, mean_and_contrast
 from vio.frontend.tracks import ANCHOR_RADIUS_PX
 from vio.geometry.lie import FloatArray
+from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image
 
 _WINDOW_PX = 11  # side of the window, of the half-resolution image
@@ -86,14 +87,26 @@ def _track_forward_backward(
     forward, good = _flow(last, view.half, points, guess, levels)
     good &= inside(view.full, forward, ANCHOR_RADIUS_PX + 2)
     tolerance = _MAX_FORWARD_BACKWARD_PX
-    expected = np.linalg.norm(forward - guess, axis=1) <= tolerance
-    doubtful = (good & ~expected if trusted else good).nonzero()[0]
+    doubtful = (good & _apart(forward, guess, tolerance) if trusted else good).nonzero()[0]
     if len(doubtful):
         before = points.take(doubtful, axis=0)
         backward, seen_back = _flow(view.half, last, forward.take(doubtful, axis=0), before, levels)
-        error = np.linalg.norm(backward - before, axis=1)
-        good[doubtful] = seen_back & (error <= tolerance)
+        good[doubtful] = seen_back & ~_apart(backward, before, tolerance)
     return forward, good
+
+
+def _apart(points: FloatArray, others: FloatArray, distance: float) -> BoolArray:
+    """Mask (N,) of points (N, 2) that are further than a distance from others (N, 2)."""
+    out = np.empty(len(points), dtype=np.bool_)
+    _mark_apart(points, others, distance, out)
+    return out
+
+
+@compiled
+def _mark_apart(points: FloatArray, others: FloatArray, distance: float, out: BoolArray) -> None:
+    for n in range(len(points)):
+        du, dv = points[n, 0] - others[n, 0], points[n, 1] - others[n, 1]
+        out[n] = not np.sqrt(du * du + dv * dv) <= distance
 
 
 def _flow(
@@ -104,7 +117,7 @@ def _flow(
     Returns:
         The new pixels (N, 2), and a mask (N,) of those found; the others stay where they were.
     """
-    half, seen = lucas_kanade(
+    pixels, seen = lucas_kanade(
         source,
         target,
         points / 2,
@@ -114,7 +127,10 @@ def _flow(
         iterations=_ITERATIONS,
         epsilon_px=_LK_EPSILON_PX,
     )
-    return np.where(seen[:, None], 2 * half, points), seen
+    pixels *= 2
+    lost = (~seen).nonzero()[0]
+    pixels[lost] = points[lost]
+    return pixels, seen
 
 
 def lucas_kanade(

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.cameras.projection import CameraArgs, camera_args, moved_pixel
+from vio.cameras.projection import CameraArgs, camera_args, moved_pixel, point_at, turn_to
 from vio.frontend.patches import inside
 from vio.frontend.tracks import Tracks
 from vio.geometry.lie import FloatArray, se3_from_parts
-from vio.geometry.stereo import StereoCamera, depth_of, left_rays
+from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image, IntArray, TrackPrior
 
@@ -22,8 +22,11 @@ def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
     """Return the valid part of a prior: finite left pixels, one row per id, and the rotation if it is orthonormal."""
     if prior is None:
         return None
-    ids, first = np.unique(prior.ids, return_index=True)
-    finite = np.isfinite(prior.z[first, :2]).all(axis=1)
+    ids, z = prior.ids, prior.z
+    if (ids[1:] <= ids[:-1]).any():
+        ids, first = np.unique(ids, return_index=True)
+        z = z[first]
+    finite = np.isfinite(z[:, :2]).all(axis=1)
     R = prior.R_cam_prev
     if R is not None and not (np.isfinite(R).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_SLACK):
         R = None
@@ -32,7 +35,7 @@ def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
     motion = prior.motion
     if motion is not None and not (np.isfinite(motion.T_curr_prev).all() and np.isfinite(motion.covariance).all()):
         motion = None
-    return TrackPrior(ids[finite], prior.z[first[finite]], R, motion)
+    return TrackPrior(ids[finite], z[finite], R, motion)
 
 
 def prior_pixels(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:
@@ -43,12 +46,27 @@ def prior_pixels(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray
 
 def _common_rows(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, IntArray]:
     """Rows (K,) of the ids (N,) that a usable prior contains, and its rows (K,) for them."""
-    if not len(prior.ids):
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    order = np.argsort(prior.ids)
-    at = order[np.minimum(np.searchsorted(prior.ids, ids, sorter=order), len(order) - 1)]
-    rows = (prior.ids[at] == ids).nonzero()[0]
-    return rows, at[rows]
+    rows, given = np.empty(len(ids), dtype=np.int64), np.empty(len(ids), dtype=np.int64)
+    count = _find(np.ascontiguousarray(ids), prior.ids, rows, given)
+    return rows[:count], given[:count]
+
+
+@compiled
+def _find(ids: IntArray, increasing: IntArray, rows: IntArray, given: IntArray) -> int:
+    """Write the rows (K,) of those ids (N,) that are among others (M,), and their rows there; return K."""
+    count = 0
+    for n in range(len(ids)):
+        low, high = 0, len(increasing)
+        while low < high:
+            middle = (low + high) // 2
+            if increasing[middle] < ids[n]:
+                low = middle + 1
+            else:
+                high = middle
+        if low < len(increasing) and increasing[low] == ids[n]:
+            rows[count], given[count] = n, low
+            count += 1
+    return count
 
 
 def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tuple[FloatArray, BoolArray]:
@@ -96,7 +114,8 @@ def guessed_pixels(
     """
     if prior is not None and prior.R_cam_prev is not None:
         expected = se3_from_parts(prior.R_cam_prev, expected[:3, 3])
-    guess = moved_pixels(camera, expected, _points_with_borrowed_depth(camera, old), old.left)
+    guess = old.left.copy()
+    _move_all(camera_args(camera), np.ascontiguousarray(expected), old.point, old.has_point, old.left, guess)
     if prior is not None:
         rows, predicted = prior_rows(old, np.arange(len(old)), prior)
         guess[rows] = predicted
@@ -106,36 +125,46 @@ def guessed_pixels(
     return guess
 
 
-def _points_with_borrowed_depth(camera: StereoCamera, old: Tracks) -> FloatArray:
-    """Points (N, 3) of the features; unknown depths are the median depth of the nearest neighbours in the image."""
-    known, unknown = old.has_point.nonzero()[0], (~old.has_point).nonzero()[0]
-    if len(unknown) == 0 or len(known) < _NEIGHBOURS:
-        return np.where(old.has_point[:, None], old.point, left_rays(camera, old.left) * _FAR_M)
-    depth = depth_of(camera, old.point)[known]
-    borrowed = np.empty(len(unknown))
-    _borrow(old.left[known], depth, old.left[unknown], borrowed)
-    point = old.point.copy()
-    point[unknown] = left_rays(camera, old.left[unknown]) * borrowed[:, None]
-    return point
+@compiled
+def _move_all(
+    camera: CameraArgs,
+    T: FloatArray,
+    point: FloatArray,
+    has_point: BoolArray,
+    left: FloatArray,
+    pixels: FloatArray,
+) -> None:
+    """Replace left pixels (N, 2) as `_move` does; the depth of features without a point is that of their neighbours."""
+    count, depth = 0, np.empty(len(left))
+    for n in range(len(left)):
+        depth[n] = turn_to(camera, point[n, 1], point[n, 2])[4]
+        count += has_point[n]
+    for n in range(len(left)):
+        x, y, z = point[n, 0], point[n, 1], point[n, 2]
+        if not has_point[n]:
+            away = _borrowed(left, depth, has_point, n) if count >= _NEIGHBOURS else _FAR_M
+            x, y, z = point_at(camera, left[n, 0], left[n, 1], away)
+        u, v, ahead = moved_pixel(camera, T, x, y, z)
+        if ahead > _MIN_DEPTH_M:
+            pixels[n, 0], pixels[n, 1] = u, v
 
 
 @compiled
-def _borrow(known: FloatArray, depth: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
-    """Write the median depth of the three nearest of known pixels (K, 2), K >= 3, for each of some pixels (N, 2)."""
+def _borrowed(pixels: FloatArray, depth: FloatArray, known: BoolArray, n: int) -> float:
+    """Return the median depth of those three of the known pixels, of (N, 2), that are next to the n-th one."""
     gap, near = np.empty(_NEIGHBOURS), np.empty(_NEIGHBOURS)
-    for n in range(len(pixels)):
-        for i in range(_NEIGHBOURS):
-            gap[i] = np.inf
-        for k in range(len(known)):
-            distance = abs(pixels[n, 0] - known[k, 0]) + abs(pixels[n, 1] - known[k, 1])
-            if not distance < gap[2]:
-                continue
-            i = 2
-            while i > 0 and distance < gap[i - 1]:  # kept in order
-                gap[i], near[i] = gap[i - 1], near[i - 1]
-                i -= 1
-            gap[i], near[i] = distance, depth[k]
-        out[n] = max(min(near[0], near[1]), min(max(near[0], near[1]), near[2]))
+    for i in range(_NEIGHBOURS):
+        gap[i] = np.inf
+    for k in range(len(pixels)):
+        distance = abs(pixels[n, 0] - pixels[k, 0]) + abs(pixels[n, 1] - pixels[k, 1])
+        if not (known[k] and distance < gap[2]):
+            continue
+        i = 2
+        while i > 0 and distance < gap[i - 1]:  # kept in order
+            gap[i], near[i] = gap[i - 1], near[i - 1]
+            i -= 1
+        gap[i], near[i] = distance, depth[k]
+    return max(min(near[0], near[1]), min(max(near[0], near[1]), near[2]))
 
 
 def prior_rows(tracks: Tracks, rows: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:

@@ -194,11 +194,17 @@ def image_change(image: Image, other: Image) -> float:
 
     Pixels at the end of the scale are left out, as far as others are left: an exposure that changes clips others.
     """
+    return float(_CONTRAST * _change(image, other))
+
+
+@compiled
+def _change(image: Image, other: Image) -> float:
+    """Return `image_change` over the contrast that images are scaled to."""
     kept = np.empty((2, image.size), dtype=np.uint8)
     count = _keep_unclipped(image, other, kept)
     if count < image.size and count / image.size > _LEAST_UNCLIPPED:
-        image, other = kept[:1, :count], kept[1:, :count]
-    return float(_CONTRAST * _difference(image, other))
+        return _difference(kept[:1, :count], kept[1:, :count])
+    return _difference(image, other)
 
 
 @compiled

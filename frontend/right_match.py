@@ -118,5 +118,6 @@ class RightMatcher:
 
 def _rows_by_slot(old: Tracks, now: Tracks) -> IntArray:
     """Rows (N,) in `old` of the features (N,) of `now`, all of which it contains: an active feature keeps its slot."""
-    order = np.argsort(old.slot)
-    return np.asarray(order[np.searchsorted(old.slot, now.slot, sorter=order)], dtype=np.int64)
+    rows = np.empty(old.slot.max(initial=-1) + 1, dtype=np.int64)
+    rows[old.slot] = np.arange(len(old))
+    return rows[now.slot]

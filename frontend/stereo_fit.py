@@ -72,7 +72,7 @@ class StereoFit:
         pixels, skew, valid = self._fit(tracks, rows, right, expected)
         if moved:
             valid &= np.abs(tracks.left[rows, 0] - pixels[:, 0] - expected) <= INLIER_PX
-        return self._with_right_pixels(tracks, rows, pixels, skew, valid.nonzero()[0])
+        return self._with_right_pixels(tracks, rows, pixels, skew, valid)
 
     def track_off_right(self, tracks: Tracks, left: ImageLevels, right: ImageLevels, *, by_motion: bool) -> Tracks:
         """Match features of known depth anywhere on their rows, as far as a common offset explains their disparities.
@@ -103,7 +103,7 @@ class StereoFit:
         tolerance = INLIER_PX + (_DEPTH_SLACK * expected if by_motion else 0.0)
         agree = np.abs(off - offset * grows - slope * expected) <= tolerance
         self._offset_px = (1.0 - _OFFSET_GAIN) * offset
-        return self._with_right_pixels(tracks, rows, pixels, skew, agree.nonzero()[0])
+        return self._with_right_pixels(tracks, rows, pixels, skew, agree)
 
     def _offset_growth(self, left: FloatArray) -> FloatArray:
         """By how much more (N,) a turn of the right camera moves pixels at left pixels (N, 2) than in the centre."""
@@ -120,8 +120,7 @@ class StereoFit:
         """Match the given rows (K,) near their disparities (K,)."""
         if not len(rows):
             return tracks
-        pixels, skew, valid = self._fit(tracks, rows, right, disparity)
-        return self._with_right_pixels(tracks, rows, pixels, skew, valid.nonzero()[0])
+        return self._with_right_pixels(tracks, rows, *self._fit(tracks, rows, right, disparity))
 
     def search(self, left_half: Image, right_half: Image, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Coarse disparities (N,) of left pixels (N, 2), and a mask (N,) of those that are unique."""
@@ -198,54 +197,79 @@ class StereoFit:
         Returns:
             Right pixels (K, 2), the change of the warp's linear part (K, 2, 2), and a mask (K,) of the good ones.
         """
-        left, before = tracks.left.take(rows, 0), tracks.warp.take(rows, 0)
-        expected, start = self._rows.rows(left), before.copy()
-        start[:, :, :2] += tracks.skew.take(rows, 0)
-        start[:, 0, 2] -= disparity
+        count = len(rows)
+        left, start = np.empty((count, 2)), np.empty((count, 2, 3))
+        _begin(tracks.left, tracks.warp, tracks.skew, rows, disparity, left, start)
+        expected = self._rows.rows(left)
         start[:, 1, 2] = expected
         warp, score = align(self._bank.store, tracks.slot.take(rows), right.full, start, _ITERATIONS, expected)
-        skew, valid = warp[:, :, :2] - before[:, :, :2], score >= _MIN_CORRELATION
-        _reject(left, start, expected, warp, skew, self.max_disparity_px, valid)
-        return warp[:, :, 2], skew, valid
+        pixels, skew, valid = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, dtype=np.bool_)
+        _judge(tracks.warp, rows, left, start, warp, score, self.max_disparity_px, pixels, skew, valid)
+        return pixels, skew, valid
 
     def _with_right_pixels(
-        self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray, good: IntArray
+        self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray, good: BoolArray
     ) -> Tracks:
-        """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of those rows (K,) that are `good` (M,)."""
-        rows, pixels, skew = rows[good], pixels.take(good, axis=0), skew.take(good, axis=0)
+        """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of those rows (K,) that are `good`."""
         if self._offset_px:
-            pixels = pixels + self._offset_px * np.stack(
-                [self._offset_growth(tracks.left[rows]), np.zeros(len(rows))], 1
-            )
+            growth = self._offset_growth(tracks.left[rows])
+            pixels = pixels + self._offset_px * np.stack([growth, np.zeros(len(rows))], 1)
         right, has_right, skews = tracks.right.copy(), tracks.has_right.copy(), tracks.skew.copy()
-        right[rows], has_right[rows], skews[rows] = pixels, True, skew
         point, has_point = tracks.point.copy(), tracks.has_point.copy()
         f_baseline = self._camera.fu * self._camera.baseline_m
-        _triangulate(camera_args(self._camera), f_baseline, tracks.left, rows, pixels, point, has_point)
+        columns = right, has_right, skews, point, has_point
+        _match(camera_args(self._camera), f_baseline, tracks.left, rows, pixels, skew, good, *columns)
         return changed(tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point)
 
 
 @compiled
-def _reject(
+def _begin(
     left: FloatArray,
-    start: FloatArray,
-    rows: FloatArray,
     warp: FloatArray,
     skew: FloatArray,
+    rows: IntArray,
+    disparity: FloatArray,
+    pixels: FloatArray,
+    start: FloatArray,
+) -> None:
+    """Write the left pixels (K, 2) of rows (K,) of features, and the warps (K, 2, 3) to start from, without the row."""
+    for k, n in enumerate(rows):
+        for i in range(2):
+            pixels[k, i], start[k, i, 2] = left[n, i], warp[n, i, 2]
+            for j in range(2):
+                start[k, i, j] = warp[n, i, j] + skew[n, i, j]
+        start[k, 0, 2] -= disparity[k]
+
+
+@compiled
+def _judge(
+    before: FloatArray,
+    rows: IntArray,
+    left: FloatArray,
+    start: FloatArray,
+    warp: FloatArray,
+    score: FloatArray,
     max_disparity: float,
+    pixels: FloatArray,
+    skew: FloatArray,
     valid: BoolArray,
 ) -> None:
-    """Clear the mask (K,) of matches that no point ahead of the camera has.
+    """Write right pixels (K, 2), skews (K, 2, 2), and a mask (K,) of matches that a point ahead of the camera may have.
 
-    They are given by left pixels (K, 2), warps (K, 2, 3) before and after the alignment, expected rows (K,) and skews
-    (K, 2, 2).
+    They are given by warps (N, 2, 3) of the left image and rows (K,) of these, left pixels (K, 2), warps (K, 2, 3)
+    before and after the alignment, which starts in the expected row, and correlations (K,).
     """
-    for k in range(len(valid)):
-        u, v, disparity = warp[k, 0, 2], warp[k, 1, 2], left[k, 0] - warp[k, 0, 2]
-        steep = max(max(abs(skew[k, 0, 0]), abs(skew[k, 0, 1])), max(abs(skew[k, 1, 0]), abs(skew[k, 1, 1])))
-        valid[k] &= is_on_peak(u - start[k, 0, 2], v - start[k, 1, 2]) and steep <= _MAX_SKEW
-        valid[k] &= abs(rows[k] - v) <= _MAX_ROW_DIFFERENCE_PX
-        valid[k] &= MIN_MATCH_DISPARITY_PX <= disparity <= max_disparity
+    for k, n in enumerate(rows):
+        steep = 0.0
+        for i in range(2):
+            pixels[k, i] = warp[k, i, 2]
+            for j in range(2):
+                skew[k, i, j] = warp[k, i, j] - before[n, i, j]
+                steep = max(steep, abs(skew[k, i, j]))
+        du, dv = pixels[k, 0] - start[k, 0, 2], pixels[k, 1] - start[k, 1, 2]
+        valid[k] = score[k] >= _MIN_CORRELATION and is_on_peak(du, dv) and steep <= _MAX_SKEW
+        valid[k] &= abs(dv) <= _MAX_ROW_DIFFERENCE_PX
+        valid[k] &= MIN_MATCH_DISPARITY_PX <= left[k, 0] - pixels[k, 0] <= max_disparity
 
 
 def common_offset(expected: FloatArray, off: FloatArray) -> tuple[float, float]:
@@ -264,19 +288,33 @@ def common_offset(expected: FloatArray, off: FloatArray) -> tuple[float, float]:
 
 
 @compiled
-def _triangulate(
+def _match(
     camera: CameraArgs,
     f_baseline: float,
     left: FloatArray,
     rows: IntArray,
+    pixels: FloatArray,
+    skew: FloatArray,
+    good: BoolArray,
     right: FloatArray,
+    has_right: BoolArray,
+    skews: FloatArray,
     point: FloatArray,
     has_point: BoolArray,
 ) -> None:
-    """Set the points of rows (K,) of features at left pixels (N, 2) with right pixels (K, 2); the row is the mean."""
+    """Set the columns of features, at left pixels (N, 2), in those rows (K,) whose match is `good` (K,).
+
+    A match is a right pixel (K, 2) and a skew (K, 2, 2); a point has the mean row of both images.
+    """
     for k, n in enumerate(rows):
-        disparity = left[n, 0] - right[k, 0]
+        if not good[k]:
+            continue
+        has_right[n], right[n, 0], right[n, 1] = True, pixels[k, 0], pixels[k, 1]
+        for i in range(2):
+            for j in range(2):
+                skews[n, i, j] = skew[k, i, j]
+        disparity = left[n, 0] - pixels[k, 0]
         if disparity >= _MIN_DISPARITY_PX:
-            v = (left[n, 1] + right[k, 1]) / 2.0
+            v = (left[n, 1] + pixels[k, 1]) / 2.0
             point[n, 0], point[n, 1], point[n, 2] = point_at(camera, left[n, 0], v, f_baseline / disparity)
             has_point[n] = True

@@ -37,7 +37,6 @@ class EpipolarRowModel:
 
     def __init__(self, width: int, height: int) -> None:
         self._centre = np.array([width / 2, height / 2])
-        self._scale = width / 2
         self._normal = _FIELD_PRIOR * np.eye(5)
         self._moment = np.zeros(5)
         self._field: FloatArray = np.zeros(5)
@@ -45,9 +44,7 @@ class EpipolarRowModel:
 
     def _terms(self, pixels: FloatArray) -> FloatArray:
         terms = np.empty((len(pixels), 5))
-        terms[:, 0] = 1.0
-        terms[:, 1:3] = (pixels - self._centre) / self._scale
-        terms[:, 3:] = terms[:, 1:3] * terms[:, 2:3]  # x y, y y
+        _write_terms(pixels, self._centre, terms)
         return terms
 
     @property
@@ -67,18 +64,36 @@ class EpipolarRowModel:
 
     def update(self, left: FloatArray, right: FloatArray) -> None:
         """Update the estimate with the matches (N, 2) and (N, 2) of one frame; outliers have little weight."""
-        terms = self._terms(left)
-        off = right[:, 1] - left[:, 1]
-        prior = (1 - _FIELD_MEMORY) * _FIELD_PRIOR * np.eye(5)
-        kept, moment = _FIELD_MEMORY * self._normal + prior, _FIELD_MEMORY * self._moment
-        for _ in range(_FIELD_ITERATIONS):
-            self._normal, self._moment = kept.copy(), moment.copy()
-            add_equations(terms, off, self._field, _FIELD_SIGMA_PX, self._normal, self._moment)
-            self._field = self._moment.copy()
-            solve_positive(self._normal.copy(), self._field)
+        terms, off = self._terms(left), right[:, 1] - left[:, 1]
+        _learn(terms, off, self._normal, self._moment, self._field)
         if len(terms):
             fitted = terms @ self._field
             self.rms_px = math.sqrt(float(fitted @ fitted) / len(fitted))
+
+
+@compiled
+def _write_terms(pixels: FloatArray, centre: FloatArray, terms: FloatArray) -> None:
+    """Write the terms (N, 5) of the row differences at pixels (N, 2)."""
+    for n in range(len(pixels)):
+        x, y = (pixels[n, 0] - centre[0]) / centre[0], (pixels[n, 1] - centre[1]) / centre[0]
+        terms[n, 0], terms[n, 1], terms[n, 2], terms[n, 3], terms[n, 4] = 1.0, x, y, x * y, y * y
+
+
+@compiled
+def _learn(terms: FloatArray, off: FloatArray, normal: FloatArray, moment: FloatArray, field: FloatArray) -> None:
+    """Add the row differences (N,) of a frame's matches to the normal equations, and solve these for the field."""
+    size = len(field)
+    for i in range(size):
+        for j in range(size):
+            normal[i, j] *= _FIELD_MEMORY
+        normal[i, i] += (1 - _FIELD_MEMORY) * _FIELD_PRIOR
+        moment[i] *= _FIELD_MEMORY
+    kept, kept_moment = normal.copy(), moment.copy()
+    for _ in range(_FIELD_ITERATIONS):
+        normal[:], moment[:] = kept, kept_moment
+        add_equations(terms, off, field, _FIELD_SIGMA_PX, normal, moment)
+        field[:] = moment
+        solve_positive(normal.copy(), field)
 
 
 def shifted_rows(image: Image, rows: int) -> Image:
@@ -103,6 +118,7 @@ def correlate(
     size, flat = side * side, FLAT_RMS**2 * side * side
     strip, product = np.empty(count + side - 1, np.float32), np.empty(count, np.float32)
     total, squares = np.empty(len(strip), np.float32), np.empty(len(strip), np.float32)
+    windows, square_windows = np.empty(count, np.float32), np.empty(count, np.float32)
     for n in range(len(centres)):
         column, row, first = centres[n, 0] - radius, centres[n, 1], first_column[n]
         own_total, own_squares = 0, 0
@@ -119,15 +135,22 @@ def correlate(
                 gray = int(source[y, column + x])
                 own_total += gray
                 own_squares += gray * gray
-                level = np.float32(gray)
-                for k in range(count):  # unsigned indices are not checked for being negative
-                    product[k] += level * strip[np.uint64(x) + np.uint64(k)]
+            own = source[y, column:]
+            for x in range(0, side - 2, 3):  # three at once: to read and write the sums takes longer than to add
+                a, b, c = np.float32(own[x]), np.float32(own[x + 1]), np.float32(own[x + 2])
+                one, two, three = strip[x:], strip[x + 1 :], strip[x + 2 :]
+                for k in range(count):
+                    product[k] += a * one[k] + b * two[k] + c * three[k]
+            for x in range(side - side % 3, side):
+                a, one = np.float32(own[x]), strip[x:]
+                for k in range(count):
+                    product[k] += a * one[k]
         energy = own_squares - own_total**2 / size
-        _sum_windows(total, side)
-        _sum_windows(squares, side)
+        _sum_windows(total, side, windows)
+        _sum_windows(squares, side, square_windows)
         for k in range(count):
-            level_sum = np.float64(total[k])
-            other = squares[k] - level_sum**2 / size
+            level_sum = np.float64(windows[k])
+            other = square_windows[k] - level_sum**2 / size
             score = (product[k] - own_total * level_sum / size) / np.sqrt(energy * other)
             inside = radius <= first + k < width - radius
             out[n, k] = score if inside and energy > flat and other > flat else -1.0
@@ -146,16 +169,14 @@ def _cut_row(image: Image, y: int, first: int, strip: Scores) -> None:
 
 
 @compiled
-def _sum_windows(values: Scores, side: int) -> None:
-    """Replace each number by the sum of itself and those behind it, `side` in all; the last ones are meaningless."""
-    running = np.float32(0.0)
-    for k in range(side - 1):
-        running += values[k]
-    for k in range(len(values) - side + 1):
-        first = values[k]
-        running += values[k + side - 1]
-        values[k] = running
-        running -= first
+def _sum_windows(values: Scores, side: int, out: Scores) -> None:
+    """Write the sums (N,) of `side` numbers in a row, of (N + side - 1,)."""
+    for k in range(len(out)):
+        out[k] = 0.0
+    for x in range(side):
+        rest = values[x:]
+        for k in range(len(out)):
+            out[k] += rest[k]
 
 
 @compiled

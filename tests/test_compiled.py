@@ -25,8 +25,8 @@ from vio.filters.multiview import Views
 from vio.frontend import outliers, patches, right_camera
 from vio.frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
 from vio.frontend.outliers import _gauss_newton, _refine, pixel_errors
-from vio.frontend.prediction import _borrow, moved_pixels
-from vio.frontend.stereo_fit import _triangulate
+from vio.frontend.prediction import _borrowed, moved_pixels
+from vio.frontend.stereo_fit import _match
 from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import (
     FloatArray,
@@ -151,7 +151,16 @@ def test_features_are_moved_and_triangulated_as_single_points_are_in_numpy(camer
     rows, point, has_point = np.arange(0, 40, 2), np.zeros((40, 3)), np.zeros(40, dtype=np.bool_)
     rows[1], rows[2] = 3, 5
     f_baseline = camera.fu * camera.baseline_m
-    _triangulate(camera_args(camera), f_baseline, z[:, :2].copy(), rows, z[rows, 2:], point, has_point)
+    good, skew, right = np.ones(20, dtype=np.bool_), np.arange(80.0).reshape(20, 2, 2), np.zeros((40, 2))
+    good[5] = False
+    skews, has_right, left = np.zeros((40, 2, 2)), np.zeros(40, dtype=np.bool_), z[:, :2].copy()
+    columns = right, has_right, skews, point, has_point
+    _match(camera_args(camera), f_baseline, left, rows, z[rows, 2:].copy(), skew, good, *columns)
+    matched = rows[good]
+    assert has_right.nonzero()[0].tolist() == sorted(matched.tolist())
+    np.testing.assert_array_equal(right[matched], z[matched, 2:])
+    np.testing.assert_array_equal(skews[matched], skew[good])
+    rows = matched
     expected, valid = triangulate(camera, z[rows])
     assert not valid[1:3].any()
     np.testing.assert_array_equal(has_point[rows], valid)
@@ -162,8 +171,9 @@ def test_features_are_moved_and_triangulated_as_single_points_are_in_numpy(camer
 def test_unknown_depths_are_the_median_of_the_three_nearest_known_ones() -> None:
     rng = np.random.default_rng(15)
     known, depth, pixels = rng.uniform(0, 300, (50, 2)), rng.uniform(1, 9, 50), rng.uniform(0, 300, (20, 2))
-    found = np.zeros(20)
-    _borrow(known, depth, pixels, found)
+    together, has_point = np.concatenate([pixels, known]), np.arange(70) >= 20
+    depths = np.concatenate([np.full(20, np.nan), depth])
+    found = [_borrowed(together, depths, has_point, n) for n in range(20)]
     nearest = np.argsort(np.abs(pixels[:, None] - known).sum(axis=2), axis=1)[:, :3]
     np.testing.assert_array_equal(found, np.median(depth[nearest], axis=1))
 

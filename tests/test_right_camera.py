@@ -140,7 +140,7 @@ def test_few_points_or_an_unknown_motion_contradict_nothing() -> None:
 
 def test_prior_gives_the_depth_of_the_features_that_it_names() -> None:
     z = np.array([[100.0, 50.0, 80.0, 50.0], [200.0, 60.0, 200.0, 60.0]])
-    depth, known = prior_depths(CAMERA, np.array([-1, 7, 5, -1, 9]), TrackPrior(np.array([9, 7]), z))
+    depth, known = prior_depths(CAMERA, np.array([-1, 7, 5, -1, 9]), TrackPrior(np.array([7, 9]), z[::-1]))
     assert known.tolist() == [False, False, False, False, True]  # a disparity of zero is no depth
     assert depth[4] == pytest.approx(CAMERA.fu * CAMERA.baseline_m / 20.0)
 
