@@ -349,7 +349,7 @@ def test_a_loop_that_was_measured_wrong_is_right_at_the_end(room_walk: Walk, tmp
     graph = builder.graph
     wrong = graph.loops[0]
     T = wrong.pose.T_i_j @ se3_exp([0.15, 0.0, 0.1, 0.0, 0.07, 0.0])
-    graph.loops[0] = replace(wrong, pose=RelativePose(T, wrong.pose.covariance))
+    graph.set_loop(0, replace(wrong, pose=RelativePose(T, wrong.pose.covariance)))
     builder.finish(field)
     builder.close()
     loop = graph.loops[0]

@@ -160,7 +160,7 @@ class MapBuilder:
         row = KeyframeRow(self._own, keyframe.frame, keyframe.time_ns, T, keyframe.T_odom_cam, drift, path, up, sigma)
         graph.append(row)
         if motion is not None:
-            graph.add_motion(number - 1, number, motion)
+            graph.add_motions([(number - 1, number, motion)])
         if not self._localise:
             self._store.add_keyframe(row, features)
             if motion is not None:
@@ -247,10 +247,11 @@ class MapBuilder:
 
     def _measure_again(self) -> None:
         """Measure the loops of this session once more, from where the map has its keyframes now."""
-        loops, again = self.graph.loops, dict[int, LoopRow]()
-        for n, loop in enumerate(loops):
+        again = dict[int, LoopRow]()
+        for n, loop in enumerate(self.graph.loops):
             if loop.second >= self.first and (measured := self.places.measured_again(loop)) is not None:
-                loops[n] = again[n] = measured
+                again[n] = measured
+                self.graph.set_loop(n, measured)
         self._waiting += len(again)
         self._store.set_loops(again)
 
@@ -306,7 +307,7 @@ class MapBuilder:
             excess = squared(r, drift + pose.covariance) / GATE
             graph.odometry_scale = max(graph.odometry_scale, excess)
         row = LoopRow(i, k, pose, loop.seen.inliers, kept=True)
-        graph.loops.append(row)
+        graph.add_loops([row])
         if not self._localise:
             self._store.add_loop(row)
         self.places.newest, self._moved = loop, True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -35,10 +36,16 @@ class Rows:
 
     def append(self, row: npt.ArrayLike) -> None:
         """Add a row."""
-        if self._size == len(self._data):
+        self.extend([row])
+
+    def extend(self, rows: Sequence[npt.ArrayLike] | npt.NDArray[Any]) -> None:
+        """Add rows."""
+        end = self._size + len(rows)
+        while end > len(self._data):
             self._data = np.concatenate([self._data, np.zeros_like(self._data)])
-        self._data[self._size] = row
-        self._size += 1
+        if len(rows):
+            self._data[self._size : end] = np.asarray(rows)
+        self._size = end
 
     @property
     def rows(self) -> FloatArray:
@@ -60,12 +67,12 @@ class MapGraph:
         self._ups: list[tuple[int, FloatArray, float]] = []
         self.odometry: list[tuple[int, int, RelativePose]] = []
         self._links = Rows(3)  # of each motion of the odometry: its keyframes, and the variance of its position, m^2
-        for motion in store.odometry():
-            self.add_motion(*motion)
-        self.loops: list[LoopRow] = store.loops()
+        self.add_motions(store.odometry())
+        self.loops: list[LoopRow] = []
+        self._loop_links = Rows(3)  # of each loop, likewise
+        self.add_loops(store.loops())
         self.odometry_scale = 1.0  # on the covariance of the odometry, so that the loops fit to it
-        for row in store.keyframes():
-            self.append(row)
+        self.extend(store.keyframes())
 
     def __len__(self) -> int:
         return len(self.path_m.rows)
@@ -90,20 +97,35 @@ class MapGraph:
 
     def append(self, row: KeyframeRow) -> None:
         """Add a keyframe."""
-        if row.up_cam is not None:
-            self._ups.append((len(self), row.up_cam, row.up_sigma_rad))
-        self.T_map_cam.append(row.T_map_cam)
-        self.T_odom_cam.append(row.T_odom_cam)
-        self._drift.append(row.drift)
-        self.path_m.append(row.path_m)
-        self._session.append(row.session)
-        self._frame.append(row.frame)
-        self._times.append(row.time_ns)
+        self.extend([row])
 
-    def add_motion(self, first: int, second: int, motion: RelativePose) -> None:
-        """Add what the odometry says of the motion between two keyframes."""
-        self.odometry.append((first, second, motion))
-        self._links.append((first, second, np.trace(motion.covariance[:3, :3])))
+    def extend(self, rows: Sequence[KeyframeRow]) -> None:
+        """Add keyframes."""
+        self._ups += [
+            (k, row.up_cam, row.up_sigma_rad) for k, row in enumerate(rows, len(self)) if row.up_cam is not None
+        ]
+        self.T_map_cam.extend([row.T_map_cam for row in rows])
+        self.T_odom_cam.extend([row.T_odom_cam for row in rows])
+        self._drift.extend([row.drift for row in rows])
+        self.path_m.extend([row.path_m for row in rows])
+        self._session.extend([row.session for row in rows])
+        self._frame.extend([row.frame for row in rows])
+        self._times += [row.time_ns for row in rows]
+
+    def add_motions(self, motions: Sequence[tuple[int, int, RelativePose]]) -> None:
+        """Add what the odometry says of motions between two keyframes each."""
+        self.odometry += motions
+        self._links.extend(_links(motions))
+
+    def add_loops(self, rows: Sequence[LoopRow]) -> None:
+        """Add loops."""
+        self.loops += rows
+        self._loop_links.extend(_links([(o.first, o.second, o.pose) for o in rows]))
+
+    def set_loop(self, number: int, row: LoopRow) -> None:
+        """Replace a loop by a newer measurement of it."""
+        self.loops[number] = row
+        self._loop_links.rows[[number]] = _links([(row.first, row.second, row.pose)])
 
     def gathered(self, T_odom_cam: FloatArray, motion: RelativePose | None) -> tuple[FloatArray, float]:
         """Return the covariance (6, 6) and the path that the odometry has gathered at a new keyframe.
@@ -166,11 +188,14 @@ class MapGraph:
         if int(rows.sum()) <= _WINDOW:
             self.optimise_part(part)
             return True
-        seen, new = self.loops[:-newest], self.loops[-newest:]
-        free = np.zeros(len(self), dtype=np.bool_)
-        free[_nearest(self._linked([o for o in seen if o.kept]), new, rows)] = True
+        free, kept = (
+            np.zeros(len(self), dtype=np.bool_),
+            np.array([o.kept for o in self.loops[:-newest]], dtype=np.bool_),
+        )
+        known = self._linked(self._loop_links[:-newest][kept])
+        free[_nearest(known, self.loops[-newest:], rows)] = True
         free[int(np.argmax(rows))] = False
-        pairs = self._linked(self.loops)
+        pairs = self._linked(self._loop_links.rows)
         around = (pairs + pairs.T) @ free.astype(np.float64) > 0
         self._optimise(free | around, around & ~free)
         return False
@@ -197,12 +222,9 @@ class MapGraph:
         grown = self.odometry_scale * self.drift(numbers[i], numbers, systematic=0.0)
         return np.asarray(A @ P[before] @ np.swapaxes(A, 1, 2) + grown)
 
-    def _linked(self, loops: Sequence[LoopRow]) -> coo_matrix:
-        """Return the variances of the motions (K, K) between keyframes, by the odometry and by loops."""
-        covariance = np.array([o.pose.covariance for o in loops]).reshape(-1, 6, 6)
-        variance = np.concatenate([self._links[:, 2], np.trace(covariance[:, :3, :3], axis1=1, axis2=2)])
-        pairs = np.array([(o.first, o.second) for o in loops]).reshape(-1, 2)
-        first, second = np.concatenate([self._links[:, :2], pairs]).T
+    def _linked(self, loops: FloatArray) -> coo_matrix:
+        """Return the variances of the motions (K, K) between keyframes, by the odometry and by loops (L, 3)."""
+        first, second, variance = np.concatenate([self._links.rows, loops]).T
         ends = first.astype(np.int64), second.astype(np.int64)
         return coo_matrix((variance, ends), shape=(len(self), len(self))).tocsr()
 
@@ -274,6 +296,12 @@ class MapGraph:
     def _is_upright(self, rows: BoolArray) -> bool:
         """Whether z is up in the frame of these keyframes: it is that of the first one's session."""
         return self.sessions[int(self._session.rows[int(np.argmax(rows))])].upright
+
+
+def _links(motions: Sequence[tuple[int, int, RelativePose]]) -> FloatArray:
+    """Return the keyframes of motions and the variances of their positions (M, 3)."""
+    variance = [m.covariance[0, 0] + m.covariance[1, 1] + m.covariance[2, 2] for _, _, m in motions]
+    return np.array([(i, j, v) for (i, j, _), v in zip(motions, variance, strict=True)]).reshape(-1, 3)
 
 
 def _nearest(links: coo_matrix, new: Sequence[LoopRow], rows: BoolArray) -> IntArray:
