@@ -18,11 +18,12 @@ from vio.errors import ConfigError, DataError
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
+from vio.mapping.density import spread
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.place_finder import GATE, FoundPlace, PlaceFinder, squared
-from vio.records import LoopEvent
+from vio.records import BoolArray, LoopEvent
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +102,16 @@ class MapUpdate:
 class MapBuilder:
     """Builds, continues, or only reads a map, one keyframe after the other."""
 
-    def __init__(self, store: MapStore, source: str, camera: StereoCamera, *, upright: bool, localise: bool) -> None:
+    def __init__(
+        self,
+        store: MapStore,
+        source: str,
+        camera: StereoCamera,
+        *,
+        upright: bool,
+        localise: bool,
+        density: int | None = None,
+    ) -> None:
         """Begin a session in a map.
 
         Args:
@@ -110,6 +120,7 @@ class MapBuilder:
             camera: rectified pair.
             upright: whether z of the odometry's world is up.
             localise: find poses in the map, and leave it as it is.
+            density: keyframes a cubic metre that can be found again, others keep poses and motions alone; None: all.
 
         Raises:
             ConfigError: the images are not those of a pinhole stereo pair.
@@ -117,7 +128,7 @@ class MapBuilder:
         """
         check_camera(store.path, camera)
         _check_sessions(store, camera)
-        self._store, self._camera, self._localise = store, camera, localise
+        self._store, self._camera, self._localise, self._density = store, camera, localise, density
         self.graph = MapGraph(store)
         self.first = len(self.graph)  # keyframe of this session
         sessions = self.graph.sessions
@@ -171,6 +182,7 @@ class MapBuilder:
         events = self._close_loops(number, features)
         if not self._localise:
             self.places.remember(self._camera, features)
+            self._forget(graph.part == graph.part[number], np.floor(graph.T_map_cam[number][:3, 3]))
             if number % _COMMIT_EVERY == 0:
                 self.commit()
         return self._update(events)
@@ -193,6 +205,9 @@ class MapBuilder:
             own = slice(self.first, None)
             self.graph.T_map_cam.rows[own] = self.graph.T_odom_cam.rows[own]
             self._moved = True
+        if self._density is not None and not self._localise:
+            self._forget(np.ones(len(self.graph), dtype=np.bool_))
+            self._store.clear_features(np.flatnonzero(~self.places.shows_something))
         self.commit()
         return self._update(())
 
@@ -244,6 +259,20 @@ class MapBuilder:
                 return
         sessions[own] = replace(sessions[own], field=field)
         self.places.forget_pixels()
+
+    def _forget(self, rows: BoolArray, cell: FloatArray | None = None) -> None:
+        """Find no more what exceeds the density among keyframes (K,), of one cubic metre (3,) or of all."""
+        if self._density is None:
+            return
+        graph = self.graph
+        rows = rows & self.places.shows_something
+        if cell is not None:
+            rows &= (np.floor(graph.T_map_cam.rows[:, :3, 3]) == cell).all(axis=1)
+        near = np.flatnonzero(rows)
+        if len(near) > self._density:
+            ends = [k for o in graph.loops if o.kept for k in (o.first, o.second)]
+            loops = np.bincount(ends, minlength=len(graph))
+            self.places.forget(near[~spread(graph.T_map_cam[near], graph.part[near], loops[near], self._density)])
 
     def _measure_again(self) -> None:
         """Measure the loops of this session once more, from where the map has its keyframes now."""
