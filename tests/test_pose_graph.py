@@ -309,3 +309,22 @@ def test_verticals_do_not_pull_at_a_map_whose_z_is_not_up(tmp_path: Path) -> Non
     np.testing.assert_allclose(graph.T_map_cam.rows, before, atol=1e-9)
     graph.optimise_part(0)  # the whole may be levelled
     np.testing.assert_allclose(graph.T_map_cam.rows[-1, :3, :3] @ (T[:3, :3].T @ up), [0.0, 0.0, 1.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("level", [False, True])
+def test_the_frame_of_a_map_stays_where_its_keyframes_are_known_to_stand(tmp_path: Path, level: bool) -> None:
+    """The last ten of thirty came after a gap in the odometry, and were 100 m off until a loop placed them."""
+    graph, step = MapGraph(MapStore(tmp_path / "a.map", create=True)), se3_exp([1.0, 0.2, 0, 0.02, 0, 0.1])
+    graph.sessions = [SessionRow("walk", StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360), True, 0)]
+    T = se3_exp([0.0, 0.0, 0.0, 0.3, 0.0, 0.0])
+    for k in range(30):
+        variance = 1e-4 * k + (1e3 if k >= 20 else 0.0)
+        graph.append(KeyframeRow(0, k, k, T, T, variance * np.eye(6), 0.0, None, 0.0))
+        T = T @ step
+    stated = se3_exp([3.0, -2.0, 1.0, *((0, 0, 0.2) if level else (0.1, 0.3, 0.2))]) @ graph.T_map_cam.rows
+    expected, up = stated.copy(), graph.T_map_cam.rows[:, 2, :3].copy()
+    stated[20:, 0, 3] += 100.0
+    graph.keep_place(0, np.ones(30, dtype=np.bool_), stated, level=level)
+    assert np.abs(graph.T_map_cam.rows - expected)[:, :3, 3].max() < 1e-2
+    if level:
+        np.testing.assert_allclose(graph.T_map_cam.rows[:, 2, :3], up, atol=1e-12)

@@ -199,7 +199,7 @@ class MapBuilder:
             if self._waiting:
                 self._optimise()
             self._measure_again()
-        if self._waiting or self._partial:
+        if self._optimised or self._waiting:
             self._optimise(whole=True)
         if not self._optimised:
             own = slice(self.first, None)
@@ -366,7 +366,12 @@ class MapBuilder:
             self.graph.join(int(part[k]), int(part[i]), T)
 
     def _optimise(self, *, whole: bool = False) -> None:
-        part = self.graph.sessions[self._own].part
+        graph, part = self.graph, self.graph.sessions[self._own].part
+        own = graph.session == self._own
+        stated, stays = graph.T_map_cam.rows.copy(), graph.part == part
+        if not self._optimised:  # until then the odometry's poses stood for those in the map
+            alone = not (stays & ~own).any()
+            stays, stated = (own, graph.T_odom_cam.rows.copy()) if alone else (stays & ~own, stated)
         self._partial = False
         if self._localise:
             self.graph.optimise_end(max(len(self.graph) - _LOCAL, self.first))
@@ -374,6 +379,8 @@ class MapBuilder:
             self.graph.optimise_part(part)
         else:
             self._partial = not self.graph.optimise_near(part, self._waiting)
+        if not (self._localise or self._partial):
+            graph.keep_place(part, stays, stated, level=whole)
         if self.places.newest is not None and not self.graph.loops[-1].kept:
             self.places.newest = None
         self._waiting, self._moved, self._optimised = 0, True, True

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse
+from vio.geometry.lie import FloatArray, nearest_rotation, se3_adjoint, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.upright import mean_up, rotation_to_up
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
@@ -24,6 +24,7 @@ _DRIFT_SHARE, _DRIFT_RAD_PER_M = 0.01, float(np.radians(0.005))
 _FIRST_REACH, _FURTHER = 30.0, 2.0  # of the search for them, in mean variances of a motion; and from try to try
 _WINDOW = 1000  # keyframes that are optimised for a new loop, beside those of its cycle
 _MOST_EXACT = 200  # keyframes whose covariance is computed, beside the first of each session
+_LEAST_VARIANCE_M2 = 1e-8  # of a keyframe's position since its session began
 UNKNOWN = 1e6  # variance of the motion from one session to the next, m^2 and rad^2: nothing is known of it
 
 
@@ -199,6 +200,30 @@ class MapGraph:
         around = (pairs + pairs.T) @ free.astype(np.float64) > 0
         self._optimise(free | around, around & ~free)
         return False
+
+    def keep_place(self, part: int, stays: BoolArray, T_before: FloatArray, *, level: bool) -> None:
+        """Move and turn the frame of a part as a whole, so that keyframes stand on average where they stood: (G7).
+
+        Args:
+            part: of the map.
+            stays: (K,) keyframes of it.
+            T_before: (K, 4, 4) poses of all keyframes, those of `stays` where they should stand.
+            level: turn about the vertical alone, where z is up.
+        """
+        rows, numbers, session = self.part == part, np.flatnonzero(stays), self.session
+        begins = np.unique(session, return_index=True)[1][session[numbers]]
+        variance = np.trace(self.drift(begins, numbers, systematic=0.0)[:, :3, :3], axis1=1, axis2=2)
+        w = 1.0 / (variance + np.median(variance) + _LEAST_VARIANCE_M2)
+        w /= w.sum()
+        T, B = self.T_map_cam.rows[stays], T_before[stays]
+        p, q = w @ T[:, :3, 3], w @ B[:, :3, 3]
+        M = np.einsum("k,ki,kj->ij", w, B[:, :3, 3] - q, T[:, :3, 3] - p)
+        M += np.einsum("k,kia,kja->ij", w, B[:, :3, :3], T[:, :3, :3])  # directions, which a straight path leaves open
+        if level and self._is_upright(rows):
+            R = so3_exp(np.array([0.0, 0.0, np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])]))
+        else:
+            R = nearest_rotation(M)
+        self.T_map_cam.rows[rows] = se3_from_parts(R, q - R @ p) @ self.T_map_cam.rows[rows]
 
     def covariances(self, part: int) -> FloatArray:
         """Covariances (K, 6, 6) of xi in `T_map_cam exp(xi)` of the keyframes of a part, relative to its first one.
