@@ -19,7 +19,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import project, triangulate
 from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.features import KeyframeFeatures, extract
-from vio.mapping.files import merge_maps
+from vio.mapping.files import merge_maps, prune_map
 from vio.mapping.map_store import EarthRow, MapStore
 from vio.protocols import Dataset
 from vio.records import LoopEvent
@@ -116,10 +116,11 @@ def _map(
     seed: int = 0,
     rows: slice = slice(None),
     localise: bool = False,
+    density: int | None = None,
     events: list[LoopEvent] | None = None,
 ) -> MapBuilder:
     store = MapStore(path, create=not localise, read_only=localise)
-    builder = MapBuilder(store, "walk", walk.camera, upright=False, localise=localise)
+    builder = MapBuilder(store, "walk", walk.camera, upright=False, localise=localise, density=density)
     for keyframe, features in walk.keyframes(seed=seed, rows=rows):
         found = builder.add(keyframe, features).loops
         if events is not None:
@@ -274,6 +275,32 @@ def test_after_a_gap_without_odometry_the_place_is_found_again(
     builder.close()
 
 
+def test_with_a_density_each_cubic_metre_keeps_features_of_so_many_keyframes(
+    room_walk: Walk, whole_map: MapBuilder, tmp_path: Path
+) -> None:
+    """Keyframes beyond it keep their poses and motions, the map its numbers, and loops are found with the others."""
+    path, density = tmp_path / "a.map", 1
+    builder = _map(room_walk, path, density=density)
+    builder.finish()
+    builder.close()
+    with closing(MapStore(path, read_only=True)) as store:
+        T, shows = np.array([k.T_map_cam for k in store.keyframes()]), store.show_something()
+        sizes = np.array([len(store.features(k)) for k in range(len(T))])
+    np.testing.assert_array_equal(sizes > 0, shows)
+    cells = np.floor(T[:, :3, 3])
+    full = np.unique(cells, axis=0, return_counts=True)[1]
+    assert full.max() > density, "the walk comes to a place more often"
+    assert np.unique(cells[shows], axis=0, return_counts=True)[1].max() == density
+    assert len(T) == len(whole_map.graph)
+    found = {o.second for o in builder.graph.loops}
+    assert np.sqrt(np.mean(_errors_m(T, room_walk.T) ** 2)) < 0.03
+    assert len(found) >= 0.8 * 12, "of the keyframes of the second round"
+    again = MapBuilder(MapStore(path), "again", room_walk.camera, upright=False, localise=False)
+    np.testing.assert_array_equal(again.places.shows_something, shows)
+    again.close()
+    assert prune_map(path, density)["keyframes"] == shows.sum()
+
+
 def test_a_checkpoint_goes_on_to_the_same_map(room_walk: Walk, whole_map: MapBuilder, tmp_path: Path) -> None:
     keyframes = list(room_walk.keyframes(seed=0))
     path = tmp_path / "b.map"
@@ -349,7 +376,7 @@ def test_a_loop_that_was_measured_wrong_is_right_at_the_end(room_walk: Walk, tmp
     graph = builder.graph
     wrong = graph.loops[0]
     T = wrong.pose.T_i_j @ se3_exp([0.15, 0.0, 0.1, 0.0, 0.07, 0.0])
-    graph.loops[0] = replace(wrong, pose=RelativePose(T, wrong.pose.covariance))
+    graph.set_loop(0, replace(wrong, pose=RelativePose(T, wrong.pose.covariance)))
     builder.finish(field)
     builder.close()
     loop = graph.loops[0]

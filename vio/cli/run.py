@@ -30,6 +30,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")
     parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map: loops are closed in it")
     parser.add_argument(
+        "--map-density", type=int, metavar="N", help="keep features of N keyframes in a cubic metre of the map (all)"
+    )
+    parser.add_argument(
         "--save-calibration",
         type=Path,
         nargs="?",
@@ -53,8 +56,8 @@ def add_parser(commands: Any) -> None:
 
 
 _OF_A_NEW_RUN = (
-    "reference", "start", "stop", "lengths", "out", "save_observations", "save_calibration", "map", "view", "no_plot",
-    "set", "config", "motion", "backend", "frontend", "calibration", "camera", "topics",
+    "reference", "start", "stop", "lengths", "out", "save_observations", "save_calibration", "map", "map_density",
+    "view", "no_plot", "set", "config", "motion", "backend", "frontend", "calibration", "camera", "topics",
 )  # fmt: skip
 
 
@@ -63,6 +66,8 @@ def execute(args: argparse.Namespace) -> int:
 
     if args.open and not args.report:
         raise ConfigError("--open shows the page of --report; give both")
+    if args.map_density is not None and (args.map is None or args.map_density < 1):
+        raise ConfigError("--map-density is of a --map, and at least 1")
 
     def finished(metrics: dict[str, Any]) -> None:
         print_result(metrics, metric_rows(metrics, plot=not args.no_plot), as_json=args.json)
@@ -86,6 +91,7 @@ def execute(args: argparse.Namespace) -> int:
         save_calibration=args.save_calibration,
         progress=not args.quiet,
         map_file=args.map,
+        map_density=args.map_density,
         view=args.view,
         plot=not args.no_plot,
         command=args.command_line,

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import math
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -103,6 +103,7 @@ def process(
     save_calibration: Path | None = None,
     progress: bool = True,
     map_file: Path | None = None,
+    map_density: int | None = None,
     localise: bool = False,
     view: str | None = None,
     plot: bool = True,
@@ -131,11 +132,18 @@ def process(
         "save_observations": save_observations,
         "save_calibration": None if calibration is None else str(calibration.absolute()),
         "map": None if map_file is None else str(map_file.absolute()),
+        "map_density": map_density,
         "localise": localise,
         "plot": plot,
         "command": command,
     }
     return _process(dataset, config, folder, request, progress=progress, resume=False, view=view, finished=finished)
+
+
+def _map_use(request: Mapping[str, Any]) -> MapUse | None:
+    if request.get("map") is None:
+        return None
+    return MapUse(Path(request["map"]), request.get("localise", False), density=request.get("map_density"))
 
 
 def _opened(source: str, config: Config, *, mapped: bool) -> Dataset:
@@ -201,7 +209,7 @@ def _process(
                 stop=stop,
                 keep_observations=save_observations or builds_map,  # which its adjustment takes
                 viewer=Viewers(viewers),
-                map=MapUse(Path(request["map"]), request.get("localise", False)) if request.get("map") else None,
+                map=_map_use(request),
                 control=RunControl(growing_folder(folder, dataset, config, request), resume, asked.reason),
             )
             if builds_map:

@@ -49,6 +49,7 @@ class MapUse:
     localise: bool = False  # find poses in the map, and leave it as it is
     # Wait for the map's thread, so that results repeat to the bit; False: keyframes and results come when it is ready.
     wait: bool = True
+    density: int | None = None  # keyframes a cubic metre that can be found again; None: all
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,4 +215,5 @@ def _open_map(use: MapUse, source: Source, config: Config, backend: Backend) -> 
         localise=use.localise,
         wait=use.wait,
         alone=source.motion is None,
+        density=use.density,
     )

@@ -18,11 +18,12 @@ from vio.errors import ConfigError, DataError
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
+from vio.mapping.density import spread
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.place_finder import GATE, FoundPlace, PlaceFinder, squared
-from vio.records import LoopEvent
+from vio.records import BoolArray, LoopEvent
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +102,16 @@ class MapUpdate:
 class MapBuilder:
     """Builds, continues, or only reads a map, one keyframe after the other."""
 
-    def __init__(self, store: MapStore, source: str, camera: StereoCamera, *, upright: bool, localise: bool) -> None:
+    def __init__(
+        self,
+        store: MapStore,
+        source: str,
+        camera: StereoCamera,
+        *,
+        upright: bool,
+        localise: bool,
+        density: int | None = None,
+    ) -> None:
         """Begin a session in a map.
 
         Args:
@@ -110,6 +120,7 @@ class MapBuilder:
             camera: rectified pair.
             upright: whether z of the odometry's world is up.
             localise: find poses in the map, and leave it as it is.
+            density: keyframes a cubic metre that can be found again, others keep poses and motions alone; None: all.
 
         Raises:
             ConfigError: the images are not those of a pinhole stereo pair.
@@ -117,7 +128,7 @@ class MapBuilder:
         """
         check_camera(store.path, camera)
         _check_sessions(store, camera)
-        self._store, self._camera, self._localise = store, camera, localise
+        self._store, self._camera, self._localise, self._density = store, camera, localise, density
         self.graph = MapGraph(store)
         self.first = len(self.graph)  # keyframe of this session
         sessions = self.graph.sessions
@@ -160,7 +171,7 @@ class MapBuilder:
         row = KeyframeRow(self._own, keyframe.frame, keyframe.time_ns, T, keyframe.T_odom_cam, drift, path, up, sigma)
         graph.append(row)
         if motion is not None:
-            graph.add_motion(number - 1, number, motion)
+            graph.add_motions([(number - 1, number, motion)])
         if not self._localise:
             self._store.add_keyframe(row, features)
             if motion is not None:
@@ -171,6 +182,7 @@ class MapBuilder:
         events = self._close_loops(number, features)
         if not self._localise:
             self.places.remember(self._camera, features)
+            self._forget(graph.part == graph.part[number], np.floor(graph.T_map_cam[number][:3, 3]))
             if number % _COMMIT_EVERY == 0:
                 self.commit()
         return self._update(events)
@@ -187,12 +199,15 @@ class MapBuilder:
             if self._waiting:
                 self._optimise()
             self._measure_again()
-        if self._waiting or self._partial:
+        if self._optimised or self._waiting:
             self._optimise(whole=True)
         if not self._optimised:
             own = slice(self.first, None)
             self.graph.T_map_cam.rows[own] = self.graph.T_odom_cam.rows[own]
             self._moved = True
+        if self._density is not None and not self._localise:
+            self._forget(np.ones(len(self.graph), dtype=np.bool_))
+            self._store.clear_features(np.flatnonzero(~self.places.shows_something))
         self.commit()
         return self._update(())
 
@@ -245,12 +260,27 @@ class MapBuilder:
         sessions[own] = replace(sessions[own], field=field)
         self.places.forget_pixels()
 
+    def _forget(self, rows: BoolArray, cell: FloatArray | None = None) -> None:
+        """Find no more what exceeds the density among keyframes (K,), of one cubic metre (3,) or of all."""
+        if self._density is None:
+            return
+        graph = self.graph
+        rows = rows & self.places.shows_something
+        if cell is not None:
+            rows &= (np.floor(graph.T_map_cam.rows[:, :3, 3]) == cell).all(axis=1)
+        near = np.flatnonzero(rows)
+        if len(near) > self._density:
+            ends = [k for o in graph.loops if o.kept for k in (o.first, o.second)]
+            loops = np.bincount(ends, minlength=len(graph))
+            self.places.forget(near[~spread(graph.T_map_cam[near], graph.part[near], loops[near], self._density)])
+
     def _measure_again(self) -> None:
         """Measure the loops of this session once more, from where the map has its keyframes now."""
-        loops, again = self.graph.loops, dict[int, LoopRow]()
-        for n, loop in enumerate(loops):
+        again = dict[int, LoopRow]()
+        for n, loop in enumerate(self.graph.loops):
             if loop.second >= self.first and (measured := self.places.measured_again(loop)) is not None:
-                loops[n] = again[n] = measured
+                again[n] = measured
+                self.graph.set_loop(n, measured)
         self._waiting += len(again)
         self._store.set_loops(again)
 
@@ -306,7 +336,7 @@ class MapBuilder:
             excess = squared(r, drift + pose.covariance) / GATE
             graph.odometry_scale = max(graph.odometry_scale, excess)
         row = LoopRow(i, k, pose, loop.seen.inliers, kept=True)
-        graph.loops.append(row)
+        graph.add_loops([row])
         if not self._localise:
             self._store.add_loop(row)
         self.places.newest, self._moved = loop, True
@@ -336,7 +366,12 @@ class MapBuilder:
             self.graph.join(int(part[k]), int(part[i]), T)
 
     def _optimise(self, *, whole: bool = False) -> None:
-        part = self.graph.sessions[self._own].part
+        graph, part = self.graph, self.graph.sessions[self._own].part
+        own = graph.session == self._own
+        stated, stays = graph.T_map_cam.rows.copy(), graph.part == part
+        if not self._optimised:  # until then the odometry's poses stood for those in the map
+            alone = not (stays & ~own).any()
+            stays, stated = (own, graph.T_odom_cam.rows.copy()) if alone else (stays & ~own, stated)
         self._partial = False
         if self._localise:
             self.graph.optimise_end(max(len(self.graph) - _LOCAL, self.first))
@@ -344,6 +379,8 @@ class MapBuilder:
             self.graph.optimise_part(part)
         else:
             self._partial = not self.graph.optimise_near(part, self._waiting)
+        if not (self._localise or self._partial):
+            graph.keep_place(part, stays, stated, level=whole)
         if self.places.newest is not None and not self.graph.loops[-1].kept:
             self.places.newest = None
         self._waiting, self._moved, self._optimised = 0, True, True

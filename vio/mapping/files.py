@@ -17,13 +17,12 @@ from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.mapping.builder import Keyframe, MapBuilder
+from vio.mapping.density import spread
 from vio.mapping.map_database import check_path
 from vio.mapping.map_store import MapStore, SessionRow
 from vio.records import BoolArray, IntArray
 
 log = logging.getLogger(__name__)
-
-_M_PER_RAD = 2.0  # a turn of a radian shows as much that is new as a step of so many metres
 
 
 def describe_map(path: Path) -> dict[str, Any]:
@@ -143,9 +142,7 @@ def drop_session(path: Path, session: int) -> dict[str, Any]:
 
 
 def prune_map(path: Path, density: int) -> dict[str, Any]:
-    """Leave at most so many keyframes in a cubic metre, in place; return what the map holds then.
-
-    Of the two keyframes of a cell that show the most alike, that with fewer loops goes, or the older one.
+    """Leave at most so many keyframes in a cubic metre, see `spread`, in place; return what the map holds then.
 
     Raises:
         DataError: the file cannot be used.
@@ -155,20 +152,8 @@ def prune_map(path: Path, density: int) -> dict[str, Any]:
     with contextlib.closing(store):
         loops = np.bincount([k for o in store.loops() if o.kept for k in (o.first, o.second)], minlength=len(T))
         parts = np.array([s.part for s in store.sessions()])[[k.session for k in store.keyframes()]]
-    kept = np.ones(len(T), dtype=np.bool_)
-    cells = np.concatenate([np.floor(T[:, :3, 3]), parts[:, None]], axis=1)
-    for cell in np.unique(cells, axis=0):
-        rows = np.flatnonzero((cells == cell).all(axis=1))
-        position, axis = T[rows, :3, 3], T[rows, :3, 2]
-        apart = np.linalg.norm(position[:, None] - position, axis=2) + _M_PER_RAD * np.arccos(
-            np.clip(axis @ axis.T, -1.0, 1.0)
-        )
-        np.fill_diagonal(apart, np.inf)
-        for _ in range(len(rows) - density):
-            a, b = sorted(np.unravel_index(int(np.argmin(apart)), apart.shape))
-            gone = b if loops[rows[b]] < loops[rows[a]] else a
-            kept[rows[gone]] = False
-            apart[gone], apart[:, gone] = np.inf, np.inf
+        kept = store.show_something()
+    kept[kept] = spread(T[kept], parts[kept], loops[kept], density)
     return _keep(path, path, kept)
 
 

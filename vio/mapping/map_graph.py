@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse
+from vio.geometry.lie import FloatArray, nearest_rotation, se3_adjoint, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.upright import mean_up, rotation_to_up
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
@@ -23,6 +24,7 @@ _DRIFT_SHARE, _DRIFT_RAD_PER_M = 0.01, float(np.radians(0.005))
 _FIRST_REACH, _FURTHER = 30.0, 2.0  # of the search for them, in mean variances of a motion; and from try to try
 _WINDOW = 1000  # keyframes that are optimised for a new loop, beside those of its cycle
 _MOST_EXACT = 200  # keyframes whose covariance is computed, beside the first of each session
+_LEAST_VARIANCE_M2 = 1e-8  # of a keyframe's position since its session began
 UNKNOWN = 1e6  # variance of the motion from one session to the next, m^2 and rad^2: nothing is known of it
 
 
@@ -35,10 +37,16 @@ class Rows:
 
     def append(self, row: npt.ArrayLike) -> None:
         """Add a row."""
-        if self._size == len(self._data):
+        self.extend([row])
+
+    def extend(self, rows: Sequence[npt.ArrayLike] | npt.NDArray[Any]) -> None:
+        """Add rows."""
+        end = self._size + len(rows)
+        while end > len(self._data):
             self._data = np.concatenate([self._data, np.zeros_like(self._data)])
-        self._data[self._size] = row
-        self._size += 1
+        if len(rows):
+            self._data[self._size : end] = np.asarray(rows)
+        self._size = end
 
     @property
     def rows(self) -> FloatArray:
@@ -60,12 +68,12 @@ class MapGraph:
         self._ups: list[tuple[int, FloatArray, float]] = []
         self.odometry: list[tuple[int, int, RelativePose]] = []
         self._links = Rows(3)  # of each motion of the odometry: its keyframes, and the variance of its position, m^2
-        for motion in store.odometry():
-            self.add_motion(*motion)
-        self.loops: list[LoopRow] = store.loops()
+        self.add_motions(store.odometry())
+        self.loops: list[LoopRow] = []
+        self._loop_links = Rows(3)  # of each loop, likewise
+        self.add_loops(store.loops())
         self.odometry_scale = 1.0  # on the covariance of the odometry, so that the loops fit to it
-        for row in store.keyframes():
-            self.append(row)
+        self.extend(store.keyframes())
 
     def __len__(self) -> int:
         return len(self.path_m.rows)
@@ -90,20 +98,35 @@ class MapGraph:
 
     def append(self, row: KeyframeRow) -> None:
         """Add a keyframe."""
-        if row.up_cam is not None:
-            self._ups.append((len(self), row.up_cam, row.up_sigma_rad))
-        self.T_map_cam.append(row.T_map_cam)
-        self.T_odom_cam.append(row.T_odom_cam)
-        self._drift.append(row.drift)
-        self.path_m.append(row.path_m)
-        self._session.append(row.session)
-        self._frame.append(row.frame)
-        self._times.append(row.time_ns)
+        self.extend([row])
 
-    def add_motion(self, first: int, second: int, motion: RelativePose) -> None:
-        """Add what the odometry says of the motion between two keyframes."""
-        self.odometry.append((first, second, motion))
-        self._links.append((first, second, np.trace(motion.covariance[:3, :3])))
+    def extend(self, rows: Sequence[KeyframeRow]) -> None:
+        """Add keyframes."""
+        self._ups += [
+            (k, row.up_cam, row.up_sigma_rad) for k, row in enumerate(rows, len(self)) if row.up_cam is not None
+        ]
+        self.T_map_cam.extend([row.T_map_cam for row in rows])
+        self.T_odom_cam.extend([row.T_odom_cam for row in rows])
+        self._drift.extend([row.drift for row in rows])
+        self.path_m.extend([row.path_m for row in rows])
+        self._session.extend([row.session for row in rows])
+        self._frame.extend([row.frame for row in rows])
+        self._times += [row.time_ns for row in rows]
+
+    def add_motions(self, motions: Sequence[tuple[int, int, RelativePose]]) -> None:
+        """Add what the odometry says of motions between two keyframes each."""
+        self.odometry += motions
+        self._links.extend(_links(motions))
+
+    def add_loops(self, rows: Sequence[LoopRow]) -> None:
+        """Add loops."""
+        self.loops += rows
+        self._loop_links.extend(_links([(o.first, o.second, o.pose) for o in rows]))
+
+    def set_loop(self, number: int, row: LoopRow) -> None:
+        """Replace a loop by a newer measurement of it."""
+        self.loops[number] = row
+        self._loop_links.rows[[number]] = _links([(row.first, row.second, row.pose)])
 
     def gathered(self, T_odom_cam: FloatArray, motion: RelativePose | None) -> tuple[FloatArray, float]:
         """Return the covariance (6, 6) and the path that the odometry has gathered at a new keyframe.
@@ -166,14 +189,41 @@ class MapGraph:
         if int(rows.sum()) <= _WINDOW:
             self.optimise_part(part)
             return True
-        seen, new = self.loops[:-newest], self.loops[-newest:]
-        free = np.zeros(len(self), dtype=np.bool_)
-        free[_nearest(self._linked([o for o in seen if o.kept]), new, rows)] = True
+        free, kept = (
+            np.zeros(len(self), dtype=np.bool_),
+            np.array([o.kept for o in self.loops[:-newest]], dtype=np.bool_),
+        )
+        known = self._linked(self._loop_links[:-newest][kept])
+        free[_nearest(known, self.loops[-newest:], rows)] = True
         free[int(np.argmax(rows))] = False
-        pairs = self._linked(self.loops)
+        pairs = self._linked(self._loop_links.rows)
         around = (pairs + pairs.T) @ free.astype(np.float64) > 0
         self._optimise(free | around, around & ~free)
         return False
+
+    def keep_place(self, part: int, stays: BoolArray, T_before: FloatArray, *, level: bool) -> None:
+        """Move and turn the frame of a part as a whole, so that keyframes stand on average where they stood: (G7).
+
+        Args:
+            part: of the map.
+            stays: (K,) keyframes of it.
+            T_before: (K, 4, 4) poses of all keyframes, those of `stays` where they should stand.
+            level: turn about the vertical alone, where z is up.
+        """
+        rows, numbers, session = self.part == part, np.flatnonzero(stays), self.session
+        begins = np.unique(session, return_index=True)[1][session[numbers]]
+        variance = np.trace(self.drift(begins, numbers, systematic=0.0)[:, :3, :3], axis1=1, axis2=2)
+        w = 1.0 / (variance + np.median(variance) + _LEAST_VARIANCE_M2)
+        w /= w.sum()
+        T, B = self.T_map_cam.rows[stays], T_before[stays]
+        p, q = w @ T[:, :3, 3], w @ B[:, :3, 3]
+        M = np.einsum("k,ki,kj->ij", w, B[:, :3, 3] - q, T[:, :3, 3] - p)
+        M += np.einsum("k,kia,kja->ij", w, B[:, :3, :3], T[:, :3, :3])  # directions, which a straight path leaves open
+        if level and self._is_upright(rows):
+            R = so3_exp(np.array([0.0, 0.0, np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])]))
+        else:
+            R = nearest_rotation(M)
+        self.T_map_cam.rows[rows] = se3_from_parts(R, q - R @ p) @ self.T_map_cam.rows[rows]
 
     def covariances(self, part: int) -> FloatArray:
         """Covariances (K, 6, 6) of xi in `T_map_cam exp(xi)` of the keyframes of a part, relative to its first one.
@@ -197,12 +247,9 @@ class MapGraph:
         grown = self.odometry_scale * self.drift(numbers[i], numbers, systematic=0.0)
         return np.asarray(A @ P[before] @ np.swapaxes(A, 1, 2) + grown)
 
-    def _linked(self, loops: Sequence[LoopRow]) -> coo_matrix:
-        """Return the variances of the motions (K, K) between keyframes, by the odometry and by loops."""
-        covariance = np.array([o.pose.covariance for o in loops]).reshape(-1, 6, 6)
-        variance = np.concatenate([self._links[:, 2], np.trace(covariance[:, :3, :3], axis1=1, axis2=2)])
-        pairs = np.array([(o.first, o.second) for o in loops]).reshape(-1, 2)
-        first, second = np.concatenate([self._links[:, :2], pairs]).T
+    def _linked(self, loops: FloatArray) -> coo_matrix:
+        """Return the variances of the motions (K, K) between keyframes, by the odometry and by loops (L, 3)."""
+        first, second, variance = np.concatenate([self._links.rows, loops]).T
         ends = first.astype(np.int64), second.astype(np.int64)
         return coo_matrix((variance, ends), shape=(len(self), len(self))).tocsr()
 
@@ -274,6 +321,12 @@ class MapGraph:
     def _is_upright(self, rows: BoolArray) -> bool:
         """Whether z is up in the frame of these keyframes: it is that of the first one's session."""
         return self.sessions[int(self._session.rows[int(np.argmax(rows))])].upright
+
+
+def _links(motions: Sequence[tuple[int, int, RelativePose]]) -> FloatArray:
+    """Return the keyframes of motions and the variances of their positions (M, 3)."""
+    variance = [m.covariance[0, 0] + m.covariance[1, 1] + m.covariance[2, 2] for _, _, m in motions]
+    return np.array([(i, j, v) for (i, j, _), v in zip(motions, variance, strict=True)]).reshape(-1, 3)
 
 
 def _nearest(links: coo_matrix, new: Sequence[LoopRow], rows: BoolArray) -> IntArray:

@@ -18,7 +18,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures
 from vio.mapping.map_database import APPLICATION_ID, KEYS, SINCE, MapDatabase, damaged
 from vio.mapping.place_index import SEGMENT, Segment
-from vio.records import IntArray
+from vio.records import BoolArray, IntArray
 
 _TELLING_FEATURES = 20
 
@@ -180,6 +180,11 @@ class MapStore(MapDatabase):
         """Say of loops whether they agree with the others."""
         self._set("loops", ("kept",), {n: (value,) for n, value in kept.items()})
 
+    def clear_features(self, keyframes: IntArray) -> None:
+        """Leave keyframes with their poses and motions alone."""
+        columns = ("z", "has_right", "sigma_px", "descriptors")
+        self._set("features", columns, dict.fromkeys(keyframes.tolist(), (b"",) * len(columns)))
+
     def set_parts(self, parts: list[int]) -> None:
         """Replace the part of each session."""
         self._set("sessions", ("part",), {n: (part,) for n, part in enumerate(parts)})
@@ -273,6 +278,12 @@ class MapStore(MapDatabase):
             return PlacesRow(words, p, np.frombuffer(stereo, dtype="<i8").reshape(SEGMENT))
 
         return self._read("places", made) if self.version >= SINCE["places"] else []
+
+    def show_something(self) -> BoolArray:
+        """Mask (K,) of the keyframes that have features."""
+        with self._errors():
+            rows = self._db.execute("SELECT length(z) > 0 FROM features ORDER BY keyframe").fetchall()
+        return np.array(rows, dtype=np.bool_).reshape(-1)
 
     def features(self, keyframe: int) -> KeyframeFeatures:
         """Return the features of one keyframe."""

@@ -35,9 +35,8 @@ class Overlaps:
 
     def restore(self, points: FloatArray, count: IntArray) -> None:
         """Take the points (K, P, 3) and counts (K,) that `newest` gave of keyframes, in their order."""
-        for p, n in zip(points, count.tolist(), strict=True):
-            self._points.append(p)
-            self._count.append(n)
+        self._points.extend(points)
+        self._count.extend(count)
 
     def newest(self, count: int) -> tuple[FloatArray, IntArray]:
         """Return the points (K, P, 3) of the newest keyframes, and how many stereo points each has (K,)."""

@@ -76,6 +76,7 @@ class PlaceFinder:
         """
         self._graph, self._camera, self._own, self._writes = graph, camera, own, writes
         self.newest: FoundPlace | None = None  # accepted loop
+        self._forgotten = set(np.flatnonzero(~store.show_something()).tolist())  # keyframes that are found no more
         self.reopen(store, len(graph))
 
     def reopen(self, store: MapStore, keyframes: int) -> None:
@@ -98,6 +99,17 @@ class PlaceFinder:
         """Memory of the points by which places are expected."""
         return self._overlaps.nbytes
 
+    @property
+    def shows_something(self) -> BoolArray:
+        """Mask (N,) of the keyframes that can be found again."""
+        shows = np.ones(len(self._index), dtype=np.bool_)
+        shows[sorted(self._forgotten)] = False
+        return shows
+
+    def forget(self, keyframes: IntArray) -> None:
+        """Find keyframes no more."""
+        self._forgotten.update(keyframes.tolist())
+
     def forget_pixels(self) -> None:
         """Forget what was made of the pixels of keyframes, as the estimate of the rectification error has changed."""
         self._shown.cache_clear()
@@ -109,6 +121,8 @@ class PlaceFinder:
         that agree with it would be chosen, right or wrong.
         """
         i, k = loop.first, loop.second
+        if self._forgotten & {i, k}:
+            return None
         prior = self._priors(np.array([i]), k).get(i)
         views = place_points(self._views(i, i))
         seen = search(views, self._camera, self.features(k), loop.pose if prior is None else prior, prior)
@@ -148,7 +162,7 @@ class PlaceFinder:
         if not known or depth is None:
             return None
         drift = self.drift_since(np.arange(known), number)
-        allowed = self._may_be_seen(number, depth, drift[:, :3, :3])
+        allowed = self._may_be_seen(number, depth, drift[:, :3, :3]) & self.shows_something
         expected = self._search(number, features, allowed)
         if expected is not None:
             return expected
@@ -228,7 +242,8 @@ class PlaceFinder:
     def _views(self, i: int, origin: int, *, reach: int = _GUIDED_NEIGHBOURS) -> list[PlaceView]:
         """Return keyframe i and its neighbours in its session, with their motion from another keyframe."""
         graph, session = self._graph, self._graph.session
-        rows = range(max(i - reach, 0), min(i + reach + 1, len(self._index)))
+        around = range(max(i - reach, 0), min(i + reach + 1, len(self._index)))
+        rows = [m for m in around if m not in self._forgotten]
         near = np.array(sorted((m for m in rows if session[m] == session[i]), key=lambda m: abs(m - i)), dtype=np.int64)
         covariance = graph.drift(np.full(len(near), origin), near, systematic=0.0)
         motion = se3_inverse(graph.T_map_cam[origin]) @ graph.T_map_cam[near]

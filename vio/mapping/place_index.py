@@ -108,14 +108,14 @@ class PlaceIndex:
 
     def restore(self, segments: Sequence[Segment]) -> None:
         """Take the first keyframes of a map from its file, into an empty index."""
-        counts = np.array([np.diff(s.begins.astype(np.int64), axis=1) for s in segments]).reshape(-1, _TABLES, _WORDS)
-        np.cumsum(counts.sum(axis=0), axis=1, out=self._begins[:, 1:])
+        if not segments:
+            return
+        begins = np.array([s.begins for s in segments])
+        owners, offsets = _joined([s.owners for s in segments])
         self._merged = len(segments) * SEGMENT
-        self._owners = self._room(int(self._begins[0, -1]))
-        cursor = self._begins[:, :-1].copy()
-        for n, segment in enumerate(segments):
-            first = n * SEGMENT
-            _append_segment(segment.begins, segment.owners, first, cursor, self._owners, self._newest, self._frequency)
+        self._owners = self._room(owners.shape[1])
+        _join_segments(begins, owners, offsets, self._begins, self._owners, self._newest, self._frequency)
+        for segment in segments:
             self._sizes += np.bincount(segment.owners[0], minlength=SEGMENT).tolist()
 
     def full_segment(self) -> Segment | None:
@@ -172,32 +172,38 @@ class PlaceIndex:
         return np.array(out, dtype=np.int64)
 
 
-def _joined(keyframes: list[Words]) -> tuple[Words, IntArray]:
-    """Return the words (T, N) of all keyframes, and where those of each begin (K + 1,)."""
-    words = np.concatenate([np.zeros((_TABLES, 0), dtype=np.uint16), *keyframes], axis=1)
-    return words, np.cumsum([0, *(row.shape[1] for row in keyframes)])
+def _joined(parts: Sequence[npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], IntArray]:
+    """Return the words or owners (T, N) of all parts, and where those of each begin (K + 1,)."""
+    nothing = np.zeros((_TABLES, 0), dtype=np.uint16)
+    return np.concatenate(parts or [nothing], axis=1), np.cumsum([0, *(part.shape[1] for part in parts)])
 
 
 @compiled
-def _append_segment(
+def _join_segments(
     begins: npt.NDArray[np.uint32],
     owners: npt.NDArray[np.uint8],
-    first: int,
-    cursor: IntArray,
+    offsets: IntArray,
+    out_begins: IntArray,
     out_owners: Owners,
     newest: IntArray,
     frequency: IntArray,
 ) -> None:
-    """Add a segment, whose first keyframe is given, at the cursor (T, W) of each word; count its keyframes."""
-    for t in range(len(begins)):
-        for w in range(begins.shape[1] - 1):
-            for e in range(begins[t, w], begins[t, w + 1]):
-                number = first + owners[t, e]
-                out_owners[t, cursor[t, w]] = number
-                cursor[t, w] += 1
-                if newest[t, w] != number + 1:
-                    newest[t, w] = number + 1
-                    frequency[t, w] += 1
+    """Write the index of segments that follow one another, word by word, and count the keyframes with each.
+
+    Those of segment s begin at `offsets[s]` of the owners (T, N), and there at `begins[s]` (T, W + 1).
+    """
+    for t in range(len(owners)):
+        n = 0
+        for w in range(newest.shape[1]):
+            for s in range(len(begins)):
+                for e in range(offsets[s] + begins[s, t, w], offsets[s] + begins[s, t, w + 1]):
+                    number = s * SEGMENT + owners[t, e]
+                    out_owners[t, n] = number
+                    n += 1
+                    if newest[t, w] != number + 1:
+                        newest[t, w] = number + 1
+                        frequency[t, w] += 1
+            out_begins[t, w + 1] = n
 
 
 @compiled

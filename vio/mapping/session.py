@@ -70,6 +70,7 @@ class MapSession:
         localise: bool,
         wait: bool = True,
         alone: bool = False,
+        density: int | None = None,
     ) -> None:
         """Open the map.
 
@@ -83,6 +84,7 @@ class MapSession:
             wait: for the map's thread where it is behind; False: a result is taken over once it is there, and no frame
                 becomes a keyframe while several wait.
             alone: whether the odometry has images alone, so that it is lost where they show nothing.
+            density: keyframes a cubic metre that can be found again; None: all.
 
         Raises:
             ConfigError: the images are not those of a pinhole stereo pair.
@@ -94,7 +96,7 @@ class MapSession:
         self._field: DisplacementField | None = None  # what the stereo calibration is off by, at the newest frame
         self._T_cam_body, self._T_body_cam = T_cam0_body, se3_inverse(T_cam0_body)
         store = MapStore(path, create=not localise, read_only=localise)
-        self._builder = MapBuilder(store, source, camera, upright=imu, localise=localise)
+        self._builder = MapBuilder(store, source, camera, upright=imu, localise=localise, density=density)
         self._executor = ThreadPoolExecutor(1, "map")
         self._waiting: list[tuple[int, int, Future[MapUpdate]]] = []  # when it is due, frame, result
         self._frames = 0
