@@ -539,7 +539,7 @@ def test_reproduce_writes_a_table_and_a_figure(
 
 def test_the_module_runs_as_a_process(recording: Path, tmp_path: Path) -> None:
     """Logs go to stderr, so that stdout is JSON alone."""
-    argv = [sys.executable, "-m", "vio", "run", str(recording), "--out", str(tmp_path / "out"), "--json"]
+    argv = [sys.executable, "-m", "vio", "run", str(recording), "--out", str(tmp_path / "out"), "--no-plot", "--json"]
     done = subprocess.run(argv, capture_output=True, text=True, check=True)
     assert json.loads(done.stdout)["frames"] == FRAMES
 
@@ -549,7 +549,7 @@ def test_without_pycolmap_only_its_commands_fail(
 ) -> None:
     code = "import sys; sys.modules['pycolmap'] = None; from vio.cli import main; sys.exit(main(sys.argv[1:]))"
     out = tmp_path / "out"
-    argv = [sys.executable, "-c", code, "run", str(recording), "--out", str(out), "--save-observations"]
+    argv = [sys.executable, "-c", code, "run", str(recording), "--out", str(out), "--save-observations", "--no-plot"]
     assert subprocess.run(argv, capture_output=True, check=False).returncode == 0
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     for name in [name for name in sys.modules if name.startswith("vio.offline.colmap")]:
