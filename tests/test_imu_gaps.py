@@ -107,7 +107,7 @@ def _brisk(t: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, Fl
 
 @cache
 def _step_errors() -> dict[tuple[float, bool], list[float]]:
-    """Squared errors of rotation, velocity and position (9 numbers) in units of their Q, of steps that end between samples.
+    """Squared errors of rotation, velocity and position (9 numbers) by their Q, of steps that end between samples.
 
     100 Hz, white noise as in the data sheet; a frame lies `phase` of a period after a sample, and the sample after it
     has come or not. The samples before are the same for all phases.
