@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.dataset_makers import make_drive, make_mat, utias_arrays
 from vio.bench.bench import Place, bench
+from vio.bench.engines import run_here
+from vio.bench.execute import _with_render
 from vio.bench.identity import InputDigests
 from vio.bench.maps import loop_figures, placement_figures, wrong_share
 from vio.bench.suite import chosen, suite_from
@@ -78,6 +82,19 @@ def test_a_map_of_what_is_not_in_the_suite_is_named(wrong: dict[str, object], tm
         suite_from({"sequences": {"a": "a", "b": {"source": "b", **wrong}}}, tmp_path / "suite.yaml")
 
 
+@pytest.fixture
+def tasks_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do the tasks of a bench in this process; in `test_bench` each has a process of its own."""
+
+    def perform_here(job: dict[str, Any], cache: str) -> dict[str, Any]:
+        first = job["first"] and _with_render(job["first"], Path(cache))
+        return perform({**_with_render(job, Path(cache)), "first": first, "scratch": cache})
+
+    engine = partial(run_here, perform=perform_here)
+    monkeypatch.setattr("vio.bench.bench.run_here", lambda jobs, cache, *, workers: engine(jobs, cache, workers=1))
+
+
+@pytest.mark.usefixtures("tasks_here")
 def test_a_map_is_built_and_another_sequence_is_localised_in_it(tmp_path: Path) -> None:
     render = "--scene room --trajectory handheld --rig small --width 200 --rate 10 --duration 6"
     covers = [["2s", "2.8s"], ["4s", "4.8s"]]

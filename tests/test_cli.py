@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_ki
 from vio.cli import main
 from vio.config import BASIC, Config, describe
 from vio.errors import DataError
-from vio.files.trajectories import read_trajectory
+from vio.files.trajectories import read_trajectory, write_tum
+from vio.geometry.lie import se3_inverse
 
 FRAMES = 24
 CONTRACT = ("out", "frames", "path_length_m", "ms_per_frame", "ate_m", "rpe", "t_err_percent", "r_err_deg_per_100m")
@@ -29,14 +31,21 @@ def recording(tmp_path: Path) -> Path:
     return make_npz(tmp_path / "drive.npz", ece276a_arrays(make_drive(FRAMES)))
 
 
-@pytest.fixture
-def truth(tmp_path: Path) -> Path:
-    from vio.geometry.lie import se3_inverse
-
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cam0 = make_drive(FRAMES).T_world_imu @ se3_inverse(T_CAM0_IMU)
-    path = tmp_path / "truth.txt"
+    path = tmp_path_factory.mktemp("truth") / "truth.txt"
     np.savetxt(path, (se3_inverse(cam0[0]) @ cam0)[:, :3].reshape(-1, 12))
     return path
+
+
+@pytest.fixture(scope="module")
+def finished(truth: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The folder of a run with its observations, compared with the truth; tests only read it."""
+    folder = tmp_path_factory.mktemp("finished")
+    recording, out = make_npz(folder / "drive.npz", ece276a_arrays(make_drive(FRAMES))), str(folder / "out")
+    assert main(["run", str(recording), "--save-observations", "--reference", str(truth), "--out", out, "--quiet"]) == 0
+    return out
 
 
 def _json(capsys: pytest.CaptureFixture[str], *argv: str) -> Any:
@@ -76,16 +85,15 @@ def test_run_without_reference_prints_null(recording: Path, tmp_path: Path, caps
 
 
 def test_reference_of_cam0_is_compared_with_the_lever_arm(
-    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: str, truth: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The filter estimates the IMU, a KITTI reference describes cam0, a metre away: rotation would show it."""
-    out = str(tmp_path / "out")
-    metrics = _json(capsys, "run", str(recording), "--reference", str(truth), "--out", out)
+    metrics = json.loads(Path(finished, "metrics.json").read_text())
     assert metrics["evaluation"]["body"] == "cam0"
     assert metrics["evaluation"]["ate_deg"] < 0.5
-    same = _json(capsys, "eval", out, str(truth))
+    same = _json(capsys, "eval", finished, str(truth))
     assert same["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-6)
-    plain = _json(capsys, "eval", str(Path(out, "trajectory.kitti")), str(truth))
+    plain = _json(capsys, "eval", f"{finished}/trajectory.kitti", str(truth))
     assert plain["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-4)
 
 
@@ -121,10 +129,9 @@ def test_a_shorter_reference_evaluates_the_frames_it_covers(
 
 
 def test_saved_observations_replay_bit_identically(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    first, second, third = (tmp_path / name for name in ("first", "second", "third"))
-    _json(capsys, "run", str(recording), "--save-observations", "--out", str(first))
+    first, second, third = Path(finished), tmp_path / "second", tmp_path / "third"
     _json(capsys, "run", str(first / "observations.npz"), "--out", str(second))
     assert (first / "trajectory.tum").read_bytes() == (second / "trajectory.tum").read_bytes()
     _json(
@@ -136,15 +143,13 @@ def test_saved_observations_replay_bit_identically(
 
 
 def test_run_and_its_kitti_file_are_compared_in_one_world(
-    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: str, truth: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The run describes the IMU in a world of its own, poses.txt and trajectory.kitti the first cam0."""
-    out = str(tmp_path / "out")
-    _json(capsys, "run", str(recording), "--out", out)
-    kitti = _json(capsys, "eval", f"{out}/trajectory.kitti", str(truth), "--align", "none")
-    first = _json(capsys, "eval", out, str(truth), "--align", "first")
+    kitti = _json(capsys, "eval", f"{finished}/trajectory.kitti", str(truth), "--align", "none")
+    first = _json(capsys, "eval", finished, str(truth), "--align", "first")
     assert first["ate_m"] == pytest.approx(kitti["ate_m"], abs=1e-6)
-    assert main(["eval", out, str(truth), "--align", "none"]) == 1
+    assert main(["eval", finished, str(truth), "--align", "none"]) == 1
     assert (
         "describes imu and the reference cam0, whose world frames differ; take align first" in capsys.readouterr().err
     )
@@ -221,14 +226,11 @@ def test_replaces_an_earlier_run_but_no_other_files(
 
 
 def test_rejects_features_of_another_recording(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    first = tmp_path / "first"
-    assert main(["run", str(recording), "--save-observations", "--out", str(first)]) == 0
     arrays = ece276a_arrays(make_drive(9))
     other = make_npz(tmp_path / "other.npz", {**arrays, "time_stamps": arrays["time_stamps"] + 77.7})
-    capsys.readouterr()
-    features = f"frontend.features={first / 'observations.npz'}"
+    features = f"frontend.features={finished}/observations.npz"
     assert main(["run", str(recording), "--set", features, "--out", str(tmp_path / "again")]) == 0
     assert main(["run", str(other), "--set", features, "--out", str(tmp_path / "mixed")]) == 1
     assert "its frames are not those of" in capsys.readouterr().err
@@ -405,11 +407,10 @@ def test_debug_raises_the_expected_error(tmp_path: Path) -> None:
 
 
 def test_eval_reads_the_extrinsics_from_a_file(
-    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: str, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A trajectory of the IMU can be compared with one of cam0 only with the extrinsics between them."""
-    _json(capsys, "run", str(recording), "--out", str(tmp_path / "out"))
-    files = [str(tmp_path / "out" / "trajectory.tum"), str(truth)]
+    files = [f"{finished}/trajectory.tum", str(truth)]
     assert "give the extrinsic T_cam0_imu" in _error(capsys, "eval", *files)
     given = tmp_path / "T_cam0_imu.txt"
     np.savetxt(given, T_CAM0_IMU[:3])
@@ -479,13 +480,8 @@ def test_config_prints_the_effective_configuration(tmp_path: Path, capsys: pytes
     assert "iterations: 7" in capsys.readouterr().out
 
 
-def test_eval_aligns_as_requested(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from dataclasses import replace
-
-    from vio.files.trajectories import write_tum
-
-    _json(capsys, "run", str(recording), "--out", str(tmp_path / "out"))
-    estimate = tmp_path / "out" / "trajectory.tum"
+def test_eval_aligns_as_requested(finished: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    estimate = Path(finished, "trajectory.tum")
     trajectory = read_trajectory(estimate)
     poses = trajectory.T_world_body.copy()
     poses[:, :3, 3] *= 1.1
@@ -517,13 +513,12 @@ def test_eval_refuses_two_poses(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "only 2 poses match; a comparison needs at least 3" in capsys.readouterr().err
 
 
-def test_evo_reads_every_trajectory_file(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evo_reads_every_trajectory_file(finished: str) -> None:
     from evo.tools import file_interface
 
-    out = Path(_json(capsys, "run", str(recording), "--out", str(tmp_path / "out"))["out"])
     for name in ("trajectory.tum", "dead_reckoning.tum"):
-        assert file_interface.read_tum_trajectory_file(str(out / name)).num_poses == FRAMES
-    assert file_interface.read_kitti_poses_file(str(out / "trajectory.kitti")).num_poses == FRAMES
+        assert file_interface.read_tum_trajectory_file(f"{finished}/{name}").num_poses == FRAMES
+    assert file_interface.read_kitti_poses_file(f"{finished}/trajectory.kitti").num_poses == FRAMES
 
 
 def test_reproduce_writes_a_table_and_a_figure(
@@ -539,7 +534,7 @@ def test_reproduce_writes_a_table_and_a_figure(
 
 def test_the_module_runs_as_a_process(recording: Path, tmp_path: Path) -> None:
     """Logs go to stderr, so that stdout is JSON alone."""
-    argv = [sys.executable, "-m", "vio", "run", str(recording), "--out", str(tmp_path / "out"), "--json"]
+    argv = [sys.executable, "-m", "vio", "run", str(recording), "--out", str(tmp_path / "out"), "--no-plot", "--json"]
     done = subprocess.run(argv, capture_output=True, text=True, check=True)
     assert json.loads(done.stdout)["frames"] == FRAMES
 
@@ -549,7 +544,7 @@ def test_without_pycolmap_only_its_commands_fail(
 ) -> None:
     code = "import sys; sys.modules['pycolmap'] = None; from vio.cli import main; sys.exit(main(sys.argv[1:]))"
     out = tmp_path / "out"
-    argv = [sys.executable, "-c", code, "run", str(recording), "--out", str(out), "--save-observations"]
+    argv = [sys.executable, "-c", code, "run", str(recording), "--out", str(out), "--save-observations", "--no-plot"]
     assert subprocess.run(argv, capture_output=True, check=False).returncode == 0
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     for name in [name for name in sys.modules if name.startswith("vio.offline.colmap")]:

@@ -170,7 +170,7 @@ def readme_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(vio.sim.scenarios, "_DURATION_S", 1.2)
         patch.setattr(vio.sim.scenarios, "_WIDTH_PX", 400)
         assert main(["demo", "--out", "demo"]) == 0
-        flight = "vio render --rig euroc --width 320 --duration 0.5 --out path/to/MH_03_medium"
+        flight = "vio render --rig euroc --width 320 --duration 0.5 --workers 1 --out path/to/MH_03_medium"
         assert main(shlex.split(flight)[1:]) == 0
         drive = Path("demo/street")
         sequence = Path("path/to/sequences/07")

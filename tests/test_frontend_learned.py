@@ -25,7 +25,9 @@ MATCH = MatchSettings(max_keypoints=250)
 @pytest.fixture(scope="module")
 def torch() -> Any:
     pytest.importorskip("kornia", reason=REASON)
-    return pytest.importorskip("torch", reason=REASON)
+    module = pytest.importorskip("torch", reason=REASON)
+    module.set_num_threads(1)  # other workers use the other cores
+    return module
 
 
 SMALL = replace(CAMERA, width=240, height=160)
@@ -107,11 +109,9 @@ def test_weights_file_cannot_run_code(torch: Any, tmp_path: Path) -> None:
         build(LearnedSettings(detector="aliked", detector_weights=path))
 
 
-def test_rejects_weights_of_another_network(torch: Any, tmp_path: Path) -> None:
-    import kornia.feature as kf
-
+def test_rejects_weights_of_another_network(torch: Any, files: dict[str, Path], tmp_path: Path) -> None:
     path = tmp_path / "hardnet.pth"
-    torch.save({"state_dict": kf.HardNet(pretrained=False).state_dict()}, path)
+    torch.save({"state_dict": torch.load(files["hardnet"])}, path)
     for settings in (
         LearnedSettings(detector="aliked", detector_weights=path),
         LearnedSettings(detector="disk", detector_weights=path),
@@ -136,8 +136,7 @@ def test_lightglue_rejects_unsupported_detectors(torch: Any) -> None:
         build(LearnedSettings(matcher="lightglue"))
 
 
-def test_rejects_lightglue_weights_for_other_descriptors(torch: Any, tmp_path: Path) -> None:
-    files = networks(torch, tmp_path)
+def test_rejects_lightglue_weights_for_other_descriptors(files: dict[str, Path]) -> None:
     for name, weights in (("disk", "hardnet"), ("xfeat", "lightglue")):
         settings = LearnedSettings(
             detector=name,  # type: ignore[arg-type]
@@ -155,10 +154,12 @@ def test_rejects_lightglue_weights_for_other_descriptors(torch: Any, tmp_path: P
 # --- networks filled from files ---------------------------------------------------------------------------------------
 
 
-def networks(torch: Any, folder: Path) -> dict[str, Path]:
+@pytest.fixture(scope="module")
+def files(torch: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Files of random weights of every supported network; the results are meaningless, but of the right form."""
     import kornia.feature as kf
 
+    folder = tmp_path_factory.mktemp("weights")
     torch.manual_seed(1)
     made = {
         "aliked": kf.ALIKED("aliked-t16"),
@@ -177,8 +178,7 @@ def networks(torch: Any, folder: Path) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("name", ["aliked", "disk", "xfeat", "hardnet", "hynet", "sosnet", "lightglue"])
-def test_every_network_runs_with_weights_from_a_file(torch: Any, name: str, tmp_path: Path) -> None:
-    files = networks(torch, tmp_path)
+def test_every_network_runs_with_weights_from_a_file(name: str, files: dict[str, Path]) -> None:
     settings = LearnedSettings(descriptor_weights=files.get(name))
     if name == "lightglue":
         settings = LearnedSettings(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -21,6 +24,7 @@ from vio.records import Event, ImuSample, StereoFrame, UpdateReport, VelocitySam
 
 QUIET = MsckfSettings()
 FLIGHT = Flight(frames=200)
+PHASES = (0.1, 0.5, 0.9)
 
 
 def _sample(time_ns: int) -> ImuSample:
@@ -101,41 +105,46 @@ def _brisk(t: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, Fl
     return R, p, 5 * v, 25 * a, 5 * omega
 
 
-def _step_error(phase: float, *, wait: bool, start_s: float, seed: int) -> FloatArray:
-    """NEES of rotation, velocity and position (9 numbers, standardised) of a step that ends between two samples.
+@cache
+def _step_errors() -> dict[tuple[float, bool], list[float]]:
+    """Squared errors of rotation, velocity and position (9 numbers) by their Q, of steps that end between samples.
 
-    100 Hz, white noise as in the data sheet; the frame lies `phase` of a period after a sample.
+    100 Hz, white noise as in the data sheet; a frame lies `phase` of a period after a sample, and the sample after it
+    has come or not. The samples before are the same for all phases.
     """
-    rate, motion = 100.0, ImuMotion(QUIET)
-    rng = np.random.default_rng(seed)
-    first = round(start_s * rate) - 200
-    last = round(start_s * rate) + 5
-    for k in range(first, last + 1 + wait):
-        R, _, _, a, omega = _brisk(k / rate)
-        gyro = omega + rng.normal(0, QUIET.gyro_noise_density * np.sqrt(rate), 3)
-        accel = R.T @ (a + np.array([0, 0, 9.81])) + rng.normal(0, QUIET.accel_noise_density * np.sqrt(rate), 3)
-        motion.take(ImuSample(k * 10_000_000, gyro, accel))
-    t0, t1 = (last - 5) / rate, (last + phase) / rate
-    R, p, v, *_ = _brisk(t0)
-    zero = np.zeros(3)
-    step = motion.advance(NavState(se3_from_parts(R, p), v, zero, zero, zero), round(t0 * 1e9), round(t1 * 1e9))
-    R, p, v, *_ = _brisk(t1)
-    xi = se3_log(se3_from_parts(R, p) @ se3_inverse(step.nav.T_world_imu))
-    error = np.concatenate([xi, v - step.nav.velocity])
-    root = np.linalg.cholesky(step.Q[:9, :9] + 1e-18 * np.eye(9))
-    whitened: FloatArray = np.linalg.solve(root, error)
-    return whitened
+    rate, out = 100.0, dict[tuple[float, bool], list[float]]()
+    for start_s, seed in product((2.2, 3.1, 4.7, 6.3), range(20)):
+        motion, rng = ImuMotion(QUIET), np.random.default_rng(seed)
+        last = round(start_s * rate) + 5
+        for k in range(last - 205, last + 2):
+            if k == last + 1:
+                _step(motion, last, False, out)
+            R, _, _, a, omega = _brisk(k / rate)
+            gyro = omega + rng.normal(0, QUIET.gyro_noise_density * np.sqrt(rate), 3)
+            accel = R.T @ (a + np.array([0, 0, 9.81])) + rng.normal(0, QUIET.accel_noise_density * np.sqrt(rate), 3)
+            motion.take(ImuSample(k * 10_000_000, gyro, accel))
+        _step(motion, last, True, out)
+    return out
+
+
+def _step(fed: ImuMotion, last: int, wait: bool, out: dict[tuple[float, bool], list[float]]) -> None:
+    """Add the squared errors of the steps from five samples before the last one to each phase after it."""
+    R, p, v, *_ = _brisk(t0 := (last - 5) / 100.0)
+    nav = NavState(se3_from_parts(R, p), v, *np.zeros((3, 3)))
+    for phase in PHASES:
+        step = deepcopy(fed).advance(nav, round(t0 * 1e9), round((t1 := (last + phase) / 100.0) * 1e9))
+        R, p, v, *_ = _brisk(t1)
+        xi = se3_log(se3_from_parts(R, p) @ se3_inverse(step.nav.T_world_imu))
+        error = np.concatenate([xi, v - step.nav.velocity])
+        whitened = np.linalg.solve(np.linalg.cholesky(step.Q[:9, :9] + 1e-18 * np.eye(9)), error)
+        out.setdefault((phase, wait), []).append(float(whitened @ whitened))
 
 
 @pytest.mark.parametrize("wait", [True, False])
-@pytest.mark.parametrize("phase", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("phase", PHASES)
 def test_a_step_that_ends_between_two_samples_is_as_good_as_its_noise(phase: float, wait: bool) -> None:
     """Interpolated, or held with the noise grown: the squared error stays below the 95 % bound of its Q."""
-    values = [
-        np.sum(_step_error(phase, wait=wait, start_s=start, seed=seed) ** 2)
-        for start in (2.2, 3.1, 4.7, 6.3)
-        for seed in range(20)
-    ]
+    values = _step_errors()[phase, wait]
     assert np.mean(values) < 9 * 1.25, np.mean(values)  # without, 15 and 40 at the later two phases
 
 
@@ -153,7 +162,7 @@ def _without(first_s: float, length_s: float) -> type[Flight]:
     return Gappy
 
 
-@pytest.mark.parametrize("length_s", [0.1, 0.4, 1.0, 3.0, 100.0])
+@pytest.mark.parametrize("length_s", [0.1, 0.4, 1.0, 3.0])
 def test_images_carry_a_gap_while_turning_and_accelerating(length_s: float) -> None:
     """Errors stay those of images, and the NEES of the motion since before the gap stays within its bound."""
     # A mount known to 1 cm, seen for two seconds, adds 6 mm, and a stereo field that is not known yet as much.
@@ -162,7 +171,7 @@ def test_images_carry_a_gap_while_turning_and_accelerating(length_s: float) -> N
     )
     seeds, first = 5, 40
     errors, covariances = [], []
-    frames = first + 10 + min(round(20 * length_s), 60)
+    frames = first + 10 + round(20 * length_s)
     for seed in range(seeds):
         e, C, _ = _without(0.05 * first + 0.012, length_s)(frames).run(settings, "imu", seed)
         errors.append(e)

@@ -17,7 +17,7 @@ from vio.records import Event, ImuSample, Observations, Recording, StereoFrame, 
 from vio.runs.pipeline import RunControl, RunResult
 from vio.runs.recorder import GrowingFolder
 
-FRAMES = 150
+FRAMES = 110
 EXCHANGED = [1, 0, 2]
 
 

@@ -29,7 +29,7 @@ from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_o
 from vio.sim.sequence import SimulatedRecording, Simulation
 from vio.sim.world import corridor
 
-SMALL = ["--width", "96", "--duration", "0.2"]
+SMALL = ["--width", "96", "--duration", "0.2", "--workers", "1"]
 START_NS = 1_500_000_000_000_000_000
 
 
@@ -101,7 +101,7 @@ def test_the_summary_describes_the_folder_and_the_folder_reads_back(
 
 def test_a_kitti_folder_has_the_velocities_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "kitti"
-    assert render(out, "--format", "kitti", "--rate", "30", "--width", "96", "--duration", "0.1") == 0
+    assert render(out, *SMALL, "--format", "kitti", "--rate", "30", "--duration", "0.1") == 0
     printed = capsys.readouterr()
     assert f"{out} (kitti" in printed.out
     assert printed.err == ""
@@ -125,7 +125,7 @@ def test_car_trajectory_defaults_to_kitti_cameras_rate_and_format() -> None:
 
 def test_flight_folder_provides_ground_truth_image_times_and_imu(tmp_path: Path, flight: Path) -> None:
     out = tmp_path / "flight"
-    assert render(out, "--trajectory", str(flight), "--width", "96") == 0
+    assert render(out, "--trajectory", str(flight), "--width", "96", "--workers", "1") == 0
     stamps = [int(line) for line in (flight / "image_timestamps_ns.txt").read_text().split()]
     assert sorted(int(path.stem) for path in (out / "mav0/cam1/data").iterdir()) == stamps
     written = np.loadtxt(out / "mav0/imu0/data.csv", delimiter=",")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
 import re
 import signal
@@ -550,12 +549,11 @@ def test_messages_pass_over_dds_and_late_ones_get_the_last(domain: int) -> None:
 @pytest.mark.slow
 @needs_dds
 @needs_loopback
-def test_three_processes_give_the_poses_of_the_file_run(flight: Path, domain: int, tmp_path: Path) -> None:
-    """Recording, node and receiver, each a process of its own; nothing is lost, and the poses are equal to the bit."""
+def test_three_processes_give_the_poses_of_the_file_run(flight: Path, domain: int) -> None:
+    """Recording, node and this process, which receives; nothing is lost, and the poses are equal to the bit."""
     times, poses = _file_run(flight)
-    receiver = subprocess.Popen(
-        [sys.executable, "-c", _RECEIVER, str(len(times))], stdout=subprocess.PIPE, text=True, cwd=tmp_path
-    )
+    receiver, taken = open_transport("dds"), list[bytes]()
+    receiver.subscribe("/vio/odometry", "nav_msgs/msg/Odometry", taken.append, "reliable")
     command = [sys.executable, "-m", "vio"]
     arguments = ["--left", TOPICS.left, "--right", str(TOPICS.right), "--imu", str(TOPICS.imu), "--reliable"]
     node = subprocess.Popen(
@@ -564,33 +562,18 @@ def test_three_processes_give_the_poses_of_the_file_run(flight: Path, domain: in
     try:
         source = subprocess.run([*command, "play", str(flight), "--ros2", "--reliable", "--rate", "max"], check=True)
         assert source.returncode == 0
-        printed, _ = receiver.communicate(timeout=240)
+        deadline = time.monotonic() + 240
+        while len(taken) < len(times) and time.monotonic() < deadline:
+            receiver.spin(0.2)
         node.send_signal(signal.SIGTERM)  # SIGINT is ignored where a shell started the tests behind it
         assert node.wait(timeout=60) == 0
     finally:
-        receiver.kill()
+        receiver.close()
         node.kill()
         node.communicate()
-    received = json.loads(printed)
+    received = [_pose(data) for data in taken]
     assert [t for t, _ in received] == times
-    np.testing.assert_array_equal([p for _, p in received], poses[:, :3, 3])
-
-
-_RECEIVER = """
-import json, sys
-from vio.datasets.bags.cdr import decoded
-from vio.ros2.transport import open_transport
-transport, poses = open_transport("dds"), []
-def take(data):
-    fields = decoded(data, "nav_msgs/msg/Odometry", "odometry")
-    stamp, p = fields.header.stamp, fields.pose.pose.position
-    poses.append((stamp.sec * 10**9 + stamp.nanosec, (p.x, p.y, p.z)))
-transport.subscribe("/vio/odometry", "nav_msgs/msg/Odometry", take, "reliable")
-while len(poses) < int(sys.argv[1]):
-    transport.spin(0.2)
-print(json.dumps(poses))
-transport.close()
-"""
+    np.testing.assert_array_equal([T[:3, 3] for _, T in received], poses[:, :3, 3])
 
 
 def test_the_files_for_colcon_name_the_command() -> None:

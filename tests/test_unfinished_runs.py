@@ -16,6 +16,7 @@ import zlib
 from collections import deque
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -126,11 +127,15 @@ def flight_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return _flight_log(tmp_path_factory.mktemp("log") / "flight.npz")
 
 
+@lru_cache(maxsize=1)
 def _rendered() -> SimulatedRecording:
+    """A flight whose images are rendered once, however often it is read."""
     motion = hand_held(duration_s=2.0)
-    return SimulatedRecording(
+    recording = SimulatedRecording(
         simulate(room(seed=1), small_rig(320, 200), motion, rate_hz=10.0, imu=ImuNoise(), effects=CLEAN, seed=1)
     )
+    recording.images = lru_cache(recording.images)  # type: ignore[method-assign]
+    return recording
 
 
 def _assert_same(a: RunResult, b: RunResult) -> None:
@@ -235,9 +240,9 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
 
 # Processes that end
 
-PATCHED = (
-    "import sys, vio.runs.recorder as r, vio.cli; r._FLUSH_S = 0.0; r._CHECKPOINT_S = 0.1; "
-    "sys.exit(vio.cli.main(sys.argv[1:]))"
+PATCHED = (  # as is the picture in this process, see tests/conftest.py
+    "import sys, vio.runs.recorder as r, vio.runs.picture as p, vio.cli; r._FLUSH_S = 0.0; r._CHECKPOINT_S = 0.1; "
+    "p.RunPicture.write = lambda picture, path: path.write_bytes(b'PNG'); sys.exit(vio.cli.main(sys.argv[1:]))"
 )
 
 
@@ -292,7 +297,7 @@ def test_two_runs_into_one_folder_are_refused(
     flight_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    command = [sys.executable, "-c", PATCHED, "run", str(flight_log), "--out", str(out)]
+    command = [sys.executable, "-c", PATCHED, "run", str(flight_log), "--stop", "20", "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as first:
         _wait_for((out / "unfinished" / "run.json").is_file)
         first.send_signal(signal.SIGSTOP)
@@ -303,7 +308,7 @@ def test_two_runs_into_one_folder_are_refused(
         finally:
             first.send_signal(signal.SIGCONT)
         assert first.wait(timeout=120) == 0
-    assert len(read_trajectory(out / "trajectory.tum")) == FRAMES
+    assert len(read_trajectory(out / "trajectory.tum")) == 20
 
 
 def test_an_earlier_run_stays_until_the_new_one_has_a_frame(flight_log: Path, tmp_path: Path) -> None:
@@ -356,16 +361,28 @@ def test_a_disk_that_fills_keeps_what_is_written(
 # What lies in the folder when a run goes on
 
 
-@pytest.fixture
-def stopped(flight_log: Path, tmp_path: Path) -> Path:
-    """The folder of a run that was interrupted, with a recording of its own."""
-    shutil.copy(flight_log, tmp_path / "flight.npz")
-    dataset, config, out = open_dataset(tmp_path / "flight.npz"), Config(), tmp_path / "run"
-    request = {"source": f"log:{tmp_path / 'flight.npz'}", "start": 0, "stop": None, "reference": None, "map": None}
+@pytest.fixture(scope="module")
+def interrupted(flight_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A place with a recording and the folder of its run that was interrupted, and a copy of the place."""
+    place, kept = tmp_path_factory.mktemp("interrupted") / "place", tmp_path_factory.mktemp("kept") / "place"
+    place.mkdir()
+    shutil.copy(flight_log, place / "flight.npz")
+    dataset, config = open_dataset(place / "flight.npz"), Config()
+    request = {"source": f"log:{place / 'flight.npz'}", "start": 0, "stop": None, "reference": None, "map": None}
     request |= {"save_observations": True, "lengths_m": None}
-    folder = growing_folder(out, dataset, config, request)
+    folder = growing_folder(place / "run", dataset, config, request)
     run(dataset, config, keep_observations=True, control=RunControl(folder, should_stop=Stop(300)))
-    return out
+    shutil.copytree(place, kept)
+    return place, kept
+
+
+@pytest.fixture
+def stopped(interrupted: tuple[Path, Path]) -> Path:
+    """The folder of a run that was interrupted, with a recording of its own; each test gets it as it was."""
+    place, kept = interrupted
+    shutil.rmtree(place)
+    shutil.copytree(kept, place)
+    return place / "run"
 
 
 def test_settings_that_name_files_are_kept_in_a_checkpoint(flight_log: Path, tmp_path: Path) -> None:
