@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -328,3 +332,46 @@ def test_the_frame_of_a_map_stays_where_its_keyframes_are_known_to_stand(tmp_pat
     assert np.abs(graph.T_map_cam.rows - expected)[:, :3, 3].max() < 1e-2
     if level:
         np.testing.assert_allclose(graph.T_map_cam.rows[:, 2, :3], up, atol=1e-12)
+
+
+def test_no_call_holds_the_interpreter_for_a_frame_while_a_loop_is_settled_in_a_large_map(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A hundred rounds of a circle, 100,000 keyframes: CPU time of each call but SuperLU's, which lets others run."""
+    count, period = 100_000, 1000
+    angle = 2 * np.pi * np.arange(count) / period
+    T = se3_exp(np.stack([*(0 * angle for _ in range(5)), angle], axis=1))
+    T[:, :3, 3] = np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle], axis=1) * 5 * period / (2 * np.pi)
+    step, near = (RelativePose(se3_inverse(T[0]) @ T[k], v * np.eye(6)) for k, v in ((1, 3e-4), (0, 3e-3)))
+    camera = StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360)
+    store = SimpleNamespace(
+        sessions=lambda: [SessionRow("rounds", camera, False, 0)],
+        keyframes=lambda: [KeyframeRow(0, k, k, T[k], T[k], np.eye(6), 5.0 * k, None, 0.0) for k in range(count)],
+        odometry=lambda: [(k - 1, k, step) for k in range(1, count)],
+        loops=lambda: [LoopRow(k, k + period, near, 50, True) for k in range(0, count - period, 10)],
+    )
+    graph = MapGraph(cast("MapStore", store))
+    graph.add_loops([LoopRow(count - 2 * period - 5, count - 5, near, 50, True)])
+    began, longest = list[float](), dict[str, float]()
+
+    def watch(frame: object, event: str, call: Any) -> None:
+        if event == "c_call":
+            began.append(time.thread_time())
+        elif event.startswith("c_") and began:
+            name, spent = call.__name__, time.thread_time() - began.pop()
+            longest[name] = max(longest.get(name, 0.0), spent)
+
+    def watched(*arguments: Any, **named: Any) -> FloatArray:  # Python's profiler sees no functions of Cython
+        start = time.thread_time()
+        away = dijkstra(*arguments, **named)
+        longest["dijkstra"] = max(longest.get("dijkstra", 0.0), time.thread_time() - start)
+        return away
+
+    monkeypatch.setattr("vio.mapping.map_graph.dijkstra", watched)
+    sys.setprofile(watch)
+    try:
+        assert not graph.optimise_near(0, 1)
+    finally:
+        sys.setprofile(None)
+    longest.pop("gstrf")
+    assert max(longest.values()) < 0.008, longest  # s, a quarter of a frame; a search of the whole map takes 11 ms
