@@ -25,6 +25,8 @@ LONGEST = (
 # Files whose tests look at the picture of a run. All others write an empty one: drawing takes longer than a short run.
 DRAWN = ("test_plotting",)
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of torch and COLMAP: other workers use the other cores
+
 settings.register_profile("vio", deadline=None)  # no test judges a machine by its speed
 # For tools/mutate.py: the same examples each time, and a failure is not made simpler.
 settings.register_profile("once", deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])

@@ -25,9 +25,7 @@ MATCH = MatchSettings(max_keypoints=250)
 @pytest.fixture(scope="module")
 def torch() -> Any:
     pytest.importorskip("kornia", reason=REASON)
-    module = pytest.importorskip("torch", reason=REASON)
-    module.set_num_threads(1)  # other workers use the other cores
-    return module
+    return pytest.importorskip("torch", reason=REASON)
 
 
 SMALL = replace(CAMERA, width=240, height=160)
