@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import lzma
 import math
 import struct
@@ -221,8 +222,10 @@ def _samples_between(motion: MotionSamples[MotionSample], first_ns: int, last_ns
     after = times_ns[is_imu & (times_ns >= last_ns)]
     begin_ns = np.where(is_imu, first_ns - NS_PER_S, first_ns)
     end_ns = np.where(is_imu, after[0] if len(after) else last_ns, last_ns)
-    for k in np.flatnonzero((begin_ns <= times_ns) & (times_ns <= end_ns)):
-        yield motion[int(k)]
+    inside = (begin_ns <= times_ns) & (times_ns <= end_ns)
+    if inside.any():
+        span = slice(int(inside.argmax()), len(inside) - int(inside[::-1].argmax()))
+        yield from itertools.compress(motion.take(span), inside[span])
 
 
 def npz_names(path: Path) -> frozenset[str]:

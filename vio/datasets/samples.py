@@ -15,6 +15,7 @@ from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, ImuRecord, ImuSample, IntArray, MotionSample, VelocitySample
 
 Sample_co = TypeVar("Sample_co", bound=ImuSample | VelocitySample, covariant=True)
+_CHUNK = 1000  # samples whose times are plain numbers at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,20 +44,20 @@ class MotionSamples(Sequence[Sample_co]):
         if isinstance(index, slice):
             return self.take(index)
         k = range(len(self))[index]
-        return self._sample(int(self.times_ns[k]), self.values[k], bool(self.is_imu[k]))
+        kind = ImuSample if self.is_imu[k] else VelocitySample
+        return cast(Sample_co, kind(int(self.times_ns[k]), self.values[k, :3], self.values[k, 3:]))
 
     def __iter__(self) -> Iterator[Sample_co]:
-        for time_ns, values, is_imu in zip(self.times_ns, self.values, self.is_imu, strict=True):
-            yield self._sample(int(time_ns), values, bool(is_imu))
+        for k in range(0, len(self), _CHUNK):
+            part = slice(k, k + _CHUNK)
+            columns = self.times_ns[part].tolist(), self.values[part, :3], self.values[part, 3:], self.is_imu[part]
+            for time_ns, first, second, is_imu in zip(*columns, strict=True):
+                kind = ImuSample if is_imu else VelocitySample
+                yield cast(Sample_co, kind(time_ns, first, second))
 
     def take(self, rows: slice | BoolArray | IntArray) -> MotionSamples[Sample_co]:
         """Return some of the samples."""
         return MotionSamples(self.times_ns[rows], self.values[rows], self.is_imu[rows])
-
-    @staticmethod
-    def _sample(time_ns: int, values: FloatArray, is_imu: bool) -> Sample_co:
-        kind = ImuSample if is_imu else VelocitySample
-        return cast(Sample_co, kind(time_ns, values[:3], values[3:]))
 
 
 def imu_samples(record: ImuRecord) -> MotionSamples[ImuSample]:

@@ -9,6 +9,7 @@ consistency (2017); Barrau & Bonnabel (2017).
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -297,7 +298,8 @@ class Msckf(Backend):
         window = self._started()
         if self._source != "imu":
             return {}
-        sigma = float(np.sqrt(np.linalg.eigvalsh(own[3:5, 3:5])[-1]))
+        (xx, xy), (_, yy) = own[3:5, 3:5].tolist()
+        sigma = math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))  # of the larger eigenvalue
         return {"tilt_sigma_rad": sigma, "gravity_world": self._gravity(window)}
 
     def _gravity(self, window: Window) -> FloatArray | None:

@@ -253,7 +253,12 @@ class Fit:
 
 def _keep_positive(out: FloatArray, P: FloatArray, count: int) -> None:
     """Add to the first variances of a covariance what keeps it positive to rounding, also where P knows one exactly."""
-    np.einsum("ii->i", out)[:count] += 1e-14 * P.diagonal()[:count] + 1e-24
+    _diagonal(out)[:count] += 1e-14 * P.diagonal()[:count] + 1e-24
+
+
+def _diagonal(A: FloatArray) -> FloatArray:
+    """Return the diagonal of a contiguous matrix (n, n), for changes in place."""
+    return A.reshape(-1)[:: len(A) + 1]
 
 
 def factor(P: FloatArray, first: int = 0) -> Factor:
@@ -282,7 +287,7 @@ def fit(prior: Factor, information: FloatArray) -> Fit:
         inner, _ = lapack.dsygst(information.T, L.T, itype=2, lower=0)
     else:
         inner = np.asfortranarray(L.T @ information @ L)
-    np.einsum("ii->i", inner)[:] += 1.0
+    _diagonal(inner.T)[:] += 1.0
     K_transposed, failed = lapack.dpotrf(inner, lower=0, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("the information is not positive")

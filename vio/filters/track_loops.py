@@ -11,7 +11,7 @@ import numpy as np
 from vio.cameras.projection import CameraArgs, point_at, turn_to
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled, solve_positive
-from vio.records import BoolArray, IntArray
+from vio.records import BoolArray, IntArray, SigmaArray
 
 
 @compiled
@@ -154,6 +154,39 @@ def middle(values: FloatArray) -> float:
     for i in range(1, k):
         below = max(below, values[i])
     return 0.5 * (below + values[k])
+
+
+@compiled
+def weigh_by_sigma(sigma: SigmaArray, least: float, most: float, weight: FloatArray) -> None:
+    """Multiply weights (N, 4), where above zero, by the median standard deviation over the pixel's own (N, 3)."""
+    values, count = np.empty(3 * len(sigma)), 0
+    for n in range(len(sigma)):
+        for a in range(3):
+            if weight[n, a] > 0.0 and sigma[n, a] > 0.0 and np.isfinite(sigma[n, a]):
+                values[count] = sigma[n, a]
+                count += 1
+    if count == 0:
+        return
+    centre = middle(values[:count])
+    for n in range(len(sigma)):
+        for a in range(3):
+            if weight[n, a] > 0.0 and sigma[n, a] > 0.0:
+                relative = np.float32(centre) / sigma[n, a]  # of float32, as the standard deviations are
+                weight[n, a] *= min(max(relative, np.float32(least)), np.float32(most))
+
+
+@compiled
+def newest_residual(r: FloatArray, J: FloatArray) -> float | None:
+    """Return the median absolute residual of the newest clone's pixels, of (F, N, 4); None: there are none."""
+    values, count, n = np.empty(4 * len(r)), 0, r.shape[1] - 1
+    for f in range(len(r)):
+        for a in range(4):
+            if J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0:
+                values[count] = abs(r[f, n, a])
+                count += 1
+    if count == 0:
+        return None
+    return middle(values[:count])
 
 
 @compiled

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.filters import track_loops as loops
 from vio.filters.multiview import Views
 from vio.geometry.lie import FloatArray
-from vio.numerics.robust import median
 from vio.records import BoolArray, IntArray, Observations
 
 # Of a pixel, over the frame's median: a residual can be small, or a patch fit badly, by chance.
@@ -20,7 +20,7 @@ class TrackTable:
     def __init__(self, columns: int) -> None:
         self._columns = columns
         self._row_of: dict[int, int] = {}
-        self._rows: IntArray | None = None  # all rows in order of their ids; None: tracks have come or gone
+        self._rows: IntArray | None = None  # all rows in order of their ids; None: tracks have come
         self._free: list[int] = []
         self._ids = np.zeros(0, dtype=np.int64)
         self._z = np.zeros((0, columns, 4))
@@ -77,7 +77,10 @@ class TrackTable:
         """Remove tracks."""
         if not len(rows):
             return
-        self._rows = None
+        gone = np.zeros(len(self._ids), dtype=np.bool_)
+        gone[rows] = True
+        ordered = self.rows()
+        self._rows = ordered[~gone[ordered]]
         for track in self._ids[rows].tolist():
             del self._row_of[track]
         self._free += rows.tolist()
@@ -126,11 +129,7 @@ def precision(seen: Observations) -> FloatArray:
     weight = measured(seen.has_right)
     if seen.sigma is None:
         return weight
-    known: BoolArray = (weight[:, :3] > 0) & (seen.sigma > 0)
-    finite = seen.sigma[known & np.isfinite(seen.sigma)]
-    if len(finite):
-        relative = np.divide(median(finite), seen.sigma, out=np.ones_like(seen.sigma), where=known)
-        weight[:, :3] *= np.clip(relative, 1.0 / _MOST_SIGMA, _MOST_PRECISION)
+    loops.weigh_by_sigma(seen.sigma, 1.0 / _MOST_SIGMA, _MOST_PRECISION, weight)
     return weight
 
 

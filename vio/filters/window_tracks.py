@@ -51,17 +51,27 @@ _MOST_COMMON_NOISE = 4.0  # of a frame over the learned variance: beyond twice t
 
 @dataclass(frozen=True)
 class LinearTracks:
-    """Tracks linearised at one estimate of the window."""
+    """Tracks linearised at one estimate of the window; their normal equations are collected where they are used."""
 
+    camera: StereoCamera
+    variance: float  # of one pixel coordinate, px^2
     T_cam0_world: FloatArray  # (N, 4, 4) camera poses
     rows: IntArray  # (F,) in the table
     p_world: FloatArray  # (F, 3)
     at: Residuals
     # (F, N, 4) pixels as they are predicted: those seen share their noise with the residuals, which biases coefficients
     z: FloatArray
-    weight: FloatArray  # (F, N) robust weight of each view
-    information: TrackInformation
     field: StereoCorrection | None  # what was taken out of the pixels; None: the rectification error is not estimated
+
+    @cached_property
+    def weight(self) -> FloatArray:
+        """Robust weight (F, N) of each view."""
+        return robust_weights(self.at, self.variance)
+
+    @cached_property
+    def information(self) -> TrackInformation:
+        """What the tracks say of the clones and of their points."""
+        return track_information(self.camera, self.T_cam0_world, self.at, self.p_world, self.weight)
 
     @cached_property
     def stereo(self) -> StereoColumns | None:
@@ -72,8 +82,7 @@ class LinearTracks:
 
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
-        r, used = self.at.r[:, -1], np.any(self.at.z_D_p[:, -1], axis=2)
-        return median(np.abs(r[used])) if used.any() else None
+        return loops.newest_residual(self.at.r, self.at.z_D_p)
 
 
 class WindowTracks:
@@ -186,9 +195,7 @@ class WindowTracks:
         field: StereoCorrection | None,
         z: FloatArray,
     ) -> LinearTracks:
-        weight = robust_weights(at, self.variance)
-        information = track_information(self._camera, T_cam0_world, at, p_world, weight)
-        return LinearTracks(T_cam0_world, rows, p_world, at, z, weight, information, field)
+        return LinearTracks(self._camera, self.variance, T_cam0_world, rows, p_world, at, z, field)
 
     def drift_scores(self, tracks: LinearTracks, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
         """Scores and information (K, 6) of tracks (K,) by a drift of the poses about the newest one, points eliminated.

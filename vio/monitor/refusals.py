@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.calibration.severity import rows_grade
-from vio.geometry.lie import FloatArray
 from vio.numerics.robust import median
-from vio.records import BoolArray, Estimate, Observations, UpdateReport
+from vio.records import BoolArray, Estimate, IntArray, Observations, UpdateReport
 
 _SPAN_S, _LEAST_FRAMES = 1.0, 3
 _MOST_REFUSED = 0.4  # of the features over the span; healthy recordings come to a third at most
@@ -24,9 +23,13 @@ class _Frame:
     time_ns: int
     used: int
     gated: int
-    pixels: FloatArray  # (N, 2) of the features in the left image
-    refused: BoolArray  # (N,) which of them
+    seen: Observations  # its features
+    refused_ids: IntArray  # of those refused
     innovation_ratio: float | None
+
+    def refused(self) -> BoolArray:
+        """Which features (N,) were refused."""
+        return np.isin(self.seen.ids, self.refused_ids)
 
 
 class RefusalReport:
@@ -41,9 +44,8 @@ class RefusalReport:
         """Add the features of a frame and what the filter did with them; return the line to report, if any."""
         if self._reported:
             return []
-        refused = np.isin(seen.ids, report.gated_ids)
-        new = _Frame(seen.time_ns, report.used, report.gated, seen.z[:, :2], refused, report.innovation_ratio)
-        self._frames.append(new)
+        used, gated = report.used, report.gated
+        self._frames.append(_Frame(seen.time_ns, used, gated, seen, report.gated_ids, report.innovation_ratio))
         full = False
         while seen.time_ns - self._frames[0].time_ns >= _SPAN_S * 1e9:
             self._frames.popleft()
@@ -69,7 +71,7 @@ class RefusalReport:
         place = self._place()
         if place is not None:
             return f"most lie together {place}; something moves there, or a lens is dirty"
-        where = "they are spread over the image; " if any(f.refused.any() for f in self._frames) else ""
+        where = "they are spread over the image; " if any(f.refused().any() for f in self._frames) else ""
         field = estimate.stereo_field
         if field is not None and rows_grade(field.rows_rms_px) != "negligible":
             return (
@@ -80,7 +82,8 @@ class RefusalReport:
 
     def _place(self) -> str | None:
         """Where in the image half of the refused features lie with few others; None: they are spread."""
-        pixels, refused = (np.concatenate([getattr(f, name) for f in self._frames]) for name in ("pixels", "refused"))
+        pixels = np.concatenate([f.seen.z[:, :2] for f in self._frames])
+        refused = np.concatenate([f.refused() for f in self._frames])
         if not refused.any():
             return None
         low, size = pixels.min(axis=0), np.maximum(np.ptp(pixels, axis=0), 1.0)

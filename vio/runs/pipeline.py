@@ -113,7 +113,7 @@ class RunControl:
 
     folder: GrowingFolder | None = None  # None: everything stays in memory
     resume: bool = False  # go on from the checkpoint in the folder
-    should_stop: Callable[[], str | None] = lambda: None  # asked after each event; a reason ends the run in order
+    should_stop: Callable[[], str | None] = lambda: None  # asked after each frame; a reason ends the run in order
 
 
 _TO_THE_END = RunControl()
@@ -296,8 +296,10 @@ class _Loop:
                 if event.index not in self._frames:
                     continue
                 state.unread += self._between(state.next_frame + (state.frame_ns is not None), event.index)
-            self._take(event)
+            has_results = self._take(event)
             state.note(event)
+            if not (has_results or isinstance(event, StereoFrame)):
+                continue
             if _LEAST_REFUSED <= monitor.frames_refused > len(recorder):
                 break
             stopped = should_stop()
@@ -332,13 +334,17 @@ class _Loop:
         """Frames `first <= index < end` that the run is to take."""
         return [index for index in range(first, end) if index in self._frames]
 
-    def _take(self, event: Event) -> None:
+    def _take(self, event: Event) -> bool:
+        """Process an event; return whether it completed a frame."""
         state = self._state
         if not isinstance(event, StereoFrame):
             self._recorder.sample(event)
-        self._record(state.processor.add(event))
+        results = state.processor.add(event)
+        if results:
+            self._record(results)
         if state.dead_reckoning is not None:
             state.dead_reckoning.add(event)
+        return bool(results)
 
     def _record(self, results: list[FrameResult]) -> None:
         state = self._state

@@ -127,7 +127,7 @@ class RunRecorder:
         self.revise(smoothed, len(estimates) - self._lag, len(estimates) - self._lag + 1)
         with self._writing():
             estimates.append(estimate_row(index, result.estimate))
-            self._tables["frames"].append(self._rows.row(replace(result.log, read_ms=read_ms)))
+            self._tables["frames"].append(self._rows.row(result.log, read_ms))
             if result.estimate.T_map_body is not None:
                 self._tables["mapped"].append(mapped_row(index, result.estimate))
             if self._keep:

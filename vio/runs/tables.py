@@ -128,13 +128,13 @@ class FrameRows:
     def __init__(self) -> None:
         self.stages: list[str] = []  # in the order of first appearance
 
-    def row(self, frame: FrameLog) -> Rows:
-        """Return a frame's log as a row (1,)."""
+    def row(self, frame: FrameLog, read_ms: float) -> Rows:
+        """Return a frame's log as a row (1,), with the time that reading took."""
         row = np.zeros(1, dtype=FRAME)
         for field in dataclasses.fields(frame)[:-1]:
             value = getattr(frame, field.name)
             row[field.name] = np.nan if value is None else value
-        row["stages_ms"] = np.nan
+        row["read_ms"], row["stages_ms"] = read_ms, np.nan
         for name, ms in frame.stages_ms.items():
             if name not in self.stages and len(self.stages) < _STAGES:
                 self.stages.append(name)
