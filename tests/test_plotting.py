@@ -52,14 +52,14 @@ def test_a_panel_draws_its_values_where_its_axes_say() -> None:
     x = np.array([0.0, 2.0, np.nan, 6.0, 10.0, 1e9])
     panel.line(x, np.full(6, 0.5), "#ff0000")
     panel.band(np.array([0.0, 10.0]), np.zeros(2), np.full(2, 0.2), "#0000ff", 0.5, "band")
-    panel.dots(np.array([2.0, 50.0]), np.array([0.8, 0.8]), "#00ff00")
+    panel.dots(np.array([5.0, 50.0]), np.array([0.8, 0.8]), "#00ff00")
     panel.draw(canvas, title="title", x_label="x", y_label="y", legend=1)
     assert canvas.png().startswith(b"\x89PNG")
     at = canvas.pixels
     for u in (70, 190, 240):
         assert np.abs(at[70, u].astype(int) - rgb("#ff0000")).max() < 30  # the middle of an anti-aliased line
     assert at[70, 110].min() > 200  # between the two parts of the curve
-    assert tuple(at[40, 90]) == rgb("#00ff00")
+    assert tuple(at[40, 150]) == rgb("#00ff00")
     assert tuple(at[110, 140]) in {(127, 127, 255), (128, 128, 255)}
     assert (at[:20] == 255).all()
     assert (at[130:] == 255).all()
