@@ -85,11 +85,9 @@ def execute(args: argparse.Namespace) -> int:
         print_result(facts, _side_by_side(results), as_json=args.json)
     if args.plot is not None:
         from vio.runs.compared import draw_comparison
-        from vio.runs.picture import figure_png, write_picture
+        from vio.runs.picture import write_picture
 
-        write_picture(
-            args.plot, lambda: figure_png(draw_comparison({printable(name): r for name, r in results.items()}))
-        )
+        write_picture(args.plot, lambda: draw_comparison({printable(name): r for name, r in results.items()}))
         if not args.json:
             print_result({}, [("plot", str(args.plot))], as_json=False)
     return 0

@@ -20,7 +20,7 @@ from vio.offline.loop_tracks import loop_pairs
 from vio.offline.saved_run import SavedRun
 from vio.offline.verdict import MapperResult, overall_verdict
 from vio.records import Trajectory
-from vio.runs.picture import figure_png, write_picture
+from vio.runs.picture import write_picture
 
 _MATCH_S, _MAP_S = 2.0, 1.0  # for a keyframe, see `expected_minutes`
 _MARGIN = 0.15  # of the path's extent, left free about it
@@ -88,7 +88,7 @@ def check_run(
             found = model, compare_keyframes(path, rows, model.T_world_cam0, run.truth, linked=model.linked)
         results.append(MapperResult(mapper, len(keyframes), found))
         progress(2 + len(results), steps)
-    write_picture(folder / "check.png", lambda: figure_png(draw_check(path.trajectory, results)))
+    write_picture(folder / "check.png", lambda: draw_check(path.trajectory, results))
     shutil.rmtree(images)
     database.unlink()
     return tuple(results)

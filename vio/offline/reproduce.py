@@ -19,7 +19,7 @@ from vio.filters.settings import VislamSettings
 from vio.geometry.lie import FloatArray
 from vio.numerics.threads import one_blas_thread
 from vio.records import Trajectory
-from vio.runs.picture import figure_png, write_picture
+from vio.runs.picture import write_picture
 from vio.runs.pipeline import RunResult, run
 from vio.selection.selectors import SelectorSettings
 
@@ -131,7 +131,7 @@ def reproduce(file: Path, reference: Path | None, out: Path) -> ReproducedTable:
     with atomic_folder(table.out, replace=True, marker="table.json") as inside:
         (inside / "table.md").write_text(table.as_text(), encoding="utf-8")
         (inside / "table.json").write_text(json_text(table.as_dict(), indent=2) + "\n", encoding="utf-8")
-        write_picture(inside / "trajectories.png", lambda: figure_png(_figure(file.stem, results)))
+        write_picture(inside / "trajectories.png", lambda: _figure(file.stem, results))
     return table
 
 

@@ -1,4 +1,4 @@
-"""The picture of a run."""
+"""Plots of a run, drawn with matplotlib without its global state."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import logging
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from vio.files.printable import printable
 from vio.files.tables import Rows
 from vio.geometry.lie import FloatArray
 from vio.records import STAGES
-from vio.runs.canvas import Canvas, Panel
 from vio.runs.curves import SIGMAS, STAGE_COLOURS, Curves, DrawnRun, binned, draw, stereo_curves
 from vio.runs.pipeline import RunResult
 
@@ -31,9 +29,8 @@ _MOVED_SIGMAS = 3.0  # a stereo calibration that ends within so many standard de
 _LEAST_MARGIN_M = 0.02  # about a rig that stands
 _SCALE = 1.3  # of the largest value to the end of an axis
 _BINS = 250  # of the curves that are medians over frames
-_WIDTH, _HEIGHT = 1430, 990  # pixels, and so the rest
-_LEFT, _MIDDLE_LEFT, _MIDDLE, _RIGHT = 95, 755, 870, 1410  # of the map, and of the panels beside it
-_TOP, _BOTTOM, _SPACE = 75, 930, 27
+# Of the panels, as shares of the figure and of a panel. A layout that matplotlib finds by itself draws all twice.
+_MARGINS = {"left": 0.06, "right": 0.985, "bottom": 0.06, "top": 0.925, "wspace": 0.18, "hspace": 0.26}
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,22 +62,17 @@ class RunPicture:
 
     def write(self, path: Path) -> None:
         """Write a PNG; a picture that cannot be drawn or written gives a warning: the results do not depend on it."""
-        write_picture(path, lambda: _draw(self))
+        write_picture(path, lambda: _figure(self))
 
 
-def figure_png(figure: Any) -> bytes:
-    """Return the PNG of a matplotlib figure."""
-    stream = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # another script
-        figure.savefig(stream, format="png", pil_kwargs={"compress_level": 1})  # a tenth larger, sooner
-    return stream.getvalue()
-
-
-def write_picture(path: Path, draw: Callable[[], bytes]) -> None:
-    """Write the PNG that `draw` returns; a failure gives a warning and leaves no file."""
+def write_picture(path: Path, draw: Callable[[], Any]) -> None:
+    """Write the matplotlib figure that `draw` returns as a PNG; a failure gives a warning and leaves no file."""
     try:
-        path.write_bytes(draw())
+        stream = io.BytesIO()
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # another script
+            draw().savefig(stream, format="png", pil_kwargs={"compress_level": 1})  # a tenth larger, sooner
+        path.write_bytes(stream.getvalue())
     except Exception as error:
         log.warning("%s was not drawn (%s: %s)", path.name, type(error).__name__, " ".join(str(error).split()))
         log.debug("the traceback of the picture", exc_info=True)
@@ -88,28 +80,40 @@ def write_picture(path: Path, draw: Callable[[], bytes]) -> None:
             path.unlink(missing_ok=True)
 
 
-def _draw(picture: RunPicture) -> bytes:
-    """Return the PNG of a picture."""
-    canvas, curves = Canvas(_WIDTH, _HEIGHT), draw(picture.run, picture.run.view_of_reference())
-    canvas.text((_WIDTH / 2, 16), picture.title, 18, "ma")
-    _draw_map(canvas, curves)
-    count = 5 if picture.focal is None else 6
-    edges = np.linspace(_TOP, _BOTTOM + _SPACE, count + 1).round().astype(int)
-    seconds = (0.0, max(float(curves.seconds[-1]), 1e-3))
-    panels = [Panel((_MIDDLE, int(top), _RIGHT, int(end) - _SPACE), x_limits=seconds) for top, end in pairwise(edges)]
-    shown: list[dict[str, Any]] = [
-        _error_curves(panels[0], curves, picture.dead_reckoning),
-        _height_curves(panels[1], curves),
-        _attitude_curves(panels[2], curves),
-        _count_curves(panels[3], curves.seconds, picture.frames),
-        _time_curves(panels[4], curves.seconds, picture.frames),
-    ]
+def _figure_class() -> Any:
+    """Load matplotlib without the texts of help that it writes for each of its classes, a third of its loading time."""
+    from matplotlib import artist
+
+    written, artist.kwdoc = artist.kwdoc, lambda _: ""  # type: ignore[assignment]
+    try:
+        from matplotlib.figure import Figure
+    finally:
+        artist.kwdoc = written
+    return Figure
+
+
+def _figure(picture: RunPicture) -> Any:
+    Figure = _figure_class()
+    figure = Figure(figsize=(13, 9), dpi=110)
+    curves = draw(picture.run, picture.run.view_of_reference())
+    calibrated = picture.focal is not None
+    grid = figure.add_gridspec(6 if calibrated else 5, 2, width_ratios=(1.25, 1), **_MARGINS)
+    _draw_map(figure.add_subplot(grid[:, 0]), curves)
+    panels = [figure.add_subplot(grid[row, 1]) for row in range(6 if calibrated else 5)]
+    _draw_error(panels[0], curves, picture.dead_reckoning)
+    _draw_height(panels[1], curves)
+    _draw_attitude(panels[2], curves)
+    _draw_counts(panels[3], curves.seconds, picture.frames)
+    _draw_time(panels[4], curves.seconds, picture.frames)
     if picture.focal is not None:
-        shown.append(_calibration_curves(panels[5], curves.seconds, picture.run.estimates, picture.focal))
-    shown[-1] |= {"x_label": "time in the recording (s)"}
-    for panel, how in zip(panels, shown, strict=True):
-        panel.draw(canvas, x_ticks=panel is panels[-1], **how)
-    return canvas.png()
+        _draw_calibration(panels[5], curves.seconds, picture.run.estimates, picture.focal)
+    for axes in panels:
+        axes.set_xlim(0, max(float(curves.seconds[-1]), 1e-3))
+        axes.grid(alpha=0.25)
+        axes.tick_params(labelbottom=axes is panels[-1])  # all have the time axis of the last one
+    panels[-1].set_xlabel("time in the recording (s)")
+    figure.suptitle(picture.title, fontsize=12, parse_math=False)  # a $ in a file name is no formula
+    return figure
 
 
 def has_calibration_panel(result: RunResult) -> bool:
@@ -130,21 +134,30 @@ def _title(result: RunResult, evaluation: Evaluation | None) -> str:
     return f"{name}, ATE {ate}" + ("" if drift is None else f", drift {drift:.2f} %")
 
 
-def _draw_map(canvas: Canvas, curves: Curves) -> None:
+def _draw_map(axes: Any, curves: Curves) -> None:
     """Draw trajectories and landmarks from above, right and ahead at the start."""
-    box = _LEFT, _TOP, _MIDDLE_LEFT, _BOTTOM
-    paths = [np.zeros((1, 3)), curves.position, *([] if curves.truth is None else [curves.truth.position])]
-    low, high = _view(np.concatenate(paths)[:, :2], (box[2] - box[0]) / (box[3] - box[1]))
-    panel = Panel(box, (low[0], high[0]), (low[1], high[1]))
-    panel.dots(curves.points[:, 0], curves.points[:, 1], _LANDMARKS, "landmarks")
+    paths = [("estimate", curves.position, _ESTIMATE, "-", 1.8 if curves.truth is None else 1.6)]
+    if curves.dead_reckoning is not None:
+        paths.insert(0, ("dead reckoning", curves.dead_reckoning, _DEAD_RECKONING, "--", 1.2))
     if curves.truth is not None:
-        panel.line(curves.truth.position[:, 0], curves.truth.position[:, 1], _REFERENCE, 4, label="ground truth")
-    if (reckoned := curves.dead_reckoning) is not None:
-        panel.line(reckoned[:, 0], reckoned[:, 1], _DEAD_RECKONING, label="dead reckoning", dashed=True)
-    panel.line(curves.position[:, 0], curves.position[:, 1], _ESTIMATE, 2, label="estimate")
-    panel.ring(0.0, 0.0, _REFERENCE, "start")
-    across, ahead = "right of the start (m)", "ahead of the start (m)"
-    panel.draw(canvas, title="from above", x_label=across, y_label=ahead, legend=1)
+        paths.insert(0, ("ground truth", curves.truth.position, _REFERENCE, "-", 3.0))
+    points = curves.points[:, :2]
+    box = axes.get_position()
+    shape = box.width * axes.figure.get_figwidth() / (box.height * axes.figure.get_figheight())
+    low, high = _view(np.concatenate([path[1][:, :2] for path in paths if path[0] != "dead reckoning"]), shape)
+    inside = np.all((points >= low) & (points <= high), axis=1)
+    axes.scatter(*points[inside].T, s=1.2, c=_LANDMARKS, linewidths=0, label="landmarks", rasterized=True)
+    for label, positions, colour, style, width in paths:
+        axes.plot(*positions[:, :2].T, color=colour, ls=style, lw=width, label=label)
+    axes.plot(0, 0, "o", color=_REFERENCE, ms=6, mfc="white", label="start")
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_title("from above", fontsize=9, loc="left")
+    axes.set_xlabel("right of the start (m)")
+    axes.set_ylabel("ahead of the start (m)")
+    axes.legend(loc="best", fontsize=9, markerscale=1.5)
+    axes.grid(alpha=0.25)
 
 
 def _view(paths: FloatArray, shape: float) -> tuple[FloatArray, FloatArray]:
@@ -155,64 +168,68 @@ def _view(paths: FloatArray, shape: float) -> tuple[FloatArray, FloatArray]:
     return 0.5 * (low + high) - half, 0.5 * (low + high) + half
 
 
-def _error_curves(panel: Panel, curves: Curves, dead_reckoning: Evaluation | None) -> dict[str, Any]:
+def _draw_error(axes: Any, curves: Curves, dead_reckoning: Evaluation | None) -> None:
     if curves.truth is None:
-        panel.line(curves.seconds, np.linalg.norm(curves.position_sigma, axis=1), _ESTIMATE)
-        return {"y_label": "position σ (m)", "title": "no reference: the filter's own uncertainty"}
-    panel.line(curves.truth.seconds, curves.truth.error_m, _ESTIMATE)
+        axes.plot(curves.seconds, np.linalg.norm(curves.position_sigma, axis=1), color=_ESTIMATE, lw=1.2)
+        axes.set_ylabel("position σ (m)")
+        axes.set_title("no reference: the filter's own uncertainty", fontsize=9, loc="left")
+        return
+    axes.plot(curves.truth.seconds, curves.truth.error_m, color=_ESTIMATE, lw=1.4, label="estimate")
     if dead_reckoning is not None:
-        panel.line(curves.seconds[dead_reckoning.rows], dead_reckoning.errors_m, _DEAD_RECKONING, dashed=True)
-    panel.y_limits = 0.0, _SCALE * max(float(curves.truth.error_m.max()), 1e-6)  # dead reckoning may leave the panel
-    return {"y_label": "position error (m)"}
+        seconds = curves.seconds[dead_reckoning.rows]
+        axes.plot(seconds, dead_reckoning.errors_m, "--", color=_DEAD_RECKONING, lw=1.1)
+    axes.set_ylabel("position error (m)")
+    axes.set_ylim(0, _SCALE * max(float(curves.truth.error_m.max()), 1e-6))  # dead reckoning may leave the panel
 
 
-def _height_curves(panel: Panel, curves: Curves) -> dict[str, Any]:
-    """Add the height above the start with a band of three standard deviations."""
+def _draw_height(axes: Any, curves: Curves) -> None:
+    """Draw the height above the start with a band of three standard deviations."""
     height, band = curves.position[:, 2], SIGMAS * curves.position_sigma[:, 2]
     if curves.truth is not None:
-        panel.line(curves.truth.seconds, curves.truth.position[:, 2], _REFERENCE, 2, label="ground truth")
-    panel.band(curves.seconds, height - band, height + band, _ESTIMATE, 0.2)
-    panel.line(curves.seconds, height, _ESTIMATE, label="estimate, 3σ")
+        axes.plot(curves.truth.seconds, curves.truth.position[:, 2], color=_REFERENCE, lw=2.0, label="ground truth")
+    axes.fill_between(curves.seconds, height - band, height + band, color=_ESTIMATE, alpha=0.2, lw=0)
+    axes.plot(curves.seconds, height, color=_ESTIMATE, lw=1.3, label="estimate, 3σ")
     spread = max(float(np.ptp(height)), 0.1)
-    panel.y_limits = float(height.min()) - 0.5 * spread, float(height.max()) + 0.5 * spread
-    return {"y_label": "height (m)", "legend": 2}
+    axes.set_ylim(height.min() - 0.5 * spread, height.max() + 0.5 * spread)
+    axes.set_ylabel("height (m)")
+    axes.legend(loc="best", fontsize=8, ncols=2)
 
 
-def _attitude_curves(panel: Panel, curves: Curves) -> dict[str, Any]:
-    """Add the left camera's heading, pitch and roll."""
+def _draw_attitude(axes: Any, curves: Curves) -> None:
+    """Draw the left camera's heading, pitch and roll."""
     for k, (name, colour) in enumerate((("heading", _ESTIMATE), ("pitch", _DEAD_RECKONING), ("roll", _GREEN))):
-        panel.line(curves.seconds, curves.attitude[:, k], colour, label=name)
-    return {"y_label": "attitude (deg)", "legend": 3}
+        axes.plot(curves.seconds, curves.attitude[:, k], color=colour, lw=1.2, label=name)
+    axes.set_ylabel("attitude (deg)")
+    axes.legend(loc="best", fontsize=8, ncols=3)
 
 
-def _count_curves(panel: Panel, seconds: FloatArray, frames: Rows) -> dict[str, Any]:
-    most = 1.0
+def _draw_counts(axes: Any, seconds: FloatArray, frames: Rows) -> None:
     for name, colour in (("matched", _LANDMARKS), ("selected", _DEAD_RECKONING), ("used", _ESTIMATE)):
-        times, counts = binned(seconds, frames[name], _BINS)
-        panel.line(times, counts, colour, label=name)
-        most = max(most, float(counts.max()))
-    panel.y_limits = 0.0, 1.05 * most
-    return {"y_label": "features", "legend": 3}
+        axes.plot(*binned(seconds, frames[name], _BINS), color=colour, lw=1.2, label=name)
+    axes.set_ylabel("features")
+    axes.set_ylim(bottom=0)
+    axes.legend(loc="best", fontsize=8, ncols=3)
 
 
-def _time_curves(panel: Panel, seconds: FloatArray, frames: Rows) -> dict[str, Any]:
+def _draw_time(axes: Any, seconds: FloatArray, frames: Rows) -> None:
     times, _ = binned(seconds, seconds, _BINS)
-    total = np.zeros(len(times))
-    for stage, colour in zip(STAGES, STAGE_COLOURS, strict=True):
-        before, total = total, total + binned(seconds, frames[f"{stage}_ms"], _BINS)[1]
-        panel.band(times, before, total, colour, 1.0, stage)
-    panel.y_limits = 0.0, max(2 * float(np.median(total)), 1.0)  # frames that compile leave the panel
-    return {"y_label": "time (ms)", "legend": 5}
+    medians = [binned(seconds, frames[f"{stage}_ms"], _BINS)[1] for stage in STAGES]
+    axes.stackplot(times, medians, labels=STAGES, colors=STAGE_COLOURS, linewidth=0)
+    axes.set_ylabel("time (ms)")
+    axes.set_ylim(0, max(2 * float(np.median(np.sum(medians, axis=0))), 1.0))  # frames that compile leave the panel
+    axes.legend(loc="upper right", fontsize=8, ncols=5)
 
 
-def _calibration_curves(panel: Panel, seconds: FloatArray, estimates: Rows, focal: float) -> dict[str, Any]:
-    """Add the right columns' coefficients of (R3) with a standard deviation, and how far the rows are off."""
+def _draw_calibration(axes: Any, seconds: FloatArray, estimates: Rows, focal: float) -> None:
+    """Draw the right columns' coefficients of (R3) with a standard deviation, and how far the rows are off."""
     values, sigmas = stereo_curves(estimates, focal)
     names = ("all columns", "along u", "with radius²", "with radius⁴")
     for name, colour, v, sigma in zip(
         names, (_ESTIMATE, _DEAD_RECKONING, _GREEN, _PURPLE), values.T, sigmas.T, strict=True
     ):
-        panel.band(seconds, v - sigma, v + sigma, colour, 0.2)
-        panel.line(seconds, v, colour, label=name)
-    panel.line(seconds, estimates["stereo_rows_rms_px"], _LANDMARKS, label="rows, rms")
-    return {"title": "stereo calibration is off by", "y_label": "px", "legend": 5}
+        axes.plot(seconds, v, color=colour, lw=1.2, label=name)
+        axes.fill_between(seconds, v - sigma, v + sigma, color=colour, alpha=0.2, lw=0)
+    axes.plot(seconds, estimates["stereo_rows_rms_px"], color=_LANDMARKS, lw=1.2, label="rows, rms")
+    axes.set_title("stereo calibration is off by", fontsize=9, loc="left")
+    axes.set_ylabel("px")
+    axes.legend(loc="best", fontsize=8, ncols=4)
