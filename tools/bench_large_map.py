@@ -149,7 +149,7 @@ def measure(path: Path) -> dict[str, float]:
         return found.get(number)
 
     builder.places.find = placed  # type: ignore[assignment, method-assign]
-    find(0, features(0))
+    find(size - 1, features(first))
     ticker, quiet = Ticker(), QuietCollector()
     quiet.hold()
     T: FloatArray = np.eye(4)
