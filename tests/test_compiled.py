@@ -362,6 +362,16 @@ def test_the_imu_is_integrated_as_in_numpy() -> None:
     assert not Q[:, :, 9:].any()
 
 
+def test_newest_residual_is_the_median_of_what_the_newest_clone_measured() -> None:
+    T, p, views = _scene()
+    at = multiview.residuals(CAMERA, T, p, views)
+    measured = np.any(at.z_D_p[:, -1], axis=2)
+    assert 0 < measured.sum() < measured.size
+    assert track_loops.newest_residual(at.r, at.z_D_p) == np.median(np.abs(at.r[:, -1][measured]))
+    at.z_D_p[:, -1] = 0.0
+    assert track_loops.newest_residual(at.r, at.z_D_p) is None
+
+
 def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     T, p, views = _scene()
     rng = np.random.default_rng(13)

@@ -405,9 +405,9 @@ class FrameUpdate:
         unsure = _scale_sigma(window) > _SCALE_SIGMA
         if room <= 0 or unsure or not candidates.any():
             return np.zeros(0, dtype=np.int64)
-        by_stereo = np.sqrt(self.tracks.variance) * relative_stereo_sigma(tracks.at, tracks.information.q)
-        has_depth = (depth_sigma < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)
-        chosen = np.flatnonzero(candidates & has_depth)
+        chosen = np.flatnonzero(candidates)
+        by_stereo = np.sqrt(self.tracks.variance) * relative_stereo_sigma(tracks.at, tracks.information.q, chosen)
+        chosen = chosen[(depth_sigma[chosen] < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)]
         field = self._rig.field(window)
         if field is not None:
             p = transform_points(window.T_cam0_world(-1)[0], tracks.p_world[chosen])

@@ -278,7 +278,7 @@ class Msckf(Backend):
         M[:6] = window.since_first(M[:6])
         known = motion.uncertainty(window.nav, M @ own @ M.T)
         R = window.calibration.R_upright_world.T
-        estimate = Estimate(
+        return Estimate(
             propagation.time_ns,
             se3_from_parts(R, np.zeros(3)) @ T,
             A @ covariance @ A.T,
@@ -289,9 +289,8 @@ class Msckf(Backend):
             accel_bias=window.nav.accel_bias,
             accel_bias_sigma=known.accel_bias_sigma,
             **self._vertical(own),
-            **window.calibration.report(window.state, window.nav, own),
+            **self._rig.report(window, own),
         )
-        return self._rig.report(window, estimate)
 
     def _vertical(self, own: FloatArray) -> dict[str, Any]:
         """The fields of `Estimate` that say where gravity points, by the upright covariance (15 + C, 15 + C)."""

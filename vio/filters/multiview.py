@@ -305,14 +305,14 @@ def track_information(
     return info
 
 
-def relative_stereo_sigma(at: Residuals, q: InverseDepth) -> FloatArray:
-    """Standard deviation (F,) of the inverse depth by the right views alone, over itself, for one pixel of noise.
+def relative_stereo_sigma(at: Residuals, q: InverseDepth, chosen: IntArray) -> FloatArray:
+    """Standard deviation of the inverse depths of tracks (K,) by the right views alone, over itself.
 
-    Infinite without a right view.
+    It is that for one pixel of noise; infinite without a right view.
     """
-    views = np.any(at.z_D_p[:, :, 2], axis=2).sum(axis=1)
+    views = np.any(at.z_D_p[chosen, :, 2], axis=2).sum(axis=1)
     out: FloatArray = np.sqrt(np.divide(_STEREO_VARIANCE, views, out=np.full(len(views), np.inf), where=views > 0))
-    return out / q.disparity
+    return out / q.disparity[chosen]
 
 
 def usable_points(

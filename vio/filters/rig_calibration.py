@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -22,10 +22,10 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import (
     ROTATION_NOT_COMPARABLE,
     ROW_TERMS,
-    Estimate,
     MotionSource,
     Observations,
     RotationComparison,
+    StereoFieldEstimate,
     StereoScaleEstimate,
 )
 
@@ -150,15 +150,17 @@ class RigCalibration:
             rows, rows_D_common = self._rows.without_common(stereo), self._rows.rows_D_common
         return StereoCorrection(self.camera, rows, stereo, estimated, rows_D_common)
 
-    def report(self, window: Window, estimate: Estimate) -> Estimate:
-        """Return an estimate with the scale that was taken over, and with the rows that were learned."""
-        scale, field, test = estimate.stereo_scale, estimate.stereo_field, window.prior.scale_test
+    def report(self, window: Window, own: FloatArray) -> dict[str, Any]:
+        """Return the fields of `Estimate` on the calibration, by the errors' covariance (15 + C, 15 + C).
+
+        That is with the scale that was taken over, and with the rows that were learned.
+        """
+        out, test = window.calibration.report(window.state, window.nav, own), window.prior.scale_test
         if test is not None and test.is_confirmed and self.rotation is not None and self.rotation.agree:
             log, sigma = test.estimate()  # a wrong focal length passes for it
-            scale = StereoScaleEstimate(np.array([log, 0.0]), np.diag([sigma**2, 0.0]))
-        if field is not None:
-            own, P = self._rows.without_common(field.coefficients), self._rows.covariance
-            field = replace(field, rows_rms_px=self._rows.rms_px, rows=own, rows_covariance=P)
-        if scale is estimate.stereo_scale and field is estimate.stereo_field:
-            return estimate
-        return replace(estimate, stereo_scale=scale, stereo_field=field)
+            out["stereo_scale"] = StereoScaleEstimate(np.array([log, 0.0]), np.diag([sigma**2, 0.0]))
+        if "stereo_field" in out:
+            field, P = out["stereo_field"], self._rows.covariance
+            rows = self._rows.without_common(field.coefficients)
+            out["stereo_field"] = StereoFieldEstimate(field.coefficients, field.covariance, self._rows.rms_px, rows, P)
+        return out
