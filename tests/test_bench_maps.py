@@ -12,7 +12,7 @@ import pytest
 from tests.dataset_makers import make_drive, make_mat, utias_arrays
 from vio.bench.bench import Place, bench
 from vio.bench.engines import run_here
-from vio.bench.execute import _with_render
+from vio.bench.execute import rendered_sources
 from vio.bench.identity import InputDigests
 from vio.bench.maps import loop_figures, placement_figures, wrong_share
 from vio.bench.suite import chosen, suite_from
@@ -87,8 +87,7 @@ def tasks_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Do the tasks of a bench in this process; in `test_bench` each has a process of its own."""
 
     def perform_here(job: dict[str, Any], cache: str) -> dict[str, Any]:
-        first = job["first"] and _with_render(job["first"], Path(cache))
-        return perform({**_with_render(job, Path(cache)), "first": first, "scratch": cache})
+        return perform({**rendered_sources(job, Path(cache)), "scratch": cache})
 
     engine = partial(run_here, perform=perform_here)
     monkeypatch.setattr("vio.bench.bench.run_here", lambda jobs, cache, *, workers: engine(jobs, cache, workers=1))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import functools
 import http.server
-import importlib.util
 import itertools
 import sys
 import threading
@@ -230,8 +229,8 @@ def test_the_accelerometer_is_interpolated_at_the_times_of_the_gyro() -> None:
         np.testing.assert_array_equal(sample.gyro, float(sample.time_ns))
 
 
-@pytest.mark.skipif(importlib.util.find_spec("pyrealsense2") is None, reason="pyrealsense2 is not installed")
 def test_a_realsense_made_by_its_library_gives_pairs_samples_and_calibration(tmp_path: Path) -> None:
+    pytest.importorskip("pyrealsense2", reason="pyrealsense2 or libusb is not installed", exc_type=ImportError)
     path = tmp_path / "camera.db3"
     _record_realsense(path)
     source = open_source(f"realsense:{path}")

@@ -36,11 +36,7 @@ def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict
     """Do one task in a process of its own, again where that is killed; return its record, which may be a failure."""
     try:
         Path(cache).mkdir(parents=True, exist_ok=True)
-        job = {**job, "first": job.get("first") and dict(job["first"])}
-        for part in (job, job["first"]):
-            if part is not None and part["render"] is not None:
-                part["source"] = str(_rendered(part["render"], Path(cache)))
-        lost = 0
+        job, lost = rendered_sources(job, Path(cache)), 0
         while True:
             record, number = _in_process(job, Path(cache))
             if record is not None:
@@ -55,6 +51,15 @@ def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict
         return failed(" ".join(str(error).split()), keep=False)
     except OSError as error:
         return failed(f"cannot use {error.filename or cache}: {error.strerror or error}", keep=False)
+
+
+def rendered_sources(job: dict[str, Any], cache: Path) -> dict[str, Any]:
+    """Return a job with the folders of its renders as sources; they are made now unless they are there."""
+    job = {**job, "first": job.get("first") and dict(job["first"])}
+    for part in (job, job["first"]):
+        if part is not None and part["render"] is not None:
+            part["source"] = str(_rendered(part["render"], cache))
+    return job
 
 
 def failed(reason: str, *, keep: bool) -> dict[str, Any]:

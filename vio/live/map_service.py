@@ -144,7 +144,7 @@ def _pair(body: bytes, camera: StereoCamera) -> tuple[Image, Image]:
     shape: tuple[int | None, ...] | None = None if camera.width is None else (camera.height, camera.width)
     for name, content in zip(("left", "right"), data, strict=True):
         try:
-            image, _ = decode_gray(content, name)
+            image = decode_gray(content, name)
         except UnreadableImageError as error:
             raise _RefusedError(HTTPStatus.BAD_REQUEST, str(error)) from None
         if shape is not None and image.shape != shape:

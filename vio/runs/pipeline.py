@@ -296,10 +296,8 @@ class _Loop:
                 if event.index not in self._frames:
                     continue
                 state.unread += self._between(state.next_frame + (state.frame_ns is not None), event.index)
-            has_results = self._take(event)
+            self._take(event)
             state.note(event)
-            if not (has_results or isinstance(event, StereoFrame)):
-                continue
             if _LEAST_REFUSED <= monitor.frames_refused > len(recorder):
                 break
             stopped = should_stop()
@@ -334,8 +332,7 @@ class _Loop:
         """Frames `first <= index < end` that the run is to take."""
         return [index for index in range(first, end) if index in self._frames]
 
-    def _take(self, event: Event) -> bool:
-        """Process an event; return whether it completed a frame."""
+    def _take(self, event: Event) -> None:
         state = self._state
         if not isinstance(event, StereoFrame):
             self._recorder.sample(event)
@@ -344,7 +341,6 @@ class _Loop:
             self._record(results)
         if state.dead_reckoning is not None:
             state.dead_reckoning.add(event)
-        return bool(results)
 
     def _record(self, results: list[FrameResult]) -> None:
         state = self._state

@@ -40,15 +40,17 @@ class RealSenseSource:
             name: serial number, file ending in .bag or .db3, or empty.
 
         Raises:
-            MissingDependencyError: pyrealsense2 is not installed.
+            MissingDependencyError: pyrealsense2 or a library that it needs is not installed.
             DataError: there is no such device, or it has no two infrared imagers.
         """
         try:
             import pyrealsense2 as rs
-        except ImportError as error:
+        except ModuleNotFoundError as error:
             raise MissingDependencyError(
                 "realsense: needs the package pyrealsense2; install it with: pip install 'stereo-vio[realsense]'"
             ) from error
+        except ImportError as error:  # such as libusb, which the system must have
+            raise MissingDependencyError(f"realsense: pyrealsense2 cannot be loaded: {error}") from error
         self._rs, self._name = rs, name or "realsense"
         self._is_file = name.endswith((".bag", ".db3"))
         if self._is_file and not Path(name).is_file():
