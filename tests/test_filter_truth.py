@@ -454,3 +454,23 @@ def test_blurred_frames_count_less() -> None:
         run = fly(course, None, seed=seed, spoil=spoil)
         values.append(squared(run.error(38), run.estimates[38].covariance))
     assert np.mean(values) < chi2.ppf(0.999, 6 * len(values)) / len(values)
+
+
+# Landmarks beside a factor on the information of pixels
+
+
+@pytest.mark.parametrize("factor", [1.0, 8.0])
+def test_landmarks_are_gated_with_the_variance_that_they_entered_with(
+    factor: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of the measurements are those of landmarks; none is out of place. Of white noise 1 % is refused, at most."""
+    monkeypatch.setattr("vio.filters.overdispersion.PRIOR_FACTOR", factor)
+    monkeypatch.setattr("vio.filters.overdispersion._PRIOR_TRACKS", 1e9)
+    course = Course(20, 3.0, (0.4, 0.5, 0.0), yaw_rate=0.2, depth=(2.0, 8.0), features=40)
+    refused = offered = 0
+    for seed in range(4):
+        for report in fly(course, None, replace(SETTINGS, max_landmarks=20, max_features=10), seed=seed).reports:
+            offered += len(report.landmark_ids)
+            refused += len(np.intersect1d(report.gated_ids, report.landmark_ids))
+    assert refused < 0.02 * offered
+    assert offered > 2000

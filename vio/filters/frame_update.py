@@ -316,7 +316,8 @@ class FrameUpdate:
             z = unweighted(pixels.z, at.r, at.precision)
             H = field.jacobian(z) * (at.precision * np.any(at.J, axis=2))[..., None]
             J = np.concatenate([J, H], axis=2)
-        nis = leave_one_out_nis(at.r, J, window.landmark_covariance(fitted), at.weight, self.tracks.variance)
+        weight = at.weight * (self.tracks.variance / self._variance)  # that they entered the fit with
+        nis = leave_one_out_nis(at.r, J, window.landmark_covariance(fitted), weight, self.tracks.variance)
         dof = np.maximum(np.any(at.J, axis=2).sum(axis=1), 1)
         used, dropped = self._landmark_gate.check(window.landmark_ids, nis, dof)
         rejected = window.landmark_ids[~used]
