@@ -16,6 +16,7 @@ from scipy.stats import chi2
 
 from tests.true_world import TrueWorld
 from vio.filters import imu_start, navigation
+from vio.filters.frame_update import FrameUpdate
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
@@ -474,3 +475,37 @@ def test_landmarks_are_gated_with_the_variance_that_they_entered_with(
             refused += len(np.intersect1d(report.gated_ids, report.landmark_ids))
     assert refused < 0.02 * offered
     assert offered > 2000
+
+
+# Steps of a fit
+
+
+@pytest.mark.parametrize(
+    ("innovation", "residuals", "steps"),
+    [
+        (136.7, [52.5, 10.5, 0.48, 0.25], 4),  # MH_01 after 1.85 s without frames
+        (3.0, [0.2, 0.2], 2),
+        (3.0, [2.9], 1),  # comes no nearer
+        (0.4, [0.1], 1),  # was near
+    ],
+)
+def test_a_fit_goes_on_while_it_was_far_and_comes_nearer(
+    innovation: float, residuals: list[float], steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Tracks:
+        rows = np.arange(3)
+        stereo = None
+
+        def __init__(self, residual: float) -> None:
+            self._residual = residual
+
+        def newest_innovation(self) -> float:
+            return self._residual
+
+    update, left = FrameUpdate.__new__(FrameUpdate), [Tracks(r) for r in residuals]
+    monkeypatch.setattr(update, "_information", lambda *_: (np.eye(1), np.zeros(1), None))
+    monkeypatch.setattr(update, "_move_to_optimum", lambda *_: None)
+    monkeypatch.setattr(update, "_linearise", lambda *_: left.pop(0))
+    tracks, _ = update._fit(None, Tracks(innovation), None, innovation)  # type: ignore[arg-type]
+    assert len(residuals) - len(left) == steps
+    assert tracks.newest_innovation() == residuals[steps - 1]

@@ -57,6 +57,7 @@ _LANDMARK_STEREO_SIGMA = 0.1  # or by the right views alone, which know the scal
 _SCALE_SIGMA = 0.001
 _MAP_DEPTH_SIGMA = 0.2  # by all views; a point of the map is reported with its covariance, and not used
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
+_NEARER = 1.25  # by which factor a step must have come nearer for another one
 _MOST_STEPS = 4  # over the window in a frame: one is the rule, two bring in a start in motion, a third is an exception
 
 
@@ -184,8 +185,8 @@ class FrameUpdate:
             fitted = self._move_to_optimum(window, tracks, tracks.stereo, A, b, len(A))
             tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = tracks.newest_innovation()
-            # Another step pays only where this one had far to go.
-            if innovation is None or residual is None or innovation < max(_FAR, 3 * residual):
+            # Another step pays only where this one had far to go, and came nearer.
+            if innovation is None or residual is None or innovation < max(_FAR, _NEARER * residual):
                 break
             innovation = residual
         return tracks, fitted
