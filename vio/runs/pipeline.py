@@ -113,7 +113,7 @@ class RunControl:
 
     folder: GrowingFolder | None = None  # None: everything stays in memory
     resume: bool = False  # go on from the checkpoint in the folder
-    should_stop: Callable[[], str | None] = lambda: None  # asked after each frame; a reason ends the run in order
+    should_stop: Callable[[], str | None] = lambda: None  # asked after each event; a reason ends the run in order
 
 
 _TO_THE_END = RunControl()
@@ -291,10 +291,8 @@ class _Loop:
                 continue
             if isinstance(event, StereoFrame):
                 state.unread += self._between(state.next_frame + (state.frame_ns is not None), event.index)
-            has_results = self._take(event)
+            self._take(event)
             state.note(event)
-            if not (has_results or isinstance(event, StereoFrame)):
-                continue
             if _LEAST_REFUSED <= processor.frames_refused > len(recorder):
                 break
             stopped = should_stop()
@@ -318,8 +316,7 @@ class _Loop:
         """Frames `first <= index < end` that the run is to take."""
         return [index for index in range(first, end) if index in self._frames]
 
-    def _take(self, event: Event) -> bool:
-        """Process an event; return whether it completed a frame."""
+    def _take(self, event: Event) -> None:
         state = self._state
         if not isinstance(event, StereoFrame):
             self._recorder.sample(event)
@@ -328,7 +325,6 @@ class _Loop:
             self._record(results)
         if state.dead_reckoning is not None:
             state.dead_reckoning.add(event)
-        return bool(results)
 
     def _record(self, results: list[FrameResult]) -> None:
         state = self._state
