@@ -113,7 +113,7 @@ class RunControl:
 
     folder: GrowingFolder | None = None  # None: everything stays in memory
     resume: bool = False  # go on from the checkpoint in the folder
-    should_stop: Callable[[], str | None] = lambda: None  # asked after each frame; a reason ends the run in order
+    should_stop: Callable[[], str | None] = lambda: None  # asked after each event; a reason ends the run in order
 
 
 _TO_THE_END = RunControl()
