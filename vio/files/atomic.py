@@ -79,14 +79,29 @@ def _remove_leftovers(target: Path) -> None:
         os.close(descriptor)
 
 
-def _new_partial_folder(target: Path) -> tuple[Path, int | None]:
-    """Make a folder for `target` to be written in, and lock it."""
-    while True:
-        partial = _sibling(target, "partial")
-        partial.mkdir(parents=True)
-        lock = lock_path(partial)
-        if partial.is_dir():  # another process may have taken it for a leftover before it was locked
-            return partial, lock
+@contextlib.contextmanager
+def _partial_folder(target: Path) -> Iterator[Path]:
+    """Make and lock a folder for `target` to be written in; what was made and not renamed is removed at the end."""
+    parents = [parent for parent in target.parents if not parent.exists()]
+    partial: Path | None = None
+    lock: int | None = None
+    try:
+        try:
+            while partial is None or not partial.is_dir():  # one may be taken for a leftover before it is locked
+                partial = _sibling(target, "partial")
+                partial.mkdir(parents=True)
+                lock = lock_path(partial)
+        except OSError as error:
+            raise _unwritable(target, error) from error
+        yield partial
+    finally:
+        if lock is not None:
+            os.close(lock)
+        if partial is not None:
+            shutil.rmtree(partial, ignore_errors=True)
+        for parent in parents:
+            with contextlib.suppress(OSError):  # not empty
+                parent.rmdir()
 
 
 def _unwritable(path: Path, error: OSError) -> DataError:
@@ -192,15 +207,7 @@ def atomic_folder(
     target = Path(path).absolute()
     check_replaceable(target, replace, marker, own)
     _remove_leftovers(target)
-    parents = [parent for parent in target.parents if not parent.exists()]
-    partial: Path | None = None
-    lock: int | None = None
-    done = False
-    try:
-        try:
-            partial, lock = _new_partial_folder(target)
-        except OSError as error:
-            raise _unwritable(target, error) from error
+    with _partial_folder(target) as partial:
         try:
             yield partial
         except OSError as error:
@@ -212,16 +219,6 @@ def atomic_folder(
             _swap_in(partial, target)
         except OSError as error:
             raise _unwritable(target, error) from error
-        done = True
-    finally:
-        if lock is not None:
-            os.close(lock)
-        if not done:
-            if partial is not None:
-                shutil.rmtree(partial, ignore_errors=True)
-            for parent in parents:
-                with contextlib.suppress(OSError):
-                    parent.rmdir()
 
 
 def check_replaceable(target: Path, replace: bool, marker: str | None, own: Collection[str] | None = None) -> None:
@@ -258,23 +255,11 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         DataError: no folder can be made there, or the disk is full.
     """
     target = Path(path).absolute()
-    parents = [parent for parent in target.parents if not parent.exists()]
-    try:
+    with _partial_folder(target) as partial:
         try:
-            partial, lock = _new_partial_folder(target)
-            try:
-                with (partial / "probe").open("wb") as stream:
-                    stream.write(bytes(_PROBE_BYTES))
-            finally:
-                if lock is not None:
-                    os.close(lock)
-                shutil.rmtree(partial, ignore_errors=True)
-        finally:
-            for parent in parents:
-                with contextlib.suppress(OSError):
-                    parent.rmdir()
-    except OSError as error:
-        raise _unwritable(target, error) from error
+            (partial / "probe").write_bytes(bytes(_PROBE_BYTES))
+        except OSError as error:
+            raise _unwritable(target, error) from error
 
 
 @contextlib.contextmanager
