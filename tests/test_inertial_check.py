@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vio.datasets.euroc_files import read_imu_csv
 from vio.datasets.rigs import load_rig
 from vio.datasets.samples import imu_samples
 from vio.datasets.tables import read_imu_table
@@ -107,7 +106,7 @@ def _real(folder: Path, seconds: float) -> Watched:
     used = truth_ns < truth_ns[0] + round((seconds + 1) * 1e9)
     motion, _ = fit_spline(truth_ns[used], poses[used], knot_s=0.1)
     start, end = motion.start_ns, motion.start_ns + round(seconds * 1e9)
-    record = read_imu_csv(folder / "imu0.csv")
+    record = read_imu_table(folder / "imu0.csv", whole_ns=True)[0]
     samples = [s for s in imu_samples(record) if start <= s.time_ns <= end]
     times = np.arange(start, end, _FRAME_NS)
     rig = euroc_rectified_rig()

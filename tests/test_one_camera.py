@@ -351,7 +351,7 @@ def test_tum_rgbd_is_associated_by_stamps_and_its_camera_is_known(tmp_path: Path
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda f: (f / "depth.txt").write_text("# nothing\n"), "expected lines 'time file'"),
+        (lambda f: (f / "depth.txt").write_text("# nothing\n"), "holds no line of data"),
         (lambda f: (f / "depth.txt").write_text("9.0 depth/a.png\n"), "one clock"),
         (lambda f: [cv2.imwrite(str(p), np.zeros((300, 480), np.uint8)) for p in (f / "depth").iterdir()], "16 bits"),
         (lambda f: [cv2.imwrite(str(p), np.ones((30, 48), np.uint16)) for p in (f / "depth").iterdir()], "registered"),

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from vio.datasets.euroc_files import imu_csv, read_imu_csv
+from vio.datasets.euroc_files import imu_csv
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order, motion_samples, velocity_samples
+from vio.datasets.tables import read_imu_table
 from vio.errors import DataError
 from vio.files.text import lines_of
 from vio.records import ImuRecord, ImuSample, VelocitySample
@@ -31,7 +32,7 @@ def test_reading_an_imu_takes_its_numbers_and_little_more(tmp_path: Path) -> Non
     path.write_text(imu_csv(record))
     text_bytes = path.stat().st_size
     tracemalloc.start()
-    samples = imu_samples(read_imu_csv(path))
+    samples = imu_samples(read_imu_table(path, whole_ns=True)[0])
     held, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert held < 2 * _ROW_BYTES * _SAMPLES  # the record and the samples share the times

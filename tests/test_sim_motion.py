@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vio.datasets.euroc_files import read_imu_csv
+from vio.datasets.tables import read_imu_table
 from vio.errors import DataError, SimulationError
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log
 from vio.sim.imu import (
@@ -221,7 +221,7 @@ def test_spline_fits_a_real_flight_within_its_noise(data_dir: Path, flight: str)
     assert report.position_rms_m < 5e-4
     assert report.rotation_rms_rad < 2e-3
     assert report.rejected < 0.02 * report.samples
-    imu = read_imu_csv(folder / "imu0.csv")
+    imu = read_imu_table(folder / "imu0.csv", whole_ns=True)[0]
     inside = (imu.times_ns >= spline.start_ns) & (imu.times_ns <= spline.end_ns)
     state = motion_at(spline, imu.times_ns[inside])
     # The real sensors agree with the spline but for bias and vibration.

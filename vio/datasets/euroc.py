@@ -20,14 +20,7 @@ import numpy as np
 from vio.cameras.rig import rectifier_of
 from vio.datasets.common import naming
 from vio.datasets.companions import check_overlap
-from vio.datasets.euroc_files import (
-    STATE_CSV,
-    TUM_FILE,
-    read_camera_yaml,
-    read_imu_csv,
-    read_imu_yaml,
-    stamped_rows,
-)
+from vio.datasets.euroc_files import STATE_CSV, TUM_FILE, read_camera_yaml, read_imu_yaml
 from vio.datasets.frame_times import PAIRED_NS, pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImageSize, full_scale
@@ -35,6 +28,7 @@ from vio.datasets.images import list_images
 from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.samples import MotionSamples, imu_samples
 from vio.datasets.settings import DatasetSettings
+from vio.datasets.tables import read_imu_table, stamped_rows
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
 from vio.files.trajectories import read_trajectory
@@ -132,7 +126,7 @@ def _read_camera(folder: Path) -> _Camera:
     path = folder / "data.csv"
     times_ns, rows, lines = stamped_rows(path, 2, "timestamp [ns],filename")
     there = list_images(folder / "data")
-    files, renamed = _find_images(there, rows, path, lines)
+    files, renamed = _find_images(there, [name for _, name in rows], path, lines)
     unlisted, missing = len(set(there.names) - set(files.names)), len(times_ns) - len(files.names)
     return _Camera(model, T_body_cam, times_ns[: len(files.names)], files, renamed, unlisted, missing)
 
@@ -203,8 +197,8 @@ def _read_imu(
         T_body_imu, noise = read_imu_yaml(path)
     else:
         notes.append(f"{path} is missing; the IMU is assumed to be the body frame, its noise is unknown")
-    samples = imu_samples(read_imu_csv(folder / "data.csv", notes))
-    return T_body_imu, noise, samples, tuple(notes)
+    record, notes_read = read_imu_table(folder / "data.csv", cut=notes, whole_ns=True)
+    return T_body_imu, noise, imu_samples(record), (*notes, *notes_read)
 
 
 def _read_reference(file: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -> Trajectory:

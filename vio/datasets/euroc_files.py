@@ -6,20 +6,17 @@ Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
 
 from __future__ import annotations
 
-import math
-import re
-from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import check_gravity_column, image_size, naming
+from vio.datasets.common import image_size, naming
 from vio.datasets.yaml_files import as_number, densities_text, imu_densities, numbers, read_yaml_file
-from vio.errors import CalibrationError, DataError
-from vio.files.text import INT64_MAX, check_increasing, exact_text, lines_of, write_text
+from vio.errors import CalibrationError
+from vio.files.text import exact_text, write_text
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair, rig_from_rectified
 from vio.geometry.lie import FloatArray, checked_transform, quat_xyzw_from_rotation, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
@@ -37,7 +34,6 @@ STATE_CSV = Path("state_groundtruth_estimate0", "data.csv")  # ground truth, wit
 TUM_FILE = "groundtruth_tum.txt"  # ground truth beside mav0
 _ULPS = 2  # units in the last place within which a translation is looked for that is read back as it was
 _IMAGES_HEADER = "#timestamp [ns],filename"
-_STAMP = re.compile(r"\d{1,19}")
 _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
@@ -206,42 +202,6 @@ def image_list_csv(times_ns: IntArray, last_ns: int) -> str:
     return "\n".join([_IMAGES_HEADER, *(f"{t},{image_name(t, last_ns)}" for t in times_ns.tolist())]) + "\n"
 
 
-def read_imu_csv(path: Path, cut: list[str] | None = None) -> ImuRecord:
-    """Read `timestamp [ns], gyro x y z [rad/s], accel x y z [m/s^2]`.
-
-    Args:
-        path: the file.
-        cut: where to note a last line that ends too early, which is left out then; None: it is an error.
-
-    Raises:
-        DataError: a line lacks seven finite numbers, or the clock does not increase; the message names the line. Or
-            gravity is in the gyro's columns.
-    """
-    form = "timestamp [ns], gyro x y z, accel x y z"
-    times, lines, numbers_read, bad = array("q"), array("q"), array("d"), []
-    for number, stamp, row in _stamped_lines(path, 7, form, cut):
-        fields = row.split(",")
-        try:
-            values = [float(field) for field in fields]
-        except ValueError:
-            values = [as_number(field.strip()) for field in fields]
-        if not all(map(math.isfinite, values)):
-            bad.append((number, row))
-        times.append(stamp)
-        lines.append(number)
-        numbers_read.extend(values)
-    times_ns = check_increasing(times, lambda k: f"{path}, line {lines[k]}")
-    if bad:
-        number, row = bad[0]
-        raise DataError(
-            f"{path}, line {number}: a reading is not a finite number ({row}; {len(bad)} lines in all); remove such "
-            "lines"
-        )
-    readings = np.array(numbers_read).reshape(-1, 6)
-    check_gravity_column(readings, str(path), form, "exchange these columns with 5 to 7")
-    return ImuRecord(times_ns, readings[:, :3], readings[:, 3:])
-
-
 def imu_csv(record: ImuRecord) -> str:
     """The text of the IMU's `data.csv`, with all digits."""
     return _stamped_csv(_IMU_HEADER, record.times_ns, np.hstack([record.gyro, record.accel]))
@@ -263,48 +223,3 @@ def state_csv(times_ns: IntArray, T_world_body: FloatArray, velocity_world: Floa
 def _stamped_csv(header: str, times_ns: IntArray, values: FloatArray) -> str:
     rows = (f"{t},{exact_text(row, ',')}" for t, row in zip(times_ns.tolist(), values, strict=True))
     return "\n".join([header, *rows]) + "\n"
-
-
-def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[str], list[int]]:
-    """Return the times (N,) of a csv, the text of each line behind its time, and their line numbers.
-
-    Comment lines, which begin with '#', are skipped. The text holds `columns - 1` fields between commas.
-
-    Raises:
-        DataError: the file is missing or empty, a line has a wrong number of fields, or the clock does not increase.
-    """
-    times: list[int] = []
-    rows: list[str] = []
-    lines: list[int] = []
-    for number, stamp, row in _stamped_lines(path, columns, form):
-        times.append(stamp)
-        rows.append(row)
-        lines.append(number)
-    return check_increasing(times, lambda k: f"{path}, line {lines[k]}"), rows, lines
-
-
-def _stamped_lines(path: Path, columns: int, form: str, cut: list[str] | None = None) -> Iterator[tuple[int, int, str]]:
-    """Yield line number, time and the text behind the time of each line, see `stamped_rows` and `read_imu_csv`."""
-    empty = True
-    lines = lines_of(path)
-    for number, line in lines:
-        if line.startswith("#"):
-            continue
-        if (count := line.count(",") + 1) != columns:
-            if cut is not None and not empty and count < columns and next(lines, None) is None:
-                cut.append(
-                    f"{path}, line {number}: the last line ends too early ({count} of {columns} values); left out"
-                )
-                return
-            raise DataError(f"{path}, line {number}: {count} values instead of {columns} ({form})")
-        stamp, _, rest = line.partition(",")
-        stamp = stamp.strip()
-        if not _STAMP.fullmatch(stamp) or int(stamp) > INT64_MAX:
-            raise DataError(
-                f"{path}, line {number}: {stamp!r} is no time in whole nanoseconds ({form}); write seconds times 1e9, "
-                "without a point or exponent"
-            )
-        empty = False
-        yield number, int(stamp), rest.strip()
-    if empty:
-        raise DataError(f"{path}: holds no line of data ({form}); copy it again, or remove its folder")

@@ -9,7 +9,7 @@ import numpy as np
 from vio.datasets.bags import is_bag
 from vio.datasets.bags.index import stamp_of
 from vio.datasets.bags.store import Bag
-from vio.datasets.tables import drive_times, numbers_of, read_table, stamps_ns
+from vio.datasets.tables import drive_times, read_table, stamps_ns
 from vio.earth.gnss import UP_SHARE, GnssFixes, checked_fixes
 from vio.errors import DataError
 from vio.files.text import text_lines
@@ -46,7 +46,7 @@ def _read_csv(path: Path) -> GnssFixes:
     table = read_table(path, columns, _FORM)
     if table.header and not all(word in name for word, name in zip(("time", "lat", "lon"), table.header, strict=False)):
         raise DataError(f"{path}: has the columns {','.join(table.header)}; expected {_FORM}")
-    values = numbers_of(table)
+    values = table.values
     sigmas = values[:, 3:].copy() if columns == 7 else np.full((len(values), 3), np.nan)
     no_up = np.isnan(sigmas[:, 2])
     sigmas[no_up, 2] = UP_SHARE * sigmas[no_up, :2].max(axis=1)

@@ -21,7 +21,6 @@ import numpy as np
 
 from vio.cameras.rig import Rig
 from vio.datasets.companions import IMU_FILES, calibration_beside, find_calibration_of, read_companions
-from vio.datasets.euroc_files import stamped_rows
 from vio.datasets.frame_times import pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImagePairs, measured_images
@@ -29,7 +28,7 @@ from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.tables import drive_times, is_date, parse_stamps
+from vio.datasets.tables import drive_times, is_date, parse_stamps, stamped_rows
 from vio.datasets.tum_rgbd import LISTS, associated_images, is_tum_folder, published_camera
 from vio.datasets.unused import Layout
 from vio.errors import CalibrationError, DataError
@@ -296,7 +295,7 @@ def _missing_note(file: Path, pairs: ImagePairs) -> tuple[str, ...]:
 def _listed_times(file: Path, pairs: ImagePairs) -> IntArray:
     """Read the times (F,) of images from EuRoC's list of a camera."""
     times_ns, rows, _ = stamped_rows(file, 2, "timestamp [ns], filename")
-    time_of = dict(zip(rows, times_ns.tolist(), strict=True))
+    time_of = dict(zip((name for _, name in rows), times_ns.tolist(), strict=True))
     missing = next((left.name for left, _ in pairs if left.name not in time_of), None)
     if missing is not None:
         raise DataError(f"{file}: does not list {missing}; copy both again, or remove the image")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from array import array
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -12,8 +13,9 @@ import numpy as np
 
 from vio.datasets.common import check_gravity_column
 from vio.datasets.samples import MotionSamples, velocity_samples
+from vio.datasets.yaml_files import as_number
 from vio.errors import DataError
-from vio.files.text import INT64_MAX, check_increasing, text_lines
+from vio.files.text import INT64_MAX, check_increasing, lines_of, text_lines
 from vio.geometry.lie import FloatArray
 from vio.records import ImuRecord, IntArray, VelocitySample
 
@@ -21,56 +23,88 @@ _UNITS = {"s": 9, "sec": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanos
 # Stamps of 1973 and later in ns, us and ms; smaller ones are seconds from any zero.
 _NS_SINCE, _US_SINCE, _MS_SINCE = Decimal("1e17"), Decimal("1e14"), Decimal("1e11")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
+_STAMP = re.compile(r"\d{1,19}")
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
 _LEAST_IMU_HZ = 50.0  # below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
 
 
 @dataclass(frozen=True, slots=True)
-class TextTable:
-    """The fields of a file as text."""
+class NumberTable:
+    """The stamps of a file as text, and its other columns as numbers."""
 
     path: Path
     header: tuple[str, ...]  # lower case; empty: none
-    rows: tuple[tuple[str, ...], ...]
-    lines: tuple[int, ...]  # line numbers from 1, one per row
+    stamps: tuple[str, ...]
+    values: FloatArray  # (N, K); NaN: no number
+    lines: Sequence[int]  # (N,) line numbers from 1
 
     def where(self, row: int) -> str:
         """Name the place of a row for a message."""
         return f"{self.path}, line {self.lines[row]}"
 
 
-def read_table(path: Path, columns: int, form: str) -> TextTable:
-    """Read a table separated by commas, semicolons or white space; its header is the last comment or text line above.
+def read_table(path: Path, columns: int, form: str, cut: list[str] | None = None) -> NumberTable:
+    """Read a table of stamps and numbers; see `table_rows`."""
+    rows = table_rows(path, columns, form, cut)
+    header = tuple(field.lower() for field in next(rows)[1])
+    stamps, values, lines = list[str](), array("d"), array("q")
+    for number, fields in rows:
+        stamps.append(fields[0])
+        lines.append(number)
+        values.extend([as_number(field) for field in fields[1:]])
+    return NumberTable(path, header, tuple(stamps), np.array(values).reshape(-1, columns - 1), lines)
+
+
+def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[list[str]], list[int]]:
+    """Return the times (N,) of a table that are in whole nanoseconds, the fields of each line, and its number.
+
+    Raises:
+        DataError: as `table_rows`, or a stamp is another number, or not later than the one before.
+    """
+    rows = list(table_rows(path, columns, form))[1:]
+    lines = [number for number, _ in rows]
+    stamps = [fields[0] for _, fields in rows]
+    return _whole_ns(stamps, lambda k: f"{path}, line {lines[k]}"), [fields for _, fields in rows], lines
+
+
+def table_rows(path: Path, columns: int, form: str, cut: list[str] | None = None) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the fields of each line of a table, and before the first one 0 and those of the header.
+
+    Commas, semicolons or white space separate. The header is the last comment or text line above; it may have none.
 
     Args:
         path: the file.
         columns: expected number of columns.
         form: their names, for messages.
+        cut: where to note a last line that ends too early, which is left out then; None: it is an error.
 
     Raises:
         DataError: the file cannot be read or is empty, or a line has another number of columns.
     """
-    header: tuple[str, ...] = ()
-    rows: list[tuple[str, ...]] = []
-    lines: list[int] = []
-    unread = ""
-    for number, line in text_lines(path):
+    header, unread, is_data = list[str](), "", False
+    lines = lines_of(path)
+    for number, line in lines:
         text = line.strip()
-        fields = tuple(_split(text.lstrip("#")))
-        if not text or text.startswith("#") or (not rows and not _NUMBER.fullmatch(fields[0])):
+        fields = _split(text.lstrip("#"))
+        if not text or text.startswith("#") or (not is_data and not _NUMBER.fullmatch(fields[0])):
             if header and text and not text.startswith("#"):
                 unread = f"; line {number}, {text[:40]!r}, does not begin with a number (decimals need a point)"
-            if not rows and len(fields) == columns:
-                header = tuple(field.lower() for field in fields)
+            if not is_data and len(fields) == columns:
+                header = fields
             continue
         if len(fields) != columns:
+            if cut is not None and is_data and len(fields) < columns and next(lines, None) is None:
+                early = f"the last line ends too early ({len(fields)} of {columns} values)"
+                cut.append(f"{path}, line {number}: {early}; left out")
+                return
             raise DataError(f"{path}, line {number}: {len(fields)} values instead of {columns} ({form})")
-        rows.append(fields)
-        lines.append(number)
-    if not rows:
+        if not is_data:
+            is_data = True
+            yield 0, header
+        yield number, fields
+    if not is_data:
         raise DataError(f"{path}: holds no line of data ({form}){unread}; copy it again, or remove it")
-    return TextTable(path, header, tuple(rows), tuple(lines))
 
 
 def _split(text: str) -> list[str]:
@@ -80,15 +114,23 @@ def _split(text: str) -> list[str]:
     return text.split()
 
 
-def stamps_ns(table: TextTable) -> IntArray:
+def stamps_ns(table: NumberTable) -> IntArray:
     """Return the first column as nanoseconds (N,), strictly increasing; the unit as stated, else by its size.
 
     Raises:
         DataError: a stamp is no number, or not later than the one before.
     """
     stated = re.search(r"(?:\[|_|\()\s*(ns|us|ms|sec|s)\s*(?:\]|\)|$)", table.header[0]) if table.header else None
-    texts = [row[0] for row in table.rows]
-    return parse_stamps(texts, table.where, None if stated is None else stated[1])
+    return parse_stamps(table.stamps, table.where, None if stated is None else stated[1])
+
+
+def _whole_ns(texts: Sequence[str], where: Callable[[int], str]) -> IntArray:
+    """Return stamps (N,) that are written as whole nanoseconds."""
+    for k, text in enumerate(texts):
+        if not _STAMP.fullmatch(text) or int(text) > INT64_MAX:
+            remedy = "write seconds times 1e9, without a point or exponent"
+            raise DataError(f"{where(k)}: {text!r} is no time in whole nanoseconds; {remedy}")
+    return check_increasing([int(text) for text in texts], where)
 
 
 def parse_stamps(texts: Sequence[str], where: Callable[[int], str], unit: str | None = None) -> IntArray:
@@ -122,8 +164,15 @@ def parse_stamps(texts: Sequence[str], where: Callable[[int], str], unit: str | 
     return check_increasing([int(value.scaleb(power).to_integral_value()) for value in values], where)
 
 
-def read_imu_table(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
+def read_imu_table(
+    path: Path, *, cut: list[str] | None = None, whole_ns: bool = False
+) -> tuple[ImuRecord, tuple[str, ...]]:
     """Read raw inertial readings; a header may name the order of its columns, and the units deg/s and g.
+
+    Args:
+        path: the file.
+        cut: see `table_rows`.
+        whole_ns: whether stamps must be in whole nanoseconds.
 
     Returns:
         The record, and notes about what was converted or looks wrong.
@@ -131,15 +180,14 @@ def read_imu_table(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
     Raises:
         DataError: a line lacks seven finite numbers, the stamps do not increase, or the order of columns is unclear.
     """
-    table = read_table(path, 7, _IMU_FORM)
-    times_ns = stamps_ns(table)
+    table = read_table(path, 7, _IMU_FORM, cut)
+    times_ns = _whole_ns(table.stamps, table.where) if whole_ns else stamps_ns(table)
     values = _finite(table)
     order = _imu_order(table)
     if order is None:
-        remedy = "add a header such as 'timestamp [ns],ax,ay,az,wx,wy,wz'"
+        remedy = "exchange these columns with 5 to 7, or add a header such as 'timestamp [ns],ax,ay,az,wx,wy,wz'"
         check_gravity_column(values, str(path), _IMU_FORM, remedy)
-        gyro, accel = values[:, :3], values[:, 3:]
-        return ImuRecord(times_ns, gyro, accel), imu_notes(times_ns, str(path))
+        return ImuRecord(times_ns, values[:, :3], values[:, 3:]), imu_notes(times_ns, str(path))
     gyro, accel = values[:, order[:3]], values[:, order[3:]]
     notes: list[str] = []
     if any("deg" in table.header[1 + k] for k in order[:3]):
@@ -151,10 +199,8 @@ def read_imu_table(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
     return ImuRecord(times_ns, gyro, accel), (*notes, *imu_notes(times_ns, str(path)))
 
 
-def _imu_order(table: TextTable) -> list[int] | None:
-    """Return the columns of gyro x y z and accel x y z by the header's names; None: no header."""
-    if not table.header:
-        return None
+def _imu_order(table: NumberTable) -> list[int] | None:
+    """Return the columns of gyro x y z and accel x y z by the header's names; None: it names no axes."""
     found: dict[tuple[str, str], int] = {}
     for k, cell in enumerate(table.header[1:]):
         name = re.sub(r"[\[(].*", "", cell)
@@ -164,6 +210,8 @@ def _imu_order(table: TextTable) -> list[int] | None:
         axis = next((c for c in reversed(letters) if c in "xyz"), "")
         found[(kind, axis)] = k
     wanted = [(kind, axis) for kind in "wa" for axis in "xyz"]
+    if not any(kind and axis for kind, axis in found):
+        return None
     if set(found) != set(wanted):
         raise DataError(
             f"{table.path}: the header {','.join(table.header)[:80]!r} does not name gyro and accel; write "
@@ -198,26 +246,15 @@ def read_velocity_table(path: Path) -> MotionSamples[VelocitySample]:
     return velocity_samples(times_ns, values[:, :3], values[:, 3:])
 
 
-def _finite(table: TextTable) -> FloatArray:
+def _finite(table: NumberTable) -> FloatArray:
     """Return all columns but the first as finite numbers (N, K)."""
-    values = numbers_of(table)
-    bad = ~np.isfinite(values).all(axis=1)
+    bad = ~np.isfinite(table.values).all(axis=1)
     if bad.any():
-        k = int(np.argmax(bad))
         raise DataError(
-            f"{table.where(k)}: a reading is not a finite number ({','.join(table.rows[k])[:80]}; {int(bad.sum())} "
-            "lines in all); remove such lines"
+            f"{table.where(int(np.argmax(bad)))}: a reading is not a finite number ({int(bad.sum())} lines in all); "
+            "remove such lines"
         )
-    return values
-
-
-def numbers_of(table: TextTable) -> FloatArray:
-    """Return all columns but the first (N, K); NaN: no number."""
-    return np.array([[_number(x) for x in row[1:]] for row in table.rows])
-
-
-def _number(text: str) -> float:
-    return float(text) if _NUMBER.fullmatch(text) else float("nan")
+    return table.values
 
 
 _DATE = re.compile(r"(19|20|21)\d\d-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{0,9})?")  # whose nanoseconds fit 64 bits

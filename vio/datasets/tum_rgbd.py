@@ -11,9 +11,8 @@ import numpy as np
 
 from vio.cameras.rig import Rig
 from vio.datasets.frame_times import nearest
-from vio.datasets.tables import parse_stamps
+from vio.datasets.tables import parse_stamps, table_rows
 from vio.errors import DataError
-from vio.files.text import text_lines
 from vio.geometry.distortion import CameraModel
 from vio.records import IntArray
 
@@ -57,12 +56,9 @@ def associated_images(path: Path) -> tuple[list[Path], list[Path], IntArray, tup
 
 def _read_list(file: Path) -> tuple[IntArray, list[Path]]:
     """Read the stamps (N,) and files of a list."""
-    rows = [(n, line.split()) for n, line in text_lines(file) if line.strip() and not line.startswith("#")]
-    wrong = next((n for n, fields in rows if len(fields) != 2), None)
-    if wrong is not None or not rows:
-        raise DataError(f"{file}, line {wrong or 1}: expected lines 'time file'; copy it again")
-    times_ns = parse_stamps([fields[0] for _, fields in rows], lambda k: f"{file}, line {rows[k][0]}", "s")
-    return times_ns, [file.parent / fields[1] for _, fields in rows]
+    _, *rows = table_rows(file, 2, "time file")
+    times_ns = parse_stamps([time for _, (time, _) in rows], lambda k: f"{file}, line {rows[k][0]}", "s")
+    return times_ns, [file.parent / name for _, (_, name) in rows]
 
 
 def published_camera(path: Path, size: tuple[int, int]) -> Rig:

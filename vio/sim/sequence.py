@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.datasets.common import blank_frames, frame_range, merge_events
-from vio.datasets.euroc_files import read_imu_csv, stamped_rows
 from vio.datasets.samples import imu_samples, in_time_order
+from vio.datasets.tables import read_imu_table, stamped_rows
 from vio.errors import DataError, SimulationError
 from vio.files.text import check_increasing
 from vio.geometry.distortion import StereoRig, rectified_pair
@@ -403,7 +403,8 @@ def read_flight(groundtruth: Path, image_times: Path | None = None, imu_csv: Pat
     times = times[(times >= motion.start_ns) & (times <= motion.end_ns)]
     if len(times) == 0:
         raise DataError(f"no image time is within the ground truth {groundtruth}; use the same clock for both")
-    return RecordedFlight(motion, fit, times, None if imu_csv is None else read_imu_csv(imu_csv))
+    imu = None if imu_csv is None else read_imu_table(imu_csv, whole_ns=True)[0]
+    return RecordedFlight(motion, fit, times, imu)
 
 
 def room_around(motion: MotionSpline, *, seed: int = 0, texel_m: float | None = None) -> World:
