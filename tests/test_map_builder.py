@@ -301,10 +301,13 @@ def test_with_a_density_each_cubic_metre_keeps_features_of_so_many_keyframes(
     assert prune_map(path, density)["keyframes"] == shows.sum()
 
 
-def test_a_checkpoint_goes_on_to_the_same_map(room_walk: Walk, whole_map: MapBuilder, tmp_path: Path) -> None:
+@pytest.mark.parametrize("density", [None, 1])
+def test_a_checkpoint_goes_on_to_the_same_map(density: int | None, room_walk: Walk, tmp_path: Path) -> None:
     keyframes = list(room_walk.keyframes(seed=0))
-    path = tmp_path / "b.map"
-    builder = _map(room_walk, path, rows=slice(0, 30))
+    path, whole = tmp_path / "b.map", _map(room_walk, tmp_path / "a.map", density=density)
+    whole.finish()
+    whole.close()
+    builder = _map(room_walk, path, rows=slice(0, 30), density=density)
     builder.commit()
     dataset = cast("Dataset", SimpleNamespace(observations=None))
     save_checkpoint(tmp_path / "state", builder, dataset)
@@ -318,10 +321,16 @@ def test_a_checkpoint_goes_on_to_the_same_map(room_walk: Walk, whole_map: MapBui
         resumed.add(keyframe, features)
     resumed.finish()
     resumed.close()
-    np.testing.assert_array_equal(resumed.graph.T_map_cam.rows, whole_map.graph.T_map_cam.rows)
-    rows = [[r.T_map_cam.tobytes() for r in MapStore(p, read_only=True).keyframes()] for p in (path, whole_map.path)]
+    np.testing.assert_array_equal(resumed.graph.T_map_cam.rows, whole.graph.T_map_cam.rows)
+    np.testing.assert_array_equal(resumed.places.shows_something, whole.places.shows_something)
+    assert resumed.places.shows_something.all() == (density is None)
+    rows = []
+    for of in (path, whole.path):
+        with closing(MapStore(of, read_only=True)) as store:
+            poses = [row.T_map_cam.tobytes() for row in store.keyframes()]
+            rows.append((poses, [len(store.features(k)) for k in range(len(poses))], str(store.loops())))
     assert rows[0] == rows[1]
-    assert rows[0] == [T.tobytes() for T in resumed.graph.T_map_cam.rows], "the file holds what was optimised"
+    assert rows[0][0] == [T.tobytes() for T in resumed.graph.T_map_cam.rows], "the file holds what was optimised"
 
 
 def test_the_map_is_made_of_pixels_without_what_the_calibration_is_found_to_be_off_by(

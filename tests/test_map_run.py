@@ -286,6 +286,28 @@ def test_motions_are_joined_where_the_window_moves_on(tmp_path: Path) -> None:
     assert np.linalg.eigvalsh(motion.covariance)[0] > 7.0, "of eight steps of unit variance each"
 
 
+@pytest.mark.parametrize("wrong", [8, 10])
+def test_a_motion_does_not_follow_a_frame_that_the_filter_takes_back(wrong: int, tmp_path: Path) -> None:
+    """Its window is half a metre off as of one frame, the keyframe itself or one after it, and right again."""
+    session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False)
+    step, gray = se3_exp([0.0, 0.0, 0.05, 0.0, 0.01, 0.0]), np.zeros((64, 64), dtype=np.uint8)
+    for k in range(16):
+        off = [0.5 * (k == wrong), 0.0, 0.0, 0.0, 0.0, 0.0]
+
+        def relative(older: int, newer: int, off: list[float] = off) -> RelativePose:
+            n = newer - older
+            return RelativePose(np.linalg.matrix_power(step, n) @ se3_exp(np.multiply(off, n > 0)), 1e-6 * np.eye(6))
+
+        ids = np.arange(40) + 1000 * (k >= 8)
+        seen = observations(k, 10**8 * k, ids, np.tile([9.0, 9, 5, 9], (40, 1)))
+        estimate = Estimate(k, np.linalg.matrix_power(step, k) @ se3_exp(off), 1e-4 * np.eye(6))
+        session.frame(StereoFrame(k, 10**8 * k, gray, gray), seen, estimate, relative)
+    session.finish()
+    session.close()
+    ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
+    np.testing.assert_allclose(motion.T_i_j, np.linalg.matrix_power(step, 8), atol=1e-9)
+
+
 @pytest.mark.parametrize("alone", [False, True])
 def test_what_a_covered_camera_does_to_the_place(alone: bool, tmp_path: Path) -> None:
     """Ten dark frames of 0.1 s, which the filter's window does not hold: the covariance grows as the filter's own.
