@@ -16,6 +16,7 @@ import pytest
 import vio
 from tests.test_msckf import CAMERA, T_CAM0_IMU, Flight
 from tests.test_unfinished_runs import Stop
+from vio.bench.maps import map_figures
 from vio.cli import main
 from vio.config import Config
 from vio.datasets import open_dataset
@@ -507,6 +508,19 @@ def test_a_map_with_loops_is_adjusted_with_the_imu(looped: tuple[RunResult, Path
         graph = MapGraph(store)
     graph.optimise_part(0)
     np.testing.assert_allclose(graph.T_map_cam.rows, _poses(path), atol=1e-6)
+
+
+def test_the_errors_of_a_map_are_normalised_relative_to_its_first_keyframe(looped: tuple[RunResult, Path]) -> None:
+    result, path = looped
+    truth = result.recording.reference
+    assert truth is not None
+    score = evaluate(result.trajectory, truth, T_cam0_imu=result.T_cam0_body)
+    found = map_figures(result, score, truth, store=path, T_ref_map=None, covered=())
+    assert found["map_nees_95"] < 60, "the first poses known at the time have covariances of next to nothing"
+    assert "map_nees" not in map_figures(
+        replace(result, mapped=replace(result.mapped, loops=())),  # type: ignore[type-var]
+        score, truth, store=path, T_ref_map=None, covered=(),
+    )  # fmt: skip
 
 
 def test_a_map_that_turns_as_a_whole_has_not_moved() -> None:
