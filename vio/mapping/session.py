@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -43,7 +43,7 @@ _LOST_STEP = 3  # likewise while it has no place
 _LOST_M = 1.0  # standard deviation of the position, likewise
 _MOST_WAITING = 3  # keyframes without a result, where the odometry waits for none: beyond, the next one comes later
 HANDOVER_FRAMES = 10  # from a keyframe to the frame at which its result is taken over
-SETTLED_FRAMES = 5  # from a keyframe to the frame at which its motion is taken from the filter's window, as known then
+SETTLED_FRAMES = 3  # from a keyframe to the frame after which its motion is no longer corrected by the window
 # On the standard deviations of a motion: errors of a track last longer than a frame, which the window does not count.
 # Measured over a keyframe's step: 1.6 to 3.1 times the standard deviation (street), 1.2 to 3.1 (room).
 _MOTION_INFLATION = 2.0
@@ -61,11 +61,11 @@ _BROKEN = np.repeat([30.0**2, 1.0**2], 3)  # variance of the motion where the fi
 class _Held:
     """A keyframe whose motion the filter's window still corrects."""
 
-    keyframe: Keyframe
+    keyframe: Keyframe  # without its motion
     due: int  # when its motion is taken
     anchor: int | None  # a frame from which the window knows it; None: the first keyframe
     base: RelativePose | None  # from the keyframe before to the anchor, where that is another frame
-    motions: list[RelativePose] = field(default_factory=list)  # since the keyframe before, as known at each frame since
+    motions: list[RelativePose]  # since the keyframe before, as known at each frame from it on
 
 
 class MapSession:
@@ -253,8 +253,8 @@ class MapSession:
         if self._known is None:
             return None
         now = RelativePose(np.eye(4) if self._T_map_cam is None else self._T_map_cam, self._known)
-        for motion in [*(m for _, m in self._moves), *(h.keyframe.motion for h in self._held)]:
-            now = now if motion is None else now.then(motion)
+        for motion in [*(move[1] for move in self._moves), *(m for h in self._held for m in h.motions[-1:])]:
+            now = now.then(motion)
         if self._newest is not None:
             now = now.then(self._newest[1])
         if self._dark is not None:
@@ -313,16 +313,16 @@ class MapSession:
         assert frame.right is not None
         T_odom_cam = estimate.T_world_imu @ self._T_body_cam
         up, sigma = self._vertical(estimate)
-        motion = None if motion is None else _inflated(motion)
-        keyframe = Keyframe(frame.index, frame.time_ns, T_odom_cam, motion, up, sigma, self._field)
-        self._held.append(_Held(keyframe, self._frames + SETTLED_FRAMES, self._anchor, self._base))
+        keyframe = Keyframe(frame.index, frame.time_ns, T_odom_cam, None, up, sigma, self._field)
+        motions = [] if motion is None else [_inflated(motion)]
+        self._held.append(_Held(keyframe, self._frames + SETTLED_FRAMES, self._anchor, self._base, motions))
         self._features.append(self._executor.submit(extract, frame.left, frame.right))
         self._ids, self._base, self._anchor, self._since = ids, None, frame.index, 0
         self._last_keyframe = frame.index
         self._newest = frame.index, RelativePose(np.eye(4), np.zeros((6, 6))), T_odom_cam
 
     def _release(self, relative: Relative | None) -> None:
-        """Correct the motions of the newest keyframes, and hand over those that are due; None: all, as they are.
+        """Take the newest motions as known now, and hand over the keyframes that are due; None: all, as they are.
 
         A filter may take a single image wrongly and notice it with the next ones.
         """
@@ -330,15 +330,14 @@ class MapSession:
             motion = None if relative is None or held.anchor is None else relative(held.anchor, held.keyframe.frame)
             if motion is not None:
                 motion = motion.seen_by(self._T_cam_body)
-                held.motions.append(motion if held.base is None else held.base.then(motion))
-                held.keyframe = replace(held.keyframe, motion=_inflated(_middle(held.motions)))
+                held.motions.append(_inflated(motion if held.base is None else held.base.then(motion)))
         while self._held and (relative is None or self._held[0].due <= self._frames):
             held = self._held.pop(0)
-            frame, motion = held.keyframe.frame, held.keyframe.motion
-            result = self._executor.submit(_add, self._builder, held.keyframe, self._features.pop(0))
-            self._waiting.append((held.due + HANDOVER_FRAMES - SETTLED_FRAMES, frame, result))
-            if motion is not None:
-                self._moves.append((frame, motion))
+            keyframe = replace(held.keyframe, motion=_middle(held.motions) if held.motions else None)
+            result = self._executor.submit(_add, self._builder, keyframe, self._features.pop(0))
+            self._waiting.append((held.due + HANDOVER_FRAMES - SETTLED_FRAMES, keyframe.frame, result))
+            if keyframe.motion is not None:
+                self._moves.append((keyframe.frame, keyframe.motion))
 
     def _vertical(self, estimate: Estimate) -> tuple[FloatArray | None, float]:
         """Direction against gravity in the camera (3,) and its standard deviation; None where it is not known."""
