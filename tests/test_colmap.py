@@ -83,11 +83,9 @@ def round_trip() -> Simulation:
 def _add_loop(run: Path, ends: tuple[int, int], *, points: int = 120) -> None:
     """Write a loop between two frames as a run with a map does, with exact geometry and noise, and poses in the map."""
     saved, rng = read_saved_run(run), np.random.default_rng(6)
-    assert saved.truth is not None
     truth = saved.truth.trajectory.in_cam0(saved.T_cam0_imu)
     rows = [int(np.flatnonzero(saved.tracked.frames == k)[0]) for k in ends]
     times = saved.tracked.trajectory.times_ns
-    assert times is not None
     T = [truth.T_world_body[k] for k in rows]
     camera, p = saved.tracked.camera, rng.uniform([-0.9, -0.6, 1.5], [0.9, 0.6, 5.0], (points, 3))
     z = [project(camera, transform_points(se3_inverse(T_k) @ T[0], p)) for T_k in T]
@@ -279,7 +277,6 @@ def test_refine_uses_the_matches_of_loops(tmp_path: Path, capsys: pytest.Capture
     """Tracks of three frames drift; a loop says where the camera has come back to."""
     run = _make_run(round_trip(), tmp_path / "run", lost_after=3)
     truth = read_saved_run(run).truth
-    assert truth is not None
     true = truth.trajectory.in_cam0(truth.T_cam0_imu).T_world_body[list(LOOP)]
     errors, facts = [], []
     for with_loop in (False, True):

@@ -145,7 +145,6 @@ def _assert_same(a: RunResult, b: RunResult) -> None:
     for name in ("ids", "p_world", "covariance"):
         np.testing.assert_array_equal(*(getattr(r.landmarks, name)[k] for r, k in zip((a, b), order, strict=True)))
     if a.dead_reckoning is not None:
-        assert b.dead_reckoning is not None
         np.testing.assert_array_equal(a.dead_reckoning.T_world_body, b.dead_reckoning.T_world_body)
     assert a.warnings == b.warnings
 
