@@ -10,8 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.commands import wait_for
 from tests.dataset_makers import FRAME_S, make_drive, make_kitti, make_mat, utias_arrays
 from vio.bench import execute
 from vio.bench.bench import Place, bench, has_succeeded, read_bench
@@ -438,10 +438,10 @@ def test_a_bench_that_is_killed_goes_on_where_it_was(
     argv += ["--cache", str(tmp_path / "cache"), "--workers", "1", "--quiet"]
     results = tmp_path / "cache" / "results"
     with subprocess.Popen([sys.executable, "-m", "vio", *argv], cwd=ROOT, stderr=subprocess.PIPE) as process:
-        _wait_for(lambda: len(list(results.glob("*/*.json"))) == 1)
-        _wait_for(lambda: len(_workers(tmp_path)) == 1)
+        wait_for(lambda: len(list(results.glob("*/*.json"))) == 1)
+        wait_for(lambda: len(_workers(tmp_path)) == 1)
         os.kill(process.pid, signal.SIGKILL)
-    _wait_for(lambda: not _workers(tmp_path))
+    wait_for(lambda: not _workers(tmp_path))
     assert len(list((tmp_path / "cache").glob("task-*"))) == 1, "which the next call removes"
     before = {path: path.stat().st_mtime_ns for path in results.glob("*/*.json")}
     assert len(before) == 1, "the second task was in its middle"
@@ -472,13 +472,6 @@ def _workers(folder: Path) -> list[str]:
         if "vio.bench.worker" in text and str(folder) in text:
             found.append(text)
     return found
-
-
-def _wait_for(holds: Callable[[], bool], seconds: float = 600.0) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.02)
 
 
 def _check_files(out: Path) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import vio
+from tests.commands import render
 from tests.test_msckf import CAMERA, T_CAM0_IMU, Flight
 from tests.test_unfinished_runs import Stop
 from vio.cli import main
@@ -50,11 +51,8 @@ from vio.runs.recorder import GrowingFolder
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rendered flight as an EuRoC folder: 20 frames of 320 pixels with an IMU, over 2 s."""
-    folder = tmp_path_factory.mktemp("flight") / "flight"
-    options = {"rig": "small", "width": "320", "rate": "10", "duration": "2", "workers": "1", "format": "euroc"}
-    arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
-    assert main(["render", "--out", str(folder), "--json", *arguments]) == 0
-    return folder
+    options = {"rig": "small", "width": "320", "rate": "10", "duration": "2", "format": "euroc"}
+    return render(tmp_path_factory.mktemp("flight") / "flight", **options)
 
 
 @pytest.fixture(scope="module")

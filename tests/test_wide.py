@@ -12,6 +12,7 @@ import pytest
 
 import vio
 from tests import test_msckf
+from tests.commands import render
 from tests.numpy_twins import residuals
 from vio.cameras.rectification_error import TERMS, error_jacobian
 from vio.cameras.rig import Rig
@@ -47,11 +48,8 @@ _EXACT = "--set", "msckf.calibrate_stereo=off"  # pixels stay as they were measu
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rendered flight as an EuRoC folder: 9 frames of 160 pixels over 0.9 s."""
-    folder = tmp_path_factory.mktemp("flight") / "wide"
-    options = {"rig": "wide", "width": "160", "rate": "10", "duration": "0.9", "workers": "1"}
-    arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
-    assert main(["render", "--out", str(folder), "--json", *arguments]) == 0
-    return folder
+    options = {"rig": "wide", "width": "160", "rate": "10", "duration": "0.9"}
+    return render(tmp_path_factory.mktemp("flight") / "wide", **options)
 
 
 @pytest.fixture(scope="module")
