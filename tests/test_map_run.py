@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import vio
+from tests.commands import render
 from tests.test_msckf import CAMERA, T_CAM0_IMU, Flight
 from tests.test_unfinished_runs import Stop
 from vio.bench.maps import map_figures
@@ -51,11 +52,8 @@ from vio.runs.recorder import GrowingFolder
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rendered flight as an EuRoC folder: 20 frames of 320 pixels with an IMU, over 2 s."""
-    folder = tmp_path_factory.mktemp("flight") / "flight"
-    options = {"rig": "small", "width": "320", "rate": "10", "duration": "2", "workers": "1", "format": "euroc"}
-    arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
-    assert main(["render", "--out", str(folder), "--json", *arguments]) == 0
-    return folder
+    options = {"rig": "small", "width": "320", "rate": "10", "duration": "2", "format": "euroc"}
+    return render(tmp_path_factory.mktemp("flight") / "flight", **options)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +87,6 @@ def test_a_run_with_a_map_writes_its_poses_and_its_metrics(mapped: Path) -> None
     assert (np.linalg.eigvalsh(covariance)[1:] > 0).all()
     assert (mapped / "loops.csv").read_text().startswith("frame,time_ns,keyframe")
     finished = read_finished_run(mapped)
-    assert finished.mapped is not None
     assert finished.loops == ()
     keyframes = finished.map_keyframes
     assert len(keyframes.frame) == metrics["keyframes"]
@@ -108,7 +105,6 @@ def test_loops_are_read_as_they_were_written(tmp_path: Path) -> None:
     write_loops(tmp_path, loops)
     found = read_loops(tmp_path)
     assert found == loops
-    assert found[0].matches is not None
     np.testing.assert_array_equal(found[0].matches.z_frame, z[1])
     np.testing.assert_array_equal(found[0].matches.has_right_keyframe, has_right[0])
     (tmp_path / "loops.csv").write_text("frame,time_ns\n1,2\n")
@@ -121,7 +117,6 @@ def test_a_run_goes_on_to_the_same_map(flight: Path, mapped: Path, tmp_path: Pat
     first = run(open_dataset(flight), Config(), map=MapUse(path), control=RunControl(folder, should_stop=Stop(300)))
     assert 5 < len(first.frames) < 20
     second = run(open_dataset(flight), Config(), map=MapUse(path), control=RunControl(folder, resume=True))
-    assert second.mapped is not None
     final = read_trajectory(mapped / "map_trajectory.tum")
     np.testing.assert_allclose(second.mapped.T_map_body, final.T_world_body, atol=1e-8)
     rows = [
@@ -216,7 +211,6 @@ def test_live_estimates_have_their_pose_in_the_map(flight: Path, mapped: Path, t
                 assert event.left is not None
                 assert event.right is not None
                 estimate = odometry.add_stereo(event.time_ns, event.left, event.right)
-                assert estimate is not None
                 assert estimate.T_map_body is not None
                 np.testing.assert_allclose(estimate.T_map_body, estimate.T_world_imu, atol=1e-12)
         assert odometry.loops == ()
@@ -235,7 +229,6 @@ def _motions(seed: int) -> tuple[FloatArray, FloatArray]:
     for k in range(16):
         filter_.update(flight.observe(k, 0.5, rng))
     whole = filter_.relative(6, 15)
-    assert whole is not None
     truth = se3_inverse(flight.T_world_imu(6)) @ flight.T_world_imu(15)
     r = se3_log(se3_inverse(whole.T_i_j) @ truth)
     parts = [filter_.relative(6, 10), filter_.relative(10, 15)]
@@ -456,7 +449,6 @@ def looped(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RunR
     """A run with an IMU, whose first and last keyframe a loop joins, and its map."""
     path = tmp_path_factory.mktemp("looped") / "yard.map"
     result = run(open_dataset(flight), Config(), map=MapUse(path), keep_observations=True)
-    assert result.mapped is not None
     assert result.observations is not None
     assert result.mapped.adjustment is None
     frames = result.mapped.in_map.frame.tolist()
@@ -487,8 +479,6 @@ def test_a_map_with_loops_is_adjusted_with_the_imu(looped: tuple[RunResult, Path
     result, path = _copied(looped, tmp_path)
     before = _poses(path)
     done = adjust_map(result, path).mapped
-    assert done is not None
-    assert done.adjustment is not None
     assert done.adjustment.startswith("with the IMU at ")
     in_map = done.in_map
     np.testing.assert_allclose(_poses(path) @ result.T_cam0_body, in_map.T_map_body, atol=1e-12)
@@ -550,7 +540,6 @@ def test_a_map_that_is_not_adjusted_stays_as_it_is(
 ) -> None:
     result, path = _copied(looped, tmp_path)
     mapped = result.mapped
-    assert mapped is not None
     before = _poses(path)
     asked = iter([None] * 3)
     reason = {"interrupted": lambda: next(asked, "interrupted")}.get(what, lambda: None)
@@ -565,7 +554,6 @@ def test_a_map_that_is_not_adjusted_stays_as_it_is(
         monkeypatch.setattr("vio.offline.inertial_adjustment._STEPS", 3)
     result = replace(result, mapped=mapped, observations=None if what == "unobserved" else result.observations)
     done = adjust_map(result, path, reason).mapped
-    assert done is not None
     assert words in (done.adjustment or "")
     assert done.T_map_body is mapped.T_map_body
     np.testing.assert_array_equal(_poses(path), before)
