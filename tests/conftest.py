@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import Phase, settings
 
+from tests.commands import render
 from vio.numerics.threads import one_blas_thread
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -60,13 +61,8 @@ def data_dir() -> Path:
 @pytest.fixture(scope="session")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rendered flight as an EuRoC folder: 16 frames of 160 pixels with an IMU."""
-    from vio.cli import main
-
-    folder = tmp_path_factory.mktemp("flight") / "flight"
-    options = {"rig": "small", "width": "160", "rate": "20", "duration": "0.8", "workers": "1", "format": "euroc"}
-    arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
-    assert main(["render", "--out", str(folder), "--json", *arguments]) == 0
-    return folder
+    options = {"rig": "small", "width": "160", "rate": "20", "duration": "0.8", "format": "euroc"}
+    return render(tmp_path_factory.mktemp("flight") / "flight", **options)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -10,8 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.commands import wait_for
 from tests.dataset_makers import FRAME_S, make_drive, make_kitti, make_mat, utias_arrays
 from vio.bench import execute
 from vio.bench.bench import Place, bench, has_succeeded, read_bench
@@ -244,7 +244,6 @@ def test_nees_of_poses_with_errors_of_their_covariance_is_six() -> None:
     score = evaluate(Trajectory(estimate, times_ns, "imu"), reference, T_cam0_imu=T_cam0_imu)
     for scale, expected in ((1, 6.0), (4, 1.5)):
         values = pose_nees(score, estimate, scale * covariances, T_cam0_imu, upright=False)
-        assert values is not None
         assert values.mean() == pytest.approx(expected, rel=0.03)
         assert np.percentile(values, 95) == pytest.approx(12.6 / scale, rel=0.05)  # chi-square of 6 degrees of freedom
     assert pose_nees(score, estimate, 0 * covariances, T_cam0_imu, upright=False) is None
@@ -261,8 +260,6 @@ def test_nees_of_an_upright_world_knows_that_the_first_inclination_was_uncertain
     times_ns = np.arange(len(truth), dtype=np.int64) * 10**8
     score = evaluate(Trajectory(estimate, times_ns, "imu"), Trajectory(truth, times_ns, "imu"))
     upright, whole = (pose_nees(score, estimate, covariances, np.eye(4), upright=flag) for flag in (True, False))
-    assert upright is not None
-    assert whole is not None
     assert upright.mean() == pytest.approx(6.0, rel=0.05)
     assert whole.mean() > 20
 
@@ -389,7 +386,6 @@ def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
     assert store.get("abcd") is None
     store.put("abcd", {"figures": {"ate_m": 0.1 + 0.2}, "failure": None})
     kept = store.get("abcd")
-    assert kept is not None
     assert kept["figures"]["ate_m"] == 0.1 + 0.2, "all digits"
     store.path("abcd").write_text('{"figures": ')
     assert store.get("abcd") is None
@@ -442,10 +438,10 @@ def test_a_bench_that_is_killed_goes_on_where_it_was(
     argv += ["--cache", str(tmp_path / "cache"), "--workers", "1", "--quiet"]
     results = tmp_path / "cache" / "results"
     with subprocess.Popen([sys.executable, "-m", "vio", *argv], cwd=ROOT, stderr=subprocess.PIPE) as process:
-        _wait_for(lambda: len(list(results.glob("*/*.json"))) == 1)
-        _wait_for(lambda: len(_workers(tmp_path)) == 1)
+        wait_for(lambda: len(list(results.glob("*/*.json"))) == 1)
+        wait_for(lambda: len(_workers(tmp_path)) == 1)
         os.kill(process.pid, signal.SIGKILL)
-    _wait_for(lambda: not _workers(tmp_path))
+    wait_for(lambda: not _workers(tmp_path))
     assert len(list((tmp_path / "cache").glob("task-*"))) == 1, "which the next call removes"
     before = {path: path.stat().st_mtime_ns for path in results.glob("*/*.json")}
     assert len(before) == 1, "the second task was in its middle"
@@ -478,13 +474,6 @@ def _workers(folder: Path) -> list[str]:
     return found
 
 
-def _wait_for(holds: Callable[[], bool], seconds: float = 600.0) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.02)
-
-
 def _check_files(out: Path) -> None:
     """Tables as CSV, and a report that loads nothing."""
     with (out / "table.csv").open() as stream:
@@ -497,7 +486,6 @@ def _check_files(out: Path) -> None:
     assert page.count("<svg") == 3
     assert not re.search(r'(?:src|href)="(?!https://example|#)[^"]*\.(?:js|css|png)|<script|@import', page)
     poses = read_trajectory(out / "trajectories" / "a.w.0.tum")
-    assert poses.frame_indices is not None
     assert poses.frame_indices.tolist() == list(range(14))
 
 

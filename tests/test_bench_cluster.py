@@ -9,13 +9,13 @@ import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.commands import PATIENCE_S, wait_for
 from tests.dataset_makers import make_drive, make_mat, utias_arrays
 from vio.bench.bench import Place, Result, bench
 from vio.bench.engines import run_on_dask
@@ -50,8 +50,8 @@ class Cluster:
 
     def wait_for_workers(self, number: int) -> None:
         """Return when the scheduler knows so many."""
-        with distributed.Client(self.address, timeout=_PATIENCE_S, set_as_default=False) as client:
-            client.wait_for_workers(number, timeout=_PATIENCE_S)
+        with distributed.Client(self.address, timeout=PATIENCE_S, set_as_default=False) as client:
+            client.wait_for_workers(number, timeout=PATIENCE_S)
 
     def _start(self, *words: str) -> subprocess.Popen[bytes]:
         environment = os.environ | {"PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": "false"}
@@ -82,16 +82,6 @@ class _Closing:
         self.cluster.stop()
 
 
-_PATIENCE_S = 600.0  # ends a test that hangs; beside other work each process may take half a minute to start
-
-
-def _wait_for(holds: Callable[[], bool], seconds: float = _PATIENCE_S) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.02)
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")
 def test_lost_workers_and_a_lost_scheduler_cost_no_row(cluster: Cluster, tmp_path: Path) -> None:
     """Two machines' worth of workers, one killed in its task, the scheduler restarted, a corrupt recording among good.
@@ -112,13 +102,13 @@ def test_lost_workers_and_a_lost_scheduler_cost_no_row(cluster: Cluster, tmp_pat
     found: list[Result] = []
     driver = threading.Thread(target=lambda: found.append(bench(suite, place)))
     driver.start()
-    _wait_for(lambda: len(list(cache.glob("task-*/job.json"))) == 2)  # both are at work
+    wait_for(lambda: len(list(cache.glob("task-*/job.json"))) == 2)  # both are at work
     os.kill(workers[0].pid, signal.SIGKILL)
-    _wait_for(lambda: any(cache.glob("results/*/*.json")))
+    wait_for(lambda: any(cache.glob("results/*/*.json")))
     os.kill(scheduler.pid, signal.SIGKILL)
     cluster.scheduler()
     cluster.worker()
-    driver.join(_PATIENCE_S)
+    driver.join(PATIENCE_S)
     assert found, (tmp_path / "dask.log").read_text(errors="replace")[-2000:]
     outcomes = {o.sequence: o for o in found[0].outcomes}
     assert [o.sequence for o in found[0].failures] == ["corrupt"]

@@ -114,6 +114,7 @@ def test_a_map_is_built_and_another_sequence_is_localised_in_it(tmp_path: Path) 
     assert first.figures["map_ate_m"] < 0.05
     assert first.figures["loops"] >= first.figures["loops_false"] == 0
     assert first.figures["place_s"] == 0.0
+    assert (first.figures["loops"] == 0) == (first.absent.get("map_nees_95") == "there is no loop")
     assert first.absent["again_s"] == "nothing covered the cameras"
     assert second.absent["loops"] == "no map was built"
     assert second.figures["map_causal_ate_m"] < 0.1

@@ -89,7 +89,6 @@ def test_a_model_that_broke_in_two_is_not_held_against_the_run() -> None:
     text = overall_verdict([_result("incremental", _poses(), _poses(1)), broken])
     assert text.startswith("the run and COLMAP agree: ")
     assert "COLMAP's global model breaks at frames 190 to 200, the other one does not" in text
-    assert broken.found is not None
     comparison = broken.found[1]
     assert comparison.piece.sum() == 20
     assert comparison.ate_m < 0.01, "the longer piece is compared, not the two as one"
@@ -121,7 +120,6 @@ def test_a_run_that_bends_evenly_does_not_agree() -> None:
 
 def test_a_missed_loop_is_named() -> None:
     result = _result("incremental", _poses(), _poses(1))
-    assert result.found is not None
     model = replace(result.found[0], revisits=np.array([[1, 28], [2, 29]]))
     text = overall_verdict([replace(result, found=(model, result.found[1]))])
     assert text.endswith("; frames 10 and 280 show one place, which the run did not close as a loop")

@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from tests.commands import refused
 from tests.dataset_makers import make_kitti
 from vio.cli import main
 from vio.config import Config
@@ -83,11 +84,9 @@ def round_trip() -> Simulation:
 def _add_loop(run: Path, ends: tuple[int, int], *, points: int = 120) -> None:
     """Write a loop between two frames as a run with a map does, with exact geometry and noise, and poses in the map."""
     saved, rng = read_saved_run(run), np.random.default_rng(6)
-    assert saved.truth is not None
     truth = saved.truth.trajectory.in_cam0(saved.T_cam0_imu)
     rows = [int(np.flatnonzero(saved.tracked.frames == k)[0]) for k in ends]
     times = saved.tracked.trajectory.times_ns
-    assert times is not None
     T = [truth.T_world_body[k] for k in rows]
     camera, p = saved.tracked.camera, rng.uniform([-0.9, -0.6, 1.5], [0.9, 0.6, 5.0], (points, 3))
     z = [project(camera, transform_points(se3_inverse(T_k) @ T[0], p)) for T_k in T]
@@ -118,11 +117,6 @@ def _json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, obje
     assert main([*arguments, "--json"]) == 0
     out: dict[str, object] = json.loads(capsys.readouterr().out)
     return out
-
-
-def _error(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    assert main(list(arguments)) == 1
-    return capsys.readouterr().err
 
 
 def _contents(folder: Path) -> dict[str, bytes]:
@@ -279,7 +273,6 @@ def test_refine_uses_the_matches_of_loops(tmp_path: Path, capsys: pytest.Capture
     """Tracks of three frames drift; a loop says where the camera has come back to."""
     run = _make_run(round_trip(), tmp_path / "run", lost_after=3)
     truth = read_saved_run(run).truth
-    assert truth is not None
     true = truth.trajectory.in_cam0(truth.T_cam0_imu).T_world_body[list(LOOP)]
     errors, facts = [], []
     for with_loop in (False, True):
@@ -291,7 +284,7 @@ def test_refine_uses_the_matches_of_loops(tmp_path: Path, capsys: pytest.Capture
         errors.append(float(np.linalg.norm(gap[:3, 3])))
     assert [f["loops"] for f in facts] == [0, 1]
     assert errors[1] < 0.5 * errors[0], errors
-    assert "its loops moved the poses away" in _error(capsys, "refine", str(run), "--priors", "filter")
+    assert "its loops moved the poses away" in refused(capsys, "refine", str(run), "--priors", "filter")
     exported = _json(capsys, "export", "colmap", str(run), "--no-images", "--refined", "--keyframes", "12")
     assert exported["loops"] == 1
     model = pycolmap.Reconstruction(run / "colmap" / "sparse" / "0")
@@ -319,7 +312,7 @@ def test_a_feature_of_several_loops_is_one_point() -> None:
 def test_priors_need_a_filter_that_reproduces_the_run(
     folder: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert "--imu takes a run with an IMU" in _error(capsys, "refine", str(folder), "--imu")
+    assert "--imu takes a run with an IMU" in refused(capsys, "refine", str(folder), "--imu")
     held = _json(capsys, "refine", str(folder), "--priors", "filter", "--keyframes", "12")
     assert held["priors"] == "filter"
     free = _json(capsys, "refine", str(folder), "--keyframes", "12")
@@ -350,16 +343,16 @@ def test_an_interrupted_refinement_leaves_nothing(
 def test_refine_reports_unusable_runs(
     simulation: Simulation, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "no run folder" in _error(capsys, "refine", str(tmp_path))
+    assert "no run folder" in refused(capsys, "refine", str(tmp_path))
     short = _make_run(simulation, tmp_path / "short", stop=1)
-    assert "a run of 1 frames has fewer than two views" in _error(capsys, "refine", str(short))
+    assert "a run of 1 frames has fewer than two views" in refused(capsys, "refine", str(short))
     blink = _make_run(simulation, tmp_path / "blink", stop=20, lost_after=1)
-    message = _error(capsys, "refine", str(blink))
+    message = refused(capsys, "refine", str(blink))
     assert "not observable because no feature is seen consistently in 2 keyframes" in message
     assert "do not overlap" in message
     assert not (blink / "refined").exists()
     (folder / "observations.npz").unlink()
-    assert "repeat its run with --save-observations" in _error(capsys, "refine", str(folder))
+    assert "repeat its run with --save-observations" in refused(capsys, "refine", str(folder))
 
 
 # --- export ---------------------------------------------------------------------------------------------------------
@@ -387,9 +380,9 @@ def test_export_without_images_is_a_reference_for_eval(folder: Path, capsys: pyt
 
 
 def test_export_reports_missing_images(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "name the recording with --source" in _error(capsys, "export", "colmap", str(folder))
+    assert "name the recording with --source" in refused(capsys, "export", "colmap", str(folder))
     assert not (folder / "colmap").exists()
-    assert "create it with `vio refine" in _error(capsys, "export", "colmap", str(folder), "--refined")
+    assert "create it with `vio refine" in refused(capsys, "export", "colmap", str(folder), "--refined")
 
 
 # --- rendered images ------------------------------------------------------------------------------------------------

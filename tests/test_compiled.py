@@ -468,8 +468,6 @@ def test_functions_run_where_no_cache_folder_is_writable(tmp_path: Path, monkeyp
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     (tmp_path / "part.py").write_text(MODULE)
     spec = importlib.util.spec_from_file_location("part", tmp_path / "part.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     assert module.doubled(3.0) == 6.0

@@ -58,11 +58,9 @@ def test_factors_are_the_features_of_the_drive(tmp_path: Path) -> None:
     assert any("not used: the points X Y Z" in note for note in recording.notes)
     for k in (0, 5, 11):
         seen = dataset.observations(k)
-        assert seen is not None
         ids = np.flatnonzero(DRIVE.features[0, :, k] != -1)
         assert seen.ids.tolist() == ids.tolist()
         np.testing.assert_allclose(seen.z, DRIVE.features[:, ids, k].T, atol=1e-5)
-    assert recording.reference is not None
     assert recording.reference.body == "cam0"
     np.testing.assert_allclose(recording.reference.T_world_body, T_world_cam(DRIVE), atol=1e-7)
 
@@ -73,8 +71,6 @@ def test_numbers_with_gaps_keep_their_times(tmp_path: Path) -> None:
     path.write_text("\n".join(lines))
     recording = read_gtsam(path).recording
     assert recording.frame_times_ns.tolist() == [100_000_000 * k for k in range(12) if k not in (3, 4)]
-    assert recording.reference is not None
-    assert recording.reference.times_ns is not None
     assert recording.reference.times_ns.tolist() == recording.frame_times_ns.tolist()
 
 

@@ -53,7 +53,6 @@ def test_reads_a_self_contained_folder_completely(tmp_path: Path) -> None:
     assert recording.motion == {"velocity"}
     assert recording.notes == ()
     drive = make_drive(5)
-    assert recording.reference is not None
     assert recording.T_cam0_imu is not None
     in_imu = se3_inverse(recording.T_cam0_imu) @ recording.reference.T_world_body @ recording.T_cam0_imu
     np.testing.assert_allclose(in_imu, drive.T_world_imu, atol=1e-9)
@@ -95,8 +94,6 @@ def test_shorter_reference_covers_the_first_frames(tmp_path: Path) -> None:
     lines = (folder / "poses.txt").read_text().splitlines(keepends=True)
     (folder / "poses.txt").write_text("".join(lines[:3]))
     reference = read_kitti(folder, DEFAULT).recording.reference
-    assert reference is not None
-    assert reference.frame_indices is not None
     assert reference.frame_indices.tolist() == [0, 1, 2]
 
 
@@ -140,9 +137,7 @@ def test_colour_moves_extrinsics_and_reference_to_camera_2(tmp_path: Path) -> No
     gray = read_kitti(folder, DEFAULT).recording
     colour = read_kitti(folder, DatasetSettings(colour=True)).recording
     assert gray.T_cam0_imu is not None
-    assert gray.reference is not None
     assert colour.T_cam0_imu is not None
-    assert colour.reference is not None
     T_cam2_cam0 = se3_from_parts(np.eye(3), [0.06, 0, 0])  # camera 2 is 6 cm left of camera 0
     np.testing.assert_allclose(colour.T_cam0_imu, T_cam2_cam0 @ gray.T_cam0_imu, atol=1e-12)
     # Both describe one motion of the body: relative poses in the imu frame agree, whichever camera was watched.
@@ -158,7 +153,6 @@ def test_colour_moves_extrinsics_and_reference_to_camera_2(tmp_path: Path) -> No
     np.testing.assert_allclose(colour.reference.T_world_body[0], np.eye(4), atol=1e-12)
     assert np.abs(colour.reference.positions[-1] - gray.reference.positions[-1]).max() > 1e-4
     frame = next(e for e in read_kitti(folder, DatasetSettings(colour=True)).events() if isinstance(e, StereoFrame))
-    assert frame.left is not None
     assert frame.left.ndim == 2
 
 
@@ -387,8 +381,6 @@ def test_real_recording(name: str, count: int, camera: StereoCamera, data_dir: P
     assert len(events) == 6
     for frame in events[1::2]:
         assert isinstance(frame, StereoFrame)
-        assert frame.left is not None
-        assert frame.right is not None
         assert frame.left.shape == frame.right.shape == (camera.height, camera.width)
 
 
@@ -416,7 +408,6 @@ def test_real_extrinsics_relate_velocities_to_the_reference(name: str, data_dir:
 def test_real_images_match_along_rows(data_dir: Path) -> None:
     """The left image's patches are found in the right image on the same row, to the left: the pair is not swapped."""
     frame = next(e for e in read_kitti(data_dir / "kitti_0039", DEFAULT).events() if isinstance(e, StereoFrame))
-    assert frame.left is not None
     assert frame.right is not None
     corners = cv2.goodFeaturesToTrack(frame.left[:, 200:-50], 60, 0.05, 20).reshape(-1, 2).astype(int)
     disparities = []

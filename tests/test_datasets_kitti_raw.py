@@ -73,7 +73,6 @@ def test_frames_are_rectified_as_opencv_would(tmp_path: Path) -> None:
             rectifying_rotations(rig)[:2],
             strict=True,
         ):
-            assert image is not None
             D = np.array([model.coefficients])
             maps = cv2.initUndistortRectifyMap(model.K, D, R, camera.K, (64, 48), cv2.CV_32FC1)
             expected = cv2.remap(load_gray(path)[0], *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -88,7 +87,6 @@ def test_images_rectified_by_kitti_pass_through(tmp_path: Path) -> None:
     assert (camera.fu, camera.cu, camera.cv) == (38.0, 27.0, 19.0)
     assert camera.baseline_m == pytest.approx(0.11, abs=1e-9)
     assert (camera.width, camera.height) == RECT_SIZE
-    assert dataset.recording.T_cam0_imu is not None
     R_rect = so3_exp([0.004, 0.01, -0.002])
     expected = (R_rect @ (T_CAM0_VELO @ T_VELO_IMU)[:3, :3], R_rect @ (T_CAM0_VELO @ T_VELO_IMU)[:3, 3])
     np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3, :3], expected[0], atol=1e-9)
@@ -296,8 +294,6 @@ def test_real_extrinsics_agree_with_the_odometry_folder(data_dir: Path) -> None:
     """`T_cam0_imu` of the rectified clip is R_rect_00 T_cam0_velo T_velo_imu; this one differs by a known rotation."""
     dataset, published = _real(data_dir)
     other = open_dataset(data_dir / "kitti_0039").recording.T_cam0_imu
-    assert other is not None
-    assert dataset.recording.T_cam0_imu is not None
     R_rect_cam0 = rectifying_rotations(dataset.rectifier.rig)[0]
     expected = R_rect_cam0 @ published.R_rect_cam0.T @ other[:3]
     np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3], expected, atol=1e-4)
@@ -335,7 +331,6 @@ def test_real_rectified_images_show_features_where_those_of_kitti_do(data_dir: P
     pairs = ((frame.left, theirs.left, published.R_rect_cam0), (frame.right, theirs.right, published.R_rect_cam1))
     for (ours, other, R_theirs), R in zip(pairs, R_ours, strict=True):
         assert ours is not None
-        assert other is not None
         H = K_theirs @ R_theirs @ R.T @ np.linalg.inv(K_ours)
         turned = cv2.warpPerspective(ours, H, other.shape[::-1])
         corners = cv2.goodFeaturesToTrack(turned[20:-20, 20:-20], 300, 0.01, 12) + np.float32(20)

@@ -119,7 +119,6 @@ def test_round_trip_keeps_every_bit(
     assert [frame.index for frame in frames] == [o.frame_index for o in observed]
     for expected in observed:
         found = dataset.observations(expected.frame_index)
-        assert found is not None
         assert (found.frame_index, found.time_ns) == (expected.frame_index, expected.time_ns)
         for field in ("ids", "z", "has_right", "stale"):
             assert _same_bits(getattr(found, field), getattr(expected, field))
@@ -147,7 +146,6 @@ def test_a_left_only_feature_keeps_its_arbitrary_right_pixels(tmp_path: Path) ->
     seen = Observations(1, 100, np.array([3]), z, np.array([False]), np.array([True]))
     write_observation_log(tmp_path / "a.npz", _recording(), [seen], [])
     found = read_observation_log(tmp_path / "a.npz").observations(1)
-    assert found is not None
     assert found.z.tobytes() == z.tobytes()
 
 
@@ -259,7 +257,6 @@ def test_the_required_arrays_alone_are_a_recording(tmp_path: Path) -> None:
     assert dataset.recording.T_cam0_imu is None
     assert [type(event) for event in dataset.events()] == [StereoFrame, StereoFrame]
     seen = dataset.observations(0)
-    assert seen is not None
     assert (seen.ids.dtype, seen.z.dtype) == (np.int64, np.float64)
     assert seen.ids.tolist() == [1, 2]
     assert seen.has_right.tolist() == [True, False]

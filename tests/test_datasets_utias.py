@@ -44,7 +44,6 @@ def test_reads_a_synthetic_file_completely(tmp_path: Path) -> None:
     recording = dataset.recording
     np.testing.assert_allclose(recording.camera.M, CAMERA.M, rtol=1e-12)
     np.testing.assert_allclose(recording.T_cam0_imu, T_CAM0_IMU, atol=1e-12)
-    assert recording.reference is not None
     assert recording.reference.body == "imu"
     np.testing.assert_array_equal(recording.reference.times_ns, recording.frame_times_ns)
     np.testing.assert_allclose(recording.reference.T_world_body, drive.T_world_imu, atol=1e-12)
@@ -52,7 +51,6 @@ def test_reads_a_synthetic_file_completely(tmp_path: Path) -> None:
     assert dataset.variances is None
     assert recording.notes == ("velocities cover 11 frames, features 8; the first 8 are read",)
     observed = dataset.observations(5)
-    assert observed is not None
     seen = np.flatnonzero(drive.features[0, :, 5] != -1)
     np.testing.assert_array_equal(observed.ids, seen)
     np.testing.assert_array_equal(observed.z, drive.features[:, seen, 5].T)
@@ -136,7 +134,6 @@ def test_published_drive(name: str, drives: dict[str, FeatureDataset]) -> None:
     assert dataset.recording.camera.baseline_m == pytest.approx(0.53715, abs=1e-5)
     assert not dataset.stale_frames.any()
     reference = dataset.recording.reference
-    assert reference is not None
     assert len(reference) == frames
     np.testing.assert_allclose(reference.T_world_body[0], np.eye(4), atol=1e-12)
 
@@ -148,7 +145,6 @@ def test_theta_is_the_rotation_vector_from_vehicle_to_inertial_axes(
     """`R_i_v = exp(theta)` agrees with the measured rates; `exp(-theta)` does not."""
     dataset = drives[name]
     reference = dataset.recording.reference
-    assert reference is not None
     R = reference.T_world_body[:, :3, :3]
     dt = np.diff(dataset.recording.frame_times_ns)[:, None] * 1e-9
     w = _angular(dataset)
@@ -168,7 +164,6 @@ def test_features_reproject_under_the_reference_with_these_extrinsics(
     dataset = drives[name]
     recording = dataset.recording
     assert recording.reference is not None
-    assert recording.T_cam0_imu is not None
     other = recording.T_cam0_imu.copy()
     other[:3, 3] = -recording.T_cam0_imu[:3, :3].T @ recording.T_cam0_imu[:3, 3]
     medians = []
@@ -181,8 +176,6 @@ def test_features_reproject_under_the_reference_with_these_extrinsics(
 
 def _ahead(dataset: FeatureDataset, poses: FloatArray, t: int) -> FloatArray:
     here, there = dataset.observations(t), dataset.observations(t + 3)
-    assert here is not None
-    assert there is not None
     common, a, b = np.intersect1d(here.ids, there.ids, return_indices=True)
     p, valid = triangulate(dataset.recording.camera, here.z[a], min_disparity_px=2.0)
     p = transform_points(se3_inverse(poses[t + 3]) @ poses[t], p)
@@ -200,21 +193,16 @@ def test_starry_night(starry_night: FeatureDataset) -> None:
     assert recording.camera == StereoCamera(
         484.49984741211, 484.4998474121, 321.68048095703, 247.4814453125, 0.23997700214386
     )
-    assert recording.landmarks_reference is not None
     assert recording.landmarks_reference.p_world.shape == (20, 3)
     assert not recording.landmarks_reference.covariance.any()
     assert not starry_night.tracks.stale.any()  # it repeats integer pixels, but only while stationary
-    assert starry_night.variances is not None
     np.testing.assert_allclose(starry_night.variances.pixels, [37.98, 129.84, 41.95, 132.5], atol=0.1)
 
 
 def test_starry_night_reprojects_with_the_published_variance(starry_night: FeatureDataset) -> None:
     """Reprojection of the known landmarks from the known poses has exactly the file's `y_var`."""
     recording = starry_night.recording
-    assert recording.reference is not None
     assert recording.T_cam0_imu is not None
-    assert recording.landmarks_reference is not None
-    assert starry_night.variances is not None
     poses = recording.reference.in_cam0(recording.T_cam0_imu).T_world_body
     frames = starry_night.tracks.frames
     p_world = recording.landmarks_reference.p_world[starry_night.tracks.ids]
@@ -226,7 +214,6 @@ def test_starry_night_reprojects_with_the_published_variance(starry_night: Featu
 
 def test_theta_of_the_raw_file_is_the_reference_pose(data_dir: Path, starry_night: FeatureDataset) -> None:
     raw = loadmat(data_dir / "utias_starry_night" / "dataset3.mat")
-    assert starry_night.recording.reference is not None
     T = starry_night.recording.reference.T_world_body[700]
     np.testing.assert_allclose(T[:3, :3], so3_exp(raw["theta_vk_i"][:, 700]), atol=1e-12)
     np.testing.assert_array_equal(T[:3, 3], raw["r_i_vk_i"][:, 700])

@@ -234,7 +234,6 @@ def test_exports_keep_the_colours_of_the_images(flight: Path, tmp_path: Path) ->
     assert main(["run", str(tinted), "--save-observations", "--out", str(run), "--no-plot", "--json"]) == 0
     assert main(["export", "colmap", str(run), "--keyframes", "3"]) == 0
     image = cv2.imread(str(next((run / "colmap" / "images").rglob("*.png"))), cv2.IMREAD_UNCHANGED)
-    assert image is not None
     assert image.shape[2] == 3
     assert np.abs(image[..., 0].astype(int) - image[..., 2] // 2).max() <= 3
     head, _, body = (run / "colmap" / "points.ply").read_bytes().partition(b"end_header\n")

@@ -246,7 +246,6 @@ def test_readme_python_runs(
     assert len(blocks) == 1
     _execute(README, blocks[0], {})
     printed = re.search(r"ATE (\d\.\d+) m over (\d+\.\d) m", capsys.readouterr().out)
-    assert printed is not None
     assert float(printed.group(1)) < 0.1
     assert float(printed.group(2)) > 5
 

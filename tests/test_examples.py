@@ -53,7 +53,6 @@ def test_a_live_loop_prints_a_pose_for_every_frame(flight: Path) -> None:
     text = _run("live_loop.py", flight, process=True)
     # A machine at full load may leave out frames, and says how many.
     found = re.search(r"results=(\d+), dropped=(\d+), refused=0, waiting=0", text)
-    assert found is not None
     poses, dropped = int(found[1]), int(found[2])
     assert poses + dropped == 16
     assert len(re.findall(r"^\d+\.\d{3} s .* m$", text, re.MULTILINE)) == poses
@@ -70,7 +69,6 @@ def test_precomputed_features_run_again(flight: Path) -> None:
 
 def test_features_of_another_program_give_the_path(tmp_path: Path) -> None:
     ahead = re.search(r"at the end ([\d.]+) m ahead", _run("foreign_features.py", tmp_path / "features.npz"))
-    assert ahead is not None
     assert float(ahead[1]) == pytest.approx(29, abs=0.1)
 
 
@@ -85,7 +83,6 @@ def test_a_front_end_of_ones_own_is_checked_and_used(flight: Path) -> None:
     text = _run("own_frontend.py", flight, process=True)
     assert "survival" in text
     ate = re.search(r"ATE ([\d.]+) m", text)
-    assert ate is not None
     assert float(ate[1]) < 0.02
 
 

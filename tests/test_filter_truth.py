@@ -309,7 +309,6 @@ def test_points_that_begin_to_move_do_not_steer(motion: MotionSource | None) -> 
     for seed in range(2):
         run = fly(CROWD, motion, seed=seed)
         window = run.filter._window
-        assert window is not None
         assert len(window.landmark_ids) > 20
         assert CROWD.moving(window.landmark_ids).sum() <= 1
         values += [squared(run.error(k), run.estimates[k].covariance) for k in range(70, CROWD.frames)]
@@ -334,7 +333,6 @@ def _next_frame(run: Run, moved: BoolArray | None = None, px: float = 0.0) -> tu
 def test_landmarks_out_of_place_are_gated_reported_and_without_effect(walked: Run) -> None:
     """Five landmarks jump by 15 px: they are used no more, each is counted, and the estimate stays where it was."""
     clean, report, seen = _next_frame(walked)
-    assert walked.filter._window is not None
     chosen = walked.filter._window.landmark_ids[:5]
     moved = np.isin(seen.ids, chosen)
     assert moved.sum() == 5
@@ -345,7 +343,6 @@ def test_landmarks_out_of_place_are_gated_reported_and_without_effect(walked: Ru
     difference = se3_log(se3_inverse(a.T_world_imu) @ b.T_world_imu)
     assert squared(difference, a.covariance) < 3.0  # of 6; five landmarks less are another estimate
     window = jumped._window
-    assert window is not None
     assert not np.isin(chosen, window.landmark_ids).any()  # dropped
 
 
@@ -366,7 +363,6 @@ def test_gated_tracks_do_not_steer(walked: Run, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(WindowTracks, "without_wrong_views", remember)
     monkeypatch.setattr(WindowTracks, "gate", refuse)
     clean, report, seen = _next_frame(walked)
-    assert walked.filter._window is not None
     moved = (seen.ids % 3 == 0) & ~np.isin(seen.ids, walked.filter._window.landmark_ids)
     assert 5 < moved.sum() < 0.5 * len(seen)
     biased, spoiled, _ = _next_frame(walked, moved, 1.0)
@@ -429,7 +425,6 @@ def test_smoothed_estimates_carry_their_own_covariance_and_velocity(
 def test_the_newest_smoothed_estimate_is_the_causal_one(walked: Run) -> None:
     filt = walked.filter
     newest, causal = filt.smoothed(walked.course.frames - 1), filt.estimate()
-    assert newest is not None
     np.testing.assert_allclose(newest.T_world_imu, causal.T_world_imu, atol=1e-12)
     # The causal covariance is the prior's and that of the tracks that go on, in the same frame.
     np.testing.assert_allclose(newest.covariance, causal.covariance, rtol=1e-6, atol=1e-15)

@@ -30,7 +30,6 @@ def _compared(
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_correct_pair_and_a_correct_gyro_turn_alike(seed: int) -> None:
     turns, found = _compared(_recording("room", seed), _recording("room", seed).camera)
-    assert turns is not None
     assert abs(turns.excess) < max(4 * turns.sigma, 0.003)
     assert not turns.differ
     assert found == []
@@ -40,7 +39,6 @@ def test_a_correct_pair_and_a_correct_gyro_turn_alike(seed: int) -> None:
 def test_a_wrong_scale_of_the_gyro_is_no_focal_length(seed: int) -> None:
     it = _recording("room", seed)
     turns, found = _compared(it, it.camera, _gyro(it, lambda rate: 1.05 * rate))
-    assert turns is not None
     assert abs(turns.excess - (1 / 1.05 - 1)) < max(4 * turns.sigma, 0.003)
     assert turns.differ
     assert not turns.gyro_agrees
@@ -52,7 +50,6 @@ def test_a_wrong_scale_of_the_gyro_is_no_focal_length(seed: int) -> None:
 def test_real_gyros_turn_as_their_cameras_do(data_dir: Path, flight: str) -> None:
     it = _real(data_dir / "euroc_real_imu" / flight, 30.0)
     turns, _ = _compared(it, it.camera)
-    assert turns is not None
     assert not turns.differ
 
 
@@ -63,14 +60,12 @@ def test_a_focal_length_that_is_off_shows_in_the_turns() -> None:
     T_world_imu = motion_at(motion, np.array(times)).T_world_imu
     it = replace(near, frames=_observe(near.camera, T_world_imu, near.T_cam0_imu, times, 8.0, 0, 0.1))
     turns, found = _compared(it, _longer(it.camera))
-    assert turns is not None
     assert turns.differ
     assert turns.gyro_agrees
     (finding,) = found
     assert "msckf.stereo_focal_sigma" in finding.explanation
     assert "gyro's scale" not in finding.explanation
     right, _ = _compared(it, it.camera)
-    assert right is not None
     assert not right.differ
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.commands import refused
 from vio.cli import main
 from vio.datasets import open_dataset
 from vio.datasets.settings import DatasetSettings
@@ -21,11 +22,6 @@ def run(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    assert main(list(arguments)) == 1
-    return capsys.readouterr().err
-
-
 def test_files_of_others_are_not_replaced(
     flight: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -36,7 +32,7 @@ def test_files_of_others_are_not_replaced(
     ):
         file = tmp_path / name
         file.write_text("mine\n")
-        assert "was not made by this command; remove it, or choose another name" in _refused(
+        assert "was not made by this command; remove it, or choose another name" in refused(
             capsys, *arguments, str(file)
         )
         assert file.read_text() == "mine\n"
@@ -47,8 +43,8 @@ def test_files_of_others_are_not_replaced(
 
 
 def test_results_are_no_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "holds the results of a run, not a recording" in _refused(capsys, "run", str(run))
-    assert "no recording is named" in _refused(capsys, "run", "")
+    assert "holds the results of a run, not a recording" in refused(capsys, "run", str(run))
+    assert "no recording is named" in refused(capsys, "run", "")
 
 
 def test_images_without_a_calibration_are_named(flight: Path, tmp_path: Path) -> None:
@@ -65,7 +61,7 @@ def test_a_run_that_can_go_on_is_not_said_to_be_lost(
     shutil.copytree(run, tmp_path / "run")
     (tmp_path / "run" / "unfinished").mkdir()
     (tmp_path / "run" / "estimates.npy").rename(tmp_path / "run" / "unfinished" / "estimates.npy")
-    assert f"`vio run --resume {tmp_path / 'run'}` goes on with it" in _refused(capsys, "report", str(tmp_path / "run"))
+    assert f"`vio run --resume {tmp_path / 'run'}` goes on with it" in refused(capsys, "report", str(tmp_path / "run"))
 
 
 def test_settings_of_a_left_camera_serve_its_observations(run: Path) -> None:

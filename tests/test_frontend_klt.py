@@ -187,7 +187,6 @@ def test_features_without_right_match_stay_as_left_only_rows(monkeypatch: pytest
     monkeypatch.setattr(new_features, "_MAX_LEFT_ONLY_FRAMES", 2)
 
     def covered(frame: StereoFrame) -> StereoFrame:
-        assert frame.right is not None
         right = frame.right.copy()
         right[:120] = 128
         return replace(frame, right=right)
@@ -222,7 +221,6 @@ def test_moving_features_without_depth_are_rejected(with_prior: bool, monkeypatc
     gray = np.full_like(FRAMES[0].right, 128)
     frames = [replace(frame, right=gray) for frame in FRAMES[:4]]
     left = frames[3].left
-    assert left is not None
     left = left.copy()
     left[60:180, 140:300] = left[68:188, 140:300]
     frames[3] = replace(frames[3], left=left)
@@ -249,8 +247,6 @@ def test_occluded_tracks_are_dropped() -> None:
     """A board with another texture covers a part of the next frame."""
     board = view(Wall(np.array([0.0, 0.0, 1.0]), 2.0, seed=9), POSES[1])
     left, right = FRAMES[1].left, FRAMES[1].right
-    assert left is not None
-    assert right is not None
     left, right = left.copy(), right.copy()
     left[60:220, 150:330] = eight_bit(board, 90)[60:220, 150:330]
     right[60:220, 120:300] = eight_bit(board, 91)[60:220, 150:330]
@@ -406,7 +402,6 @@ def test_darker_right_camera_keeps_accuracy() -> None:
     """Different gain left and right, as in EuRoC V2_03: the patches are normalised."""
     dark = []
     for frame in FRAMES[:3]:
-        assert frame.right is not None
         dark.append(replace(frame, right=(0.6 * frame.right.astype(np.float64) + 5).astype(np.uint8)))
     for pose, output in zip(POSES[:3], run(dark), strict=True):
         seen = output.observations.take(output.observations.has_right)
@@ -418,8 +413,6 @@ def test_darker_right_camera_keeps_accuracy() -> None:
 def test_images_may_be_overwritten_after_the_call(outputs: list[FrontendOutput]) -> None:
     """A reader may reuse its buffer."""
     frontend = KltFrontend(CAMERA, SETTINGS)
-    assert FRAMES[0].left is not None
-    assert FRAMES[0].right is not None
     left, right = FRAMES[0].left.copy(), FRAMES[0].right.copy()
     frontend.process(StereoFrame(0, 0, left, right))
     left[:], right[:] = 0, 0
@@ -559,7 +552,6 @@ def kitti(folder: Path, count: int) -> tuple[StereoCamera, list[StereoFrame], Fl
     for k in range(count):
         images = [cv2.imread(str(folder / f"image_{i}" / f"{k:06d}.png"), cv2.IMREAD_GRAYSCALE) for i in (0, 1)]
         frames.append(StereoFrame(k, k * 100_000_000, *(np.asarray(image, dtype=np.uint8) for image in images)))
-    assert frames[0].left is not None
     height, width = frames[0].left.shape
     camera = StereoCamera(P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2], -P1[0, 3] / P0[0, 0], width, height)
     poses = np.tile(np.eye(4), (count, 1, 1))

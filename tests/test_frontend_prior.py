@@ -173,7 +173,6 @@ def test_invalid_parts_of_a_prior_are_ignored() -> None:
     z = np.arange(16.0).reshape(4, 4)
     z[1, 0], z[2, 3] = np.nan, np.inf  # the right pixel is not needed
     kept = usable_prior(TrackPrior(np.array([7, 3, 5, 7]), z, np.eye(3)))
-    assert kept is not None
     assert kept.ids.tolist() == [5, 7]
     np.testing.assert_array_equal(kept.z[:, :2], z[[2, 0], :2])
     assert kept.R_cam_prev is not None
@@ -210,6 +209,5 @@ def test_prior_overrides_truck_of_any_size_with_enough_support(share: float, mon
     predicted = se3_exp([0.05, 0.0, -0.1, 0.0, 0.002, 0.0])
     for R_prior, T_prior in ((np.eye(3), None), (None, predicted)):
         found = rigid_consensus(make_problem(), p, uv, np.eye(4), R_prior, T_prior)
-        assert found is not None
         assert found.inliers[:still].mean() > 0.95
         assert not found.inliers[still:].any()

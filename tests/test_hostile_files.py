@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from tests.dataset_makers import ece276a_arrays, make_drive, make_kitti, make_mat, make_npz, utias_arrays
+from tests.test_config import _numbers
 from vio.cli import main
-from vio.config import Config, SettingInfo, describe, load_config
+from vio.config import SettingInfo, load_config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.common import read_npz
 from vio.datasets.image_pairs import full_scale
@@ -227,10 +228,6 @@ def test_pipes_and_devices_do_not_block(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 # --- settings -------------------------------------------------------------------------------------------------------
-
-
-def _numbers() -> list[SettingInfo]:
-    return [s for s in describe(Config()) if isinstance(s.default, (int, float)) and not isinstance(s.default, bool)]
 
 
 @pytest.mark.parametrize("info", _numbers(), ids=lambda info: info.key)

@@ -76,7 +76,6 @@ def _tilt_and_velocity(start: Start, filt: Msckf) -> tuple[float, float, float]:
     """Error of the vertical in the body frame (degrees), its NEES, and that of the velocity in the body frame."""
     R_true, _, v_true, *_ = start.state((FRAMES - 1) * 0.05)
     window = filt._window
-    assert window is not None
     R = window.nav.T_world_imu[:3, :3]
     P = filt._propagation.posterior.own
     up_true, up = R_true[2], R[2]  # R' e_z

@@ -284,7 +284,6 @@ def test_all_that_can_be_off_is_found_beside_the_terms() -> None:
     assert error @ np.linalg.solve(last.T_cam0_imu_covariance, error) < 22.5  # chi-square, 0.999 of 6
     assert abs(last.time_offset_s - 0.004) < 1e-3
     field = last.stereo_field
-    assert field is not None
     assert field.coefficients @ np.linalg.solve(field.covariance, field.coefficients) < 26.1  # 0.999 of 8
     assert run.rms_m < 0.04
 
@@ -297,8 +296,6 @@ def test_a_stereo_field_that_begins_later_finds_its_place_behind_the_terms() -> 
     for k in range(2):
         filt.update(flight.observe(k, 0.5, noise, 40))
     estimate = filt.estimate()
-    assert estimate.stereo_field is not None
-    assert estimate.imu_terms_sigma is not None
     right = np.sqrt(np.diag(estimate.stereo_field.covariance))
     assert right[0] == pytest.approx(np.radians(STEREO_YAW_SIGMA_DEG), rel=0.3)  # not 1 %, of a scale
     assert estimate.imu_terms_sigma[:2] == pytest.approx([0.01, 0.01], rel=0.1)
@@ -356,8 +353,6 @@ def test_survives_a_late_imu_a_gap_a_checkpoint_and_a_restart(tmp_path: Path) ->
     np.testing.assert_array_equal(before.T_world_imu, resumed.T_world_imu)
     filters[0].restart(flight.observe(50, 0.5, noise, 40))
     after = filters[0].estimate()
-    assert before.imu_terms_sigma is not None
-    assert after.imu_terms_sigma is not None
     assert before.imu_terms_sigma[6:9].max() < 0.6 * after.imu_terms_sigma[6:9].min()
     np.testing.assert_allclose(after.imu_terms, before.imu_terms, atol=1e-3)
 
@@ -379,7 +374,6 @@ def test_summary_and_metrics_state_the_terms() -> None:
     sigmas = np.where(np.isin(np.arange(15), CHOSEN["scale"]), 5e-4, np.radians(0.03))
     last = Estimate(0, np.eye(4), np.eye(6), imu_terms=OFF_BY_1_PERCENT, imu_terms_sigma=sigmas)
     stated = imu_calibration(cast("RunResult", SimpleNamespace(estimates=[last])))
-    assert stated is not None
     assert stated["accelerometer"]["scale_percent"] == pytest.approx({"x": 1.0, "y": -1.0, "z": 0.7})
     assert list(stated["gyro"]["misalignment_deg"]) == ["xy", "xz", "yz", "yx", "zx", "zy"]
     rows = _calibration_rows({"stereo_scale": None, "camera_imu": None, "imu": stated})

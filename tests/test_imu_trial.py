@@ -107,7 +107,6 @@ def test_live_estimates_are_right_once_the_unit_is_known(as_recorded: RunResult)
         elif isinstance(event, ImuSample):
             odometry.add_imu(event.time_ns, event.gyro, event.accel)
     odometry.finish()
-    assert odometry.estimate is not None
     apart = odometry.estimate.T_world_imu[:3, 3] - as_recorded.trajectory.positions[-1]
     assert np.linalg.norm(apart) < 0.01
 

@@ -102,7 +102,6 @@ def _real(folder: Path, seconds: float) -> Watched:
     """Return the real IMU data of a flight, and observations of points along its ground truth."""
     truth = read_trajectory(folder / "groundtruth_tum.txt", fmt="tum")
     truth_ns, poses = truth.times_ns, truth.T_world_body
-    assert truth_ns is not None
     used = truth_ns < truth_ns[0] + round((seconds + 1) * 1e9)
     motion, _ = fit_spline(truth_ns[used], poses[used], knot_s=0.1)
     start, end = motion.start_ns, motion.start_ns + round(seconds * 1e9)

@@ -59,7 +59,6 @@ def _turn_right_camera(folder: Path, w_deg: list[float]) -> None:
     H = K @ so3_exp(np.radians(w_deg)) @ np.linalg.inv(K)
     for file in (folder / "mav0" / "cam1" / "data").glob("*.png"):
         image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        assert image is not None
         size = image.shape[1], image.shape[0]
         cv2.imwrite(str(file), cv2.warpPerspective(image, H, size, borderMode=cv2.BORDER_REPLICATE))
 
@@ -194,7 +193,6 @@ def record_at_rest(density: float, seconds: float = 6.0) -> ImuRecord:
 
 def test_noise_at_rest_is_compared_with_the_data_sheet() -> None:
     part = noise_part(record_at_rest(5e-4), ImuDensities(1e-4, 1e-5, 5e-4, 1e-4))
-    assert part is not None
     assert part.facts["gyro_density"] == pytest.approx(5e-4, rel=0.2)
     assert re.search(r"gyro .* \([45]\.\d times the stated\); state the measured one, accel [^;]*, at rest", part.text)
     assert noise_part(record_at_rest(5e-4, 2.0), None) is None, "too short"

@@ -48,7 +48,6 @@ def _writing(out: Path) -> subprocess.Popen[str]:
         text=True,
         preexec_fn=_take_interrupts,
     )
-    assert process.stdout is not None
     assert process.stdout.readline() == "writing\n"
     return process
 

@@ -41,7 +41,6 @@ class Walk:
         motion = spline_from_waypoints(se3_from_parts(R, np.stack([x, y, np.full_like(x, 1.4)], axis=1)), 1.0)
         self._recording = SimulatedRecording(simulate(world, RIG, motion, rate_hz=1.0))
         trajectory = self._recording.recording.reference
-        assert trajectory is not None
         self.T = trajectory.T_world_body @ RIG.T_imu_cam0
         self.camera = self._recording.recording.camera
         self.features = [extract(*self._recording.images(k)) for k in range(len(self._recording))]
@@ -159,7 +158,6 @@ def test_a_loop_names_the_frame_and_the_pixels_that_show_the_place(
     assert len(whole_events) == len(whole_map.graph.loops)
     for o in whole_events:
         assert o.keyframe_frame == o.keyframe, "frames and keyframes of this walk are numbered alike"
-        assert o.matches is not None
         assert len(o.matches) > 10, "those of the keyframe that shows most"
         seen = o.matches.has_right_keyframe & o.matches.has_right_frame
         p, _ = triangulate(room_walk.camera, o.matches.z_keyframe[seen])
@@ -301,10 +299,13 @@ def test_with_a_density_each_cubic_metre_keeps_features_of_so_many_keyframes(
     assert prune_map(path, density)["keyframes"] == shows.sum()
 
 
-def test_a_checkpoint_goes_on_to_the_same_map(room_walk: Walk, whole_map: MapBuilder, tmp_path: Path) -> None:
+@pytest.mark.parametrize("density", [None, 1])
+def test_a_checkpoint_goes_on_to_the_same_map(density: int | None, room_walk: Walk, tmp_path: Path) -> None:
     keyframes = list(room_walk.keyframes(seed=0))
-    path = tmp_path / "b.map"
-    builder = _map(room_walk, path, rows=slice(0, 30))
+    path, whole = tmp_path / "b.map", _map(room_walk, tmp_path / "a.map", density=density)
+    whole.finish()
+    whole.close()
+    builder = _map(room_walk, path, rows=slice(0, 30), density=density)
     builder.commit()
     dataset = cast("Dataset", SimpleNamespace(observations=None))
     save_checkpoint(tmp_path / "state", builder, dataset)
@@ -318,10 +319,16 @@ def test_a_checkpoint_goes_on_to_the_same_map(room_walk: Walk, whole_map: MapBui
         resumed.add(keyframe, features)
     resumed.finish()
     resumed.close()
-    np.testing.assert_array_equal(resumed.graph.T_map_cam.rows, whole_map.graph.T_map_cam.rows)
-    rows = [[r.T_map_cam.tobytes() for r in MapStore(p, read_only=True).keyframes()] for p in (path, whole_map.path)]
+    np.testing.assert_array_equal(resumed.graph.T_map_cam.rows, whole.graph.T_map_cam.rows)
+    np.testing.assert_array_equal(resumed.places.shows_something, whole.places.shows_something)
+    assert resumed.places.shows_something.all() == (density is None)
+    rows = []
+    for of in (path, whole.path):
+        with closing(MapStore(of, read_only=True)) as store:
+            poses = [row.T_map_cam.tobytes() for row in store.keyframes()]
+            rows.append((poses, [len(store.features(k)) for k in range(len(poses))], str(store.loops())))
     assert rows[0] == rows[1]
-    assert rows[0] == [T.tobytes() for T in resumed.graph.T_map_cam.rows], "the file holds what was optimised"
+    assert rows[0][0] == [T.tobytes() for T in resumed.graph.T_map_cam.rows], "the file holds what was optimised"
 
 
 def test_the_map_is_made_of_pixels_without_what_the_calibration_is_found_to_be_off_by(
@@ -343,7 +350,6 @@ def test_the_map_is_made_of_pixels_without_what_the_calibration_is_found_to_be_o
         builder.close()
         held = MapStore(tmp_path / f"{name}.map", read_only=True)
         field = held.sessions()[0].field
-        assert field is not None
         np.testing.assert_array_equal(field.coefficients, ended.coefficients)
         errors = []
         for loop in held.loops():
@@ -401,7 +407,6 @@ def test_a_merge_keeps_where_the_later_map_is_on_the_earth(
     merge_maps(first, later, tmp_path / "both.map")
     with closing(MapStore(tmp_path / "both.map", read_only=True)) as store:
         found, rows = store.earth(), store.keyframes()
-    assert found is not None
     assert found.origin == earth.origin
     assert np.linalg.norm(found.T_enu_map[:3, 3] - earth.T_enu_map[:3, 3]) > 0.2, "the frame is another one"
     now = np.array([row.T_map_cam for row in rows[-len(before) :]])
@@ -414,5 +419,4 @@ def test_a_merge_keeps_where_the_later_map_is_on_the_earth(
     assert "that recorded first is kept" in caplog.text
     with closing(MapStore(tmp_path / "two.map", read_only=True)) as store:
         kept = store.earth()
-    assert kept is not None
     np.testing.assert_array_equal(kept.T_enu_map, earth.T_enu_map)

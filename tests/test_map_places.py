@@ -49,7 +49,6 @@ def _views(
 def _error(seed: int, **how: float) -> tuple[FloatArray, FloatArray, int]:
     i, j = _views(seed, **how)
     seen = verify(CAMERA, i, CAMERA, j)
-    assert seen is not None
     return se3_log(se3_inverse(seen.pose.T_i_j) @ T_I_J), seen.pose.covariance, seen.inliers
 
 

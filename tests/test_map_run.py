@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 import vio
+from tests.commands import render
 from tests.test_msckf import CAMERA, T_CAM0_IMU, Flight
 from tests.test_unfinished_runs import Stop
+from vio.bench.maps import map_figures
 from vio.cli import main
 from vio.config import Config
 from vio.datasets import open_dataset
@@ -50,11 +52,8 @@ from vio.runs.recorder import GrowingFolder
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rendered flight as an EuRoC folder: 20 frames of 320 pixels with an IMU, over 2 s."""
-    folder = tmp_path_factory.mktemp("flight") / "flight"
-    options = {"rig": "small", "width": "320", "rate": "10", "duration": "2", "workers": "1", "format": "euroc"}
-    arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
-    assert main(["render", "--out", str(folder), "--json", *arguments]) == 0
-    return folder
+    options = {"rig": "small", "width": "320", "rate": "10", "duration": "2", "format": "euroc"}
+    return render(tmp_path_factory.mktemp("flight") / "flight", **options)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +87,6 @@ def test_a_run_with_a_map_writes_its_poses_and_its_metrics(mapped: Path) -> None
     assert (np.linalg.eigvalsh(covariance)[1:] > 0).all()
     assert (mapped / "loops.csv").read_text().startswith("frame,time_ns,keyframe")
     finished = read_finished_run(mapped)
-    assert finished.mapped is not None
     assert finished.loops == ()
     keyframes = finished.map_keyframes
     assert len(keyframes.frame) == metrics["keyframes"]
@@ -107,7 +105,6 @@ def test_loops_are_read_as_they_were_written(tmp_path: Path) -> None:
     write_loops(tmp_path, loops)
     found = read_loops(tmp_path)
     assert found == loops
-    assert found[0].matches is not None
     np.testing.assert_array_equal(found[0].matches.z_frame, z[1])
     np.testing.assert_array_equal(found[0].matches.has_right_keyframe, has_right[0])
     (tmp_path / "loops.csv").write_text("frame,time_ns\n1,2\n")
@@ -120,7 +117,6 @@ def test_a_run_goes_on_to_the_same_map(flight: Path, mapped: Path, tmp_path: Pat
     first = run(open_dataset(flight), Config(), map=MapUse(path), control=RunControl(folder, should_stop=Stop(300)))
     assert 5 < len(first.frames) < 20
     second = run(open_dataset(flight), Config(), map=MapUse(path), control=RunControl(folder, resume=True))
-    assert second.mapped is not None
     final = read_trajectory(mapped / "map_trajectory.tum")
     np.testing.assert_allclose(second.mapped.T_map_body, final.T_world_body, atol=1e-8)
     rows = [
@@ -215,7 +211,6 @@ def test_live_estimates_have_their_pose_in_the_map(flight: Path, mapped: Path, t
                 assert event.left is not None
                 assert event.right is not None
                 estimate = odometry.add_stereo(event.time_ns, event.left, event.right)
-                assert estimate is not None
                 assert estimate.T_map_body is not None
                 np.testing.assert_allclose(estimate.T_map_body, estimate.T_world_imu, atol=1e-12)
         assert odometry.loops == ()
@@ -234,7 +229,6 @@ def _motions(seed: int) -> tuple[FloatArray, FloatArray]:
     for k in range(16):
         filter_.update(flight.observe(k, 0.5, rng))
     whole = filter_.relative(6, 15)
-    assert whole is not None
     truth = se3_inverse(flight.T_world_imu(6)) @ flight.T_world_imu(15)
     r = se3_log(se3_inverse(whole.T_i_j) @ truth)
     parts = [filter_.relative(6, 10), filter_.relative(10, 15)]
@@ -284,6 +278,28 @@ def test_motions_are_joined_where_the_window_moves_on(tmp_path: Path) -> None:
     assert (first, second) == (0, 1)
     np.testing.assert_allclose(motion.T_i_j, poses[8], atol=1e-12)
     assert np.linalg.eigvalsh(motion.covariance)[0] > 7.0, "of eight steps of unit variance each"
+
+
+@pytest.mark.parametrize("wrong", [8, 10])
+def test_a_motion_does_not_follow_a_frame_that_the_filter_takes_back(wrong: int, tmp_path: Path) -> None:
+    """Its window is half a metre off as of one frame, the keyframe itself or one after it, and right again."""
+    session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False)
+    step, gray = se3_exp([0.0, 0.0, 0.05, 0.0, 0.01, 0.0]), np.zeros((64, 64), dtype=np.uint8)
+    for k in range(16):
+        off = [0.5 * (k == wrong), 0.0, 0.0, 0.0, 0.0, 0.0]
+
+        def relative(older: int, newer: int, off: list[float] = off) -> RelativePose:
+            n = newer - older
+            return RelativePose(np.linalg.matrix_power(step, n) @ se3_exp(np.multiply(off, n > 0)), 1e-6 * np.eye(6))
+
+        ids = np.arange(40) + 1000 * (k >= 8)
+        seen = observations(k, 10**8 * k, ids, np.tile([9.0, 9, 5, 9], (40, 1)))
+        estimate = Estimate(k, np.linalg.matrix_power(step, k) @ se3_exp(off), 1e-4 * np.eye(6))
+        session.frame(StereoFrame(k, 10**8 * k, gray, gray), seen, estimate, relative)
+    session.finish()
+    session.close()
+    ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
+    np.testing.assert_allclose(motion.T_i_j, np.linalg.matrix_power(step, 8), atol=1e-9)
 
 
 @pytest.mark.parametrize("alone", [False, True])
@@ -433,7 +449,6 @@ def looped(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RunR
     """A run with an IMU, whose first and last keyframe a loop joins, and its map."""
     path = tmp_path_factory.mktemp("looped") / "yard.map"
     result = run(open_dataset(flight), Config(), map=MapUse(path), keep_observations=True)
-    assert result.mapped is not None
     assert result.observations is not None
     assert result.mapped.adjustment is None
     frames = result.mapped.in_map.frame.tolist()
@@ -464,8 +479,6 @@ def test_a_map_with_loops_is_adjusted_with_the_imu(looped: tuple[RunResult, Path
     result, path = _copied(looped, tmp_path)
     before = _poses(path)
     done = adjust_map(result, path).mapped
-    assert done is not None
-    assert done.adjustment is not None
     assert done.adjustment.startswith("with the IMU at ")
     in_map = done.in_map
     np.testing.assert_allclose(_poses(path) @ result.T_cam0_body, in_map.T_map_body, atol=1e-12)
@@ -485,6 +498,19 @@ def test_a_map_with_loops_is_adjusted_with_the_imu(looped: tuple[RunResult, Path
         graph = MapGraph(store)
     graph.optimise_part(0)
     np.testing.assert_allclose(graph.T_map_cam.rows, _poses(path), atol=1e-6)
+
+
+def test_the_errors_of_a_map_are_normalised_relative_to_its_first_keyframe(looped: tuple[RunResult, Path]) -> None:
+    result, path = looped
+    truth = result.recording.reference
+    assert truth is not None
+    score = evaluate(result.trajectory, truth, T_cam0_imu=result.T_cam0_body)
+    found = map_figures(result, score, truth, store=path, T_ref_map=None, covered=())
+    assert found["map_nees_95"] < 60, "the first poses known at the time have covariances of next to nothing"
+    assert "map_nees" not in map_figures(
+        replace(result, mapped=replace(result.mapped, loops=())),  # type: ignore[type-var]
+        score, truth, store=path, T_ref_map=None, covered=(),
+    )  # fmt: skip
 
 
 def test_a_map_that_turns_as_a_whole_has_not_moved() -> None:
@@ -514,7 +540,6 @@ def test_a_map_that_is_not_adjusted_stays_as_it_is(
 ) -> None:
     result, path = _copied(looped, tmp_path)
     mapped = result.mapped
-    assert mapped is not None
     before = _poses(path)
     asked = iter([None] * 3)
     reason = {"interrupted": lambda: next(asked, "interrupted")}.get(what, lambda: None)
@@ -529,7 +554,6 @@ def test_a_map_that_is_not_adjusted_stays_as_it_is(
         monkeypatch.setattr("vio.offline.inertial_adjustment._STEPS", 3)
     result = replace(result, mapped=mapped, observations=None if what == "unobserved" else result.observations)
     done = adjust_map(result, path, reason).mapped
-    assert done is not None
     assert words in (done.adjustment or "")
     assert done.T_map_body is mapped.T_map_body
     np.testing.assert_array_equal(_poses(path), before)

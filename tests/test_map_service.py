@@ -50,7 +50,6 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file, recording = tmp_path_factory.mktemp("maps") / "room.map", _recording(1, 1.1)
     builder = MapBuilder(MapStore(file, create=True), "room", recording.recording.camera, upright=True, localise=False)
     truth = recording.recording.reference
-    assert truth is not None
     before = None
     for k, T in enumerate(truth.T_world_body @ RIG.T_imu_cam0):
         motion = None if before is None else RelativePose(se3_inverse(before) @ T, 1e-6 * np.eye(6))
@@ -167,7 +166,6 @@ def test_the_command_serves_until_it_is_ended(path: Path) -> None:
     command = [sys.executable, "-m", "vio", "map", "serve", str(path), "--port", "0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
-            assert process.stderr is not None
             line = process.stderr.readline()
             assert line.startswith("serving 9 keyframes at http://127.0.0.1:"), line
             with urllib.request.urlopen(f"{line.split()[-1]}/", timeout=20) as answer:

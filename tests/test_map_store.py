@@ -66,7 +66,6 @@ def test_the_stereo_field_of_a_session_comes_back(tmp_path: Path) -> None:
     store.set_field(0, field)
     store.close()
     found = MapStore(tmp_path / "a.map", read_only=True).sessions()[0].field
-    assert found is not None
     np.testing.assert_array_equal(found.coefficients, field.coefficients)
     np.testing.assert_array_equal(found.covariance, field.covariance)
 

@@ -116,7 +116,6 @@ def test_a_compromise_between_slow_object_and_scene_is_outvoted() -> None:
     uv = np.concatenate([pixels(T_TRUE, wall, 14), slow])
     p, on_truck = np.concatenate([wall, truck]), np.arange(360) >= 100
     found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
-    assert found is not None
     assert 0.3 < found.inliers[~on_truck].mean() < 0.7  # control
     chosen = choose_motion(make_problem(), p, uv, found, None, voting=voters(np.where(on_truck, 6, 30)))
     assert chosen.motion.inliers[~on_truck].mean() > 0.95
@@ -247,8 +246,6 @@ def test_an_object_that_moves_along_the_road_is_reported_where_the_rows_agree() 
 def test_a_prediction_that_is_no_number_is_not_used() -> None:
     broken = MotionPrior(np.full((4, 4), np.nan), IMU)
     prior = usable_prior(TrackPrior(np.array([1]), np.array([[1.0, 2.0, 0.0, 2.0]]), np.eye(3), broken))
-    assert prior is not None
     assert prior.motion is None
     good = usable_prior(TrackPrior(np.array([1]), np.array([[1.0, 2.0, 0.0, 2.0]]), np.eye(3), prediction()))
-    assert good is not None
     assert good.motion is not None

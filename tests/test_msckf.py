@@ -308,7 +308,6 @@ def test_velocity_measurement_moves_the_twist_and_its_bias() -> None:
     nav, _ = motion.start(0)
     motion.take(VelocitySample(0, np.array([5.0, 0, 0]), np.array([0, 0, 0.3])))
     measurement = motion.measurement(nav)
-    assert measurement is not None
     np.testing.assert_allclose(measurement.residual, [5, 0, 0, 0, 0, 0.3])
     assert motion.measurement(nav) is None  # a sample measures once
 
@@ -555,7 +554,6 @@ def test_the_world_stays_where_the_first_window_left_it_while_gravity_becomes_kn
     bias = np.array([0.0, 0, 0, 0.25, -0.2, 0.1])
     errors, covariances, filt = flight.run(settings, "imu", bias=bias)
     estimate, window = filt.estimate(), filt._window
-    assert window is not None
     R = window.calibration.R_upright_world
     learned_deg = np.degrees(np.linalg.norm(so3_log(R)))
     assert learned_deg > 0.3, learned_deg  # else there is nothing to see
@@ -572,7 +570,6 @@ def test_the_world_stays_where_the_first_window_left_it_while_gravity_becomes_kn
     values = nees(errors[6:], covariances[6:])
     assert values.mean() < 12, values
     smoothed = filt.smoothed(flight.frames - 3)
-    assert smoothed is not None
     np.testing.assert_array_equal(smoothed.gravity_world, estimate.gravity_world)
     moved = se3_log(se3_inverse(smoothed.T_world_imu) @ estimate.T_world_imu)
     true = se3_log(se3_inverse(flight.T_world_imu(flight.frames - 3)) @ flight.T_world_imu(flight.frames - 1))
@@ -743,7 +740,6 @@ def test_window_and_map_stay_bounded() -> None:
     _, _, filt = Flight(frames=60).run(settings, "imu")
     assert len(filt.landmarks().ids) > 100  # the map that is told remembers every track
     window = filt._window
-    assert window is not None
     assert len(window.clones) <= 6
     assert len(window.landmark_ids) <= 8
     assert window.prior.P.shape[0] <= window.state.own.stop + 36 + 24
@@ -899,10 +895,8 @@ def test_no_landmark_without_a_well_determined_depth(monkeypatch: pytest.MonkeyP
     flight = FarFlight(30)
     _start_in_flight(monkeypatch, flight, 0)
     _, _, filt = flight.run(EXACT_RIG, "imu", sigma=0.5)
-    assert filt._window is not None
     assert len(filt._window.landmarks) == 0
     _, _, near = Flight(30).run(EXACT_RIG, "imu", sigma=0.1)
-    assert near._window is not None
     assert len(near._window.landmarks) > 10
 
 
@@ -924,7 +918,6 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(
     class Fragile(Msckf):
         def update(self, observations: Observations) -> UpdateReport:
             if observations.frame_index == 12 and not events:
-                assert self._window is not None
                 self._window.prior.P[0, 0] = np.nan
             try:
                 return super().update(observations)

@@ -125,7 +125,6 @@ def test_start_in_motion_waits_and_is_as_good_as_it_says() -> None:
         assert flown.begun is not None
         assert 10 <= flown.begun <= 35
         start = flown.filter._begun
-        assert start is not None
         assert start.scale_sigma is not None
         assert 0.005 < start.scale_sigma <= 0.1
     first = [flown.rows[0, 1] for flown in _curves()]
@@ -160,7 +159,6 @@ def test_start_at_standstill_knows_the_velocity_and_finds_the_scale_in_flight() 
     assert flown.begun is not None
     assert flown.begun <= 12
     start = flown.filter._begun
-    assert start is not None
     assert start.scale_sigma is None
     assert np.sqrt(start.P.diagonal()[6:9].max()) < 0.05
     assert flown.rows[-1, 2] < 0.1
@@ -186,7 +184,6 @@ def test_linear_alignment_is_exact_without_noise() -> None:
     found = gyro_bias(bearings, FreeMotion(t, turned, moves, phi_D_bias), 0.1)
     np.testing.assert_allclose(found, 1e-3 * true_bias, atol=2e-6)
     aligned = align_visual_inertial(bearings, FreeMotion(t, R, moves, phi_D_bias), 9.81)
-    assert aligned is not None
     np.testing.assert_allclose(aligned.velocity, v, atol=1e-6)
     np.testing.assert_allclose(aligned.gravity, g, atol=1e-6)
 
@@ -243,7 +240,6 @@ def test_depth_images_give_right_pixels_and_holes_give_left_only_tracks() -> Non
         holes = depth.copy()
         holes[:, :150] = 0.0
         seen = frontend.process(StereoFrame(k, k * STEP_NS, image, None, holes)).observations
-    assert seen is not None
     inside, hole = seen.z[:, 0] > 151, seen.z[:, 0] < 149
     assert seen.has_right[inside].mean() > 0.95
     assert not seen.has_right[hole].any()
@@ -498,7 +494,6 @@ def test_odometry_takes_single_images_and_depths() -> None:
     for k in range(4):
         image, depth = _walls()[k]
         estimate = odometry.add_images(k * STEP_NS, image, depth_m=depth)
-    assert estimate is not None
     expected = se3_inverse(_pose(0)) @ _pose(3)
     np.testing.assert_allclose(estimate.T_world_imu[:3, 3], expected[:3, 3], atol=3e-3)
     with pytest.raises(DataError, match="one image came, but this rig takes an image with its depth_m"):

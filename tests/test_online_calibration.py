@@ -375,7 +375,6 @@ def test_a_baseline_that_is_off_by_10_percent_is_found_where_it_is_in_doubt() ->
     short = replace(CAMERA, baseline_m=CAMERA.baseline_m / 1.1)
     run = _fly(Shaking(160), wide, 0, xi=np.zeros(6), offset_s=0.0, camera=short)
     scale = run.estimates[-1].stereo_scale
-    assert scale is not None
     percent, sigma = scale.percent()["baseline"]
     assert abs(percent - 10.0) < 3 * sigma
     assert percent > 5 * sigma

@@ -46,7 +46,6 @@ def test_the_folder_of_a_run_tells_its_errors_without_the_recording(runs: tuple[
     again = evaluate(own, reference, T_cam0_imu=np.array(metrics["T_cam0_imu"]))
     assert again.ate_m.rmse == pytest.approx(metrics["ate_m"], rel=1e-6)
     run = read_finished_run(runs[0])
-    assert run.evaluation is not None
     assert run.evaluation.ate_m.rmse == pytest.approx(metrics["ate_m"], rel=1e-6)
 
 
@@ -99,7 +98,6 @@ def test_a_run_with_a_map_is_drawn_in_it_with_its_loops(runs: tuple[Path, Path])
     )
     for shown in (run, replace(run, evaluation=None)):
         (curve,) = curves_of([shown])
-        assert curve.mapped is not None
         np.testing.assert_allclose(curve.mapped.position, curve.position, atol=1e-9)
         np.testing.assert_allclose(curve.mapped.keyframes, curve.position[:1], atol=1e-9)
         np.testing.assert_allclose(curve.mapped.loops, curve.position[None, [-1, 0]], atol=1e-9)
@@ -118,7 +116,6 @@ def test_names_of_files_cannot_bring_script_into_a_page(runs: tuple[Path, Path],
 def test_curves_lie_on_the_truth_and_bands_hold_it(runs: tuple[Path, Path]) -> None:
     run = read_finished_run(runs[0])
     (curve,) = curves_of([run])
-    assert curve.truth is not None
     assert np.array_equal(curve.truth.seconds, curve.seconds)
     distance = np.linalg.norm(curve.position - curve.truth.position, axis=1)
     assert np.abs(distance - curve.truth.error_m).max() < 2e-3  # two alignments of nearly the same path

@@ -109,7 +109,6 @@ def _pose(data: bytes) -> tuple[int, FloatArray]:
 
 def _file_run(flight: Path) -> tuple[list[int], FloatArray]:
     trajectory = vio.run(vio.open_dataset(flight), Config()).trajectory
-    assert trajectory.times_ns is not None
     return trajectory.times_ns.tolist(), trajectory.T_world_body
 
 

@@ -34,7 +34,6 @@ def _drive(camera: StereoCamera) -> StereoScaleEstimate | None:
 def test_velocities_find_a_baseline_that_is_off_by_10_percent() -> None:
     short = replace(CAMERA, baseline_m=CAMERA.baseline_m / 1.1)
     scale = _drive(short)
-    assert scale is not None
     percent, sigma = scale.percent()["baseline"]
     assert abs(percent - 10.0) < 3 * sigma
     assert percent > 5 * sigma
@@ -45,7 +44,6 @@ def test_an_imu_finds_a_baseline_that_is_off_by_10_percent() -> None:
     flight, short = Shaking(240), replace(HAND_HELD, baseline_m=HAND_HELD.baseline_m / 1.1)
     run = _fly(flight, OFF, 0, xi=np.zeros(6), offset_s=0.0, camera=short)
     scale = run.estimates[-1].stereo_scale
-    assert scale is not None
     percent, sigma = scale.percent()["baseline"]
     assert abs(percent - 10.0) < 3 * sigma
     assert percent > 5 * sigma
@@ -73,7 +71,6 @@ def test_nothing_is_said_of_the_baseline_without_right_views() -> None:
         return replace(seen, has_right=np.zeros(len(seen), dtype=np.bool_))
 
     window = fly(Course(20, 0.3), "imu", spoil=left_only).filter._window
-    assert window is not None
     assert window.prior.scale_test is None
 
 
@@ -81,7 +78,6 @@ def test_the_noise_of_a_standstill_is_no_motion() -> None:
     """Zero velocity is zero at any scale; the accelerometer's noise is worth less than one of information a frame."""
     run = fly(Course(20, 2.0, pixel_sigma_px=0.3), "imu")
     test = run.filter._window.prior.scale_test  # type: ignore[union-attr]
-    assert test is not None
     assert test.estimate()[1] ** -2 - 0.1**-2 < run.course.frames
     assert run.estimates[-1].stereo_scale is None
 

@@ -134,7 +134,6 @@ def test_gain_is_added_where_the_shutter_does_not_do_and_steps_make_jumps() -> N
 
 def test_cameras_run_loops_of_their_own() -> None:
     exposures = flight().simulation.exposures
-    assert exposures is not None
     assert np.ptp(np.log2(exposures.shutter_ms[:, 0])) > 0.1
     assert not np.allclose(exposures.shutter_ms[:, 0] / exposures.shutter_ms[:, 1], 0.85, rtol=0.02)
     left, right = (np.mean([flight().images(k)[camera].mean() for k in (4, 14, 24)]) for camera in (0, 1))

@@ -155,7 +155,6 @@ def test_events_are_in_time_order_with_ground_truth(plain: Simulation) -> None:
         recording.events(5, 5)
     assert recording.recording.motion == {"imu", "velocity"}
     reference = recording.recording.reference
-    assert reference is not None
     state = recording.true_state(400_000_000)
     np.testing.assert_allclose(state.T_world_imu, reference.T_world_body[4], atol=1e-12)
     later = recording.true_state(400_100_000)
@@ -168,7 +167,6 @@ def test_events_are_in_time_order_with_ground_truth(plain: Simulation) -> None:
 def test_frames_are_reproducible_to_the_bit(plain: Simulation) -> None:
     noisy = replace(plain, effects=SensorEffects(read_noise=2.0, full_well=8000.0))
     first, again = SimulatedRecording(noisy).frame(5), SimulatedRecording(noisy).frame(5)
-    assert first.left is not None
     assert first.left.dtype == np.uint8
     assert first.left.shape == (120, 192)
     assert np.array_equal(first.left, again.left)  # type: ignore[arg-type]
@@ -317,7 +315,6 @@ def test_a_kitti_folder_reads_back(plain: Simulation, tmp_path: Path) -> None:
     assert (read.camera.fu, read.camera.cu, read.camera.width) == (mine.camera.fu, mine.camera.cu, 192)
     assert read.camera.baseline_m == pytest.approx(mine.camera.baseline_m)
     np.testing.assert_allclose(read.T_cam0_imu, mine.T_cam0_imu, atol=1e-12)
-    assert read.reference is not None
     truth = recording.reference.in_cam0(se3_inverse(RIG.T_imu_cam0)).T_world_body
     np.testing.assert_allclose(read.reference.T_world_body, se3_inverse(truth[0]) @ truth, atol=1e-9)
     events = list(dataset.events())
@@ -351,7 +348,6 @@ def test_an_euroc_folder_reads_back(world: World, tmp_path: Path) -> None:
         image = cv2.imread(str(mav / name / "data" / rows[1][1]), cv2.IMREAD_UNCHANGED)
         assert np.array_equal(image, recording.images(1)[int(name[-1])])
     imu = np.loadtxt(mav / "imu0" / "data.csv", delimiter=",", comments="#", usecols=range(1, 7))
-    assert simulation.imu is not None
     np.testing.assert_array_equal(imu, np.hstack([simulation.imu.gyro, simulation.imu.accel]))
     state = np.loadtxt(mav / "state_groundtruth_estimate0" / "data.csv", delimiter=",", comments="#")
     assert state.shape[1] == 17

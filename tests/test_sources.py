@@ -240,15 +240,12 @@ def test_a_realsense_made_by_its_library_gives_pairs_samples_and_calibration(tmp
     samples = [event for event in events if isinstance(event, SourceSample)]
     assert [f.time_ns for f in frames] == [1_000_000_000 + 50_000_000 * k for k in range(5)]
     for k, frame in enumerate(frames):
-        assert frame.right is not None
         assert (frame.left[0, 0], frame.right[0, 0]) == (20 * k + 1, 20 * k + 2)
     assert source.has_imu
     assert len(samples) == 50
     np.testing.assert_allclose(samples[3].accel, [0.0, 3.0, 1.0])
     rig = source.rig
-    assert rig is not None
     assert rig.cam0.fu == 100.0
-    assert rig.T_cam1_cam0 is not None
     np.testing.assert_allclose(rig.T_cam1_cam0[:3, 3], [-0.05, 0.0, 0.0], atol=1e-7)
     with pytest.raises(DataError, match="no such camera; connected are"):
         open_source("realsense:12345")
@@ -424,9 +421,6 @@ def test_an_oak_gives_pairs_samples_and_calibration_in_metres(monkeypatch: pytes
     ]
     assert [s.time_ns for s in samples] == [1_000_000_000 + 5_000_000 * k for k in range(10)]
     rig = source.rig
-    assert rig is not None
-    assert rig.T_cam1_cam0 is not None
-    assert rig.T_cam0_imu is not None
     np.testing.assert_allclose(rig.T_cam1_cam0[:3, 3], [-0.075, 0.0, 0.0])
     np.testing.assert_allclose(rig.T_cam0_imu[:3, 3], [0.01, 0.02, 0.03])
     assert rig.cam0.model == "radtan"

@@ -34,7 +34,6 @@ JITTER = np.random.default_rng(1).normal(0, 1, 200)
 @pytest.mark.parametrize("jitter_ms", [1.0, 3.0])
 def test_names_jitter_with_its_size(jitter_ms: float) -> None:
     finding = judge_stamps(_record(STEADY + 1e-3 * jitter_ms * JITTER, STEADY))
-    assert finding is not None
     assert finding.fault == "camera stamps"
     size_ms = float(finding.seen.split("off by ")[1].split(" ms")[0])
     assert 0.7 * jitter_ms < size_ms < 1.3 * jitter_ms  # a robust estimate by 200 intervals

@@ -397,7 +397,6 @@ def test_no_landmark_enters_while_the_field_is_estimated() -> None:
         run = fly(replace(ROUND, seconds=3.0), "imu", ON, seed, spoil=_turn(TURN))
         assert not any(len(report.landmark_ids) for report in run.reports)
         field = run.estimates[-1].stereo_field
-        assert field is not None
         total += test_filter_truth.squared(field.coefficients - TURN * np.eye(8)[[0, 2]].sum(axis=0), field.covariance)
     assert total < chi2.ppf(0.999, 16)
 
@@ -423,7 +422,6 @@ def test_a_focal_length_that_is_off_by_5_percent_is_found() -> None:
     off, right = fly(ROUND, "imu", settings, spoil=_scaled(1.0, 1.05)), fly(ROUND, "imu", settings)
     for run, true in ((off, 5.0), (right, 0.0)):
         scale = run.estimates[-1].stereo_scale
-        assert scale is not None
         percent, sigma = scale.percent()["focal length"]
         assert abs(percent - true) < 3 * sigma
         assert sigma < 0.3
@@ -446,7 +444,6 @@ def test_distortion_of_both_lenses_is_no_focal_length() -> None:
         spoil=bent,
     )
     scale = run.estimates[-1].stereo_scale
-    assert scale is not None
     percent, sigma = scale.percent()["focal length"]
     assert abs(percent) < 3 * sigma
     assert sigma < 0.6

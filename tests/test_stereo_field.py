@@ -200,7 +200,6 @@ def test_the_next_run_from_a_saved_calibration_has_nothing_to_correct(turned: Pa
     seen = []
     for k in range(60):
         o = first.observations(k)
-        assert o is not None
         left, _ = rectify_pixels(rig.cam0, pair.R_rect_cam0, pair.camera, o.z[:, :2])
         right, _ = rectify_pixels(rig.cam1, pair.R_rect_cam1, pair.camera, o.z[:, 2:])
         seen.append(replace(o, z=np.concatenate([left, right], axis=1)))
@@ -208,7 +207,6 @@ def test_the_next_run_from_a_saved_calibration_has_nothing_to_correct(turned: Pa
     _write(path, pair.camera, seen)
     result = vio.run(vio.open_dataset(path), load_config(overrides=['msckf.calibrate_stereo="on"']))
     field = result.estimates[-1].stereo_field
-    assert field is not None
     assert field.rows_rms_px < 0.25
     assert np.all(np.abs(field.coefficients) < 3 * np.sqrt(np.diag(field.covariance)))
     before = json.loads((ran / "metrics.json").read_text())["stereo_field"]
@@ -230,7 +228,6 @@ def test_what_a_saved_calibration_leaves_widens_the_prior_of_the_lenses(tmp_path
     _write(path, replace(CAMERA, residual_px=residual_px), [course.observe(k, rng) for k in range(course.frames)])
     result = vio.run(vio.open_dataset(path), load_config())
     field = result.estimates[0].stereo_field
-    assert field is not None
     sigma = np.sqrt(field.covariance[3, 3])
     assert sigma == pytest.approx(np.clip(3 * residual_px / CAMERA.fu, 5e-4, 2e-3), rel=0.2)
     file.write_text(kalibr_text(replace(rig, residual_px=-1.0)))
@@ -245,7 +242,6 @@ def test_a_live_user_gets_the_calibrated_rig(turned: Path) -> None:
         odometry.calibrated_rig()
     for k in range(20):
         o = dataset.observations(k)
-        assert o is not None
         odometry.add_observations(o.time_ns, o.ids, o.z)
     found = odometry.calibrated_rig()
     assert abs(found.parameters[1] - TURN) < 2 * found.sigmas[1]
@@ -271,7 +267,6 @@ def test_check_refine_and_export_take_the_calibration_of_the_run(ran: Path, monk
     before, after = (float(np.sqrt(np.mean(r**2))) for r in rows)
     assert before > 0.5
     assert after == pytest.approx(0.15 * np.sqrt(2), rel=0.1)  # noise alone
-    assert run.field is not None
     (_, v0), (_, v1) = run.field.maps()
     assert np.abs(v1 - v0).max() > 1.0
 
@@ -287,8 +282,6 @@ def test_check_refine_and_export_take_the_calibration_of_the_run(ran: Path, monk
 
     monkeypatch.setattr("vio.offline.run_images.open_dataset", lambda source, options: Images())
     (frame,) = run.images.frames(run.tracked.frames[np.array([3])])
-    assert frame.left is not None
-    assert frame.right is not None
     assert abs(int(np.argmax(frame.right[:, 20])) - int(np.argmax(frame.left[:, 20]))) >= 1
 
 

@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 import zlib
 from collections import deque
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.commands import wait_for
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from tests.test_pipeline import FakeDrive
 from vio.cli import main
@@ -145,7 +145,6 @@ def _assert_same(a: RunResult, b: RunResult) -> None:
     for name in ("ids", "p_world", "covariance"):
         np.testing.assert_array_equal(*(getattr(r.landmarks, name)[k] for r, k in zip((a, b), order, strict=True)))
     if a.dead_reckoning is not None:
-        assert b.dead_reckoning is not None
         np.testing.assert_array_equal(a.dead_reckoning.T_world_body, b.dead_reckoning.T_world_body)
     assert a.warnings == b.warnings
 
@@ -258,13 +257,6 @@ def _take_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def _wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 120
-    while not condition():
-        assert time.monotonic() < end, "the run did not get there"
-        time.sleep(0.01)
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_process_that_ends_loses_a_second_at_most(
     flight_log: Path, undisturbed: str, tmp_path: Path, number: signal.Signals
@@ -274,7 +266,7 @@ def test_a_process_that_ends_loses_a_second_at_most(
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=_take_interrupts
     ) as process:
-        _wait_for((out / "unfinished" / "checkpoint").is_file)
+        wait_for((out / "unfinished" / "checkpoint").is_file)
         process.send_signal(number)
         _, error = process.communicate(timeout=120)
     metrics = json.loads((out / "metrics.json").read_text())
@@ -299,7 +291,7 @@ def test_two_runs_into_one_folder_are_refused(
     out = tmp_path / "run"
     command = [sys.executable, "-c", PATCHED, "run", str(flight_log), "--stop", "20", "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as first:
-        _wait_for((out / "unfinished" / "run.json").is_file)
+        wait_for((out / "unfinished" / "run.json").is_file)
         first.send_signal(signal.SIGSTOP)
         try:
             for again in (["run", str(flight_log), "--out", str(out)], ["run", "--resume", str(out)]):

@@ -93,6 +93,22 @@ def test_what_moves_slowly_is_no_blur() -> None:
     assert passed[:40].mean() < 0.1
 
 
+@pytest.mark.parametrize(("off", "noise_px"), [(0.0, 0.1), (5e-4, 0.1), (5e-4, 0.15)])
+def test_a_pose_that_is_off_is_no_noise_of_all_tracks(off: float, noise_px: float) -> None:
+    """A tenth of a pixel is believed; pixels have more, or the newest pose is off by half a millimetre and milliradian.
+
+    The common noise is that of the pixels within a sixth, where the pose makes it 1.5 to 3 times as much.
+    """
+    tracks = _tracks(_points(300), noise_px=noise_px, settings=replace(SETTINGS, pixel_sigma_px=0.1))
+    T = T_CAM0_WORLD.copy()
+    T[-1] = se3_exp(np.full(6, off)) @ T[-1]
+    linear = tracks.linearise(T, tracks.choose(4), 5)
+    _, _, dof = tracks.gate(linear.at)
+    assert off == 0 or tracks.common_noise > 1.5 * (noise_px / 0.1) ** 2
+    tracks.leave_motion_out(linear, dof)
+    np.testing.assert_allclose(tracks.common_noise, (noise_px / 0.1) ** 2, rtol=1 / 6)
+
+
 @pytest.mark.parametrize("dof", [1, 3, 6, 45, 199])
 @pytest.mark.parametrize(
     ("ratio", "count", "change"),

@@ -135,7 +135,8 @@ def absent_reasons(
     if figures.get("placed_again") is not None:
         why["again_s"] = "the place was not found again"
     if figures.get("loops") is not None:
-        why |= {"loop_error_m": "there is no loop", "loop_recall": "no place was seen again"}
+        no_loop = dict.fromkeys(("loop_error_m", *_OF_PLACES[-3:]), "there is no loop")
+        why |= {**no_loop, "loop_recall": "no place was seen again"}
     if peer:
         own = ("nees", "refused_share", "cpu_ms", "memory_mib", *_OF_MAPS)
         why |= dict.fromkeys(own, "a trajectory of another system does not say")

@@ -85,6 +85,11 @@ def map_figures(
     causal = Trajectory(np.array(placed["T_map_body"]), np.array(placed["time_ns"]), result.body)
     figures |= _causal_figures(causal, np.array(placed["covariance"]), reference, result.T_cam0_body, T_ref_map)
     if store is not None:
+        if mapped.loops:  # else its poses are the odometry's
+            held, upright = mapped.in_map, result.motion == "imu"
+            built = Trajectory(held.T_map_body, held.time_ns, result.body, held.frame)
+            score = evaluate(built, reference, T_cam0_imu=result.T_cam0_body)
+            figures |= _nees_figures(score, built, held.covariance, result.T_cam0_body, upright=upright)
         T_true = truth.reference.in_imu(result.T_cam0_body).T_world_body
         figures |= loop_figures(store, frames[truth.rows], T_true, result.T_cam0_body)
     return {name: value for name, value in figures.items() if value is not None}
@@ -121,7 +126,7 @@ def _causal_figures(
     T_cam0_body: FloatArray,
     T_ref_map: FloatArray | None,
 ) -> dict[str, float]:
-    """Return error and NEES of the localised poses as known at the time, and the share of wrong places."""
+    """Return the error of the localised poses as known at the time; in another session's map, NEES and false share."""
     try:
         score = evaluate(causal, reference, T_cam0_imu=T_cam0_body)
     except EvaluationError:  # known for too short a time
@@ -130,13 +135,26 @@ def _causal_figures(
     if T_ref_map is not None:
         T_true = score.reference.in_imu(T_cam0_body).T_world_body
         figures["placed_wrong"] = wrong_share(T_ref_map @ causal.T_world_body[score.rows], T_true)
-    # A map is turned upright, and another session's is entered anywhere: its world is not that of the first pose.
-    world = se3_inverse(score.T_ref_est if T_ref_map is None else T_ref_map)
-    values = pose_nees(score, causal.T_world_body, covariances, T_cam0_body, upright=False, T_world_true=world)
+        figures |= _nees_figures(score, causal, covariances, T_cam0_body, T_world_true=se3_inverse(T_ref_map))
+    return figures
+
+
+def _nees_figures(
+    score: Evaluation,
+    poses: Trajectory,
+    covariances: FloatArray,
+    T_cam0_body: FloatArray,
+    *,
+    upright: bool = False,
+    T_world_true: FloatArray | None = None,
+) -> dict[str, float]:
+    """Return the NEES of poses with covariances (N, 6, 6) in a map; all arguments are those of `pose_nees`."""
+    P = covariances
+    values = pose_nees(score, poses.T_world_body, P, T_cam0_body, upright=upright, T_world_true=T_world_true)
     if values is None:
-        return figures
+        return {}
     quantiles = {f"map_nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}
-    return {**figures, "map_nees": float(values.mean()), **quantiles}
+    return {"map_nees": float(values.mean()), **quantiles}
 
 
 def wrong_share(T: FloatArray, T_true: FloatArray) -> float:

@@ -25,7 +25,7 @@ from vio.filters.multiview import (
     usable_points,
 )
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import StereoColumns, StereoCorrection, stereo_columns
+from vio.filters.stereo_calibration import StereoColumns, StereoCorrection, eliminate_points, stereo_columns
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -46,6 +46,7 @@ _SPENT_ON_NOISE = 3.0
 _VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
 _MOST_DOF = 199
+_NO_INFORMATION = 1e-9  # over the largest: directions of the poses that pixels alone do not tell, as where the world is
 _MOST_COMMON_NOISE = 4.0  # of a frame over the learned variance: beyond twice the noise it is no blur
 
 
@@ -94,6 +95,7 @@ class WindowTracks:
         self._least_px = _LEAST_MONO_PX if camera.kind == "mono" else LEAST_PIXEL_SIGMA_PX
         self._frames = 0  # from which the noise was learned
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
+        self._misfit = 1.0  # of all tracks in the last frame: their squared residuals over what is believed, at least 1
         self.common_noise = 1.0  # variance of all tracks' pixels over it in the last frame, at least 1
 
     def choose(self, clones: int) -> IntArray:
@@ -234,17 +236,38 @@ class WindowTracks:
     def gate(self, at: Residuals) -> tuple[BoolArray, FloatArray, IntArray]:
         """Test the tracks against the chi-square quantile of the settings, relative to how well all of them fit.
 
-        How well they fit, `common_noise`, is kept: it divides the information of this frame's pixels, too.
+        How well they fit, `common_noise`, is kept: it divides the information of this frame's pixels, too, less what
+        `leave_motion_out` takes out of it.
 
         Returns:
             Mask (F,) of those that pass, their normalised squared residuals (F,), and the degrees of freedom (F,).
         """
         of_views, counts = squared_residuals(at)
         dof, squares = np.clip(counts.sum(axis=1) - 3, 1, _MOST_DOF), of_views.sum(axis=1) / self.variance
-        self.common_noise = _common_noise(squares, dof)
+        self._misfit = _misfit(squares, dof)
+        self.common_noise = min(self._misfit, _MOST_COMMON_NOISE)
         limits = chi_square_table(self._settings.gate_probability)[dof] * self.common_noise
         passed: BoolArray = squares <= limits
         return passed, squares, dof
+
+    def leave_motion_out(self, tracks: LinearTracks, dof: IntArray) -> None:
+        """Leave out of the common noise what other poses would explain: it is an error of the prior, not of the pixels.
+
+        With nothing but pixels to hold the poses, the weighted squares fall by `b' A^+ b`.
+
+        Args:
+            tracks: linearised at the estimate, all of them.
+            dof: (F,) their degrees of freedom, the poses known.
+        """
+        if self.common_noise == 1.0:
+            return
+        A, b = eliminate_points(tracks.information, np.ones(len(dof), dtype=np.bool_))
+        scale = np.sqrt(np.where(A.diagonal() > 0, A.diagonal(), 1.0))
+        move, _, spent, _ = np.linalg.lstsq(A / np.outer(scale, scale), b / scale, rcond=_NO_INFORMATION)
+        squares, total = float(np.sum(tracks.weight * squared_residuals(tracks.at)[0])), int(dof.sum())
+        if total > spent:
+            left = (1 - float(move @ (b / scale)) / squares) / (1 - spent / total)
+            self.common_noise = min(max(self._misfit * min(left, 1.0), 1.0), _MOST_COMMON_NOISE)
 
     def update_pixel_noise(self, squares: FloatArray, dof: IntArray, fitted: float) -> None:
         """Let the pixel noise follow the median of squared residuals over that of chi-square, robustly.
@@ -284,7 +307,7 @@ class WindowTracks:
         self.table.remove(ended)
 
 
-def _common_noise(squares: FloatArray, dof: IntArray) -> float:
+def _misfit(squares: FloatArray, dof: IntArray) -> float:
     """Variance of all tracks' pixels over what is assumed, where their squared residuals (F,) show more; else 1.
 
     Blur comes and goes faster than the noise is learned, and then what fails the gate is the whole frame. The best
@@ -294,7 +317,7 @@ def _common_noise(squares: FloatArray, dof: IntArray) -> float:
         return 1.0
     k = len(squares) // 4
     ratio = np.partition(squares / chi_square_table(0.25)[dof], k)[k]
-    return min(max(float(ratio), 1.0), _MOST_COMMON_NOISE)
+    return max(float(ratio), 1.0)
 
 
 @lru_cache(maxsize=8)

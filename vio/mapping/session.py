@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -20,11 +20,10 @@ from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate, check_camera
-from vio.mapping.features import extract
+from vio.mapping.features import KeyframeFeatures, extract
 from vio.mapping.map_store import MapStore
 from vio.records import (
     Estimate,
-    Image,
     IntArray,
     LoopEvent,
     MapKeyframes,
@@ -33,6 +32,7 @@ from vio.records import (
     no_map_keyframes,
 )
 
+_T = TypeVar("_T")
 Relative: TypeAlias = Callable[[int, int], "RelativePose | None"]
 
 _SHARED = 0.6  # of the last keyframe's features that are still seen: below it, a new keyframe
@@ -43,6 +43,7 @@ _LOST_STEP = 3  # likewise while it has no place
 _LOST_M = 1.0  # standard deviation of the position, likewise
 _MOST_WAITING = 3  # keyframes without a result, where the odometry waits for none: beyond, the next one comes later
 HANDOVER_FRAMES = 10  # from a keyframe to the frame at which its result is taken over
+SETTLED_FRAMES = 3  # from a keyframe to the frame after which its motion is no longer corrected by the window
 # On the standard deviations of a motion: errors of a track last longer than a frame, which the window does not count.
 # Measured over a keyframe's step: 1.6 to 3.1 times the standard deviation (street), 1.2 to 3.1 (room).
 _MOTION_INFLATION = 2.0
@@ -54,6 +55,17 @@ _LEAST_UP_SIGMA_RAD = float(np.radians(0.1))  # errors of the vertical last long
 # Where images show nothing, a filter without a motion sensor holds its velocity; a hand or a car in a curve does not.
 _DARK_S = 0.5
 _BROKEN = np.repeat([30.0**2, 1.0**2], 3)  # variance of the motion where the filter began anew, m^2 and rad^2
+
+
+@dataclass(slots=True)
+class _Held:
+    """A keyframe whose motion the filter's window still corrects."""
+
+    keyframe: Keyframe  # without its motion
+    due: int  # when its motion is taken
+    anchor: int | None  # a frame from which the window knows it; None: the first keyframe
+    base: RelativePose | None  # from the keyframe before to the anchor, where that is another frame
+    motions: list[RelativePose]  # since the keyframe before, as known at each frame from it on
 
 
 class MapSession:
@@ -119,6 +131,8 @@ class MapSession:
         self._known: FloatArray | None = None if self._T_map_odom is None else np.zeros((6, 6))
         self._T_map_cam: FloatArray | None = None
         self._moves: list[tuple[int, RelativePose]] = []  # later keyframes, each with the motion since the one before
+        self._held: list[_Held] = []  # newest keyframes, which are not yet added
+        self._features: list[Future[KeyframeFeatures]] = []  # of each of them
         self.loops: list[LoopEvent] = []
 
     def frame(
@@ -136,6 +150,7 @@ class MapSession:
         self._T_odom_body = estimate.T_world_imu
         if estimate.stereo_field is not None:
             self._field = DisplacementField.of(self._camera, estimate.stereo_field)
+        self._release(relative)
         events = self._take(lambda due, done: due <= self._frames and (done or self._wait))
         fresh = seen.take(seen.has_right & ~seen.stale)
         seen_now = len(fresh) >= _LEAST_TRACKED
@@ -152,13 +167,14 @@ class MapSession:
         self._since += 1
         if motion is None and self._newest is not None:
             return events
-        busy = not self._wait and len(self._waiting) >= _MOST_WAITING
+        busy = not self._wait and len(self._waiting) + len(self._held) >= _MOST_WAITING
         if not busy and self._is_due(fresh.ids, motion):
-            self._submit(frame, fresh.ids, estimate, motion)
+            self._hold(frame, fresh.ids, estimate, motion)
         return events
 
     def finish(self) -> tuple[LoopEvent, ...]:
         """Wait for everything, and write the map."""
+        self._release(None)
         events = self._take(lambda due, done: True)
         if self._frames:
             ended = self._executor.submit(self._builder.finish, self._field).result()
@@ -237,7 +253,7 @@ class MapSession:
         if self._known is None:
             return None
         now = RelativePose(np.eye(4) if self._T_map_cam is None else self._T_map_cam, self._known)
-        for _, motion in self._moves:
+        for motion in [*(move[1] for move in self._moves), *(m for h in self._held for m in h.motions[-1:])]:
             now = now.then(motion)
         if self._newest is not None:
             now = now.then(self._newest[1])
@@ -292,21 +308,36 @@ class MapSession:
                 return True
         return bool(np.isin(self._ids, ids).mean() < _SHARED)
 
-    def _submit(self, frame: StereoFrame, ids: IntArray, estimate: Estimate, motion: RelativePose | None) -> None:
+    def _hold(self, frame: StereoFrame, ids: IntArray, estimate: Estimate, motion: RelativePose | None) -> None:
         assert frame.left is not None
         assert frame.right is not None
         T_odom_cam = estimate.T_world_imu @ self._T_body_cam
         up, sigma = self._vertical(estimate)
-        if motion is not None:
-            motion = _inflated(motion)
-        keyframe = Keyframe(frame.index, frame.time_ns, T_odom_cam, motion, up, sigma, self._field)
-        result = self._executor.submit(_add, self._builder, keyframe, frame.left, frame.right)
-        self._waiting.append((self._frames + HANDOVER_FRAMES, frame.index, result))
-        if motion is not None:
-            self._moves.append((frame.index, motion))
+        keyframe = Keyframe(frame.index, frame.time_ns, T_odom_cam, None, up, sigma, self._field)
+        motions = [] if motion is None else [_inflated(motion)]
+        self._held.append(_Held(keyframe, self._frames + SETTLED_FRAMES, self._anchor, self._base, motions))
+        self._features.append(self._executor.submit(extract, frame.left, frame.right))
         self._ids, self._base, self._anchor, self._since = ids, None, frame.index, 0
         self._last_keyframe = frame.index
         self._newest = frame.index, RelativePose(np.eye(4), np.zeros((6, 6))), T_odom_cam
+
+    def _release(self, relative: Relative | None) -> None:
+        """Take the newest motions as known now, and hand over the keyframes that are due; None: all, as they are.
+
+        A filter may take a single image wrongly and notice it with the next ones.
+        """
+        for held in self._held:
+            motion = None if relative is None or held.anchor is None else relative(held.anchor, held.keyframe.frame)
+            if motion is not None:
+                motion = motion.seen_by(self._T_cam_body)
+                held.motions.append(_inflated(motion if held.base is None else held.base.then(motion)))
+        while self._held and (relative is None or self._held[0].due <= self._frames):
+            held = self._held.pop(0)
+            keyframe = replace(held.keyframe, motion=_middle(held.motions) if held.motions else None)
+            result = self._executor.submit(_add, self._builder, keyframe, self._features.pop(0))
+            self._waiting.append((held.due + HANDOVER_FRAMES - SETTLED_FRAMES, keyframe.frame, result))
+            if keyframe.motion is not None:
+                self._moves.append((keyframe.frame, keyframe.motion))
 
     def _vertical(self, estimate: Estimate) -> tuple[FloatArray | None, float]:
         """Direction against gravity in the camera (3,) and its standard deviation; None where it is not known."""
@@ -338,19 +369,17 @@ class MapSession:
         """State for a checkpoint: waits for the thread, and brings the map to the disk."""
         results = [(due, frame, future.result()) for due, frame, future in self._waiting]
         self._executor.submit(self._builder.commit).result()
+        features = [future.result() for future in self._features]
         state = {key: value for key, value in self.__dict__.items() if key not in ("_executor", "_waiting")}
-        return {**state, "_results": results}
+        return {**state, "_results": results, "_features": features}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a checkpoint; `reopen` then gives it the map's file."""
-        results = state.pop("_results")
+        results, features = state.pop("_results"), state.pop("_features")
         self.__dict__.update(state)
         self._executor = ThreadPoolExecutor(1, "map")
-        self._waiting = []
-        for due, frame, update in results:
-            done: Future[MapUpdate] = Future()
-            done.set_result(update)
-            self._waiting.append((due, frame, done))
+        self._features = [_done(each) for each in features]
+        self._waiting = [(due, frame, _done(update)) for due, frame, update in results]
 
     def reopen(self, path: Path) -> None:
         """Go on from a checkpoint with the map in a file, as it was then.
@@ -377,6 +406,14 @@ def _unknown(older: int, newer: int) -> RelativePose | None:
     return RelativePose(np.eye(4), np.zeros((6, 6))) if older == newer else None
 
 
+def _middle(motions: list[RelativePose]) -> RelativePose:
+    """Return that of several estimates of one motion which is closest to all of them; of equals, the newest."""
+    T = np.array([motion.T_i_j for motion in motions[::-1]])
+    apart = se3_log(se3_inverse(T)[:, None] @ T)
+    P = np.linalg.inv(motions[-1].covariance)
+    return motions[::-1][int(np.argmin(np.sqrt(np.einsum("abi,ij,abj->ab", apart, P, apart)).sum(axis=1)))]
+
+
 def _inflated(motion: RelativePose) -> RelativePose:
     """Return a motion by the filter with the covariance that its errors have, see the constants above."""
     xi = se3_log(motion.T_i_j)
@@ -384,6 +421,13 @@ def _inflated(motion: RelativePose) -> RelativePose:
     return RelativePose(motion.T_i_j, _MOTION_INFLATION**2 * motion.covariance + np.diag(sigma**2))
 
 
-def _add(builder: MapBuilder, keyframe: Keyframe, left: Image, right: Image) -> MapUpdate:
-    """What the map's thread does with a keyframe."""
-    return builder.add(keyframe, extract(left, right))
+def _done(result: _T) -> Future[_T]:
+    """Return what has been computed as if it had been waited for."""
+    done: Future[_T] = Future()
+    done.set_result(result)
+    return done
+
+
+def _add(builder: MapBuilder, keyframe: Keyframe, features: Future[KeyframeFeatures]) -> MapUpdate:
+    """What the map's thread does with a keyframe once its motion is known."""
+    return builder.add(keyframe, features.result())
