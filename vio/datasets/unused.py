@@ -9,9 +9,8 @@ from pathlib import Path
 
 from vio.datasets.images import SUFFIXES
 
-# No data, or other files of a calibration that was read.
-_SILENT = ("readme*", "license*", "*.md", "simulation.json", "rectification.json", "conversion.json", "calib_*_to_*")
-_SHEETS = (".yaml", ".yml")  # a calibration may lie in several
+_SILENT = ("readme*", "license*", "*.md", "simulation.json", "rectification.json", "conversion.json")  # no data
+_PHOTOMETRIC = ("pcalib*.txt", "vignette*.png")  # of DSO and TUM-VI
 _NAMED = 12  # of a list
 
 
@@ -26,24 +25,48 @@ class Layout:
 
 
 def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
-    """Return a note that names what lies in the folder and was not read; files in `used` need not exist."""
-    kept = {path.absolute() for path in (layout.left, layout.right, *used) if path.exists()}
-    sheets = {path.parent for path in kept if path.suffix in _SHEETS}
+    """Return a note that names what lies in the folder and was not read, and one for photometric files.
+
+    Files in `used` need not exist.
+    """
+    used = [file for file in used if file.exists()]
+    kept = {layout.left.absolute(), layout.right.absolute(), *(file.absolute() for file in used)}
     kept |= {parent for path in kept for parent in path.parents}
+    for path in used:  # the other files of a calibration that lies in several
+        if path.suffix.lower() in (".yaml", ".yml", ".txt", ".xml"):
+            kept |= {other.absolute() for other in path.parent.iterdir() if _belongs(other, path)}
     images = [side for side in (layout.left, layout.right) if side.is_dir()]
+    folders = dict.fromkeys((layout.root, layout.base, *images, *(side.parent for side in images)))
     found = []
-    for folder in dict.fromkeys((layout.root, layout.base, *images, *(side.parent for side in images))):
-        for child in sorted(folder.iterdir()) if layout.root in (folder, *folder.parents) else ():
-            if child.name.startswith(".") or any(fnmatch.fnmatch(child.name.lower(), form) for form in _SILENT):
-                continue
-            suffix, path = child.suffix.lower(), child.absolute()
-            read = suffix in SUFFIXES if folder in images else suffix in _SHEETS and path.parent in sheets
-            if not read and path not in kept:
+    for folder in folders:
+        if folder != layout.root and layout.root not in folder.parents:
+            continue
+        with_images = folder in images
+        children = (child for child in folder.iterdir() if not (with_images and child.suffix.lower() in SUFFIXES))
+        for child in sorted(children):
+            silent = child.name.startswith(".") or any(fnmatch.fnmatch(child.name.lower(), s) for s in _SILENT)
+            if not silent and child.absolute() not in kept:
                 found.append(str(child.relative_to(layout.root)) + ("/" if child.is_dir() else ""))
-    return [f"not used: {listed(found)}"] if found else []
+    photometric = [name for name in found if any(fnmatch.fnmatch(Path(name).name, p) for p in _PHOTOMETRIC)]
+    others = [name for name in found if name not in photometric]
+    notes = []
+    if photometric:
+        why = "photometric calibration is not applied, as the tracks gain nothing by it"
+        notes.append(f"{why}: {listed(photometric)}")
+    return [*notes, f"not used: {listed(others)}"] if others else notes
 
 
 def listed(names: Sequence[str]) -> str:
     """Return the first names, and how many more there are."""
     shown = ", ".join(names[:_NAMED]) or "none"
     return f"{shown} and {len(names) - _NAMED} more" if len(names) > _NAMED else shown
+
+
+def _belongs(other: Path, calibration: Path) -> bool:
+    """Return whether a file is read together with a calibration file."""
+    partners = {"left": "right", "intrinsic": "extrinsic", "camchain": "imu", "calibration": "imu"}
+    named = any(a in calibration.name and b in other.name for a, b in partners.items())
+    return (named and other.suffix in (".yaml", ".yml")) or (
+        calibration.name.startswith("calib_cam_to_cam")
+        and (other.name in ("calib_velo_to_cam.txt", "calib_imu_to_velo.txt"))
+    )
