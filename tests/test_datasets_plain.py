@@ -341,6 +341,7 @@ BAD = {
     "unsorted IMU stamps": (_edit("imu.csv", "1699999999995000000", "1699999999985000000"), "runs backwards"),
     "an IMU of another epoch": (_break(_shifted), "no sample is within the time of the images; clocks without overlap"),
     "an IMU with six columns": (_edit("imu.csv", ",0.25,9.81,0", ",0.25,9.81"), "line 2: 6 values instead of 7"),
+    "an IMU with a digit separator": (_edit("imu.csv", "9.81", "9_81"), "line 2: a reading is not a finite number"),
     "an IMU with a NaN": (_edit("imu.csv", "9.81", "nan"), "line 2: a reading is not a finite number"),
     "an IMU with other names": (_edit("imu.csv", "wx,wy,wz", "mx,my,mz"), "does not name gyro and accel"),
     "an empty IMU": (_write("imu.csv", "#timestamp,wx,wy,wz,ax,ay,az\n"), "holds no line of data"),

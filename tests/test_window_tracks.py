@@ -103,9 +103,9 @@ def test_a_pose_that_is_off_is_no_noise_of_all_tracks(off: float, noise_px: floa
     T = T_CAM0_WORLD.copy()
     T[-1] = se3_exp(np.full(6, off)) @ T[-1]
     linear = tracks.linearise(T, tracks.choose(4), 5)
-    _, _, dof = tracks.gate(linear.at)
+    _, nis, dof = tracks.gate(linear.at)
     assert off == 0 or tracks.common_noise > 1.5 * (noise_px / 0.1) ** 2
-    tracks.leave_motion_out(linear, dof)
+    tracks.leave_motion_out(linear, nis, dof)
     np.testing.assert_allclose(tracks.common_noise, (noise_px / 0.1) ** 2, rtol=1 / 6)
 
 

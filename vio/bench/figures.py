@@ -13,7 +13,8 @@ from vio.errors import EvaluationError
 from vio.evaluation.association import associate_times
 from vio.evaluation.consistency import nees
 from vio.evaluation.trajectories import Evaluation
-from vio.geometry.lie import FloatArray, se3_inverse, se3_log, yaw_and_position
+from vio.geometry.lie import FloatArray, se3_inverse, se3_log
+from vio.geometry.upright import yaw_and_position
 from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
 _OF_REFERENCE = ("ate_sim3_m", "scale_error_percent", "rpe_m", "drift_percent", "drift_deg_per_100m", "nees")

@@ -149,8 +149,7 @@ def _nees_figures(
     T_world_true: FloatArray | None = None,
 ) -> dict[str, float]:
     """Return the NEES of poses with covariances (N, 6, 6) in a map; all arguments are those of `pose_nees`."""
-    P = covariances
-    values = pose_nees(score, poses.T_world_body, P, T_cam0_body, upright=upright, T_world_true=T_world_true)
+    values = pose_nees(score, poses.T_world_body, covariances, T_cam0_body, upright=upright, T_world_true=T_world_true)
     if values is None:
         return {}
     quantiles = {f"map_nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}

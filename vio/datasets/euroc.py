@@ -124,9 +124,9 @@ def euroc_base(path: Path) -> Path:
 def _read_camera(folder: Path) -> _Camera:
     model, T_body_cam = read_camera_yaml(folder / "sensor.yaml")
     path = folder / "data.csv"
-    times_ns, rows, lines = stamped_rows(path, 2, "timestamp [ns],filename")
+    times_ns, names, lines = stamped_rows(path, 2, "timestamp [ns],filename")
     there = list_images(folder / "data")
-    files, renamed = _find_images(there, [name for _, name in rows], path, lines)
+    files, renamed = _find_images(there, names, path, lines)
     unlisted, missing = len(set(there.names) - set(files.names)), len(times_ns) - len(files.names)
     return _Camera(model, T_body_cam, times_ns[: len(files.names)], files, renamed, unlisted, missing)
 

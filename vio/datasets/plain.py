@@ -294,8 +294,8 @@ def _missing_note(file: Path, pairs: ImagePairs) -> tuple[str, ...]:
 
 def _listed_times(file: Path, pairs: ImagePairs) -> IntArray:
     """Read the times (F,) of images from EuRoC's list of a camera."""
-    times_ns, rows, _ = stamped_rows(file, 2, "timestamp [ns], filename")
-    time_of = dict(zip((name for _, name in rows), times_ns.tolist(), strict=True))
+    times_ns, names, _ = stamped_rows(file, 2, "timestamp [ns], filename")
+    time_of = dict(zip(names, times_ns.tolist(), strict=True))
     missing = next((left.name for left, _ in pairs if left.name not in time_of), None)
     if missing is not None:
         raise DataError(f"{file}: does not list {missing}; copy both again, or remove the image")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from array import array
 from collections.abc import Callable, Iterator, Sequence
@@ -13,7 +14,6 @@ import numpy as np
 
 from vio.datasets.common import check_gravity_column
 from vio.datasets.samples import MotionSamples, velocity_samples
-from vio.datasets.yaml_files import as_number
 from vio.errors import DataError
 from vio.files.text import INT64_MAX, check_increasing, lines_of, text_lines
 from vio.geometry.lie import FloatArray
@@ -23,6 +23,7 @@ _UNITS = {"s": 9, "sec": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanos
 # Stamps of 1973 and later in ns, us and ms; smaller ones are seconds from any zero.
 _NS_SINCE, _US_SINCE, _MS_SINCE = Decimal("1e17"), Decimal("1e14"), Decimal("1e11")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
+_PLAIN = re.compile(r"[0-9.eE+-]*")  # numbers in these are written as `_NUMBER` says, or are none
 _STAMP = re.compile(r"\d{1,19}")
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
@@ -52,20 +53,28 @@ def read_table(path: Path, columns: int, form: str, cut: list[str] | None = None
     for number, fields in rows:
         stamps.append(fields[0])
         lines.append(number)
-        values.extend([as_number(field) for field in fields[1:]])
+        values.extend(_numbers(fields[1:]))
     return NumberTable(path, header, tuple(stamps), np.array(values).reshape(-1, columns - 1), lines)
 
 
-def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[list[str]], list[int]]:
-    """Return the times (N,) of a table that are in whole nanoseconds, the fields of each line, and its number.
+def _numbers(texts: Sequence[str]) -> list[float]:
+    """Return what fields say as numbers; NaN: no number."""
+    if _PLAIN.fullmatch("".join(texts)):
+        with contextlib.suppress(ValueError):
+            return [float(text) for text in texts]
+    return [float(text) if _NUMBER.fullmatch(text) else float("nan") for text in texts]
+
+
+def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[str], list[int]]:
+    """Return the times (N,) of a table that are in whole nanoseconds, the last field of each line, and its number.
 
     Raises:
         DataError: as `table_rows`, or a stamp is another number, or not later than the one before.
     """
     rows = list(table_rows(path, columns, form))[1:]
     lines = [number for number, _ in rows]
-    stamps = [fields[0] for _, fields in rows]
-    return _whole_ns(stamps, lambda k: f"{path}, line {lines[k]}"), [fields for _, fields in rows], lines
+    times_ns = _whole_ns([fields[0] for _, fields in rows], lambda k: f"{path}, line {lines[k]}")
+    return times_ns, [fields[-1] for _, fields in rows], lines
 
 
 def table_rows(path: Path, columns: int, form: str, cut: list[str] | None = None) -> Iterator[tuple[int, list[str]]]:

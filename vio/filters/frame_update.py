@@ -146,7 +146,7 @@ class FrameUpdate:
 
         tracks = self.tracks.without_wrong_views(tracks)
         good, nis, dof = self.tracks.gate(tracks.at)
-        self.tracks.leave_motion_out(tracks, dof)
+        self.tracks.leave_motion_out(tracks, nis, dof)
         gated_ids = self.tracks.table.ids(tracks.rows[~good])
         pixels, rejected = self._gate_landmarks(window, pixels, fitted)
         gated_ids = np.concatenate([gated_ids, rejected])

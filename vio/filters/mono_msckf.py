@@ -19,6 +19,7 @@ from vio.filters.window import Window
 from vio.filters.window_posterior import scale_sigma
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, so3_exp
 from vio.geometry.stereo import StereoCamera
+from vio.geometry.upright import nearest_yaw
 from vio.imu.standstill import STANDSTILL_S
 from vio.records import (
     Estimate,
@@ -111,8 +112,7 @@ class MonoMsckf(Msckf):
         """A start after a divergence in the world of before, where position and yaw are those held since."""
         held, P_held = restarted(good, time_ns, self._propagation.motion, self._settings)
         R, R_new = held.T_world_imu[:3, :3], begun.nav.T_world_imu[:3, :3]
-        turn = R @ R_new.T
-        yaw = so3_exp([0.0, 0.0, np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])])
+        yaw = so3_exp([0.0, 0.0, nearest_yaw(R @ R_new.T)])
         T = se3_from_parts(yaw, held.T_world_imu[:3, 3])
         M = np.eye(DIM)
         M[:6, :6], M[6:9, 6:9] = se3_adjoint(T), yaw

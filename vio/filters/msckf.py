@@ -32,6 +32,7 @@ from vio.filters.window import Clone, Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, so3_exp, so3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
+from vio.geometry.upright import nearest_yaw
 from vio.protocols import Backend
 from vio.records import (
     Estimate,
@@ -388,7 +389,7 @@ class Msckf(Backend):
         old = self._tilted
         phi, t = so3_log(after.T_world_imu[:3, :3] @ before.T_world_imu[:3, :3].T), _half_tangent(old)
         moved = so3_exp(phi) @ old
-        yaw = -float(np.arctan2(moved[1, 0] - moved[0, 1], moved[0, 0] + moved[1, 1]))
+        yaw = -nearest_yaw(moved)
         self._tilted = so3_exp([0.0, 0.0, yaw]) @ moved
         tilt = _half_tangent(self._tilted) - t
         R, M = window.turn_world(yaw, np.array([-tilt[1], tilt[0], 0.0]))

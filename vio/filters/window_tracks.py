@@ -95,7 +95,6 @@ class WindowTracks:
         self._least_px = _LEAST_MONO_PX if camera.kind == "mono" else LEAST_PIXEL_SIGMA_PX
         self._frames = 0  # from which the noise was learned
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
-        self._misfit = 1.0  # of all tracks in the last frame: their squared residuals over what is believed, at least 1
         self.common_noise = 1.0  # variance of all tracks' pixels over it in the last frame, at least 1
 
     def choose(self, clones: int) -> IntArray:
@@ -244,19 +243,19 @@ class WindowTracks:
         """
         of_views, counts = squared_residuals(at)
         dof, squares = np.clip(counts.sum(axis=1) - 3, 1, _MOST_DOF), of_views.sum(axis=1) / self.variance
-        self._misfit = _misfit(squares, dof)
-        self.common_noise = min(self._misfit, _MOST_COMMON_NOISE)
+        self.common_noise = min(_misfit(squares, dof), _MOST_COMMON_NOISE)
         limits = chi_square_table(self._settings.gate_probability)[dof] * self.common_noise
         passed: BoolArray = squares <= limits
         return passed, squares, dof
 
-    def leave_motion_out(self, tracks: LinearTracks, dof: IntArray) -> None:
+    def leave_motion_out(self, tracks: LinearTracks, nis: FloatArray, dof: IntArray) -> None:
         """Leave out of the common noise what other poses would explain: it is an error of the prior, not of the pixels.
 
         With nothing but pixels to hold the poses, the weighted squares fall by `b' A^+ b`.
 
         Args:
             tracks: linearised at the estimate, all of them.
+            nis: (F,) their normalised squared residuals, as `gate` returns them.
             dof: (F,) their degrees of freedom, the poses known.
         """
         if self.common_noise == 1.0:
@@ -267,7 +266,7 @@ class WindowTracks:
         squares, total = float(np.sum(tracks.weight * squared_residuals(tracks.at)[0])), int(dof.sum())
         if total > spent:
             left = (1 - float(move @ (b / scale)) / squares) / (1 - spent / total)
-            self.common_noise = min(max(self._misfit * min(left, 1.0), 1.0), _MOST_COMMON_NOISE)
+            self.common_noise = min(max(_misfit(nis, dof) * min(left, 1.0), 1.0), _MOST_COMMON_NOISE)
 
     def update_pixel_noise(self, squares: FloatArray, dof: IntArray, fitted: float) -> None:
         """Let the pixel noise follow the median of squared residuals over that of chi-square, robustly.

@@ -100,3 +100,17 @@ def up_in(T_map: FloatArray, T_world: FloatArray, up_world: FloatArray) -> Float
     """
     up: FloatArray = (T_map[:, :3, :3] @ np.swapaxes(T_world[:, :3, :3], 1, 2) @ up_world).sum(axis=0)
     return up / np.linalg.norm(up)
+
+
+def nearest_yaw(M: FloatArray) -> float:
+    """Return the angle of the turn about z that is nearest to a matrix (3, 3), a rotation or a sum of some."""
+    return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
+
+
+def yaw_and_position(T: FloatArray, T_other: FloatArray) -> FloatArray:
+    """Return the motion (4, 4) of an upright world that brings a pose (4, 4) in it nearest to one in another, T.
+
+    It is a turn about the vertical and a shift: what two upright worlds may differ by.
+    """
+    R = so3_exp(np.array([0.0, 0.0, nearest_yaw(T[:3, :3] @ T_other[:3, :3].T)]))
+    return se3_from_parts(R, T[:3, 3] - R @ T_other[:3, 3])

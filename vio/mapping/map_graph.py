@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_adjoint, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.relative_pose import RelativePose
-from vio.geometry.upright import mean_up, rotation_to_up
+from vio.geometry.upright import mean_up, nearest_yaw, rotation_to_up
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.pose_graph import Edges, UpDirections, marginals, optimise
 from vio.records import BoolArray, IntArray
@@ -220,7 +220,7 @@ class MapGraph:
         M = np.einsum("k,ki,kj->ij", w, B[:, :3, 3] - q, T[:, :3, 3] - p)
         M += np.einsum("k,kia,kja->ij", w, B[:, :3, :3], T[:, :3, :3])  # directions, which a straight path leaves open
         if level and self._is_upright(rows):
-            R = so3_exp(np.array([0.0, 0.0, np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])]))
+            R = so3_exp(np.array([0.0, 0.0, nearest_yaw(M)]))
         else:
             R = nearest_rotation(M)
         self.T_map_cam.rows[rows] = se3_from_parts(R, q - R @ p) @ self.T_map_cam.rows[rows]

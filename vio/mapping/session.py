@@ -324,7 +324,7 @@ class MapSession:
     def _release(self, relative: Relative | None) -> None:
         """Take the newest motions as known now, and hand over the keyframes that are due; None: all, as they are.
 
-        A filter may take a single image wrongly and notice it with the next ones.
+        The filter may accept a single wrong image and correct the pose with the next ones.
         """
         for held in self._held:
             motion = None if relative is None or held.anchor is None else relative(held.anchor, held.keyframe.frame)

@@ -13,7 +13,8 @@ import numpy as np
 from vio.calibration.stereo_field import DisplacementField
 from vio.errors import VioError
 from vio.evaluation.trajectories import metres_text
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, yaw_and_position
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
+from vio.geometry.upright import yaw_and_position
 from vio.mapping.map_store import MapStore
 from vio.offline.inertial_refinement import InertialRun, adjust_with_imu, inertial_keyframes
 from vio.offline.keyframes import TrackedPath
