@@ -189,13 +189,12 @@ class Msckf(Backend):
                 raise DivergedError(_lost(observations.frame_index))
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         propagation.blind = False
-        now = window.nav, propagation.since_frame
-        late_s, twist = propagation.late_s, propagation.twist(window, *now)
-        exposure = window.camera_D_own(late_s, twist)
-        expected = propagation.expected_error(window, *now, *exposure[1:])
+        now, late_s = (window.nav, propagation.since_frame), propagation.late_s
+        exposure, expected = propagation.exposure(window, *now, late_s)
         # Half a window gives the velocity: before, its product with the offset's error would pass for knowledge of it.
         moving = len(window.clones) >= self._settings.clones // 2
         if "time_offset" in window.state and moving and not window.clocks_compared:
+            twist = propagation.twist(window, *now)
             window.compare_clocks(observations.time_ns, late_s, twist)
             exposure = window.camera_D_own(late_s, twist)
         window.add_clone(observations.frame_index, observations.time_ns, exposure)

@@ -241,22 +241,24 @@ class Window:
         if len(self.landmarks):
             self._anchor_to_newest(self.state.clone(-2).start + 3)
 
-    def camera_D_own(
-        self, late_s: float, twist: Twist, nav: NavState | None = None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def camera_D_own(self, late_s: float, twist: Twist) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the body's pose and the Jacobian of `camera_at`, and the covariance of `exposure_noise`."""
+        T, J = self.camera_at(late_s, twist, self.nav)
+        return T, J, self.exposure_noise(T, late_s, twist)
+
+    def camera_at(self, late_s: float, twist: Twist, nav: NavState) -> tuple[FloatArray, FloatArray]:
         """How errors of navigation state and calibration move the camera at an exposure, equation (C2).
 
         Args:
             late_s: the navigation state's time on the IMU's clock minus the frame's stamp.
             twist: of the body at the exposure.
-            nav: the navigation state; None: the window's.
+            nav: the navigation state.
 
         Returns:
-            The body's pose (4, 4) at the exposure, the Jacobian (6, 15 + C), and a noise covariance (6, 6).
+            The body's pose (4, 4) at the exposure, and the Jacobian (6, 15 + C).
         """
-        T = self.nav.T_world_imu if nav is None else nav.T_world_imu
-        state, calibration = self.state, self.calibration
-        J, exposed, noise = np.eye(6, state.own.stop), T, np.zeros((6, 6))
+        T, state, calibration = nav.T_world_imu, self.state, self.calibration
+        J, exposed = np.eye(6, state.own.stop), T
         compared = self.clocks_compared and "time_offset" in state
         if "time_offset" in state:
             exposed = T @ se3_exp(twist.mean * (calibration.time_offset_s - late_s))
@@ -264,11 +266,16 @@ class Window:
             column = BLOCKS[name].camera_D_error(T, exposed, twist if compared else None)
             if column is not None:
                 J[:, state[name]] = column
-        if compared:
-            A, row = se3_adjoint(exposed), state["time_offset"].start
-            spread = float(self.prior.P[row, row]) + (calibration.time_offset_s - late_s) ** 2
-            noise = A @ twist.covariance @ A.T * spread
-        return exposed, J, noise
+        return exposed, J
+
+    def exposure_noise(self, T_world_imu: FloatArray, late_s: float, twist: Twist) -> FloatArray:
+        """Covariance (6, 6) of the camera at an exposure of the body (4, 4), by an uncertain twist over its offset."""
+        if not self.clocks_compared or "time_offset" not in self.state:
+            return np.zeros((6, 6))
+        A, row = se3_adjoint(T_world_imu), self.state["time_offset"].start
+        spread = float(self.prior.P[row, row]) + (self.calibration.time_offset_s - late_s) ** 2
+        out: FloatArray = A @ twist.covariance @ A.T * spread
+        return out
 
     def _anchor_to_newest(self, previous_rotation: int) -> None:
         """Measure the landmarks' errors from the newest exposure's rotation: xi_f += p^ (phi_new - phi_old)."""
