@@ -199,7 +199,7 @@ class Msckf(Backend):
             exposure = window.camera_D_own(late_s, twist)
         window.add_clone(observations.frame_index, observations.time_ns, exposure)
         self._keep_first_attitude(window)
-        before = window.clones[len(window.clones) > self._settings.clones]  # the oldest that stays
+        before = window.clones[int(len(window.clones) > self._settings.clones)]  # the oldest that stays
         try:
             report = self._frame.update(window, seen, expected)
             self._apply_zero_velocity(window)
@@ -381,11 +381,11 @@ class Msckf(Backend):
         """
         if self._source != "imu" or before.time_ns != self._began_ns:
             return
-        after = next((c for c in window.clones if c.frame_index == before.frame_index), None)
-        if after is None:
+        after = window.clones.T_world_imu[window.clones.frame_indices == before.frame_index]
+        if not len(after):
             return
         old = self._tilted
-        phi, t = so3_log(after.T_world_imu[:3, :3] @ before.T_world_imu[:3, :3].T), _half_tangent(old)
+        phi, t = so3_log(after[0, :3, :3] @ before.T_world_imu[:3, :3].T), _half_tangent(old)
         moved = so3_exp(phi) @ old
         yaw = -float(np.arctan2(moved[1, 0] - moved[0, 1], moved[0, 0] + moved[1, 1]))
         self._tilted = so3_exp([0.0, 0.0, yaw]) @ moved

@@ -162,7 +162,7 @@ class Propagation:
         T_cam0_imu, late_s = window.calibration.T_cam0_imu, (body_ns - time_ns) * 1e-9
         (T_world_imu, *_), expected = self.exposure(window, nav, growth, late_s)
         T_cam0_world = T_cam0_imu @ se3_inverse(T_world_imu)
-        T_curr_prev = T_cam0_world @ window.exposures()[-1] @ se3_inverse(T_cam0_imu)
+        T_curr_prev = T_cam0_world @ window.clones.T_world_imu[-1] @ se3_inverse(T_cam0_imu)
         # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world)
         A = se3_adjoint(T_cam0_world)
         measured = self.source is not None and not growth.bridged
@@ -256,7 +256,7 @@ class Propagation:
             with_newest = self.reported.with_newest
             J = np.eye(6, len(with_newest), len(own))  # of the camera, and back to the body
             J[:, : len(own)] += window.since_first(window.body_D_error()[-6:])[:, : len(own)]
-            return window.clones[-1].T_world_imu, J @ with_newest @ J.T
+            return window.clones.T_world_imu[-1], J @ with_newest @ J.T
         T, J, noise = window.camera_D_own(self.late_s, self.twist(window, window.nav, self.since_frame))
         if "extrinsics" in window.state:
             J[:, window.state["extrinsics"]] = 0.0  # of the body
