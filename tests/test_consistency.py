@@ -39,7 +39,7 @@ def _fill(kind: type[Window], motion: str) -> Window:
 def _usual_difference(a: Window, b: Window) -> FloatArray:
     """Means of a minus means of b, in the usual errors."""
     poses = [(a.nav.T_world_imu, b.nav.T_world_imu)]
-    poses += [(x.T_world_imu, y.T_world_imu) for x, y in zip(a.clones, b.clones, strict=True)]
+    poses += [(x, y) for x, y in zip(a.clones.T_world_imu, b.clones.T_world_imu, strict=True)]
     changes = [np.concatenate([x[:3, 3] - y[:3, 3], so3_log(x[:3, :3] @ y[:3, :3].T)]) for x, y in poses]
     rest = [a.nav.velocity - b.nav.velocity, a.nav.rate - b.nav.rate]
     if isinstance(a.motion, ImuMotion):

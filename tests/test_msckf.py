@@ -610,7 +610,7 @@ def test_a_new_landmark_hangs_on_the_poses_as_its_triangulation_does(monkeypatch
         table = filt._frame.tracks.table
         rows = table.rows()
         views = table.views(rows[np.isin(table.ids(rows), ids[:1])], len(window.clones))
-        T = np.array([c.T_world_imu for c in window.clones])
+        T = window.clones.T_world_imu
         made.append((T, p_world[:1], A[:3, window.state.clones.start : window.state.landmarks.start], views))
         add(window, ids, p_world, A, covariance, by_considered)
 

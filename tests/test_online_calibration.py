@@ -222,12 +222,12 @@ def test_jacobian_of_the_cloned_camera_equals_central_differences() -> None:
 
 def test_moving_the_means_moves_cameras_and_bodies_as_their_errors_say() -> None:
     window = _window()
-    cameras, bodies = window.T_cam0_world(), window.exposures()
+    cameras, bodies = window.T_cam0_world(), window.clones.T_world_imu
 
     def moves(error: FloatArray) -> FloatArray:
         moved = _moved(window, np.concatenate([error[:6], np.zeros(9), error[6:]]))
         by_camera = [_camera_error(a, b) for a, b in zip(cameras, moved.T_cam0_world(), strict=True)]
-        by_body = [se3_log(b @ se3_inverse(a)) for a, b in zip(bodies, moved.exposures(), strict=True)]
+        by_body = [se3_log(b @ se3_inverse(a)) for a, b in zip(bodies, moved.clones.T_world_imu, strict=True)]
         return np.concatenate([*by_camera, *by_body])
 
     numeric = numeric_jacobian(moves, np.zeros(6 + 7 + 30))
@@ -262,7 +262,7 @@ def test_exposures_are_where_the_images_saw_them_when_the_clocks_are_first_compa
     window.prior.P[row, row] = sigma2 = BOTH.time_offset_sigma_s**2
     early, late = (NavState(*parts) for parts in (_nav_parts(0.3), _nav_parts(0.35)))
     window.clocks_compared, window.nav, twist = False, late, _twist(late)
-    window.clones = [replace(window.clones[0], velocity=early.velocity)]
+    window.clones = replace(window.clones, velocities=early.velocity[None])
     own, (_, J, _) = slice(0, window.state.clones.start), window.camera_D_own(0.0, twist)
     without_offset = J @ window.prior.P[own, own] @ J.T
     window.compare_clocks(STEP_NS, 0.0, twist)

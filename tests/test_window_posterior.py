@@ -12,7 +12,7 @@ from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
 from vio.filters.window_posterior import WindowPosterior
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_from_parts, se3_inverse
 
 _START = se3_exp([3.0, -2.0, 1.0, 0.4, -0.8, 1.1])
 _LIMITS = 0.02, 0.01  # m/s, rad/s
@@ -85,7 +85,8 @@ def test_each_clone_is_told_with_its_own_covariance_on_the_bodys_side() -> None:
     root = np.random.default_rng(0).normal(size=(len(window.prior.P), len(window.prior.P)))
     P = root @ root.T
     posterior = WindowPosterior.of(window, P)
-    for k, clone in enumerate(window.clones):
+    for k in range(len(window.clones)):
+        clone = window.clones[k]
         estimate = posterior.estimate(10 + k)
         A = se3_adjoint(se3_inverse(clone.T_world_imu))
         rows = window.state.clone(k)
@@ -102,12 +103,9 @@ def test_without_imu_the_velocity_is_that_of_the_poses_around() -> None:
     window = _window(np.zeros(6))
     t = np.arange(5) * 0.1
     p = np.column_stack([3 * t**2, 1 - 2 * t, 0 * t])
-    window.clones = [
-        replace(c, T_world_imu=np.block([[c.T_world_imu[:3, :3], q[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]))
-        for c, q in zip(window.clones, p, strict=True)
-    ]
+    window.clones = replace(window.clones, T_world_imu=se3_from_parts(window.clones.T_world_imu[:, :3, :3], p))
     posterior = WindowPosterior.of(window, window.prior.P)
-    smoothed = [posterior.estimate(c.frame_index) for c in posterior.clones]
+    smoothed = [posterior.estimate(index) for index in posterior.clones.frame_indices.tolist()]
     velocities = np.array([estimate.velocity_world for estimate in smoothed if estimate is not None])
     exact = np.column_stack([6 * t, np.full(5, -2.0), 0 * t])
     np.testing.assert_allclose(velocities[1:-1], exact[1:-1], atol=1e-12)

@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ from vio.filters.multiview import Residuals
 from vio.filters.navigation import DIM, ImuMotion, NavState, Transition
 from vio.filters.noise import MotionNoise
 from vio.filters.settings import MsckfSettings
-from vio.filters.window import Clone, Window
+from vio.filters.window import Window
 from vio.filters.window_tracks import WindowTracks
 from vio.geometry.lie import (
     FloatArray,
@@ -105,7 +105,7 @@ class StandardErrors(Window):
 
     def linearisation_point(self) -> tuple[NavState, FloatArray, FloatArray]:
         """The navigation state, positions (N, 3) of the clones and landmarks (M, 3) at which (E1) is taken."""
-        return self.nav, _positions(self.clones), self.landmarks
+        return self.nav, self.clones.T_world_imu[:, :3, 3], self.landmarks
 
     def standard_D_error(self) -> FloatArray:
         """Jacobian (D, D) of the usual errors with respect to the window's own, equation (E1)."""
@@ -132,9 +132,8 @@ class StandardErrors(Window):
             velocity=self.nav.velocity + change[6:9],
         )
         moves = change[self.state.clone(0).start : self.state.landmarks.start].reshape(-1, 6)
-        self.clones = [
-            replace(c, T_world_imu=_moved(c.T_world_imu, move)) for c, move in zip(self.clones, moves, strict=True)
-        ]
+        poses = [_moved(T, move) for T, move in zip(self.clones.T_world_imu, moves, strict=True)]
+        self.clones = replace(self.clones, T_world_imu=np.array(poses).reshape(-1, 4, 4))
         self.landmarks = self.landmarks + change[self.state.landmarks.start :].reshape(-1, 3)
         self.prior.delta = self.prior.delta + error
         self._follow(before)
@@ -159,12 +158,12 @@ class FirstEstimates(StandardErrors):
 
     def _begin(self) -> None:
         self._first_nav = self.nav
-        self._first_clones = list(self.clones)
+        self._first_positions = self.clones.T_world_imu[:, :3, 3]
         self._first_landmarks = self.landmarks
 
     def linearisation_point(self) -> tuple[NavState, FloatArray, FloatArray]:
         """As above, at the first estimates."""
-        return self._first_nav, _positions(self._first_clones), self._first_landmarks
+        return self._first_nav, self._first_positions, self._first_landmarks
 
     def propagate(self, step: Transition, walk: FloatArray | None = None) -> None:
         """Move the navigation state; the prediction is its first estimate."""
@@ -175,7 +174,8 @@ class FirstEstimates(StandardErrors):
         """Copy the pose; where it is now is its first estimate."""
         with self._landmarks_at_first():
             super().add_clone(frame_index, time_ns, *rest)
-        self._first_clones = [*self._first_clones, self.clones[-1]]
+        newest = self.clones.T_world_imu[-1:, :3, 3]
+        self._first_positions = np.concatenate([self._first_positions, newest])
 
     def inflate_process_noise(self, extra: FloatArray) -> None:
         """Add noise to the last step."""
@@ -185,7 +185,7 @@ class FirstEstimates(StandardErrors):
     def drop_oldest_clone(self) -> None:
         """Forget the oldest clone."""
         super().drop_oldest_clone()
-        self._first_clones = self._first_clones[1:]
+        self._first_positions = self._first_positions[1:]
 
     def keep_landmarks(self, chosen: BoolArray) -> None:
         """Forget the landmarks outside a mask (M,)."""
@@ -218,11 +218,6 @@ class FirstEstimates(StandardErrors):
 def _at_means(window: Window) -> StandardErrors:
     """The navigation state of a window alone, linearised at its means."""
     return StandardErrors(window.motion, window.nav, np.eye(DIM))
-
-
-def _positions(clones: Sequence[Clone]) -> FloatArray:
-    """Positions (N, 3) of clones."""
-    return np.array([c.T_world_imu[:3, 3] for c in clones]).reshape(-1, 3)
 
 
 def _moved(T: FloatArray, change: FloatArray) -> FloatArray:

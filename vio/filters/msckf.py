@@ -190,18 +190,17 @@ class Msckf(Backend):
                 raise DivergedError(_lost(observations.frame_index))
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         propagation.blind = False
-        now = window.nav, propagation.since_frame
-        late_s, twist = propagation.late_s, propagation.twist(window, *now)
-        exposure = window.camera_D_own(late_s, twist)
-        expected = propagation.expected_error(window, *now, *exposure[1:])
+        now, late_s = (window.nav, propagation.since_frame), propagation.late_s
+        exposure, expected = propagation.exposure(window, *now, late_s)
         # Half a window gives the velocity: before, its product with the offset's error would pass for knowledge of it.
         moving = len(window.clones) >= self._settings.clones // 2
         if "time_offset" in window.state and moving and not window.clocks_compared:
+            twist = propagation.twist(window, *now)
             window.compare_clocks(observations.time_ns, late_s, twist)
             exposure = window.camera_D_own(late_s, twist)
         window.add_clone(observations.frame_index, observations.time_ns, exposure)
         self._keep_first_attitude(window)
-        before = window.clones[len(window.clones) > self._settings.clones]  # the oldest that stays
+        before = window.clones[int(len(window.clones) > self._settings.clones)]  # the oldest that stays
         try:
             report = self._frame.update(window, seen, expected)
             self._apply_zero_velocity(window)
@@ -383,11 +382,11 @@ class Msckf(Backend):
         """
         if self._source != "imu" or before.time_ns != self._began_ns:
             return
-        after = next((c for c in window.clones if c.frame_index == before.frame_index), None)
-        if after is None:
+        after = window.clones.T_world_imu[window.clones.frame_indices == before.frame_index]
+        if not len(after):
             return
         old = self._tilted
-        phi, t = so3_log(after.T_world_imu[:3, :3] @ before.T_world_imu[:3, :3].T), _half_tangent(old)
+        phi, t = so3_log(after[0, :3, :3] @ before.T_world_imu[:3, :3].T), _half_tangent(old)
         moved = so3_exp(phi) @ old
         yaw = -nearest_yaw(moved)
         self._tilted = so3_exp([0.0, 0.0, yaw]) @ moved

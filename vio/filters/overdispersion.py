@@ -20,7 +20,7 @@ _PRIOR_TRACKS = 30.0  # as many ended tracks count for it
 _MOST_FEATURES = 4096  # whose clusters are kept: far more than are seen at once
 _CELL_RAD = 0.2  # side of the cells of directions in which features are neighbours
 _FRAMES = 10  # of those in which tracks end, in which neighbours' are one cluster
-_NO_SCORE: FloatArray = np.zeros(6)
+_NO_SCORE = [0.0] * 6
 
 
 class Overdispersion:
@@ -28,7 +28,7 @@ class Overdispersion:
 
     def __init__(self) -> None:
         self._cluster: dict[int, tuple[int, int, int]] = {}  # of features, by id, in the order in which they ended last
-        self._scores: dict[tuple[int, int, int], FloatArray] = {}  # of clusters
+        self._scores: dict[tuple[int, int, int], list[float]] = {}  # of clusters
         self._squares, self._information = np.zeros(6), np.zeros(6)
         self._tracks, self._calls = 0, 0
         self.factor = PRIOR_FACTOR  # by how much too often the information of pixels is counted, at least one
@@ -43,13 +43,14 @@ class Overdispersion:
             information: (K, 6) likewise, their expected squares.
         """
         cells = np.floor(directions / _CELL_RAD).astype(np.int64).tolist()
-        for feature, (x, y), score in zip(ids.tolist(), cells, scores, strict=True):
+        squares = self._squares.tolist()
+        for feature, (x, y), score in zip(ids.tolist(), cells, scores.tolist(), strict=True):
             cluster = self._cluster.pop(feature, (x, y, self._calls // _FRAMES))
             self._cluster[feature] = cluster  # a feature that began again stays in its cluster
             before = self._scores.pop(cluster, _NO_SCORE)
-            together = score + before
-            self._squares += score * (together + before)
-            self._scores[cluster] = together
+            self._scores[cluster] = together = [a + b for a, b in zip(score, before, strict=True)]
+            squares = [s + a * (c + b) for s, a, b, c in zip(squares, score, before, together, strict=True)]
+        self._squares = np.array(squares)
         self._calls += 1
         self._information += information.sum(axis=0)
         self._tracks += len(ids)

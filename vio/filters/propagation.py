@@ -89,6 +89,7 @@ class Propagation:
         self.gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
         self._coming: _Coming | None = None  # the step that `predict` has integrated
         self._twist: tuple[NavState, Growth, Twist] | None = None  # the last one, and of what
+        self._camera: tuple[NavState, Growth, float, tuple[FloatArray, FloatArray, FloatArray]] | None = None  # too
 
     def unknown_noise(self) -> MotionNoise:
         """The motion model's noise where nothing was learned of it."""
@@ -159,12 +160,11 @@ class Propagation:
                 return None
             nav, growth = coming.step.nav, coming.growth
         T_cam0_imu, late_s = window.calibration.T_cam0_imu, (body_ns - time_ns) * 1e-9
-        T_world_imu, *camera_D_own = window.camera_D_own(late_s, self.twist(window, nav, growth), nav)
+        (T_world_imu, *_), expected = self.exposure(window, nav, growth, late_s)
         T_cam0_world = T_cam0_imu @ se3_inverse(T_world_imu)
-        T_curr_prev = T_cam0_world @ window.exposures()[-1] @ se3_inverse(T_cam0_imu)
+        T_curr_prev = T_cam0_world @ window.clones.T_world_imu[-1] @ se3_inverse(T_cam0_imu)
         # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world)
         A = se3_adjoint(T_cam0_world)
-        expected = self.expected_error(window, nav, growth, *camera_D_own)
         measured = self.source is not None and not growth.bridged
         motion = MotionPrior(T_curr_prev, A @ expected @ A.T, measured)
         of_rotation = motion.covariance[3:, 3:]  # no eigenvalue is larger than its trace
@@ -172,26 +172,34 @@ class Propagation:
             return None
         return T_cam0_world, motion
 
-    def expected_error(
-        self, window: Window, nav: NavState, growth: Growth, camera_D_own: FloatArray, noise: FloatArray
-    ) -> FloatArray:
-        """Covariance (6, 6) of `xi_curr - xi_prev`, of the camera, where the errors have grown since the last frame.
+    def exposure(
+        self, window: Window, nav: NavState, growth: Growth, late_s: float
+    ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray]:
+        """Predict the camera at a frame; what `predict` has asked for, `update` finds.
 
         Args:
             window: the window.
-            nav: the navigation state at the present frame.
+            nav: the navigation state at the frame.
             growth: since the last frame.
-            camera_D_own: how the camera's pose at the present frame follows them, equation (C2).
-            noise: and what that leaves open.
+            late_s: the navigation state's time on the IMU's clock minus the frame's stamp.
+
+        Returns:
+            What `Window.camera_D_own` returns, and the covariance (6, 6) of `xi_curr - xi_prev`, of the camera, where
+            the errors have grown since the last frame.
         """
-        if not window.calibration.moves_camera and "imu_terms" not in window.state:
-            M = growth.Phi[:6] - np.eye(6, DIM)
-            out: FloatArray = M @ self.posterior.own[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
-            return out
-        J = camera_D_own
-        M = np.concatenate([J @ self.grown(window, nav, growth), -np.eye(6)], axis=1)
-        out = M @ self.posterior.with_newest @ M.T + J[:, :DIM] @ growth.Q @ J[:, :DIM].T + noise
-        return np.asarray(out, dtype=np.float64)
+        last, twist = self._camera, self.twist(window, nav, growth)
+        if last is None or last[0] is not nav or last[1] is not growth or last[2] != late_s:
+            T, J = window.camera_at(late_s, twist, nav)
+            if not window.calibration.moves_camera and "imu_terms" not in window.state:
+                M = growth.Phi[:6] - np.eye(6, DIM)
+                moved = M @ self.posterior.own[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
+            else:
+                M = np.concatenate([J @ self.grown(window, nav, growth), -np.eye(6)], axis=1)
+                moved = M @ self.posterior.with_newest @ M.T + J[:, :DIM] @ growth.Q @ J[:, :DIM].T
+            last = self._camera = nav, growth, late_s, (T, J, moved)
+        T, J, moved = last[3]
+        noise = window.exposure_noise(T, late_s, twist)
+        return (T, J, noise), moved + noise
 
     def grown(self, window: Window, nav: NavState, growth: Growth) -> FloatArray:
         """Transition (15 + C, 15 + C) of the errors of navigation state and calibration since the last frame."""
@@ -248,7 +256,7 @@ class Propagation:
             with_newest = self.reported.with_newest
             J = np.eye(6, len(with_newest), len(own))  # of the camera, and back to the body
             J[:, : len(own)] += window.since_first(window.body_D_error()[-6:])[:, : len(own)]
-            return window.clones[-1].T_world_imu, J @ with_newest @ J.T
+            return window.clones.T_world_imu[-1], J @ with_newest @ J.T
         T, J, noise = window.camera_D_own(self.late_s, self.twist(window, window.nav, self.since_frame))
         if "extrinsics" in window.state:
             J[:, window.state["extrinsics"]] = 0.0  # of the body

@@ -7,8 +7,7 @@ covariance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -41,6 +40,41 @@ class Clone:
     velocity: FloatArray  # (3,) as in NavState
 
 
+@dataclass(frozen=True, slots=True)
+class Clones:
+    """The clones of a window, oldest first: the fields of `Clone` in arrays."""
+
+    frame_indices: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (N,)
+    times_ns: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (N,)
+    T_world_imu: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (N, 4, 4)
+    velocities: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3)
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+    def __getitem__(self, index: int) -> Clone:
+        number, time_ns = int(self.frame_indices[index]), int(self.times_ns[index])
+        return Clone(number, time_ns, self.T_world_imu[index], self.velocities[index])
+
+    def with_newest(self, clone: Clone) -> Clones:
+        """Return the clones and a newer one."""
+        return Clones(
+            np.append(self.frame_indices, clone.frame_index),
+            np.append(self.times_ns, clone.time_ns),
+            np.concatenate([self.T_world_imu, clone.T_world_imu[None]]),
+            np.concatenate([self.velocities, clone.velocity[None]]),
+        )
+
+    def without_oldest(self) -> Clones:
+        """Return all but the first."""
+        return Clones(self.frame_indices[1:], self.times_ns[1:], self.T_world_imu[1:], self.velocities[1:])
+
+    def turned(self, R: FloatArray) -> Clones:
+        """Return the same in a world that is turned by R (3, 3)."""
+        velocities = np.array([R @ v for v in self.velocities])
+        return replace(self, T_world_imu=se3_from_parts(R, np.zeros(3)) @ self.T_world_imu, velocities=velocities)
+
+
 _NO_CALIBRATION = Calibration(np.eye(4))
 
 
@@ -65,7 +99,7 @@ class Window:
         self.motion = motion
         self.nav = nav
         self.calibration = calibration
-        self.clones = ()
+        self.clones = Clones()
         self.landmark_ids: IntArray = np.zeros(0, dtype=np.int64)
         self.landmarks: FloatArray = np.zeros((0, 3))
         self.prior = Prior(P)
@@ -76,25 +110,9 @@ class Window:
         """Find the rows of all errors, after a change of which there are."""
         self.state = ErrorState(self.calibration.estimated, len(self.clones), len(self.landmarks))
 
-    @property
-    def clones(self) -> Sequence[Clone]:
-        """The body at the frames of the window, oldest first."""
-        return self._clones
-
-    @clones.setter
-    def clones(self, clones: Sequence[Clone]) -> None:
-        self._clones = tuple(clones)
-        self._exposures: FloatArray | None = None  # their poses in one array
-
-    def exposures(self) -> FloatArray:
-        """Poses (N, 4, 4) of the body when the frames were exposed; not to be changed."""
-        if self._exposures is None:
-            self._exposures = np.array([c.T_world_imu for c in self._clones])
-        return self._exposures
-
     def T_cam0_world(self, first: int = 0) -> FloatArray:
         """Camera poses (N, 4, 4) at the exposures from one on."""
-        T = self.exposures()[first:]
+        T = self.clones.T_world_imu[first:]
         out: FloatArray = np.empty(T.shape)
         loops.camera_poses(self.calibration.T_cam0_imu, T, out)
         return out
@@ -105,13 +123,14 @@ class Window:
         out = np.eye(6 * len(self.clones), state.clones.stop, state.clones.start)
         if "extrinsics" in state:
             back = se3_inverse(self.nav.T_world_imu)
-            out[:, state["extrinsics"]] = se3_adjoint(self.exposures() @ back).reshape(-1, 6)
+            out[:, state["extrinsics"]] = se3_adjoint(self.clones.T_world_imu @ back).reshape(-1, 6)
         return out
 
     def camera_move_since(self, index: int) -> FloatArray:
         """Motion (4, 4) `T_clone_newest` of cam0 from a clone to the newest one."""
         T = self.calibration.T_cam0_imu
-        move = se3_inverse(self.clones[index].T_world_imu) @ self.clones[-1].T_world_imu
+        poses = self.clones.T_world_imu
+        move = se3_inverse(poses[index]) @ poses[-1]
         out: FloatArray = T @ move @ se3_inverse(T)
         return out
 
@@ -236,27 +255,29 @@ class Window:
         of_scale[:DIM] += scaled_nav(self.nav, self.calibration.T_cam0_imu)
         scaled_clone = scaled_nav(replace(self.nav, T_world_imu=T), self.calibration.T_cam0_imu)[:6]
         self.prior.insert_dependent(self.state.clones.stop, camera_D_own, noise, camera_D_own @ of_scale - scaled_clone)
-        self.clones = (*self.clones, Clone(frame_index, time_ns, T, self.nav.velocity))
+        self.clones = self.clones.with_newest(Clone(frame_index, time_ns, T, self.nav.velocity))
         self._lay_out()
         if len(self.landmarks):
             self._anchor_to_newest(self.state.clone(-2).start + 3)
 
-    def camera_D_own(
-        self, late_s: float, twist: Twist, nav: NavState | None = None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def camera_D_own(self, late_s: float, twist: Twist) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the body's pose and the Jacobian of `camera_at`, and the covariance of `exposure_noise`."""
+        T, J = self.camera_at(late_s, twist, self.nav)
+        return T, J, self.exposure_noise(T, late_s, twist)
+
+    def camera_at(self, late_s: float, twist: Twist, nav: NavState) -> tuple[FloatArray, FloatArray]:
         """How errors of navigation state and calibration move the camera at an exposure, equation (C2).
 
         Args:
             late_s: the navigation state's time on the IMU's clock minus the frame's stamp.
             twist: of the body at the exposure.
-            nav: the navigation state; None: the window's.
+            nav: the navigation state.
 
         Returns:
-            The body's pose (4, 4) at the exposure, the Jacobian (6, 15 + C), and a noise covariance (6, 6).
+            The body's pose (4, 4) at the exposure, and the Jacobian (6, 15 + C).
         """
-        T = self.nav.T_world_imu if nav is None else nav.T_world_imu
-        state, calibration = self.state, self.calibration
-        J, exposed, noise = np.eye(6, state.own.stop), T, np.zeros((6, 6))
+        T, state, calibration = nav.T_world_imu, self.state, self.calibration
+        J, exposed = np.eye(6, state.own.stop), T
         compared = self.clocks_compared and "time_offset" in state
         if "time_offset" in state:
             exposed = T @ se3_exp(twist.mean * (calibration.time_offset_s - late_s))
@@ -264,11 +285,16 @@ class Window:
             column = BLOCKS[name].camera_D_error(T, exposed, twist if compared else None)
             if column is not None:
                 J[:, state[name]] = column
-        if compared:
-            A, row = se3_adjoint(exposed), state["time_offset"].start
-            spread = float(self.prior.P[row, row]) + (calibration.time_offset_s - late_s) ** 2
-            noise = A @ twist.covariance @ A.T * spread
-        return exposed, J, noise
+        return exposed, J
+
+    def exposure_noise(self, T_world_imu: FloatArray, late_s: float, twist: Twist) -> FloatArray:
+        """Covariance (6, 6) of the camera at an exposure of the body (4, 4), by an uncertain twist over its offset."""
+        if not self.clocks_compared or "time_offset" not in self.state:
+            return np.zeros((6, 6))
+        A, row = se3_adjoint(T_world_imu), self.state["time_offset"].start
+        spread = float(self.prior.P[row, row]) + (self.calibration.time_offset_s - late_s) ** 2
+        out: FloatArray = A @ twist.covariance @ A.T * spread
+        return out
 
     def _anchor_to_newest(self, previous_rotation: int) -> None:
         """Measure the landmarks' errors from the newest exposure's rotation: xi_f += p^ (phi_new - phi_old)."""
@@ -286,7 +312,7 @@ class Window:
     def drop_oldest_clone(self) -> None:
         """Forget the oldest clone."""
         self.prior.keep(np.delete(np.arange(self.state.size), self.state.clone(0)))
-        self.clones = self.clones[1:]
+        self.clones = self.clones.without_oldest()
         self._lay_out()
 
     def keep_landmarks(self, chosen: BoolArray) -> None:
@@ -361,23 +387,19 @@ class Window:
         """Move the means by an error vector (D,); the prior stays where it is."""
         state = self.state
         of_clones = error[state.clones]
-        T, moves = self.exposures().copy(), of_clones.reshape(-1, 6).copy()
+        clones, moves = self.clones, of_clones.reshape(-1, 6).copy()
+        T, velocities = clones.T_world_imu.copy(), clones.velocities
         if "extrinsics" in state:
             loops.add_extrinsic_moves(T, self.nav.T_world_imu, error[state["extrinsics"]], moves)
         move_poses(moves, T)
         if len(self.landmarks):
             self.landmarks = self.landmarks.copy()
             loops.move_points(of_clones[-3:], error[state.landmarks].reshape(-1, 3), self.landmarks)
-        velocities = [c.velocity for c in self.clones]
         if isinstance(self.motion, ImuMotion):
-            ages = np.array([self.clones[-1].time_ns - c.time_ns for c in self.clones]) * 1e-9
+            ages = (clones.times_ns[-1] - clones.times_ns) * 1e-9
             R = 0.5 * (T[:, :3, :3] + T[-1, :3, :3])
-            velocities = list(self.motion.corrected_earlier(np.array(velocities), R, ages, error[state.motion]))
-        self.clones = [
-            Clone(c.frame_index, c.time_ns, pose, velocity)
-            for c, pose, velocity in zip(self.clones, T, velocities, strict=True)
-        ]
-        self._exposures = T
+            velocities = self.motion.corrected_earlier(velocities, R, ages, error[state.motion])
+        self.clones = Clones(clones.frame_indices, clones.times_ns, T, velocities)
         if self.calibration.estimated:
             self.calibration = self.calibration.corrected(error[state.calibration], self.nav.T_world_imu)
         self.nav = self.motion.corrected(self.nav, error[state.motion])
@@ -405,7 +427,7 @@ class Window:
         M = turn @ M
         T = se3_from_parts(R, np.zeros(3))
         self.nav = replace(self.nav, T_world_imu=T @ self.nav.T_world_imu, velocity=R @ self.nav.velocity)
-        self.clones = [replace(c, T_world_imu=T @ c.T_world_imu, velocity=R @ c.velocity) for c in self.clones]
+        self.clones = self.clones.turned(R)
         self.landmarks = self.landmarks @ R.T
         P = M @ prior.P @ M.T
         prior.P, prior.delta, prior.error_D_constants = 0.5 * (P + P.T), turn @ prior.delta, M @ prior.error_D_constants

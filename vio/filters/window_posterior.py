@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.filters.navigation import ImuMotion
-from vio.filters.window import Clone, Window
+from vio.filters.window import Clones, Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log, so3_hat
 from vio.geometry.relative_pose import RelativePose
 from vio.numerics.statistics import chi_square_quantile
@@ -21,7 +21,7 @@ _STATIONARY_LIMIT = float(chi_square_quantile(0.95, 6))  # of the motion over th
 class WindowPosterior:
     """Smoothed poses: each has seen the frames after it, up to the newest."""
 
-    clones: tuple[Clone, ...]  # oldest first
+    clones: Clones
     P: FloatArray  # (6N, 6N) covariance of their right-invariant errors
     reported: FloatArray  # (6N, 6N) the same with the uncertainty of the rig's scale
     gyro_bias: FloatArray  # (3,) rad/s, of the newest frame
@@ -41,18 +41,17 @@ class WindowPosterior:
             of_body = J @ P @ J.T if "extrinsics" in window.state else own[0]
             own = of_body, J_reported @ reported @ J_reported.T
         has_imu, R = isinstance(window.motion, ImuMotion), window.calibration.R_upright_world
-        return cls(tuple(window.clones), *own, window.nav.gyro_bias, window.nav.accel_bias, has_imu, R)
+        return cls(window.clones, *own, window.nav.gyro_bias, window.nav.accel_bias, has_imu, R)
 
     def rotated(self, R: FloatArray) -> WindowPosterior:
         """Return the same in a world that is turned by R (3, 3)."""
-        T = se3_from_parts(R, np.zeros(3))
-        clones = tuple(replace(c, T_world_imu=T @ c.T_world_imu, velocity=R @ c.velocity) for c in self.clones)
-        turn = np.kron(np.eye(2 * len(clones)), R)
-        return replace(self, clones=clones, P=turn @ self.P @ turn.T, reported=turn @ self.reported @ turn.T)
+        turn = np.kron(np.eye(2 * len(self.clones)), R)
+        P, reported = turn @ self.P @ turn.T, turn @ self.reported @ turn.T
+        return replace(self, clones=self.clones.turned(R), P=P, reported=reported)
 
     def estimate(self, frame_index: int) -> Estimate | None:
         """Return the smoothed estimate at a frame of the window; None where the frame is not in it."""
-        index = next((k for k, c in enumerate(self.clones) if c.frame_index == frame_index), None)
+        index = self._place(frame_index)
         if index is None:
             return None
         clone, rows = self.clones[index], slice(6 * index, 6 * index + 6)
@@ -69,22 +68,26 @@ class WindowPosterior:
 
     def _velocities(self) -> FloatArray:
         """World velocities (N, 3) by the smoothed poses around each: a drifting twist keeps only its newest."""
-        p = np.array([c.T_world_imu[:3, 3] for c in self.clones])
-        if len(p) < 2:
-            return np.array([c.velocity for c in self.clones])
-        t = np.array([c.time_ns - self.clones[0].time_ns for c in self.clones]) * 1e-9
-        return np.asarray(np.gradient(p, t, axis=0), dtype=np.float64)
+        if len(self.clones) < 2:
+            return self.clones.velocities
+        t = (self.clones.times_ns - self.clones.times_ns[0]) * 1e-9
+        return np.asarray(np.gradient(self.clones.T_world_imu[:, :3, 3], t, axis=0), dtype=np.float64)
+
+    def _place(self, frame_index: int) -> int | None:
+        """Which clone is that of a frame; None: it is not in the window."""
+        found = np.flatnonzero(self.clones.frame_indices == frame_index)
+        return int(found[0]) if len(found) else None
 
     def motion(self, older: int, newer: int) -> RelativePose | None:
         """Return the body's motion between two frames of the window; None where one of them is not in it.
 
         With right-invariant errors, `T_i^-1 T_j = T_ij_hat exp(Ad(T_j_hat^-1) (xi_j - xi_i))`.
         """
-        place = {c.frame_index: k for k, c in enumerate(self.clones)}
-        if older not in place or newer not in place:
+        i, j = self._place(older), self._place(newer)
+        if i is None or j is None:
             return None
-        T_i, T_j = (self.clones[place[frame]].T_world_imu for frame in (older, newer))
-        a, b = (slice(6 * place[frame], 6 * place[frame] + 6) for frame in (older, newer))
+        T_i, T_j = self.clones.T_world_imu[i], self.clones.T_world_imu[j]
+        a, b = slice(6 * i, 6 * i + 6), slice(6 * j, 6 * j + 6)
         A = se3_adjoint(se3_inverse(T_j))
         C = A @ (self.P[a, a] + self.P[b, b] - self.P[a, b] - self.P[b, a]) @ A.T
         return RelativePose(se3_inverse(T_i) @ T_j, C)
@@ -123,7 +126,7 @@ def scale_sigma(posterior: WindowPosterior) -> float | None:
 
     It is that of the factor by which the poses' positions, from the oldest one on, are longer than the truth.
     """
-    T = np.array([c.T_world_imu for c in posterior.clones])
+    T = posterior.clones.T_world_imu
     p = T[:, :3, 3] - T[0, :3, 3]
     length2 = float(np.sum(p**2))
     if length2 < _LEAST_MOTION_M**2:

@@ -144,10 +144,10 @@ class WindowTracks:
         if not wrong.any():
             return tracks
         self.table.drop_views(tracks.rows, wrong)
-        kept = ~wrong
-        r, z_D_p = tracks.at.r * kept[..., None], tracks.at.z_D_p * kept[..., None, None]
+        enough = np.count_nonzero((pixels > 0) & ~wrong, axis=1) >= 2
+        r, z_D_p = tracks.at.r.copy(), tracks.at.z_D_p.copy()
+        r[wrong], z_D_p[wrong] = 0.0, 0.0
         at = Residuals(r, z_D_p, np.ones(len(wrong), dtype=np.bool_), tracks.at.weight)
-        enough = np.count_nonzero((pixels > 0) & kept, axis=1) >= 2
         rows, p, z = tracks.rows[enough], tracks.p_world[enough], tracks.z[enough]
         return self._linear(tracks.T_cam0_world, rows, p, at.take(enough), tracks.field, z)
 
