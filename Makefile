@@ -94,8 +94,8 @@ $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e .
 	@touch $@
 	@# What tests compile, they compile themselves; here the first command still renders or reads meanwhile.
-	@echo "compiling loops in the background, once: about 30 s of CPU"
-	@$(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 &
+	@echo "compiling loops in the background, once: about a minute of CPU"
+	@nice $(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 &
 
 $(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[docs]'

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import Phase, settings
 
 from tests.commands import render
+from vio.numerics import prebuilt
 from vio.numerics.threads import one_blas_thread
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -28,6 +29,8 @@ LONGEST = (
 # Files whose tests look at the picture of a run. All others write an empty one: drawing takes longer than a short run.
 DRAWN = ("test_plotting",)
 
+# Tests judge the sources: numba compiles them, and no module that an earlier state of them has left.
+prebuilt.FOLDER = Path("no machine code")
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of torch and COLMAP: other workers use the other cores
 
 settings.register_profile("vio", deadline=None)  # no test judges a machine by its speed

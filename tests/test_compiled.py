@@ -13,7 +13,6 @@ import numba
 import numpy as np
 import pytest
 from numba.core import types
-from numba.core.dispatcher import Dispatcher
 
 from tests import numpy_twins
 from tests.test_frontend_patches import PLAIN, POINTS, picture
@@ -41,7 +40,7 @@ from vio.geometry.lie import (
     transform_points,
 )
 from vio.geometry.stereo import StereoCamera, project, triangulate
-from vio.numerics.compiled import invert_positive, move_by_twist, solve_positive
+from vio.numerics.compiled import Loop, invert_positive, move_by_twist, solve_positive
 
 CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
 CAMERAS = {"pinhole": CAMERA, "cylinder": replace(CAMERA, projection="cylinder")}
@@ -186,7 +185,7 @@ def test_no_loop_is_compiled_for_one_number_alone() -> None:
     p = np.random.default_rng(16).uniform([-1, -1, 3], [1, 1, 9], (20, 3))
     _refine(CAMERA, np.eye(4), p, project(CAMERA, p)[:, :2], 1.0, slice(0, 6))
     loops = [f for module in (outliers, patches, png_rows, right_camera) for f in vars(module).values()]
-    signatures = [s for f in loops if isinstance(f, Dispatcher) for s in f.signatures]
+    signatures = [s for f in loops if isinstance(f, Loop) for s in f.by_numba.signatures]
     assert signatures
     assert not [s for s in signatures if any(isinstance(part, types.Literal) for part in s)]
 

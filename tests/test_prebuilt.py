@@ -1,33 +1,79 @@
-"""Machine code that a wheel holds is used as it was made for, and nowhere else."""
+"""Machine code in an extension module is used for the loops and on the machines that it was made for, nowhere else."""
 
 from __future__ import annotations
 
+import inspect
 import json
-from collections.abc import Callable, Iterator
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import numba
 import numpy as np
 import pytest
 
 from tools.prebuild import write_code
 from vio.numerics import prebuilt
-from vio.numerics.compiled import _OPTIONS, solve_positive
+from vio.numerics.compiled import Loop, compiled, compiled_sums
+
+ROOT = Path(__file__).parent.parent
+HALF = 0.5
+
+
+@compiled
+def halved(x: float) -> float:
+    return HALF * x
+
+
+@compiled
+def add_halves(values: Any, out: Any) -> float | None:
+    """Add to `out` half of each value; return the last one's."""
+    last = np.nan
+    for k in range(len(values)):
+        last = halved(values[k])
+        out[k] += last
+    if np.isnan(last):
+        return None
+    return last
+
+
+@compiled_sums
+def total(values: Any, first: int) -> float:
+    out = 0.0
+    for k in range(first, len(values)):
+        out += values[k]
+    return out / (len(values) - first)
+
+
+LOOPS = {"halved": halved, "add_halves": add_halves, "total": total}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An extension module with the loops of this file."""
+    if shutil.which("cc") is None:
+        pytest.skip("needs a C compiler")
+    folder = tmp_path_factory.mktemp("made") / "machine_code"
+    loops = [Loop(loop.function, loop.options) for loop in LOOPS.values()]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prebuilt, "_extension", lambda: (None, {}))
+        add_halves_, total_ = loops[1:]
+        add_halves_(np.arange(3.0), np.zeros(3))
+        total_(np.arange(5.0), 0)
+        total_(np.arange(5.0, dtype=np.float32), 0)
+        write_code(folder, loops, "host", prebuilt.processor_flags())
+    return folder
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The machine code of a package of one file, for this process."""
-    made = tmp_path / "vio" / "numerics" / "machine_code"
-    monkeypatch.setattr(prebuilt, "FOLDER", made)
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
-    loop = numba.njit(solve_positive.__wrapped__, cache=True, **_OPTIONS)
-    loop(np.eye(2), np.ones(2))
-    write_code(made, [loop])
-    (tmp_path / "vio" / "part.py").write_text("x = 1\n")
-    _edit(made, sources=prebuilt.source_hash())
-    yield made
-    prebuilt._loops.cache_clear()
+def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it, in which this process looks for code."""
+    copy = shutil.copytree(made, tmp_path / "machine_code")
+    monkeypatch.setattr(prebuilt, "FOLDER", copy)
+    monkeypatch.setattr(prebuilt, "_extension", prebuilt._extension.__wrapped__)
+    return copy
 
 
 def _edit(folder: Path, **changes: object) -> None:
@@ -35,36 +81,99 @@ def _edit(folder: Path, **changes: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
-def _loads() -> bool:
-    """Return whether a fresh process would load a function's machine code; either way, the function is right."""
-    prebuilt._loops.cache_clear()
-    loop = prebuilt.attach(numba.njit(solve_positive.__wrapped__, **_OPTIONS))
-    b = np.array([2.0, 8.0])
-    loop(np.diag([1.0, 4.0]), b)
-    np.testing.assert_array_equal(b, [2.0, 2.0])
-    return sum(loop.stats.cache_hits.values()) == 1
+def _fresh(name: str) -> Loop:
+    return Loop(LOOPS[name].function, LOOPS[name].options)  # type: ignore[attr-defined]
 
 
-def test_machine_code_is_loaded_where_it_was_made_for(folder: Path) -> None:
-    assert _loads()
+def _is_loaded(loop: Loop, *arguments: Any) -> bool:
+    """Call a loop; return whether numba was not needed."""
+    loop(*arguments)
+    return "by_numba" not in vars(loop)
 
 
-def _another_source(folder: Path) -> None:
-    (folder.parent.parent / "part.py").write_text("x = 2\n")
+def test_machine_code_is_used_and_gives_the_same(folder: Path) -> None:
+    values, out, expected = np.arange(4.0), np.zeros(4), np.zeros(4)
+    loop = _fresh("add_halves")
+    assert loop(values, out) == add_halves(values, expected) == 1.5
+    assert loop(values[:0], out) is None
+    np.testing.assert_array_equal(out, expected)
+    assert "by_numba" not in vars(loop)
 
 
-def _more_sources(folder: Path) -> None:
-    (folder.parent.parent / "other.py").write_text("")
+def test_each_set_of_types_has_its_code(folder: Path) -> None:
+    loop = _fresh("total")
+    for dtype in (np.float64, np.float32):
+        assert _is_loaded(loop, np.arange(6, dtype=dtype), np.int64(1))
+        assert loop(np.arange(6, dtype=dtype), 1) == 3.0
+    assert np.isnan(loop(np.zeros(2), 2)), "divisions follow IEEE 754"
 
 
-def _damaged_code(folder: Path) -> None:
-    code = bytearray((folder / prebuilt.CODE).read_bytes())
-    code[::50] = bytes(len(code[::50]))
-    (folder / prebuilt.CODE).write_bytes(code)
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.arange(3),
+        np.arange(3.0).astype(">f8"),
+        np.arange(6.0)[::2],
+        np.zeros((3, 1)),
+        np.arange(3.0).view(np.recarray),
+    ],
+    ids=["whole numbers", "other order of bytes", "gaps", "two dimensions", "another class"],
+)
+def test_arrays_of_other_types_are_left_to_numba(values: Any, folder: Path) -> None:
+    loop = _fresh("total")
+    loop(np.arange(3.0), 0)
+    (code, _) = prebuilt.code_of(loop.function, lambda: loop.fingerprint)
+    with pytest.raises(TypeError):
+        code(values, 0)
+    if values.ndim == 1 and values.dtype.isnative:
+        assert not _is_loaded(loop, values, 0)
+        assert loop(values, 0) == np.mean(values)
+
+
+@pytest.mark.parametrize(
+    "arguments", [(None, 0), ([1.0], 0), ("text", 0), (1.0, 0), (np.zeros(2), 0.5), (np.zeros(2),)]
+)
+def test_other_arguments_are_an_error(arguments: tuple[Any, ...], folder: Path) -> None:
+    loop = _fresh("total")
+    for code in prebuilt.code_of(loop.function, lambda: loop.fingerprint):
+        with pytest.raises(TypeError):
+            code(*arguments)
+
+
+def test_what_must_not_be_written_to_is_left_to_numba(folder: Path) -> None:
+    loop, out = _fresh("add_halves"), np.zeros(3)
+    out.flags.writeable = False
+    (code,) = prebuilt.code_of(loop.function, lambda: loop.fingerprint)
+    with pytest.raises(TypeError):
+        code(np.arange(3.0), out)
+
+
+def test_a_process_with_machine_code_does_not_load_numba(folder: Path) -> None:
+    code = f"""
+import sys
+from pathlib import Path
+import numpy as np
+from vio.numerics import prebuilt
+from vio.numerics.compiled import Loop, compiled_sums
+prebuilt.FOLDER = Path({str(folder)!r})
+exec({inspect.getsource(total.function)!r})
+total.function.__module__ = {__name__!r}
+print(total(np.arange(6.0), 1), "numba" in sys.modules)
+"""
+    command = [sys.executable, "-c", "from typing import Any\n" + code]
+    assert subprocess.check_output(command, text=True, cwd=ROOT).split() == ["3.0", "False"]
 
 
 def _no_code(folder: Path) -> None:
-    (folder / prebuilt.CODE).unlink()
+    next(folder.glob("*vio_loops*")).unlink()
+
+
+def _damaged_code(folder: Path) -> None:
+    path = next(folder.glob("*vio_loops*"))
+    code = bytearray(path.read_bytes())
+    code[::50] = bytes(len(code[::50]))
+    path.unlink()
+    path.write_bytes(code)
 
 
 def _cut_manifest(folder: Path) -> None:
@@ -76,28 +185,46 @@ def _other_manifest(folder: Path) -> None:
     (folder / prebuilt.MANIFEST).write_text("[]")
 
 
+def _another_environment(name: str) -> Callable[[Path], None]:
+    return lambda folder: _edit(folder, environment=prebuilt.environment() | {name: "another"})
+
+
+def _another_processor(folder: Path) -> None:
+    _edit(folder, flags=["an instruction set to come"])
+
+
 @pytest.mark.parametrize(
-    "change", [_another_source, _more_sources, _damaged_code, _no_code, _cut_manifest, _other_manifest]
+    "change",
+    [
+        _no_code,
+        _damaged_code,
+        _cut_manifest,
+        _other_manifest,
+        _another_processor,
+        *map(_another_environment, prebuilt.environment()),
+    ],
 )
-def test_stale_or_damaged_machine_code_is_not_used(change: Callable[[Path], None], folder: Path) -> None:
+def test_code_that_is_damaged_or_for_another_machine_is_not_used(change: Callable[[Path], None], folder: Path) -> None:
     change(folder)
-    assert not _loads()
+    loop = _fresh("total")
+    assert not _is_loaded(loop, np.arange(3.0), 0)
+    assert loop(np.arange(3.0), 0) == 1.0
 
 
-@pytest.mark.parametrize("name", prebuilt.environment())
-def test_machine_code_of_another_version_is_not_used(name: str, folder: Path) -> None:
-    _edit(folder, environment=prebuilt.environment() | {name: "another"})
-    assert not _loads()
+def test_settings_of_numba_are_for_what_numba_compiles(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert _is_loaded(_fresh("total"), np.arange(3.0), 0)
+    monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
+    assert not _is_loaded(_fresh("total"), np.arange(3.0), 0)
 
 
-def test_machine_code_is_not_used_by_a_processor_that_lacks_an_instruction(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lacking = dict(numba.core.codegen.ll.get_host_cpu_features()) | {"avx2": False}
-    monkeypatch.setattr("llvmlite.binding.get_host_cpu_features", lambda: lacking)
-    assert not _loads()
+def test_a_loop_that_was_edited_is_compiled_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert _is_loaded(_fresh("add_halves"), np.arange(3.0), np.zeros(3))
+    monkeypatch.setattr(sys.modules[__name__], "HALF", 0.25)
+    monkeypatch.setattr(sys.modules[__name__], "halved", _fresh("halved"))
+    loop, out = _fresh("add_halves"), np.zeros(3)
+    assert not _is_loaded(loop, np.arange(3.0), out)  # as a constant of a function that it calls is another
 
 
-def test_a_processor_that_the_user_names_is_compiled_for(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numba.config, "CPU_NAME", "generic")
-    assert not _loads()
+def test_options_belong_to_a_loop(folder: Path) -> None:
+    loop = Loop(total.function, halved.options)  # type: ignore[attr-defined]
+    assert not _is_loaded(loop, np.arange(3.0), 0)

@@ -50,7 +50,7 @@ def main(argv: list[str]) -> int:
         if prebuilt:
             prebuild = [str(programs / "python"), str(Path(__file__).with_name("prebuild.py")), str(dist)]
             again = [*pip, "--no-deps", "--force-reinstall", "--no-index", "--find-links", str(dist), "stereo-vio"]
-            commands[1:1] = [prebuild, again]
+            commands[1:1] = [[*pip, "setuptools"], prebuild, again]
         for command in commands:
             subprocess.run(command, cwd=folder, env=clean, check=True)
         if prebuilt and (anew := sorted(path.name for path in Path(folder, "compiled").rglob("*.nbi"))):

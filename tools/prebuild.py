@@ -1,42 +1,70 @@
 """Compile the loops ahead of the first run: into the wheel, or for a checkout.
 
 python -m tools.prebuild dist     # beside the wheel in dist/, write one for this Python on Linux x86-64
-python -m tools.prebuild          # fill numba's cache of this checkout, for its first run
+python -m tools.prebuild          # for this checkout: numba's cache, and with a C++ compiler the extension module
+
+`vio/numerics/prebuilt.py` loads the module. numba's ahead-of-time compiler writes it. That takes no options for a
+function, trusts the types of arguments, and takes the address of an exception for the exception: replacements mend it
+while it works. It needs a C++ compiler and setuptools.
 """
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import importlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
+import warnings
 import zipfile
-from collections.abc import Iterable
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
-from vio.numerics import prebuilt
+from llvmlite import ir
+
+from vio.numerics import compiled, prebuilt
+from vio.numerics.compiled import Loop
+
+# numba's types are incomplete.
+boxing, cgutils, types, cpu, pythonapi, numpy_support = (
+    importlib.import_module(f"numba.{name}")
+    for name in ("core.boxing", "core.cgutils", "core.types", "core.cpu", "core.pythonapi", "np.numpy_support")
+)
+PythonAPI: Any = pythonapi.PythonAPI
 
 # Recordings of a second or two, small enough that nearly all of the time goes into compiling.
 _RENDERED = {
     "flight": "--rig small --width 320 --rate 10 --duration 3 --format euroc",
+    "wide": "--rig fisheye --width 320 --rate 10 --duration 1.5",
     "drive": "--scene street --trajectory car --width 320 --duration 0.8",
     "depth": "--rig small --width 320 --rate 10 --duration 0.8 --format rgbd",
 }
 _COMMANDS = (
     "run flight --map flight.map --out mapped",
+    "mesh mapped",
     "localise flight --map flight.map --out localised",
     "run flight --no-plot --out landmarks --set msckf.calibrate_stereo=off --set msckf.calibrate_camera_imu=both",
-    "run flight --no-plot --out cylinder --set dataset.projection=cylinder --stop 10",
+    "run flight --no-plot --out cylinder --set dataset.projection=cylinder",
     "run flight --no-plot --out mono --camera left",
     "run drive --out driven",
     "run depth --no-plot --out depths",
 )
-_TAG = f"cp{sys.version_info[0]}{sys.version_info[1]}-none-manylinux_2_17_x86_64"
+_TAG = f"cp{sys.version_info[0]}{sys.version_info[1]}-none-manylinux_2_29_x86_64"
+# The processors that a wheel is for: LLVM's names, and those of Linux for what must be there.
+_CPU_NAME = "x86-64-v3"
+_FEATURES = "sse3 ssse3 sse4.1 sse4.2 popcnt cx16 sahf avx avx2 bmi bmi2 f16c fma lzcnt movbe xsave"
+_FLAGS = "pni ssse3 sse4_1 sse4_2 popcnt cx16 lahf_lm avx avx2 bmi1 bmi2 f16c fma abm movbe xsave"
+
+# Bytes from the start of an object, as NumPy's and Python's headers have them: ndarray, dtype, type.
+_TYPE, _NDIM, _DTYPE, _FLAG_BITS, _ORDER, _TYPE_NUMBER, _NAME = 8, 24, 56, 64, 26, 28, 24
+_C_CONTIGUOUS, _F_CONTIGUOUS, _WRITEABLE = 0x1, 0x2, 0x400
+_BYTE, _INT, _POINTER = ir.IntType(8), ir.IntType(32), ir.IntType(8).as_pointer()
 
 
 def compile_loops() -> None:
@@ -58,32 +86,131 @@ def _check(status: int) -> None:
         raise RuntimeError("a recording could not be processed: see above")
 
 
-def compiled_loops() -> list[Any]:
-    """Return the loops of this process."""
-    from numba.core.dispatcher import Dispatcher
+def write_code(folder: Path, loops: Iterable[Loop], processor: str, flags: Iterable[str]) -> None:
+    """Write an extension module and its manifest into a new folder.
 
-    modules = [(name, module) for name, module in sorted(sys.modules.items()) if name.partition(".")[0] == "vio"]
-    found = [(name, f) for name, module in modules for f in vars(module).values() if isinstance(f, Dispatcher)]
-    return [loop for name, loop in found if loop.py_func.__module__ == name]
-
-
-def write_code(folder: Path, loops: Iterable[Any]) -> None:
-    """Write the machine code of loops that this process has compiled, and its manifest, into a new folder."""
-    from numba.core.serialize import dumps
-
+    Args:
+        folder: of the module.
+        loops: those that this process has called are written, for the types that they were called with.
+        processor: to compile for, LLVM's name; "host" for this one.
+        flags: instruction sets without which the module must not be used, Linux' names.
+    """
     folder.mkdir(parents=True)
-    places: dict[str, dict[str, tuple[int, int, str]]] = {}
-    with open(folder / prebuilt.CODE, "wb") as file:
-        for loop in loops:
-            for signature, result in loop.overloads.items():
-                parts = list(result._reduce())
-                parts[6] = ""  # types as text, for printing
-                code: bytes = dumps(tuple(parts))  # type: ignore[no-untyped-call]
-                place = file.tell(), len(code), hashlib.sha256(code).hexdigest()
-                places.setdefault(prebuilt.name_of(loop.py_func), {})[str(signature)] = place
-                file.write(code)
-    manifest = {"environment": prebuilt.environment(), "sources": prebuilt.source_hash(), "loops": places}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numba plans to replace its ahead-of-time compiler
+        module = importlib.import_module("numba.pycc").CC(prebuilt.MODULE, source_module=prebuilt.__name__)
+    module.target_cpu, module.output_dir = processor, str(folder)
+    places: dict[str, dict[str, Any]] = {}
+    options: dict[Callable[..., Any], dict[str, Any]] = {}
+    for loop in loops:
+        signatures = [s for s in loop.by_numba.nopython_signatures if _has_plain_types(s)] if loop.is_called else []
+        if not signatures:
+            continue
+        name, options[loop.function] = prebuilt.name_of(loop.function), loop.options
+        symbols = [f"{name.replace('.', '_')}_{k}" for k in range(len(signatures))]
+        for symbol, signature in zip(symbols, signatures, strict=True):
+            module.export(symbol, signature)(loop.function)
+        places[name] = {"fingerprint": loop.fingerprint, "symbols": symbols}
+    with _mended(options):
+        module.compile()
+    file = folder / module.output_file
+    manifest = {
+        "environment": prebuilt.environment(),
+        "flags": sorted(flags),
+        "file": file.name,
+        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        "loops": places,
+    }
     (folder / prebuilt.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+
+
+def _has_plain_types(signature: Any) -> bool:
+    """Whether no argument is a value of its own: a default, or a number written out by a caller."""
+    return not any(isinstance(type_, (types.Omitted, types.Literal)) for type_ in signature.args)
+
+
+@contextmanager
+def _mended(options: dict[Callable[..., Any], dict[str, Any]]) -> Iterator[None]:
+    """Let numba's ahead-of-time compiler use options of functions, check arguments and raise exceptions."""
+    ahead_of_time: Any = importlib.import_module("numba.pycc.compiler")
+    compile_extra, get_c_object, number_long = (
+        ahead_of_time.compile_extra,
+        PythonAPI.get_c_object,
+        PythonAPI.number_long,
+    )
+    unboxers = dict(pythonapi._unboxers.functions)
+
+    def with_options(typing: Any, target: Any, function: Any, args: Any, result: Any, flags: Any, **rest: Any) -> Any:
+        flags, chosen = flags.copy(), options[function]
+        flags.error_model, flags.release_gil = chosen["error_model"], chosen["nogil"]
+        flags.fastmath = cpu.FastMathOptions(chosen["fastmath"])
+        return compile_extra(typing, target, function, args, result, flags, **rest)
+
+    def c_object(api: Any, name: str) -> Any:
+        place = get_c_object(api, name)
+        is_variable = name.startswith("PyExc_")
+        return api.builder.load(api.builder.bitcast(place, api.pyobj.as_pointer())) if is_variable else place
+
+    def whole_number(api: Any, number: Any) -> Any:
+        function = ir.FunctionType(api.pyobj, [api.pyobj])
+        return api.builder.call(api._get_function(function, "PyNumber_Index"), [number])
+
+    def checked_array(kind: Any, argument: Any, c: Any) -> Any:
+        return _if(_fits(kind, argument, c), kind, c, lambda: unboxers[types.Array](kind, argument, c))
+
+    def checked_none(kind: Any, argument: Any, c: Any) -> Any:
+        is_none = c.builder.icmp_unsigned("==", argument, c.pyapi.borrow_none())
+        return _if(is_none, kind, c, lambda: unboxers[types.NoneType](kind, argument, c))
+
+    ahead_of_time.compile_extra = with_options
+    PythonAPI.get_c_object, PythonAPI.number_long = c_object, whole_number
+    pythonapi._unboxers.functions |= {types.Array: checked_array, types.NoneType: checked_none}
+    try:
+        yield
+    finally:
+        ahead_of_time.compile_extra = compile_extra
+        PythonAPI.get_c_object, PythonAPI.number_long = get_c_object, number_long
+        pythonapi._unboxers.functions |= unboxers
+
+
+def _if(fits: Any, kind: Any, c: Any, unbox: Callable[[], Any]) -> Any:
+    """Emit: unbox an argument of a kind where it fits, else raise TypeError."""
+    value = cgutils.alloca_once(c.builder, c.context.get_value_type(kind))
+    failed = cgutils.alloca_once_value(c.builder, cgutils.true_bit)
+    with c.builder.if_else(fits) as (then, otherwise):
+        with then:
+            native = unbox()
+            c.builder.store(native.value, value)
+            c.builder.store(native.is_error, failed)
+        with otherwise:
+            c.pyapi.err_set_string("PyExc_TypeError", "an argument is of another type")
+    return pythonapi.NativeValue(c.builder.load(value), is_error=c.builder.load(failed))
+
+
+def _fits(kind: Any, argument: Any, c: Any) -> Any:
+    """Emit: whether an argument is an array of a kind: its type, dimensions, order in memory and bytes."""
+    builder = c.builder
+
+    def field(place: Any, offset: int, type_: Any) -> Any:
+        at = builder.gep(builder.bitcast(place, _POINTER), [_INT(offset)])
+        return builder.load(builder.bitcast(at, type_.as_pointer()))
+
+    def equal(a: Any, b: int) -> Any:
+        return builder.icmp_unsigned("==", a, a.type(b))
+
+    compare = c.pyapi._get_function(ir.FunctionType(_INT, [_POINTER, _POINTER]), "strcmp")
+    name = c.context.insert_const_string(c.pyapi.module, "numpy.ndarray")
+    is_array = equal(builder.call(compare, [field(field(argument, _TYPE, _POINTER), _NAME, _POINTER), name]), 0)
+    fits = cgutils.alloca_once_value(builder, cgutils.false_bit)
+    needed = {"C": _C_CONTIGUOUS, "F": _F_CONTIGUOUS, "A": 0}[kind.layout] | _WRITEABLE * kind.mutable
+    with builder.if_then(is_array):
+        dtype = field(argument, _DTYPE, _POINTER)
+        good = equal(builder.and_(field(argument, _FLAG_BITS, _INT), _INT(needed)), needed)
+        good = builder.and_(good, equal(field(argument, _NDIM, _INT), kind.ndim))
+        good = builder.and_(good, equal(field(dtype, _TYPE_NUMBER, _INT), numpy_support.as_dtype(kind.dtype).num))
+        good = builder.and_(good, builder.not_(equal(field(dtype, _ORDER, _BYTE), ord(">"))))
+        builder.store(good, fits)
+    return builder.load(fits)
 
 
 def write_wheel(plain: Path) -> Path:
@@ -97,8 +224,8 @@ def write_wheel(plain: Path) -> Path:
         environment = os.environ | {
             "PYTHONPATH": str(site),
             "NUMBA_CACHE_DIR": f"{temporary}/cache",
-            "NUMBA_CPU_NAME": prebuilt.CPU_NAME,
-            "NUMBA_CPU_FEATURES": prebuilt.FEATURES,
+            "NUMBA_CPU_NAME": _CPU_NAME,
+            "NUMBA_CPU_FEATURES": ",".join(f"+{name}" for name in _FEATURES.split()),
             "NUMBA_DISABLE_INTEL_SVML": "1",
         }
         subprocess.run([sys.executable, __file__, "--write", str(code)], env=environment, check=True)
@@ -129,16 +256,31 @@ def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
     archive.writestr(entry, content)
 
 
+def build_here() -> None:
+    """Compile the loops of this checkout for this processor, in place of the extension module that it has."""
+    final = prebuilt.FOLDER
+    prebuilt.FOLDER = final.with_name(f"{final.name}.new")
+    shutil.rmtree(prebuilt.FOLDER, ignore_errors=True)
+    compile_loops()
+    try:
+        write_code(prebuilt.FOLDER, compiled.LOOPS, "host", prebuilt.processor_flags())
+    except Exception as error:  # noqa: BLE001  of setuptools or the compiler, each with classes of its own
+        print(f"no extension module ({error}): each process loads the loops from numba's cache", file=sys.stderr)
+    else:
+        shutil.rmtree(final, ignore_errors=True)
+        prebuilt.FOLDER.rename(final)
+
+
 def main(argv: list[str]) -> int:
     """Compile for a wheel or a checkout."""
     if argv[:1] == ["--write"]:
         compile_loops()
-        write_code(Path(argv[1]), compiled_loops())
+        write_code(Path(argv[1]), compiled.LOOPS, _CPU_NAME, _FLAGS.split())
     elif argv:
         (plain,) = Path(argv[0]).glob("*-py3-none-any.whl")
         print(write_wheel(plain))
     else:
-        compile_loops()
+        build_here()
     return 0
 
 

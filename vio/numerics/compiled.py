@@ -1,24 +1,24 @@
-"""Loops compiled to machine code by numba, kept in a cache on disk.
+"""Loops as machine code: compiled by numba, ahead of time or at the first call.
 
-For loops over small matrices and patches, where NumPy spends its time on calls and temporary arrays. Import this module
-only where arrays are worked on: it loads numba. Inside a compiled function, write out assignments of whole rows and
-sums of arrays as loops: numba's own forms of these take seconds to compile, and `reshape`, or `np.zeros` in place of
-`np.empty`, a tenth of a second. A whole number that is written out as an argument of a compiled function makes numba
-compile that function anew, for this number alone: pass `int(np.int64(1))`.
+For loops over small matrices and patches, where NumPy spends its time on calls and temporary arrays. Inside a compiled
+function, write out assignments of whole rows and sums of arrays as loops: numba's own forms of these take seconds to
+compile, and `reshape`, or `np.zeros` in place of `np.empty`, a tenth of a second. A whole number that is written out as
+an argument of a compiled function makes numba compile that function anew, for this number alone: pass
+`int(np.int64(1))`.
 """
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray
-from vio.numerics.prebuilt import attach
+from vio.numerics import prebuilt
 
 log = logging.getLogger(__name__)
 
@@ -26,16 +26,85 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Without the entry for callers in C, which nothing here uses, a function compiles in a tenth less time.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
-_LOOPS: list[Any] = []
+LOOPS: list[Loop] = []
+
+
+class Loop:
+    """A function as machine code: from the extension module, or as numba compiles it for the types of a call."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        """Prepare; the first call looks for the code."""
+        functools.update_wrapper(self, function)
+        self.function, self.options = function, options
+        self._call: Callable[..., Any] = self._first_call
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call it."""
+        try:
+            return self._call(*arguments)
+        except TypeError:  # nothing is computed yet: the arguments are of types that the extension has no code for
+            return self.by_numba(*arguments)
+
+    def _first_call(self, *arguments: Any) -> Any:
+        codes = prebuilt.code_of(self.function, lambda: self.fingerprint)
+        if not codes:
+            self._call = self.by_numba
+        elif len(codes) == 1:
+            self._call = codes[0]
+        else:
+            self._call = functools.partial(_first_that_takes, codes)
+        return self._call(*arguments)
+
+    @property
+    def is_called(self) -> bool:
+        """Whether it has been called from Python."""
+        return self._call != self._first_call
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """What its machine code depends on."""
+        return prebuilt.fingerprint(self.function, self.options)
+
+    @functools.cached_property
+    def by_numba(self) -> Any:
+        """The function as numba has it; its code is compiled at the first call, or loaded from the cache."""
+        import numba
+
+        try:
+            return numba.njit(self.function, cache=True, **self.options)
+        except RuntimeError:  # numba found no folder that it may write to
+            log.debug("no folder for numba's cache is writable: %s is compiled in each process", self.function.__name__)
+            return numba.njit(self.function, **self.options)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """What numba sees where a function that it compiles calls this one."""
+        return self.by_numba._numba_type_
+
+    @property
+    def is_compiled_anew(self) -> bool:
+        """Whether this process has compiled it, rather than loaded it."""
+        stats = getattr(self.__dict__.get("by_numba"), "stats", None)  # none with NUMBA_DISABLE_JIT
+        return stats is not None and bool(stats.cache_misses)
+
+
+def _first_that_takes(codes: list[Callable[..., Any]], *arguments: Any) -> Any:
+    """Call the first function that takes arguments of these types."""
+    for code in codes[:-1]:
+        try:
+            return code(*arguments)
+        except TypeError:
+            continue
+    return codes[-1](*arguments)
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function at its first call, for the types of that call; later processes load it from the cache.
+    """Use a function as machine code, which is looked for, or compiled for the types of the call, at its first call.
 
-    Divisions follow IEEE 754 as NumPy's do, and sums keep their order. The cache is beside the source file, else in the
-    user's cache folder (NUMBA_CACHE_DIR overrides both); where neither is writable, every process compiles anew.
+    Divisions follow IEEE 754 as NumPy's do, and sums keep their order. numba's cache is beside the source file, else in
+    the user's cache folder (NUMBA_CACHE_DIR overrides both); where neither is writable, every process compiles anew.
     """
-    return _compiled(function, fastmath=False)
+    return _loop(function, {"fastmath": False})
 
 
 def compiled_sums(function: Function) -> Function:
@@ -44,22 +113,17 @@ def compiled_sums(function: Function) -> Function:
     The order is part of the machine code, so results still repeat to the bit on one kind of processor. Unlike numba's
     `fastmath=True`, infinities and NaN keep their meaning.
     """
-    return _compiled(function, fastmath={"reassoc", "contract", "nsz"})
+    return _loop(function, {"fastmath": {"reassoc", "contract", "nsz"}})
 
 
-def _compiled(function: Function, **options: Any) -> Function:
-    try:
-        loop = numba.njit(function, cache=True, **_OPTIONS, **options)
-    except RuntimeError:  # numba found no folder that it may write to
-        log.debug("no folder for numba's cache is writable: %s is compiled in each process", function.__qualname__)
-        loop = numba.njit(function, **_OPTIONS, **options)
-    _LOOPS.append(loop)
-    return attach(loop)
+def _loop(function: Function, options: dict[str, Any]) -> Function:
+    LOOPS.append(loop := Loop(function, _OPTIONS | options))
+    return cast(Function, loop)
 
 
 def has_compiled() -> bool:
-    """Return whether this process has compiled any loop, rather than loaded all from the cache."""
-    return any(loop.stats.cache_misses for loop in _LOOPS if hasattr(loop, "stats"))  # without: NUMBA_DISABLE_JIT
+    """Return whether this process has compiled any loop, rather than loaded all of them."""
+    return any(loop.is_compiled_anew for loop in LOOPS)
 
 
 @compiled

@@ -1,118 +1,132 @@
-"""Machine code of the compiled loops that a wheel holds, so that its first run compiles nothing.
+"""Machine code of the compiled loops in an extension module, so that a run needs neither numba nor its compiler.
 
-`tools/prebuild.py` writes it for x86-64-v3. It is used only by the sources, the versions and the settings of numba that
-it was compiled from and with, on processors that have all of its instructions; everywhere else loops are compiled.
+`tools/prebuild.py` writes it beside this file, into a wheel or a checkout. A loop's code is used only where bytecode
+and constants of the loop, and of the loops that it calls, are those that it was made from; where Python and NumPy are
+those that it was made for; and on processors that have all of its instructions. Everywhere else numba compiles.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import importlib.util
 import json
-import pickle
+import os
+import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from types import CodeType, ModuleType
 from typing import Any
 
-import llvmlite
-import llvmlite.binding
-import numba
 import numpy as np
 
 FOLDER = Path(__file__).with_name("machine_code")
-MANIFEST, CODE = "manifest.json", "loops.bin"
-CPU_NAME = "x86-64-v3"
-_ADDED = "sse3 ssse3 sse4.1 sse4.2 popcnt cx16 sahf avx avx2 bmi bmi2 f16c fma lzcnt movbe xsave"  # to plain x86-64
-FEATURES = ",".join(f"+{name}" for name in _ADDED.split())
+MANIFEST, MODULE = "manifest.json", "vio_loops"
+_CPU_INFO = Path("/proc/cpuinfo")
+# Settings of numba that change no code: with others, numba compiles as they say.
+_HARMLESS = {"NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS"}
 
 
 def environment() -> dict[str, str]:
-    """Return what machine code depends on beside sources and processor."""
-    config: Any = numba.config
+    """Return what machine code depends on beside loops and processor."""
     return {
         "python": str(sys.implementation.cache_tag),
-        "numba": numba.__version__,
-        "llvmlite": llvmlite.__version__,
         "numpy": np.__version__.partition(".")[0],
-        "triple": llvmlite.binding.get_process_triple(),
-        "options": f"{config.OPT} {config.BOUNDSCHECK} {config.DEBUGINFO_DEFAULT} {config.DISABLE_JIT}",
+        "system": f"{sys.platform} {platform.machine()}",
     }
 
 
-def source_hash() -> str:
-    """Return a hash of the names and contents of this package's Python files."""
-    package, digest = FOLDER.parent.parent, hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        content = path.read_bytes()
-        digest.update(f"{path.relative_to(package).as_posix()} {len(content)}\n".encode() + content)
+def processor_flags(path: Path = _CPU_INFO) -> frozenset[str]:
+    """Return the names of the processor's instruction sets as Linux lists them; empty on other systems."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            listed = next((line for line in file if line.startswith("flags")), ":")
+    except OSError:
+        return frozenset()
+    return frozenset(listed.partition(":")[2].split())
+
+
+def fingerprint(function: Callable[..., Any], options: Mapping[str, Any]) -> str:
+    """Return a hash of a function's bytecode and options, and of the constants and compiled functions that it uses.
+
+    Raises:
+        TypeError: it uses a global of another kind.
+    """
+    digest = hashlib.sha256(repr(sorted((name, _text(value)) for name, value in options.items())).encode())
+    digest.update(repr(function.__defaults__).encode())
+    names = _add_code(function.__code__, digest)
+    for name in sorted(names & function.__globals__.keys()):
+        digest.update(f"{name} {_text(function.__globals__[name])}\n".encode())
     return digest.hexdigest()
 
 
+def _add_code(code: CodeType, digest: Any) -> set[str]:
+    """Add the bytecode of a function and of those inside it to a hash; return the names that they refer to."""
+    names = set(code.co_names)
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            names |= _add_code(constant, digest)
+        else:
+            digest.update(repr(constant).encode())
+    digest.update(code.co_code + repr((code.co_names, code.co_varnames, code.co_freevars)).encode())
+    return names
+
+
+def _text(value: Any) -> str:
+    """Return what a value is, as text that changes with it."""
+    if isinstance(value, set):
+        return repr(sorted(value))
+    if isinstance(value, (bool, int, float, str, tuple, type(None))):
+        return repr(value)
+    if isinstance(value, ModuleType):
+        return value.__name__
+    return str(value.fingerprint)  # of a compiled function
+
+
 @functools.cache
-def _loops() -> Mapping[str, Mapping[str, tuple[int, int, str]]]:
-    """Return begin, length and hash of the code of each function and signature; none where it must not be used."""
-    config: Any = numba.config
-    if config.CPU_NAME is not None or config.CPU_FEATURES is not None:  # another processor is asked for
-        return {}
+def _extension() -> tuple[ModuleType | None, Mapping[str, Mapping[str, Any]]]:
+    """Return the extension module and what its manifest says of each loop; none where it must not be used."""
+    if any(name.startswith("NUMBA_") and name not in _HARMLESS for name in os.environ):
+        return None, {}
     try:
         manifest = json.loads((FOLDER / MANIFEST).read_bytes())
-        loops: Mapping[str, Mapping[str, tuple[int, int, str]]] = manifest["loops"]
-        same = manifest["environment"] == environment() and _runs_here() and manifest["sources"] == source_hash()
-    except (OSError, ValueError, KeyError, TypeError):  # there is none, or it is damaged
-        return {}
-    return loops if same else {}
+        loops: Mapping[str, Mapping[str, Any]] = manifest["loops"]
+        file = FOLDER / manifest["file"]
+        here = manifest["environment"] == environment() and set(manifest["flags"]) <= processor_flags()
+        if not here or hashlib.sha256(file.read_bytes()).hexdigest() != manifest["sha256"]:
+            return None, {}
+        spec = importlib.util.spec_from_file_location(MODULE, file)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    except (OSError, ValueError, KeyError, TypeError, ImportError):  # there is none, or it is damaged
+        return None, {}
+    return module, loops
 
 
-def _runs_here() -> bool:
-    """Return whether processor and operating system allow all instructions."""
+def code_of(function: Callable[..., Any], made_from: Callable[[], str]) -> list[Callable[..., Any]]:
+    """Return a function's machine code, one for each set of types; none where there is none for it as it is now.
+
+    Each raises TypeError, before it computes anything, where its arguments are of other types.
+
+    Args:
+        function: the function.
+        made_from: returns its fingerprint.
+    """
+    module, loops = _extension()
+    known = loops.get(name_of(function))
+    if module is None or known is None:
+        return []
     try:
-        has = llvmlite.binding.get_host_cpu_features()
-    except RuntimeError:  # LLVM does not know the processor
-        return False
-    return all(has.get(name, False) for name in _ADDED.split())
+        current = made_from()
+    except (TypeError, AttributeError):
+        return []
+    symbols: Iterable[str] = known["symbols"] if known["fingerprint"] == current else ()
+    return [getattr(module, symbol) for symbol in symbols]
 
 
-class PrebuiltCache:
-    """Gives numba the machine code of one function, and asks its own cache for signatures that are missing."""
-
-    def __init__(self, cache: Any, signatures: Mapping[str, tuple[int, int, str]]) -> None:
-        self._cache, self._signatures = cache, signatures
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._cache, name)
-
-    def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Return the function as compiled for a signature, or None."""
-        target_context.refresh()
-        code = self._code(str(signature))
-        if code is None:
-            return self._cache.load_overload(signature, target_context)
-        rebuild: Any = numba.core.compiler.CompileResult._rebuild
-        return rebuild(target_context, *pickle.loads(code))
-
-    def _code(self, signature: str) -> bytes | None:
-        """Read the code of a signature; None where there is none, or it is damaged."""
-        if signature not in self._signatures:
-            return None
-        begin, length, digest = self._signatures[signature]
-        try:
-            with open(FOLDER / CODE, "rb") as file:
-                file.seek(begin)
-                code = file.read(length)
-        except OSError:
-            return None
-        return code if hashlib.sha256(code).hexdigest() == digest else None
-
-
-def attach(loop: Any) -> Any:
-    """Give a function compiled by numba its machine code, where there is some; return the function."""
-    signatures = _loops().get(name_of(getattr(loop, "py_func", loop)))
-    if signatures:
-        loop._cache = PrebuiltCache(loop._cache, signatures)
-    return loop
-
-
-def name_of(function: Any) -> str:
+def name_of(function: Callable[..., Any]) -> str:
     """Return the name that a function has in the manifest."""
     return f"{function.__module__}.{function.__qualname__}"

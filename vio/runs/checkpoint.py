@@ -17,6 +17,7 @@ import zlib
 from collections import deque
 from collections.abc import Mapping
 from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol
 
@@ -89,7 +90,6 @@ def load_checkpoint(path: Path, dataset: Dataset, inputs: Mapping[str, Any] | No
 def _program() -> dict[str, str]:
     """What must be equal for equal bits."""
     import cv2
-    import numba
 
     return {
         "format": _FORMAT,
@@ -97,7 +97,7 @@ def _program() -> dict[str, str]:
         "python": platform.python_version(),
         "numpy": np.__version__,
         "opencv": cv2.__version__,
-        "numba": numba.__version__,
+        "numba": metadata.version("numba"),
     }
 
 
