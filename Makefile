@@ -91,7 +91,7 @@ $(BIN)/python$(EXE):
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
-	$(PIP_INSTALL) -e .
+	$(PIP_INSTALL) -e . setuptools
 	@touch $@
 	@# What tests compile, they compile themselves; here the first command still renders or reads meanwhile.
 	@echo "compiling loops in the background, once: about a minute of CPU"
