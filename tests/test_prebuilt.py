@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import platform
 import shutil
 import subprocess
 import sys
@@ -209,6 +210,13 @@ def test_code_that_is_damaged_or_for_another_machine_is_not_used(change: Callabl
     loop = _fresh("total")
     assert not _is_loaded(loop, np.arange(3.0), 0)
     assert loop(np.arange(3.0), 0) == 1.0
+
+
+@pytest.mark.parametrize("name", ["flags\t\t", "Features\t"])
+def test_instruction_sets_are_those_that_linux_lists(name: str, tmp_path: Path) -> None:
+    (tmp_path / "cpuinfo").write_text(f"processor\t: 0\n{name}: fpu sse avx2\nbugs\t: some\n{name}: fpu\n")
+    assert prebuilt.processor_flags(tmp_path / "cpuinfo") == {"fpu", "sse", "avx2"}
+    assert prebuilt.processor_flags(tmp_path / "no file") == {platform.node()}
 
 
 def test_settings_of_numba_are_for_what_numba_compiles(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,12 +38,12 @@ def environment() -> dict[str, str]:
 
 
 def processor_flags(path: Path = _CPU_INFO) -> frozenset[str]:
-    """Return the names of the processor's instruction sets as Linux lists them; empty on other systems."""
+    """Return the names of the processor's instruction sets as Linux lists them; elsewhere, the machine's name."""
     try:
         with path.open(encoding="utf-8") as file:
-            listed = next((line for line in file if line.startswith("flags")), ":")
+            listed = next((line for line in file if line.startswith(("flags", "Features"))), ":")
     except OSError:
-        return frozenset()
+        return frozenset([platform.node()])
     return frozenset(listed.partition(":")[2].split())
 
 
