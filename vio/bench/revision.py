@@ -61,6 +61,7 @@ def _run(file: Path, place: Place, out: Path, code: Path, only: list[str]) -> No
     command += ["--workers", str(place.workers), "--identity", place.identity]
     command += ["--only", ",".join(only)] if only else []
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(code), os.environ.get("PYTHONPATH", "")])}
+    environment.setdefault("NUMBA_OPT", "3")  # its default: with a setting of numba, numba loads the loops of both
     done = subprocess.run(command, cwd=code, env=environment, capture_output=True, text=True, check=False)
     if done.returncode and not done.stdout:  # with results, a run has failed, which the comparison says
         last = (done.stderr.strip() or "no message").splitlines()[-1]
