@@ -77,15 +77,10 @@ def compare_keyframes(
     *,
     linked: BoolArray | None = None,
 ) -> KeyframeComparison:
-    """Compare poses of the left camera from another source with those of a run.
+    """Compare poses (R, 4, 4) of the left camera from another source, in any world, with rows (R,) of a run.
 
-    Args:
-        run: the run.
-        rows: (R,) rows of its trajectory.
-        T_other_cam0: (R, 4, 4) poses from the other source at these rows, in any world frame.
-        truth: ground truth to compare both with.
-        linked: (R - 1,) whether the other source joins each keyframe to the next; motions where it does not are not
-            compared. None: all of them.
+    `linked` (R - 1,) says whether the other source joins each keyframe to the next; motions where it does not are not
+    compared. None: all of them are.
 
     Reference: Umeyama (1991) for the alignment, as in `vio.evaluation.trajectories`.
     """

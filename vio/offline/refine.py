@@ -58,18 +58,13 @@ def refine_run(
 ) -> Refinement:
     """Bundle-adjust the keyframes of a run under its stereo rig, and take the other frames along.
 
-    Without IMU they are aligned to the refined points; with one, they keep the odometry's motion between keyframes.
+    Without IMU they are aligned to the refined points; with one, they keep the odometry's motion between keyframes, and
+    what the rig is off by is found, too.
 
     The features that agree with the loops of a run with a map are points across the loop, and the poses to begin with
-    are those in the map.
-
-    Args:
-        run: the run.
-        most: largest number of keyframes; None: as many as needed.
-        priors: use the filter's camera positions and covariances as priors, if the filter reproduces the run.
-        threads: of the solver; one makes the result repeatable.
-        progress: called with the number of steps done.
-        imu: take in the IMU, and find what the rig is off by.
+    are those in the map. There are `most` keyframes at most (None: as many as needed). `priors` are the filter's camera
+    positions and covariances, if it reproduces the run. One thread makes the result repeatable. `progress` is called
+    with the number of steps done.
 
     Raises:
         ConfigError: priors were asked for of a run that closed loops, or the IMU of one that used none.
