@@ -141,14 +141,10 @@ def merge_override(section: _Section, override: str, *, example: str) -> _Sectio
 
 
 def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: str = "", root: Any = None) -> _Section:
-    """Return a copy of a section with some settings replaced.
+    """Return a copy of a section, a dataclass instance, with some settings replaced by values nested by section.
 
-    Args:
-        section: a dataclass instance.
-        values: deviations, nested by section.
-        where: the source of the values, for messages.
-        prefix: the path of the section, ending in a dot, for messages.
-        root: the configuration that contains the section, for messages; None: the section itself.
+    For messages, `where` is the source of the values, `prefix` the path of the section, ending in a dot, and `root` the
+    configuration that contains it (None: itself).
 
     Raises:
         ConfigError: a key is unknown, or a value has the wrong type or is out of range.

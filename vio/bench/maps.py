@@ -61,13 +61,9 @@ def map_figures(
 ) -> dict[str, Any]:
     """Return the figures of a run with a map by name; those that are undefined are left out.
 
-    Args:
-        result: of the run.
-        truth: its odometry against the reference.
-        reference: ground truth.
-        store: the map that the run built; None: it was localised in one of another session.
-        T_ref_map: (4, 4) world of the reference from the map of another session; None: not known.
-        covered: first frame, and the one after the last, of each time that the cameras were covered.
+    `truth` is its odometry against the reference. `store` is the map that it built; None: it was localised in one of
+    another session, from which `T_ref_map` (4, 4) leads to the reference's world, if that is known. `covered` are first
+    frame, and the one after the last, of each time that the cameras were covered.
 
     Raises:
         VioError: the poses in the map cannot be compared, or the map's file is damaged.
@@ -100,11 +96,8 @@ def placement_figures(
 ) -> dict[str, float | None]:
     """Return how many frames are localised, how soon the first is, and the same after the cameras were covered.
 
-    Args:
-        frames: (N,) numbers of the frames with an estimate.
-        times_ns: (N,) their times.
-        placed: (N,) which of them are localised at the time.
-        covered: first frame, and the one after the last, of each time that the cameras were covered.
+    Frames with an estimate have numbers and times (N,), and `placed` (N,) says which are localised at the time;
+    `covered` is as of `map_figures`.
     """
     figures: dict[str, float | None] = {"placed": float(placed.mean())}
     if placed.any():

@@ -29,6 +29,7 @@ from vio.datasets import open_dataset
 from vio.datasets.frame_times import frames_between, parse_bound, used_frames
 from vio.errors import DataError, EvaluationError, VioError
 from vio.evaluation.association import associate
+from vio.evaluation.errors_along_path import path_length_m
 from vio.evaluation.trajectories import LEAST_POSES, Evaluation, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
@@ -229,7 +230,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         trajectory = result.trajectory
         figures: dict[str, Any] = {
             "frames": len(result.frames),
-            "path_m": float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()),
+            "path_m": path_length_m(trajectory.positions),
             "coverage": coverage(_used(truth, config), trajectory),
             "refused_share": refused_share(result.frames.column("used"), result.frames.column("gated")),
             "used_per_frame": float(np.mean(np.asarray(result.frames.column("used"), dtype=np.float64))),

@@ -31,12 +31,8 @@ class OccupancyGrid:
 def occupancy_grid(mesh: Mesh, R_upright_world: FloatArray, voxel_m: float) -> OccupancyGrid | None:
     """Return the floor plan of a mesh, in coordinates to the right and ahead; None: it is empty or too large.
 
-    Ground is the lowest surface within 1.5 m; an obstacle is what stands 0.2 to 2 m above it.
-
-    Args:
-        mesh: the surface.
-        R_upright_world: (3, 3) whose rows are right, ahead and up.
-        voxel_m: of the mesh; a cell is twice as large, at least 5 cm.
+    Ground is the lowest surface within 1.5 m; an obstacle is what stands 0.2 to 2 m above it. The rows of
+    `R_upright_world` (3, 3) are right, ahead and up; a cell is two voxels wide, at least 5 cm.
     """
     p = mesh.vertices.astype(np.float64) @ R_upright_world.T
     cell_m = max(2 * voxel_m, 0.05)

@@ -19,11 +19,7 @@ _SHARE_SEEN = 0.98  # of the vertices that are to be in the picture
 def preview(mesh: Mesh, path_m: FloatArray, R_upright_world: FloatArray, voxel_m: float) -> Image:
     """Return a picture (720, 1280, 3) from above and behind, with the path (N, 3) in red.
 
-    Args:
-        mesh: the surface.
-        path_m: (N, 3) of the camera.
-        R_upright_world: (3, 3) whose rows are right, ahead and up.
-        voxel_m: size of the squares that stand for the vertices.
+    The rows of `R_upright_world` (3, 3) are right, ahead and up; squares of `voxel_m` stand for the vertices.
     """
     p, n = (x.astype(np.float64) @ R_upright_world.T for x in (mesh.vertices, mesh.normals))
     path = path_m @ R_upright_world.T

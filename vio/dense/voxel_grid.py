@@ -52,12 +52,7 @@ class VoxelGrid:
     """Depth images, fused."""
 
     def __init__(self, voxel_m: float, *, most_blocks: int = MOST_BLOCKS) -> None:
-        """Begin empty.
-
-        Args:
-            voxel_m: distance of the samples.
-            most_blocks: that are in memory at once, but for those that one image shows.
-        """
+        """Begin empty, with samples `voxel_m` apart; in memory are `most_blocks` and those that one image shows."""
         self.voxel_m, self.truncation_m = voxel_m, TRUNCATION * voxel_m
         self._most = most_blocks
         self._pool = np.zeros(min(1024, most_blocks), dtype=BLOCK)
@@ -80,14 +75,9 @@ class VoxelGrid:
     def fuse(
         self, depth: DepthImage, image: Image, camera: StereoCamera, T_world_cam: FloatArray, far_m: float
     ) -> None:
-        """Take up the depths of one image.
+        """Take up depths (H, W) of a pinhole's pixels with their colours (H, W) or (H, W, 3), seen from a pose (4, 4).
 
-        Args:
-            depth: (H, W) of a pinhole's pixels.
-            image: (H, W) or (H, W, 3) their colours.
-            camera: of both.
-            T_world_cam: (4, 4).
-            far_m: depths beyond it are not used.
+        Depths beyond `far_m` are not used.
         """
         keys = self._blocks_at(depth, camera, T_world_cam, far_m)
         if not len(keys):

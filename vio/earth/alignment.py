@@ -79,9 +79,7 @@ class Georeference:
 def heading_deg(T_enu_map: FloatArray, covariance: FloatArray) -> tuple[float, float]:
     """Return the heading of a map's x axis from east, and its standard deviation.
 
-    Args:
-        T_enu_map: (4, 4).
-        covariance: (6, 6) of xi in T_enu_map exp(xi).
+    The covariance (6, 6) is that of xi in T_enu_map exp(xi).
     """
     R = T_enu_map[:3, :3]
     heading, sigma = np.arctan2(R[1, 0], R[0, 0]), np.sqrt((R @ covariance[3:, 3:] @ R.T)[2, 2])
@@ -89,13 +87,9 @@ def heading_deg(T_enu_map: FloatArray, covariance: FloatArray) -> tuple[float, f
 
 
 def georeference(path: Path, fixes: GnssFixes, lever_arm_m: FloatArray, time_offset_ns: int = 0) -> Georeference:
-    """Return where a trajectory is on the earth.
+    """Return where a trajectory is on the earth, by positions of an antenna at `lever_arm_m` (3,) in the body frame.
 
-    Args:
-        path: the trajectory.
-        fixes: positions of an antenna.
-        lever_arm_m: (3,) the antenna in the body frame.
-        time_offset_ns: added to the stamps of the positions.
+    `time_offset_ns` is added to the stamps of the positions.
 
     Raises:
         EstimationError: fewer than three positions are within the trajectory's time, or they determine nothing.

@@ -33,14 +33,9 @@ class GnssFixes:
 def checked_fixes(
     times_ns: IntArray, geodetic: FloatArray, covariance: FloatArray | None, where: str, notes: tuple[str, ...] = ()
 ) -> GnssFixes:
-    """Return positions in the order of time, without those that are not finite or repeat a stamp.
+    """Return positions (N, 3) in the order of stamps (N,), without those that are not finite or repeat a stamp.
 
-    Args:
-        times_ns: (N,) stamps.
-        geodetic: (N, 3) latitude, longitude, height; NaN: not known.
-        covariance: (N, 3, 3); NaN or zero: not known; None: of none.
-        where: for messages.
-        notes: about what was read.
+    They are latitude, longitude and height, NaN where not known; covariances (N, 3, 3) are NaN or zero there.
 
     Raises:
         DataError: there is no position, or one is none of WGS84.

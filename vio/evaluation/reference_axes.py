@@ -16,12 +16,10 @@ _AXES_DEG = 5.0  # a rotation so near one of the 24 that exchange axes is called
 
 
 def attitude_note(R_est: FloatArray, R_ref: FloatArray, sigma_rad: float) -> str | None:
-    """Return which convention explains a large attitude error; None: the error is small.
+    """Return which convention explains a large error of attitudes (M, 3, 3), world from body; None: it is small.
 
-    Args:
-        R_est: (M, 3, 3) world from body, by the estimate, in the reference's world by an alignment of positions.
-        R_ref: (M, 3, 3) world from body, by the reference.
-        sigma_rad: standard deviation of the alignment's rotation about the path.
+    Those of the estimate are in the reference's world by an alignment of positions, whose rotation about the path has
+    the standard deviation `sigma_rad`.
     """
     off_deg = float(np.median(rotation_angle_deg(np.swapaxes(R_ref, 1, 2) @ R_est)))
     if off_deg < max(_LARGE_DEG, _SIGMAS * float(np.degrees(sigma_rad))):

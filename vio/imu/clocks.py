@@ -52,12 +52,7 @@ class SampleCoverage:
             self._in_gap += 1
 
     def so_far(self, imu: tuple[int, int] | None, step_ns: float) -> list[InertialFinding]:
-        """Report early that no frame has samples.
-
-        Args:
-            imu: first and last stamp of the samples, ns; None: no samples.
-            step_ns: their usual interval.
-        """
+        """Report early that no frame has samples, by their first and last stamp (None: no samples) and interval, ns."""
         long = self._frames >= _NO_IMU_FRAMES and self._seconds >= _NO_IMU_S
         return [_no_overlap(self._span, imu, step_ns)] if long and self._covered == 0 else []
 

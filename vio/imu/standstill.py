@@ -17,12 +17,10 @@ _PROBABILITY = 0.999  # of the chi-square test: a standstill passes so often
 
 
 def blocks_agree(times_s: FloatArray, values: FloatArray, density: float) -> bool:
-    """Chi-square test that the means of a signal over blocks differ by white noise alone.
+    """Chi-square test that the means of a signal (N, 3) over blocks differ by white noise alone.
 
-    Args:
-        times_s: (N,) relative to the last sample, so zero or negative; down to `-STANDSTILL_S`.
-        values: (N, 3).
-        density: of the white noise by the data sheet, in the signal's unit per sqrt(Hz).
+    Times (N,) are relative to the last sample, down to `-STANDSTILL_S`; `density` is that of the white noise by the
+    data sheet, in the signal's unit per sqrt(Hz).
     """
     blocks = np.minimum((-times_s / _BLOCK_S).astype(np.int64), round(STANDSTILL_S / _BLOCK_S) - 1)
     present = np.unique(blocks)

@@ -68,13 +68,9 @@ class Inputs:
     ) -> None:
         """Begin a trajectory.
 
-        Args:
-            camera: what a frame consists of.
-            shapes: of the images, as they are given.
-            motion: the sensor that samples may come from; None: none.
-            offset_ns: subtracted from the samples' stamps, so that they are on the camera's clock.
-            most_hz: frames a second that are used; None: all.
-            say: takes a line about a stamp that is left out.
+        The camera says what a frame consists of, `shapes` are those of its images, and samples may come from `motion`.
+        `offset_ns` is subtracted from their stamps, so that they are on the camera's clock; `most_hz` frames a second
+        are used (None: all); `say` takes a line about a stamp that is left out.
         """
         self._camera, self._shapes, self._motion, self._offset_ns = camera, shapes, motion, offset_ns
         self._limit, self._say = FrameRateLimit(most_hz), say
@@ -133,13 +129,9 @@ class Inputs:
     def samples(
         self, source: MotionSource, t_ns: Any, first: npt.ArrayLike, second: npt.ArrayLike
     ) -> list[MotionSample]:
-        """Return samples on the camera's clock, without those whose stamps jump ahead.
+        """Return samples at a time, or times (N,), on the camera's clock, without those whose stamps jump ahead.
 
-        Args:
-            source: the sensor.
-            t_ns: time, or times (N,), in nanoseconds.
-            first: gyro or linear velocity, (3,) or (N, 3).
-            second: accelerometer or angular velocity, likewise.
+        Gyro and accelerometer, or linear and angular velocity, are (3,) or (N, 3).
 
         Raises:
             DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.

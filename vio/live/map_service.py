@@ -167,13 +167,7 @@ def _facts(found: FoundPose | None) -> dict[str, Any]:
 
 
 def ask(url: str, left: Image, right: Image, *, timeout_s: float = 30.0) -> FoundPose | None:
-    """Ask a server where a rectified pair (H, W) was taken; None: it does not know.
-
-    Args:
-        url: of the server, such as http://127.0.0.1:8734.
-        left: 8-bit gray.
-        right: likewise.
-        timeout_s: how long an answer is waited for.
+    """Ask the server at a URL where a rectified pair (H, W), gray, was taken; None: it does not know.
 
     Raises:
         VioError: the server refused the images, or there is none.

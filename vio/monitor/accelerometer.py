@@ -83,12 +83,9 @@ def _wrong_axes(force: ForceFit, C: FloatArray) -> InertialFinding | None:
 
 
 def judge_up(force: FloatArray, R_cam0_imu: FloatArray, *, measured: bool) -> list[InertialFinding]:
-    """Return a hint if the accelerometer's 'up' points down in nearly all images.
+    """Return a hint if the accelerometer's 'up', by mean forces (K, 3) of any unit, points down in nearly all images.
 
-    Args:
-        force: (K, 3) mean specific forces, imu frame, any unit.
-        R_cam0_imu: (3, 3).
-        measured: whether motion has shown that the accelerometer's sign is right.
+    `measured` says whether motion has shown that the accelerometer's sign is right; the extrinsic rotation is (3, 3).
     """
     up = force @ R_cam0_imu.T
     down_in_image = up[:, 1] / np.maximum(np.linalg.norm(up, axis=1), 1e-9)

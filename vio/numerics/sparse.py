@@ -18,12 +18,9 @@ def factors(H: csc_matrix) -> SuperLU:
 
 
 def marginals(H: csc_matrix, D: csr_matrix, size: int) -> FloatArray:
-    """Covariances (C, d, d) of `D_c x`, each alone, where x has the information matrix H (n, n).
+    """Covariances (C, d, d) of `D_c x`, each alone, where x has the information H (n, n), a sum of `J' W J`.
 
-    Args:
-        H: sum of `J' W J`, symmetric and positive definite.
-        D: (C d, n) rows of D_c, one after the other.
-        size: d.
+    `D` (C d, n) has the rows of all D_c, one after the other; `size` is d.
     """
     solver, out = factors(H), np.zeros((D.shape[0] // size, size, size))
     for first in range(0, len(out), _AT_ONCE):

@@ -116,12 +116,8 @@ def measure(
 ) -> CalibrationReport:
     """Measure a recording's calibration: first left and right, which everything else depends on.
 
-    Args:
-        source: the recording.
-        build_frontend: makes the front end that tracks its images.
-        pairs: stereo pairs to match.
-        frames: frames to track for the motion sensor.
-        progress: called with (done, total) of the part at work.
+    `pairs` of images are matched, and `frames` tracked for the motion sensor; `progress` is called with (done, total)
+    of the part at work.
 
     Raises:
         VioError: the recording cannot be read.

@@ -53,17 +53,9 @@ def check_run(
 
     Of a run that closed loops, keyframes at both ends of loops are matched as well, and its poses are those in the map.
 
-    Writes a folder of each mapper's name with its model, and the plot `check.png`.
-
-    Args:
-        run: the run.
-        folder: an existing, empty folder.
-        mappers: COLMAP's.
-        most: largest number of keyframes.
-        source: the recording, if it is not at the path stored in the run.
-        threads: for all steps; one makes the result repeatable.
-        progress: called with (done, total).
-        announce: called with the number of keyframes and the time that they take.
+    Writes a folder of each mapper's name with its model, and the plot `check.png`, into an existing, empty folder.
+    There are `most` keyframes at most. `source` is the recording, if it is not at the path stored in the run. One
+    thread makes the result repeatable. `announce` is called with the number of keyframes and the time that they take.
 
     Raises:
         VioError: the run has too few views, or its images are not available.

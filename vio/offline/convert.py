@@ -71,16 +71,10 @@ def convert(
     stop: int | None = None,
     progress: Progress = lambda done, total: None,
 ) -> Converted:
-    """Write a recording into an existing, empty folder.
+    """Write a recording's frames from `start` to before `stop` (None: to the end) into an existing, empty folder.
 
-    Args:
-        dataset: a recording with images.
-        out: the folder.
-        form: "euroc" (mav0), "kitti" (image_0 image_1 calib.txt times.txt), "plain" (left right, Kalibr's file), or a
-            ROS 2 bag of SQLite ("rosbag2") or MCAP ("mcap") with Kalibr's file beside it.
-        start: first frame.
-        stop: frame after the last one; None: to the end.
-        progress: called after each frame.
+    The form is "euroc" (mav0), "kitti" (image_0 image_1 calib.txt times.txt), "plain" (left right, Kalibr's file), or a
+    ROS 2 bag of SQLite ("rosbag2") or MCAP ("mcap") with Kalibr's file beside it.
 
     Raises:
         DataError: the recording has no images, or too many cannot be read.

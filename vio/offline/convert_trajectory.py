@@ -25,17 +25,10 @@ _BODIES: dict[TrajectoryFormat, BodyFrame] = {"kitti": "cam0", "euroc": "imu"}
 def convert_trajectory(
     source: Path, out: Path, form: TrajectoryFormat, *, times: Path | None = None, calibration: Path | None = None
 ) -> Trajectory:
-    """Write a trajectory file in another form; the world frame stays, the body becomes that of the form.
+    """Write a trajectory file in another form, and return it; the world stays, the body becomes that of the form.
 
-    Args:
-        source: a TUM, KITTI or EuRoC trajectory.
-        out: the file to write.
-        form: "tum" (the body stays as it is), "kitti" (cam0) or "euroc" (IMU).
-        times: of the poses of a KITTI file, one a line.
-        calibration: a rig with the IMU's pose, or `T_cam0_imu.txt`, for a change between IMU and cam0.
-
-    Returns:
-        The trajectory as written.
+    TUM keeps the body, KITTI describes cam0 and EuRoC the IMU. `times` are those of the poses of a KITTI file, one a
+    line; `calibration` is a rig with the IMU's pose, or `T_cam0_imu.txt`, for a change between IMU and cam0.
 
     Raises:
         DataError: a file cannot be used, or times are missing.

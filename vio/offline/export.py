@@ -52,13 +52,8 @@ def export_colmap(
 ) -> Exported:
     """Write `sparse/0`, `images`, `transforms.json` and `points.ply` into an existing, empty folder.
 
-    Args:
-        run: the run.
-        folder: the output folder.
-        most: largest number of keyframes; None: as many as needed.
-        images: whether to write the rectified images, which give the points their colours.
-        source: the recording, if it is not at the path stored in the run.
-        progress: called with (done, total) after each keyframe's images.
+    There are `most` keyframes at most (None: as many as needed). With `images` the rectified images are written, which
+    give the points their colours. `source` is the recording, if it is not at the path stored in the run.
 
     Raises:
         VioError: the run has too few views or no consistent track, or its images are not available.

@@ -30,12 +30,8 @@ def export_bag(run: Path, out: Path, storage: Storage) -> ExportedBag:
     """Write a run as a bag: /tf and /vio/pose with covariance at every frame; path, landmarks and ground truth at once.
 
     The frames are world, imu and cam0 (without an IMU world and cam0). The ground truth is aligned to the run's world.
-    What is written at once is stamped with the first frame, and kept for subscribers that come late.
-
-    Args:
-        run: folder of `vio run`; an unfinished one's may be given too.
-        out: an existing folder without a bag.
-        storage: "rosbag2" (SQLite) or "mcap".
+    What is written at once is stamped with the first frame, and kept for subscribers that come late. The run may be
+    unfinished; the folder exists, without a bag.
 
     Raises:
         DataError: it is no run's folder, a file in it is damaged, or the bag cannot be written.
@@ -63,12 +59,8 @@ def export_bag(run: Path, out: Path, storage: Storage) -> ExportedBag:
 def ros_covariance(T_world_body: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return the covariance (6, 6) of x y z and of rotations about the world's axes, as PoseWithCovariance has it.
 
-    Args:
-        T_world_body: (4, 4).
-        covariance: (6, 6) of xi in T_body_world = exp(xi) T_body_world_hat, [rho; phi].
-
-    To first order xi moves the position by -R rho and the orientation by -R phi about the world's axes; R is the
-    rotation of T_world_body.
+    Given is that of xi in T_body_world = exp(xi) T_body_world_hat, [rho; phi]. To first order xi moves the position by
+    -R rho and the orientation by -R phi about the world's axes; R is the rotation of T_world_body (4, 4).
     """
     turn = np.kron(np.eye(2), T_world_body[:3, :3])
     return turn @ covariance @ turn.T

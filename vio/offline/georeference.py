@@ -118,12 +118,7 @@ def place_on_earth(
 ) -> dict[str, Any]:
     """Fuse a trajectory with GNSS positions, write all files into a folder, and return what is said of it.
 
-    Args:
-        of: the trajectory.
-        fixes: positions of an antenna.
-        lever_arm_m: (3,) the antenna in the body frame.
-        time_offset_s: added to the stamps of the positions.
-        folder: exists.
+    The antenna is at `lever_arm_m` (3,) in the body frame; `time_offset_s` is added to the stamps of the positions.
 
     Raises:
         EstimationError: the positions do not determine its place.

@@ -19,15 +19,10 @@ def write_images(
     folder: Path,
     each: Callable[[int, Image], None] = lambda keyframe, left: None,
 ) -> None:
-    """Write the rectified images of the keyframes, in colour where the recording has any.
+    """Write the rectified images of keyframes (K,), increasing rows of the trajectory, in colour where there is any.
 
-    Args:
-        run: the run.
-        source: the recording, if it is not at the path stored in the run.
-        keyframes: (K,) rows of the trajectory, increasing.
-        names: file names relative to the folder.
-        folder: created if missing.
-        each: called with each keyframe's index and left image.
+    Names are relative to the folder. `source` is the recording, if it is not at the path stored in the run; `each` is
+    called with each keyframe's index and left image.
 
     Raises:
         DataError: the images are not available.

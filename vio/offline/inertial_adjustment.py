@@ -91,12 +91,9 @@ class InertialAdjustment:
     def solve(
         self, body: BodyStates, covariance_of: IntArray | None = None, progress: Callable[[], None] = lambda: None
     ) -> Optimum:
-        """Return the optimum from some states on.
+        """Return the optimum from some states of the keyframes on, with the covariance of those asked for (C,).
 
-        Args:
-            body: states of the keyframes to begin with.
-            covariance_of: (C,) keyframes whose covariance is wanted.
-            progress: called before each step; what it raises ends the adjustment.
+        `progress` is called before each step; what it raises ends the adjustment.
         """
         at, steps, converged = self._descend(body, progress)
         squared, _ = self._squared(at)

@@ -136,15 +136,9 @@ def _median_depth_m(run: TrackedPath) -> float:
 def tracked_segments(
     where: Path, camera: StereoCamera, tracks: FeatureTracks, motion: CameraMotion, *, longest: int, most: int
 ) -> list[TrackedPath]:
-    """Return pieces of a recording, with poses concatenated from frame to frame.
+    """Return pieces of a recording, `most` at most and each of `longest` frames, spread over it.
 
-    Args:
-        where: the recording.
-        camera: rectified pair.
-        tracks: stereo features of the recording.
-        motion: of the camera, where it was estimated.
-        longest: frames of a piece.
-        most: pieces, spread over the recording.
+    Their poses are concatenated from frame to frame, where the camera's motion was estimated.
     """
     breaks = np.flatnonzero(np.diff(motion.frames) != 1) + 1
     rows = np.arange(len(motion.frames))

@@ -32,13 +32,10 @@ def loop_pairs(loops: Sequence[LoopEvent], frames: IntArray) -> IntArray:
 
 
 def loop_rows(loops: Sequence[LoopEvent], frames: IntArray) -> LoopRows:
-    """Return the points that loops join and what keyframes show of them.
+    """Return the points that loops join and what keyframes, of increasing frame numbers (K,), show of them.
 
-    A feature that several loops match is one point. One that they match to two features of a keyframe is none.
-
-    Args:
-        loops: with their matches; those of other runs' keyframes, or without matches, add nothing.
-        frames: (K,) frame numbers of the keyframes, increasing.
+    A feature that several loops match is one point. One that they match to two features of a keyframe is none. Loops of
+    other runs' keyframes, or without matches, add nothing.
     """
     ends: list[tuple[int, FloatArray, BoolArray]] = []  # both ends of a loop, one after the other
     for o in loops:

@@ -30,12 +30,8 @@ def adjust_map(result: RunResult, map_file: Path, should_stop: Callable[[], str 
     """Return a run with the poses of its map adjusted with the IMU, and write them to the map's file.
 
     Without an IMU or loops of the run's own, and of a run that ended early, nothing changes. Where the adjustment does
-    not converge or contradicts the map, the map stays as it is, and `MappedRun.adjustment` says so.
-
-    Args:
-        result: a run with a map and its observations.
-        map_file: that map.
-        should_stop: asked before each step; a reason ends the adjustment.
+    not converge or contradicts the map, the map stays as it is, and `MappedRun.adjustment` says so. `should_stop` is
+    asked before each step; a reason ends the adjustment.
 
     Raises:
         DataError: the map's file cannot be written.

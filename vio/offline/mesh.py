@@ -66,12 +66,9 @@ class DenseMap:
 
 
 def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> MeshSource:
-    """Return what the mesh of a run is made from.
+    """Return what the mesh of a run is made from, with the poses in a map that holds it (None: its own).
 
-    Args:
-        folder: of the run.
-        map_file: a map that holds the run, for its poses; None: those of the run.
-        voxel_m: distance of the samples; None: by the depth of the landmarks.
+    Samples are `voxel_m` apart; None: by the depth of the landmarks.
 
     Raises:
         DataError: it is no run's folder, or of one camera without depths, or the map does not hold the run.
@@ -108,12 +105,8 @@ def build_mesh(
 ) -> DenseMap:
     """Fuse the depths of the chosen frames, and return their surface.
 
-    Args:
-        made_from: poses and images.
-        source: the recording, if it is not at the path stored in the run.
-        most_blocks: of voxels in memory.
-        progress: called with (done, total) after each frame.
-        stop: asked after each frame whether to leave the others out.
+    `source` is the recording, if it is not at the path stored in the run; `most_blocks` of voxels are in memory; `stop`
+    is asked after each frame whether to leave the others out.
 
     Raises:
         DataError: the images are not available, or show no surface.

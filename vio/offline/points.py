@@ -42,15 +42,10 @@ class PointTracks:
 def build_tracks(
     run: TrackedPath, keyframes: IntArray, T_world_cam0: FloatArray, *, gate_px: float = 3.0
 ) -> PointTracks:
-    """Turn a run's observations in keyframes into points, each seen in at least two of them.
+    """Turn what keyframes, rows (K,) of the trajectory at poses (K, 4, 4), show into points that two or more see.
 
-    The features that agree with the run's loops are points of their own, with ids after those of the tracks.
-
-    Args:
-        run: the run.
-        keyframes: (K,) rows of the trajectory.
-        T_world_cam0: (K, 4, 4) poses of the keyframes.
-        gate_px: a row with a larger reprojection error (in any coordinate) is an outlier.
+    The features that agree with the run's loops are points of their own, with ids after those of the tracks. A row with
+    a larger reprojection error than `gate_px` in any coordinate is an outlier.
 
     Raises:
         EstimationError: no track is consistent.

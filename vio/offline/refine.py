@@ -11,7 +11,6 @@ import numpy as np
 
 from vio.config import Config, merge
 from vio.errors import ConfigError, EvaluationError
-from vio.evaluation.alignment import align_poses, apply_alignment
 from vio.evaluation.trajectories import evaluate
 from vio.files.inputs import read_input
 from vio.files.yaml_text import MOST_BYTES, read_yaml
@@ -19,6 +18,7 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_hat, transfor
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.numerics.robust import robust_sigma
 from vio.offline.colmap.adjustment import Adjustment, PositionPriors, adjust
+from vio.offline.comparison import aligned_distance_m
 from vio.offline.inertial_refinement import InertialRun, adjust_with_imu, inertial_keyframes
 from vio.offline.keyframes import TrackedPath, choose_keyframes
 from vio.offline.loop_tracks import loop_pairs
@@ -58,18 +58,13 @@ def refine_run(
 ) -> Refinement:
     """Bundle-adjust the keyframes of a run under its stereo rig, and take the other frames along.
 
-    Without IMU they are aligned to the refined points; with one, they keep the odometry's motion between keyframes.
+    Without IMU they are aligned to the refined points; with one, they keep the odometry's motion between keyframes, and
+    what the rig is off by is found, too.
 
     The features that agree with the loops of a run with a map are points across the loop, and the poses to begin with
-    are those in the map.
-
-    Args:
-        run: the run.
-        most: largest number of keyframes; None: as many as needed.
-        priors: use the filter's camera positions and covariances as priors, if the filter reproduces the run.
-        threads: of the solver; one makes the result repeatable.
-        progress: called with the number of steps done.
-        imu: take in the IMU, and find what the rig is off by.
+    are those in the map. There are `most` keyframes at most (None: as many as needed). `priors` are the filter's camera
+    positions and covariances, if it reproduces the run. One thread makes the result repeatable. `progress` is called
+    with the number of steps done.
 
     Raises:
         ConfigError: priors were asked for of a run that closed loops, or the IMU of one that used none.
@@ -103,7 +98,7 @@ def refine_run(
     progress(STEPS)
     refined = replace(path.trajectory, T_world_body=poses)
     before, after = _scores(run, refined)
-    moved_rms_m = position_difference_m(path.trajectory, refined)
+    moved_rms_m = aligned_distance_m(path.trajectory.T_world_body, refined.T_world_body)
     if path.sigmas is not None:
         sigma_m = float(np.sqrt(np.mean(path.sigmas[:, 0] ** 2)))
         if moved_rms_m > _MOST_SIGMAS * sigma_m:
@@ -260,10 +255,3 @@ def position_covariances(estimates: Sequence[Estimate], T_cam0_imu: FloatArray) 
     P = np.array([e.covariance for e in estimates])
     J = R @ p_D_xi
     return J @ P @ np.swapaxes(J, 1, 2) + _LEAST_SIGMA_M**2 * np.eye(3)
-
-
-def position_difference_m(one: Trajectory, other: Trajectory) -> float:
-    """Return the root mean square distance of paired positions after SE(3) alignment."""
-    alignment = align_poses(one.T_world_body, other.T_world_body, "se3")
-    aligned = apply_alignment(alignment, one.T_world_body)
-    return float(np.sqrt(np.mean(np.sum((aligned[:, :3, 3] - other.positions) ** 2, axis=1))))

@@ -36,12 +36,9 @@ class RunImages:
     field: DisplacementField | None  # what the run found its stereo calibration to be off by; None: nothing
 
     def frames(self, indices: IntArray, source: str | None = None, *, colour: bool = False) -> Iterator[StereoFrame]:
-        """Yield the corrected images of frames (K,), in order, with the depths of a camera that has them.
+        """Yield the corrected images of frames (K,), in order, in colour if asked for, with depths where there are any.
 
-        Args:
-            indices: frame numbers, increasing.
-            source: the recording, if it is not at the path stored in the run.
-            colour: keep the images' colours, (H, W, 3).
+        `source` is the recording, if it is not at the path stored in the run.
 
         Raises:
             DataError: the recording is missing, has no images or another camera, or a frame cannot be read.

@@ -129,12 +129,7 @@ class SelfCalibration:
 
 
 def intrinsics_of(camera: StereoCamera, found: SelfCalibration) -> Intrinsics | NotObservable:
-    """Return focal length and principal point of a calibration with free intrinsics.
-
-    Args:
-        camera: the pair as calibrated.
-        found: by `self_calibrate` with `intrinsics`.
-    """
+    """Return focal length and principal point of a pair by `self_calibrate` with `intrinsics`."""
     focal, _, cu, cv = (float(found.values[NAMES.index(name)]) for name in INTRINSICS)
     sigmas = [float(found.sigmas[NAMES.index(name)]) for name in INTRINSICS]
     return judged_observable(camera, focal, sigmas[0], (cu, cv), (sigmas[2], sigmas[3]))
@@ -161,14 +156,10 @@ def project_off(camera: StereoCamera, x: FloatArray, p: FloatArray) -> FloatArra
 
 
 def self_calibrate(camera: StereoCamera, segments: Sequence[Segment], *, intrinsics: bool) -> SelfCalibration:
-    """Estimate what a rectified pair's calibration is off by, from segments of video.
+    """Estimate what the calibration of a rectified pair with an image size is off by, from segments of video.
 
-    The length of the baseline is held: it is the scale.
-
-    Args:
-        camera: the pair as calibrated, with image size.
-        segments: at least one; rows with gross outliers are weighted down and left out.
-        intrinsics: whether focal length, its ratio and the principal point are free, too; else they are as given.
+    The length of the baseline is held: it is the scale. With `intrinsics`, focal length, its ratio and the principal
+    point are free, too. Rows with gross outliers are weighted down and left out.
 
     Raises:
         EstimationError: no segment has a consistent track.

@@ -96,13 +96,7 @@ def track(
     frames: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[FeatureTracks, Sequence[MotionSample]]:
-    """Return stereo tracks of the first frames, from the file or by a front end, and the motion samples.
-
-    Args:
-        dataset: the recording.
-        build_frontend: makes the front end if the recording contains images.
-        frames: largest number of frames to track.
-        progress: called with (done, total) after each of them.
+    """Return stereo tracks of at most `frames` frames, from the file or by a front end, and the motion samples.
 
     Raises:
         DataError: the images cannot be read.

@@ -33,11 +33,7 @@ td { font-variant-numeric: tabular-nums; } li { margin: 3px 0; overflow-wrap: an
 
 
 def write_report(path: Path, runs: Sequence[FinishedRun]) -> None:
-    """Write the page about one or several runs.
-
-    Args:
-        path: the file, replaced at once when it is complete.
-        runs: in the order of their colours; the first 8 get one each.
+    """Write the page about runs, of which the first 8 get a colour each; the file is replaced when it is complete.
 
     Raises:
         VioError: the file cannot be written.

@@ -77,12 +77,8 @@ def corrected(
 ) -> FloatArray:
     """Return poses (N, 4, 4) in the map: the odometry, with the corrections of the keyframes spread between them.
 
-    Args:
-        T_odom_body: (N, 4, 4) odometry.
-        index: (N,) frame numbers.
-        frames: (K,) frame numbers of the keyframes, increasing.
-        T_map: (K, 4, 4) their poses in the map.
-        T_odom: (K, 4, 4) their poses by the odometry.
+    Odometry and frame numbers `index` (N,) are those of all frames; frame numbers (K,), increasing, and poses (K, 4, 4)
+    in the map and by the odometry those of the keyframes.
     """
     if not len(frames):
         return T_odom_body

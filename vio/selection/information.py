@@ -60,12 +60,7 @@ def prior_information(motion: MotionPrior | None) -> FloatArray:
 
 
 def log_det_gain(prior: FloatArray, L: FloatArray) -> float:
-    """Half the gain in log-determinant (nats) of the information on K motions from features.
-
-    Args:
-        prior: (K, 6, 6) information before.
-        L: (S, K, 3, 6) factors of the features.
-    """
+    """Half the gain in log-determinant (nats) of information (K, 6, 6) from features' factors (S, K, 3, 6)."""
     after = prior + np.einsum("skai,skaj->kij", L, L)
     return float(0.5 * np.sum(np.linalg.slogdet(after)[1] - np.linalg.slogdet(prior)[1]))
 

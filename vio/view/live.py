@@ -80,13 +80,10 @@ class RerunViewer:
     def __init__(
         self, stream: rr.RecordingStream, rig: ViewedRig, *, address: str | None = None, share: float = _SHARE
     ) -> None:
-        """Draw what does not change.
+        """Draw what does not change, into a stream such as that of `open_stream`.
 
-        Args:
-            stream: of `open_stream`, or any other.
-            rig: of the run.
-            address: of the page, where the run is shown in a browser.
-            share: of the time since the first frame that images, tracks and points may take; 1: all of them are shown.
+        `address` is that of the page, where the run is shown in a browser; `share` is of the time since the first
+        frame, that images, tracks and points may take; 1: all of them are shown.
         """
         self._stream, self._rig, self._share = stream, rig, share
         self.address = address
@@ -124,15 +121,9 @@ class RerunViewer:
         seen: Observations | None = None,
         states: IntArray | None = None,
     ) -> None:
-        """Show what is known of one frame.
+        """Show what is known of one frame: its estimate, curves by name (`SERIES`), left image (H, W) and features.
 
-        Args:
-            index: number of the frame.
-            estimate: after it.
-            numbers: curves by name, see `SERIES`.
-            image: left, (H, W).
-            seen: its features.
-            states: of the features (N,), see `states_of`.
+        States (N,) of these are those of `states_of`.
         """
         self._stream.set_time("frame", sequence=index)
         self._start_ns = estimate.time_ns if self._start_ns is None else self._start_ns

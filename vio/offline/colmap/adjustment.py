@@ -49,19 +49,12 @@ def adjust(
     threads: int = 1,
     progress: Callable[[], None] = lambda: None,
 ) -> Adjustment:
-    """Bundle-adjust keyframes and points, with fixed intrinsics and stereo extrinsics.
+    """Bundle-adjust keyframes and points, with fixed intrinsics and stereo extrinsics, from poses (K, 4, 4) on.
 
     Two rounds: all rows with a robust loss, then from the initial values again without the outliers of the first. The
     pose of the first keyframe is fixed. Rows of points that loops join have a standard deviation of their own in what
-    counts as an outlier: ORB's pixels are less exact than those of tracks.
-
-    Args:
-        camera: the rectified pair.
-        T_world_cam0: (K, 4, 4) initial poses.
-        tracks: points and rows.
-        priors: a Gaussian on each camera position, weighted against the pixels' standard deviation.
-        threads: of the solver; one makes the result repeatable.
-        progress: called after each of the two rounds.
+    counts as an outlier: ORB's pixels are less exact than those of tracks. Priors are weighted against the pixels'
+    standard deviation. One thread makes the result repeatable. `progress` is called after each round.
 
     Raises:
         EstimationError: the solver failed.

@@ -90,12 +90,7 @@ def build_model(
 ) -> pycolmap.Reconstruction:
     """Build a COLMAP model: two pinhole cameras in a rig, a frame for each keyframe, points with tracks and colours.
 
-    Args:
-        camera: the rectified pair; its image size must be known.
-        T_world_cam0: (K, 4, 4) poses of the keyframes, metres.
-        tracks: the points.
-        names: image files of the keyframes.
-        colours: (M, 3) of the points; None: gray.
+    Poses of the keyframes are (K, 4, 4), colours of the points (M, 3); None: gray.
 
     Raises:
         DataError: the image size is unknown.
@@ -123,14 +118,10 @@ def _add_points(
     right_index: IntArray,
     colours: ColourArray | None,
 ) -> None:
-    """Add the points with their tracks.
+    """Add the points with their tracks and colours (M, 3) to a model that has the frames.
 
-    Args:
-        model: already contains the frames.
-        tracks: the points.
-        begins: (K,) first row of each keyframe; the pixels of its left image are its rows, in order.
-        right_index: (R,) index of each row among the pixels of its keyframe's right image; -1: no right pixel.
-        colours: (M, 3); None: gray.
+    The pixels of a keyframe's left image are its rows from `begins` (K + 1,) on, in order; `right_index` (R,) is the
+    index of each row among the pixels of its right image, -1 where it has none.
     """
     by_point = np.argsort(tracks.point, kind="stable")
     parts = np.searchsorted(tracks.point[by_point], np.arange(len(tracks.ids) + 1))
@@ -168,15 +159,9 @@ def add_frame(
     left: FloatArray,
     right: FloatArray,
 ) -> None:
-    """Add a keyframe with both images.
+    """Add a keyframe at a pose (4, 4), with pixels (N, 2) of its left and (M, 2) of its right image, in our convention.
 
-    Args:
-        model: already contains cameras and rig.
-        keyframe: its index.
-        T_cam0_world: (4, 4).
-        names: image files of all keyframes.
-        left: (N, 2) pixels in the left image, in our convention.
-        right: (M, 2) in the right one.
+    The model has cameras and rig already.
     """
     images = [
         pycolmap.Image(

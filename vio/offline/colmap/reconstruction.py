@@ -45,13 +45,8 @@ def match_images(
 ) -> None:
     """Find SIFT features in image files and match them within and between keyframes, into a new COLMAP database.
 
-    Args:
-        database: the file to create.
-        images: folder that the names are relative to; left images must be in one folder, right ones in another.
-        names: the keyframes' images.
-        camera: the rectified pair, intrinsics and baseline of the rig.
-        loops: (L, 2) keyframes that show one place, which are matched as well, and those next to them.
-        threads: for all steps; one makes the result repeatable.
+    Names are relative to `images`; left ones are in one folder, right ones in another. Keyframes that show one place,
+    `loops` (L, 2), are matched as well, and those next to them. One thread makes the result repeatable.
     """
     pycolmap.set_random_seed(SEED)
     reader = pycolmap.ImageReaderOptions(
@@ -110,14 +105,8 @@ def reconstruct(
 ) -> Reconstructed | None:
     """Reconstruct keyframes from a database of matches, with fixed rig and intrinsics; None: not successful.
 
-    Args:
-        database: made by `match_images`; not modified.
-        images: folder that the names are relative to.
-        names: the keyframes' images.
-        mapper: COLMAP's incremental or global mapper.
-        out: folder for the model, created if missing.
-        loops: (L, 2) keyframes that show one place.
-        threads: for all steps.
+    The database is that of `match_images`, and not modified; `loops` (L, 2) are keyframes that show one place. The
+    model is written into `out`.
     """
     pycolmap.set_random_seed(SEED)
     out.mkdir(parents=True, exist_ok=True)
