@@ -1,13 +1,11 @@
 """Consistency of the sliding-window filter, with the noise known and learned.
 
-    python tools/consistency.py --out FOLDER [--motions imu none velocity] [--variants VARIANT …] [--runs 20]
-        [--seconds 7.5] [--pixel-sigma 1.0] [--features 60] [--landmarks 30]
-        [--outliers 0.0] [--imu-offset-ms 0.0] [--jobs 2]
+    python -m tools.consistency [--motions imu none velocity] [--variants VARIANT …] [--runs 20] [--seconds 7.5]
+        [--pixel-sigma 1.0] [--features 60] [--landmarks 30] [--outliers 0.0] [--imu-offset-ms 0.0] [--jobs 2]
 
 Monte-Carlo flights through exact points, with exact noise: pixels, IMU and its biases, velocities, and the place and
 yaw of the start are drawn from the very distributions that the filter assumes. Each flight is flown once by every
-variant, with the same noise. Writes FOLDER/table.md (also printed) and FOLDER/consistency.png;
-docs/notes/consistency.md shows them.
+variant, with the same noise. Prints tables in Markdown; docs/notes/consistency.md shows them.
 """
 
 from __future__ import annotations
@@ -23,8 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 from unittest.mock import patch
 
 import numpy as np
@@ -76,7 +73,6 @@ SAMPLES = _FRAME_NS // _IMU_NS  # of the IMU in a frame
 _START: dict[Start, tuple[float, float]] = {"uncertain": (0.05, np.radians(1.0)), "known": (0.0, 0.0)}
 _MOTIONS: tuple[Motion, ...] = get_args(Motion)
 _VARIANTS: tuple[Variant, ...] = get_args(Variant)
-_COLOURS = dict(zip(_VARIANTS, ("#1f5fbf", "#111111"), strict=True))
 _MEASURES = {"pose": 6, "position": 3, "orientation": 3, "yaw": 1, "velocity": 3, "gyro bias": 3, "accel bias": 3}
 
 
@@ -387,10 +383,9 @@ def _record(
 
 
 def main() -> int:
-    """Fly everything and write the tables and the picture."""
+    """Fly everything and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     usual = Scenario()
-    parser.add_argument("--out", type=Path, required=True, help="folder for the results")
     parser.add_argument("--motions", nargs="+", default=list(_MOTIONS), choices=_MOTIONS)
     parser.add_argument("--variants", nargs="+", default=list(_VARIANTS), choices=_VARIANTS)
     parser.add_argument("--runs", type=int, default=20, help="flights per motion model and variant")
@@ -413,11 +408,7 @@ def main() -> int:
     except VioError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    args.out.mkdir(parents=True, exist_ok=True)
-    table = _tables(summaries)
-    (args.out / "table.md").write_text(table, encoding="utf-8")
-    _plot(args.out / "consistency.png", summaries)
-    print(table)
+    print(_tables(summaries))
     return 0
 
 
@@ -429,7 +420,7 @@ class Summary:
     start: Start
     variant: Variant
     runs: int
-    nees: dict[str, FloatArray]  # (F - 1,) by measure, mean over the runs
+    nees: dict[str, float]  # by measure, mean over the runs and frames
     nees_se: dict[str, float]  # by measure, standard error over the runs of the mean over all frames
     inside: dict[str, float]  # by measure, share of the frames in which the mean lies in its 95 % band
     nis: float
@@ -478,7 +469,7 @@ def _summary(records: list[Record]) -> Summary:
     return Summary(
         *_group(records[0].job),
         runs,
-        mean,
+        {m: float(values.mean()) for m, values in mean.items()},
         {m: float(v.mean(axis=1).std(ddof=min(runs - 1, 1)) / np.sqrt(runs)) for m, v in every.items()},
         inside,
         float(np.nanmean([r.nis[1:] for r in records])),
@@ -523,50 +514,9 @@ def _tables(summaries: list[Summary]) -> str:
 
 
 def _nees_cell(summary: Summary, measure: str) -> str:
-    mean, error = float(summary.nees[measure].mean()), summary.nees_se[measure]
+    mean, error = summary.nees[measure], summary.nees_se[measure]
     digits = 1 if mean >= 20 else 2
     return f"{mean:.{digits}f} ± {error:.{digits}f} ({100 * summary.inside[measure]:.0f} %)"
-
-
-def _plot(path: Path, summaries: list[Summary]) -> None:
-    """Columns: motion and start; above the pose NEES over time, below yaw's estimated sigma and its error."""
-    from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-
-    columns = list(dict.fromkeys((s.motion, s.start) for s in summaries))
-    figure = Figure(figsize=(3.1 * len(columns) + 0.6, 5.4), dpi=90, layout="constrained")
-    grid = figure.subplots(2, len(columns), squeeze=False, sharey="row")
-    for (motion, start), (above, below) in zip(columns, grid.T, strict=True):
-        above.set_title(f"{motion}, start {start}", fontsize=9)
-        low, high = nees_bounds(_MEASURES["pose"], summaries[0].runs)
-        above.axhspan(low, high, color="#cfd8e3", lw=0)
-        for s in summaries:
-            if (s.motion, s.start) != (motion, start):
-                continue
-            t = _times(len(s.yaw_sigma_deg) + 1)[1:]
-            style: dict[str, Any] = {"color": _COLOURS[s.variant], "lw": 1.2}
-            above.plot(t, s.nees["pose"], **style)
-            below.plot(t, s.yaw_sigma_deg, **style)
-            below.plot(t, s.yaw_error_deg, ls=":", **style)
-        above.set_yscale("log")
-        below.set_yscale("log")
-        below.set_ylim(bottom=0.02)
-        below.set_xlabel("time (s)", fontsize=8)
-        for axes in (above, below):
-            axes.tick_params(labelsize=7, which="both")
-            axes.grid(alpha=0.25)
-            axes.yaxis.set_major_formatter("{x:g}")
-    grid[0, 0].set_ylabel("pose NEES, 6 expected", fontsize=8)
-    grid[1, 0].set_ylabel("yaw (deg)", fontsize=8)
-    used = [v for v in _VARIANTS if any(s.variant == v for s in summaries)]
-    handles = [Line2D([], [], color=_COLOURS[v], lw=1.2, label=v) for v in used]
-    handles += [
-        Line2D([], [], color="#cfd8e3", lw=6, label="95 % band"),
-        Line2D([], [], color="#666666", label="estimated sigma"),
-        Line2D([], [], color="#666666", ls=":", label="error, RMS"),
-    ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8)
-    figure.savefig(path)
 
 
 if __name__ == "__main__":
