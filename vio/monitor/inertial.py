@@ -20,11 +20,10 @@ from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import judge_force, judge_lever_arm, judge_up, resolve_size
 from vio.monitor.force_fit import FIRST_EVALUATION, LEAST_WINDOWS, Evidence, fit_force
 from vio.monitor.gyro import judge_gyro
-from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset
+from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset, judge_stamps
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
 from vio.monitor.rotation_comparison import compare_rotations, judge_rotations
 from vio.monitor.samples import Samples, Size, judge_size
-from vio.monitor.stamps import judge_stamps
 from vio.records import ROTATION_NOT_COMPARABLE, ImuSample, Observations, RotationComparison
 
 _LEAST_AT_END = 20  # intervals needed to judge at the end of a run
