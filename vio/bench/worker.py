@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, pose_nees
+from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, nees_figures
 from vio.bench.identity import code_digest, package_versions
 from vio.config import Config, merge
 from vio.datasets import open_dataset
@@ -243,7 +243,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         if truth.reference is not None:
             score = _evaluate(job, trajectory, truth.reference, result.T_cam0_body)
             figures |= figures_of(score, positions_only=job["positions_only"])
-            figures |= _nees(result, score) if job["exact_truth"] else {"nees": None}
+            figures |= {"nees": None} | (_nees(result, score) if job["exact_truth"] else {})
             figures["landmarks_m"] = (landmark_error(result, score) or {}).get("rmse_m")
             record |= {"curve": error_curve(score, trajectory.times_ns), "notes": list(score.notes)}
             if result.mapped is not None and result.stopped is None:
@@ -295,16 +295,13 @@ def _median(values: Iterable[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
-def _nees(result: RunResult, score: Evaluation) -> dict[str, float | None]:
+def _nees(result: RunResult, score: Evaluation) -> dict[str, float]:
     rows = result.estimates
     T_world_imu, covariances = (np.array(rows.column(name)) for name in ("T_world_imu", "covariance"))
     # With an IMU, the world stays that of the first seconds while gravity is known better, and says where it points.
     stays = np.isfinite(np.array(rows.column("gravity_world"))).all(axis=1)
     upright: BoolArray = np.asarray(~stays if result.motion == "imu" else np.zeros_like(stays), dtype=np.bool_)
-    values = pose_nees(score, T_world_imu, covariances, result.T_cam0_body, upright=upright)
-    if values is None:
-        return {"nees": None}
-    return {"nees": float(values.mean()), **{f"nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}}
+    return nees_figures(score, T_world_imu, covariances, result.T_cam0_body, name="nees", upright=upright)
 
 
 def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from vio.errors import EvaluationError
 from vio.evaluation.alignment import align_poses, apply_alignment
+from vio.evaluation.association import take
 from vio.evaluation.errors_along_path import path_length_m, rotation_angle_deg
 from vio.evaluation.trajectories import evaluate
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_inverse
@@ -209,12 +210,7 @@ def _against(
     truth: GroundTruth, run: TrackedPath, rows: IntArray, T_other_cam0: FloatArray
 ) -> tuple[float | None, float | None, float | None]:
     """Return ATE and scale of the other poses, and ATE of the run; None where they cannot be compared."""
-    own = replace(
-        run.trajectory,
-        T_world_body=run.trajectory.T_world_body[rows],
-        times_ns=None if run.trajectory.times_ns is None else run.trajectory.times_ns[rows],
-        frame_indices=run.frames[rows],
-    )
+    own = take(run.trajectory, rows)
     other = replace(own, T_world_body=T_other_cam0)
     try:
         ate, of_run = (
