@@ -112,11 +112,7 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
 
 
 def _truth(job: dict[str, Any], config: Config) -> _Truth:
-    """Open the recording of a job.
-
-    Raises:
-        VioError: it cannot be used, or its reference cannot be read.
-    """
+    """Open the recording of a job."""
     dataset = open_dataset(job["source"], config.dataset)
     stop = None if job["stop"] is None else parse_bound(job["stop"])
     first, end = frames_between(dataset.recording, parse_bound(job["start"]), stop)
@@ -308,11 +304,7 @@ def _nees(result: RunResult, score: Evaluation) -> dict[str, float | None]:
 
 
 def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
-    """Evaluate another system's trajectory on the recording.
-
-    Raises:
-        VioError: the file is damaged, or the recording has no reference.
-    """
+    """Evaluate another system's trajectory on the recording."""
     recording = truth.dataset.recording
     if truth.reference is None:
         raise DataError(f"{recording.path}: no ground truth; name one with reference: in the suite")
