@@ -100,6 +100,11 @@ def pose_nees(
         return None
 
 
+def nees_figures(values: FloatArray, name: str) -> dict[str, float]:
+    """Return mean, median and 95 % of NEES (M,), by names that begin with `name`."""
+    return {name: float(values.mean()), **{f"{name}_{q}": float(np.percentile(values, q)) for q in (50, 95)}}
+
+
 def _yaw_and_position(T: FloatArray, T_true: FloatArray) -> FloatArray:
     """Return the motion (4, 4) of an upright world into another that fits two poses (4, 4) of one body best."""
     C = T[:3, :3] @ T_true[:3, :3].T

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.bench.figures import pose_nees
+from vio.bench.figures import nees_figures, pose_nees
 from vio.errors import EvaluationError
 from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.evaluation.trajectories import Evaluation, evaluate
@@ -126,10 +126,7 @@ def _causal_figures(
     # A map is turned upright, and another session's is entered anywhere: its world is not that of the first pose.
     world = se3_inverse(score.T_ref_est if T_ref_map is None else T_ref_map)
     values = pose_nees(score, causal.T_world_body, covariances, T_cam0_body, upright=False, T_world_true=world)
-    if values is None:
-        return figures
-    quantiles = {f"map_nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}
-    return {**figures, "map_nees": float(values.mean()), **quantiles}
+    return figures if values is None else figures | nees_figures(values, "map_nees")
 
 
 def wrong_share(T: FloatArray, T_true: FloatArray) -> float:

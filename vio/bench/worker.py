@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, pose_nees
+from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, nees_figures, pose_nees
 from vio.bench.identity import code_digest, package_versions
 from vio.config import Config, merge
 from vio.datasets import open_dataset
@@ -298,9 +298,7 @@ def _nees(result: RunResult, score: Evaluation) -> dict[str, float | None]:
     stays = np.isfinite(np.array(rows.column("gravity_world"))).all(axis=1)
     upright: BoolArray = np.asarray(~stays if result.motion == "imu" else np.zeros_like(stays), dtype=np.bool_)
     values = pose_nees(score, T_world_imu, covariances, result.T_cam0_body, upright=upright)
-    if values is None:
-        return {"nees": None}
-    return {"nees": float(values.mean()), **{f"nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}}
+    return {"nees": None} if values is None else {**nees_figures(values, "nees")}
 
 
 def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
