@@ -100,21 +100,9 @@ def pose_nees(
         return None
 
 
-def nees_figures(
-    evaluation: Evaluation,
-    T_world_imu: FloatArray,
-    covariances: FloatArray,
-    T_cam0_imu: FloatArray,
-    *,
-    name: str,
-    upright: BoolArray | bool = False,
-    T_world_true: FloatArray | None = None,
-) -> dict[str, float]:
-    """Return mean, median and what 95 % stay within of `pose_nees`, by names that begin with `name`; {}: undefined."""
-    found = pose_nees(evaluation, T_world_imu, covariances, T_cam0_imu, upright=upright, T_world_true=T_world_true)
-    if found is None:
-        return {}
-    return {name: float(found.mean()), **{f"{name}_{q}": float(np.percentile(found, q)) for q in (50, 95)}}
+def nees_figures(values: FloatArray, name: str) -> dict[str, float]:
+    """Return mean, median and 95 % of NEES (M,), by names that begin with `name`."""
+    return {name: float(values.mean()), **{f"{name}_{q}": float(np.percentile(values, q)) for q in (50, 95)}}
 
 
 def _yaw_and_position(T: FloatArray, T_true: FloatArray) -> FloatArray:

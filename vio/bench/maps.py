@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.bench.figures import nees_figures
+from vio.bench.figures import nees_figures, pose_nees
 from vio.errors import EvaluationError
 from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.evaluation.trajectories import Evaluation, evaluate
@@ -85,8 +85,8 @@ def map_figures(
             held, upright = mapped.in_map, result.motion == "imu"
             built = Trajectory(held.T_map_body, held.time_ns, result.body, held.frame)
             score = evaluate(built, reference, T_cam0_imu=result.T_cam0_body)
-            T, P = held.T_map_body, held.covariance
-            figures |= nees_figures(score, T, P, result.T_cam0_body, name="map_nees", upright=upright)
+            values = pose_nees(score, held.T_map_body, held.covariance, result.T_cam0_body, upright=upright)
+            figures |= {} if values is None else nees_figures(values, "map_nees")
         T_true = truth.reference.in_imu(result.T_cam0_body).T_world_body
         figures |= loop_figures(store, frames[truth.rows], T_true, result.T_cam0_body)
     return {name: value for name, value in figures.items() if value is not None}
@@ -129,8 +129,9 @@ def _causal_figures(
     if T_ref_map is not None:
         T_true = score.reference.in_imu(T_cam0_body).T_world_body
         figures["placed_wrong"] = wrong_share(T_ref_map @ causal.T_world_body[score.rows], T_true)
-        T, T_true_ref = causal.T_world_body, se3_inverse(T_ref_map)
-        figures |= nees_figures(score, T, covariances, T_cam0_body, name="map_nees", T_world_true=T_true_ref)
+        T, world = causal.T_world_body, se3_inverse(T_ref_map)
+        values = pose_nees(score, T, covariances, T_cam0_body, upright=False, T_world_true=world)
+        figures |= {} if values is None else nees_figures(values, "map_nees")
     return figures
 
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, nees_figures
+from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, nees_figures, pose_nees
 from vio.bench.identity import code_digest, package_versions
 from vio.config import Config, merge
 from vio.datasets import open_dataset
@@ -112,11 +112,7 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
 
 
 def _truth(job: dict[str, Any], config: Config) -> _Truth:
-    """Open the recording of a job.
-
-    Raises:
-        VioError: it cannot be used, or its reference cannot be read.
-    """
+    """Open the recording of a job."""
     dataset = open_dataset(job["source"], config.dataset)
     stop = None if job["stop"] is None else parse_bound(job["stop"])
     first, end = frames_between(dataset.recording, parse_bound(job["start"]), stop)
@@ -243,7 +239,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         if truth.reference is not None:
             score = _evaluate(job, trajectory, truth.reference, result.T_cam0_body)
             figures |= figures_of(score, positions_only=job["positions_only"])
-            figures |= {"nees": None} | (_nees(result, score) if job["exact_truth"] else {})
+            figures |= _nees(result, score) if job["exact_truth"] else {"nees": None}
             figures["landmarks_m"] = (landmark_error(result, score) or {}).get("rmse_m")
             record |= {"curve": error_curve(score, trajectory.times_ns), "notes": list(score.notes)}
             if result.mapped is not None and result.stopped is None:
@@ -295,21 +291,18 @@ def _median(values: Iterable[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
-def _nees(result: RunResult, score: Evaluation) -> dict[str, float]:
+def _nees(result: RunResult, score: Evaluation) -> dict[str, float | None]:
     rows = result.estimates
     T_world_imu, covariances = (np.array(rows.column(name)) for name in ("T_world_imu", "covariance"))
     # With an IMU, the world stays that of the first seconds while gravity is known better, and says where it points.
     stays = np.isfinite(np.array(rows.column("gravity_world"))).all(axis=1)
     upright: BoolArray = np.asarray(~stays if result.motion == "imu" else np.zeros_like(stays), dtype=np.bool_)
-    return nees_figures(score, T_world_imu, covariances, result.T_cam0_body, name="nees", upright=upright)
+    values = pose_nees(score, T_world_imu, covariances, result.T_cam0_body, upright=upright)
+    return {"nees": None} if values is None else {**nees_figures(values, "nees")}
 
 
 def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
-    """Evaluate another system's trajectory on the recording.
-
-    Raises:
-        VioError: the file is damaged, or the recording has no reference.
-    """
+    """Evaluate another system's trajectory on the recording."""
     recording = truth.dataset.recording
     if truth.reference is None:
         raise DataError(f"{recording.path}: no ground truth; name one with reference: in the suite")
