@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -124,9 +122,6 @@ class LiveOdometry(EventInputs[None]):
     def inputs(self) -> Inputs:
         """The checks of the present trajectory."""
         return self._odometry.inputs
-
-    def _checking(self) -> AbstractContextManager[object]:
-        return contextlib.nullcontext()
 
     def take(self, given: GivenFrame | Sequence[MotionSample] | None) -> None:
         """Queue what was checked; predictions begin with samples at once.
