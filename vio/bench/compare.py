@@ -110,13 +110,9 @@ def compare(
 ) -> Comparison:
     """Compare the results of two output folders, or two systems of them.
 
-    Args:
-        a: before.
-        b: after; the same folder where two of its systems are compared.
-        between: the system of A and the system of B, each a configuration or another system's name; None: each
-            configuration of A with that of the same name of B.
-        factor: by which the ATE of a single sequence must change to be shown.
-        margin: a change below this factor counts as none where the interval says so.
+    `between` names the system of A, before, and that of B, after, each a configuration or another system; None: each
+    configuration of A with that of the same name of B. The ATE of a single sequence is shown where it changes by more
+    than `factor`; a change below `margin` counts as none where the interval says so.
 
     Raises:
         VioError: a folder holds no bench, or the two sides have no run in common.

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -163,9 +161,6 @@ class LiveOdometry(EventInputs[None]):
     def inputs(self) -> Inputs:
         """The checks of the present trajectory."""
         return self._odometry.inputs
-
-    def _checking(self) -> AbstractContextManager[object]:
-        return contextlib.nullcontext()
 
     def take(self, given: GivenFrame | Sequence[MotionSample] | None) -> None:
         """Queue what was checked; predictions begin with samples at once.

@@ -41,12 +41,10 @@ class EventQueue:
     """
 
     def __init__(self, most_frames: int, drop: Drop) -> None:
-        """Create an empty queue.
+        """Create an empty queue, in which `most_frames` wait.
 
-        Args:
-            most_frames: that wait.
-            drop: what a frame too many does: "oldest" takes the place of the one that has waited longest, "none" waits
-                behind all others, "block" makes `put` wait for room.
+        One too many takes the place of the one that has waited longest ("oldest"), waits behind all others ("none"), or
+        makes `put` wait for room ("block").
         """
         self._most, self._drop = most_frames, drop
         self._calls: queue.SimpleQueue[QueuedCall | None] = queue.SimpleQueue()  # None: the end
