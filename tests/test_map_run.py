@@ -514,12 +514,18 @@ def test_the_errors_of_a_map_are_normalised_relative_to_its_first_keyframe(loope
 
 
 def test_a_map_that_turns_as_a_whole_has_not_moved() -> None:
-    """Its covariance is relative to the first keyframe: one centimetre since that one is a standard deviation."""
+    """Its covariance is relative to the first keyframe's position and yaw: a centimetre is a standard deviation.
+
+    How the first keyframe is inclined is no matter of choice: that it alone tilts has not moved the others.
+    """
     T = se3_exp(np.random.default_rng(0).normal(0, 1, (5, 6)))
     P = np.broadcast_to(1e-4 / 6 * np.eye(6), (5, 6, 6))
     in_map = MapKeyframes(*3 * (np.arange(5),), np.ones(5, dtype=np.bool_), T, P)
-    turned = se3_exp([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]) @ T
+    turned = se3_exp([1.0, 2.0, 3.0, 0.0, 0.0, 0.3]) @ T
     assert _sigmas_moved(in_map, turned) < 1e-9
+    tilted = turned.copy()
+    tilted[0] = tilted[0] @ se3_exp([0, 0, 0, *tilted[0][0, :3] * 0.05])  # about a horizontal axis of the world
+    assert _sigmas_moved(in_map, tilted) < 1e-3
     turned[1:] = turned[1:] @ se3_exp([0.01, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(_sigmas_moved(in_map, turned), 1.0)
 

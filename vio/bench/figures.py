@@ -13,7 +13,7 @@ from vio.errors import EvaluationError
 from vio.evaluation.association import associate_times
 from vio.evaluation.consistency import nees
 from vio.evaluation.trajectories import Evaluation
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
+from vio.geometry.lie import FloatArray, se3_inverse, se3_log, yaw_and_position
 from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
 _OF_REFERENCE = ("ate_sim3_m", "scale_error_percent", "rpe_m", "drift_percent", "drift_deg_per_100m", "nees")
@@ -88,7 +88,7 @@ def pose_nees(
     for rows in (np.flatnonzero(upright), np.flatnonzero(~upright)):
         if len(rows):
             a, b = T[rows[0]], truth[rows[0]]
-            first = _yaw_and_position(a, b) if upright[rows[0]] else a @ se3_inverse(b)
+            first = yaw_and_position(a, b) if upright[rows[0]] else a @ se3_inverse(b)
             world = first if T_world_true is None else T_world_true
             errors[rows] = se3_log(se3_inverse(world @ truth[rows]) @ T[rows])
     invertible = np.linalg.cond(P) < _MOST_CONDITION
@@ -103,14 +103,6 @@ def pose_nees(
 def nees_figures(values: FloatArray, name: str) -> dict[str, float]:
     """Return mean, median and 95 % of NEES (M,), by names that begin with `name`."""
     return {name: float(values.mean()), **{f"{name}_{q}": float(np.percentile(values, q)) for q in (50, 95)}}
-
-
-def _yaw_and_position(T: FloatArray, T_true: FloatArray) -> FloatArray:
-    """Return the motion (4, 4) of an upright world into another that fits two poses (4, 4) of one body best."""
-    C = T[:3, :3] @ T_true[:3, :3].T
-    yaw = np.arctan2(C[1, 0] - C[0, 1], C[0, 0] + C[1, 1])
-    R = so3_exp(np.array([0.0, 0.0, yaw]))
-    return se3_from_parts(R, T[:3, 3] - R @ T_true[:3, 3])
 
 
 def absent_reasons(

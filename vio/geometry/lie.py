@@ -322,3 +322,14 @@ def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
     R = T_[:3, :3]
     deviation = float(np.abs(R.T @ R - np.eye(3)).max())
     return se3_from_parts(R if deviation <= _EXACT else nearest_rotation(R), T_[:3, 3])
+
+
+def yaw_and_position(T: FloatArray, T_other: FloatArray) -> FloatArray:
+    """Return the motion (4, 4) of an upright world that brings a pose (4, 4) in it nearest to one in another, T.
+
+    It is a turn about the vertical and a shift: what two upright worlds may differ by.
+    """
+    C = T[:3, :3] @ T_other[:3, :3].T
+    yaw = np.arctan2(C[1, 0] - C[0, 1], C[0, 0] + C[1, 1])
+    R = so3_exp(np.array([0.0, 0.0, yaw]))
+    return se3_from_parts(R, T[:3, 3] - R @ T_other[:3, 3])

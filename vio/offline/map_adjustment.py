@@ -13,7 +13,7 @@ import numpy as np
 from vio.calibration.stereo_field import DisplacementField
 from vio.errors import VioError
 from vio.evaluation.trajectories import metres_text
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, yaw_and_position
 from vio.mapping.map_store import MapStore
 from vio.offline.inertial_refinement import InertialRun, adjust_with_imu, inertial_keyframes
 from vio.offline.keyframes import TrackedPath
@@ -115,9 +115,10 @@ def _path(result: RunResult, mapped: MappedRun) -> TrackedPath:
 def _sigmas_moved(in_map: MapKeyframes, T_map_body: FloatArray) -> float:
     """By how many standard deviations of the map its keyframes but the first move to poses (K, 4, 4), in the median.
 
-    Both are taken since the first keyframe, as the covariance is: the adjustment may turn the whole map.
+    The covariance is relative to the position and the yaw of the first keyframe, as both worlds are upright: the
+    adjustment may shift the whole map and turn it about the vertical.
     """
-    before, after = (se3_inverse(T[0]) @ T[1:] for T in (in_map.T_map_body, T_map_body))
-    xi = se3_log(se3_inverse(before) @ after)
+    before, after = in_map.T_map_body, T_map_body
+    xi = se3_log(se3_inverse(before[1:]) @ yaw_and_position(before[0], after[0]) @ after[1:])
     squared = np.einsum("ki,ki->k", xi, np.linalg.solve(in_map.covariance[1:], xi[:, :, None])[:, :, 0])
     return float(np.sqrt(np.median(squared) / 6))
