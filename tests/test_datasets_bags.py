@@ -506,7 +506,7 @@ BAD = {
     "CameraInfo of zeros": (_bad(_uncalibrated), None, r"/left/camera_info: not calibrated \(K or P is zero\)"),
     "mixed encodings": (_bad(_mixed), None, "/left/image_raw mixes mono8, mono16; record one encoding"),
     "an odd encoding": (_bad(_odd_encoding), None, "images of encoding '32FC1' are not read; use mono8"),
-    "another size": (_bad(_other_size), None, r"is 64 x 40 pixels but /left/camera_info specifies 64 x 48"),
+    "another size": (_bad(_other_size), None, r"is 64 x 40 pixels but /left/camera_info is for 64 x 48"),
     "an IMU with a NaN": (_bad(_nan), None, "/imu: the sample at 1000000000000000001 ns is not finite"),
     "an IMU of another clock": (_bad(_other_clock), None, "no sample is within the time of the images"),
     "cameras without synchronisation": (_bad(_unsynchronised), None, "within 3 ms; the cameras must be synchronised"),

@@ -361,7 +361,7 @@ BAD = {
     ),
     "images of another size": (
         _break(lambda f: [cv2.imwrite(str(p), np.zeros((40, 50), np.uint8)) for p in f.glob("*/*.png")]),
-        r"is 50 x 40 pixels but .*camchain-imucam\.yaml specifies 64 x 48",
+        r"is 50 x 40 pixels but .*camchain-imucam\.yaml is for 64 x 48",
     ),
     "a calibration that is missing": (
         lambda f: make_plain(f) and f / "none",

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from vio.cameras.rig import Rectifier
 from vio.datasets.bags.companions import chosen_rig, contents, motion_of
 from vio.datasets.bags.index import Stamps, stamp_of
 from vio.datasets.bags.pictures import gray_of
@@ -25,7 +24,7 @@ from vio.datasets.image_pairs import BadFrame, ImageRecording, ImageSize, readab
 from vio.datasets.images import UnreadableImageError, white_note, white_of
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
-from vio.records import ImuDensities, IntArray, Recording, StereoFrame
+from vio.records import IntArray, Recording, StereoFrame
 
 _Messages = tuple[int, list[Any]]  # of a frame: its number, and the image of each camera, decoded but for its pixels
 
@@ -37,10 +36,8 @@ class BagDataset(ImageRecording):
     topics: tuple[Topic, ...]  # of the images: left, and right where there is one
     stamps_ns: tuple[IntArray, ...]  # (F,) stamps of the images of each topic, of a pair in one row
     logged_ns: IntArray  # (F,) when the bag received the first image of each frame
-    rectifier: Rectifier
     white: int  # level of white of 16-bit images
     unstamped: tuple[bool, ...]  # of each topic: the headers have no stamps, the times of logging serve
-    imu_noise: ImuDensities | None = None
 
     def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
         return readable_frames(self._load, self._messages(chosen), self.settings)
@@ -125,8 +122,8 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         ImageSize(camera.width, camera.height, Path(file or info or path))
         for camera, info in zip(rig.cameras, found.infos, strict=True)
     )
-    images = roles.cameras, stamps_ns, logged_ns, rectifier, white, tuple(each.unstamped for each in stamps)
-    return BagDataset(recording, motion, sizes, settings, *images, rig.imu_noise)
+    images = roles.cameras, stamps_ns, logged_ns, white, tuple(each.unstamped for each in stamps)
+    return BagDataset(recording, motion, sizes, settings, rectifier, *images, imu_noise=rig.imu_noise)
 
 
 def _frames(
