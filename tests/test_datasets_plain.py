@@ -16,8 +16,9 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.images import UnreadableImageError, load_gray, other_damage
 from vio.datasets.plain import read_plain
 from vio.datasets.rigs.kalibr import kalibr_text
-from vio.datasets.tables import parse_stamps, read_imu_table
+from vio.datasets.tables import read_imu_table
 from vio.errors import CalibrationError, DataError, VioError
+from vio.files.text import parse_stamps
 from vio.records import ImuSample, StereoFrame
 
 DEFAULT = DatasetSettings()

@@ -28,11 +28,11 @@ from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.kitti_raw import CAMERAS, find_above
 from vio.datasets.rigs import find_calibration, kitti_rig, load_rig
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.tables import drive_times, is_date, parse_stamps, stamped_rows
+from vio.datasets.tables import drive_times, is_date, stamped_rows
 from vio.datasets.tum_rgbd import LISTS, associated_images, is_tum_folder, published_camera
 from vio.datasets.unused import Layout
 from vio.errors import CalibrationError, DataError
-from vio.files.text import text_lines
+from vio.files.text import parse_stamps, text_lines
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.records import NS_PER_S, IntArray, Trajectory
