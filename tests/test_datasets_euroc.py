@@ -34,8 +34,9 @@ from vio.cli.output import NOTE
 from vio.cli.running import process
 from vio.config import load_config
 from vio.datasets import DatasetSettings, open_dataset
-from vio.datasets.euroc import pair_stamps, read_euroc
+from vio.datasets.euroc import read_euroc
 from vio.datasets.euroc_files import camera_yaml, read_camera_yaml, rig_read_as
+from vio.datasets.frame_times import pair_stamps
 from vio.datasets.image_pairs import ImageDataset
 from vio.datasets.images import load_gray
 from vio.errors import CalibrationError, DataError

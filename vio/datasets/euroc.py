@@ -21,7 +21,7 @@ from vio.cameras.rig import rectifier_of
 from vio.datasets.common import naming
 from vio.datasets.companions import Beside, check_overlap, parts_of
 from vio.datasets.euroc_files import STATE_CSV, TUM_FILE, read_camera_yaml, read_imu_yaml
-from vio.datasets.frame_times import PAIRED_NS, pair_stamps
+from vio.datasets.frame_times import paired
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImageDataset, full_scale
 from vio.datasets.images import list_images
@@ -128,13 +128,7 @@ def _find_images(there: ImageFiles, names: Sequence[str], path: Path, lines: Seq
 
 def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray, tuple[str, ...]]:
     """Indices (F,), (F,) of the left and right images that form pairs, and notes about the pairing."""
-    a, b = pair_stamps(left.times_ns, right.times_ns)
-    if not len(a):
-        spans = [f"{c.times_ns[0]} to {c.times_ns[-1]} ns" for c in (left, right)]
-        raise DataError(
-            f"{mav}: no image of cam0 ({spans[0]}) has one of cam1 ({spans[1]}) within {PAIRED_NS / 1e6:g} ms; "
-            "both data.csv must use one clock and come from one recording"
-        )
+    a, b, differing = paired(left.times_ns, right.times_ns, ("cam0", "cam1"), mav)
     notes: list[str] = []
     if renamed := left.renamed + right.renamed:
         notes.append(f"{renamed} images have another extension than listed in their data.csv; matched by their stem")
@@ -149,16 +143,7 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
             f"{left.unlisted} images of cam0 and {right.unlisted} of cam1 are not listed in their data.csv and are "
             "skipped"
         )
-    unpaired = len(left.times_ns) - len(a), len(right.times_ns) - len(b)
-    if any(unpaired):
-        notes.append(f"{unpaired[0]} images of cam0 and {unpaired[1]} of cam1 have no partner and are skipped")
-    offset_ms = float(np.median(right.times_ns[b] - left.times_ns[a])) / 1e6
-    if np.any(right.times_ns[b] != left.times_ns[a]):
-        notes.append(
-            f"the stamps of cam1 differ from those of cam0 (median {offset_ms:+.3f} ms); each left image is paired "
-            "with the nearest right one"
-        )
-    return a, b, tuple(notes)
+    return a, b, (*notes, *differing)
 
 
 # --- inertial record and ground truth -------------------------------------------------------------------------------

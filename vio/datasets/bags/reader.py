@@ -19,7 +19,7 @@ from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import COMPRESSED
 from vio.datasets.common import naming
 from vio.datasets.companions import reference_of_body
-from vio.datasets.frame_times import PAIRED_NS, pair_stamps
+from vio.datasets.frame_times import paired
 from vio.datasets.image_pairs import BadFrame, ImageRecording, ImageSize, readable_frames
 from vio.datasets.images import UnreadableImageError, white_note, white_of
 from vio.datasets.settings import DatasetSettings
@@ -146,16 +146,5 @@ def _frames(
     if len(images) == 1:
         return (times[0],), logged[0], notes
     left, right = times
-    a, b = pair_stamps(left, right)
-    if not len(a):
-        spans = [f"{t[0]} to {t[-1]} ns" for t in times]
-        raise DataError(
-            f"{path}: no image of {names[0]} ({spans[0]}) has one of {names[1]} ({spans[1]}) within "
-            f"{PAIRED_NS / 1e6:g} ms; the cameras must be synchronised"
-        )
-    alone = len(left) - len(a), len(right) - len(b)
-    if any(alone):
-        notes.append(f"{alone[0]} left and {alone[1]} right images have no partner and are skipped")
-    if (offset := float(np.median(right[b] - left[a])) / 1e6) != 0:
-        notes.append(f"the right images are stamped {offset:+.3f} ms from the left ones (median)")
-    return (left[a], right[b]), np.minimum(logged[0][a], logged[1][b]), notes
+    a, b, differing = paired(left, right, names, path)
+    return (left[a], right[b]), np.minimum(logged[0][a], logged[1][b]), [*notes, *differing]
