@@ -34,10 +34,11 @@ from vio.cli.output import NOTE
 from vio.cli.running import process
 from vio.config import load_config
 from vio.datasets import DatasetSettings, open_dataset
-from vio.datasets.euroc import pair_stamps, read_euroc
+from vio.datasets.euroc import read_euroc
 from vio.datasets.euroc_files import camera_yaml, read_camera_yaml, rig_read_as
+from vio.datasets.frame_times import pair_stamps
+from vio.datasets.image_pairs import ImageDataset
 from vio.datasets.images import load_gray
-from vio.datasets.rectified import RectifiedDataset
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, so3_exp
@@ -47,11 +48,11 @@ from vio.records import ImuDensities, ImuSample, Recording, StereoFrame
 from vio.sim.rigs import euroc_like_rig
 
 
-def _read(path: Path, **settings: object) -> RectifiedDataset:
+def _read(path: Path, **settings: object) -> ImageDataset:
     return read_euroc(path, replace(DatasetSettings(), **settings))  # type: ignore[arg-type] # names are checked by replace
 
 
-def _frames(dataset: RectifiedDataset) -> list[StereoFrame]:
+def _frames(dataset: ImageDataset) -> list[StereoFrame]:
     return [event for event in dataset.events() if isinstance(event, StereoFrame)]
 
 
@@ -499,9 +500,7 @@ def test_rejects_images_of_another_size_than_the_calibration(tmp_path: Path) -> 
     make_euroc(tmp_path)
     for file in (tmp_path / "mav0" / "cam1" / "data").iterdir():
         cv2.imwrite(str(file), np.zeros((20, 30), np.uint8))
-    message = (
-        r"none of 4 frames can be used; the first: .*png is 30 x 20 pixels but .*cam1/sensor.yaml specifies 64 x 48"
-    )
+    message = r"none of 4 frames can be used; the first: .*png is 30 x 20 pixels but .*cam1/sensor.yaml is for 64 x 48"
     with pytest.raises(DataError, match=message):
         _frames(_read(tmp_path))
 
@@ -516,9 +515,9 @@ def test_an_imu_without_calibration_is_noted(tmp_path: Path) -> None:
 # --- real recordings ------------------------------------------------------------------------------------------------
 
 
-def _real(data_dir: Path, name: str) -> RectifiedDataset:
+def _real(data_dir: Path, name: str) -> ImageDataset:
     dataset = open_dataset(data_dir / "euroc" / name)
-    assert isinstance(dataset, RectifiedDataset)
+    assert isinstance(dataset, ImageDataset)
     return dataset
 
 

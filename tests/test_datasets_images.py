@@ -111,7 +111,7 @@ def test_missing_image_is_unreadable(tmp_path: Path) -> None:
 
 
 def test_sizes_are_compared_by_name() -> None:
-    with pytest.raises(DataError, match=r"b\.png is 32 x 24 pixels but a\.png specifies 30 x 24"):
+    with pytest.raises(DataError, match=r"b\.png is 32 x 24 pixels but a\.png is for 30 x 24"):
         ImageSize(30, 24, Path("a.png")).check(PIXELS, Path("b.png"))
     ImageSize(32, 24, Path("a.png")).check(PIXELS, Path("b.png"))
 

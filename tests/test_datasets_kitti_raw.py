@@ -14,9 +14,10 @@ import pytest
 from tests.euroc_maker import KITTI_RIG, RECT_SIZE, T_CAM0_VELO, T_VELO_IMU, make_kitti_raw
 from vio.cameras.rig import Rig
 from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.image_pairs import ImageDataset
 from vio.datasets.images import load_gray
-from vio.datasets.kitti_raw import KittiRawCalibration, read_cam_to_cam, read_kitti_raw
-from vio.datasets.rectified import RectifiedDataset
+from vio.datasets.kitti_raw import KittiRawCalibration, read_cam_to_cam
+from vio.datasets.plain import read_kitti_raw
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point
@@ -25,11 +26,11 @@ from vio.geometry.rectify import rectified_cameras, rectifying_rotations
 from vio.records import StereoFrame
 
 
-def _read(path: Path) -> RectifiedDataset:
+def _read(path: Path) -> ImageDataset:
     return read_kitti_raw(path, DatasetSettings())
 
 
-def _frames(dataset: RectifiedDataset) -> list[StereoFrame]:
+def _frames(dataset: ImageDataset) -> list[StereoFrame]:
     return [event for event in dataset.events() if isinstance(event, StereoFrame)]
 
 
@@ -198,7 +199,7 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "another size": (
         _entry("S_00", "100 80"),
         DataError,
-        r"images are 64 x 48 pixels but .* is for 100 x 80 \(raw\) or 56 x 40 \(rectified\)",
+        r"is for images of 100 x 80 \(raw\) or 56 x 40 \(rectified\), not 64 x 48 pixels",
     ),
     "images without frame numbers": (
         lambda d: [(d / f"image_0{k}/data/0000000101.png").rename(d / f"image_0{k}/data/b.png") for k in (0, 1)],
@@ -251,7 +252,7 @@ def test_rejects_bad_drives_with_one_line_error(case: str, tmp_path: Path) -> No
 # --- the real drive -------------------------------------------------------------------------------------------------
 
 
-def _real(data_dir: Path) -> tuple[RectifiedDataset, KittiRawCalibration]:
+def _real(data_dir: Path) -> tuple[ImageDataset, KittiRawCalibration]:
     folder = data_dir / "kitti_0039_unrectified"
     return _read(folder), read_cam_to_cam(folder / "calib_cam_to_cam.txt")
 

@@ -16,8 +16,9 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.images import UnreadableImageError, load_gray, other_damage
 from vio.datasets.plain import read_plain
 from vio.datasets.rigs.kalibr import kalibr_text
-from vio.datasets.tables import parse_stamps, read_imu_table
+from vio.datasets.tables import read_imu_table
 from vio.errors import CalibrationError, DataError, VioError
+from vio.files.text import parse_stamps
 from vio.records import ImuSample, StereoFrame
 
 DEFAULT = DatasetSettings()
@@ -362,7 +363,7 @@ BAD = {
     ),
     "images of another size": (
         _break(lambda f: [cv2.imwrite(str(p), np.zeros((40, 50), np.uint8)) for p in f.glob("*/*.png")]),
-        r"is 50 x 40 pixels but .*camchain-imucam\.yaml specifies 64 x 48",
+        r"is 50 x 40 pixels but .*camchain-imucam\.yaml is for 64 x 48",
     ),
     "a calibration that is missing": (
         lambda f: make_plain(f) and f / "none",

@@ -129,7 +129,7 @@ BAD = {
     "not a video": (lambda f: (f / "left.avi").write_bytes(b"no video" * 99), r"left\.avi: no frame can be decoded"),
     "a truncated video": (_truncate, r"right\.avi: (frame \d+ of 16 cannot be decoded|no frame can be decoded)"),
     "another rate": (_other_rate, r"left\.avi has 20 and right\.avi 25 frames per second"),
-    "another size": (_other_size, "is 160 x .* pixels but .* specifies 99 x"),
+    "another size": (_other_size, "is 160 x .* pixels but .* is for 99 x"),
     "an IMU without times": (lambda f: (f / "times.txt").unlink(), r"imu\.csv: needs the times of the images"),
     "too many times": (lambda f: (f / "times.txt").write_text("1\n" * 99), "holds 99 times for 16 image pairs"),
 }

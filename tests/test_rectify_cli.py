@@ -15,7 +15,7 @@ from tests.euroc_maker import RECTIFIED_RIG, camera_stamps, make_euroc, make_kit
 from vio.cli import main
 from vio.cli.rectify import MARKER
 from vio.datasets import open_dataset
-from vio.datasets.rectified import RectifiedDataset
+from vio.datasets.image_pairs import ImageDataset
 from vio.geometry.distortion import StereoRig, rig_from_rectified
 from vio.geometry.rectify import rectified_cameras
 from vio.protocols import Dataset
@@ -57,7 +57,7 @@ def test_an_euroc_folder_becomes_a_rectified_one(
     source, out = make_euroc(tmp_path / "raw", truth=truth), tmp_path / "rect"
     facts = _json(capsys, "rectify", str(source), "--out", str(out))
     raw, done = open_dataset(source), open_dataset(out)
-    assert isinstance(done, RectifiedDataset)
+    assert isinstance(done, ImageDataset)
     assert done.rectifier.maps is None, "the new folder needs no rectifying"
     camera = raw.recording.camera
     assert facts == {

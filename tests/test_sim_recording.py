@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from vio.datasets.kitti import read_kitti
+from vio.datasets.plain import read_kitti
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError, SimulationError, VioError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_inverse, transform_points
