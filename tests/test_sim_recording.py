@@ -110,7 +110,7 @@ def test_exact_blur_is_the_mean_of_sub_exposures() -> None:
 def test_motion_blur_is_along_the_motion_and_the_approximate_one_agrees(plain: Simulation) -> None:
     time_ns = 2_000_000_000
     sharp, approximate, exact = (
-        _recording(plain, effects).radiance(time_ns)[0]
+        _recording(plain, effects)._seen(0, time_ns, None)
         for effects in (
             CLEAN,
             replace(CLEAN, blur_exposure_ms=30.0, blur_samples=9),

@@ -295,15 +295,6 @@ class SimulatedRecording:
         plan = self.simulation.exposures
         return None if plan is None else plan.at(index, camera)
 
-    def radiance(self, time_ns: int) -> tuple[Radiance, Radiance]:
-        """Render both linear images (H, W) at a true time, with the blur and glare that the effects set.
-
-        With exposure control the blur is that of the nominal shutter time.
-        """
-        effects = self.simulation.effects
-        exposure = Exposure(effects.shutter_ms) if effects.auto_exposure else None
-        return self._seen(0, time_ns, exposure), self._seen(1, time_ns, exposure)
-
     def _seen(self, camera: int, time_ns: int, exposure: Exposure | None) -> Radiance:
         """Light (H, W) that reaches the sensor: blurred over the shutter time, with the lens's glare."""
         shutter_ms = self.simulation.effects.blur_exposure_ms if exposure is None else exposure.shutter_ms
