@@ -361,7 +361,7 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "unknown lens": (
         _edit("cam0/sensor.yaml", "radial-tangential", "double-sphere"),
         CalibrationError,
-        "'double-sphere' is unknown; the known ones are radial-tangential, radtan, plumb_bob, equidistant, none",
+        "'double-sphere' is not read; known: radial-tangential, radtan, plumb_bob, rational_polynomial, equidistant",
     ),
     "unknown camera": (
         _edit("cam0/sensor.yaml", "camera_model: pinhole", "camera_model: omni"),
