@@ -36,7 +36,7 @@ from vio.sim.exposure import ExposurePlan, plan_exposures
 from vio.sim.glare import glare
 from vio.sim.imu import ImuNoise, VelocityNoise, simulate_imu, simulate_velocity
 from vio.sim.miscalibration import CalibrationErrors, CalibrationSigmas, drawn_rig, miscalibrated
-from vio.sim.motion import FitReport, MotionSpline, motion_at, recorded_motion
+from vio.sim.motion import MotionSpline, motion_at, recorded_motion
 from vio.sim.render import CameraRays, Radiance, View, camera_rays, correspondence, depth_map, render
 from vio.sim.world import World, check_clear, room
 
@@ -370,7 +370,6 @@ class RecordedFlight:
     """A real flight: its smoothed motion, real image times, and the real IMU where there is one."""
 
     motion: MotionSpline
-    fit: FitReport
     frame_times_ns: IntArray  # (F,)
     imu: ImuRecord | None = field(default=None)
 
@@ -386,7 +385,7 @@ def read_flight(groundtruth: Path, image_times: Path | None = None, imu_csv: Pat
     Raises:
         DataError: a file cannot be used; the message names it.
     """
-    motion, fit = recorded_motion(groundtruth)
+    motion, _ = recorded_motion(groundtruth)
     if image_times is None:
         times = np.arange(motion.start_ns, motion.end_ns, 50_000_000)
     else:
@@ -395,7 +394,7 @@ def read_flight(groundtruth: Path, image_times: Path | None = None, imu_csv: Pat
     if len(times) == 0:
         raise DataError(f"no image time is within the ground truth {groundtruth}; use the same clock for both")
     imu = None if imu_csv is None else read_imu_table(imu_csv, whole_ns=True)[0]
-    return RecordedFlight(motion, fit, times, imu)
+    return RecordedFlight(motion, times, imu)
 
 
 def room_around(motion: MotionSpline, *, seed: int = 0, texel_m: float | None = None) -> World:
