@@ -156,7 +156,7 @@ def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
     target = Path(path)
     _remove_leftovers(target)
     partial = _sibling(target, "partial")
-    try:
+    with _writing(target):
         try:
             with partial.open("xb") as stream:
                 if fcntl is not None:
@@ -168,8 +168,6 @@ def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
             partial.replace(target)
         finally:
             partial.unlink(missing_ok=True)
-    except OSError as error:
-        raise _unwritable(target, error) from error
 
 
 def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
