@@ -36,8 +36,6 @@ def bag_of(dataset: Dataset, storage: str, path: Path) -> Path:
     script = Script(storage)
     for event in dataset.events():
         if isinstance(event, StereoFrame):
-            assert event.left is not None
-            assert event.right is not None
             of_stereo(script, [(event.time_ns, event.left, event.right)])
         elif isinstance(event, ImuSample):
             script.imu("/imu0", event, event.time_ns + 1_000_000)

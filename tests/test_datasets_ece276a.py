@@ -300,7 +300,6 @@ def test_published_file_0027(drive_0027: FeatureDataset) -> None:
     assert recording.frame_times_ns[0] == pytest.approx(1317386425562502384, abs=240)
     assert recording.camera == StereoCamera(707.0912, 707.0912, 601.8873, 183.1104, 0.5371506532679237)
     first = drive_0027.observations(0)
-    assert first is not None
     assert len(first) == 64
     assert len(drive_0027.tracks.ids) == 75647
     assert int(drive_0027.tracks.stale.sum()) == 4196

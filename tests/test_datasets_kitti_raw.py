@@ -45,7 +45,6 @@ def test_calibration_is_read(above: bool, tmp_path: Path) -> None:
     assert recording.camera.fu == pytest.approx(expected.camera.fu, rel=1e-9)
     assert recording.camera.baseline_m == pytest.approx(expected.camera.baseline_m, rel=1e-9)
     assert (recording.camera.width, recording.camera.height) == (64, 48)
-    assert recording.T_cam0_imu is not None
     np.testing.assert_allclose(recording.T_cam0_imu, expected.T_rect0_imu @ T_CAM0_VELO @ T_VELO_IMU, atol=1e-9)
     assert open_dataset(f"kitti_raw:{path}").recording.camera == recording.camera
 
@@ -309,8 +308,6 @@ def test_real_rows_are_aligned_as_well_as_by_kitti(data_dir: Path) -> None:
     medians = []
     for source, index in ((dataset, 0), (clip, 76)):
         frame = next(e for e in source.events(index, index + 1) if isinstance(e, StereoFrame))
-        assert frame.left is not None
-        assert frame.right is not None
         pl, pr = match_sift(frame.left, frame.right)
         assert len(pl) > 200
         medians.append(np.median(np.abs(pl[:, 1] - pr[:, 1])) / source.recording.camera.fv)
@@ -331,7 +328,6 @@ def test_real_rectified_images_show_features_where_those_of_kitti_do(data_dir: P
     moved = []
     pairs = ((frame.left, theirs.left, published.R_rect_cam0), (frame.right, theirs.right, published.R_rect_cam1))
     for (ours, other, R_theirs), R in zip(pairs, R_ours, strict=True):
-        assert ours is not None
         H = K_theirs @ R_theirs @ R.T @ np.linalg.inv(K_ours)
         turned = cv2.warpPerspective(ours, H, other.shape[::-1])
         corners = cv2.goodFeaturesToTrack(turned[20:-20, 20:-20], 300, 0.01, 12) + np.float32(20)

@@ -118,7 +118,6 @@ def _other_rate(folder: Path) -> None:
 
 def _other_size(folder: Path) -> None:
     camera = load_rig(folder).camera
-    assert camera.width is not None
     other = rig_of(rig_from_rectified(camera, np.eye(4)))
     text = kalibr_text(other).replace(f"resolution: [{camera.width},", "resolution: [99,")
     (folder / "camchain-imucam.yaml").write_text(text)

@@ -118,7 +118,6 @@ def test_floor_plan_of_a_box_on_a_floor() -> None:
     p = np.concatenate([floor[np.isfinite(floor).all(axis=1)], wall, lamp]).astype(np.float32)
     p += 1e-3
     plan = occupancy_grid(Mesh(p, p, np.zeros_like(p, np.uint8), np.zeros((0, 3), np.uint32)), np.eye(3), 0.05)
-    assert plan is not None
 
     def at(x_m: float, y_m: float) -> int:
         column, row = np.floor((np.array([x_m, y_m]) - plan.origin_m) / plan.cell_m).astype(int)
@@ -228,7 +227,6 @@ def test_exports_keep_the_colours_of_the_images(flight: Path, tmp_path: Path) ->
     shutil.copytree(flight, tinted)
     for file in tinted.glob("mav0/cam*/data/*.png"):
         gray = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        assert gray is not None
         cv2.imwrite(str(file), np.stack([gray // 2, gray, gray], axis=2))  # blue, green, red
     run = tmp_path / "run"
     assert main(["run", str(tinted), "--save-observations", "--out", str(run), "--no-plot", "--json"]) == 0

@@ -49,8 +49,6 @@ def events(recording: SimulatedRecording) -> list[Any]:
 @pytest.fixture(scope="module")
 def rig(recording: SimulatedRecording) -> Rig:
     camera = recording.recording.camera
-    assert camera.width is not None
-    assert camera.height is not None
     numbers = (camera.fu, camera.fv, camera.cu, camera.cv, camera.baseline_m, camera.width, camera.height)
     return Rig.rectified(*numbers, recording.recording.T_cam0_imu)
 

@@ -73,8 +73,6 @@ def test_an_euroc_folder_becomes_a_rectified_one(
     }
     assert done.recording.camera == replace(camera, baseline_m=done.recording.camera.baseline_m)
     assert done.recording.camera.baseline_m == pytest.approx(camera.baseline_m, abs=1e-12)
-    assert raw.recording.T_cam0_imu is not None
-    assert done.recording.T_cam0_imu is not None
     np.testing.assert_allclose(done.recording.T_cam0_imu, raw.recording.T_cam0_imu, atol=1e-12)
     _same_frames(raw, done)
     copied = ["imu0/data.csv", "imu0/sensor.yaml"]
@@ -109,8 +107,6 @@ def test_a_kitti_raw_drive_becomes_an_odometry_folder(
     assert (a.fu, a.fv, a.cu, a.cv, a.width, a.height) == (b.fu, b.fv, b.cu, b.cv, b.width, b.height)
     assert a.baseline_m == pytest.approx(b.baseline_m, rel=1e-12)
     if imu_known:
-        assert raw.recording.T_cam0_imu is not None
-        assert done.recording.T_cam0_imu is not None
         np.testing.assert_allclose(done.recording.T_cam0_imu, raw.recording.T_cam0_imu, atol=1e-12)
     else:
         assert done.recording.T_cam0_imu is None
@@ -220,7 +216,6 @@ def test_a_rendered_folder_reads_as_the_rectified_cameras_would_see_it(
     ideal = replace(simulation, rig=rig_from_rectified(done.camera, done.T_rect0_imu))
     frame = _images(dataset)[3]
     for image, view in zip((frame.left, frame.right), views(ideal, frame.time_ns), strict=True):
-        assert image is not None
         expected = render(simulation.world, camera_rays(view.camera), view.T_world_cam, frame.time_ns)
         difference = (image - expected)[4:-4, 4:-4]
         assert np.sqrt(np.mean(difference**2)) < 0.15 * expected.std()

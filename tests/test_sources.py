@@ -43,8 +43,6 @@ def video(pairs: list[StereoFrame], tmp_path_factory: pytest.TempPathFactory) ->
     path = tmp_path_factory.mktemp("video") / "pair.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 20.0, (320, 90))
     for pair in pairs:
-        assert pair.left is not None
-        assert pair.right is not None
         writer.write(np.dstack([np.hstack([pair.left, pair.right])] * 3))
     writer.release()
     return path
@@ -59,7 +57,6 @@ def test_a_video_gives_the_images_side_by_side(video: Path, pairs: list[StereoFr
     assert {b.time_ns - a.time_ns for a, b in itertools.pairwise(frames)} == {50_000_000}
     for frame, pair in zip(frames, pairs, strict=True):
         for image, expected in ((frame.left, pair.left), (frame.right, pair.right)):
-            assert expected is not None
             assert np.abs(image.astype(int) - expected).max() <= 1  # of the way through colour
     (single, *_) = open_source(f"video:{video}", "single").events()
     assert isinstance(single, SourceFrame)
