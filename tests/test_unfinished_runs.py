@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.commands import wait_for
+from tests.commands import refused, wait_for
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from tests.test_pipeline import FakeDrive
 from vio.cli import main
@@ -383,9 +383,7 @@ def test_settings_that_name_files_are_kept_in_a_checkpoint(flight_log: Path, tmp
 def _refused(folder: Path, capsys: pytest.CaptureFixture[str], pattern: str) -> None:
     """Go on with a run, which must be refused in one line and leave its tables as they are."""
     held = {path: path.read_bytes() for path in folder.rglob("*.npy")}
-    assert main(["run", "--resume", str(folder), "--quiet"]) == 1
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
+    error = refused(capsys, "run", "--resume", str(folder), "--quiet")
     assert re.search(pattern, error), error
     assert {path: path.read_bytes() for path in folder.rglob("*.npy")} == held
 
