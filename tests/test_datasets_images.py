@@ -15,13 +15,7 @@ import pytest
 
 from tests.dataset_makers import make_images
 from vio.datasets.image_pairs import ImageSize, pair_images
-from vio.datasets.images import (
-    UnreadableImageError,
-    list_images,
-    load_gray,
-    prefetch,
-    write_png,
-)
+from vio.datasets.images import UnreadableImageError, list_images, load_gray, prefetch, write_png
 from vio.errors import DataError
 
 PIXELS = np.random.default_rng(5).integers(0, 256, (24, 32)).astype(np.uint8)

@@ -19,14 +19,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.map_graph import MapGraph, _nearest
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
-from vio.mapping.pose_graph import (
-    Edges,
-    UpDirections,
-    optimise,
-    r_D_poses,
-    residual,
-    up_residual,
-)
+from vio.mapping.pose_graph import Edges, UpDirections, optimise, r_D_poses, residual, up_residual
 
 COUNT = 60
 SIGMA = np.repeat([0.02, 0.004], 3)  # of a step of the odometry, m and rad

@@ -18,7 +18,6 @@ from vio.records import BoolArray, IntArray, Trajectory
 
 _SCALE_SIGMA = 0.02  # a scale with a larger standard deviation is not reported
 _LEAST_MOTIONS = 8  # keyframes needed to detect outlying motions
-_LEAST_PIECE = 3  # keyframes that an alignment needs
 _OUTLYING = 6.0  # robust standard deviations
 # What COLMAP's own path may be off by at its end, beside the run's standard deviations.
 _END_SHARE, _END_DEG, _END_DEG_PER_M = 0.01, 0.5, 0.01

@@ -11,15 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.cameras.rig import Rig
-from vio.datasets.euroc_files import (
-    STATE_CSV,
-    image_name,
-    imu_csv,
-    imu_yaml,
-    median_rate_hz,
-    state_csv,
-    write_cameras,
-)
+from vio.datasets.euroc_files import STATE_CSV, image_name, imu_csv, imu_yaml, median_rate_hz, state_csv, write_cameras
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.datasets.rigs.kalibr import kalibr_text
