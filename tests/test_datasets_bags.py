@@ -12,7 +12,7 @@ import pytest
 rosbags = pytest.importorskip("rosbags", reason="needs rosbags")
 
 from tests.bag_maker import Script, noise_frames, of_stereo  # noqa: E402
-from tests.same_events import assert_same_events  # noqa: E402
+from tests.same_events import assert_same_events, frames_of  # noqa: E402
 from vio.cameras.rig import Rig  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
 from vio.datasets.bags.pictures import raw_gray  # noqa: E402
@@ -47,14 +47,14 @@ def bag_of(dataset: Dataset, storage: str, path: Path) -> Path:
 
 def test_the_left_camera_alone_needs_no_right_image(flight: Path, tmp_path: Path) -> None:
     script = Script("mcap")
-    pairs = [e for e in open_dataset(flight).events(0, 4) if isinstance(e, StereoFrame)]
+    pairs = frames_of(open_dataset(flight), 0, 4)
     for pair in pairs:
         of_stereo(script, [(pair.time_ns, pair.left, pair.left[:8, :8])])  # right images of a wrong size
     path = script.write(tmp_path / "f")
     rig = Rig.rectified(40.0, 40.0, 31.5, 23.5, 0.11, *reversed(pairs[0].left.shape))  # type: ignore[union-attr,misc]
     (tmp_path / "camchain.yaml").write_text(kalibr_text(rig))
     settings = DatasetSettings(calibration=tmp_path / "camchain.yaml", camera="left")
-    alone = [e for e in open_dataset(path, settings).events() if isinstance(e, StereoFrame)]
+    alone = frames_of(open_dataset(path, settings))
     assert len(alone) == len(pairs)
     for one, pair in zip(alone, pairs, strict=True):
         np.testing.assert_array_equal(one.left, pair.left)
@@ -129,7 +129,7 @@ def test_compressed_images_and_empty_topics(tmp_path: Path) -> None:
     script.empty += [("/bob/imu", "sensor_msgs/msg/Imu"), ("/lidar", "sensor_msgs/msg/PointCloud2")]
     dataset = open_dataset(script.write(tmp_path / "f"))
     expected = list(noise_frames(4))
-    frames = [event for event in dataset.events() if isinstance(event, StereoFrame)]
+    frames = frames_of(dataset)
     for frame, (time_ns, left, right) in zip(frames, expected, strict=True):
         assert frame.time_ns == time_ns
         np.testing.assert_array_equal(frame.left, left)
@@ -145,7 +145,7 @@ def test_compressed_images_that_ros_rectified_stay_as_they_are(tmp_path: Path) -
     for time_ns, left, right in noise_frames(4):
         script.compressed("/left/image_rect/compressed", time_ns, left)
         script.compressed("/right/image_rect/compressed", time_ns, right)
-    frames = [event for event in open_dataset(script.write(tmp_path / "f")).events() if isinstance(event, StereoFrame)]
+    frames = frames_of(open_dataset(script.write(tmp_path / "f")))
     for frame, (_, left, right) in zip(frames, noise_frames(4), strict=True):
         np.testing.assert_array_equal(frame.left, left)
         np.testing.assert_array_equal(frame.right, right)
@@ -244,7 +244,7 @@ def test_frames_logged_late_come_in_the_order_of_their_stamps(tmp_path: Path) ->
     script = plain_script(imu=False)
     late = [n for n in script.notes if n.topic == "/right/image_raw"][1]
     script.notes[script.notes.index(late)] = type(late)(late.topic, late.kind, START_NS + 130_000_000, late.fields)
-    frames = [event for event in open_dataset(script.write(tmp_path / "f")).events() if isinstance(event, StereoFrame)]
+    frames = frames_of(open_dataset(script.write(tmp_path / "f")))
     assert [frame.index for frame in frames] == [0, 1, 2, 3]
     for frame, (_, left, right) in zip(frames, noise_frames(4), strict=True):
         np.testing.assert_array_equal(frame.left, left)
@@ -277,7 +277,7 @@ def test_a_truncated_image_is_skipped(tmp_path: Path, caplog: pytest.LogCaptureF
     for k, (time_ns, left, right) in enumerate(noise_frames(4)):
         script.image("/left/image_raw", time_ns, left, cut=100 if k == 1 else 0)
         script.image("/right/image_raw", time_ns, right)
-    frames = [event for event in open_dataset(script.write(tmp_path / "f")).events() if isinstance(event, StereoFrame)]
+    frames = frames_of(open_dataset(script.write(tmp_path / "f")))
     assert [frame.index for frame in frames] == [0, 2, 3]
     assert "frame 1 is skipped" in caplog.text
     assert "the message is truncated" in caplog.text

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.dataset_makers import edit
 from tests.euroc_maker import (
     EQUIDISTANT_RIG,
     HEIGHT,
@@ -28,6 +29,7 @@ from tests.euroc_maker import (
     truth_poses,
     write_imu,
 )
+from tests.same_events import frames_of
 from tests.sift import match_sift
 from vio.cameras.rig import rectifier_of
 from vio.cli.output import NOTE
@@ -50,10 +52,6 @@ from vio.sim.rigs import euroc_like_rig
 
 def _read(path: Path, **settings: object) -> ImageDataset:
     return read_euroc(path, replace(DatasetSettings(), **settings))  # type: ignore[arg-type] # names are checked by replace
-
-
-def _frames(dataset: ImageDataset) -> list[StereoFrame]:
-    return [event for event in dataset.events() if isinstance(event, StereoFrame)]
 
 
 def test_calibration_clock_and_truth_are_read(tmp_path: Path) -> None:
@@ -115,7 +113,7 @@ def _opencv_maps(rig: StereoRig) -> list[tuple[np.ndarray, np.ndarray]]:
 def test_frames_are_rectified_as_opencv_would(rig: StereoRig, tmp_path: Path) -> None:
     dataset = _read(make_euroc(tmp_path, rig=rig))
     maps = _opencv_maps(rig)
-    for frame in _frames(dataset):
+    for frame in frames_of(dataset):
         for image, path, (u, v) in zip((frame.left, frame.right), dataset.pairs[frame.index], maps, strict=True):
             expected = cv2.remap(load_gray(path)[0], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             difference = np.abs(image.astype(int) - expected.astype(int))
@@ -128,7 +126,7 @@ def test_interpolation_is_a_setting(tmp_path: Path) -> None:
     make_euroc(tmp_path)
     lefts = {}
     for name in ("linear", "cubic", "lanczos4"):
-        left = _frames(_read(tmp_path, interpolation=name))[0].left
+        left = frames_of(_read(tmp_path, interpolation=name))[0].left
         lefts[name] = left.astype(int)
     for other in ("cubic", "lanczos4"):
         assert 0 < np.abs(lefts["linear"] - lefts[other]).mean() < 3
@@ -145,7 +143,7 @@ def test_a_rectified_folder_passes_through_unchanged(rig: StereoRig, tmp_path: P
     assert (camera.fu, camera.fv, camera.cu, camera.cv) == (40, 40, 31.5, 23.5)
     assert camera.baseline_m == pytest.approx(0.11, abs=1e-6)
     np.testing.assert_allclose(dataset.recording.T_cam0_imu, se3_inverse(T_IMU_CAM0), atol=2e-6)
-    for frame in _frames(dataset):
+    for frame in frames_of(dataset):
         for image, path in zip((frame.left, frame.right), dataset.pairs[frame.index], strict=True):
             np.testing.assert_array_equal(image, load_gray(path)[0])
 
@@ -197,7 +195,7 @@ def test_finds_images_with_another_extension(tmp_path: Path) -> None:
     assert [note for note in dataset.recording.notes if "another extension" in note] == [
         "8 images have another extension than listed in their data.csv; matched by their stem"
     ]
-    assert len(_frames(dataset)) == 4
+    assert len(frames_of(dataset)) == 4
 
 
 def test_a_copy_that_ended_early_is_used_as_far_as_it_goes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -302,12 +300,7 @@ Corruption = Callable[[Path], object]
 
 
 def _edit(name: str, old: str, new: str) -> Corruption:
-    def corrupt(mav: Path) -> None:
-        text = (mav / name).read_text()
-        assert old in text
-        (mav / name).write_text(text.replace(old, new, 1))
-
-    return corrupt
+    return lambda mav: edit(mav / name, old, new)
 
 
 def _line(name: str, number: int, text: str) -> Corruption:
@@ -486,10 +479,10 @@ def test_unreadable_images_are_skipped_up_to_a_limit(tmp_path: Path, caplog: pyt
     file = tmp_path / "mav0" / "cam1" / "data" / f"{_T1}.png"
     file.write_bytes(file.read_bytes()[:300])
     dataset = _read(tmp_path)
-    assert [frame.index for frame in _frames(dataset)] == [0, 2, 3]
+    assert [frame.index for frame in frames_of(dataset)] == [0, 2, 3]
     assert f"{_T1}.png: the PNG is truncated" in caplog.text
     with pytest.raises(DataError, match=r"truncated.*max_bad_frames allows 0"):
-        _frames(_read(tmp_path, max_bad_frames=0))
+        frames_of(_read(tmp_path, max_bad_frames=0))
 
 
 def test_rejects_images_of_another_size_than_the_calibration(tmp_path: Path) -> None:
@@ -498,7 +491,7 @@ def test_rejects_images_of_another_size_than_the_calibration(tmp_path: Path) -> 
         cv2.imwrite(str(file), np.zeros((20, 30), np.uint8))
     message = r"none of 4 frames can be used; the first: .*png is 30 x 20 pixels but .*cam1/sensor.yaml is for 64 x 48"
     with pytest.raises(DataError, match=message):
-        _frames(_read(tmp_path))
+        frames_of(_read(tmp_path))
 
 
 def test_an_imu_without_calibration_is_noted(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.dataset_makers import T_CAM0_IMU, calib_text, make_drive, make_images, make_kitti
+from tests.dataset_makers import T_CAM0_IMU, calib_text, edit, make_drive, make_images, make_kitti
+from tests.same_events import frames_of
 from vio.cameras.rig import Rig
 from vio.datasets import open_dataset
 from vio.datasets.kitti import read_calibration
@@ -40,8 +41,8 @@ P3: 7.188560000000e+02 0.000000000000e+00 6.071928000000e+02 -3.372877000000e+02
 """
 
 
-def frames_of(folder: Path, settings: DatasetSettings = DEFAULT) -> list[StereoFrame]:
-    return [event for event in read_kitti(folder, settings).events() if isinstance(event, StereoFrame)]
+def frames_in(folder: Path, settings: DatasetSettings = DEFAULT) -> list[StereoFrame]:
+    return frames_of(read_kitti(folder, settings))
 
 
 def test_reads_a_self_contained_folder_completely(tmp_path: Path) -> None:
@@ -84,7 +85,7 @@ def test_reads_a_folder_with_images_only(tmp_path: Path) -> None:
         (folder / name).unlink()
     recording = read_kitti(folder, DEFAULT).recording
     assert (recording.reference, recording.T_cam0_imu, recording.motion) == (None, None, frozenset())
-    assert len(frames_of(folder)) == 4
+    assert len(frames_in(folder)) == 4
 
 
 def test_shorter_reference_covers_the_first_frames(tmp_path: Path) -> None:
@@ -201,9 +202,9 @@ def test_too_many_unreadable_images_are_an_error(prefetch: int, tmp_path: Path) 
     folder = make_kitti(tmp_path / "seq", frames=8)
     for k in (2, 4, 5):
         cut(folder / "image_1" / f"{k:06d}.png")
-    assert len(frames_of(folder, DatasetSettings(max_bad_frames=3, prefetch_frames=prefetch))) == 5
+    assert len(frames_in(folder, DatasetSettings(max_bad_frames=3, prefetch_frames=prefetch))) == 5
     with pytest.raises(DataError, match=r"000005\.png: the PNG is truncated.*\(3 unusable frames, .* allows 2\)"):
-        frames_of(folder, DatasetSettings(max_bad_frames=2, prefetch_frames=prefetch))
+        frames_in(folder, DatasetSettings(max_bad_frames=2, prefetch_frames=prefetch))
 
 
 def test_all_images_unreadable_is_an_error_at_once(tmp_path: Path) -> None:
@@ -219,7 +220,7 @@ def test_unreadable_frames_have_no_limit_but_all_of_them(tmp_path: Path, caplog:
     folder = make_kitti(tmp_path / "seq", frames=8)
     for k in range(7):
         cut(folder / "image_1" / f"{k:06d}.png")
-    assert len(frames_of(folder)) == 1
+    assert len(frames_in(folder)) == 1
     lines = [record.getMessage() for record in caplog.records]
     assert [line.split(":")[0] for line in lines[:5]] == [f"frame {k} is skipped" for k in range(5)]
     assert lines[5:] == ["7 of 8 frames were skipped; the first 5 are named above"]
@@ -228,7 +229,7 @@ def test_unreadable_frames_have_no_limit_but_all_of_them(tmp_path: Path, caplog:
     with pytest.raises(
         DataError, match=r"none of 8 frames can be used; the first: .*000000\.png: the PNG is truncated"
     ):
-        frames_of(folder)
+        frames_in(folder)
     assert not caplog.records, "the error says it all"
 
 
@@ -239,7 +240,7 @@ def test_a_frame_of_another_size_is_skipped_and_named(
     folder = make_kitti(tmp_path / "seq", frames=4)
     for name in ("image_0", "image_1") if camera == "both" else (camera,):
         assert cv2.imwrite(str(folder / name / "000002.png"), np.zeros((24, 30), dtype=np.uint8))
-    assert [frame.index for frame in frames_of(folder)] == [0, 1, 3]
+    assert [frame.index for frame in frames_in(folder)] == [0, 1, 3]
     (line,) = [record.getMessage() for record in caplog.records]
     assert "frame 2 is skipped" in line
     assert "000002.png is 30 x 24 pixels but" in line
@@ -277,12 +278,7 @@ def _remove(name: str) -> Callable[[Path], object]:
 
 
 def _replace(name: str, old: str, new: str) -> Callable[[Path], object]:
-    def replace(folder: Path) -> None:
-        text = (folder / name).read_text()
-        assert old in text
-        (folder / name).write_text(text.replace(old, new, 1))
-
-    return replace
+    return lambda folder: edit(folder / name, old, new)
 
 
 GOOD = calib_text(0.0, 0.54)

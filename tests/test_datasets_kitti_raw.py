@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.euroc_maker import KITTI_RIG, RECT_SIZE, T_CAM0_VELO, T_VELO_IMU, make_kitti_raw
+from tests.same_events import frames_of
 from vio.cameras.rig import Rig
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.image_pairs import ImageDataset
@@ -28,10 +29,6 @@ from vio.records import StereoFrame
 
 def _read(path: Path) -> ImageDataset:
     return read_kitti_raw(path, DatasetSettings())
-
-
-def _frames(dataset: ImageDataset) -> list[StereoFrame]:
-    return [event for event in dataset.events() if isinstance(event, StereoFrame)]
 
 
 @pytest.mark.parametrize("above", [False, True], ids=["calibration beside", "calibration above"])
@@ -65,7 +62,7 @@ def test_a_drive_keeps_its_clock_with_a_calibration_that_a_run_saved(lines: int,
 def test_frames_are_rectified_as_opencv_would(tmp_path: Path) -> None:
     dataset = _read(make_kitti_raw(tmp_path))
     camera, rig = dataset.recording.camera, dataset.rectifier.rig
-    for frame in _frames(dataset):
+    for frame in frames_of(dataset):
         for image, path, model, R in zip(
             (frame.left, frame.right),
             dataset.pairs[frame.index],
@@ -91,7 +88,7 @@ def test_images_rectified_by_kitti_pass_through(tmp_path: Path) -> None:
     expected = (R_rect @ (T_CAM0_VELO @ T_VELO_IMU)[:3, :3], R_rect @ (T_CAM0_VELO @ T_VELO_IMU)[:3, 3])
     np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3, :3], expected[0], atol=1e-9)
     np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3, 3], expected[1], atol=1e-9)
-    for frame in _frames(dataset):
+    for frame in frames_of(dataset):
         np.testing.assert_array_equal(frame.left, load_gray(dataset.pairs[frame.index][0])[0])
 
 

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.dataset_makers import calib_text, make_kitti
+from tests.dataset_makers import calib_text, edit, make_kitti
 from tests.euroc_maker import KITTI_RIG, RADTAN_RIG, RECTIFIED_RIG, make_euroc, make_kitti_raw, truth_poses
 from tests.plain_maker import STEP_S, make_plain, rig_of
+from tests.same_events import frames_of
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.images import UnreadableImageError, load_gray, other_damage
 from vio.datasets.plain import read_plain
@@ -22,10 +23,6 @@ from vio.files.text import parse_stamps
 from vio.records import ImuSample, StereoFrame
 
 DEFAULT = DatasetSettings()
-
-
-def frames_of(path: Path) -> list[StereoFrame]:
-    return [event for event in open_dataset(path).events() if isinstance(event, StereoFrame)]
 
 
 # --- images ---------------------------------------------------------------------------------------------------------
@@ -113,7 +110,7 @@ def test_other_image_types_are_read_and_truncated_ones_refused(suffix: str, tmp_
 
 def test_twelve_bits_in_sixteen_are_scaled_and_said(tmp_path: Path) -> None:
     folder = make_plain(tmp_path, imu=False, rig=RECTIFIED_RIG)
-    expected = frames_of(folder)
+    expected = frames_of(open_dataset(folder))
     for file in folder.glob("*/*.png"):
         image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
         assert cv2.imwrite(str(file), image.astype(np.uint16) * 16)
@@ -121,7 +118,7 @@ def test_twelve_bits_in_sixteen_are_scaled_and_said(tmp_path: Path) -> None:
         "the images have 16 bits but use 12: the levels 0 to 4095 are scaled to 8 bits"
         in open_dataset(folder).recording.notes
     )
-    for dark, bright in zip(frames_of(folder), expected, strict=True):
+    for dark, bright in zip(frames_of(open_dataset(folder)), expected, strict=True):
         np.testing.assert_allclose(dark.left, bright.left, atol=1)
 
 
@@ -303,12 +300,7 @@ def _break(change: Callable[[Path], object], **options: bool) -> Callable[[Path]
 
 
 def _edit(name: str, old: str, new: str) -> Callable[[Path], Path]:
-    def change(folder: Path) -> None:
-        text = (folder / name).read_text()
-        assert old in text
-        (folder / name).write_text(text.replace(old, new, 1))
-
-    return _break(change)
+    return _break(lambda folder: edit(folder / name, old, new))
 
 
 def _write(name: str, text: str, **options: bool) -> Callable[[Path], Path]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.plain_maker import rig_of
-from tests.same_events import assert_same_events
+from tests.same_events import assert_same_events, frames_of
 from vio.cli import main
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.frame_times import Seconds, frames_between, parse_bound
@@ -19,7 +19,6 @@ from vio.datasets.rigs import load_rig
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import DataError, VioError
 from vio.geometry.distortion import rig_from_rectified
-from vio.records import StereoFrame
 
 
 def write_video(path: Path, images: list[np.ndarray], rate_hz: float = 20.0) -> None:
@@ -76,9 +75,9 @@ def test_the_left_camera_alone_needs_no_right_image(flight: Path, tmp_path: Path
     shutil.copytree(flight, tmp_path / "f")
     for file in (tmp_path / "f" / "mav0" / "cam1" / "data").iterdir():
         file.write_bytes(b"no image")
-    pairs = [e for e in open_dataset(flight).events(0, 6) if isinstance(e, StereoFrame)]
+    pairs = frames_of(open_dataset(flight), 0, 6)
     left = open_dataset(tmp_path / "f", DatasetSettings(camera="left"))
-    alone = [e for e in left.events(0, 6) if isinstance(e, StereoFrame)]
+    alone = frames_of(left, 0, 6)
     assert len(alone) == len(pairs)
     for one, pair in zip(alone, pairs, strict=True):
         assert one.right is None
@@ -86,11 +85,11 @@ def test_the_left_camera_alone_needs_no_right_image(flight: Path, tmp_path: Path
 
 
 def test_the_left_video_alone_is_decoded(videos: Path, flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pairs = [e for e in open_dataset(flight).events(0, 4) if isinstance(e, StereoFrame)]
+    pairs = frames_of(open_dataset(flight), 0, 4)
     left = open_dataset(videos, DatasetSettings(camera="left"))
     opened, real = [], cv2.VideoCapture
     monkeypatch.setattr(cv2, "VideoCapture", lambda name: opened.append(name) or real(name))
-    alone = [e for e in left.events(0, 4) if isinstance(e, StereoFrame)]
+    alone = frames_of(left, 0, 4)
     assert [Path(name).name for name in opened] == ["left.avi"]
     for one, pair in zip(alone, pairs, strict=True):
         np.testing.assert_array_equal(one.left, pair.left)
@@ -169,4 +168,4 @@ def test_run_takes_seconds(flight: Path, tmp_path: Path) -> None:
     assert main(arguments) == 0
     text = (out / "trajectory.tum").read_text()
     assert "# frames: 2-4" in text
-    assert len([e for e in open_dataset(flight).events(2, 5) if isinstance(e, StereoFrame)]) == 3
+    assert len(frames_of(open_dataset(flight), 2, 5)) == 3

@@ -15,6 +15,7 @@ import pytest
 
 from tests.commands import refused
 from tests.dataset_makers import ece276a_arrays, make_drive, make_kitti, make_mat, make_npz, utias_arrays
+from tests.same_events import frames_of
 from tests.test_config import _numbers
 from vio.config import SettingInfo, load_config
 from vio.datasets import DatasetSettings, open_dataset
@@ -26,7 +27,6 @@ from vio.files.tables import check_table
 from vio.files.text import text_lines
 from vio.files.yaml_text import read_yaml
 from vio.filters.settings import MsckfSettings
-from vio.records import StereoFrame
 from vio.runs.finished import read_estimates
 from vio.runs.tables import ESTIMATE
 
@@ -100,7 +100,7 @@ def _deep_recording(folder: Path, top: int) -> Path:
 def test_bits_in_use_are_scaled_by_one_factor_for_the_whole_run(top: int, bits: int, tmp_path: Path) -> None:
     dataset = open_dataset(_deep_recording(tmp_path / "deep", top))
     assert f"the images have 16 bits but use {bits}: the levels 0 to {top}" in " ".join(dataset.recording.notes)
-    frames = [event for event in dataset.events() if isinstance(event, StereoFrame)]
+    frames = frames_of(dataset)
     brightest = [int(frame.left.max()) for frame in frames if frame.left is not None]
     assert brightest == [51] * 3 + [255] * 9  # the dark ones stay darker: the brightness does not jump
 
@@ -221,7 +221,7 @@ def test_pipes_and_devices_do_not_block(tmp_path: Path, capsys: pytest.CaptureFi
     for name in ("image_0/000000.png", "image_1/000002.png"):
         (folder / name).unlink()
         os.mkfifo(folder / name)
-    frames = [event for event in open_dataset(folder).events() if isinstance(event, StereoFrame)]
+    frames = frames_of(open_dataset(folder))
     assert [frame.index for frame in frames] == [1, 3]
 
 

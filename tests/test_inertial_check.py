@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -132,15 +133,9 @@ def _checked(
     return check, [*found, *check.finish()]
 
 
-def _watch(
-    it: Watched,
-    *,
-    samples: list[ImuSample] | None = None,
-    T_cam0_imu: FloatArray | None = None,
-    frames: list[Observations] | None = None,
-) -> list[InertialFinding]:
-    """What the check finds in samples and frames."""
-    return _checked(it, samples=samples, T_cam0_imu=T_cam0_imu, frames=frames)[1]
+def _watch(it: Watched, **changed: Any) -> list[InertialFinding]:
+    """What the check finds in samples and frames; the arguments are those of `_checked`."""
+    return _checked(it, **changed)[1]
 
 
 def _faults(found: list[InertialFinding]) -> list[str]:

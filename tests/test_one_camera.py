@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import vio
+from tests.same_events import frames_of
 from tests.test_frontend_scene import CAMERA as WALL_CAMERA
 from tests.test_frontend_scene import SLANTED
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
@@ -287,7 +288,7 @@ def test_folder_of_one_camera_and_imu_is_read(tmp_path: Path) -> None:
     dataset = open_dataset(_mono_folder(tmp_path))
     recording = dataset.recording
     assert (recording.kind, recording.camera.kind, recording.motion) == ("mono", "mono", {"imu"})
-    frames = [e for e in dataset.events() if isinstance(e, StereoFrame)]
+    frames = frames_of(dataset)
     assert all(f.right is None and f.depth is None for f in frames)
     np.testing.assert_array_equal(frames[2].left, _walls()[2][0])
     assert sum(isinstance(e, ImuSample) for e in dataset.events()) > 20

@@ -12,6 +12,7 @@ import pytest
 from tests.commands import json_of, refused
 from tests.dataset_makers import make_kitti
 from tests.euroc_maker import RECTIFIED_RIG, camera_stamps, make_euroc, make_kitti_raw
+from tests.same_events import frames_of
 from vio.cli import main
 from vio.cli.rectify import MARKER
 from vio.datasets import open_dataset
@@ -19,7 +20,6 @@ from vio.datasets.image_pairs import ImageDataset
 from vio.geometry.distortion import StereoRig, rig_from_rectified
 from vio.geometry.rectify import rectified_cameras
 from vio.protocols import Dataset
-from vio.records import StereoFrame
 from vio.sim.export import export_euroc
 from vio.sim.imu import ImuNoise
 from vio.sim.motion import hand_held
@@ -27,10 +27,6 @@ from vio.sim.render import camera_rays, render
 from vio.sim.rigs import small_rig
 from vio.sim.sequence import SimulatedRecording, simulate, views
 from vio.sim.world import room
-
-
-def _images(dataset: Dataset) -> list[StereoFrame]:
-    return [event for event in dataset.events() if isinstance(event, StereoFrame)]
 
 
 @pytest.mark.parametrize("truth", ["state", "tum"])
@@ -67,7 +63,7 @@ def test_an_euroc_folder_becomes_a_rectified_one(
 
 def _same_frames(raw: Dataset, done: Dataset) -> None:
     """Reading the raw folder and reading the written one give the same bits."""
-    ours, written = _images(raw), _images(done)
+    ours, written = frames_of(raw), frames_of(done)
     assert len(ours) == len(written) > 0
     for a, b in zip(ours, written, strict=True):
         np.testing.assert_array_equal(a.left, b.left)
@@ -197,7 +193,7 @@ def test_a_rendered_folder_reads_as_the_rectified_cameras_would_see_it(
     assert dataset.recording.camera.fu == pytest.approx(done.camera.fu, rel=1e-9)
     assert dataset.recording.motion == {"imu"}
     ideal = replace(simulation, rig=rig_from_rectified(done.camera, done.T_rect0_imu))
-    frame = _images(dataset)[3]
+    frame = frames_of(dataset)[3]
     for image, view in zip((frame.left, frame.right), views(ideal, frame.time_ns), strict=True):
         expected = render(simulation.world, camera_rays(view.camera), view.T_world_cam, frame.time_ns)
         difference = (image - expected)[4:-4, 4:-4]

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 import vio
+from tests.same_events import frames_of
 from vio.cli import main
 from vio.config import Config
 from vio.datasets.rigs import load_rig
@@ -34,7 +35,7 @@ from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame, open_
 
 @pytest.fixture(scope="module")
 def pairs(flight: Path) -> list[StereoFrame]:
-    return [event for event in vio.open_dataset(flight).events() if isinstance(event, StereoFrame)]
+    return frames_of(vio.open_dataset(flight))
 
 
 @pytest.fixture(scope="module")
