@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
@@ -32,10 +31,6 @@ from vio.live.prediction import PosePredictor
 from vio.records import Estimate, ImuSample, MotionSource, imu_matrices
 from vio.runs.checkpoint import load_checkpoint, save_checkpoint
 from vio.runs.folder import imu_calibration
-
-if TYPE_CHECKING:
-    from vio.protocols import Dataset
-    from vio.runs.pipeline import RunResult
 
 T_IMU_CAM0 = se3_inverse(T_CAM0_IMU)
 EXACT = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)  # the stereo pair
@@ -325,7 +320,7 @@ def test_survives_a_late_imu_a_gap_a_checkpoint_and_a_restart(tmp_path: Path) ->
     noise, flight = np.random.default_rng(0), Shaking(60)
     samples = [s for s in _samples(flight, OFF_BY_1_PERCENT, FULL, noise) if s.time_ns > 10 * STEP_NS]
     samples = [s for s in samples if not 25 * STEP_NS < s.time_ns < 29 * STEP_NS]
-    filters, dataset = [LateImuMsckf(CAMERA, T_CAM0_IMU, FULL)], cast("Dataset", SimpleNamespace(observations=None))
+    filters, dataset = [LateImuMsckf(CAMERA, T_CAM0_IMU, FULL)], SimpleNamespace(observations=None)
     for k in range(50):
         if k == 45:
             save_checkpoint(tmp_path / "state", filters[0], dataset)
@@ -362,7 +357,7 @@ def test_predicted_poses_between_frames_use_the_terms() -> None:
 def test_summary_and_metrics_state_the_terms() -> None:
     sigmas = np.where(np.isin(np.arange(15), CHOSEN["scale"]), 5e-4, np.radians(0.03))
     last = Estimate(0, np.eye(4), np.eye(6), imu_terms=OFF_BY_1_PERCENT, imu_terms_sigma=sigmas)
-    stated = imu_calibration(cast("RunResult", SimpleNamespace(estimates=[last])))
+    stated = imu_calibration(SimpleNamespace(estimates=[last]))
     assert stated["accelerometer"]["scale_percent"] == pytest.approx({"x": 1.0, "y": -1.0, "z": 0.7})
     assert list(stated["gyro"]["misalignment_deg"]) == ["xy", "xz", "yz", "yx", "zx", "zy"]
     rows = _calibration_rows({"stereo_scale": None, "camera_imu": None, "imu": stated})

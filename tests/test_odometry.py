@@ -6,7 +6,7 @@ import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -286,7 +286,7 @@ def test_slow_cameras_have_no_jumps() -> None:
 @pytest.mark.parametrize("T", [np.full((4, 4), np.nan), np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(3)])
 def test_wrong_extrinsics_are_refused_with_a_back_end_of_the_callers_own(T: Any) -> None:
     with pytest.raises(VioError, match="T_cam0_imu"):
-        Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T, parts=Parts(frontend=Picky(), backend=cast(Any, object())))
+        Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T, parts=Parts(frontend=Picky(), backend=object()))
 
 
 def test_a_pixel_that_is_not_seen_may_be_anything() -> None:
