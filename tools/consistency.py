@@ -217,7 +217,12 @@ class Flight:
     ) -> tuple[list[ImuSample], FloatArray]:
         """Samples at 200 Hz, and the biases (K, 6) in them: drawn from the prior, then walking.
 
-        Number 0 is at the first frame; they come `offset_s` after the frames, their stamps `clock_s` ahead of those.
+        Args:
+            samples: their numbers; 0 is at the first frame.
+            noise: of sensor and biases.
+            s: what they are drawn from.
+            offset_s: of the samples against the frames.
+            clock_s: by which their stamps are ahead of the frames' clock.
         """
         k, n, dt = np.array(samples), len(samples), _IMU_NS * 1e-9
         walk = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) * np.sqrt(dt)
