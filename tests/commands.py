@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,11 +23,26 @@ def render(folder: Path, **options: str) -> Path:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Return the error message of a command that must end with status 1."""
+    """Return the error of a command, which must end with status 1 and print this one line alone."""
     from vio.cli import main
 
+    capsys.readouterr()
     assert main(list(arguments)) == 1
-    return capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("error: ")
+    assert printed.err.count("\n") == 1, printed.err
+    return printed.err
+
+
+def json_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> Any:
+    """Return the object that a command prints with `--json`; it must succeed and print nothing else."""
+    from vio.cli import main
+
+    assert main([*arguments, "--json"]) == 0
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1, "one object, nothing else, on stdout"
+    return json.loads(out)
 
 
 def wait_for(holds: Callable[[], bool], seconds: float = PATIENCE_S) -> None:

@@ -191,3 +191,10 @@ def edited(key: str, index: object, value: float) -> Callable[[Arrays], Arrays]:
         return {**arrays, key: copy}
 
     return edit
+
+
+def edit(file: Path, old: str, new: str) -> None:
+    """Replace the first occurrence of a text that must be in a file."""
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new, 1))

@@ -1,4 +1,4 @@
-"""Compare two recordings bit by bit."""
+"""The frames of a recording, and two recordings compared bit by bit."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ import numpy as np
 
 from vio.protocols import Dataset
 from vio.records import ImuSample, StereoFrame
+
+
+def frames_of(dataset: Dataset, start: int = 0, stop: int | None = None) -> list[StereoFrame]:
+    """The frames of a range."""
+    return [event for event in dataset.events(start, stop) if isinstance(event, StereoFrame)]
 
 
 def assert_same_events(a: Dataset, b: Dataset, start: int = 0, stop: int | None = None) -> None:

@@ -20,7 +20,6 @@ def _result(index: int, *, images: bool = True) -> Any:
 
 def _drawn(view: AnnotatedImage) -> np.ndarray:
     data = view.jpeg()
-    assert data is not None
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
 
 

@@ -110,16 +110,11 @@ def test_detects_an_import_cycle(tmp_path: Path) -> None:
     assert layer == {"vio.a": 2, "vio.b": 1, "vio.c": 0}
 
 
-def test_pycolmap_stays_in_its_package() -> None:
-    users = [_name(f) for f in FILES if "pycolmap" in _heads(f, top_level_only=False)]
+@pytest.mark.parametrize(("library", "package"), [("pycolmap", "vio.offline.colmap"), ("rosbags", "vio.datasets.bags")])
+def test_a_library_stays_in_its_package(library: str, package: str) -> None:
+    users = [_name(f) for f in FILES if library in _heads(f, top_level_only=False)]
     assert users
-    assert all(_within(name, "vio.offline.colmap") for name in users), users
-
-
-def test_rosbags_stays_in_its_package() -> None:
-    users = [_name(f) for f in FILES if "rosbags" in _heads(f, top_level_only=False)]
-    assert users
-    assert all(_within(name, "vio.datasets.bags") for name in users), users
+    assert all(_within(name, package) for name in users), users
 
 
 def test_dask_stays_in_its_module() -> None:

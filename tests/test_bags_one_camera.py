@@ -13,7 +13,7 @@ import pytest
 rosbags = pytest.importorskip("rosbags", reason="needs rosbags")
 
 from tests.bag_maker import Script, noise_frames  # noqa: E402
-from tests.same_events import assert_same_events  # noqa: E402
+from tests.same_events import assert_same_events, frames_of  # noqa: E402
 from vio.cameras.rig import Rig  # noqa: E402
 from vio.config import Config  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
@@ -23,7 +23,6 @@ from vio.errors import CalibrationError, ConfigError  # noqa: E402
 from vio.geometry.distortion import CameraModel  # noqa: E402
 from vio.geometry.lie import se3_exp, se3_inverse  # noqa: E402
 from vio.geometry.stereo import one_camera  # noqa: E402
-from vio.protocols import Dataset  # noqa: E402
 from vio.records import ImuSample, StereoFrame  # noqa: E402
 from vio.runs.pipeline import run  # noqa: E402
 
@@ -34,10 +33,6 @@ LENS = (-0.3, 0.1, 0.001, -0.002)
 RIG = Rig(CameraModel(40.0, 41.0, 31.0, 23.0, 64, 48, "radtan", LENS), T_cam0_imu=T_CAM0_IMU)
 FRAMES = [(time_ns, left) for time_ns, left, _ in noise_frames(4)]
 SAMPLES = [ImuSample(START_NS + 5_000_000 * k, np.array([0.1, 0.2, k]), np.array([0.0, 0, 9.8])) for k in range(-4, 34)]
-
-
-def frames_of(dataset: Dataset, start: int = 0, stop: int | None = None) -> list[StereoFrame]:
-    return [event for event in dataset.events(start, stop) if isinstance(event, StereoFrame)]
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +53,6 @@ def test_a_flight_of_one_camera_is_the_same_recording_to_the_bit(
     script = Script(storage)
     for event in folder.events():
         if isinstance(event, StereoFrame):
-            assert event.left is not None
             script.image("/camera/image_raw", event.time_ns, event.left)
         elif isinstance(event, ImuSample):
             script.imu("/imu0", event, event.time_ns + 1_000_000)

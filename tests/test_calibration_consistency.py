@@ -4,15 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tools.calibration_consistency import (
-    FromStandstill,
-    Off,
-    _misread,
-    _seen,
-    calibration_nees,
-    fly,
-    walked_terms,
-)
+from tools.calibration_consistency import FromStandstill, Off, _misread, _seen, calibration_nees, fly, walked_terms
 from tools.consistency import CAMERA, T_CAM0_IMU, Flight
 from vio.filters.imu_terms import IMU_TERMS, calibrated
 from vio.filters.navigation import ImuMotion, NavState

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.commands import json_of, refused
 from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_kitti, make_npz
 from vio.cli import main
 from vio.config import BASIC, Config, describe
@@ -48,26 +49,10 @@ def finished(truth: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     return out
 
 
-def _json(capsys: pytest.CaptureFixture[str], *argv: str) -> Any:
-    assert main([*argv, "--json"]) == 0
-    out = capsys.readouterr().out
-    assert out.count("\n") == 1, "one object, nothing else, on stdout"
-    return json.loads(out)
-
-
-def _error(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
-    assert main(list(argv)) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("error: ")
-    assert captured.err.count("\n") == 1, captured.err
-    return captured.err
-
-
 def test_run_prints_the_contract(
     recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    metrics = _json(capsys, "run", str(recording), "--out", str(tmp_path / "out"), "--reference", str(truth))
+    metrics = json_of(capsys, "run", str(recording), "--out", str(tmp_path / "out"), "--reference", str(truth))
     assert set(CONTRACT) <= set(metrics)
     assert metrics["frames"] == FRAMES
     assert metrics["ate_m"] < 0.05
@@ -79,7 +64,7 @@ def test_run_prints_the_contract(
 
 
 def test_run_without_reference_prints_null(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    metrics = _json(capsys, "run", str(recording), "--out", str(tmp_path / "out"), "--motion", "none")
+    metrics = json_of(capsys, "run", str(recording), "--out", str(tmp_path / "out"), "--motion", "none")
     assert [metrics[key] for key in ("ate_m", "rpe", "t_err_percent", "r_err_deg_per_100m")] == [None] * 4
     assert metrics["motion"] == "none"
 
@@ -91,9 +76,9 @@ def test_reference_of_cam0_is_compared_with_the_lever_arm(
     metrics = json.loads(Path(finished, "metrics.json").read_text())
     assert metrics["evaluation"]["body"] == "cam0"
     assert metrics["evaluation"]["ate_deg"] < 0.5
-    same = _json(capsys, "eval", finished, str(truth))
+    same = json_of(capsys, "eval", finished, str(truth))
     assert same["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-6)
-    plain = _json(capsys, "eval", f"{finished}/trajectory.kitti", str(truth))
+    plain = json_of(capsys, "eval", f"{finished}/trajectory.kitti", str(truth))
     assert plain["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-4)
 
 
@@ -101,11 +86,11 @@ def test_a_range_of_frames_is_compared_with_its_own_reference(
     recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     args = ("run", str(recording), "--reference", str(truth), "--out", str(tmp_path / "out"))
-    metrics = _json(capsys, *args, "--start", "6", "--stop", "22", "--save-observations")
+    metrics = json_of(capsys, *args, "--start", "6", "--stop", "22", "--save-observations")
     assert metrics["frames"] == 16
     assert (metrics["first_frame"], metrics["last_frame"]) == (6, 21)
     assert metrics["ate_m"] < 0.05
-    replayed = _json(capsys, "run", str(tmp_path / "out" / "observations.npz"), "--out", str(tmp_path / "replayed"))
+    replayed = json_of(capsys, "run", str(tmp_path / "out" / "observations.npz"), "--out", str(tmp_path / "replayed"))
     assert replayed["frames"] == 16
     assert not [line for line in replayed["warnings"] if "could not be read" in line]
 
@@ -116,7 +101,7 @@ def test_slow_frames_count_as_compiling_only_where_loops_were_compiled(
     monkeypatch.setattr("vio.runs.folder._SLOW", 1.0)
     for compiled in (True, False):
         monkeypatch.setattr("vio.runs.folder.has_compiled", lambda compiled=compiled: compiled)
-        assert (_json(capsys, "run", str(recording), "--out", str(tmp_path / "out"))["start_s"] > 0) == compiled
+        assert (json_of(capsys, "run", str(recording), "--out", str(tmp_path / "out"))["start_s"] > 0) == compiled
 
 
 def test_a_shorter_reference_evaluates_the_frames_it_covers(
@@ -124,7 +109,7 @@ def test_a_shorter_reference_evaluates_the_frames_it_covers(
 ) -> None:
     short = tmp_path / "short.txt"
     short.write_text("".join(truth.read_text().splitlines(keepends=True)[:15]))
-    metrics = _json(capsys, "run", str(recording), "--reference", str(short), "--out", str(tmp_path / "out"))
+    metrics = json_of(capsys, "run", str(recording), "--reference", str(short), "--out", str(tmp_path / "out"))
     assert metrics["evaluation"]["matched"] == 15
 
 
@@ -132,9 +117,9 @@ def test_saved_observations_replay_bit_identically(
     finished: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, second, third = Path(finished), tmp_path / "second", tmp_path / "third"
-    _json(capsys, "run", str(first / "observations.npz"), "--out", str(second))
+    json_of(capsys, "run", str(first / "observations.npz"), "--out", str(second))
     assert (first / "trajectory.tum").read_bytes() == (second / "trajectory.tum").read_bytes()
-    _json(
+    json_of(
         capsys,
         *("run", str(recording), "--frontend", "precomputed", "--out", str(third)),
         *("--set", f"frontend.features={first / 'observations.npz'}"),
@@ -146,8 +131,8 @@ def test_run_and_its_kitti_file_are_compared_in_one_world(
     finished: str, truth: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The run describes the IMU in a world of its own, poses.txt and trajectory.kitti the first cam0."""
-    kitti = _json(capsys, "eval", f"{finished}/trajectory.kitti", str(truth), "--align", "none")
-    first = _json(capsys, "eval", finished, str(truth), "--align", "first")
+    kitti = json_of(capsys, "eval", f"{finished}/trajectory.kitti", str(truth), "--align", "none")
+    first = json_of(capsys, "eval", finished, str(truth), "--align", "first")
     assert first["ate_m"] == pytest.approx(kitti["ate_m"], abs=1e-6)
     assert main(["eval", finished, str(truth), "--align", "none"]) == 1
     assert (
@@ -162,31 +147,31 @@ def test_reference_of_another_recording_is_noted(
     poses[:, 3::4] *= 3
     np.savetxt(tmp_path / "other.txt", poses)
     out = str(tmp_path / "out")
-    metrics = _json(capsys, "run", str(recording), "--reference", str(tmp_path / "other.txt"), "--out", out)
+    metrics = json_of(capsys, "run", str(recording), "--reference", str(tmp_path / "other.txt"), "--out", out)
     assert "is it the reference of this recording?" in metrics["evaluation"]["notes"][0]
-    _json(capsys, "eval", out, str(tmp_path / "other.txt"))
+    json_of(capsys, "eval", out, str(tmp_path / "other.txt"))
     assert caplog.text.count("is it the reference of this recording?") == 2
 
 
 def test_log_replays_the_motion_of_its_run(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A log holds the velocities even of a run on images alone."""
     first, again, other = (tmp_path / name for name in ("first", "again", "other"))
-    _json(capsys, "run", str(recording), "--motion", "none", "--save-observations", "--out", str(first))
+    json_of(capsys, "run", str(recording), "--motion", "none", "--save-observations", "--out", str(first))
     log = str(first / "observations.npz")
-    assert _json(capsys, "run", log, "--out", str(again))["motion"] == "none"
+    assert json_of(capsys, "run", log, "--out", str(again))["motion"] == "none"
     assert (first / "trajectory.tum").read_bytes() == (again / "trajectory.tum").read_bytes()
-    assert _json(capsys, "run", log, "--motion", "velocity", "--out", str(other))["motion"] == "velocity"
+    assert json_of(capsys, "run", log, "--motion", "velocity", "--out", str(other))["motion"] == "velocity"
 
 
 def test_log_of_unknown_motion_takes_its_sensor_and_says_so(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     """As logs of version 1 are."""
-    _json(capsys, "run", str(recording), "--motion", "none", "--save-observations", "--out", str(tmp_path / "first"))
+    json_of(capsys, "run", str(recording), "--motion", "none", "--save-observations", "--out", str(tmp_path / "first"))
     arrays = dict(np.load(tmp_path / "first" / "observations.npz"))
     del arrays["run_motion"]
     np.savez(tmp_path / "old.npz", **(arrays | {"version": np.array(1)}))
-    assert _json(capsys, "run", str(tmp_path / "old.npz"), "--out", str(tmp_path / "again"))["motion"] == "velocity"
+    assert json_of(capsys, "run", str(tmp_path / "old.npz"), "--out", str(tmp_path / "again"))["motion"] == "velocity"
     assert caplog.text.count("the log does not say which motion its run used; motion auto takes its velocity") == 1
 
 
@@ -194,8 +179,8 @@ def test_effective_configuration_reproduces_the_run(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
-    _json(capsys, "run", str(recording), "--set", "selector.name=visibility", "--motion", "none", "--out", str(first))
-    _json(capsys, "run", str(recording), "--config", str(first / "config.yaml"), "--out", str(second))
+    json_of(capsys, "run", str(recording), "--set", "selector.name=visibility", "--motion", "none", "--out", str(first))
+    json_of(capsys, "run", str(recording), "--config", str(first / "config.yaml"), "--out", str(second))
     assert (first / "trajectory.tum").read_bytes() == (second / "trajectory.tum").read_bytes()
 
 
@@ -203,7 +188,7 @@ def test_runs_without_out_are_numbered(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    outs = [_json(capsys, "run", str(recording))["out"] for _ in range(2)]
+    outs = [json_of(capsys, "run", str(recording))["out"] for _ in range(2)]
     assert outs == [str(Path("runs/drive")), str(Path("runs/drive-2"))]
 
 
@@ -217,10 +202,8 @@ def test_replaces_an_earlier_run_but_no_other_files(
     (out / "check").mkdir()
     before = (out / "metrics.json").read_bytes()
     capsys.readouterr()
-    assert main(run) == 1
-    error = capsys.readouterr().err
+    error = refused(capsys, *run)
     assert "holds check, notes.md beside an earlier result" in error
-    assert error.count("\n") == 1
     assert (out / "notes.md").read_text() == "what I thought"
     assert (out / "metrics.json").read_bytes() == before
 
@@ -312,7 +295,7 @@ def test_errors_are_one_line_and_write_nothing(
     if argv[0] == "run" and "--out" not in argv:
         argv += ["--out", str(tmp_path / "out")]
     before = sorted(tmp_path.rglob("*"))
-    assert message in _error(capsys, *argv)
+    assert message in refused(capsys, *argv)
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -323,14 +306,14 @@ def test_reports_and_skips_truncated_images_up_to_a_limit(
     image = folder / "image_1" / "000003.png"
     image.write_bytes(image.read_bytes()[:-20])
     run = ("run", str(folder), "--out", str(tmp_path / "out"))
-    metrics = _json(capsys, *run)
+    metrics = json_of(capsys, *run)
     assert metrics["frames"] == 5
     assert "1 of 6 frames could not be read and were skipped: 3" in metrics["warnings"]
     assert "000003.png" in caplog.text
     assert main(["report", str(tmp_path / "out")]) == 0
     assert "5 of 6 frames" in (tmp_path / "out" / "report.html").read_text()
     capsys.readouterr()
-    assert "000003.png" in _error(capsys, *run, "--set", "dataset.max_bad_frames=0")
+    assert "000003.png" in refused(capsys, *run, "--set", "dataset.max_bad_frames=0")
 
 
 def test_an_interrupt_while_the_picture_is_drawn_costs_the_picture_alone(
@@ -396,12 +379,12 @@ def test_several_trajectories_are_compared_and_drawn(
     assert [line.split()[0][-2:] for line in lines[1:3]] == ["/a", "/b"]
     assert all(re.search(r"\d m+ +\d", line) for line in lines[1:3])
     assert picture.stat().st_size > 10_000
-    both = _json(capsys, "eval", *runs, truth)
-    alone = [_json(capsys, "eval", out, truth) for out in runs]
+    both = json_of(capsys, "eval", *runs, truth)
+    alone = [json_of(capsys, "eval", out, truth) for out in runs]
     assert [both[out]["ate_m"] for out in runs] == [one["ate_m"] for one in alone]
 
 
-def test_debug_raises_the_expected_error(tmp_path: Path) -> None:
+def test_debug_raises_the_expectedrefused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="does not exist"):
         main(["--debug", "run", str(tmp_path / "nothing")])
 
@@ -411,12 +394,12 @@ def test_eval_reads_the_extrinsics_from_a_file(
 ) -> None:
     """A trajectory of the IMU can be compared with one of cam0 only with the extrinsics between them."""
     files = [f"{finished}/trajectory.tum", str(truth)]
-    assert "give the extrinsic T_cam0_imu" in _error(capsys, "eval", *files)
+    assert "give the extrinsic T_cam0_imu" in refused(capsys, "eval", *files)
     given = tmp_path / "T_cam0_imu.txt"
     np.savetxt(given, T_CAM0_IMU[:3])
-    assert _json(capsys, "eval", *files, "--extrinsics", str(given))["ate_m"] < 0.05
+    assert json_of(capsys, "eval", *files, "--extrinsics", str(given))["ate_m"] < 0.05
     given.unlink()
-    assert "give a file with T_cam0_imu, 3 or 4 rows of 4 numbers" in _error(
+    assert "give a file with T_cam0_imu, 3 or 4 rows of 4 numbers" in refused(
         capsys, "eval", *files, "--extrinsics", str(given)
     )
 
@@ -488,7 +471,7 @@ def test_eval_aligns_as_requested(finished: str, tmp_path: Path, capsys: pytest.
     larger = tmp_path / "larger.tum"
     write_tum(larger, replace(trajectory, T_world_body=poses))
     scores = {
-        mode: _json(capsys, "eval", str(estimate), str(larger), "--align", mode) for mode in ("se3", "sim3", "none")
+        mode: json_of(capsys, "eval", str(estimate), str(larger), "--align", mode) for mode in ("se3", "sim3", "none")
     }
     assert scores["sim3"]["ate_m"] < 1e-6
     assert scores["sim3"]["scale"] == pytest.approx(1.1)
@@ -524,7 +507,7 @@ def test_evo_reads_every_trajectory_file(finished: str) -> None:
 def test_reproduce_writes_a_table_and_a_figure(
     recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    tables = _json(capsys, "reproduce", f"{recording}={truth}", "--out", str(tmp_path / "table"))
+    tables = json_of(capsys, "reproduce", f"{recording}={truth}", "--out", str(tmp_path / "table"))
     rows = {row["name"]: row for row in tables[0]["rows"]}
     assert rows["dead reckoning"]["ate_m"] == pytest.approx(rows["mapping only"]["ate_m"])
     assert rows["recommended"]["ate_m"] < 0.05
@@ -592,7 +575,7 @@ def test_each_finding_of_the_stereo_calibration_has_a_line_of_its_own(capsys: py
 
 
 @pytest.mark.skipif(shutil.which("head") is None, reason="needs head")
-def test_a_closed_pipe_is_no_error() -> None:
+def test_a_closed_pipe_is_norefused() -> None:
     done = subprocess.run(
         f"{sys.executable} -m vio config --show | head -n 1", shell=True, capture_output=True, text=True, check=True
     )

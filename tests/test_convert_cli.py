@@ -80,7 +80,6 @@ def test_a_bag_without_the_files_beside_it_has_its_calibration(form: str, flight
         (out / name).unlink()
     alone = open_dataset(out).recording
     assert alone.camera == beside.camera
-    assert alone.T_cam0_imu is not None
     np.testing.assert_allclose(alone.T_cam0_imu, beside.T_cam0_imu, atol=1e-15)
     assert any("/tf_static" in note for note in alone.notes)
     np.testing.assert_array_equal(alone.reference.T_world_body, beside.reference.T_world_body)
@@ -148,8 +147,6 @@ def test_velocities_and_poses_at_the_frames_go_to_kitti(tmp_path: Path, capsys: 
     assert (after.recording.kind, facts["notes"]) == ("kitti", [])
     a, b = ([event for event in dataset.events() if isinstance(event, VelocitySample)] for dataset in (before, after))
     np.testing.assert_array_equal([s.linear for s in a], [s.linear for s in b])
-    assert before.recording.reference is not None
-    assert after.recording.reference is not None
     assert len(after.recording.reference) == len(before.recording.reference)
     assert main(["convert", str(source), "--to", "euroc", "--out", str(tmp_path / "e")]) == 0
     assert "velocities have no place in EuRoC's form" in capsys.readouterr().out

@@ -152,7 +152,6 @@ def test_gtsams_own_examples(name: str, frames: int, length_m: float, data_dir: 
     path = data_dir / "gtsam_stereo_factors" / f"VO_stereo_factors{name}.txt"
     dataset = open_dataset(path)
     reference = dataset.recording.reference
-    assert reference is not None
     assert len(reference) == frames
     if name == "00s":  # the other has 300 features a frame and takes ten seconds
         as_given = load_config(overrides=["msckf.calibrate_stereo=off"])  # as the published poses take the cameras

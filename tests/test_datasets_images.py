@@ -15,13 +15,7 @@ import pytest
 
 from tests.dataset_makers import make_images
 from vio.datasets.image_pairs import ImageSize, pair_images
-from vio.datasets.images import (
-    UnreadableImageError,
-    list_images,
-    load_gray,
-    prefetch,
-    write_png,
-)
+from vio.datasets.images import UnreadableImageError, list_images, load_gray, prefetch, write_png
 from vio.errors import DataError
 
 PIXELS = np.random.default_rng(5).integers(0, 256, (24, 32)).astype(np.uint8)
@@ -111,7 +105,7 @@ def test_missing_image_is_unreadable(tmp_path: Path) -> None:
 
 
 def test_sizes_are_compared_by_name() -> None:
-    with pytest.raises(DataError, match=r"b\.png is 32 x 24 pixels but a\.png specifies 30 x 24"):
+    with pytest.raises(DataError, match=r"b\.png is 32 x 24 pixels but a\.png is for 30 x 24"):
         ImageSize(30, 24, Path("a.png")).check(PIXELS, Path("b.png"))
     ImageSize(32, 24, Path("a.png")).check(PIXELS, Path("b.png"))
 

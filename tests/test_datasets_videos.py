@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.plain_maker import rig_of
-from tests.same_events import assert_same_events
+from tests.same_events import assert_same_events, frames_of
 from vio.cli import main
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.frame_times import Seconds, frames_between, parse_bound
@@ -19,7 +19,6 @@ from vio.datasets.rigs import load_rig
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import DataError, VioError
 from vio.geometry.distortion import rig_from_rectified
-from vio.records import StereoFrame
 
 
 def write_video(path: Path, images: list[np.ndarray], rate_hz: float = 20.0) -> None:
@@ -76,9 +75,9 @@ def test_the_left_camera_alone_needs_no_right_image(flight: Path, tmp_path: Path
     shutil.copytree(flight, tmp_path / "f")
     for file in (tmp_path / "f" / "mav0" / "cam1" / "data").iterdir():
         file.write_bytes(b"no image")
-    pairs = [e for e in open_dataset(flight).events(0, 6) if isinstance(e, StereoFrame)]
+    pairs = frames_of(open_dataset(flight), 0, 6)
     left = open_dataset(tmp_path / "f", DatasetSettings(camera="left"))
-    alone = [e for e in left.events(0, 6) if isinstance(e, StereoFrame)]
+    alone = frames_of(left, 0, 6)
     assert len(alone) == len(pairs)
     for one, pair in zip(alone, pairs, strict=True):
         assert one.right is None
@@ -86,11 +85,11 @@ def test_the_left_camera_alone_needs_no_right_image(flight: Path, tmp_path: Path
 
 
 def test_the_left_video_alone_is_decoded(videos: Path, flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pairs = [e for e in open_dataset(flight).events(0, 4) if isinstance(e, StereoFrame)]
+    pairs = frames_of(open_dataset(flight), 0, 4)
     left = open_dataset(videos, DatasetSettings(camera="left"))
     opened, real = [], cv2.VideoCapture
     monkeypatch.setattr(cv2, "VideoCapture", lambda name: opened.append(name) or real(name))
-    alone = [e for e in left.events(0, 4) if isinstance(e, StereoFrame)]
+    alone = frames_of(left, 0, 4)
     assert [Path(name).name for name in opened] == ["left.avi"]
     for one, pair in zip(alone, pairs, strict=True):
         np.testing.assert_array_equal(one.left, pair.left)
@@ -118,7 +117,6 @@ def _other_rate(folder: Path) -> None:
 
 def _other_size(folder: Path) -> None:
     camera = load_rig(folder).camera
-    assert camera.width is not None
     other = rig_of(rig_from_rectified(camera, np.eye(4)))
     text = kalibr_text(other).replace(f"resolution: [{camera.width},", "resolution: [99,")
     (folder / "camchain-imucam.yaml").write_text(text)
@@ -129,7 +127,7 @@ BAD = {
     "not a video": (lambda f: (f / "left.avi").write_bytes(b"no video" * 99), r"left\.avi: no frame can be decoded"),
     "a truncated video": (_truncate, r"right\.avi: (frame \d+ of 16 cannot be decoded|no frame can be decoded)"),
     "another rate": (_other_rate, r"left\.avi has 20 and right\.avi 25 frames per second"),
-    "another size": (_other_size, "is 160 x .* pixels but .* specifies 99 x"),
+    "another size": (_other_size, "is 160 x .* pixels but .* is for 99 x"),
     "an IMU without times": (lambda f: (f / "times.txt").unlink(), r"imu\.csv: needs the times of the images"),
     "too many times": (lambda f: (f / "times.txt").write_text("1\n" * 99), "holds 99 times for 16 image pairs"),
 }
@@ -170,4 +168,4 @@ def test_run_takes_seconds(flight: Path, tmp_path: Path) -> None:
     assert main(arguments) == 0
     text = (out / "trajectory.tum").read_text()
     assert "# frames: 2-4" in text
-    assert len([e for e in open_dataset(flight).events(2, 5) if isinstance(e, StereoFrame)]) == 3
+    assert len(frames_of(open_dataset(flight), 2, 5)) == 3

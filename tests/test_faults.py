@@ -107,7 +107,6 @@ def test_the_reference_of_the_mirrored_pair_is_the_path_of_its_images() -> None:
     """A point, mirrored with the world, is seen where the exchanged and mirrored images show it."""
     changed = HEALTHY["mirror"](_Sorted(), PERIOD).recording
     assert changed.T_cam0_imu is not None
-    assert CAMERA.width is not None
     M = np.diag([-1.0, 1.0, 1.0])
     points = transform_points(POSES[5] @ se3_inverse(T_CAM0_IMU), np.array([[0.3, -0.2, 4.0], [-1.0, 0.5, 7.0]]))
     old = _pixels(CAMERA, T_CAM0_IMU, POSES[5], points)

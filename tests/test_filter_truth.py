@@ -110,7 +110,6 @@ class Run:
     def velocity_error(self, k: int, estimate: Estimate | None = None) -> FloatArray:
         """Velocity error (3,) of frame k, world."""
         v = (estimate or self.estimates[k]).velocity_world
-        assert v is not None
         return np.asarray(self.T_world_estimated[k][:3, :3] @ v - self.course.velocity)
 
 
@@ -203,7 +202,6 @@ def test_slow_turn_leaves_the_gyro_bias_alone(monkeypatch: pytest.MonkeyPatch) -
     course = Course(60, 2.5, yaw_rate=0.02, features=40)
     run = fly(course, "imu")
     error = run.estimates[-1].gyro_bias
-    assert error is not None
     assert squared(error, run.navigation[-1][9:12, 9:12]) < chi2.ppf(0.999, 3)
     assert np.linalg.norm(error) < 0.002
     assert squared(run.error(course.frames - 1), run.estimates[-1].covariance) < chi2.ppf(0.999, 6)
@@ -228,7 +226,6 @@ def test_creep_and_slow_turns_are_followed(
     assert abs(error[5]) < max(0.1 * turned, 1e-3)
     if motion == "imu":
         bias = run.estimates[last].gyro_bias
-        assert bias is not None
         assert squared(bias, run.navigation[last][9:12, 9:12]) < chi2.ppf(0.999, 3)
 
 

@@ -18,7 +18,6 @@ from vio.records import FrontendOutput, Image, StereoFrame
 
 def banded(image: Image | None, frame: int, camera: int, gray: float = 50.0) -> Image:
     """An image with three bands at a phase of its own."""
-    assert image is not None
     phase = np.random.default_rng((frame, camera)).uniform()
     bands = gray * np.sin(2 * np.pi * (3 * np.arange(len(image)) / len(image) + phase))
     return np.clip(image + bands[:, None], 0, 255).astype(np.uint8)

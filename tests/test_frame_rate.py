@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.same_events import frames_of
 from tests.test_datasets_videos import make_videos
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from vio.bench.worker import _Truth, _used
@@ -43,7 +44,7 @@ def test_frames_left_out_are_not_read(flight: Path, tmp_path: Path) -> None:
     for camera in ("cam0", "cam1"):
         for file in sorted((folder / "mav0" / camera / "data").iterdir())[1::2]:
             file.write_bytes(b"no image")
-    found = [e for e in open_dataset(folder, TEN).events() if isinstance(e, StereoFrame)]
+    found = frames_of(open_dataset(folder, TEN))
     assert [e.index for e in found] == list(range(0, 16, 2))
     whole = {e.index: e for e in open_dataset(flight).events() if isinstance(e, StereoFrame)}
     for frame in found:
@@ -76,7 +77,7 @@ def test_every_reader_leaves_the_same_frames_out(name: str, flight: Path, tmp_pa
     whole = open_dataset(path, DatasetSettings(calibration=calibration))
     cut = open_dataset(path, DatasetSettings(calibration=calibration, max_frame_rate=10.0))
     frames = {e.index: e for e in whole.events() if isinstance(e, StereoFrame)}
-    found = [e for e in cut.events(3, 12) if isinstance(e, StereoFrame)]
+    found = frames_of(cut, 3, 12)
     assert [e.index for e in found] == [4, 6, 8, 10]  # the frames that a run from the first one on takes
     for frame in found:
         np.testing.assert_array_equal(frame.left, frames[frame.index].left)

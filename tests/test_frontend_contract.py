@@ -192,8 +192,6 @@ def test_odd_and_tiny_sizes_work(name: str, width: int, height: int) -> None:
     camera = replace(CAMERA, cu=width / 2, cv=height / 2, width=width, height=height)
     frames = []
     for frame in FRAMES[:2]:
-        assert frame.left is not None
-        assert frame.right is not None
         u, v = (480 - width) // 2, (300 - height) // 2
         pair = [np.ascontiguousarray(image[v : v + height, u : u + width]) for image in (frame.left, frame.right)]
         frames.append(replace(frame, left=pair[0], right=pair[1]))

@@ -442,7 +442,6 @@ def test_rectification_error_is_estimated_and_does_not_bias_disparity() -> None:
     roll = np.radians(0.15)
     frames = []
     for frame in FRAMES:
-        assert frame.right is not None
         turn = np.array([[np.cos(roll), -np.sin(roll), 0.0], [np.sin(roll), np.cos(roll), 0.0]])
         centre = np.array([CAMERA.cu, CAMERA.cv])
         turn[:, 2] = centre - turn[:, :2] @ centre
@@ -460,8 +459,6 @@ def test_rectification_error_is_estimated_and_does_not_bias_disparity() -> None:
 def test_tracks_survive_exposure_steps(outputs: list[FrontendOutput]) -> None:
     brighter = []
     for k, frame in enumerate(FRAMES[:4]):
-        assert frame.left is not None
-        assert frame.right is not None
         gain = 1.0 if k % 2 == 0 else 0.7
         pair = [np.rint(gain * image.astype(np.float64)).astype(np.uint8) for image in (frame.left, frame.right)]
         brighter.append(replace(frame, left=pair[0], right=pair[1]))

@@ -41,8 +41,6 @@ def build(settings: LearnedSettings, match: MatchSettings = MATCH) -> Descriptor
 def small_frame(index: int, pose: FloatArray) -> StereoFrame:
     """The upper left part of the rendered pair, where pixel coordinates are unchanged."""
     frame = stereo_frame(index, pose)
-    assert frame.left is not None
-    assert frame.right is not None
     left, right = (np.ascontiguousarray(image[:160, :240]) for image in (frame.left, frame.right))
     return replace(frame, left=left, right=right)
 

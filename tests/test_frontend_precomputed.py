@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from vio.frontend import BUILDERS, FrontendSettings, build_frontend
 from vio.frontend.klt import KltFrontend
 from vio.frontend.precomputed import PrecomputedFrontend
 from vio.geometry.stereo import StereoCamera
-from vio.protocols import Dataset
 from vio.records import Event, Observations, Recording, StereoFrame, observations
 
 CAMERA = StereoCamera(300.0, 300.0, 160.0, 120.0, 0.1, 320, 240)
@@ -82,7 +80,7 @@ def test_auto_selects_by_content_of_the_recording() -> None:
 
 
 def test_error_for_unknown_name_lists_known_ones() -> None:
-    dataset = cast(Dataset, cast(Any, SimpleNamespace()))
+    dataset = SimpleNamespace()
     with pytest.raises(ConfigError, match=r"'orbit'.*auto, klt, orb, sift, kornia, precomputed"):
         build_frontend("orbit", CAMERA, FrontendSettings(), dataset)
 

@@ -59,7 +59,6 @@ def moved(prior: TrackPrior, off: FloatArray) -> TrackPrior:
 
 
 def turned(prior: TrackPrior) -> TrackPrior:
-    assert prior.R_cam_prev is not None
     return replace(prior, R_cam_prev=se3_exp([0.0, 0.0, 0.0, 0.0, np.radians(5.0), 0.0])[:3, :3] @ prior.R_cam_prev)
 
 
@@ -189,7 +188,6 @@ def test_predicted_motion_reuses_an_expected_motion_that_fits() -> None:
     hard_turn = se3_exp([0.1, 0.0, -0.3, 0.0, 0.2, 0.05])
     for T in (T_TRUE, hard_turn):  # from far away, the result is a start near the truth
         far = predicted_motion(CAMERA, p, pixels(T, p, 31, noise=0.0), np.eye(4))
-        assert far is not None
         assert np.median(pixel_errors(CAMERA, far, p, pixels(T, p, 31, noise=0.0))) < 2.0
     scattered = np.random.default_rng(36).uniform([0, 0], [1242, 375], (300, 2))
     assert predicted_motion(CAMERA, p, scattered, np.eye(4)) is None

@@ -22,7 +22,6 @@ def _run(rows: int) -> list[FrontendOutput]:
     out = []
     for k, T in enumerate(flight(5)):
         frame = stereo_frame(k, T)
-        assert frame.right is not None
         out.append(front.process(replace(frame, right=_moved_down(frame.right, rows))))
     return out
 

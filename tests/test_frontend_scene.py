@@ -63,8 +63,6 @@ def truth(wall: Wall, T_world_cam: FloatArray, pixels: FloatArray, T_world_other
 
 def view(wall: Wall, T_world_cam: FloatArray, camera: StereoCamera = CAMERA) -> FloatArray:
     """Noise-free image (H, W) of the wall."""
-    assert camera.width is not None
-    assert camera.height is not None
     v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
     return wall.paint(wall.hit(T_world_cam, np.stack([u, v], axis=-1), camera))
 

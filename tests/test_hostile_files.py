@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.commands import refused
 from tests.dataset_makers import ece276a_arrays, make_drive, make_kitti, make_mat, make_npz, utias_arrays
+from tests.same_events import frames_of
 from tests.test_config import _numbers
-from vio.cli import main
 from vio.config import SettingInfo, load_config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.common import read_npz
@@ -26,7 +27,6 @@ from vio.files.tables import check_table
 from vio.files.text import text_lines
 from vio.files.yaml_text import read_yaml
 from vio.filters.settings import MsckfSettings
-from vio.records import StereoFrame
 from vio.runs.finished import read_estimates
 from vio.runs.tables import ESTIMATE
 
@@ -100,7 +100,7 @@ def _deep_recording(folder: Path, top: int) -> Path:
 def test_bits_in_use_are_scaled_by_one_factor_for_the_whole_run(top: int, bits: int, tmp_path: Path) -> None:
     dataset = open_dataset(_deep_recording(tmp_path / "deep", top))
     assert f"the images have 16 bits but use {bits}: the levels 0 to {top}" in " ".join(dataset.recording.notes)
-    frames = [event for event in dataset.events() if isinstance(event, StereoFrame)]
+    frames = frames_of(dataset)
     brightest = [int(frame.left.max()) for frame in frames if frame.left is not None]
     assert brightest == [51] * 3 + [255] * 9  # the dark ones stay darker: the brightness does not jump
 
@@ -213,9 +213,7 @@ def test_pipes_and_devices_do_not_block(tmp_path: Path, capsys: pytest.CaptureFi
         ["config", "--config", str(pipe)],
         ["config", "--config", "/dev/zero"],
     ):
-        assert main(argv) == 1, argv
-        error = capsys.readouterr().err
-        assert error.count("\n") == 1
+        error = refused(capsys, *argv)
         assert "it is a pipe, socket or device, no file" in error, argv
     with pytest.raises(DataError, match="no file"):
         text_lines(Path("/dev/zero"))
@@ -223,7 +221,7 @@ def test_pipes_and_devices_do_not_block(tmp_path: Path, capsys: pytest.CaptureFi
     for name in ("image_0/000000.png", "image_1/000002.png"):
         (folder / name).unlink()
         os.mkfifo(folder / name)
-    frames = [event for event in open_dataset(folder).events() if isinstance(event, StereoFrame)]
+    frames = frames_of(open_dataset(folder))
     assert [frame.index for frame in frames] == [1, 3]
 
 
@@ -299,10 +297,7 @@ def test_strange_arguments_are_one_line(
     (tmp_path / "loop").symlink_to("loop")
     for name, x in (("est", "1"), ("huge", "1e308")):
         (tmp_path / f"{name}.tum").write_text("".join(f"{k} {x} {k} 0 0 0 0 1\n" for k in range(5)))
-    assert main([part.format(**files) for part in argv]) == 1
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert error.count("\n") == 1
+    error = refused(capsys, *[part.format(**files) for part in argv])
     assert re.search(message, error), error
 
 

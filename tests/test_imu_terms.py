@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
@@ -32,10 +31,6 @@ from vio.live.prediction import PosePredictor
 from vio.records import Estimate, ImuSample, MotionSource, imu_matrices
 from vio.runs.checkpoint import load_checkpoint, save_checkpoint
 from vio.runs.folder import imu_calibration
-
-if TYPE_CHECKING:
-    from vio.protocols import Dataset
-    from vio.runs.pipeline import RunResult
 
 T_IMU_CAM0 = se3_inverse(T_CAM0_IMU)
 EXACT = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)  # the stereo pair
@@ -67,7 +62,6 @@ def test_jacobian_of_a_step_equals_central_differences() -> None:
     """(A3), of every term, far from zero terms and biases; the biases' own columns stay right beside them."""
     motion = _motion(FULL)
     step = motion.advance(MOVING, 0, 100_000_000)
-    assert step.Phi_imu is not None
 
     def after(error: FloatArray) -> FloatArray:
         start = motion.corrected(MOVING, np.concatenate([np.zeros(9), error]))
@@ -84,8 +78,6 @@ def test_steps_compose() -> None:
     motion = _motion(FULL, hz=200)
     whole, first = (motion.advance(MOVING, 0, end) for end in (100_000_000, 40_000_000))
     growth = NO_STEP.then(first).then(motion.advance(first.nav, 40_000_000, 100_000_000))
-    assert growth.Phi_imu is not None
-    assert whole.Phi_imu is not None
     np.testing.assert_allclose(growth.Phi_imu, whole.Phi_imu, atol=1e-9)
 
 
@@ -134,7 +126,6 @@ def test_rest_is_measured_by_the_calibrated_gyro() -> None:
     motion, gyro = ImuMotion(FULL), np.array([0.03, -0.02, 0.05])  # a step's mean reading, calibrated
     raw = np.linalg.solve(imu_matrices(TERMS)[1], gyro)
     measurement = motion.zero_velocity(MOVING, gyro)
-    assert measurement is not None
 
     def residual(error: FloatArray) -> FloatArray:
         nav = motion.corrected(MOVING, error)
@@ -150,7 +141,6 @@ def test_earlier_velocities_follow_the_terms() -> None:
     early = replace(MOVING, accel_bias=np.zeros(3), imu_terms=np.zeros(15))
     step = motion.advance(early, 0, 100_000_000)
     error = np.concatenate([np.zeros(DIM), np.random.default_rng(0).normal(0, 1e-4, 6), np.zeros(9)])
-    assert step.Phi_imu is not None
     now = np.concatenate([step.Phi_imu @ error[DIM:], error[DIM:]])
     R = 0.5 * (early.T_world_imu + step.nav.T_world_imu)[:3, :3]
     velocities = np.array([early.velocity, step.nav.velocity])
@@ -174,8 +164,6 @@ class Run:
     def terms(self) -> tuple[FloatArray, FloatArray]:
         """The terms at the end and their standard deviations (15,)."""
         last = self.estimates[-1]
-        assert last.imu_terms is not None
-        assert last.imu_terms_sigma is not None
         return last.imu_terms, last.imu_terms_sigma
 
 
@@ -242,7 +230,6 @@ def test_predicted_motions_are_as_uncertain_as_the_terms() -> None:
     assert 0.5 < np.mean(squared) < 4.5
 
     step = filt._propagation.coming(filt._started(), 20 * STEP_NS).step
-    assert step.Phi_imu is not None
     grown = filt._propagation.grown(filt._started(), step.nav, NO_STEP.then(step))
     np.testing.assert_array_equal(grown[:DIM, : DIM + 15], np.concatenate([step.Phi, step.Phi_imu], axis=1))
     np.testing.assert_array_equal(grown[:DIM, DIM + 15 :], 0.0)  # of the first attitude
@@ -277,9 +264,6 @@ def test_all_that_can_be_off_is_found_beside_the_terms() -> None:
     terms, sigmas = run.terms
     assert np.all(np.abs(terms - OFF_BY_1_PERCENT) < 3.5 * sigmas)
     last = run.estimates[-1]
-    assert last.T_cam0_imu is not None
-    assert last.T_cam0_imu_covariance is not None
-    assert last.time_offset_s is not None
     error = se3_log(se3_inverse(last.T_cam0_imu) @ T_CAM0_IMU)
     assert error @ np.linalg.solve(last.T_cam0_imu_covariance, error) < 22.5  # chi-square, 0.999 of 6
     assert abs(last.time_offset_s - 0.004) < 1e-3
@@ -336,7 +320,7 @@ def test_survives_a_late_imu_a_gap_a_checkpoint_and_a_restart(tmp_path: Path) ->
     noise, flight = np.random.default_rng(0), Shaking(60)
     samples = [s for s in _samples(flight, OFF_BY_1_PERCENT, FULL, noise) if s.time_ns > 10 * STEP_NS]
     samples = [s for s in samples if not 25 * STEP_NS < s.time_ns < 29 * STEP_NS]
-    filters, dataset = [LateImuMsckf(CAMERA, T_CAM0_IMU, FULL)], cast("Dataset", SimpleNamespace(observations=None))
+    filters, dataset = [LateImuMsckf(CAMERA, T_CAM0_IMU, FULL)], SimpleNamespace(observations=None)
     for k in range(50):
         if k == 45:
             save_checkpoint(tmp_path / "state", filters[0], dataset)
@@ -373,7 +357,7 @@ def test_predicted_poses_between_frames_use_the_terms() -> None:
 def test_summary_and_metrics_state_the_terms() -> None:
     sigmas = np.where(np.isin(np.arange(15), CHOSEN["scale"]), 5e-4, np.radians(0.03))
     last = Estimate(0, np.eye(4), np.eye(6), imu_terms=OFF_BY_1_PERCENT, imu_terms_sigma=sigmas)
-    stated = imu_calibration(cast("RunResult", SimpleNamespace(estimates=[last])))
+    stated = imu_calibration(SimpleNamespace(estimates=[last]))
     assert stated["accelerometer"]["scale_percent"] == pytest.approx({"x": 1.0, "y": -1.0, "z": 0.7})
     assert list(stated["gyro"]["misalignment_deg"]) == ["xy", "xz", "yz", "yx", "zx", "zy"]
     rows = _calibration_rows({"stereo_scale": None, "camera_imu": None, "imu": stated})

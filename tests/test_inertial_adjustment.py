@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
@@ -18,9 +17,6 @@ from vio.offline.inertial_refinement import inertial_keyframes
 from vio.offline.keyframes import TrackedPath
 from vio.offline.points import PointTracks
 from vio.records import ImuDensities, LoopEvent, Trajectory
-
-if TYPE_CHECKING:
-    from vio.records import FeatureTracks
 
 _CAMERA = StereoCamera(300.0, 300.0, 240.0, 150.0, 0.11, 480, 300)
 _T_CAM0_IMU = se3_exp(np.array([0.02, -0.01, 0.03, 0.1, -0.2, 1.5]))
@@ -164,6 +160,6 @@ def test_keyframes_at_loops_do_not_exceed_the_number_that_was_asked_for() -> Non
     frames = np.arange(60)
     trajectory = Trajectory(np.tile(np.eye(4), (60, 1, 1)), 100_000_000 * frames, "cam0", frames)
     loops = tuple(LoopEvent(31 + 2 * k, 0, k, 0, 50, 0.0, False, k) for k in range(14))
-    path = TrackedPath(Path("run"), _CAMERA, trajectory, cast("FeatureTracks", None), loops)
+    path = TrackedPath(Path("run"), _CAMERA, trajectory, None, loops)
     assert len(inertial_keyframes(path, 12)) <= 12
     assert len(inertial_keyframes(path, None)) > 12

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,8 +56,6 @@ def _observe(
     points = rng.uniform(-1, 1, (6000, 3))
     points[np.arange(6000), rng.integers(0, 3, 6000)] = rng.choice([-1.0, 1.0], 6000)
     points = centre + points * (half / 2 + reach)
-    assert camera.width is not None
-    assert camera.height is not None
     frames = []
     for k, time_ns in enumerate(times_ns):
         p = transform_points(T_cam0_imu @ se3_inverse(T_world_imu[k]), points)
@@ -134,15 +133,9 @@ def _checked(
     return check, [*found, *check.finish()]
 
 
-def _watch(
-    it: Watched,
-    *,
-    samples: list[ImuSample] | None = None,
-    T_cam0_imu: FloatArray | None = None,
-    frames: list[Observations] | None = None,
-) -> list[InertialFinding]:
-    """What the check finds in samples and frames."""
-    return _checked(it, samples=samples, T_cam0_imu=T_cam0_imu, frames=frames)[1]
+def _watch(it: Watched, **changed: Any) -> list[InertialFinding]:
+    """What the check finds in samples and frames; the arguments are those of `_checked`."""
+    return _checked(it, **changed)[1]
 
 
 def _faults(found: list[InertialFinding]) -> list[str]:
@@ -532,8 +525,6 @@ def test_tumvi_agrees_with_its_motion_capture(data_dir: Path) -> None:
     truth, record = read_trajectory(folder / "gt_imu.csv"), imu_samples(read_imu_table(folder / "imu.txt")[0])
     rig = load_rig(folder)
     T, camera = rig.T_cam0_imu, StereoCamera(365.0, 365.0, 512.0, 512.0, 0.101, 1024, 1024)
-    assert truth.times_ns is not None
-    assert T is not None
     for start_s in (0, 120):
         begin = truth.times_ns[0] + start_s * 10**9
         used = (truth.times_ns >= begin) & (truth.times_ns <= begin + 21 * 10**9)

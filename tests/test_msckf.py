@@ -14,14 +14,7 @@ from vio.errors import ConfigError, DataError, DivergedError, EstimationError
 from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters import imu_start
 from vio.filters.msckf import Msckf
-from vio.filters.multiview import (
-    Residuals,
-    Views,
-    first_points,
-    refine_points,
-    residuals,
-    track_information,
-)
+from vio.filters.multiview import Residuals, Views, first_points, refine_points, residuals, track_information
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.prior import posterior
 from vio.filters.restart import restarted
@@ -525,7 +518,6 @@ def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion:
     flight, settings = Flight(frames=6), replace(EXACT_RIG, calibrate_camera_imu="none")
     _, _, filt = flight.run(settings, motion)
     window, noise = filt._window, np.random.default_rng(1)
-    assert window is not None
     P = filt._propagation.posterior.own.copy()
     samples = flight.imu(noise, settings, np.zeros(6)) if motion == "imu" else []
     other = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
@@ -563,7 +555,6 @@ def test_the_world_stays_where_the_first_window_left_it_while_gravity_becomes_kn
     # Gravity, seen from the body, is what it is, within its standard deviation.
     down = estimate.T_world_imu[:3, :3].T @ estimate.gravity_world / settings.gravity_mps2
     tilt = np.linalg.norm(np.cross(down, flight.state((flight.frames - 1) * 0.05)[0].T @ [0.0, 0, -1]))
-    assert estimate.tilt_sigma_rad is not None
     assert tilt < 3.5 * estimate.tilt_sigma_rad, (tilt, estimate.tilt_sigma_rad)
 
     # The path since is as exact as it is said to be, and does not turn with gravity.
@@ -938,7 +929,6 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(
 def test_a_restart_carries_the_pose_on_and_grows_its_covariance_with_the_time_in_between() -> None:
     filt = Flight(frames=12).run(EXACT_RIG, None)[2]
     good = filt._good
-    assert good is not None
     sigmas = []
     for elapsed_s in (0.05, 0.2):
         nav, P = restarted(good, good.time_ns + round(1e9 * elapsed_s), TwistMotion(EXACT_RIG), EXACT_RIG)

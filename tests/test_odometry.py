@@ -6,7 +6,7 @@ import contextlib
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,8 +49,6 @@ def events(recording: SimulatedRecording) -> list[Any]:
 @pytest.fixture(scope="module")
 def rig(recording: SimulatedRecording) -> Rig:
     camera = recording.recording.camera
-    assert camera.width is not None
-    assert camera.height is not None
     numbers = (camera.fu, camera.fv, camera.cu, camera.cv, camera.baseline_m, camera.width, camera.height)
     return Rig.rectified(*numbers, recording.recording.T_cam0_imu)
 
@@ -288,7 +286,7 @@ def test_slow_cameras_have_no_jumps() -> None:
 @pytest.mark.parametrize("T", [np.full((4, 4), np.nan), np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(3)])
 def test_wrong_extrinsics_are_refused_with_a_back_end_of_the_callers_own(T: Any) -> None:
     with pytest.raises(VioError, match="T_cam0_imu"):
-        Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T, parts=Parts(frontend=Picky(), backend=cast(Any, object())))
+        Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T, parts=Parts(frontend=Picky(), backend=object()))
 
 
 def test_a_pixel_that_is_not_seen_may_be_anything() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import vio
+from tests.same_events import frames_of
 from tests.test_frontend_scene import CAMERA as WALL_CAMERA
 from tests.test_frontend_scene import SLANTED
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
@@ -92,7 +93,6 @@ class Flown:
             T = world.meet(k, se3_from_parts(R, p))
             off_v = world.T[:3, :3].T @ v - estimate.velocity_world
             off_p = T[:3, :3].T @ (p - T[:3, 3])
-            assert estimate.velocity_covariance is not None
             C = estimate.covariance[:3, :3] + 1e-12 * np.eye(3)
             rows.append(
                 [
@@ -122,10 +122,8 @@ def _curves() -> tuple[Flown, ...]:
 def test_start_in_motion_waits_and_is_as_good_as_it_says() -> None:
     """No pose before the scale is known to 10 %; then velocities are within their covariance, over all seeds."""
     for flown in _curves():
-        assert flown.begun is not None
         assert 10 <= flown.begun <= 35
         start = flown.filter._begun
-        assert start.scale_sigma is not None
         assert 0.005 < start.scale_sigma <= 0.1
     first = [flown.rows[0, 1] for flown in _curves()]
     assert np.mean(first) < nees_bounds(3, len(first))[1]
@@ -148,7 +146,6 @@ def test_steady_flight_never_begins_as_nothing_shows_its_scale() -> None:
 def test_steady_flight_tells_nothing_more_of_the_scale() -> None:
     """The scale stays as uncertain as it was where the acceleration ended; the position becomes so with the path."""
     flown = Flown(Path3(75, "coasting"), 2)
-    assert flown.begun is not None
     early, last = flown.rows[62 - flown.begun], flown.rows[-1]  # the window holds no acceleration in either
     assert last[3] > 0.9 * early[3]
     assert last[4] > 1.1 * early[4]
@@ -156,7 +153,6 @@ def test_steady_flight_tells_nothing_more_of_the_scale() -> None:
 
 def test_start_at_standstill_knows_the_velocity_and_finds_the_scale_in_flight() -> None:
     flown = Flown(Path3(70, "take-off"), 1)
-    assert flown.begun is not None
     assert flown.begun <= 12
     start = flown.filter._begun
     assert start.scale_sigma is None
@@ -292,7 +288,7 @@ def test_folder_of_one_camera_and_imu_is_read(tmp_path: Path) -> None:
     dataset = open_dataset(_mono_folder(tmp_path))
     recording = dataset.recording
     assert (recording.kind, recording.camera.kind, recording.motion) == ("mono", "mono", {"imu"})
-    frames = [e for e in dataset.events() if isinstance(e, StereoFrame)]
+    frames = frames_of(dataset)
     assert all(f.right is None and f.depth is None for f in frames)
     np.testing.assert_array_equal(frames[2].left, _walls()[2][0])
     assert sum(isinstance(e, ImuSample) for e in dataset.events()) > 20
@@ -309,7 +305,6 @@ def test_folder_with_depth_images_is_read_in_metres(tmp_path: Path) -> None:
     other = open_dataset(folder, DatasetSettings(depth_factor=2000.0))
     assert any("depth_factor 2000 takes the place of the calibration's 1000" in n for n in other.recording.notes)
     frame = next(e for e in dataset.events() if isinstance(e, StereoFrame))
-    assert frame.depth is not None
     np.testing.assert_allclose(frame.depth, _walls()[0][1], atol=6e-4)
     (folder / "calibration.yaml").write_text(kalibr_text(replace(RIG, depth_factor=None)))
     with pytest.raises(CalibrationError, match="depth_factor"):
@@ -340,7 +335,6 @@ def test_tum_rgbd_is_associated_by_stamps_and_its_camera_is_known(tmp_path: Path
     assert "1 images have no depth" in notes
     assert "freiburg3" in notes
     frame = next(e for e in dataset.events() if isinstance(e, StereoFrame))
-    assert frame.depth is not None
     np.testing.assert_allclose(frame.depth, _walls()[0][1], atol=6e-4)
 
 

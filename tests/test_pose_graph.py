@@ -6,7 +6,7 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,14 +19,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.map_graph import MapGraph, _nearest
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
-from vio.mapping.pose_graph import (
-    Edges,
-    UpDirections,
-    optimise,
-    r_D_poses,
-    residual,
-    up_residual,
-)
+from vio.mapping.pose_graph import Edges, UpDirections, optimise, r_D_poses, residual, up_residual
 
 COUNT = 60
 SIGMA = np.repeat([0.02, 0.004], 3)  # of a step of the odometry, m and rad
@@ -350,7 +343,7 @@ def test_no_call_holds_the_interpreter_for_a_frame_while_a_loop_is_settled_in_a_
         odometry=lambda: [(k - 1, k, step) for k in range(1, count)],
         loops=lambda: [LoopRow(k, k + period, near, 50, True) for k in range(0, count - period, 10)],
     )
-    graph = MapGraph(cast("MapStore", store))
+    graph = MapGraph(store)
     graph.add_loops([LoopRow(count - 2 * period - 5, count - 5, near, 50, True)])
     began, longest = list[float](), dict[str, float]()
 

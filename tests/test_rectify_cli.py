@@ -5,21 +5,20 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.commands import json_of, refused
 from tests.dataset_makers import make_kitti
 from tests.euroc_maker import RECTIFIED_RIG, camera_stamps, make_euroc, make_kitti_raw
+from tests.same_events import frames_of
 from vio.cli import main
 from vio.cli.rectify import MARKER
 from vio.datasets import open_dataset
-from vio.datasets.rectified import RectifiedDataset
 from vio.geometry.distortion import StereoRig, rig_from_rectified
 from vio.geometry.rectify import rectified_cameras
 from vio.protocols import Dataset
-from vio.records import StereoFrame
 from vio.sim.export import export_euroc
 from vio.sim.imu import ImuNoise
 from vio.sim.motion import hand_held
@@ -29,35 +28,13 @@ from vio.sim.sequence import SimulatedRecording, simulate, views
 from vio.sim.world import room
 
 
-def _json(capsys: pytest.CaptureFixture[str], *argv: str) -> Any:
-    assert main([*argv, "--json"]) == 0
-    captured = capsys.readouterr()
-    assert captured.out.count("\n") == 1, "one object, nothing else, on stdout"
-    return json.loads(captured.out)
-
-
-def _error(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
-    assert main(list(argv)) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    lines = [line for line in captured.err.splitlines() if not line.startswith("WARNING")]
-    assert len(lines) == 1
-    assert lines[0].startswith("error: ")
-    return lines[0]
-
-
-def _images(dataset: Dataset) -> list[StereoFrame]:
-    return [event for event in dataset.events() if isinstance(event, StereoFrame)]
-
-
 @pytest.mark.parametrize("truth", ["state", "tum"])
 def test_an_euroc_folder_becomes_a_rectified_one(
     truth: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source, out = make_euroc(tmp_path / "raw", truth=truth), tmp_path / "rect"
-    facts = _json(capsys, "rectify", str(source), "--out", str(out))
+    facts = json_of(capsys, "rectify", str(source), "--out", str(out))
     raw, done = open_dataset(source), open_dataset(out)
-    assert isinstance(done, RectifiedDataset)
     assert done.rectifier.maps is None, "the new folder needs no rectifying"
     camera = raw.recording.camera
     assert facts == {
@@ -73,8 +50,6 @@ def test_an_euroc_folder_becomes_a_rectified_one(
     }
     assert done.recording.camera == replace(camera, baseline_m=done.recording.camera.baseline_m)
     assert done.recording.camera.baseline_m == pytest.approx(camera.baseline_m, abs=1e-12)
-    assert raw.recording.T_cam0_imu is not None
-    assert done.recording.T_cam0_imu is not None
     np.testing.assert_allclose(done.recording.T_cam0_imu, raw.recording.T_cam0_imu, atol=1e-12)
     _same_frames(raw, done)
     copied = ["imu0/data.csv", "imu0/sensor.yaml"]
@@ -86,7 +61,7 @@ def test_an_euroc_folder_becomes_a_rectified_one(
 
 def _same_frames(raw: Dataset, done: Dataset) -> None:
     """Reading the raw folder and reading the written one give the same bits."""
-    ours, written = _images(raw), _images(done)
+    ours, written = frames_of(raw), frames_of(done)
     assert len(ours) == len(written) > 0
     for a, b in zip(ours, written, strict=True):
         np.testing.assert_array_equal(a.left, b.left)
@@ -100,7 +75,7 @@ def test_a_kitti_raw_drive_becomes_an_odometry_folder(
     source, out = make_kitti_raw(tmp_path / "raw", [100, 101, 103]), tmp_path / "rect"
     if not imu_known:
         (source / "calib_imu_to_velo.txt").unlink()
-    facts = _json(capsys, "rectify", str(source), "--out", str(out), "--interpolation", "linear")
+    facts = json_of(capsys, "rectify", str(source), "--out", str(out), "--interpolation", "linear")
     raw, done = open_dataset(source), open_dataset(out)
     assert facts["kind"] == "kitti_raw"
     assert facts["frames"] == 3
@@ -109,8 +84,6 @@ def test_a_kitti_raw_drive_becomes_an_odometry_folder(
     assert (a.fu, a.fv, a.cu, a.cv, a.width, a.height) == (b.fu, b.fv, b.cu, b.cv, b.width, b.height)
     assert a.baseline_m == pytest.approx(b.baseline_m, rel=1e-12)
     if imu_known:
-        assert raw.recording.T_cam0_imu is not None
-        assert done.recording.T_cam0_imu is not None
         np.testing.assert_allclose(done.recording.T_cam0_imu, raw.recording.T_cam0_imu, atol=1e-12)
     else:
         assert done.recording.T_cam0_imu is None
@@ -132,12 +105,12 @@ def test_the_table_names_what_was_written(tmp_path: Path, capsys: pytest.Capture
 def test_replaces_only_an_older_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, out = make_euroc(tmp_path / "raw", 3), tmp_path / "rect"
     for _ in range(2):
-        assert _json(capsys, "rectify", str(source), "--out", str(out))["frames"] == 3
+        assert json_of(capsys, "rectify", str(source), "--out", str(out))["frames"] == 3
     other = tmp_path / "precious"
     other.mkdir()
     (other / "thesis.txt").write_text("mine")
-    assert "will not be replaced" in _error(capsys, "rectify", str(source), "--out", str(other))
-    assert "will not be replaced" in _error(capsys, "rectify", str(source), "--out", str(source))
+    assert "will not be replaced" in refused(capsys, "rectify", str(source), "--out", str(other))
+    assert "will not be replaced" in refused(capsys, "rectify", str(source), "--out", str(source))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["precious", "raw", "rect"]
     assert (other / "thesis.txt").read_text() == "mine"
 
@@ -150,7 +123,7 @@ def test_rejects_a_recording_that_is_rectified_already(tmp_path: Path, capsys: p
     )
     for source in sources:
         out = tmp_path / "out"
-        assert "rectified already" in (message := _error(capsys, "rectify", str(source), "--out", str(out)))
+        assert "rectified already" in (message := refused(capsys, "rectify", str(source), "--out", str(out)))
         assert "there is nothing to do" in message
         assert not out.exists()
 
@@ -162,13 +135,13 @@ def test_skips_a_corrupt_image_and_none_left_leaves_no_folder(
     stamps = camera_stamps(8)
     data = source / "mav0" / "cam0" / "data"
     (data / f"{stamps[2]}.png").write_bytes(b"")
-    assert _json(capsys, "rectify", str(source), "--out", str(out))["frames"] == 7
+    assert json_of(capsys, "rectify", str(source), "--out", str(out))["frames"] == 7
     assert "frame 2 is skipped" in caplog.text
     assert open_dataset(out).recording.frame_times_ns.tolist() == [t for k, t in enumerate(stamps) if k != 2]
     for stamp in stamps:
         (data / f"{stamp}.png").write_bytes(b"")
     again = tmp_path / "again"
-    assert "none of 8 frames can be used" in _error(capsys, "rectify", str(source), "--out", str(again))
+    assert "none of 8 frames can be used" in refused(capsys, "rectify", str(source), "--out", str(again))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["raw", "rect"], "nothing half-written"
 
 
@@ -218,9 +191,8 @@ def test_a_rendered_folder_reads_as_the_rectified_cameras_would_see_it(
     assert dataset.recording.camera.fu == pytest.approx(done.camera.fu, rel=1e-9)
     assert dataset.recording.motion == {"imu"}
     ideal = replace(simulation, rig=rig_from_rectified(done.camera, done.T_rect0_imu))
-    frame = _images(dataset)[3]
+    frame = frames_of(dataset)[3]
     for image, view in zip((frame.left, frame.right), views(ideal, frame.time_ns), strict=True):
-        assert image is not None
         expected = render(simulation.world, camera_rays(view.camera), view.T_world_cam, frame.time_ns)
         difference = (image - expected)[4:-4, 4:-4]
         assert np.sqrt(np.mean(difference**2)) < 0.15 * expected.std()
@@ -231,10 +203,10 @@ def test_a_rendered_folder_reads_as_the_rectified_cameras_would_see_it(
 def test_run_takes_an_unrectified_folder_like_a_rectified_one(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    metrics = _json(capsys, "run", str(folder), "--out", str(tmp_path / "run"), "--backend", "vislam")
+    metrics = json_of(capsys, "run", str(folder), "--out", str(tmp_path / "run"), "--backend", "vislam")
     assert metrics["frames"] == 8
     assert metrics["ate_m"] < 0.02, "the ground truth of the IMU is found and honoured"
     assert metrics["motion"] == "none", "the paper's filter has no IMU model and uses the images alone"
-    assert _json(capsys, "rectify", str(folder), "--out", str(tmp_path / "rect"))["frames"] == 8
-    again = _json(capsys, "run", str(tmp_path / "rect"), "--out", str(tmp_path / "run2"), "--backend", "vislam")
+    assert json_of(capsys, "rectify", str(folder), "--out", str(tmp_path / "rect"))["frames"] == 8
+    again = json_of(capsys, "run", str(tmp_path / "rect"), "--out", str(tmp_path / "run2"), "--backend", "vislam")
     assert again["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-6)

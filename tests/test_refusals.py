@@ -10,7 +10,7 @@ import pytest
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.imu.findings import ImuVerdict
-from vio.monitor.refusals import RefusalReport
+from vio.monitor.health import RefusalReport
 from vio.monitor.run import RunMonitor
 from vio.records import BoolArray, Estimate, Observations, StereoFieldEstimate, UpdateReport, observations
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.commands import refused
 from vio.cli import main
 from vio.evaluation.trajectories import evaluate
 from vio.files.trajectories import read_trajectory
@@ -198,9 +199,7 @@ def test_damaged_folders_are_named(
     folder = tmp_path / "run"
     shutil.copytree(runs[0], folder)
     (folder / name).write_bytes(content)
-    assert main(["report", str(folder)]) == 1
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
+    message = refused(capsys, "report", str(folder))
     assert name in message
     assert says in message
 

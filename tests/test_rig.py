@@ -233,7 +233,6 @@ def test_euroc_folder_as_a_rig_is_that_of_its_reader(tmp_path: Path) -> None:
     recording = open_dataset(folder).recording
     for path in (folder, folder / "mav0", folder / "mav0" / "cam0" / "sensor.yaml"):
         rig = vio.load_rig(path)
-        assert rig.T_rect0_imu is not None
         np.testing.assert_allclose(rig.T_rect0_imu, recording.T_cam0_imu, atol=1e-12)
         assert rig.camera.fu == pytest.approx(recording.camera.fu, abs=1e-9)
         assert rig.imu_noise.accel_walk == 3e-3
@@ -258,7 +257,6 @@ def test_kitti_raw_calibration_is_chosen_by_the_image_size(tmp_path: Path) -> No
     (tmp_path / "calib_velo_to_cam.txt").write_text(rigid_text(se3_inverse(T_CAM0_IMU)))
     (tmp_path / "calib_imu_to_velo.txt").write_text(rigid_text(T_CAM0_IMU @ T_CAM0_IMU))
     T = vio.load_rig(tmp_path).T_cam0_imu
-    assert T is not None
     np.testing.assert_allclose(T, T_CAM0_IMU, atol=1e-9)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 import vio
-from vio.cli import main
+from tests.commands import refused
 from vio.config import Config
 from vio.datasets.bags.cdr import decoded, fields_of
 from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
@@ -408,10 +408,8 @@ def test_silent_unknown_and_wrong_topics_are_named(monkeypatch: pytest.MonkeyPat
 def test_wrong_arguments_are_named_in_one_line(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(arguments) == 1
-    error = capsys.readouterr().err
+    error = refused(capsys, *arguments)
     assert message in error
-    assert error.count("\n") == 1
 
 
 def test_without_the_extra_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -145,7 +145,6 @@ def test_cameras_run_loops_of_their_own() -> None:
 def test_planned_brightness_is_that_of_the_images() -> None:
     """The coarse metering stands for the images: within a fifth."""
     exposures = flight().simulation.exposures
-    assert exposures is not None
     for k in (5, 25):
         assert flight().images(k)[0].mean() == pytest.approx(exposures.brightness[k, 0], rel=0.25)
 
@@ -386,7 +385,6 @@ def test_odometry_follows_real_looking_flights() -> None:
     for seed, share in ((0, 0.01), (2, 0.04)):
         simulated = flight() if seed == scenario().seed else SimulatedRecording(plan(replace(scenario(), seed=seed)))
         recording = simulated.recording
-        assert recording.reference is not None
         result = run(simulated, Config(motion="imu"))
         scores = evaluate(result.trajectory, recording.reference, T_cam0_imu=recording.T_cam0_imu)
         assert len(result.estimates) == 30

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from vio.datasets.kitti import read_kitti
+from vio.datasets.plain import read_kitti
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError, SimulationError, VioError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_inverse, transform_points
@@ -110,7 +110,7 @@ def test_exact_blur_is_the_mean_of_sub_exposures() -> None:
 def test_motion_blur_is_along_the_motion_and_the_approximate_one_agrees(plain: Simulation) -> None:
     time_ns = 2_000_000_000
     sharp, approximate, exact = (
-        _recording(plain, effects).radiance(time_ns)[0]
+        _recording(plain, effects)._seen(0, time_ns, None)
         for effects in (
             CLEAN,
             replace(CLEAN, blur_exposure_ms=30.0, blur_samples=9),
@@ -160,7 +160,6 @@ def test_events_are_in_time_order_with_ground_truth(plain: Simulation) -> None:
     later = recording.true_state(400_100_000)
     speed = (later.T_world_imu - state.T_world_imu)[:3, 3] / 1e-4
     np.testing.assert_allclose(speed, state.velocity_world, atol=1e-3)
-    assert state.gyro_bias is not None
     assert np.linalg.norm(state.gyro_bias) > 0
 
 

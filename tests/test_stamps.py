@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from vio.geometry.lie import FloatArray
+from vio.monitor.gyro_fit import judge_stamps
 from vio.monitor.motion import Intervals, Record, record_of
-from vio.monitor.stamps import judge_stamps
 
 STEP_S = 0.05
 

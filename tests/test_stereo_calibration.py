@@ -44,7 +44,7 @@ from vio.filters.stereo_calibration import (
 from vio.geometry.distortion import CameraModel, project_point
 from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, project
-from vio.records import MotionSource, Observations, StereoFieldEstimate, observations
+from vio.records import MotionSource, Observations, observations
 
 CAMERA = StereoCamera(460.0, 440.0, 370.0, 240.0, 0.11, 752, 480)  # fu and fv differ, so that neither passes for both
 CLONES = len(T_CAM0_WORLD)
@@ -349,7 +349,6 @@ def _turn(angle: float) -> Spoil:
 def _field(run: Run, k: int = -1) -> tuple[FloatArray, FloatArray]:
     """Coefficients (8,) and their standard deviations (8,) at a frame."""
     field = run.estimates[k].stereo_field
-    assert isinstance(field, StereoFieldEstimate)
     return field.coefficients, np.sqrt(np.diag(field.covariance))
 
 

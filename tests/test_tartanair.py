@@ -169,7 +169,6 @@ def _dense_shift(clip: Clip, k: int) -> float:
     v, u = np.mgrid[0:640, 0:640].astype(np.float32)
     disparity = (CAMERA.fu * CAMERA.baseline_m / clip.depth[k]).astype(np.float32)
     left, right = clip.frames[k].left, clip.frames[k].right
-    assert right is not None
     warped = cv2.GaussianBlur(cv2.remap(right, u - disparity, v, cv2.INTER_CUBIC).astype(np.float64), (0, 0), 1)
     difference = cv2.GaussianBlur(left.astype(np.float64), (0, 0), 1) - warped
     slope = cv2.Sobel(warped, cv2.CV_64F, 1, 0) / 8

@@ -53,7 +53,6 @@ def test_tum_round_trip_is_exact_in_time_and_position(tmp_path: Path, times: lis
     trajectory.T_world_body[:, :3, 3] = np.reshape(xyz, (8, 3))[: len(times)]
     write_tum(tmp_path / "t.tum", trajectory)
     back = read_trajectory(tmp_path / "t.tum")
-    assert back.times_ns is not None
     np.testing.assert_array_equal(back.times_ns, times)
     np.testing.assert_array_equal(back.positions, trajectory.positions)
     np.testing.assert_allclose(back.T_world_body, trajectory.T_world_body, rtol=0, atol=1e-15)
@@ -168,7 +167,6 @@ def test_frame_numbers_come_back(steps: list[int], tmp_path: Path) -> None:
     write_tum(tmp_path / "t.tum", trajectory)
     assert is_trajectory_file(tmp_path / "t.tum")
     again = read_trajectory(tmp_path / "t.tum").frame_indices
-    assert again is not None
     np.testing.assert_array_equal(again, frames)
 
 
@@ -205,10 +203,10 @@ BAD = {
     "comments count": (f"# one\n\n1 {TUM_ROW}\n# four\n1.5 0 0 0 0 0 1\n", None, "line 5: 7 columns"),
     "time repeats": (f"1 {TUM_ROW}\n1.0 {TUM_ROW}\n", None, "line 2: the clock repeats.*reorder"),
     "time backwards": (f"2 {TUM_ROW}\n1 {TUM_ROW}\n", None, "line 2: the clock runs backwards.*reorder"),
-    "time not a number": (f"one {TUM_ROW}\n", None, "line 1: the time 'one' is not a number"),
-    "time nan": (f"nan {TUM_ROW}\n", None, "line 1: the time 'nan' is not a number"),
-    "time huge": (f"1e999999999 {TUM_ROW}\n", None, "line 1: the time .* cannot be in seconds"),
-    "time in ns": (f"1403715273262142976 {TUM_ROW}\n", None, "cannot be in seconds; divide nanoseconds by 1e9"),
+    "time not a number": (f"one {TUM_ROW}\n", None, "line 1: 'one' is no time"),
+    "time nan": (f"nan {TUM_ROW}\n", None, "line 1: 'nan' is no time"),
+    "time huge": (f"1e999999999 {TUM_ROW}\n", None, "line 1: .* is out of range for a time"),
+    "time in ns": (f"1403715273262142976 {TUM_ROW}\n", None, "is out of range for a time; divide nanoseconds by 1e9"),
     "quaternion norm": (f"1 {TUM_ROW}\n2 0 0 0 0 0 0 1.1\n", None, "line 2: the quaternion has norm 1.1.*column order"),
     "quaternion zero": ("1 0 0 0 0 0 0 0\n", None, "line 1: the quaternion has norm 0, not 1"),
     "quaternion huge": ("1 0 0 0 0 0 0 1e300\n", None, "line 1: a pose is not finite, or beyond"),
@@ -223,8 +221,8 @@ BAD = {
     "kitti columns": (f"{KITTI_ROW}\n1 2 3\n", None, "line 2: 3 columns instead of 12"),
     "euroc columns": (f"{EUROC_HEADER}1,2,3\n", None, "line 2: 3 columns instead of 8"),
     "euroc uneven": (f"{EUROC_HEADER}1,0,0,0,1,0,0,0\n2,0,0,0,1,0,0\n", None, "line 3: 7 columns instead of 8"),
-    "euroc seconds": (f"{EUROC_HEADER}1.5,0,0,0,1,0,0,0\n", None, "line 2: the time '1.5' is not in whole nanoseconds"),
-    "euroc overflow": (f"{EUROC_HEADER}9223372036854775808,0,0,0,1,0,0,0\n", None, "is not in whole nanoseconds"),
+    "euroc seconds": (f"{EUROC_HEADER}1.5,0,0,0,1,0,0,0\n", None, "line 2: '1.5' is no time in whole nanoseconds"),
+    "euroc overflow": (f"{EUROC_HEADER}9223372036854775808,0,0,0,1,0,0,0\n", None, "is no time in whole nanoseconds"),
     "euroc quaternion": (f"{EUROC_HEADER}1,0,0,0,2,0,0,0\n", None, "line 2: the quaternion has norm 2"),
     "empty": ("", None, "holds no poses"),
     "only comments": ("# timestamp\n", None, "holds no poses"),
@@ -265,7 +263,6 @@ def test_evo_reads_written_files(tmp_path: Path) -> None:
     trajectory = replace(make(50, body="cam0"), frame_indices=np.arange(3, 53))
     write_tum(tmp_path / "t.tum", trajectory)
     tum = file_interface.read_tum_trajectory_file(str(tmp_path / "t.tum"))
-    assert trajectory.times_ns is not None
     np.testing.assert_allclose(tum.timestamps, trajectory.times_ns / 1e9, rtol=1e-15)
     np.testing.assert_allclose(tum.poses_se3, trajectory.T_world_body, atol=1e-14)
     write_kitti(tmp_path / "t.kitti", replace(trajectory, frame_indices=None))
@@ -278,7 +275,6 @@ def test_reads_files_written_by_evo(tmp_path: Path) -> None:
     from evo.tools import file_interface
 
     trajectory = make(50, start_ns=0)
-    assert trajectory.times_ns is not None
     theirs = PoseTrajectory3D(poses_se3=list(trajectory.T_world_body), timestamps=trajectory.times_ns / 1e9)
     file_interface.write_tum_trajectory_file(str(tmp_path / "t.tum"), theirs)
     file_interface.write_kitti_poses_file(str(tmp_path / "t.kitti"), theirs)

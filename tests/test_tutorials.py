@@ -55,7 +55,6 @@ def _write_bag(flight: Path, path: Path) -> None:
     """Write a rectified flight as a ROS 1 bag with its calibration."""
     dataset = open_dataset(flight)
     recording, script = dataset.recording, Script("bag")
-    assert recording.T_cam0_imu is not None
     script.static(int(recording.frame_times_ns[0]), "left", "imu", recording.T_cam0_imu)
     for event in dataset.events():
         if isinstance(event, ImuSample):

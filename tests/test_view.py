@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.commands import refused
 from vio.cli import main
 from vio.config import load_config
 from vio.datasets import open_dataset
@@ -186,9 +187,7 @@ def test_a_wrong_place_is_named_before_the_run(
     says: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["run", str(flight), "--quiet", "--out", "run", "--view", where]) == 1
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
+    message = refused(capsys, "run", str(flight), "--quiet", "--out", "run", "--view", where)
     assert says in message
     assert not (tmp_path / "run").exists()
 

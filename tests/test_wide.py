@@ -14,6 +14,7 @@ import vio
 from tests import test_msckf
 from tests.commands import render
 from tests.numpy_twins import residuals
+from tests.same_events import frames_of
 from vio.cameras.rectification_error import TERMS, error_jacobian
 from vio.cameras.rig import Rig
 from vio.cli import main
@@ -33,7 +34,7 @@ from vio.geometry.rectify import PINHOLE_REACH
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
 from vio.offline.saved_run import read_saved_run
 from vio.offline.source import open_source
-from vio.records import Observations, StereoFrame, observations
+from vio.records import Observations, observations
 from vio.sim.rigs import wide_rig
 
 CYLINDER = StereoCamera(200.0, 200.0, 300.0, 314.0, 0.11, 600, 628, "cylinder")
@@ -142,8 +143,7 @@ def test_a_saved_run_shows_other_programs_a_pinhole(flight: Path, wide_run: Path
     np.testing.assert_allclose(z[:, :2], project(camera, 5.0 * rays)[:, :2], atol=1e-9)
     (ours,) = run.images.frames(run.tracked.frames[np.array([frame])])
     other = open_dataset(str(flight), DatasetSettings(projection="pinhole"))
-    (theirs,) = [e for e in other.events(frame, frame + 1) if isinstance(e, StereoFrame)]
-    assert theirs.right is not None
+    (theirs,) = frames_of(other, frame, frame + 1)
     v, u = np.mgrid[10:150:3, 10:150:3].astype(np.float64)
     expected = project(other.recording.camera, left_rays(camera, np.stack([u, v], axis=-1)))[..., :2].astype(np.float32)
     image = cv2.remap(theirs.right, expected[..., 0], expected[..., 1], cv2.INTER_LINEAR).astype(np.float64)
@@ -293,7 +293,6 @@ def test_rows_show_a_turned_right_camera() -> None:
     rng = np.random.default_rng(5)
     for k in range(20):
         rows.update(observations(k, k, np.arange(300), z + rng.normal(0, 0.1, z.shape)))
-    assert rows.offset_px is not None
     assert rows.offset_px > 0.2
     np.testing.assert_allclose(rows.coefficients[[0, 1, 3]], [-2e-3, -1.5e-3, 1e-3], atol=1e-4)
     np.testing.assert_allclose(rows.coefficients[[2, 4, 5]], 0.0, atol=1e-4)

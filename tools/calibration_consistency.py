@@ -3,7 +3,7 @@
     python -m tools.calibration_consistency [--rigs RIG …] [--starts START …] [--runs 20] [--seconds 10]
         [--pixel-sigma 0.5] [--jobs 2]
 
-Monte-Carlo flights as those of tools/consistency.py, each with a rig that is off by what the priors of the settings
+Monte-Carlo flights as those of `tools.consistency`, each with a rig that is off by what the priors of the settings
 expect: the extrinsics of camera and IMU and their clocks, the IMU's scales and misalignments, all of these, the right
 camera's attitude, or the length of the baseline. They begin in motion, at a velocity that the filter does not know, or
 at standstill. Prints NEES of what is estimated, halfway and at the end, in Markdown; docs/notes/consistency.md shows

@@ -1,13 +1,11 @@
-"""Consistency of the sliding-window filter, beside the two it is compared with: standard errors, first estimates.
+"""Consistency of the sliding-window filter, with the noise known and learned.
 
-    python tools/consistency.py --out FOLDER [--motions imu none velocity] [--variants VARIANT …] [--runs 20]
-        [--seconds 7.5] [--pixel-sigma 1.0] [--features 60] [--landmarks 30]
-        [--outliers 0.0] [--imu-offset-ms 0.0] [--jobs 2]
+    python -m tools.consistency [--motions imu none velocity] [--variants VARIANT …] [--runs 20] [--seconds 7.5]
+        [--pixel-sigma 1.0] [--features 60] [--landmarks 30] [--outliers 0.0] [--imu-offset-ms 0.0] [--jobs 2]
 
 Monte-Carlo flights through exact points, with exact noise: pixels, IMU and its biases, velocities, and the place and
 yaw of the start are drawn from the very distributions that the filter assumes. Each flight is flown once by every
-variant, with the same noise. Writes FOLDER/table.md (also printed) and FOLDER/consistency.png.
-docs/notes/consistency.md says what the variants are; its equation numbers are cited here.
+variant, with the same noise. Prints tables in Markdown; docs/notes/consistency.md shows them.
 """
 
 from __future__ import annotations
@@ -23,8 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Literal, get_args
 from unittest.mock import patch
 
 import numpy as np
@@ -32,10 +29,9 @@ import numpy as np
 from vio.errors import VioError
 from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters import imu_start, navigation, window_tracks
-from vio.filters.frame_update import FrameUpdate
 from vio.filters.msckf import Msckf
 from vio.filters.multiview import Residuals
-from vio.filters.navigation import DIM, ImuMotion, NavState, Transition
+from vio.filters.navigation import NavState
 from vio.filters.noise import MotionNoise
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
@@ -65,12 +61,9 @@ from vio.records import (
     observations,
 )
 
-if TYPE_CHECKING:
-    from typing_extensions import Self  # in typing from Python 3.11
-
 Motion = Literal["imu", "none", "velocity"]
 Start = Literal["uncertain", "known"]
-Variant = Literal["standard", "first estimates", "right-invariant", "right-invariant, noise learned"]
+Variant = Literal["right-invariant", "right-invariant, noise learned"]
 
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
@@ -80,149 +73,7 @@ SAMPLES = _FRAME_NS // _IMU_NS  # of the IMU in a frame
 _START: dict[Start, tuple[float, float]] = {"uncertain": (0.05, np.radians(1.0)), "known": (0.0, 0.0)}
 _MOTIONS: tuple[Motion, ...] = get_args(Motion)
 _VARIANTS: tuple[Variant, ...] = get_args(Variant)
-_COLOURS = dict(zip(_VARIANTS, ("#c44e52", "#d9822b", "#1f5fbf", "#111111"), strict=True))
 _MEASURES = {"pose": 6, "position": 3, "orientation": 3, "yaw": 1, "velocity": 3, "gyro bias": 3, "accel bias": 3}
-
-
-# The variants of the window
-
-
-class StandardErrors(Window):
-    """The window with the prior in the usual errors: differences of positions, velocities and points.
-
-    The error vector, and its prior, stay right-invariant *at the present linearisation point*,
-    equation (E1), so that the rest of the filter need not know. When the means move, the prior in the usual errors
-    stays the same (E2).
-    """
-
-    @classmethod
-    def over(cls, window: Window) -> Self:
-        """Take over a plain window."""
-        out = cls.__new__(cls)
-        vars(out).update(vars(window))
-        out._begin()
-        return out
-
-    def linearisation_point(self) -> tuple[NavState, FloatArray, FloatArray]:
-        """The navigation state, positions (N, 3) of the clones and landmarks (M, 3) at which (E1) is taken."""
-        return self.nav, self.clones.T_world_imu[:, :3, 3], self.landmarks
-
-    def standard_D_error(self) -> FloatArray:
-        """Jacobian (D, D) of the usual errors with respect to the window's own, equation (E1)."""
-        nav, positions, landmarks = self.linearisation_point()
-        M = np.eye(len(self.prior.P))
-        M[0:3, 3:6] = -so3_hat(nav.T_world_imu[:3, 3])
-        if isinstance(self.motion, ImuMotion):
-            M[6:9, 3:6] = -so3_hat(nav.velocity)
-        for k, position in enumerate(positions):
-            rows = self.state.clone(k)
-            M[rows.start : rows.start + 3, rows.start + 3 : rows.stop] = -so3_hat(position)
-        if len(landmarks):
-            anchor = self.state.clone(len(self.clones) - 1)
-            M[self.state.landmarks.start :, anchor.start + 3 : anchor.stop] = -so3_hat(landmarks).reshape(-1, 3)
-        return M
-
-    def relinearise(self, error: FloatArray) -> None:
-        """Move the means by an error vector (D,), each as the usual errors say; the prior in those stays."""
-        before = self.standard_D_error()
-        change = before @ error
-        self.nav = replace(
-            self.motion.corrected(self.nav, change),
-            T_world_imu=_moved(self.nav.T_world_imu, change[:6]),
-            velocity=self.nav.velocity + change[6:9],
-        )
-        moves = change[self.state.clone(0).start : self.state.landmarks.start].reshape(-1, 6)
-        poses = [_moved(T, move) for T, move in zip(self.clones.T_world_imu, moves, strict=True)]
-        self.clones = replace(self.clones, T_world_imu=np.array(poses).reshape(-1, 4, 4))
-        self.landmarks = self.landmarks + change[self.state.landmarks.start :].reshape(-1, 3)
-        self.prior.delta = self.prior.delta + error
-        self._follow(before)
-
-    def right_invariant(self, P: FloatArray) -> FloatArray:
-        """Covariance (15, 15) of the navigation state's right-invariant error at the present means."""
-        return P
-
-    def _begin(self) -> None:
-        """Set up what the window has beyond a plain one."""
-
-    def _follow(self, before: FloatArray) -> None:
-        """Write the prior in right-invariant errors at the new linearisation point, equation (E2)."""
-        # M = I + L with L L = 0, so the inverse is I - L.
-        change = np.eye(len(before)) + before - self.standard_D_error()
-        self.prior.P = change @ self.prior.P @ change.T
-        self.prior.delta = change @ self.prior.delta
-
-
-class FirstEstimates(StandardErrors):
-    """The usual errors linearised at the first estimate of each state, so that the point never changes."""
-
-    def _begin(self) -> None:
-        self._first_nav = self.nav
-        self._first_positions = self.clones.T_world_imu[:, :3, 3]
-        self._first_landmarks = self.landmarks
-
-    def linearisation_point(self) -> tuple[NavState, FloatArray, FloatArray]:
-        """As above, at the first estimates."""
-        return self._first_nav, self._first_positions, self._first_landmarks
-
-    def propagate(self, step: Transition, walk: FloatArray | None = None) -> None:
-        """Move the navigation state; the prediction is its first estimate."""
-        super().propagate(step, walk)
-        self._first_nav = step.nav
-
-    def add_clone(self, frame_index: int, time_ns: int, *rest: Any) -> None:
-        """Copy the pose; where it is now is its first estimate."""
-        with self._landmarks_at_first():
-            super().add_clone(frame_index, time_ns, *rest)
-        newest = self.clones.T_world_imu[-1:, :3, 3]
-        self._first_positions = np.concatenate([self._first_positions, newest])
-
-    def inflate_process_noise(self, extra: FloatArray) -> None:
-        """Add noise to the last step."""
-        with self._landmarks_at_first():
-            super().inflate_process_noise(extra)
-
-    def drop_oldest_clone(self) -> None:
-        """Forget the oldest clone."""
-        super().drop_oldest_clone()
-        self._first_positions = self._first_positions[1:]
-
-    def keep_landmarks(self, chosen: BoolArray) -> None:
-        """Forget the landmarks outside a mask (M,)."""
-        super().keep_landmarks(chosen)
-        self._first_landmarks = self._first_landmarks[chosen]
-
-    def add_landmarks(self, ids: IntArray, p_world: FloatArray, *rest: Any) -> None:
-        """Add landmarks (K, 3); where they are now is their first estimate."""
-        super().add_landmarks(ids, p_world, *rest)
-        self._first_landmarks = np.concatenate([self._first_landmarks, p_world])
-
-    def right_invariant(self, P: FloatArray) -> FloatArray:
-        """Covariance (15, 15) of the navigation state's right-invariant error at the present means, not the first."""
-        first = self.standard_D_error()[:DIM, :DIM]
-        now = StandardErrors.standard_D_error(_at_means(self))[:DIM, :DIM]
-        change = np.eye(DIM) + first - now
-        out: FloatArray = change @ P @ change.T
-        return out
-
-    def _follow(self, before: FloatArray) -> None:
-        """Do nothing: the linearisation point stayed."""
-
-    @contextmanager
-    def _landmarks_at_first(self) -> Iterator[None]:
-        now, self.landmarks = self.landmarks, self._first_landmarks
-        yield
-        self.landmarks = now
-
-
-def _at_means(window: Window) -> StandardErrors:
-    """The navigation state of a window alone, linearised at its means."""
-    return StandardErrors(window.motion, window.nav, np.eye(DIM))
-
-
-def _moved(T: FloatArray, change: FloatArray) -> FloatArray:
-    """A pose (4, 4) whose position and world-side rotation change by (6,)."""
-    return se3_from_parts(so3_exp(change[3:]) @ T[:3, :3], T[:3, 3] + change[:3])
 
 
 class JudgedTracks(WindowTracks):
@@ -239,33 +90,14 @@ class JudgedTracks(WindowTracks):
         return good, nis, dof
 
 
-class AblationUpdate(FrameUpdate):
-    """Reports the covariance of right-invariant errors, whatever the window's own are."""
-
-    def _marginalise(self, window: Window, *rest: Any) -> tuple[int, float]:
-        new = super()._marginalise(window, *rest)
-        if isinstance(window, StandardErrors):
-            posterior = self._propagation.posterior
-            self._propagation.posterior = replace(posterior, own=window.right_invariant(posterior.own))
-        return new
-
-
-class Ablation(Msckf):
-    """The sliding-window filter over a window of choice, uncertain of its first place and yaw."""
+class UncertainStart(Msckf):
+    """The sliding-window filter, uncertain of its first place and yaw."""
 
     def __init__(
-        self,
-        settings: MsckfSettings,
-        motion: MotionSource | None,
-        kind: type[StandardErrors] | None,
-        *,
-        start: Start,
-        learn_noise: bool,
+        self, settings: MsckfSettings, motion: MotionSource | None, *, start: Start, learn_noise: bool
     ) -> None:
         super().__init__(CAMERA, T_CAM0_IMU, settings, motion=motion)
-        self._kind, self._start, self._begun = kind, _START[start], False
-        self._learn_noise = learn_noise
-        self._frame = AblationUpdate(settings, self._rig, self._propagation, self._points)
+        self._start, self._begun, self._learn_noise = _START[start], False, learn_noise
         self._frame.tracks = self._judged = JudgedTracks(CAMERA, settings)
 
     @property
@@ -274,16 +106,14 @@ class Ablation(Msckf):
         return self._judged.nis
 
     def _measure(self) -> None:
-        """Right after the start, once, make place and yaw uncertain and take the window of choice."""
-        window = self._started()
+        """Right after the start, once, make place and yaw uncertain."""
         if not self._begun:
             if not self._learn_noise:
                 self._propagation.noise = MotionNoise(1.0, 1.0, 1.0)
             position_sigma, yaw_sigma = self._start
-            window.prior.P[:3, :3] += np.eye(3) * position_sigma**2
-            window.prior.P[5, 5] += yaw_sigma**2
-            if self._kind is not None:
-                self._window = self._kind.over(window)
+            P = self._started().prior.P
+            P[:3, :3] += np.eye(3) * position_sigma**2
+            P[5, 5] += yaw_sigma**2
             self._begun = True
         super()._measure()
 
@@ -468,9 +298,8 @@ def fly(job: Job) -> Record:
 def _fly(job: Job, learn: bool) -> Record:
     scenario, flight = job.scenario, Flight()
     settings = scenario.settings(learn_noise=learn)
-    kind = {"standard": StandardErrors, "first estimates": FirstEstimates}.get(job.variant)
     source = None if job.motion == "none" else job.motion
-    filt = Ablation(settings, source, kind, start=job.start, learn_noise=learn)
+    filt = UncertainStart(settings, source, start=job.start, learn_noise=learn)
     noise = np.random.default_rng(job.seed)
     R, p, v = flight.state(_times(scenario.frames))
     T = se3_from_parts(R, p)
@@ -554,12 +383,11 @@ def _record(
 
 
 def main() -> int:
-    """Fly everything and write the tables and the picture."""
+    """Fly everything and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     usual = Scenario()
-    parser.add_argument("--out", type=Path, required=True, help="folder for the results")
     parser.add_argument("--motions", nargs="+", default=list(_MOTIONS), choices=_MOTIONS)
-    parser.add_argument("--variants", nargs="+", default=list(_VARIANTS[:3]), choices=_VARIANTS)
+    parser.add_argument("--variants", nargs="+", default=list(_VARIANTS), choices=_VARIANTS)
     parser.add_argument("--runs", type=int, default=20, help="flights per motion model and variant")
     parser.add_argument("--seconds", type=float, default=usual.seconds, help="length of a flight")
     parser.add_argument("--pixel-sigma", type=float, default=usual.pixel_sigma_px, help="noise of a pixel")
@@ -580,11 +408,7 @@ def main() -> int:
     except VioError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    args.out.mkdir(parents=True, exist_ok=True)
-    table = _tables(summaries)
-    (args.out / "table.md").write_text(table, encoding="utf-8")
-    _plot(args.out / "consistency.png", summaries)
-    print(table)
+    print(_tables(summaries))
     return 0
 
 
@@ -596,7 +420,7 @@ class Summary:
     start: Start
     variant: Variant
     runs: int
-    nees: dict[str, FloatArray]  # (F - 1,) by measure, mean over the runs
+    nees: dict[str, float]  # by measure, mean over the runs and frames
     nees_se: dict[str, float]  # by measure, standard error over the runs of the mean over all frames
     inside: dict[str, float]  # by measure, share of the frames in which the mean lies in its 95 % band
     nis: float
@@ -645,7 +469,7 @@ def _summary(records: list[Record]) -> Summary:
     return Summary(
         *_group(records[0].job),
         runs,
-        mean,
+        {m: float(values.mean()) for m, values in mean.items()},
         {m: float(v.mean(axis=1).std(ddof=min(runs - 1, 1)) / np.sqrt(runs)) for m, v in every.items()},
         inside,
         float(np.nanmean([r.nis[1:] for r in records])),
@@ -690,51 +514,9 @@ def _tables(summaries: list[Summary]) -> str:
 
 
 def _nees_cell(summary: Summary, measure: str) -> str:
-    mean, error = float(summary.nees[measure].mean()), summary.nees_se[measure]
+    mean, error = summary.nees[measure], summary.nees_se[measure]
     digits = 1 if mean >= 20 else 2
     return f"{mean:.{digits}f} ± {error:.{digits}f} ({100 * summary.inside[measure]:.0f} %)"
-
-
-def _plot(path: Path, summaries: list[Summary]) -> None:
-    """Columns: motion and start; above the pose NEES over time, below yaw's estimated sigma and its error."""
-    from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-
-    columns = list(dict.fromkeys((s.motion, s.start) for s in summaries))
-    figure = Figure(figsize=(3.1 * len(columns) + 0.6, 5.4), dpi=90, layout="constrained")
-    grid = figure.subplots(2, len(columns), squeeze=False, sharey="row")
-    for (motion, start), (above, below) in zip(columns, grid.T, strict=True):
-        above.set_title(f"{motion}, start {start}", fontsize=9)
-        low, high = nees_bounds(_MEASURES["pose"], summaries[0].runs)
-        above.axhspan(low, high, color="#cfd8e3", lw=0)
-        for s in summaries:
-            if (s.motion, s.start) != (motion, start):
-                continue
-            t = _times(len(s.yaw_sigma_deg) + 1)[1:]
-            # Broad, as it lies under the right-invariant line.
-            style: dict[str, Any] = {"color": _COLOURS[s.variant], "lw": 3.0 if s.variant == "first estimates" else 1.2}
-            above.plot(t, s.nees["pose"], **style)
-            below.plot(t, s.yaw_sigma_deg, **style)
-            below.plot(t, s.yaw_error_deg, ls=":", **style)
-        above.set_yscale("log")
-        below.set_yscale("log")
-        below.set_ylim(bottom=0.02)
-        below.set_xlabel("time (s)", fontsize=8)
-        for axes in (above, below):
-            axes.tick_params(labelsize=7, which="both")
-            axes.grid(alpha=0.25)
-            axes.yaxis.set_major_formatter("{x:g}")
-    grid[0, 0].set_ylabel("pose NEES, 6 expected", fontsize=8)
-    grid[1, 0].set_ylabel("yaw (deg)", fontsize=8)
-    used = [v for v in _VARIANTS if any(s.variant == v for s in summaries)]
-    handles = [Line2D([], [], color=_COLOURS[v], lw=3.0 if v == "first estimates" else 1.2, label=v) for v in used]
-    handles += [
-        Line2D([], [], color="#cfd8e3", lw=6, label="95 % band"),
-        Line2D([], [], color="#666666", label="estimated sigma"),
-        Line2D([], [], color="#666666", ls=":", label="error, RMS"),
-    ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8)
-    figure.savefig(path)
 
 
 if __name__ == "__main__":

@@ -28,10 +28,11 @@ from vio.geometry.lie import FloatArray
 from vio.numerics.threads import one_blas_thread
 from vio.protocols import Frontend
 from vio.records import Image, IntArray, Observations, StereoFrame
-from vio.sim.render import View, cast, correspondence, inside_image, observe, surface_points
+from vio.sim.render import View, cast, correspondence, observe, surface_points
 from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_of, default_workers, plan
 from vio.sim.sequence import SimulatedRecording, Simulation, views
 from vio.sim.world import Surfaces, surfaces_at
+from vio.testing import FrontendErrors, compare
 
 SHOWN_EFFECTS = (
     "exposure", "gain", "gain-high", "blur", "noise", "dark", "bare-wall", "moving", "dropped", "duplicated",
@@ -42,32 +43,23 @@ _CROSSED_PX = 1.5  # error above which a track at another depth than its point h
 _OTHER_DEPTH = 0.02  # relative
 _RIM_PX = 3.0  # a feature this close to a nearer surface may be a point of its outline
 _CROSSED_FRAMES = 3  # a track on the wrong surface for more frames counts as kept
-_MARGIN_PX = 12.0  # points closer to the image border are not required to be tracked
 _CORNERS = 150  # strongest corners of an image, for the recall of repeatable corners
 _CORNER_GAP_PX = 24.0
 _REPEATED_PX = 1.5  # distance from the true pixel up to which a corner is repeated
 _COVERED_PX = 3.0  # distance up to which a track covers a corner
 
 
-@dataclass
-class Tally:
+@dataclass(slots=True)
+class Tally(FrontendErrors):
     """Errors and counts of a front end; arrays have one entry per observation, one array per frame."""
 
-    step: list[FloatArray] = field(default_factory=list)  # (N, 2) px, measured minus true
     since_birth: list[FloatArray] = field(default_factory=list)  # (N, 2) px
     age: list[IntArray] = field(default_factory=list)  # (N,) frames since birth, beside `since_birth`
-    disparity: list[FloatArray] = field(default_factory=list)  # (N,) px
-    row: list[FloatArray] = field(default_factory=list)  # (N,) px, right row minus true
-    features: list[int] = field(default_factory=list)  # features in each frame
-    matched: list[int] = field(default_factory=list)  # features with a right match in each frame
     frames_of: dict[int, int] = field(default_factory=dict)  # number of frames of each feature
     # Largest number of consecutive frames of each feature on another surface.
     crossed: dict[int, int] = field(default_factory=dict)
-    trackable: int = 0  # features whose point is visible in the next frame
-    tracked: int = 0  # of these, tracked there within _OUTLIER_PX
     corners: int = 0  # repeatable corners
     corners_covered: int = 0  # of these, covered by one track in both images
-    reused: int = 0  # ids that reappeared after they were lost
 
 
 @dataclass
@@ -88,42 +80,20 @@ def evaluate(simulation: Simulation, frames: Iterable[StereoFrame], frontend: Fr
     for frame in frames:
         now = frontend.process(frame).observations
         now = now.take(~now.stale)
-        tally.features.append(len(now))
-        tally.matched.append(int(now.has_right.sum()))
-        alive = set() if before is None else set(before.ids.tolist())
+        compare(tally, simulation, before, now)
         for name in now.ids.tolist():
-            tally.reused += name in tally.frames_of and name not in alive
             tally.frames_of[name] = tally.frames_of.get(name, 0) + 1
-        left, right = views(simulation, int(simulation.taken_ns[frame.index]))
-        _evaluate_stereo(tally, simulation, now, left, right)
+        left = _left_view(simulation, frame.index)
         _evaluate_life(tally, birth, beyond, simulation, now, left, frame.index)
-        if before is not None and image_before is not None and frame.left is not None:
-            last = views(simulation, int(simulation.taken_ns[before.frame_index]))[0]
-            _evaluate_step(tally, simulation, before, now, last, left)
-            if frame.index % 5 == 0:
-                _evaluate_corners(tally, simulation, (before, image_before, last), (now, frame.left, left))
+        if before is not None and image_before is not None and frame.left is not None and frame.index % 5 == 0:
+            last = _left_view(simulation, before.frame_index)
+            _evaluate_corners(tally, simulation, (before, image_before, last), (now, frame.left, left))
         before, image_before = now, frame.left
     return tally
 
 
-def _evaluate_stereo(tally: Tally, simulation: Simulation, now: Observations, left: View, right: View) -> None:
-    seen = now.take(now.has_right)
-    true, visible = correspondence(simulation.world, left, right, seen.z[:, :2])
-    error = seen.z[:, 2:] - true
-    tally.disparity.append(-error[visible, 0])
-    tally.row.append(error[visible, 1])
-
-
-def _evaluate_step(
-    tally: Tally, simulation: Simulation, before: Observations, now: Observations, last: View, left: View
-) -> None:
-    true, visible = correspondence(simulation.world, last, left, before.z[:, :2])
-    _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
-    error = now.z[j, :2] - true[i]
-    tally.step.append(error[visible[i]])
-    trackable = visible & inside_image(left.camera, true, margin_px=_MARGIN_PX)
-    tally.trackable += int(trackable.sum())
-    tally.tracked += int((trackable[i] & (np.linalg.norm(error, axis=1) <= _OUTLIER_PX)).sum())
+def _left_view(simulation: Simulation, index: int) -> View:
+    return views(simulation, int(simulation.taken_ns[index]))[0]
 
 
 def _evaluate_life(
@@ -239,10 +209,10 @@ def figures(tally: Tally) -> dict[str, Any]:
         "stereo_least": int(min(tally.matched)),
         "step": _errors(tally.step),
         "since_birth": _errors(tally.since_birth),
-        "disparity": _errors(tally.disparity),
-        "row": _errors(tally.row),
+        "disparity": _errors([-error[:, 0] for error in tally.right]),
+        "row": _errors([error[:, 1] for error in tally.right]),
         "life_mean": float(lives.mean()),
-        "recall": tally.tracked / tally.trackable if tally.trackable else None,
+        "recall": tally.followed / tally.visible if tally.visible else None,
         "corner_recall": tally.corners_covered / tally.corners if tally.corners else None,
         "crossed": len(crossed) / tracked if tracked else None,
         "crossed_and_kept": int((crossed > _CROSSED_FRAMES).sum()) / tracked if tracked else None,

@@ -108,11 +108,7 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
 
 
 def _preset_or(path: Path) -> Path:
-    """Return the file of a preset where a path is its name, else the path.
-
-    Raises:
-        ConfigError: a bare name is neither a file's nor a preset's.
-    """
+    """Return the file of a preset where a path is its name, else the path."""
     if path.suffix or path.name != str(path) or path.is_file():
         return path
     preset = _PRESETS / f"{path}.yaml"

@@ -53,8 +53,8 @@ class FrontendReport:
 
 
 @dataclass(slots=True)
-class _Errors:
-    """Errors of all frames, one array a frame."""
+class FrontendErrors:
+    """Errors of a front end, one array a frame, pixels."""
 
     step: list[FloatArray] = field(default_factory=list)  # (N, 2)
     right: list[FloatArray] = field(default_factory=list)  # (N, 2)
@@ -102,22 +102,18 @@ def check_frontend(
     )
     simulation = plan(scenario)
     recording = SimulatedRecording(simulation)
-    frontend, errors = build(rectified_camera(simulation.rig)), _Errors()
+    frontend, errors = build(rectified_camera(simulation.rig)), FrontendErrors()
     before: Observations | None = None
     for frame in recording.events():
         if isinstance(frame, StereoFrame):
             now = _process(frontend, frame)
-            _compare(errors, simulation, before, now)
+            compare(errors, simulation, before, now)
             before = now
     return _report(errors)
 
 
 def _process(frontend: Frontend, frame: StereoFrame) -> Observations:
-    """Return the fresh observations of a frame.
-
-    Raises:
-        DataError: they are of another kind, or of another frame.
-    """
+    """Return the fresh observations of a frame."""
     output = frontend.process(frame)
     found = getattr(output, "observations", None)
     if not isinstance(found, Observations):
@@ -127,7 +123,8 @@ def _process(frontend: Frontend, frame: StereoFrame) -> Observations:
     return found.take(~found.stale)
 
 
-def _compare(errors: _Errors, simulation: Simulation, before: Observations | None, now: Observations) -> None:
+def compare(errors: FrontendErrors, simulation: Simulation, before: Observations | None, now: Observations) -> None:
+    """Add the errors of a frame's fresh observations, and of the step from those of the frame before."""
     left, right = _views(simulation, now)
     seen = now.take(now.has_right)
     true, visible = correspondence(simulation.world, left, right, seen.z[:, :2])
@@ -151,7 +148,7 @@ def _views(simulation: Simulation, seen: Observations) -> tuple[View, View]:
     return views(simulation, int(simulation.taken_ns[seen.frame_index]))
 
 
-def _report(errors: _Errors) -> FrontendReport:
+def _report(errors: FrontendErrors) -> FrontendReport:
     step, right = (np.concatenate(part) if part else np.zeros((0, 2)) for part in (errors.step, errors.right))
     good_step, good_right = (part[np.linalg.norm(part, axis=1) <= _CORRECT_PX] for part in (step, right))
     return FrontendReport(

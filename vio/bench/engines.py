@@ -79,11 +79,7 @@ def run_on_dask(
 
 
 def _check_workers(client: Any, jobs: Mapping[str, Job]) -> None:
-    """Refuse workers whose results would be others, before the first task; one that comes later refuses its tasks.
-
-    Raises:
-        VioError: a worker has other code or packages; the message names it.
-    """
+    """Refuse workers whose results would be others, before the first task; one that comes later refuses its tasks."""
     wanted = next(((job["code"], job["packages"]) for job in jobs.values() if "code" in job), None)
     if wanted is None:
         return

@@ -97,11 +97,7 @@ def _in_process(job: dict[str, Any], cache: Path) -> tuple[dict[str, Any] | None
 
 
 def _rendered(render: dict[str, Any], cache: Path) -> Path:
-    """Return the folder of a rendered recording, made now unless it is there.
-
-    Raises:
-        DataError: it cannot be rendered; the message is that of `vio render`.
-    """
+    """Return the folder of a rendered recording, made now unless it is there."""
     folder = cache / "renders" / render["key"]
     folder.parent.mkdir(parents=True, exist_ok=True)
     with folder.with_name(f".{folder.name}.lock").open("w") as stream:
@@ -117,11 +113,7 @@ def _rendered(render: dict[str, Any], cache: Path) -> Path:
 
 
 def _call(command: list[str], limit_s: float | None = None) -> tuple[int, str]:
-    """Run a command that ends with this process; return its status and the end of its stderr.
-
-    Raises:
-        TimeoutExpired: it took longer than the limit, and was ended.
-    """
+    """Run a command that ends with this process; return its status and the end of its stderr."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     with tempfile.TemporaryFile(mode="w+", encoding="utf-8", errors="replace") as words:
         process = subprocess.Popen(

@@ -101,6 +101,11 @@ def pose_nees(
         return None
 
 
+def nees_figures(values: FloatArray, name: str) -> dict[str, float]:
+    """Return mean, median and 95 % of NEES (M,), by names that begin with `name`."""
+    return {name: float(values.mean()), **{f"{name}_{q}": float(np.percentile(values, q)) for q in (50, 95)}}
+
+
 def absent_reasons(
     figures: Mapping[str, Any], *, has_reference: bool, positions_only: bool, peer: bool
 ) -> dict[str, str]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.bench.figures import pose_nees
+from vio.bench.figures import nees_figures, pose_nees
 from vio.errors import EvaluationError
 from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.evaluation.trajectories import Evaluation, evaluate
@@ -89,7 +89,8 @@ def map_figures(
             held, upright = mapped.in_map, result.motion == "imu"
             built = Trajectory(held.T_map_body, held.time_ns, result.body, held.frame)
             score = evaluate(built, reference, T_cam0_imu=result.T_cam0_body)
-            figures |= _nees_figures(score, built, held.covariance, result.T_cam0_body, upright=upright)
+            values = pose_nees(score, held.T_map_body, held.covariance, result.T_cam0_body, upright=upright)
+            figures |= {} if values is None else nees_figures(values, "map_nees")
         T_true = truth.reference.in_imu(result.T_cam0_body).T_world_body
         figures |= loop_figures(store, frames[truth.rows], T_true, result.T_cam0_body)
     return {name: value for name, value in figures.items() if value is not None}
@@ -135,25 +136,10 @@ def _causal_figures(
     if T_ref_map is not None:
         T_true = score.reference.in_imu(T_cam0_body).T_world_body
         figures["placed_wrong"] = wrong_share(T_ref_map @ causal.T_world_body[score.rows], T_true)
-        figures |= _nees_figures(score, causal, covariances, T_cam0_body, T_world_true=se3_inverse(T_ref_map))
+        T, world = causal.T_world_body, se3_inverse(T_ref_map)
+        values = pose_nees(score, T, covariances, T_cam0_body, upright=False, T_world_true=world)
+        figures |= {} if values is None else nees_figures(values, "map_nees")
     return figures
-
-
-def _nees_figures(
-    score: Evaluation,
-    poses: Trajectory,
-    covariances: FloatArray,
-    T_cam0_body: FloatArray,
-    *,
-    upright: bool = False,
-    T_world_true: FloatArray | None = None,
-) -> dict[str, float]:
-    """Return the NEES of poses with covariances (N, 6, 6) in a map; all arguments are those of `pose_nees`."""
-    values = pose_nees(score, poses.T_world_body, covariances, T_cam0_body, upright=upright, T_world_true=T_world_true)
-    if values is None:
-        return {}
-    quantiles = {f"map_nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}
-    return {"map_nees": float(values.mean()), **quantiles}
 
 
 def wrong_share(T: FloatArray, T_true: FloatArray) -> float:

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import yaml
 
 from vio.bench.bench import Place
 from vio.bench.identity import ROOT
-from vio.bench.suite import SUCCESS_PERCENT, Suite
+from vio.bench.suite import Sequence, Suite
 from vio.errors import ConfigError, DataError
 from vio.files.atomic import atomic_write_text
 
@@ -82,20 +83,19 @@ def _checked_out(commit: str, folder: Path) -> Path:
 
 
 def _as_yaml(suite: Suite) -> dict[str, Any]:
-    """Return a suite for any revision: without what only tables use, and with absolute paths."""
-    sequences = {}
-    for s in suite.sequences:
-        values: dict[str, Any] = {"source": s.source, "reference": s.reference, "stop": s.stop, "settings": s.settings}
-        values |= {"render": list(s.render) or None, "lengths_m": None if s.lengths_m is None else list(s.lengths_m)}
-        values |= {name: getattr(s, name) for name in ("render_each_seed", "positions_only", "exact_truth", "start")}
-        # Older revisions do not know all keys.
-        values |= {"map": s.map or None, "map_of": s.map_of, "covered": [list(span) for span in s.covered] or None}
-        sequences[s.name] = {name: value for name, value in values.items() if value is not None}
+    """Return a suite for any revision: without what only tables use, with absolute paths.
+
+    Older revisions do not know all keys: what has its default is left out.
+    """
+    sequences = {s.name: {key: value for key, value in _changed(s).items() if key != "name"} for s in suite.sequences}
     configurations = {
         name: {**values, **({"config": str(suite.folder / str(values["config"]))} if values.get("config") else {})}
         for name, values in suite.configurations.items()
     }
-    out: dict[str, Any] = {"name": suite.name, "sequences": sequences, "configurations": configurations}
-    out |= {"seeds": list(suite.seeds), "time_limit_s": suite.time_limit_s}
-    out["success_percent"] = suite.success_percent if suite.success_percent != SUCCESS_PERCENT else None
-    return {name: value for name, value in out.items() if value is not None}
+    limits = {key: value for key, value in _changed(suite).items() if key in ("time_limit_s", "success_percent")}
+    known = {"name": suite.name, "sequences": sequences, "configurations": configurations, "seeds": list(suite.seeds)}
+    return known | limits
+
+
+def _changed(record: Suite | Sequence) -> dict[str, Any]:
+    return {f.name: value for f in fields(record) if (value := getattr(record, f.name)) != f.default}

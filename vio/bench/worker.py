@@ -22,13 +22,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, pose_nees
+from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, nees_figures, pose_nees
 from vio.bench.identity import code_digest, package_versions
 from vio.config import Config, merge
 from vio.datasets import open_dataset
 from vio.datasets.frame_times import frames_between, parse_bound, used_frames
 from vio.errors import DataError, EvaluationError, VioError
 from vio.evaluation.association import associate
+from vio.evaluation.errors_along_path import path_length_m
 from vio.evaluation.trajectories import LEAST_POSES, Evaluation, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
@@ -111,11 +112,7 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
 
 
 def _truth(job: dict[str, Any], config: Config) -> _Truth:
-    """Open the recording of a job.
-
-    Raises:
-        VioError: it cannot be used, or its reference cannot be read.
-    """
+    """Open the recording of a job."""
     dataset = open_dataset(job["source"], config.dataset)
     stop = None if job["stop"] is None else parse_bound(job["stop"])
     first, end = frames_between(dataset.recording, parse_bound(job["start"]), stop)
@@ -229,7 +226,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         trajectory = result.trajectory
         figures: dict[str, Any] = {
             "frames": len(result.frames),
-            "path_m": float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()),
+            "path_m": path_length_m(trajectory.positions),
             "coverage": coverage(_used(truth, config), trajectory),
             "refused_share": refused_share(result.frames.column("used"), result.frames.column("gated")),
             "used_per_frame": float(np.mean(np.asarray(result.frames.column("used"), dtype=np.float64))),
@@ -301,17 +298,11 @@ def _nees(result: RunResult, score: Evaluation) -> dict[str, float | None]:
     stays = np.isfinite(np.array(rows.column("gravity_world"))).all(axis=1)
     upright: BoolArray = np.asarray(~stays if result.motion == "imu" else np.zeros_like(stays), dtype=np.bool_)
     values = pose_nees(score, T_world_imu, covariances, result.T_cam0_body, upright=upright)
-    if values is None:
-        return {"nees": None}
-    return {"nees": float(values.mean()), **{f"nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}}
+    return {"nees": None} if values is None else {**nees_figures(values, "nees")}
 
 
 def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
-    """Evaluate another system's trajectory on the recording.
-
-    Raises:
-        VioError: the file is damaged, or the recording has no reference.
-    """
+    """Evaluate another system's trajectory on the recording."""
     recording = truth.dataset.recording
     if truth.reference is None:
         raise DataError(f"{recording.path}: no ground truth; name one with reference: in the suite")

@@ -54,11 +54,16 @@ class Rectifier:
         return self.lenses
 
     @property
+    def cameras(self) -> tuple[CameraModel, ...]:
+        """The raw cameras: left and right, or the only one."""
+        return (self.lenses,) if isinstance(self.lenses, CameraModel) else (self.lenses.cam0, self.lenses.cam1)
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What rectifying keeps of a wide lens; nothing for a lens that a planar image can hold."""
         if self.maps is None:
             return ()
-        lens = self.lenses if isinstance(self.lenses, CameraModel) else self.lenses.cam0
+        lens = self.cameras[0]
         seen, kept = (np.degrees(field_of_view(camera)) for camera in (lens, self.camera))
         if seen.max() <= 2 * np.degrees(PINHOLE_REACH):
             return ()

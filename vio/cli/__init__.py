@@ -19,49 +19,28 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from importlib import import_module
 from types import FrameType
 
 from vio._version import __version__
-from vio.cli import (
-    bench,
-    calibrate,
-    check,
-    completion,
-    config,
-    convert,
-    demo,
-    evaluate,
-    export,
-    georeference,
-    inspect,
-    live,
-    localise,
-    map,
-    mesh,
-    play,
-    rectify,
-    refine,
-    render,
-    report,
-    reproduce,
-    ros2,
-    run,
-    view,
-)
 from vio.cli.output import NOTE
 from vio.errors import StoppedError, VioError
 from vio.files.printable import printable
 
+# The file of each command, by what it is for.
 BY_PURPOSE = {
-    "Try it": (demo,),
-    "Before a run": (inspect, calibrate, rectify, convert),
-    "Run": (run, config),
-    "Live": (live, ros2, play),
-    "Look and compare": (report, view, mesh, evaluate, export),
-    "Maps": (map, localise, georeference),
-    "Check without ground truth": (check, refine),
-    "Measure": (bench, render, reproduce),
-    "Shell": (completion,),
+    purpose: tuple(import_module(f"vio.cli.{name}") for name in names.split())
+    for purpose, names in {
+        "Try it": "demo",
+        "Before a run": "inspect calibrate rectify convert",
+        "Run": "run config",
+        "Live": "live ros2 play",
+        "Look and compare": "report view mesh evaluate export",
+        "Maps": "map localise georeference",
+        "Check without ground truth": "check refine",
+        "Measure": "bench render reproduce",
+        "Shell": "completion",
+    }.items()
 }
 _COMMANDS = tuple(module for modules in BY_PURPOSE.values() for module in modules)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import shlex
 from dataclasses import asdict
 from pathlib import Path
@@ -107,14 +106,18 @@ def _facts(report: CalibrationReport) -> dict[str, Any]:
 
 
 def _plain(record: Any) -> dict[str, Any]:
-    """Return a result as plain JSON types."""
+    """Return a result as plain JSON types, which have no NaN."""
     import numpy as np
 
     from vio.calibration.findings import NotObservable
 
     if isinstance(record, NotObservable):
         return {"verdict": str(record)}
-    return {key: _finite(v.tolist()) if isinstance(v, np.ndarray) else v for key, v in asdict(record).items()}
+    none = np.array(None)
+    return {
+        key: np.where(np.isfinite(v), v.astype(object), none).tolist() if isinstance(v, np.ndarray) else v
+        for key, v in asdict(record).items()
+    }
 
 
 def _parameters(found: SelfCalibration) -> dict[str, Any]:
@@ -128,13 +131,6 @@ def _parameters(found: SelfCalibration) -> dict[str, Any]:
         "points": found.points,
         "residual_px": found.residual_px,
     }
-
-
-def _finite(values: Any) -> Any:
-    """Return nested lists of numbers with None for non-finite values: JSON has no NaN."""
-    if isinstance(values, list):
-        return [_finite(value) for value in values]
-    return values if math.isfinite(values) else None
 
 
 def _rows(report: CalibrationReport) -> list[tuple[str, str]]:

@@ -84,8 +84,7 @@ def execute(args: argparse.Namespace) -> int:
         facts = {name: result.as_dict() for name, result in results.items()}
         print_result(facts, _side_by_side(results), as_json=args.json)
     if args.plot is not None:
-        from vio.runs.compared import draw_comparison
-        from vio.runs.picture import write_picture
+        from vio.runs.picture import draw_comparison, write_picture
 
         write_picture(args.plot, lambda: draw_comparison({printable(name): r for name, r in results.items()}))
         if not args.json:

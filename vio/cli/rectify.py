@@ -35,7 +35,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets import DatasetSettings, open_dataset
-    from vio.datasets.rectified import RectifiedDataset, check_not_rectified
+    from vio.datasets.image_pairs import ImageDataset
     from vio.files.atomic import atomic_folder, check_spares
     from vio.files.text import write_text
     from vio.offline.convert import convert, write_rectified_euroc
@@ -48,12 +48,8 @@ def execute(args: argparse.Namespace) -> int:
         logging.getLogger(__name__).log(NOTE, "%s", note)
     if recording.kind in ("plain", "bag", "video"):
         raise DataError(f"{recording.path} is of kind {recording.kind}; rectify it with vio convert --to euroc")
-    if not isinstance(dataset, RectifiedDataset):
-        raise DataError(
-            f"{recording.path} is of kind {recording.kind}, which is rectified already: there is nothing to do; the "
-            f"kinds that may need it are euroc, kitti_raw"
-        )
-    check_not_rectified(dataset)
+    if not isinstance(dataset, ImageDataset) or dataset.rectifier.maps is None:
+        raise DataError(f"{recording.path} is rectified already: there is nothing to do; use it as it is")
     camera = recording.camera
     facts = {
         "kind": recording.kind,

@@ -20,8 +20,8 @@ __all__ = ["READERS", "DatasetSettings", "in_colour", "open_dataset"]
 
 # Module and function of the reader of each kind, imported when it is needed.
 READERS = {
-    "kitti": "kitti:read_kitti",
-    "kitti_raw": "kitti_raw:read_kitti_raw",
+    "kitti": "plain:read_kitti",
+    "kitti_raw": "plain:read_kitti_raw",
     "euroc": "euroc:read_euroc",
     "plain": "plain:read_plain",
     "mono": "plain:read_mono",
@@ -154,10 +154,10 @@ def _folder_kind(path: Path) -> str | None:
     from vio.datasets.bags import is_bag
     from vio.datasets.euroc import is_euroc_folder
     from vio.datasets.gtsam import factor_files
-    from vio.datasets.kitti import is_kitti_folder
-    from vio.datasets.kitti_raw import is_kitti_raw_folder
     from vio.datasets.plain import (
         holds_more_than_kitti,
+        is_kitti_folder,
+        is_kitti_raw_folder,
         is_mono_folder,
         is_plain_folder,
         is_rgbd_folder,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -56,13 +57,60 @@ def find_calibration_of(layout: Layout) -> Path:
 
 
 @dataclass(frozen=True, slots=True)
-class Companions:
-    """A recording of image files or videos, and what its frames are read with."""
+class Beside:
+    """What lies beside the images of a recording."""
 
-    recording: Recording
-    motion: Sequence[MotionSample]  # in time order
-    rectifier: Rectifier
-    sizes: tuple[ImageSize, ...]  # of each camera
+    motion: MotionSamples[MotionSample]  # in time order
+    motion_notes: Sequence[str]
+    reference: Trajectory | None
+    files: Sequence[Path]  # that were read, or are known not to matter
+
+
+Parts: TypeAlias = tuple[
+    Recording, MotionSamples[MotionSample], tuple[ImageSize, ...], DatasetSettings, Rectifier
+]  # of an `ImageRecording`
+
+
+def parts_of(
+    kind: str,
+    layout: Layout,
+    rectifier: Rectifier,
+    settings: DatasetSettings,
+    times_ns: IntArray,
+    beside: Beside,
+    notes: Sequence[str],
+    stated_by: Sequence[Path],
+    *,
+    has_body: bool = True,
+) -> Parts:
+    """Return what a recording of image files or videos is made of.
+
+    Args:
+        kind: of the recording.
+        layout: where its parts lie.
+        rectifier: of its images.
+        settings: reader settings.
+        times_ns: of the frames (F,).
+        beside: what was read beside the images.
+        notes: about all but motion samples.
+        stated_by: file that states the size of the images, for each camera.
+        has_body: whether the pose of an IMU is known.
+    """
+    recording = Recording(
+        kind=kind,
+        path=layout.root,
+        camera=rectifier.camera,
+        T_cam0_imu=rectifier.T_rect0_imu if has_body else None,
+        frame_times_ns=times_ns,
+        has_images=True,
+        motion=beside.motion.kinds,
+        reference=beside.reference,
+        notes=(*notes, *rectifier.notes, *beside.motion_notes, *unused_note(layout, beside.files)),
+        motion_notes=tuple(beside.motion_notes),
+    )
+    cameras = zip(rectifier.cameras, stated_by, strict=True)
+    sizes = tuple(ImageSize(camera.width, camera.height, file) for camera, file in cameras)
+    return recording, beside.motion, sizes, settings, rectifier
 
 
 def read_companions(
@@ -74,8 +122,9 @@ def read_companions(
     notes: Sequence[str],
     used: Sequence[Path],
     *,
+    reference: Trajectory | None = None,
     has_depths: bool = False,
-) -> Companions:
+) -> Parts:
     """Read what lies beside images: the pose of the IMU, its samples, velocities and ground truth.
 
     Args:
@@ -86,6 +135,7 @@ def read_companions(
         times: of the frames (F,), and the file that they are from; None: assumed.
         notes: about images and times.
         used: further files and folders that were read, or are known not to matter.
+        reference: ground truth that was read already.
         has_depths: whether one camera has depth images.
 
     Raises:
@@ -98,23 +148,16 @@ def read_companions(
     with naming(file):
         depth_noise = settings.depth_noise if has_depths else None
         rectifier = rig.rectifier(settings.interpolation, settings.projection, depth_noise=depth_noise)
-    reference, reference_file = _read_reference(layout, rig, rectifier, times_ns)
-    read = [file, times_file, *extrinsics, *motion_files, reference_file, *used]
-    unused = unused_note(layout, [source for source in read if source is not None])
+    reference_file = None
+    if reference is None:
+        reference, reference_file = _read_reference(layout, rig, rectifier, times_ns)
+    read = [source for source in (file, times_file, reference_file) if source is not None]
+    beside = Beside(motion, motion_notes, reference, [*read, *extrinsics, *motion_files, *used])
     has_body = rig.T_cam0_imu is not None and (rig.cam1 is not None or len(motion_files) > 0)
-    recording = Recording(
-        kind=kind,
-        path=layout.root,
-        camera=rectifier.camera,
-        T_cam0_imu=rectifier.T_rect0_imu if has_body else None,
-        frame_times_ns=times_ns,
-        has_images=True,
-        motion=frozenset("velocity" if file.name == "velocity.csv" else "imu" for file in motion_files),
-        reference=reference,
-        notes=(*notes, *rig.notes, *rectifier.notes, *motion_notes, *unused),
-        motion_notes=tuple(motion_notes),
+    stated_by = [file] * len(rig.cameras)
+    return parts_of(
+        kind, layout, rectifier, settings, times_ns, beside, (*notes, *rig.notes), stated_by, has_body=has_body
     )
-    return Companions(recording, motion, rectifier, tuple(ImageSize(c.width, c.height, file) for c in rig.cameras))
 
 
 def _with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Path]]:
@@ -127,13 +170,13 @@ def _with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Pa
 
 def _read_motion(
     layout: Layout, rig: Rig, times_ns: IntArray, timed: bool
-) -> tuple[Sequence[MotionSample], list[Path], list[str]]:
+) -> tuple[MotionSamples[MotionSample], list[Path], list[str]]:
     """Read the IMU and the velocities, on the clock of the images; return the samples, their files and notes."""
     imu = next((f for base in (layout.root, layout.base) for n in IMU_FILES if (f := base / n).is_file()), None)
     velocity = layout.root / "velocity.csv"
     files = [f for f in (imu, velocity) if f is not None and f.is_file()]
     if not files:
-        return (), [], []
+        return in_time_order(), [], []
     if not timed:
         raise DataError(f"{files[0]}: needs the times of the images on the same clock; add times.txt, or remove it")
     if rig.T_cam0_imu is None:

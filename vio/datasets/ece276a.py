@@ -69,7 +69,7 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
     )
     linear = _velocities(arrays, linear_key, path, count)
     angular = _velocities(arrays, angular_key, path, count)
-    tracks, stale_frames, notes = resolve_repeats(
+    tracks, notes = resolve_repeats(
         tracks_from_dense(features, path), moving_frames(linear, angular), settings.repeated_tracks
     )
     T_cam0_imu, extrinsics_notes = _resolve_extrinsics(
@@ -87,7 +87,7 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
         notes=(*extrinsics_notes, *notes),
     )
     motion = velocity_samples(times_ns, linear, angular)
-    return FeatureDataset(recording, tracks, motion, np.arange(count), stale_frames)
+    return FeatureDataset(recording, tracks, motion, np.arange(count))
 
 
 def _array(

@@ -19,22 +19,21 @@ import numpy as np
 
 from vio.cameras.rig import rectifier_of
 from vio.datasets.common import naming
-from vio.datasets.companions import check_overlap
+from vio.datasets.companions import Beside, check_overlap, parts_of
 from vio.datasets.euroc_files import STATE_CSV, TUM_FILE, read_camera_yaml, read_imu_yaml
-from vio.datasets.frame_times import PAIRED_NS, pair_stamps
+from vio.datasets.frame_times import paired
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
-from vio.datasets.image_pairs import ImageSize, full_scale
+from vio.datasets.image_pairs import ImageDataset, full_scale
 from vio.datasets.images import list_images
-from vio.datasets.rectified import RectifiedDataset
-from vio.datasets.samples import MotionSamples, imu_samples
+from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import read_imu_table, stamped_rows
-from vio.datasets.unused import Layout, unused_note
+from vio.datasets.unused import Layout
 from vio.errors import DataError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.records import ImuDensities, ImuSample, IntArray, Recording, Trajectory
+from vio.records import ImuDensities, IntArray, MotionSample, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +54,7 @@ def is_euroc_folder(path: Path) -> bool:
     return (path / "mav0").is_dir() or any((path / "cam0" / name).is_file() for name in ("sensor.yaml", "data.csv"))
 
 
-def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
+def read_euroc(path: Path, settings: DatasetSettings) -> ImageDataset:
     """Read an EuRoC folder.
 
     Raises:
@@ -79,32 +78,11 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     truth = next((file for file in candidates if file.is_file()), None)
     read = [mav / name / file for name in ("cam0", "cam1", "imu0") for file in ("sensor.yaml", "data.csv")]
     layout = Layout(path, mav, mav / "cam0" / "data", mav / "cam1" / "data")
-    unused = unused_note(layout, read if truth is None else [*read, truth])
-    recording = Recording(
-        kind="euroc",
-        path=path,
-        camera=rectifier.camera,
-        T_cam0_imu=rectifier.T_rect0_imu,
-        frame_times_ns=times_ns,
-        has_images=True,
-        motion=frozenset({"imu"}) if samples else frozenset(),
-        reference=None if truth is None else _read_reference(truth, T_body_imu, rig.T_imu_cam0),
-        notes=(*notes, *imu_notes, *depth_notes, *rectifier.notes, *unused),
-        motion_notes=imu_notes,
-    )
-    return RectifiedDataset(
-        recording=recording,
-        pairs=pairs,
-        motion=samples,
-        rectifier=rectifier,
-        sizes=tuple(
-            ImageSize(camera.width, camera.height, mav / name / "sensor.yaml")
-            for name, camera in (("cam0", rig.cam0), ("cam1", rig.cam1))
-        ),
-        settings=settings,
-        imu_noise=noise,
-        white=white,
-    )
+    reference = None if truth is None else _read_reference(truth, T_body_imu, rig.T_imu_cam0)
+    beside = Beside(samples, imu_notes, reference, read if truth is None else [*read, truth])
+    sheets = [mav / name / "sensor.yaml" for name in ("cam0", "cam1")]
+    parts = parts_of("euroc", layout, rectifier, settings, times_ns, beside, (*notes, *depth_notes), sheets)
+    return ImageDataset(*parts, pairs, imu_noise=noise, white=white)
 
 
 def euroc_base(path: Path) -> Path:
@@ -150,13 +128,7 @@ def _find_images(there: ImageFiles, names: Sequence[str], path: Path, lines: Seq
 
 def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray, tuple[str, ...]]:
     """Indices (F,), (F,) of the left and right images that form pairs, and notes about the pairing."""
-    a, b = pair_stamps(left.times_ns, right.times_ns)
-    if not len(a):
-        spans = [f"{c.times_ns[0]} to {c.times_ns[-1]} ns" for c in (left, right)]
-        raise DataError(
-            f"{mav}: no image of cam0 ({spans[0]}) has one of cam1 ({spans[1]}) within {PAIRED_NS / 1e6:g} ms; "
-            "both data.csv must use one clock and come from one recording"
-        )
+    a, b, differing = paired(left.times_ns, right.times_ns, ("cam0", "cam1"), mav)
     notes: list[str] = []
     if renamed := left.renamed + right.renamed:
         notes.append(f"{renamed} images have another extension than listed in their data.csv; matched by their stem")
@@ -171,16 +143,7 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
             f"{left.unlisted} images of cam0 and {right.unlisted} of cam1 are not listed in their data.csv and are "
             "skipped"
         )
-    unpaired = len(left.times_ns) - len(a), len(right.times_ns) - len(b)
-    if any(unpaired):
-        notes.append(f"{unpaired[0]} images of cam0 and {unpaired[1]} of cam1 have no partner and are skipped")
-    offset_ms = float(np.median(right.times_ns[b] - left.times_ns[a])) / 1e6
-    if np.any(right.times_ns[b] != left.times_ns[a]):
-        notes.append(
-            f"the stamps of cam1 differ from those of cam0 (median {offset_ms:+.3f} ms); each left image is paired "
-            "with the nearest right one"
-        )
-    return a, b, tuple(notes)
+    return a, b, (*notes, *differing)
 
 
 # --- inertial record and ground truth -------------------------------------------------------------------------------
@@ -188,17 +151,17 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
 
 def _read_imu(
     folder: Path,
-) -> tuple[FloatArray, ImuDensities | None, MotionSamples[ImuSample] | tuple[()], tuple[str, ...]]:
+) -> tuple[FloatArray, ImuDensities | None, MotionSamples[MotionSample], tuple[str, ...]]:
     """Return `T_body_imu` (4, 4), noise, samples and notes; the body is the IMU where there is no folder of one."""
     T_body_imu, noise, notes = np.eye(4), None, list[str]()
     if not folder.is_dir():
-        return T_body_imu, noise, (), ()
+        return T_body_imu, noise, in_time_order(), ()
     if (path := folder / "sensor.yaml").is_file():
         T_body_imu, noise = read_imu_yaml(path)
     else:
         notes.append(f"{path} is missing; the IMU is assumed to be the body frame, its noise is unknown")
     record, notes_read = read_imu_table(folder / "data.csv", cut=notes, whole_ns=True)
-    return T_body_imu, noise, imu_samples(record), (*notes, *notes_read)
+    return T_body_imu, noise, in_time_order(imu_samples(record)), (*notes, *notes_read)
 
 
 def _read_reference(file: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -> Trajectory:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.datasets.common import image_size, naming
-from vio.datasets.yaml_files import as_number, densities_text, imu_densities, numbers, read_yaml_file
+from vio.datasets.yaml_files import as_number, densities_text, imu_densities, lens_model, numbers, read_yaml_file
 from vio.errors import CalibrationError
 from vio.files.text import exact_text, write_text
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair, rig_from_rectified
@@ -22,13 +22,6 @@ from vio.geometry.lie import FloatArray, checked_transform, quat_xyzw_from_rotat
 from vio.geometry.stereo import StereoCamera
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
 
-DISTORTION_MODELS: dict[str, DistortionModel] = {
-    "radial-tangential": "radtan",
-    "radtan": "radtan",
-    "plumb_bob": "radtan",
-    "equidistant": "equidistant",
-    "none": "pinhole",
-}
 SENSOR_YAML_MODELS: tuple[DistortionModel, ...] = ("pinhole", "radtan", "equidistant")  # those it has a name for
 STATE_CSV = Path("state_groundtruth_estimate0", "data.csv")  # ground truth, within mav0
 TUM_FILE = "groundtruth_tum.txt"  # ground truth beside mav0
@@ -57,12 +50,7 @@ def read_camera_yaml(path: Path) -> tuple[CameraModel, FloatArray]:
     entries = read_yaml_file(path)
     if (kind := entries.get("camera_model", "pinhole")) != "pinhole":
         raise CalibrationError(f"{path}: camera_model {kind!r} is not supported; only 'pinhole' is (with distortion)")
-    name = entries.get("distortion_model", "none")
-    if not isinstance(name, str) or name not in DISTORTION_MODELS:
-        raise CalibrationError(
-            f"{path}: distortion_model {name!r} is unknown; the known ones are {', '.join(DISTORTION_MODELS)}"
-        )
-    model = DISTORTION_MODELS[name]
+    model = lens_model(entries.get("distortion_model", "none"), path)
     coefficients = () if model == "pinhole" else numbers(entries, "distortion_coefficients", path)
     if model == "radtan" and not any(coefficients):
         model, coefficients = "pinhole", ()

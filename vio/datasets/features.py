@@ -8,17 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.datasets.common import blank_frames, frame_range, merge_events
-from vio.geometry.lie import FloatArray
-from vio.records import BoolArray, Event, FeatureTracks, IntArray, MotionSample, Observations, Recording
-
-
-@dataclass(frozen=True, slots=True)
-class SensorVariances:
-    """Noise variances supplied with the recording."""
-
-    linear: FloatArray  # (3,) (m/s)^2
-    angular: FloatArray  # (3,) (rad/s)^2
-    pixels: FloatArray  # (4,) px^2 of [ul vl ur vr]
+from vio.records import Event, FeatureTracks, IntArray, MotionSample, Observations, Recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +19,6 @@ class FeatureDataset:
     tracks: FeatureTracks
     motion: Sequence[MotionSample]  # in time order
     present: IntArray  # (P,) numbers of the frames that events may yield, increasing
-    stale_frames: BoolArray  # (F,) more than half of the continued tracks repeat their pixels while moving
-    variances: SensorVariances | None = None
 
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order, without images.

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -103,6 +105,34 @@ def pair_stamps(left_ns: IntArray, right_ns: IntArray) -> tuple[IntArray, IntArr
         return equal_a.astype(np.int64), equal_b.astype(np.int64)
     steady = near & (np.abs(offset - np.median(offset[near])) <= _JITTER_NS)
     return a[steady], b[steady]
+
+
+def paired(
+    left_ns: IntArray, right_ns: IntArray, names: Sequence[str], where: Path
+) -> tuple[IntArray, IntArray, list[str]]:
+    """Return what `pair_stamps` does of the images of two cameras, and notes about images that differ or are alone.
+
+    Raises:
+        DataError: no image of the left camera has one of the right camera.
+    """
+    a, b = pair_stamps(left_ns, right_ns)
+    if not len(a):
+        left, right = (f"{name} ({t[0]} to {t[-1]} ns)" for name, t in zip(names, (left_ns, right_ns), strict=True))
+        raise DataError(
+            f"{where}: no image of {left} has one of {right} within {PAIRED_NS / 1e6:g} ms; the cameras must "
+            "be synchronised, and their stamps of one clock"
+        )
+    notes = []
+    alone = len(left_ns) - len(a), len(right_ns) - len(b)
+    if any(alone):
+        notes.append(f"{alone[0]} images of {names[0]} and {alone[1]} of {names[1]} have no partner and are skipped")
+    if np.any(right_ns[b] != left_ns[a]):
+        offset_ms = float(np.median(right_ns[b] - left_ns[a])) / 1e6
+        notes.append(
+            f"the stamps of {names[1]} differ from those of {names[0]} (median {offset_ms:+.3f} ms); each left image "
+            "is paired with the nearest right one"
+        )
+    return a, b, notes
 
 
 def nearest(of: IntArray, among: IntArray) -> IntArray:

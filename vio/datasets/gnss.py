@@ -74,11 +74,7 @@ def _read_oxts(folder: Path) -> GnssFixes:
 
 
 def _read_navsatfix(path: Path, topic: str | None) -> GnssFixes:
-    """Read the positions of a bag's only topic of NavSatFix, or of the one named.
-
-    Raises:
-        DataError: there is no such topic, or several, or the bag is damaged.
-    """
+    """Read the positions of a bag's only topic of NavSatFix, or of the one named."""
     times, positions, covariances, lost = [], [], [], 0
     with Bag(path) as bag:
         found = [t.name for t in bag.topics if t.kind == _NAVSATFIX and t.count and topic in (None, t.name)]

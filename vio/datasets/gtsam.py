@@ -83,7 +83,7 @@ def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDa
             f"not used: the points X Y Z of {file.name}",
         ),
     )
-    return FeatureDataset(recording, tracks, (), np.arange(len(numbers)), np.zeros(len(numbers), dtype=np.bool_))
+    return FeatureDataset(recording, tracks, (), np.arange(len(numbers)))
 
 
 def _only_file(path: Path) -> Path:

@@ -10,12 +10,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+from vio.cameras.rig import Rectifier
 from vio.datasets.common import blank_frames, chosen_frames, merge_events
 from vio.datasets.image_files import FilePairs, stem_of
 from vio.datasets.images import (
     WHITE_16,
     UnreadableImageError,
     list_images,
+    load_depth,
     load_gray,
     prefetch,
     white_level,
@@ -23,7 +25,8 @@ from vio.datasets.images import (
 )
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
-from vio.records import Event, Image, MotionSample, Observations, Recording, StereoFrame
+from vio.geometry.lie import FloatArray
+from vio.records import Event, Image, ImuDensities, MotionSample, Observations, Recording, StereoFrame
 
 logger = logging.getLogger(__name__)
 
@@ -120,8 +123,8 @@ def first_readable(pairs: ImagePairs) -> tuple[Path, Image, int]:
     return last, *load_gray(last)
 
 
-def measured_images(pairs: ImagePairs) -> tuple[Path, tuple[int, int], int, tuple[str, ...]]:
-    """Return the first left image that can be read, its width and height, the level of white of all, and notes.
+def measured_images(pairs: ImagePairs) -> tuple[tuple[int, int], int, tuple[str, ...]]:
+    """Return width and height of the first left image that can be read, the level of white of all, and notes.
 
     Raises:
         UnreadableImageError: all left images are unreadable.
@@ -130,7 +133,7 @@ def measured_images(pairs: ImagePairs) -> tuple[Path, tuple[int, int], int, tupl
     white, notes = full_scale(pairs)
     if bits == 16 and not notes:
         notes = (f"images have 16 bits ({path.name}); scaled to 8 bits by 1/257",)
-    return path, (image.shape[1], image.shape[0]), white, notes
+    return (image.shape[1], image.shape[0]), white, notes
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,19 +148,21 @@ class ImageSize:
         """Raise UnreadableImageError unless an image (H, W) or (H, W, 3) has this size."""
         if image.shape[:2] != (self.height, self.width):
             raise UnreadableImageError(
-                f"{path} is {image.shape[1]} x {image.shape[0]} pixels but {self.stated_by} specifies {self.width} x "
+                f"{path} is {image.shape[1]} x {image.shape[0]} pixels but {self.stated_by} is for {self.width} x "
                 f"{self.height}; give images of one size, and the calibration of these images"
             )
 
 
 @dataclass(frozen=True, slots=True)
 class ImageRecording(ABC):
-    """Implements `vio.protocols.Dataset` over images, which a subclass reads."""
+    """Implements `vio.protocols.Dataset` over images, which a subclass reads; they are rectified as they are read."""
 
     recording: Recording
     motion: Sequence[MotionSample] = field(repr=False)  # in time order
     sizes: tuple[ImageSize, ...]  # of the left and the right images; one of one camera
     settings: DatasetSettings
+    rectifier: Rectifier
+    imu_noise: ImuDensities | None = field(default=None, kw_only=True)
     colour: bool = field(default=False, kw_only=True)  # see `in_colour`
 
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
@@ -183,25 +188,36 @@ class ImageRecording(ABC):
 
 @dataclass(frozen=True, slots=True)
 class ImageDataset(ImageRecording):
-    """Implements `vio.protocols.Dataset` over image files that are rectified."""
+    """Implements `vio.protocols.Dataset` over image files."""
 
     pairs: ImagePairs
     white: int = field(default=WHITE_16, kw_only=True)  # level of white of 16-bit files, from `full_scale`
-
-    def frame(self, index: int, left: Image, right: Image | None = None) -> StereoFrame:
-        """Return a frame of images as read from the files (H, W each), which are rectified."""
-        return StereoFrame(index, int(self.recording.frame_times_ns[index]), left, right)
+    depths: Sequence[Path] | None = field(default=None, kw_only=True)  # depth image of each frame; None: there are none
+    depth_factor: float = field(default=1.0, kw_only=True)  # levels of a depth image per metre
 
     def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
         return readable_frames(self._load, chosen, self.settings)
 
     def _load(self, index: int) -> StereoFrame | BadFrame:
-        """Read one frame; runs in the prefetch thread."""
+        """Read and rectify one frame; runs in the prefetch thread."""
+        time_ns = int(self.recording.frame_times_ns[index])
         try:
             images = []
             for size, path in zip(self.sizes[: self.settings.cameras], self.pairs[index], strict=False):
                 images.append(load_gray(path, self.white, colour=self.colour)[0])
                 size.check(images[-1], path)
-            return self.frame(index, *images)
+            depth_m = None if self.depths is None else _depth_m(self.depths[index], images[0], self.depth_factor)
+            return self.rectifier.frame(index, time_ns, *images, depth_m=depth_m)
         except UnreadableImageError as error:
             return BadFrame(index, str(error))
+
+
+def _depth_m(file: Path, image: Image, factor: float) -> FloatArray:
+    """Read the depths (H, W) of an image (H, W), metres."""
+    levels = load_depth(file)
+    if levels.shape != image.shape[:2]:
+        raise UnreadableImageError(
+            f"{file} is {levels.shape[1]} x {levels.shape[0]} pixels, but its image is {image.shape[1]} x "
+            f"{image.shape[0]}; depth images must be registered to the images"
+        )
+    return levels / factor

@@ -223,8 +223,7 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
         notes=tuple(str(note) for note in arrays["notes"]),
         run_motion=cast(RunMotion, str(arrays["run_motion"])) if "run_motion" in arrays else None,
     )
-    stale_share = [bool(len(o) and o.mean() > 0.5) for o in np.split(tracks.stale, dense_offsets[1:-1])]
-    return FeatureDataset(recording, tracks, motion, frames, np.array(stale_share, dtype=np.bool_))
+    return FeatureDataset(recording, tracks, motion, frames)
 
 
 def _checked(arrays: Mapping[str, np.ndarray], path: Path) -> Mapping[str, np.ndarray]:

@@ -1,7 +1,7 @@
-"""A plain folder of images: one image folder, two, or one with depth images, a calibration, and what else lies there.
+"""Folders of images: KITTI's, and plain ones of one camera, two, or one with depth images.
 
-Images: `left right`, `image_0 image_1`, `cam0 cam1` and other usual names, the files in the folder or in its `data` or
-`images`. Calibration: any that `vio.load_rig` reads. Optional: `times.txt`, `imu.csv`, `velocity.csv`,
+A plain folder has images in `left right`, `image_0 image_1`, `cam0 cam1` and other usual names, in the folder or in its
+`data` or `images`. Calibration: any that `vio.load_rig` reads. Optional: `times.txt`, `imu.csv`, `velocity.csv`,
 `T_cam0_imu.txt`, and ground truth in `reference.tum`. TUM-VI in both of its forms is such a folder. What lies there
 and is not used is named in the recording's notes.
 
@@ -23,17 +23,19 @@ from vio.cameras.rig import Rig
 from vio.datasets.companions import IMU_FILES, calibration_beside, find_calibration_of, read_companions
 from vio.datasets.frame_times import pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles
-from vio.datasets.image_pairs import ImagePairs, measured_images
+from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
 from vio.datasets.images import SUFFIXES, list_images
-from vio.datasets.rectified import RectifiedDataset
-from vio.datasets.rigs import find_calibration, load_rig
+from vio.datasets.kitti_raw import CAMERAS, find_above
+from vio.datasets.rigs import find_calibration, kitti_rig, load_rig
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.tables import drive_times, is_date, parse_stamps, stamped_rows
+from vio.datasets.tables import drive_times, is_date, stamped_rows
 from vio.datasets.tum_rgbd import LISTS, associated_images, is_tum_folder, published_camera
 from vio.datasets.unused import Layout
 from vio.errors import CalibrationError, DataError
-from vio.files.text import text_lines
-from vio.records import NS_PER_S, IntArray
+from vio.files.text import parse_stamps, text_lines
+from vio.files.trajectories import read_trajectory
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.records import NS_PER_S, IntArray, Trajectory
 
 _PAIRS: tuple[tuple[str, ...], ...] = (
     ("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_00", "image_01"),
@@ -42,9 +44,21 @@ _PAIRS: tuple[tuple[str, ...], ...] = (
     ("image_lcam_front", "image_rcam_front"), ("infra1", "infra2"),
 )  # fmt: skip
 ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
+_GRAY, _COLOUR = (0, 1), (2, 3)  # of KITTI
 _INSIDE = ("data", "images", "")
+_DRIVE_NS = 100_000_000  # between frames of a KITTI drive
 _SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
+
+
+def is_kitti_folder(path: Path) -> bool:
+    """Return whether a folder looks like a KITTI sequence."""
+    return any((path / f"image_{k}").is_dir() for k in range(4))
+
+
+def is_kitti_raw_folder(path: Path) -> bool:
+    """Return whether a folder looks like a KITTI raw drive."""
+    return (path / "image_00").is_dir()
 
 
 def is_plain_folder(path: Path) -> bool:
@@ -115,7 +129,7 @@ class _Images:
     listed_ns: IntArray | None = None  # times in TUM's lists; None: those of any plain folder
 
 
-def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
+def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
     """Read a plain folder of stereo images.
 
     Raises:
@@ -130,7 +144,65 @@ def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     return _read("plain", layout, _Images(pairs, notes), settings)
 
 
-def read_mono(path: Path, settings: DatasetSettings) -> RectifiedDataset:
+def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
+    """Read a KITTI odometry folder.
+
+    Official: `sequences/NN/` with `image_0 image_1 calib.txt times.txt` (and `image_2 image_3` in colour), poses in
+    `../../poses/NN.txt`. Self-contained: the same with, where there are any, `poses.txt`, `velocity.csv` (in the IMU's
+    frame) and `T_cam0_imu.txt`. Poses and extrinsics of KITTI's camera 0 are transformed to the left camera used.
+
+    Raises:
+        DataError: files are missing, counts differ or a clock is wrong; the message names file and remedy.
+        CalibrationError: the calibration is missing or invalid.
+    """
+    cameras = _choose_cameras(path, settings.colour)
+    layout = Layout(path, path, *(path / f"image_{k}" for k in cameras))
+    pairs = pair_images(layout.left, layout.right)
+    size, white, notes = measured_images(pairs)
+    file, times_file = path / "calib.txt", path / "times.txt"
+    rig, T_left_cam0 = kitti_rig(file, size, cameras)
+    if not times_file.is_file():
+        raise DataError(f"{times_file} is missing; it holds one time in seconds for each image")
+    times_ns = times_of(times_file, pairs)
+    poses = _poses_file(path)
+    reference = None if poses is None else _read_reference(poses, times_ns, T_left_cam0)
+    used = [] if poses is None else [poses]
+    times = times_ns, times_file
+    parts = read_companions("kitti", layout, (file, rig), settings, times, notes, used, reference=reference)
+    return ImageDataset(*parts, pairs, white=white)
+
+
+def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
+    """Read the gray pair of a KITTI raw drive: `image_00/data/0000000000.png`, `image_01/data/…`.
+
+    The drives named `_extract` are unrectified: they are rectified as they are read, with rotations computed here
+    (`R_rect_00` and `P_rect_00` belong to KITTI's). The drives named `_sync` are rectified already; the image size
+    distinguishes the two. The IMU's record (`oxts`) is not read.
+
+    Raises:
+        DataError: images are missing, counts differ or a clock is wrong; the message names file and remedy.
+        CalibrationError: the calibration is missing or invalid.
+    """
+    layout = Layout(path, path, *(path / name / "data" for name in ("image_00", "image_01")))
+    for folder in (layout.left, layout.right):
+        if not folder.is_dir():
+            raise DataError(f"{path}: holds no {folder.relative_to(path)}; give a KITTI raw drive with both cameras")
+    pairs = pair_images(layout.left, layout.right)
+    file = find_above(path, CAMERAS)
+    if file is None:
+        raise CalibrationError(
+            f"{path}: {CAMERAS} is neither there nor in the folders above; copy KITTI's calibration of that day there"
+        )
+    size, white, notes = measured_images(pairs)
+    rig = load_rig(file, image_size=size, cameras=2)
+    used = [path / name / "timestamps.txt" for name in ("image_00", "image_01")]  # one trigger: the left ones serve
+    times_ns, time_notes = _drive_times(used[0], _frame_numbers(pairs))
+    calibration, times = (file, rig), (times_ns, used[0])
+    parts = read_companions("kitti_raw", layout, calibration, settings, times, (*time_notes, *notes), used)
+    return ImageDataset(*parts, pairs, white=white)
+
+
+def read_mono(path: Path, settings: DatasetSettings) -> ImageDataset:
     """Read a folder of one camera.
 
     Raises:
@@ -144,7 +216,7 @@ def read_mono(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     return _read("mono", layout, _Images(FilePairs(files, files)), settings)
 
 
-def read_rgbd(path: Path, settings: DatasetSettings) -> RectifiedDataset:
+def read_rgbd(path: Path, settings: DatasetSettings) -> ImageDataset:
     """Read a folder of images and depth images.
 
     Raises:
@@ -168,9 +240,9 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     return _read("rgbd", layout, _Images(FilePairs(files, files), depths=depths_of_files), settings)
 
 
-def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings) -> RectifiedDataset:
+def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings) -> ImageDataset:
     """Read what goes with the images: calibration, times, motion samples and ground truth."""
-    _, size, white, notes = measured_images(images.pairs)
+    size, white, notes = measured_images(images.pairs)
     is_tum, used = images.listed_ns is not None, list[Path]()
     file = settings.calibration or (calibration_beside(layout) if is_tum else find_calibration_of(layout))
     if file is None:
@@ -190,9 +262,36 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
     if kind != "plain" and times_file == layout.left:  # EuRoC's list repeats the times that the images are named by
         used.append(layout.left.parent / "data.csv")
     times, notes, has_depths = (times_ns, times_file), (*images.notes, *notes), images.depths is not None
-    found = read_companions(kind, layout, (file, rig), settings, times, notes, used, has_depths=has_depths)
-    common = found.recording, found.motion, found.sizes, settings, images.pairs, found.rectifier
-    return RectifiedDataset(*common, rig.imu_noise, images.depths, depth_factor, white=white)
+    parts = read_companions(kind, layout, (file, rig), settings, times, notes, used, has_depths=has_depths)
+    return ImageDataset(
+        *parts, images.pairs, imu_noise=rig.imu_noise, white=white, depths=images.depths, depth_factor=depth_factor
+    )
+
+
+def _choose_cameras(path: Path, colour: bool | None) -> tuple[int, int]:
+    wanted = [_GRAY, _COLOUR] if colour is None else [_COLOUR] if colour else [_GRAY]
+    for cameras in wanted:
+        if (path / f"image_{cameras[0]}").is_dir() and (path / f"image_{cameras[1]}").is_dir():
+            return cameras
+    looked = " or ".join(f"image_{a} with image_{b}" for a, b in wanted)
+    hint = "" if colour is None else f" (dataset.colour is {str(colour).lower()})"
+    raise DataError(f"{path}: holds no {looked}{hint}; give a KITTI odometry folder with both images of each pair")
+
+
+def _poses_file(path: Path) -> Path | None:
+    """Return the ground truth of a folder, or of a sequence of KITTI's own; None: there is none."""
+    absolute = path.absolute()
+    candidates = [path / "poses.txt", absolute.parent.parent / "poses" / f"{absolute.name}.txt"]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _read_reference(file: Path, times_ns: IntArray, T_left_cam0: FloatArray) -> Trajectory:
+    """Read the ground truth of camera 0 and move it, and the world, to the left camera; identity stays identity."""
+    poses = read_trajectory(file, fmt="kitti").T_world_body
+    if len(poses) > len(times_ns):
+        raise DataError(f"{file} holds {len(poses)} poses for {len(times_ns)} images; give one line for each image")
+    moved = T_left_cam0 @ poses @ se3_inverse(T_left_cam0) if np.any(T_left_cam0 != np.eye(4)) else poses
+    return Trajectory(moved, times_ns[: len(poses)], "cam0", np.arange(len(poses)))
 
 
 def _depth_factor(rig: Rig, settings: DatasetSettings, where: Path) -> tuple[float, tuple[str, ...]]:
@@ -317,7 +416,7 @@ def times_of(file: Path, pairs: ImagePairs) -> IntArray:
     by_name = {Path(fields[0]).stem: (n, fields[1]) for n, fields in rows if len(fields) > 1}
     if by_name and all(left.stem in by_name for left, _ in pairs):
         chosen = [by_name[left.stem] for left, _ in pairs]
-    elif len(rows) == len(pairs):
+    elif len(rows) == len(pairs) and all(len(fields) == 1 for _, fields in rows):
         chosen = [(n, fields[0]) for n, fields in rows]
     else:
         raise DataError(
@@ -325,3 +424,26 @@ def times_of(file: Path, pairs: ImagePairs) -> IntArray:
             "'name time'"
         )
     return parse_stamps([text for _, text in chosen], lambda k: f"{file}, line {chosen[k][0]}")
+
+
+def _frame_numbers(pairs: ImagePairs) -> IntArray:
+    """Read the frame numbers (F,) from the image names."""
+    bad = next((left for left, _ in pairs if not re.fullmatch(r"\d{1,18}", left.stem)), None)
+    if bad is not None:
+        raise DataError(f"{bad}: an image of KITTI raw is named by its frame number (0000000000.png); rename it")
+    numbers = np.array([int(left.stem) for left, _ in pairs], dtype=np.int64)
+    if (np.diff(numbers) <= 0).any():
+        k = int(np.argmax(np.diff(numbers) <= 0))
+        raise DataError(
+            f"{pairs[k + 1][0]}: its frame number does not increase after {pairs[k][0].name}; name all images with the "
+            "same number of digits"
+        )
+    return numbers
+
+
+def _drive_times(path: Path, numbers: IntArray) -> tuple[IntArray, tuple[str, ...]]:
+    """Return times (F,) of the images, and a note where they follow from the frame numbers."""
+    if not path.is_file():
+        note = f"{path} is missing; times follow from the frame numbers at 10 Hz"
+        return numbers * _DRIVE_NS, (note,)
+    return drive_times(path, numbers), ()

@@ -12,7 +12,7 @@ from typing import TypeVar, cast, overload
 import numpy as np
 
 from vio.geometry.lie import FloatArray
-from vio.records import BoolArray, ImuRecord, ImuSample, IntArray, MotionSample, VelocitySample
+from vio.records import BoolArray, ImuRecord, ImuSample, IntArray, MotionSample, MotionSource, VelocitySample
 
 Sample_co = TypeVar("Sample_co", bound=ImuSample | VelocitySample, covariant=True)
 _CHUNK = 1000  # samples whose times are plain numbers at once
@@ -54,6 +54,11 @@ class MotionSamples(Sequence[Sample_co]):
             for time_ns, first, second, is_imu in zip(*columns, strict=True):
                 kind = ImuSample if is_imu else VelocitySample
                 yield cast(Sample_co, kind(time_ns, first, second))
+
+    @property
+    def kinds(self) -> frozenset[MotionSource]:
+        """Which kinds of samples there are."""
+        return frozenset("imu" if imu else "velocity" for imu in np.unique(self.is_imu).tolist())
 
     def take(self, rows: slice | BoolArray | IntArray) -> MotionSamples[Sample_co]:
         """Return some of the samples."""

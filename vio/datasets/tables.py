@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import re
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +14,12 @@ import numpy as np
 from vio.datasets.common import check_gravity_column
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
-from vio.files.text import INT64_MAX, check_increasing, lines_of, text_lines
+from vio.files.text import check_increasing, lines_of, parse_stamps, text_lines, whole_ns_stamps
 from vio.geometry.lie import FloatArray
 from vio.records import ImuRecord, IntArray, VelocitySample
 
-_UNITS = {"s": 9, "sec": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanoseconds
-# Stamps of 1973 and later in ns, us and ms; smaller ones are seconds from any zero.
-_NS_SINCE, _US_SINCE, _MS_SINCE = Decimal("1e17"), Decimal("1e14"), Decimal("1e11")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _PLAIN = re.compile(r"[0-9.eE+-]*")  # numbers in these are written as `_NUMBER` says, or are none
-_STAMP = re.compile(r"\d{1,19}")
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
 _LEAST_IMU_HZ = 50.0  # below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
@@ -73,7 +68,7 @@ def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[st
     """
     rows = list(table_rows(path, columns, form))[1:]
     lines = [number for number, _ in rows]
-    times_ns = _whole_ns([fields[0] for _, fields in rows], lambda k: f"{path}, line {lines[k]}")
+    times_ns = whole_ns_stamps([fields[0] for _, fields in rows], lambda k: f"{path}, line {lines[k]}")
     return times_ns, [fields[-1] for _, fields in rows], lines
 
 
@@ -133,46 +128,6 @@ def stamps_ns(table: NumberTable) -> IntArray:
     return parse_stamps(table.stamps, table.where, None if stated is None else stated[1])
 
 
-def _whole_ns(texts: Sequence[str], where: Callable[[int], str]) -> IntArray:
-    """Return stamps (N,) that are written as whole nanoseconds."""
-    for k, text in enumerate(texts):
-        if not _STAMP.fullmatch(text) or int(text) > INT64_MAX:
-            remedy = "write seconds times 1e9, without a point or exponent"
-            raise DataError(f"{where(k)}: {text!r} is no time in whole nanoseconds; {remedy}")
-    return check_increasing([int(text) for text in texts], where)
-
-
-def parse_stamps(texts: Sequence[str], where: Callable[[int], str], unit: str | None = None) -> IntArray:
-    """Parse stamps as exact decimals.
-
-    Args:
-        texts: one stamp each.
-        where: returns the place of an entry, for messages.
-        unit: "s", "ms", "us" or "ns"; None: by the size of the first (seconds since 1970 or since the start, or
-            milliseconds, microseconds or nanoseconds since 1970).
-
-    Raises:
-        DataError: as `stamps_ns`.
-    """
-    values: list[Decimal] = []
-    for k, text in enumerate(texts):
-        try:
-            value = Decimal(text)
-        except InvalidOperation:
-            value = Decimal("NaN")
-        if not value.is_finite():
-            raise DataError(f"{where(k)}: {text!r} is no time; remove or correct that entry")
-        values.append(value)
-    size = values[0].copy_abs()
-    by_size = 0 if size >= _NS_SINCE else 3 if size >= _US_SINCE else 6 if size >= _MS_SINCE else 9
-    power = _UNITS[unit] if unit is not None else by_size
-    limit = Decimal(INT64_MAX).scaleb(-power)
-    for k, value in enumerate(values):
-        if value.copy_abs() > limit:  # abs() would round, which no context can do with an exponent of any size
-            raise DataError(f"{where(k)}: {texts[k]!r} is out of range for a time; state its unit in the header ([ns])")
-    return check_increasing([int(value.scaleb(power).to_integral_value()) for value in values], where)
-
-
 def read_imu_table(
     path: Path, *, cut: list[str] | None = None, whole_ns: bool = False
 ) -> tuple[ImuRecord, tuple[str, ...]]:
@@ -190,7 +145,7 @@ def read_imu_table(
         DataError: a line lacks seven finite numbers, the stamps do not increase, or the order of columns is unclear.
     """
     table = read_table(path, 7, _IMU_FORM, cut)
-    times_ns = _whole_ns(table.stamps, table.where) if whole_ns else stamps_ns(table)
+    times_ns = whole_ns_stamps(table.stamps, table.where) if whole_ns else stamps_ns(table)
     values = _finite(table)
     order = _imu_order(table)
     if order is None:

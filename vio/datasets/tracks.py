@@ -146,28 +146,24 @@ def _jump(tracks: FeatureTracks, previous: IntArray, carried: BoolArray) -> floa
 
 def resolve_repeats(
     tracks: FeatureTracks, moving: BoolArray, mode: RepeatsMode
-) -> tuple[FeatureTracks, BoolArray, tuple[str, ...]]:
-    """Flag repeated rows, and give tracks that switched their point a new id from there on.
-
-    Returns:
-        The tracks, the mask (F,) of stale frames, and notes for the user.
-    """
+) -> tuple[FeatureTracks, tuple[str, ...]]:
+    """Return tracks with repeated rows flagged and, where they switched their point, a new id; and notes."""
     marked, found = mark_repeats(tracks, moving)
     if not found.rows:
-        return marked, found.frames, ()
+        return marked, ()
     count = int(found.frames.sum())
     note = (
         f"{count} of {len(found.frames)} feature frames are stale: {found.rows} observations repeat the pixels of the "
         "frame before while the vehicle moves"
     )
     if mode == "literal":
-        return tracks, found.frames, (f"{note}; used as they are, as requested",)
+        return tracks, (f"{note}; used as they are, as requested",)
     jump = "" if found.jump is None else f" (pixels move {found.jump:.2f} steps afterwards"
     changed = found.jump is not None and found.jump < _JUMP_THRESHOLD
     if mode == "flag" or (mode == "auto" and not changed):
-        return marked, found.frames, (f"{note}; they are flagged{jump and jump + ')'}",)
+        return marked, (f"{note}; they are flagged{jump and jump + ')'}",)
     why = jump and jump + (", not 2: they show other points of the scene)" if changed else ")")
-    return split_ids(marked), found.frames, (f"{note}; they are flagged, and their tracks continue under new ids{why}",)
+    return split_ids(marked), (f"{note}; they are flagged, and their tracks continue under new ids{why}",)
 
 
 def split_ids(tracks: FeatureTracks) -> FeatureTracks:

@@ -11,8 +11,9 @@ import numpy as np
 
 from vio.cameras.rig import Rig
 from vio.datasets.frame_times import nearest
-from vio.datasets.tables import parse_stamps, table_rows
+from vio.datasets.tables import table_rows
 from vio.errors import DataError
+from vio.files.text import parse_stamps
 from vio.geometry.distortion import CameraModel
 from vio.records import IntArray
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.datasets.common import check_array_bytes, clock_ns, finite_rows, naming, shape_text
-from vio.datasets.features import FeatureDataset, SensorVariances
+from vio.datasets.features import FeatureDataset
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
@@ -26,7 +26,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, Landmarks, Recording, Trajectory
 
 KEYS = ("y_k_j", "t", "v_vk_vk_i", "w_vk_vk_i", "fu", "fv", "cu", "cv", "b", "C_c_v", "rho_v_c_v")
-OPTIONAL_KEYS = ("r_i_vk_i", "theta_vk_i", "rho_i_pj_i", "v_var", "w_var", "y_var")
+OPTIONAL_KEYS = ("r_i_vk_i", "theta_vk_i", "rho_i_pj_i")
 
 
 def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
@@ -44,7 +44,7 @@ def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
     times_ns = clock_ns(_rows(arrays, "t", path, 1, count)[:, 0], lambda k: f"{path}, t[{k}]")
     linear = _finite(arrays, "v_vk_vk_i", path, count)
     angular = _finite(arrays, "w_vk_vk_i", path, count)
-    tracks, stale_frames, notes = resolve_repeats(
+    tracks, notes = resolve_repeats(
         tracks_from_dense(np.swapaxes(features, 1, 2), path), moving_frames(linear, angular), settings.repeated_tracks
     )
     longest = max(arrays[key].shape[1] for key in ("v_vk_vk_i", "w_vk_vk_i"))
@@ -63,7 +63,7 @@ def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
         notes=notes,
     )
     motion = velocity_samples(times_ns, linear, angular)
-    return FeatureDataset(recording, tracks, motion, np.arange(count), stale_frames, _variances(arrays, path))
+    return FeatureDataset(recording, tracks, motion, np.arange(count))
 
 
 def _read_mat(path: Path) -> Mapping[str, FloatArray]:
@@ -143,11 +143,3 @@ def _landmarks(arrays: Mapping[str, FloatArray], path: Path, count: int) -> Land
         return None
     p = _finite(arrays, "rho_i_pj_i", path, count)
     return Landmarks(np.arange(count), p, np.zeros((count, 3, 3)))
-
-
-def _variances(arrays: Mapping[str, FloatArray], path: Path) -> SensorVariances | None:
-    if not {"v_var", "w_var", "y_var"} <= set(arrays):
-        return None
-    return SensorVariances(
-        _vector(arrays, "v_var", path, 3), _vector(arrays, "w_var", path, 3), _vector(arrays, "y_var", path, 4)
-    )

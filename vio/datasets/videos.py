@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from vio.cameras.rig import Rectifier
 from vio.datasets.companions import find_calibration_of, read_companions
 from vio.datasets.image_pairs import ImageRecording
 from vio.datasets.images import prefetch
@@ -23,7 +22,7 @@ from vio.datasets.rigs import load_rig
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout
 from vio.errors import DataError
-from vio.records import NS_PER_S, Image, ImuDensities, IntArray, StereoFrame
+from vio.records import NS_PER_S, Image, IntArray, StereoFrame
 
 SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
 _NAMES = (("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("image_0", "image_1"), ("video_0", "video_1"))
@@ -68,8 +67,8 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
     times_ns, times_file, notes = _times(path, files, min(left.count, right.count), left.rate_hz)
     if left.count != right.count:
         notes.append(f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the shorter counts")
-    found = read_companions("video", layout, (file, rig), settings, (times_ns, times_file), notes, files)
-    return VideoDataset(found.recording, found.motion, found.sizes, settings, files, found.rectifier, rig.imu_noise)
+    parts = read_companions("video", layout, (file, rig), settings, (times_ns, times_file), notes, files)
+    return VideoDataset(*parts, files, imu_noise=rig.imu_noise)
 
 
 def _facts(file: Path) -> _Facts:
@@ -104,8 +103,6 @@ class VideoDataset(ImageRecording):
     """Implements `vio.protocols.Dataset` over two video files; a frame that cannot be decoded is an error."""
 
     files: tuple[Path, Path]
-    rectifier: Rectifier
-    imu_noise: ImuDensities | None = None
 
     def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
         """Decode in order; the prefetch thread is the only one that uses the decoders."""

@@ -11,6 +11,7 @@ import numpy as np
 from vio.errors import CalibrationError
 from vio.files.text import text_lines
 from vio.files.yaml_text import read_yaml as read_yaml_text
+from vio.geometry.distortion import DistortionModel
 from vio.geometry.lie import FloatArray
 from vio.records import ImuDensities
 
@@ -21,6 +22,11 @@ NOISE_UNITS = {  # entries of an IMU's noise, as EuRoC and Kalibr name them, in 
     "gyroscope_random_walk": "rad / s^2 / sqrt(Hz)",
     "accelerometer_noise_density": "m / s^2 / sqrt(Hz)",
     "accelerometer_random_walk": "m / s^3 / sqrt(Hz)",
+}
+_LENS_MODELS: dict[str, DistortionModel] = {  # by the names that calibrations give them
+    **dict.fromkeys(("radial-tangential", "radtan", "plumb_bob", "rational_polynomial"), "radtan"),
+    **dict.fromkeys(("equidistant", "equi", "fisheye", "kannala_brandt"), "equidistant"),
+    "none": "pinhole",
 }
 _MAX_BYTES = 1_000_000  # a calibration is some kilobytes; a larger file is another one
 
@@ -58,6 +64,17 @@ def section(entries: Entries, key: str, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise CalibrationError(f"{where}: has no block '{key}:'; copy the calibration again")
     return {str(k): v for k, v in value.items()}
+
+
+def lens_model(name: object, where: Path | str) -> DistortionModel:
+    """Return the lens model of a distortion that a calibration names.
+
+    Raises:
+        CalibrationError: the name is not known.
+    """
+    if (model := _LENS_MODELS.get(str(name).lower())) is None:
+        raise CalibrationError(f"{where}: distortion_model {name!r} is not read; known: {', '.join(_LENS_MODELS)}")
+    return model
 
 
 def as_number(value: object) -> float:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
-from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import Image
 
@@ -101,28 +98,3 @@ def depth_sigma_m(camera: StereoCamera, depth_m: float) -> float:
 def farthest_m(camera: StereoCamera, sigma_m: float) -> float:
     """Return the depth whose standard deviation is `sigma_m`."""
     return float(np.sqrt(sigma_m * camera.fu * camera.baseline_m / DISPARITY_SIGMA_PX))
-
-
-@dataclass(frozen=True, slots=True)
-class DepthErrors:
-    """Errors of depth images within a range of true depths."""
-
-    nearest_m: float
-    farthest_m: float
-    pixels: int  # whose true depth is in the range
-    known: float  # share of them with a depth
-    median_m: float  # of the absolute errors; NaN: none is known
-    percentile_90_m: float
-
-
-def depth_errors(depth_m: FloatArray, truth_m: FloatArray, edges_m: FloatArray) -> list[DepthErrors]:
-    """Return the errors of depths (...), 0 where unknown, against true ones (...), by ranges between edges (E,)."""
-    out = []
-    for nearest, farthest in zip(edges_m[:-1].tolist(), edges_m[1:].tolist(), strict=True):
-        inside = (truth_m >= nearest) & (truth_m < farthest)
-        known = inside & (depth_m > 0)
-        error = np.abs(depth_m[known] - truth_m[known])
-        median, high = np.percentile(error, (50, 90)).tolist() if len(error) else (np.nan, np.nan)
-        pixels = int(inside.sum())
-        out.append(DepthErrors(nearest, farthest, pixels, len(error) / max(pixels, 1), median, high))
-    return out

@@ -14,7 +14,7 @@ import re
 import shutil
 import stat
 import uuid
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, Literal
 
@@ -86,22 +86,33 @@ def _partial_folder(target: Path) -> Iterator[Path]:
     partial: Path | None = None
     lock: int | None = None
     try:
-        try:
+        with _writing(target):
             while partial is None or not partial.is_dir():  # one may be taken for a leftover before it is locked
                 partial = _sibling(target, "partial")
                 partial.mkdir(parents=True)
                 lock = lock_path(partial)
-        except OSError as error:
-            raise _unwritable(target, error) from error
         yield partial
     finally:
         if lock is not None:
             os.close(lock)
         if partial is not None:
             shutil.rmtree(partial, ignore_errors=True)
-        for parent in parents:
-            with contextlib.suppress(OSError):  # not empty
-                parent.rmdir()
+        _remove_empty(parents)
+
+
+def _remove_empty(folders: Sequence[Path]) -> None:
+    for folder in folders:
+        with contextlib.suppress(OSError):  # not empty
+            folder.rmdir()
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Raise DataError, which names the path, in the place of OSError."""
+    try:
+        yield
+    except OSError as error:
+        raise _unwritable(path, error) from error
 
 
 def _unwritable(path: Path, error: OSError) -> DataError:
@@ -145,7 +156,7 @@ def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
     target = Path(path)
     _remove_leftovers(target)
     partial = _sibling(target, "partial")
-    try:
+    with _writing(target):
         try:
             with partial.open("xb") as stream:
                 if fcntl is not None:
@@ -157,8 +168,6 @@ def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
             partial.replace(target)
         finally:
             partial.unlink(missing_ok=True)
-    except OSError as error:
-        raise _unwritable(target, error) from error
 
 
 def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
@@ -182,10 +191,8 @@ def check_new_file(path: Path, sign: bytes | None = None) -> None:
     """
     if not path.exists():
         return
-    try:
+    with _writing(path):
         ours = sign is not None and path.is_file() and sign in path.read_bytes()
-    except OSError as error:
-        raise _unwritable(path, error) from error
     if not ours:
         raise DataError(f"{path} exists and was not made by this command; remove it, or choose another name")
 
@@ -215,10 +222,8 @@ def atomic_folder(
                 raise _unwritable(target, error) from error
             raise
         check_replaceable(target, replace, marker, own)  # another process may have created it meanwhile
-        try:
+        with _writing(target):
             _swap_in(partial, target)
-        except OSError as error:
-            raise _unwritable(target, error) from error
 
 
 def check_replaceable(target: Path, replace: bool, marker: str | None, own: Collection[str] | None = None) -> None:
@@ -255,11 +260,8 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         DataError: no folder can be made there, or the disk is full.
     """
     target = Path(path).absolute()
-    with _partial_folder(target) as partial:
-        try:
-            (partial / "probe").write_bytes(bytes(_PROBE_BYTES))
-        except OSError as error:
-            raise _unwritable(target, error) from error
+    with _partial_folder(target) as partial, _writing(target):
+        (partial / "probe").write_bytes(bytes(_PROBE_BYTES))
 
 
 @contextlib.contextmanager
@@ -272,10 +274,8 @@ def locked_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path).absolute()
     missing = [folder for folder in (target, *target.parents) if not folder.exists()]
-    try:
+    with _writing(target):
         target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _unwritable(target, error) from error
     lock = lock_path(target)
     if lock is None:
         raise VioError(f"{target}: another process is writing into this folder; choose another path, or wait for it")
@@ -283,9 +283,7 @@ def locked_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield target
     finally:
         os.close(lock)
-        for folder in missing:
-            with contextlib.suppress(OSError):  # not empty
-                folder.rmdir()
+        _remove_empty(missing)
 
 
 def _swap_in(partial: Path, target: Path) -> None:

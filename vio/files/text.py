@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,10 @@ from vio.geometry.lie import FloatArray
 from vio.records import NS_PER_S, IntArray
 
 INT64_MAX = 2**63 - 1
+_UNITS = {"s": 9, "sec": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanoseconds
+# Stamps of 1973 and later in ns, us and ms; smaller ones are seconds from any zero.
+_NS_SINCE, _US_SINCE, _MS_SINCE = Decimal("1e17"), Decimal("1e14"), Decimal("1e11")
+_WHOLE, _SIGNED = re.compile(r"\d{1,19}"), re.compile(r"[+-]?\d{1,19}")
 _PIECE = 2**16  # characters that are split into lines at a time
 
 
@@ -110,3 +116,54 @@ def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> In
         now, before = seconds_text(int(times[k])), seconds_text(int(times[k - 1]))
         raise DataError(f"{where(k)}: the clock {what} ({now} s after {before} s); remove or reorder that entry")
     return times
+
+
+def parse_stamps(texts: Sequence[str], where: Callable[[int], str], unit: str | None = None) -> IntArray:
+    """Parse stamps as exact decimals.
+
+    Args:
+        texts: one stamp each.
+        where: returns the place of an entry, for messages.
+        unit: "s", "ms", "us" or "ns"; None: by the size of the first (seconds since 1970 or since the start, or
+            milliseconds, microseconds or nanoseconds since 1970).
+
+    Raises:
+        DataError: a stamp is no number, or not later than the one before.
+    """
+    values: list[Decimal] = []
+    for k, text in enumerate(texts):
+        try:
+            value = Decimal(text)
+        except InvalidOperation:
+            value = Decimal("NaN")
+        if not value.is_finite():
+            raise DataError(f"{where(k)}: {text!r} is no time; remove or correct that entry")
+        values.append(value)
+    size = values[0].copy_abs()
+    by_size = 0 if size >= _NS_SINCE else 3 if size >= _US_SINCE else 6 if size >= _MS_SINCE else 9
+    power = _UNITS[unit] if unit is not None else by_size
+    limit = Decimal(INT64_MAX).scaleb(-power)
+    for k, value in enumerate(values):
+        if value.copy_abs() > limit:  # abs() would round, which no context can do with an exponent of any size
+            remedy = "divide nanoseconds by 1e9, or state their unit in a header ([ns])"
+            raise DataError(f"{where(k)}: {texts[k]!r} is out of range for a time; {remedy}")
+    return check_increasing([int(value.scaleb(power).to_integral_value()) for value in values], where)
+
+
+def whole_ns_stamps(texts: Sequence[str], where: Callable[[int], str], *, signed: bool = False) -> IntArray:
+    """Return stamps (N,) that are written as whole nanoseconds, strictly increasing.
+
+    Args:
+        texts: one stamp each.
+        where: returns the place of an entry, for messages.
+        signed: whether a sign may stand before them.
+
+    Raises:
+        DataError: a stamp is another number, or not later than the one before.
+    """
+    form = _SIGNED if signed else _WHOLE
+    for k, text in enumerate(texts):
+        if not form.fullmatch(text) or abs(int(text)) > INT64_MAX:
+            remedy = "write seconds times 1e9, without a point or exponent"
+            raise DataError(f"{where(k)}: {text!r} is no time in whole nanoseconds; {remedy}")
+    return check_increasing([int(text) for text in texts], where)

@@ -10,7 +10,6 @@ import os
 import re
 from array import array
 from dataclasses import dataclass, replace
-from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NoReturn, TypeAlias, get_args
@@ -19,7 +18,7 @@ import numpy as np
 
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
-from vio.files.text import INT64_MAX, check_increasing, exact_text, lines_of, seconds_text
+from vio.files.text import exact_text, lines_of, parse_stamps, seconds_text, whole_ns_stamps
 from vio.geometry.lie import (
     FloatArray,
     nearest_rotation,
@@ -37,14 +36,12 @@ TrajectoryFormat: TypeAlias = Literal["tum", "kitti", "euroc"]
 ROTATION_TOLERANCE = 1e-3  # deviation of a quaternion's norm or of R^T R from one accepted as rounding
 _LARGEST = 1e12  # of a coordinate, in metres: beyond, squares overflow
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
-_MAX_S = Decimal(INT64_MAX).scaleb(-9)
 _COLUMNS: dict[TrajectoryFormat, str] = {
     "tum": "8 columns 'timestamp tx ty tz qx qy qz qw'",
     "kitti": "12 columns, the first three rows of a 4x4 pose",
     "euroc": "at least 8 comma-separated columns 'timestamp [ns], px, py, pz, qw, qx, qy, qz'",
 }
 _EUROC_HEADER = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w, q_RS_x, q_RS_y, q_RS_z\n"
-_STAMP = re.compile(r"[+-]?\d{1,19}")
 _LONGEST_LINE = 2**20  # bytes: the frames of a day with gaps are numbered in a comment of less
 _LONGEST_LIST = 100  # characters of frame numbers in a warning
 _DEFAULT_BODY: dict[TrajectoryFormat, BodyFrame] = {"tum": "imu", "kitti": "cam0", "euroc": "imu"}
@@ -92,7 +89,10 @@ def read_trajectory(
     _check_columns(table, kind)
     if kind == "kitti":
         return Trajectory(_kitti_poses(table), None, body or _DEFAULT_BODY[kind])
-    times_ns = check_increasing([_time_ns(table, row, kind) for row in range(len(table.rows))], table.where)
+    stamps = [table.fields(row, 1)[0].strip() for row in range(len(table.rows))]
+    times_ns = (
+        whole_ns_stamps(stamps, table.where, signed=True) if kind == "euroc" else parse_stamps(stamps, table.where, "s")
+    )
     poses = _quaternion_poses(table, kind)
     header_body = _header(table, r"body:\s*(\S+)") if kind == "tum" else None
     frames = _header(table, r"frames:\s*(.*\S)") if kind == "tum" else None
@@ -248,24 +248,6 @@ def _floats(table: _Table, first: int, last: int) -> FloatArray:
             f"a pose is not finite, or beyond {_LARGEST:g} (first of {int(bad.sum())}); remove such lines",
         )
     return out
-
-
-def _time_ns(table: _Table, row: int, kind: TrajectoryFormat) -> int:
-    """The first field of a row as integer nanoseconds."""
-    text = table.fields(row, 1)[0].strip()
-    if kind == "euroc":
-        if not _STAMP.fullmatch(text) or abs(int(text)) > INT64_MAX:
-            table.fail(row, f"the time {text!r} is not in whole nanoseconds; EuRoC form has {_COLUMNS[kind]}")
-        return int(text)
-    try:
-        seconds = Decimal(text)
-    except InvalidOperation:
-        seconds = Decimal("NaN")
-    if not seconds.is_finite():
-        table.fail(row, f"the time {text!r} is not a number of seconds; remove or correct this line")
-    if not -_MAX_S <= seconds <= _MAX_S:
-        table.fail(row, f"the time {text!r} cannot be in seconds; divide nanoseconds by 1e9 first")
-    return int(seconds.scaleb(9).to_integral_value())
 
 
 def _quaternion_poses(table: _Table, kind: TrajectoryFormat) -> FloatArray:

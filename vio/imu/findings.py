@@ -28,38 +28,14 @@ InertialFault: TypeAlias = Literal[
 ]
 
 # A second finding of a group would repeat the first.
-_GROUPS: dict[InertialFault, str] = {
-    "clocks without overlap": "overlap",
-    "clocks overlap in part": "overlap",
-    "clocks apart": "overlap",
-    "accelerometer units": "size",
-    "gravity removed": "size",
-    "gyro sign": "rotation",
-    "gyro axes": "rotation",
-    "gyro disagrees": "rotation",
-    "extrinsics inverted": "rotation",
-    "extrinsics rotation": "rotation",
-    "accelerometer sign": "force",
-    "accelerometer axes": "force",
-    "upside down": "force",
+_GROUPS: dict[str, tuple[InertialFault, ...]] = {
+    "overlap": ("clocks without overlap", "clocks overlap in part", "clocks apart"),
+    "size": ("accelerometer units", "gravity removed"),
+    "rotation": ("gyro sign", "gyro axes", "gyro disagrees", "extrinsics inverted", "extrinsics rotation"),
+    "force": ("accelerometer sign", "accelerometer axes", "upside down"),
 }
-
-
 # With any of these the readings are of no use to a filter, unless a factor on them is all that is wrong.
-_UNUSABLE: frozenset[InertialFault] = frozenset(
-    {
-        "accelerometer units",
-        "gravity removed",
-        "gyro units",
-        "gyro sign",
-        "gyro axes",
-        "gyro disagrees",
-        "extrinsics inverted",
-        "extrinsics rotation",
-        "accelerometer sign",
-        "accelerometer axes",
-    }
-)
+_UNUSABLE = {*_GROUPS["size"], *_GROUPS["rotation"], "gyro units", "accelerometer sign", "accelerometer axes"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,4 +75,4 @@ class InertialFinding:
     @property
     def group(self) -> str:
         """The group of related faults; only one finding of each is reported."""
-        return _GROUPS.get(self.fault, self.fault)
+        return next((name for name, faults in _GROUPS.items() if self.fault in faults), self.fault)

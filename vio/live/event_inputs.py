@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from typing import Generic, TypeVar
 
 import numpy.typing as npt
@@ -19,15 +19,12 @@ class EventInputs(ABC, Generic[Result]):
     """Checks what is given, numbers frames, and hands both on."""
 
     _copies = True  # whether images are copied
+    _checking: AbstractContextManager[object] = nullcontext()  # held from the check of an event until it is taken
 
     @property
     @abstractmethod
     def inputs(self) -> Inputs:
         """The checks of the present trajectory."""
-
-    @abstractmethod
-    def _checking(self) -> AbstractContextManager[object]:
-        """Return what is held from the check of an event until it is taken."""
 
     @abstractmethod
     def take(self, given: GivenFrame | Sequence[MotionSample] | None) -> Result:
@@ -45,7 +42,7 @@ class EventInputs(ABC, Generic[Result]):
             DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
             ConfigError: this odometry does not use an IMU.
         """
-        with self._checking():
+        with self._checking:
             self.take(self.inputs.samples("imu", t_ns, gyro, accel))
 
     def add_velocity(self, t_ns: int | npt.ArrayLike, linear: npt.ArrayLike, angular: npt.ArrayLike) -> None:
@@ -60,7 +57,7 @@ class EventInputs(ABC, Generic[Result]):
             DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
             ConfigError: this odometry does not use velocities; set `motion` to velocity.
         """
-        with self._checking():
+        with self._checking:
             self.take(self.inputs.samples("velocity", t_ns, linear, angular))
 
     def add_stereo(self, t_ns: int, left: npt.ArrayLike, right: npt.ArrayLike) -> Result:
@@ -101,7 +98,7 @@ class EventInputs(ABC, Generic[Result]):
         Raises:
             DataError: a wrong type, shape or size, a time not after the last frame's, or images of another rig's kind.
         """
-        with self._checking():
+        with self._checking:
             return self.take(self.inputs.images(t_ns, left, right, depth_m, copy=self._copies))
 
     def add_observations(
@@ -118,5 +115,5 @@ class EventInputs(ABC, Generic[Result]):
         Raises:
             DataError: shapes disagree, an id occurs twice, a pixel is not finite, or a time not after the last one.
         """
-        with self._checking():
+        with self._checking:
             return self.take(self.inputs.observations(t_ns, ids, z, has_right))

@@ -139,10 +139,6 @@ class FramePipeline:
         revised, self._revised = self._revised, {}
         return revised
 
-    def smoothed(self, frame_index: int) -> Estimate | None:
-        """Return the estimate at a past frame with all frames since; None where the window does not hold it."""
-        return self.backend.smoothed(frame_index)
-
     def _update(self, seen: Observations) -> UpdateReport:
         """Update with a frame; a back end that diverges is restarted."""
         try:

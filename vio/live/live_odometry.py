@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
+import threading
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -20,19 +19,57 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.build import CONFIGURED, MapUse, Parts
 from vio.live.event_inputs import EventInputs
-from vio.live.event_queue import DROPS, Drop
 from vio.live.figures import LiveFigures, LiveMonitor
 from vio.live.inputs import GivenFrame, Inputs, checked_time
 from vio.live.odometry import Odometry
 from vio.live.prediction import PredictedPose, SharedPredictor
-from vio.live.stream import EstimateStream
 from vio.live.warm_up import warm_up
-from vio.live.worker import QuietCollector, Worker
+from vio.live.worker import DROPS, Drop, QuietCollector, Worker
 from vio.records import Estimate, FrameResult, Landmarks, MotionSample
 
 log = logging.getLogger(__name__)
 
 _LANDMARK_FRAMES = 100  # results after which the points that will not change any more are taken from the filter
+_MOST_WAITING = 1000  # estimates that wait for the reader; of a slower one, the oldest are forgotten
+
+
+class EstimateStream(Iterator[Estimate]):
+    """Estimates as they come; it ends when the odometry is closed. `trajectory` counts the resets before the last."""
+
+    def __init__(self, raise_failure: Callable[[], None]) -> None:
+        """Create an empty stream; `raise_failure` raises what the odometry ended with, if it failed."""
+        self.trajectory = self._resets = 0
+        self._estimates: deque[tuple[int, Estimate]] = deque(maxlen=_MOST_WAITING)
+        self._changed = threading.Condition()
+        self._ended = False
+        self._raise_failure = raise_failure
+
+    def put(self, estimate: Estimate) -> None:
+        """Add the newest estimate."""
+        with self._changed:
+            self._estimates.append((self._resets, estimate))
+            self._changed.notify()
+
+    def reset(self) -> None:
+        """Begin a new trajectory."""
+        self._resets += 1
+
+    def end(self) -> None:
+        """Nothing more will come."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    def __next__(self) -> Estimate:
+        """Wait for the next estimate."""
+        with self._changed:
+            while not self._estimates and not self._ended:
+                self._changed.wait()
+            if self._estimates:
+                self.trajectory, estimate = self._estimates.popleft()
+                return estimate
+        self._raise_failure()
+        raise StopIteration
 
 
 class LiveOdometry(EventInputs[None]):
@@ -124,9 +161,6 @@ class LiveOdometry(EventInputs[None]):
     def inputs(self) -> Inputs:
         """The checks of the present trajectory."""
         return self._odometry.inputs
-
-    def _checking(self) -> AbstractContextManager[object]:
-        return contextlib.nullcontext()
 
     def take(self, given: GivenFrame | Sequence[MotionSample] | None) -> None:
         """Queue what was checked; predictions begin with samples at once.

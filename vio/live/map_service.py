@@ -123,11 +123,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _pair(body: bytes, camera: StereoCamera) -> tuple[Image, Image]:
-    """Return the images of a request.
-
-    Raises:
-        _RefusedError: it is none, an image is damaged or of another size, or the camera is another one.
-    """
+    """Return the images of a request."""
     try:
         request = json.loads(body)
         texts = [request["left"], request["right"]]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -109,7 +108,7 @@ class Odometry(EventInputs["Estimate | None"]):
         self._parts = parts
         self._map = MapUse(Path(map), localise) if isinstance(map, (str, Path)) else map
         self._on_frame = on_frame
-        self._lock = threading.RLock()
+        self._lock = self._checking = threading.RLock()
         self._blas = BlasLimit()
         self._begin()
 
@@ -146,9 +145,6 @@ class Odometry(EventInputs["Estimate | None"]):
     def inputs(self) -> Inputs:
         """The checks of the present trajectory."""
         return self._inputs
-
-    def _checking(self) -> AbstractContextManager[object]:
-        return self._lock
 
     def take(self, given: GivenFrame | Sequence[MotionSample] | None) -> Estimate | None:
         """Process what `inputs` has checked, maybe in another thread; the return value is that of `add_stereo`."""
@@ -271,7 +267,7 @@ class Odometry(EventInputs["Estimate | None"]):
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since; None where the window no longer holds it."""
         with self._lock:
-            return self._processor.pipeline.smoothed(frame_index)
+            return self._processor.pipeline.backend.smoothed(frame_index)
 
     def __enter__(self) -> Odometry:
         return self

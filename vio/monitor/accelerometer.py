@@ -1,8 +1,10 @@
-"""Faults of an accelerometer or of the lever arm, found by comparing its readings with the camera's motion."""
+"""Faults of an accelerometer or of the lever arm, by its readings and the camera's motion; exchanged axes."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from itertools import permutations, product
 
 import numpy as np
 
@@ -13,7 +15,6 @@ from vio.calibration.lever_arm import estimate_lever_arm
 from vio.calibration.verdicts import judge_imu
 from vio.geometry.lie import FloatArray
 from vio.imu.findings import InertialFinding
-from vio.monitor.axes import axes_text, signed_permutations
 from vio.monitor.force_fit import LEAST_WINDOWS, WINDOW_S, Evidence, ForceFit
 from vio.monitor.gyro_fit import GyroFit
 from vio.monitor.motion import Record
@@ -27,6 +28,21 @@ _AXES_WORSE_EARLY = 9.0  # likewise in fewer windows; right axes came to at most
 _UPSIDE_DOWN = 0.5  # cosine between image-down and up: within 60 degrees
 _UPSIDE_SHARE = 0.95
 _NS = 1e-9
+
+
+def signed_permutations() -> Iterator[FloatArray]:
+    """Yield all 48 maps that exchange and invert axes; those that change least come first."""
+    every = [
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+    yield from sorted(every, key=lambda P: -float(np.trace(P)))
+
+
+def axes_text(P: FloatArray) -> str:
+    """Return how true readings of x y z appear in the recording, e.g. `[+y -x +z]`."""
+    return "[" + " ".join(f"{'+' if row.sum() > 0 else '-'}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in P) + "]"
 
 
 def resolve_size(size: Size, evidence: Evidence) -> Size:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
+import numpy.typing as npt
 
 from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, nearest_rotation
 from vio.imu.findings import InertialFault, InertialFinding
-from vio.monitor.accelerometer import AXES_WORSE
-from vio.monitor.axes import axes_text, matrix_text, signed_permutations, triple_text
+from vio.monitor.accelerometer import AXES_WORSE, axes_text, signed_permutations
 from vio.monitor.force_fit import Evidence
 from vio.monitor.gyro_fit import AGREES, FAR_OFFSETS_S, GyroFit
 
@@ -59,7 +59,7 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     return [
         InertialFinding(
             "gyro units",
-            f"{seen}, and no rotation fits: the best linear map stretches by {triple_text(stretch)}",
+            f"{seen}, and no rotation fits: the best linear map stretches by {_triple_text(stretch)}",
             "the gyro's axes have different scales, or one of them is dead",
         )
     ]
@@ -153,7 +153,7 @@ def _explanations(R: FloatArray, *, gyro_alone: bool) -> Iterator[_Explanation]:
             )
         else:
             explanation = (
-                f"T_cam0_imu belongs to other IMU axes, or {explanation}; its rotation should be {matrix_text(R @ P)}"
+                f"T_cam0_imu belongs to other IMU axes, or {explanation}; its rotation should be {_matrix_text(R @ P)}"
             )
             yield _Explanation("extrinsics rotation", R @ P, "a rotation by multiples of 90 degrees fits", explanation)
 
@@ -165,7 +165,7 @@ def _free_explanations(S_cg: FloatArray) -> Iterator[_Explanation]:
         "extrinsics rotation",
         best,
         "another rotation fits",
-        f"the rotation of T_cam0_imu should be about {matrix_text(best)}; run `vio calibrate`",
+        f"the rotation of T_cam0_imu should be about {_matrix_text(best)}; run `vio calibrate`",
     )
     yield _Explanation(
         "gyro axes",
@@ -173,3 +173,11 @@ def _free_explanations(S_cg: FloatArray) -> Iterator[_Explanation]:
         "a mirrored frame fits",
         "the gyro's axes are left-handed; check their order and signs",
     )
+
+
+def _matrix_text(R: FloatArray) -> str:
+    return "[" + ", ".join(_triple_text(row) for row in R) + "]"
+
+
+def _triple_text(v: npt.NDArray[np.floating]) -> str:
+    return f"[{v[0]:.3f}, {v[1]:.3f}, {v[2]:.3f}]"

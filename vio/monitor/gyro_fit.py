@@ -1,4 +1,4 @@
-"""The gyro's rates against those of the camera: the best linear map between them, at the best clock offset."""
+"""The gyro's rates against those of the camera: the best linear map, at the best clock offset; jitter of stamps."""
 
 from __future__ import annotations
 
@@ -22,6 +22,12 @@ _CLEARLY_WORSE = 2.0
 _NAMED_OFFSET_S = 0.02
 _NEAR_OFFSETS_S = np.arange(-0.1, 0.1001, 0.01)
 FAR_OFFSETS_S = np.arange(-5.0, 5.001, 0.025)
+# Of stamps that jitter.
+_LEAST_INTERVALS = 40
+_LEAST_RATE_RADPS = 0.1  # where a millisecond is 0.1 mrad, about what the images resolve
+_LEAST_JITTER_S = 5e-4  # standard deviation of the intervals; smaller does little harm
+_SLOPE = 0.7, 1.3  # of the time missed by the gyro over the stamps' deviation: 1 for jitter, 0 for true intervals
+_LEAST_CORRELATION = 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,4 +157,34 @@ def judge_offset(gyro_fit: GyroFit, record: Record, least: int) -> InertialFindi
         f"the rates of gyro and images agree best if a frame stamped t is at t {gyro_fit.offset_s:+.3f} s of the "
         f"IMU's clock ({100 * gyro_fit.unexplained:.1f} % of the rotation unexplained; without the shift it {left})",
         f"the IMU's clock is ahead of the camera's by {gyro_fit.offset_s:+.3f} s; subtract that from the IMU's stamps",
+    )
+
+
+def judge_stamps(record: Record) -> InertialFinding | None:
+    """Compare each interval's deviation from the usual one with the time that the camera's rotation took by the gyro.
+
+    Over an interval of stamps `dt` the gyro turns at a mean rate `w`; the images show an angle `a`, so the exposures
+    lay `a / w` apart. Where `a / w - dt` is the negative of `dt - median(dt)`, the stamps are wrong, not the exposures.
+    """
+    means, covered = record.means(np.zeros(1))
+    gyro = np.linalg.norm(means[0, :, :3], axis=1)
+    camera = np.linalg.norm(record.twists[:, 3:], axis=1)
+    dt = record.end - record.begin
+    usual = float(np.median(dt)) if len(dt) else 0.0
+    used = covered[0] & (gyro > _LEAST_RATE_RADPS) & (np.abs(dt - usual) < 0.5 * usual)
+    if used.sum() < _LEAST_INTERVALS or robust_sigma(dt[used] - usual) < _LEAST_JITTER_S:
+        return None
+    weight = gyro[used]  # the angle's error is the same everywhere, the time's error falls with the rate
+    deviation = weight * (dt[used] - usual)
+    missed = weight * (dt[used] - dt[used] * camera[used] / gyro[used])
+    slope = float(deviation @ missed / (deviation @ deviation))
+    correlation = float(deviation @ missed / np.sqrt((deviation @ deviation) * (missed @ missed)))
+    if not _SLOPE[0] < slope < _SLOPE[1] or correlation < _LEAST_CORRELATION:
+        return None
+    jitter_ms = 1e3 * robust_sigma(dt[used] - usual) / np.sqrt(2)
+    return InertialFinding(
+        "camera stamps",
+        f"the frames' intervals scatter as if each stamp were off by {jitter_ms:.1f} ms (standard deviation), but the "
+        f"gyro shows exposures at a steady {1e3 * usual:.1f} ms",
+        "the stamps jitter, perhaps taken when the image arrived; stamp frames at the exposure, by the camera's clock",
     )

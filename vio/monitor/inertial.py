@@ -20,11 +20,10 @@ from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import judge_force, judge_lever_arm, judge_up, resolve_size
 from vio.monitor.force_fit import FIRST_EVALUATION, LEAST_WINDOWS, Evidence, fit_force
 from vio.monitor.gyro import judge_gyro
-from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset
+from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset, judge_stamps
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
 from vio.monitor.rotation_comparison import compare_rotations, judge_rotations
 from vio.monitor.samples import Samples, Size, judge_size
-from vio.monitor.stamps import judge_stamps
 from vio.records import ROTATION_NOT_COMPARABLE, ImuSample, Observations, RotationComparison
 
 _LEAST_AT_END = 20  # intervals needed to judge at the end of a run
@@ -49,17 +48,12 @@ class InertialCheck:
         self._frames = 0
         self.reset()
 
-    @property
-    def done(self) -> bool:
-        """Whether the comparison of motions has ended; `reset` restarts it."""
-        return self._done
-
     def reset(self) -> None:
         """Restart the comparison of motions; reported findings are not repeated."""
         self._camera, self._motion = CameraTwists(self._stereo), RecentMotion()
         self._since_evaluation = self._seen = 0
         self._suspected: set[InertialFault] = set()
-        self._done = False
+        self.done = False  # whether the comparison of motions has ended
         self.rotation_comparison: RotationComparison | None = None  # the newest comparison; None: too few frames yet
         self.axes_compared = False  # the accelerometer's with the images' path, or there will be no rotation for it
         self.imu_at_fault = False  # by the newest judgement of units, axes, signs and clocks, reported yet or not
@@ -73,7 +67,7 @@ class InertialCheck:
         self._frames += 1
         self._coverage.frame(observations.time_ns, self._samples.last_ns)
         found = self._coverage.so_far(self._samples.span_ns, self._samples.step_s / _NS)
-        if not self._done:
+        if not self.done:
             found += self._compare(observations)
         elif self._frames % BATCH == 0:
             found += self._samples.check_new(keep=False)
@@ -82,8 +76,8 @@ class InertialCheck:
     def finish(self) -> tuple[InertialFinding, ...]:
         """Return the findings at the end of the run; call it also when the run fails."""
         found = self._coverage.at_end(self._samples.span_ns, self._samples.step_s / _NS)
-        found += self._samples.check_new(keep=not self._done)
-        if not self._done:
+        found += self._samples.check_new(keep=not self.done)
+        if not self.done:
             motion = self._camera.flush()
             if motion is not None:
                 self._motion.add(motion)
@@ -173,7 +167,7 @@ class InertialCheck:
             found = judge_lever_arm(record, gyro_fit, self._T, rates)
             if not last:
                 self._suspected |= {f.fault for f in found}  # at this stage, one evaluation suffices
-        self._done = enough and all(f.fault in self._suspected for f in found)
+        self.done = enough and all(f.fault in self._suspected for f in found)
         return found
 
     def _compare_first_rotations(self) -> None:

@@ -13,10 +13,8 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.imu.findings import ImuVerdict
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
-from vio.monitor.health import RunHealth
-from vio.monitor.imu_faults import ImuFaultReport
-from vio.monitor.refusals import RefusalReport
-from vio.monitor.silence import ImuSilence
+from vio.monitor.health import RefusalReport, RunHealth
+from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.records import (
     Estimate,
     ImuSample,

@@ -13,7 +13,7 @@ from vio.calibration.stereo import StereoEstimate
 from vio.calibration.stereo_field import rig_off_by
 from vio.cameras.rig import Rig
 from vio.datasets.euroc_files import SENSOR_YAML_MODELS, camera_yaml, median_rate_hz
-from vio.datasets.rectified import RectifiedDataset
+from vio.datasets.image_pairs import ImageDataset
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
@@ -70,7 +70,7 @@ def _measured_imu(report: CalibrationReport, rig: StereoRig) -> tuple[FloatArray
     T_cam0_imu, offset_s = se3_inverse(rig.T_imu_cam0), 0.0
     alignment, lever_arm, dataset = report.imu.alignment, report.imu.lever_arm, report.source.dataset
     R_rect_cam0 = np.eye(3)  # the motion was measured with the rectified camera
-    if isinstance(dataset, RectifiedDataset):
+    if isinstance(dataset, ImageDataset) and dataset.rectifier.maps is not None:
         R_rect_cam0 = (dataset.rectifier.T_rect0_imu @ rig.T_imu_cam0)[:3, :3]
     if isinstance(alignment, ImuAlignment) and alignment.weak is None:
         T_cam0_imu = se3_from_parts(R_rect_cam0.T @ alignment.R_cam0_imu, T_cam0_imu[:3, 3])

@@ -14,10 +14,9 @@ import numpy as np
 from vio.offline.colmap.model import keyframe_images
 from vio.offline.colmap.reconstruction import Mapper, match_images, reconstruct
 from vio.offline.comparison import compare_keyframes
-from vio.offline.images import write_images
 from vio.offline.keyframes import keyframes_by_overlap
 from vio.offline.loop_tracks import loop_pairs
-from vio.offline.saved_run import SavedRun
+from vio.offline.saved_run import SavedRun, write_images
 from vio.offline.verdict import MapperResult, overall_verdict
 from vio.records import Trajectory
 from vio.runs.picture import write_picture

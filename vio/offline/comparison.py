@@ -8,7 +8,8 @@ import numpy as np
 
 from vio.errors import EvaluationError
 from vio.evaluation.alignment import align_poses, apply_alignment
-from vio.evaluation.errors_along_path import rotation_angle_deg
+from vio.evaluation.association import take
+from vio.evaluation.errors_along_path import path_length_m, rotation_angle_deg
 from vio.evaluation.trajectories import evaluate
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_inverse
 from vio.numerics.robust import robust_sigma
@@ -17,7 +18,6 @@ from vio.records import BoolArray, IntArray, Trajectory
 
 _SCALE_SIGMA = 0.02  # a scale with a larger standard deviation is not reported
 _LEAST_MOTIONS = 8  # keyframes needed to detect outlying motions
-_LEAST_PIECE = 3  # keyframes that an alignment needs
 _OUTLYING = 6.0  # robust standard deviations
 # What COLMAP's own path may be off by at its end, beside the run's standard deviations.
 _END_SHARE, _END_DEG, _END_DEG_PER_M = 0.01, 0.5, 0.01
@@ -100,13 +100,13 @@ def compare_keyframes(
     ate_m, ate_deg = (float(np.sqrt(np.mean(d[piece] ** 2))) for d in (difference_m, difference_deg))
     scale, sigma, why = _scale_ratio(T_other_cam0[piece], own[piece], ate_m)
     segments = _disagreements(run.frames[rows], own, T_other_cam0, linked)
-    path_m = float(np.linalg.norm(np.diff(own[piece, :3, 3], axis=0), axis=1).sum())
+    path_m = path_length_m(own[piece, :3, 3])
     ends = np.flatnonzero(piece)[[0, -1]]
     same = T_other_cam0.copy()  # of the run's length: another scale is said apart
     same[:, :3, 3] /= scale or 1.0
     end_m, end_deg = (float(d[0]) for d in motion_differences(own[ends], same[ends]))
     most_m, most_deg = _expected_end(run, rows[ends], path_m)
-    off_m = max(end_m, _ate_m(same[piece], own[piece]))
+    off_m = max(end_m, aligned_distance_m(same[piece], own[piece]))
     if not segments and (off_m > most_m or end_deg > most_deg):
         first, last = run.frames[rows[ends]].tolist()
         segments = (Segment(first, last, off_m, end_deg),)
@@ -142,7 +142,8 @@ def _expected_end(run: TrackedPath, ends: IntArray, path_m: float) -> tuple[floa
     return _END_SIGMAS * sigma_m + by_colmap[0], _END_SIGMAS * sigma_deg + by_colmap[1]
 
 
-def _ate_m(T_other: FloatArray, T_own: FloatArray) -> float:
+def aligned_distance_m(T_other: FloatArray, T_own: FloatArray) -> float:
+    """Return the root mean square distance of the positions of paired poses (R, 4, 4) after SE(3) alignment."""
     aligned = apply_alignment(align_poses(T_other, T_own, "se3"), T_other)
     return float(np.sqrt(np.mean(np.sum((aligned[:, :3, 3] - T_own[:, :3, 3]) ** 2, axis=1))))
 
@@ -213,12 +214,7 @@ def _against(
     truth: GroundTruth, run: TrackedPath, rows: IntArray, T_other_cam0: FloatArray
 ) -> tuple[float | None, float | None, float | None]:
     """Return ATE and scale of the other poses, and ATE of the run; None where they cannot be compared."""
-    own = replace(
-        run.trajectory,
-        T_world_body=run.trajectory.T_world_body[rows],
-        times_ns=None if run.trajectory.times_ns is None else run.trajectory.times_ns[rows],
-        frame_indices=run.frames[rows],
-    )
+    own = take(run.trajectory, rows)
     other = replace(own, T_world_body=T_other_cam0)
     try:
         ate, of_run = (

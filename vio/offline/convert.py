@@ -25,9 +25,9 @@ from vio.datasets.euroc_files import (
     write_cameras,
 )
 from vio.datasets.euroc_files import TUM_FILE as EUROC_TUM
+from vio.datasets.image_pairs import ImageDataset
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
-from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.samples import motion_samples
 from vio.datasets.yaml_files import densities_text
@@ -106,7 +106,7 @@ def convert(
     return Converted(len(written.times_ns), len(written.imu), len(written.velocities), tuple(lacking))
 
 
-def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progress) -> int:
+def write_rectified_euroc(dataset: ImageDataset, out: Path, progress: Progress) -> int:
     """Write an EuRoC recording as a folder of rectified images; the IMU and the ground truth are copied as they are.
 
     Returns:

@@ -9,9 +9,8 @@ from typing import TypeAlias
 
 from vio.datasets.kitti import read_extrinsics
 from vio.datasets.rigs import load_rig
-from vio.datasets.tables import parse_stamps
 from vio.errors import CalibrationError, DataError
-from vio.files.text import text_lines
+from vio.files.text import parse_stamps, text_lines
 from vio.files.trajectories import TrajectoryFormat, read_trajectory, write_euroc, write_kitti, write_tum
 from vio.geometry.lie import FloatArray
 from vio.protocols import Dataset

@@ -21,11 +21,10 @@ from vio.offline.colmap.model import (
     mean_reprojection_error_px,
     write_model,
 )
-from vio.offline.images import write_images
 from vio.offline.keyframes import choose_keyframes
 from vio.offline.loop_tracks import loop_pairs
 from vio.offline.points import PointTracks, build_tracks
-from vio.offline.saved_run import SavedRun
+from vio.offline.saved_run import SavedRun, write_images
 from vio.records import Image, IntArray
 
 

@@ -162,11 +162,7 @@ def _gray(image: Image) -> Image:
 
 
 def _poses_in_map(file: Path, run: Trajectory) -> FloatArray:
-    """Return the poses (N, 4, 4) of a run's frames in a map that holds it.
-
-    Raises:
-        DataError: no session of the map has the run's keyframes.
-    """
+    """Return the poses (N, 4, 4) of a run's frames in a map that holds it."""
     with contextlib.closing(MapStore(file, read_only=True)) as store:
         graph, rows = MapGraph(store), store.keyframes()
     assert run.times_ns is not None

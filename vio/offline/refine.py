@@ -11,7 +11,6 @@ import numpy as np
 
 from vio.config import Config, merge
 from vio.errors import ConfigError, EvaluationError
-from vio.evaluation.alignment import align_poses, apply_alignment
 from vio.evaluation.trajectories import evaluate
 from vio.files.inputs import read_input
 from vio.files.yaml_text import MOST_BYTES, read_yaml
@@ -19,6 +18,7 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_hat, transfor
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.numerics.robust import robust_sigma
 from vio.offline.colmap.adjustment import Adjustment, PositionPriors, adjust
+from vio.offline.comparison import aligned_distance_m
 from vio.offline.inertial_refinement import InertialRun, adjust_with_imu, inertial_keyframes
 from vio.offline.keyframes import TrackedPath, choose_keyframes
 from vio.offline.loop_tracks import loop_pairs
@@ -103,7 +103,7 @@ def refine_run(
     progress(STEPS)
     refined = replace(path.trajectory, T_world_body=poses)
     before, after = _scores(run, refined)
-    moved_rms_m = position_difference_m(path.trajectory, refined)
+    moved_rms_m = aligned_distance_m(path.trajectory.T_world_body, refined.T_world_body)
     if path.sigmas is not None:
         sigma_m = float(np.sqrt(np.mean(path.sigmas[:, 0] ** 2)))
         if moved_rms_m > _MOST_SIGMAS * sigma_m:
@@ -260,10 +260,3 @@ def position_covariances(estimates: Sequence[Estimate], T_cam0_imu: FloatArray) 
     P = np.array([e.covariance for e in estimates])
     J = R @ p_D_xi
     return J @ P @ np.swapaxes(J, 1, 2) + _LEAST_SIGMA_M**2 * np.eye(3)
-
-
-def position_difference_m(one: Trajectory, other: Trajectory) -> float:
-    """Return the root mean square distance of paired positions after SE(3) alignment."""
-    alignment = align_poses(one.T_world_body, other.T_world_body, "se3")
-    aligned = apply_alignment(alignment, one.T_world_body)
-    return float(np.sqrt(np.mean(np.sum((aligned[:, :3, 3] - other.positions) ** 2, axis=1))))

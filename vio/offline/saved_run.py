@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vio.calibration.stereo_field import DisplacementField
 from vio.cameras.rectification_error import METRIC_TERMS, TERMS
 from vio.datasets.features import FeatureDataset
+from vio.datasets.images import write_png
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
 from vio.files.trajectories import read_trajectory
@@ -24,11 +25,14 @@ from vio.geometry.stereo import StereoCamera
 from vio.offline.comparison import GroundTruth
 from vio.offline.keyframes import TrackedPath
 from vio.offline.run_images import RunImages, field_coefficients, original_source
-from vio.records import FIELD_TERMS, FeatureTracks, LoopEvent, need_stereo
+from vio.records import FIELD_TERMS, FeatureTracks, Image, IntArray, LoopEvent, need_stereo
 from vio.runs.files import RunFile
 from vio.runs.finished import read_estimates
 from vio.runs.folder import read_metrics
 from vio.runs.mapped import read_loops
+
+if TYPE_CHECKING:
+    from vio.offline.colmap.model import ModelImages
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,3 +163,34 @@ def with_poses(run: SavedRun, folder: Path) -> SavedRun:
     if trajectory.frame_indices is None or not np.array_equal(trajectory.frame_indices, run.tracked.frames):
         raise DataError(f"{folder} contains other frames than {run.tracked.where}; refine again")
     return replace(run, tracked=replace(run.tracked, trajectory=trajectory))
+
+
+def write_images(
+    run: SavedRun,
+    source: str | None,
+    keyframes: IntArray,
+    names: ModelImages,
+    folder: Path,
+    each: Callable[[int, Image], None] = lambda keyframe, left: None,
+) -> None:
+    """Write the rectified images of the keyframes, in colour where the recording has any.
+
+    Args:
+        run: the run.
+        source: the recording, if it is not at the path stored in the run.
+        keyframes: (K,) rows of the trajectory, increasing.
+        names: file names relative to the folder.
+        folder: created if missing.
+        each: called with each keyframe's index and left image.
+
+    Raises:
+        DataError: the images are not available.
+    """
+    for name in (names.left[0], names.right[0]):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    for k, frame in enumerate(run.images.frames(run.tracked.frames[keyframes], source, colour=True)):
+        assert frame.left is not None
+        assert frame.right is not None
+        for name, image in ((names.left[k], frame.left), (names.right[k], frame.right)):
+            write_png(folder / name, image)
+        each(k, frame.left)

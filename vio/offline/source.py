@@ -12,7 +12,6 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.euroc_files import read_camera_yaml
 from vio.datasets.features import FeatureDataset
 from vio.datasets.image_pairs import ImageDataset, pair_images
-from vio.datasets.rectified import RectifiedDataset
 from vio.errors import CalibrationError
 from vio.geometry.distortion import StereoRig, rig_from_rectified
 from vio.geometry.lie import FloatArray
@@ -43,7 +42,7 @@ class CalibrationSource:
 
     def rectifying(self) -> tuple[FloatArray, FloatArray] | None:
         """Return the rotations (3, 3) from raw to rectified cameras; None: already rectified, or not possible."""
-        if not isinstance(self.dataset, RectifiedDataset) or self.dataset.rectifier.maps is None:
+        if not isinstance(self.dataset, ImageDataset) or self.dataset.rectifier.maps is None:
             return None
         return rectifying_rotations(self.dataset.rectifier.rig)[:2]
 
@@ -71,13 +70,11 @@ def open_source(text: str) -> CalibrationSource:
         return found
     recording = dataset.recording
     need_stereo(recording, "a calibration of cameras")
-    if isinstance(dataset, RectifiedDataset):
+    if isinstance(dataset, ImageDataset):
         return CalibrationSource(recording.path, dataset.rectifier.rig, dataset.pairs, dataset, None)
     known = recording.camera.width is not None
-    T = recording.T_cam0_body
-    rig = rig_from_rectified(recording.camera, T) if known else None
-    pairs = dataset.pairs if isinstance(dataset, ImageDataset) else ()
-    return CalibrationSource(recording.path, rig, pairs, dataset, None)
+    rig = rig_from_rectified(recording.camera, recording.T_cam0_body) if known else None
+    return CalibrationSource(recording.path, rig, (), dataset, None)
 
 
 def _raw_euroc(path: Path, rejection: str) -> CalibrationSource | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.calibration.severity import Grade, length_grade
+from vio.evaluation.errors_along_path import path_length_m
 from vio.offline.colmap.reconstruction import Mapper, Reconstructed
 from vio.offline.comparison import KeyframeComparison, Segment, motion_differences
 from vio.records import IntArray
@@ -113,7 +114,7 @@ def _disagreement(found: dict[Mapper, KeyframeComparison]) -> str:
 
 
 def _length(comparison: KeyframeComparison) -> float:
-    return float(np.linalg.norm(np.diff(comparison.aligned[comparison.piece, :3, 3], axis=0), axis=1).sum())
+    return path_length_m(comparison.aligned[comparison.piece, :3, 3])
 
 
 def _per_100_m(comparison: KeyframeComparison, segments: Sequence[Segment]) -> float:

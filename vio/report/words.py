@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from vio.evaluation.errors_along_path import path_length_m
 from vio.evaluation.trajectories import lengths_text, metres_text, rotation_drift_text
+from vio.records import STAGES
 from vio.runs.finished import FinishedRun
 from vio.runs.folder import refused_share
 
@@ -23,8 +25,8 @@ def summary(run: FinishedRun) -> list[str]:
     source = str(m.get("source", "")).replace("\\", "/").rstrip("/").rpartition("/")[2]
     lines = [
         f"{counted} frames of {source or 'a recording'} ({m.get('kind', 'unknown kind')}), {span_s:.1f} s and "
-        f"{_path_m(run):.1f} m, processed from {_MOTION.get(str(m.get('motion')), 'images alone')} by "
-        f"{m.get('backend', 'the filter')}."
+        f"{path_length_m(run.trajectory.positions):.1f} m, processed from "
+        f"{_MOTION.get(str(m.get('motion')), 'images alone')} by {m.get('backend', 'the filter')}."
     ]
     if m.get("complete") is False:
         why = m.get("stopped")
@@ -51,16 +53,8 @@ def summary(run: FinishedRun) -> list[str]:
     if nis is not None:
         lines.append(f"The median innovation (NIS) is {nis:.2g} of its covariance.")
     warnings = m.get("warnings") or []
-    lines.append(f"{len(warnings)} warnings, below." if len(warnings) > 1 else _one(warnings))
-    return lines
-
-
-def _one(warnings: Sequence[str]) -> str:
-    return "One warning, below." if warnings else "No warnings."
-
-
-def _path_m(run: FinishedRun) -> float:
-    return float(np.linalg.norm(np.diff(run.trajectory.positions, axis=0), axis=1).sum())
+    many = f"{len(warnings)} warnings, below."
+    return [*lines, {0: "No warnings.", 1: "One warning, below."}.get(len(warnings), many)]
 
 
 def _speed(run: FinishedRun) -> str:
@@ -75,10 +69,7 @@ def _speed(run: FinishedRun) -> str:
 
 
 def _work_ms(run: FinishedRun) -> Any:
-    return np.sum([run.frames[name] for name in run.frames if name in _TIMES], axis=0)
-
-
-_TIMES = ("read_ms", "frontend_ms", "monitor_ms", "select_ms", "filter_ms")
+    return np.sum([run.frames[f"{stage}_ms"] for stage in STAGES if f"{stage}_ms" in run.frames], axis=0)
 
 
 def calibration_findings(metrics: Mapping[str, Any]) -> list[str]:
@@ -114,7 +105,7 @@ def run_figures(run: FinishedRun) -> dict[str, str]:
     refused, innovations = refused_share(run.frames["used"], run.frames["gated"]), m.get("innovation_ratio")
     return {
         "frames": str(len(run.estimates)),
-        "path (m)": f"{_path_m(run):.2f}",
+        "path (m)": f"{path_length_m(run.trajectory.positions):.2f}",
         "back end": f"{m.get('backend', '–')}, motion {m.get('motion', '–')}",
         "ATE": "–" if evaluation is None else metres_text(evaluation.ate_m.rmse),
         "largest error": "–" if evaluation is None else metres_text(evaluation.ate_m.max),

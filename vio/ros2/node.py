@@ -12,8 +12,8 @@ from vio.cameras.rig import Rig
 from vio.config import Config
 from vio.errors import CalibrationError
 from vio.live.build import MapUse
-from vio.live.event_queue import Drop
 from vio.live.live_odometry import LiveOdometry
+from vio.live.worker import Drop
 from vio.ros2.calibration import CameraInfos
 from vio.ros2.outputs import RESET, SAVE, FrameNames, Outputs
 from vio.ros2.sensors import SILENT_S, Sensors, SensorTopics, Silence, check_types

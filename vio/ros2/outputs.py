@@ -13,9 +13,8 @@ import numpy as np
 
 from vio.errors import VioError
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.live.live_odometry import LiveOdometry
+from vio.live.live_odometry import EstimateStream, LiveOdometry
 from vio.live.results import live_trajectory, write_results
-from vio.live.stream import EstimateStream
 from vio.offline.export_bag import ros_covariance
 from vio.records import NS_PER_S, Estimate
 from vio.ros2.sensors import Sensors

@@ -13,9 +13,9 @@ import numpy as np
 
 from vio.datasets.bags.cdr import decoded
 from vio.datasets.bags.index import stamp_of
-from vio.datasets.bags.pictures import compressed_pixels, gray_of, raw_gray
+from vio.datasets.bags.pictures import gray_of, raw_gray
 from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
-from vio.datasets.images import WHITE_16, UnreadableImageError, brightest, white_of
+from vio.datasets.images import UnreadableImageError, brightest, white_of
 from vio.errors import DataError, OrderError
 from vio.geometry.lie import FloatArray
 from vio.live.live_odometry import LiveOdometry
@@ -133,12 +133,8 @@ class Sensors:
 
     def _white(self, fields: Any, kind: str, where: str) -> int:
         """Return the level of white of 16-bit images, from the first ones."""
-        encoding = getattr(fields, "encoding", "16")
-        if len(self._levels) < _WHITE_IMAGES and "16" in encoding:
-            pixels = compressed_pixels(fields, where) if kind == COMPRESSED else raw_gray(fields, where)
-            if pixels.dtype != np.uint16:
-                return WHITE_16
-            self._levels.append(brightest(pixels))
+        if kind == IMAGE and len(self._levels) < _WHITE_IMAGES and "16" in fields.encoding:
+            self._levels.append(brightest(raw_gray(fields, where)))
         return white_of(max(self._levels, default=0.0))
 
     def _refuse(self, why: str) -> None:

@@ -113,9 +113,7 @@ def read_trajectories(folder: Path) -> tuple[Trajectory, Trajectory]:
 
 def write_loops(folder: Path, loops: Sequence[LoopEvent]) -> None:
     """Write the loops of a run, one a line, and the features that agree with them."""
-    rows = [[getattr(o, column) for column in _LOOP_COLUMNS] for o in loops]
-    lines = [",".join("" if value is None else str(value) for value in row) for row in rows]
-    (folder / RunFile.LOOPS).write_text("\n".join([",".join(_LOOP_COLUMNS), *lines]) + "\n", encoding="utf-8")
+    _write_rows(folder / RunFile.LOOPS, _LOOP_COLUMNS, [[getattr(o, name) for name in _LOOP_COLUMNS] for o in loops])
     known = [(n, o.matches) for n, o in enumerate(loops) if o.matches is not None]
     of_loop = np.repeat([n for n, _ in known], [len(m) for _, m in known]).astype(np.int64)
     none = np.zeros((0, 4)), np.zeros(0, dtype=np.bool_)
@@ -133,10 +131,8 @@ def write_keyframes(folder: Path, keyframes: MapKeyframes) -> None:
     poses = np.concatenate([T[:, :3, 3], quat_xyzw_from_rotation(T[:, :3, :3])], axis=1).tolist()
     columns = (keyframes.keyframe, keyframes.frame, keyframes.time_ns, keyframes.own.astype(np.int64))
     numbers = np.stack(columns, axis=1).tolist()
-    lines = [",".join(map(str, [*row, *pose])) for row, pose in zip(numbers, poses, strict=True)]
-    (folder / RunFile.MAP_KEYFRAMES).write_text(
-        "\n".join([",".join(_KEYFRAME_COLUMNS), *lines]) + "\n", encoding="utf-8"
-    )
+    rows = [[*row, *pose] for row, pose in zip(numbers, poses, strict=True)]
+    _write_rows(folder / RunFile.MAP_KEYFRAMES, _KEYFRAME_COLUMNS, rows)
 
 
 def read_loops(folder: Path) -> tuple[LoopEvent, ...]:
@@ -202,6 +198,11 @@ def _read_covariances(path: Path, count: int) -> FloatArray:
     if P.shape != (count, 6, 6) or P.dtype != np.float64:
         raise DataError(f"{path}: is damaged; repeat the run")
     return P
+
+
+def _write_rows(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    lines = [",".join("" if value is None else str(value) for value in row) for row in [columns, *rows]]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _read_rows(path: Path) -> list[dict[str, str]]:

@@ -1,4 +1,4 @@
-"""Plots of a run, drawn with matplotlib without its global state."""
+"""Plots of a run and of several trajectories, drawn with matplotlib without its global state."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import io
 import logging
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ _ESTIMATE, _REFERENCE, _DEAD_RECKONING, _LANDMARKS = "#1f5fbf", "#111111", "#d98
 _GREEN, _PURPLE = "#3a9d5d", "#8a5fb0"
 _MOVED_SIGMAS = 3.0  # a stereo calibration that ends within so many standard deviations of zero is not drawn
 _LEAST_MARGIN_M = 0.02  # about a rig that stands
+_MILLIMETRES_BELOW_M = 0.02  # largest error of trajectories that are compared
+_COLOURS = ("#1f5fbf", "#d9822b", "#2e8b57", "#a83279", "#7a5195", "#0f8b8d", "#b5533c", "#6b7280")
 _SCALE = 1.3  # of the largest value to the end of an axis
 _BINS = 250  # of the curves that are medians over frames
 # Of the panels, as shares of the figure and of a panel. A layout that matplotlib finds by itself draws all twice.
@@ -233,3 +235,29 @@ def _draw_calibration(axes: Any, seconds: FloatArray, estimates: Rows, focal: fl
     axes.set_title("stereo calibration is off by", fontsize=9, loc="left")
     axes.set_ylabel("px")
     axes.legend(loc="best", fontsize=8, ncols=4)
+
+
+def draw_comparison(results: Mapping[str, Evaluation]) -> Any:
+    """Draw evaluations against one reference, by name, in the plane in which the reference extends furthest."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 5.6), dpi=110, layout="constrained")
+    above, along = figure.subplots(1, 2, width_ratios=(1, 1.2))
+    truth = max((r.reference.positions for r in results.values()), key=len)
+    plane = np.linalg.svd(truth - truth.mean(axis=0), full_matrices=False)[2][:2]
+    above.plot(*((truth - truth[0]) @ plane.T).T, color="#111111", lw=3.0, label="reference")
+    largest = max(float(r.errors_m.max()) for r in results.values())
+    factor, unit = (1e3, "mm") if largest < _MILLIMETRES_BELOW_M else (1.0, "m")
+    for k, (name, r) in enumerate(results.items()):
+        colour, label = _COLOURS[k % len(_COLOURS)], f"{name}: ATE {metres_text(r.ate_m.rmse)}"
+        above.plot(*((r.aligned.positions - truth[0]) @ plane.T).T, color=colour, lw=1.4, label=label)
+        steps = np.linalg.norm(np.diff(r.reference.positions, axis=0), axis=1)
+        along.plot(np.concatenate([[0.0], np.cumsum(steps)]), factor * r.errors_m, color=colour, lw=1.4)
+    above.set_aspect("equal", "datalim")
+    above.set(xlabel="m, along the longest extent", ylabel="m", title="paths")
+    along.set(xlabel="way on the reference (m)", ylabel=f"position error ({unit})", title="errors after alignment")
+    along.set_ylim(bottom=0)
+    for panel in (above, along):
+        panel.grid(alpha=0.25)
+    above.legend(fontsize=8, loc="best")
+    return figure

@@ -312,7 +312,7 @@ class _Loop:
             last = max(state.next_frame, *state.unread)
             monitor.say(_unread_line(state.unread, sum(index <= last for index in self._frames)))
         self._record(processor.finish())
-        recorder.revise(processor.pipeline.smoothed)
+        recorder.revise(processor.pipeline.backend.smoothed)
         if monitor.frames_refused > len(recorder):
             raise DataError(f"most frames were refused: {monitor.refusal}")
         return stopped
@@ -345,7 +345,7 @@ class _Loop:
     def _record(self, results: list[FrameResult]) -> None:
         state = self._state
         for result in results:
-            self._recorder.frame(result, self._read_ms, state.processor.pipeline.smoothed)
+            self._recorder.frame(result, self._read_ms, state.processor.pipeline.backend.smoothed)
             self._read_ms = 0.0
             if state.dead_reckoning is not None:
                 self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))

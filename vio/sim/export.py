@@ -11,15 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.cameras.rig import Rig
-from vio.datasets.euroc_files import (
-    STATE_CSV,
-    image_name,
-    imu_csv,
-    imu_yaml,
-    median_rate_hz,
-    state_csv,
-    write_cameras,
-)
+from vio.datasets.euroc_files import STATE_CSV, image_name, imu_csv, imu_yaml, median_rate_hz, state_csv, write_cameras
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.datasets.rigs.kalibr import kalibr_text
@@ -27,7 +19,6 @@ from vio.errors import SimulationError
 from vio.files.atomic import atomic_folder
 from vio.files.text import exact_text, seconds_text, write_text
 from vio.files.trajectories import in_first_cam0, write_tum
-from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.protocols import Progress
 from vio.records import ImuDensities
@@ -145,19 +136,9 @@ def description(recording: SimulatedRecording) -> str:
         if simulation.imu is None
         else ("simulated" if simulation.imu.gyro_bias is not None else "recorded"),
         "effects": asdict(simulation.effects),
-        "true_rig": _rig_facts(simulation.rig),
+        "true_rig": asdict(simulation.rig),  # which the calibration that is written may miss
     }
-    return json.dumps(facts, indent=2) + "\n"
-
-
-def _rig_facts(rig: StereoRig) -> dict[str, object]:
-    """The true cameras, which the calibration that is written may miss, as JSON."""
-    return {
-        "cam0": asdict(rig.cam0),
-        "cam1": asdict(rig.cam1),
-        "T_imu_cam0": rig.T_imu_cam0.tolist(),
-        "T_imu_cam1": rig.T_imu_cam1.tolist(),
-    }
+    return json.dumps(facts, indent=2, default=np.ndarray.tolist) + "\n"
 
 
 _FACTOR = 5000  # levels per metre, as TUM's

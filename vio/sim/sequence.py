@@ -36,7 +36,7 @@ from vio.sim.exposure import ExposurePlan, plan_exposures
 from vio.sim.glare import glare
 from vio.sim.imu import ImuNoise, VelocityNoise, simulate_imu, simulate_velocity
 from vio.sim.miscalibration import CalibrationErrors, CalibrationSigmas, drawn_rig, miscalibrated
-from vio.sim.motion import FitReport, MotionSpline, motion_at, recorded_motion
+from vio.sim.motion import MotionSpline, motion_at, recorded_motion
 from vio.sim.render import CameraRays, Radiance, View, camera_rays, correspondence, depth_map, render
 from vio.sim.world import World, check_clear, room
 
@@ -295,15 +295,6 @@ class SimulatedRecording:
         plan = self.simulation.exposures
         return None if plan is None else plan.at(index, camera)
 
-    def radiance(self, time_ns: int) -> tuple[Radiance, Radiance]:
-        """Render both linear images (H, W) at a true time, with the blur and glare that the effects set.
-
-        With exposure control the blur is that of the nominal shutter time.
-        """
-        effects = self.simulation.effects
-        exposure = Exposure(effects.shutter_ms) if effects.auto_exposure else None
-        return self._seen(0, time_ns, exposure), self._seen(1, time_ns, exposure)
-
     def _seen(self, camera: int, time_ns: int, exposure: Exposure | None) -> Radiance:
         """Light (H, W) that reaches the sensor: blurred over the shutter time, with the lens's glare."""
         shutter_ms = self.simulation.effects.blur_exposure_ms if exposure is None else exposure.shutter_ms
@@ -379,7 +370,6 @@ class RecordedFlight:
     """A real flight: its smoothed motion, real image times, and the real IMU where there is one."""
 
     motion: MotionSpline
-    fit: FitReport
     frame_times_ns: IntArray  # (F,)
     imu: ImuRecord | None = field(default=None)
 
@@ -395,7 +385,7 @@ def read_flight(groundtruth: Path, image_times: Path | None = None, imu_csv: Pat
     Raises:
         DataError: a file cannot be used; the message names it.
     """
-    motion, fit = recorded_motion(groundtruth)
+    motion, _ = recorded_motion(groundtruth)
     if image_times is None:
         times = np.arange(motion.start_ns, motion.end_ns, 50_000_000)
     else:
@@ -404,7 +394,7 @@ def read_flight(groundtruth: Path, image_times: Path | None = None, imu_csv: Pat
     if len(times) == 0:
         raise DataError(f"no image time is within the ground truth {groundtruth}; use the same clock for both")
     imu = None if imu_csv is None else read_imu_table(imu_csv, whole_ns=True)[0]
-    return RecordedFlight(motion, fit, times, imu)
+    return RecordedFlight(motion, times, imu)
 
 
 def room_around(motion: MotionSpline, *, seed: int = 0, texel_m: float | None = None) -> World:

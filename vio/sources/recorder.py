@@ -17,11 +17,9 @@ from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
 from vio.files.text import exact_text, seconds_text
-from vio.records import ImuSample
 from vio.sources.source import SourceEvent, SourceFrame
 
 Form: TypeAlias = Literal["plain", "rosbag2", "mcap"]
-FORMS: tuple[Form, ...] = ("plain", "rosbag2", "mcap")
 
 _WAITING = 100  # frames that may wait for the disk; beyond, the source waits
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # fast
@@ -135,7 +133,7 @@ def _bag(folder: Path, storage: Literal["rosbag2", "mcap"]) -> Iterator[Callable
 
         def write(event: SourceEvent) -> None:
             if not isinstance(event, SourceFrame):
-                bag.imu("/imu0", "imu", ImuSample(event.time_ns, event.gyro, event.accel))
+                bag.imu("/imu0", "imu", event)
                 return
             for name, image in zip(_CAMERAS, (event.left, event.right), strict=True):
                 if image is not None:

@@ -12,10 +12,10 @@ from vio.config import Config
 from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import FloatArray
 from vio.live.build import MapUse
-from vio.live.event_queue import Drop
 from vio.live.figures import LiveFigures
 from vio.live.live_odometry import LiveOdometry
 from vio.live.results import write_results
+from vio.live.worker import Drop
 from vio.records import FrameResult
 from vio.sources.recorder import Form, Recorder
 from vio.sources.source import LiveSource, SourceFrame

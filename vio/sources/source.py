@@ -11,7 +11,7 @@ from typing import Literal, Protocol, TypeAlias
 from vio.cameras.rig import Rig
 from vio.errors import ConfigError
 from vio.geometry.lie import FloatArray
-from vio.records import Image
+from vio.records import Image, ImuSample
 
 Layout: TypeAlias = Literal["side-by-side", "top-bottom", "single"]
 
@@ -25,16 +25,7 @@ class SourceFrame:
     right: Image | None  # None: one camera
 
 
-@dataclass(frozen=True, slots=True)
-class SourceSample:
-    """One sample of the IMU, on its own clock as the rig states it."""
-
-    time_ns: int
-    gyro: FloatArray  # (3,) rad/s
-    accel: FloatArray  # (3,) m/s^2
-
-
-SourceEvent: TypeAlias = "SourceFrame | SourceSample"
+SourceEvent: TypeAlias = "SourceFrame | ImuSample"  # samples on the IMU's own clock as the rig states it
 
 
 class LiveSource(Protocol):
@@ -98,19 +89,19 @@ class ImuInterpolation:
         self._gyro: deque[tuple[int, FloatArray]] = deque()
         self._accel: deque[tuple[int, FloatArray]] = deque()
 
-    def gyro(self, time_ns: int, value: FloatArray) -> Iterator[SourceSample]:
+    def gyro(self, time_ns: int, value: FloatArray) -> Iterator[ImuSample]:
         """Take a sample (3,) rad/s of the gyro; yield what is complete."""
         if not self._gyro or time_ns > self._gyro[-1][0]:
             self._gyro.append((time_ns, value))
         yield from self._complete()
 
-    def accel(self, time_ns: int, value: FloatArray) -> Iterator[SourceSample]:
+    def accel(self, time_ns: int, value: FloatArray) -> Iterator[ImuSample]:
         """Take a sample (3,) m/s^2 of the accelerometer; yield what is complete."""
         if not self._accel or time_ns > self._accel[-1][0]:
             self._accel.append((time_ns, value))
         yield from self._complete()
 
-    def _complete(self) -> Iterator[SourceSample]:
+    def _complete(self) -> Iterator[ImuSample]:
         while self._gyro and self._accel and self._gyro[0][0] <= self._accel[-1][0]:
             time_ns, gyro = self._gyro.popleft()
             while len(self._accel) > 1 and self._accel[1][0] <= time_ns:
@@ -119,4 +110,4 @@ class ImuInterpolation:
             if time_ns < t0:
                 continue
             share = (time_ns - t0) / (t1 - t0) if t1 > t0 else 0.0
-            yield SourceSample(time_ns, gyro, a0 + share * (a1 - a0))
+            yield ImuSample(time_ns, gyro, a0 + share * (a1 - a0))

@@ -176,7 +176,7 @@ def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
     for name in infos:
         takers[name] = [partial(_info, index)]
     for name in (t.name for t in bag.topics if t.kind == TF and t.name.endswith("tf_static")):
-        takers[name] = [partial(_frames, index)]
+        takers[name] = [lambda fields, message: index.add_frames(fields)]
     for message in bag.messages(list(takers)):
         fields = bag.decoded(message)
         for taker in takers[message.topic]:
@@ -205,9 +205,10 @@ def _image(bag: Bag, stamps: Stamps, topic: Topic, fields: Any, message: Message
         stamps.white = max(stamps.white, brightest(pixels))
 
 
-def _late(index: BagIndex, rows: list[tuple[int, tuple[float, ...]]], topic: str, time_ns: int) -> None:
-    if rows and time_ns < rows[-1][0]:
+def _add(index: BagIndex, rows: list[tuple[int, tuple[float, ...]]], topic: str, row: tuple[int, Any]) -> None:
+    if rows and row[0] < rows[-1][0]:
         index.disordered[topic] = index.disordered.get(topic, 0) + 1
+    rows.append(row)
 
 
 def _imu(index: BagIndex, fields: Any, message: Message) -> None:
@@ -216,16 +217,14 @@ def _imu(index: BagIndex, fields: Any, message: Message) -> None:
     time_ns = stamp_of(fields)
     if not np.isfinite(values).all():
         raise DataError(f"{message.topic}: the sample at {time_ns} ns is not finite ({values}); record the IMU again")
-    _late(index, index.imu, message.topic, time_ns)
     index.imu_frame = index.imu_frame or str(fields.header.frame_id)
-    index.imu.append((time_ns, values))
+    _add(index, index.imu, message.topic, (time_ns, values))
 
 
 def _velocity(index: BagIndex, fields: Any, message: Message) -> None:
     twist = fields.twist.twist if hasattr(fields.twist, "twist") else fields.twist
     v, w = twist.linear, twist.angular
-    _late(index, index.velocities, message.topic, stamp_of(fields))
-    index.velocities.append((stamp_of(fields), (v.x, v.y, v.z, w.x, w.y, w.z)))
+    _add(index, index.velocities, message.topic, (stamp_of(fields), (v.x, v.y, v.z, w.x, w.y, w.z)))
 
 
 def _pose(index: BagIndex, fields: Any, message: Message) -> None:
@@ -240,12 +239,7 @@ def _pose(index: BagIndex, fields: Any, message: Message) -> None:
     else:
         pose = fields.pose.pose if hasattr(fields.pose, "pose") else fields.pose
         p, q = pose.position, pose.orientation
-    _late(index, index.poses, message.topic, stamp_of(fields))
-    index.poses.append((stamp_of(fields), (p.x, p.y, p.z, q.x, q.y, q.z, q.w)))
-
-
-def _frames(index: BagIndex, fields: Any, message: Message) -> None:
-    index.add_frames(fields)
+    _add(index, index.poses, message.topic, (stamp_of(fields), (p.x, p.y, p.z, q.x, q.y, q.z, q.w)))
 
 
 def _info(index: BagIndex, fields: Any, message: Message) -> None:

@@ -30,13 +30,9 @@ def gray_of(fields: Any, where: str, *, compressed: bool, white: int = WHITE_16,
         UnreadableImageError: the pixels are truncated or do not decode.
         DataError: the encoding is not read.
     """
-    read = compressed_pixels if compressed else raw_gray
-    return to_8_bits(read(fields, where, colour=colour), white)
-
-
-def compressed_pixels(fields: Any, where: str, *, colour: bool = False) -> npt.NDArray[Any]:
-    """Decode a CompressedImage: gray (H, W) or colour (H, W, 3), 8 bits; of 16-bit files by full scale."""
-    return decode_gray(bytes(fields.data), where, colour=colour)
+    if compressed:
+        return decode_gray(bytes(fields.data), where, colour=colour)
+    return to_8_bits(raw_gray(fields, where, colour=colour), white)
 
 
 def raw_gray(fields: Any, where: str, *, colour: bool = False) -> npt.NDArray[Any]:

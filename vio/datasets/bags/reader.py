@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from vio.cameras.rig import Rectifier
 from vio.datasets.bags.companions import chosen_rig, contents, motion_of
 from vio.datasets.bags.index import Stamps, stamp_of
 from vio.datasets.bags.pictures import gray_of
@@ -20,12 +19,12 @@ from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import COMPRESSED
 from vio.datasets.common import naming
 from vio.datasets.companions import reference_of_body
-from vio.datasets.frame_times import PAIRED_NS, pair_stamps
+from vio.datasets.frame_times import paired
 from vio.datasets.image_pairs import BadFrame, ImageRecording, ImageSize, readable_frames
 from vio.datasets.images import UnreadableImageError, white_note, white_of
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
-from vio.records import ImuDensities, IntArray, Recording, StereoFrame
+from vio.records import IntArray, Recording, StereoFrame
 
 _Messages = tuple[int, list[Any]]  # of a frame: its number, and the image of each camera, decoded but for its pixels
 
@@ -37,10 +36,8 @@ class BagDataset(ImageRecording):
     topics: tuple[Topic, ...]  # of the images: left, and right where there is one
     stamps_ns: tuple[IntArray, ...]  # (F,) stamps of the images of each topic, of a pair in one row
     logged_ns: IntArray  # (F,) when the bag received the first image of each frame
-    rectifier: Rectifier
     white: int  # level of white of 16-bit images
     unstamped: tuple[bool, ...]  # of each topic: the headers have no stamps, the times of logging serve
-    imu_noise: ImuDensities | None = None
 
     def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
         return readable_frames(self._load, self._messages(chosen), self.settings)
@@ -125,8 +122,8 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         ImageSize(camera.width, camera.height, Path(file or info or path))
         for camera, info in zip(rig.cameras, found.infos, strict=True)
     )
-    images = roles.cameras, stamps_ns, logged_ns, rectifier, white, tuple(each.unstamped for each in stamps)
-    return BagDataset(recording, motion, sizes, settings, *images, rig.imu_noise)
+    images = roles.cameras, stamps_ns, logged_ns, white, tuple(each.unstamped for each in stamps)
+    return BagDataset(recording, motion, sizes, settings, rectifier, *images, imu_noise=rig.imu_noise)
 
 
 def _frames(
@@ -149,16 +146,5 @@ def _frames(
     if len(images) == 1:
         return (times[0],), logged[0], notes
     left, right = times
-    a, b = pair_stamps(left, right)
-    if not len(a):
-        spans = [f"{t[0]} to {t[-1]} ns" for t in times]
-        raise DataError(
-            f"{path}: no image of {names[0]} ({spans[0]}) has one of {names[1]} ({spans[1]}) within "
-            f"{PAIRED_NS / 1e6:g} ms; the cameras must be synchronised"
-        )
-    alone = len(left) - len(a), len(right) - len(b)
-    if any(alone):
-        notes.append(f"{alone[0]} left and {alone[1]} right images have no partner and are skipped")
-    if (offset := float(np.median(right[b] - left[a])) / 1e6) != 0:
-        notes.append(f"the right images are stamped {offset:+.3f} ms from the left ones (median)")
-    return (left[a], right[b]), np.minimum(logged[0][a], logged[1][b]), notes
+    a, b, differing = paired(left, right, names, path)
+    return (left[a], right[b]), np.minimum(logged[0][a], logged[1][b]), [*notes, *differing]

@@ -20,11 +20,12 @@ from vio.datasets.rigs.opencv import is_opencv, read_entries, rig_from_opencv
 from vio.datasets.yaml_files import read_yaml_file
 from vio.errors import CalibrationError
 from vio.files.text import text_lines
-from vio.geometry.lie import se3_from_parts, se3_inverse
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 
-__all__ = ["find_calibration", "load_rig"]
+__all__ = ["find_calibration", "kitti_rig", "load_rig"]
 
 Size = tuple[int, int]
+_OFF_AXIS_NOTE_M = 1e-3  # by which KITTI's right camera may be off the left one's x axis before it is noted
 
 KNOWN = (
     "Kalibr's camchain.yaml or camchain-imucam.yaml, EuRoC's sensor.yaml (mav0), KITTI's calib.txt or "
@@ -89,7 +90,7 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
     if path.name == CAMERAS:
         return _kitti_raw(path, image_size)
     if suffix == ".txt":
-        return _kitti(path, image_size)
+        return kitti_rig(path, image_size)[0]
     if suffix == ".xml":
         return read_boofcv(path) if is_boofcv(path) else rig_from_opencv(read_entries(path), str(path), image_size)
     entries = read_yaml_file(path, "the cameras' calibration")
@@ -123,17 +124,31 @@ def _euroc(path: Path, cameras: int | None) -> Rig:
         return Rig(cam0, cam1, se3_inverse(T_imu_cam1) @ T_imu_cam0, se3_inverse(T_imu_cam0), noise)
 
 
-def _kitti(path: Path, image_size: Size | None) -> Rig:
-    """Read KITTI's `calib.txt` of the gray pair (else of the colour pair), and `T_cam0_imu.txt` beside it."""
-    lines = [line for _, line in text_lines(path)]
-    gray = any(line.startswith("P0:") for line in lines)
-    calibration = read_calibration(path, (0, 1) if gray else (2, 3))
+def kitti_rig(path: Path, image_size: Size | None, cameras: tuple[int, int] | None = None) -> tuple[Rig, FloatArray]:
+    """Return KITTI's `calib.txt`, with `T_cam0_imu.txt` beside it, and `T_left_cam0` (4, 4) from KITTI's camera 0.
+
+    Args:
+        path: the file.
+        image_size: width and height of the images, pixels.
+        cameras: numbers of the left and the right one; None: the gray pair, else that in colour.
+
+    Raises:
+        CalibrationError: a file is invalid, or no image size is given.
+    """
+    if cameras is None:
+        cameras = (0, 1) if any(line.startswith("P0:") for _, line in text_lines(path)) else (2, 3)
+    calibration = read_calibration(path, cameras)
     if image_size is None:
         raise CalibrationError(f"{path}: states no image size; pass image_size=(W, H)")
     c, T_cam0_imu = calibration.camera, read_extrinsics(path.with_name("T_cam0_imu.txt"))
     T_left_imu = None if T_cam0_imu is None else calibration.T_left_cam0 @ T_cam0_imu
     with naming(path):
-        return Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, *image_size, T_cam0_imu=T_left_imu)
+        rig = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, *image_size, T_cam0_imu=T_left_imu)
+    if calibration.off_axis_m > _OFF_AXIS_NOTE_M:
+        off_axis = f"is {1e3 * calibration.off_axis_m:.1f} mm off the x axis of that of image_{cameras[0]}"
+        note = f"the camera of image_{cameras[1]} {off_axis}; the pair is treated as rectified anyway"
+        rig = rig.noting(note)
+    return rig, calibration.T_left_cam0
 
 
 def _kitti_raw(path: Path, image_size: Size | None) -> Rig:

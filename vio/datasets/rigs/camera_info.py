@@ -16,20 +16,11 @@ import numpy as np
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.opencv import trimmed_coefficients
-from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml_file, section
+from vio.datasets.yaml_files import Entries, lens_model, matrix, numbers, read_yaml_file, section
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts
 
-_MODELS: dict[str, DistortionModel] = {
-    "": "radtan",
-    "none": "pinhole",
-    "plumb_bob": "radtan",
-    "radtan": "radtan",
-    "rational_polynomial": "radtan",
-    "equidistant": "equidistant",
-    "fisheye": "equidistant",
-}
 _PAIRS = (("left", "right"), ("LEFT", "RIGHT"), ("cam0", "cam1"), ("camera_0", "camera_1"), ("infra1", "infra2"))
 
 
@@ -138,11 +129,7 @@ def _camera(info: CameraInfo, *, rectified: bool) -> CameraModel:
 
 
 def _lens(info: CameraInfo) -> tuple[DistortionModel, tuple[float, ...]]:
-    if info.model not in _MODELS:
-        raise CalibrationError(
-            f"{info.where}: distortion_model {info.model!r} is not read; known: {', '.join(_MODELS)[2:]}"
-        )
-    model = _MODELS[info.model]
+    model = lens_model(info.model or "plumb_bob", info.where)
     if model == "pinhole" or not any(info.D):
         return "pinhole", ()
     if model == "equidistant":

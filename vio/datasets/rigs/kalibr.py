@@ -16,19 +16,12 @@ import yaml
 
 from vio.cameras.rig import Rig
 from vio.datasets.common import image_size, naming
-from vio.datasets.yaml_files import Entries, imu_densities, matrix, numbers, read_yaml_file, section
+from vio.datasets.yaml_files import Entries, imu_densities, lens_model, matrix, numbers, read_yaml_file, section
 from vio.errors import CalibrationError
-from vio.geometry.distortion import CameraModel, DistortionModel
+from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
 from vio.records import ImuDensities
 
-_BENDS: dict[str, DistortionModel] = {
-    "none": "pinhole",
-    "radtan": "radtan",
-    "plumb_bob": "radtan",
-    "equi": "equidistant",
-    "equidistant": "equidistant",
-}
 _LEADING = {"pinhole": 0, "omni": 1, "ds": 2}  # parameters of the projection before fu fv cu cv
 _SAME_M, _SAME_RAD = 2e-3, 5e-3  # how far the two statements of the stereo pose may be apart before it is said
 
@@ -87,12 +80,10 @@ def _camera(block: Mapping[str, Any], where: str) -> CameraModel:
     kind, bend = block.get("camera_model", "pinhole"), str(block.get("distortion_model", "none"))
     if kind not in _LEADING:
         raise CalibrationError(f"{where}: camera_model {kind!r} is not read; calibrate with {', '.join(_LEADING)}")
-    if bend not in _BENDS:
-        raise CalibrationError(f"{where}: distortion_model {bend!r} is not read; calibrate with {', '.join(_BENDS)}")
     leading = _LEADING[str(kind)]
     values = numbers(block, "intrinsics", where, leading + 4)
     fu, fv, cu, cv = values[leading:]
-    model = _BENDS[bend]
+    model = lens_model(bend, where)
     coefficients = () if model == "pinhole" else numbers(block, "distortion_coeffs", where)
     if kind == "ds" and not any(coefficients):
         model, coefficients = "double_sphere", values[:2]

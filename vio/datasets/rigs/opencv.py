@@ -15,9 +15,8 @@ import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import naming
-from vio.datasets.yaml_files import Entries, as_number, matrix, read_yaml_file
+from vio.datasets.yaml_files import Entries, as_number, lens_model, matrix, read_yaml_file
 from vio.errors import CalibrationError
-from vio.geometry.distortion import DistortionModel
 from vio.geometry.lie import FloatArray, checked_transform
 
 _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
@@ -41,14 +40,6 @@ _SIZES = (
     ("imageWidth", "imageHeight"),
     ("LEFT.width", "LEFT.height"),
 )
-_MODELS: dict[str, DistortionModel] = {
-    "radtan": "radtan",
-    "plumb_bob": "radtan",
-    "pinhole": "radtan",
-    "fisheye": "equidistant",
-    "equidistant": "equidistant",
-    "kannala_brandt": "equidistant",
-}
 _TOO_WIDE_M = 5.0  # a longer baseline is taken for millimetres, or squares of the board, and said
 
 
@@ -107,9 +98,8 @@ def rig_from_opencv(entries: Entries, where: str, image_size: tuple[int, int] | 
 def _raw(entries: Entries, where: str, width: int, height: int) -> Rig:
     K0, K1 = (_required(entries, key, (3, 3), where) for key in ("K0", "K1"))
     stated = entries.get("distortion_model", entries.get("camera_model", entries.get("model")))
-    if stated is not None and str(stated).lower() not in _MODELS:
-        raise CalibrationError(f"{where}: distortion model {stated!r} is not read; known: {', '.join(_MODELS)}")
-    model = _MODELS[str(stated).lower()] if stated is not None else "radtan"
+    named = stated is not None and str(stated).lower() != "pinhole"  # that is the projection
+    model = lens_model(stated, where) if named else "radtan"
     notes: list[str] = []
     cameras = []
     for K, key in ((K0, "D0"), (K1, "D1")):

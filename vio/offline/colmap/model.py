@@ -123,14 +123,10 @@ def _add_points(
     right_index: IntArray,
     colours: ColourArray | None,
 ) -> None:
-    """Add the points with their tracks.
+    """Add the points with their tracks and colours (M, 3) to a model that has the frames.
 
-    Args:
-        model: already contains the frames.
-        tracks: the points.
-        begins: (K,) first row of each keyframe; the pixels of its left image are its rows, in order.
-        right_index: (R,) index of each row among the pixels of its keyframe's right image; -1: no right pixel.
-        colours: (M, 3); None: gray.
+    The pixels of a keyframe's left image are its rows from `begins` (K + 1,) on, in order; `right_index` (R,) is the
+    index of each row among the pixels of its right image, -1 where it has none.
     """
     by_point = np.argsort(tracks.point, kind="stable")
     parts = np.searchsorted(tracks.point[by_point], np.arange(len(tracks.ids) + 1))
