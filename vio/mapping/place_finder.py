@@ -90,16 +90,6 @@ class PlaceFinder:
         return {key: value for key, value in self.__dict__.items() if key not in _OF_THE_FILE}
 
     @property
-    def index_bytes(self) -> int:
-        """Memory of the words of all keyframes."""
-        return self._index.nbytes
-
-    @property
-    def overlap_bytes(self) -> int:
-        """Memory of the points by which places are expected."""
-        return self._overlaps.nbytes
-
-    @property
     def shows_something(self) -> BoolArray:
         """Mask (N,) of the keyframes that can be found again."""
         shows = np.ones(len(self._index), dtype=np.bool_)
