@@ -22,11 +22,6 @@ class Overlaps:
         self._points = Rows(_POINTS, 3)  # in the keyframe's camera
         self._count = Rows()  # of stereo points
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the points, bytes."""
-        return self._points.rows.nbytes + self._count.rows.nbytes
-
     def add(self, p: FloatArray) -> None:
         """Add a keyframe with its stereo points (N, 3), in the order of their columns."""
         chosen = np.linspace(0, len(p) - 1, _POINTS).astype(np.int64)
