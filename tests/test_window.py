@@ -12,6 +12,7 @@ from vio.filters.navigation import DIM, Measurement, NavState, TwistMotion
 from vio.filters.prior import factor, fit, posterior
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
+from vio.filters.window_posterior import move_covariance
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 
 STEP_NS = 50_000_000
@@ -85,11 +86,11 @@ def test_covariance_of_the_last_move_counts_what_both_poses_share() -> None:
     J = np.zeros((6, len(window.prior.P)))
     J[:, window.state.clone(3)], J[:, window.state.clone(2)] = np.eye(6), -np.eye(6)
     prior = fit(factor(window.prior.P), np.zeros_like(window.prior.P))
-    np.testing.assert_allclose(window.move_covariance(2, prior), J @ window.prior.P @ J.T, atol=1e-12)
+    np.testing.assert_allclose(move_covariance(window, 2, prior), J @ window.prior.P @ J.T, atol=1e-12)
     for index in (2, -2):
         move = window.camera_move_since(index)
         np.testing.assert_allclose(window.clones[2].T_world_imu @ move, window.clones[3].T_world_imu, atol=1e-12)
-    assert not window.move_covariance(3, prior).any()
+    assert not move_covariance(window, 3, prior).any()
     np.testing.assert_allclose(window.camera_move_since(3), np.eye(4), atol=1e-12)
 
 

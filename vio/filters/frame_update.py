@@ -36,7 +36,7 @@ from vio.filters.stereo_calibration import (
 )
 from vio.filters.tracks import precision, rows_of
 from vio.filters.window import Window
-from vio.filters.window_posterior import WindowPosterior
+from vio.filters.window_posterior import WindowPosterior, landmark_covariance, move_covariance
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat, transform_points
 from vio.geometry.stereo import depth_of, project
@@ -240,7 +240,7 @@ class FrameUpdate:
         if predicted is None or len(tracks.rows) < MIN_TRACKS_FOR_NOISE:
             return None
         moved = window.camera_move_since(-2)
-        remaining = window.move_covariance(len(window.clones) - 2, fitted)
+        remaining = move_covariance(window, len(window.clones) - 2, fitted)
         A = se3_adjoint(se3_inverse(window.nav.T_world_imu))
         process = A @ self._propagation.since_frame.Q[:6, :6] @ A.T
         B = se3_adjoint(se3_inverse(window.calibration.T_cam0_imu))
@@ -319,7 +319,7 @@ class FrameUpdate:
             H = field.jacobian(z) * (at.precision * np.any(at.J, axis=2))[..., None]
             J = np.concatenate([J, H], axis=2)
         weight = at.weight * (self.tracks.variance / self._variance)  # that they entered the fit with
-        nis = leave_one_out_nis(at.r, J, window.landmark_covariance(fitted), weight, self.tracks.variance)
+        nis = leave_one_out_nis(at.r, J, landmark_covariance(window, fitted), weight, self.tracks.variance)
         dof = np.maximum(np.any(at.J, axis=2).sum(axis=1), 1)
         used, dropped = self._landmark_gate.check(window.landmark_ids, nis, dof)
         rejected = window.landmark_ids[~used]

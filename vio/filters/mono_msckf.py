@@ -13,7 +13,7 @@ from vio.filters.msckf import Msckf
 from vio.filters.navigation import DIM, ImuMotion, NavState
 from vio.filters.noise import MotionNoise
 from vio.filters.propagation import IMU_FACTORS
-from vio.filters.restart import GoodState, restarted
+from vio.filters.restart import GoodState, required, restarted
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
 from vio.filters.window_posterior import scale_sigma
@@ -122,7 +122,7 @@ class MonoMsckf(Msckf):
 
     def restart(self, observations: Observations) -> UpdateReport:
         """Begin anew after a divergence, see `Msckf`; there is no estimate until the start is observable again."""
-        self._resumed = good = self._last_good()
+        self._resumed = good = required(self._good)
         self._window, self._begun, self._good = None, None, None
         self._propagation.forget()
         self._forget_tracks(good)

@@ -25,7 +25,7 @@ from vio.filters.noise import MotionNoise
 from vio.filters.online_calibration import Calibration, all_imu_terms, first_calibration
 from vio.filters.point_map import PointMap
 from vio.filters.propagation import Propagation, first_imu_noise
-from vio.filters.restart import GoodState, restarted
+from vio.filters.restart import GoodState, required, restarted
 from vio.filters.rig_calibration import RigCalibration
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Clone, Window
@@ -237,18 +237,12 @@ class Msckf(Backend):
             EstimationError: there was no good update.
             DivergedError: the filter diverges again at once.
         """
-        good, propagation = self._last_good(), self._propagation
+        good, propagation = required(self._good), self._propagation
         nav, P = restarted(good, observations.time_ns, propagation.motion, self._settings)
         window = self._window = self._first_window(nav, P, good.calibration)
         propagation.begin(window, observations.time_ns, propagation.body_time(window, observations.time_ns))
         self._forget_tracks(good)
         return self._update(observations)
-
-    def _last_good(self) -> GoodState:
-        """The state to start again from."""
-        if self._good is None:
-            raise EstimationError("msckf has no good state to start again from; check calibration and first frames")
-        return self._good
 
     def _forget_tracks(self, good: GoodState) -> None:
         """Forget all tracks and the motion's noise; go on with the calibration of the last good state."""
@@ -288,25 +282,9 @@ class Msckf(Backend):
             gyro_bias_sigma=known.gyro_bias_sigma,
             accel_bias=window.nav.accel_bias,
             accel_bias_sigma=known.accel_bias_sigma,
-            **self._vertical(own),
+            **(_vertical(window, own, self._settings) if self._source == "imu" else {}),
             **self._rig.report(window, own),
         )
-
-    def _vertical(self, own: FloatArray) -> dict[str, Any]:
-        """The fields of `Estimate` that say where gravity points, by the upright covariance (15 + C, 15 + C)."""
-        window = self._started()
-        if self._source != "imu":
-            return {}
-        (xx, xy), (_, yy) = own[3:5, 3:5].tolist()
-        sigma = math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))  # of the larger eigenvalue
-        return {"tilt_sigma_rad": sigma, "gravity_world": self._gravity(window)}
-
-    def _gravity(self, window: Window) -> FloatArray | None:
-        """Gravity (3,) in the world that is reported, m/s^2; None: along -z."""
-        if "first_attitude" not in window.state:
-            return None
-        out: FloatArray = window.calibration.R_upright_world.T @ [0.0, 0.0, -self._settings.gravity_mps2]
-        return out
 
     def imu_terms_covariance(self) -> FloatArray:
         """Return the covariance (15, 15) of the errors of `Estimate.imu_terms`; zero where a term is not estimated."""
@@ -324,7 +302,9 @@ class Msckf(Backend):
         """Return the estimate at a past frame with all frames since; None where it has left the window."""
         window, smoothed = self._window, self._frame.smoothed
         found = None if smoothed is None else smoothed.estimate(frame_index)
-        return found if found is None or window is None else replace(found, gravity_world=self._gravity(window))
+        return (
+            found if found is None or window is None else replace(found, gravity_world=_gravity(window, self._settings))
+        )
 
     def relative(self, older: int, newer: int) -> RelativePose | None:
         """Return the body's motion between two frames of the window, by numbers, with all frames since.
@@ -414,6 +394,21 @@ class Msckf(Backend):
         if measurement is not None:
             window.absorb_measurement(measurement)
             self._stationary_ns = window.clones[-1].time_ns
+
+
+def _vertical(window: Window, own: FloatArray, settings: MsckfSettings) -> dict[str, Any]:
+    """The fields of `Estimate` that say where gravity points, by the upright covariance (15 + C, 15 + C)."""
+    (xx, xy), (_, yy) = own[3:5, 3:5].tolist()
+    sigma = math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))  # of the larger eigenvalue
+    return {"tilt_sigma_rad": sigma, "gravity_world": _gravity(window, settings)}
+
+
+def _gravity(window: Window, settings: MsckfSettings) -> FloatArray | None:
+    """Gravity (3,) in the world that is reported, m/s^2; None: along -z."""
+    if "first_attitude" not in window.state:
+        return None
+    out: FloatArray = window.calibration.R_upright_world.T @ [0.0, 0.0, -settings.gravity_mps2]
+    return out
 
 
 def _lost(frame_index: int) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vio.errors import EstimationError
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.online_calibration import Calibration, body_twist
 from vio.filters.settings import MsckfSettings
@@ -27,6 +28,17 @@ class GoodState:
     nav: NavState
     covariance: FloatArray  # (15 + C, 15 + C) of navigation state and calibration, with all that was seen
     calibration: Calibration
+
+
+def required(good: GoodState | None) -> GoodState:
+    """Return the state to start again from.
+
+    Raises:
+        EstimationError: there is none.
+    """
+    if good is None:
+        raise EstimationError("msckf has no good state to start again from; check calibration and first frames")
+    return good
 
 
 def restarted(

@@ -134,27 +134,6 @@ class Window:
         out: FloatArray = T @ move @ se3_inverse(T)
         return out
 
-    def move_covariance(self, index: int, fitted: Fit) -> FloatArray:
-        """Covariance (6, 6) of `xi_newest - xi_clone` after a fit of all errors."""
-        S = fitted.whitened(fitted.rows(self.state.clone(-1)) - fitted.rows(self.state.clone(index)))
-        return S @ S.T
-
-    def landmark_covariance(self, fitted: Fit) -> FloatArray:
-        """Covariance (M, 3 + S, 3 + S) of what a landmark's pixels depend on, after a fit of all errors.
-
-        That is `xi_f - xi_rho`, the landmark relative to the newest exposure, and the coefficients of the stereo
-        calibration.
-        """
-        state, M, n = self.state, len(self.landmarks), len(fitted.prior.L)
-        exposure, S = state.clone(-1).start, state.stereo.stop - state.stereo.start
-        position = fitted.rows(slice(exposure, exposure + 3))
-        root = fitted.whitened(fitted.rows(state.landmarks).reshape(M, 3, n) - position)
-        if S:
-            stereo = fitted.whitened(fitted.rows(state.stereo))
-            root = np.concatenate([root, np.broadcast_to(stereo, (M, S, n))], axis=1)
-        out: FloatArray = root @ np.swapaxes(root, 1, 2)
-        return out
-
     def propagate(self, step: Transition, walk: FloatArray | None = None) -> None:
         """Move the navigation state by one step of its motion model.
 

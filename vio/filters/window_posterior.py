@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.filters.navigation import ImuMotion
+from vio.filters.prior import Fit
 from vio.filters.window import Clones, Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log, so3_hat
 from vio.geometry.relative_pose import RelativePose
@@ -137,3 +138,26 @@ def scale_sigma(posterior: WindowPosterior) -> float | None:
     row[0] -= p.sum(axis=0) @ moves[0]
     row = row.ravel() / length2
     return float(np.sqrt(max(row @ posterior.P @ row, 0.0)))
+
+
+def move_covariance(window: Window, index: int, fitted: Fit) -> FloatArray:
+    """Covariance (6, 6) of `xi_newest - xi_clone` after a fit of all errors."""
+    S = fitted.whitened(fitted.rows(window.state.clone(-1)) - fitted.rows(window.state.clone(index)))
+    return S @ S.T
+
+
+def landmark_covariance(window: Window, fitted: Fit) -> FloatArray:
+    """Covariance (M, 3 + S, 3 + S) of what a landmark's pixels depend on, after a fit of all errors.
+
+    That is `xi_f - xi_rho`, the landmark relative to the newest exposure, and the coefficients of the stereo
+    calibration.
+    """
+    state, M, n = window.state, len(window.landmarks), len(fitted.prior.L)
+    exposure, S = state.clone(-1).start, state.stereo.stop - state.stereo.start
+    position = fitted.rows(slice(exposure, exposure + 3))
+    root = fitted.whitened(fitted.rows(state.landmarks).reshape(M, 3, n) - position)
+    if S:
+        stereo = fitted.whitened(fitted.rows(state.stereo))
+        root = np.concatenate([root, np.broadcast_to(stereo, (M, S, n))], axis=1)
+    out: FloatArray = root @ np.swapaxes(root, 1, 2)
+    return out
