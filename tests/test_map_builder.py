@@ -191,6 +191,16 @@ def test_a_session_finds_its_place_in_an_earlier_map(room_walk: Walk, first_roun
     assert first_round.read_bytes() == before
 
 
+def test_a_place_that_one_keyframe_has_found_is_said_to_wait_for_another(room_walk: Walk, first_round: Path) -> None:
+    store = MapStore(first_round, read_only=True)
+    builder = MapBuilder(store, "walk", room_walk.camera, upright=False, localise=True)
+    waits = [builder.add(*row).unconfirmed for row in room_walk.keyframes(seed=5, rows=slice(27, 31))]
+    assert waits[0]
+    assert builder.is_joined
+    assert not waits[-1]
+    builder.close()
+
+
 def test_who_is_localised_in_a_bent_map_is_not_bent_with_it(room_walk: Walk, tmp_path: Path) -> None:
     """The map's odometry once was off by 0.2 m and says so: what the later session's odometry says counts more."""
     builder = MapBuilder(

@@ -96,6 +96,7 @@ class MapUpdate:
     T_map_cam: FloatArray | None  # (4, 4) of the keyframe, once a loop holds it; None: it moves with the odometry
     covariance: FloatArray | None  # (6, 6) of xi in T_map_cam = T_hat exp(xi), given the map; None likewise
     loops: tuple[LoopEvent, ...]
+    unconfirmed: bool = False  # whether the session, which has no place yet, may have found it, as another may confirm
 
 
 class MapBuilder:
@@ -284,9 +285,9 @@ class MapBuilder:
         self._store.set_loops(again)
 
     def _update(self, events: tuple[LoopEvent, ...]) -> MapUpdate:
-        if not self.is_joined:
-            return MapUpdate(None, None, None, events)
         graph, k = self.graph, len(self.graph) - 1
+        if not self.is_joined:
+            return MapUpdate(None, None, None, events, unconfirmed=any(o.second == k for o in self._pending))
         T_map_odom = graph.T_map_cam[k] @ se3_inverse(graph.T_odom_cam[k]) if self._optimised else np.eye(4)
         newest = self.places.newest
         since = self.places.drift_since(np.array([self.first if newest is None else newest.first]), k)
