@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from vio.evaluation.alignment import align_poses, apply_alignment
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_log
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp, so3_log
 from vio.geometry.stereo import StereoCamera, project
 from vio.imu.preintegration import BodyStates, Readings
 from vio.offline.inertial_adjustment import Fit, InertialAdjustment, RigPrior
 from vio.offline.inertial_refinement import inertial_keyframes
 from vio.offline.keyframes import TrackedPath
-from vio.offline.points import PointTracks
+from vio.offline.points import PointTracks, keep_rows
 from vio.records import ImuDensities, LoopEvent, Trajectory
 
 _CAMERA = StereoCamera(300.0, 300.0, 240.0, 150.0, 0.11, 480, 300)
@@ -112,22 +112,45 @@ def test_derivatives_match_finite_differences() -> None:
     np.testing.assert_allclose(by_others[:gauge], ((o1 - o0) / (2 * h))[:gauge], rtol=1e-4, atol=2e-2)
 
 
-def test_covariance_is_that_of_all_that_is_unknown() -> None:
+def test_covariance_counts_all_that_is_unknown_and_errors_that_pixels_share() -> None:
     problem, at, _ = _flight(range(12, 12), 0.0)
+    tracks = keep_rows(problem.tracks, problem.tracks.point % 3 == 0)
+    problem = replace(problem, tracks=tracks, sigma_px=np.full(len(tracks.point), 0.15))
+    at = replace(at, p_world=tracks.p_world)
     system = problem._system(at, problem._preintegrated(at.body), 3.0)
     K, M, (R, n) = len(problem.seconds), len(at.p_world), system.e.shape
     J = np.zeros((R, n, 15 * K + 27 + 3 * M))
-    for r, (k, m) in enumerate(zip(problem.tracks.keyframe, problem.tracks.point, strict=True)):
+    for r, (k, m) in enumerate(zip(tracks.keyframe, tracks.point, strict=True)):
         J[r, :, 15 * k : 15 * k + 6], J[r, :, 15 * K : 15 * K + 27] = system.own[r], system.rig[r]
         J[r, :, 15 * K + 27 + 3 * m :][:, :3] = system.points[r]
-    J = J.reshape(R * n, -1)
-    N = J.T @ J
-    N[: 15 * K + 27, : 15 * K + 27] += (system.others.T @ system.others).toarray()
+    N = J.reshape(R * n, -1).T @ J.reshape(R * n, -1)
+    others = np.pad(system.others.toarray(), ((0, 0), (0, 3 * M)))
+    N += others.T @ others
     scale = 1 / np.sqrt(np.diag(N))
     P = np.linalg.inv(N * scale * scale[:, None]) * scale * scale[:, None]
-    found = system.covariance(np.array([3, 20]))
-    for k, own in zip((3, 20), found, strict=True):
-        np.testing.assert_allclose(own, P[15 * k : 15 * k + 6, 15 * k : 15 * k + 6], rtol=1e-3, atol=1e-9)
+    clusters = problem._clusters()
+    assert 0.2 * M < clusters.max() + 1 < 0.8 * M
+    of_clusters = [clusters[tracks.point] == c for c in range(clusters.max() + 1)]
+    y = np.array([P @ np.einsum("rai,ra->i", J[rows], system.e[rows]) for rows in of_clusters])
+    P = y.T @ y + (others @ P).T @ (others @ P)
+    D = problem._cameras_by_states(at, np.array([3, 20]))
+    found = system.covariance(D, clusters)
+    of_states = P[: 15 * K + 27, : 15 * K + 27]
+    for c, own in enumerate(found):
+        rows = D[6 * c : 6 * c + 6].toarray()
+        np.testing.assert_allclose(own, rows @ of_states @ rows.T, rtol=1e-3, atol=1e-9)
+
+
+def test_cameras_follow_from_body_extrinsics_and_clock_as_their_derivatives_say() -> None:
+    problem, at, _ = _flight(range(12, 12), 0.0)
+    K, h, rng = len(problem.seconds), 1e-4, np.random.default_rng(4)
+    x, s = rng.normal(0, 1, (K, 15)), rng.normal(0, 1, 27)
+    x[:, 6:] = 0  # velocity and bias act by the twist alone, to second order
+    none, before = np.zeros(at.p_world.shape), problem.cameras(at)
+    moved = se3_log(se3_inverse(before) @ problem.cameras(problem._moved(at, h * x, none, h * s))) / h
+    chosen = np.array([2, 9, 24])
+    by_states = problem._cameras_by_states(at, chosen) @ np.concatenate([x.ravel(), s])
+    np.testing.assert_allclose(by_states.reshape(-1, 6), moved[chosen], atol=2e-3)
 
 
 @pytest.mark.parametrize("longer", [0.0, 0.008])

@@ -189,6 +189,38 @@ def test_a_session_finds_its_place_in_an_earlier_map(room_walk: Walk, first_roun
     assert first_round.read_bytes() == before
 
 
+def test_a_place_that_one_keyframe_has_found_is_said_to_wait_for_another(room_walk: Walk, first_round: Path) -> None:
+    store = MapStore(first_round, read_only=True)
+    builder = MapBuilder(store, "walk", room_walk.camera, upright=False, localise=True)
+    waits = [builder.add(*row).unconfirmed for row in room_walk.keyframes(seed=5, rows=slice(27, 31))]
+    assert waits[0]
+    assert builder.is_joined
+    assert not waits[-1]
+    builder.close()
+
+
+def test_who_is_localised_in_a_bent_map_is_not_bent_with_it(room_walk: Walk, tmp_path: Path) -> None:
+    """The map's odometry once was off by 0.2 m and says so: what the later session's odometry says counts more."""
+    builder = MapBuilder(
+        MapStore(tmp_path / "a.map", create=True), "w", room_walk.camera, upright=False, localise=False
+    )
+    bend = np.eye(4)
+    for keyframe, features in room_walk.keyframes(seed=0, rows=slice(0, 20)):
+        motion = keyframe.motion
+        if keyframe.frame == 6:
+            bend = keyframe.T_odom_cam @ se3_exp([0.2, 0, 0, 0, 0, 0]) @ se3_inverse(keyframe.T_odom_cam)
+            motion = RelativePose(motion.T_i_j @ se3_exp([0.2, 0, 0, 0, 0, 0]), np.diag((10 * STEP_SIGMA) ** 2))
+        builder.add(replace(keyframe, T_odom_cam=bend @ keyframe.T_odom_cam, motion=motion), features)
+    builder.finish()
+    builder.close()
+    found = _map(room_walk, tmp_path / "a.map", seed=5, rows=slice(25, 37), localise=True)
+    found.finish()
+    own = found.graph.T_map_cam.rows[20:]
+    seen = {o.first < 6 for o in found.graph.loops if o.kept and o.second >= 20}
+    assert seen == {True, False}, "on both sides of the bend"
+    assert _errors_m(own, room_walk.T[25:37]).max() < 0.09, "0.17 m where the map is taken as exact"
+
+
 def test_a_jump_of_the_odometry_that_its_motions_do_not_have_leaves_the_place(
     room_walk: Walk, first_round: Path
 ) -> None:

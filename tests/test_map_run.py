@@ -28,7 +28,8 @@ from vio.filters.msckf import Msckf
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.live.build import MapUse
-from vio.mapping.builder import MapBuilder, MapUpdate
+from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate
+from vio.mapping.features import KeyframeFeatures
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import LoopRow, MapStore
 from vio.mapping.session import HANDOVER_FRAMES, MapSession
@@ -323,6 +324,27 @@ def test_what_a_covered_camera_does_to_the_place(alone: bool, tmp_path: Path) ->
     np.testing.assert_allclose(sigmas[21] ** 2 - sigmas[11] ** 2, 30.0**2 if alone else 0.1, rtol=1e-3)
     ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
     assert (np.sqrt(motion.covariance[0, 0]) >= 30.0) is np.bool_(alone)
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_a_place_that_waits_for_a_second_keyframe_gets_one_soon(
+    waits: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A session without a place, which moves so slowly that one keyframe would do."""
+    session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False)
+    made = list[int]()
+
+    def add(self: MapBuilder, keyframe: Keyframe, features: KeyframeFeatures) -> MapUpdate:
+        made.append(keyframe.frame)
+        return MapUpdate(None, None, None, (), unconfirmed=waits and len(made) == 1)
+
+    monkeypatch.setattr(MapBuilder, "add", add)
+    monkeypatch.setattr(MapBuilder, "finish", lambda self, field: MapUpdate(None, None, None, ()))
+    for k in range(40):
+        _stand(session, observations(k, 10**8 * k, np.arange(40), np.tile([9.0, 9, 5, 9], (40, 1))))
+    session.finish()
+    session.close()
+    assert made == ([0, 10, 13, 16, 19] if waits else [0])
 
 
 def test_a_place_does_not_follow_a_jump_of_the_filter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,6 @@ _COMMIT_EVERY = 20  # keyframes
 _ONLY = ("pinhole", "stereo")  # projection and kind of the cameras that maps know
 _SAME_RIG = 0.03  # by which two calibrations of one rig may differ in focal length and baseline
 _FIELD_MOVED_PX = 0.02  # by which a rectification error moves the pixels of a keyframe before all are corrected anew
-_LOCAL = 20  # keyframes of a localised session that are optimised together
 _OF_THE_FILE = ("_store", "_stored_poses", "_stored_kept")
 
 
@@ -97,6 +96,7 @@ class MapUpdate:
     T_map_cam: FloatArray | None  # (4, 4) of the keyframe, once a loop holds it; None: it moves with the odometry
     covariance: FloatArray | None  # (6, 6) of xi in T_map_cam = T_hat exp(xi), given the map; None likewise
     loops: tuple[LoopEvent, ...]
+    unconfirmed: bool = False  # whether the session, which has no place yet, may have found it, as another may confirm
 
 
 class MapBuilder:
@@ -285,9 +285,9 @@ class MapBuilder:
         self._store.set_loops(again)
 
     def _update(self, events: tuple[LoopEvent, ...]) -> MapUpdate:
-        if not self.is_joined:
-            return MapUpdate(None, None, None, events)
         graph, k = self.graph, len(self.graph) - 1
+        if not self.is_joined:
+            return MapUpdate(None, None, None, events, unconfirmed=any(o.second == k for o in self._pending))
         T_map_odom = graph.T_map_cam[k] @ se3_inverse(graph.T_odom_cam[k]) if self._optimised else np.eye(4)
         newest = self.places.newest
         since = self.places.drift_since(np.array([self.first if newest is None else newest.first]), k)
@@ -369,17 +369,17 @@ class MapBuilder:
         graph, part = self.graph, self.graph.sessions[self._own].part
         own = graph.session == self._own
         stated, stays = graph.T_map_cam.rows.copy(), graph.part == part
-        if not self._optimised:  # until then the odometry's poses stood for those in the map
+        if self._localise:  # the frame is that of the map, whose keyframes are no more exact than it knows them
+            stays &= ~own
+        elif not self._optimised:  # until then the odometry's poses stood for those in the map
             alone = not (stays & ~own).any()
             stays, stated = (own, graph.T_odom_cam.rows.copy()) if alone else (stays & ~own, stated)
         self._partial = False
-        if self._localise:
-            self.graph.optimise_end(max(len(self.graph) - _LOCAL, self.first))
-        elif whole:
-            self.graph.optimise_part(part)
+        if whole:
+            graph.optimise_part(part)
         else:
-            self._partial = not self.graph.optimise_near(part, self._waiting)
-        if not (self._localise or self._partial):
+            self._partial = not graph.optimise_near(part, self._waiting)
+        if not self._partial:
             graph.keep_place(part, stays, stated, level=whole)
         if self.places.newest is not None and not self.graph.loops[-1].kept:
             self.places.newest = None

@@ -253,16 +253,6 @@ class MapGraph:
         ends = first.astype(np.int64), second.astype(np.int64)
         return coo_matrix((variance, ends), shape=(len(self), len(self))).tocsr()
 
-    def optimise_end(self, first: int) -> None:
-        """Optimise the keyframes from `first` on against those before it that loops join them to, which stay."""
-        ends = np.array([(o.first, o.second) for o in self.loops], dtype=np.int64).reshape(-1, 2)
-        linked = ends[(ends[:, 1] >= first) & (ends[:, 0] < first)][:, 0]
-        if not len(linked):
-            return
-        fixed = np.zeros(len(self), dtype=np.bool_)
-        fixed[linked] = True
-        self._optimise(fixed | (np.arange(len(self)) >= first), fixed)
-
     def _optimise(self, rows: BoolArray, fixed: BoolArray, *, level: bool = False) -> None:
         """Optimise the keyframes of a mask (K,); mark the loops that contradict the rest.
 

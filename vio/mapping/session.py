@@ -130,6 +130,7 @@ class MapSession:
         # Of the newest keyframe with a result: (6, 6) covariance in the map, and (4, 4) pose once a loop holds it
         self._known: FloatArray | None = None if self._T_map_odom is None else np.zeros((6, 6))
         self._T_map_cam: FloatArray | None = None
+        self._unconfirmed = False  # whether it found a place that another keyframe may confirm
         self._moves: list[tuple[int, RelativePose]] = []  # later keyframes, each with the motion since the one before
         self._held: list[_Held] = []  # newest keyframes, which are not yet added
         self._features: list[Future[KeyframeFeatures]] = []  # of each of them
@@ -301,6 +302,8 @@ class MapSession:
         """Whether a frame becomes a keyframe: it shows little of what the last one showed."""
         if motion is None:
             return True
+        if self._unconfirmed and self._since >= _LOST_STEP:
+            return True
         if self._localise and self._since >= _LOST_STEP:
             covariance = self.covariance
             lost = covariance is None or covariance[:3, :3].trace() > _LOST_M**2
@@ -358,6 +361,7 @@ class MapSession:
             _, frame, result = self._waiting.pop(0)
             update = result.result()
             self._T_map_odom, self._known, self._T_map_cam = update.T_map_odom, update.covariance, update.T_map_cam
+            self._unconfirmed = update.unconfirmed
             self._moves = [move for move in self._moves if move[0] > frame]
             events += update.loops
         self.loops += events

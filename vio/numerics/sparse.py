@@ -17,18 +17,21 @@ def factors(H: csc_matrix) -> SuperLU:
     return splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def marginals(H: csc_matrix, D: csr_matrix, size: int) -> FloatArray:
+def marginals(H: csc_matrix, D: csr_matrix, size: int, scores: csr_matrix | None = None) -> FloatArray:
     """Covariances (C, d, d) of `D_c x`, each alone, where x has the information matrix H (n, n).
 
     Args:
         H: sum of `J' W J`, symmetric and positive definite.
         D: (C d, n) rows of D_c, one after the other.
         size: d.
+        scores: (S, n) rows whose squares are together the covariance of the gradient; None: that is H.
     """
     solver, out = factors(H), np.zeros((D.shape[0] // size, size, size))
     for first in range(0, len(out), _AT_ONCE):
         rows = D[size * first : size * (first + _AT_ONCE)]
-        P = np.asarray(rows @ solver.solve(rows.T.toarray()))
+        x = solver.solve(rows.T.toarray())
+        y = None if scores is None else scores @ x
+        P = np.asarray(rows @ x if y is None else y.T @ y)
         here = np.arange(len(P) // size)
         out[first : first + len(here)] = P.reshape(len(here), size, len(here), size)[here, :, here, :]
     return 0.5 * (out + np.swapaxes(out, 1, 2))

@@ -5,7 +5,8 @@ Factors: stereo pixels of tracks and of points that loops join, the IMU's motion
 poses, which is what a bundle adjustment of images alone lacks. Gauss-Newton with Levenberg's damping; points are
 eliminated (Schur complement), the rest is one sparse system. Pixels have Geman-McClure's weights, which begin wide.
 Ceres, as pycolmap has it, takes no factors in Python but pixels and priors of poses.
-Reference: Triggs et al., Bundle adjustment: a modern synthesis (2000).
+References: Triggs et al., Bundle adjustment: a modern synthesis (2000); the covariance: White, Maximum likelihood
+estimation of misspecified models (1982), clustered as by Liang & Zeger (1986).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from scipy.sparse import block_array, bsr_matrix, coo_matrix, csc_matrix, csr_matrix, diags_array, hstack, vstack
 
 from vio.cameras.rectification_error import METRIC_TERMS, error_basis, error_jacobian
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_hat
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, so3_hat
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.imu.preintegration import BodyStates, Preintegrated, Readings, preintegrate
 from vio.numerics import sparse
@@ -34,6 +35,8 @@ _WIDER = 2  # … doubled in so many first steps, once each
 _SETTLED = 7  # steps after which neither width nor preintegration change
 _CONVERGED = 1e-4  # of the cost, from step to step: what goes on is rows that turn into outliers, and moves no pose
 _MOST_DAMPING = 1e3
+# Tracks that end in one cell of directions within one second share their errors, as in (R7).
+_CELL_RAD, _CELL_S = 0.2, 1.0
 _GAUGE = 1e4  # inverse standard deviation, 1/m and 1/rad, of position and heading of the first keyframe
 
 
@@ -71,7 +74,7 @@ class Optimum:
     converged: bool
     pixels: float  # mean squared error of the pixels that agree, 1 expected
     inertial: float  # likewise of the IMU's motions
-    covariance: FloatArray  # (C, 6, 6) of xi in `T_world_imu exp(xi)` of the keyframes asked for, since the first one
+    covariance: FloatArray  # (C, 6, 6) of xi in `T_world_cam0 exp(xi)` of the keyframes asked for, since the first one
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +107,8 @@ class InertialAdjustment:
         covariance = np.zeros((0, 6, 6))
         if covariance_of is not None:
             progress()
-            covariance = self._system(at, steps, _WIDTH).covariance(covariance_of)
+            system = self._system(at, steps, _WIDTH)
+            covariance = system.covariance(self._cameras_by_states(at, covariance_of), self._clusters())
         pixels = float(np.mean(squared[squared < _WIDTH**2])) / 3
         return Optimum(at, converged, pixels, float(np.mean(r**2)), covariance)
 
@@ -161,6 +165,27 @@ class InertialAdjustment:
         e, t = self._extrinsics(at.rig)
         T_world_imu = at.body.T_world_imu @ se3_exp(t * self._twists(at))
         return np.asarray(T_world_imu @ se3_exp(-e) @ se3_inverse(self.T_cam0_imu))
+
+    def _cameras_by_states(self, at: Fit, keyframes: IntArray) -> csr_matrix:
+        """Derivatives (6C, 15K + 27) of xi in `T_world_cam0 exp(xi)` of keyframes (C,), extrinsics to first order."""
+        K, first = len(self.seconds), _FIELD + METRIC_TERMS + 2
+        cam_D_imu = se3_adjoint(se3_inverse(self.cameras(at)[keyframes]) @ at.body.T_world_imu[keyframes])
+        out = np.zeros((len(keyframes), 6, _OWN + _SHARED))
+        out[:, :, :6] = cam_D_imu
+        out[:, :, _OWN + first : _OWN + first + 6] = -se3_adjoint(self.T_cam0_imu) * self.prior.extrinsics
+        twists = self.prior.time_s * self._twists(at)[keyframes]
+        out[:, :, _OWN + first + 6] = np.einsum("cij,cj->ci", cam_D_imu, twists)
+        own = _blocks(np.arange(len(keyframes)), keyframes, out[:, :, :_OWN], len(keyframes), K)
+        return hstack([own, csr_matrix(out[:, :, _OWN:].reshape(-1, _SHARED))]).tocsr()
+
+    def _clusters(self) -> IntArray:
+        """Return numbers (M,) of the clusters of points: where and when their tracks end."""
+        tracks, c, last = self.tracks, self.camera, np.zeros(len(self.tracks.ids), dtype=np.int64)
+        last[tracks.point] = np.arange(len(tracks.point))  # rows are ordered by keyframe
+        across, down = (tracks.z[last, :2] - [c.cu, c.cv]).T / [[c.fu], [c.fv]]
+        seconds = self.seconds[tracks.keyframe[last]]
+        cells = np.stack([np.arctan(across) / _CELL_RAD, np.arctan(down) / _CELL_RAD, seconds / _CELL_S])
+        return np.asarray(np.unique(np.floor(cells), axis=1, return_inverse=True)[1]).ravel()
 
     def _extrinsics(self, rig: FloatArray) -> tuple[FloatArray, float]:
         n = _FIELD + METRIC_TERMS + 2
@@ -298,12 +323,24 @@ class _System:
         p = -np.einsum("mij,mj->mi", points.V_inverse, points.e + by_poses + points.by_rig @ s)
         return own, p, s
 
-    def covariance(self, keyframes: IntArray) -> FloatArray:
-        """Covariances (C, 6, 6) of the poses of some keyframes, with all else unknown."""
-        N, _, _ = self._reduced(0.0)
-        rows = (_OWN * keyframes[:, None] + np.arange(6)).ravel()
-        pick = csr_matrix((np.ones(len(rows)), (np.arange(len(rows)), rows)), shape=(len(rows), N.shape[0]))
-        return sparse.marginals(N, pick, 6)
+    def covariance(self, D: csr_matrix, clusters: IntArray) -> FloatArray:
+        """Covariances (C, 6, 6) of `D x` (6C, 15K + 27) by the squared scores of clusters of points (M,).
+
+        Pixels of a cluster share errors, so that their score, `J' r` without the points, varies more than the normal
+        matrix says: `N^-1 (sum s s' + M) N^-1`, with M that of all else.
+        """
+        N, _, points = self._reduced(0.0)
+        e, rows = self._without_points(points), np.arange(len(self.e))
+        own = np.pad(np.einsum("rai,ra->ri", self.own, e), ((0, 0), (0, _OWN - 6)))[:, None]
+        of_poses = _blocks(rows, self.tracks.keyframe, own, len(rows), self.keyframes)
+        scores = hstack([of_poses, csr_matrix(np.einsum("rai,ra->ri", self.rig, e))])
+        summed = csr_matrix((np.ones(len(rows)), (clusters[self.tracks.point], rows))) @ scores
+        return sparse.marginals(N, D, 6, vstack([summed, self.others]).tocsr())
+
+    def _without_points(self, points: _Points) -> FloatArray:
+        """Return the residuals (R, 3) that are left where the points follow."""
+        p = np.einsum("mij,mj->mi", points.V_inverse, points.e)
+        return np.asarray(self.e - np.einsum("rij,rj->ri", self.points, p[self.tracks.point]))
 
     def _reduced(self, damping: float) -> tuple[csc_matrix, FloatArray, _Points]:
         """Return normal matrix and gradient of keyframes and rig without the points, and what gives those."""
@@ -325,19 +362,18 @@ class _System:
         )
         mixed = _sums(keyframe, own_T @ self.rig - W @ V_rig[point], K).reshape(6 * K, _SHARED)
         rig = _product(self.rig, self.rig) - _product(W_rig, V_rig)
-        V_inverse_e = np.einsum("mij,mj->mi", V_inverse, V_e)
+        eliminated = _Points(V_inverse, V_e, by_point, W_rig)
+        e = self._without_points(eliminated)
         g = np.zeros(_OWN * K + _SHARED)
-        g[: _OWN * K].reshape(K, _OWN)[:, :6] = _sums(
-            keyframe, np.einsum("rai,ra->ri", self.own, self.e) - np.einsum("rij,rj->ri", W, V_inverse_e[point]), K
-        )
-        g[_OWN * K :] = np.einsum("rai,ra->i", self.rig, self.e) - np.einsum("maj,ma->j", W_rig, V_inverse_e)
+        g[: _OWN * K].reshape(K, _OWN)[:, :6] = _sums(keyframe, np.einsum("rai,ra->ri", self.own, e), K)
+        g[_OWN * K :] = np.einsum("rai,ra->i", self.rig, e)
         g += self.others.T @ self.other_e
         places = np.concatenate([(_OWN * np.arange(K)[:, None] + np.arange(6)).ravel(), _OWN * K + np.arange(_SHARED)])
         seen = block_array([[poses, mixed], [mixed.T, rig]], format="coo")
         N = coo_matrix((seen.data, (places[seen.row], places[seen.col])), shape=(len(g), len(g))).tocsc()
         N = N + (self.others.T @ self.others).tocsc()
         N = N + damping * diags_array(N.diagonal(), format="csc")
-        return N, g, _Points(V_inverse, V_e, by_point, W_rig)
+        return N, g, eliminated
 
 
 def _whitening(steps: Preintegrated) -> FloatArray:

@@ -93,8 +93,7 @@ def _adjusted(result: RunResult, mapped: MappedRun, should_stop: Callable[[], st
         raise VioError("it did not converge")
     T, number = path.trajectory.T_world_body, np.arange(len(path.frames))
     T_map_body = corrected(T, number, keyframes, done.T_world_cam0, T[keyframes]) @ T_cam0_body
-    T_near = done.T_world_cam0[near][of_near] @ T_cam0_body
-    A = se3_adjoint(se3_inverse(T_map_body[rows]) @ T_near)
+    A = se3_adjoint(se3_inverse(T_map_body[rows]) @ done.T_world_cam0[near][of_near])
     P = A @ done.best.covariance[of_near] @ np.swapaxes(A, 1, 2)
     sigmas = _sigmas_moved(in_map, T_map_body[rows])
     moved_m = float(np.sqrt(np.mean(np.sum((T_map_body - mapped.T_map_body)[:, :3, 3] ** 2, axis=1))))
