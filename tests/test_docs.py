@@ -56,7 +56,7 @@ def _make_demo() -> None:
     """The environment, then the command that `readme_folder` has run."""
     *before, last = _make("demo")
     assert any("-m venv" in line for line in before)
-    assert any("pip install" in line and line.endswith("-e .") for line in before)
+    assert any("pip install" in line and line.endswith("-e . setuptools") for line in before)
     assert last.endswith("/vio demo --out demo")
 
 
