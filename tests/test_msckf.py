@@ -926,6 +926,35 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(
     assert np.isfinite(filt.landmarks().p_world).all()
 
 
+@pytest.mark.parametrize("unseen_frames", [10, 100])
+def test_images_alone_begin_anew_after_a_time_in_which_the_rotation_was_lost(unseen_frames: int) -> None:
+    """After five seconds the poses before are not related to the next ones by errors that are linear; half of one is."""
+    events: list[str] = []
+
+    class Restarting(Msckf):
+        def update(self, observations: Observations) -> UpdateReport:
+            try:
+                return super().update(observations)
+            except DivergedError as error:
+                events.append(str(error))
+                return self.restart(observations)
+
+    flight, first = Flight(frames=150), 20
+
+    def covered(k: int, seen: Observations, _: np.random.Generator) -> Observations:
+        return seen.take(np.full(len(seen), not first <= k < first + unseen_frames))
+
+    errors, covariances, _ = flight.run(EXACT_RIG, None, spoil=covered, filter_class=Restarting)
+    lost = f"msckf has lost its way in {(unseen_frames + 1) * 0.05:.1f} s without a feature or a motion sensor"
+    assert events == ([lost] if unseen_frames == 100 else [])
+    chi_square = np.einsum("ki,kij,kj->k", errors[first:], np.linalg.inv(covariances[first:]), errors[first:])
+    assert np.mean(chi_square < 22.5) > 0.9  # the 99.9 % quantile for six degrees of freedom
+    begin, end = first + unseen_frames + 5, flight.frames - 1
+    true_motion = se3_inverse(flight.T_world_imu(begin)) @ flight.T_world_imu(end)
+    motion = se3_exp(-errors[begin]) @ true_motion @ se3_exp(errors[end])
+    assert np.linalg.norm(se3_log(se3_inverse(true_motion) @ motion)) < 0.1  # of a radian, or a metre of several
+
+
 def test_a_restart_carries_the_pose_on_and_grows_its_covariance_with_the_time_in_between() -> None:
     filt = Flight(frames=12).run(EXACT_RIG, None)[2]
     good = filt._good

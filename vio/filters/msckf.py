@@ -180,6 +180,9 @@ class Msckf(Backend):
             self._began_ns, self._tilted = observations.time_ns, np.eye(3)  # one camera begins anew after a divergence
             propagation.begin(self._window, observations.time_ns, observations.time_ns)
             self._measure()
+        elif len(seen) and propagation.is_lost and self._good is not None:
+            unseen_s = (observations.time_ns - self._good.time_ns) * 1e-9
+            raise DivergedError(f"msckf has lost its way in {unseen_s:.1f} s without a feature or a motion sensor")
         else:
             propagation.advance(self._window, observations.time_ns)
         window = self._window

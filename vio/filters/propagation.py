@@ -21,6 +21,9 @@ _TWIST_FACTORS = (1.0, 0.1, 10.0)
 # A start with a large uncertainty of the tilt is linearised far from the truth, which shows as process noise.
 _FACTOR_PER_TILT_SIGMA = 1 / np.radians(8.0)
 _MOST_START_FACTOR = 5.0
+_LINEAR_RAD = (
+    1.0  # standard deviation of a rotation beyond which the errors of poses before and after it are not linear
+)
 _USELESS_RAD = 0.2  # standard deviation of a predicted rotation beyond which its pixels start no search
 
 
@@ -105,6 +108,12 @@ class Propagation:
         """Forget the last frame and the steps since."""
         self.gyro, self.blind = None, False
         self.since_frame, self._coming = NO_STEP, None
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether so long a time without features or sensors has passed that no pose before it is related to the next."""
+        of_rotation = self.since_frame.Q[3:6, 3:6]
+        return self.blind and self.source is None and bool(np.linalg.eigvalsh(of_rotation)[-1] > _LINEAR_RAD**2)
 
     def take(self, sample: MotionSample) -> None:
         """Take a motion sample, which may change what the next step looks like."""
