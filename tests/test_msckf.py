@@ -928,7 +928,7 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(
 
 @pytest.mark.parametrize("unseen_frames", [10, 100])
 def test_images_alone_begin_anew_after_a_time_in_which_the_rotation_was_lost(unseen_frames: int) -> None:
-    """After five seconds the poses before are not related to the next ones by errors that are linear; half of one is."""
+    """Errors of the poses before a gap of five seconds and after it are not linear in each other, of half a second are."""
     events: list[str] = []
 
     class Restarting(Msckf):

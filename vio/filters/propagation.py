@@ -111,7 +111,7 @@ class Propagation:
 
     @property
     def is_lost(self) -> bool:
-        """Whether so long a time without features or sensors has passed that no pose before it is related to the next."""
+        """Whether no feature and no sensor has related poses to each other for so long that the rotation is lost."""
         of_rotation = self.since_frame.Q[3:6, 3:6]
         return self.blind and self.source is None and bool(np.linalg.eigvalsh(of_rotation)[-1] > _LINEAR_RAD**2)
 
