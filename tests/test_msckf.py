@@ -928,7 +928,7 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(
 
 @pytest.mark.parametrize("unseen_frames", [10, 100])
 def test_images_alone_begin_anew_after_a_time_in_which_the_rotation_was_lost(unseen_frames: int) -> None:
-    """Errors of the poses before a gap of five seconds and after it are not linear in each other, of half a second are."""
+    """Errors of the poses before and after five seconds are not linear in each other; with half of one, they are."""
     events: list[str] = []
 
     class Restarting(Msckf):
