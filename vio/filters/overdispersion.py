@@ -18,7 +18,7 @@ from vio.records import IntArray
 PRIOR_FACTOR = 2.5  # before any track has ended: white noise has 1, front ends on real images 2 to 7
 _PRIOR_TRACKS = 30.0  # as many ended tracks count for it
 _MOST_FEATURES = 4096  # whose clusters are kept: far more than are seen at once
-_CELL_RAD = 0.2  # side of the cells of directions in which features are neighbours
+CELL_RAD = 0.2  # side of the cells of directions in which features are neighbours
 _FRAMES = 10  # of those in which tracks end, in which neighbours' are one cluster
 _NO_SCORE = [0.0] * 6
 
@@ -42,7 +42,7 @@ class Overdispersion:
             scores: (K, 6) by a drift of the poses, in the noise that the filter believes.
             information: (K, 6) likewise, their expected squares.
         """
-        cells = np.floor(directions / _CELL_RAD).astype(np.int64).tolist()
+        cells = np.floor(directions / CELL_RAD).astype(np.int64).tolist()
         squares = self._squares.tolist()
         for feature, (x, y), score in zip(ids.tolist(), cells, scores.tolist(), strict=True):
             cluster = self._cluster.pop(feature, (x, y, self._calls // _FRAMES))

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.sparse import block_array, bsr_matrix, coo_matrix, csc_matrix, csr_matrix, diags_array, hstack, vstack
 
 from vio.cameras.rectification_error import METRIC_TERMS, error_basis, error_jacobian
+from vio.filters.overdispersion import CELL_RAD
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, so3_hat
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.imu.preintegration import BodyStates, Preintegrated, Readings, preintegrate
@@ -35,8 +36,7 @@ _WIDER = 2  # … doubled in so many first steps, once each
 _SETTLED = 7  # steps after which neither width nor preintegration change
 _CONVERGED = 1e-4  # of the cost, from step to step: what goes on is rows that turn into outliers, and moves no pose
 _MOST_DAMPING = 1e3
-# Tracks that end in one cell of directions within one second share their errors, as in (R7).
-_CELL_RAD, _CELL_S = 0.2, 1.0
+_CELL_S = 1.0  # tracks that end within it in one cell of directions share their errors, as in (R7)
 _GAUGE = 1e4  # inverse standard deviation, 1/m and 1/rad, of position and heading of the first keyframe
 
 
@@ -184,7 +184,7 @@ class InertialAdjustment:
         last[tracks.point] = np.arange(len(tracks.point))  # rows are ordered by keyframe
         across, down = (tracks.z[last, :2] - [c.cu, c.cv]).T / [[c.fu], [c.fv]]
         seconds = self.seconds[tracks.keyframe[last]]
-        cells = np.stack([np.arctan(across) / _CELL_RAD, np.arctan(down) / _CELL_RAD, seconds / _CELL_S])
+        cells = np.stack([np.arctan(across) / CELL_RAD, np.arctan(down) / CELL_RAD, seconds / _CELL_S])
         return np.asarray(np.unique(np.floor(cells), axis=1, return_inverse=True)[1]).ravel()
 
     def _extrinsics(self, rig: FloatArray) -> tuple[FloatArray, float]:
