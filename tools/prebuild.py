@@ -31,7 +31,7 @@ from llvmlite import ir
 from vio.numerics import compiled, prebuilt
 from vio.numerics.compiled import Loop
 
-# numba's types are incomplete.
+# Imported without numba's types, which are incomplete; `boxing` registers what is mended here.
 boxing, cgutils, types, cpu, pythonapi, numpy_support = (
     importlib.import_module(f"numba.{name}")
     for name in ("core.boxing", "core.cgutils", "core.types", "core.cpu", "core.pythonapi", "np.numpy_support")
@@ -50,7 +50,8 @@ _COMMANDS = (
     "mesh mapped",
     "localise flight --map flight.map --out localised",
     "run flight --no-plot --out landmarks --set msckf.calibrate_stereo=off --set msckf.calibrate_camera_imu=both",
-    "run flight --no-plot --out cylinder --set dataset.projection=cylinder",
+    "run flight --no-plot --out cylinder --set dataset.projection=cylinder --stop 10",
+    "run wide --no-plot --out bent",
     "run flight --no-plot --out mono --camera left",
     "run drive --out driven",
     "run depth --no-plot --out depths",

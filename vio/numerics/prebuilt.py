@@ -51,7 +51,7 @@ def fingerprint(function: Callable[..., Any], options: Mapping[str, Any]) -> str
     """Return a hash of a function's bytecode and options, and of the constants and compiled functions that it uses.
 
     Raises:
-        TypeError: it uses a global of another kind.
+        AttributeError: it uses a global of another kind.
     """
     digest = hashlib.sha256(repr(sorted((name, _text(value)) for name, value in options.items())).encode())
     digest.update(repr(function.__defaults__).encode())
@@ -79,8 +79,8 @@ def _text(value: Any) -> str:
         return repr(sorted(value))
     if isinstance(value, (bool, int, float, str, tuple, type(None))):
         return repr(value)
-    if isinstance(value, ModuleType):
-        return value.__name__
+    if value is np:
+        return "numpy"
     return str(value.fingerprint)  # of a compiled function
 
 
@@ -121,7 +121,7 @@ def code_of(function: Callable[..., Any], made_from: Callable[[], str]) -> list[
         return []
     try:
         current = made_from()
-    except (TypeError, AttributeError):
+    except AttributeError:
         return []
     symbols: Iterable[str] = known["symbols"] if known["fingerprint"] == current else ()
     return [getattr(module, symbol) for symbol in symbols]
