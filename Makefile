@@ -94,7 +94,7 @@ $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e . setuptools
 	@touch $@
 	@# What tests compile, they compile themselves; here the first command still renders or reads meanwhile.
-	@echo "compiling loops in the background, once: about a minute of CPU"
+	@echo "compiling loops in the background, once: about 100 s of CPU"
 	@nice $(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 &
 
 $(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
