@@ -17,7 +17,7 @@ from numba.core import types
 from tests import numpy_twins
 from tests.test_frontend_patches import PLAIN, POINTS, picture
 from vio.cameras.projection import camera_args
-from vio.cameras.rectification_error import error_jacobian
+from vio.cameras.rectification_error import ErrorColumns
 from vio.datasets import png_rows
 from vio.filters import multiview, pose_loops, stereo_calibration, track_loops
 from vio.filters.multiview import Views
@@ -382,9 +382,9 @@ def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     at, p = at.take(at.ahead), p[at.ahead]
     weight = rng.uniform(0.1, 1.0, at.r.shape[:2])
     info = multiview.track_information(CAMERA, T, at, p, weight)
-    H = error_jacobian(CAMERA, expected[: len(p)])
+    H = ErrorColumns(CAMERA).jacobian(expected[: len(p)])
     np.testing.assert_allclose(H, numpy_twins.field_jacobian(CAMERA, expected[: len(p)]), rtol=1e-12)
-    ours = stereo_calibration.stereo_columns(at, H, info.q.p_D_q, weight)
+    ours = stereo_calibration.stereo_columns(ErrorColumns(CAMERA), at, expected[: len(p)], info.q.p_D_q, weight)
     _same(ours, numpy_twins.stereo_columns(at, H, info.q.p_D_q, weight))
     chosen = np.arange(len(p)) % 3 > 0
     A, b = stereo_calibration.eliminate_points(info, chosen, ours)

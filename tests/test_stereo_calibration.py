@@ -20,9 +20,9 @@ from tests.test_filter_truth import SETTINGS, Course, Run, Spoil, fly
 from tests.test_multiview import T_CAM0_WORLD
 from vio.cameras.rectification_error import (
     TERMS,
+    ErrorColumns,
     corrected_pixels,
     error_basis,
-    error_jacobian,
     vertical_disparity_terms,
 )
 from vio.filters.multiview import (
@@ -89,7 +89,7 @@ def test_error_jacobian_equals_central_differences_of_distorted_projections() ->
         return np.concatenate([left, right], axis=1)
 
     numeric = numeric_jacobian(seen, np.zeros(TERMS), eps=1e-6).reshape(-1, 4, TERMS)
-    np.testing.assert_allclose(error_jacobian(CAMERA, z), numeric, atol=1e-4)
+    np.testing.assert_allclose(ErrorColumns(CAMERA).jacobian(z), numeric, atol=1e-4)
 
 
 def test_what_both_lenses_do_to_rows_is_taken_off_those_of_the_right_camera() -> None:
@@ -103,7 +103,7 @@ def test_what_both_lenses_do_to_rows_is_taken_off_those_of_the_right_camera() ->
 
     numeric = numeric_jacobian(corrected, np.zeros(TERMS), eps=1e-6).reshape(-1, 4, TERMS)
     field = StereoCorrection(CAMERA, rows, np.zeros(TERMS), np.arange(TERMS), rows_D_common)
-    np.testing.assert_allclose(field.jacobian(z), -numeric, atol=1e-4)
+    np.testing.assert_allclose(field.columns().jacobian(z), -numeric, atol=1e-4)
 
 
 def test_jacobian_rows_and_correction_are_of_the_same_terms() -> None:
@@ -111,7 +111,7 @@ def test_jacobian_rows_and_correction_are_of_the_same_terms() -> None:
     z = rng.uniform([100, 50, 50, 50], [700, 430, 650, 430], (20, 4))
     coefficients, rows = rng.normal(0, 1e-3, 8), np.append(rng.normal(0, 1e-3, 6), 0.0)
     basis, (own, common) = error_basis(CAMERA, z), vertical_disparity_terms(CAMERA, z)
-    np.testing.assert_allclose(basis[:, :3, :8], error_jacobian(CAMERA, z)[:, :3, :8], rtol=1e-12)
+    np.testing.assert_allclose(basis[:, :3, :8], ErrorColumns(CAMERA).jacobian(z)[:, :3, :8], rtol=1e-12)
     np.testing.assert_allclose(basis[:, 3, 8:], CAMERA.fv * own, rtol=1e-12)
     np.testing.assert_allclose(basis[:, 3, 4:8] - basis[:, 1, 4:8], CAMERA.fv * common, rtol=1e-9, atol=1e-9)
     found = corrected_pixels(CAMERA, np.append(coefficients, [0.0, 0.0]), rows, z, np.ones_like(z))
@@ -138,7 +138,7 @@ def test_a_wrong_baseline_and_focal_length_are_taken_out_of_the_pixels() -> None
     np.testing.assert_allclose(np.delete(corrected, 3, axis=0)[:, 2], np.delete(expected, 3, axis=0)[:, 2], atol=1e-9)
     assert corrected[3, 2] == z[3, 2]
     np.testing.assert_allclose(field.seen(expected), z, atol=1e-9)
-    assert field.jacobian(z).shape == (20, 4, 2)
+    assert field.columns().jacobian(z).shape == (20, 4, 2)
 
 
 def _turned_right(z: FloatArray, camera: StereoCamera, w: FloatArray) -> FloatArray:
@@ -275,8 +275,8 @@ def _linear() -> tuple[FloatArray, Residuals, TrackInformation, StereoColumns, F
     at = residuals(CAMERA, T_CAM0_WORLD, p, views)
     weight = np.random.default_rng(8).uniform(0.3, 1.0, (len(p), CLONES))
     info = track_information(CAMERA, T_CAM0_WORLD, at, p, weight)
-    H = error_jacobian(CAMERA, views.z - at.r)
-    return p, at, info, stereo_columns(at, H, info.q.p_D_q, weight), H, weight
+    wanted, z = ErrorColumns(CAMERA), views.z - at.r
+    return p, at, info, stereo_columns(wanted, at, z, info.q.p_D_q, weight), wanted.jacobian(z), weight
 
 
 def test_elimination_equals_the_schur_complement_with_the_coefficients_as_columns() -> None:
@@ -317,7 +317,7 @@ def test_points_follow_the_coefficients_as_their_triangulation_does() -> None:
     z = np.array([[project(CAMERA, transform_points(T, p[0])) for T in T_CAM0_WORLD]])
     at = residuals(CAMERA, T_CAM0_WORLD, p, Views(z, weight))
     info = track_information(CAMERA, T_CAM0_WORLD, at, p, np.ones((1, CLONES)))
-    columns = stereo_columns(at, error_jacobian(CAMERA, z), info.q.p_D_q, np.ones((1, CLONES)))
+    columns = stereo_columns(ErrorColumns(CAMERA), at, z, info.q.p_D_q, np.ones((1, CLONES)))
 
     def triangulated(s: FloatArray) -> FloatArray:
         field = StereoCorrection(CAMERA, np.zeros(7), s, np.arange(TERMS))

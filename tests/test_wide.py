@@ -15,7 +15,7 @@ from tests import test_msckf
 from tests.commands import render
 from tests.numpy_twins import residuals
 from tests.same_events import frames_of
-from vio.cameras.rectification_error import TERMS, error_jacobian
+from vio.cameras.rectification_error import TERMS, ErrorColumns
 from vio.cameras.rig import Rig
 from vio.cli import main
 from vio.cli.running import _opened
@@ -318,7 +318,7 @@ def test_the_field_takes_out_a_right_camera_below_the_left_one_s_row() -> None:
 def test_derivatives_by_the_field_are_those_of_the_correction() -> None:
     pixels, p = _around(50)
     z, step = project(CYLINDER, p), 1e-4
-    H = error_jacobian(CYLINDER, z)
+    H = ErrorColumns(CYLINDER).jacobian(z)
     for j in range(9):
         a = step * np.eye(9)[j]
         change = z[:, :3] - _field(a, np.zeros(7), pixels, z[:, 2:])[:, :3]

@@ -11,13 +11,15 @@ images.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
-from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS
+from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS, IntArray
 
 METRIC_TERMS = 2  # logarithms of baseline and focal length over the calibrated ones, (R4)
 TERMS = FIELD_TERMS + METRIC_TERMS
@@ -25,15 +27,25 @@ CONSIDERED = METRIC_TERMS + 2  # what may be considered in place of estimated: t
 _COLUMNS = FIELD_TERMS + ROW_TERMS - 1
 
 
-def error_jacobian(camera: StereoCamera, z: FloatArray, first: int = 0, terms: int = TERMS) -> FloatArray:
-    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by coefficients of (R3) and (R4), (..., 4, terms), pixels.
+@dataclass(frozen=True, slots=True)
+class ErrorColumns:
+    """Which derivatives of pixels by coefficients of (R3) and (R4) are wanted."""
 
-    The row of `vr` is zero: right rows are not measured. On a cylinder the column of the focal length is zero. Behind
-    the ten coefficients come those of the principal point (u, v), over the focal length.
-    """
-    out = np.empty((*z.shape[:-1], 4, terms))
-    _write_jacobian(camera_args(camera), np.ascontiguousarray(z).reshape(-1, 4), first, out.reshape(-1, 4, terms))
-    return out
+    camera: StereoCamera
+    # (S,) which ones; behind the ten coefficients come those of the principal point (u, v), over the focal length
+    chosen: IntArray = field(default_factory=lambda: np.arange(TERMS))
+    # (7, 4) what k1, k2, q1, q2 take off the rows of (R2), which right columns follow; (7, 0): nothing
+    rows_D_common: FloatArray = field(default_factory=lambda: np.zeros((ROW_TERMS, 0)))
+
+    def jacobian(self, z: FloatArray) -> FloatArray:
+        """Derivatives (..., 4, S) of pixels `[ul vl ur vr]` (..., 4), pixels.
+
+        The row of `vr` is zero: right rows are not measured. On a cylinder the column of the focal length is zero.
+        """
+        out = np.empty((*z.shape[:-1], 4, len(self.chosen)))
+        pixels, flat = np.ascontiguousarray(z).reshape(-1, 4), out.reshape(-1, 4, len(self.chosen))
+        _write_jacobian(camera_args(self.camera), pixels, self.chosen, self.rows_D_common, flat)
+        return out
 
 
 def error_basis(camera: StereoCamera, z: FloatArray) -> FloatArray:
@@ -136,28 +148,49 @@ def _cylinder_terms(x: float, azimuth: float, out: FloatArray) -> None:
 
 
 @compiled
-def _write_jacobian(camera: CameraArgs, z: FloatArray, first: int, out: FloatArray) -> None:
-    """Write the derivatives (M, 4, S) of pixels (M, 4) by S coefficients of (R3) and (R4), from the `first` one on."""
-    fu, fv, cu, cv, _, cylinder = camera
+def _write_jacobian(
+    camera: CameraArgs, z: FloatArray, chosen: IntArray, rows_D_common: FloatArray, out: FloatArray
+) -> None:
+    """Write the derivatives (M, 4, S) of pixels (M, 4) by S coefficients, see `ErrorColumns`."""
     left, right = np.empty((2, _COLUMNS)), np.empty((2, _COLUMNS))
     for m in range(len(z)):
-        x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
-        _write_terms(camera, x, y, fu, fv, left)
-        _write_terms(camera, xr, y, fu, fv, right)
-        for s in range(out.shape[2]):
-            k = first + s
-            out[m, 0, s] = left[0, k] if 4 <= k < 8 else 0.0
-            out[m, 1, s] = left[1, k] if 4 <= k < 8 else 0.0
-            out[m, 2, s] = right[0, k] if k < 8 else 0.0
-            out[m, 3, s] = 0.0
-            if k == 8:
-                out[m, 2, s] = z[m, 2] - z[m, 0]
-            if k == 9 and not cylinder:
-                out[m, 0, s], out[m, 1, s], out[m, 2, s] = fu * x, fv * y, fu * xr
-            if k == 10:
-                out[m, 0, s] = out[m, 2, s] = fu
-            if k == 11:
-                out[m, 1, s] = fv
+        write_view(camera, z[m], chosen, rows_D_common, left, right, out[m])
+
+
+@compiled
+def write_view(
+    camera: CameraArgs,
+    z: FloatArray,
+    chosen: IntArray,
+    rows_D_common: FloatArray,
+    left: FloatArray,
+    right: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write the derivatives (4, S) of the pixels (4,) of one view, see `ErrorColumns`; left and right (2, 14) are lost."""
+    fu, fv, cu, cv, _, cylinder = camera
+    x, y, xr = (z[0] - cu) / fu, (z[1] - cv) / fv, (z[2] - cu) / fu
+    _write_terms(camera, x, y, fu, fv, left)
+    _write_terms(camera, xr, y, fu, fv, right)
+    for s in range(len(chosen)):
+        k = chosen[s]
+        out[0, s] = left[0, k] if 4 <= k < 8 else 0.0
+        out[1, s] = left[1, k] if 4 <= k < 8 else 0.0
+        out[2, s] = right[0, k] if k < 8 else 0.0
+        out[3, s] = 0.0
+        if 4 <= k < 4 + rows_D_common.shape[1]:
+            for j in range(6):
+                out[2, s] -= right[0, 8 + j] * rows_D_common[j, k - 4]
+            if cylinder:
+                out[2, s] += rows_D_common[6, k - 4] * fu * xr * (x - xr) * np.sin(y)
+        if k == 8:
+            out[2, s] = z[2] - z[0]
+        if k == 9 and not cylinder:
+            out[0, s], out[1, s], out[2, s] = fu * x, fv * y, fu * xr
+        if k == 10:
+            out[0, s] = out[2, s] = fu
+        if k == 11:
+            out[1, s] = fv
 
 
 @compiled

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.cameras.rectification_error import CONSIDERED, error_jacobian
+from vio.cameras.rectification_error import CONSIDERED, ErrorColumns
 from vio.filters import track_loops
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
@@ -276,7 +276,7 @@ class FrameUpdate:
         if pixels is not None and len(pixels.z):
             at, H = self._landmark_residuals(window, pixels), np.empty((len(pixels.z), 4, 0))
             if field is not None or considered:
-                H = self._joint_jacobian(field, unweighted(pixels.z, at.r, at.precision), considered)
+                H = self._error_columns(field, considered).jacobian(unweighted(pixels.z, at.r, at.precision))
             # In their anchor, the newest clone: dp = xi_f - xi_rho.
             rows = state.clone(-1).start, state.landmarks.start, state.stereo.start
             weight = at.weight / self._variance
@@ -287,14 +287,14 @@ class FrameUpdate:
         """The tracks' columns of the coefficients estimated and of those considered; None: none is considered."""
         if not self._rig.considered_sigmas(window).any():
             return None
-        H = self._joint_jacobian(tracks.field, tracks.z, CONSIDERED)
-        return stereo_columns(tracks.at, H, tracks.information.q.p_D_q, tracks.weight)
+        wanted = self._error_columns(tracks.field, CONSIDERED)
+        return stereo_columns(wanted, tracks.at, tracks.z, tracks.information.q.p_D_q, tracks.weight)
 
-    def _joint_jacobian(self, field: StereoCorrection | None, z: FloatArray, considered: int) -> FloatArray:
-        """Derivatives (..., 4, S + C) of predicted pixels by the coefficients estimated, and by the C considered."""
+    def _error_columns(self, field: StereoCorrection | None, considered: int) -> ErrorColumns:
+        """Columns of the coefficients that are estimated, and of the C considered."""
         if field is None:
-            return error_jacobian(self._rig.camera, z, FIELD_TERMS, considered)
-        return field.jacobian(z, considered)
+            return ErrorColumns(self._rig.camera, np.arange(FIELD_TERMS, FIELD_TERMS + considered))
+        return field.columns(considered)
 
     def _landmark_residuals(self, window: Window, pixels: Views) -> LandmarkResiduals:
         """Residuals of the landmarks' pixels in the newest exposure."""
@@ -316,7 +316,7 @@ class FrameUpdate:
         J, field = at.J, self._rig.field(window)
         if field is not None:
             z = unweighted(pixels.z, at.r, at.precision)
-            H = field.jacobian(z) * (at.precision * np.any(at.J, axis=2))[..., None]
+            H = field.columns().jacobian(z) * (at.precision * np.any(at.J, axis=2))[..., None]
             J = np.concatenate([J, H], axis=2)
         weight = at.weight * (self.tracks.variance / self._variance)  # that they entered the fit with
         nis = leave_one_out_nis(at.r, J, landmark_covariance(window, fitted), weight, self.tracks.variance)

@@ -141,7 +141,7 @@ class RigCalibration:
         estimated, stereo = window.calibration.stereo_terms, window.calibration.stereo
         if not len(estimated):
             return None
-        rows, rows_D_common = np.zeros(ROW_TERMS), None
+        rows, rows_D_common = np.zeros(ROW_TERMS), np.zeros((ROW_TERMS, 0))
         if "stereo_field" in window.state:
             rows = self._rows.coefficients
         # Lenses that bend both images alike pass for a focal length: 2 ± 0.4 % for k1 = -0.03. Where that counts as

@@ -11,11 +11,12 @@ Cvisic, Markovic & Petrovic, Recalibrating the KITTI dataset camera setup for im
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from vio.cameras.rectification_error import TERMS, corrected_pixels, error_jacobian, vertical_disparity_terms
+from vio.cameras.projection import camera_args
+from vio.cameras.rectification_error import ErrorColumns, corrected_pixels, vertical_disparity_terms
 from vio.filters import track_loops as loops
 from vio.filters.multiview import CAUCHY, Residuals, TrackInformation, Views
 from vio.geometry.lie import FloatArray
@@ -108,25 +109,16 @@ class StereoCorrection:
     rows: FloatArray  # (7,) of (R2) that are the right camera's own, in focal lengths; zero where they show no fault
     coefficients: FloatArray  # (10,) of (R3) and (R4)
     terms: IntArray  # (S,) which of them are estimated
-    # (7, 4) what k1, k2, q1, q2 have taken off `rows`, which were learned with them; None: nothing
-    rows_D_common: FloatArray | None = None
+    # (7, 4) what k1, k2, q1, q2 have taken off `rows`, which were learned with them; (7, 0): nothing
+    rows_D_common: FloatArray = field(default_factory=lambda: np.zeros((ROW_TERMS, 0)))
 
-    def jacobian(self, z: FloatArray, considered: int = 0) -> FloatArray:
-        """Derivatives of pixels (..., 4) by the coefficients that are estimated (..., 4, S), then by those considered.
+    def columns(self, considered: int = 0) -> ErrorColumns:
+        """Columns of the coefficients that are estimated, then of those considered: none, or four.
 
-        Args:
-            z: pixels.
-            considered: how many are considered; zero, or four (baseline, focal length, principal point).
+        The four are baseline, focal length, principal point.
         """
-        first, terms = int(self.terms[0]), len(self.terms)
-        follow = first + terms == FIELD_TERMS  # those considered come next
-        out = error_jacobian(self.camera, z, first, terms + considered * follow)
-        if self.rows_D_common is not None and first == 0:
-            for k, rows in enumerate(self.rows_D_common.T):
-                out[..., 2, RIGHT_TERMS + k] -= self._right_columns(z, rows)
-        if follow or not considered:
-            return out
-        return np.concatenate([out, error_jacobian(self.camera, z, FIELD_TERMS, considered)], axis=-1)
+        chosen = np.concatenate([self.terms, np.arange(FIELD_TERMS, FIELD_TERMS + considered)])
+        return ErrorColumns(self.camera, chosen, self.rows_D_common)
 
     def depth_sigma(self, p_cam: FloatArray, P: FloatArray) -> FloatArray:
         """Standard deviations (M,) of stereo depths, over them, by errors of the coefficients of covariance P (S, S).
@@ -136,15 +128,9 @@ class StereoCorrection:
             P: of the coefficients that are estimated.
         """
         z = project(self.camera, p_cam)
-        J = self.jacobian(z)
+        J = self.columns().jacobian(z)
         by_terms = J[:, 0] - J[:, 2]
         out: FloatArray = np.sqrt(np.einsum("ms,st,mt->m", by_terms, P, by_terms)) / (z[:, 0] - z[:, 2])
-        return out
-
-    def _right_columns(self, z: FloatArray, rows: FloatArray) -> FloatArray:
-        """What rows (7,) of (R2) tell of the right columns of pixels (..., 4), pixels (...)."""
-        alone = StereoCorrection(self.camera, rows, np.zeros(TERMS), self.terms)
-        out: FloatArray = z[..., 2] - alone.corrected(Views(z, np.ones_like(z))).z.reshape(z.shape)[..., 2]
         return out
 
     def corrected(self, views: Views) -> Views:
@@ -178,20 +164,23 @@ class StereoColumns:
         return out
 
 
-def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: FloatArray) -> StereoColumns:
+def stereo_columns(
+    wanted: ErrorColumns, at: Residuals, z: FloatArray, p_D_q: FloatArray, weight: FloatArray
+) -> StereoColumns:
     """Collect the normal equations of `r = J (B xi_i + dp) + H s`.
 
     Args:
+        wanted: columns of H.
         at: residuals and Jacobians of F tracks in N clones.
-        H: derivatives of each view's pixels by the coefficients (F, N, 4, S).
+        z: pixels (F, N, 4) at which H is taken.
         p_D_q: the points' coordinates (F, 3, 3), equation (M5).
         weight: robust weights (F, N).
     """
-    F, N, _, S = H.shape
+    (F, N), S = weight.shape, len(wanted.chosen)
     columns = StereoColumns(np.empty((F, N, 3, S)), np.empty((F, S, 3)), np.empty((F, S, S)), np.empty((F, S)))
-    loops.collect_columns(
-        at.r, at.z_D_p, H, at.weight, weight, p_D_q, columns.by_point, columns.G, columns.A, columns.b
-    )
+    of_terms = camera_args(wanted.camera), wanted.chosen, wanted.rows_D_common, z
+    out = columns.by_point, columns.G, columns.A, columns.b
+    loops.collect_columns(*of_terms, at.r, at.z_D_p, at.weight, weight, p_D_q, *out)
     return columns
 
 

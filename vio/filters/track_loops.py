@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, point_at, turn_to
+from vio.cameras.rectification_error import write_view
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled, solve_positive
 from vio.records import BoolArray, IntArray, SigmaArray
@@ -798,9 +799,12 @@ def innovations(
 
 @compiled
 def collect_columns(
+    camera: CameraArgs,
+    chosen: IntArray,
+    rows_D_common: FloatArray,
+    z: FloatArray,
     r: FloatArray,
     J: FloatArray,
-    H: FloatArray,
     precision: FloatArray,
     weight: FloatArray,
     p_D_q: FloatArray,
@@ -811,10 +815,11 @@ def collect_columns(
 ) -> None:
     """Write `J' W H` (F, N, 3, S) of each view, and G (F, S, 3), its sum over the views of each track, transposed.
 
-    And `H' W H` (F, S, S) and `H' W r` (F, S) of each track. H (F, N, 4, S) are the derivatives of the pixels, of which
-    those count that were measured; right rows do not depend on them. r and J are times the precision (F, N, 4), H not.
+    And `H' W H` (F, S, S) and `H' W r` (F, S) of each track. H are the derivatives of the pixels z (F, N, 4) by what
+    `ErrorColumns` has chosen; those count that were measured. r and J are times the precision (F, N, 4), H not.
     """
-    terms, h, by_q = H.shape[3], np.empty(H.shape[3]), np.empty(3)
+    terms = len(chosen)
+    left, right, H, h, by_q = np.empty((2, 14)), np.empty((2, 14)), np.empty((4, terms)), np.empty(terms), np.empty(3)
     for f in range(len(J)):
         for s in range(terms):
             b[f, s] = G[f, s, 0] = G[f, s, 1] = G[f, s, 2] = 0.0
@@ -826,13 +831,14 @@ def collect_columns(
                     by_point[f, n, i, s] = 0.0
             if weight[f, n] == 0.0:
                 continue
+            write_view(camera, z[f, n], chosen, rows_D_common, left, right, H)
             for a in range(3):
                 row = J[f, n, a]
                 if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
                     continue
                 _by_point(row, p_D_q[f], by_q)
                 for s in range(terms):
-                    h[s] = precision[f, n, a] * H[f, n, a, s]
+                    h[s] = precision[f, n, a] * H[a, s]
                 for s in range(terms):
                     if h[s] == 0.0:  # left pixels do not depend on the right camera
                         continue

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import block_array, bsr_matrix, coo_matrix, csc_matrix, csr_matrix, diags_array, hstack, vstack
 
-from vio.cameras.rectification_error import METRIC_TERMS, error_basis, error_jacobian
+from vio.cameras.rectification_error import METRIC_TERMS, ErrorColumns, error_basis
 from vio.filters.overdispersion import CELL_RAD
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, so3_hat
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
@@ -28,6 +28,7 @@ from vio.records import FIELD_TERMS, ROW_TERMS, IntArray
 
 _OWN = 15  # states of a keyframe: xi of its pose, velocity, biases of gyro and accelerometer
 _FIELD = FIELD_TERMS + ROW_TERMS
+_METRIC_COLUMNS: IntArray = np.arange(FIELD_TERMS, FIELD_TERMS + METRIC_TERMS + 2)
 # Field, baseline, focal length, centre, extrinsics, time, accelerometer.
 _SHARED = _FIELD + METRIC_TERMS + 2 + 6 + 1 + 1
 _STEPS = 25
@@ -200,7 +201,7 @@ class InertialAdjustment:
         # Where points are expected: at noisy pixels, a longer baseline would pass for less noise.
         expected = project(self.camera, q)
         by_field = error_basis(self.camera, expected) @ prior.field
-        by_metric = error_jacobian(self.camera, expected, FIELD_TERMS, METRIC_TERMS + 2) * prior.metric
+        by_metric = ErrorColumns(self.camera, _METRIC_COLUMNS).jacobian(expected) * prior.metric
         D = np.concatenate([by_field, by_metric], axis=2)[:, :3]
         r = (tracks.z - expected)[:, :3] - D @ at.rig[: D.shape[2]]
         r[~tracks.has_right, 2] = 0
