@@ -95,15 +95,23 @@ def _write_terms(camera: CameraArgs, x: float, y: float, fu: float, fv: float, o
             out[1, j] *= fv
         return
     r2 = x * x + y * y
-    u_right = fu, fu * x, fu * r2, fu * r2 * r2
-    u_both = fu * x * r2, fu * x * r2 * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x)
-    v_both = fv * y * r2, fv * y * r2 * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y
+    u_right, (u_both, v_both) = (fu, fu * x, fu * r2, fu * r2 * r2), _common_terms(x, y, fu, fv)
     for j in range(4):
         out[0, j], out[1, j], out[0, 4 + j], out[1, 4 + j] = u_right[j], 0.0, u_both[j], v_both[j]
     u_rows = 0.0, -fu * y, 0.0, -fu * y * y, -fu * x * y, fu * x * y
     v_rows = fv, fv * x, fv * y, fv * x * y, fv * x * x, fv * y * y
     for j in range(6):
         out[0, 8 + j], out[1, 8 + j] = u_rows[j], v_rows[j]
+
+
+@compiled
+def _common_terms(
+    x: float, y: float, fu: float, fv: float
+) -> tuple[tuple[float, float, float, float], tuple[float, float, float, float]]:
+    """By how much a pinhole's columns and rows move for one unit of k1, k2, q1, q2, times fu and fv."""
+    r2 = x * x + y * y
+    of_columns = fu * x * r2, fu * x * r2 * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x)
+    return of_columns, (fv * y * r2, fv * y * r2 * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y)
 
 
 @compiled
@@ -152,45 +160,59 @@ def _write_jacobian(
     camera: CameraArgs, z: FloatArray, chosen: IntArray, rows_D_common: FloatArray, out: FloatArray
 ) -> None:
     """Write the derivatives (M, 4, S) of pixels (M, 4) by S coefficients, see `ErrorColumns`."""
-    left, right = np.empty((2, _COLUMNS)), np.empty((2, _COLUMNS))
+    every = np.empty((3, TERMS + 2))
     for m in range(len(z)):
-        write_view(camera, z[m], chosen, rows_D_common, left, right, out[m])
+        write_view(camera, z[m], rows_D_common, every)
+        for s in range(len(chosen)):
+            for a in range(3):
+                out[m, a, s] = every[a, chosen[s]]
+            out[m, 3, s] = 0.0
 
 
 @compiled
-def write_view(
-    camera: CameraArgs,
-    z: FloatArray,
-    chosen: IntArray,
-    rows_D_common: FloatArray,
-    left: FloatArray,
-    right: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write the derivatives (4, S) of the pixels (4,) of one view, see `ErrorColumns`; left and right (2, 14) are lost."""
+def write_view(camera: CameraArgs, z: FloatArray, rows_D_common: FloatArray, out: FloatArray) -> None:
+    """Write all derivatives (3, 12) of one view's pixels (4,) but the right row, see `ErrorColumns`."""
     fu, fv, cu, cv, _, cylinder = camera
     x, y, xr = (z[0] - cu) / fu, (z[1] - cv) / fv, (z[2] - cu) / fu
-    _write_terms(camera, x, y, fu, fv, left)
-    _write_terms(camera, xr, y, fu, fv, right)
-    for s in range(len(chosen)):
-        k = chosen[s]
-        out[0, s] = left[0, k] if 4 <= k < 8 else 0.0
-        out[1, s] = left[1, k] if 4 <= k < 8 else 0.0
-        out[2, s] = right[0, k] if k < 8 else 0.0
-        out[3, s] = 0.0
-        if 4 <= k < 4 + rows_D_common.shape[1]:
-            for j in range(6):
-                out[2, s] -= right[0, 8 + j] * rows_D_common[j, k - 4]
-            if cylinder:
-                out[2, s] += rows_D_common[6, k - 4] * fu * xr * (x - xr) * np.sin(y)
-        if k == 8:
-            out[2, s] = z[2] - z[0]
-        if k == 9 and not cylinder:
-            out[0, s], out[1, s], out[2, s] = fu * x, fv * y, fu * xr
-        if k == 10:
-            out[0, s] = out[2, s] = fu
-        if k == 11:
-            out[1, s] = fv
+    for k in range(TERMS + 2):
+        out[0, k] = out[1, k] = out[2, k] = 0.0
+    if cylinder:
+        _write_on_cylinder(camera, x, y, xr, out)
+    else:
+        r2, (left, row), (right, _) = xr * xr + y * y, _common_terms(x, y, fu, fv), _common_terms(xr, y, fu, fv)
+        out[2, 0], out[2, 1], out[2, 2], out[2, 3] = fu, fu * xr, fu * r2, fu * r2 * r2
+        for k in range(4):
+            out[0, 4 + k], out[1, 4 + k], out[2, 4 + k] = left[k], row[k], right[k]
+        out[0, 9], out[1, 9], out[2, 9] = fu * x, fv * y, fu * xr
+    out[2, 8] = z[2] - z[0]
+    out[0, 10], out[2, 10], out[1, 11] = fu, fu, fv
+    if rows_D_common.shape[1]:
+        _take_off_common(camera, x, y, xr, rows_D_common, out)
+
+
+@compiled
+def _write_on_cylinder(camera: CameraArgs, x: float, y: float, xr: float, out: FloatArray) -> None:
+    """Write the columns of (R3) into the derivatives (3, 12) of a view on a cylinder."""
+    left, right = np.empty((2, _COLUMNS)), np.empty((2, _COLUMNS))
+    _write_terms(camera, x, y, camera[0], camera[1], left)
+    _write_terms(camera, xr, y, camera[0], camera[1], right)
+    for k in range(4):
+        out[2, k] = right[0, k]
+        out[0, 4 + k], out[1, 4 + k], out[2, 4 + k] = left[0, 4 + k], left[1, 4 + k], right[0, 4 + k]
+
+
+@compiled
+def _take_off_common(
+    camera: CameraArgs, x: float, y: float, xr: float, rows_D_common: FloatArray, out: FloatArray
+) -> None:
+    """Take what right columns follow of the rows that k1, k2, q1, q2 take off, out of a view's derivatives (3, 12)."""
+    right = np.empty((2, _COLUMNS))
+    _write_terms(camera, xr, y, camera[0], camera[1], right)
+    for k in range(4):
+        for j in range(6):
+            out[2, 4 + k] -= right[0, 8 + j] * rows_D_common[j, k]
+        if camera[5]:
+            out[2, 4 + k] += rows_D_common[6, k] * camera[0] * xr * (x - xr) * np.sin(y)
 
 
 @compiled

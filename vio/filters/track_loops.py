@@ -819,39 +819,44 @@ def collect_columns(
     `ErrorColumns` has chosen; those count that were measured. r and J are times the precision (F, N, 4), H not.
     """
     terms = len(chosen)
-    left, right, H, h, by_q = np.empty((2, 14)), np.empty((2, 14)), np.empty((4, terms)), np.empty(terms), np.empty(3)
+    H, by_q = np.empty((3, 12)), np.empty(3)
+    h, wh, sums = np.empty(terms), np.empty(terms), np.empty((3, terms))
     for f in range(len(J)):
+        own, own_b = A[f], b[f]
         for s in range(terms):
-            b[f, s] = G[f, s, 0] = G[f, s, 1] = G[f, s, 2] = 0.0
+            own_b[s] = sums[0, s] = sums[1, s] = sums[2, s] = 0.0
             for t in range(terms):
-                A[f, s, t] = 0.0
+                own[s, t] = 0.0
         for n in range(J.shape[1]):
+            of_view = by_point[f, n]
             for i in range(3):
                 for s in range(terms):
-                    by_point[f, n, i, s] = 0.0
+                    of_view[i, s] = 0.0
             if weight[f, n] == 0.0:
                 continue
-            write_view(camera, z[f, n], chosen, rows_D_common, left, right, H)
+            write_view(camera, z[f, n], rows_D_common, H)
             for a in range(3):
                 row = J[f, n, a]
                 if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
                     continue
                 _by_point(row, p_D_q[f], by_q)
                 for s in range(terms):
-                    h[s] = precision[f, n, a] * H[a, s]
+                    h[s] = precision[f, n, a] * H[a, chosen[s]]
+                    wh[s] = weight[f, n] * h[s]
+                    own_b[s] += wh[s] * r[f, n, a]
                 for s in range(terms):
-                    if h[s] == 0.0:  # left pixels do not depend on the right camera
-                        continue
-                    wh = weight[f, n] * h[s]
-                    b[f, s] += wh * r[f, n, a]
-                    for t in range(s + 1):
-                        A[f, s, t] += wh * h[t]
-                    for i in range(3):
-                        by_point[f, n, i, s] += by_q[i] * wh
-                        G[f, s, i] += by_q[i] * wh
+                    if h[s] != 0.0:  # left pixels do not depend on the right camera
+                        for t in range(s + 1):
+                            own[s, t] += wh[s] * h[t]
+                for i in range(3):
+                    for s in range(terms):
+                        of_view[i, s] += by_q[i] * wh[s]
+                        sums[i, s] += by_q[i] * wh[s]
         for s in range(terms):
+            for i in range(3):
+                G[f, s, i] = sums[i, s]
             for t in range(s):
-                A[f, t, s] = A[f, s, t]
+                own[t, s] = own[s, t]
 
 
 @compiled
