@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy.linalg import lapack
 
 from vio.filters import track_loops as loops
 from vio.filters.multiview import (
@@ -46,7 +47,7 @@ _SPENT_ON_NOISE = 3.0
 _VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
 _MOST_DOF = 199
-_NO_INFORMATION = 1e-9  # over the largest: directions of the poses that pixels alone do not tell, as where the world is
+_NO_INFORMATION = 1e-8  # left of a pose's own, at most: directions that pixels alone do not tell, as where the world is
 _MOST_COMMON_NOISE = 4.0  # of a frame over the learned variance: beyond twice the noise it is no blur
 
 
@@ -262,10 +263,13 @@ class WindowTracks:
             return
         A, b = eliminate_points(tracks.information, np.ones(len(dof), dtype=np.bool_))
         scale = np.sqrt(np.where(A.diagonal() > 0, A.diagonal(), 1.0))
-        move, _, spent, _ = np.linalg.lstsq(A / np.outer(scale, scale), b / scale, rcond=_NO_INFORMATION)
+        # `b' A^+ b` by Cholesky with pivots, in the directions that A determines: b has no part in the others.
+        U, order, spent, _ = lapack.dpstrf(A / np.outer(scale, scale), tol=_NO_INFORMATION, lower=0)
+        determined = order[:spent] - 1
+        y, _ = lapack.dtrtrs(U[:spent, :spent], (b / scale)[determined], trans=1)
         squares, total = float(np.sum(tracks.weight * squared_residuals(tracks.at)[0])), int(dof.sum())
         if total > spent:
-            left = (1 - float(move @ (b / scale)) / squares) / (1 - spent / total)
+            left = (1 - float(y @ y) / squares) / (1 - spent / total)
             self.common_noise = min(max(_misfit(nis, dof) * min(left, 1.0), 1.0), _MOST_COMMON_NOISE)
 
     def update_pixel_noise(self, squares: FloatArray, dof: IntArray, fitted: float) -> None:
