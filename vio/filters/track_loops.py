@@ -132,6 +132,55 @@ def anchor_points(
 
 
 @compiled
+def find_rows(ids: IntArray, known: IntArray, ordered: IntArray, rows: IntArray) -> int:
+    """Write the rows (K,) of ids (K,), -1 where unknown, and return how many are; `ordered` are all rows by their ids."""
+    unknown = 0
+    for k in range(len(ids)):
+        low, high = 0, len(ordered)
+        while low < high:
+            half = (low + high) // 2
+            if known[ordered[half]] < ids[k]:
+                low = half + 1
+            else:
+                high = half
+        rows[k] = ordered[low] if low < len(ordered) and known[ordered[low]] == ids[k] else -1
+        unknown += rows[k] < 0
+    return unknown
+
+
+@compiled
+def write_column(
+    rows: IntArray, column: int, z: FloatArray, weight: FloatArray, table_z: FloatArray, table_weight: FloatArray
+) -> None:
+    """Write pixels and weights (K, 4) into a column of the rows (K,) of tables (R, N, 4)."""
+    for k in range(len(rows)):
+        for a in range(4):
+            table_z[rows[k], column, a], table_weight[rows[k], column, a] = z[k, a], weight[k, a]
+
+
+@compiled
+def count_views(rows: IntArray, weight: FloatArray, seen: BoolArray, length: IntArray) -> None:
+    """Write in which columns (F, N) rows of a table (R, N, 4) were seen, and in how many (F,)."""
+    for f in range(len(rows)):
+        length[f] = 0
+        for n in range(weight.shape[1]):
+            seen[f, n] = weight[rows[f], n, 0] > 0.0
+            length[f] += seen[f, n]
+
+
+@compiled
+def shift_columns(rows: IntArray, z: FloatArray, weight: FloatArray) -> None:
+    """Move rows of tables (R, N, 4) one column towards the first, which is lost; nothing was seen in the last one."""
+    last = z.shape[1] - 1
+    for f in rows:
+        for n in range(last):
+            for a in range(4):
+                z[f, n, a], weight[f, n, a] = z[f, n + 1, a], weight[f, n + 1, a]
+        for a in range(4):
+            weight[f, last, a] = 0.0
+
+
+@compiled
 def middle(values: FloatArray) -> float:
     """Median of one or more values (n,), which are reordered. Reference: Hoare, Algorithm 65: Find, CACM (1961)."""
     k, low, high = len(values) // 2, 0, len(values) - 1

@@ -19,9 +19,8 @@ class TrackTable:
 
     def __init__(self, columns: int) -> None:
         self._columns = columns
-        self._row_of: dict[int, int] = {}
-        self._rows: IntArray | None = None  # all rows in order of their ids; None: tracks have come
-        self._free: list[int] = []
+        self._rows: IntArray = np.zeros(0, dtype=np.int64)  # of all tracks, in order of their ids
+        self._free: IntArray = np.zeros(0, dtype=np.int64)  # rows without a track; the last one is used next
         self._ids = np.zeros(0, dtype=np.int64)
         self._z = np.zeros((0, columns, 4))
         self._weight = np.zeros((0, columns, 4))  # as in `Views`
@@ -31,18 +30,21 @@ class TrackTable:
 
     def add_frame(self, column: int, seen: Observations) -> None:
         """Write the observations of one frame into a column; unknown ids become new tracks."""
-        ids, row_of = seen.ids.tolist(), self._row_of
-        self._add([track for track in ids if track not in row_of])
-        if ids:
-            rows = np.array([row_of[track] for track in ids])
-            self._z[rows, column] = seen.z
-            self._weight[rows, column] = precision(seen)
+        rows: IntArray = np.empty(len(seen), dtype=np.int64)
+        new = loops.find_rows(seen.ids, self._ids, self._rows, rows)
+        if new:
+            unknown = np.flatnonzero(rows < 0)
+            while new > len(self._free):
+                self._grow(2 * len(self._ids))
+            rows[unknown] = self._free[-1 : -new - 1 : -1]
+            self._free = self._free[:-new]
+            self._ids[rows[unknown]] = seen.ids[unknown]
+            together = np.concatenate([self._rows, rows[unknown]])
+            self._rows = together[np.argsort(self._ids[together])]
+        loops.write_column(rows, column, seen.z, precision(seen), self._z, self._weight)
 
     def rows(self) -> IntArray:
         """Rows (F,) of all tracks, in order of their ids, so that no result depends on the table's history."""
-        if self._rows is None:
-            rows = np.fromiter(self._row_of.values(), dtype=np.int64, count=len(self._row_of))
-            self._rows = rows[np.argsort(self._ids[rows])]
         return self._rows
 
     def ids(self, rows: IntArray) -> IntArray:
@@ -55,14 +57,19 @@ class TrackTable:
 
     def seen(self, rows: IntArray) -> BoolArray:
         """Which columns (F, N) rows were seen in."""
-        return self._weight[rows, :, 0] > 0
+        return self.lengths(rows)[0]
+
+    def lengths(self, rows: IntArray) -> tuple[BoolArray, IntArray]:
+        """Which columns (F, N) rows were seen in, and how many they are (F,)."""
+        seen: BoolArray = np.empty((len(rows), self._columns), dtype=np.bool_)
+        length: IntArray = np.empty(len(rows), dtype=np.int64)
+        loops.count_views(rows, self._weight, seen, length)
+        return seen, length
 
     def shift(self) -> None:
         """Forget the oldest column; tracks that were seen there alone are removed."""
-        self._z[:, :-1], self._weight[:, :-1] = self._z[:, 1:].copy(), self._weight[:, 1:].copy()
-        self._weight[:, -1] = 0.0
-        rows = self.rows()
-        self.remove(rows[~self.seen(rows).any(axis=1)])
+        loops.shift_columns(self._rows, self._z, self._weight)
+        self.remove(self._rows[self.lengths(self._rows)[1] == 0])
 
     def forget_views(self, rows: IntArray) -> None:
         """Forget all views of rows but keep the tracks; their pixels have been used."""
@@ -79,24 +86,8 @@ class TrackTable:
             return
         gone = np.zeros(len(self._ids), dtype=np.bool_)
         gone[rows] = True
-        ordered = self.rows()
-        self._rows = ordered[~gone[ordered]]
-        for track in self._ids[rows].tolist():
-            del self._row_of[track]
-        self._free += rows.tolist()
-        self._weight[rows] = 0.0
-        self.has_point[rows] = False
-
-    def _add(self, tracks: list[int]) -> None:
-        """Give new tracks free rows."""
-        if not tracks:
-            return
-        while len(tracks) > len(self._free):
-            self._grow(2 * len(self._ids))
-        rows = self._free[: -len(tracks) - 1 : -1]
-        del self._free[-len(tracks) :]
-        self._row_of.update(zip(tracks, rows, strict=True))
-        self._ids[rows], self._rows = tracks, None
+        self._rows, self._free = self._rows[~gone[self._rows]], np.concatenate([self._free, rows])
+        self.forget_views(rows)
 
     def _grow(self, size: int) -> None:
         old = len(self._ids)
@@ -106,7 +97,7 @@ class TrackTable:
         self._weight = np.concatenate([self._weight, np.zeros((extra, self._columns, 4))])
         self.points = np.concatenate([self.points, np.zeros((extra, 3))])
         self.has_point = np.concatenate([self.has_point, np.zeros(extra, dtype=np.bool_)])
-        self._free += range(size - 1, old - 1, -1)
+        self._free = np.concatenate([self._free, np.arange(size - 1, old - 1, -1)])
 
 
 def measured(has_right: BoolArray) -> FloatArray:

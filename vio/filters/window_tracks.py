@@ -101,13 +101,14 @@ class WindowTracks:
     def choose(self, clones: int) -> IntArray:
         """Rows of the tracks that constrain the poses: two views or more, the most informative first if too many."""
         rows = self.table.rows()
-        seen = self.table.seen(rows)
-        length = seen.sum(axis=1)
-        rows, seen, length = rows[length >= 2], seen[length >= 2], length[length >= 2]
+        seen, length = self.table.lengths(rows)
+        enough = length >= 2
+        rows = rows[enough]
         if len(rows) > self._settings.max_features:
             # What ends now has its last chance; then the longest.
+            seen = seen[enough]
             ends = ~seen[:, clones - 1] | seen[:, 0]
-            best = np.lexsort((self.table.ids(rows), -length, ~ends))[: self._settings.max_features]
+            best = np.lexsort((self.table.ids(rows), -length[enough], ~ends))[: self._settings.max_features]
             rows = rows[np.sort(best)]
         return rows
 
