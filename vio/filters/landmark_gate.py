@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.filters import gate_loops as loops
 from vio.filters.window_tracks import chi_square_table
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, IntArray
@@ -33,16 +34,9 @@ def leave_one_out_nis(
         weight: robust weights (K,) that the pixels entered the fit with.
         variance: of one pixel coordinate, px^2.
     """
-    R = (variance / np.maximum(weight, 1e-6))[:, None, None]
-    inner = R * np.eye(4) - J @ covariance @ np.swapaxes(J, 1, 2)
-    # Rounding, and noise that was re-estimated since, must not make a variance negative.
-    values, vectors = np.linalg.eigh(0.5 * (inner + np.swapaxes(inner, 1, 2)))
-    values = np.maximum(values, 1e-3 * R[:, 0])
-    y = (np.swapaxes(vectors, 1, 2) @ r[..., None])[..., 0]
-    predicted = R[:, 0] / values * y
-    expected = R[:, 0] ** 2 / values - R[:, 0] + variance
-    out: FloatArray = np.sum(predicted**2 / expected, axis=1)
-    return out
+    nis: FloatArray = np.empty(len(r))
+    loops.leave_out(r, J, covariance, weight, variance, nis)
+    return nis
 
 
 class LandmarkGate:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack
 
+from vio.filters import gate_loops as loops
 from vio.geometry.lie import FloatArray
 from vio.numerics.statistics import chi_square_cdf, chi_square_quantile
 
@@ -67,22 +68,11 @@ def whitened_correction(step: StepErrors, part: slice) -> WhitenedCorrection:
     Directions are the eigenvectors of the removed share of the predicted covariance; those in which the images removed
     little say nothing about the motion model and are left out.
     """
-    B = step.expected[part, part]
-    scale = float(np.trace(B))
-    if not scale > 0:
-        return WhitenedCorrection(0.0, 0, 0.0)
-    # Rows of V' whiten the predicted correction and make the removed covariance diagonal.
-    removed, V, failed = lapack.dsygv(B - step.remaining[part, part], B + 1e-12 * scale * np.eye(3))
-    if failed:
+    errors = step.correction, step.expected, step.process, step.remaining
+    found = WhitenedCorrection(*loops.whiten_correction(*errors, part.start, _INFORMED))
+    if math.isnan(found.squared):
         raise np.linalg.LinAlgError("the predicted covariance is not positive")
-    chosen = removed > _INFORMED
-    dof = int(np.count_nonzero(chosen))
-    if not dof:
-        return WhitenedCorrection(0.0, 0, 0.0)
-    whiten = V.T[chosen]
-    y = whiten @ step.correction[part]
-    share = float(np.vdot(whiten @ step.process[part, part], whiten)) / dof
-    return WhitenedCorrection(float(y @ (y / removed[chosen])), dof, min(share, 1.0))
+    return found
 
 
 class MotionNoise:

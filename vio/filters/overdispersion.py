@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.filters import track_loops as loops
 from vio.geometry.lie import FloatArray
 from vio.records import IntArray
 
@@ -20,7 +21,6 @@ _PRIOR_TRACKS = 30.0  # as many ended tracks count for it
 _MOST_FEATURES = 4096  # whose clusters are kept: far more than are seen at once
 CELL_RAD = 0.2  # side of the cells of directions in which features are neighbours
 _FRAMES = 10  # of those in which tracks end, in which neighbours' are one cluster
-_NO_SCORE = [0.0] * 6
 
 
 class Overdispersion:
@@ -28,7 +28,9 @@ class Overdispersion:
 
     def __init__(self) -> None:
         self._cluster: dict[int, tuple[int, int, int]] = {}  # of features, by id, in the order in which they ended last
-        self._scores: dict[tuple[int, int, int], list[float]] = {}  # of clusters
+        self._row: dict[tuple[int, int, int], int] = {}  # of clusters in `_scores`, in the order of their last change
+        self._free: list[int] = []  # rows without a cluster
+        self._scores: FloatArray = np.zeros((0, 6))
         self._squares, self._information = np.zeros(6), np.zeros(6)
         self._tracks, self._calls = 0, 0
         self.factor = PRIOR_FACTOR  # by how much too often the information of pixels is counted, at least one
@@ -43,20 +45,24 @@ class Overdispersion:
             information: (K, 6) likewise, their expected squares.
         """
         cells = np.floor(directions / CELL_RAD).astype(np.int64).tolist()
-        squares = self._squares.tolist()
-        for feature, (x, y), score in zip(ids.tolist(), cells, scores.tolist(), strict=True):
+        rows: IntArray = np.empty(len(ids), dtype=np.int64)
+        if len(self._free) < len(ids):
+            self._free += range(len(self._scores), len(self._scores) + _MOST_FEATURES)
+            self._scores = np.concatenate([self._scores, np.zeros((_MOST_FEATURES, 6))])
+        for k, (feature, (x, y)) in enumerate(zip(ids.tolist(), cells, strict=True)):
             cluster = self._cluster.pop(feature, (x, y, self._calls // _FRAMES))
             self._cluster[feature] = cluster  # a feature that began again stays in its cluster
-            before = self._scores.pop(cluster, _NO_SCORE)
-            self._scores[cluster] = together = [a + b for a, b in zip(score, before, strict=True)]
-            squares = [s + a * (c + b) for s, a, b, c in zip(squares, score, before, together, strict=True)]
-        self._squares = np.array(squares)
+            row = self._row.pop(cluster, None)
+            rows[k] = self._row[cluster] = self._free.pop() if row is None else row
+        loops.add_scores(rows, scores, self._scores, self._squares)
         self._calls += 1
         self._information += information.sum(axis=0)
         self._tracks += len(ids)
-        for kept in (self._cluster, self._scores):
-            while len(kept) > _MOST_FEATURES:
-                kept.pop(next(iter(kept)))  # type: ignore[call-overload]
+        while len(self._cluster) > _MOST_FEATURES:
+            del self._cluster[next(iter(self._cluster))]
+        while len(self._row) > _MOST_FEATURES:
+            self._free.append(row := self._row.pop(next(iter(self._row))))
+            self._scores[row] = 0.0
         known = self._information > 0
         if known.any():
             ratio = float(np.mean(self._squares[known] / self._information[known]))

@@ -133,7 +133,7 @@ def anchor_points(
 
 @compiled
 def find_rows(ids: IntArray, known: IntArray, ordered: IntArray, rows: IntArray) -> int:
-    """Write the rows (K,) of ids (K,), -1 where unknown, and return how many are; `ordered` are all rows by their ids."""
+    """Write the rows (K,) of ids (K,), -1 where unknown, and return how many are. `ordered` are the rows by `known` id."""
     unknown = 0
     for k in range(len(ids)):
         low, high = 0, len(ordered)
@@ -906,6 +906,16 @@ def collect_columns(
                 G[f, s, i] = sums[i, s]
             for t in range(s):
                 own[t, s] = own[s, t]
+
+
+@compiled
+def add_scores(clusters: IntArray, scores: FloatArray, together: FloatArray, squares: FloatArray) -> None:
+    """Add scores (K, 6) of tracks to those of their clusters (C, 6), and what the squares of these grow by (6,)."""
+    for k, c in enumerate(clusters):
+        for i in range(6):
+            before = together[c, i]
+            together[c, i] = scores[k, i] + before
+            squares[i] += scores[k, i] * (together[c, i] + before)
 
 
 @compiled

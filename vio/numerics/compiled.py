@@ -174,6 +174,39 @@ def solve_positive(A: FloatArray, b: FloatArray) -> None:
 
 
 @compiled
+def eigenvectors(A: FloatArray, V: FloatArray) -> None:
+    """Make a small symmetric A (n, n) diagonal in place, and write its eigenvectors into the columns of V (n, n).
+
+    By Jacobi's rotations, each of which clears one entry. Reference: Golub & Van Loan, Matrix Computations, 8.5.
+    """
+    n = len(A)
+    for i in range(n):
+        for j in range(n):
+            V[i, j] = 1.0 if i == j else 0.0
+    for _ in range(12):  # sweeps; convergence is quadratic
+        off, own = 0.0, 0.0
+        for i in range(n):
+            own += A[i, i] * A[i, i]
+            for j in range(i):
+                off += A[i, j] * A[i, j]
+        if not off > 1e-32 * own:
+            break
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                if A[p, q] == 0.0:
+                    continue
+                ratio = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
+                t = (1.0 if ratio >= 0.0 else -1.0) / (abs(ratio) + np.sqrt(1.0 + ratio * ratio))
+                c = 1.0 / np.sqrt(1.0 + t * t)
+                s = c * t
+                for k in range(n):
+                    A[k, p], A[k, q] = c * A[k, p] - s * A[k, q], s * A[k, p] + c * A[k, q]
+                for k in range(n):
+                    A[p, k], A[q, k] = c * A[p, k] - s * A[q, k], s * A[p, k] + c * A[q, k]
+                    V[k, p], V[k, q] = c * V[k, p] - s * V[k, q], s * V[k, p] + c * V[k, q]
+
+
+@compiled
 def move_by_twist(xi: FloatArray, T: FloatArray) -> None:
     """Replace a transform T (4, 4) by `exp(xi) T`, with a twist (6,) `[rho; phi]`: `se3_exp` of `vio.geometry.lie`."""
     x, y, z = xi[3], xi[4], xi[5]

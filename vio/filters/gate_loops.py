@@ -1,0 +1,95 @@
+"""The compiled loops behind the tests of corrections and landmarks: small symmetric matrices, many at a time.
+
+Each loop writes into the arrays that come last. `tests/numpy_twins.py` holds the same in NumPy.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.numerics.compiled import compiled, eigenvectors
+
+
+@compiled
+def whiten_correction(
+    correction: FloatArray,
+    expected: FloatArray,
+    process: FloatArray,
+    remaining: FloatArray,
+    first: int,
+    informed: float,
+) -> tuple[float, int, float]:
+    """Return the fields of `WhitenedCorrection` for three rows of a step's errors, from the `first` one on.
+
+    Not a number where the predicted covariance is not positive.
+    """
+    scale = expected[first, first] + expected[first + 1, first + 1] + expected[first + 2, first + 2]
+    if not scale > 0.0:
+        return 0.0, 0, 0.0
+    L, M, V = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):  # L L' = B, and the rows of V are the inverse of L
+        for j in range(i + 1):
+            total = expected[first + i, first + j] + (1e-12 * scale if i == j else 0.0)
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j and not total > 0.0:
+                return np.nan, 0, 0.0
+            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
+        for j in range(3):
+            total = 1.0 if i == j else 0.0
+            for k in range(i):
+                total -= L[i, k] * V[k, j]
+            V[i, j] = total / L[i, i]
+    for i in range(3):
+        for j in range(3):
+            M[i, j] = 0.0
+            for k in range(3):
+                for m in range(3):
+                    removed = expected[first + k, first + m] - remaining[first + k, first + m]
+                    M[i, j] += V[i, k] * removed * V[j, m]
+    U, row = np.empty((3, 3)), np.empty(3)
+    eigenvectors(M, U)
+    squared, dof, share = 0.0, 0, 0.0
+    for e in range(3):
+        if not M[e, e] > informed:
+            continue
+        dof += 1
+        y = 0.0
+        for i in range(3):
+            row[i] = U[0, e] * V[0, i] + U[1, e] * V[1, i] + U[2, e] * V[2, i]
+            y += row[i] * correction[first + i]
+        squared += y * y / M[e, e]
+        for i in range(3):
+            for j in range(3):
+                share += row[i] * process[first + i, first + j] * row[j]
+    return squared, dof, min(share / max(dof, 1), 1.0)
+
+
+@compiled
+def leave_out(
+    r: FloatArray, J: FloatArray, covariance: FloatArray, weight: FloatArray, variance: float, nis: FloatArray
+) -> None:
+    """Write the normalised innovations squared (K,) of `leave_one_out_nis`."""
+    n = J.shape[2]
+    JC, inner, U = np.empty((4, n)), np.empty((4, 4)), np.empty((4, 4))
+    for k in range(len(r)):
+        R = variance / max(weight[k], 1e-6)
+        for a in range(4):
+            for j in range(n):
+                JC[a, j] = 0.0
+                for i in range(n):
+                    JC[a, j] += J[k, a, i] * covariance[k, i, j]
+            for b in range(a + 1):
+                total = R if a == b else 0.0
+                for j in range(n):
+                    total -= JC[a, j] * J[k, b, j]
+                inner[a, b] = inner[b, a] = total
+        eigenvectors(inner, U)
+        nis[k] = 0.0
+        for e in range(4):
+            # Rounding, and noise that was re-estimated since, must not make a variance negative.
+            value, y = max(inner[e, e], 1e-3 * R), 0.0
+            for a in range(4):
+                y += U[a, e] * r[k, a]
+            nis[k] += (R / value * y) ** 2 / (R * R / value - R + variance)
