@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vio.filters.multiview import (
@@ -14,7 +16,6 @@ from vio.filters.multiview import (
     Views,
 )
 from vio.filters.navigation import _free_flow
-from vio.filters.stereo_calibration import StereoColumns
 from vio.frontend.align import FLAT_RMS, Templates, offsets
 from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
@@ -314,6 +315,16 @@ def corrected(
     right = left[..., 0] - (out[..., 0] - out[..., 2]) / (focal * baseline)
     scaled = np.concatenate([left, right[..., None], out[..., 3:]], axis=-1)
     return np.where((weight > 0) & (np.arange(4) < 3), scaled, out)
+
+
+@dataclass(frozen=True)
+class StereoColumns:
+    """The part of the tracks' normal equations that concerns the field's S coefficients; pixel noise is one pixel."""
+
+    by_point: FloatArray  # (F, N, 3, S) `J' W H` of each view, the point in the coordinates (M5)
+    G: FloatArray  # (F, S, 3) its sum over the views, transposed: the cross information of coefficients and point
+    A: FloatArray  # (F, S, S) information about the coefficients before the points are eliminated
+    b: FloatArray  # (F, S) its vector
 
 
 def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: FloatArray) -> StereoColumns:

@@ -276,7 +276,7 @@ def _linear() -> tuple[FloatArray, Residuals, TrackInformation, StereoColumns, F
     weight = np.random.default_rng(8).uniform(0.3, 1.0, (len(p), CLONES))
     info = track_information(CAMERA, T_CAM0_WORLD, at, p, weight)
     wanted, z = ErrorColumns(CAMERA), views.z - at.r
-    return p, at, info, stereo_columns(wanted, at, z, info.q.p_D_q, weight), wanted.jacobian(z), weight
+    return p, at, info, stereo_columns(wanted, at, z, weight), wanted.jacobian(z), weight
 
 
 def test_elimination_equals_the_schur_complement_with_the_coefficients_as_columns() -> None:
@@ -317,7 +317,8 @@ def test_points_follow_the_coefficients_as_their_triangulation_does() -> None:
     z = np.array([[project(CAMERA, transform_points(T, p[0])) for T in T_CAM0_WORLD]])
     at = residuals(CAMERA, T_CAM0_WORLD, p, Views(z, weight))
     info = track_information(CAMERA, T_CAM0_WORLD, at, p, np.ones((1, CLONES)))
-    columns = stereo_columns(ErrorColumns(CAMERA), at, z, info.q.p_D_q, np.ones((1, CLONES)))
+    columns = stereo_columns(ErrorColumns(CAMERA), at, z, np.ones((1, CLONES)))
+    eliminate_points(info, np.ones(1, dtype=np.bool_), columns)
 
     def triangulated(s: FloatArray) -> FloatArray:
         field = StereoCorrection(CAMERA, np.zeros(7), s, np.arange(TERMS))

@@ -287,8 +287,7 @@ class FrameUpdate:
         """The tracks' columns of the coefficients estimated and of those considered; None: none is considered."""
         if not self._rig.considered_sigmas(window).any():
             return None
-        wanted = self._error_columns(tracks.field, CONSIDERED)
-        return stereo_columns(wanted, tracks.at, tracks.z, tracks.information.q.p_D_q, tracks.weight)
+        return stereo_columns(self._error_columns(tracks.field, CONSIDERED), tracks.at, tracks.z, tracks.weight)
 
     def _error_columns(self, field: StereoCorrection | None, considered: int) -> ErrorColumns:
         """Columns of the coefficients that are estimated, and of the C considered."""
@@ -359,6 +358,8 @@ class FrameUpdate:
         promoted = self._promote(window, tracks, columns, candidates, depth_sigma, stereo)
 
         A, b, considered = self._information(window, tracks, good & ~ending, None, joint)
+        if columns is not None and not good.all():
+            eliminate_points(tracks.information, ~good, columns)  # the points of tracks that are left out move, too
         size = window.state.clones.stop
         P = self._move_to_optimum(window, tracks, columns, A, b, size).covariance()  # without landmarks
         fitted = float(np.sum(A[:size, :size] * P))

@@ -150,12 +150,13 @@ class StereoCorrection:
 
 @dataclass(frozen=True, slots=True)
 class StereoColumns:
-    """The part of the tracks' normal equations that concerns the field's S coefficients; pixel noise is one pixel."""
+    """The part of F tracks' normal equations that concerns the field's S coefficients: `r = J (B xi_i + dp) + H s`."""
 
-    by_point: FloatArray  # (F, N, 3, S) `J' W H` of each view, the point in the coordinates (M5)
-    G: FloatArray  # (F, S, 3) its sum over the views, transposed: the cross information of coefficients and point
-    A: FloatArray  # (F, S, S) information about the coefficients before the points are eliminated
-    b: FloatArray  # (F, S) its vector
+    wanted: ErrorColumns  # columns of H
+    at: Residuals  # and Jacobians of the tracks in N clones
+    z: FloatArray  # (F, N, 4) pixels at which H is taken
+    weight: FloatArray  # (F, N) robust weights
+    G: FloatArray  # (F, S, 3) cross information of coefficients and point, of tracks whose points were eliminated
 
     def point_D_stereo(self, info: TrackInformation, chosen: IntArray) -> FloatArray:
         """How the estimated points of tracks (K,) follow errors of the coefficients (K, 3, S), world: `-C^-1 G`."""
@@ -164,24 +165,9 @@ class StereoColumns:
         return out
 
 
-def stereo_columns(
-    wanted: ErrorColumns, at: Residuals, z: FloatArray, p_D_q: FloatArray, weight: FloatArray
-) -> StereoColumns:
-    """Collect the normal equations of `r = J (B xi_i + dp) + H s`.
-
-    Args:
-        wanted: columns of H.
-        at: residuals and Jacobians of F tracks in N clones.
-        z: pixels (F, N, 4) at which H is taken.
-        p_D_q: the points' coordinates (F, 3, 3), equation (M5).
-        weight: robust weights (F, N).
-    """
-    (F, N), S = weight.shape, len(wanted.chosen)
-    columns = StereoColumns(np.empty((F, N, 3, S)), np.empty((F, S, 3)), np.empty((F, S, S)), np.empty((F, S)))
-    of_terms = camera_args(wanted.camera), wanted.chosen, wanted.rows_D_common, z
-    out = columns.by_point, columns.G, columns.A, columns.b
-    loops.collect_columns(*of_terms, at.r, at.z_D_p, at.weight, weight, p_D_q, *out)
-    return columns
+def stereo_columns(wanted: ErrorColumns, at: Residuals, z: FloatArray, weight: FloatArray) -> StereoColumns:
+    """Return the columns of tracks, see `StereoColumns`, before `eliminate_points` has collected them."""
+    return StereoColumns(wanted, at, z, weight, np.zeros((len(weight), len(wanted.chosen), 3)))
 
 
 def eliminate_points(
@@ -189,17 +175,19 @@ def eliminate_points(
 ) -> tuple[FloatArray, FloatArray]:
     """Information matrix (6N + S, 6N + S) and vector about clones and coefficients of the chosen tracks, (M4).
 
-    `sum_f M_f - G_f C_f^-1 G_f'`: exact elimination of each point. Without columns, S is zero.
+    `sum_f M_f - G_f C_f^-1 G_f'`: exact elimination of each point. Without columns, S is zero; those given learn the
+    cross information of the chosen tracks.
     """
-    rows, F, size = np.flatnonzero(chosen), len(info.G), info.G.shape[1]
-    if columns is None:
-        columns = StereoColumns(
-            np.empty((F, size // 6, 3, 0)), np.empty((F, 0, 3)), np.empty((F, 0, 0)), np.empty((F, 0))
-        )
-    D = size + columns.b.shape[1]
+    rows, size = np.flatnonzero(chosen), info.G.shape[1]
+    D = size if columns is None else size + len(columns.wanted.chosen)
     V, A, b = np.empty((3 * len(rows), D)), np.zeros((D, D)), np.zeros(D)
-    points = info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient
-    loops.eliminate_tracks(rows, *points, columns.by_point, columns.G, columns.A, columns.b, V, A, b)
-    A[size:, :size] = A[:size, size:].T
+    loops.eliminate_tracks(rows, info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient, V, A, b)
+    if columns is not None:
+        wanted, at = columns.wanted, columns.at
+        of_views = columns.z, at.r, at.z_D_p, at.weight, columns.weight
+        points = info.q.p_D_q, info.C, info.q_D_clone, info.point_gradient
+        of_terms = camera_args(wanted.camera), wanted.chosen, wanted.rows_D_common
+        loops.eliminate_columns(rows, *of_terms, *of_views, *points, columns.G, V, A, b)
+        A[size:, :size] = A[:size, size:].T
     A -= V.T @ V
     return A, b

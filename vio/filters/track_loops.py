@@ -133,7 +133,7 @@ def anchor_points(
 
 @compiled
 def find_rows(ids: IntArray, known: IntArray, ordered: IntArray, rows: IntArray) -> int:
-    """Write the rows (K,) of ids (K,), -1 where unknown, and return how many are. `ordered` are the rows by `known` id."""
+    """Write the rows (K,) of ids (K,), -1 where unknown, and return how many are; all rows are ordered by id."""
     unknown = 0
     for k in range(len(ids)):
         low, high = 0, len(ordered)
@@ -719,29 +719,20 @@ def eliminate_tracks(
     B: FloatArray,
     gradient: FloatArray,
     point_gradient: FloatArray,
-    by_point: FloatArray,
-    own: FloatArray,
-    own_A: FloatArray,
-    own_b: FloatArray,
     V: FloatArray,
     A: FloatArray,
     b: FloatArray,
 ) -> None:
-    """Write `V` (3K, 6N + S), whose `V' V` is what the points of the chosen tracks take away, equation (M4).
+    """Write the clones' columns of `V` (3K, 6N + S): `V' V` is what points of the chosen tracks take away, (M4).
 
-    What they say of clones and coefficients but for that is added to A (6N + S, 6N + S), its triangle of the clones'
-    rows and that of the coefficients, and the vector with the points taken out to b (6N + S,). `by_point`, `own`,
-    `own_A` and `own_b` are the columns of `StereoColumns`.
+    What they say of the clones but for that is added to A (6N + S, 6N + S), and the vector with the points taken out to
+    b (6N + S,).
     """
     L, y = np.empty((3, 3)), np.empty(3)
-    clones, terms = G.shape[1] // 6, own.shape[1]
-    size = 6 * clones
     for c, f in enumerate(chosen):
         _factor(C[f], L)
-        y[0] = point_gradient[f, 0] / L[0, 0]
-        y[1] = (point_gradient[f, 1] - L[1, 0] * y[0]) / L[1, 1]
-        y[2] = (point_gradient[f, 2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
-        for n in range(clones):
+        _solve_lower(L, point_gradient[f], y)
+        for n in range(G.shape[1] // 6):
             takes_part = _has_part(G, f, n)
             for k in range(6 * n, 6 * n + 6):
                 if not takes_part:
@@ -751,13 +742,14 @@ def eliminate_tracks(
                 g0, g1, g2 = G[f, k, 0], G[f, k, 1], G[f, k, 2]
                 for j in range(6):
                     A[k, 6 * n + j] += g0 * B[f, 0, j] + g1 * B[f, 1, j] + g2 * B[f, 2, j]
-                b0, b1, b2 = B[f, 0, k - 6 * n], B[f, 1, k - 6 * n], B[f, 2, k - 6 * n]
-                for s in range(terms):
-                    A[k, size + s] += b0 * by_point[f, n, 0, s] + b1 * by_point[f, n, 1, s] + b2 * by_point[f, n, 2, s]
-        for s in range(terms):
-            b[size + s] += own_b[f, s] - _whiten(L, own[f, s], y, V, c, size + s)
-            for t in range(terms):
-                A[size + s, size + t] += own_A[f, s, t]
+
+
+@compiled
+def _solve_lower(L: FloatArray, g: FloatArray, y: FloatArray) -> None:
+    """Write `L^-1 g` (3,)."""
+    y[0] = g[0] / L[0, 0]
+    y[1] = (g[1] - L[1, 0] * y[0]) / L[1, 1]
+    y[2] = (g[2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
 
 
 @compiled
@@ -847,7 +839,8 @@ def innovations(
 
 
 @compiled
-def collect_columns(
+def eliminate_columns(
+    rows: IntArray,
     camera: CameraArgs,
     chosen: IntArray,
     rows_D_common: FloatArray,
@@ -857,33 +850,42 @@ def collect_columns(
     precision: FloatArray,
     weight: FloatArray,
     p_D_q: FloatArray,
-    by_point: FloatArray,
+    C: FloatArray,
+    B: FloatArray,
+    point_gradient: FloatArray,
     G: FloatArray,
+    V: FloatArray,
     A: FloatArray,
     b: FloatArray,
 ) -> None:
-    """Write `J' W H` (F, N, 3, S) of each view, and G (F, S, 3), its sum over the views of each track, transposed.
+    """Do what `eliminate_tracks` does for the S coefficients that `ErrorColumns` has chosen, behind the clones.
 
-    And `H' W H` (F, S, S) and `H' W r` (F, S) of each track. H are the derivatives of the pixels z (F, N, 4) by what
-    `ErrorColumns` has chosen; those count that were measured. r and J are times the precision (F, N, 4), H not.
+    Of A the rows of the clones and those of the coefficients. G (F, S, 3) is `H' W J`, the sum over the views of each
+    of these tracks. H are the derivatives of the pixels z (F, N, 4), of which those count that were measured. r and J
+    are times the precision (F, N, 4), H not.
     """
-    terms = len(chosen)
-    H, by_q = np.empty((3, 12)), np.empty(3)
-    h, wh, sums = np.empty(terms), np.empty(terms), np.empty((3, terms))
-    for f in range(len(J)):
-        own, own_b = A[f], b[f]
+    terms, size = len(chosen), 6 * J.shape[1]
+    H, by_q, L, y = np.empty((3, 12)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    h, wh, own_b, own, of_view, sums = (
+        np.empty(terms),
+        np.empty(terms),
+        np.empty(terms),
+        np.empty((terms, terms)),
+        np.empty((3, terms)),
+        np.empty((3, terms)),
+    )
+    for c, f in enumerate(rows):
         for s in range(terms):
             own_b[s] = sums[0, s] = sums[1, s] = sums[2, s] = 0.0
             for t in range(terms):
                 own[s, t] = 0.0
         for n in range(J.shape[1]):
-            of_view = by_point[f, n]
-            for i in range(3):
-                for s in range(terms):
-                    of_view[i, s] = 0.0
             if weight[f, n] == 0.0:
                 continue
             write_view(camera, z[f, n], rows_D_common, H)
+            for i in range(3):
+                for s in range(terms):
+                    of_view[i, s] = 0.0
             for a in range(3):
                 row = J[f, n, a]
                 if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
@@ -901,11 +903,17 @@ def collect_columns(
                     for s in range(terms):
                         of_view[i, s] += by_q[i] * wh[s]
                         sums[i, s] += by_q[i] * wh[s]
+            for k in range(6):
+                b0, b1, b2 = B[f, 0, k], B[f, 1, k], B[f, 2, k]
+                for s in range(terms):
+                    A[6 * n + k, size + s] += b0 * of_view[0, s] + b1 * of_view[1, s] + b2 * of_view[2, s]
+        _factor(C[f], L)
+        _solve_lower(L, point_gradient[f], y)
         for s in range(terms):
-            for i in range(3):
-                G[f, s, i] = sums[i, s]
-            for t in range(s):
-                own[t, s] = own[s, t]
+            G[f, s, 0], G[f, s, 1], G[f, s, 2] = sums[0, s], sums[1, s], sums[2, s]
+            b[size + s] += own_b[s] - _whiten(L, G[f, s], y, V, c, size + s)
+            for t in range(terms):
+                A[size + s, size + t] += own[s, t] if t <= s else own[t, s]
 
 
 @compiled

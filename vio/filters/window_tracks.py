@@ -80,7 +80,7 @@ class LinearTracks:
         """Columns of the coefficients that are estimated; None: there are none."""
         if self.field is None:
             return None
-        return stereo_columns(self.field.columns(), self.at, self.z, self.information.q.p_D_q, self.weight)
+        return stereo_columns(self.field.columns(), self.at, self.z, self.weight)
 
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
