@@ -128,6 +128,57 @@ def take_rows(P: FloatArray, rows: IntArray, out: FloatArray) -> None:
 
 
 @compiled
+def insert_rows(P: FloatArray, at: int, J: FloatArray, noise: FloatArray, out: FloatArray) -> None:
+    """Write a covariance (D + k, D + k) with errors `J error + noise` at a row, from that of the others (D, D).
+
+    J is (k, m) of the first m errors. Where it is the identity, the new rows are exact copies.
+    """
+    D, k = len(P), len(J)
+    for i in range(D):
+        row = i if i < at else i + k
+        for j in range(D):
+            out[row, j if j < at else j + k] = P[i, j]
+    for a in range(k):
+        for j in range(D):
+            beside, below = 0.0, 0.0
+            for m in range(J.shape[1]):
+                if J[a, m] != 0.0:
+                    beside += J[a, m] * P[m, j]
+                    below += J[a, m] * P[j, m]
+            column = j if j < at else j + k
+            out[at + a, column], out[column, at + a] = beside, below
+    for a in range(k):
+        for b in range(k):
+            total = 0.0
+            for m in range(J.shape[1]):
+                if J[b, m] != 0.0:
+                    total += J[b, m] * out[at + a, m if m < at else m + k]
+            out[at + a, at + b] = total + noise[a, b]
+
+
+@compiled
+def append_rows(P: FloatArray, AP: FloatArray, A: FloatArray, blocks: FloatArray, out: FloatArray) -> None:
+    """Write a covariance (D + n, D + n) with errors `A error + noise` of points, (n, D), behind the others (D, D).
+
+    AP is `A P`; blocks (n / 3, 3, 3) are the noise's covariances.
+    """
+    D, n = len(P), len(A)
+    for i in range(D):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = 0.5 * (P[i, j] + P[j, i])
+    for a in range(n):
+        for j in range(D):
+            out[D + a, j] = out[j, D + a] = AP[a, j]
+        for b in range(a + 1):
+            total = 0.0
+            for j in range(D):
+                if A[b, j] != 0.0:
+                    total += AP[a, j] * A[b, j]
+            total += blocks[a // 3, a % 3, b % 3] if a // 3 == b // 3 else 0.0
+            out[D + a, D + b] = out[D + b, D + a] = total
+
+
+@compiled
 def _add_noise(
     R: FloatArray,
     p: FloatArray,

@@ -73,14 +73,9 @@ class Prior:
             noise: covariance (k, k).
             of_scale: how they depend on the scale that is tested (k,).
         """
-        D, (k, own) = len(self.P), (len(J), slice(0, J.shape[1]))
-        added, beside = J @ self.P[own], self.P[:, own] @ J.T  # exact copies where J is the identity
-        P = np.empty((D + k, D + k))
-        new, end = slice(at, at + k), slice(at + k, D + k)
-        P[:at, :at], P[:at, end] = self.P[:at, :at], self.P[:at, at:]
-        P[end, :at], P[end, end] = self.P[at:, :at], self.P[at:, at:]
-        P[new, :at], P[new, end] = added[:, :at], added[:, at:]
-        P[:at, new], P[end, new], P[new, new] = beside[:at], beside[at:], added[:, own] @ J.T + noise
+        D, own = len(self.P) + len(J), slice(0, J.shape[1])
+        P: FloatArray = np.empty((D, D))
+        loops.insert_rows(self.P, at, J, noise, P)
         delta, V = self.delta, self.error_D_constants
         self.delta = np.concatenate([delta[:at], J @ delta[own], delta[at:]])
         of_new = J @ V[own]
@@ -96,19 +91,15 @@ class Prior:
             blocks: covariances of the noise (K, 3, 3).
             by_considered: B (3K, 4); None: zero.
         """
-        D, n = len(self.P), len(A)
-        P = np.zeros((D + n, D + n))
-        AP = A @ self.P
-        P[:D, :D], P[D:, :D], P[:D, D:] = self.P, AP, AP.T
-        P[D:, D:] = AP @ A.T
-        for k, block in enumerate(blocks):
-            P[D + 3 * k : D + 3 * k + 3, D + 3 * k : D + 3 * k + 3] += block
+        D = len(self.P) + len(A)
+        P: FloatArray = np.empty((D, D))
+        loops.append_rows(self.P, A @ self.P, A, blocks, P)
         self.delta = np.concatenate([self.delta, A @ self.delta])
         V = A @ self.error_D_constants
         if by_considered is not None:
             V[:, 1:] += by_considered
         self.error_D_constants = np.concatenate([self.error_D_constants, V])
-        self.P = 0.5 * (P + P.T)
+        self.P = P
 
     def keep(self, rows: IntArray) -> None:
         """Marginalise all errors but those of given rows."""
