@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.calibration.findings import NotObservable
-from vio.geometry.lie import FloatArray, se3_exp, se3_log, so3_hat
-from vio.geometry.stereo import StereoCamera, depth_of, project, triangulate, z_D_p_cam
-from vio.records import FeatureTracks, IntArray
+from vio.cameras.projection import CameraArgs, camera_args, turn_to
+from vio.geometry.lie import FloatArray, se3_exp, se3_log
+from vio.geometry.stereo import StereoCamera, triangulate
+from vio.numerics.compiled import compiled, move_by_twist, solve_positive
+from vio.records import BoolArray, FeatureTracks, IntArray
 
 _MIN_LINKS = 8  # tracks needed between two frames
 _MIN_DISPARITY_PX = 2.0
@@ -45,31 +47,86 @@ def stereo_twists(camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArra
     count = np.bincount(tracks.frames[earlier], minlength=len(times_ns))[tracks.frames[earlier]]
     enough = count >= _MIN_LINKS
     p, later, of = p[enough], later[enough], tracks.frames[earlier][enough]
-    frames, begins, group = np.unique(of, return_index=True, return_inverse=True)
+    frames, begins = np.unique(of, return_index=True)
     if not len(frames):
         return CameraMotion(times_ns, frames.astype(np.int64), np.zeros((0, 6)))
     dt = (np.diff(times_ns) * _NS)[frames]
     T_next_prev = se3_exp(-dt[:, None] * guess[frames])
-    determined = np.ones(len(frames), dtype=np.bool_)
-    for width in _WIDTHS_PX:
-        T = T_next_prev[group]
-        q = np.einsum("nij,nj->ni", T[:, :3, :3], p) + T[:, :3, 3]
-        ahead = depth_of(camera, q) > _MIN_DEPTH_M
-        q = np.where(ahead[:, None], q, [0.0, 0.0, 1.0])
-        r = tracks.z[later] - project(camera, q)
-        weight = ahead / (1 + np.sum(r**2, axis=1) / width**2) ** 2
-        z_D_p = z_D_p_cam(camera, q)
-        z_D_xi = np.concatenate([z_D_p, -z_D_p @ so3_hat(q)], axis=2)
-        weighted = z_D_xi * weight[:, None, None]
-        normal = np.add.reduceat(np.swapaxes(weighted, 1, 2) @ z_D_xi, begins)
-        gradient = np.add.reduceat(np.einsum("nij,ni->nj", weighted, r), begins)
-        spread = np.linalg.eigvalsh(normal)
-        determined &= spread[:, 0] > _DEGENERATE * spread[:, -1]
-        normal[~determined] = np.eye(6)
-        gradient[~determined] = 0
-        T_next_prev = se3_exp(np.linalg.solve(normal, gradient[..., None])[..., 0]) @ T_next_prev
+    determined = np.empty(len(frames), dtype=np.bool_)
+    _fit_motions(camera_args(camera), p, tracks.z[later], np.append(begins, len(p)), T_next_prev, determined)
     twists = -se3_log(T_next_prev) / dt[:, None]
     return CameraMotion(times_ns, frames[determined].astype(np.int64), twists[determined])
+
+
+@compiled
+def _fit_motions(
+    camera: CameraArgs, p: FloatArray, z: FloatArray, begins: IntArray, T: FloatArray, determined: BoolArray
+) -> None:
+    """Move motions (K, 4, 4) so that points (L, 3) come to pixels (L, 4), and write which are determined (K,).
+
+    Motion k is that of the points from `begins[k]` (K + 1,) on.
+    """
+    normal, shifted, xi, none = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
+    for k in range(len(T)):
+        determined[k] = True
+        for width in _WIDTHS_PX:
+            for i in range(6):
+                xi[i] = 0.0
+                for j in range(6):
+                    normal[i, j] = 0.0
+            for m in range(begins[k], begins[k + 1]):
+                _add_point(camera, p[m], z[m], width * width, T[k], normal, xi)
+            trace = 0.0
+            for i in range(6):
+                none[i] = 0.0
+                trace += normal[i, i]
+            for i in range(6):
+                for j in range(i + 1):
+                    shifted[i, j] = normal[i, j] - (_DEGENERATE * trace if i == j else 0.0)
+            solve_positive(shifted, none)  # not a number where it is not positive
+            if none[0] != 0.0:
+                determined[k] = False
+                break
+            solve_positive(normal, xi)
+            move_by_twist(xi, T[k])
+
+
+@compiled
+def _add_point(
+    camera: CameraArgs,
+    p: FloatArray,
+    z: FloatArray,
+    width2: float,
+    T: FloatArray,
+    normal: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Add what a point's pixels (4,) say of a motion (4, 4) to normal equations (6, 6) and (6,), if it is ahead."""
+    fu, fv, cu, cv, baseline, _ = camera
+    q, row, D = np.empty(3), np.empty(6), np.empty(3)
+    for i in range(3):
+        q[i] = T[i, 0] * p[0] + T[i, 1] * p[1] + T[i, 2] * p[2] + T[i, 3]
+    azimuth, s, c, y, depth = turn_to(camera, q[1], q[2])
+    if not depth > _MIN_DEPTH_M:
+        return
+    u, v = fu * q[0] / depth, fv * y / depth
+    r0, r1, r3 = z[0] - u - cu, z[1] - v - fv * azimuth - cv, z[3] - v - fv * azimuth - cv
+    r2 = z[2] - (u - fu * baseline / depth) - cu
+    weight = 1.0 / (1.0 + (r0 * r0 + r1 * r1 + r2 * r2 + r3 * r3) / width2) ** 2
+    for a in range(4):
+        r = r0 if a == 0 else r1 if a == 1 else r2 if a == 2 else r3
+        if a == 0 or a == 2:
+            across = u if a == 0 else u - fu * baseline / depth
+            D[0], D[1], D[2] = fu / depth, -across * s / depth, -across * c / depth
+        else:
+            D[0], D[1], D[2] = 0.0, (fv * c - v * s) / depth, (-fv * s - v * c) / depth
+        row[0], row[1], row[2] = D[0], D[1], D[2]
+        row[3], row[4] = q[1] * D[2] - q[2] * D[1], q[2] * D[0] - q[0] * D[2]
+        row[5] = q[0] * D[1] - q[1] * D[0]
+        for i in range(6):
+            gradient[i] += weight * row[i] * r
+            for j in range(i + 1):
+                normal[i, j] += weight * row[i] * row[j]
 
 
 def _links(tracks: FeatureTracks) -> tuple[IntArray, IntArray]:
