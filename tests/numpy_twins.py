@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 
 from vio.filters.multiview import (
     CAUCHY,
@@ -15,7 +16,6 @@ from vio.filters.multiview import (
     TrackInformation,
     Views,
 )
-from vio.filters.navigation import _free_flow
 from vio.frontend.align import FLAT_RMS, Templates, offsets
 from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
@@ -362,14 +362,56 @@ def eliminate_columns(
     return A, cross.T, b
 
 
+def whitened_correction(
+    correction: FloatArray,
+    expected: FloatArray,
+    process: FloatArray,
+    remaining: FloatArray,
+    part: slice,
+    informed: float,
+) -> tuple[float, int, float]:
+    """The fields of `WhitenedCorrection`, by LAPACK's generalised eigenvectors."""
+    B = expected[part, part]
+    removed, V = scipy.linalg.eigh(B - remaining[part, part], B)
+    chosen = removed > informed
+    whiten = V.T[chosen]
+    y, dof = whiten @ correction[part], int(np.count_nonzero(chosen))
+    share = float(np.vdot(whiten @ process[part, part], whiten)) / max(dof, 1)
+    return float(y @ (y / removed[chosen])), dof, min(share, 1.0)
+
+
+def leave_one_out_nis(
+    r: FloatArray, J: FloatArray, covariance: FloatArray, weight: FloatArray, variance: float
+) -> FloatArray:
+    """Normalised innovations squared (K,) of landmarks' pixels, predicted without these very pixels."""
+    R = (variance / np.maximum(weight, 1e-6))[:, None, None]
+    values, vectors = np.linalg.eigh(R * np.eye(4) - J @ covariance @ np.swapaxes(J, 1, 2))
+    values = np.maximum(values, 1e-3 * R[:, 0])
+    predicted = R[:, 0] / values * (np.swapaxes(vectors, 1, 2) @ r[..., None])[..., 0]
+    expected = R[:, 0] ** 2 / values - R[:, 0] + variance
+    out: FloatArray = np.sum(predicted**2 / expected, axis=1)
+    return out
+
+
 # --- poses of the window, and the IMU's samples ------------------------------------------------------------------
+
+
+def free_flow(s: FloatArray, gravity: FloatArray) -> FloatArray:
+    """Transition (K, 9, 9) of [rho phi xi_v] over times (K,)."""
+    out = np.zeros((len(s), 9, 9))
+    out[:] = np.eye(9)
+    G = so3_hat(gravity)
+    out[:, 0:3, 6:9] = s[:, None, None] * np.eye(3)
+    out[:, 0:3, 3:6] = (0.5 * s**2)[:, None, None] * G
+    out[:, 6:9, 3:6] = s[:, None, None] * G
+    return out
 
 
 def moved_velocities(
     gravity: FloatArray, ages_s: FloatArray, R: FloatArray, error: FloatArray, velocities: FloatArray
 ) -> FloatArray:
     """Velocities (N, 3) of the past, moved by a present error (15,): (N2) back, with the accelerometer's bias."""
-    xi_v = (_free_flow(-ages_s, gravity) @ error[:9])[:, 6:9] + ages_s[:, None] * (R @ error[12:15])
+    xi_v = (free_flow(-ages_s, gravity) @ error[:9])[:, 6:9] + ages_s[:, None] * (R @ error[12:15])
     out: FloatArray = velocities @ so3_exp(error[3:6]).T + xi_v @ so3_left_jacobian(error[3:6]).T
     return out
 
@@ -400,7 +442,7 @@ def integrated(
     B[:, 0:3, 0:3] = -so3_hat(0.5 * (p[:-1] + p[1:])) @ R[:-1]
     B[:, 3:6, 0:3] = B[:, 6:9, 3:6] = -R[:-1]
     B[:, 6:9, 0:3] = -so3_hat(0.5 * (v[:-1] + v[1:])) @ R[:-1]
-    moved = _free_flow(left, gravity) @ B
+    moved = free_flow(left, gravity) @ B
     variance = densities[:, None] ** 2 * dt + hidden
     Q = [np.einsum("k,kij,klj->il", s, M, M) for s, M in zip(variance, (moved[:, :, 3:], moved[:, :, :3]), strict=True)]
     return R, p, v, np.einsum("kij,k->ij", moved, dt), np.array(Q)

@@ -19,7 +19,8 @@ from tests.test_frontend_patches import PLAIN, POINTS, picture
 from vio.cameras.projection import camera_args
 from vio.cameras.rectification_error import ErrorColumns
 from vio.datasets import png_rows
-from vio.filters import multiview, pose_loops, stereo_calibration, track_loops
+from vio.filters import gate_loops, multiview, pose_loops, stereo_calibration, track_loops
+from vio.filters.landmark_gate import leave_one_out_nis
 from vio.filters.multiview import Views
 from vio.frontend import outliers, patches, right_camera
 from vio.frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
@@ -40,7 +41,7 @@ from vio.geometry.lie import (
     transform_points,
 )
 from vio.geometry.stereo import StereoCamera, project, triangulate
-from vio.numerics.compiled import Loop, invert_positive, move_by_twist, solve_positive
+from vio.numerics.compiled import Loop, eigenvectors, invert_positive, move_by_twist, solve_positive
 
 CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
 CAMERAS = {"pinhole": CAMERA, "cylinder": replace(CAMERA, projection="cylinder")}
@@ -349,8 +350,8 @@ def test_the_imu_is_integrated_as_in_numpy() -> None:
     T, v, turned = se3_exp(rng.normal(size=6)), rng.normal(size=3), np.zeros(3)
     given = times - times[0], readings, bias, gravity, densities, hidden
     R_k, p_k, v_k, biases, noise = numpy_twins.integrated(*given, T, v)
-    Phi, Q = np.eye(15), np.zeros((2, 15, 15))
-    pose_loops.integrate(*given, T, v, turned, Phi, Q)
+    Phi, Q, summed, walks = np.eye(15), np.zeros((2, 15, 15)), np.empty((15, 15)), np.array([1e-4, 2e-3])
+    pose_loops.integrate(*given[:-1], walks, hidden, T, v, turned, Phi, Q, summed)
     np.testing.assert_allclose(T, se3_from_parts(R_k[-1], p_k[-1]), atol=1e-13)
     np.testing.assert_allclose(v, v_k[-1], atol=1e-13)
     gyro = readings[:, :3] - bias[:3]
@@ -359,6 +360,75 @@ def test_the_imu_is_integrated_as_in_numpy() -> None:
     np.testing.assert_allclose(Q[:, :9, :9], noise, rtol=1e-9, atol=1e-16)
     assert not Q[:, 9:].any()
     assert not Q[:, :, 9:].any()
+    seconds = 1e-9 * (times[-1] - times[0])
+    np.testing.assert_allclose(Phi[:9, :9], numpy_twins.free_flow(np.array([seconds]), gravity)[0], rtol=1e-12)
+    walked = np.diag(np.concatenate([np.zeros(9), np.repeat(walks**2 * seconds, 3)]))
+    np.testing.assert_allclose(summed, Q[0] + Q[1] + walked, rtol=1e-12)
+    cuts, found = np.sort(np.append(rng.uniform(times[0] - 5e6, times[-1] + 5e6, 20), times[3])), np.empty((21, 6))
+    pose_loops.interpolate(cuts, times, readings, found)
+    np.testing.assert_array_equal(found, np.stack([np.interp(cuts, times, column) for column in readings.T], axis=1))
+
+
+def test_small_symmetric_matrices_are_made_diagonal() -> None:
+    rng = np.random.default_rng(31)
+    for n in (1, 2, 3, 4, 6):
+        root = rng.normal(size=(n, n))
+        A, V = root @ np.diag(10.0 ** rng.uniform(-6, 6, n)) @ root.T, np.empty((n, n))
+        found = A.copy()
+        eigenvectors(found, V)
+        np.testing.assert_allclose(V @ np.diag(found.diagonal()) @ V.T, A, atol=1e-13 * np.abs(A).max())
+        np.testing.assert_allclose(V.T @ V, np.eye(n), atol=1e-13)
+        np.testing.assert_allclose(np.sort(found.diagonal()), np.linalg.eigvalsh(A), atol=1e-13 * np.abs(A).max())
+
+
+def test_corrections_and_landmarks_are_tested_as_in_numpy() -> None:
+    rng = np.random.default_rng(32)
+    root = rng.normal(size=(3, 6, 6))
+    remaining, process, more = root @ np.swapaxes(root, 1, 2)
+    expected, correction = remaining + 3 * process + more, rng.normal(size=6)
+    for first in (0, 3):
+        found = gate_loops.whiten_correction(correction, expected, process, remaining, first, 0.3)
+        twin = numpy_twins.whitened_correction(correction, expected, process, remaining, slice(first, first + 3), 0.3)
+        np.testing.assert_allclose(found, twin, rtol=1e-6)
+    assert np.isnan(
+        gate_loops.whiten_correction(correction, np.diag([9.0, 1, -1, 1, 1, 1]), process, remaining, 0, 0.3)[0]
+    )
+    assert gate_loops.whiten_correction(correction, np.zeros((6, 6)), process, remaining, 0, 0.3) == (0.0, 0, 0.0)
+    r, J, root = rng.normal(size=(9, 4)), 20 * rng.normal(size=(9, 4, 5)), 0.01 * rng.normal(size=(9, 5, 5))
+    weight, covariance = rng.uniform(0, 1, 9), root @ np.swapaxes(root, 1, 2)
+    np.testing.assert_allclose(
+        leave_one_out_nis(r, J, covariance, weight, 0.3),
+        numpy_twins.leave_one_out_nis(r, J, covariance, weight, 0.3),
+        rtol=1e-9,
+    )
+
+
+def test_errors_are_added_to_a_covariance_as_in_numpy() -> None:
+    rng = np.random.default_rng(33)
+    root = rng.normal(size=(20, 20))
+    P, J, noise, at = root @ root.T, rng.normal(size=(6, 9)) * (rng.uniform(size=(6, 9)) > 0.4), np.eye(6), 12
+    M = np.insert(np.eye(20), [at] * 6, np.pad(J, ((0, 0), (0, 11))), axis=0)
+    expected, found = M @ P @ M.T, np.empty((26, 26))
+    expected[at : at + 6, at : at + 6] += noise
+    pose_loops.insert_rows(P, at, J, noise, found)
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+    A, blocks, found = rng.normal(size=(6, 20)), np.stack([np.eye(3), 2 * np.eye(3)]), np.empty((26, 26))
+    pose_loops.append_rows(P, A @ P, A, blocks, found)
+    M = np.concatenate([np.eye(20), A])
+    expected = M @ P @ M.T
+    expected[20:, 20:] += np.diag([1.0, 1, 1, 2, 2, 2])
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+
+
+def test_rows_of_a_table_are_found_by_id() -> None:
+    rng = np.random.default_rng(34)
+    known = rng.permutation(50)[:30].astype(np.int64)
+    ordered = np.argsort(known)[:25]
+    ids, rows = rng.permutation(60).astype(np.int64), np.empty(60, dtype=np.int64)
+    place = {int(known[row]): int(row) for row in ordered}
+    expected = [place.get(int(i), -1) for i in ids]
+    assert track_loops.find_rows(ids, known, ordered, rows) == expected.count(-1)
+    assert rows.tolist() == expected
 
 
 def test_newest_residual_is_the_median_of_what_the_newest_clone_measured() -> None:

@@ -42,10 +42,9 @@ from vio.geometry.lie import (
 from vio.geometry.upright import rotation_to_up
 from vio.imu.faults import ImuSampleCheck, readings_of
 from vio.numerics.compiled import move_by_twist
-from vio.records import ImuSample, IntArray, MotionSample, VelocitySample
+from vio.records import ImuSample, MotionSample, VelocitySample
 
 DIM = 15  # error dimensions of the navigation state
-_BIASES: IntArray = np.arange(9, DIM)
 UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
 _EXTRAPOLATE_NS = 30_000_000  # by which samples may end before an exposure and its pose is still taken from its twist
 _SAMPLE_S = 0.005  # between two samples of a usual IMU, where only one has come
@@ -104,6 +103,8 @@ class Growth:
 
     def then(self, step: Transition) -> Growth:
         """Append a step."""
+        if self is NO_STEP:
+            return Growth(step.Phi, step.Q, step.Q_parts, step.bridged, step.Phi_imu)
         Phi = step.Phi
         Q, Q_parts = Phi @ self.Q @ Phi.T + step.Q, Phi @ self.Q_parts @ Phi.T + step.Q_parts
         Phi_imu = step.Phi_imu
@@ -134,6 +135,7 @@ class ImuMotion:
         # (6,) mean reading `[gyro, accel]` of the last second; kept where terms are estimated.
         self._usual: FloatArray | None = None
         self._gravity = np.array([0.0, 0.0, -settings.gravity_mps2])
+        self._walks = np.array([settings.gyro_bias_walk, settings.accel_bias_walk])
         self._new: list[ImuSample] = []  # not checked yet
         self._kept: list[ImuSample] = []
         self._history = ImuHistory()
@@ -214,12 +216,9 @@ class ImuMotion:
         variance = np.zeros((2, steps)) if hidden is None else hidden.variance
         T, v, turned = nav.T_world_imu.copy(), nav.velocity.copy(), np.zeros(3)
         total = float(times[-1]) * 1e-9
-        Phi, Q_parts = np.eye(DIM), np.zeros((2, DIM, DIM))
-        Phi[:9, :9] = _free_flow(np.array([total]), self._gravity)[0]  # depends on gravity alone
-        bias = np.concatenate([nav.gyro_bias, nav.accel_bias])
-        loops.integrate(times, readings, bias, self._gravity, densities, variance, T, v, turned, Phi, Q_parts)
-        Q = Q_parts[0] + Q_parts[1]
-        Q[_BIASES, _BIASES] = np.repeat([s.gyro_bias_walk**2 * total, s.accel_bias_walk**2 * total], 3)
+        Phi, Q_parts, Q = np.eye(DIM), np.zeros((2, DIM, DIM)), np.empty((DIM, DIM))
+        bias, noise = np.concatenate([nav.gyro_bias, nav.accel_bias]), (densities, self._walks, variance)
+        loops.integrate(times, readings, bias, self._gravity, *noise, T, v, turned, Phi, Q_parts, Q)
         moved = NavState(T, v, readings[-1, :3] - nav.gyro_bias, nav.gyro_bias, nav.accel_bias, nav.imu_terms)
         Phi_imu = None
         if len(self._chosen):
@@ -345,7 +344,8 @@ class ImuMotion:
         hidden = self._history.hidden(cuts, t)
         if hidden is not None:
             cuts = hidden.cuts_ns
-        readings = np.stack([np.interp(cuts, t, column) for column in readings_of(samples).T], axis=1)
+        readings = np.empty((len(cuts), 6))
+        loops.interpolate(cuts, t, readings_of(samples), readings)
         return cuts, readings, hidden
 
 
@@ -447,17 +447,6 @@ class TwistMotion:
             nav.gyro_bias + error[12:15],
             nav.accel_bias,
         )
-
-
-def _free_flow(s: FloatArray, gravity: FloatArray) -> FloatArray:
-    """Transition (K, 9, 9) of [rho phi xi_v] over times (K,): the same for every state, which is the filter's point."""
-    out = np.zeros((len(s), 9, 9))
-    out[:] = np.eye(9)
-    G = so3_hat(gravity)
-    out[:, 0:3, 6:9] = s[:, None, None] * np.eye(3)
-    out[:, 0:3, 3:6] = (0.5 * s**2)[:, None, None] * G
-    out[:, 6:9, 3:6] = s[:, None, None] * G
-    return out
 
 
 def _yaw_sigma(tilt_sigma: float, known_sigma: float) -> float:

@@ -222,18 +222,20 @@ def integrate(
     bias: FloatArray,
     gravity: FloatArray,
     densities: FloatArray,
+    walks: FloatArray,
     hidden: FloatArray,
     T: FloatArray,
     v: FloatArray,
     turned: FloatArray,
     Phi: FloatArray,
     Q_parts: FloatArray,
+    Q: FloatArray,
 ) -> None:
     """Integrate readings (K, 6) `[gyro, accel]` at times (K,), equations (N1) to (N4).
 
-    Moves the pose T (4, 4) and the velocity v (3,); adds the rotation to `turned` (3,), the biases' part to Phi
-    (15, 15), and to Q_parts (2, 15, 15) the noise of accelerometer and gyro, of densities (2,) and what gaps hide
-    (2, K - 1).
+    Moves the pose T (4, 4) and the velocity v (3,); adds the rotation to `turned` (3,), the step to Phi (15, 15), an
+    identity, and to Q_parts (2, 15, 15) the noise of accelerometer and gyro, of densities (2,) and what gaps hide
+    (2, K - 1). Q (15, 15) is their sum, with the walks of the biases of gyro and accelerometer (2,).
     """
     R, p = T[:3, :3].copy(), T[:3, 3].copy()
     new, phi, force = np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -263,10 +265,45 @@ def integrate(
         for i in range(3):
             for j in range(3):
                 R[i, j] = new[i, j]
+    total = end * 1e-9
+    for i in range(15):
+        for j in range(15):
+            Q[i, j] = Q_parts[0, i, j] + Q_parts[1, i, j]
     for i in range(3):
         T[i, 3] = p[i]
         for j in range(3):
             T[i, j] = R[i, j]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        Phi[i, 6 + i] = total  # (N2), the same for every state, which is the filter's point
+        Phi[i, 3 + j], Phi[i, 3 + k] = -(0.5 * total**2) * gravity[k], (0.5 * total**2) * gravity[j]
+        Phi[6 + i, 3 + j], Phi[6 + i, 3 + k] = -total * gravity[k], total * gravity[j]
+        Q[9 + i, 9 + i], Q[12 + i, 12 + i] = walks[0] ** 2 * total, walks[1] ** 2 * total
+
+
+@compiled
+def interpolate(cuts: FloatArray, t: FloatArray, readings: FloatArray, out: FloatArray) -> None:
+    """Write readings (K, 6) at times (K,) from those (S, 6) at times (S,): on straight lines, the ends held."""
+    s = 0
+    for k in range(len(cuts)):
+        while s < len(t) and t[s] <= cuts[k]:
+            s += 1
+        for i in range(6):
+            if s == 0 or s == len(t):
+                out[k, i] = readings[min(s, len(t) - 1), i]
+            else:
+                slope = (readings[s, i] - readings[s - 1, i]) / (t[s] - t[s - 1])
+                out[k, i] = slope * (cuts[k] - t[s - 1]) + readings[s - 1, i]
+
+
+@compiled
+def scale_nav(T_world_imu: FloatArray, T_cam0_imu: FloatArray, velocity: FloatArray, out: FloatArray) -> None:
+    """Write how a navigation state's error (15,) moves with the logarithm of the world's scale, equation (S1)."""
+    for i in range(3):
+        out[i], out[6 + i] = T_world_imu[i, 3], velocity[i]
+        out[3 + i] = out[9 + i] = out[12 + i] = 0.0
+        for k in range(3):
+            for j in range(3):
+                out[i] -= T_world_imu[i, k] * T_cam0_imu[j, k] * T_cam0_imu[j, 3]
 
 
 @compiled

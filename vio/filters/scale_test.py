@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.filters import pose_loops as loops
 from vio.filters.navigation import NavState
-from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.lie import FloatArray
 
 _SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
 # More than correct baselines show (docs/notes/design_decisions.md, contradiction of the scale).
@@ -32,8 +33,9 @@ def is_clear(velocity: FloatArray, covariance: FloatArray) -> bool:
 
 def scaled_nav(nav: NavState, T_cam0_imu: FloatArray) -> FloatArray:
     """How the navigation state's error (15,) moves with the logarithm of the world's scale, equation (S1)."""
-    T_world_cam0 = nav.T_world_imu @ se3_inverse(T_cam0_imu)
-    return np.concatenate([T_world_cam0[:3, 3], np.zeros(3), nav.velocity, np.zeros(6)])
+    out: FloatArray = np.empty(15)
+    loops.scale_nav(nav.T_world_imu, T_cam0_imu, nav.velocity, out)
+    return out
 
 
 class ScaleTest:
