@@ -15,6 +15,7 @@ from tests import test_msckf
 from tests.commands import render
 from tests.numpy_twins import residuals
 from tests.same_events import frames_of
+from vio.cameras.projection import camera_args
 from vio.cameras.rectification_error import TERMS, ErrorColumns
 from vio.cameras.rig import Rig
 from vio.cli import main
@@ -28,6 +29,7 @@ from vio.filters import multiview
 from vio.filters.multiview import Views
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import StereoCorrection, VerticalDisparityModel
+from vio.filters.track_loops import start_by_parallax
 from vio.frontend.outliers import RansacProblem, bearing_consensus, epipolar_distance
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, transform_points
 from vio.geometry.rectify import PINHOLE_REACH
@@ -196,7 +198,9 @@ def test_points_all_about_the_baseline_are_triangulated(left_only: bool) -> None
     exact = Views(z, weight)
     np.testing.assert_allclose(residuals(CYLINDER, T, p, exact).r, 0.0, atol=1e-9)
     if left_only:
-        np.testing.assert_allclose(multiview._by_parallax(CYLINDER, T, exact), p, rtol=1e-6, atol=1e-6)
+        found = np.empty(p.shape)
+        start_by_parallax(camera_args(CYLINDER), (1e-3, 1e3), 1e-12, T, z, weight, found)
+        np.testing.assert_allclose(found, p, rtol=1e-6, atol=1e-6)
     start, known = multiview.first_points(CYLINDER, T, exact)
     assert known.all()
     np.testing.assert_allclose(start, p, rtol=1e-3, atol=1e-3)

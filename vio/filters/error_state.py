@@ -16,6 +16,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from vio.filters import track_loops as loops
 from vio.filters.navigation import DIM
 from vio.filters.online_calibration import BLOCKS
 from vio.geometry.lie import FloatArray
@@ -81,30 +82,24 @@ class ErrorState:
         return out
 
     def information(
-        self, A: FloatArray, b: FloatArray, considered: int = 0
+        self, A: FloatArray, b: FloatArray, variance: float = 1.0, considered: int = 0
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Turn information about clones and stereo coefficients into that about the error vector.
 
         Args:
             A: information matrix (6N + S, 6N + S); of the clones alone, S is zero.
             b: information vector (6N + S,).
+            variance: of a pixel, by which both are divided.
             considered: how many of the coefficients, the last ones, have no errors here.
 
         Returns:
             Matrix (D, D), vector (D,), and the information of all errors with the coefficients considered (D, C).
         """
-        out, vector, by_considered = (
-            np.zeros((self.size, self.size)),
-            np.zeros(self.size),
-            np.zeros((self.size, considered)),
+        out: tuple[FloatArray, FloatArray, FloatArray] = (
+            np.empty((self.size, self.size)),
+            np.empty(self.size),
+            np.empty((self.size, considered)),
         )
-        last = len(b) - considered
-        size = min(self.clones.stop - self.clones.start, last)
-        clones, stereo = slice(self.clones.start, self.clones.start + size), self.stereo
-        out[clones, clones], vector[clones] = A[:size, :size], b[:size]
-        if last > size:
-            out[clones, stereo], out[stereo, clones] = A[:size, size:last], A[size:last, :size]
-            out[stereo, stereo], vector[stereo] = A[size:last, size:last], b[size:last]
-        if considered:
-            by_considered[clones], by_considered[stereo] = A[:size, last:], A[size:last, last:]
-        return out, vector, by_considered
+        clones = self.clones
+        loops.place_information(A, b, variance, clones.stop - clones.start, clones.start, self.stereo.start, *out)
+        return out

@@ -270,9 +270,7 @@ class FrameUpdate:
         field, state = self._rig.field(window), window.state
         considered = 0 if joint is None else CONSIDERED
         A, b = eliminate_points(tracks.information, chosen, tracks.stereo if joint is None else joint)
-        A /= self._variance
-        b /= self._variance
-        A, b, by_considered = state.information(A, b, considered)
+        A, b, by_considered = state.information(A, b, self._variance, considered)
         if pixels is not None and len(pixels.z):
             at, H = self._landmark_residuals(window, pixels), np.empty((len(pixels.z), 4, 0))
             if field is not None or considered:

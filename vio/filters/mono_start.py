@@ -199,7 +199,7 @@ class MonoStarter:
                     return None
                 self._follow_noise(tracks, lin)
                 A, b = eliminate_points(lin.information, np.ones(len(lin.rows), dtype=np.bool_))
-                A, b, _ = window.state.information(A / tracks.variance, b / tracks.variance)
+                A, b, _ = window.state.information(A, b, tracks.variance)
                 try:
                     fitted, error = window.optimum(A, b, len(A))
                 except np.linalg.LinAlgError:

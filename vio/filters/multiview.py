@@ -15,7 +15,7 @@ import numpy as np
 from vio.cameras.projection import camera_args
 from vio.filters import track_loops as loops
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import StereoCamera, left_rays
+from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray
 
 MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
@@ -131,43 +131,10 @@ def first_points(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -
     left_only: BoolArray = ~known & (np.sum(earlier[..., 0] > 0, axis=1) >= 2)
     if left_only.any():
         left = Views(views.z[left_only], earlier[left_only])
-        start = _by_parallax(camera, T_cam0_world, left)
+        start: FloatArray = np.empty((len(left.z), 3))
+        loops.start_by_parallax(camera_args(camera), disparities, _TINY, T_cam0_world, left.z, left.weight, start)
         p[left_only] = refine_points(camera, T_cam0_world, start, left, _PARALLAX_STEPS, CAUCHY)
     return p, known | left_only
-
-
-def _on_rays(camera: StereoCamera, T_cam0_world: FloatArray, pixels: FloatArray, disparity: FloatArray) -> FloatArray:
-    """Points (F, 3) in the world that cameras (F, 4, 4) see at left pixels (F, 2), at disparities (F,) made valid."""
-    disparity = np.clip(disparity, LEAST_DISPARITY_PX, camera.fu / MIN_DEPTH)
-    p_cam = left_rays(camera, pixels) * (camera.fu * camera.baseline_m / disparity)[:, None]
-    out: FloatArray = np.einsum("fji,fj->fi", T_cam0_world[:, :3, :3], p_cam - T_cam0_world[:, :3, 3])
-    return out
-
-
-def _by_parallax(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -> FloatArray:
-    """Points (F, 3) on the ray of each track's first left view, at the inverse depth that fits its others best.
-
-    With m that ray, and c its camera seen from camera i, view i shows `(m_i + rho c_i)`, up to scale; times its third
-    component this is linear in the inverse depth rho. A cylinder's rays may have no third component: there their cross
-    product with it is zero, which is linear as well.
-    """
-    seen = views.weight[..., 0] > 0
-    first, rows = np.argmax(seen, axis=1), np.arange(len(seen))
-    R, t = T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3]
-    m = np.einsum("fji,fj->fi", R[first], left_rays(camera, views.z[rows, first, :2]))
-    m_i = np.einsum("nij,fj->fni", R, m)
-    centre = -np.einsum("nji,nj->ni", R, t)
-    c_i = np.einsum("nij,fj->fni", R, centre[first]) + t
-    rays = left_rays(camera, np.where(seen[..., None], views.z[..., :2], 0.0))
-    if camera.is_cylinder:
-        parallax = np.cross(rays, c_i) * seen[..., None]
-        rho = -np.sum(parallax * np.cross(rays, m_i), axis=(1, 2))
-    else:
-        xy = rays[..., :2]
-        parallax = (c_i[..., :2] - xy * c_i[..., 2:]) * seen[..., None]
-        rho = np.sum(parallax * (xy * m_i[..., 2:] - m_i[..., :2]), axis=(1, 2))
-    rho = rho / (np.sum(parallax**2, axis=(1, 2)) + _TINY)
-    return _on_rays(camera, T_cam0_world[first], views.z[rows, first, :2], rho * camera.fu * camera.baseline_m)
 
 
 def refine_points(

@@ -128,6 +128,36 @@ def take_rows(P: FloatArray, rows: IntArray, out: FloatArray) -> None:
 
 
 @compiled
+def take_blocks(P: FloatArray, out: FloatArray) -> None:
+    """Write each point's block with the last S errors (M, 3 + S, 3 + S) of the covariance of all (3M + S, same)."""
+    points = 3 * len(out)
+    for m in range(len(out)):
+        for i in range(out.shape[1]):
+            row = 3 * m + i if i < 3 else points + i - 3
+            for j in range(out.shape[1]):
+                out[m, i, j] = P[row, 3 * m + j if j < 3 else points + j - 3]
+
+
+@compiled
+def take_since_first(P: FloatArray, first: int, attitude: int, out: FloatArray) -> None:
+    """Write the covariance (6N, 6N) of poses, from row `first` of P on, in the world that is reported: (N14).
+
+    `attitude` is the row of the error of the first attitude.
+    """
+    for i in range(len(out)):
+        a = attitude + i % 6 - 3
+        for j in range(len(out)):
+            b = attitude + j % 6 - 3
+            out[i, j] = P[first + i, first + j]
+            if i % 6 >= 3:
+                out[i, j] -= P[a, first + j]
+            if j % 6 >= 3:
+                out[i, j] -= P[first + i, b]
+            if i % 6 >= 3 and j % 6 >= 3:
+                out[i, j] += P[a, b]
+
+
+@compiled
 def insert_rows(P: FloatArray, at: int, J: FloatArray, noise: FloatArray, out: FloatArray) -> None:
     """Write a covariance (D + k, D + k) with errors `J error + noise` at a row, from that of the others (D, D).
 

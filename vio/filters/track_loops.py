@@ -92,6 +92,45 @@ def square_views(r: FloatArray, J: FloatArray, squares: FloatArray, count: IntAr
 
 
 @compiled
+def mark_wrong_views(
+    r: FloatArray, J: FloatArray, variance: float, limits: FloatArray, wrong: BoolArray, enough: BoolArray
+) -> bool:
+    """Write which views (F, N) exceed the limit of their number of pixels, and which tracks (F,) have two others.
+
+    Returns:
+        Whether there is any such view.
+    """
+    found = False
+    for f in range(J.shape[0]):
+        others = 0
+        for n in range(J.shape[1]):
+            squares, count = 0.0, 0
+            for a in range(4):
+                squares += r[f, n, a] ** 2
+                count += J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
+            wrong[f, n] = squares > variance * limits[count]
+            others += count > 0 and not wrong[f, n]
+            found = found or wrong[f, n]
+        enough[f] = others >= 2
+    return found
+
+
+@compiled
+def square_tracks(r: FloatArray, J: FloatArray, variance: float, most: int, squares: FloatArray, dof: IntArray) -> None:
+    """Write squared residuals (F,) of tracks over the variance, and their degrees of freedom (F,), 1 to `most`."""
+    for f in range(J.shape[0]):
+        squares[f], count = 0.0, -3
+        for n in range(J.shape[1]):
+            of_view = 0.0
+            for a in range(4):
+                of_view += r[f, n, a] ** 2
+                count += J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
+            squares[f] += of_view
+        squares[f] /= variance
+        dof[f] = min(max(count, 1), most)
+
+
+@compiled
 def anchor_points(
     camera: CameraArgs,
     least_depth: float,
@@ -296,6 +335,47 @@ def start_by_stereo(
         if best >= 0:
             disparity = min(max(largest, disparities[0]), disparities[1])
             _put_on_ray(camera, T[best], z[f, best, 0], z[f, best, 1], disparity, p[f])
+
+
+@compiled
+def start_by_parallax(
+    camera: CameraArgs,
+    disparities: tuple[float, float],
+    tiny: float,
+    T: FloatArray,
+    z: FloatArray,
+    weight: FloatArray,
+    p: FloatArray,
+) -> None:
+    """Write points (F, 3) on the ray of each track's first left view, at the inverse depth that fits its others best.
+
+    With m that ray, and c its camera seen from camera i, view i shows `(m_i + rho c_i)`, up to scale; times its third
+    component this is linear in the inverse depth rho. A cylinder's rays may have no third component: there their cross
+    product with it is zero, which is linear as well. Disparities are kept between two values.
+    """
+    m, c, m_i, c_i = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for f in range(len(p)):
+        k = _first_view(weight, f)
+        x, y, w = point_at(camera, z[f, k, 0], z[f, k, 1], 1.0)
+        for i in range(3):
+            m[i] = T[k, 0, i] * x + T[k, 1, i] * y + T[k, 2, i] * w
+            c[i] = -(T[k, 0, i] * T[k, 0, 3] + T[k, 1, i] * T[k, 1, 3] + T[k, 2, i] * T[k, 2, 3])
+        along, squared = 0.0, tiny
+        for n in range(len(T)):
+            if not weight[f, n, 0] > 0.0:
+                continue
+            for i in range(3):
+                m_i[i] = T[n, i, 0] * m[0] + T[n, i, 1] * m[1] + T[n, i, 2] * m[2]
+                c_i[i] = T[n, i, 0] * c[0] + T[n, i, 1] * c[1] + T[n, i, 2] * c[2] + T[n, i, 3]
+            x, y, w = point_at(camera, z[f, n, 0], z[f, n, 1], 1.0)
+            a0, a1, a2 = w * c_i[0] - x * c_i[2], w * c_i[1] - y * c_i[2], x * c_i[1] - y * c_i[0]
+            b0, b1, b2 = w * m_i[0] - x * m_i[2], w * m_i[1] - y * m_i[2], x * m_i[1] - y * m_i[0]
+            if not camera[5]:
+                a2 = b2 = 0.0
+            along -= a0 * b0 + a1 * b1 + a2 * b2
+            squared += a0 * a0 + a1 * a1 + a2 * a2
+        disparity = min(max(along / squared * camera[0] * camera[4], disparities[0]), disparities[1])
+        _put_on_ray(camera, T[k], z[f, k, 0], z[f, k, 1], disparity, p[f])
 
 
 @compiled
@@ -587,6 +667,49 @@ def add_landmarks(
                     A[stereo + s, stereo + t] += wh * h[t]
                 for t in range(estimated, terms):
                     considered[stereo + s, t - estimated] += wh * h[t]
+
+
+@compiled
+def place_information(
+    A: FloatArray,
+    b: FloatArray,
+    variance: float,
+    size: int,
+    clones: int,
+    stereo: int,
+    out: FloatArray,
+    vector: FloatArray,
+    considered: FloatArray,
+) -> None:
+    """Place information (6N + S + C, same) and (6N + S + C,), over a variance, among D errors.
+
+    Args:
+        A: of clones, then of coefficients that are estimated and of those that are considered.
+        b: its vector.
+        variance: of a pixel.
+        size: 6N.
+        clones: row of the first clone.
+        stereo: row of the first coefficient.
+        out: (D, D).
+        vector: (D,).
+        considered: of all errors with the coefficients considered (D, C).
+    """
+    last = len(b) - considered.shape[1]
+    for i in range(len(out)):
+        vector[i] = 0.0
+        for j in range(len(out)):
+            out[i, j] = 0.0
+        for j in range(considered.shape[1]):
+            considered[i, j] = 0.0
+    for i in range(last):
+        row = clones + i if i < size else stereo + i - size
+        vector[row] = b[i] / variance
+        for j in range(size):
+            out[row, clones + j] = A[i, j] / variance
+        for j in range(size, last):
+            out[row, stereo + j - size] = A[i, j] / variance
+        for j in range(last, len(b)):
+            considered[row, j - last] = A[i, j] / variance
 
 
 @compiled

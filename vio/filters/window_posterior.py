@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vio.filters import pose_loops as loops
 from vio.filters.navigation import ImuMotion
 from vio.filters.prior import Fit
 from vio.filters.window import Clones, Window
@@ -36,11 +37,14 @@ class WindowPosterior:
         reported = P if reported is None else reported
         rows = window.state.clones
         own = P[rows, rows], reported[rows, rows]
-        if "extrinsics" in window.state or "first_attitude" in window.state:
+        if "extrinsics" in window.state:
             J = window.body_D_error()
             J_reported = window.since_first(J)
-            of_body = J @ P @ J.T if "extrinsics" in window.state else own[0]
-            own = of_body, J_reported @ reported @ J_reported.T
+            own = J @ P @ J.T, J_reported @ reported @ J_reported.T
+        elif "first_attitude" in window.state:
+            since: FloatArray = np.empty(own[1].shape)
+            loops.take_since_first(reported, rows.start, window.state["first_attitude"].start, since)
+            own = own[0], since
         has_imu, R = isinstance(window.motion, ImuMotion), window.calibration.R_upright_world
         return cls(window.clones, *own, window.nav.gyro_bias, window.nav.accel_bias, has_imu, R)
 
@@ -155,9 +159,10 @@ def landmark_covariance(window: Window, fitted: Fit) -> FloatArray:
     state, M, n = window.state, len(window.landmarks), len(fitted.prior.L)
     exposure, S = state.clone(-1).start, state.stereo.stop - state.stereo.start
     position = fitted.rows(slice(exposure, exposure + 3))
-    root = fitted.whitened(fitted.rows(state.landmarks).reshape(M, 3, n) - position)
-    if S:
-        stereo = fitted.whitened(fitted.rows(state.stereo))
-        root = np.concatenate([root, np.broadcast_to(stereo, (M, S, n))], axis=1)
-    out: FloatArray = root @ np.swapaxes(root, 1, 2)
+    J_L = np.empty((3 * M + S, n))
+    np.subtract(fitted.rows(state.landmarks).reshape(M, 3, n), position, out=J_L[: 3 * M].reshape(M, 3, n))
+    J_L[3 * M :] = fitted.rows(state.stereo)
+    root = fitted.whitened(J_L)
+    out: FloatArray = np.empty((M, 3 + S, 3 + S))
+    loops.take_blocks(root @ root.T, out)
     return out

@@ -141,15 +141,15 @@ class WindowTracks:
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
         """Drop single views that contradict the rest of their track permanently, and linearise what is left."""
-        squares, pixels = squared_residuals(tracks.at)
-        wrong: BoolArray = squares > self.variance * chi_square_table(_VIEW_PROBABILITY)[pixels]
-        if not wrong.any():
+        at, limits = tracks.at, chi_square_table(_VIEW_PROBABILITY)
+        wrong: BoolArray = np.empty(at.r.shape[:2], dtype=np.bool_)
+        enough: BoolArray = np.empty(len(wrong), dtype=np.bool_)
+        if not loops.mark_wrong_views(at.r, at.z_D_p, self.variance, limits, wrong, enough):
             return tracks
         self.table.drop_views(tracks.rows, wrong)
-        enough = np.count_nonzero((pixels > 0) & ~wrong, axis=1) >= 2
-        r, z_D_p = tracks.at.r.copy(), tracks.at.z_D_p.copy()
+        r, z_D_p = at.r.copy(), at.z_D_p.copy()
         r[wrong], z_D_p[wrong] = 0.0, 0.0
-        at = Residuals(r, z_D_p, np.ones(len(wrong), dtype=np.bool_), tracks.at.weight)
+        at = Residuals(r, z_D_p, np.ones(len(wrong), dtype=np.bool_), at.weight)
         rows, p, z = tracks.rows[enough], tracks.p_world[enough], tracks.z[enough]
         return self._linear(tracks.T_cam0_world, rows, p, at.take(enough), tracks.field, z)
 
@@ -243,8 +243,8 @@ class WindowTracks:
         Returns:
             Mask (F,) of those that pass, their normalised squared residuals (F,), and the degrees of freedom (F,).
         """
-        of_views, counts = squared_residuals(at)
-        dof, squares = np.clip(counts.sum(axis=1) - 3, 1, _MOST_DOF), of_views.sum(axis=1) / self.variance
+        squares, dof = np.empty(len(at.r)), np.empty(len(at.r), dtype=np.int64)
+        loops.square_tracks(at.r, at.z_D_p, self.variance, _MOST_DOF, squares, dof)
         self.common_noise = min(_misfit(squares, dof), _MOST_COMMON_NOISE)
         limits = chi_square_table(self._settings.gate_probability)[dof] * self.common_noise
         passed: BoolArray = squares <= limits
