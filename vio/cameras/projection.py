@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -15,11 +14,19 @@ from vio.numerics.compiled import compiled
 CameraArgs: TypeAlias = tuple[float, float, float, float, float, bool]
 
 
-@lru_cache(maxsize=8)
+_MOST_KNOWN = 8
+_known: dict[int, tuple[StereoCamera, CameraArgs]] = {}  # by identity: a camera's hash costs more than the answer
+
+
 def camera_args(camera: StereoCamera) -> CameraArgs:
     """Return the intrinsics of both rectified images, as compiled functions take them."""
-    fu, fv, cu, cv = float(camera.fu), float(camera.fv), float(camera.cu), float(camera.cv)
-    return fu, fv, cu, cv, float(camera.baseline_m), camera.is_cylinder
+    known = _known.get(id(camera))
+    if known is None:
+        fu, fv, cu, cv = float(camera.fu), float(camera.fv), float(camera.cu), float(camera.cv)
+        if len(_known) == _MOST_KNOWN:
+            _known.clear()
+        known = _known[id(camera)] = camera, (fu, fv, cu, cv, float(camera.baseline_m), camera.is_cylinder)
+    return known[1]
 
 
 @compiled

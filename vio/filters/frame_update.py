@@ -344,9 +344,10 @@ class FrameUpdate:
         ended, joint = np.flatnonzero(ending & good), self._joint_columns(window, tracks)
         columns = tracks.stereo if joint is None else joint
         if len(ended):
-            x, y, z = transform_points(window.T_cam0_world(-1)[0], tracks.p_world[ended]).T
-            angles = np.column_stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))])
-            self._overdispersion.add(table.ids(tracks.rows[ended]), angles, *self.tracks.drift_scores(tracks, ended))
+            directions = np.empty((len(ended), 2))
+            track_loops.write_directions(ended, tracks.T_cam0_world[-1], tracks.p_world, directions)
+            scored = self.tracks.drift_scores(tracks, ended)
+            self._overdispersion.add(table.ids(tracks.rows[ended]), directions, *scored)
         # Errors that last stay in one place of the image, too, and the field takes them in with every frame.
         repeated = self._overdispersion.factor
         A, b, considered = self._information(window, tracks, ending & good, pixels, joint)

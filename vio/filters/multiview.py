@@ -236,12 +236,8 @@ class TrackInformation:
 
     def relative_depth_sigma(self) -> FloatArray:
         """Standard deviation (F,) of the inverse depth given the clones over itself, for one pixel of noise."""
-        C = self.C
-        minor = C[:, 0, 0] * C[:, 1, 1] - C[:, 0, 1] ** 2
-        # What is left of the third diagonal entry once the other two coordinates are eliminated.
-        a = (C[:, 0, 2] * C[:, 1, 1] - C[:, 1, 2] * C[:, 0, 1]) / minor
-        b = (C[:, 1, 2] * C[:, 0, 0] - C[:, 0, 2] * C[:, 0, 1]) / minor
-        out: FloatArray = 1.0 / np.sqrt(C[:, 2, 2] - a * C[:, 0, 2] - b * C[:, 1, 2]) / self.q.disparity
+        out: FloatArray = np.empty(len(self.C))
+        loops.depth_sigmas(self.C, self.q.disparity, out)
         return out
 
 
@@ -277,9 +273,9 @@ def relative_stereo_sigma(at: Residuals, q: InverseDepth, chosen: IntArray) -> F
 
     It is that for one pixel of noise; infinite without a right view.
     """
-    views = np.any(at.z_D_p[chosen, :, 2], axis=2).sum(axis=1)
-    out: FloatArray = np.sqrt(np.divide(_STEREO_VARIANCE, views, out=np.full(len(views), np.inf), where=views > 0))
-    return out / q.disparity[chosen]
+    out: FloatArray = np.empty(len(chosen))
+    loops.stereo_sigmas(chosen, at.z_D_p, q.disparity, _STEREO_VARIANCE, out)
+    return out
 
 
 def usable_points(

@@ -13,6 +13,7 @@ Reference: Li & Mourikis, Online temporal calibration for camera-IMU systems (20
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -95,9 +96,7 @@ class Calibration:
     @property
     def stereo_terms(self) -> IntArray:
         """Which of the coefficients `stereo` are estimated."""
-        blocks = [BLOCKS[name] for name in self.estimated]
-        terms = [np.arange(TERMS)[block.terms] for block in blocks if isinstance(block, StereoBlock)]
-        return np.concatenate([np.arange(0), *terms])
+        return _stereo_terms(tuple(self.estimated))
 
     def estimating(self, name: str, settings: MsckfSettings) -> Calibration:
         """Return the calibration with one more of its blocks estimated."""
@@ -152,6 +151,14 @@ class Calibration:
             rows = state[name]
             out |= BLOCKS[name].report(self, nav, covariance[rows, rows])
         return out
+
+
+@lru_cache(maxsize=8)
+def _stereo_terms(names: tuple[str, ...]) -> IntArray:
+    """Which of the coefficients `Calibration.stereo` are estimated with the blocks of given names."""
+    blocks = [BLOCKS[name] for name in names]
+    terms = [np.arange(TERMS)[block.terms] for block in blocks if isinstance(block, StereoBlock)]
+    return np.concatenate([np.arange(0), *terms])
 
 
 class CalibrationBlock:

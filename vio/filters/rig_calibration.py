@@ -66,6 +66,7 @@ class RigCalibration:
         self.camera, self.settings = camera, settings
         self.rotation: RotationComparison | None = ROTATION_NOT_COMPARABLE  # as others compared them; None: they will
         self._rows = VerticalDisparityModel(camera)
+        self._sigmas = constant_sigmas(settings)
         self._field_variances = prior_variances(settings)["stereo_field"]  # (8,) before anything was seen of it
         self._rows_off = LEAST_FIELD_SIGMA / _COLUMNS_BY_ROWS  # size of the rows' field that gave them, focal lengths
         self._field: tuple[Calibration, StereoCorrection | None] | None = None  # at a calibration, by the present rows
@@ -113,10 +114,7 @@ class RigCalibration:
 
     def considered_sigmas(self, window: Window) -> FloatArray:
         """Standard deviations (4,) as `constant_sigmas` returns them; zero where one is estimated."""
-        sigmas = constant_sigmas(self.settings)
-        if "stereo_scale" in window.state:
-            sigmas[:2] = 0.0
-        return sigmas
+        return self._sigmas * [0.0, 0.0, 1.0, 1.0] if "stereo_scale" in window.state else self._sigmas
 
     def uncertainty(self, window: Window, V: FloatArray) -> FloatArray:
         """What the constants considered add to a covariance (..., k, k), by how its errors follow them (..., k, 4)."""

@@ -12,6 +12,7 @@ Cvisic, Markovic & Petrovic, Recalibrating the KITTI dataset camera setup for im
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -117,8 +118,7 @@ class StereoCorrection:
 
         The four are baseline, focal length, principal point.
         """
-        chosen = np.concatenate([self.terms, np.arange(FIELD_TERMS, FIELD_TERMS + considered)])
-        return ErrorColumns(self.camera, chosen, self.rows_D_common)
+        return ErrorColumns(self.camera, _with_considered(tuple(self.terms.tolist()), considered), self.rows_D_common)
 
     def depth_sigma(self, p_cam: FloatArray, P: FloatArray) -> FloatArray:
         """Standard deviations (M,) of stereo depths, over them, by errors of the coefficients of covariance P (S, S).
@@ -146,6 +146,11 @@ class StereoCorrection:
         out[:, 2] = out[:, 0] - (z[:, 0] - z[:, 2]) * np.exp(focal + baseline)
         out[:, 3] = out[:, 1]
         return out
+
+
+@lru_cache(maxsize=8)
+def _with_considered(terms: tuple[int, ...], considered: int) -> IntArray:
+    return np.array([*terms, *range(FIELD_TERMS, FIELD_TERMS + considered)], dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)

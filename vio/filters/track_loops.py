@@ -920,6 +920,27 @@ def point_covariances(rows: IntArray, C: FloatArray, p_D_q: FloatArray, out: Flo
 
 
 @compiled
+def depth_sigmas(C: FloatArray, disparity: FloatArray, out: FloatArray) -> None:
+    """Write `relative_depth_sigma` (F,): what is left of the third diagonal entry without the other two coordinates."""
+    for f in range(len(C)):
+        c = C[f]
+        minor = c[0, 0] * c[1, 1] - c[0, 1] ** 2
+        a = (c[0, 2] * c[1, 1] - c[1, 2] * c[0, 1]) / minor
+        b = (c[1, 2] * c[0, 0] - c[0, 2] * c[0, 1]) / minor
+        out[f] = 1.0 / np.sqrt(c[2, 2] - a * c[0, 2] - b * c[1, 2]) / disparity[f]
+
+
+@compiled
+def stereo_sigmas(rows: IntArray, J: FloatArray, disparity: FloatArray, variance: float, out: FloatArray) -> None:
+    """Write `relative_stereo_sigma` (K,) of tracks (K,), with the variance of one view's disparity."""
+    for k, f in enumerate(rows):
+        views = 0
+        for n in range(J.shape[1]):
+            views += J[f, n, 2, 0] != 0.0 or J[f, n, 2, 1] != 0.0 or J[f, n, 2, 2] != 0.0
+        out[k] = np.sqrt(variance / views) / disparity[f] if views > 0 else np.inf
+
+
+@compiled
 def innovations(
     r: FloatArray,
     J: FloatArray,
@@ -1020,7 +1041,7 @@ def eliminate_columns(
                     own_b[s] += wh[s] * r[f, n, a]
                 for s in range(terms):
                     if h[s] != 0.0:  # left pixels do not depend on the right camera
-                        for t in range(s + 1):
+                        for t in range(terms):
                             own[s, t] += wh[s] * h[t]
                 for i in range(3):
                     for s in range(terms):
@@ -1047,6 +1068,16 @@ def add_scores(clusters: IntArray, scores: FloatArray, together: FloatArray, squ
             before = together[c, i]
             together[c, i] = scores[k, i] + before
             squares[i] += scores[k, i] * (together[c, i] + before)
+
+
+@compiled
+def write_directions(rows: IntArray, T: FloatArray, p: FloatArray, out: FloatArray) -> None:
+    """Write azimuth and elevation (K, 2), rad, of points (F, 3) of the world as a camera (4, 4) sees them."""
+    for k, f in enumerate(rows):
+        x = T[0, 0] * p[f, 0] + T[0, 1] * p[f, 1] + T[0, 2] * p[f, 2] + T[0, 3]
+        y = T[1, 0] * p[f, 0] + T[1, 1] * p[f, 1] + T[1, 2] * p[f, 2] + T[1, 3]
+        z = T[2, 0] * p[f, 0] + T[2, 1] * p[f, 1] + T[2, 2] * p[f, 2] + T[2, 3]
+        out[k, 0], out[k, 1] = np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))
 
 
 @compiled
