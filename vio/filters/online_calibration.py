@@ -105,11 +105,12 @@ class Calibration:
 
     def corrected(self, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
         """Return the calibration moved by an error (C,), the body's pose (4, 4) being that of the error."""
-        out, first = self, 0
+        changed: dict[str, Any] = {}
+        first = 0
         for name, size in self.estimated.items():
-            out = BLOCKS[name].corrected(out, error[first : first + size], T_world_imu)
+            BLOCKS[name].correct(self, error[first : first + size], T_world_imu, changed)
             first += size
-        return out
+        return replace(self, **changed)
 
     def variances(self, of_block: dict[str, FloatArray]) -> FloatArray:
         """Join variances, given by block, of the blocks that are estimated (C,)."""
@@ -185,8 +186,10 @@ class CalibrationBlock:
         """Random walks (n,), standard deviations per root second."""
         return self.sigmas(settings) * self.walk
 
-    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
-        """Return a calibration moved by an error (n,) at a pose of the body (4, 4)."""
+    def correct(
+        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+    ) -> None:
+        """Put the fields of a calibration that an error (n,) at a pose of the body (4, 4) moves into `changed`."""
         raise NotImplementedError
 
     def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
@@ -221,8 +224,10 @@ class _ImuTermsBlock(CalibrationBlock):
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
         return term_sigmas()[CHOSEN[settings.calibrate_imu]]
 
-    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
-        return calibration
+    def correct(
+        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+    ) -> None:
+        """Nothing of the calibration moves."""
 
     def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
         sigmas = np.sqrt(np.diag(all_imu_terms(covariance)))
@@ -236,11 +241,13 @@ class StereoBlock(CalibrationBlock):
     enters = "pixels"
     walk = _STEREO_WALK
 
-    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
-        """Return a calibration moved by an error (n,) of its coefficients."""
-        stereo = calibration.stereo.copy()
-        stereo[self.terms] += error
-        return replace(calibration, stereo=stereo)
+    def correct(
+        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+    ) -> None:
+        """Put the coefficients moved by an error (n,) of some of them into `changed`."""
+        if "stereo" not in changed:
+            changed["stereo"] = calibration.stereo.copy()
+        changed["stereo"][self.terms] += error
 
 
 class _StereoFieldBlock(StereoBlock):
@@ -289,9 +296,11 @@ class _ExtrinsicsBlock(CalibrationBlock):
     def walks(self, settings: MsckfSettings) -> FloatArray:
         return np.repeat([_EXTRINSIC_TRANSLATION_WALK_M, np.radians(_EXTRINSIC_ROTATION_WALK_DEG)], 3)
 
-    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
-        T = calibration.T_cam0_imu @ se3_exp(se3_adjoint(se3_inverse(T_world_imu)) @ error)
-        return replace(calibration, T_cam0_imu=T)
+    def correct(
+        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+    ) -> None:
+        moved = calibration.T_cam0_imu @ se3_exp(se3_adjoint(se3_inverse(T_world_imu)) @ error)
+        changed["T_cam0_imu"] = moved
 
     def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
         back = se3_adjoint(se3_inverse(nav.T_world_imu))
@@ -319,8 +328,10 @@ class _TimeOffsetBlock(CalibrationBlock):
     def walks(self, settings: MsckfSettings) -> FloatArray:
         return np.array([_TIME_OFFSET_WALK_S])
 
-    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
-        return replace(calibration, time_offset_s=calibration.time_offset_s + float(error[0]))
+    def correct(
+        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+    ) -> None:
+        changed["time_offset_s"] = calibration.time_offset_s + float(error[0])
 
     def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
         sigma = float(np.sqrt(covariance[0, 0]))
@@ -342,8 +353,10 @@ class _FirstAttitudeBlock(CalibrationBlock):
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
         return np.zeros(3)
 
-    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
-        return replace(calibration, R_upright_world=so3_exp(error) @ calibration.R_upright_world)
+    def correct(
+        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+    ) -> None:
+        changed["R_upright_world"] = so3_exp(error) @ calibration.R_upright_world
 
     def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
         return {}

@@ -11,6 +11,7 @@ Cvisic, Markovic & Petrovic, Recalibrating the KITTI dataset camera setup for im
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -57,20 +58,16 @@ class VerticalDisparityModel:
         # The median is taken out, as in the first frames the field itself is not yet known.
         weight = np.empty(len(z))
         loops.weigh_rows(rows - camera.fv * (basis @ self.coefficients), CAUCHY, weight)
-        weighted = (basis * weight[:, None]).T
-        self._A = _ROW_MEMORY * self._A + weighted @ basis
-        self._b = _ROW_MEMORY * self._b + weighted @ rows
-        self._common = _ROW_MEMORY * self._common + weighted @ common
+        loops.add_rows(basis, common, rows, weight, _ROW_MEMORY, self._A, self._b, self._common)
         solution = self._b.copy()
         solve_positive(self._A + (1 - _ROW_MEMORY) * _ROW_PRIOR, solution)
         self._inverse = np.empty(self._A.shape)
         invert_positive(self._A + _ROW_PRIOR, self._inverse)
-        self.coefficients = solution / camera.fv
-        field, self._matches = basis @ solution, len(z)
-        misfit = rows - field
-        self._squares = _ROW_MEMORY * self._squares + float(weight @ (misfit * misfit))
-        self._count = _ROW_MEMORY * self._count + float(weight.sum())
-        self.rms_px = float(np.sqrt(field @ field / len(field)))
+        self.coefficients, self._matches = solution / camera.fv, len(z)
+        misfits, weights, squares = loops.fitted_rows(basis, rows, weight, solution)
+        self._squares = _ROW_MEMORY * self._squares + misfits
+        self._count = _ROW_MEMORY * self._count + weights
+        self.rms_px = math.sqrt(squares / len(z))
 
     def without_common(self, stereo: FloatArray) -> FloatArray:
         """Return the coefficients (7,) without what the distortion of both lenses, in (8,) of (R3), does to rows.

@@ -291,6 +291,50 @@ def weigh_rows(residual: FloatArray, cauchy: float, weight: FloatArray) -> None:
 
 
 @compiled
+def add_rows(
+    basis: FloatArray,
+    common: FloatArray,
+    rows: FloatArray,
+    weight: FloatArray,
+    memory: float,
+    A: FloatArray,
+    b: FloatArray,
+    C: FloatArray,
+) -> None:
+    """Add normal equations of rows (M,) in terms (M, 7), and what others (M, 4) do to them, to those remembered."""
+    for i in range(len(b)):
+        b[i] *= memory
+        for j in range(len(b)):
+            A[i, j] *= memory
+        for j in range(C.shape[1]):
+            C[i, j] *= memory
+    for m in range(len(rows)):
+        for i in range(len(b)):
+            w = basis[m, i] * weight[m]
+            b[i] += w * rows[m]
+            for j in range(len(b)):
+                A[i, j] += w * basis[m, j]
+            for j in range(C.shape[1]):
+                C[i, j] += w * common[m, j]
+
+
+@compiled
+def fitted_rows(
+    basis: FloatArray, rows: FloatArray, weight: FloatArray, solution: FloatArray
+) -> tuple[float, float, float]:
+    """Return the weighted squares of what a solution (7,) leaves of rows (M,), the sum of weights, and its squares."""
+    misfits, weights, squares = 0.0, 0.0, 0.0
+    for m in range(len(rows)):
+        fitted = 0.0
+        for i in range(len(solution)):
+            fitted += basis[m, i] * solution[i]
+        misfits += weight[m] * (rows[m] - fitted) ** 2
+        weights += weight[m]
+        squares += fitted * fitted
+    return misfits, weights, squares
+
+
+@compiled
 def _first_view(weight: FloatArray, f: int) -> int:
     """The first clone that saw a track; 0 where none did."""
     for n in range(weight.shape[1]):

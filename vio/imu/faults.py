@@ -194,8 +194,9 @@ class _SpikeCheck:
     def __init__(self) -> None:
         self._last: tuple[int, _Reading] | None = None  # time and reading of the last sample that passed
         self._suspect: ImuSample | None = None
-        self._times: IntArray = np.zeros(0, dtype=np.int64)  # (S,) of the samples of the last seconds that passed
-        self._changes: FloatArray = np.zeros((0, 6))  # (S, 6) to each of them
+        # Of the samples of the last seconds that passed, in parts: their times (S,), and the changes (S, 6) to them.
+        self._times: list[IntArray] = []
+        self._changes: list[FloatArray] = []
         self._limit: _Reading | None = None  # (6,) a larger change is suspect; None: unknown
         self._period_ns = 0.0
         self._until_refresh = 0
@@ -265,16 +266,20 @@ class _SpikeCheck:
 
     def _accept(self, times: IntArray, changes: FloatArray, reading: _Reading) -> None:
         """Add changes (K, 6) at times (K,); the reading is the last one."""
-        now, count = int(times[-1]), len(times)
-        times, changes = np.concatenate([self._times, times]), np.concatenate([self._changes, changes])
-        old = int(np.searchsorted(times, now - _HISTORY_NS))
-        self._last, self._times, self._changes = (now, reading), times[old:], changes[old:]
-        self._until_refresh -= count
-        if self._until_refresh <= 0 and len(self._times) >= _LEAST_HISTORY:
-            self._until_refresh = max(_REFRESH, len(self._times) // _REFRESH_SHARE)
-            self._period_ns = median(np.diff(self._times))
+        self._last = int(times[-1]), reading
+        self._times.append(times)
+        self._changes.append(changes)
+        self._until_refresh -= len(times)
+        if self._until_refresh > 0:
+            return
+        together, changed = np.concatenate(self._times), np.concatenate(self._changes)
+        old = int(np.searchsorted(together, self._last[0] - _HISTORY_NS))
+        self._times, self._changes = [together[old:]], [changed[old:]]
+        if len(together) - old >= _LEAST_HISTORY:
+            self._until_refresh = max(_REFRESH, (len(together) - old) // _REFRESH_SHARE)
+            self._period_ns = median(np.diff(together[old:]))
             least = np.array(_SPIKE_IMPULSE) / max(self._period_ns * _NS, 1e-6)
-            self._limit = np.maximum(_SPIKE_SIGMAS * robust_sigmas(self._changes), least).tolist()
+            self._limit = np.maximum(_SPIKE_SIGMAS * robust_sigmas(changed[old:]), least).tolist()
 
 
 def _reading(sample: ImuSample) -> _Reading:
