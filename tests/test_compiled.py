@@ -420,6 +420,73 @@ def test_errors_are_added_to_a_covariance_as_in_numpy() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
 
 
+def test_information_and_covariances_find_their_places() -> None:
+    rng = np.random.default_rng(35)
+    size, estimated, considered, clones, stereo, D = 12, 3, 2, 8, 4, 26
+    b = rng.normal(size=size + estimated + considered)
+    root = rng.normal(size=(len(b), len(b)))
+    A = root @ root.T
+    own = np.concatenate([clones + np.arange(size), stereo + np.arange(estimated)])
+    out, vector, by_considered = np.ones((D, D)), np.ones(D), np.ones((D, considered))
+    track_loops.place_information(A, b, 0.3, size, clones, stereo, out, vector, by_considered)
+    expected, last = np.zeros((D, D)), len(own)
+    expected[np.ix_(own, own)] = A[:last, :last] / 0.3
+    np.testing.assert_array_equal(out, expected)
+    np.testing.assert_array_equal(vector[own], b[:last] / 0.3)
+    np.testing.assert_array_equal(by_considered[own], A[:last, last:] / 0.3)
+    assert not np.delete(vector, own).any()
+    assert not np.delete(by_considered, own, axis=0).any()
+    P, J, found = np.cov(rng.normal(size=(D, 40))), np.zeros((12, D)), np.empty((12, 12))
+    J[:, 10:22], J[3:6, 2:5], J[9:, 2:5] = np.eye(12), -np.eye(3), -np.eye(3)
+    pose_loops.take_since_first(P, 10, 2, found)
+    np.testing.assert_allclose(found, J @ P @ J.T, atol=1e-14)
+    blocks = np.empty((7, 8, 8))
+    pose_loops.take_blocks(P, blocks)
+    for m, block in enumerate(blocks):
+        rows = [*range(3 * m, 3 * m + 3), *range(21, 26)]
+        np.testing.assert_array_equal(block, P[np.ix_(rows, rows)])
+
+
+def test_rows_scores_and_gates_are_summed_as_in_numpy() -> None:
+    rng = np.random.default_rng(36)
+    basis, common, rows, weight = (
+        rng.normal(size=(40, 7)),
+        rng.normal(size=(40, 4)),
+        rng.normal(size=40),
+        rng.random(40),
+    )
+    A, b, C, solution = rng.normal(size=(7, 7)), rng.normal(size=7), rng.normal(size=(7, 4)), rng.normal(size=7)
+    expected = [0.9 * old + (basis * weight[:, None]).T @ x for old, x in ((A, basis), (b, rows), (C, common))]
+    track_loops.add_rows(basis, common, rows, weight, 0.9, A, b, C)
+    for found, twin in zip((A, b, C), expected, strict=True):
+        np.testing.assert_allclose(found, twin, atol=1e-12)
+    fitted = basis @ solution
+    expected = [weight @ (rows - fitted) ** 2, weight.sum(), fitted @ fitted]
+    np.testing.assert_allclose(track_loops.fitted_rows(basis, rows, weight, solution), expected, rtol=1e-12)
+    scores, clusters, together, squares = (
+        rng.normal(size=(5, 6)),
+        np.array([2, 0, 2, 2, 1]),
+        np.zeros((3, 6)),
+        np.zeros(6),
+    )
+    track_loops.add_scores(clusters, scores, together, squares)
+    sums = np.array([scores[clusters == k].sum(axis=0) for k in range(3)])
+    np.testing.assert_allclose(together, sums, atol=1e-14)
+    np.testing.assert_allclose(squares, (sums**2).sum(axis=0), atol=1e-13)
+    r, J = rng.normal(size=(6, 5, 4)), rng.normal(size=(6, 5, 4, 3))
+    J[..., 3, :], r[..., 3] = 0.0, 0.0
+    J[0, 1:4], r[0, 1:4], J[1, 2, 2], r[1, 2, 2] = 0.0, 0.0, 0.0, 0.0
+    of_views, counts = multiview.squared_residuals(multiview.Residuals(r, J, np.ones(6, np.bool_), np.ones(r.shape)))
+    limits, wrong, enough = np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.empty((6, 5), np.bool_), np.empty(6, np.bool_)
+    assert track_loops.mark_wrong_views(r, J, 1.1, limits, wrong, enough)
+    np.testing.assert_array_equal(wrong, of_views > 1.1 * limits[counts])
+    np.testing.assert_array_equal(enough, ((counts > 0) & ~wrong).sum(axis=1) >= 2)
+    squares, dof = np.empty(6), np.empty(6, np.int64)
+    track_loops.square_tracks(r, J, 0.7, 11, squares, dof)
+    np.testing.assert_allclose(squares, of_views.sum(axis=1) / 0.7, rtol=1e-14)
+    np.testing.assert_array_equal(dof, np.clip(counts.sum(axis=1) - 3, 1, 11))
+
+
 def test_rows_of_a_table_are_found_by_id() -> None:
     rng = np.random.default_rng(34)
     known = rng.permutation(50)[:30].astype(np.int64)
@@ -429,6 +496,21 @@ def test_rows_of_a_table_are_found_by_id() -> None:
     expected = [place.get(int(i), -1) for i in ids]
     assert track_loops.find_rows(ids, known, ordered, rows) == expected.count(-1)
     assert rows.tolist() == expected
+
+
+def test_points_begin_where_two_left_rays_meet() -> None:
+    rng = np.random.default_rng(37)
+    T, p = se3_exp(rng.normal(0, 0.2, (4, 6))), rng.uniform([-2, -1, 4], [2, 1, 9], (12, 3))
+    z = np.stack([project(CAMERA, transform_points(T_k, p)) for T_k in T], axis=1)
+    weight, found, directions = np.tile([1.0, 1.0, 0.0, 0.0], (12, 4, 1)), np.empty((12, 3)), np.empty((2, 2))
+    weight[:6, 0] = 0.0
+    track_loops.start_by_parallax(camera_args(CAMERA), (1e-3, 1e3), 1e-12, T, z, weight, found)
+    np.testing.assert_allclose(found, p, rtol=1e-7)
+    track_loops.write_directions(np.array([3, 7]), T[1], p, directions)
+    x, y, d = transform_points(T[1], p[[3, 7]]).T
+    np.testing.assert_allclose(
+        directions, np.column_stack([np.arctan2(x, d), np.arctan2(y, np.hypot(x, d))]), rtol=1e-12
+    )
 
 
 def test_newest_residual_is_the_median_of_what_the_newest_clone_measured() -> None:
