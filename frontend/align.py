@@ -2,8 +2,8 @@
 
 The inverse-compositional form uses the gradients of the template in every iteration: an iteration costs one
 interpolation of the image under each template, and a template is prepared only once. A warp (2, 3) maps
-template offsets `[x, y, 1]` to image pixels `[u, v]`. The loops over pixels are compiled; `tests/numpy_twins.py` holds
-the same alignment in NumPy.
+template offsets `[x, y, 1]` to image pixels `[u, v]`. Pixels count by a Gaussian window: what is at the rim may be at
+another depth. The loops over pixels are compiled; `tests/numpy_twins.py` holds the same alignment in NumPy.
 Reference: Baker & Matthews, Lucas-Kanade 20 years on, IJCV (2004).
 """
 
@@ -31,6 +31,7 @@ _LEAST_SCORE, _MOST_SCORE = 0.1, 0.99999  # that a standard deviation is compute
 _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
 _DAMPING = 1e-6  # relative to the diagonal: limits the step in weakly textured directions
+_WINDOW_SIGMA = 0.4  # standard deviation of the window over the radius of a template
 _SUBPIXELS = 32  # anchors are cut at multiples of this fraction of a pixel, where the weights of float32 are exact
 FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
 
@@ -41,11 +42,11 @@ _PAIR = np.dtype("<u2")
 
 @dataclass(frozen=True, slots=True)
 class Templates:
-    """Patches prepared for alignment; S = (2r + 1)^2 pixels each."""
+    """Discs prepared for alignment; S pixels each, those of `disc`, with the weights of `window`."""
 
-    patch: npt.NDArray[np.float32]  # (N, S) gray levels minus their mean
-    gradient: npt.NDArray[np.float32]  # (N, 2, S) along u and v
-    energy: npt.NDArray[np.float32]  # (N,) sum of squares of the patch
+    patch: npt.NDArray[np.float32]  # (N, S) weight times gray levels minus their weighted mean
+    gradient: npt.NDArray[np.float32]  # (N, 2, S) weight times gradient along u and v
+    energy: npt.NDArray[np.float32]  # (N,) weighted sum of squares of gray levels minus their mean
     inverse: npt.NDArray[np.float32]  # (N, 8, 8) of the normal matrix
     row_inverse: npt.NDArray[np.float32]  # (N, 6, 6) the same, with the expected row as a prior
     sigma: npt.NDArray[np.float32]  # (N, 3) px, (F1) of the last alignment: of u, v, and u along a row; 0: none yet
@@ -53,17 +54,41 @@ class Templates:
 
 def empty_templates(count: int, radius: int) -> Templates:
     """Allocate `count` empty templates of a radius."""
-    size = (2 * radius + 1) ** 2
+    size = disc(radius).shape[1]
     shapes = ((size,), (2, size), (), (_PARAMETERS, _PARAMETERS), (_ROW_PARAMETERS, _ROW_PARAMETERS), (3,))
     return Templates(*(np.zeros((count, *shape), np.float32) for shape in shapes))
 
 
 @lru_cache(maxsize=8)
 def offsets(radius: int) -> Pixels:
-    """Offsets (2, S) `[x, y]` of the pixels of a patch from its centre, in row-major order; read-only."""
+    """Offsets (2, (2r + 1)^2) `[x, y]` of the pixels of a square patch from its centre, row by row; read-only."""
     out = np.mgrid[-radius : radius + 1, -radius : radius + 1][::-1].astype(np.float32).reshape(2, -1)
     out.flags.writeable = False
     return out
+
+
+@lru_cache(maxsize=8)
+def disc(radius: int) -> Pixels:
+    """Offsets (2, S) `[x, y]` of the pixels of a template from its centre, row by row; read-only."""
+    square = offsets(radius)
+    out = np.ascontiguousarray(square[:, (square**2).sum(axis=0) <= (radius + 0.5) ** 2])
+    out.flags.writeable = False
+    return out
+
+
+@lru_cache(maxsize=8)
+def window(radius: int) -> Pixels:
+    """Weights (S,) of a template's pixels, which sum to the number of independent pixels that they are worth."""
+    weight = np.exp(-0.5 * (disc(radius).astype(np.float64) ** 2).sum(axis=0) / (_WINDOW_SIGMA * radius) ** 2)
+    out = (weight * weight.sum() / (weight @ weight)).astype(np.float32)
+    out.flags.writeable = False
+    return out
+
+
+@lru_cache(maxsize=8)
+def _radius(size: int) -> int:
+    """Radius of the template that has `size` pixels."""
+    return next(radius for radius in range(1, size) if disc(radius).shape[1] == size)
 
 
 def warped_patches(image: Image, warp: FloatArray, radius: int) -> Pixels:
@@ -99,7 +124,7 @@ def _sample(
 ) -> None:
     """Write the gray levels (S,) under one warp (2, 3) into `out`; `at` (S,) and `part` (2, S) are overwritten."""
     height, width = image.shape
-    radius = -xy[0, 0]
+    radius = -xy[1, 0]
     reach_u = radius * (abs(warp[0, 0]) + abs(warp[0, 1]))
     reach_v = radius * (abs(warp[1, 0]) + abs(warp[1, 1]))
     # False also for a warp that is not finite.
@@ -171,12 +196,16 @@ def templates(wide: Patches) -> Templates:
 
 def replace_templates(store: Templates, slots: IntArray, wide: Patches) -> None:
     """Prepare templates from patches (N, 2r+3, 2r+3) in rows (N,) of others."""
-    _prepare(wide, slots, store.patch, store.gradient, store.energy, store.inverse, store.row_inverse)
+    radius = wide.shape[1] // 2 - 1
+    columns = store.patch, store.gradient, store.energy, store.inverse, store.row_inverse
+    _prepare(wide, disc(radius), window(radius), slots, *columns)
 
 
 @compiled
 def _prepare(
     wide: Patches,
+    xy: Pixels,
+    weights: Pixels,
     slots: IntArray,
     patch: Pixels,
     gradient: Pixels,
@@ -185,23 +214,24 @@ def _prepare(
     row_inverse: Pixels,
 ) -> None:
     """Write rows (N,) of the columns of templates."""
-    side = wide.shape[1] - 2
-    size, radius = side * side, side // 2
+    size, centre = xy.shape[1], wide.shape[1] // 2
     basis, normal = np.empty((_PARAMETERS, size)), np.empty((_PARAMETERS, _PARAMETERS))
     on_row = np.empty((_ROW_PARAMETERS, _ROW_PARAMETERS))
     for n, slot in enumerate(slots):
-        mean = _mean_inside(wide[n])
+        mean = _weighted_mean(wide[n], xy, weights)
         energy[slot] = 0.0
-        for y in range(side):
-            above, here, below = wide[n, y], wide[n, y + 1], wide[n, y + 2]
-            for x in range(side):
-                k, centred = y * side + x, here[x + 1] - mean
-                gu, gv = (here[x + 2] - here[x]) / np.float32(2.0), (below[x + 1] - above[x + 1]) / np.float32(2.0)
-                patch[slot, k], gradient[slot, 0, k], gradient[slot, 1, k] = centred, gu, gv
-                energy[slot] += centred * centred
-                basis[0, k], basis[1, k], basis[2, k], basis[3, k] = gu, gv, centred, 1.0
-                basis[4, k], basis[5, k] = gu * (x - radius), gu * (y - radius)
-                basis[6, k], basis[7, k] = gv * (x - radius), gv * (y - radius)
+        for k in range(size):
+            x, y, weight = xy[0, k], xy[1, k], weights[k]
+            above, here, below = wide[n, centre + int(y) - 1], wide[n, centre + int(y)], wide[n, centre + int(y) + 1]
+            i = centre + int(x)
+            centred = here[i] - mean
+            gu, gv = (here[i + 1] - here[i - 1]) / np.float32(2.0), (below[i] - above[i]) / np.float32(2.0)
+            patch[slot, k], gradient[slot, 0, k], gradient[slot, 1, k] = weight * centred, weight * gu, weight * gv
+            energy[slot] += weight * centred * centred
+            root = np.sqrt(weight)
+            gu, gv = root * gu, root * gv
+            basis[0, k], basis[1, k], basis[2, k], basis[3, k] = gu, gv, root * centred, root
+            basis[4, k], basis[5, k], basis[6, k], basis[7, k] = gu * x, gu * y, gv * x, gv * y
         for i in range(_PARAMETERS):
             for j in range(i + 1):
                 normal[i, j] = _product(basis[i], basis[j])
@@ -215,14 +245,13 @@ def _prepare(
 
 
 @compiled
-def _mean_inside(wide: Pixels) -> np.float32:
-    """Mean of a patch (h, w) without its outermost pixels."""
-    height, width = wide.shape
-    total = 0.0
-    for y in range(1, height - 1):
-        for x in range(1, width - 1):
-            total += wide[y, x]
-    return np.float32(total / ((height - 2) * (width - 2)))
+def _weighted_mean(wide: Pixels, xy: Pixels, weights: Pixels) -> np.float32:
+    """Mean of a patch (2r + 3, 2r + 3) over a template's pixels (2, S), by their weights (S,)."""
+    centre, total, sum_of_weights = len(wide) // 2, 0.0, 0.0
+    for k in range(len(weights)):
+        total += weights[k] * wide[centre + int(xy[1, k]), centre + int(xy[0, k])]
+        sum_of_weights += weights[k]
+    return np.float32(total / sum_of_weights)
 
 
 @compiled_sums
@@ -257,11 +286,11 @@ def align(
         template's centre comes too close to the image border for the patch to fit. `store.sigma` holds the standard
         deviations then, equation (F1).
     """
-    radius = int(store.patch.shape[1] ** 0.5) // 2
+    radius = _radius(store.patch.shape[1])
     warp, score = warp.copy(), np.empty(len(warp))
     inverse, row_weight = (store.inverse, 0.0) if rows is None else (store.row_inverse, _ROW_WEIGHT)
     expected = score if rows is None else rows  # not read without a weight
-    columns = store.patch, store.gradient, store.energy, inverse, offsets(radius)
+    columns = store.patch, store.gradient, store.energy, inverse, disc(radius), window(radius)
     image = np.ascontiguousarray(image)
     _refine(*columns, slots, image, _pairs(image), warp, expected, row_weight, iterations, score, store.sigma)
     return warp, score
@@ -274,6 +303,7 @@ def _refine(
     energy: Pixels,
     inverse: Pixels,
     xy: Pixels,
+    weights: Pixels,
     slots: IntArray,
     image: Image,
     pairs: Pairs,
@@ -285,9 +315,11 @@ def _refine(
     sigma: Pixels,
 ) -> None:
     """Refine the warps (N, 2, 3) in place; write the correlations (N,) into `score` and rows (N,) of `sigma` (M, 3)."""
-    size, parameters = patch.shape[1], inverse.shape[1]
-    margin, last_u, last_v = 1.0 - xy[0, 0], image.shape[1] - 1.0, image.shape[0] - 1.0
-    at, part, view = np.empty(size, np.int32), np.empty((2, size), np.float32), np.empty(size, np.float32)
+    pixels, parameters, size = patch.shape[1], inverse.shape[1], 0.0
+    for k in range(pixels):
+        size += weights[k]
+    margin, last_u, last_v = 1.0 - xy[1, 0], image.shape[1] - 1.0, image.shape[0] - 1.0
+    at, part, view = np.empty(pixels, np.int32), np.empty((2, pixels), np.float32), np.empty(pixels, np.float32)
     moments, fit = np.empty(_PARAMETERS, np.float32), np.empty(_PARAMETERS)
     for i in range(_PARAMETERS):
         fit[i] = 0.0
@@ -295,7 +327,7 @@ def _refine(
         score[n] = -1.0
         for _ in range(iterations):
             _sample(image, pairs, warp[n], xy, at, part, view)
-            square = _moments(patch[slot], gradient[slot], view, xy, moments)
+            square = _moments(patch[slot], gradient[slot], weights, view, xy, moments)
             score[n] = _correlation(energy[slot], moments[2], square - moments[3] ** 2 / size, size)
             if row_weight > 0.0:
                 gain = max(moments[2] / max(energy[slot], 1.0), 0.1)
@@ -323,8 +355,12 @@ def _refine(
 
 
 @compiled_sums
-def _moments(patch: Pixels, gradient: Pixels, view: Pixels, xy: Pixels, out: Pixels) -> np.float32:
-    """Write the products (8,) of pixels (S,) with the derivatives by the parameters; return the sum of squares."""
+def _moments(patch: Pixels, gradient: Pixels, weights: Pixels, view: Pixels, xy: Pixels, out: Pixels) -> np.float32:
+    """Write the weighted products (8,) of pixels (S,) with the derivatives by the parameters.
+
+    Returns:
+        The weighted sum of their squares.
+    """
     zero = np.float32(0.0)
     u, v, like, total, u_x, u_y, v_x, v_y, square = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for k in range(len(view)):
@@ -337,8 +373,9 @@ def _moments(patch: Pixels, gradient: Pixels, view: Pixels, xy: Pixels, out: Pix
         v_x += xy[0, k] * gv
         v_y += xy[1, k] * gv
         like += patch[k] * gray
-        total += gray
-        square += gray * gray
+        weighted = weights[k] * gray
+        total += weighted
+        square += weighted * gray
     out[0], out[1], out[2], out[3] = u, v, like, total
     out[4], out[5], out[6], out[7] = u_x, u_y, v_x, v_y
     return square
@@ -361,7 +398,7 @@ def _undo(warp: FloatArray, fit: FloatArray) -> None:
 
 
 @compiled
-def _correlation(energy: float, product: float, other: float, size: int) -> float:
+def _correlation(energy: float, product: float, other: float, size: float) -> float:
     """Normalised correlation of a patch of known energy with pixels of energy `other`; -1 if either is flat."""
     flat = FLAT_RMS**2 * size
     if not (other > flat and energy > flat):

@@ -12,7 +12,7 @@ from vio.frontend.patches import ImageLevels
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray, SigmaArray
 
-ANCHOR_RADIUS_PX = 7  # half side of the anchor patch that a feature is aligned with
+ANCHOR_RADIUS_PX = 9  # of the anchor patch that a feature is aligned with
 INLIER_PX = 1.0  # largest reprojection error of a static feature under the consensus motion
 
 

@@ -16,7 +16,7 @@ from vio.filters.multiview import (
     TrackInformation,
     Views,
 )
-from vio.frontend.align import FLAT_RMS, Templates, offsets
+from vio.frontend.align import FLAT_RMS, Templates, disc, offsets, window
 from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
 from vio.records import BoolArray
@@ -25,9 +25,9 @@ PRIOR = 1e-6  # per px^2, on a disparity: that of `vio.filters.multiview`
 ROW_WEIGHT = (4.0 / 0.3) ** 2  # gray levels and pixels: those of `frontend.align`
 
 
-def sampled(image: FloatArray, warp: FloatArray, radius: int) -> FloatArray:
+def sampled(image: FloatArray, warp: FloatArray, xy: FloatArray) -> FloatArray:
     """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's border is repeated."""
-    x, y = offsets(radius).astype(np.float64)
+    x, y = xy.astype(np.float64)
     u, v = np.moveaxis(warp @ np.stack([x, y, np.ones_like(x)]), 1, 0)
     u, v = np.clip(u, 0, image.shape[1] - 1), np.clip(v, 0, image.shape[0] - 1)
     i, j = np.minimum(u.astype(int), image.shape[1] - 2), np.minimum(v.astype(int), image.shape[0] - 2)
@@ -41,38 +41,48 @@ def sampled(image: FloatArray, warp: FloatArray, radius: int) -> FloatArray:
 def prepared(wide: FloatArray) -> Templates:
     """Templates of patches (N, 2r+3, 2r+3), in double precision."""
     n, radius = len(wide), wide.shape[1] // 2 - 1
-    flat = (n, (2 * radius + 1) ** 2)
-    patch = wide[:, 1:-1, 1:-1].reshape(flat)
-    gu = ((wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2).reshape(flat)
-    gv = ((wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2).reshape(flat)
-    x, y = offsets(radius).astype(np.float64)
-    centred = patch - patch.mean(axis=1, keepdims=True)
-    basis = np.stack([gu, gv, centred, np.ones(flat), gu * x, gu * y, gv * x, gv * y], axis=1)
-    normal = basis @ basis.transpose(0, 2, 1)
+    x, y = disc(radius).astype(np.float64)
+    weight, inside = window(radius).astype(np.float64), np.isin(_names(offsets(radius)), _names(disc(radius)))
+    patch, gu, gv = (
+        part.reshape(n, -1)[:, inside]
+        for part in (
+            wide[:, 1:-1, 1:-1],
+            (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2,
+            (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2,
+        )
+    )
+    centred = patch - np.average(patch, axis=1, weights=weight)[:, None]
+    basis = np.stack([gu, gv, centred, np.ones_like(gu), gu * x, gu * y, gv * x, gv * y], axis=1)
+    normal = (basis * weight) @ basis.transpose(0, 2, 1)
     normal += (1e-6 * np.einsum("nii->ni", normal) + 1e-6)[:, :, None] * np.eye(8)
     on_row = normal[:, :6, :6].copy()
     on_row[:, 1, 1] += ROW_WEIGHT
-    energy = np.sum(centred**2, axis=1)
-    columns = (centred, np.stack([gu, gv], axis=1), energy, np.linalg.inv(normal), np.linalg.inv(on_row))
-    columns += (np.zeros((len(wide), 3)),)
+    weighted = weight * centred, weight * np.stack([gu, gv], axis=1), centred**2 @ weight
+    columns = (*weighted, np.linalg.inv(normal), np.linalg.inv(on_row), np.zeros((len(wide), 3)))
     return Templates(*columns)  # type: ignore[arg-type]  # float64
 
 
+def _names(xy: FloatArray) -> FloatArray:
+    """A number (S,) for each offset of (2, S)."""
+    return np.asarray(1000.0 * xy[0] + xy[1])
+
+
 def aligned(
-    store: Templates, image: FloatArray, warp: FloatArray, iterations: int, rows: FloatArray | None
+    store: Templates, radius: int, image: FloatArray, warp: FloatArray, iterations: int, rows: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
     """Warps (N, 2, 3) and correlations (N,) of `frontend.align.align`, all templates in step."""
-    size, radius = store.patch.shape[1], int(store.patch.shape[1] ** 0.5) // 2
-    x, y = offsets(radius).astype(np.float64)
+    x, y = disc(radius).astype(np.float64)
+    weight = window(radius).astype(np.float64)
+    size = weight.sum()
     warp, score, active = warp.copy(), np.full(len(warp), -1.0), np.arange(len(warp))
     inverse = store.inverse if rows is None else store.row_inverse
     for _ in range(iterations):
-        view, here = sampled(image, warp[active], radius), warp[active]
+        view, here = sampled(image, warp[active], disc(radius)), warp[active]
         patch, energy = store.patch[active], store.energy[active]
         gu, gv = np.moveaxis(store.gradient[active] * view[:, None], 1, 0)
-        terms = [gu, gv, patch * view, view, gu * x, gu * y, gv * x, gv * y]
+        terms = [gu, gv, patch * view, weight * view, gu * x, gu * y, gv * x, gv * y]
         moments = np.stack([term.sum(axis=1) for term in terms], axis=1)
-        other = np.sum((view - view.mean(axis=1, keepdims=True)) ** 2, axis=1)
+        other = (view - np.average(view, axis=1, weights=weight)[:, None]) ** 2 @ weight
         flat = (other <= FLAT_RMS**2 * size) | (energy <= FLAT_RMS**2 * size)
         score[active] = np.where(flat, -1.0, moments[:, 2] / np.sqrt(np.where(flat, 1.0, other * energy)))
         if rows is not None:

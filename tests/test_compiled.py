@@ -23,7 +23,7 @@ from vio.filters import gate_loops, multiview, pose_loops, stereo_calibration, t
 from vio.filters.landmark_gate import leave_one_out_nis
 from vio.filters.multiview import Views
 from vio.frontend import outliers, patches, right_camera
-from vio.frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
+from vio.frontend.align import align, cut_patches, offsets, rounded, shift_warps, templates, warped_patches
 from vio.frontend.outliers import _gauss_newton, _refine, pixel_errors
 from vio.frontend.prediction import _borrowed, moved_pixels
 from vio.frontend.stereo_fit import _match
@@ -55,7 +55,7 @@ def test_patches_are_sampled_exactly_inside_the_image_and_at_its_border() -> Non
     warp = shift_warps(np.concatenate([POINTS, across, down, outside]))
     warp[:, :, :2] += np.random.default_rng(3).normal(0, 0.2, (len(warp), 2, 2))
     image = PLAIN
-    np.testing.assert_allclose(warped_patches(image, warp, 7), numpy_twins.sampled(PLAIN, warp, 7), atol=2e-3)
+    np.testing.assert_allclose(warped_patches(image, warp, 7), numpy_twins.sampled(PLAIN, warp, offsets(7)), atol=2e-3)
 
 
 def test_warp_that_is_not_finite_samples_the_border() -> None:
@@ -71,7 +71,7 @@ def test_alignment_equals_numpy(on_rows: bool) -> None:
     rows = POINTS[:, 1] - 0.2 if on_rows else None
     start = shift_warps(POINTS + np.array([3.0, -0.3]))
     wide = cut_patches(image, centres, 7)
-    twin, expected = numpy_twins.aligned(numpy_twins.prepared(wide.astype(np.float64)), other, start, 5, rows)
+    twin, expected = numpy_twins.aligned(numpy_twins.prepared(wide.astype(np.float64)), 7, other, start, 5, rows)
     warp, score = align(templates(wide), np.arange(len(POINTS)), other, start, 5, rows)
     inside = score > -1.0  # elsewhere the patch has left the image
     assert inside.mean() > 0.8

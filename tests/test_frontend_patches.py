@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -25,7 +27,7 @@ from vio.frontend.patches import half_image, inside
 from vio.frontend.prediction import moved_pixels, prior_pixels
 from vio.frontend.settings import GridSettings
 from vio.frontend.stereo_match import EpipolarRowModel, correlate, match_rows
-from vio.frontend.tracks import AnchorBank
+from vio.frontend.tracks import ANCHOR_RADIUS_PX, AnchorBank
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, Image, IntArray, TrackPrior
@@ -109,7 +111,7 @@ def test_affine_alignment_finds_a_known_warp(gain: float, offset: float) -> None
     other = np.clip(np.rint(gain * picture(linear).astype(np.float64) + offset), 0, 255).astype(np.uint8)
     expected = POINTS @ np.linalg.inv(linear)[:2, :2].T + np.linalg.inv(linear)[:2, 2]
     start = expected + np.random.default_rng(1).uniform(-1.5, 1.5, POINTS.shape)
-    warp, score = fitted(PLAIN, other, 7, start, 15)
+    warp, score = fitted(PLAIN, other, ANCHOR_RADIUS_PX, start, 15)
     error = np.linalg.norm(warp[:, :, 2] - expected, axis=1)
     assert np.median(error) < 0.02
     assert np.mean(error < 0.1) > 0.9
@@ -129,11 +131,35 @@ def fitted(
     return warp, score
 
 
+def test_what_is_at_another_depth_at_the_rim_hardly_moves_the_centre() -> None:
+    """The centre's surface moves by 1 px, that above a line half a radius away by half as much."""
+    rng, radius, errors = np.random.default_rng(21), ANCHOR_RADIUS_PX, []
+    near, far = 128 + 40 * rng.normal(0, 1, (2, 200, 300)).astype(np.float32)
+    v, u = np.mgrid[0:200, 0:300].astype(np.float32)
+    for row in rounded(rng.uniform(20, 180, 60)):
+        pictures = []
+        for moved in (0.0, 1.0):
+            layers = [cv2.GaussianBlur(layer, (0, 0), 2.0) * 5 - 512 for layer in (near, far)]
+            below, above = (cv2.remap(*layer, cv2.INTER_LINEAR) for layer in _moved(layers, u, v, moved))
+            seen = np.where(v > row - 0.5 * radius + moved, below, above)
+            pictures.append(np.clip(np.rint(seen), 0, 255).astype(np.uint8))
+        at = np.array([[150.0, row]])
+        store = templates(cut_patches(pictures[0], at, radius))
+        warp, _ = align(store, np.zeros(1, dtype=np.int64), pictures[1], shift_warps(at), 8)
+        errors.append(warp[0, 1, 2] - row - 1.0)
+    assert abs(np.mean(errors)) < 0.035  # 0.044 where all pixels of a square count alike
+
+
+def _moved(layers: list[Any], u: Any, v: Any, moved: float) -> list[tuple[Any, Any, Any]]:
+    """Arguments of `cv2.remap` for two surfaces, of which the second one moves half as far."""
+    return [(layer, u, v - step) for layer, step in zip(layers, (moved, 0.5 * moved), strict=True)]
+
+
 def test_alignment_with_expected_rows_leaves_the_rows_straight() -> None:
     sheared = np.array([[1.05, 0.2, -20.0], [0.0, 1.0, 0.3], [0.0, 0.0, 1.0]])
     other = picture(sheared)
     expected = POINTS @ np.linalg.inv(sheared)[:2, :2].T + np.linalg.inv(sheared)[:2, 2]
-    warp, _ = fitted(PLAIN, other, 6, expected + 0.7, 10, rows=expected[:, 1])
+    warp, _ = fitted(PLAIN, other, ANCHOR_RADIUS_PX, expected + 0.7, 10, rows=expected[:, 1])
     assert np.median(np.linalg.norm(warp[:, :, 2] - expected, axis=1)) < 0.02
     np.testing.assert_allclose(warp[:, 1, :2], np.tile([0.0, 1.0], (60, 1)), atol=1e-12)
 
