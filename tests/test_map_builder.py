@@ -189,6 +189,41 @@ def test_a_session_finds_its_place_in_an_earlier_map(room_walk: Walk, first_roun
     assert first_round.read_bytes() == before
 
 
+def test_covariance_in_a_map_has_what_the_calibration_leaves_open(room_walk: Walk, first_round: Path) -> None:
+    stated = []
+    for rig in ((0.0, 0.0), (0.01, 2e-3)):
+        store = MapStore(first_round, read_only=True)
+        builder = MapBuilder(store, "walk", room_walk.camera, upright=False, localise=True)
+        for keyframe, features in room_walk.keyframes(seed=5, rows=slice(28, 35)):
+            update = builder.add(replace(keyframe, rig_sigmas=rig), features)
+        assert update.covariance is not None
+        stated.append(update.covariance)
+        builder.close()
+    T, by_rig = builder.graph.T_map_cam, stated[1] - stated[0]
+    d = T[len(T.rows) - 1][:3, 3] - T[slice(0, 25)][:, :3, 3].mean(axis=0)
+    np.testing.assert_allclose(np.sqrt(np.trace(by_rig[:3, :3])), 0.01 * np.linalg.norm(d), rtol=0.15)
+    np.testing.assert_allclose(by_rig[3:, 3:], np.diag([4e-6, 4e-6, 0.0]), atol=1e-12)
+
+
+def test_covariance_after_a_gap_is_that_of_the_loop_that_ended_it(
+    room_walk: Walk, first_round: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loops agree with the odometry, so that the map is not yet optimised again."""
+    monkeypatch.setattr("vio.mapping.builder._SETTLED", np.inf)
+    store = MapStore(first_round, read_only=True)
+    builder = MapBuilder(store, "walk", room_walk.camera, upright=False, localise=True)
+    jump = np.diag(np.repeat([30.0**2, 1.0], 3))
+    for n, (keyframe, features) in enumerate(room_walk.keyframes(seed=5, rows=slice(26, 35))):
+        motion = keyframe.motion
+        if n == 5:
+            assert motion is not None
+            motion = RelativePose(motion.T_i_j, jump)
+        update = builder.add(replace(keyframe, motion=motion), features)
+    assert update.covariance is not None
+    assert np.sqrt(np.trace(update.covariance[:3, :3])) < 0.2
+    builder.close()
+
+
 def test_a_place_that_one_keyframe_has_found_is_said_to_wait_for_another(room_walk: Walk, first_round: Path) -> None:
     store = MapStore(first_round, read_only=True)
     builder = MapBuilder(store, "walk", room_walk.camera, upright=False, localise=True)

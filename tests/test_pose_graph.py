@@ -14,12 +14,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from tests.numerics import numeric_jacobian, right_retract
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
+from vio.geometry.lie import FloatArray, nearest_rotation, se3_exp, se3_from_parts, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.map_graph import MapGraph, _nearest
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
-from vio.mapping.pose_graph import Edges, UpDirections, optimise, r_D_poses, residual, up_residual
+from vio.mapping.pose_graph import Edges, UpDirections, marginals, optimise, r_D_poses, residual, up_residual
 
 COUNT = 60
 SIGMA = np.repeat([0.02, 0.004], 3)  # of a step of the odometry, m and rad
@@ -145,6 +145,32 @@ def test_the_error_at_the_optimum_is_that_of_its_covariance() -> None:
 
     dof = 6 * (len(odometry) + len(loops) - (COUNT - 1))
     assert abs(np.mean(squared) - dof) < 4 * np.sqrt(2 * dof / 12)
+
+
+def test_covariance_in_the_frame_of_all_poses_does_not_depend_on_the_pose_that_is_held() -> None:
+    T, _, odometry, loops = _problem(6)
+    weights = RNG(1).uniform(size=COUNT)
+    held = [np.arange(COUNT) == k for k in (0, 17)]
+    poses = np.array([3, 40])
+    P, Q = (marginals(T, odometry, loops, NO_UP_DIRECTIONS, h, poses, frame=weights) for h in held)
+    np.testing.assert_allclose(P, Q, rtol=1e-6, atol=1e-12)
+    alone = marginals(T, odometry, loops, NO_UP_DIRECTIONS, held[0], poses)
+    assert np.trace(P[1]) < np.trace(alone[1]), "the first pose is no part of what the frame is uncertain by"
+
+
+def test_error_in_the_frame_of_all_poses_is_that_of_its_covariance() -> None:
+    """Normalised squared errors of the last pose, 6 expected, where the optimum stands as the truth does on average."""
+    weights, last, squared = np.full(COUNT, 1 / COUNT), np.array([COUNT - 1]), []
+    for seed in range(20):
+        T, start, odometry, loops = _problem(seed)
+        best = optimise(start, odometry, loops, NO_UP_DIRECTIONS, _fixed()).T_map_cam
+        P = marginals(best, odometry, loops, NO_UP_DIRECTIONS, _fixed(), last, frame=weights)[0]
+        p, q = (X[:, :3, 3].mean(axis=0) for X in (T, best))
+        M = np.einsum("kia,kja->ij", T[:, :3, :3], best[:, :3, :3])
+        R = nearest_rotation(M + (T[:, :3, 3] - p).T @ (best[:, :3, 3] - q))
+        xi = se3_log(se3_inverse(T[-1]) @ se3_from_parts(R, p - R @ q) @ best[-1])
+        squared.append(float(xi @ np.linalg.solve(P, xi)))
+    assert abs(np.mean(squared) - 6) < 3 * np.sqrt(12 / 20)
 
 
 def test_the_vertical_keeps_the_map_upright() -> None:

@@ -422,7 +422,7 @@ class Estimate:
     scale_sigma: float | None = field(default=None, metadata=_kept())
     # The pose in a map; None without one, or without a place in it yet.
     T_map_body: FloatArray | None = None  # (4, 4)
-    T_map_body_covariance: FloatArray | None = None  # (6, 6) of xi in T_map_body = T_hat exp(xi), given the map
+    T_map_body_covariance: FloatArray | None = None  # (6, 6) of xi in T_map_body = T_hat exp(xi)
 
 
 def _no_ids() -> IntArray:

@@ -197,6 +197,7 @@ def _record(features: Dataset | None) -> Callable[[], list[Observations]] | None
 
 def _open_map(use: MapUse, source: Source, config: Config, backend: Backend) -> MapSession:
     """Open the map of a run."""
+    from vio.filters.rig_calibration import constant_sigmas
     from vio.mapping.session import MapSession
 
     recording = source.recording
@@ -206,6 +207,7 @@ def _open_map(use: MapUse, source: Source, config: Config, backend: Backend) -> 
             raise ConfigError(f"{recording.path}: a map is made of images, and this recording has features only")
     if not backend.window_frames:
         raise ConfigError(f"a map needs the back end msckf, not {config.backend}; leave --backend out")
+    sigmas = constant_sigmas(config.msckf)
     return MapSession(
         use.path,
         source.camera,
@@ -216,4 +218,5 @@ def _open_map(use: MapUse, source: Source, config: Config, backend: Backend) -> 
         wait=use.wait,
         alone=source.motion is None,
         density=use.density,
+        rig_sigmas=(float(np.hypot(*sigmas[:2])), float(sigmas[2])),
     )

@@ -20,7 +20,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.density import spread
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.map_graph import MapGraph
+from vio.mapping.map_graph import MapGraph, Placed
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.place_finder import GATE, FoundPlace, PlaceFinder, squared
 from vio.records import BoolArray, LoopEvent
@@ -86,6 +86,8 @@ class Keyframe:
     up_cam: FloatArray | None  # (3,) unit vector against gravity; None: not known
     up_sigma_rad: float  # standard deviation of its direction
     field: DisplacementField | None = None  # what the stereo calibration is off by, as known now
+    # Standard deviations of what the calibration leaves open: scale, over it, and direction of the optical axis, rad.
+    rig_sigmas: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +96,7 @@ class MapUpdate:
 
     T_map_odom: FloatArray | None  # (4, 4); None: the session has not found its place in the map
     T_map_cam: FloatArray | None  # (4, 4) of the keyframe, once a loop holds it; None: it moves with the odometry
-    covariance: FloatArray | None  # (6, 6) of xi in T_map_cam = T_hat exp(xi), given the map; None likewise
+    covariance: FloatArray | None  # (6, 6) of xi in T_map_cam = T_hat exp(xi), in the map's frame; None: no place
     loops: tuple[LoopEvent, ...]
     unconfirmed: bool = False  # whether the session, which has no place yet, may have found it, as another may confirm
 
@@ -142,6 +144,7 @@ class MapBuilder:
         self._waiting = 0  # loops since the last optimisation
         self._partial = False  # whether loops were optimised with what is around them alone
         self._optimised = False  # whether loops hold this session: until then it is reported as the odometry has it
+        self._placed: Placed | None = None  # how well the newest keyframe was known when all were optimised
         self._moved = False  # poses since the last commit
         # As the file has them:
         self._stored_poses, self._stored_kept = self.graph.T_map_cam.rows.copy(), [o.kept for o in self.graph.loops]
@@ -185,7 +188,7 @@ class MapBuilder:
             self._forget(graph.part == graph.part[number], np.floor(graph.T_map_cam[number][:3, 3]))
             if number % _COMMIT_EVERY == 0:
                 self.commit()
-        return self._update(events)
+        return self._update(events, keyframe.rig_sigmas)
 
     def finish(self, field: DisplacementField | None = None) -> MapUpdate:
         """Optimise once more, write everything, and return the last correction.
@@ -209,7 +212,7 @@ class MapBuilder:
             self._forget(np.ones(len(self.graph), dtype=np.bool_))
             self._store.clear_features(np.flatnonzero(~self.places.shows_something))
         self.commit()
-        return self._update(())
+        return self._update((), (0.0, 0.0))
 
     def commit(self) -> None:
         """Bring everything to the disk as one step."""
@@ -284,15 +287,32 @@ class MapBuilder:
         self._waiting += len(again)
         self._store.set_loops(again)
 
-    def _update(self, events: tuple[LoopEvent, ...]) -> MapUpdate:
+    def _update(self, events: tuple[LoopEvent, ...], rig_sigmas: tuple[float, float]) -> MapUpdate:
         graph, k = self.graph, len(self.graph) - 1
         if not self.is_joined:
             return MapUpdate(None, None, None, events, unconfirmed=any(o.second == k for o in self._pending))
         T_map_odom = graph.T_map_cam[k] @ se3_inverse(graph.T_odom_cam[k]) if self._optimised else np.eye(4)
-        newest = self.places.newest
-        since = self.places.drift_since(np.array([self.first if newest is None else newest.first]), k)
-        T_map_cam = None if newest is None else graph.T_map_cam[k].copy()
-        return MapUpdate(T_map_odom, T_map_cam, since[0], events)
+        T_map_cam = None if self.places.newest is None else graph.T_map_cam[k].copy()
+        return MapUpdate(T_map_odom, T_map_cam, self._covariance(k, rig_sigmas), events)
+
+    def _covariance(self, k: int, rig_sigmas: tuple[float, float]) -> FloatArray:
+        """Covariance (6, 6) of keyframe k: as last optimised, with the odometry since and the rig's errors, (G9).
+
+        That by the newest loop alone, with the map as exact, where it says more than the odometry since (which may have
+        begun anew), and where not all of the map was optimised.
+        """
+        graph, newest = self.graph, self.places.newest
+        by_loop = self.places.drift_since(np.array([self.first if newest is None else newest.first]), k)[0]
+        if self._placed is None:
+            return by_loop
+        placed, T = self._placed, graph.T_odom_cam
+        since = graph.odometry_scale * graph.drift(np.array([placed.keyframe]), np.array([k]), systematic=0.0)[0]
+        if since[:3, :3].trace() > by_loop[:3, :3].trace():
+            return by_loop
+        A, T_map_cam = se3_adjoint(se3_inverse(T[k]) @ T[placed.keyframe]), graph.T_map_cam[k]
+        d = np.append(rig_sigmas[0] * (T_map_cam[:3, 3] - placed.centre) @ T_map_cam[:3, :3], np.zeros(3))
+        axis = rig_sigmas[1] ** 2 * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 0.0])
+        return np.asarray(A @ placed.covariance @ A.T + since + np.outer(d, d) + axis)
 
     # Loops
 
@@ -379,8 +399,10 @@ class MapBuilder:
             graph.optimise_part(part)
         else:
             self._partial = not graph.optimise_near(part, self._waiting)
+        self._placed = None
         if not self._partial:
             graph.keep_place(part, stays, stated, level=whole)
+            self._placed = graph.placed(part, stays)
         if self.places.newest is not None and not self.graph.loops[-1].kept:
             self.places.newest = None
         self._waiting, self._moved, self._optimised = 0, True, True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,15 @@ class Rows:
 
     def __getitem__(self, index: int | slice | IntArray | tuple[slice, int | slice]) -> FloatArray:
         return self.rows[index]
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """How well a keyframe is known after an optimisation, in the frame in which the map stands on average."""
+
+    keyframe: int
+    covariance: FloatArray  # (6, 6) of xi in T_map_cam = T_hat exp(xi)
+    centre: FloatArray  # (3,) of the map, in it: from there a wrong scale moves all that it holds
 
 
 class MapGraph:
@@ -210,11 +219,7 @@ class MapGraph:
             T_before: (K, 4, 4) poses of all keyframes, those of `stays` where they should stand.
             level: turn about the vertical alone, where z is up.
         """
-        rows, numbers, session = self.part == part, np.flatnonzero(stays), self.session
-        begins = np.unique(session, return_index=True)[1][session[numbers]]
-        variance = np.trace(self.drift(begins, numbers, systematic=0.0)[:, :3, :3], axis1=1, axis2=2)
-        w = 1.0 / (variance + np.median(variance) + _LEAST_VARIANCE_M2)
-        w /= w.sum()
+        rows, w = self.part == part, self.frame_weights(stays)[stays]
         T, B = self.T_map_cam.rows[stays], T_before[stays]
         p, q = w @ T[:, :3, 3], w @ B[:, :3, 3]
         M = np.einsum("k,ki,kj->ij", w, B[:, :3, 3] - q, T[:, :3, 3] - p)
@@ -224,6 +229,21 @@ class MapGraph:
         else:
             R = nearest_rotation(M)
         self.T_map_cam.rows[rows] = se3_from_parts(R, q - R @ p) @ self.T_map_cam.rows[rows]
+
+    def frame_weights(self, stays: BoolArray) -> FloatArray:
+        """Weights (K,) by which the frame is that of keyframes `stays` (K,), w in (G7); their sum is 1."""
+        numbers, session = np.flatnonzero(stays), self.session
+        begins = np.unique(session, return_index=True)[1][session[numbers]]
+        variance = np.trace(self.drift(begins, numbers, systematic=0.0)[:, :3, :3], axis1=1, axis2=2)
+        w = np.zeros(len(self))
+        w[numbers] = 1.0 / (variance + np.median(variance) + _LEAST_VARIANCE_M2)
+        return w / w.sum()
+
+    def placed(self, part: int, stays: BoolArray) -> Placed:
+        """Return how well the newest keyframe, of a part, is known in the frame of keyframes `stays` (K,)."""
+        rows, w, newest = self.part == part, self.frame_weights(stays), len(self) - 1
+        at = np.array([int(rows.sum()) - 1])
+        return Placed(newest, self._marginals(rows, at, frame=w[rows])[0], w @ self.T_map_cam.rows[:, :3, 3])
 
     def covariances(self, part: int) -> FloatArray:
         """Covariances (K, 6, 6) of xi in `T_map_cam exp(xi)` of the keyframes of a part, relative to its first one.
@@ -237,15 +257,19 @@ class MapGraph:
         begins = np.unique(self.session[numbers], return_index=True)[1]
         few = np.linspace(0, len(numbers) - 1, min(_MOST_EXACT, len(numbers))).astype(np.int64)
         exact = np.union1d(begins, few)
-        inside = [n for n, o in enumerate(self.loops) if o.kept and rows[o.first] and rows[o.second]]
-        ups, T = self._up_directions(rows), self.T_map_cam.rows[rows]
-        levelled = 0 if len(ups.pose) else None
-        P = marginals(T, *self._edges(rows, inside), ups, np.zeros(len(T), dtype=np.bool_), exact, levelled=levelled)
+        P, T = self._marginals(rows, exact), self.T_map_cam.rows[rows]
         before = np.searchsorted(exact, np.arange(len(T)), side="right") - 1
         i = exact[before]
         A = se3_adjoint(se3_inverse(T) @ T[i])
         grown = self.odometry_scale * self.drift(numbers[i], numbers, systematic=0.0)
         return np.asarray(A @ P[before] @ np.swapaxes(A, 1, 2) + grown)
+
+    def _marginals(self, rows: BoolArray, poses: IntArray, frame: FloatArray | None = None) -> FloatArray:
+        """Return `marginals` of some of the keyframes of a mask (K,), by their places among them."""
+        inside = [n for n, o in enumerate(self.loops) if o.kept and rows[o.first] and rows[o.second]]
+        ups, T = self._up_directions(rows), self.T_map_cam.rows[rows]
+        fixed, levelled = np.zeros(len(T), dtype=np.bool_), 0 if len(ups.pose) else None
+        return marginals(T, *self._edges(rows, inside), ups, fixed, poses, levelled=levelled, frame=frame)
 
     def _linked(self, loops: FloatArray) -> coo_matrix:
         """Return the variances of the motions (K, K) between keyframes, by the odometry and by loops (L, 3)."""

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, se3_left_jacobian, se3_log, so3_hat
@@ -24,6 +24,7 @@ _TRUNCATION = 0.999  # probability at which a loop's residual is cut off
 _MU_GROWTH = 1.6  # of the control parameter, from one step to the next
 _MOST_STEPS, _MOST_GNC_STEPS = 15, 30
 _CONVERGED = 1e-6  # largest change, m and rad
+_FRAME_METRIC = np.repeat([1.0, 2.0], 3)  # by which (G7) weighs an error xi: |R - R'|_F^2 = 2 |phi|^2
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,15 +203,26 @@ def marginals(
     poses: IntArray,
     *,
     levelled: int | None = None,
+    frame: FloatArray | None = None,
 ) -> FloatArray:
     """Return the covariances (C, 6, 6) of xi in `T exp(xi)` of some poses (C,) of an optimum (K, 4, 4), by (G4).
 
     The other arguments are those of `optimise`; all loops count, and what stays is exact.
+
+    Args:
+        frame: (K,) weights of the poses that define the frame by where they stand on average, (G9); None: it is that in
+            which the fixed poses stay.
     """
     weight = np.ones(len(loops))
     free = _Free(_anchored(fixed, odometry, loops, weight), levelled)
     H, _, P = _normal(T, odometry, loops, weight, up_directions, free)
-    return sparse.marginals(H, P.tocsr()[(6 * poses[:, None] + np.arange(6)).ravel()], 6)
+    D = P.tocsr()[(6 * poses[:, None] + np.arange(6)).ravel()]
+    if frame is not None:
+        A = se3_adjoint(se3_inverse(T))
+        AW = frame[:, None, None] * np.swapaxes(A, 1, 2) * _FRAME_METRIC
+        mean = np.linalg.solve(np.sum(AW @ A, axis=0), np.concatenate(AW, axis=1))  # (6, 6K) twist of the frame by xi
+        D = D - csr_matrix(np.concatenate(A[poses]) @ mean @ P)
+    return sparse.marginals(H, D.tocsr(), 6)
 
 
 def _normal(

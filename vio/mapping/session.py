@@ -83,6 +83,7 @@ class MapSession:
         wait: bool = True,
         alone: bool = False,
         density: int | None = None,
+        rig_sigmas: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         """Open the map.
 
@@ -97,6 +98,7 @@ class MapSession:
                 becomes a keyframe while several wait.
             alone: whether the odometry has images alone, so that it is lost where they show nothing.
             density: keyframes a cubic metre that can be found again; None: all.
+            rig_sigmas: those of `Keyframe`, by the calibration as given.
 
         Raises:
             ConfigError: the images are not those of a pinhole stereo pair.
@@ -104,7 +106,8 @@ class MapSession:
         """
         check_camera(path, camera)
         self._localise, self._imu, self._alone, self._wait = localise, imu, alone, wait
-        self._camera = camera
+        self._camera, self._rig_sigmas = camera, rig_sigmas
+        self.scale_sigma = rig_sigmas[0]  # as the filter knows it at the newest frame
         self._field: DisplacementField | None = None  # what the stereo calibration is off by, at the newest frame
         self._T_cam_body, self._T_body_cam = T_cam0_body, se3_inverse(T_cam0_body)
         store = MapStore(path, create=not localise, read_only=localise)
@@ -151,6 +154,8 @@ class MapSession:
         self._T_odom_body = estimate.T_world_imu
         if estimate.stereo_field is not None:
             self._field = DisplacementField.of(self._camera, estimate.stereo_field)
+        scale = estimate.stereo_scale
+        self.scale_sigma = self._rig_sigmas[0] if scale is None else float(np.sqrt(scale.covariance.sum()))
         self._release(relative)
         events = self._take(lambda due, done: due <= self._frames and (done or self._wait))
         fresh = seen.take(seen.has_right & ~seen.stale)
@@ -238,7 +243,7 @@ class MapSession:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Covariance (6, 6) of xi in T_map_body = T_hat exp(xi), [rho; phi], at the newest frame, given the map.
+        """Covariance (6, 6) of xi in T_map_body = T_hat exp(xi), [rho; phi], at the newest frame, in the map's frame.
 
         That of the newest keyframe whose place is known, grown by the odometry since; None without a place. Where
         images show nothing, it grows as the filter's own; of images alone, the place is soon not known.
@@ -316,7 +321,8 @@ class MapSession:
         assert frame.right is not None
         T_odom_cam = estimate.T_world_imu @ self._T_body_cam
         up, sigma = self._vertical(estimate)
-        keyframe = Keyframe(frame.index, frame.time_ns, T_odom_cam, None, up, sigma, self._field)
+        seen = up, sigma, self._field, (self.scale_sigma, self._rig_sigmas[1])
+        keyframe = Keyframe(frame.index, frame.time_ns, T_odom_cam, None, *seen)
         motions = [] if motion is None else [_inflated(motion)]
         self._held.append(_Held(keyframe, self._frames + SETTLED_FRAMES, self._anchor, self._base, motions))
         self._features.append(self._executor.submit(extract, frame.left, frame.right))

@@ -50,16 +50,12 @@ class MappedRun:
     adjustment: str | None = None  # what became of the adjustment with the IMU; None: there was nothing to adjust
 
 
-def mapped_run(session: MapSession, estimates: Records[Estimate], causal: Rows, scale_sigma: float) -> MappedRun:
-    """Return the poses of all frames in the map.
-
-    `causal` are those known at the time; `scale_sigma` is the standard deviation of the scale by the calibration, over
-    it.
-    """
+def mapped_run(session: MapSession, estimates: Records[Estimate], causal: Rows) -> MappedRun:
+    """Return the poses of all frames in the map; `causal` are those known at the time."""
     T_odom_body, index = (np.array(estimates.column(name)) for name in ("T_world_imu", "index"))
     frames, T_map, T_odom = session.keyframes()
     T = corrected(T_odom_body, index, frames, T_map, T_odom)
-    in_map = _with_scale(session.map_keyframes(), scale_sigma)
+    in_map = _with_scale(session.map_keyframes(), session.scale_sigma)
     return MappedRun(T, causal, session.is_joined, len(frames), session.settled_loops(), in_map)
 
 

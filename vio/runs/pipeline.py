@@ -204,17 +204,8 @@ def run(
             wall_s=time.perf_counter() - began,
             stopped=stopped,
             rig=given_rig(dataset),
-            mapped=None
-            if session is None
-            else mapped_run(session, recorder.estimates, recorder.mapped, _scale_sigma(recorder.estimates[-1], config)),
+            mapped=None if session is None else mapped_run(session, recorder.estimates, recorder.mapped),
         )
-
-
-def _scale_sigma(last: Estimate, config: Config) -> float:
-    """Return the standard deviation of a run's scale, over it: that of the calibration, or as the run found it."""
-    scale, s = last.stereo_scale, config.msckf
-    considered = float(np.hypot(s.stereo_baseline_sigma, s.stereo_focal_sigma))
-    return considered if scale is None else float(np.sqrt(scale.covariance.sum()))
 
 
 def given_rig(dataset: Dataset) -> Rig | None:
