@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 
 from vio.calibration.stereo_field import DisplacementField
+from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import project, triangulate
 from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.features import KeyframeFeatures, extract
-from vio.mapping.files import merge_maps, prune_map
+from vio.mapping.files import prune_map
 from vio.mapping.map_store import EarthRow, MapStore
+from vio.mapping.merging import merge_maps
 from vio.records import LoopEvent
 from vio.runs.checkpoint import load_checkpoint, save_checkpoint
 from vio.sim.motion import look_rotation, spline_from_waypoints
@@ -457,6 +459,40 @@ def test_a_loop_that_was_measured_wrong_is_right_at_the_end(room_walk: Walk, tmp
     E = se3_inverse(loop.pose.T_i_j) @ se3_inverse(room_walk.T[loop.first]) @ room_walk.T[loop.second]
     assert np.linalg.norm(E[:3, 3]) < 0.03
     assert loop.kept
+
+
+def test_a_sparse_map_is_merged_by_two_keyframes_that_are_far_apart(
+    room_walk: Walk, first_round: Path, tmp_path: Path
+) -> None:
+    """Its own motions and loops stay, although the keyframes that they join show nothing any more."""
+    later = tmp_path / "later.map"
+    builder = _map(room_walk, later, seed=1, rows=slice(12, None))
+    builder.finish()
+    builder.close()
+    with closing(MapStore(later)) as store:
+        odometry, loops = store.odometry(), [o for o in store.loops() if o.kept]
+        store.clear_features(np.setdiff1d(np.arange(25), [14, 21]))  # of images that the first map does not have
+    assert loops
+    merge_maps(first_round, later, tmp_path / "both.map")
+    with closing(MapStore(tmp_path / "both.map", read_only=True)) as both:
+        assert len(both.sessions()) == 2
+        assert repr(both.odometry()[-len(odometry) :]) == repr([(i + 25, j + 25, motion) for i, j, motion in odometry])
+        kept = {(o.first, o.second) for o in both.loops() if o.kept}
+        assert {(o.first + 25, o.second + 25) for o in loops} <= kept
+        T = np.array([row.T_map_cam for row in both.keyframes()])
+    errors = np.linalg.norm((room_walk.T[0] @ T[25:] - room_walk.T[12:])[:, :3, 3], axis=1)
+    assert np.median(errors) < 0.1
+
+
+def test_maps_of_one_corridor_of_equal_doors_are_not_merged(doors_walk: Walk, tmp_path: Path) -> None:
+    """What the way back shows is like several places of the way there."""
+    paths = [tmp_path / "there.map", tmp_path / "back.map"]
+    for path, rows in zip(paths, (slice(0, 19), slice(19, None)), strict=True):
+        builder = _map(doors_walk, path, rows=rows)
+        builder.finish()
+        builder.close()
+    with pytest.raises(DataError, match="shows no place of"):
+        merge_maps(*paths, tmp_path / "both.map")
 
 
 def test_a_merge_keeps_where_the_later_map_is_on_the_earth(

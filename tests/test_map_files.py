@@ -14,9 +14,10 @@ from tests.test_map_store import CAMERA, _features, _pose, _row, fill
 from vio.cli import main
 from vio.errors import DataError
 from vio.geometry.lie import se3_exp
-from vio.mapping.files import check_map, describe_map, drop_session, extract_map, merge_maps, prune_map
+from vio.mapping.files import check_map, describe_map, drop_session, extract_map, prune_map
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, PlacesRow, SessionRow
+from vio.mapping.merging import merge_maps
 from vio.mapping.place_index import SEGMENT, Segment
 
 

@@ -154,7 +154,10 @@ def test_maps_are_shown_and_merged(
     assert main(["map", "merge", str(path), str(tmp_path / "other.map"), "--out", str(out), "--json"]) == 0
     merged = json.loads(capsys.readouterr().out)
     swapped = tmp_path / "swapped.map"
-    assert main(["map", "merge", str(tmp_path / "other.map"), str(path), "--out", str(swapped), "--json"]) == 0
+    swap = ["map", "merge", str(tmp_path / "other.map"), str(path), "--out", str(swapped), "--workers"]
+    assert main([*swap, "0"]) == 1
+    assert "--workers takes 1 to 64 processes, got 0" in capsys.readouterr().err
+    assert main([*swap, "3"]) == 0
     capsys.readouterr()
     with closing(MapStore(out, read_only=True)) as one, closing(MapStore(swapped, read_only=True)) as other:
         for rows in ("sessions", "keyframes", "odometry", "loops"):

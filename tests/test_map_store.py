@@ -25,9 +25,10 @@ from vio.geometry.stereo import StereoCamera
 from vio.mapping import map_database
 from vio.mapping.builder import MapBuilder
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.files import check_map, merge_maps
+from vio.mapping.files import check_map
 from vio.mapping.map_database import VERSION
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
+from vio.mapping.merging import merge_maps
 
 CAMERA = StereoCamera(400.0, 401.0, 319.5, 179.5, 0.12, 640, 360)
 

@@ -45,6 +45,7 @@ def add_parser(commands: Any) -> None:
     merge.add_argument("first", type=Path, metavar="A", help="a map's file")
     merge.add_argument("second", type=Path, metavar="B", help="a map's file")
     merge.add_argument("--out", type=Path, required=True, metavar="MAP", help="the merged map, a new file")
+    merge.add_argument("--workers", type=int, default=1, metavar="N", help="processes that look for places (default 1)")
     check = actions.add_parser("check", help="read everything in a map against its checksums")
     drop = actions.add_parser("drop", help="take a session out of a map, as `vio map show` numbers it")
     prune = actions.add_parser("prune", help="keep the most informative keyframes of each cubic metre")
@@ -76,9 +77,11 @@ def execute(args: argparse.Namespace) -> int:
         return _serve(args)
     if args.action == "prune" and args.density < 1:
         raise ConfigError("--density must be at least 1")
+    if args.action == "merge" and not 1 <= args.workers <= 64:
+        raise ConfigError(f"--workers takes 1 to 64 processes, got {args.workers}")
     actions = {
         "show": lambda: files.describe_map(args.map),
-        "merge": lambda: files.merge_maps(args.first, args.second, args.out),
+        "merge": lambda: _merge(args),
         "check": lambda: files.check_map(args.map),
         "drop": lambda: files.drop_session(args.map, args.session),
         "prune": lambda: files.prune_map(args.map, args.density),
@@ -86,6 +89,14 @@ def execute(args: argparse.Namespace) -> int:
     }
     facts = actions[args.action]()
     return print_result(facts, _rows(facts), as_json=args.json)
+
+
+def _merge(args: argparse.Namespace) -> dict[str, Any]:
+    from vio.mapping.merging import merge_maps
+    from vio.numerics.threads import one_blas_thread
+
+    with one_blas_thread():
+        return merge_maps(args.first, args.second, args.out, workers=args.workers)
 
 
 def _serve(args: argparse.Namespace) -> int:

@@ -27,7 +27,7 @@ from vio.records import BoolArray, LoopEvent
 
 log = logging.getLogger(__name__)
 
-_CONFIRM_WITHIN = 6  # keyframes
+CONFIRM_WITHIN = 6  # keyframes
 _NEIGHBOURS_M = 50.0  # path between two places up to which the map's own drift between them is counted
 _SETTLED = 6.0  # squared error of a new loop, its expected value, up to which the optimisation can wait …
 _PATIENCE = 8  # … for so many loops
@@ -47,7 +47,7 @@ def check_camera(path: Path, camera: StereoCamera) -> None:
         )
 
 
-def _check_sessions(store: MapStore, camera: StereoCamera) -> None:
+def check_sessions(store: MapStore, camera: StereoCamera) -> None:
     """Warn where a map was made with another rig; raise DataError where with another kind of camera."""
     others = [s.camera for s in store.sessions()]
     for other in others:
@@ -129,7 +129,7 @@ class MapBuilder:
             DataError: those of the map are not.
         """
         check_camera(store.path, camera)
-        _check_sessions(store, camera)
+        check_sessions(store, camera)
         self._store, self._camera, self._localise, self._density = store, camera, localise, density
         self.graph = MapGraph(store)
         self.first = len(self.graph)  # keyframe of this session
@@ -321,35 +321,20 @@ class MapBuilder:
         loop = self.places.find(number, features)
         if loop is None:
             return ()
-        near = [o for o in self._pending if number - o.second <= _CONFIRM_WITHIN]
-        agree = [o for o in near if self._agree(o, loop)]
+        near = [o for o in self._pending if number - o.second <= CONFIRM_WITHIN]
+        others = [o for o in near if agree(self.graph, o, loop)]
         self._pending = [*near, loop]
-        if len(agree) < loop.needed:
+        if len(others) < loop.needed:
             return ()
-        known = {(o.first, o.second) for o in self.graph.loops[-4 * _CONFIRM_WITHIN :]}
-        return tuple(self._accept(o) for o in [*agree, loop] if (o.first, o.second) not in known)
-
-    def _agree(self, a: FoundPlace, b: FoundPlace) -> bool:
-        """Whether two loops say the same of where the session is in the map."""
-        graph = self.graph
-        if graph.part[a.first] != graph.part[b.first]:
-            return False
-        T = graph.T_map_cam
-        T_second = se3_inverse(T[a.second]) @ T[b.second]
-        r = se3_log(se3_inverse(T[a.first] @ a.seen.pose.T_i_j @ T_second) @ T[b.first] @ b.seen.pose.T_i_j)
-        A = se3_adjoint(se3_inverse(T_second))
-        C = A @ a.seen.pose.covariance @ A.T + b.seen.pose.covariance
-        C = C + graph.drift(np.array([a.second]), np.array([b.second]))[0]
-        if abs(graph.path_m[a.first] - graph.path_m[b.first]) < _NEIGHBOURS_M:
-            C = C + graph.drift(np.array([a.first]), np.array([b.first]))[0]
-        return squared(r, C) < GATE
+        known = {(o.first, o.second) for o in self.graph.loops[-4 * CONFIRM_WITHIN :]}
+        return tuple(self._accept(o) for o in [*others, loop] if (o.first, o.second) not in known)
 
     def _accept(self, loop: FoundPlace) -> LoopEvent:
         """Add a confirmed loop to the graph, and optimise where it moves the map."""
         graph, i, k, pose = self.graph, loop.first, loop.second, loop.seen.pose
         joined = bool(graph.part[i] != graph.part[k])
         if joined:
-            self._join(i, k, graph.T_map_cam[i] @ pose.T_i_j)
+            join_parts(graph, self._home, i, k, graph.T_map_cam[i] @ pose.T_i_j)
         r = se3_log(se3_inverse(graph.T_map_cam[k]) @ graph.T_map_cam[i] @ pose.T_i_j)
         if not joined and graph.session[i] == graph.session[k]:
             drift = graph.drift(np.array([i]), np.array([k]), systematic=0.0)[0]
@@ -359,7 +344,7 @@ class MapBuilder:
         graph.add_loops([row])
         if not self._localise:
             self._store.add_loop(row)
-        self.places.newest, self._moved = loop, True
+        self.places.newest, self._moved = row, True
         self._waiting += 1
         settled = self._optimised and squared(r, pose.covariance) <= _SETTLED
         if joined or not settled or self._waiting >= _PATIENCE:
@@ -375,15 +360,6 @@ class MapBuilder:
             keyframe_frame=graph.frame(i) if graph.session[i] == self._own else None,
             matches=loop.seen.matches,
         )
-
-    def _join(self, i: int, k: int, T_map_k: FloatArray) -> None:
-        """Bring the parts of two keyframes into one frame: that of the map's first session, if one of them is in it."""
-        part = self.graph.part
-        T = T_map_k @ se3_inverse(self.graph.T_map_cam[k])
-        if part[k] == self._home:
-            self.graph.join(int(part[i]), int(part[k]), se3_inverse(T))
-        else:
-            self.graph.join(int(part[k]), int(part[i]), T)
 
     def _optimise(self, *, whole: bool = False) -> None:
         graph, part = self.graph, self.graph.sessions[self._own].part
@@ -406,3 +382,36 @@ class MapBuilder:
         if self.places.newest is not None and not self.graph.loops[-1].kept:
             self.places.newest = None
         self._waiting, self._moved, self._optimised = 0, True, True
+
+
+def agree(graph: MapGraph, a: FoundPlace, b: FoundPlace) -> bool:
+    """Whether two loops, of which b is the later one, say the same of where their session is in the map."""
+    if graph.part[a.first] != graph.part[b.first]:
+        return False
+    T = graph.T_map_cam
+    T_second = se3_inverse(T[a.second]) @ T[b.second]
+    r = se3_log(se3_inverse(T[a.first] @ a.seen.pose.T_i_j @ T_second) @ T[b.first] @ b.seen.pose.T_i_j)
+    A = se3_adjoint(se3_inverse(T_second))
+    C = A @ a.seen.pose.covariance @ A.T + b.seen.pose.covariance
+    C = C + graph.drift(np.array([a.second]), np.array([b.second]))[0]
+    if abs(graph.path_m[a.first] - graph.path_m[b.first]) < _NEIGHBOURS_M:
+        C = C + graph.drift(np.array([a.first]), np.array([b.first]))[0]
+    return squared(r, C) < GATE
+
+
+def join_parts(graph: MapGraph, home: int, i: int, k: int, T_map_k: FloatArray) -> None:
+    """Bring the parts of keyframes i and k into one frame: that of part `home`, if one of them is in it, or that of i.
+
+    Args:
+        graph: their map.
+        home: the part whose frame is the map's.
+        i: a keyframe.
+        k: another one.
+        T_map_k: (4, 4) pose of k in the frame of i.
+    """
+    part = graph.part
+    T = T_map_k @ se3_inverse(graph.T_map_cam[k])
+    if part[k] == home:
+        graph.join(int(part[i]), int(part[k]), se3_inverse(T))
+    else:
+        graph.join(int(part[k]), int(part[i]), T)

@@ -1,4 +1,4 @@
-"""Maps as files: what one holds, two made into one, and parts of one."""
+"""Maps as files: what one holds, and parts of one."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from vio.errors import DataError
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
+from vio.geometry.lie import FloatArray
 from vio.geometry.relative_pose import RelativePose
-from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.density import spread
 from vio.mapping.map_database import check_path
 from vio.mapping.map_store import MapStore, SessionRow
@@ -58,61 +57,6 @@ def describe_map(path: Path) -> dict[str, Any]:
                 for session, rows in zip(sessions, own, strict=True)
             ],
         }
-
-
-def merge_maps(first: Path, second: Path, out: Path) -> dict[str, Any]:
-    """Write a map that holds the sessions of two, joined where they show one place; return what it holds.
-
-    Nothing is written where they hold the same recording, or show no place in common. The keyframes of the second map
-    are taken up again one after the other, so that its loops are found anew, and those with the first map beside them.
-    The order of the two does not matter: that which was recorded first is continued, and its frame is kept. Where only
-    the other one is on the earth, its place is brought into that frame; of two places, that of the frame's map is kept.
-
-    Raises:
-        DataError: a file is no map, both hold the same recording or no common place, or `out` exists or cannot be
-            written.
-    """
-    if out.exists():
-        raise DataError(f"{out}: exists; give another name for the merged map")
-    check_path(out)
-    if first.exists() and second.exists() and first.samefile(second):
-        raise DataError(f"{second}: is the same map as {first}; give two different ones")
-    first, second = sorted((first, second), key=_begin)
-    partial = out.with_name(f".{out.name}.{uuid.uuid4().hex[:12]}.partial")
-    try:
-        source = MapStore(first, read_only=True)
-        source.copy_to(partial, known_as=out)
-        source.close()
-        other, store = MapStore(second, read_only=True), MapStore(partial, known_as=out)
-        with contextlib.closing(other), contextlib.closing(store):
-            if shared := len(store.images() & other.images()):
-                raise DataError(
-                    f"{second}: {shared} of its keyframes are in {first} already: both hold one recording; "
-                    "vio map drop takes a session out of one"
-                )
-            before = len(store.sessions())
-            taken = [k for number in range(len(other.sessions())) for k in _take_up(other, number, store)]
-            parts = [s.part for s in store.sessions()]
-            if not set(parts[before:]) & set(parts[:before]):
-                raise DataError(f"{second}: shows no place of {first}; keep two maps, or record a way between them")
-            _merge_earth(store, other, taken)
-        os.replace(partial, out)
-    except OSError as error:
-        raise DataError(f"{out}: cannot be written ({error.strerror or error}); check the folder") from error
-    finally:
-        partial.unlink(missing_ok=True)
-    return describe_map(out)
-
-
-def _begin(path: Path) -> tuple[Any, ...]:
-    """What orders two maps: one whose z is up first, then by the time of the first keyframe, then by its features."""
-    store = MapStore(path, read_only=True)
-    with contextlib.closing(store):
-        sessions, keyframes = store.sessions(), store.keyframes()
-        if not keyframes:
-            return True, 0, 0, b""
-        seen = store.features(0)
-        return not sessions[0].upright, keyframes[0].time_ns, len(keyframes), seen.descriptors.tobytes()
 
 
 def check_map(path: Path) -> dict[str, Any]:
@@ -228,56 +172,3 @@ def _copy_rows(source: MapStore, store: MapStore, kept: BoolArray) -> None:
     for loop in source.loops():
         if kept[loop.first] and kept[loop.second]:
             store.add_loop(replace(loop, first=number[loop.first], second=number[loop.second]))
-
-
-def _merge_earth(store: MapStore, other: MapStore, taken: list[int]) -> None:
-    """Give a merged map the place on the earth of the map that was taken up, where it has none of its own.
-
-    Each keyframe k of both says how the frames lie, `T_store_k T_other_k^-1`. That of the one in the middle is taken,
-    and the mean square of the others' difference from it is added to the covariance.
-
-    Args:
-        store: the merged map.
-        other: the map that was taken up.
-        taken: its keyframes, in the order of the last ones of the merged map.
-    """
-    earth = other.earth()
-    if earth is None:
-        return
-    if store.earth() is not None:
-        log.warning("%s: both maps are on the earth; the place of that recorded first is kept", store.path)
-        return
-    rows, before, sessions = store.keyframes(), other.keyframes(), store.sessions()
-    home, home_before = sessions[0].part, other.sessions()[0].part
-    first = len(rows) - len(taken)
-    pairs = [
-        (rows[first + n].T_map_cam, before[k].T_map_cam)
-        for n, k in enumerate(taken)
-        if sessions[rows[first + n].session].part == home and other.sessions()[before[k].session].part == home_before
-    ]
-    if not pairs:
-        log.warning("%s: what was on the earth is not joined to the first session; its place is left out", store.path)
-        return
-    T_now, T_before = (np.array(T) for T in zip(*pairs, strict=True))
-    middle = int(np.argmin(np.linalg.norm(T_now[:, :3, 3] - np.median(T_now[:, :3, 3], axis=0), axis=1)))
-    T_other_store = T_before @ se3_inverse(T_now)
-    # In the frame of the keyframe in the middle, in which a rotation moves least.
-    xi = se3_log(se3_inverse(T_now[middle]) @ se3_inverse(T_other_store[middle]) @ T_other_store @ T_now[middle])
-    A, B = se3_adjoint(se3_inverse(T_other_store[middle])), se3_adjoint(T_now[middle])
-    covariance = A @ earth.covariance @ A.T + B @ (xi.T @ xi / len(xi)) @ B.T
-    store.set_earth(replace(earth, T_enu_map=earth.T_enu_map @ T_other_store[middle], covariance=covariance))
-
-
-def _take_up(other: MapStore, number: int, store: MapStore) -> list[int]:
-    """Add a session of one map to another; return its keyframes."""
-    session = other.sessions()[number]
-    motions = {second: motion for _, second, motion in other.odometry()}
-    builder = MapBuilder(store, session.source, session.camera, upright=session.upright, localise=False)
-    rows = other.keyframes()
-    taken = [k for k, row in enumerate(rows) if row.session == number]
-    for k in taken:
-        row = rows[k]
-        seen = row.T_odom_cam, motions.get(k), row.up_cam, row.up_sigma_rad, session.field
-        builder.add(Keyframe(row.frame, row.time_ns, *seen), other.features(k))
-    builder.finish()
-    return taken

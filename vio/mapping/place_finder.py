@@ -64,8 +64,17 @@ class FoundPlace:
 class PlaceFinder:
     """What finds the keyframes of a map again, made of their features."""
 
-    def __init__(self, store: MapStore, graph: MapGraph, camera: StereoCamera, own: int, *, writes: bool) -> None:
-        """Remember all keyframes of a map.
+    def __init__(
+        self,
+        store: MapStore,
+        graph: MapGraph,
+        camera: StereoCamera,
+        own: int,
+        *,
+        writes: bool,
+        most: int | None = None,
+    ) -> None:
+        """Remember the keyframes of a map.
 
         Args:
             store: the map, open.
@@ -73,11 +82,14 @@ class PlaceFinder:
             camera: of the session that looks for places.
             own: number of that session.
             writes: whether the file keeps what finds keyframes again.
+            most: the first ones alone; None: all.
         """
+        count = len(graph) if most is None else most
         self._graph, self._camera, self._own, self._writes = graph, camera, own, writes
-        self.newest: FoundPlace | None = None  # accepted loop
-        self._forgotten = set(np.flatnonzero(~store.show_something()).tolist())  # keyframes that are found no more
-        self.reopen(store, len(graph))
+        self.newest: LoopRow | None = None  # accepted loop
+        # Keyframes that are found no more.
+        self._forgotten = set(np.flatnonzero(~store.show_something()[:count]).tolist())
+        self.reopen(store, count)
 
     def reopen(self, store: MapStore, keyframes: int) -> None:
         """Begin again with so many keyframes of the file."""
@@ -160,7 +172,7 @@ class PlaceFinder:
         for i in self._index.candidates(features.descriptors, allowed, _CANDIDATES).tolist():
             camera = self._graph.sessions[int(self._graph.session[i])].camera
             seen = verify(camera, self.features(i), self._camera, features)
-            if seen is not None and self._fits(i, number, seen, drift[i]):
+            if seen is not None and self.fits(i, number, seen, drift[i]):
                 lost = drift[i, :3, :3].trace() > _LOST_M**2 and seen.inliers < _SURE_INLIERS
                 found.append(FoundPlace(i, number, seen, _CONFIRMATIONS_LOST if lost else _CONFIRMATIONS))
         if not found:
@@ -179,7 +191,7 @@ class PlaceFinder:
         if seen is None:
             return None
         refined = _as_place(views, k, seen, features, loop.needed)
-        return refined if self._fits(refined.first, k, refined.seen, drift) else None
+        return refined if self.fits(refined.first, k, refined.seen, drift) else None
 
     def _search(self, number: int, features: KeyframeFeatures, allowed: BoolArray) -> FoundPlace | None:
         """Look for the points of the places that should be visible by the odometry, at the pixels that it predicts.
@@ -273,9 +285,7 @@ class PlaceFinder:
             return direct
         m, n = self.newest.first, self.newest.second
         A = se3_adjoint(se3_inverse(graph.T_odom_cam[k]) @ graph.T_odom_cam[n])
-        here = A @ self.newest.seen.pose.covariance @ A.T + graph.drift(
-            np.array([n]), np.array([k]), systematic=systematic
-        )
+        here = A @ self.newest.pose.covariance @ A.T + graph.drift(np.array([n]), np.array([k]), systematic=systematic)
         there = graph.drift(i, np.full(len(i), m), systematic=systematic)
         # The drift between i and m is known in the frame of the later one of them; its size is what matters here.
         by_loop = there + here
@@ -297,7 +307,7 @@ class PlaceFinder:
         unknown = (part[:count] != part[number]) | (sigma > 0.5 * UNKNOWN**0.5)
         return ~recent & (unknown | (near & (ahead | (sigma > _LOST_M))))
 
-    def _fits(self, i: int, k: int, seen: Verified, drift: FloatArray) -> bool:
+    def fits(self, i: int, k: int, seen: Verified, drift: FloatArray) -> bool:
         """Whether a place agrees with the odometry, where that knows anything of it."""
         graph = self._graph
         if graph.part[i] != graph.part[k]:

@@ -1,0 +1,298 @@
+"""Two maps made into one: the later one is added as it is, and the first one's places are looked for in its keyframes.
+
+Each keyframe is looked for in the first map alone, so that the search divides over processes and its result is the same
+however many there are: first where nothing is known of where the maps lie, then, where places were found, once more
+with what they say.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import uuid
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from vio.errors import DataError, VioError
+from vio.geometry.lie import se3_adjoint, se3_inverse, se3_log
+from vio.mapping.builder import CONFIRM_WITHIN, agree, check_sessions, join_parts
+from vio.mapping.files import describe_map
+from vio.mapping.map_database import check_path
+from vio.mapping.map_graph import UNKNOWN, MapGraph
+from vio.mapping.map_store import LoopRow, MapStore
+from vio.mapping.place_finder import FoundPlace, PlaceFinder
+from vio.records import IntArray
+
+log = logging.getLogger(__name__)
+
+_ROUNDS = 2  # of the search; the second knows where the maps lie
+_Map: TypeAlias = Callable[[Callable[[IntArray], list[FoundPlace]], Iterable[IntArray]], Iterable[list[FoundPlace]]]
+
+
+def merge_maps(first: Path, second: Path, out: Path, *, workers: int = 1) -> dict[str, Any]:
+    """Write a map that holds the sessions of two, joined where they show one place; return what it holds.
+
+    Nothing is written where they hold the same recording, or show no place in common. Motions and loops of both stay as
+    they are; places of the map recorded first are looked for in the keyframes of the other one, and all poses optimised
+    with them. The order of the two does not matter: the frame is that of the map recorded first. Where only the other
+    one is on the earth, its place is brought into that frame; of two places, that of the frame's map is kept.
+
+    Args:
+        first: a map.
+        second: another one.
+        out: a new file.
+        workers: processes that search; the result is the same with any number.
+
+    Raises:
+        DataError: a file is no map, both hold the same recording or no common place, or `out` exists or cannot be
+            written.
+        VioError: a process ended unexpectedly.
+    """
+    if out.exists():
+        raise DataError(f"{out}: exists; give another name for the merged map")
+    check_path(out)
+    if first.exists() and second.exists() and first.samefile(second):
+        raise DataError(f"{second}: is the same map as {first}; give two different ones")
+    first, second = sorted((first, second), key=_begin)
+    partial_file = out.with_name(f".{out.name}.{uuid.uuid4().hex[:12]}.partial")
+    try:
+        source = MapStore(first, read_only=True)
+        source.copy_to(partial_file, known_as=out)
+        source.close()
+        other, store = MapStore(second, read_only=True), MapStore(partial_file, known_as=out)
+        with contextlib.closing(other), contextlib.closing(store):
+            if shared := len(store.images() & other.images()):
+                raise DataError(
+                    f"{second}: {shared} of its keyframes are in {first} already: both hold one recording; "
+                    "vio map drop takes a session out of one"
+                )
+            before = len(store.keyframes())
+            _append(other, store)
+            if not _Merge(store, before).join(partial_file, workers):
+                raise DataError(f"{second}: shows no place of {first}; keep two maps, or record a way between them")
+            _merge_earth(store, other)
+        os.replace(partial_file, out)
+    except OSError as error:
+        raise DataError(f"{out}: cannot be written ({error.strerror or error}); check the folder") from error
+    finally:
+        partial_file.unlink(missing_ok=True)
+    return describe_map(out)
+
+
+def _begin(path: Path) -> tuple[Any, ...]:
+    """What orders two maps: one whose z is up first, then by the time of the first keyframe, then by its features."""
+    store = MapStore(path, read_only=True)
+    with contextlib.closing(store):
+        sessions, keyframes = store.sessions(), store.keyframes()
+        if not keyframes:
+            return True, 0, 0, b""
+        seen = store.features(0)
+        return not sessions[0].upright, keyframes[0].time_ns, len(keyframes), seen.descriptors.tobytes()
+
+
+def _append(other: MapStore, store: MapStore) -> None:
+    """Add all that a map holds to another one, in parts of its own."""
+    sessions, rows, loops = len(store.sessions()), store.keyframes(), other.loops()
+    drift, path_m = (rows[-1].drift + UNKNOWN * np.eye(6), rows[-1].path_m) if rows else (np.zeros((6, 6)), 0.0)
+    for session in other.sessions():
+        check_sessions(store, session.camera)
+        store.add_session(replace(session, part=session.part + sessions))
+    for k, row in enumerate(other.keyframes()):
+        moved = replace(row, session=row.session + sessions, drift=row.drift + drift, path_m=row.path_m + path_m)
+        store.add_keyframe(moved, other.features(k))
+    for i, j, motion in other.odometry():
+        store.add_odometry(len(rows) + i, len(rows) + j, motion)
+    for loop in loops:
+        store.add_loop(replace(loop, first=len(rows) + loop.first, second=len(rows) + loop.second))
+    store.commit()
+
+
+class _Merge:
+    """Joins the keyframes of a map from `before` on to those before, in its file."""
+
+    def __init__(self, store: MapStore, before: int) -> None:
+        self._store, self._before, self._graph = store, before, MapGraph(store)
+        shows = store.show_something()
+        self._order = np.cumsum(shows)  # of the keyframes that show something, by which neighbours are counted
+        self._rows = before + np.flatnonzero(shows[before:])
+        self._found: list[FoundPlace] = []  # accepted
+
+    def join(self, path: Path, workers: int) -> bool:
+        """Look for places, and optimise with them; return whether there are any.
+
+        Args:
+            path: the file.
+            workers: processes that search.
+        """
+        with contextlib.ExitStack() as stack:
+            each: _Map = map
+            if workers > 1:  # threads would wait for each other: half of a search holds the interpreter
+                pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
+                each = stack.enter_context(pool).map
+            try:
+                self._look(partial(places_found, path, self._store.path, self._before), each, workers)
+            except BrokenProcessPool as error:
+                fault = f"{self._store.path}: a process that searches ended unexpectedly; try fewer workers"
+                raise VioError(fault) from error
+        if self._found:  # writes what finds the keyframes again
+            graph, own = self._graph, len(self._graph.sessions) - 1
+            PlaceFinder(self._store, graph, graph.sessions[own].camera, own, writes=True)
+        return bool(self._found)
+
+    def _look(self, search: Callable[[IntArray], list[FoundPlace]], each: _Map, parts: int) -> None:
+        """Search in rounds, and optimise after each, until nothing new is found."""
+        graph, left = self._graph, self._rows
+        for _ in range(_ROUNDS):
+            found = [*self._found, *(place for part in each(search, np.array_split(left, parts)) for place in part)]
+            known = {o.second for o in self._found}
+            new = self._accepted([o for o in self._confirmed(found) if o.second not in known])
+            if not new:
+                break
+            self._optimise(new)
+            self._found += new
+            joined = {int(graph.session[o.second]) for o in self._found}
+            seen = np.isin(self._rows, [o.second for o in self._found])
+            left = self._rows[np.isin(graph.session[self._rows], list(joined)) & ~seen]
+
+    def _confirmed(self, found: Sequence[FoundPlace]) -> list[FoundPlace]:
+        """Return the places that other keyframes confirm, before or after them."""
+        found, out = sorted(found, key=lambda o: o.second), list[FoundPlace]()
+        for n, place in enumerate(found):  # one a keyframe
+            near = found[max(n - CONFIRM_WITHIN, 0) : n + CONFIRM_WITHIN + 1]
+            others = [o for o in near if o is not place and self._confirms(*sorted((o, place), key=lambda p: p.second))]
+            if len(others) >= min(o.needed for o in (place, *others)):
+                out.append(place)
+        return out
+
+    def _confirms(self, a: FoundPlace, b: FoundPlace) -> bool:
+        graph, near = self._graph, self._order[b.second] - self._order[a.second] <= CONFIRM_WITHIN
+        return bool(near and graph.session[a.second] == graph.session[b.second] and agree(graph, a, b))
+
+    def _accepted(self, found: Sequence[FoundPlace]) -> list[FoundPlace]:
+        """Join the parts of the map by the surest places; return those that agree with them, in their order."""
+        graph, out, own = self._graph, list[FoundPlace](), len(self._graph.sessions) - 1
+        finder = PlaceFinder(self._store, graph, graph.sessions[own].camera, own, writes=False, most=0)
+        for place in sorted(found, key=lambda o: -o.seen.inliers):
+            i, k = place.first, place.second
+            if graph.part[i] != graph.part[k]:
+                join_parts(graph, graph.sessions[0].part, i, k, graph.T_map_cam[i] @ place.seen.pose.T_i_j)
+            else:
+                finder.newest = _nearest(graph, [_loop(o) for o in [*self._found, *out]], k)
+                if not finder.fits(i, k, place.seen, finder.drift_since(np.array([i]), k)[0]):
+                    continue
+            out.append(place)
+        return sorted(out, key=lambda o: o.second)
+
+    def _optimise(self, new: Sequence[FoundPlace]) -> None:
+        """Add loops, optimise the parts that have them, and write poses, loops and parts."""
+        graph, store = self._graph, self._store
+        rows = [_loop(o) for o in new]
+        graph.add_loops(rows)
+        for row in rows:
+            store.add_loop(row)
+        for part in sorted({int(graph.part[o.first]) for o in new}):
+            stated = graph.T_map_cam.rows.copy()
+            graph.optimise_part(part)
+            stays = (graph.part == part) & (np.arange(len(graph)) < self._before)
+            graph.keep_place(part, stays, stated, level=True)
+        store.set_poses(dict(enumerate(graph.T_map_cam.rows)))
+        store.set_kept({n: o.kept for n, o in enumerate(graph.loops)})
+        store.set_parts([s.part for s in graph.sessions])
+        store.commit()
+
+
+def _loop(place: FoundPlace) -> LoopRow:
+    return LoopRow(place.first, place.second, place.seen.pose, place.seen.inliers, kept=True)
+
+
+def _nearest(graph: MapGraph, loops: Sequence[LoopRow], k: int) -> LoopRow | None:
+    """Return the loop whose later keyframe is closest to keyframe k along the path of its session."""
+    own = [o for o in loops if graph.session[o.second] == graph.session[k]]
+    return min(own, key=lambda o: abs(graph.path_m[o.second] - graph.path_m[k]), default=None)
+
+
+def _start_worker() -> None:
+    """Limit the process to one thread; the main process alone handles a user's interrupt."""
+    import signal
+
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threadpool_limits(limits=1, user_api="blas")
+    cv2.setNumThreads(1)
+
+
+def places_found(path: Path, known_as: Path, before: int, rows: IntArray) -> list[FoundPlace]:
+    """Return the places among the first `before` keyframes of a map that others (N,) show, one a keyframe at most.
+
+    Args:
+        path: the map's file.
+        known_as: what messages call it.
+        before: number of keyframes that may be found.
+        rows: later keyframes, increasing.
+
+    Raises:
+        DataError: the file cannot be used.
+    """
+    out, finders = list[FoundPlace](), dict[int, PlaceFinder]()
+    with contextlib.closing(MapStore(path, read_only=True, known_as=known_as)) as store:
+        graph = MapGraph(store)
+        session, loops = graph.session, [o for o in graph.loops if o.kept and o.first < before <= o.second]
+        for k in rows.tolist():
+            own = int(session[k])
+            if own not in finders:
+                camera = graph.sessions[own].camera
+                finders[own] = PlaceFinder(store, graph, camera, own, writes=False, most=before)
+            finder = finders[own]
+            finder.newest = _nearest(graph, loops, k)
+            place = finder.find(k, finder.features(k))
+            if place is not None:
+                out.append(place)
+    return out
+
+
+def _merge_earth(store: MapStore, other: MapStore) -> None:
+    """Give a merged map the place on the earth of the map that was taken up, where it has none of its own.
+
+    Each keyframe k of both says how the frames lie, `T_store_k T_other_k^-1`. That of the one in the middle is taken,
+    and the mean square of the others' difference from it is added to the covariance.
+
+    Args:
+        store: the merged map.
+        other: the map that was taken up; its keyframes are the last ones of the merged map.
+    """
+    earth = other.earth()
+    if earth is None:
+        return
+    if store.earth() is not None:
+        log.warning("%s: both maps are on the earth; the place of that recorded first is kept", store.path)
+        return
+    rows, before, sessions = store.keyframes(), other.keyframes(), store.sessions()
+    home, home_before = sessions[0].part, other.sessions()[0].part
+    parts = [s.part for s in other.sessions()]
+    pairs = [
+        (now.T_map_cam, row.T_map_cam)
+        for now, row in zip(rows[len(rows) - len(before) :], before, strict=True)
+        if sessions[now.session].part == home and parts[row.session] == home_before
+    ]
+    if not pairs:
+        log.warning("%s: what was on the earth is not joined to the first session; its place is left out", store.path)
+        return
+    T_now, T_before = (np.array(T) for T in zip(*pairs, strict=True))
+    middle = int(np.argmin(np.linalg.norm(T_now[:, :3, 3] - np.median(T_now[:, :3, 3], axis=0), axis=1)))
+    T_other_store = T_before @ se3_inverse(T_now)
+    # In the frame of the keyframe in the middle, in which a rotation moves least.
+    xi = se3_log(se3_inverse(T_now[middle]) @ se3_inverse(T_other_store[middle]) @ T_other_store @ T_now[middle])
+    A, B = se3_adjoint(se3_inverse(T_other_store[middle])), se3_adjoint(T_now[middle])
+    covariance = A @ earth.covariance @ A.T + B @ (xi.T @ xi / len(xi)) @ B.T
+    store.set_earth(replace(earth, T_enu_map=earth.T_enu_map @ T_other_store[middle], covariance=covariance))
