@@ -124,6 +124,7 @@ class _Merge:
         shows = store.show_something()
         self._order = np.cumsum(shows)  # of the keyframes that show something, by which neighbours are counted
         self._rows = before + np.flatnonzero(shows[before:])
+        self._session = self._graph.session
         self._found: list[FoundPlace] = []  # accepted
 
     def join(self, path: Path, workers: int) -> bool:
@@ -135,7 +136,7 @@ class _Merge:
         """
         with contextlib.ExitStack() as stack:
             each: _Map = map
-            if workers > 1:  # threads would wait for each other: half of a search holds the interpreter
+            if workers > 1:  # not threads, which would share one interpreter
                 pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
                 each = stack.enter_context(pool).map
             try:
@@ -150,7 +151,7 @@ class _Merge:
 
     def _look(self, search: Callable[[IntArray], list[FoundPlace]], each: _Map, parts: int) -> None:
         """Search in rounds, and optimise after each, until nothing new is found."""
-        graph, left = self._graph, self._rows
+        left = self._rows
         for _ in range(_ROUNDS):
             found = [*self._found, *(place for part in each(search, np.array_split(left, parts)) for place in part)]
             known = {o.second for o in self._found}
@@ -159,9 +160,9 @@ class _Merge:
                 break
             self._optimise(new)
             self._found += new
-            joined = {int(graph.session[o.second]) for o in self._found}
-            seen = np.isin(self._rows, [o.second for o in self._found])
-            left = self._rows[np.isin(graph.session[self._rows], list(joined)) & ~seen]
+            seen = np.array([o.second for o in self._found])
+            joined = np.isin(self._session[self._rows], self._session[seen])
+            left = self._rows[joined & ~np.isin(self._rows, seen)]
 
     def _confirmed(self, found: Sequence[FoundPlace]) -> list[FoundPlace]:
         """Return the places that other keyframes confirm, before or after them."""
@@ -174,8 +175,8 @@ class _Merge:
         return out
 
     def _confirms(self, a: FoundPlace, b: FoundPlace) -> bool:
-        graph, near = self._graph, self._order[b.second] - self._order[a.second] <= CONFIRM_WITHIN
-        return bool(near and graph.session[a.second] == graph.session[b.second] and agree(graph, a, b))
+        near = self._order[b.second] - self._order[a.second] <= CONFIRM_WITHIN
+        return bool(near and self._session[a.second] == self._session[b.second] and agree(self._graph, a, b))
 
     def _accepted(self, found: Sequence[FoundPlace]) -> list[FoundPlace]:
         """Join the parts of the map by the surest places; return those that agree with them, in their order."""
@@ -186,7 +187,7 @@ class _Merge:
             if graph.part[i] != graph.part[k]:
                 join_parts(graph, graph.sessions[0].part, i, k, graph.T_map_cam[i] @ place.seen.pose.T_i_j)
             else:
-                finder.newest = _nearest(graph, [_loop(o) for o in [*self._found, *out]], k)
+                finder.newest = _nearest(graph, self._session, [_loop(o) for o in [*self._found, *out]], k)
                 if not finder.fits(i, k, place.seen, finder.drift_since(np.array([i]), k)[0]):
                     continue
             out.append(place)
@@ -214,9 +215,9 @@ def _loop(place: FoundPlace) -> LoopRow:
     return LoopRow(place.first, place.second, place.seen.pose, place.seen.inliers, kept=True)
 
 
-def _nearest(graph: MapGraph, loops: Sequence[LoopRow], k: int) -> LoopRow | None:
-    """Return the loop whose later keyframe is closest to keyframe k along the path of its session."""
-    own = [o for o in loops if graph.session[o.second] == graph.session[k]]
+def _nearest(graph: MapGraph, session: IntArray, loops: Sequence[LoopRow], k: int) -> LoopRow | None:
+    """Return the loop whose later keyframe is closest to keyframe k along the path of its session, of (K,)."""
+    own = [o for o in loops if session[o.second] == session[k]]
     return min(own, key=lambda o: abs(graph.path_m[o.second] - graph.path_m[k]), default=None)
 
 
@@ -254,7 +255,7 @@ def places_found(path: Path, known_as: Path, before: int, rows: IntArray) -> lis
                 camera = graph.sessions[own].camera
                 finders[own] = PlaceFinder(store, graph, camera, own, writes=False, most=before)
             finder = finders[own]
-            finder.newest = _nearest(graph, loops, k)
+            finder.newest = _nearest(graph, session, loops, k)
             place = finder.find(k, finder.features(k))
             if place is not None:
                 out.append(place)
