@@ -53,6 +53,18 @@ def test_the_gate_knows_how_many_pixels_were_seen() -> None:
     np.testing.assert_allclose(squares, r[:, 1, 0] ** 2 / tracks.variance)
 
 
+@pytest.mark.parametrize(("ending", "going_on"), [(300, 15), (100, 50), (0, 150)])
+def test_the_newest_pose_is_not_left_to_a_few_tracks_where_nearly_all_end(ending: int, going_on: int) -> None:
+    """Behind a cover hundreds of tracks end at once, and a wrong one among a few that go on would decide."""
+    tracks, p = WindowTracks(CAMERA, SETTINGS), _points(500)
+    for k in range(1, 4):
+        ids = np.arange(ending if k == 3 else 0, 500)
+        tracks.table.add_frame(k, observations(k, k, ids, project(CAMERA, transform_points(T_CAM0_WORLD[k], p[ids]))))
+    chosen = tracks.choose(4)
+    assert len(chosen) == SETTINGS.max_features == 150
+    assert int((tracks.table.ids(chosen) >= ending).sum()) == going_on
+
+
 def test_the_gate_of_a_track_as_long_as_the_table_of_quantiles_or_longer() -> None:
     tracks = WindowTracks(CAMERA, SETTINGS)
     J = np.ones((1, 80, 4, 3))

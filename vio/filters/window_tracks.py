@@ -46,6 +46,9 @@ _MOST_CHANGE = 4.0  # of the variance from frame to frame that is believed in th
 _SPENT_ON_NOISE = 3.0
 _VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
+_GOING_ON = (
+    0.1  # of the tracks used, at least, that the newest frame shows and that stay in the window, if there are as many
+)
 _MOST_DOF = 199
 _NO_INFORMATION = 1e-8  # left of a pose's own, at most: directions that pixels alone do not tell, as where the world is
 _MOST_COMMON_NOISE = 4.0  # of a frame over the learned variance: beyond twice the noise it is no blur
@@ -105,10 +108,14 @@ class WindowTracks:
         enough = length >= 2
         rows = rows[enough]
         if len(rows) > self._settings.max_features:
-            # What ends now has its last chance; then the longest.
+            # What ends now has its last chance; then the longest. Where nearly all ends at once, as behind a cover, the
+            # newest pose needs some that go on: of few views a wrong one decides.
             seen = seen[enough]
             ends = ~seen[:, clones - 1] | seen[:, 0]
-            best = np.lexsort((self.table.ids(rows), -length[enough], ~ends))[: self._settings.max_features]
+            order, count = np.lexsort((self.table.ids(rows), -length[enough], ~ends)), int(ends.sum())
+            most = self._settings.max_features
+            going_on = order[count:][: round(_GOING_ON * most)]
+            best = np.concatenate([going_on, order[:count], order[count + len(going_on) :]])[:most]
             rows = rows[np.sort(best)]
         return rows
 
