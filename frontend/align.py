@@ -32,6 +32,7 @@ _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
 _DAMPING = 1e-6  # relative to the diagonal: limits the step in weakly textured directions
 _WINDOW_SIGMA = 0.4  # standard deviation of the window over the radius of a template
+_INSIDE = 0.8  # of the radius, up to which a template must be inside the image: two standard deviations of the window
 _SUBPIXELS = 32  # anchors are cut at multiples of this fraction of a pixel, where the weights of float32 are exact
 FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
 
@@ -283,8 +284,8 @@ def align(
 
     Returns:
         The refined warps (N, 2, 3), and the normalised correlation (N,) just before the last step; -1 where the
-        template's centre comes too close to the image border for the patch to fit. `store.sigma` holds the standard
-        deviations then, equation (F1).
+        template's centre comes too close to the image border for most of the window to fit. `store.sigma` holds the
+        standard deviations then, equation (F1).
     """
     radius = _radius(store.patch.shape[1])
     warp, score = warp.copy(), np.empty(len(warp))
@@ -318,7 +319,7 @@ def _refine(
     pixels, parameters, size = patch.shape[1], inverse.shape[1], 0.0
     for k in range(pixels):
         size += weights[k]
-    margin, last_u, last_v = 1.0 - xy[1, 0], image.shape[1] - 1.0, image.shape[0] - 1.0
+    margin, last_u, last_v = 1.0 - _INSIDE * xy[1, 0], image.shape[1] - 1.0, image.shape[0] - 1.0
     at, part, view = np.empty(pixels, np.int32), np.empty((2, pixels), np.float32), np.empty(pixels, np.float32)
     moments, fit = np.empty(_PARAMETERS, np.float32), np.empty(_PARAMETERS)
     for i in range(_PARAMETERS):

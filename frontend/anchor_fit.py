@@ -10,7 +10,7 @@ from vio.frontend.detect import min_distance_px
 from vio.frontend.outliers import Consensus
 from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import GridSettings
-from vio.frontend.tracks import ANCHOR_RADIUS_PX, INLIER_PX, AnchorBank, Tracks
+from vio.frontend.tracks import ANCHOR_REACH_PX, INLIER_PX, AnchorBank, Tracks
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
@@ -150,7 +150,7 @@ def _begin(
     are `found` (N, 2) where `seen`; with a consensus motion T (4, 4) (`moved`), others with a point are at the pixels
     where it takes that. Points (N, 3) are those before and after the motion.
     """
-    count, margin = 0, ANCHOR_RADIUS_PX + 2.0
+    count, margin = 0, ANCHOR_REACH_PX + 2.0
     for n in range(len(left)):
         u, v, change = found[n, 0], found[n, 1], 1.0
         if moved and has_point[n]:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from vio.errors import ConfigError
 from vio.frontend.settings import GridSettings
-from vio.frontend.tracks import ANCHOR_RADIUS_PX
+from vio.frontend.tracks import ANCHOR_REACH_PX
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image, IntArray
@@ -24,7 +24,7 @@ _MIN_GRADIENT = 1.0  # of a corner in its weakest direction, gray levels per pix
 _MIN_RELATIVE_GRADIENT = 0.15  # the same, over that of the strongest corner of its grid cell
 _MIN_GRADIENT_OVER_NOISE = 5.0  # where corners are few: down to so many times the gradient of the image noise
 # The outermost pixels of the half image have no corners: their anchor would not fit into the full image.
-_BORDER_PX = ANCHOR_RADIUS_PX // 2 + 2
+_BORDER_PX = ANCHOR_REACH_PX // 2 + 2
 _CURVATURE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)  # zero on planes and straight edges
 _CURVATURE_OF_UNIT_NOISE = 6.0 * math.sqrt(2.0 / math.pi)  # mean absolute value; the norm of the kernel is 6
 _ROUNDING_NOISE = 1.0 / math.sqrt(12.0)  # of whole gray levels

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from vio.frontend.patches import ImageLevels, inside, mean_and_contrast
-from vio.frontend.tracks import ANCHOR_RADIUS_PX
+from vio.frontend.tracks import ANCHOR_REACH_PX
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image
@@ -85,7 +85,7 @@ def _track_forward_backward(
     sources agree on them, and alignment with the anchor is to come.
     """
     forward, good = _flow(last, view.half, points, guess, levels)
-    good &= inside(view.full, forward, ANCHOR_RADIUS_PX + 2)
+    good &= inside(view.full, forward, ANCHOR_REACH_PX + 2)
     tolerance = _MAX_FORWARD_BACKWARD_PX
     doubtful = (good & _apart(forward, guess, tolerance) if trusted else good).nonzero()[0]
     if len(doubtful):

@@ -13,6 +13,7 @@ from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray, SigmaArray
 
 ANCHOR_RADIUS_PX = 9  # of the anchor patch that a feature is aligned with
+ANCHOR_REACH_PX = 7  # within which most of its weight is: at least so far from the image's border features stay
 INLIER_PX = 1.0  # largest reprojection error of a static feature under the consensus motion
 
 
