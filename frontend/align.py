@@ -215,18 +215,20 @@ def _prepare(
     row_inverse: Pixels,
 ) -> None:
     """Write rows (N,) of the columns of templates."""
-    size, centre = xy.shape[1], wide.shape[1] // 2
+    size, side = xy.shape[1], wide.shape[1]
     basis, normal = np.empty((_PARAMETERS, size)), np.empty((_PARAMETERS, _PARAMETERS))
-    on_row = np.empty((_ROW_PARAMETERS, _ROW_PARAMETERS))
+    on_row, at = np.empty((_ROW_PARAMETERS, _ROW_PARAMETERS)), np.empty(size, np.int64)
+    for k in range(size):
+        at[k] = (side // 2 + int(xy[1, k])) * side + side // 2 + int(xy[0, k])
     for n, slot in enumerate(slots):
-        mean = _weighted_mean(wide[n], xy, weights)
+        pixels = wide[n].reshape(side * side)
+        mean = _weighted_mean(pixels, at, weights)
         energy[slot] = 0.0
         for k in range(size):
-            x, y, weight = xy[0, k], xy[1, k], weights[k]
-            above, here, below = wide[n, centre + int(y) - 1], wide[n, centre + int(y)], wide[n, centre + int(y) + 1]
-            i = centre + int(x)
-            centred = here[i] - mean
-            gu, gv = (here[i + 1] - here[i - 1]) / np.float32(2.0), (below[i] - above[i]) / np.float32(2.0)
+            x, y, weight, i = xy[0, k], xy[1, k], weights[k], at[k]
+            centred = pixels[i] - mean
+            gu = (pixels[i + 1] - pixels[i - 1]) / np.float32(2.0)
+            gv = (pixels[i + side] - pixels[i - side]) / np.float32(2.0)
             patch[slot, k], gradient[slot, 0, k], gradient[slot, 1, k] = weight * centred, weight * gu, weight * gv
             energy[slot] += weight * centred * centred
             root = np.sqrt(weight)
@@ -246,11 +248,11 @@ def _prepare(
 
 
 @compiled
-def _weighted_mean(wide: Pixels, xy: Pixels, weights: Pixels) -> np.float32:
-    """Mean of a patch (2r + 3, 2r + 3) over a template's pixels (2, S), by their weights (S,)."""
-    centre, total, sum_of_weights = len(wide) // 2, 0.0, 0.0
-    for k in range(len(weights)):
-        total += weights[k] * wide[centre + int(xy[1, k]), centre + int(xy[0, k])]
+def _weighted_mean(pixels: Pixels, at: IntArray, weights: Pixels) -> np.float32:
+    """Mean of the pixels at indices (S,), by their weights (S,)."""
+    total = sum_of_weights = 0.0
+    for k in range(len(at)):
+        total += weights[k] * pixels[at[k]]
         sum_of_weights += weights[k]
     return np.float32(total / sum_of_weights)
 
