@@ -32,7 +32,7 @@ _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
 _DAMPING = 1e-6  # relative to the diagonal: limits the step in weakly textured directions
 _WINDOW_SIGMA = 0.4  # standard deviation of the window over the radius of a template
-_INSIDE = 0.8  # of the radius, up to which a template must be inside the image: two standard deviations of the window
+INSIDE = 2.0 * _WINDOW_SIGMA  # of the radius, up to which a template must be inside the image: most of its weight
 _SUBPIXELS = 32  # anchors are cut at multiples of this fraction of a pixel, where the weights of float32 are exact
 FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
 
@@ -321,7 +321,7 @@ def _refine(
     pixels, parameters, size = patch.shape[1], inverse.shape[1], 0.0
     for k in range(pixels):
         size += weights[k]
-    margin, last_u, last_v = 1.0 - _INSIDE * xy[1, 0], image.shape[1] - 1.0, image.shape[0] - 1.0
+    margin, last_u, last_v = 1.0 - INSIDE * xy[1, 0], image.shape[1] - 1.0, image.shape[0] - 1.0
     at, part, view = np.empty(pixels, np.int32), np.empty((2, pixels), np.float32), np.empty(pixels, np.float32)
     moments, fit = np.empty(_PARAMETERS, np.float32), np.empty(_PARAMETERS)
     for i in range(_PARAMETERS):

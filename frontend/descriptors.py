@@ -19,6 +19,7 @@ from vio.frontend.prediction import moved_pixels, prior_pixels, usable_prior
 from vio.frontend.settings import FrontendSettings, MatchSettings
 from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX
 from vio.frontend.swap import SwapDetector
+from vio.frontend.tracks import ANCHOR_RADIUS_PX
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, triangulate
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
@@ -29,7 +30,6 @@ _MAX_RATIO = 0.8  # of a descriptor's distance to that of the second-nearest
 _SEARCH_RADIUS = 0.06  # half side of the search window around the predicted pixel, over the image width
 _MAX_ROW_DIFFERENCE_PX = 1.5  # of a stereo match
 _INLIER_PX = 1.5  # largest reprojection error of a static feature under the consensus motion
-_REFINE_RADIUS = 9  # of the patches, pixels
 _REFINE_ITERATIONS = 6
 _REFINE_MIN_CORRELATION = 0.8
 _FAR_M = 1e6  # depth assumed where it is unknown
@@ -239,7 +239,7 @@ class DescriptorFrontend:
             return start, np.ones(len(start), dtype=np.bool_)
         centres = rounded(points)
         offset = points - centres
-        store, slots = templates(cut_patches(source, centres, _REFINE_RADIUS)), np.arange(len(points))
+        store, slots = templates(cut_patches(source, centres, ANCHOR_RADIUS_PX)), np.arange(len(points))
         warp, score = align(store, slots, target, shift_warps(start - offset), _REFINE_ITERATIONS, rows)
         pixels = template_points(warp, offset)
         good = (score >= _REFINE_MIN_CORRELATION) & on_peak(pixels, start)

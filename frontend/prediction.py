@@ -9,7 +9,7 @@ from vio.frontend.patches import inside
 from vio.frontend.tracks import Tracks
 from vio.geometry.lie import FloatArray, se3_from_parts
 from vio.geometry.stereo import StereoCamera
-from vio.numerics.compiled import compiled
+from vio.numerics.compiled import compiled, index_of
 from vio.records import BoolArray, Image, IntArray, TrackPrior
 
 _ROTATION_SLACK = 1e-3  # largest deviation of R R' of a predicted rotation from the identity
@@ -56,15 +56,9 @@ def _find(ids: IntArray, increasing: IntArray, rows: IntArray, given: IntArray) 
     """Write the rows (K,) of those ids (N,) that are among others (M,), and their rows there; return K."""
     count = 0
     for n in range(len(ids)):
-        low, high = 0, len(increasing)
-        while low < high:
-            middle = (low + high) // 2
-            if increasing[middle] < ids[n]:
-                low = middle + 1
-            else:
-                high = middle
-        if low < len(increasing) and increasing[low] == ids[n]:
-            rows[count], given[count] = n, low
+        at = index_of(ids[n], increasing)
+        if at >= 0:
+            rows[count], given[count] = n, at
             count += 1
     return count
 

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vio.frontend.align import cut_patches, empty_templates, replace_templates, shift_warps
+from vio.frontend.align import INSIDE, cut_patches, empty_templates, replace_templates, shift_warps
 from vio.frontend.columns import joined
 from vio.frontend.patches import ImageLevels
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray, SigmaArray
 
 ANCHOR_RADIUS_PX = 9  # of the anchor patch that a feature is aligned with
-ANCHOR_REACH_PX = 7  # within which most of its weight is: at least so far from the image's border features stay
+ANCHOR_REACH_PX = round(INSIDE * ANCHOR_RADIUS_PX)  # at least so far from the image's border features stay
 INLIER_PX = 1.0  # largest reprojection error of a static feature under the consensus motion
 
 

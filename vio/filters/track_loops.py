@@ -11,7 +11,7 @@ import numpy as np
 from vio.cameras.projection import CameraArgs, point_at, turn_to
 from vio.cameras.rectification_error import write_view
 from vio.geometry.lie import FloatArray
-from vio.numerics.compiled import compiled, solve_positive
+from vio.numerics.compiled import compiled, index_of, solve_positive
 from vio.records import BoolArray, IntArray, SigmaArray
 
 
@@ -81,14 +81,21 @@ def _mark_views(J: FloatArray, out: BoolArray) -> None:
 
 
 @compiled
+def _square_view(r: FloatArray, J: FloatArray) -> tuple[float, int]:
+    """Squared residual of a view, of (4,) and (4, 3), and how many of its pixel coordinates were measured."""
+    squares, count = 0.0, 0
+    for a in range(4):
+        squares += r[a] ** 2
+        count += J[a, 0] != 0.0 or J[a, 1] != 0.0 or J[a, 2] != 0.0
+    return squares, count
+
+
+@compiled
 def square_views(r: FloatArray, J: FloatArray, squares: FloatArray, count: IntArray) -> None:
     """Write squared residuals (F, N) of views, and how many of their pixel coordinates were measured."""
     for f in range(J.shape[0]):
         for n in range(J.shape[1]):
-            squares[f, n], count[f, n] = 0.0, 0
-            for a in range(4):
-                squares[f, n] += r[f, n, a] ** 2
-                count[f, n] += J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
+            squares[f, n], count[f, n] = _square_view(r[f, n], J[f, n])
 
 
 @compiled
@@ -104,10 +111,7 @@ def mark_wrong_views(
     for f in range(J.shape[0]):
         others = 0
         for n in range(J.shape[1]):
-            squares, count = 0.0, 0
-            for a in range(4):
-                squares += r[f, n, a] ** 2
-                count += J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
+            squares, count = _square_view(r[f, n], J[f, n])
             wrong[f, n] = squares > variance * limits[count]
             others += count > 0 and not wrong[f, n]
             found = found or wrong[f, n]
@@ -121,11 +125,8 @@ def square_tracks(r: FloatArray, J: FloatArray, variance: float, most: int, squa
     for f in range(J.shape[0]):
         squares[f], count = 0.0, -3
         for n in range(J.shape[1]):
-            of_view = 0.0
-            for a in range(4):
-                of_view += r[f, n, a] ** 2
-                count += J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
-            squares[f] += of_view
+            of_view, measured = _square_view(r[f, n], J[f, n])
+            squares[f], count = squares[f] + of_view, count + measured
         squares[f] /= variance
         dof[f] = min(max(count, 1), most)
 
@@ -171,19 +172,13 @@ def anchor_points(
 
 
 @compiled
-def find_rows(ids: IntArray, known: IntArray, ordered: IntArray, rows: IntArray) -> int:
-    """Write the rows (K,) of ids (K,), -1 where unknown, and return how many are; all rows are ordered by id."""
+def find_rows(ids: IntArray, increasing: IntArray, ordered: IntArray, rows: IntArray) -> int:
+    """Write the rows (K,) of ids (K,), -1 where unknown, and return how many are; ids (F,) are those of rows (F,)."""
     unknown = 0
     for k in range(len(ids)):
-        low, high = 0, len(ordered)
-        while low < high:
-            half = (low + high) // 2
-            if known[ordered[half]] < ids[k]:
-                low = half + 1
-            else:
-                high = half
-        rows[k] = ordered[low] if low < len(ordered) and known[ordered[low]] == ids[k] else -1
-        unknown += rows[k] < 0
+        at = index_of(ids[k], increasing)
+        rows[k] = ordered[at] if at >= 0 else -1
+        unknown += at < 0
     return unknown
 
 

@@ -31,7 +31,7 @@ class TrackTable:
     def add_frame(self, column: int, seen: Observations) -> None:
         """Write the observations of one frame into a column; unknown ids become new tracks."""
         rows: IntArray = np.empty(len(seen), dtype=np.int64)
-        new = loops.find_rows(seen.ids, self._ids, self._rows, rows)
+        new = loops.find_rows(seen.ids, self._ids[self._rows], self._rows, rows)
         if new:
             unknown = np.flatnonzero(rows < 0)
             while new > len(self._free):

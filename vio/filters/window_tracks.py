@@ -46,9 +46,7 @@ _MOST_CHANGE = 4.0  # of the variance from frame to frame that is believed in th
 _SPENT_ON_NOISE = 3.0
 _VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
-_GOING_ON = (
-    0.1  # of the tracks used, at least, that the newest frame shows and that stay in the window, if there are as many
-)
+_GOING_ON = 0.1  # of the tracks used, at least, that the newest frame shows and that stay in the window
 _MOST_DOF = 199
 _NO_INFORMATION = 1e-8  # left of a pose's own, at most: directions that pixels alone do not tell, as where the world is
 _MOST_COMMON_NOISE = 4.0  # of a frame over the learned variance: beyond twice the noise it is no blur

@@ -30,6 +30,7 @@ from vio.mapping.map_database import check_path
 from vio.mapping.map_graph import UNKNOWN, MapGraph
 from vio.mapping.map_store import LoopRow, MapStore
 from vio.mapping.place_finder import FoundPlace, PlaceFinder
+from vio.numerics.threads import start_worker
 from vio.records import IntArray
 
 log = logging.getLogger(__name__)
@@ -137,7 +138,7 @@ class _Merge:
         with contextlib.ExitStack() as stack:
             each: _Map = map
             if workers > 1:  # not threads, which would share one interpreter
-                pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
+                pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start_worker)
                 each = stack.enter_context(pool).map
             try:
                 self._look(partial(places_found, path, self._store.path, self._before), each, workers)
@@ -219,18 +220,6 @@ def _nearest(graph: MapGraph, session: IntArray, loops: Sequence[LoopRow], k: in
     """Return the loop whose later keyframe is closest to keyframe k along the path of its session, of (K,)."""
     own = [o for o in loops if session[o.second] == session[k]]
     return min(own, key=lambda o: abs(graph.path_m[o.second] - graph.path_m[k]), default=None)
-
-
-def _start_worker() -> None:
-    """Limit the process to one thread; the main process alone handles a user's interrupt."""
-    import signal
-
-    import cv2
-    from threadpoolctl import threadpool_limits
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threadpool_limits(limits=1, user_api="blas")
-    cv2.setNumThreads(1)
 
 
 def places_found(path: Path, known_as: Path, before: int, rows: IntArray) -> list[FoundPlace]:

@@ -174,6 +174,19 @@ def solve_positive(A: FloatArray, b: FloatArray) -> None:
 
 
 @compiled
+def index_of(value: int, increasing: npt.NDArray[np.int64]) -> int:
+    """Index of a number among increasing ones (M,), by bisection; -1: it is not one of them."""
+    low, high = 0, len(increasing)
+    while low < high:
+        middle = (low + high) // 2
+        if increasing[middle] < value:
+            low = middle + 1
+        else:
+            high = middle
+    return low if low < len(increasing) and increasing[low] == value else -1
+
+
+@compiled
 def eigenvectors(A: FloatArray, V: FloatArray) -> None:
     """Make a small symmetric A (n, n) diagonal in place, and write its eigenvectors into the columns of V (n, n).
 

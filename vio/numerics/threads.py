@@ -37,3 +37,15 @@ class BlasLimit:
             return nullcontext()
         limit: AbstractContextManager[Any] = self._controller.limit(limits=1, user_api="blas")
         return limit
+
+
+def start_worker() -> None:
+    """Limit a worker process to one thread; the main process alone handles a user's interrupt."""
+    import signal
+
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threadpool_limits(limits=1, user_api="blas")
+    cv2.setNumThreads(1)

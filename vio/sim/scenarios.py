@@ -14,13 +14,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
-import cv2
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from vio.errors import DataError, SimulationError
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts
+from vio.numerics.threads import start_worker
 from vio.protocols import Progress
 from vio.records import NS_PER_S, Image, ImuRecord, IntArray
 from vio.setting import setting
@@ -407,7 +406,7 @@ class ParallelRecording(SimulatedRecording, contextlib.AbstractContextManager["P
         super().__init__(plan(scenario) if simulation is None else simulation)
         self._scenario = scenario
         self._workers = workers
-        self._pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
+        self._pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start_worker)
         self._waiting: dict[int, Future[tuple[Image, Image]]] = {}
 
     def __exit__(self, *_: object) -> None:
@@ -433,15 +432,6 @@ class ParallelRecording(SimulatedRecording, contextlib.AbstractContextManager["P
 def default_workers(frames: int) -> int:
     """Default number of processes: one for short recordings, which finish before a second one has started."""
     return min(2, os.cpu_count() or 1) if frames >= 100 else 1
-
-
-def _start_worker() -> None:
-    """Limit the process to one thread; the main process alone handles a user's interrupt."""
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threadpool_limits(limits=1, user_api="blas")
-    cv2.setNumThreads(1)
 
 
 @functools.lru_cache(maxsize=1)
