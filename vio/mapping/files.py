@@ -7,6 +7,7 @@ import logging
 import os
 import shutil
 import uuid
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -128,23 +129,35 @@ def _keep(path: Path, out: Path, kept: BoolArray) -> dict[str, Any]:
     if not kept.any():
         raise DataError(f"{path}: no keyframe would be left")
     check_path(out)
-    target = out.resolve()  # what a link leads to
-    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}.partial")
     source = MapStore(path, read_only=out != path)  # in place, no other process writes meanwhile
-    try:
+    with new_map(out) as partial:
         store = MapStore(partial, create=True, known_as=out)
         with contextlib.closing(source), contextlib.closing(store):
             _copy_rows(source, store, kept)
+        target = out.resolve()
         if target.with_name(f"{target.name}-wal").exists():  # its changes would be taken for those of the new file
             raise DataError(f"{out}: another process reads it; try again when that has ended")
         if out == path:
             shutil.copymode(target, partial)
+    return describe_map(out)
+
+
+@contextlib.contextmanager
+def new_map(out: Path) -> Iterator[Path]:
+    """Give the path of a file to write, which takes the place of `out` at the end of the block; else it goes.
+
+    Raises:
+        DataError: it cannot be written.
+    """
+    target = out.resolve()  # what a link leads to
+    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:12]}.partial")
+    try:
+        yield partial
         os.replace(partial, target)
     except OSError as error:
         raise DataError(f"{out}: cannot be written ({error.strerror or error}); check the folder") from error
     finally:
         partial.unlink(missing_ok=True)
-    return describe_map(out)
 
 
 def _copy_rows(source: MapStore, store: MapStore, kept: BoolArray) -> None:

@@ -10,8 +10,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import multiprocessing
-import os
-import uuid
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -25,7 +23,7 @@ import numpy as np
 from vio.errors import DataError, VioError
 from vio.geometry.lie import se3_adjoint, se3_inverse, se3_log
 from vio.mapping.builder import CONFIRM_WITHIN, agree, check_sessions, join_parts
-from vio.mapping.files import describe_map
+from vio.mapping.files import describe_map, new_map
 from vio.mapping.map_database import check_path
 from vio.mapping.map_graph import UNKNOWN, MapGraph
 from vio.mapping.map_store import LoopRow, MapStore
@@ -64,12 +62,11 @@ def merge_maps(first: Path, second: Path, out: Path, *, workers: int = 1) -> dic
     if first.exists() and second.exists() and first.samefile(second):
         raise DataError(f"{second}: is the same map as {first}; give two different ones")
     first, second = sorted((first, second), key=_begin)
-    partial_file = out.with_name(f".{out.name}.{uuid.uuid4().hex[:12]}.partial")
-    try:
+    with new_map(out) as written:
         source = MapStore(first, read_only=True)
-        source.copy_to(partial_file, known_as=out)
+        source.copy_to(written, known_as=out)
         source.close()
-        other, store = MapStore(second, read_only=True), MapStore(partial_file, known_as=out)
+        other, store = MapStore(second, read_only=True), MapStore(written, known_as=out)
         with contextlib.closing(other), contextlib.closing(store):
             if shared := len(store.images() & other.images()):
                 raise DataError(
@@ -78,14 +75,9 @@ def merge_maps(first: Path, second: Path, out: Path, *, workers: int = 1) -> dic
                 )
             before = len(store.keyframes())
             _append(other, store)
-            if not _Merge(store, before).join(partial_file, workers):
+            if not _Merge(store, before).join(written, workers):
                 raise DataError(f"{second}: shows no place of {first}; keep two maps, or record a way between them")
             _merge_earth(store, other)
-        os.replace(partial_file, out)
-    except OSError as error:
-        raise DataError(f"{out}: cannot be written ({error.strerror or error}); check the folder") from error
-    finally:
-        partial_file.unlink(missing_ok=True)
     return describe_map(out)
 
 
