@@ -494,7 +494,7 @@ def test_rows_of_a_table_are_found_by_id() -> None:
     ids, rows = rng.permutation(60).astype(np.int64), np.empty(60, dtype=np.int64)
     place = {int(known[row]): int(row) for row in ordered}
     expected = [place.get(int(i), -1) for i in ids]
-    assert track_loops.find_rows(ids, known, ordered, rows) == expected.count(-1)
+    assert track_loops.find_rows(ids, known[ordered], ordered, rows) == expected.count(-1)
     assert rows.tolist() == expected
 
 
