@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ _ROTATION_SIGMA_RAD = np.radians(2.0)
 _LEAST_SPEED_MPS = 1.0  # the last velocity may have been wrong by itself, and by this
 _EXTRAPOLATED_S = 0.5  # for which the last velocity and rate are believed; beyond it the pose is held
 _RATE_SIGMA_RADPS = 1.0  # of a body that nothing measures: a turn within a second is not seen
+_ANY_ROTATION_RAD = math.pi / math.sqrt(3.0)  # standard deviation of an angle that may be any
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,7 @@ def restarted(
     moved = replace(nav, T_world_imu=T @ se3_exp(min(elapsed_s, _EXTRAPOLATED_S) * twist))
     speed = float(np.linalg.norm(velocity)) + _LEAST_SPEED_MPS
     position, rotation = speed * elapsed_s, float(np.hypot(_ROTATION_SIGMA_RAD, _RATE_SIGMA_RADPS * elapsed_s))
+    rotation = min(rotation, _ANY_ROTATION_RAD)
     J = np.eye(6)
     J[:3, 3:] = so3_hat(moved.T_world_imu[:3, 3])
     P = np.zeros((DIM, DIM))
