@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 import shlex
@@ -33,7 +32,7 @@ from vio.records import FrameResult, Trajectory
 from vio.report.words import camera_imu_findings
 from vio.runs.files import CHECKPOINT, FILES, RunFile
 from vio.runs.folder import calibration_text, finish_run_folder, growing_folder, read_request
-from vio.runs.pipeline import RunControl, RunResult, given_rig, run
+from vio.runs.pipeline import RunControl, RunResult, Viewers, given_rig, run
 from vio.view.annotated import AnnotatedImage
 
 if TYPE_CHECKING:
@@ -44,31 +43,6 @@ log = logging.getLogger(__name__)
 
 _COMPILED_S = 1.0  # in slow frames; less is the usual scatter
 _LINES = 3  # of what the calibration is off by, in the summary; all are in metrics.json
-
-
-class Viewers:
-    """Several viewers as one."""
-
-    def __init__(self, viewers: Sequence[Viewer]) -> None:
-        self._viewers = viewers
-
-    def frame(self, result: FrameResult) -> None:
-        """Show one frame."""
-        for viewer in self._viewers:
-            viewer.frame(result)
-
-    def skip(self, frames: int) -> None:
-        """Count frames that an earlier process has done."""
-        for viewer in self._viewers:
-            skip = getattr(viewer, "skip", None)
-            if skip is not None:
-                skip(frames)
-
-    def close(self) -> None:
-        """Close all, whatever happens to one of them."""
-        with contextlib.ExitStack() as stack:
-            for viewer in self._viewers:
-                stack.callback(viewer.close)
 
 
 class ProgressViewer:

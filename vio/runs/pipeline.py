@@ -48,7 +48,7 @@ from vio.runs.recorder import GrowingFolder, RunRecorder
 if TYPE_CHECKING:
     from vio.mapping.session import MapSession
 
-__all__ = ["STAGES", "FrameLog", "NullViewer", "RunControl", "RunResult", "run"]
+__all__ = ["STAGES", "FrameLog", "RunControl", "RunResult", "Viewers", "run"]
 
 _MOST_NAMED = 5  # frames that could not be read
 _LEAST_REFUSED = 10  # frames that the front end refused, and more of them than not, before a run gives up
@@ -97,14 +97,29 @@ class RunResult:
         return Trajectory(T_world_body=T_world_body, times_ns=times_ns, body=self.body, frame_indices=indices)
 
 
-class NullViewer:
-    """Shows nothing."""
+class Viewers:
+    """Several viewers as one."""
+
+    def __init__(self, viewers: Sequence[Viewer]) -> None:
+        self._viewers = viewers
 
     def frame(self, result: FrameResult) -> None:
-        """Ignore the frame."""
+        """Show one frame."""
+        for viewer in self._viewers:
+            viewer.frame(result)
+
+    def skip(self, frames: int) -> None:
+        """Count frames that an earlier process has done, in the viewers that count."""
+        for viewer in self._viewers:
+            skip = getattr(viewer, "skip", None)
+            if skip is not None:
+                skip(frames)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Close all, whatever happens to one of them."""
+        with contextlib.ExitStack() as stack:
+            for viewer in self._viewers:
+                stack.callback(viewer.close)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,12 +171,11 @@ def run(
     began = time.perf_counter()
     recorder = RunRecorder(body, lag_frames=config.lag_frames, keep_observations=keep_observations, folder=folder)
     features = source.features or dataset
+    shown = Viewers(() if viewer is None else (viewer,))
     if control.resume:
         state = recorder.restore(features)
         _reopen_map(state.processor.map, map)
-        skip = getattr(viewer, "skip", None)
-        if skip is not None:  # a viewer that knows of frames that an earlier process has done
-            skip(len(recorder))
+        shown.skip(len(recorder))
     else:
         reckoned = source.motion == "velocity"
         state = _RunState(
@@ -170,11 +184,7 @@ def run(
             start,
         )
     processor, stopped = state.processor, None
-    with (
-        contextlib.closing(recorder),
-        contextlib.closing(viewer or NullViewer()) as shown,
-        contextlib.closing(processor),
-    ):
+    with contextlib.closing(recorder), contextlib.closing(shown), contextlib.closing(processor):
         loop = _Loop(state, recorder, shown, _taken_frames(dataset, config, start, stop))
         try:
             with _opencv_threads(dataset, config, parts.frontend):
