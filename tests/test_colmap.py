@@ -22,7 +22,7 @@ from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp, transform_points
 from vio.geometry.stereo import project
 from vio.live.build import Parts
-from vio.offline.colmap.model import ModelImages, build_model, keyframe_images, mean_reprojection_error_px, write_model
+from vio.offline.colmap.model import ModelImages, build_model, keyframe_images, mean_reprojection_error_px
 from vio.offline.colmap.reconstruction import linked_steps, pairs_to_match
 from vio.offline.colmap.trajectory import read_colmap_trajectory
 from vio.offline.comparison import GroundTruth, KeyframeComparison, compare_keyframes
@@ -184,7 +184,7 @@ def test_a_model_projects_as_our_camera_with_an_offset_of_half_a_pixel(saved: Tr
     tracks = build_tracks(saved, keyframes, T)
     names = keyframe_images(keyframes)
     colours = np.arange(3 * len(tracks.ids), dtype=np.int64).astype(np.uint8).reshape(-1, 3)
-    write_model(build_model(saved.camera, T, tracks, names, colours), tmp_path)
+    build_model(saved.camera, T, tracks, names, colours).write_binary(tmp_path)
     model = pycolmap.Reconstruction(tmp_path)
     assert (model.num_cameras(), model.num_rigs(), model.num_frames()) == (2, 1, len(keyframes))
     assert model.num_points3D() == len(tracks.ids)
@@ -220,7 +220,7 @@ def test_reads_a_model_as_a_trajectory(saved: TrackedPath, tmp_path: Path, stamp
     names = ModelImages(tuple(f"cam0/{k}.png" for k in numbers), tuple(f"cam1/{k}.png" for k in numbers))
     place = tmp_path / "sparse" / "0"
     place.mkdir(parents=True)
-    write_model(build_model(saved.camera, T, tracks, names), place)
+    build_model(saved.camera, T, tracks, names).write_binary(place)
     found = read_colmap_trajectory(tmp_path)
     assert found.body == "cam0"
     np.testing.assert_allclose(found.T_world_body, T, atol=1e-12)

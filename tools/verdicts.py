@@ -50,9 +50,9 @@ def simulated(n: int, change: float, noise: Noise, rng: np.random.Generator) -> 
     return compare_outcomes(runs(before), runs(after))
 
 
-def verdicts(n: int, change: float, noise: str, repeat: int, seed: int = 0) -> tuple[Counter[str], Counter[str]]:
+def verdicts(n: int, change: float, noise: str, repeat: int) -> tuple[Counter[str], Counter[str]]:
     """Count what is said of the ATE alone, and of the whole."""
-    rng, ate, whole = np.random.default_rng([seed, n, round(100 * change)]), Counter[str](), Counter[str]()
+    rng, ate, whole = np.random.default_rng([0, n, round(100 * change)]), Counter[str](), Counter[str]()
     for _ in range(repeat):
         result = simulated(n, change, NOISES[noise], rng)
         ate[result.changes[0].verdict] += 1

@@ -34,7 +34,7 @@ def run_here(
 
 
 def run_on_dask(
-    jobs: Mapping[str, Job], cache: str, *, address: str, wait_s: float = 300.0, perform: Perform = perform_job
+    jobs: Mapping[str, Job], cache: str, *, address: str, wait_s: float = 300.0
 ) -> Iterator[tuple[str, Record]]:
     """Yield key and record of each job as it is done by the workers of the Dask scheduler at an address.
 
@@ -60,7 +60,7 @@ def run_on_dask(
                 if first:
                     _check_workers(client, pending)
                 first, last_s = False, time.monotonic()
-                for key, record in _session(client, pending, cache, perform):
+                for key, record in _session(client, pending, cache):
                     del pending[key]
                     yield key, record
         except ImportError as error:
@@ -93,11 +93,13 @@ def _check_workers(client: Any, jobs: Mapping[str, Job]) -> None:
             raise VioError(f"the Dask worker {address} has other {what} than this command; install the same versions")
 
 
-def _session(client: Any, jobs: Mapping[str, Job], cache: str, perform: Perform) -> Iterator[tuple[str, Record]]:
+def _session(client: Any, jobs: Mapping[str, Job], cache: str) -> Iterator[tuple[str, Record]]:
     """Yield what one connection to the scheduler brings; return when it is lost, or all is done."""
     from distributed import KilledWorker
 
-    futures = {client.submit(perform, job, cache, key=f"vio-{key}", pure=False): key for key, job in list(jobs.items())}
+    futures = {
+        client.submit(perform_job, job, cache, key=f"vio-{key}", pure=False): key for key, job in list(jobs.items())
+    }
     while futures:
         done = [future for future in futures if future.done()]
         if not done:

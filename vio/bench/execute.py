@@ -32,7 +32,7 @@ _running: set[subprocess.Popen[str]] = set()
 _lock = threading.Lock()
 
 
-def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict[str, Any]:
+def perform_job(job: dict[str, Any], cache: str) -> dict[str, Any]:
     """Do one task in a process of its own, again where that is killed; return its record, which may be a failure."""
     try:
         Path(cache).mkdir(parents=True, exist_ok=True)
@@ -43,7 +43,7 @@ def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict
                 record["lost_processes"] = lost
                 return record
             lost += 1
-            if lost > retries:
+            if lost > RETRIES:
                 hint = "; out of memory? Use fewer --workers" if number == getattr(signal, "SIGKILL", 9) else ""
                 name = signal.Signals(number).name
                 return failed(f"its process was ended by {name}, {lost} times{hint}", keep=False)

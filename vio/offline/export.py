@@ -19,7 +19,6 @@ from vio.offline.colmap.model import (
     build_model,
     keyframe_images,
     mean_reprojection_error_px,
-    write_model,
 )
 from vio.offline.keyframes import choose_keyframes
 from vio.offline.loop_tracks import loop_pairs
@@ -72,7 +71,7 @@ def export_colmap(
     camera = run.tracked.camera
     model = build_model(camera, T_world_cam0, tracks, names, colours)
     (folder / "sparse" / "0").mkdir(parents=True)
-    write_model(model, folder / "sparse" / "0")
+    model.write_binary(folder / "sparse" / "0")
     transforms = nerfstudio_transforms(camera, T_world_cam0, names.below("images"))
     (folder / "transforms.json").write_text(transforms, encoding="utf-8")
     (folder / "points.ply").write_bytes(ply_points(tracks.p_world, colours))

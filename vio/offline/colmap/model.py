@@ -206,8 +206,3 @@ def mean_reprojection_error_px(model: pycolmap.Reconstruction) -> float:
     """Return COLMAP's mean reprojection error: the mean over points of their mean residual length."""
     model.update_point_3d_errors()
     return float(model.compute_mean_reprojection_error())
-
-
-def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model in COLMAP's binary format; the folder must exist."""
-    model.write_binary(folder)
