@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray
 from vio.records import ImuSample, IntArray, MotionSample
 
@@ -23,13 +22,7 @@ class Rates:
 
 
 def rates_of(samples: Sequence[MotionSample]) -> Rates:
-    """Return motion samples of one kind as arrays.
-
-    Raises:
-        EstimationError: there are no samples.
-    """
-    if not samples:
-        raise EstimationError("the recording holds no motion sensor; only the cameras can be calibrated")
+    """Return motion samples of one kind, one at least, as arrays."""
     inertial = isinstance(samples[0], ImuSample)
     pairs = [(s.gyro, s.accel) if isinstance(s, ImuSample) else (s.angular, s.linear) for s in samples]
     return Rates(

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vio.geometry.lie import FloatArray
-from vio.runs.curves import SIGMAS, STAGE_COLOURS, Curves, Truth, binned, stereo_curves, thinned
+from vio.runs.curves import COLOURS, SIGMAS, STAGE_COLOURS, Curves, Truth, binned, stereo_curves, thinned
 from vio.runs.finished import FinishedRun
 from vio.runs.pipeline import STAGES
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
-COLOURS = ("#1f5fbf", "#d9822b", "#2e8b57", "#a83279", "#7a5195", "#0f8b8d", "#b5533c", "#6b7280")
 _TRUTH, _POINTS, _LOOPS = "#111111", "#9aa5b1", "#c82828"
 _BULK = (10, 90)  # percentiles of the bands' edges that an axis shows at least
 _LONGEST_SIDE = 1.8  # of the box in three dimensions; seen whole from where plotly puts the eye
@@ -120,50 +119,49 @@ def _mapped(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Repor
 
 
 def _position(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
-    figure = _three(runs, [(c.seconds, c.position, c.position_sigma) for c in curves], [f"{a} (m)" for a in _AXES])
-    for truth in _truths(curves):
-        _dotted(figure, truth.seconds, truth.position)
+    found = [(c.seconds, c.position, c.position_sigma) for c in curves]
+    truths = [(truth.seconds, truth.position) for truth in _truths(curves)]
+    figure = _three(runs, found, truths, [f"{a} (m)" for a in _AXES])
     return _over_time("Position and height", figure, "Bands are three standard deviations of the filter.")
 
 
 def _attitude(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
-    names = ("heading (deg)", "pitch (deg)", "roll (deg)")
-    figure = _three(runs, [(c.seconds, c.attitude, c.attitude_sigma) for c in curves], names)
-    for truth in _truths(curves):
-        _dotted(figure, truth.seconds, truth.attitude)
+    found = [(c.seconds, c.attitude, c.attitude_sigma) for c in curves]
+    truths = [(truth.seconds, truth.attitude) for truth in _truths(curves)]
+    figure = _three(runs, found, truths, ("heading (deg)", "pitch (deg)", "roll (deg)"))
     text = "Of the left camera: heading to the right, pitch up, roll with the right side down."
     return _over_time("Attitude", figure, text)
 
 
 def _velocity(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
-    figure = _three(runs, [(c.seconds, c.velocity, c.velocity_sigma) for c in curves], [f"{a} (m/s)" for a in _AXES])
-    for truth in _truths(curves):
-        if len(truth.seconds) > 2:
-            _dotted(figure, truth.seconds, np.gradient(truth.position, truth.seconds, axis=0))
+    found = [(c.seconds, c.velocity, c.velocity_sigma) for c in curves]
+    known = [truth for truth in _truths(curves) if len(truth.seconds) > 2]
+    truths = [(truth.seconds, np.gradient(truth.position, truth.seconds, axis=0)) for truth in known]
+    figure = _three(runs, found, truths, [f"{a} (m/s)" for a in _AXES])
     return _over_time("Velocity", figure, "Ground truth: differences of its positions.")
 
 
 def _three(
-    runs: Sequence[FinishedRun], found: Sequence[tuple[FloatArray, FloatArray, FloatArray]], names: Sequence[str]
+    runs: Sequence[FinishedRun],
+    found: Sequence[tuple[FloatArray, FloatArray, FloatArray]],
+    truths: Sequence[tuple[FloatArray, FloatArray]],
+    names: Sequence[str],
 ) -> go.Figure:
-    """Draw three components of runs over time: seconds (N,), values (N, 3), sigmas (N, 3) of each."""
+    """Draw three components of runs over time: seconds (N,), values (N, 3), sigmas (N, 3) of each, and the truth's."""
     figure = _subplots(3, 1)
     for row, name in enumerate(names, start=1):
         for run, (seconds, values, sigmas), colour in zip(runs, found, COLOURS, strict=False):
             _band(figure, seconds, values[:, row - 1], sigmas[:, row - 1], run.name, colour, row)
         figure.update_yaxes(title_text=name, row=row, col=1)
+    for seconds, values in truths:
+        for row in (1, 2, 3):
+            _xy(figure, seconds, values[:, row - 1], "ground truth", _TRUTH, row, dash="dot")
     return figure
 
 
 def _truths(curves: Sequence[Curves]) -> list[Truth]:
     """Return the references, that of each recording once."""
     return [c.truth for c in curves if c.truth is not None and c.draws_truth]
-
-
-def _dotted(figure: go.Figure, seconds: FloatArray, values: FloatArray) -> None:
-    """Draw three components (K, 3) of the ground truth."""
-    for row in (1, 2, 3):
-        _xy(figure, seconds, values[:, row - 1], "ground truth", _TRUTH, row, dash="dot")
 
 
 def _errors(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
@@ -11,9 +11,9 @@ from vio._version import __version__
 from vio.files.atomic import atomic_write_text
 from vio.files.inputs import read_input
 from vio.files.printable import printable
-from vio.report.figures import COLOURS, ReportSection, sections
+from vio.report.figures import ReportSection, sections
 from vio.report.words import calibration_findings, run_figures, summary
-from vio.runs.curves import curves_of
+from vio.runs.curves import COLOURS, curves_of
 from vio.runs.files import MeshFile, RunFile
 from vio.runs.finished import FinishedRun
 
@@ -53,7 +53,7 @@ def page(runs: Sequence[FinishedRun]) -> str:
     path, *figures = (_figure(section, number) for number, section in enumerate(sections(runs, curves_of(runs))))
     warnings = _lists("Warnings", runs, [[str(line) for line in run.metrics.get("warnings") or []] for run in runs])
     calibration = _lists("Calibration", runs, [calibration_findings(run.metrics) for run in runs])
-    parts = [_words(runs), warnings, path, _table(runs), calibration, _images(runs), *figures]
+    parts = [_words(runs), warnings, path, _key_figures(runs), calibration, _images(runs), *figures]
     parts.append(_settings(runs))
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
@@ -107,30 +107,31 @@ def _lists(title: str, runs: Sequence[FinishedRun], lines: Sequence[Sequence[str
     return f"<section><h2>{title}</h2>{''.join(lists)}</section>" if lists else ""
 
 
-def _table(runs: Sequence[FinishedRun]) -> str:
+def _key_figures(runs: Sequence[FinishedRun]) -> str:
     columns = [run_figures(run) for run in runs]
-    head = "".join(f"<th>{_text(run.name)}</th>" for run in runs)
-    cells = {name: "".join(f"<td>{_text(c[name])}</td>" for c in columns) for name in columns[0]}
-    rows = "".join(f"<tr><th>{_text(name)}</th>{cell}</tr>" for name, cell in cells.items())
-    table = f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{rows}</tbody></table>"
-    return f'<section><h2>Figures</h2><div class="scroll">{table}</div></section>'
+    rows = {name: [column[name] for column in columns] for name in columns[0]}
+    return _table("Figures", [run.name for run in runs], rows)
 
 
 def _settings(runs: Sequence[FinishedRun]) -> str:
-    keys = sorted({key for run in runs for key in run.changed})
-    if not keys:
-        return "<section><h2>Settings</h2><p>All settings have their defaults.</p></section>"
-    head = "".join(f"<th>{_text(run.name)}</th>" for run in runs)
-    rows = []
-    for key in keys:
+    rows = {}
+    for key in sorted({key for run in runs for key in run.changed}):
         default = next(run.changed[key][1] for run in runs if key in run.changed)
-        values = (run.changed[key][0] if key in run.changed else default for run in runs)
-        cells = "".join(f"<td>{_text(str(value))}</td>" for value in values)
-        rows.append(f"<tr><th>{_text(key)}</th><td>{_text(str(default))}</td>{cells}</tr>")
-    return (
-        "<section><h2>Settings that differ from the default</h2><div class='scroll'><table><thead><tr><th></th>"
-        f"<th>default</th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div></section>"
+        rows[key] = [str(v) for v in (default, *(run.changed.get(key, (default,))[0] for run in runs))]
+    if not rows:
+        return "<section><h2>Settings</h2><p>All settings have their defaults.</p></section>"
+    return _table("Settings that differ from the default", ["default", *(run.name for run in runs)], rows)
+
+
+def _table(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
+    """Return a section with a table of named columns and rows."""
+    head = "".join(f"<th>{_text(name)}</th>" for name in columns)
+    body = "".join(
+        f"<tr><th>{_text(name)}</th>{''.join(f'<td>{_text(cell)}</td>' for cell in cells)}</tr>"
+        for name, cells in rows.items()
     )
+    table = f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<section><h2>{title}</h2><div class="scroll">{table}</div></section>'
 
 
 def _figure(section: ReportSection, number: int) -> str:

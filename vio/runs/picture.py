@@ -18,7 +18,7 @@ from vio.files.printable import printable
 from vio.files.tables import Rows
 from vio.geometry.lie import FloatArray
 from vio.records import STAGES
-from vio.runs.curves import SIGMAS, STAGE_COLOURS, Curves, DrawnRun, binned, draw, stereo_curves
+from vio.runs.curves import COLOURS, SIGMAS, STAGE_COLOURS, Curves, DrawnRun, binned, draw, stereo_curves
 from vio.runs.pipeline import RunResult
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,6 @@ _GREEN, _PURPLE = "#3a9d5d", "#8a5fb0"
 _MOVED_SIGMAS = 3.0  # a stereo calibration that ends within so many standard deviations of zero is not drawn
 _LEAST_MARGIN_M = 0.02  # about a rig that stands
 _MILLIMETRES_BELOW_M = 0.02  # largest error of trajectories that are compared
-_COLOURS = ("#1f5fbf", "#d9822b", "#2e8b57", "#a83279", "#7a5195", "#0f8b8d", "#b5533c", "#6b7280")
 _SCALE = 1.3  # of the largest value to the end of an axis
 _BINS = 250  # of the curves that are medians over frames
 # Of the panels, as shares of the figure and of a panel. A layout that matplotlib finds by itself draws all twice.
@@ -249,7 +248,7 @@ def draw_comparison(results: Mapping[str, Evaluation]) -> Any:
     largest = max(float(r.errors_m.max()) for r in results.values())
     factor, unit = (1e3, "mm") if largest < _MILLIMETRES_BELOW_M else (1.0, "m")
     for k, (name, r) in enumerate(results.items()):
-        colour, label = _COLOURS[k % len(_COLOURS)], f"{name}: ATE {metres_text(r.ate_m.rmse)}"
+        colour, label = COLOURS[k % len(COLOURS)], f"{name}: ATE {metres_text(r.ate_m.rmse)}"
         above.plot(*((r.aligned.positions - truth[0]) @ plane.T).T, color=colour, lw=1.4, label=label)
         steps = np.linalg.norm(np.diff(r.reference.positions, axis=0), axis=1)
         along.plot(np.concatenate([[0.0], np.cumsum(steps)]), factor * r.errors_m, color=colour, lw=1.4)
