@@ -16,7 +16,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -64,6 +64,7 @@ from vio.records import (
 Motion = Literal["imu", "none", "velocity"]
 Start = Literal["uncertain", "known"]
 Variant = Literal["right-invariant", "right-invariant, noise learned"]
+Group = tuple[Motion, Start, Variant]
 
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
@@ -400,56 +401,22 @@ def main() -> int:
     scenario = Scenario(
         args.seconds, args.pixel_sigma, args.features, args.landmarks, args.outliers, args.imu_offset_ms * 1e-3
     )
-    groups = list(_groups(args.motions, args.variants))
-    jobs = [Job(scenario, *group, seed) for seed, group in product(range(args.runs), groups)]
+    # Every motion model from an uncertain start, the IMU from a known one too.
+    groups: list[Group] = [(motion, "uncertain", variant) for motion, variant in product(args.motions, args.variants)]
+    groups += [("imu", "known", variant) for variant in args.variants if "imu" in args.motions]
+    jobs = [Job(scenario, *group, seed=seed) for seed, group in product(range(args.runs), groups)]
+    records: dict[Group, list[Record]] = {group: [] for group in groups}
     try:
-        records = _fly_all(jobs, args.jobs)
-        summaries = [_summary([r for r in records if _group(r.job) == group]) for group in groups]
+        with ProcessPoolExecutor(max(args.jobs, 1)) as pool:
+            for k, (job, record) in enumerate(zip(jobs, pool.map(_fly_alone, jobs), strict=True), start=1):
+                group = (job.motion, job.start, job.variant)
+                records[group].append(record)
+                print(f"{k}/{len(jobs)} {' '.join(group)} {job.seed}", file=sys.stderr)
     except VioError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(_tables(summaries))
+    print(f"{_nees_table(records)}\n\n{_error_table(records)}\n")
     return 0
-
-
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """All runs of one motion model, start and variant; arrays hold one entry per frame but the first."""
-
-    motion: Motion
-    start: Start
-    variant: Variant
-    runs: int
-    nees: dict[str, float]  # by measure, mean over the runs and frames
-    nees_se: dict[str, float]  # by measure, standard error over the runs of the mean over all frames
-    inside: dict[str, float]  # by measure, share of the frames in which the mean lies in its 95 % band
-    nis: float
-    yaw_sigma_deg: FloatArray  # (F - 1,) root mean square over the runs
-    yaw_error_deg: FloatArray  # (F - 1,) likewise
-    position_rmse_m: float
-    orientation_rmse_deg: float
-    drift_rms_m: float
-
-
-def _groups(motions: list[Motion], variants: list[Variant]) -> Iterator[tuple[Motion, Start, Variant]]:
-    """What is compared: every motion model from an uncertain start, the IMU from a known one too."""
-    for motion, variant in product(motions, variants):
-        yield motion, "uncertain", variant
-    for variant in variants if "imu" in motions else []:
-        yield "imu", "known", variant
-
-
-def _group(job: Job) -> tuple[Motion, Start, Variant]:
-    return job.motion, job.start, job.variant
-
-
-def _fly_all(jobs: list[Job], processes: int) -> list[Record]:
-    records: list[Record] = []
-    with ProcessPoolExecutor(max(processes, 1)) as pool:
-        for record in pool.map(_fly_alone, jobs):
-            records.append(record)
-            print(f"{len(records)}/{len(jobs)} {' '.join(_group(record.job))} {record.job.seed}", file=sys.stderr)
-    return records
 
 
 @one_blas_thread()
@@ -457,66 +424,54 @@ def _fly_alone(job: Job) -> Record:
     return fly(job)
 
 
-def _summary(records: list[Record]) -> Summary:
-    """One group; the first frame, where the pose is what was drawn, is left out."""
-    runs = len(records)
-    every = {m: np.array([r.nees[m][1:] for r in records]) for m in records[0].nees}
-    mean: dict[str, FloatArray] = {m: values.mean(axis=0) for m, values in every.items()}
-    inside = {}
-    for measure, values in mean.items():
-        low, high = nees_bounds(_MEASURES[measure], runs)
-        inside[measure] = float(np.mean((values >= low) & (values <= high)))
-    return Summary(
-        *_group(records[0].job),
-        runs,
-        {m: float(values.mean()) for m, values in mean.items()},
-        {m: float(v.mean(axis=1).std(ddof=min(runs - 1, 1)) / np.sqrt(runs)) for m, v in every.items()},
-        inside,
-        float(np.nanmean([r.nis[1:] for r in records])),
-        _rms([r.yaw_sigma_deg[1:] for r in records]),
-        _rms([r.yaw_error_deg[1:] for r in records]),
-        float(np.sqrt(np.mean([r.position_m[1:] ** 2 for r in records]))),
-        float(np.sqrt(np.mean([r.orientation_deg[1:] ** 2 for r in records]))),
-        float(np.sqrt(np.mean([r.drift_m**2 for r in records]))),
-    )
-
-
-def _rms(rows: list[FloatArray]) -> FloatArray:
-    out: FloatArray = np.sqrt(np.mean(np.square(rows), axis=0))
-    return out
-
-
-def _tables(summaries: list[Summary]) -> str:
-    """Markdown: NEES by measure, then what the filter estimates for yaw beside the errors."""
-    names = list(_MEASURES)
+def _nees_table(records: Mapping[Group, Sequence[Record]]) -> str:
+    """Return NEES by measure in Markdown, without the first frame, where the pose is what was drawn."""
     lines = [
         "Mean NEES ± its standard error over the runs (share of the frames inside the 95 % band)",
         "",
         "| motion, start | variant | " + " | ".join(f"{m} ({d})" for m, d in _MEASURES.items()) + " | NIS (1) |",
-        "|---|---" + "|---:" * (len(names) + 1) + "|",
+        "|---|---" + "|---:" * (len(_MEASURES) + 1) + "|",
     ]
-    for s in summaries:
-        cells = [_nees_cell(s, m) if m in s.nees else "–" for m in names]
-        lines.append(f"| {s.motion}, {s.start} | {s.variant} | {' | '.join(cells)} | {s.nis:.2f} |")
-    lines += [
-        "",
+    for (motion, start, variant), runs in records.items():
+        cells = [
+            _nees_cell(np.array([r.nees[m][1:] for r in runs]), dimension) if m in runs[0].nees else "–"
+            for m, dimension in _MEASURES.items()
+        ]
+        nis = np.nanmean([r.nis[1:] for r in runs])
+        lines.append(f"| {motion}, {start} | {variant} | {' | '.join(cells)} | {nis:.2f} |")
+    return "\n".join(lines)
+
+
+def _nees_cell(values: FloatArray, dimension: int) -> str:
+    """Tell NEES (R, F) over runs and frames."""
+    runs, mean = len(values), values.mean(axis=0)
+    low, high = nees_bounds(dimension, runs)
+    inside = np.mean((mean >= low) & (mean <= high))
+    error = values.mean(axis=1).std(ddof=min(runs - 1, 1)) / np.sqrt(runs)
+    digits = 1 if mean.mean() >= 20 else 2
+    return f"{mean.mean():.{digits}f} ± {error:.{digits}f} ({100 * inside:.0f} %)"
+
+
+def _error_table(records: Mapping[Group, Sequence[Record]]) -> str:
+    """Return what the filter estimates for yaw beside the errors, likewise."""
+    lines = [
         "| motion, start | variant | yaw sigma at 1 s (deg) | least | at the end | yaw error at the end, RMS "
         "| position RMSE (m) | orientation RMSE (deg) | drift at the end, RMS (m) |",
         "|---|---" + "|---:" * 7 + "|",
     ]
-    for s in summaries:
-        sigma = s.yaw_sigma_deg
+    for (motion, start, variant), runs in records.items():
+        sigma = np.sqrt(np.mean([r.yaw_sigma_deg[1:] ** 2 for r in runs], axis=0))
         second = min(round(1e9 / _FRAME_NS), len(sigma)) - 1
-        cells = [f"{x:.3f}" for x in (sigma[second], sigma.min(), sigma[-1], s.yaw_error_deg[-1])]
-        cells += [f"{s.position_rmse_m:.4f}", f"{s.orientation_rmse_deg:.3f}", f"{s.drift_rms_m:.4f}"]
-        lines.append(f"| {s.motion}, {s.start} | {s.variant} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        cells = [f"{x:.3f}" for x in (sigma[second], sigma.min(), sigma[-1], _rms(r.yaw_error_deg[-1] for r in runs))]
+        cells.append(f"{_rms(r.position_m[1:] for r in runs):.4f}")
+        cells.append(f"{_rms(r.orientation_deg[1:] for r in runs):.3f}")
+        cells.append(f"{_rms(r.drift_m for r in runs):.4f}")
+        lines.append(f"| {motion}, {start} | {variant} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
-def _nees_cell(summary: Summary, measure: str) -> str:
-    mean, error = summary.nees[measure], summary.nees_se[measure]
-    digits = 1 if mean >= 20 else 2
-    return f"{mean:.{digits}f} ± {error:.{digits}f} ({100 * summary.inside[measure]:.0f} %)"
+def _rms(values: Iterable[float | FloatArray]) -> float:
+    return float(np.sqrt(np.mean(np.array([*values]) ** 2)))
 
 
 if __name__ == "__main__":
