@@ -98,8 +98,9 @@ def drawn(rig: Rig, settings: MsckfSettings, noise: np.random.Generator) -> Off:
     return replace(right, turn=noise.normal(0, np.radians(STEREO_YAW_SIGMA_DEG), 3))
 
 
+@one_blas_thread()
 def fly(
-    rig: Rig, start: Start, seed: int, *, seconds: float = 10.0, pixel_sigma_px: float = 0.5
+    rig: Rig, start: Start, seed: int, seconds: float = 10.0, pixel_sigma_px: float = 0.5
 ) -> list[dict[str, float]]:
     """Fly once; return NEES by what is estimated, halfway and at the end."""
     scenario = Scenario(seconds, pixel_sigma_px)
@@ -219,11 +220,6 @@ def _mean_text(values: list[float]) -> str:
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=min(len(values) - 1, 1)) / np.sqrt(len(values)):.2f}"
 
 
-@one_blas_thread()
-def _fly_alone(job: tuple[Rig, Start, int, float, float]) -> list[dict[str, float]]:
-    return fly(*job[:3], seconds=job[3], pixel_sigma_px=job[4])
-
-
 def main() -> int:
     """Fly everything and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -239,7 +235,7 @@ def main() -> int:
     results: dict[tuple[Rig, Start], list[list[dict[str, float]]]] = {group: [] for group in groups}
     try:
         with ProcessPoolExecutor(max(args.jobs, 1)) as pool:
-            for job, halves in zip(jobs, pool.map(_fly_alone, jobs), strict=True):
+            for job, halves in zip(jobs, pool.map(fly, *zip(*jobs, strict=True)), strict=True):
                 results[job[0], job[1]].append(halves)
                 print(*job[:3], file=sys.stderr)
     except VioError as error:

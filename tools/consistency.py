@@ -289,6 +289,7 @@ class Record:
     drift_m: float  # error of the last position as seen from the first pose
 
 
+@one_blas_thread()
 def fly(job: Job) -> Record:
     """Fly once."""
     learn = job.variant == "right-invariant, noise learned"
@@ -408,7 +409,7 @@ def main() -> int:
     records: dict[Group, list[Record]] = {group: [] for group in groups}
     try:
         with ProcessPoolExecutor(max(args.jobs, 1)) as pool:
-            for k, (job, record) in enumerate(zip(jobs, pool.map(_fly_alone, jobs), strict=True), start=1):
+            for k, (job, record) in enumerate(zip(jobs, pool.map(fly, jobs), strict=True), start=1):
                 group = (job.motion, job.start, job.variant)
                 records[group].append(record)
                 print(f"{k}/{len(jobs)} {' '.join(group)} {job.seed}", file=sys.stderr)
@@ -417,11 +418,6 @@ def main() -> int:
         return 1
     print(f"{_nees_table(records)}\n\n{_error_table(records)}\n")
     return 0
-
-
-@one_blas_thread()
-def _fly_alone(job: Job) -> Record:
-    return fly(job)
 
 
 def _nees_table(records: Mapping[Group, Sequence[Record]]) -> str:
