@@ -55,14 +55,13 @@ class _CpuTimer:
         self.frames = 0
         self.stages: dict[str, float] = {}  # median wall time of a stage
         self._began_s = self._ended_s = time.process_time()
-        self._first = 0
 
     def frame(self, result: FrameResult) -> None:
         """Count a frame."""
         self.frames += 1
         self._ended_s = time.process_time()
         if self.frames <= _WARM_FRAMES:
-            self._began_s, self._first = self._ended_s, self.frames
+            self._began_s = self._ended_s
 
     def close(self) -> None:
         """Nothing is held."""
@@ -70,8 +69,8 @@ class _CpuTimer:
     @property
     def ms_per_frame(self) -> float | None:
         """Mean CPU time of a frame after the first ones; None: there were no others."""
-        count = self.frames - self._first
-        return 1e3 * (self._ended_s - self._began_s) / count if count else None
+        count = self.frames - _WARM_FRAMES
+        return 1e3 * (self._ended_s - self._began_s) / count if count > 0 else None
 
 
 @dataclass(frozen=True, slots=True)

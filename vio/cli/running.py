@@ -29,7 +29,7 @@ from vio.files.trajectories import read_trajectory
 from vio.live.build import MapUse, resolve_motion
 from vio.protocols import Dataset, Viewer
 from vio.records import FrameResult, Trajectory
-from vio.report.words import camera_imu_findings
+from vio.report.words import camera_imu_findings, scale_findings
 from vio.runs.files import CHECKPOINT, FILES, RunFile
 from vio.runs.folder import calibration_text, finish_run_folder, growing_folder, read_request
 from vio.runs.pipeline import RunControl, RunResult, Viewers, given_rig, run
@@ -358,13 +358,8 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
 
 def _calibration_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """What was found of the camera's scale, and of camera and IMU; they are near zero where the calibration is good."""
-    rows = []
-    if scale := metrics["stereo_scale"]:
-        found = [
-            f"{name.replace('_', ' ')} off by {x['percent']:+.2f} ± {x['sigma_percent']:.2f} %"
-            for name, x in scale.items()
-        ]
-        rows.append(("cameras", ", ".join(found)))
+    scale = scale_findings(metrics)
+    rows = [("cameras", ", ".join(scale))] if scale else []
     rows += [("IMU", line) for line in camera_imu_findings(metrics)]
     for sensor, own in (metrics.get("imu") or {}).items():
         words = [

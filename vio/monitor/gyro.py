@@ -144,13 +144,10 @@ def _explanations(R: FloatArray, *, gyro_alone: bool) -> Iterator[_Explanation]:
     for P in signed_permutations():
         # The recording contains P^T times the true rates, so that R P maps it to the camera.
         explanation = f"the gyro's axes contain {axes_text(P.T)} in place of [+x +y +z]"
-        if np.linalg.det(P) < 0:
-            explanation = f"{explanation}, a left-handed frame; correct their order and signs"
+        mirrored = np.linalg.det(P) < 0
+        if mirrored or gyro_alone:
+            explanation += f"{', a left-handed frame' if mirrored else ''}; correct their order and signs"
             yield _Explanation("gyro axes", R @ P, "exchanged axes fit", explanation)
-        elif gyro_alone:
-            yield _Explanation(
-                "gyro axes", R @ P, "exchanged axes fit", f"{explanation}; correct their order and signs"
-            )
         else:
             explanation = (
                 f"T_cam0_imu belongs to other IMU axes, or {explanation}; its rotation should be {_matrix_text(R @ P)}"

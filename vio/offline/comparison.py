@@ -32,6 +32,10 @@ class GroundTruth:
     trajectory: Trajectory  # of the left camera or the IMU
     T_cam0_imu: FloatArray  # (4, 4)
 
+    def ate_m(self, found: Trajectory) -> float:
+        """Return the ATE (rms) of a trajectory after rigid alignment; EvaluationError where they do not meet."""
+        return evaluate(found, self.trajectory, T_cam0_imu=self.T_cam0_imu).ate_m.rmse
+
 
 @dataclass(frozen=True, slots=True)
 class Segment:
@@ -217,9 +221,7 @@ def _against(
     own = take(run.trajectory, rows)
     other = replace(own, T_world_body=T_other_cam0)
     try:
-        ate, of_run = (
-            float(evaluate(t, truth.trajectory, T_cam0_imu=truth.T_cam0_imu).as_dict()["ate_m"]) for t in (other, own)
-        )
+        ate, of_run = truth.ate_m(other), truth.ate_m(own)
         scaled = evaluate(other, truth.trajectory, align="sim3", T_cam0_imu=truth.T_cam0_imu)
         scale = float(scaled.as_dict()["scale"])
     except EvaluationError:

@@ -11,7 +11,6 @@ import numpy as np
 
 from vio.config import Config, merge
 from vio.errors import ConfigError, EvaluationError
-from vio.evaluation.trajectories import evaluate
 from vio.files.inputs import read_input
 from vio.files.yaml_text import MOST_BYTES, read_yaml
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_hat, transform_points
@@ -148,18 +147,13 @@ def _adjusted_with_imu(run: SavedRun, keyframes: IntArray) -> Adjustment:
 
 def _scores(run: SavedRun, refined: Trajectory) -> tuple[float | None, float | None]:
     """Return ATE before and after, against the reference in the recording; None without one."""
-    truth = run.truth
-    if truth is None:
+    if run.truth is None:
         return None, None
     try:
-        before, after = (
-            float(evaluate(t, truth.trajectory, T_cam0_imu=truth.T_cam0_imu).as_dict()["ate_m"])
-            for t in (run.tracked.trajectory, refined)
-        )
+        return run.truth.ate_m(run.tracked.trajectory), run.truth.ate_m(refined)
     except EvaluationError as error:
         log.warning("the reference was not used: %s", error)
         return None, None
-    return before, after
 
 
 def _priors(run: SavedRun, keyframes: IntArray) -> PositionPriors | None:

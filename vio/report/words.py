@@ -79,9 +79,15 @@ def calibration_findings(metrics: Mapping[str, Any]) -> list[str]:
         text = field.get("text")
         lines += [f"Stereo pair: {text}; corrected in this run."] if text else []
         lines += [] if field.get("rig") is None else list(field["rig"]["lines"])
-    for name, x in (metrics.get("stereo_scale") or {}).items():
-        lines.append(f"{name.replace('_', ' ')} off by {x['percent']:+.2f} ± {x['sigma_percent']:.2f} %")
-    return lines + camera_imu_findings(metrics)
+    return lines + scale_findings(metrics) + camera_imu_findings(metrics)
+
+
+def scale_findings(metrics: Mapping[str, Any]) -> list[str]:
+    """Return what a run found of the cameras' scale, one line each; they are near zero where it is right."""
+    return [
+        f"{name.replace('_', ' ')} off by {x['percent']:+.2f} ± {x['sigma_percent']:.2f} %"
+        for name, x in (metrics.get("stereo_scale") or {}).items()
+    ]
 
 
 def camera_imu_findings(metrics: Mapping[str, Any]) -> list[str]:

@@ -23,7 +23,7 @@ from vio.geometry.upright import up_of
 from vio.records import LoopEvent, MapKeyframes, Trajectory
 from vio.runs.files import RunFile
 from vio.runs.folder import read_metrics
-from vio.runs.mapped import read_keyframes, read_loops
+from vio.runs.mapped import read_keyframes, read_lines, read_loops
 from vio.runs.tables import ESTIMATE
 
 log = logging.getLogger(__name__)
@@ -128,11 +128,7 @@ def read_estimates(path: Path) -> Rows:
 
 def _read_frames(path: Path, count: int) -> dict[str, FloatArray]:
     """Read the log of the frames by column; missing values are NaN."""
-    try:
-        text = read_input(path).decode("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: cannot be read ({error}); repeat the run") from error
-    header, *lines = list(csv.reader(text.splitlines())) or [[]]
+    header, *lines = list(csv.reader(read_lines(path))) or [[]]
     if len(lines) != count or any(len(line) != len(header) for line in lines):
         raise DataError(f"{path}: has {len(lines)} frames where estimates.npy has {count}; repeat the run")
     try:

@@ -142,7 +142,7 @@ def read_loops(folder: Path) -> tuple[LoopEvent, ...]:
         return ()
     matches = _read_matches(folder / RunFile.LOOP_MATCHES)
     try:
-        rows = _read_rows(path)
+        rows = csv.DictReader(read_lines(path))
         return tuple(
             LoopEvent(
                 **{name: int(row[name]) for name in _LOOP_COLUMNS[:5]},
@@ -168,7 +168,7 @@ def read_keyframes(folder: Path) -> MapKeyframes:
     if not path.is_file():
         return no_map_keyframes()
     try:
-        rows = _read_rows(path)
+        rows = [*csv.DictReader(read_lines(path))]
         keyframe, frame, time_ns, own = (
             np.array([int(row[name]) for row in rows], dtype=np.int64) for name in _KEYFRAME_COLUMNS[:4]
         )
@@ -201,12 +201,16 @@ def _write_rows(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _read_rows(path: Path) -> list[dict[str, str]]:
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file of a run.
+
+    Raises:
+        DataError: it cannot be read.
+    """
     try:
-        text = read_input(path).decode("utf-8")
+        return read_input(path).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot be read ({error}); repeat the run") from error
-    return list(csv.DictReader(text.splitlines()))
 
 
 def _read_matches(path: Path) -> dict[int, LoopMatches]:
