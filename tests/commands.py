@@ -22,12 +22,12 @@ def render(folder: Path, **options: str) -> Path:
     return folder
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     """Return the error of a command, which must end with status 1 and print this one line alone."""
     from vio.cli import main
 
     capsys.readouterr()
-    assert main(list(arguments)) == 1
+    assert main([*map(str, arguments)]) == 1
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.startswith("error: ")
@@ -35,11 +35,12 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return printed.err
 
 
-def json_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> Any:
+def json_of(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> Any:
     """Return the object that a command prints with `--json`; it must succeed and print nothing else."""
     from vio.cli import main
 
-    assert main([*arguments, "--json"]) == 0
+    capsys.readouterr()
+    assert main([*map(str, arguments), "--json"]) == 0
     out = capsys.readouterr().out
     assert out.count("\n") == 1, "one object, nothing else, on stdout"
     return json.loads(out)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.commands import json_of, refused
 from tools.verdicts import verdicts
 from vio.bench.compare import compare_outcomes, comparison_lines, holm
 from vio.bench.tables import Outcome
@@ -182,8 +183,7 @@ def test_the_command_tells_by_its_exit_status(tmp_path: Path, capsys: pytest.Cap
     printed = capsys.readouterr().out
     assert "1.9 to 1.9" in printed
     assert printed.endswith("\nworse\n")
-    assert main(["bench", "compare", b, a, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["verdict"] == "better"
+    assert json_of(capsys, "bench", "compare", b, a)["verdict"] == "better"
     assert main(["bench", "compare", a, a]) == 0
     assert capsys.readouterr().out.endswith("not worse by 10 % or more\n")
     assert main(["bench", "compare", a, c]) == 3
@@ -194,13 +194,10 @@ def test_the_command_tells_by_its_exit_status(tmp_path: Path, capsys: pytest.Cap
     assert json.loads(capsys.readouterr().out)["changes"][0]["effect"]["n"] == 4
     assert main(["bench", "compare", a, "--between", "x", "other"]) == 3, "one trajectory without a seed"
     assert "ATE 0.1 to 0.3 m" in capsys.readouterr().out
-    assert main(["bench", "compare", a, "--between", "x", "z"]) == 1
-    assert "no such system; choose of x, y, other" in capsys.readouterr().err
-    assert main(["bench", "compare", a, b, "--factor", "1"]) == 1
-    assert "--factor must be above 1" in capsys.readouterr().err
+    assert "no such system; choose of x, y, other" in refused(capsys, "bench", "compare", a, "--between", "x", "z")
+    assert "--factor must be above 1" in refused(capsys, "bench", "compare", a, b, "--factor", "1")
     (tmp_path / "b" / "bench.json").write_text('{"outcomes": [{}]}')
-    assert main(["bench", "compare", a, b]) == 1
-    assert "is damaged" in capsys.readouterr().err
+    assert "is damaged" in refused(capsys, "bench", "compare", a, b)
 
 
 # --- the simulation of a schedule -----------------------------------------------------------------------------------

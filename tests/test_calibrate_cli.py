@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.commands import refused
 from tests.dataset_makers import R_CAM0_IMU, ece276a_arrays, make_drive, make_npz
 from tests.dataset_makers import T_CAM0_IMU as T_OF_DRIVE
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU
@@ -144,5 +145,4 @@ def test_measures_cameras_that_cannot_be_rectified(
 def test_rejects_numbers_that_are_too_small(
     option: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["calibrate", str(tmp_path), *option]) == 1
-    assert "--pairs must be at least 1 and --frames at least 2" in capsys.readouterr().err
+    assert "--pairs must be at least 1 and --frames at least 2" in refused(capsys, "calibrate", tmp_path, *option)

@@ -239,17 +239,17 @@ def test_reads_a_model_as_a_trajectory(saved: TrackedPath, tmp_path: Path, stamp
 
 def test_refine_lowers_the_error_and_does_not_change_the_run(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = _contents(folder)
-    first = json_of(capsys, "refine", str(folder))
+    first = json_of(capsys, "refine", folder)
     after = _contents(folder)
     assert {name: data for name, data in after.items() if not name.startswith("refined")} == before
     assert isinstance(first["ate_m"], float)
     assert isinstance(first["ate_before_m"], float)
     assert first["ate_m"] < 0.9 * first["ate_before_m"]
     assert first["sigma_px"] == pytest.approx(SIGMA_PX, rel=0.2)
-    again = json_of(capsys, "refine", str(folder))
+    again = json_of(capsys, "refine", folder)
     assert again["ate_m"] == first["ate_m"], "one thread is bit-identical"
     assert _contents(folder)["refined/trajectory.tum"] == after["refined/trajectory.tum"]
-    scores = json_of(capsys, "eval", str(folder / "refined"), str(folder))
+    scores = json_of(capsys, "eval", folder / "refined", folder)
     assert 0 < float(str(scores["ate_m"])) < 2 * first["ate_before_m"]
 
 
@@ -271,14 +271,14 @@ def test_refine_uses_the_matches_of_loops(tmp_path: Path, capsys: pytest.Capture
     for with_loop in (False, True):
         if with_loop:
             _add_loop(run, LOOP)
-        facts.append(json_of(capsys, "refine", str(run)))
+        facts.append(json_of(capsys, "refine", run))
         refined = with_poses(read_saved_run(run), run / "refined").tracked.trajectory.T_world_body[list(LOOP)]
         gap = se3_inverse(se3_inverse(true[0]) @ true[1]) @ se3_inverse(refined[0]) @ refined[1]
         errors.append(float(np.linalg.norm(gap[:3, 3])))
     assert [f["loops"] for f in facts] == [0, 1]
     assert errors[1] < 0.5 * errors[0], errors
-    assert "its loops moved the poses away" in refused(capsys, "refine", str(run), "--priors", "filter")
-    exported = json_of(capsys, "export", "colmap", str(run), "--no-images", "--refined", "--keyframes", "12")
+    assert "its loops moved the poses away" in refused(capsys, "refine", run, "--priors", "filter")
+    exported = json_of(capsys, "export", "colmap", run, "--no-images", "--refined", "--keyframes", "12")
     assert exported["loops"] == 1
     model = pycolmap.Reconstruction(run / "colmap" / "sparse" / "0")
     images = [model.find_image_with_name(f"left/{k:06d}.png") for k in LOOP]
@@ -305,15 +305,15 @@ def test_a_feature_of_several_loops_is_one_point() -> None:
 def test_priors_need_a_filter_that_reproduces_the_run(
     folder: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert "--imu takes a run with an IMU" in refused(capsys, "refine", str(folder), "--imu")
-    held = json_of(capsys, "refine", str(folder), "--priors", "filter", "--keyframes", "12")
+    assert "--imu takes a run with an IMU" in refused(capsys, "refine", folder, "--imu")
+    held = json_of(capsys, "refine", folder, "--priors", "filter", "--keyframes", "12")
     assert held["priors"] == "filter"
-    free = json_of(capsys, "refine", str(folder), "--keyframes", "12")
+    free = json_of(capsys, "refine", folder, "--keyframes", "12")
     assert float(str(held["moved_rms_m"])) < float(str(free["moved_rms_m"])), "priors keep the poses near the filter's"
     config = (folder / "config.yaml").read_text()
     assert "pixel_sigma_px: 0.75" in config
     (folder / "config.yaml").write_text(config.replace("pixel_sigma_px: 0.75", "pixel_sigma_px: 2.5"))
-    other = json_of(capsys, "refine", str(folder), "--priors", "filter", "--keyframes", "12")
+    other = json_of(capsys, "refine", folder, "--priors", "filter", "--keyframes", "12")
     assert other["priors"] == "none"
     assert "does not reproduce" in caplog.text
 
@@ -336,25 +336,25 @@ def test_an_interrupted_refinement_leaves_nothing(
 def test_refine_reports_unusable_runs(
     simulation: Simulation, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "no run folder" in refused(capsys, "refine", str(tmp_path))
+    assert "no run folder" in refused(capsys, "refine", tmp_path)
     short = _make_run(simulation, tmp_path / "short", stop=1)
-    assert "a run of 1 frames has fewer than two views" in refused(capsys, "refine", str(short))
+    assert "a run of 1 frames has fewer than two views" in refused(capsys, "refine", short)
     blink = _make_run(simulation, tmp_path / "blink", stop=20, lost_after=1)
-    message = refused(capsys, "refine", str(blink))
+    message = refused(capsys, "refine", blink)
     assert "not observable because no feature is seen consistently in 2 keyframes" in message
     assert "do not overlap" in message
     assert not (blink / "refined").exists()
     (folder / "observations.npz").unlink()
-    assert "repeat its run with --save-observations" in refused(capsys, "refine", str(folder))
+    assert "repeat its run with --save-observations" in refused(capsys, "refine", folder)
 
 
 # --- export ---------------------------------------------------------------------------------------------------------
 
 
 def test_export_without_images_is_a_reference_for_eval(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    facts = json_of(capsys, "export", "colmap", str(folder), "--no-images")
+    facts = json_of(capsys, "export", "colmap", folder, "--no-images")
     assert float(str(facts["mean_reprojection_error_px"])) < 2 * SIGMA_PX
-    scores = json_of(capsys, "eval", str(folder), str(folder / "colmap"))
+    scores = json_of(capsys, "eval", folder, folder / "colmap")
     assert scores["association"] == "frame"
     assert float(str(scores["ate_m"])) < 1e-9
     document = json.loads((folder / "colmap" / "transforms.json").read_text())
@@ -367,15 +367,15 @@ def test_export_without_images_is_a_reference_for_eval(folder: Path, capsys: pyt
         np.testing.assert_allclose(-c2w[:3, 2], image.viewing_direction(), atol=1e-9)
     camera = model.camera(1)
     assert [document[k] for k in ("fl_x", "fl_y", "cx", "cy")] == pytest.approx(list(camera.params))
-    json_of(capsys, "refine", str(folder))
-    refined = json_of(capsys, "export", "colmap", str(folder), "--no-images", "--refined")
+    json_of(capsys, "refine", folder)
+    refined = json_of(capsys, "export", "colmap", folder, "--no-images", "--refined")
     assert float(str(refined["mean_reprojection_error_px"])) < float(str(facts["mean_reprojection_error_px"]))
 
 
 def test_export_reports_missing_images(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "name the recording with --source" in refused(capsys, "export", "colmap", str(folder))
+    assert "name the recording with --source" in refused(capsys, "export", "colmap", folder)
     assert not (folder / "colmap").exists()
-    assert "create it with `vio refine" in refused(capsys, "export", "colmap", str(folder), "--refined")
+    assert "create it with `vio refine" in refused(capsys, "export", "colmap", folder, "--refined")
 
 
 # --- rendered images ------------------------------------------------------------------------------------------------
@@ -401,7 +401,7 @@ def test_export_writes_images_and_colours(
     rendered: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "model"
-    facts = json_of(capsys, "export", "colmap", str(rendered[1]), "--out", str(out), "--keyframes", "6")
+    facts = json_of(capsys, "export", "colmap", rendered[1], "--out", out, "--keyframes", "6")
     model = pycolmap.Reconstruction(out / "sparse" / "0")
     assert facts["images"] == model.num_images()
     assert all((out / "images" / image.name).is_file() for image in model.images.values())
@@ -419,7 +419,7 @@ def test_export_writes_images_and_colours(
 def test_check_agrees_with_a_correct_run_and_estimates_the_scale(
     rendered: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    report = json_of(capsys, "check", str(rendered[1]), "--mapper", "incremental", "--keyframes", "9")
+    report = json_of(capsys, "check", rendered[1], "--mapper", "incremental", "--keyframes", "9")
     facts = report["mappers"]["incremental"]  # type: ignore[index]
     assert facts["registered"] == report["keyframes"]
     assert facts["ate_m"] < 0.02
@@ -464,11 +464,11 @@ def test_images_without_texture_are_not_observable(
         import cv2
 
         cv2.imwrite(str(path), np.full((200, 320), 120, dtype=np.uint8))
-    report = json_of(capsys, "check", str(rendered[1]), "--source", str(blank), "--keyframes", "5")
+    report = json_of(capsys, "check", rendered[1], "--source", blank, "--keyframes", "5")
     for facts in report["mappers"].values():  # type: ignore[attr-defined]
         assert facts["verdict"].startswith("not observable because")
         assert facts["registered"] == 0
-    facts = json_of(capsys, "calibrate", str(blank), "--out", str(tmp_path / "cal"), "--pairs", "3", "--frames", "6")
+    facts = json_of(capsys, "calibrate", blank, "--out", tmp_path / "cal", "--pairs", "3", "--frames", "6")
     assert "have no texture" in facts["stereo"]["verdict"]  # type: ignore[index]
     assert facts["findings"] == []
 
@@ -477,7 +477,7 @@ def test_calibrate_measures_rectified_images_and_reports_swapped_ones(
     rendered: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "cal"
-    facts = json_of(capsys, "calibrate", str(rendered[0]), "--out", str(out), "--pairs", "5", "--frames", "8")
+    facts = json_of(capsys, "calibrate", rendered[0], "--out", out, "--pairs", "5", "--frames", "8")
     assert facts["findings"] == []
     R = np.array(facts["stereo"]["R_cam1_cam0"])  # type: ignore[index]
     assert float(rotation_angle_deg(R)) < 0.3
@@ -488,7 +488,7 @@ def test_calibrate_measures_rectified_images_and_reports_swapped_ones(
     (swapped / "image_0").rename(swapped / "aside")
     (swapped / "image_1").rename(swapped / "image_0")
     (swapped / "aside").rename(swapped / "image_1")
-    facts = json_of(capsys, "calibrate", str(swapped), "--out", str(out), "--pairs", "5", "--frames", "8")
+    facts = json_of(capsys, "calibrate", swapped, "--out", out, "--pairs", "5", "--frames", "8")
     assert [f["fault"] for f in facts["findings"]] == ["cameras swapped"]  # type: ignore[attr-defined]
 
 
@@ -544,5 +544,5 @@ def test_rejects_a_run_without_right_matches(saved: TrackedPath) -> None:
 
 def test_noise_images_are_not_calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = make_kitti(tmp_path / "kitti")
-    facts = json_of(capsys, "calibrate", str(source), "--out", str(tmp_path / "cal"), "--pairs", "3", "--frames", "4")
+    facts = json_of(capsys, "calibrate", source, "--out", tmp_path / "cal", "--pairs", "3", "--frames", "4")
     assert "not observable because" in facts["stereo"]["verdict"]  # type: ignore[index]

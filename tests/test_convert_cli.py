@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.dataset_makers import ece276a_arrays, make_drive, make_npz
+from tests.commands import json_of
+from tests.dataset_makers import ece276a_arrays, make_drive, make_kitti, make_npz
 from tests.euroc_maker import make_euroc
 from tests.plain_maker import make_plain
 from tests.same_events import assert_same_events
@@ -87,11 +87,8 @@ def test_a_bag_without_the_files_beside_it_has_its_calibration(form: str, flight
 
 def test_a_bag_keeps_velocities_and_says_how_they_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _needs_rosbags("mcap")
-    from tests.dataset_makers import make_kitti
-
     source = make_kitti(tmp_path / "kitti")
-    assert main(["convert", str(source), "--to", "mcap", "--out", str(tmp_path / "bag"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["notes"] == []
+    assert json_of(capsys, "convert", source, "--to", "mcap", "--out", tmp_path / "bag")["notes"] == []
     a, b = (
         [event for event in open_dataset(path).events() if isinstance(event, VelocitySample)]
         for path in (source, tmp_path / "bag")
@@ -137,12 +134,9 @@ def test_names_agree_with_their_list_where_the_last_frame_is_unreadable(tmp_path
 
 
 def test_velocities_and_poses_at_the_frames_go_to_kitti(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from tests.dataset_makers import make_kitti
-
     source = make_kitti(tmp_path / "kitti")
     out = tmp_path / "out"
-    assert main(["convert", str(source), "--to", "kitti", "--out", str(out), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = json_of(capsys, "convert", source, "--to", "kitti", "--out", out)
     before, after = open_dataset(source), open_dataset(out)
     assert (after.recording.kind, facts["notes"]) == ("kitti", [])
     a, b = ([event for event in dataset.events() if isinstance(event, VelocitySample)] for dataset in (before, after))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.commands import refused
 from tests.dataset_makers import T_CAM0_IMU, make_drive
 from vio.cli import main
 from vio.datasets.kitti import write_calibration
@@ -97,7 +98,6 @@ def test_bad_trajectories_are_refused_in_one_line(
     make, form, options, message = BAD[name]
     monkeypatch.chdir(tmp_path)
     make(tmp_path / "a.txt")
-    assert main(["convert", "a.txt", "--to", form, "--out", "out.txt", *options]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = refused(capsys, "convert", "a.txt", "--to", form, "--out", "out.txt", *options).splitlines()
     assert message in line
     assert not (tmp_path / "out.txt").exists()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.commands import json_of, refused
 from vio.cli import main
 from vio.dense.occupancy import occupancy_grid
 from vio.dense.preview import preview
@@ -166,9 +167,7 @@ def run_folder(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_makes_a_mesh_of_a_run(run_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capsys.readouterr()
-    assert main(["mesh", str(run_folder), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = json_of(capsys, "mesh", run_folder)
     assert facts["triangles"] > 1000
     assert facts["stopped"] is None
     names = {path.name for path in (run_folder / "mesh").iterdir()}
@@ -216,9 +215,7 @@ def test_refusals_are_one_line(run_folder: Path, tmp_path: Path, capsys: pytest.
         ([str(tmp_path)], "no run folder"),
         ([str(run_folder), "--map", str(tmp_path / "none.map")], "there is no such map"),
     ):
-        capsys.readouterr()
-        assert main(["mesh", *arguments]) == 1
-        assert message in capsys.readouterr().err
+        assert message in refused(capsys, "mesh", *arguments)
 
 
 def test_exports_keep_the_colours_of_the_images(flight: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.bag_maker import Script
+from tests.commands import json_of, refused
 from tests.numerics import numeric_jacobian
 from tests.test_map_store import CAMERA, _features, _row
 from vio.cli import main
@@ -336,15 +337,13 @@ def test_places_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     found = read_trajectory(run / "earth" / "trajectory_enu.tum").T_world_body
     np.testing.assert_allclose(found, np.array(saved["T_enu_map"]) @ moved @ T, atol=1e-4)
     _keep_earth(_map_of(other, replace(drive, path=replace(drive.path, T_map_body=T[::-1]))), file)
-    assert main(["georeference", str(run), str(other)]) == 1
-    assert "was localised in another map than" in capsys.readouterr().err
+    assert "was localised in another map than" in refused(capsys, "georeference", run, other)
     (run / "metrics.json").write_text(json.dumps({**metrics, "map": None}))
     for arguments, message in (
         ([str(run), str(file)], "is no run that found its place in a map"),
         ([str(file), str(_map_of(tmp_path / "b.map", drive))], "nothing says where it is on the earth"),
     ):
-        assert main(["georeference", *arguments]) == 1
-        assert message in capsys.readouterr().err
+        assert message in refused(capsys, "georeference", *arguments)
 
 
 def test_places_a_run(
@@ -359,9 +358,7 @@ def test_places_a_run(
     geodetic = LocalFrame(ORIGIN).geodetic(T[:, :3, 3])
     C = np.tile(0.02**2 * np.eye(3), (len(T), 1, 1))
     gnss = _csv(tmp_path / "gnss.csv", checked_fixes(reference.times_ns, geodetic, C, "x"))
-    capsys.readouterr()
-    assert main(["georeference", str(run), str(gnss), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = json_of(capsys, "georeference", run, gnss)
     assert facts["positions_used"] >= 3
     assert np.array(facts["covariance"]).shape == (6, 6)
     saved = json.loads((run / "earth" / "earth.json").read_text())
@@ -380,9 +377,7 @@ def test_places_a_run(
         ([str(run), str(gnss), "--time-offset", "1000"], "are within the trajectory"),
         ([str(tmp_path), str(gnss)], "no run folder"),
     ):
-        capsys.readouterr()
-        assert main(["georeference", *arguments]) == 1
-        assert message in capsys.readouterr().err
+        assert message in refused(capsys, "georeference", *arguments)
     loop = LoopEvent(5, 0, 0, 0, 30, 0.1, joined=False, keyframe_frame=0)  # the first frame, seen again
     monkeypatch.setattr("vio.offline.georeference.read_loops", lambda _: [loop, replace(loop, keyframe_frame=None)])
     path = placed(run).path

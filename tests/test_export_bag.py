@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.commands import json_of, refused
 from vio.cli import main
 from vio.geometry.lie import rotation_from_quat_xyzw, se3_exp, se3_inverse, so3_log
 from vio.offline.export_bag import ros_covariance
@@ -27,8 +27,7 @@ def finished(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_bag_holds_the_run(form: str, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from rosbags.highlevel import AnyReader
 
-    assert main(["export", form, str(finished), "--out", str(tmp_path / "bag"), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = json_of(capsys, "export", form, finished, "--out", tmp_path / "bag")
     run = read_finished_run(finished)
     messages: dict[str, list[tuple[int, object]]] = {}
     with AnyReader([tmp_path / "bag"]) as reader:
@@ -78,5 +77,4 @@ def test_covariances_are_those_of_ros() -> None:
 
 
 def test_options_of_another_form_are_refused(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", "mcap", str(finished), "--refined"]) == 1
-    assert "are for colmap; leave them out" in capsys.readouterr().err
+    assert "are for colmap; leave them out" in refused(capsys, "export", "mcap", finished, "--refined")

@@ -32,9 +32,7 @@ def test_files_of_others_are_not_replaced(
     ):
         file = tmp_path / name
         file.write_text("mine\n")
-        assert "was not made by this command; remove it, or choose another name" in refused(
-            capsys, *arguments, str(file)
-        )
+        assert "was not made by this command; remove it, or choose another name" in refused(capsys, *arguments, file)
         assert file.read_text() == "mine\n"
         file.unlink()
         assert main([*arguments, str(file)]) == 0
@@ -43,7 +41,7 @@ def test_files_of_others_are_not_replaced(
 
 
 def test_results_are_no_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "holds the results of a run, not a recording" in refused(capsys, "run", str(run))
+    assert "holds the results of a run, not a recording" in refused(capsys, "run", run)
     assert "no recording is named" in refused(capsys, "run", "")
 
 
@@ -61,7 +59,7 @@ def test_a_run_that_can_go_on_is_not_said_to_be_lost(
     shutil.copytree(run, tmp_path / "run")
     (tmp_path / "run" / "unfinished").mkdir()
     (tmp_path / "run" / "estimates.npy").rename(tmp_path / "run" / "unfinished" / "estimates.npy")
-    assert f"`vio run --resume {tmp_path / 'run'}` goes on with it" in refused(capsys, "report", str(tmp_path / "run"))
+    assert f"`vio run --resume {tmp_path / 'run'}` goes on with it" in refused(capsys, "report", tmp_path / "run")
 
 
 def test_settings_of_a_left_camera_serve_its_observations(run: Path) -> None:

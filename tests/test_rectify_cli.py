@@ -33,7 +33,7 @@ def test_an_euroc_folder_becomes_a_rectified_one(
     truth: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source, out = make_euroc(tmp_path / "raw", truth=truth), tmp_path / "rect"
-    facts = json_of(capsys, "rectify", str(source), "--out", str(out))
+    facts = json_of(capsys, "rectify", source, "--out", out)
     raw, done = open_dataset(source), open_dataset(out)
     assert done.rectifier.maps is None, "the new folder needs no rectifying"
     camera = raw.recording.camera
@@ -75,7 +75,7 @@ def test_a_kitti_raw_drive_becomes_an_odometry_folder(
     source, out = make_kitti_raw(tmp_path / "raw", [100, 101, 103]), tmp_path / "rect"
     if not imu_known:
         (source / "calib_imu_to_velo.txt").unlink()
-    facts = json_of(capsys, "rectify", str(source), "--out", str(out), "--interpolation", "linear")
+    facts = json_of(capsys, "rectify", source, "--out", out, "--interpolation", "linear")
     raw, done = open_dataset(source), open_dataset(out)
     assert facts["kind"] == "kitti_raw"
     assert facts["frames"] == 3
@@ -105,12 +105,12 @@ def test_the_table_names_what_was_written(tmp_path: Path, capsys: pytest.Capture
 def test_replaces_only_an_older_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, out = make_euroc(tmp_path / "raw", 3), tmp_path / "rect"
     for _ in range(2):
-        assert json_of(capsys, "rectify", str(source), "--out", str(out))["frames"] == 3
+        assert json_of(capsys, "rectify", source, "--out", out)["frames"] == 3
     other = tmp_path / "precious"
     other.mkdir()
     (other / "thesis.txt").write_text("mine")
-    assert "will not be replaced" in refused(capsys, "rectify", str(source), "--out", str(other))
-    assert "will not be replaced" in refused(capsys, "rectify", str(source), "--out", str(source))
+    assert "will not be replaced" in refused(capsys, "rectify", source, "--out", other)
+    assert "will not be replaced" in refused(capsys, "rectify", source, "--out", source)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["precious", "raw", "rect"]
     assert (other / "thesis.txt").read_text() == "mine"
 
@@ -123,7 +123,7 @@ def test_rejects_a_recording_that_is_rectified_already(tmp_path: Path, capsys: p
     )
     for source in sources:
         out = tmp_path / "out"
-        assert "rectified already" in (message := refused(capsys, "rectify", str(source), "--out", str(out)))
+        assert "rectified already" in (message := refused(capsys, "rectify", source, "--out", out))
         assert "there is nothing to do" in message
         assert not out.exists()
 
@@ -135,13 +135,13 @@ def test_skips_a_corrupt_image_and_none_left_leaves_no_folder(
     stamps = camera_stamps(8)
     data = source / "mav0" / "cam0" / "data"
     (data / f"{stamps[2]}.png").write_bytes(b"")
-    assert json_of(capsys, "rectify", str(source), "--out", str(out))["frames"] == 7
+    assert json_of(capsys, "rectify", source, "--out", out)["frames"] == 7
     assert "frame 2 is skipped" in caplog.text
     assert open_dataset(out).recording.frame_times_ns.tolist() == [t for k, t in enumerate(stamps) if k != 2]
     for stamp in stamps:
         (data / f"{stamp}.png").write_bytes(b"")
     again = tmp_path / "again"
-    assert "none of 8 frames can be used" in refused(capsys, "rectify", str(source), "--out", str(again))
+    assert "none of 8 frames can be used" in refused(capsys, "rectify", source, "--out", again)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["raw", "rect"], "nothing half-written"
 
 
@@ -203,10 +203,10 @@ def test_a_rendered_folder_reads_as_the_rectified_cameras_would_see_it(
 def test_run_takes_an_unrectified_folder_like_a_rectified_one(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    metrics = json_of(capsys, "run", str(folder), "--out", str(tmp_path / "run"), "--backend", "vislam")
+    metrics = json_of(capsys, "run", folder, "--out", tmp_path / "run", "--backend", "vislam")
     assert metrics["frames"] == 8
     assert metrics["ate_m"] < 0.02, "the ground truth of the IMU is found and honoured"
     assert metrics["motion"] == "none", "the paper's filter has no IMU model and uses the images alone"
-    assert json_of(capsys, "rectify", str(folder), "--out", str(tmp_path / "rect"))["frames"] == 8
-    again = json_of(capsys, "run", str(tmp_path / "rect"), "--out", str(tmp_path / "run2"), "--backend", "vislam")
+    assert json_of(capsys, "rectify", folder, "--out", tmp_path / "rect")["frames"] == 8
+    again = json_of(capsys, "run", tmp_path / "rect", "--out", tmp_path / "run2", "--backend", "vislam")
     assert again["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-6)

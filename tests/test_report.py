@@ -199,7 +199,7 @@ def test_damaged_folders_are_named(
     folder = tmp_path / "run"
     shutil.copytree(runs[0], folder)
     (folder / name).write_bytes(content)
-    message = refused(capsys, "report", str(folder))
+    message = refused(capsys, "report", folder)
     assert name in message
     assert says in message
 

@@ -16,6 +16,7 @@ import pytest
 
 import vio
 from tests import test_filter_truth
+from tests.commands import refused
 from tests.euroc_maker import EQUIDISTANT_RIG, RADTAN_RIG
 from tests.test_filter_truth import Course
 from tests.test_stereo_calibration import _turned_right
@@ -304,8 +305,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_the_run(
     name: str, message: str, turned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert main(["run", str(turned), "--save-calibration", str(tmp_path / name), "--out", str(out)]) == 1
-    assert message in capsys.readouterr().err
+    assert message in refused(capsys, "run", turned, "--save-calibration", tmp_path / name, "--out", out)
     assert not out.exists()
 
 
