@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.numerics import numeric_jacobian
-from tools.consistency import Flight, Job, Motion, Scenario, fly
+from tools.consistency import Job, Motion, Scenario, fly
 from vio.evaluation.consistency import nees_bounds
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
@@ -80,28 +80,6 @@ def test_a_prior_is_carried_to_other_means_by_the_sum_of_jacobians() -> None:
     np.testing.assert_allclose(new @ N @ P @ N.T @ new.T, old @ P @ old.T, atol=1e-12)
     assert np.abs(N - np.eye(len(P))).max() > 0.1
     np.testing.assert_array_equal(window.prior.P, P)
-
-
-def test_flight_and_its_imu_agree() -> None:
-    """Integrating the exact rates gives the exact states: what the Monte-Carlo calls the truth is one."""
-    flight = Flight()
-    t = np.arange(0.0, 2.0, 0.005)
-    rng = np.random.default_rng(0)
-    quiet = MsckfSettings(
-        gyro_noise_density=1e-9, accel_noise_density=1e-9, gyro_bias_sigma_radps=0, accel_bias_sigma_mps2=0,
-        gyro_bias_walk=0, accel_bias_walk=0,
-    )  # fmt: skip
-    motion = ImuMotion(quiet)
-    samples, bias = flight.imu(range(401), rng, quiet)
-    assert not bias.any()
-    for sample in samples:
-        motion.take(sample)
-    R, p, v = flight.state(t[[0, -1]])
-    T = np.tile(np.eye(4), (2, 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = R, p
-    end = motion.advance(NavState(T[0], v[0], *np.zeros((3, 3))), 0, round(t[-1] * 1e9)).nav
-    np.testing.assert_allclose(end.T_world_imu, T[1], atol=2e-4)
-    np.testing.assert_allclose(end.velocity, v[1], atol=2e-4)
 
 
 @pytest.mark.parametrize("motion", ["imu", "none"])

@@ -142,6 +142,10 @@ def _blocks(name: str) -> Iterator[_Block]:
         yield _Block("", without[: found.start()].count("\n"), re.sub(r"^ {4}", "", found.group(), flags=re.MULTILINE))
 
 
+def _python(name: str) -> list[_Block]:
+    return [block for block in _blocks(name) if block.language == "python"]
+
+
 def _commands(name: str) -> list[str]:
     """Every command line of a document's blocks, without its comment; `a ; b` are two."""
     lines = [line for block in _blocks(name) if block.language in ("", "bash") for line in block.text.splitlines()]
@@ -242,9 +246,8 @@ def test_readme_python_runs(
     readme_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(readme_folder)
-    blocks = [block for block in _blocks(README) if block.language == "python"]
-    assert len(blocks) == 1
-    _execute(README, blocks[0], {})
+    (block,) = _python(README)
+    _execute(README, block, {})
     printed = re.search(r"ATE (\d\.\d+) m over (\d+\.\d) m", capsys.readouterr().out)
     assert float(printed.group(1)) < 0.1
     assert float(printed.group(2)) > 5
@@ -255,7 +258,7 @@ def test_live_use_runs(
 ) -> None:
     monkeypatch.chdir(readme_folder)
     scope: dict[str, object] = {}
-    for block in (block for block in _blocks("docs/live.md") if block.language == "python"):
+    for block in _python("docs/live.md"):
         _execute("docs/live.md", block, scope)
         lines = capsys.readouterr().out.splitlines()
         assert len(lines) > 5 or "LiveFigures(results=" in lines[0]
@@ -280,14 +283,13 @@ def _execute(name: str, block: _Block, scope: dict[str, object]) -> None:
 def simulation() -> dict[str, object]:
     """What the example of docs/simulation.md leaves behind."""
     scope: dict[str, object] = {}
-    _execute("docs/simulation.md", next(b for b in _blocks("docs/simulation.md") if b.language == "python"), scope)
+    _execute("docs/simulation.md", _python("docs/simulation.md")[0], scope)
     return scope
 
 
 def test_conventions_run() -> None:
-    blocks = [block for block in _blocks("docs/conventions.md") if block.language == "python"]
     scope: dict[str, object] = {}
-    for block in blocks:
+    for block in _python("docs/conventions.md"):
         _execute("docs/conventions.md", block, scope)
 
 
@@ -297,9 +299,8 @@ def test_simulation_example_runs(simulation: dict[str, object]) -> None:
 
 
 def test_simulation_along_a_flight_runs(data_dir: Path) -> None:
-    blocks = [block for block in _blocks("docs/simulation.md") if block.language == "python"]
     scope: dict[str, object] = {"folder": data_dir / "euroc_real_imu" / "V1_02"}
-    _execute("docs/simulation.md", blocks[1], scope)
+    _execute("docs/simulation.md", _python("docs/simulation.md")[1], scope)
     assert len(scope["simulation"].stamps_ns) == 1670  # type: ignore[attr-defined]
 
 
@@ -317,7 +318,7 @@ def test_inertial_check_runs(simulation: dict[str, object], caplog: pytest.LogCa
         "seen": oracle.process(frame).observations,  # type: ignore[attr-defined]
         "log": logging.getLogger("doc"),
     }
-    (block,) = [block for block in _blocks("docs/inertial.md") if block.language == "python"]
+    (block,) = _python("docs/inertial.md")
     _execute("docs/inertial.md", block, scope)
     assert not caplog.records
 
@@ -330,13 +331,13 @@ def test_client_of_a_served_map_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     found = FoundPose(np.eye(4), np.eye(6), 80, 3)
     monkeypatch.setattr("vio.live.map_service.ask", lambda url, left, right: found)
     scope: dict[str, object] = {"left": images[0], "right": images[1]}
-    (block,) = [block for block in _blocks("docs/maps.md") if block.language == "python"]
+    (block,) = _python("docs/maps.md")
     _execute("docs/maps.md", block, scope)
     assert scope["found"] is found
 
 
 def test_every_python_block_is_run_by_one_of_the_tests_above() -> None:
-    counts = {name: sum(block.language == "python" for block in _blocks(name)) for name in DOCS}
+    counts = {name: len(_python(name)) for name in DOCS}
     tested = {README: 1, "docs/live.md": 2, "docs/simulation.md": 2, "docs/inertial.md": 1, "docs/maps.md": 1}
     tested["docs/conventions.md"] = 8
     assert {name: count for name, count in counts.items() if count} == tested
