@@ -47,7 +47,7 @@ STEP_NS = 100_000_000
 class FakeDrive:
     """A short drive with perfect features and velocities, without images."""
 
-    def __init__(self, frames: int = 30, *, reference: bool = True, velocity: bool = True) -> None:
+    def __init__(self, frames: int = 30, *, velocity: bool = True) -> None:
         self.u = np.array([6.0, 0, 0, 0, 0, 0.25])
         poses = np.array([se3_exp(0.1 * k * self.u) for k in range(frames)])
         times = np.arange(frames, dtype=np.int64) * STEP_NS
@@ -62,7 +62,7 @@ class FakeDrive:
             frame_times_ns=times,
             has_images=False,
             motion=frozenset({"velocity"}) if velocity else frozenset(),
-            reference=Trajectory(poses, times, "imu", np.arange(frames)) if reference else None,
+            reference=Trajectory(poses, times, "imu", np.arange(frames)),
         )
 
     @property
@@ -373,14 +373,6 @@ def test_velocities_that_begin_after_the_images_end_no_run(tmp_path: Path) -> No
         se3_inverse(reckoned[12]) @ reckoned[29], se3_inverse(drive.poses[12]) @ drive.poses[29], atol=1e-6
     )
     assert write_run_folder(tmp_path / "out", result, drive.recording.reference)["ate_m"] < 0.05
-
-
-def test_without_reference_the_scores_are_null(tmp_path: Path) -> None:
-    metrics = write_run_folder(tmp_path / "out", run(FakeDrive(reference=False), Config()), None)
-    assert metrics["ate_m"] is None
-    assert metrics["rpe"] is None
-    assert metrics["t_err_percent"] is None
-    assert metrics["path_length_m"] > 10
 
 
 def test_a_second_run_replaces_the_first_but_never_something_else(tmp_path: Path) -> None:
