@@ -29,10 +29,8 @@ from vio.geometry.stereo import CameraKind, Projection, StereoCamera
 from vio.records import (
     BodyFrame,
     FeatureTracks,
-    ImuSample,
     Landmarks,
     MotionSample,
-    MotionSource,
     Observations,
     Recording,
     RunMotion,
@@ -186,9 +184,9 @@ def write_observations(
     times_ns = check_increasing(times_ns.astype(np.int64), lambda k: f"frame times, entry {k}")
     seen = [frame_observations(k, int(times_ns[k]), *frame) for k, frame in enumerate(frames)]
     T = None if T_cam0_imu is None else checked_transform(T_cam0_imu, "T_cam0_imu")
-    kinds: set[MotionSource] = {"imu" if isinstance(sample, ImuSample) else "velocity" for sample in motion}
-    recording = Recording("features", Path(path), camera, T, times_ns, False, frozenset(kinds), reference)
-    write_observation_log(Path(path), recording, seen, motion)
+    samples = as_arrays(motion)
+    recording = Recording("features", Path(path), camera, T, times_ns, False, samples.kinds, reference)
+    write_observation_log(Path(path), recording, seen, samples)
 
 
 def is_observation_log(names: Sequence[str]) -> bool:
@@ -209,7 +207,6 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
     sigma = arrays["sigma"].astype(np.float32) if "sigma" in arrays else None
     tracks = FeatureTracks(dense_offsets, arrays["ids"], arrays["z"], arrays["has_right"], arrays["stale"], sigma)
     motion = MotionSamples[MotionSample](arrays["motion_times_ns"], arrays["motion_values"], arrays["motion_is_imu"])
-    kinds: set[MotionSource] = {"imu" if imu else "velocity" for imu in np.unique(motion.is_imu).tolist()}
     recording = Recording(
         kind="log",
         path=path,
@@ -217,7 +214,7 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
         T_cam0_imu=_extrinsics(arrays, path),
         frame_times_ns=times_ns,
         has_images=False,
-        motion=frozenset(kinds),
+        motion=motion.kinds,
         reference=_reference(arrays),
         landmarks_reference=_landmarks(arrays),
         notes=tuple(str(note) for note in arrays["notes"]),

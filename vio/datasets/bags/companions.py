@@ -15,11 +15,11 @@ from vio.datasets.companions import check_overlap, imu_on_camera_clock
 from vio.datasets.images import UnreadableImageError, decode_gray
 from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.rigs.camera_info import rig_from_camera_infos
-from vio.datasets.samples import in_time_order
+from vio.datasets.samples import MotionSamples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import imu_notes
 from vio.errors import CalibrationError
-from vio.records import IntArray, MotionSample, MotionSource
+from vio.records import IntArray, MotionSample
 
 Size = tuple[int, int]
 
@@ -131,17 +131,14 @@ def _is_rectified(topic: Topic) -> bool:
     return "rect" in topic.name.removesuffix("/compressed").rsplit("/", 1)[-1]
 
 
-def motion_of(
-    found: Contents, rig: Rig, times_ns: IntArray
-) -> tuple[Sequence[MotionSample], frozenset[MotionSource], list[str]]:
-    """Return the samples in time order on the cameras' clock, their kinds, and notes."""
+def motion_of(found: Contents, rig: Rig, times_ns: IntArray) -> tuple[MotionSamples[MotionSample], list[str]]:
+    """Return the samples in time order on the cameras' clock, and notes."""
     index, roles = found.index, found.roles
     notes = [
         f"{count} messages of {topic} were recorded out of order and are sorted"
         for topic, count in index.disordered.items()
     ]
     parts: list[Sequence[MotionSample]] = []
-    sources: set[MotionSource] = set()
     record = index.imu_record()
     if rig.T_cam0_imu is None and (record is not None or index.velocities):
         which = " and ".join(t.name for t in (roles.imu, roles.velocity) if t is not None)
@@ -149,15 +146,13 @@ def motion_of(
             f"{which} cannot be used: its pose in the camera is unknown; give --calibration FILE with T_cam_imu, as "
             "Kalibr's camchain-imucam; images alone"
         )
-        return (), frozenset(), notes
+        return in_time_order(), notes
     if record is not None and roles.imu is not None:
         samples, moved = imu_on_camera_clock(record, rig, times_ns, f"{found.path}, {roles.imu.name}")
         notes += [*moved, *imu_notes(record.times_ns, roles.imu.name)]
         parts.append(samples)
-        sources.add("imu")
     if roles.velocity is not None and (speeds := index.velocity_samples()):
         check_overlap(times_ns, speeds.times_ns, roles.velocity.name)
         notes.append(f"the twist of {roles.velocity.name} is taken in the frame of T_cam0_imu")
         parts.append(speeds)
-        sources.add("velocity")
-    return in_time_order(*parts), frozenset(sources), notes
+    return in_time_order(*parts), notes

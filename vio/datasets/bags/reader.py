@@ -101,7 +101,7 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
     stamps_ns, logged_ns, image_notes = _frames(stamps, [topic.name for topic in roles.cameras], path)
     with naming(file or path):
         rectifier = rig.rectifier(settings.interpolation, settings.projection)
-    motion, sources, motion_notes = motion_of(found, rig, stamps_ns[0])
+    motion, motion_notes = motion_of(found, rig, stamps_ns[0])
     truth = index.reference(imu=rig.T_cam0_imu is not None)
     white = white_of(max(index.left.white, index.right.white))
     recording = Recording(
@@ -111,7 +111,7 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         T_cam0_imu=None if rig.T_cam0_imu is None else rectifier.T_rect0_imu,
         frame_times_ns=stamps_ns[0],
         has_images=True,
-        motion=sources,
+        motion=motion.kinds,
         reference=None if truth is None else reference_of_body(truth, rig, rectifier),
         notes=(
             *(*rig.notes, *rectifier.notes, *image_notes, *motion_notes),
