@@ -151,18 +151,10 @@ def _unknown(path: Path) -> str:
 
 
 def _folder_kind(path: Path) -> str | None:
+    from vio.datasets import plain
     from vio.datasets.bags import is_bag
     from vio.datasets.euroc import is_euroc_folder
     from vio.datasets.gtsam import factor_files
-    from vio.datasets.plain import (
-        holds_more_than_kitti,
-        is_kitti_folder,
-        is_kitti_raw_folder,
-        is_mono_folder,
-        is_plain_folder,
-        is_rgbd_folder,
-        lacks_sensor_yaml,
-    )
     from vio.datasets.videos import video_files
 
     try:
@@ -178,23 +170,23 @@ def _folder_kind(path: Path) -> str | None:
         )
     if is_bag(path):
         return "bag"
-    if is_kitti_folder(path):
-        return "plain" if holds_more_than_kitti(path) else "kitti"
-    if is_kitti_raw_folder(path):
+    if plain.is_kitti_folder(path):
+        return "plain" if plain.holds_more_than_kitti(path) else "kitti"
+    if plain.is_kitti_raw_folder(path):
         return "kitti_raw"
-    if is_euroc_folder(path) and not is_plain_folder(path) and is_mono_folder(path):
+    if is_euroc_folder(path) and not plain.is_plain_folder(path) and plain.is_mono_folder(path):
         return "mono"
     if is_euroc_folder(path):
-        return "plain" if lacks_sensor_yaml(path) else "euroc"
-    if is_plain_folder(path):
+        return "plain" if plain.lacks_sensor_yaml(path) else "euroc"
+    if plain.is_plain_folder(path):
         return "plain"
     if video_files(path) is not None:
         return "video"
     if factor_files(path):
         return "gtsam"
-    if is_rgbd_folder(path):
+    if plain.is_rgbd_folder(path):
         return "rgbd"
-    if is_mono_folder(path):
+    if plain.is_mono_folder(path):
         return "mono"
     if "sequences" in names:
         raise DataError(f"{path} holds several KITTI sequences; name one of them, such as {path / 'sequences' / '00'}")
