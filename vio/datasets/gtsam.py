@@ -10,7 +10,6 @@ Reference: StereoVOExample_large.cpp of GTSAM, which reads these files, and Cal3
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,14 +27,6 @@ from vio.records import FeatureTracks, IntArray, Recording, Trajectory
 _FACTORS = "stereo_factors"
 _FRAME_NS = 100_000_000  # KITTI's cameras
 _COLUMNS = "pose landmark uL uR v X Y Z"
-
-
-@dataclass(frozen=True, slots=True)
-class _Poses:
-    """The poses beside the factors."""
-
-    numbers: IntArray  # (P,) increasing, as the factors number their frames
-    T_world_cam: FloatArray  # (P, 4, 4)
 
 
 def is_factor_file(path: Path) -> bool:
@@ -77,7 +68,7 @@ def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDa
         frame_times_ns=times_ns,
         has_images=False,
         motion=frozenset(),
-        reference=None if poses_file is None else _reference(_read_poses(poses_file), numbers, times_ns, poses_file),
+        reference=None if poses_file is None else _reference(poses_file, numbers, times_ns),
         notes=(
             f"{file.name} states no times; frames are taken to be {_FRAME_NS * 1e-9:g} s apart, so speeds are unknown",
             f"not used: the points X Y Z of {file.name}",
@@ -134,22 +125,21 @@ def _camera(file: Path) -> StereoCamera:
         return StereoCamera(fu, fv, cu, cv, baseline_m)
 
 
-def _read_poses(path: Path) -> _Poses:
-    """Read the lines `pose` with a row-major 4 x 4 `T_world_cam`, printed with six digits."""
+def _reference(path: Path, numbers: IntArray, times_ns: IntArray) -> Trajectory:
+    """Return the poses of the frames that have one, as those of cam0.
+
+    The lines hold `pose`, which numbers a frame as the factors do, and a row-major 4 x 4 `T_world_cam` of six digits.
+    """
     table = read_numbers(path, 17)
-    poses, numbers = table[:, 1:].reshape(-1, 4, 4), table[:, 0]
+    poses, own = table[:, 1:].reshape(-1, 4, 4), table[:, 0]
     for row, T in enumerate(poses):
         fault = "values are not finite" if not np.isfinite(table[row]).all() else rigid_fault(T)
-        if row and not numbers[row] > numbers[row - 1]:
+        if row and not own[row] > own[row - 1]:
             fault = "its number does not increase"
         if fault:
             raise DataError(f"{path}, line {row + 1}: {fault}; expected 'pose' and 16 numbers of a 4x4 pose")
-    return _Poses(numbers.astype(np.int64), se3_from_parts(nearest_rotation(poses[:, :3, :3]), poses[:, :3, 3]))
-
-
-def _reference(poses: _Poses, numbers: IntArray, times_ns: IntArray, path: Path) -> Trajectory:
-    """Return the poses of the frames that have one, as those of cam0."""
-    _, in_poses, in_frames = np.intersect1d(poses.numbers, numbers, assume_unique=True, return_indices=True)
+    T_world_cam = se3_from_parts(nearest_rotation(poses[:, :3, :3]), poses[:, :3, 3])
+    _, in_poses, in_frames = np.intersect1d(own.astype(np.int64), numbers, assume_unique=True, return_indices=True)
     if not len(in_poses):
         raise DataError(f"{path}: numbers none of the frames of the factors; give the poses of this file, or remove it")
-    return Trajectory(poses.T_world_cam[in_poses], times_ns[in_frames], "cam0", in_frames.astype(np.int64))
+    return Trajectory(T_world_cam[in_poses], times_ns[in_frames], "cam0", in_frames.astype(np.int64))

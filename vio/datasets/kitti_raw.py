@@ -21,7 +21,6 @@ from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, se3_
 CAMERAS = "calib_cam_to_cam.txt"
 VELO = "calib_velo_to_cam.txt"
 IMU = "calib_imu_to_velo.txt"
-_FRAME_NS = 100_000_000
 _MAX_PARENTS = 3
 
 
