@@ -110,26 +110,19 @@ def full_scale(pairs: ImagePairs) -> tuple[int, tuple[str, ...]]:
     return white, white_note(white)
 
 
-def first_readable(pairs: ImagePairs) -> tuple[Path, Image, int]:
-    """The first left image that can be read: its file, its pixels (H, W) and its bits per channel.
-
-    Raises:
-        UnreadableImageError: all left images are unreadable.
-    """
-    for path, _ in pairs[:-1]:
-        with contextlib.suppress(UnreadableImageError):
-            return path, *load_gray(path)
-    last = pairs[-1][0]
-    return last, *load_gray(last)
-
-
 def measured_images(pairs: ImagePairs) -> tuple[tuple[int, int], int, tuple[str, ...]]:
     """Return width and height of the first left image that can be read, the level of white of all, and notes.
 
     Raises:
         UnreadableImageError: all left images are unreadable.
     """
-    path, image, bits = first_readable(pairs)
+    for index, (path, _) in enumerate(pairs, start=1):
+        try:
+            image, bits = load_gray(path)
+            break
+        except UnreadableImageError:
+            if index == len(pairs):
+                raise
     white, notes = full_scale(pairs)
     if bits == 16 and not notes:
         notes = (f"images have 16 bits ({path.name}); scaled to 8 bits by 1/257",)

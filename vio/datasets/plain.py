@@ -196,9 +196,13 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
     size, white, notes = measured_images(pairs)
     rig = load_rig(file, image_size=size, cameras=2)
     used = [path / name / "timestamps.txt" for name in ("image_00", "image_01")]  # one trigger: the left ones serve
-    times_ns, time_notes = _drive_times(used[0], _frame_numbers(pairs))
-    calibration, times = (file, rig), (times_ns, used[0])
-    parts = read_companions("kitti_raw", layout, calibration, settings, times, (*time_notes, *notes), used)
+    numbers = _frame_numbers(pairs)
+    if used[0].is_file():
+        times_ns = drive_times(used[0], numbers)
+    else:
+        times_ns = numbers * _DRIVE_NS
+        notes = (f"{used[0]} is missing; times follow from the frame numbers at 10 Hz", *notes)
+    parts = read_companions("kitti_raw", layout, (file, rig), settings, (times_ns, used[0]), notes, used)
     return ImageDataset(*parts, pairs, white=white)
 
 
@@ -439,11 +443,3 @@ def _frame_numbers(pairs: ImagePairs) -> IntArray:
             "same number of digits"
         )
     return numbers
-
-
-def _drive_times(path: Path, numbers: IntArray) -> tuple[IntArray, tuple[str, ...]]:
-    """Return times (F,) of the images, and a note where they follow from the frame numbers."""
-    if not path.is_file():
-        note = f"{path} is missing; times follow from the frame numbers at 10 Hz"
-        return numbers * _DRIVE_NS, (note,)
-    return drive_times(path, numbers), ()

@@ -84,16 +84,13 @@ def _read_mat(path: Path) -> Mapping[str, FloatArray]:
         raise DataError(f"{path}: is damaged or no MATLAB file ({error}); copy it again") from error
     except OSError as error:
         raise DataError(f"cannot read {path}: {error.strerror or error}; copy it again") from error
-    names = [name for name in shapes if not name.startswith("__")]
-    if missing := [key for key in KEYS if key not in names]:
-        raise DataError(
-            f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found {' '.join(sorted(names))}"
-        )
-    arrays = {name: raw[name] for name in wanted if isinstance(raw.get(name), np.ndarray)}
-    for key in (*KEYS, *(key for key in OPTIONAL_KEYS if key in names)):
-        if key not in arrays or arrays[key].dtype.kind not in "fiu":
+    if missing := [key for key in KEYS if key not in wanted]:
+        names = " ".join(sorted(name for name in shapes if not name.startswith("__")))
+        raise DataError(f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found {names}")
+    for key in wanted:
+        if not isinstance(raw.get(key), np.ndarray) or raw[key].dtype.kind not in "fiu":
             raise DataError(f"{path}: {key} is not an array of real numbers; save it again as one")
-    return {name: value.astype(np.float64) for name, value in arrays.items() if value.dtype.kind in "fiu"}
+    return {key: raw[key].astype(np.float64) for key in wanted}
 
 
 def _rows(arrays: Mapping[str, FloatArray], key: str, path: Path, rows: int, count: int) -> FloatArray:
