@@ -11,12 +11,8 @@ import stat
 from pathlib import Path
 
 MOST_BYTES = 2**30  # of a text file: an hour of IMU at 1 kHz is half of that
-_READABLE = (
-    os.devnull,
-    "/dev/fd/",
-    "/proc/self/fd/",
-    "/dev/stdin",
-)  # the last: `vio eval <(command) …`, a pipe with a writer
+# `vio eval <(command) …` reads a pipe with a writer.
+_READABLE = (os.devnull, "/dev/fd/", "/proc/self/fd/", "/dev/stdin")
 
 
 def check_regular(path: Path) -> None:

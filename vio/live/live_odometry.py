@@ -136,7 +136,6 @@ class LiveOdometry(EventInputs[None]):
         self._points: deque[Landmarks] = deque()  # that do not change any more
         self._keep_landmarks, self._copies = keep_landmarks, copy_images
         self._lines: list[str] = []
-        self._forget()
         self._worker = Worker(queue_frames, drop, finish=self._odometry.finish, close=self._let_go)
 
     def warm_up(self) -> None:

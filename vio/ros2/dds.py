@@ -23,7 +23,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from vio.datasets.bags.cdr import Field, fields_of, is_message
+from vio.datasets.bags.cdr import Field, fields_of
 from vio.errors import DataError
 from vio.ros2.transport import Quality
 
@@ -62,7 +62,7 @@ def _struct(kind: str) -> Any:
 
 
 def _field(field: Field) -> Any:
-    of = _struct(field.kind) if is_message(field.kind) else _BASE[field.kind]
+    of = _struct(field.kind) if "/" in field.kind else _BASE[field.kind]
     if field.many == "array":
         return _ARRAY[of, field.length]
     if field.many == "sequence":

@@ -28,11 +28,6 @@ def decoded(data: bytes, kind: str, where: str) -> Any:
         return ros2_types().deserialize_cdr(data, kind)
 
 
-def is_message(kind: str) -> bool:
-    """Return whether a message type is known."""
-    return kind in ros2_types().fielddefs
-
-
 def fields_of(kind: str) -> tuple[Field, ...]:
     """Return the fields of a message type."""
     from rosbags.interfaces import Nodetype
