@@ -23,7 +23,7 @@ from tests.dataset_makers import (
     make_npz,
     utias_arrays,
 )
-from vio.datasets import READERS, DatasetSettings, open_dataset
+from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.common import clock_ns, merge_events, read_npz, seconds_to_ns
 from vio.datasets.observation_log import write_observation_log
 from vio.errors import CalibrationError, ConfigError, DataError
@@ -247,10 +247,6 @@ def test_settings_are_checked(name: str) -> None:
     values: dict[str, Any] = {name: -1}
     with pytest.raises(ConfigError, match=f"dataset.{name} must be at least 0"):
         DatasetSettings(**values)
-
-
-def test_every_kind_has_a_reader() -> None:
-    assert {"kitti", "ece276a", "utias", "log"} <= set(READERS)
 
 
 @pytest.mark.parametrize(("target", "message"), [("folder", "cannot list"), ("file.npz", "cannot read")])
