@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from vio.errors import VioError
+from vio.sim.effects import SensorEffects
+from vio.sim.miscalibration import CalibrationErrors
 from vio.sim.motion import car_loop, fit_spline, hand_held
 from vio.sim.oracle import OracleSettings
 from vio.sim.rigs import small_rig
+from vio.sim.scenarios import Conditions, Scenario, plan
 from vio.sim.sequence import simulate
 from vio.sim.world import room, street
 
@@ -40,6 +43,16 @@ def _with_hole() -> np.ndarray:
         (lambda: room(0, bounds=[[0, 0, 0], [5, 5, 0.4]]), "at least 0.5 m apart"),
         (lambda: room(0, bounds=[[0, 0], [5, 5]]), "an upper corner"),
         (lambda: room(0, bare_walls=("+x", "up")), r"unknown walls \['up'\]; use some of"),
+        (lambda: SensorEffects(gamma=0.0), "gamma and blur_samples must be positive"),
+        (lambda: SensorEffects(exposure=-0.1), "exposure and gain must not be negative"),
+        (lambda: SensorEffects(vignetting=1.5), "vignetting and exposure_swing must be between 0 and 1"),
+        (lambda: SensorEffects(read_noise=-1.0), "read_noise, .* must not be negative"),
+        (lambda: SensorEffects(shutter_ms=0.0), "shutter times and exposure_target must be positive"),
+        (lambda: SensorEffects(gain_max=0.5), "gain_max at least 1"),
+        (lambda: SensorEffects(camera_difference=2.0), "camera_difference must be between 0 and 1"),
+        (lambda: SensorEffects(glare=-1.0), "glare not negative"),
+        (lambda: CalibrationErrors(rotation_deg=-0.1), "finite and not negative"),
+        (lambda: plan(Scenario(conditions=Conditions(people=101))), "101 people"),
     ],
 )
 def test_rejects_invalid_arguments(make: Callable[[], object], message: str) -> None:

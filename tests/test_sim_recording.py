@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -91,12 +90,6 @@ def test_noise_has_the_specified_standard_deviation() -> None:
     assert not np.array_equal(other, read)
     right = _with_effects(replace(CLEAN, read_noise=3.0), camera=1)
     assert abs(np.corrcoef(read.ravel(), right.ravel())[0, 1]) < 0.05
-
-
-def test_rejects_invalid_effects() -> None:
-    for wrong in ({"gamma": 0.0}, {"vignetting": 1.5}, {"read_noise": -1.0}, {"exposure": -0.1}):
-        with pytest.raises(SimulationError):
-            SensorEffects(**wrong)
 
 
 def test_exact_blur_is_the_mean_of_sub_exposures() -> None:
@@ -373,16 +366,6 @@ def test_folders_are_written_atomically(plain: Simulation, tmp_path: Path) -> No
         export_kitti(_short(plain, 1), tmp_path / "out")
     export_kitti(_short(plain, 2), tmp_path / "out", replace=True)
     assert len(list((tmp_path / "out" / "image_0").iterdir())) == 2
-
-
-def test_error_names_an_unwritable_target(plain: Simulation, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(VioError, match="cannot write"):
-        export_kitti(_short(plain, 1), tmp_path / "file" / "out")
-    if os.geteuid() != 0:
-        (tmp_path / "locked").mkdir(mode=0o500)
-        with pytest.raises(VioError, match="cannot write"):
-            export_kitti(_short(plain, 1), tmp_path / "locked" / "out")
 
 
 def test_export_errors_name_the_missing_sensor(world: World, tmp_path: Path) -> None:
