@@ -13,8 +13,8 @@ import pytest
 
 from tests.dataset_makers import make_images
 from tests.test_datasets_png import chunk
-from vio.datasets.image_pairs import ImageSize, pair_images
-from vio.datasets.images import UnreadableImageError, list_images, load_gray, prefetch, write_png
+from vio.datasets.image_pairs import pair_images
+from vio.datasets.images import UnreadableImageError, list_images, load_gray, prefetch
 from vio.errors import DataError
 
 PIXELS = np.random.default_rng(5).integers(0, 256, (24, 32)).astype(np.uint8)
@@ -84,19 +84,6 @@ def test_whole_png_without_an_image_is_unreadable(tmp_path: Path) -> None:
 def test_missing_image_is_unreadable(tmp_path: Path) -> None:
     with pytest.raises(UnreadableImageError, match=r"cannot read .*a\.png"):
         load_gray(tmp_path / "a.png")
-
-
-def test_sizes_are_compared_by_name() -> None:
-    with pytest.raises(DataError, match=r"b\.png is 32 x 24 pixels but a\.png is for 30 x 24"):
-        ImageSize(30, 24, Path("a.png")).check(PIXELS, Path("b.png"))
-    ImageSize(32, 24, Path("a.png")).check(PIXELS, Path("b.png"))
-
-
-def test_a_written_png_reads_back(tmp_path: Path) -> None:
-    write_png(tmp_path / "a.png", PIXELS)
-    pixels, bits = load_gray(tmp_path / "a.png")
-    np.testing.assert_array_equal(pixels, PIXELS)
-    assert bits == 8
 
 
 def test_lists_images_in_order_without_other_files(tmp_path: Path) -> None:

@@ -79,14 +79,6 @@ def test_numbers_without_padding_are_sorted_as_numbers(tmp_path: Path) -> None:
     assert [right.name for _, right in pairs] == [f"right{k + 1}.jpg" for k in range(12)]
 
 
-def test_kitti_folders_without_padding_are_sorted_as_numbers(tmp_path: Path) -> None:
-    folder = make_kitti(tmp_path, frames=11)
-    for image in sorted(folder.glob("image_?/*.png")):
-        image.rename(image.with_name(f"{int(image.stem)}.png"))
-    dataset = open_dataset(folder)
-    assert [left.stem for left, _ in dataset.pairs] == [str(k) for k in range(11)]  # type: ignore[attr-defined]
-
-
 @pytest.mark.parametrize("suffix", [".bmp", ".tif", ".pgm", ".webp"])
 def test_other_image_types_are_read_and_truncated_ones_refused(suffix: str, tmp_path: Path) -> None:
     pixels = np.tile(np.arange(0, 248, 8, dtype=np.uint8), (24, 1))

@@ -24,7 +24,7 @@ from vio.datasets.features import FeatureDataset
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.utias import read_utias
 from vio.errors import CalibrationError, DataError
-from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, so3_log, transform_points
+from vio.geometry.lie import FloatArray, se3_inverse, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project, triangulate
 from vio.records import VelocitySample
 
@@ -207,10 +207,3 @@ def test_starry_night_reprojects_with_the_published_variance(data_dir: Path, sta
     p_cam = np.einsum("nij,nj->ni", T[:, :3, :3], p_world) + T[:, :3, 3]
     error = starry_night.tracks.z - project(recording.camera, p_cam)
     np.testing.assert_allclose(error.var(axis=0, ddof=1), y_var, rtol=2e-3)
-
-
-def test_theta_of_the_raw_file_is_the_reference_pose(data_dir: Path, starry_night: FeatureDataset) -> None:
-    raw = loadmat(data_dir / "utias_starry_night" / "dataset3.mat")
-    T = starry_night.recording.reference.T_world_body[700]
-    np.testing.assert_allclose(T[:3, :3], so3_exp(raw["theta_vk_i"][:, 700]), atol=1e-12)
-    np.testing.assert_array_equal(T[:3, 3], raw["r_i_vk_i"][:, 700])

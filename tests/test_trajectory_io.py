@@ -444,10 +444,3 @@ def test_a_folder_created_meanwhile_is_kept(tmp_path: Path) -> None:
         inside.__exit__(None, None, None)
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
     assert (tmp_path / "run" / "m").read_text() == "theirs"
-
-
-def test_an_unwritable_parent_is_a_data_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(DataError, match=r"cannot write .*; choose a writable path"):
-        fill(tmp_path / "file" / "run", "new")
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]
