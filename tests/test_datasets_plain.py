@@ -12,7 +12,7 @@ import pytest
 from tests.dataset_makers import calib_text, edit, make_kitti
 from tests.euroc_maker import KITTI_RIG, RADTAN_RIG, RECTIFIED_RIG, make_euroc, make_kitti_raw, truth_poses
 from tests.plain_maker import STEP_S, make_plain, rig_of
-from tests.same_events import assert_same_events, frames_of
+from tests.same_events import frames_of
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.images import UnreadableImageError, load_gray, other_damage
 from vio.datasets.plain import read_plain
@@ -50,25 +50,6 @@ def test_usual_folder_names_are_found(folders: tuple[str, str], tmp_path: Path) 
     assert recording.frame_times_ns[0] == 1700000000_000000000
     np.testing.assert_allclose(recording.reference.T_world_body, truth_poses(4), atol=1e-12)
     assert recording.notes == ()
-
-
-def test_the_same_pixels_as_the_reader_of_euroc_folders(tmp_path: Path) -> None:
-    """An EuRoC folder and a plain one with the same images and numbers give the same rectified bits."""
-    euroc = make_euroc(tmp_path / "euroc", rig=RECTIFIED_RIG)
-    plain = tmp_path / "plain"
-    for name, side in (("cam0", "left"), ("cam1", "right")):
-        (plain / side).parent.mkdir(exist_ok=True)
-        (euroc / "mav0" / name / "data").rename(plain / side)
-        (plain / side).rename(euroc / "mav0" / name / "data")
-        (plain / side).mkdir(parents=True)
-        for image in (euroc / "mav0" / name / "data").iterdir():
-            (plain / side / image.name).write_bytes(image.read_bytes())
-    (plain / "calibration.yaml").write_text(kalibr_text(rig_of(RECTIFIED_RIG)))
-    (plain / "imu.csv").write_bytes((euroc / "mav0" / "imu0" / "data.csv").read_bytes())
-    a, b = open_dataset(euroc), open_dataset(plain)
-    assert a.recording.camera == b.recording.camera
-    np.testing.assert_allclose(a.recording.T_cam0_imu, b.recording.T_cam0_imu, atol=1e-15)
-    assert_same_events(a, b)
 
 
 def test_numbers_without_padding_are_sorted_as_numbers(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.test_distortion import KITTI
+from tests.test_rig import LENSES
 from vio.errors import CalibrationError
 from vio.geometry.distortion import (
     CameraModel,
@@ -48,9 +49,9 @@ def test_unprojection_inverts_projection_over_the_whole_image(name: str) -> None
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["euroc", "small", "kitti_raw", "fisheye"])
+@pytest.mark.parametrize("name", ["euroc", "small", "kitti_raw", "rational", "fisheye"])
 def test_projection_agrees_with_opencv(name: str) -> None:
-    camera = CAMERAS[name]
+    camera = (CAMERAS | LENSES)[name]
     corners, opencv = (_WIDE, cv2.fisheye) if name == "fisheye" else (_NEAR, cv2)
     points = np.random.default_rng(1).uniform(*corners, (200, 3))
     distortion = np.array(camera.coefficients or (0.0,) * 4)
