@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vio
-from tests.dataset_makers import CAMERA, T_CAM0_IMU, ece276a_arrays, make_drive, make_npz
+from tests.dataset_makers import CAMERA, T_CAM0_IMU, make_npz
 from vio.cameras.rig import Rig
 from vio.datasets import open_dataset
 from vio.datasets.common import read_npz
@@ -162,19 +162,6 @@ def test_the_bytes_do_not_depend_on_when_they_are_written(tmp_path: Path) -> Non
     for name in ("a.npz", "b.npz"):
         write_observation_log(tmp_path / name, _recording(), [_seen(2, 200)], [])
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-
-
-def test_a_course_file_replays_through_the_log(tmp_path: Path) -> None:
-    source = open_dataset(make_npz(tmp_path / "course.npz", ece276a_arrays(make_drive(6))))
-    observed = [o for o in (source.observations(k) for k in range(6)) if o is not None]
-    samples = [event for event in source.events() if isinstance(event, VelocitySample)]
-    write_observation_log(tmp_path / "run.npz", source.recording, observed, samples)
-    replay = open_dataset(f"log:{tmp_path / 'run.npz'}")
-    for a, b in zip(source.events(), replay.events(), strict=True):
-        assert (type(a), a.time_ns) == (type(b), b.time_ns)
-        if isinstance(a, VelocitySample) and isinstance(b, VelocitySample):
-            assert _same_bits(a.linear, b.linear)
-            assert _same_bits(a.angular, b.angular)
 
 
 @pytest.mark.parametrize("observed", [[_seen(2, 200), _seen(1, 100)], [_seen(1, 100), _seen(1, 100)], [_seen(1, 101)]])

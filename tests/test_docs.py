@@ -29,6 +29,7 @@ from vio.cli.render import scenario_from
 from vio.config import Config, describe, merge
 from vio.geometry.lie import se3_inverse
 from vio.records import ImuSample, StereoFrame
+from vio.sim.sequence import SimulatedRecording
 
 ROOT = Path(__file__).resolve().parent.parent
 README, COMMANDS = "README.md", "docs/commands.md"
@@ -294,14 +295,19 @@ def test_conventions_run() -> None:
 
 
 def test_simulation_example_runs(simulation: dict[str, object]) -> None:
-    assert len(simulation["seen"].ids) > 50  # type: ignore[attr-defined]
+    assert len(simulation["seen"].ids) > 90  # type: ignore[attr-defined]
     assert simulation["in_right"].shape == (2, 2)  # type: ignore[attr-defined]
+    assert np.asarray(simulation["visible"]).all()
+    assert simulation["left"].shape == (180, 320)  # type: ignore[attr-defined]
 
 
 def test_simulation_along_a_flight_runs(data_dir: Path) -> None:
     scope: dict[str, object] = {"folder": data_dir / "euroc_real_imu" / "V1_02"}
     _execute("docs/simulation.md", _python("docs/simulation.md")[1], scope)
-    assert len(scope["simulation"].stamps_ns) == 1670  # type: ignore[attr-defined]
+    stamps_ns = scope["simulation"].stamps_ns  # type: ignore[attr-defined]
+    assert len(stamps_ns) == 1670
+    state = SimulatedRecording(scope["simulation"]).true_state(int(stamps_ns[5]))  # type: ignore[arg-type]
+    assert state.gyro_bias is None, "of a recorded IMU"
 
 
 def test_inertial_check_runs(simulation: dict[str, object], caplog: pytest.LogCaptureFixture) -> None:

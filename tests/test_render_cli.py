@@ -21,7 +21,8 @@ from vio.cli import build_parser, main
 from vio.cli.render import scenario_from
 from vio.datasets import DatasetSettings, open_dataset
 from vio.errors import SimulationError
-from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
+from vio.files.trajectories import tum_text
+from vio.geometry.lie import FloatArray
 from vio.records import ImuSample, IntArray, StereoFrame, VelocitySample
 from vio.sim.motion import hand_held, motion_at, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU
@@ -56,12 +57,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     motion = rotate_body_axes(hand_held(duration_s=2.0, start_ns=START_NS), R_FLU_EUROC_IMU)
     times = START_NS + np.arange(200) * 10_000_000
     T = motion_at(motion, times).T_world_imu
-    quaternions = quat_xyzw_from_rotation(T[:, :3, :3])
-    rows = [
-        f"{t // 10**9}.{t % 10**9:09d} " + " ".join(repr(float(x)) for x in (*pose[:3, 3], *q))
-        for t, pose, q in zip(times.tolist(), T, quaternions, strict=True)
-    ]
-    (folder / "groundtruth_tum.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    (folder / "groundtruth_tum.txt").write_text(tum_text(times, T), encoding="utf-8")
     frames = START_NS + np.array([40, 91, 139, 190, 240]) * 1_000_000
     (folder / "image_timestamps_ns.txt").write_text("\n".join(map(str, frames.tolist())) + "\n", encoding="utf-8")
     imu = [f"{START_NS + 5_000_000 * k},0.25,{k}.5,-1,0.125,9.75,{-k}" for k in range(200)]
@@ -89,9 +85,7 @@ def test_the_summary_describes_the_folder_and_the_folder_reads_back(
     assert len(dataset.recording.frame_times_ns) == 4
     events = list(dataset.events())
     frames = [event for event in events if isinstance(event, StereoFrame)]
-    expected = SimulatedRecording(
-        plan(Scenario(width=96, duration_s=0.2, seed=3)),
-    )
+    expected = SimulatedRecording(plan(Scenario(width=96, duration_s=0.2, seed=3)))
     for frame in frames:
         for read, made in zip((frame.left, frame.right), expected.images(frame.index), strict=True):
             np.testing.assert_array_equal(read, made)

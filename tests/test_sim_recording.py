@@ -24,7 +24,7 @@ from vio.sim.motion import car_loop, hand_held, rotate_body_axes
 from vio.sim.oracle import OracleFrontend, OracleSettings
 from vio.sim.render import Radiance, correspondence
 from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_like_rig, kitti_like_rig, small_rig
-from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate, views
+from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, simulate, views
 from vio.sim.world import World, room, street
 
 RIG = small_rig(192, 120)
@@ -182,26 +182,6 @@ def test_dropped_and_repeated_frames_and_clock_offset(world: World) -> None:
     assert not np.array_equal(recording.images(k + 1 if k + 1 not in repeated else k - 2)[0], recording.images(k)[0])
 
 
-def test_renders_images_along_a_real_flight(data_dir: Path) -> None:
-    folder = data_dir / "euroc_real_imu" / "V1_02"
-    if not folder.is_dir():
-        pytest.skip(f"no {folder}")
-    flight = read_flight(folder / "groundtruth_tum.txt", folder / "image_timestamps_ns.txt", folder / "imu0.csv")
-    simulation = simulate(
-        room_around(flight.motion, texel_m=0.02),
-        euroc_like_rig(),
-        flight.motion,
-        frame_times_ns=flight.frame_times_ns,
-        imu=flight.imu,
-    )
-    assert len(simulation.stamps_ns) > 1600
-    assert simulation.imu is flight.imu
-    recording = SimulatedRecording(simulation)
-    assert recording.true_state(int(simulation.stamps_ns[5])).gyro_bias is None
-    with pytest.raises(SimulationError, match="unrectified rig"):
-        _ = recording.recording
-
-
 def test_rejects_image_times_outside_the_ground_truth(tmp_path: Path) -> None:
     gt, times = tmp_path / "gt.txt", tmp_path / "times.txt"
     gt.write_text("".join(f"{k * 0.1:.1f} {k} 0 0 0 0 0 1\n" for k in range(20)))
@@ -273,10 +253,12 @@ def test_oracle_spreads_features_and_limits_their_age(plain: Simulation) -> None
     assert np.median(list(ages.values())) >= 4
 
 
-def test_oracle_needs_a_rectified_rig(world: World) -> None:
-    motion = rotate_body_axes(hand_held(duration_s=1.0), R_FLU_EUROC_IMU)
+def test_oracle_and_recording_need_a_rectified_rig(world: World) -> None:
+    simulation = simulate(world, euroc_like_rig(), rotate_body_axes(hand_held(duration_s=1.0), R_FLU_EUROC_IMU))
     with pytest.raises(SimulationError, match="rectified"):
-        OracleFrontend(simulate(world, euroc_like_rig(), motion))
+        OracleFrontend(simulation)
+    with pytest.raises(SimulationError, match="unrectified rig"):
+        _ = SimulatedRecording(simulation).recording
 
 
 # --- export ---------------------------------------------------------------------------------------------------------
@@ -364,15 +346,6 @@ def test_export_errors_name_the_missing_sensor(world: World, tmp_path: Path) -> 
     with pytest.raises(SimulationError, match="rectified rig"):
         export_kitti(SimulatedRecording(simulate(world, euroc_like_rig(), motion)), tmp_path / "b")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_documented_example_runs() -> None:
-    text = (Path(__file__).resolve().parent.parent / "docs" / "simulation.md").read_text(encoding="utf-8")
-    scope: dict[str, object] = {}
-    exec(text.split("```python\n")[1].split("```")[0], scope)
-    assert np.asarray(scope["visible"]).all()
-    assert scope["left"].shape == (180, 320)  # type: ignore[attr-defined]
-    assert len(scope["seen"]) > 90  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("seed", range(6))

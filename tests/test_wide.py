@@ -58,22 +58,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def wide_run(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("wide") / "run"
-    assert (
-        main(
-            [
-                "run",
-                str(flight),
-                "--save-observations",
-                "--out",
-                str(out),
-                "--json",
-                "--quiet",
-                "--set",
-                "msckf.calibrate_stereo=off",
-            ]
-        )
-        == 0
-    )
+    assert main(["run", str(flight), "--save-observations", "--out", str(out), "--json", "--quiet", *_EXACT]) == 0
     return out
 
 
