@@ -304,23 +304,6 @@ def test_what_only_the_worker_can_refuse_is_counted_and_said() -> None:
     assert live.warnings == ("not these",)
 
 
-def test_one_stamp_far_ahead_costs_one_frame_and_one_sample() -> None:
-    samples, seen = _events()
-    results: list[FrameResult] = []
-    with LiveOdometry(CAMERA, T_cam0_imu=T_CAM0_IMU, on_frame=results.append, drop="none") as live:
-        for k, frame in enumerate(seen):
-            ahead_ns = 60_000_000_000 if k == 6 else 0
-            for s in samples:
-                if (k - 1) * STEP_NS < s.time_ns <= k * STEP_NS:
-                    live.add_imu(s.time_ns + ahead_ns * (s.time_ns == k * STEP_NS), s.gyro, s.accel)
-            live.add_observations(k * STEP_NS + ahead_ns, frame.ids, frame.z)
-    assert [r.frame.index for r in results] == [k for k in range(FRAMES) if k != 6]
-    assert [line.partition(" at ")[0] for line in live.warnings if "ahead of the last one" in line] == [
-        "sample",
-        "frame",
-    ]
-
-
 def test_reset_begins_a_new_trajectory() -> None:
     _, seen = _events()
     with LiveOdometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, drop="block") as live:
