@@ -433,11 +433,7 @@ def _other_size(script: Script) -> None:
 
 
 BAD = {
-    "truncated ROS 1 bag": (
-        _cut("bag", 0.6),
-        None,
-        r"f\.bag: the bag is truncated or damaged .*; copy it",
-    ),
+    "truncated ROS 1 bag": (_cut("bag", 0.6), None, r"f\.bag: the bag is truncated or damaged .*; copy it"),
     "truncated db3": (_cut("db3", 0.5), None, "the bag is truncated or damaged"),
     "truncated mcap": (_cut("mcap", 0.6), None, "the bag is truncated or damaged"),
     "empty file": (_cut("bag", 0.0), None, "no known recording"),
@@ -472,16 +468,8 @@ BAD = {
         r"/tf: of its moving frames \(map to door\) none carries imu; name another reference=/TOPIC",
     ),
     "two pairs": (_bad(_more_images), None, "several topics could be the pair .*; name them with --topics"),
-    "a wrong topic": (
-        _bad(lambda s: None),
-        "left=/nose,right=/right/image_raw",
-        "holds no topic '/nose' for left",
-    ),
-    "a topic of another type": (
-        _bad(lambda s: None),
-        "imu=/left/image_raw",
-        "sensor_msgs/msg/Image, not sensor_msgs",
-    ),
+    "a wrong topic": (_bad(lambda s: None), "left=/nose,right=/right/image_raw", "holds no topic '/nose' for left"),
+    "a topic of another type": (_bad(lambda s: None), "imu=/left/image_raw", "sensor_msgs/msg/Image, not sensor_msgs"),
     "a topic without a name": (_bad(lambda s: None), "left", "'left' is no ROLE=/TOPIC; roles are left, right, imu"),
     "an empty topic": (
         _bad(lambda s: s.empty.append(("/e", "sensor_msgs/msg/Imu"))),

@@ -148,9 +148,7 @@ def test_a_rectified_folder_passes_through_unchanged(rig: StereoRig, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    "turn",
-    [[0, 0, 0, 2e-4, 0, 0], [0, 1e-4, 0, 0, 0, 0]],
-    ids=["turned by 0.01 deg", "0.1 mm up"],
+    "turn", [[0, 0, 0, 2e-4, 0, 0], [0, 1e-4, 0, 0, 0, 0]], ids=["turned by 0.01 deg", "0.1 mm up"]
 )
 def test_a_pair_that_is_nearly_rectified_is_rectified(turn: list[float], tmp_path: Path) -> None:
     rig = replace(RECTIFIED_RIG, T_imu_cam1=RECTIFIED_RIG.T_imu_cam1 @ se3_exp(turn))
@@ -441,11 +439,7 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         r"imu0/data.csv: holds no line",
     ),
     "an IMU without data": (lambda mav: (mav / "imu0/data.csv").unlink(), DataError, r"cannot read .*imu0/data.csv"),
-    "an IMU of another time": (
-        _shift_clock("imu0", 10**12),
-        DataError,
-        r"no sample is within the time of the images",
-    ),
+    "an IMU of another time": (_shift_clock("imu0", 10**12), DataError, r"no sample is within the time of the images"),
     "IMU noise of zero": (
         _edit("imu0/sensor.yaml", "accelerometer_random_walk: 3.0000e-3", "accelerometer_random_walk: 0"),
         CalibrationError,

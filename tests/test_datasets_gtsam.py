@@ -120,10 +120,7 @@ BAD = {
         _with(lambda _: ["700 700 3 600 180 0.5"], "VO_calibration.txt"),
         "expected one line 'fx fy s u0 v0 b' with a skew s of zero",
     ),
-    "seven columns": (
-        _with(lambda lines: [*lines[:3], "7 1 2 3 4 5 6"]),
-        "line 4: 7 values instead of 8",
-    ),
+    "seven columns": (_with(lambda lines: [*lines[:3], "7 1 2 3 4 5 6"]), "line 4: 7 values instead of 8"),
     "a landmark without a number": (_with(lambda lines: [*lines, "7 1.5 2 1 4 0 0 1"]), "is no row 'pose landmark uL"),
     "a pixel that is no number": (_with(lambda lines: [*lines, "7 9999 nan 1 4 0 0 1"]), "is no row 'pose landmark uL"),
     "a landmark seen twice": (_with(lambda lines: [*lines, lines[0]]), "sees landmark 0 more than once"),

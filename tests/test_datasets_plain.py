@@ -322,10 +322,7 @@ BAD = {
         _break(lambda f: [cv2.imwrite(str(p), np.zeros((40, 50), np.uint8)) for p in f.glob("*/*.png")]),
         r"is 50 x 40 pixels but .*camchain-imucam\.yaml is for 64 x 48",
     ),
-    "a calibration that is missing": (
-        lambda f: make_plain(f) and f / "none",
-        "none does not exist",
-    ),
+    "a calibration that is missing": (lambda f: make_plain(f) and f / "none", "none does not exist"),
     "swapped cameras": (
         _write("calib.txt", calib_text(0.0, -0.5), calibration=False),
         r"calib\.txt: P0 and P1 imply a stereo baseline of -0.5 m",

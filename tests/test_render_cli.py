@@ -343,10 +343,7 @@ def command_line(*arguments: str) -> Callable[[Path], list[str]]:
     ids=lambda value: value.__name__ if callable(value) and value.__name__ != "<lambda>" else None,
 )
 def test_rejects_bad_input_with_one_line_error_before_writing(
-    arguments: Callable[[Path], list[str]],
-    message: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    arguments: Callable[[Path], list[str]], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()

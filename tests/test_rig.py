@@ -427,10 +427,7 @@ BAD = {
         _camchain(lambda c: c["cam0"].update(intrinsics=[1, 2, 3])),
         r"cam0: 'intrinsics' is \[1, 2, 3\] instead of 4 finite numbers",
     ),
-    "unknown projection": (
-        _camchain(lambda c: c["cam1"].update(camera_model="eucm")),
-        "'eucm' is not read",
-    ),
+    "unknown projection": (_camchain(lambda c: c["cam1"].update(camera_model="eucm")), "'eucm' is not read"),
     "unknown distortion": (_camchain(lambda c: c["cam1"].update(distortion_model="fov")), "'fov' is not read"),
     "a reflection": (
         _camchain(lambda c: c["cam1"].update(T_cn_cnm1=np.diag([1.0, 1, -1, 1]).tolist())),
@@ -451,10 +448,7 @@ BAD = {
         _storage(M2=np.array([[400.0, 0, 70], [0, 400, 24], [0, 0, 1]])),
         "the principal point 70, 24 lies outside images of 64 x 48 pixels; it is the calibration of images of another",
     ),
-    "OpenCV with six coefficients": (
-        _storage(D1=np.ones(6)),
-        "6 distortion coefficients; OpenCV has 4, 5",
-    ),
+    "OpenCV with six coefficients": (_storage(D1=np.ones(6)), "6 distortion coefficients; OpenCV has 4, 5"),
     "OpenCV with a tilted sensor": (_storage(D1=np.ones(14)), "thin-prism or tilt coefficients are not read"),
     "XML with entities": (
         _text("stereo.xml", '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>'),
