@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from vio.errors import VioError
+from vio.geometry.distortion import CameraModel
 from vio.sim.effects import SensorEffects
 from vio.sim.miscalibration import CalibrationErrors
-from vio.sim.motion import car_loop, fit_spline, hand_held
+from vio.sim.motion import car_loop, fit_spline, hand_held, motion_at
 from vio.sim.oracle import OracleSettings
+from vio.sim.render import camera_rays
 from vio.sim.rigs import small_rig
 from vio.sim.scenarios import Conditions, Scenario, plan
 from vio.sim.sequence import simulate
@@ -19,6 +21,9 @@ from vio.sim.world import room, street
 
 TIMES = np.arange(20) * 100_000_000
 POSES = np.tile(np.eye(4), (20, 1, 1))
+MOTION = hand_held(duration_s=1.0)
+LATE_NS = MOTION.end_ns + np.array([1, 2]) * 10**9
+FOLDING = CameraModel(100, 100, 160, 100, 320, 200, "radtan", (-0.4, 0.0, 0.0, 0.0))
 
 
 def _with_hole() -> np.ndarray:
@@ -43,6 +48,9 @@ def _with_hole() -> np.ndarray:
         (lambda: room(0, bounds=[[0, 0, 0], [5, 5, 0.4]]), "at least 0.5 m apart"),
         (lambda: room(0, bounds=[[0, 0], [5, 5]]), "an upper corner"),
         (lambda: room(0, bare_walls=("+x", "up")), r"unknown walls \['up'\]; use some of"),
+        (lambda: motion_at(MOTION, MOTION.end_ns + 1), "the motion is defined from"),
+        (lambda: simulate(room(0), small_rig(64, 48), MOTION, frame_times_ns=LATE_NS), "no frame is within the motion"),
+        (lambda: camera_rays(FOLDING), "does not reach every pixel"),
         (lambda: SensorEffects(gamma=0.0), "gamma and blur_samples must be positive"),
         (lambda: SensorEffects(exposure=-0.1), "exposure and gain must not be negative"),
         (lambda: SensorEffects(vignetting=1.5), "vignetting and exposure_swing must be between 0 and 1"),
@@ -58,10 +66,3 @@ def _with_hole() -> np.ndarray:
 def test_rejects_invalid_arguments(make: Callable[[], object], message: str) -> None:
     with pytest.raises(VioError, match=message):
         make()
-
-
-def test_rejects_frames_outside_the_motion() -> None:
-    motion = hand_held(duration_s=1.0, seed=0)
-    late = motion.end_ns + np.array([1, 2]) * 10**9
-    with pytest.raises(VioError, match="no frame is within the motion"):
-        simulate(room(0, texel_m=0.05), small_rig(64, 48), motion, frame_times_ns=late, seed=0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vio.datasets.tables import read_imu_table
-from vio.errors import DataError, SimulationError
+from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log
 from vio.sim.imu import (
     GRAVITY_MPS2,
@@ -122,12 +122,6 @@ def test_hand_held_starts_stationary_and_car_moves_like_kitti() -> None:
     forward = np.einsum("nji,nj->ni", state.T_world_imu[:, :3, :3], state.velocity_world)
     assert np.abs(forward[:, 1]).max() < 0.1 * speed.max()  # no sideslip
     assert np.linalg.norm(state.T_world_imu[-1, :3, 3] - state.T_world_imu[0, :3, 3]) < 1.5  # a closed loop
-
-
-def test_rejects_times_outside_the_motion() -> None:
-    spline = MOTIONS["car"]
-    with pytest.raises(SimulationError, match="the motion is defined from"):
-        motion_at(spline, spline.end_ns + 1)
 
 
 def test_rejects_bad_trajectories(tmp_path: Path) -> None:
