@@ -114,9 +114,9 @@ class LiveOdometry(EventInputs[None]):
             raise ConfigError(
                 f"drop={drop!r}, queue_frames={queue_frames}: give one of {', '.join(DROPS)}, and 1 or more"
             )
-        self._config, self._T_cam0_imu = Config() if config is None else config, T_cam0_imu
+        self._config = Config() if config is None else config
         use = MapUse(Path(map), localise) if isinstance(map, (str, Path)) else map
-        self._odometry = Odometry(
+        self._odometry = odometry = Odometry(
             rig,
             self._config,
             T_cam0_imu=T_cam0_imu,
@@ -124,11 +124,9 @@ class LiveOdometry(EventInputs[None]):
             on_frame=self._take_result,
             map=None if use is None else replace(use, wait=False),
         )
-        odometry = self._odometry
         self.camera, self.T_cam0_body, self.motion = odometry.camera, odometry.T_cam0_body, odometry.motion
+        self._T_cam0_imu = rig.T_rect0_imu if isinstance(rig, Rig) else T_cam0_imu
         self._on_frame, self._with_map = on_frame, use is not None
-        if isinstance(rig, Rig):
-            self._T_cam0_imu = rig.T_rect0_imu
         self._predictor = SharedPredictor(self._config.msckf.gravity_mps2)
         self._monitor = LiveMonitor(judges_latency=drop != "block")
         self._collector = QuietCollector()
