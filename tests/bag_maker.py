@@ -69,11 +69,11 @@ class Script:
         fields = self.make(kind, header, height, width, encoding, 0, step, data[: len(data) - cut])
         self.add(topic, kind, time_ns, fields)
 
-    def compressed(self, topic: str, time_ns: int, pixels: Image, suffix: str = ".png") -> None:
+    def compressed(self, topic: str, time_ns: int, pixels: Image) -> None:
         """Add a sensor_msgs/CompressedImage."""
         kind = "sensor_msgs/msg/CompressedImage"
-        data = cv2.imencode(suffix, pixels)[1].reshape(-1)
-        self.add(topic, kind, time_ns, self.make(kind, self.header(time_ns, "left"), suffix[1:], data))
+        data = cv2.imencode(".png", pixels)[1].reshape(-1)
+        self.add(topic, kind, time_ns, self.make(kind, self.header(time_ns, "left"), "png", data))
 
     def imu(self, topic: str, sample: ImuSample, logged_ns: int | None = None) -> None:
         """Add a sensor_msgs/Imu."""

@@ -123,19 +123,19 @@ def make_mat(path: Path, arrays: Mapping[str, npt.NDArray[np.generic]]) -> Path:
     return path
 
 
-def make_images(folder: Path, frames: int, *, channels: int = 1, depth: int = 8, suffix: str = ".png") -> None:
+def make_images(folder: Path, frames: int, *, channels: int = 1, depth: int = 8) -> None:
     """Write small images (24 x 32) whose gray values differ from frame to frame."""
     folder.mkdir(parents=True)
     rng = np.random.default_rng(frames)
     for k in range(frames):
         shape = (24, 32) if channels == 1 else (24, 32, channels)
         dtype, top = (np.uint8, 256) if depth == 8 else (np.uint16, 65536)
-        assert cv2.imwrite(str(folder / f"{k:06d}{suffix}"), rng.integers(0, top, shape).astype(dtype))
+        assert cv2.imwrite(str(folder / f"{k:06d}.png"), rng.integers(0, top, shape).astype(dtype))
 
 
-def calib_text(*offsets_m: float, focal: float = 700.0) -> str:
+def calib_text(*offsets_m: float) -> str:
     """The lines `P0: …` of rectified cameras at the given places on the x axis of camera 0."""
-    lines = [f"P{k}: {focal:e} 0 6.0e+02 {-focal * x:e} 0 {focal:e} 1.8e+02 0 0 0 1 0" for k, x in enumerate(offsets_m)]
+    lines = [f"P{k}: 7.0e+02 0 6.0e+02 {-700 * x:e} 0 7.0e+02 1.8e+02 0 0 0 1 0" for k, x in enumerate(offsets_m)]
     return "\n".join([*lines, "Tr: 1 0 0 0 0 1 0 0 0 0 1 0"]) + "\n"
 
 

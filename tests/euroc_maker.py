@@ -156,9 +156,9 @@ KITTI_RIG = StereoRig(
 RECT_SIZE = (56, 40)
 
 
-def calib_cam_to_cam(rig: StereoRig = KITTI_RIG) -> str:
-    """`calib_cam_to_cam.txt` of a rig; its rectified cameras are 56 x 40 pixels, 38 px focal length, 11 cm apart."""
-    T_cam1_cam0 = se3_inverse(rig.T_cam0_cam1)
+def calib_cam_to_cam() -> str:
+    """`calib_cam_to_cam.txt` of `KITTI_RIG`; rectified cameras of 56 x 40 pixels, 38 px focal length, 11 cm apart."""
+    rig, T_cam1_cam0 = KITTI_RIG, se3_inverse(KITTI_RIG.T_cam0_cam1)
     lines = ["calib_time: 09-Jan-2012 13:57:47", "corner_dist: 9.950000e-02"]
     for k, camera, T, shift in (("00", rig.cam0, np.eye(4), 0.0), ("01", rig.cam1, T_cam1_cam0, -38.0 * 0.11)):
         entries: dict[str, npt.ArrayLike] = {

@@ -77,17 +77,16 @@ def test_a_flight_of_one_camera_is_the_same_recording_to_the_bit(
 # --- calibration ----------------------------------------------------------------------------------------------------
 
 
-def script_of(storage: str = "mcap", *, info: bool = True, imu: bool = True, images: bool = True) -> Script:
+def script_of(storage: str = "mcap", *, imu: bool = True, images: bool = True) -> Script:
     """Four frames with a CameraInfo of a lens, an IMU of 200 Hz, and its place in /tf_static by way of a base frame."""
     script = Script(storage)
     if images:
         for time_ns, image in FRAMES:
             script.image("/left/image_raw", time_ns, image)
-    if info:
-        c = RIG.cam0
-        camera = one_camera(c.fu, c.fv, c.cu, c.cv, c.width, c.height)
-        script.camera_info("/left/camera_info", START_NS, camera, right=False)
-        setattr(script.notes[-1].fields, "D" if storage == "bag" else "d", np.array([*LENS, 0.0]))
+    c = RIG.cam0
+    camera = one_camera(c.fu, c.fv, c.cu, c.cv, c.width, c.height)
+    script.camera_info("/left/camera_info", START_NS, camera, right=False)
+    setattr(script.notes[-1].fields, "D" if storage == "bag" else "d", np.array([*LENS, 0.0]))
     if imu:
         script.static(START_NS, "base", "imu", T_BASE_IMU)
         script.static(START_NS, "base", "left", T_BASE_IMU @ se3_inverse(T_CAM0_IMU))

@@ -81,12 +81,11 @@ def test_a_bag_is_the_same_recording_to_the_bit(storage: str, flight: Path, tmp_
 # --- calibration and topics -----------------------------------------------------------------------------------------
 
 
-def plain_script(storage: str = "mcap", frames: int = 4, *, info: bool = True, imu: bool = True) -> Script:
+def plain_script(storage: str = "mcap", frames: int = 4, *, imu: bool = True) -> Script:
     """A stereo pair with CameraInfo, an IMU of 200 Hz, and its place in /tf_static by way of a base frame."""
     script = of_stereo(Script(storage), noise_frames(frames))
-    if info:
-        for side in ("left", "right"):
-            script.camera_info(f"/{side}/camera_info", START_NS, RIG.camera, right=side == "right")
+    for side in ("left", "right"):
+        script.camera_info(f"/{side}/camera_info", START_NS, RIG.camera, right=side == "right")
     if imu:
         script.static(START_NS, "base", "imu", T_BASE_IMU)
         script.static(START_NS, "base", "left", T_BASE_IMU @ se3_inverse(T_CAM0_IMU))
@@ -361,11 +360,11 @@ def test_twelve_bits_in_sixteen_are_scaled_and_said(tmp_path: Path) -> None:
 # --- bad bags -------------------------------------------------------------------------------------------------------
 
 
-def _bad(change: Callable[[Script], object], storage: str = "mcap") -> Callable[[Path], Path]:
+def _bad(change: Callable[[Script], object]) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        script = plain_script(storage)
+        script = plain_script()
         change(script)
-        return script.write(folder / ("f.bag" if storage == "bag" else "f"))
+        return script.write(folder / "f")
 
     return make
 

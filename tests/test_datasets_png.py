@@ -34,11 +34,11 @@ def filtered(pixels: Image, kinds: list[int]) -> bytes:
     return bytes(out)
 
 
-def png(pixels: Image, kinds: list[int], *, extra: bytes = b"", raw: bytes | None = None, chunks: int = 2) -> bytes:
+def png(pixels: Image, kinds: list[int], *, extra: bytes = b"", raw: bytes | None = None) -> bytes:
     height, width = pixels.shape
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
     data = zlib.compress(filtered(pixels, kinds) if raw is None else raw)
-    cut = len(data) // chunks
+    cut = len(data) // 2
     parts = chunk(b"IDAT", data[:cut]) + chunk(b"IDAT", data[cut:])
     return b"\x89PNG\r\n\x1a\n" + header + extra + parts + chunk(b"IEND", b"")
 

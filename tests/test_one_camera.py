@@ -268,10 +268,10 @@ def test_virtual_baseline_makes_the_noise_of_depths_that_of_disparities(depth_m:
 RIG = Rig(CameraModel(300.0, 300.0, 239.5, 149.5, 480, 300), T_cam0_imu=np.eye(4), depth_factor=1000.0)
 
 
-def _mono_folder(folder: Path, name: str = "left") -> Path:
-    (folder / name).mkdir(parents=True)
+def _mono_folder(folder: Path) -> Path:
+    (folder / "left").mkdir(parents=True)
     for k in range(4):
-        cv2.imwrite(str(folder / name / f"{k}.png"), _walls()[k][0])
+        cv2.imwrite(str(folder / "left" / f"{k}.png"), _walls()[k][0])
     (folder / "times.txt").write_text("\n".join(f"{k * 0.05:.2f}" for k in range(4)))
     (folder / "calibration.yaml").write_text(kalibr_text(RIG))
     rows = [f"{int(k * 5e6)},0,0,0,0,0,9.81" for k in range(60)]

@@ -397,7 +397,7 @@ def read_flight(groundtruth: Path, image_times: Path | None = None, imu_csv: Pat
     return RecordedFlight(motion, times, imu)
 
 
-def room_around(motion: MotionSpline, *, seed: int = 0, texel_m: float | None = None) -> World:
+def room_around(motion: MotionSpline, *, seed: int = 0) -> World:
     """Build a room around a motion; its furniture keeps clear of the path."""
     times = np.arange(motion.start_ns, motion.end_ns, _CLEARANCE_STEP_NS)
     p = motion_at(motion, times).T_world_imu[:, :3, 3]
@@ -409,5 +409,4 @@ def room_around(motion: MotionSpline, *, seed: int = 0, texel_m: float | None = 
         furniture=int(np.clip(area / 3, 8, 40)),
         pictures=int(np.clip(area / 4, 8, 30)),
         keep_clear=p[::5],
-        texel_m=texel_m,
     )
