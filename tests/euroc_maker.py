@@ -16,7 +16,6 @@ from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, se3_exp, se3_f
 START_NS = 1403715273262142976
 STEP_NS = 50_000_000
 WIDTH, HEIGHT = 64, 48
-SPREAD_S = 0.012  # of the IMU before the first and after the last image
 
 T_IMU_CAM0 = se3_from_parts(
     np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ so3_exp([0.02, -0.01, 0.015]), [-0.02, -0.065, 0.01]

@@ -18,7 +18,6 @@ from vio.runs.pipeline import RunControl, RunResult
 from vio.runs.recorder import GrowingFolder
 
 FRAMES = 110
-EXCHANGED = [1, 0, 2]
 
 
 def _changed(sample: ImuSample, gyro: float, accel: float, axes: list[int]) -> ImuSample:

@@ -7,6 +7,7 @@ is decoded.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import re
 import struct
@@ -40,11 +41,6 @@ _JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})  # start-of-
 _PNG_LEVEL = 1  # files a tenth larger than at the usual level 3, in a third of the time
 
 
-class _End:
-    """What follows the last item of `prefetch`."""
-
-
-_END = _End()
 Item = TypeVar("Item")
 Loaded = TypeVar("Loaded")
 
@@ -280,18 +276,17 @@ def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) 
         return
     source = iter(items)
 
-    def step() -> Loaded | _End:
-        """Take and load one item; all of this is the thread's work, as the items may be read from a file, too."""
-        item = next(source, _END)
-        return item if isinstance(item, _End) else load(item)
+    def step() -> list[Loaded]:
+        """Take and load an item, if any is left; all in the thread, as the items may be read from a file, too."""
+        return [load(item) for item in itertools.islice(source, 1)]
 
-    waiting: deque[Future[Loaded | _End]] = deque()
+    waiting: deque[Future[list[Loaded]]] = deque()
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="vio-prefetch")
     try:
         waiting.extend(pool.submit(step) for _ in range(depth))
-        while not isinstance(result := waiting.popleft().result(), _End):
+        while loaded := waiting.popleft().result():
             waiting.append(pool.submit(step))
-            yield result
+            yield from loaded
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         if isinstance(source, Generator):

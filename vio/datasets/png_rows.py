@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from vio.numerics.compiled import compiled
 from vio.records import Image
 
 _SIDE_BY_SIDE = 16  # rows, as many as a vector of the processor holds numbers of 16 bits
 _PAETH = 4  # number of the filter
-_Lanes = npt.NDArray[np.int16]  # (16,) one number a row
 
 
 @compiled
