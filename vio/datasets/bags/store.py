@@ -55,9 +55,10 @@ class Message:
 class Bag:
     """Opened bags; use it as a context. Messages are streamed, so memory does not grow with the file."""
 
+    _reader: AnyReader
+
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._reader: AnyReader | None = None
 
     def __enter__(self) -> Bag:
         """Open the files.
@@ -76,13 +77,11 @@ class Bag:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._reader is not None and self._reader.stack is not None:
-            self._reader.close()
+        self._reader.close()
 
     @property
     def topics(self) -> tuple[Topic, ...]:
         """All topics, the empty ones too, in the order of their names."""
-        assert self._reader is not None
         counts: dict[tuple[str, str], int] = {}
         for connection in self._reader.connections:
             key = connection.topic, connection.msgtype
@@ -95,7 +94,6 @@ class Bag:
         Raises:
             DataError: the bag is damaged; what came before was yielded.
         """
-        assert self._reader is not None
         chosen = [c for c in self._reader.connections if c.topic in topics]
         if not chosen:
             return
@@ -109,7 +107,6 @@ class Bag:
         Raises:
             DataError: the message does not fit its type.
         """
-        assert self._reader is not None
         with named_damage(f"{self.path}, {message.topic}"):
             return self._reader.deserialize(message.data, message.kind)
 
