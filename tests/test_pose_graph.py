@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,17 +15,26 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from tests.numerics import numeric_jacobian, right_retract
-from vio.geometry.lie import FloatArray, nearest_rotation, se3_exp, se3_from_parts, se3_inverse, se3_log
+from vio.geometry.lie import FloatArray, nearest_rotation, se3_adjoint, se3_exp, se3_from_parts, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
+from vio.mapping.builder import Keyframe, MapBuilder
+from vio.mapping.features import KeyframeFeatures
+from vio.mapping.loop_geometry import Verified
 from vio.mapping.map_graph import MapGraph, _nearest
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
+from vio.mapping.place_finder import FoundPlace
 from vio.mapping.pose_graph import Edges, UpDirections, marginals, optimise, r_D_poses, residual, up_residual
+from vio.records import LoopMatches
 
 COUNT = 60
 SIGMA = np.repeat([0.02, 0.004], 3)  # of a step of the odometry, m and rad
 LOOP_SIGMA = np.repeat([0.01, 0.002], 3)
 RNG = np.random.default_rng
+CAMERA = StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360)
+ROUND, ROUNDS = 100, 3  # keyframes of a round of a circle of 50 m, and rounds
+NO_MATCHES = LoopMatches(*(np.zeros((0, 4)),) * 2, *(np.zeros(0, np.bool_),) * 2)
+NOTHING = KeyframeFeatures(np.zeros((0, 4)), np.zeros(0, np.bool_), np.zeros(0), np.zeros((0, 32), np.uint8))
 NO_UP_DIRECTIONS = UpDirections(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0))  # as without an IMU
 
 
@@ -34,6 +44,14 @@ def _circle() -> FloatArray:
     T = np.broadcast_to(np.eye(4), (COUNT, 4, 4)).copy()
     T[:] = se3_exp(np.stack([0 * angle, 0 * angle, 0 * angle, 0 * angle, 0 * angle, angle], axis=1))
     T[:, :3, 3] = np.stack([10 * np.sin(angle), 10 - 10 * np.cos(angle), 0 * angle], axis=1)
+    return T
+
+
+def _rounds() -> FloatArray:
+    """Poses (K, 4, 4) three times around a circle."""
+    angle = 2 * np.pi * np.arange(ROUNDS * ROUND) / ROUND
+    T = se3_exp(np.stack([*(0 * angle for _ in range(5)), angle], axis=1))
+    T[:, :3, 3] = np.stack([50 * np.sin(angle), 50 - 50 * np.cos(angle), 0 * angle], axis=1)
     return T
 
 
@@ -217,14 +235,9 @@ def test_a_tilt_of_the_first_pose_does_not_bend_the_map() -> None:
 def test_a_new_loop_moves_what_is_around_it_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three times around a circle: loops of the second round are settled, one of the third is new."""
     monkeypatch.setattr("vio.mapping.map_graph._WINDOW", 80)
-    count, period = 300, 100
-    angle = 2 * np.pi * np.arange(count) / period
-    T = se3_exp(np.stack([*(0 * angle for _ in range(5)), angle], axis=1))
-    T[:, :3, 3] = np.stack([50 * np.sin(angle), 50 - 50 * np.cos(angle), 0 * angle], axis=1)
-    rng = RNG(5)
+    count, period, T, rng = ROUNDS * ROUND, ROUND, _rounds(), RNG(5)
     store = MapStore(tmp_path / "a.map", create=True)
-    camera = StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360)
-    store.add_session(SessionRow("round", camera, True, 0))
+    store.add_session(SessionRow("round", CAMERA, True, 0))
     graph, start = MapGraph(store), T[0]
     for k in range(count):
         if k:
@@ -251,6 +264,90 @@ def test_a_new_loop_moves_what_is_around_it_alone(tmp_path: Path, monkeypatch: p
 
     whole = around(graph.T_map_cam.rows)
     assert np.abs(around(near) - whole).max() < 0.5 * np.abs(around(before) - whole).max()
+
+
+def _store_of_rounds(rng: np.random.Generator) -> SimpleNamespace:
+    """A map at its optimum, with a loop at each tenth keyframe."""
+    T, drift, rows, motions = _rounds(), np.zeros((6, 6)), list[KeyframeRow](), list[tuple[int, int, RelativePose]]()
+    odom = T[0]
+    for k in range(len(T)):
+        if k:
+            motions.append((k - 1, k, _measured(T, k - 1, k, SIGMA, rng)))
+            odom = odom @ motions[-1][2].T_i_j
+            A = se3_adjoint(odom)
+            drift = drift + A @ motions[-1][2].covariance @ A.T
+        rows.append(KeyframeRow(0, k, k, T[k], odom, drift, 3.14 * k, None, 0.0))
+    pairs = [(k - ROUND, k) for k in range(ROUND, len(T), 10)]
+    store = SimpleNamespace(
+        path="rounds",
+        sessions=lambda: [SessionRow("rounds", CAMERA, False, 0)],
+        keyframes=lambda: rows,
+        odometry=lambda: motions,
+        loops=lambda: [LoopRow(i, k, _measured(T, i, k, LOOP_SIGMA, rng), 50, True) for i, k in pairs],
+        show_something=lambda: np.ones(len(T), dtype=np.bool_),
+        places=list,
+        features=lambda _: NOTHING,
+    )
+    graph = MapGraph(store)
+    graph.optimise_part(0)
+    rows[:] = [replace(row, T_map_cam=graph.T_map_cam[k]) for k, row in enumerate(rows)]
+    store.loops = graph.loops.copy
+    return store
+
+
+def test_covariance_in_a_map_above_the_window_is_that_of_the_dense_inverse(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vio.mapping.map_graph._WINDOW", 60)
+    store = _store_of_rounds(RNG(1))
+    graph = MapGraph(store)
+    assert not graph.optimise_near(0, 1)
+    T, w = graph.T_map_cam.rows, graph.frame_weights(graph.part == 0)
+    rows = list[FloatArray]()
+    for i, j, pose in [*store.odometry(), *((o.first, o.second, o.pose) for o in graph.loops if o.kept)]:
+        edge, row = Edges.of([(i, j, pose)]), np.zeros((6, 6 * len(T)))
+        A, B = r_D_poses(T, edge, residual(T, edge))
+        row[:, 6 * i : 6 * i + 6], row[:, 6 * j : 6 * j + 6] = A[0], B[0]
+        rows.append(np.linalg.cholesky(edge.information[0]).T @ row)
+    A = se3_adjoint(se3_inverse(T))
+    AW = np.swapaxes(A, 1, 2) @ np.diag([1.0, 1, 1, 2, 2, 2]) * w[:, None, None]
+    D = -A[-1] @ np.linalg.solve((AW @ A).sum(axis=0), np.hstack(AW))
+    D[:, -6:] += np.eye(6)
+    J = np.concatenate(rows)
+    expected = D[:, 6:] @ np.linalg.inv(J[:, 6:].T @ J[:, 6:]) @ D[:, 6:].T
+    found = graph.placed(0, graph.part == 0, None).covariance
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * expected.max())
+
+
+def test_errors_of_a_session_in_a_map_above_the_window_are_as_its_covariance_says(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Normalised squared errors (6 expected) in the frame in which the map's keyframes stand on average.
+
+    The map of 300 keyframes counts as one of 5000, whose factors are made for each fifth keyframe at most.
+    """
+    monkeypatch.setattr("vio.mapping.map_graph._WINDOW", 60)
+    truth, first, size, computed = _rounds(), 20, ROUNDS * ROUND, list[int]()
+    exact = MapGraph._marginals
+    monkeypatch.setattr(MapGraph, "_marginals", lambda *a, **named: computed.append(len(a[0])) or exact(*a, **named))
+    squared = list[float]()
+    for seed in range(15):
+        rng, T = RNG([seed, 7]), np.eye(4)
+        builder = MapBuilder(_store_of_rounds(rng), "on", CAMERA, upright=False, localise=True)
+        graph, found = builder.graph, dict[int, FoundPlace]()
+        monkeypatch.setattr(builder.places, "find", lambda number, _, found=found: found.get(number))
+        for n in range(20):
+            motion = _measured(truth, first + n - 1, first + n, SIGMA, rng) if n else None
+            T = T if motion is None else T @ motion.T_i_j
+            if n % 2 == 0:
+                pose = _measured(truth, first + n, first + n, 4 * LOOP_SIGMA, rng)
+                found[size + n] = FoundPlace(first + n, size + n, Verified(pose, 50, 60, NO_MATCHES), 0)
+            update = builder.add(Keyframe(n, n, T, motion, None, 0.0), NOTHING)
+            stated, true = graph.T_map_cam.rows.copy(), np.concatenate([truth, truth[first : first + n + 1]])
+            graph.keep_place(0, np.arange(len(graph)) < size, true, level=False)
+            xi = se3_log(se3_inverse(true[-1]) @ graph.T_map_cam[-1])
+            graph.T_map_cam.rows[:] = stated
+            squared.append(float(xi @ np.linalg.solve(update.covariance, xi)))
+    assert 4.5 < np.mean(squared) < 7.5  # with the map taken as exact 18
+    assert 2 * 15 < len(computed) <= 4 * 15, "of the twenty keyframes of each session"
 
 
 def test_loops_that_contradict_each_other_leave_a_piece_where_it_is() -> None:

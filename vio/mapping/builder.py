@@ -142,9 +142,8 @@ class MapBuilder:
         self.places = PlaceFinder(store, self.graph, camera, self._own, writes=not localise)
         self._pending: list[FoundPlace] = []
         self._waiting = 0  # loops since the last optimisation
-        self._partial = False  # whether loops were optimised with what is around them alone
         self._optimised = False  # whether loops hold this session: until then it is reported as the odometry has it
-        self._placed: Placed | None = None  # how well the newest keyframe was known when all were optimised
+        self._placed: Placed | None = None  # how well the newest keyframe was known when loops were last optimised
         self._moved = False  # poses since the last commit
         # As the file has them:
         self._stored_poses, self._stored_kept = self.graph.T_map_cam.rows.copy(), [o.kept for o in self.graph.loops]
@@ -299,7 +298,7 @@ class MapBuilder:
         """Covariance (6, 6) of keyframe k: as last optimised, with the odometry since and the rig's errors, (G9).
 
         That by the newest loop alone, with the map as exact, where it says more than the odometry since (which may have
-        begun anew), and where not all of the map was optimised.
+        begun anew).
         """
         graph, newest = self.graph, self.places.newest
         by_loop = self.places.drift_since(np.array([self.first if newest is None else newest.first]), k)[0]
@@ -335,6 +334,7 @@ class MapBuilder:
         joined = bool(graph.part[i] != graph.part[k])
         if joined:
             join_parts(graph, self._home, i, k, graph.T_map_cam[i] @ pose.T_i_j)
+            self._placed = None
         r = se3_log(se3_inverse(graph.T_map_cam[k]) @ graph.T_map_cam[i] @ pose.T_i_j)
         if not joined and graph.session[i] == graph.session[k]:
             drift = graph.drift(np.array([i]), np.array([k]), systematic=0.0)[0]
@@ -370,15 +370,12 @@ class MapBuilder:
         elif not self._optimised:  # until then the odometry's poses stood for those in the map
             alone = not (stays & ~own).any()
             stays, stated = (own, graph.T_odom_cam.rows.copy()) if alone else (stays & ~own, stated)
-        self._partial = False
         if whole:
             graph.optimise_part(part)
-        else:
-            self._partial = not graph.optimise_near(part, self._waiting)
-        self._placed = None
-        if not self._partial:
+        if whole or graph.optimise_near(part, self._waiting):
             graph.keep_place(part, stays, stated, level=whole)
-            self._placed = graph.placed(part, stays)
+            self._placed = None
+        self._placed = graph.placed(part, stays, self._placed)
         if self.places.newest is not None and not self.graph.loops[-1].kept:
             self.places.newest = None
         self._waiting, self._moved, self._optimised = 0, True, True

@@ -64,6 +64,7 @@ class Placed:
     keyframe: int
     covariance: FloatArray  # (6, 6) of xi in T_map_cam = T_hat exp(xi)
     centre: FloatArray  # (3,) of the map, in it: from there a wrong scale moves all that it holds
+    computed_for: int  # the keyframe for which the covariance was computed
 
 
 class MapGraph:
@@ -75,8 +76,8 @@ class MapGraph:
         self.path_m, self._session, self._frame = Rows(), Rows(), Rows()
         self._times: list[int] = []  # ns; too large for float64
         self._ups: list[tuple[int, FloatArray, float]] = []
-        self.odometry: list[tuple[int, int, RelativePose]] = []
-        self._links = Rows(3)  # of each motion of the odometry: its keyframes, and the variance of its position, m^2
+        self._T_motion, self._C_motion = Rows(4, 4), Rows(6, 6)  # of the odometry, with its covariance
+        self._links = Rows(3)  # of each of them: its keyframes, and the variance of its position, m^2
         self.add_motions(store.odometry())
         self.loops: list[LoopRow] = []
         self._loop_links = Rows(3)  # of each loop, likewise
@@ -124,7 +125,8 @@ class MapGraph:
 
     def add_motions(self, motions: Sequence[tuple[int, int, RelativePose]]) -> None:
         """Add what the odometry says of motions between two keyframes each."""
-        self.odometry += motions
+        self._T_motion.extend([motion.T_i_j for _, _, motion in motions])
+        self._C_motion.extend([motion.covariance for _, _, motion in motions])
         self._links.extend(_links(motions))
 
     def add_loops(self, rows: Sequence[LoopRow]) -> None:
@@ -239,11 +241,31 @@ class MapGraph:
         w[numbers] = 1.0 / (variance + np.median(variance) + _LEAST_VARIANCE_M2)
         return w / w.sum()
 
-    def placed(self, part: int, stays: BoolArray) -> Placed:
-        """Return how well the newest keyframe, of a part, is known in the frame of keyframes `stays` (K,)."""
-        rows, w, newest = self.part == part, self.frame_weights(stays), len(self) - 1
-        at = np.array([int(rows.sum()) - 1])
-        return Placed(newest, self._marginals(rows, at, frame=w[rows])[0], w @ self.T_map_cam.rows[:, :3, 3])
+    def placed(self, part: int, stays: BoolArray, before: Placed | None) -> Placed:
+        """Return how well the newest keyframe, of a part, is known in the frame of keyframes `stays` (K,).
+
+        What that costs grows with the map. So, after what is around the newest loops was optimised alone, the keyframe
+        is taken to be known as well as the one before at which loops were, for as many keyframes as the part has
+        thousands, unless the odometry between the two says less than the newest loop.
+
+        Args:
+            part: of the keyframe.
+            stays: keyframes that define the frame.
+            before: how well the one before is known; None: how well the newest one is, is computed.
+        """
+        rows, newest, loop = self.part == part, len(self) - 1, self.loops[-1]
+        count = int(rows.sum())
+        if before is not None and (newest - before.computed_for) * _WINDOW < count:
+            if not loop.kept:
+                return before
+            since = self.drift(np.array([before.keyframe]), np.array([newest]), systematic=0.0)[0]
+            if self.odometry_scale * since[:3, :3].trace() < loop.pose.covariance[:3, :3].trace():
+                R = self.T_map_cam[newest][:3, :3].T @ self.T_map_cam[before.keyframe][:3, :3]
+                A = np.kron(np.eye(2), R)
+                return replace(before, keyframe=newest, covariance=A @ before.covariance @ A.T)
+        w = self.frame_weights(stays)
+        P = self._marginals(rows, np.array([count - 1]), frame=w[rows])[0]
+        return Placed(newest, P, w @ self.T_map_cam.rows[:, :3, 3], newest)
 
     def covariances(self, part: int) -> FloatArray:
         """Covariances (K, 6, 6) of xi in `T_map_cam exp(xi)` of the keyframes of a part, relative to its first one.
@@ -303,13 +325,11 @@ class MapGraph:
         """Return the odometry between the keyframes of a mask (K,), and some loops, by their places among them."""
         place = np.cumsum(rows) - 1
         ends = self._links.rows[:, :2].astype(np.int64)
-        near = [self.odometry[n] for n in np.flatnonzero(rows[ends].all(axis=1)).tolist()]
-        scaled = [
-            (int(place[i]), int(place[j]), RelativePose(m.T_i_j, self.odometry_scale * m.covariance))
-            for i, j, m in near
-        ]
+        near = np.flatnonzero(rows[ends].all(axis=1))
+        information = np.asarray(np.linalg.inv(self.odometry_scale * self._C_motion[near]), dtype=np.float64)
+        odometry = Edges(place[ends[near, 0]], place[ends[near, 1]], self._T_motion[near], information)
         loops = [(int(place[o.first]), int(place[o.second]), o.pose) for o in (self.loops[n] for n in inside)]
-        return Edges.of(scaled), Edges.of(loops)
+        return odometry, Edges.of(loops)
 
     def _up_directions(self, rows: BoolArray) -> UpDirections:
         place = np.cumsum(rows) - 1

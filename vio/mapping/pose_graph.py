@@ -220,7 +220,8 @@ def marginals(
     if frame is not None:
         A = se3_adjoint(se3_inverse(T))
         AW = frame[:, None, None] * np.swapaxes(A, 1, 2) * _FRAME_METRIC
-        mean = np.linalg.solve(np.sum(AW @ A, axis=0), np.concatenate(AW, axis=1))  # (6, 6K) twist of the frame by xi
+        # (6, 6K) twist of the frame by xi
+        mean = np.linalg.solve(np.sum(AW @ A, axis=0), np.swapaxes(AW, 0, 1).reshape(6, -1))
         D = D - csr_matrix(np.concatenate(A[poses]) @ mean @ P)
     return sparse.marginals(H, D.tocsr(), 6)
 
