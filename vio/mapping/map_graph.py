@@ -246,16 +246,17 @@ class MapGraph:
 
         What that costs grows with the map. So, after what is around the newest loops was optimised alone, the keyframe
         is taken to be known as well as the one before at which loops were, for as many keyframes as the part has
-        thousands, unless the odometry between the two says less than the newest loop.
+        thousands, unless the odometry between the two says less than the newest loop, (G10).
 
         Args:
             part: of the keyframe.
             stays: keyframes that define the frame.
             before: how well the one before is known; None: how well the newest one is, is computed.
         """
-        rows, newest, loop = self.part == part, len(self) - 1, self.loops[-1]
+        rows, newest = self.part == part, len(self) - 1
         count = int(rows.sum())
         if before is not None and (newest - before.computed_for) * _WINDOW < count:
+            loop = self.loops[-1]
             if not loop.kept:
                 return before
             since = self.drift(np.array([before.keyframe]), np.array([newest]), systematic=0.0)[0]
