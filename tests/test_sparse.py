@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csc_matrix, csr_matrix
+import pytest
+from scipy.sparse import csc_matrix, csr_matrix, eye, kron, random
 
 from vio.geometry.lie import se3_exp, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
@@ -20,6 +21,17 @@ def test_marginals_are_blocks_of_the_inverse() -> None:
     assert found.shape == (70, 3, 3)
     for k in range(70):
         np.testing.assert_allclose(found[k], expected[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rtol=1e-8, atol=1e-10)
+
+
+def test_a_large_matrix_that_is_ordered_by_its_blocks_has_the_same_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(2)
+    J = kron(random(80, 40, 0.05, rng=rng) + eye(80, 40), np.ones((6, 6))).tocsr()
+    J.data *= rng.normal(size=len(J.data))
+    H, b = (J.T @ J + eye(240)).tocsc()[:239, :239], rng.normal(size=(239, 3))  # the last block is a part of one
+    plain = sparse.factors(H, 6)(b)
+    monkeypatch.setattr("vio.numerics.sparse._LARGE", 200)
+    np.testing.assert_allclose(sparse.factors(H, 6)(b), plain, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(H @ sparse.factors(H, 6)(b[:, 0]), b[:, 0], atol=1e-9)
 
 
 def test_errors_of_a_graph_are_as_large_as_its_covariance_says() -> None:

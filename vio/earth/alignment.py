@@ -300,14 +300,14 @@ class _Factors:
         except RuntimeError as error:  # exactly singular
             raise EstimationError(unknown) from error
         self._border = H[:-1, -1:].toarray()
-        self._solved = self._rest.solve(self._border)
+        self._solved = self._rest(self._border)
         self._last = float(H[-1, -1] - (self._border.T @ self._solved)[0, 0])
         if not self._last > 0:  # NaN, too
             raise EstimationError(unknown)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return the solution (6K + 1, n) for a right-hand side."""
-        first = self._rest.solve(np.ascontiguousarray(right[:-1]))
+        first = self._rest(np.ascontiguousarray(right[:-1]))
         last = (right[-1:] - self._border.T @ first) / self._last
         return np.concatenate([first - self._solved @ last, last])
 

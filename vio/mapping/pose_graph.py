@@ -191,7 +191,7 @@ def _step(
 ) -> FloatArray:
     """Solve the normal equations (G4) for xi (K, 6)."""
     H, gradient, P = _normal(T, odometry, loops, weight, up_directions, free)
-    return np.asarray(P @ sparse.factors(H).solve(P.T @ gradient)).reshape(len(T), 6)
+    return np.asarray(P @ sparse.factors(H, 6)(P.T @ gradient)).reshape(len(T), 6)
 
 
 def marginals(
@@ -223,7 +223,7 @@ def marginals(
         # (6, 6K) twist of the frame by xi
         mean = np.linalg.solve(np.sum(AW @ A, axis=0), np.swapaxes(AW, 0, 1).reshape(6, -1))
         D = D - csr_matrix(np.concatenate(A[poses]) @ mean @ P)
-    return sparse.marginals(H, D.tocsr(), 6)
+    return sparse.marginals(H, D.tocsr(), 6, block=6)
 
 
 def _normal(

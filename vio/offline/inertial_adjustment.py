@@ -318,7 +318,7 @@ class _System:
     def step(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the changes of the keyframes (K, 15), points (M, 3) and rig (27,)."""
         N, g, points = self._reduced(damping)
-        x = -sparse.factors(N).solve(g)
+        x = -sparse.factors(N)(g)
         own, s = x[: _OWN * self.keyframes].reshape(-1, _OWN), x[_OWN * self.keyframes :]
         by_poses = (points.by_pose.T @ own[:, :6].ravel()).reshape(-1, 3)
         p = -np.einsum("mij,mj->mi", points.V_inverse, points.e + by_poses + points.by_rig @ s)
