@@ -42,13 +42,13 @@ class RightMatcher:
         """
         if not self._right.usable:
             tracks = with_prior_depths(self._camera, tracks, prior)
-        has_point, delay = tracks.has_point, self._delay.frames
+        testable, delay = stereo.testable(tracks), self._delay.frames
         flow = tracks.left - previous.tracks.left[_rows_by_slot(previous.tracks, tracks)]
         # Wrong matches, of rows far apart, contradict the right image that the search for the rows will need.
         tested = motion is not None and not stereo.has_few_matches
         if delay == 0.0:
             matched = stereo.track_right(tracks, right, motion is not None)
-            if tested and self._right.doubts(matched.has_right[has_point]):
+            if tested and self._right.doubts(matched.has_right[testable]):
                 off = stereo.track_off_right(tracks, left, right, by_motion=not self._right.usable)
                 if off.has_right.sum() > matched.has_right.sum():
                     matched = off
@@ -59,7 +59,7 @@ class RightMatcher:
             T = T if motion is None else motion.T_curr_prev
             matched = self._match_delayed(previous, tracks, right, flow, T, stereo)
         frame_s = (frame.time_ns - previous.time_ns) * 1e-9
-        if not self._right.check_matches(frame.index, matched.has_right[has_point], moved=tested):
+        if not self._right.check_matches(frame.index, matched.has_right[testable], moved=tested):
             if self._right.contradicts and self._delay.suspect(
                 frame.index, self._count_pairings(previous, left, tracks, right, stereo), frame_s
             ):

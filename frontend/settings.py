@@ -26,7 +26,9 @@ class DisparitySettings(Section):
 
     section: ClassVar[str] = "frontend.disparity"
 
-    max_disparity: float = setting(0.16, "largest disparity, over the image width", above=0, at_most=1)
+    max_disparity: float = setting(
+        0.16, "largest disparity, over the image width; up to 0.64 while the scene is nearer", above=0, at_most=1
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from vio.frontend.columns import changed, share_of
 from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import DisparitySettings
 from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX, EpipolarRowModel, match_rows, shifted_rows
-from vio.frontend.tracks import INLIER_PX, AnchorBank, Tracks
+from vio.frontend.tracks import ANCHOR_REACH_PX, INLIER_PX, AnchorBank, Tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, depth_of
 from vio.numerics.compiled import compiled
@@ -34,6 +34,12 @@ _GOOD_MATCH = 0.9  # correlation of patches whose rows agree
 _LEAST_POINTS = 20
 _ROWS_OFF_PX = 0.2  # root mean square over the matches: from here on the run reports the calibration, too
 _ROW_SEARCH_FRAMES = 10  # between two such searches, while matches are few
+_MOST_REACH = 0.64  # of the image width: largest disparity that is searched where the scene is near
+_REACH_FRAMES = 10  # between two searches beyond the present reach
+_BEYOND_SHARE = 0.1  # of the points without a match that must have one beyond the reach for it to be doubled …
+_LEAST_BEYOND = 10  # … and this many at least …
+_WITHIN_REACH = 0.9  # … until this share of them is within it
+_NONE_NEAR = 5  # matches in the farther half of the reach below which it is halved again
 # A pair turns so much in its mount, three times the prior of its calibration, or exposes so far apart.
 _MOST_TURN_RAD = 0.3 * np.pi / 180.0
 _OFFSET_GAIN = 0.2  # part of a frame's common offset that is believed
@@ -53,7 +59,9 @@ class StereoFit:
         size: tuple[int, int],
     ) -> None:
         """Prepare for images of one size (width, height); the bank contains the features' anchors."""
-        self.max_disparity_px = disparity.max_disparity * size[0]
+        self.max_disparity_px = disparity.max_disparity * size[0]  # doubled while the scene is nearer
+        self._least_reach_px, self._most_reach_px = self.max_disparity_px, _MOST_REACH * size[0]
+        self._reach_wait = 0  # frames until the reach is tried again
         self._camera = camera
         self._bank = bank
         self._rows = EpipolarRowModel(*size)
@@ -128,7 +136,30 @@ class StereoFit:
         if self._unmatched % _ROW_SEARCH_FRAMES == 1:
             offset = self._best_offset(left_half, right_half, points, offset)
         correlation = _MIN_CORRELATION - _COARSE_SLACK
-        return self._search(left_half, shifted_rows(right_half, offset), points, correlation)
+        right_half = shifted_rows(right_half, offset)
+        found = self._search(left_half, right_half, points, correlation)
+        if self._reach_wait:
+            return found
+        self._reach_wait = _REACH_FRAMES
+        if not self._reaches_further(left_half, right_half, points[~found[1]]):
+            return found
+        return self._search(left_half, right_half, points, correlation)
+
+    def _reaches_further(self, left_half: Image, right_half: Image, points: FloatArray) -> bool:
+        """Search further from now on if enough of the left pixels (N, 2) without a match have one beyond the reach."""
+        reach = self.max_disparity_px
+        if reach >= self._most_reach_px:
+            return False
+        self.max_disparity_px = self._most_reach_px
+        disparity, good = self._search(left_half, right_half, points, _GOOD_MATCH)
+        beyond = disparity[good & (disparity > reach)]
+        if len(beyond) >= max(_LEAST_BEYOND, _BEYOND_SHARE * len(points)):
+            while reach < np.quantile(beyond, _WITHIN_REACH):
+                reach *= 2.0
+            self.max_disparity_px = min(reach, self._most_reach_px)
+            return True
+        self.max_disparity_px = reach
+        return False
 
     def _best_offset(self, left_half: Image, right_half: Image, points: FloatArray, offset: int) -> int:
         """Row difference, in pixels at half resolution, at which most points match well; the present one if in doubt.
@@ -179,10 +210,23 @@ class StereoFit:
         self._rows.restart(0.0)
 
     def update_rows(self, tracks: Tracks) -> None:
-        """Update the row differences with the matches of a frame."""
+        """Update the row differences, and how far the search along the row reaches, with the matches of a frame."""
         few = len(tracks) >= _LEAST_POINTS and share_of(tracks.has_right) < _FEW_MATCHES
         self._unmatched = self._unmatched + 1 if few else 0
-        self._rows.update(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
+        left, right = tracks.left[tracks.has_right], tracks.right[tracks.has_right]
+        self._rows.update(left, right)
+        self._reach_wait = max(0, self._reach_wait - 1)
+        if self._reach_wait == 0 and self.max_disparity_px > self._least_reach_px:
+            near = left[:, 0] - right[:, 0] > 0.5 * self.max_disparity_px
+            if near.sum() < _NONE_NEAR:
+                self.max_disparity_px = max(0.5 * self.max_disparity_px, self._least_reach_px)
+
+    def testable(self, tracks: Tracks) -> BoolArray:
+        """Mask (N,) of the features whose known depth says that the right image shows them within the reach."""
+        rows, expected = self._expected(tracks)
+        out = np.zeros(len(tracks), dtype=np.bool_)
+        out[rows] = (expected <= self.max_disparity_px) & (tracks.left[rows, 0] - expected >= ANCHOR_REACH_PX)
+        return out
 
     def _search(
         self, left_half: Image, right_half: Image, points: FloatArray, min_correlation: float

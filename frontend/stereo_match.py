@@ -197,9 +197,12 @@ def _search(
     score = np.empty((len(points), high - low + 1), np.float32)
     correlate(source, target, centres, first, _RADIUS, score)
     _peaks(score, shift, top[0], top[1])
+    farthest = low if -low > high else high
     for n in range(len(points)):
         # The patches were cut at whole pixels; the shift carries over to the sub-pixel point.
         shift[n] += low
+        if shift[n] == farthest:  # no peak, as the next candidate may be better
+            top[0, n] = -1.0
         if centres[n, 0] != np.rint(points[n, 0]) or centres[n, 1] != np.rint(points[n, 1]):
             top[0, n] = -1.0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -11,7 +11,7 @@ import pytest
 
 from vio.frontend import detect
 from vio.frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
-from vio.frontend.columns import joined, take
+from vio.frontend.columns import changed, joined, take
 from vio.frontend.detect import (
     cell_index,
     corner_response,
@@ -23,13 +23,14 @@ from vio.frontend.detect import (
     noise_gradient,
     spread_evenly,
 )
-from vio.frontend.patches import half_image, inside
+from vio.frontend.patches import ImageLevels, half_image, inside
 from vio.frontend.prediction import moved_pixels, prior_pixels
-from vio.frontend.settings import GridSettings
+from vio.frontend.settings import DisparitySettings, GridSettings
+from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.stereo_match import EpipolarRowModel, correlate, match_rows
-from vio.frontend.tracks import ANCHOR_RADIUS_PX, AnchorBank
+from vio.frontend.tracks import ANCHOR_RADIUS_PX, AnchorBank, Tracks, new_tracks
 from vio.geometry.lie import FloatArray, se3_exp
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import StereoCamera, triangulate
 from vio.records import BoolArray, Image, IntArray, TrackPrior
 
 
@@ -51,6 +52,7 @@ def picture(warp: FloatArray, seed: int = 0, shape: tuple[int, int] = (200, 300)
 
 
 PLAIN = picture(np.eye(3))
+NEAR_CAMERA = StereoCamera(200.0, 200.0, 149.5, 99.5, 0.3, 300, 200)
 POINTS = np.random.default_rng(5).uniform([40, 40], [260, 160], (60, 2))
 
 
@@ -227,6 +229,61 @@ def test_disparity_outside_the_range_is_rejected() -> None:
         right = picture(np.array([[1.0, 0.0, shift], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))
         _, valid = match_rows(half_image(PLAIN), half_image(right), POINTS, 48.0, 0.6, 0.03)
         assert valid.mean() < 0.35  # chance matches, which the fine alignment rejects
+
+
+def _moved_right(shift: float) -> ImageLevels:
+    image = picture(np.array([[1.0, 0.0, shift], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))
+    return ImageLevels(image, half_image(image))
+
+
+def _wall(stereo: StereoFit, disparity: float) -> Tracks:
+    """Features on a wall, as they have been matched."""
+    left = POINTS[POINTS[:, 0] > 130]
+    matched, shift = np.ones(len(left), dtype=np.bool_), np.array([disparity, 0.0])
+    new = new_tracks(left, np.arange(len(left)))
+    point = triangulate(NEAR_CAMERA, np.concatenate([left, left - shift], axis=1))[0]
+    return replace(new, right=left - shift, has_right=matched, point=point, has_point=matched)
+
+
+def test_the_search_reaches_further_while_the_scene_is_near() -> None:
+    """A wall at 0.4 of the image width, beyond the setting; later nothing is so near."""
+    stereo = StereoFit(NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200))
+    half, first, points = half_image(PLAIN), stereo.max_disparity_px, POINTS[POINTS[:, 0] > 170]
+    disparity, unique = stereo.search(half, _moved_right(120.0).half, points)
+    assert unique.mean() > 0.8
+    assert np.abs(disparity[unique] - 120.0).max() < 1.5
+    assert stereo.max_disparity_px > 120.0
+    for _ in range(15):
+        stereo.update_rows(_wall(stereo, 120.0))
+    assert stereo.max_disparity_px > 120.0
+    for _ in range(30):
+        stereo.search(half, _moved_right(13.0).half, points)
+        stereo.update_rows(_wall(stereo, 13.0))
+    assert stereo.max_disparity_px == first
+
+
+def test_chance_matches_do_not_make_the_search_reach_further() -> None:
+    stereo = StereoFit(NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200))
+    other = half_image(picture(np.eye(3), seed=1))
+    first = stereo.max_disparity_px
+    stereo.search(half_image(PLAIN), other, np.random.default_rng(1).uniform([40, 40], [260, 160], (400, 2)))
+    assert stereo.max_disparity_px == first
+
+
+def test_points_beside_the_right_image_or_beyond_the_reach_are_not_testable() -> None:
+    stereo = StereoFit(NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200))
+    tracks = _wall(stereo, 30.0)
+    assert stereo.testable(tracks).all()
+    assert not stereo.testable(_wall(stereo, 60.0)).any()
+    beside = changed(tracks, left=tracks.left - [tracks.left[0, 0] - 35.0, 0.0])
+    assert not stereo.testable(beside)[0]
+
+
+def test_a_match_at_the_end_of_the_searched_row_is_none() -> None:
+    """The correlation of a smooth texture still grows there: the point is nearer than the search reaches."""
+    for shift in (41.0, 43.0):
+        _, valid = match_rows(half_image(PLAIN), _moved_right(shift).half, POINTS, 40.0, 0.6, 0.03)
+        assert valid.mean() < 0.1
 
 
 def test_matching_no_points_gives_no_disparities() -> None:
