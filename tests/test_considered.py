@@ -91,3 +91,15 @@ def test_a_prior_follows_its_constants(scaled: bool) -> None:
     for k, one in enumerate(np.eye(1 + CONSIDERED)):
         difference = without.delta - absorbed(one).delta
         np.testing.assert_allclose(without.error_D_constants[:, k], difference, atol=1e-12)
+
+
+def test_squared_distance_of_the_means_leaves_out_what_is_known_or_a_copy() -> None:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(4, 4)) * [[1e-3], [1.0], [30.0], [1.0]]
+    prior = Prior(root @ root.T)
+    prior.delta = rng.normal(size=4)
+    plain = float(prior.delta @ np.linalg.solve(prior.P, prior.delta))
+    assert prior.squared_distance() == (pytest.approx(plain), 4)
+    prior.insert(2, np.zeros((3, 3)))
+    prior.insert_dependent(7, np.eye(2, 7), np.zeros((2, 2)), np.zeros(2))
+    assert prior.squared_distance() == (pytest.approx(plain), 4)

@@ -36,7 +36,8 @@ from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera, left_rays
 from vio.geometry.upright import rotation_to_up
 from vio.imu.standstill import STANDSTILL_S
-from vio.records import ImuSample, Observations
+from vio.numerics.statistics import chi_square_quantile
+from vio.records import BoolArray, ImuSample, Observations
 
 _SPAN_S = 3.0  # of views: what a gyro bias leaves of rotations is corrected to first order only
 _LEAST_SPAN_S = 0.6  # half of it shows less than the standard deviation of the accelerometer's bias
@@ -49,6 +50,7 @@ _CONVERGED = 1e-3  # m, m/s and rad
 _STILL_PX = 0.5  # median motion of the tracks over half a second at standstill
 _TILT_SIGMA_RAD = np.radians(15.0)  # of gravity by the linear solution
 MOST_SCALE_SIGMA = 0.1  # of a start; the filter is linear in the scale to half the square of it, 0.5 %
+_AGREEMENT = 0.999  # chi-square probability of how far the fit moves what the IMU says
 _LEAST_PX = 0.15  # pixel noise that fewer residuals than a filter's cannot prove
 # On the densities of accelerometer and gyro, until the filter has learned its own: too small ones cost the scale, too
 # large ones time (docs/notes/design_decisions.md, IMU noise at the start).
@@ -197,8 +199,7 @@ class MonoStarter:
                 if len(lin.rows) < _LEAST_TRACKS:
                     self.why = f"only {len(lin.rows)} features show parallax"
                     return None
-                self._follow_noise(tracks, lin)
-                A, b = eliminate_points(lin.information, np.ones(len(lin.rows), dtype=np.bool_))
+                A, b = eliminate_points(lin.information, self._follow_noise(tracks, lin))
                 A, b, _ = window.state.information(A, b, tracks.variance)
                 try:
                     fitted, error = window.optimum(A, b, len(A))
@@ -220,6 +221,10 @@ class MonoStarter:
         if tracks.variance >= self._settings.pixel_sigma_max_px**2:
             self.why = f"features and IMU disagree by more than {self._settings.pixel_sigma_max_px:g} px"
             return None
+        squared, dof = window.prior.squared_distance()
+        if squared > chi_square_quantile(_AGREEMENT, dof):
+            self.why = "features and IMU contradict each other: do most features belong to something that moves?"
+            return None
         P = fitted.covariance()
         sigma = scale_sigma(WindowPosterior.of(window, P))
         return *_at_origin(window.nav, P[:DIM, :DIM]), float("inf") if sigma is None else sigma
@@ -236,11 +241,18 @@ class MonoStarter:
             window.add_clone(view.frame_index, view.time_ns)
         return window
 
-    def _follow_noise(self, tracks: WindowTracks, lin: LinearTracks) -> None:
-        """Set the pixel noise to that of the median track, and to no less than few tracks can show."""
+    def _follow_noise(self, tracks: WindowTracks, lin: LinearTracks) -> BoolArray:
+        """Set the pixel noise to that of the median track, and to no less than few tracks can show.
+
+        Returns:
+            Mask (F,) of the tracks that pass the gate with it; all of them far from the solution.
+        """
         _, squares, dof = tracks.gate(lin.at)
         ratio = float(np.median(squares / chi_square_table(0.5)[dof]))
-        tracks.variance = float(np.clip(tracks.variance * ratio, _LEAST_PX**2, self._settings.pixel_sigma_max_px**2))
+        most = self._settings.pixel_sigma_max_px**2
+        tracks.variance = float(np.clip(tracks.variance * ratio, _LEAST_PX**2, most))
+        passed, _, _ = tracks.gate(lin.at)
+        return passed if tracks.variance < most else np.ones(len(dof), dtype=np.bool_)
 
 
 def _upright(nav: NavState, found: VisualInertialAlignment) -> NavState:

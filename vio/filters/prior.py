@@ -17,6 +17,8 @@ from vio.filters.scale_test import ScaleTest
 from vio.geometry.lie import FloatArray
 from vio.records import IntArray
 
+_SINGULAR = 1e-12  # of the largest eigenvalue of a matrix of correlations
+
 
 class Prior:
     """Mean and covariance of D errors, and how they depend on constants that are estimated beside them."""
@@ -170,6 +172,17 @@ class Prior:
             P[rows, rows] += kept * (self.P[rows, rows] - P[rows, rows])
             V[rows] += np.sqrt(kept) * (self.error_D_constants[rows] - V[rows])
         self.P, self.delta, self.error_D_constants = P, delta, V
+
+    def squared_distance(self) -> tuple[float, int]:
+        """Squared distance of the present means from what the prior says, over its covariance, and its dimensions.
+
+        Directions in which the covariance is singular to rounding have no part: states are copies, or known.
+        """
+        scale = np.sqrt(np.where(self.P.diagonal() > 0, self.P.diagonal(), 1.0))
+        values, vectors = np.linalg.eigh(self.P / np.outer(scale, scale))
+        free = values > _SINGULAR * values[-1]
+        along = vectors[:, free].T @ (self.delta / scale)
+        return float(np.sum(along**2 / values[free])), int(free.sum())
 
     def _factor(self, information: FloatArray, size: int, first: int) -> Factor:
         """The factor of the present covariance, up to row `size`, of the errors that information (D, D) is about.
