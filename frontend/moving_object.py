@@ -28,6 +28,7 @@ from vio.records import BoolArray, IntArray, MotionPrior
 Decision: TypeAlias = Literal["predicted", "voted", "undecided"]
 
 _PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test
+_FAR_NEARER = 10.0  # ratio of two motions' squared distances from a measured one, above which that one is wrong
 _LEAST_POINTS = 12  # of a second motion
 _LEAST_SUPPORT = 0.1  # points of a second motion that may replace the first, over the first's
 _LARGE_SHARE = 0.25  # share of all points above which a second motion is reported
@@ -94,10 +95,15 @@ def choose_motion(
         return TwoMotions(found, reported, "voted" if reported else None)
     if predicted is None:
         return TwoMotions(found, reported, "undecided" if reported else None)
-    second_agrees = large and _agrees(problem.camera, second, p_prev[others[support]], predicted)
+    apart_first = _squared_distance(problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted)
+    apart_second = _squared_distance(problem.camera, second, p_prev[others[support]], predicted) if large else np.inf
+    limit = float(chi_square_quantile(_PROBABILITY, 6))
+    if measured and large:  # with a sensor that is worse than it says, the one that is far nearer is the camera's
+        limit = max(limit, min(apart_first, apart_second, max(apart_first, apart_second) / _FAR_NEARER))
+    second_agrees = apart_second <= limit
     if not (second_agrees or in_event or reported):
         return TwoMotions(found, 0.0, None)  # whether the first agrees or not
-    first_agrees = _agrees(problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted)
+    first_agrees = apart_first <= limit
     if first_agrees or not (second_agrees or (in_event and measured)):
         return TwoMotions(found, reported, "predicted" if first_agrees and not second_agrees else "undecided")
     T = second if second_agrees else predicted.T_curr_prev
@@ -145,16 +151,15 @@ def one_motion_explains(problem: RansacProblem, chosen: TwoMotions, before: Floa
     return static is not None and float((~static).mean()) < _SEEN_SHARE * smaller
 
 
-def _agrees(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, predicted: MotionPrior) -> bool:
-    """Chi-square test of a motion (4, 4) fitted to points (N, 3) against the prediction."""
+def _squared_distance(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, predicted: MotionPrior) -> float:
+    """Squared distance of a motion (4, 4), fitted to points (N, 3), from the prediction, over their covariance."""
     p = transform_points(T, p_prev)
     J = (z_D_p_cam(camera, p)[:, :2] @ circledot(p)[:, :3]).reshape(-1, 6)
     points = min(len(p), _INDEPENDENT_POINTS)
     fit = _PIXEL_SIGMA**2 * np.linalg.inv(points * J.T @ J / len(p) + 1e-9 * np.eye(6))
     fit[:3, :3] += _SCALE_SIGMA**2 * float(T[:3, 3] @ T[:3, 3]) * np.eye(3)
     xi = se3_log(T @ se3_inverse(predicted.T_curr_prev))
-    squared = float(xi @ np.linalg.solve(predicted.covariance + fit, xi))
-    return squared <= float(chi_square_quantile(_PROBABILITY, 6))
+    return float(xi @ np.linalg.solve(predicted.covariance + fit, xi))
 
 
 def voters(age: IntArray) -> BoolArray:

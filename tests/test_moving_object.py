@@ -83,6 +83,18 @@ def test_a_wrong_prediction_does_not_override_the_consensus() -> None:
     assert chosen.object_share == 0.0
 
 
+def test_of_two_motions_off_the_prediction_the_one_far_nearer_is_used() -> None:
+    """The IMU is ten times worse than it says, by a late stamp say: the scene contradicts it, the object far more."""
+    late = prediction(se3_exp([0.02, 0.0, 0.0, 0.0, 0.003, 0.0]) @ T_TRUE)
+    for static, moving in ((60, 240), (240, 60)):
+        chosen, found, truck = choose(static, moving, late)
+        assert found.inliers[truck].mean() > 0.95 or static > moving  # control
+        assert chosen.motion.inliers[~truck].mean() > 0.95
+        assert not chosen.motion.inliers[truck].any()
+    chosen, found, _ = choose(120, 180, replace(late, measured=False))
+    assert chosen.motion is found
+
+
 def test_an_object_that_hides_the_scene_does_not_become_the_scene() -> None:
     """Six points of the scene are left, too few for a motion: while the object is known, the prediction is used."""
     before, found, truck = choose(6, 300, prediction())
