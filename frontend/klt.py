@@ -16,7 +16,13 @@ from vio.frontend.flicker import BandRemoval
 from vio.frontend.flow import track_with_retries
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output
 from vio.frontend.image_check import FrameImages, ImageCheck
-from vio.frontend.moving_object import ObjectReport, choose_motion, one_motion_explains, voters
+from vio.frontend.moving_object import (
+    ObjectReport,
+    choose_motion,
+    one_motion_explains,
+    static_by_prediction,
+    voters,
+)
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.one_camera import with_depths, with_prior_depths
 from vio.frontend.outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
@@ -260,8 +266,11 @@ class KltFrontend:
             T_prior = predicted_motion(camera, old.point[known], predicted, expected)
         before, after = old.left.take(rows, axis=0), found.take(rows, axis=0)
         kept, motion = static_tracks(problem, before, point, has_depth, after, expected, R_prior, T_prior)
+        expected_motion = None if prior is None else prior.motion
+        near_m = camera.fu * camera.baseline_m / stereo.max_disparity_px
+        if motion is None and expected_motion is not None and expected_motion.measured:
+            kept = static_by_prediction(problem, before, after, kept, expected_motion, near_m)
         if motion is not None:
-            expected_motion = None if prior is None else prior.motion
             after_deep = after.take(deep, axis=0)
             chosen = choose_motion(
                 problem,
@@ -280,7 +289,6 @@ class KltFrontend:
             if self._objects.hides_scene(index, chosen) and alone:
                 return np.zeros(len(old), dtype=np.bool_), None
         if motion is not None and not has_depth.all():
-            near_m = camera.fu * camera.baseline_m / stereo.max_disparity_px
             distance = epipolar_distance(camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m)
             kept[~has_depth] = distance <= problem.limit_px
         keep = np.zeros(len(old), dtype=np.bool_)

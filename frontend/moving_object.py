@@ -21,7 +21,7 @@ from vio.frontend.columns import share_of
 from vio.frontend.image_check import ImageCheck
 from vio.frontend.outliers import Consensus, RansacProblem, bearing_consensus, best_motion, pixel_errors
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
-from vio.geometry.stereo import StereoCamera, z_D_p_cam
+from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray, MotionPrior
 
@@ -35,6 +35,8 @@ _LARGE_SHARE = 0.25  # share of all points above which a second motion is report
 _SEEN_SHARE = 0.5  # of the smaller group's points that must be off the epipolar lines of the others to prove an object
 _PIXEL_SIGMA = 0.5  # of a point's position by its depth and its track
 _INDEPENDENT_POINTS = 50  # errors of neighbours have much in common: a fit is no better than that of so many points
+_MOST_STATIC = 0.8  # share of a consensus without depths that the prediction explains, above which it is believed
+_FAR_M = 1e4  # depth of what is infinitely far away
 _SCALE_SIGMA = 0.01  # of the length of a fitted translation: depths of one frame have errors in common
 _VOTERS, _VOTING_FRAMES = 50, 5  # how many points vote, and for how many frames each must have been static
 _CLEAR_VOTE = 0.7  # share of the voting points that must follow a motion
@@ -130,6 +132,62 @@ def _voted(
     inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
     T, _ = best_motion(problem, p_prev[inliers], pixels[inliers], T[None])  # the oldest points may all be far away
     return Consensus(T, pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px)
+
+
+def static_by_prediction(
+    problem: RansacProblem,
+    before: FloatArray,
+    after: FloatArray,
+    kept: BoolArray,
+    predicted: MotionPrior,
+    near_m: float,
+) -> BoolArray:
+    """Which points of unknown depth (N,) are static, if those that one motion explains contradict the predicted one.
+
+    An object ahead of a turning camera keeps its place in the image; to move sideways explains it as well.
+
+    Args:
+        problem: camera, thresholds and random generator.
+        before: left pixels (N, 2) in the previous frame.
+        after: left pixels (N, 2) in the current frame.
+        kept: (N,) those that one motion explains.
+        predicted: the motion by a sensor.
+        near_m: the smallest depth.
+    """
+    static = _agree_with(problem.camera, predicted, before, after, near_m, problem.limit_px)
+    if static.sum() < _LEAST_POINTS or share_of(static[kept]) >= _MOST_STATIC:
+        return kept
+    return static
+
+
+def _agree_with(
+    camera: StereoCamera, predicted: MotionPrior, before: FloatArray, after: FloatArray, near_m: float, sigma_px: float
+) -> BoolArray:
+    """Which of some points of unknown depth may be static under a predicted motion, by chi-square.
+
+    Each is taken at the depth, beyond `near_m`, at which the motion brings it nearest to where it is seen.
+
+    Args:
+        camera: the rectified pair.
+        predicted: the motion.
+        before: left pixels (N, 2) in the previous frame.
+        after: left pixels (N, 2) in the current frame.
+        near_m: the smallest depth.
+        sigma_px: standard deviation of a pixel.
+    """
+    T = predicted.T_curr_prev
+    turned, seen = left_rays(camera, before) @ T[:3, :3].T, left_rays(camera, after)
+    # g x (R f + t / z) = 0
+    across, off = np.cross(seen, T[:3, 3]), np.cross(seen, turned)
+    inverse = -np.sum(across * off, axis=1) / (np.sum(across * across, axis=1) + 1e-12)
+    p = turned / np.clip(inverse, 1.0 / _FAR_M, 1.0 / near_m)[:, None] + T[:3, 3]
+    ahead = depth_of(camera, p) > 0.0
+    p[~ahead] = [0.0, 0.0, 1.0]
+    J = z_D_p_cam(camera, p)[:, :2] @ circledot(p)[:, :3]
+    S = J @ predicted.covariance @ J.transpose(0, 2, 1) + sigma_px**2 * np.eye(2)
+    d = after - project(camera, p)[:, :2]
+    squared = np.sum(d * np.linalg.solve(S, d[..., None])[..., 0], axis=1)
+    return np.asarray(ahead & (squared <= float(chi_square_quantile(_PROBABILITY, 1))))
 
 
 def one_motion_explains(problem: RansacProblem, chosen: TwoMotions, before: FloatArray, after: FloatArray) -> bool:

@@ -9,7 +9,14 @@ import pytest
 
 from tests.test_frontend_outliers import CAMERA, T_TRUE, make_problem, pixels, scene
 from vio.frontend.klt import KltFrontend
-from vio.frontend.moving_object import ObjectReport, TwoMotions, choose_motion, one_motion_explains, voters
+from vio.frontend.moving_object import (
+    ObjectReport,
+    TwoMotions,
+    choose_motion,
+    one_motion_explains,
+    static_by_prediction,
+    voters,
+)
 from vio.frontend.outliers import Consensus, rigid_consensus
 from vio.frontend.prediction import usable_prior
 from vio.frontend.settings import FrontendSettings
@@ -81,6 +88,24 @@ def test_a_wrong_prediction_does_not_override_the_consensus() -> None:
     chosen = choose_motion(make_problem(), p, uv, found, wrong)
     assert chosen.motion is found
     assert chosen.object_share == 0.0
+
+
+@pytest.mark.parametrize("static", [40, 200])
+def test_without_depths_an_object_ahead_of_a_turning_camera_contradicts_the_imu(static: int) -> None:
+    """It keeps its place in the image, which a camera that moves sideways as it turns sees, too."""
+    turn = se3_exp([0.02, 0.0, -0.8, 0.0, 0.05, 0.0])
+    wall, truck = scene(static, 12, (8.0, 40.0)), scene(160, 13, (6.0, 8.0)) * [0.3, 1.0, 1.0]
+    p = np.concatenate([wall, truck])
+    before, moves = project(CAMERA, p)[:, :2], np.arange(len(p)) >= static
+    after = np.where(moves[:, None], before, pixels(turn, p, 14))
+    everything, imu = np.ones(len(p), dtype=np.bool_), prediction(turn)
+    for kept in (moves, everything):
+        used = static_by_prediction(make_problem(), before, after, kept, imu, 1.0)
+        assert used[~moves].mean() > 0.95
+        assert used[moves].mean() < 0.2
+    np.testing.assert_array_equal(static_by_prediction(make_problem(), before, after, ~moves, imu, 1.0), ~moves)
+    useless = replace(imu, covariance=1e3 * NOTHING)
+    np.testing.assert_array_equal(static_by_prediction(make_problem(), before, after, moves, useless, 1.0), moves)
 
 
 def test_of_two_motions_off_the_prediction_the_one_far_nearer_is_used() -> None:
