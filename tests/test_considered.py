@@ -99,7 +99,10 @@ def test_squared_distance_of_the_means_leaves_out_what_is_known_or_a_copy() -> N
     prior = Prior(root @ root.T)
     prior.delta = rng.normal(size=4)
     plain = float(prior.delta @ np.linalg.solve(prior.P, prior.delta))
-    assert prior.squared_distance() == (pytest.approx(plain), 4)
+    assert prior.squared_distance(slice(None)) == (pytest.approx(plain), 4)
+    own = prior.delta[1:3]
+    part = float(own @ np.linalg.solve(prior.P[1:3, 1:3], own))
+    assert prior.squared_distance(slice(1, 3)) == (pytest.approx(part), 2)
     prior.insert(2, np.zeros((3, 3)))
     prior.insert_dependent(7, np.eye(2, 7), np.zeros((2, 2)), np.zeros(2))
-    assert prior.squared_distance() == (pytest.approx(plain), 4)
+    assert prior.squared_distance(slice(None)) == (pytest.approx(plain), 4)

@@ -27,6 +27,7 @@ from vio.filters.navigation import (
     NavState,
 )
 from vio.filters.online_calibration import Calibration
+from vio.filters.prior import Prior
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import eliminate_points
 from vio.filters.window import Window
@@ -45,12 +46,13 @@ _VIEWS = 16
 _EVERY = 5  # frames between two attempts, whose time is that of a dozen updates
 _LEAST_TRACKS = 20
 _MOST_TRACKS = 150
-_STEPS = 12  # of Gauss-Newton at most
+_STEPS = 30  # of Gauss-Newton at most: where the scale is hardly known it takes twenty
 _CONVERGED = 1e-3  # m, m/s and rad
 _STILL_PX = 0.5  # median motion of the tracks over half a second at standstill
 _TILT_SIGMA_RAD = np.radians(15.0)  # of gravity by the linear solution
 MOST_SCALE_SIGMA = 0.1  # of a start; the filter is linear in the scale to half the square of it, 0.5 %
 _AGREEMENT = 0.999  # chi-square probability of how far the fit moves what the IMU says
+_BIASES = slice(9, DIM)
 _LEAST_PX = 0.15  # pixel noise that fewer residuals than a filter's cannot prove
 # On the densities of accelerometer and gyro, until the filter has learned its own: too small ones cost the scale, too
 # large ones time (docs/notes/design_decisions.md, IMU noise at the start).
@@ -199,7 +201,8 @@ class MonoStarter:
                 if len(lin.rows) < _LEAST_TRACKS:
                     self.why = f"only {len(lin.rows)} features show parallax"
                     return None
-                A, b = eliminate_points(lin.information, self._follow_noise(tracks, lin))
+                passed = self._follow_noise(tracks, lin)
+                A, b = eliminate_points(lin.information, np.ones(len(lin.rows), dtype=np.bool_))
                 A, b, _ = window.state.information(A, b, tracks.variance)
                 try:
                     fitted, error = window.optimum(A, b, len(A))
@@ -213,6 +216,7 @@ class MonoStarter:
                 self.why = "features and IMU do not agree on one motion"
                 return None
             if attempt == 0:
+                tracks.table.remove(lin.rows[~passed])  # they are on what moves
                 first = window.clones[0]
                 begin = replace(
                     begin, T_world_imu=first.T_world_imu, velocity=first.velocity, gyro_bias=window.nav.gyro_bias
@@ -221,8 +225,7 @@ class MonoStarter:
         if tracks.variance >= self._settings.pixel_sigma_max_px**2:
             self.why = f"features and IMU disagree by more than {self._settings.pixel_sigma_max_px:g} px"
             return None
-        squared, dof = window.prior.squared_distance()
-        if squared > chi_square_quantile(_AGREEMENT, dof):
+        if not (_agrees(window.prior, slice(None)) and _agrees(window.prior, _BIASES)):
             self.why = "features and IMU contradict each other: do most features belong to something that moves?"
             return None
         P = fitted.covariance()
@@ -245,14 +248,19 @@ class MonoStarter:
         """Set the pixel noise to that of the median track, and to no less than few tracks can show.
 
         Returns:
-            Mask (F,) of the tracks that pass the gate with it; all of them far from the solution.
+            Mask (F,) of the tracks that pass the gate with it.
         """
         _, squares, dof = tracks.gate(lin.at)
         ratio = float(np.median(squares / chi_square_table(0.5)[dof]))
-        most = self._settings.pixel_sigma_max_px**2
-        tracks.variance = float(np.clip(tracks.variance * ratio, _LEAST_PX**2, most))
+        tracks.variance = float(np.clip(tracks.variance * ratio, _LEAST_PX**2, self._settings.pixel_sigma_max_px**2))
         passed, _, _ = tracks.gate(lin.at)
-        return passed if tracks.variance < most else np.ones(len(dof), dtype=np.bool_)
+        return passed
+
+
+def _agrees(prior: Prior, rows: slice) -> bool:
+    """Whether the means of some errors are where the prior has them, by chi-square."""
+    squared, dimensions = prior.squared_distance(rows)
+    return squared <= float(chi_square_quantile(_AGREEMENT, dimensions))
 
 
 def _upright(nav: NavState, found: VisualInertialAlignment) -> NavState:

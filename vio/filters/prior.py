@@ -173,15 +173,16 @@ class Prior:
             V[rows] += np.sqrt(kept) * (self.error_D_constants[rows] - V[rows])
         self.P, self.delta, self.error_D_constants = P, delta, V
 
-    def squared_distance(self) -> tuple[float, int]:
-        """Squared distance of the present means from what the prior says, over its covariance, and its dimensions.
+    def squared_distance(self, rows: slice) -> tuple[float, int]:
+        """Squared distance of the means of some errors from what the prior says, over its covariance; its dimensions.
 
         Directions in which the covariance is singular to rounding have no part: states are copies, or known.
         """
-        scale = np.sqrt(np.where(self.P.diagonal() > 0, self.P.diagonal(), 1.0))
-        values, vectors = np.linalg.eigh(self.P / np.outer(scale, scale))
+        P, delta = self.P[rows, rows], self.delta[rows]
+        scale = np.sqrt(np.where(P.diagonal() > 0, P.diagonal(), 1.0))
+        values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
         free = values > _SINGULAR * values[-1]
-        along = vectors[:, free].T @ (self.delta / scale)
+        along = vectors[:, free].T @ (delta / scale)
         return float(np.sum(along**2 / values[free])), int(free.sum())
 
     def _factor(self, information: FloatArray, size: int, first: int) -> Factor:
