@@ -27,7 +27,7 @@ class DisparitySettings(Section):
     section: ClassVar[str] = "frontend.disparity"
 
     max_disparity: float = setting(
-        0.16, "largest disparity, over the image width; up to 0.64 while the scene is nearer", above=0, at_most=1
+        0.16, "largest disparity, over the image width; up to 0.64 where the scene is nearer", above=0, at_most=1
     )
 
 

@@ -39,7 +39,6 @@ _REACH_FRAMES = 10  # between two searches beyond the present reach
 _BEYOND_SHARE = 0.1  # of the points without a match that must have one beyond the reach for it to be doubled …
 _LEAST_BEYOND = 10  # … and this many at least …
 _WITHIN_REACH = 0.9  # … until this share of them is within it
-_NONE_NEAR = 5  # matches in the farther half of the reach below which it is halved again
 # A pair turns so much in its mount, three times the prior of its calibration, or exposes so far apart.
 _MOST_TURN_RAD = 0.3 * np.pi / 180.0
 _OFFSET_GAIN = 0.2  # part of a frame's common offset that is believed
@@ -59,8 +58,8 @@ class StereoFit:
         size: tuple[int, int],
     ) -> None:
         """Prepare for images of one size (width, height); the bank contains the features' anchors."""
-        self.max_disparity_px = disparity.max_disparity * size[0]  # doubled while the scene is nearer
-        self._least_reach_px, self._most_reach_px = self.max_disparity_px, _MOST_REACH * size[0]
+        self.max_disparity_px = disparity.max_disparity * size[0]  # doubled where the scene is nearer
+        self._most_reach_px = _MOST_REACH * size[0]
         self._reach_wait = 0  # frames until the reach is tried again
         self._camera = camera
         self._bank = bank
@@ -210,16 +209,11 @@ class StereoFit:
         self._rows.restart(0.0)
 
     def update_rows(self, tracks: Tracks) -> None:
-        """Update the row differences, and how far the search along the row reaches, with the matches of a frame."""
+        """Update the row differences with the matches of a frame."""
         few = len(tracks) >= _LEAST_POINTS and share_of(tracks.has_right) < _FEW_MATCHES
         self._unmatched = self._unmatched + 1 if few else 0
-        left, right = tracks.left[tracks.has_right], tracks.right[tracks.has_right]
-        self._rows.update(left, right)
+        self._rows.update(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
         self._reach_wait = max(0, self._reach_wait - 1)
-        if self._reach_wait == 0 and self.max_disparity_px > self._least_reach_px:
-            near = left[:, 0] - right[:, 0] > 0.5 * self.max_disparity_px
-            if near.sum() < _NONE_NEAR:
-                self.max_disparity_px = max(0.5 * self.max_disparity_px, self._least_reach_px)
 
     def testable(self, tracks: Tracks) -> BoolArray:
         """Mask (N,) of the features whose known depth says that the right image shows them within the reach."""
