@@ -25,6 +25,7 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, ConfigError, DataError
 from vio.evaluation.consistency import nees_bounds
+from vio.filters import mono_start
 from vio.filters.alignment import Bearings, FreeMotion, align_visual_inertial, gyro_bias
 from vio.filters.mono_msckf import MonoMsckf
 from vio.filters.settings import MsckfSettings
@@ -153,6 +154,16 @@ def test_features_that_contradict_the_imu_start_nothing() -> None:
     flown = Flown(Turning(40, "curve"), 0)
     assert flown.begun is None
     assert "features and IMU contradict each other" in str(flown.filter.initialisation.waits_for)
+
+
+def test_a_contradiction_that_stays_is_taken_with_what_it_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that is off contradicts for good: the start comes, and says how little is known."""
+    monkeypatch.setattr(mono_start, "_PATIENCE_S", 0.4)
+    flown = Flown(Turning(50, "curve"), 0)
+    start = flown.filter._begun
+    assert start is not None
+    assert start.scale_sigma > 0.1  # as it is known by noise alone, it is below
+    assert flown.rows[0, 1] < 300  # 760 without
 
 
 def test_tracks_on_a_moving_object_are_left_out_of_the_start() -> None:

@@ -52,6 +52,7 @@ _STILL_PX = 0.5  # median motion of the tracks over half a second at standstill
 _TILT_SIGMA_RAD = np.radians(15.0)  # of gravity by the linear solution
 MOST_SCALE_SIGMA = 0.1  # of a start; the filter is linear in the scale to half the square of it, 0.5 %
 _AGREEMENT = 0.999  # chi-square probability of how far the fit moves what the IMU says
+_PATIENCE_S = 5.0  # of contradictions, after which a start is taken with a covariance that allows for them
 _BIASES = slice(9, DIM)
 _LEAST_PX = 0.15  # pixel noise that fewer residuals than a filter's cannot prove
 # On the densities of accelerometer and gyro, until the filter has learned its own: too small ones cost the scale, too
@@ -98,6 +99,7 @@ class MonoStarter:
         self._settings = replace(settings, clones=_VIEWS, max_features=_MOST_TRACKS)
         self._frames: deque[Observations] = deque()
         self._passed = 0
+        self._contradicted_ns: int | None = None  # stamp of the first view at which features and IMU did
         self.why = "no frame has come"  # the start is not possible yet
 
     def try_frame(self, seen: Observations, motion: ImuMotion) -> MonoStart | None:
@@ -145,14 +147,19 @@ class MonoStarter:
         found = self._fit(motion, views, begin, table)
         if found is None:
             return None
-        nav, P, sigma = found
+        nav, P, sigma, excess = found
         if sigma > MOST_SCALE_SIGMA:
             self.why = (
                 f"the scale is known to {100 * sigma:.0f} % only (more than {100 * MOST_SCALE_SIGMA:.0f} %); move "
                 "the camera sideways with changing speed"
             )
             return None
-        return MonoStart(nav, P, sigma, self._passed - 1)
+        return MonoStart(nav, excess * P, float(np.sqrt(excess)) * sigma, self._passed - 1)
+
+    def _keep_contradicting(self, now_ns: int) -> bool:
+        """Whether features and IMU have contradicted each other for so long that it will not pass."""
+        self._contradicted_ns = now_ns if self._contradicted_ns is None else self._contradicted_ns
+        return now_ns - self._contradicted_ns > _PATIENCE_S * 1e9
 
     def _views(self) -> list[Observations]:
         """Some of the frames, evenly spaced, with the first and the newest."""
@@ -190,8 +197,13 @@ class MonoStarter:
 
     def _fit(
         self, motion: ImuMotion, views: list[Observations], begin: NavState, tracks: WindowTracks
-    ) -> tuple[NavState, FloatArray, float] | None:
-        """Gauss-Newton over the views; the state at the newest, its covariance (15, 15), and the scale's deviation."""
+    ) -> tuple[NavState, FloatArray, float, float] | None:
+        """Gauss-Newton over the views.
+
+        Returns:
+            The state at the newest view, its covariance (15, 15), the standard deviation of the scale, and by how much
+            both variances are to be inflated, as features and IMU contradict each other.
+        """
         for attempt in range(2):  # the second time linearised at the result of the first
             window = self._window(motion, views, begin)
             tracks.table.has_point[:] = False
@@ -225,12 +237,16 @@ class MonoStarter:
         if tracks.variance >= self._settings.pixel_sigma_max_px**2:
             self.why = f"features and IMU disagree by more than {self._settings.pixel_sigma_max_px:g} px"
             return None
-        if not (_agrees(window.prior, slice(None)) and _agrees(window.prior, _BIASES)):
-            self.why = "features and IMU contradict each other: do most features belong to something that moves?"
+        excess = max(1.0, _disagreement(window.prior, slice(None)), _disagreement(window.prior, _BIASES))
+        if excess > 1.0 and not self._keep_contradicting(views[-1].time_ns):
+            self.why = (
+                "features and IMU contradict each other: their clocks may be apart, or most features belong to "
+                "something that moves"
+            )
             return None
         P = fitted.covariance()
         sigma = scale_sigma(WindowPosterior.of(window, P))
-        return *_at_origin(window.nav, P[:DIM, :DIM]), float("inf") if sigma is None else sigma
+        return *_at_origin(window.nav, P[:DIM, :DIM]), float("inf") if sigma is None else sigma, excess
 
     def _window(self, motion: ImuMotion, views: list[Observations], begin: NavState) -> Window:
         """The window of all views, predicted from a first state, under the prior alone."""
@@ -257,10 +273,10 @@ class MonoStarter:
         return passed
 
 
-def _agrees(prior: Prior, rows: slice) -> bool:
-    """Whether the means of some errors are where the prior has them, by chi-square."""
+def _disagreement(prior: Prior, rows: slice) -> float:
+    """How far the means of some errors are from where the prior has them, squared, over the limit by chi-square."""
     squared, dimensions = prior.squared_distance(rows)
-    return squared <= float(chi_square_quantile(_AGREEMENT, dimensions))
+    return squared / float(chi_square_quantile(_AGREEMENT, dimensions))
 
 
 def _upright(nav: NavState, found: VisualInertialAlignment) -> NavState:
