@@ -16,13 +16,7 @@ from vio.frontend.flicker import BandRemoval
 from vio.frontend.flow import track_with_retries
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output
 from vio.frontend.image_check import FrameImages, ImageCheck
-from vio.frontend.moving_object import (
-    ObjectReport,
-    choose_motion,
-    one_motion_explains,
-    static_by_prediction,
-    voters,
-)
+from vio.frontend.moving_object import ObjectReport, choose_motion, one_motion_explains, static_by_prediction, voters
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.one_camera import with_depths, with_prior_depths
 from vio.frontend.outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
@@ -268,8 +262,9 @@ class KltFrontend:
         kept, motion = static_tracks(problem, before, point, has_depth, after, expected, R_prior, T_prior)
         expected_motion = None if prior is None else prior.motion
         near_m = camera.fu * camera.baseline_m / stereo.max_disparity_px
-        if motion is None and expected_motion is not None and expected_motion.measured:
-            kept = static_by_prediction(problem, before, after, kept, expected_motion, near_m)
+        measured = expected_motion if expected_motion is not None and expected_motion.measured else None
+        if motion is None and measured is not None:
+            kept = static_by_prediction(problem, before, after, kept, measured, near_m)
         if motion is not None:
             after_deep = after.take(deep, axis=0)
             chosen = choose_motion(
@@ -285,8 +280,7 @@ class KltFrontend:
                 chosen = replace(chosen, object_share=0.0)
             motion, kept[has_depth] = chosen.motion, chosen.motion.inliers
             self._objects.frame(index, chosen)
-            alone = expected_motion is None or not expected_motion.measured
-            if self._objects.hides_scene(index, chosen) and alone:
+            if self._objects.hides_scene(index, chosen) and measured is None:
                 return np.zeros(len(old), dtype=np.bool_), None
         if motion is not None and not has_depth.all():
             distance = epipolar_distance(camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m)

@@ -1,7 +1,8 @@
 """Which of two motions is the camera's, where an object that moves on its own covers much of the image.
 
 The larger consensus wins RANSAC, and that may be the object's. The prediction of a motion sensor decides: each motion
-is tested by chi-square against the predicted one, with the covariance of the prediction and that of the fit. With an
+is tested by chi-square against the predicted one, with the covariance of the prediction and that of the fit; where both
+fail, the one that is clearly nearer is used. With an
 IMU that is known to millimetres and the test decides nearly always. Otherwise the points vote that have been static
 for longest: what has come into view just now cannot outvote them. Where they are few or at odds, the prediction is that
 of a body that goes on as before, and where both motions are possible the larger consensus is used, and it is said.
@@ -28,14 +29,14 @@ from vio.records import BoolArray, IntArray, MotionPrior
 Decision: TypeAlias = Literal["predicted", "voted", "undecided"]
 
 _PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test
-_FAR_NEARER = 10.0  # ratio of two motions' squared distances from a measured one, above which that one is wrong
+_CLEARLY_NEARER = 10.0  # ratio of two motions' squared distances from a measured one, above which the nearer agrees
 _LEAST_POINTS = 12  # of a second motion
 _LEAST_SUPPORT = 0.1  # points of a second motion that may replace the first, over the first's
 _LARGE_SHARE = 0.25  # share of all points above which a second motion is reported
 _SEEN_SHARE = 0.5  # of the smaller group's points that must be off the epipolar lines of the others to prove an object
 _PIXEL_SIGMA = 0.5  # of a point's position by its depth and its track
 _INDEPENDENT_POINTS = 50  # errors of neighbours have much in common: a fit is no better than that of so many points
-_MOST_STATIC = 0.8  # share of a consensus without depths that the prediction explains, above which it is believed
+_LEAST_STATIC = 0.8  # share of a consensus without depths that a measured motion must explain
 _FAR_M = 1e4  # depth of what is infinitely far away
 _SCALE_SIGMA = 0.01  # of the length of a fitted translation: depths of one frame have errors in common
 _VOTERS, _VOTING_FRAMES = 50, 5  # how many points vote, and for how many frames each must have been static
@@ -97,15 +98,17 @@ def choose_motion(
         return TwoMotions(found, reported, "voted" if reported else None)
     if predicted is None:
         return TwoMotions(found, reported, "undecided" if reported else None)
-    apart_first = _squared_distance(problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted)
-    apart_second = _squared_distance(problem.camera, second, p_prev[others[support]], predicted) if large else np.inf
+    if not (large or in_event):
+        return TwoMotions(found, 0.0, None)
+    of_first = _squared_distance(problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted)
+    of_second = _squared_distance(problem.camera, second, p_prev[others[support]], predicted) if large else np.inf
     limit = float(chi_square_quantile(_PROBABILITY, 6))
-    if measured and large:  # with a sensor that is worse than it says, the one that is far nearer is the camera's
-        limit = max(limit, min(apart_first, apart_second, max(apart_first, apart_second) / _FAR_NEARER))
-    second_agrees = apart_second <= limit
+    nearer, farther = sorted((of_first, of_second))
+    if measured and large and nearer * _CLEARLY_NEARER <= farther:
+        limit = max(limit, nearer)  # the sensor is worse than its covariance, but leaves no doubt which one it is
+    first_agrees, second_agrees = of_first <= limit, of_second <= limit
     if not (second_agrees or in_event or reported):
         return TwoMotions(found, 0.0, None)  # whether the first agrees or not
-    first_agrees = apart_first <= limit
     if first_agrees or not (second_agrees or (in_event and measured)):
         return TwoMotions(found, reported, "predicted" if first_agrees and not second_agrees else "undecided")
     T = second if second_agrees else predicted.T_curr_prev
@@ -155,7 +158,7 @@ def static_by_prediction(
         near_m: the smallest depth.
     """
     static = _agree_with(problem.camera, predicted, before, after, near_m, problem.limit_px)
-    if static.sum() < _LEAST_POINTS or share_of(static[kept]) >= _MOST_STATIC:
+    if static.sum() < _LEAST_POINTS or share_of(static[kept]) >= _LEAST_STATIC:
         return kept
     return static
 
@@ -183,7 +186,7 @@ def _agree_with(
     p = turned / np.clip(inverse, 1.0 / _FAR_M, 1.0 / near_m)[:, None] + T[:3, 3]
     ahead = depth_of(camera, p) > 0.0
     p[~ahead] = [0.0, 0.0, 1.0]
-    J = z_D_p_cam(camera, p)[:, :2] @ circledot(p)[:, :3]
+    J = _pixel_D_motion(camera, p)
     S = J @ predicted.covariance @ J.transpose(0, 2, 1) + sigma_px**2 * np.eye(2)
     d = after - project(camera, p)[:, :2]
     squared = np.sum(d * np.linalg.solve(S, d[..., None])[..., 0], axis=1)
@@ -212,12 +215,18 @@ def one_motion_explains(problem: RansacProblem, chosen: TwoMotions, before: Floa
 def _squared_distance(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, predicted: MotionPrior) -> float:
     """Squared distance of a motion (4, 4), fitted to points (N, 3), from the prediction, over their covariance."""
     p = transform_points(T, p_prev)
-    J = (z_D_p_cam(camera, p)[:, :2] @ circledot(p)[:, :3]).reshape(-1, 6)
+    J = _pixel_D_motion(camera, p).reshape(-1, 6)
     points = min(len(p), _INDEPENDENT_POINTS)
     fit = _PIXEL_SIGMA**2 * np.linalg.inv(points * J.T @ J / len(p) + 1e-9 * np.eye(6))
     fit[:3, :3] += _SCALE_SIGMA**2 * float(T[:3, 3] @ T[:3, 3]) * np.eye(3)
     xi = se3_log(T @ se3_inverse(predicted.T_curr_prev))
     return float(xi @ np.linalg.solve(predicted.covariance + fit, xi))
+
+
+def _pixel_D_motion(camera: StereoCamera, p: FloatArray) -> FloatArray:
+    """Jacobian (N, 2, 6) of the left pixels of points (N, 3) by the camera's motion, `[rho; phi]`."""
+    J: FloatArray = z_D_p_cam(camera, p)[:, :2] @ circledot(p)[:, :3]
+    return J
 
 
 def voters(age: IntArray) -> BoolArray:

@@ -146,19 +146,17 @@ class StereoFit:
 
     def _reaches_further(self, left_half: Image, right_half: Image, points: FloatArray) -> bool:
         """Search further from now on if enough of the left pixels (N, 2) without a match have one beyond the reach."""
-        reach = self.max_disparity_px
-        if reach >= self._most_reach_px:
+        reach, most = self.max_disparity_px, self._most_reach_px
+        if reach >= most:
             return False
-        self.max_disparity_px = self._most_reach_px
-        disparity, good = self._search(left_half, right_half, points, _GOOD_MATCH)
+        disparity, good = match_rows(left_half, right_half, points, most, _GOOD_MATCH, _MIN_PEAK_MARGIN)
         beyond = disparity[good & (disparity > reach)]
-        if len(beyond) >= max(_LEAST_BEYOND, _BEYOND_SHARE * len(points)):
-            while reach < np.quantile(beyond, _WITHIN_REACH):
-                reach *= 2.0
-            self.max_disparity_px = min(reach, self._most_reach_px)
-            return True
-        self.max_disparity_px = reach
-        return False
+        if len(beyond) < max(_LEAST_BEYOND, _BEYOND_SHARE * len(points)):
+            return False
+        while reach < np.quantile(beyond, _WITHIN_REACH):
+            reach *= 2.0
+        self.max_disparity_px = min(reach, most)
+        return True
 
     def _best_offset(self, left_half: Image, right_half: Image, points: FloatArray, offset: int) -> int:
         """Row difference, in pixels at half resolution, at which most points match well; the present one if in doubt.

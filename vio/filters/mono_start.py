@@ -38,7 +38,7 @@ from vio.geometry.stereo import StereoCamera, left_rays
 from vio.geometry.upright import rotation_to_up
 from vio.imu.standstill import STANDSTILL_S
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import BoolArray, ImuSample, Observations
+from vio.records import ImuSample, Observations
 
 _SPAN_S = 3.0  # of views: what a gyro bias leaves of rotations is corrected to first order only
 _LEAST_SPAN_S = 0.6  # half of it shows less than the standard deviation of the accelerometer's bias
@@ -51,9 +51,9 @@ _CONVERGED = 1e-3  # m, m/s and rad
 _STILL_PX = 0.5  # median motion of the tracks over half a second at standstill
 _TILT_SIGMA_RAD = np.radians(15.0)  # of gravity by the linear solution
 MOST_SCALE_SIGMA = 0.1  # of a start; the filter is linear in the scale to half the square of it, 0.5 %
-_AGREEMENT = 0.999  # chi-square probability of how far the fit moves what the IMU says
-_PATIENCE_S = 5.0  # of contradictions, after which a start is taken with a covariance that allows for them
-_BIASES = slice(9, DIM)
+_AGREEMENT = 0.999  # chi-square probability of the fit's distance from the prior, which is that of the IMU
+_PATIENCE_S = 5.0  # from the first contradiction, after which a start is taken with a covariance that allows for it
+_BIASES = slice(9, DIM)  # of gyro and accelerometer, among the errors
 _LEAST_PX = 0.15  # pixel noise that fewer residuals than a filter's cannot prove
 # On the densities of accelerometer and gyro, until the filter has learned its own: too small ones cost the scale, too
 # large ones time (docs/notes/design_decisions.md, IMU noise at the start).
@@ -156,8 +156,8 @@ class MonoStarter:
             return None
         return MonoStart(nav, excess * P, float(np.sqrt(excess)) * sigma, self._passed - 1)
 
-    def _keep_contradicting(self, now_ns: int) -> bool:
-        """Whether features and IMU have contradicted each other for so long that it will not pass."""
+    def _contradiction_persists(self, now_ns: int) -> bool:
+        """Note that features and IMU contradict each other; whether they did so long ago, too, as by a wrong clock."""
         self._contradicted_ns = now_ns if self._contradicted_ns is None else self._contradicted_ns
         return now_ns - self._contradicted_ns > _PATIENCE_S * 1e9
 
@@ -213,7 +213,7 @@ class MonoStarter:
                 if len(lin.rows) < _LEAST_TRACKS:
                     self.why = f"only {len(lin.rows)} features show parallax"
                     return None
-                passed = self._follow_noise(tracks, lin)
+                self._follow_noise(tracks, lin)
                 A, b = eliminate_points(lin.information, np.ones(len(lin.rows), dtype=np.bool_))
                 A, b, _ = window.state.information(A, b, tracks.variance)
                 try:
@@ -228,6 +228,7 @@ class MonoStarter:
                 self.why = "features and IMU do not agree on one motion"
                 return None
             if attempt == 0:
+                passed, _, _ = tracks.gate(lin.at)
                 tracks.table.remove(lin.rows[~passed])  # they are on what moves
                 first = window.clones[0]
                 begin = replace(
@@ -238,7 +239,7 @@ class MonoStarter:
             self.why = f"features and IMU disagree by more than {self._settings.pixel_sigma_max_px:g} px"
             return None
         excess = max(1.0, _disagreement(window.prior, slice(None)), _disagreement(window.prior, _BIASES))
-        if excess > 1.0 and not self._keep_contradicting(views[-1].time_ns):
+        if excess > 1.0 and not self._contradiction_persists(views[-1].time_ns):
             self.why = (
                 "features and IMU contradict each other: their clocks may be apart, or most features belong to "
                 "something that moves"
@@ -260,21 +261,15 @@ class MonoStarter:
             window.add_clone(view.frame_index, view.time_ns)
         return window
 
-    def _follow_noise(self, tracks: WindowTracks, lin: LinearTracks) -> BoolArray:
-        """Set the pixel noise to that of the median track, and to no less than few tracks can show.
-
-        Returns:
-            Mask (F,) of the tracks that pass the gate with it.
-        """
+    def _follow_noise(self, tracks: WindowTracks, lin: LinearTracks) -> None:
+        """Set the pixel noise to that of the median track, and to no less than few tracks can show."""
         _, squares, dof = tracks.gate(lin.at)
         ratio = float(np.median(squares / chi_square_table(0.5)[dof]))
         tracks.variance = float(np.clip(tracks.variance * ratio, _LEAST_PX**2, self._settings.pixel_sigma_max_px**2))
-        passed, _, _ = tracks.gate(lin.at)
-        return passed
 
 
 def _disagreement(prior: Prior, rows: slice) -> float:
-    """How far the means of some errors are from where the prior has them, squared, over the limit by chi-square."""
+    """Squared distance of the means of some errors from the prior, over the limit by chi-square."""
     squared, dimensions = prior.squared_distance(rows)
     return squared / float(chi_square_quantile(_AGREEMENT, dimensions))
 
