@@ -142,7 +142,7 @@ def _mended(options: dict[Callable[..., Any], dict[str, Any]]) -> Iterator[None]
 
     def with_options(typing: Any, target: Any, function: Any, args: Any, result: Any, flags: Any, **rest: Any) -> Any:
         flags, chosen = flags.copy(), options[function]
-        flags.error_model, flags.release_gil = chosen["error_model"], chosen["nogil"]
+        flags.error_model, flags.release_gil, flags.nrt = chosen["error_model"], chosen["nogil"], chosen["_nrt"]
         flags.fastmath = cpu.FastMathOptions(chosen["fastmath"])
         return compile_extra(typing, target, function, args, result, flags, **rest)
 

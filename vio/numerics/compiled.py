@@ -26,6 +26,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 # Without the entry for callers in C, which nothing here uses, a function compiles in a tenth less time.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
+# numba counts references to each array that a function is given, or cuts out of one, by atomic additions. A function
+# that makes no array of its own needs none of that; one that does without any of these names does not compile.
+_ALLOCATE = {"empty", "zeros", "copy", "reshape", "searchsorted"}
 LOOPS: list[Loop] = []
 
 
@@ -117,7 +120,8 @@ def compiled_sums(function: Function) -> Function:
 
 
 def _loop(function: Function, options: dict[str, Any]) -> Function:
-    LOOPS.append(loop := Loop(function, _OPTIONS | options))
+    counts = not _ALLOCATE.isdisjoint(function.__code__.co_names)
+    LOOPS.append(loop := Loop(function, _OPTIONS | options | {"_nrt": counts}))
     return cast(Function, loop)
 
 
