@@ -34,10 +34,11 @@ def filtered(pixels: Image, kinds: list[int]) -> bytes:
     return bytes(out)
 
 
-def png(pixels: Image, kinds: list[int], *, extra: bytes = b"", raw: bytes | None = None) -> bytes:
+def png(pixels: Image, kinds: list[int], *, extra: bytes = b"", raw: bytes | None = None, cut_end: int = 0) -> bytes:
     height, width = pixels.shape
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
     data = zlib.compress(filtered(pixels, kinds) if raw is None else raw)
+    data = data[: len(data) - cut_end]
     cut = len(data) // 2
     parts = chunk(b"IDAT", data[:cut]) + chunk(b"IDAT", data[cut:])
     return b"\x89PNG\r\n\x1a\n" + header + extra + parts + chunk(b"IEND", b"")
@@ -73,3 +74,20 @@ def test_damaged_pixels_are_refused(raw: bytes, tmp_path: Path) -> None:
     if not raw:
         with pytest.raises(UnreadableImageError, match="does not decode"):
             decode_gray(data, tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("cut_end", [1, 4])
+def test_pixels_without_their_checksum_are_refused(cut_end: int) -> None:
+    assert decode_gray8(png(np.zeros((20, 30), dtype=np.uint8), [0] * 20, cut_end=cut_end)) is None
+
+
+def test_no_changed_bit_changes_a_pixel() -> None:
+    rng = np.random.default_rng(3)
+    pixels = rng.integers(0, 256, (6, 7), dtype=np.uint8)
+    whole = png(pixels, [4, 0, 1, 2, 3, 4], extra=chunk(b"tEXt", b"Title\0room"))
+    for at in range(8, len(whole)):
+        for bit in range(8):
+            data = bytearray(whole)
+            data[at] ^= 1 << bit
+            found = decode_gray8(bytes(data))
+            assert found is None or np.array_equal(found, pixels), (at, bit)

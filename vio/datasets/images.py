@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.datasets.image_files import ImageFiles, stem_of
-from vio.datasets.png import crc32, decode_gray8
+from vio.datasets.png import MOST_PIXELS, crc32, decode_gray8
 from vio.errors import DataError
 from vio.files.inputs import check_regular, read_input
 from vio.geometry.lie import FloatArray
@@ -33,7 +33,6 @@ _TIFF_STARTS = (b"II*\0", b"MM\0*")
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 WHITE_16 = 65535  # the level of white in an image that uses all of its 16 bits
-MOST_PIXELS = 2**26  # 8192 x 8192; a header may state 2^62, and decoding would try to get the memory
 _MOST_BYTES = 2**29  # of a file: more than 64 Mpx of 16 bits in colour
 _SENSOR_BITS = (10, 12, 14)  # of cameras whose pixels are stored in the low bits of 16
 _WHITE_SHARE = 0.999  # of the pixels are no brighter than the level that shows the bits in use
@@ -127,10 +126,10 @@ def _load(path: Path, *, colour: bool = False) -> npt.NDArray[Any]:
 
 def _decoded(data: bytes, path: Path | str, *, colour: bool) -> npt.NDArray[Any]:
     """Decode a file in memory as `_load` does."""
-    if problem := _damage(data):
-        raise UnreadableImageError(f"{path}: {problem}; copy the image again")
     if data.startswith(_PNG_START) and (gray := decode_gray8(data)) is not None:
         return gray
+    if problem := _damage(data):
+        raise UnreadableImageError(f"{path}: {problem}; copy the image again")
     import cv2
 
     try:

@@ -15,7 +15,7 @@ import numpy as np
 
 from vio.records import Image
 
-__all__ = ["crc32", "decode_gray8"]
+__all__ = ["MOST_PIXELS", "crc32", "decode_gray8"]
 
 try:
     from isal.isal_zlib import IsalError as ZlibError  # inflates in half to two thirds of the time
@@ -24,6 +24,7 @@ except ImportError:  # a processor without its wheels
     from zlib import crc32, decompressobj  # type: ignore[assignment]
     from zlib import error as ZlibError  # type: ignore[assignment]  # noqa: N812
 
+MOST_PIXELS = 2**26  # 8192 x 8192; a header may state 2^62, and decoding would try to get the memory
 _START = b"\x89PNG\r\n\x1a\n"
 _GRAY_8 = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method, no interlacing
 # Chunks that change no pixel. With any other, such as transparency or an animation, the file is left to OpenCV.
@@ -32,26 +33,30 @@ _LAST_FILTER = 4  # Paeth's
 
 
 def decode_gray8(data: bytes) -> Image | None:
-    """Return the pixels (H, W) of a PNG file in memory whose chunks are intact.
+    """Return the pixels (H, W) of a PNG file in memory, which are whole by the checksum of all of them.
 
-    None where the file is not of 8-bit gray without interlacing, or where its pixels are damaged: OpenCV reads the
-    other kinds, and says what it cannot read.
+    None where the file is not of 8-bit gray without interlacing, or where it is damaged or too large: OpenCV reads the
+    other kinds, and `vio.datasets.images` says what is damaged, by the checksums of the chunks.
     """
     parts, size = [], None
     at = len(_START)
     while at + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
+        if at + 12 + length > len(data):
+            return None
         if kind == b"IDAT":
             parts.append(data[at + 8 : at + 8 + length])
         elif kind == b"IHDR" and length == 13:
             width, height, *form = struct.unpack_from(">IIBBBBB", data, at + 8)
-            size = (height, width) if tuple(form) == _GRAY_8 else None
-        elif kind != b"IEND" and kind not in _PASSED_OVER:
+            size = (height, width) if tuple(form) == _GRAY_8 and height * width <= MOST_PIXELS else None
+        elif kind == b"IEND":
+            return None if size is None else _pixels(b"".join(parts), *size)
+        elif kind not in _PASSED_OVER:
             return None
-        if kind == b"IEND" or size is None:
-            break
+        if size is None:
+            return None
         at += 12 + length
-    return None if size is None else _pixels(b"".join(parts), *size)
+    return None
 
 
 def _pixels(compressed: bytes, height: int, width: int) -> Image | None:
@@ -62,7 +67,7 @@ def _pixels(compressed: bytes, height: int, width: int) -> Image | None:
         raw = stream.decompress(compressed, size)  # no more than the header states
     except ZlibError:  # type: ignore[misc]  # an instance by the stubs of isal, a class in fact
         return None
-    if len(raw) != size:
+    if len(raw) != size or not stream.eof:  # at its end the checksum has been compared
         return None
     rows = np.frombuffer(raw, dtype=np.uint8).reshape(height, width + 1)
     if int(rows[:, 0].max()) > _LAST_FILTER:
