@@ -275,6 +275,7 @@ class KltFrontend:
                 expected_motion,
                 voting=voters(old.age[rows[deep]]),
                 in_event=self._objects.active,
+                depths_off=stereo.rows_are_off,
             )
             if stereo.rows_are_off and one_motion_explains(problem, chosen, before[has_depth], after_deep):
                 chosen = replace(chosen, object_share=0.0)

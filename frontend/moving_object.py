@@ -65,6 +65,7 @@ def choose_motion(
     *,
     voting: BoolArray | None = None,
     in_event: bool = False,
+    depths_off: bool = False,
 ) -> TwoMotions:
     """Choose between the consensus motion and that of its outliers.
 
@@ -76,9 +77,12 @@ def choose_motion(
         predicted: the motion that the filter expects, with its covariance; None: it expects nothing.
         voting: (N,) which points have been static for long; None: none.
         in_event: whether an object has been seen in the frames before. It may hide all but a few points of the scene,
-            and then the prediction of a motion sensor is taken in place of a consensus that contradicts it.
+            and then the prediction is taken in place of a consensus that contradicts it.
+        depths_off: whether the points' depths are known to be off, so that no motion explains all of a static scene;
+            a prediction that is not measured is off with them.
     """
     measured = predicted is not None and predicted.measured
+    hidden = in_event and (measured or not depths_off)  # the scene may be, and then the prediction is to be believed
     if voting is not None and not measured:
         voted = _voted(problem, p_prev, pixels, found, voting)
         if voted is not None:
@@ -86,7 +90,7 @@ def choose_motion(
             return TwoMotions(voted, share if share >= _LARGE_SHARE else 0.0, "voted")
     others = np.flatnonzero(~found.inliers)
     least = max(_LEAST_POINTS, _LEAST_SUPPORT * found.inliers.sum())
-    if len(others) < least and not (in_event and measured):
+    if len(others) < least and not hidden:
         return TwoMotions(found, 0.0, None)
     second, support = np.eye(4), np.zeros(len(others), dtype=np.bool_)
     if len(others) >= least:
@@ -94,8 +98,18 @@ def choose_motion(
         second, support = best_motion(problem, p_prev[others], pixels[others], starts)
     large, share = support.sum() >= least, float(support.sum()) / len(p_prev)
     reported = share if large and share >= _LARGE_SHARE else 0.0
-    if not measured and voting is not None and _votes_for(found, voting):
-        return TwoMotions(found, reported, "voted" if reported else None)
+    if predicted is not None and not (measured or depths_off):
+        near = _near_prediction(problem, p_prev, pixels, found, predicted)
+        if near is not None:
+            second, support, large = near.T_curr_prev, near.inliers[others], True
+    if large and not measured and voting is not None:
+        other = pixel_errors(problem.camera, second, p_prev, pixels) <= problem.limit_px
+        elected = None if depths_off else _elected(found.inliers[voting], other[voting])
+        if elected == "second":
+            share = float((found.inliers & ~other).mean())
+            return TwoMotions(Consensus(second, other), share if share >= _LARGE_SHARE else 0.0, "voted")
+        if elected == "first" or (depths_off and _votes_for(found, voting)):
+            return TwoMotions(found, reported, "voted" if reported else None)
     if predicted is None:
         return TwoMotions(found, reported, "undecided" if reported else None)
     if not (large or in_event):
@@ -109,12 +123,44 @@ def choose_motion(
     first_agrees, second_agrees = of_first <= limit, of_second <= limit
     if not (second_agrees or in_event or reported):
         return TwoMotions(found, 0.0, None)  # whether the first agrees or not
-    if first_agrees or not (second_agrees or (in_event and measured)):
+    if first_agrees or not (second_agrees or hidden):
         return TwoMotions(found, reported, "predicted" if first_agrees and not second_agrees else "undecided")
     T = second if second_agrees else predicted.T_curr_prev
     inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
     share = share_of(found.inliers)
     return TwoMotions(Consensus(T, inliers), share if share >= _LARGE_SHARE else 0.0, "predicted")
+
+
+def _near_prediction(
+    problem: RansacProblem, p_prev: FloatArray, pixels: FloatArray, found: Consensus, predicted: MotionPrior
+) -> Consensus | None:
+    """The motion near a predicted one, where the consensus contradicts it and some points follow this one alone.
+
+    A compromise between an object and what is far away can win the consensus, and leaves no second group.
+    """
+    camera, limit = problem.camera, float(chi_square_quantile(_PROBABILITY, 6))
+    if _squared_distance(camera, found.T_curr_prev, p_prev[found.inliers], predicted) <= limit:
+        return None
+    near = pixel_errors(camera, predicted.T_curr_prev, p_prev, pixels) <= 2.0 * problem.limit_px
+    if near.sum() < _LEAST_POINTS:
+        return None
+    T, _ = best_motion(problem, p_prev[near], pixels[near], predicted.T_curr_prev[None])
+    inliers = pixel_errors(camera, T, p_prev, pixels) <= problem.limit_px
+    alone, others = inliers & ~found.inliers, found.inliers & ~inliers
+    if alone.sum() < max(_LEAST_POINTS, _LEAST_SUPPORT * others.sum()):
+        return None
+    return Consensus(T, inliers) if _squared_distance(camera, T, p_prev[inliers], predicted) <= limit else None
+
+
+def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] | None:
+    """Which of two motions most of the voting points follow, of those (N,) that only one of them explains.
+
+    What is far away follows both, if they turn alike, and does not vote.
+    """
+    for_first, for_second = int((first & ~second).sum()), int((second & ~first).sum())
+    if max(for_first, for_second) < max(_LEAST_POINTS, _CLEAR_VOTE * (for_first + for_second)):
+        return None
+    return "first" if for_first > for_second else "second"
 
 
 def _votes_for(found: Consensus, voting: BoolArray) -> bool:

@@ -124,10 +124,11 @@ def test_an_object_that_hides_the_scene_does_not_become_the_scene() -> None:
     """Six points of the scene are left, too few for a motion: while the object is known, the prediction is used."""
     before, found, truck = choose(6, 300, prediction())
     assert before.motion is found  # control
-    chosen, _, _ = choose(6, 300, prediction(), in_event=True)
-    assert not chosen.motion.inliers[truck].any()
-    assert chosen.motion.inliers[~truck].sum() >= 4
-    np.testing.assert_allclose(chosen.motion.T_curr_prev, prediction().T_curr_prev)
+    for measured in (True, False):
+        chosen, _, _ = choose(6, 300, replace(prediction(), measured=measured), in_event=True)
+        assert not chosen.motion.inliers[truck].any()
+        assert chosen.motion.inliers[~truck].sum() >= 4
+        np.testing.assert_allclose(chosen.motion.T_curr_prev, prediction().T_curr_prev)
 
 
 def test_points_seen_before_outvote_what_has_come_into_view() -> None:
@@ -157,6 +158,43 @@ def test_a_compromise_between_slow_object_and_scene_is_outvoted() -> None:
     chosen = choose_motion(make_problem(), p, uv, found, None, voting=voters(np.where(on_truck, 6, 30)))
     assert chosen.motion.inliers[~on_truck].mean() > 0.95
     assert np.linalg.norm(se3_log(chosen.motion.T_curr_prev @ se3_inverse(T_TRUE))) < 0.02
+
+
+def compromise() -> tuple[FloatArray, FloatArray, Consensus, FloatArray]:
+    """An object, and a scene most of which is so far away that a turn explains it under the object's motion, too."""
+    far, near, truck = scene(110, 12, (400.0, 900.0)), scene(25, 13, (5.0, 9.0)), scene(115, 14, (6.0, 8.0))
+    of_object = se3_exp([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]) @ T_TRUE
+    p = np.concatenate([far, near, truck])
+    uv = np.concatenate([pixels(T_TRUE, far, 15), pixels(T_TRUE, near, 16), pixels(of_object, truck, 17)])
+    found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
+    assert found is not None
+    return p, uv, found, np.repeat([0, 1, 2], [110, 25, 115])
+
+
+def test_the_prediction_outweighs_an_object_that_shares_what_is_far_away_with_the_scene() -> None:
+    """The oldest points are all far away and follow both motions, so that their votes say nothing."""
+    p, uv, found, part = compromise()
+    assert found.inliers[part == 2].mean() > 0.9  # control
+    assert found.inliers[part == 0].mean() > 0.9
+    voting = voters(np.where(part == 0, 30, 6))
+    guess = replace(prediction(), measured=False)
+    chosen = choose_motion(make_problem(), p, uv, found, guess, voting=voting)
+    assert chosen.decision == "predicted"
+    assert chosen.motion.inliers[part < 2].mean() > 0.9
+    assert not chosen.motion.inliers[part == 2].any()
+    for changed in ({"predicted": None}, {"predicted": guess, "depths_off": True}):
+        assert choose_motion(make_problem(), p, uv, found, voting=voting, **changed).motion is found
+
+
+def test_a_jolt_that_nearly_all_points_follow_is_no_object() -> None:
+    p, uv = scene(200, 12, (5.0, 40.0)), np.empty((200, 2))
+    uv[:] = pixels(T_TRUE, p, 14)
+    uv[::15] += 30.0  # wrong tracks
+    found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
+    still = MotionPrior(np.eye(4), IMU, measured=False)
+    chosen = choose_motion(make_problem(), p, uv, found, still, voting=voters(np.full(200, 30)))
+    assert chosen.motion is found
+    assert chosen.object_share == 0.0
 
 
 def test_few_or_divided_votes_decide_nothing() -> None:
