@@ -117,7 +117,8 @@ def _count_matches(images: FrameImages, exchanged: bool) -> MatchCounts:
     negative = images.stereo.count_mirrored(left, right, points)
     if not exchanged and negative < _SOME * len(points):
         return MatchCounts(len(points), 0, negative)  # no exchange, however many match with a positive one
-    return MatchCounts(len(points), int(images.stereo.search(left.half, right.half, points)[1].sum()), negative)
+    positive = int(images.stereo.search(left.half, right.half, points)[1].sum())
+    return MatchCounts(len(points), positive + images.stereo.count_beyond(left, right, points), negative)
 
 
 def _thumbnail(image: Image) -> Image:

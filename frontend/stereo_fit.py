@@ -173,6 +173,12 @@ class StereoFit:
         self._rows.restart(2.0 * tried[best])
         return tried[best]
 
+    def count_beyond(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> int:
+        """Count the left pixels (N, 2) that have a good match beyond the present reach: the scene is near."""
+        right_half, most = shifted_rows(right.half, round(self._rows.offset_px / 2)), self._most_reach_px
+        disparity, good = match_rows(left.half, right_half, points, most, _GOOD_MATCH, _MIN_PEAK_MARGIN)
+        return int((good & (disparity > self.max_disparity_px)).sum())
+
     def count_mirrored(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> int:
         """Count the left pixels (N, 2) that have a match with a negative disparity."""
         a, b = (np.ascontiguousarray(view.half[:, ::-1]) for view in (left, right))

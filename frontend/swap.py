@@ -44,6 +44,8 @@ class SwapDetector(ImageCheck):
         """
         left, right = images.views
         matched = int(tracks.has_right.sum())
+        if matched < self._few * len(tracks) and self._in_order < _FRAMES:
+            matched += images.stereo.count_beyond(left, right, tracks.left[~tracks.has_right])
         self.check(images.frame, len(tracks), matched, lambda: images.stereo.count_mirrored(left, right, tracks.left))
 
     def check(self, frame: StereoFrame, features: int, matched: int, count_mirrored: Callable[[], int]) -> None:
