@@ -22,9 +22,11 @@ from vio.frontend.swap import SwapDetector
 from vio.frontend.tracks import ANCHOR_RADIUS_PX
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, triangulate
+from vio.numerics.compiled import compiled, compiled_sums
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
 
-Descriptors: TypeAlias = npt.NDArray[np.float32] | npt.NDArray[np.uint8]
+Vectors: TypeAlias = npt.NDArray[np.float32]
+Descriptors: TypeAlias = Vectors | npt.NDArray[np.uint8]
 
 _MAX_RATIO = 0.8  # of a descriptor's distance to that of the second-nearest
 _SEARCH_RADIUS = 0.06  # half side of the search window around the predicted pixel, over the image width
@@ -63,15 +65,6 @@ class Matcher(Protocol):
         """Return pairs (K, 2) of rows of `a` and `b`; only pairs in `allowed` (N, M), no row twice."""
 
 
-def distances(a: Descriptors, b: Descriptors) -> npt.NDArray[np.float32]:
-    """Distances (N, M) between descriptors: Euclidean for unit vectors, Hamming for bytes."""
-    if a.dtype == np.uint8:
-        bits_a, bits_b = (np.unpackbits(d.astype(np.uint8), axis=1).astype(np.float32) for d in (a, b))
-        return bits_a.sum(axis=1)[:, None] + bits_b.sum(axis=1) - 2 * bits_a @ bits_b.T
-    product = a.astype(np.float32) @ b.astype(np.float32).T
-    return np.sqrt(np.maximum(2.0 - 2.0 * product, 0.0)).astype(np.float32)
-
-
 @dataclass(frozen=True, slots=True)
 class MutualNearest:
     """Mutual nearest neighbours among the allowed pairs that pass the ratio test.
@@ -85,16 +78,59 @@ class MutualNearest:
         """Return pairs (K, 2); see `Matcher`."""
         if len(a) == 0 or len(b) == 0:
             return np.zeros((0, 2), dtype=np.int64)
-        distance = np.where(allowed, distances(a.descriptors, b.descriptors), np.float32(np.inf))
-        rows = np.arange(len(a))
-        best = distance.argmin(axis=1)
-        least = distance[rows, best]
-        others = distance.copy()
-        others[rows, best] = np.inf
-        second = others.min(axis=1)
-        mutual = distance.argmin(axis=0)[best] == rows
-        good = np.isfinite(least) & mutual & (least <= self.ratio * second)
-        return np.stack([rows[good], best[good]], axis=1)
+        best, good = np.empty(len(a), dtype=np.int64), np.empty(len(a), dtype=np.bool_)
+        bits, ratio = a.descriptors.dtype == np.uint8, np.float32(self.ratio)
+        _nearest(_vectors(a.descriptors), _vectors(b.descriptors), bits, allowed, ratio, best, good)
+        return np.stack([good.nonzero()[0], best[good]], axis=1)
+
+
+def _vectors(descriptors: Descriptors) -> Vectors:
+    """Vectors (N, D) whose products give the distances: the descriptors, or -1 and 1 for the bits of bytes."""
+    if descriptors.dtype != np.uint8:
+        return np.ascontiguousarray(descriptors, dtype=np.float32)
+    return 2 * np.unpackbits(descriptors.astype(np.uint8), axis=1).astype(np.float32) - 1
+
+
+@compiled
+def _nearest(
+    a: Vectors, b: Vectors, bits: bool, allowed: BoolArray, ratio: np.float32, best: IntArray, good: BoolArray
+) -> None:
+    """Write the nearest of the allowed rows of b (M, D) for each of a (N, D), and whether it is a match.
+
+    The distance is Euclidean for unit vectors, Hamming for `bits`. Of equal distances the first one counts.
+    """
+    size, far = np.float32(a.shape[1]), np.float32(np.inf)
+    least, back = np.empty(len(b), np.float32), np.empty(len(b), np.int64)
+    for j in range(len(b)):
+        least[j], back[j] = far, -1
+    for i in range(len(a)):
+        first = second = far
+        best[i] = 0
+        for j in range(len(b)):
+            if not allowed[i, j]:
+                continue
+            product = _product(a[i], b[j])
+            if bits:
+                distance = np.float32(0.5) * (size - product)
+            else:
+                distance = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * product, np.float32(0.0)))
+            if distance < first:
+                first, second, best[i] = distance, first, j
+            elif distance < second:
+                second = distance
+            if distance < least[j]:
+                least[j], back[j] = distance, i
+        good[i] = first < far and first <= ratio * second
+    for i in range(len(a)):
+        good[i] &= back[best[i]] == i
+
+
+@compiled_sums
+def _product(a: Vectors, b: Vectors) -> np.float32:
+    total = np.float32(0.0)
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,12 +244,9 @@ class DescriptorFrontend:
 
     def _allowed(self, left: Keypoints, right: Keypoints, width: int) -> BoolArray:
         """Pairs (N, M) near one row with a disparity in range."""
-        disparity = left.pixels[:, :1] - right.pixels[:, 0]
-        return np.asarray(
-            (np.abs(left.pixels[:, 1:] - right.pixels[:, 1]) <= _MAX_ROW_DIFFERENCE_PX)
-            & (disparity >= MIN_MATCH_DISPARITY_PX)
-            & (disparity <= self._disparity.max_disparity * width)
-        )
+        allowed = np.empty((len(left), len(right)), dtype=np.bool_)
+        _on_row(left.pixels, np.ascontiguousarray(right.pixels.T), self._disparity.max_disparity * width, allowed)
+        return allowed
 
     def _stereo(self, left: Keypoints, right: Keypoints, views: tuple[Image, Image]) -> _MatchedKeypoints:
         """Match the key points of the left image into the right one."""
@@ -304,11 +337,9 @@ class DescriptorFrontend:
 
     def _near_guess(self, old: _Tracks, guess: FloatArray, points: FloatArray, width: int) -> BoolArray:
         """Pairs (N, M) of tracks and left key points (M, 2) close to the predicted (N, 2) or the old pixel."""
-        reach = _SEARCH_RADIUS * width
-        near = np.zeros((len(old), len(points)), dtype=np.bool_)
+        near = np.empty((len(old), len(points)), dtype=np.bool_)
         # The last motion may be wrong, so the old pixel is a second centre of the search.
-        for centre in (guess, old.left):
-            near |= np.abs(centre[:, None] - points).max(axis=2) <= reach
+        _near_either(guess, old.left, np.ascontiguousarray(points.T), _SEARCH_RADIUS * width, near)
         return near
 
     def _add_new_features(self, tracks: _Tracks, pair: _MatchedKeypoints, used: BoolArray, image: Image) -> _Tracks:
@@ -321,3 +352,25 @@ class DescriptorFrontend:
         self._next_id += len(chosen)
         new = _Tracks(ids, left[chosen], pair.right[chosen], pair.has_right[chosen], take(pair.keypoints, chosen))
         return joined(tracks, new)
+
+
+@compiled
+def _on_row(left: FloatArray, right: FloatArray, most: float, out: BoolArray) -> None:
+    """Write which pixels left (N, 2) and right (2, M) are near one row, with a disparity up to `most`."""
+    us, vs = right[0], right[1]
+    for i in range(len(left)):
+        u, v, row = left[i, 0], left[i, 1], out[i]
+        for j in range(len(us)):
+            in_range = (u - us[j] >= MIN_MATCH_DISPARITY_PX) & (u - us[j] <= most)
+            row[j] = in_range & (abs(v - vs[j]) <= _MAX_ROW_DIFFERENCE_PX)
+
+
+@compiled
+def _near_either(one: FloatArray, other: FloatArray, points: FloatArray, reach: float, out: BoolArray) -> None:
+    """Write which points (2, M) are in the squares (half side `reach`) around one or other centres (N, 2)."""
+    us, vs = points[0], points[1]
+    for i in range(len(one)):
+        u, v, u_other, v_other, row = one[i, 0], one[i, 1], other[i, 0], other[i, 1], out[i]
+        for j in range(len(us)):
+            in_one = (abs(u - us[j]) <= reach) & (abs(v - vs[j]) <= reach)
+            row[j] = in_one | ((abs(u_other - us[j]) <= reach) & (abs(v_other - vs[j]) <= reach))

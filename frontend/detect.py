@@ -274,16 +274,25 @@ def spread_evenly(points: FloatArray, occupied: FloatArray, size: tuple[int, int
     if wanted <= 0 or len(points) == 0:
         return np.zeros(0, dtype=np.int64)
     distance = min_distance_px(width, height, grid)
-    together = np.concatenate([occupied, points])
-    near = np.abs(points[:, :1] - together[:, 0]) < distance
-    near &= np.abs(points[:, 1:] - together[:, 1]) < distance
-    # A point is compared with stronger points only, not with itself or weaker ones.
-    near[:, len(occupied) :] &= np.tril(np.ones((len(points), len(points)), dtype=np.bool_), -1)
-    candidates = np.flatnonzero(~near.any(axis=1))
+    near = np.empty(len(points), dtype=np.bool_)
+    _near_others(points, occupied, distance, near)
+    candidates = np.flatnonzero(~near)
     shape = grid_shape(width, height, grid)
     cell, held = (cell_index(uv, width, height, shape) for uv in (points[candidates], occupied))
     level = _filling(cell, held, shape[0] * shape[1])
     return candidates[np.argsort(level, kind="stable")[:wanted]]
+
+
+@compiled
+def _near_others(points: FloatArray, occupied: FloatArray, distance: float, near: BoolArray) -> None:
+    """Write which points (N, 2) have an occupied (M, 2), or a stronger one of them, in the square around them."""
+    for i in range(len(points)):
+        near[i] = False
+        for others, count in ((occupied, len(occupied)), (points, i)):
+            for j in range(count):
+                if abs(points[i, 0] - others[j, 0]) < distance and abs(points[i, 1] - others[j, 1]) < distance:
+                    near[i] = True
+                    break
 
 
 def load_mask(path: Path) -> Image:

@@ -13,10 +13,11 @@ import pytest
 
 from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
 from vio.errors import ConfigError, DataError, MissingDependencyError
+from vio.frontend import descriptors
 from vio.frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
 from vio.frontend.settings import FrontendSettings, GridSettings, LearnedSettings, MatchSettings
 from vio.geometry.lie import FloatArray
-from vio.records import StereoFrame
+from vio.records import BoolArray, StereoFrame
 
 REASON = "not installed: pip install 'stereo-vio[learned]'"
 MATCH = MatchSettings(max_keypoints=250)
@@ -252,26 +253,42 @@ def points_of(descriptors: FloatArray) -> Keypoints:
     return Keypoints(np.zeros((len(unit), 2)), unit)
 
 
+def matched_by_a_loop(gap: FloatArray, allowed: BoolArray, ratio: float) -> list[list[int]]:
+    gap, pairs = np.where(allowed, gap, np.inf), []
+    for i in range(len(gap)):
+        order = np.argsort(gap[i], kind="stable")
+        j = int(order[0])
+        if np.isfinite(gap[i, j]) and np.argmin(gap[:, j]) == i and gap[i, j] <= ratio * gap[i, order[1]]:
+            pairs.append([i, j])
+    assert len(pairs) > 5
+    return pairs
+
+
 def test_mutual_nearest_equals_a_loop() -> None:
     rng = np.random.default_rng(3)
     a, b = points_of(rng.normal(size=(40, 8))), points_of(rng.normal(size=(50, 8)))
     allowed = rng.random((40, 50)) < 0.5
     gap = np.linalg.norm(a.descriptors[:, None].astype(float) - b.descriptors[None].astype(float), axis=2)
-    gap[~allowed] = np.inf
-    expected = []
-    for i in range(40):
-        order = np.argsort(gap[i])
-        j = int(order[0])
-        if np.isfinite(gap[i, j]) and np.argmin(gap[:, j]) == i and gap[i, j] <= 0.9 * gap[i, order[1]]:
-            expected.append([i, j])
-    assert len(expected) > 5
-    np.testing.assert_array_equal(MutualNearest(0.9)(a, b, allowed), expected)
+    np.testing.assert_array_equal(MutualNearest(0.9)(a, b, allowed), matched_by_a_loop(gap, allowed, 0.9))
 
 
 def test_binary_descriptors_use_hamming_distance() -> None:
-    from vio.frontend.descriptors import distances
-
+    """Two bytes have many equal distances, of which the first one counts."""
     rng = np.random.default_rng(4)
-    a, b = rng.integers(0, 256, (5, 32), dtype=np.uint8), rng.integers(0, 256, (7, 32), dtype=np.uint8)
-    expected = [[sum(bin(int(x) ^ int(y)).count("1") for x, y in zip(p, q, strict=True)) for q in b] for p in a]
-    np.testing.assert_array_equal(distances(a, b), expected)
+    a, b = (Keypoints(np.zeros((n, 2)), rng.integers(0, 256, (n, 2), dtype=np.uint8)) for n in (40, 50))
+    allowed = rng.random((40, 50)) < 0.5
+    gap = np.array([[sum(int(x).bit_count() for x in p ^ q) for q in b.descriptors] for p in a.descriptors], float)
+    np.testing.assert_array_equal(MutualNearest(1.0)(a, b, allowed), matched_by_a_loop(gap, allowed, 1.0))
+
+
+def test_pairs_in_a_window_equal_a_formula() -> None:
+    rng = np.random.default_rng(5)
+    a, b, guess = (rng.integers(0, 2 * np.array([40, 12]), (n, 2)) / 2 for n in (60, 70, 60))  # many at the limits
+    found = np.empty((60, 70), dtype=np.bool_)
+    descriptors._on_row(a, np.ascontiguousarray(b.T), 6.0, found)
+    disparity, rows = a[:, :1] - b[:, 0], np.abs(a[:, 1:] - b[:, 1])
+    np.testing.assert_array_equal(found, (rows <= 1.5) & (disparity >= 0.3) & (disparity <= 6.0))
+    descriptors._near_either(guess, a, np.ascontiguousarray(b.T), 2.5, found)
+    expected = [np.abs(centre[:, None] - b).max(axis=2) <= 2.5 for centre in (guess, a)]
+    np.testing.assert_array_equal(found, expected[0] | expected[1])
+    assert 0.01 < found.mean() < 0.5

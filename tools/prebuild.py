@@ -53,6 +53,7 @@ _COMMANDS = (
     "run wide --no-plot --out cylinder --set dataset.projection=cylinder",
     "run flight --no-plot --out mono --camera left",
     "run drive --out driven",
+    "run drive --no-plot --out matched --frontend orb",
     "run depth --no-plot --out depths",
 )
 _TAG = f"cp{sys.version_info[0]}{sys.version_info[1]}-none-manylinux_2_29_x86_64"
