@@ -54,8 +54,8 @@ class Keypoints:
 class Extractor(Protocol):
     """Finds and describes key points."""
 
-    def __call__(self, image: Image) -> Keypoints:
-        """Return the key points of one image, strongest first."""
+    def __call__(self, *images: Image) -> list[Keypoints]:
+        """Return the key points of each of some images of one size, strongest first."""
 
 
 class Matcher(Protocol):
@@ -140,8 +140,11 @@ class OpenCvExtractor:
     engine: cv2.Feature2D
     name: str
 
-    def __call__(self, image: Image) -> Keypoints:
-        """Return the key points of one image, strongest first; see `Extractor`."""
+    def __call__(self, *images: Image) -> list[Keypoints]:
+        """Return the key points of each image; see `Extractor`."""
+        return [self._keypoints(image) for image in images]
+
+    def _keypoints(self, image: Image) -> Keypoints:
         found, descriptors = self.engine.detectAndCompute(image, None)
         described = np.zeros((0, 32), dtype=np.uint8) if descriptors is None else np.asarray(descriptors)
         values = np.array([(*k.pt, k.response) for k in found], dtype=np.float64).reshape(-1, 3)
@@ -220,8 +223,7 @@ class DescriptorFrontend:
         watch = Stopwatch()
         images = self._validator.validate(frame)
         watch.lap("prepare")
-        found = [self._extract(image) for image in images]
-        left, right = (take(points, inside(images[0], points.pixels, _BORDER_PX)) for points in found)
+        left, right = (take(points, inside(images[0], points.pixels, _BORDER_PX)) for points in self._extract(*images))
         watch.lap("extract")
         pair = self._stereo(left, right, images)
         watch.lap("stereo")

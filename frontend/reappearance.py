@@ -57,8 +57,8 @@ def motion_across(
         starts: motions (S, 4, 4) to try, beside those of minimal sets of points.
     """
     assert previous.right_half is not None
-    camera, extract = problem.camera, sift_extractor(MatchSettings())
-    before, now = extract(previous.left.full), extract(left.full)
+    camera = problem.camera
+    before, now = sift_extractor(MatchSettings())(previous.left.full, left.full)
     pairs = MutualNearest()(before, now, np.ones((len(before), len(now)), dtype=np.bool_))
     a, b = before.pixels[pairs[:, 0]], now.pixels[pairs[:, 1]]
     d_before, known = stereo.search(previous.left.half, previous.right_half, a)

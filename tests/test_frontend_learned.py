@@ -237,7 +237,7 @@ def test_corner_positions_are_unbiased(torch: Any, detector: str) -> None:
         for u in range(20, 230, 40):
             image[v : v + 17, u : u + 17] = 200
             true += [(u + a, v + b) for a in (-0.5, 16.5) for b in (-0.5, 16.5)]
-    found = build_extractor(LearnedSettings(detector=detector), MATCH, pick_device("cpu"))(image)  # type: ignore[arg-type]
+    (found,) = build_extractor(LearnedSettings(detector=detector), MATCH, pick_device("cpu"))(image)  # type: ignore[arg-type]
     gap = found.pixels[:, None] - np.array(true)
     nearest = np.abs(gap).max(axis=2).argmin(axis=0)
     offset = gap[nearest, np.arange(len(true))]
@@ -292,3 +292,44 @@ def test_pairs_in_a_window_equal_a_formula() -> None:
     expected = [np.abs(centre[:, None] - b).max(axis=2) <= 2.5 for centre in (guess, a)]
     np.testing.assert_array_equal(found, expected[0] | expected[1])
     assert 0.01 < found.mean() < 0.5
+
+
+# --- CUDA -------------------------------------------------------------------------------------------------------------
+
+
+def test_cuda_is_warmed_up_by_a_front_end_of_its_own(torch: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With both kinds of matches, in images of the camera's size; without CUDA here, all runs on the CPU."""
+    from vio.frontend import learned
+
+    process, outputs = DescriptorFrontend.process, []
+
+    def noted(self: DescriptorFrontend, frame: StereoFrame) -> Any:
+        outputs.append(process(self, frame))
+        return outputs[-1]
+
+    monkeypatch.setattr(learned, "pick_device", lambda name: torch.device("cpu"))
+    monkeypatch.setattr(DescriptorFrontend, "process", noted)
+    frontend = build(LearnedSettings(device="cuda"))
+    assert len(outputs) == 2
+    assert outputs[0].matched > 20
+    assert outputs[1].tracked > 20
+    assert frontend.process(small_frame(0, flight(1)[0])).observations.ids[0] == 0
+
+
+def test_network_recorded_on_cuda_gives_the_same_key_points(torch: Any, files: dict[str, Path]) -> None:
+    """Left and right at once, in a recording of the network's calls that is made anew for another size."""
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA here")
+    from vio.frontend.learned.extractors import _Replayed, build_extractor
+
+    settings = LearnedSettings(detector="aliked", detector_weights=files["aliked"])
+    recorded: Any = build_extractor(settings, MATCH, torch.device("cuda"))
+    plain: Any = build_extractor(settings, MATCH, torch.device("cuda"))
+    assert isinstance(recorded.network.extract_dense_map, _Replayed)
+    plain.network.extract_dense_map = plain.network.extract_dense_map._network
+    for k, width in enumerate((240, 240, 200)):
+        frame = small_frame(k, flight(3)[k])
+        images = [np.ascontiguousarray(image[:, :width]) for image in (frame.left, frame.right)]  # type: ignore[index]
+        for a, b in zip(recorded(*images), plain(*images), strict=True):
+            assert len(a) > 50
+            np.testing.assert_allclose(a.pixels, b.pixels, atol=0.01)

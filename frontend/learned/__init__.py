@@ -7,6 +7,8 @@ needs them is built.
 
 from __future__ import annotations
 
+import numpy as np
+
 from vio.errors import MissingDependencyError
 from vio.frontend.descriptors import DescriptorFrontend, Matcher, MutualNearest
 from vio.frontend.learned.extractors import build_extractor
@@ -14,6 +16,7 @@ from vio.frontend.learned.lightglue import build_lightglue
 from vio.frontend.learned.weights import pick_device
 from vio.frontend.settings import FrontendSettings
 from vio.geometry.stereo import StereoCamera
+from vio.records import StereoFrame
 
 
 def build_learned(camera: StereoCamera, settings: FrontendSettings) -> DescriptorFrontend:
@@ -31,7 +34,18 @@ def build_learned(camera: StereoCamera, settings: FrontendSettings) -> Descripto
     matcher: Matcher = MutualNearest()
     if learned.matcher == "lightglue":
         matcher = build_lightglue(learned, camera, device)
+    if learned.device == "cuda":
+        _warm_up(DescriptorFrontend(camera, settings, "kornia", extract, matcher), camera)
     return DescriptorFrontend(camera, settings, "kornia", extract, matcher)
+
+
+def _warm_up(frontend: DescriptorFrontend, camera: StereoCamera) -> None:
+    """Process two frames of noise: the first call of CUDA loads its libraries, which takes seconds."""
+    if camera.width is None or camera.height is None:
+        return
+    left = np.random.default_rng(0).integers(0, 256, (camera.height, camera.width), dtype=np.uint8)
+    for k in range(2):
+        frontend.process(StereoFrame(k, k * 10**8, left, np.roll(left, -8, axis=1)))
 
 
 def _require_torch() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
@@ -35,8 +36,11 @@ def build_extractor(learned: LearnedSettings, match: MatchSettings, device: torc
 
     name, count = learned.detector, match.max_keypoints
     if name == "aliked":
-        aliked = kf.ALIKED(learned.aliked_model, max_num_keypoints=count, detection_threshold=0.0)
-        return _Whole(filled(aliked, learned.detector_weights, "detector_weights").to(device), name, count, device)
+        aliked: Any = kf.ALIKED(learned.aliked_model, max_num_keypoints=count, detection_threshold=0.0)
+        filled(aliked, learned.detector_weights, "detector_weights").to(device)
+        if device.type == "cuda":
+            aliked.extract_dense_map = _Replayed(aliked.extract_dense_map)
+        return _Whole(aliked, name, count, device)
     if name == "disk":
         return _Whole(filled(kf.DISK(), learned.detector_weights, "detector_weights").to(device), name, count, device)
     if name == "xfeat":
@@ -108,11 +112,11 @@ def _mkd(path: Path | None) -> Module:
     )
 
 
-def _as_tensor(image: Image, device: torch.device) -> Tensor:
-    """Image (1, 1, H, W) in 0..1."""
+def _as_tensor(images: Sequence[Image], device: torch.device) -> Tensor:
+    """Images (B, 1, H, W) in 0..1."""
     import torch
 
-    return torch.from_numpy(image.astype(np.float32) / 255.0)[None, None].to(device)
+    return torch.from_numpy(np.stack(images)[:, None]).to(device).float() / 255.0
 
 
 def _keypoints(pixels: Tensor, descriptors: Tensor, strength: Tensor) -> Keypoints:
@@ -123,6 +127,31 @@ def _keypoints(pixels: Tensor, descriptors: Tensor, strength: Tensor) -> Keypoin
     order = order[np.isfinite(described[order]).all(axis=1) & np.isfinite(uv[order]).all(axis=1)]
     norm = np.maximum(np.linalg.norm(described[order], axis=1, keepdims=True), 1e-9)
     return Keypoints(uv[order].astype(np.float64), (described[order] / norm).astype(np.float32))
+
+
+class _Replayed:
+    """A network's calls of CUDA kernels, recorded at the first call for a shape and then made as one.
+
+    To make them takes longer than to run them. What is returned is overwritten by the next call.
+    """
+
+    def __init__(self, network: Callable[[Tensor], tuple[Tensor, ...]]) -> None:
+        self._network = network
+        self._input: Tensor | None = None
+
+    def __call__(self, images: Tensor) -> tuple[Tensor, ...]:
+        import torch
+
+        if self._input is None or self._input.shape != images.shape:
+            self._input, self._graph = images.clone(), torch.cuda.CUDAGraph()
+            # Weights of half precision that autocast keeps for a while would be read after they are freed.
+            with torch.autocast("cuda", dtype=torch.float16, cache_enabled=False):
+                self._network(self._input)  # the libraries choose their kernels before the recording
+                with torch.cuda.graph(self._graph):
+                    self._output = self._network(self._input)
+        self._input.copy_(images)
+        self._graph.replay()
+        return self._output
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,22 +166,24 @@ class _Whole:
     count: int
     device: torch.device
 
-    def __call__(self, image: Image) -> Keypoints:
+    def __call__(self, *images: Image) -> list[Keypoints]:
         import torch
 
+        # Calls of the network's kernels take longer than the kernels on a GPU, so that all images share them.
+        batches = [images] if self.device.type == "cuda" else [(image,) for image in images]
         with torch.inference_mode(), half_precision(self.device):
-            pixels = _as_tensor(image, self.device)
-            colour = pixels.repeat(1, 3, 1, 1)
-            if self.name == "disk":
-                found = self.network(colour, n=self.count, pad_if_not_divisible=True)[0]
-                uv, described, score = found.keypoints, found.descriptors, found.detection_scores
-            elif self.name == "xfeat":
-                found = self.network.detectAndCompute(colour)[0]
-                uv, described, score = found["keypoints"], found["descriptors"], found["scores"]
-            else:
-                found = self.network(colour)[0]
-                uv, described, score = found.keypoints, found.descriptors, found.keypoint_scores
-        return _keypoints(uv, described, score.reshape(-1))
+            return [_keypoints(*columns) for batch in batches for columns in self._found(batch)]
+
+    def _found(self, images: Sequence[Image]) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Pixels (N, 2), descriptors (N, D) and scores (N,) in each image."""
+        colour = _as_tensor(images, self.device).repeat(1, 3, 1, 1)
+        if self.name == "xfeat":
+            found = self.network.detectAndCompute(colour)
+            return [(f["keypoints"], f["descriptors"], f["scores"].reshape(-1)) for f in found]
+        if self.name == "disk":
+            found = self.network(colour, n=self.count, pad_if_not_divisible=True)
+            return [(f.keypoints, f.descriptors, f.detection_scores) for f in found]
+        return [(f.keypoints, f.descriptors, f.keypoint_scores) for f in self.network(colour)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,12 +195,15 @@ class _Patches:
     patch_px: int
     device: torch.device
 
-    def __call__(self, image: Image) -> Keypoints:
+    def __call__(self, *images: Image) -> list[Keypoints]:
+        return [self._keypoints(image) for image in images]
+
+    def _keypoints(self, image: Image) -> Keypoints:
         import kornia.feature as kf
         import torch
 
         with torch.inference_mode():
-            pixels = _as_tensor(image, self.device)
+            pixels = _as_tensor([image], self.device)
             frames, response = self.detector(pixels)
             if frames.shape[1] == 0:
                 return _keypoints(torch.zeros(0, 2), torch.zeros(0, 1), torch.zeros(0))
