@@ -25,7 +25,7 @@ _ROW_PARAMETERS = 6  # the same without the second row of the linear part
 _ROW_SIGMA_PX = 0.3  # standard deviation of a feature's row in the other image of a rectified pair
 _GRAY_SIGMA = 4.0  # standard deviation between the two images of one patch, after gain and offset
 _ROW_WEIGHT = (_GRAY_SIGMA / _ROW_SIGMA_PX) ** 2
-_MAX_MOVE_PX = 2.5
+MAX_MOVE_PX = 2.5  # of a fitted pixel from its start; beyond, it has left the correlation peak
 _DONE_PX = 0.05  # step at which a template has converged; the remaining error is a small fraction of it
 _LEAST_SCORE, _MOST_SCORE = 0.1, 0.99999  # that a standard deviation is computed with
 _MAX_STEP_PX = 1.0
@@ -419,14 +419,14 @@ def shift_warps(centres: FloatArray) -> FloatArray:
 
 def on_peak(pixels: FloatArray, start: FloatArray) -> BoolArray:
     """Mask (N,) of fitted pixels (N, 2) near their start (N, 2); others have left the correlation peak."""
-    moved = np.abs(pixels - start) <= _MAX_MOVE_PX
+    moved = np.abs(pixels - start) <= MAX_MOVE_PX
     return moved[:, 0] & moved[:, 1]
 
 
 @compiled
 def is_on_peak(du: float, dv: float) -> bool:
     """Whether one fitted pixel is near its start, as `on_peak` says."""
-    return abs(du) <= _MAX_MOVE_PX and abs(dv) <= _MAX_MOVE_PX
+    return abs(du) <= MAX_MOVE_PX and abs(dv) <= MAX_MOVE_PX
 
 
 def template_points(warp: FloatArray, offset: FloatArray) -> FloatArray:

@@ -187,6 +187,8 @@ class KltFrontend:
         stereo.forget_offset()
         previous = self._previous
         if previous is None or len(previous.tracks) == 0:
+            if prior is None or prior.motion is None or not prior.motion.measured:
+                self._right.try_again(frame.index)
             return no_tracks(), None
         old, levels = previous.tracks, self._settings.pyramid_levels
         expected = se3_exp(previous.twist_per_s * ((frame.time_ns - previous.time_ns) * 1e-9))

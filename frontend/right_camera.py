@@ -31,6 +31,7 @@ _CLIPPED = 250  # gray level from which a pixel of a resampled image may contain
 _LEAST_UNCLIPPED = 0.1  # share of the pixels
 _RATIO_GAIN = 0.1  # how fast the usual ratio of the two changes is learned, which depends on gains and scene
 _LEAST_POINTS = 20  # with fewer points of known depth, matches say nothing
+_LEAST_AGREEING = 6  # but so few suffice to agree, as hardly any wrong one is found where it should be
 _CONTRADICTS = 0.3  # share of confirmed points below which the images contradict each other; usual is 0.8 to 1
 _AGREES = 0.6  # share above which they agree again
 _FRAMES = 3  # in a row before it is said, or before images that agree are used again
@@ -146,8 +147,8 @@ class RightCamera(ImageCheck):
             if share is not None and share < _CONTRADICTS:
                 self._distrust("contradicts", index - 1, index)
             return self._cause is None
-        self._untested = 0 if tested else self._untested + 1
-        agrees = share is not None and share >= _AGREES
+        agrees = moved and len(matched) >= _LEAST_AGREEING and share_of(matched) >= _AGREES
+        self._untested = 0 if tested or agrees else self._untested + 1
         self._agreeing = self._agreeing + 1 if agrees else 0
         self._count += not agrees
         if self._agreeing >= _FRAMES or self._untested >= _BLIND_FRAMES:
@@ -155,6 +156,16 @@ class RightCamera(ImageCheck):
         elif self._count >= _FRAMES:
             self._say(index)
         return self._cause is None
+
+    def try_again(self, index: int) -> None:
+        """Use right images again that contradicted depths of which none is left, where no sensor knows the scale.
+
+        Those that the left images have given since are of any scale, and would be contradicted for ever.
+        """
+        if self._cause == "contradicts":
+            if self._said:
+                self._lines.append(f"frame {index}: no feature is left that contradicts the right images; used again")
+            self._reset()
 
     def _distrust(self, cause: Cause, since: int, index: int) -> None:
         """Note a cause; one that lasts is reported once."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args, point_at
-from vio.frontend.align import align, is_on_peak
+from vio.frontend.align import MAX_MOVE_PX, align, is_on_peak
 from vio.frontend.columns import changed, share_of
 from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import DisparitySettings
@@ -76,6 +76,8 @@ class StereoFit:
             moved: whether the depths were propagated with a consensus motion.
         """
         rows, expected = self._expected(tracks)
+        if moved:
+            self._follow(expected)
         pixels, skew, valid = self._fit(tracks, rows, right, expected)
         if moved:
             valid &= np.abs(tracks.left[rows, 0] - pixels[:, 0] - expected) <= INLIER_PX
@@ -158,6 +160,13 @@ class StereoFit:
         self.max_disparity_px = min(reach, most)
         return True
 
+    def _follow(self, expected: FloatArray) -> None:
+        """Search further from now on if enough disparities (K,) of features of known depth are beyond the reach."""
+        while self.max_disparity_px < self._most_reach_px:
+            if (expected > self.max_disparity_px - MAX_MOVE_PX).sum() < _LEAST_BEYOND:
+                break
+            self.max_disparity_px = min(2.0 * self.max_disparity_px, self._most_reach_px)
+
     def _best_offset(self, left_half: Image, right_half: Image, points: FloatArray, offset: int) -> int:
         """Row difference, in pixels at half resolution, at which most points match well; the present one if in doubt.
 
@@ -223,7 +232,9 @@ class StereoFit:
         """Mask (N,) of the features whose known depth says that the right image shows them within the reach."""
         rows, expected = self._expected(tracks)
         out = np.zeros(len(tracks), dtype=np.bool_)
-        out[rows] = (expected <= self.max_disparity_px) & (tracks.left[rows, 0] - expected >= ANCHOR_REACH_PX)
+        out[rows] = (expected <= self.max_disparity_px - MAX_MOVE_PX) & (
+            tracks.left[rows, 0] - expected >= ANCHOR_REACH_PX
+        )
         return out
 
     def _search(
