@@ -139,11 +139,13 @@ def test_flight_after_the_start_is_consistent() -> None:
 
 
 class Turning(Path3):
-    """The same flight, but all that is seen turns about a vertical axis, at 0.5 rad/s."""
+    """The same flight, but all that is seen turns about a vertical axis."""
+
+    rate_radps = 0.5
 
     def observe(self, k: int, sigma: float, noise: np.random.Generator, limit: int = 60) -> Observations:
         still, centre = self.points, self.points.mean(axis=0)
-        self.points = centre + (still - centre) @ so3_exp([0.0, 0.0, 0.5 * 0.05 * k]).T
+        self.points = centre + (still - centre) @ so3_exp([0.0, 0.0, self.rate_radps * 0.05 * k]).T
         seen = super().observe(k, sigma, noise, limit)
         self.points = still
         return seen
@@ -159,11 +161,20 @@ def test_features_that_contradict_the_imu_start_nothing() -> None:
 def test_a_contradiction_that_stays_is_taken_with_what_it_costs(monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock that is off contradicts for good: the start comes, and says how little is known."""
     monkeypatch.setattr(mono_start, "_PATIENCE_S", 0.4)
+    monkeypatch.setattr(Turning, "rate_radps", 0.45)
     flown = Flown(Turning(50, "curve"), 0)
-    start = flown.filter._begun
-    assert start is not None
-    assert start.scale_sigma > 0.1  # as it is known by noise alone, it is below
-    assert flown.rows[0, 1] < 300  # 760 without
+    start, squared = flown.filter._begun, flown.rows[0, 1]
+    monkeypatch.setattr(mono_start, "_disagreement", lambda *_: 0.0)
+    sure = Flown(Turning(50, "curve"), 0)
+    assert sure.filter._begun.scale_sigma < start.scale_sigma <= 0.1
+    assert squared < 0.5 * sure.rows[0, 1]
+
+
+def test_a_contradiction_that_costs_too_much_starts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mono_start, "_PATIENCE_S", 0.4)
+    flown = Flown(Turning(50, "curve"), 0)
+    assert flown.begun is None
+    assert "the scale is known to" in str(flown.filter.initialisation.waits_for)
 
 
 def test_tracks_on_a_moving_object_are_left_out_of_the_start() -> None:

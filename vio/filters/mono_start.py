@@ -147,14 +147,14 @@ class MonoStarter:
         found = self._fit(motion, views, begin, table)
         if found is None:
             return None
-        nav, P, sigma, excess = found
+        nav, P, sigma = found
         if sigma > MOST_SCALE_SIGMA:
             self.why = (
                 f"the scale is known to {100 * sigma:.0f} % only (more than {100 * MOST_SCALE_SIGMA:.0f} %); move "
                 "the camera sideways with changing speed"
             )
             return None
-        return MonoStart(nav, excess * P, float(np.sqrt(excess)) * sigma, self._passed - 1)
+        return MonoStart(nav, P, sigma, self._passed - 1)
 
     def _contradiction_persists(self, now_ns: int) -> bool:
         """Note that features and IMU contradict each other; whether they did so long ago, too, as by a wrong clock."""
@@ -197,12 +197,12 @@ class MonoStarter:
 
     def _fit(
         self, motion: ImuMotion, views: list[Observations], begin: NavState, tracks: WindowTracks
-    ) -> tuple[NavState, FloatArray, float, float] | None:
+    ) -> tuple[NavState, FloatArray, float] | None:
         """Gauss-Newton over the views.
 
         Returns:
-            The state at the newest view, its covariance (15, 15), the standard deviation of the scale, and by how much
-            both variances are to be inflated, as features and IMU contradict each other.
+            The state at the newest view, its covariance (15, 15) and the standard deviation of the scale, both inflated
+            where features and IMU contradict each other.
         """
         for attempt in range(2):  # the second time linearised at the result of the first
             window = self._window(motion, views, begin)
@@ -245,9 +245,9 @@ class MonoStarter:
                 "something that moves"
             )
             return None
-        P = fitted.covariance()
+        P = excess * fitted.covariance()
         sigma = scale_sigma(WindowPosterior.of(window, P))
-        return *_at_origin(window.nav, P[:DIM, :DIM]), float("inf") if sigma is None else sigma, excess
+        return *_at_origin(window.nav, P[:DIM, :DIM]), float("inf") if sigma is None else sigma
 
     def _window(self, motion: ImuMotion, views: list[Observations], begin: NavState) -> Window:
         """The window of all views, predicted from a first state, under the prior alone."""
