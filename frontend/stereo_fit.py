@@ -77,7 +77,7 @@ class StereoFit:
         """
         rows, expected = self._expected(tracks)
         if moved:
-            self._follow(expected)
+            self._follow(expected[tracks.has_right[rows]])
         pixels, skew, valid = self._fit(tracks, rows, right, expected)
         if moved:
             valid &= np.abs(tracks.left[rows, 0] - pixels[:, 0] - expected) <= INLIER_PX
@@ -161,10 +161,9 @@ class StereoFit:
         return True
 
     def _follow(self, expected: FloatArray) -> None:
-        """Search further from now on if enough disparities (K,) of features of known depth are beyond the reach."""
-        while self.max_disparity_px < self._most_reach_px:
-            if (expected > self.max_disparity_px - MAX_MOVE_PX).sum() < _LEAST_BEYOND:
-                break
+        """Search further from now on if enough features matched in the last frame come nearer, by disparity (K,)."""
+        beyond = (expected > self.max_disparity_px - MAX_MOVE_PX).sum()
+        if beyond >= max(_LEAST_BEYOND, _BEYOND_SHARE * len(expected)):
             self.max_disparity_px = min(2.0 * self.max_disparity_px, self._most_reach_px)
 
     def _best_offset(self, left_half: Image, right_half: Image, points: FloatArray, offset: int) -> int:
