@@ -255,6 +255,16 @@ def test_the_search_reaches_further_where_the_scene_is_near() -> None:
     assert stereo.max_disparity_px > 120.0
 
 
+def test_the_search_follows_features_that_come_nearer() -> None:
+    """A wall at 0.15 of the width comes to 0.2: its points know their depth, and matched in the last frame."""
+    stereo = StereoFit(NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200))
+    near = _wall(stereo, 60.0)
+    stereo.track_right(changed(near, has_right=np.zeros(len(near), dtype=np.bool_)), _moved_right(60.0), moved=True)
+    assert stereo.max_disparity_px == 48.0  # depths that no pair has confirmed
+    stereo.track_right(near, _moved_right(60.0), moved=True)
+    assert stereo.max_disparity_px == 96.0
+
+
 def test_chance_matches_do_not_make_the_search_reach_further() -> None:
     stereo = StereoFit(NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200))
     other = half_image(picture(np.eye(3), seed=1))

@@ -138,6 +138,36 @@ def test_few_points_or_an_unknown_motion_contradict_nothing() -> None:
     assert camera.check_matches(0, np.zeros(80, dtype=np.bool_), moved=False)
 
 
+def _contradicted() -> RightCamera:
+    camera = RightCamera()
+    for k in range(4):
+        camera.check_matches(k, np.zeros(80, dtype=np.bool_), moved=True)
+    assert not camera.usable
+    camera.take_lines()
+    return camera
+
+
+def test_six_points_suffice_to_agree_again() -> None:
+    for count, usable in ((6, True), (5, False)):
+        camera = _contradicted()
+        for k in range(4, 7):
+            camera.check_matches(k, np.arange(count) > 0, moved=True)
+        assert camera.usable == usable
+
+
+def test_where_no_feature_is_left_the_right_image_is_tried_again() -> None:
+    """By images alone: depths that the left images give from then on are of any scale. A frozen image stays one."""
+    camera = _contradicted()
+    camera.try_again(4)
+    assert camera.usable
+    assert camera.take_lines() == ("frame 4: no feature is left that contradicts the right images; used again",)
+    frozen = RightCamera()
+    for k, (left, right) in enumerate([(pair(k)[0], pair(0)[1]) for k in range(4)]):
+        frozen.left_is_frozen(k, left, right)
+    frozen.try_again(4)
+    assert not frozen.usable
+
+
 def test_prior_gives_the_depth_of_the_features_that_it_names() -> None:
     z = np.array([[100.0, 50.0, 80.0, 50.0], [200.0, 60.0, 200.0, 60.0]])
     depth, known = prior_depths(CAMERA, np.array([-1, 7, 5, -1, 9]), TrackPrior(np.array([7, 9]), z[::-1]))
