@@ -187,7 +187,7 @@ class KltFrontend:
         stereo.forget_offset()
         previous = self._previous
         if previous is None or len(previous.tracks) == 0:
-            if prior is None or prior.motion is None or not prior.motion.measured:
+            if prior is None or prior.measured_motion is None:
                 self._right.try_again(frame.index)
             return no_tracks(), None
         old, levels = previous.tracks, self._settings.pyramid_levels
@@ -264,7 +264,7 @@ class KltFrontend:
         kept, motion = static_tracks(problem, before, point, has_depth, after, expected, R_prior, T_prior)
         expected_motion = None if prior is None else prior.motion
         near_m = camera.fu * camera.baseline_m / stereo.max_disparity_px
-        measured = expected_motion if expected_motion is not None and expected_motion.measured else None
+        measured = None if prior is None else prior.measured_motion
         if motion is None and measured is not None:
             kept = static_by_prediction(problem, before, after, kept, measured, near_m)
         if motion is not None:

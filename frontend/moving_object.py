@@ -86,8 +86,7 @@ def choose_motion(
     if voting is not None and not measured:
         voted = _voted(problem, p_prev, pixels, found, voting)
         if voted is not None:
-            share = float((found.inliers & ~voted.inliers).mean())
-            return TwoMotions(voted, share if share >= _LARGE_SHARE else 0.0, "voted")
+            return TwoMotions(voted, _if_large((found.inliers & ~voted.inliers).mean()), "voted")
     others = np.flatnonzero(~found.inliers)
     least = max(_LEAST_POINTS, _LEAST_SUPPORT * found.inliers.sum())
     if len(others) < least and not hidden:
@@ -96,27 +95,29 @@ def choose_motion(
     if len(others) >= least:
         starts = np.stack([np.eye(4) if predicted is None else predicted.T_curr_prev, np.eye(4)])
         second, support = best_motion(problem, p_prev[others], pixels[others], starts)
-    large, share = support.sum() >= least, float(support.sum()) / len(p_prev)
-    reported = share if large and share >= _LARGE_SHARE else 0.0
-    if predicted is not None and not (measured or depths_off):
-        near = _near_prediction(problem, p_prev, pixels, found, predicted)
+    large = bool(support.sum() >= least)
+    reported = _if_large(support.sum() / len(p_prev)) if large else 0.0
+    extrapolated = not (measured or depths_off)  # the prediction is that of a body that goes on as before
+    limit, of_first = float(chi_square_quantile(_PROBABILITY, 6)), np.inf
+    if predicted is not None and (large or in_event or extrapolated):
+        of_first = _squared_distance(problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted)
+    if predicted is not None and extrapolated and of_first > limit:
+        near = _near_prediction(problem, p_prev, pixels, found, predicted, limit)
         if near is not None:
             second, support, large = near.T_curr_prev, near.inliers[others], True
+    follows_second = _followers(problem, second, p_prev, pixels) if large else np.zeros(len(p_prev), dtype=np.bool_)
     if large and not measured and voting is not None:
-        other = pixel_errors(problem.camera, second, p_prev, pixels) <= problem.limit_px
-        elected = None if depths_off else _elected(found.inliers[voting], other[voting])
+        elected = None if depths_off else _elected(found.inliers[voting], follows_second[voting])
         if elected == "second":
-            share = float((found.inliers & ~other).mean())
-            return TwoMotions(Consensus(second, other), share if share >= _LARGE_SHARE else 0.0, "voted")
+            object_share = _if_large((found.inliers & ~follows_second).mean())
+            return TwoMotions(Consensus(second, follows_second), object_share, "voted")
         if elected == "first" or (depths_off and _votes_for(found, voting)):
             return TwoMotions(found, reported, "voted" if reported else None)
     if predicted is None:
         return TwoMotions(found, reported, "undecided" if reported else None)
     if not (large or in_event):
         return TwoMotions(found, 0.0, None)
-    of_first = _squared_distance(problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted)
     of_second = _squared_distance(problem.camera, second, p_prev[others[support]], predicted) if large else np.inf
-    limit = float(chi_square_quantile(_PROBABILITY, 6))
     nearer, farther = sorted((of_first, of_second))
     if measured and large and nearer * _CLEARLY_NEARER <= farther:
         limit = max(limit, nearer)  # the sensor is worse than its covariance, but leaves no doubt which one it is
@@ -125,31 +126,44 @@ def choose_motion(
         return TwoMotions(found, 0.0, None)  # whether the first agrees or not
     if first_agrees or not (second_agrees or hidden):
         return TwoMotions(found, reported, "predicted" if first_agrees and not second_agrees else "undecided")
-    T = second if second_agrees else predicted.T_curr_prev
-    inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
-    share = share_of(found.inliers)
-    return TwoMotions(Consensus(T, inliers), share if share >= _LARGE_SHARE else 0.0, "predicted")
+    if not second_agrees:
+        second, follows_second = predicted.T_curr_prev, _followers(problem, predicted.T_curr_prev, p_prev, pixels)
+    return TwoMotions(Consensus(second, follows_second), _if_large(share_of(found.inliers)), "predicted")
+
+
+def _if_large(share: float) -> float:
+    """The share of an object that is reported; 0 for a small one."""
+    return float(share) if share >= _LARGE_SHARE else 0.0
+
+
+def _followers(problem: RansacProblem, T: FloatArray, p_prev: FloatArray, pixels: FloatArray) -> BoolArray:
+    """Mask (N,) of the points whose pixels a motion (4, 4) explains."""
+    return np.asarray(pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px)
 
 
 def _near_prediction(
-    problem: RansacProblem, p_prev: FloatArray, pixels: FloatArray, found: Consensus, predicted: MotionPrior
+    problem: RansacProblem,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    found: Consensus,
+    predicted: MotionPrior,
+    limit: float,
 ) -> Consensus | None:
-    """The motion near a predicted one, where the consensus contradicts it and some points follow this one alone.
+    """The motion near a predicted one that the consensus contradicts, if some points follow this one alone.
 
-    A compromise between an object and what is far away can win the consensus, and leaves no second group.
+    A compromise between an object and what is far away can win the consensus, and leaves no second group. `limit` is
+    that of the squared distance from the prediction.
     """
-    camera, limit = problem.camera, float(chi_square_quantile(_PROBABILITY, 6))
-    if _squared_distance(camera, found.T_curr_prev, p_prev[found.inliers], predicted) <= limit:
-        return None
-    near = pixel_errors(camera, predicted.T_curr_prev, p_prev, pixels) <= 2.0 * problem.limit_px
+    near = pixel_errors(problem.camera, predicted.T_curr_prev, p_prev, pixels) <= 2.0 * problem.limit_px
     if near.sum() < _LEAST_POINTS:
         return None
     T, _ = best_motion(problem, p_prev[near], pixels[near], predicted.T_curr_prev[None])
-    inliers = pixel_errors(camera, T, p_prev, pixels) <= problem.limit_px
+    inliers = _followers(problem, T, p_prev, pixels)
     alone, others = inliers & ~found.inliers, found.inliers & ~inliers
     if alone.sum() < max(_LEAST_POINTS, _LEAST_SUPPORT * others.sum()):
         return None
-    return Consensus(T, inliers) if _squared_distance(camera, T, p_prev[inliers], predicted) <= limit else None
+    agrees = _squared_distance(problem.camera, T, p_prev[inliers], predicted) <= limit
+    return Consensus(T, inliers) if agrees else None
 
 
 def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] | None:
@@ -178,9 +192,9 @@ def _voted(
     T, follows = best_motion(problem, p_prev[voting], pixels[voting], starts)
     if follows.mean() < _CLEAR_VOTE:
         return None
-    inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
+    inliers = _followers(problem, T, p_prev, pixels)
     T, _ = best_motion(problem, p_prev[inliers], pixels[inliers], T[None])  # the oldest points may all be far away
-    return Consensus(T, pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px)
+    return Consensus(T, _followers(problem, T, p_prev, pixels))
 
 
 def static_by_prediction(

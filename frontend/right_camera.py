@@ -142,12 +142,12 @@ class RightCamera(ImageCheck):
         if self._cause in _BY_IMAGE:
             return False
         tested = moved and len(matched) >= _LEAST_POINTS
-        share = share_of(matched) if tested else None
+        share = share_of(matched) if len(matched) else 0.0
         if self._cause is None:
-            if share is not None and share < _CONTRADICTS:
+            if tested and share < _CONTRADICTS:
                 self._distrust("contradicts", index - 1, index)
             return self._cause is None
-        agrees = moved and len(matched) >= _LEAST_AGREEING and share_of(matched) >= _AGREES
+        agrees = moved and len(matched) >= _LEAST_AGREEING and share >= _AGREES
         self._untested = 0 if tested or agrees else self._untested + 1
         self._agreeing = self._agreeing + 1 if agrees else 0
         self._count += not agrees
@@ -158,13 +158,15 @@ class RightCamera(ImageCheck):
         return self._cause is None
 
     def try_again(self, index: int) -> None:
-        """Use right images again that contradicted depths of which none is left, where no sensor knows the scale.
+        """Use right images again that contradicted depths of which none is left, where no sensor measures the scale.
 
-        Those that the left images have given since are of any scale, and would be contradicted for ever.
+        Depths from the left images since then have an arbitrary scale, and would be contradicted for ever.
         """
         if self._cause == "contradicts":
             if self._said:
-                self._lines.append(f"frame {index}: no feature is left that contradicts the right images; used again")
+                self._lines.append(
+                    f"frame {index}: no feature is left that contradicts the right images; they are used again"
+                )
             self._reset()
 
     def _distrust(self, cause: Cause, since: int, index: int) -> None:

@@ -148,23 +148,29 @@ class StereoFit:
 
     def _reaches_further(self, left_half: Image, right_half: Image, points: FloatArray) -> bool:
         """Search further from now on if enough of the left pixels (N, 2) without a match have one beyond the reach."""
+        beyond = self._beyond(left_half, right_half, points)
+        if not _are_enough(len(beyond), len(points)):
+            return False
+        farthest = min(np.quantile(beyond, _WITHIN_REACH), self._most_reach_px)
+        while self.max_disparity_px < farthest:
+            self._double_reach()
+        return True
+
+    def _beyond(self, left_half: Image, right_half: Image, points: FloatArray) -> FloatArray:
+        """Disparities (K,) of left pixels (N, 2) whose good match is beyond the present reach."""
         reach, most = self.max_disparity_px, self._most_reach_px
         if reach >= most:
-            return False
+            return np.zeros(0)
         disparity, good = match_rows(left_half, right_half, points, most, _GOOD_MATCH, _MIN_PEAK_MARGIN)
-        beyond = disparity[good & (disparity > reach)]
-        if len(beyond) < max(_LEAST_BEYOND, _BEYOND_SHARE * len(points)):
-            return False
-        while reach < np.quantile(beyond, _WITHIN_REACH):
-            reach *= 2.0
-        self.max_disparity_px = min(reach, most)
-        return True
+        return disparity[good & (disparity > reach)]
 
     def _follow(self, expected: FloatArray) -> None:
         """Search further from now on if enough features matched in the last frame come nearer, by disparity (K,)."""
-        beyond = (expected > self.max_disparity_px - MAX_MOVE_PX).sum()
-        if beyond >= max(_LEAST_BEYOND, _BEYOND_SHARE * len(expected)):
-            self.max_disparity_px = min(2.0 * self.max_disparity_px, self._most_reach_px)
+        if _are_enough(int((expected > self.max_disparity_px - MAX_MOVE_PX).sum()), len(expected)):
+            self._double_reach()
+
+    def _double_reach(self) -> None:
+        self.max_disparity_px = min(2.0 * self.max_disparity_px, self._most_reach_px)
 
     def _best_offset(self, left_half: Image, right_half: Image, points: FloatArray, offset: int) -> int:
         """Row difference, in pixels at half resolution, at which most points match well; the present one if in doubt.
@@ -183,9 +189,7 @@ class StereoFit:
 
     def count_beyond(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> int:
         """Count the left pixels (N, 2) that have a good match beyond the present reach: the scene is near."""
-        right_half, most = shifted_rows(right.half, round(self._rows.offset_px / 2)), self._most_reach_px
-        disparity, good = match_rows(left.half, right_half, points, most, _GOOD_MATCH, _MIN_PEAK_MARGIN)
-        return int((good & (disparity > self.max_disparity_px)).sum())
+        return len(self._beyond(left.half, shifted_rows(right.half, round(self._rows.offset_px / 2)), points))
 
     def count_mirrored(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> int:
         """Count the left pixels (N, 2) that have a match with a negative disparity."""
@@ -230,10 +234,9 @@ class StereoFit:
     def testable(self, tracks: Tracks) -> BoolArray:
         """Mask (N,) of the features whose known depth says that the right image shows them within the reach."""
         rows, expected = self._expected(tracks)
+        in_reach, right_u = expected <= self.max_disparity_px - MAX_MOVE_PX, tracks.left[rows, 0] - expected
         out = np.zeros(len(tracks), dtype=np.bool_)
-        out[rows] = (expected <= self.max_disparity_px - MAX_MOVE_PX) & (
-            tracks.left[rows, 0] - expected >= ANCHOR_REACH_PX
-        )
+        out[rows] = in_reach & (right_u >= ANCHOR_REACH_PX)
         return out
 
     def _search(
@@ -272,6 +275,11 @@ class StereoFit:
         columns = right, has_right, skews, point, has_point
         _match(camera_args(self._camera), f_baseline, tracks.left, rows, pixels, skew, good, *columns)
         return changed(tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point)
+
+
+def _are_enough(beyond: int, points: int) -> bool:
+    """Whether so many of some points are beyond the reach that the search is to go further."""
+    return beyond >= max(_LEAST_BEYOND, _BEYOND_SHARE * points)
 
 
 @compiled

@@ -160,7 +160,9 @@ def test_where_no_feature_is_left_the_right_image_is_tried_again() -> None:
     camera = _contradicted()
     camera.try_again(4)
     assert camera.usable
-    assert camera.take_lines() == ("frame 4: no feature is left that contradicts the right images; used again",)
+    assert camera.take_lines() == (
+        "frame 4: no feature is left that contradicts the right images; they are used again",
+    )
     frozen = RightCamera()
     for k, (left, right) in enumerate([(pair(k)[0], pair(0)[1]) for k in range(4)]):
         frozen.left_is_frozen(k, left, right)

@@ -253,6 +253,11 @@ class TrackPrior:
     R_cam_prev: FloatArray | None = None  # (3, 3) rotation that maps the previous cam0 frame into the coming one
     motion: MotionPrior | None = None  # the whole motion since the previous frame, with its covariance
 
+    @property
+    def measured_motion(self) -> MotionPrior | None:
+        """The motion, if a sensor has measured it."""
+        return self.motion if self.motion is not None and self.motion.measured else None
+
 
 @dataclass(frozen=True, slots=True)
 class MotionPrior:

@@ -27,7 +27,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 # Without the entry for callers in C, which nothing here uses, a function compiles in a tenth less time.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
 # numba counts references to each array that a function is given, or cuts out of one, by atomic additions. A function
-# that makes no array of its own needs none of that; one that does without any of these names does not compile.
+# needs that only if it allocates an array, by one of these names; one that does by another name does not compile.
 _ALLOCATE = {"empty", "zeros", "copy", "reshape", "searchsorted"}
 LOOPS: list[Loop] = []
 
