@@ -1,7 +1,7 @@
 """Packages of the wheel: `frontend/` is installed as `vio.frontend`.
 
-A checkout has `vio/frontend` as a link to it. Where git makes no links (Windows without developer mode), the folder is
-mapped here instead.
+A checkout has `vio/frontend` as a link to it. Where git makes no links (Windows without developer
+mode), the folder is mapped here instead.
 """
 
 from pathlib import Path

@@ -12,7 +12,8 @@ import vio
 
 left, right, calibration = map(Path, sys.argv[1:4])
 rate_hz = float(sys.argv[4]) if len(sys.argv) > 4 else 20.0
-# From numbers instead of a file: vio.Rig.raw(K0, K1, T_cam1_cam0, width, height, model="radtan", distortion0=..., ...)
+# From numbers instead of a file: vio.Rig.raw(K0, K1, T_cam1_cam0, width, height, model="radtan",
+# distortion0=..., ...)
 rig = vio.load_rig(calibration)
 odometry = vio.Odometry(rig, vio.load_config(overrides=["motion=none"]))
 
@@ -24,7 +25,8 @@ for k, name in enumerate(names):
     if any(image is None for image in pair):
         print(f"{name}: cannot be read")
         continue
-    estimate = odometry.add_stereo(round(k * 1e9 / rate_hz), *pair)  # raw images; they are rectified inside
+    # raw images; they are rectified inside
+    estimate = odometry.add_stereo(round(k * 1e9 / rate_hz), *pair)
     if estimate is not None:
         print(name, estimate.T_world_imu[:3, 3].round(4))
 odometry.finish()

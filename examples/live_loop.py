@@ -1,4 +1,5 @@
-"""Odometry beside the threads of a robot: an IMU driver, a camera driver and a controller that wants poses in between.
+"""Odometry beside the threads of a robot: an IMU driver, a camera driver and a controller that
+wants poses in between.
 
 python examples/live_loop.py RECORDING          # stands in for the drivers, in real time
 """
@@ -28,7 +29,8 @@ def imu_driver(live):
 
 def camera_driver(live):
     for pair in in_real_time(images):
-        live.add_stereo(pair.time_ns, pair.left, pair.right)  # copied, and processed by the odometry's own thread
+        # copied, and processed by the odometry's own thread
+        live.add_stereo(pair.time_ns, pair.left, pair.right)
 
 
 def controller(live):

@@ -1,4 +1,5 @@
-"""Features instead of images: run once, keep the features, and run the filter alone on them with other settings.
+"""Features instead of images: run once, keep the features, and run the filter alone on them with
+other settings.
 
 python examples/precomputed_features.py RECORDING
 """
@@ -15,7 +16,9 @@ dataset = vio.open_dataset(sys.argv[1])
 first = vio.run(dataset, config, keep_observations=True)
 
 with tempfile.TemporaryDirectory() as folder:
-    write_run_folder(Path(folder) / "run", first, dataset.recording.reference, save_observations=True)
+    write_run_folder(
+        Path(folder) / "run", first, dataset.recording.reference, save_observations=True
+    )
     features = vio.open_dataset(Path(folder) / "run" / "observations.npz")
     for clones in (5, 11, 20):
         again = vio.run(features, vio.load_config(overrides=[f"msckf.clones={clones}"]))

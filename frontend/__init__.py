@@ -1,4 +1,7 @@
-"""Front ends: stereo images to tracked observations. They use OpenCV; the filters of `vio` do not import them."""
+"""Front ends: stereo images to tracked observations.
+
+They use OpenCV; the filters of `vio` do not import them.
+"""
 
 from __future__ import annotations
 
@@ -13,31 +16,45 @@ from vio.protocols import Dataset, Frontend
 __all__ = ["BUILDERS", "FrontendSettings", "build_frontend", "one_opencv_thread"]
 
 
-def _build_klt(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
+def _build_klt(
+    camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None
+) -> Frontend:
     from vio.frontend.klt import KltFrontend
 
     return KltFrontend(camera, settings)
 
 
-def _build_orb(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
+def _build_orb(
+    camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None
+) -> Frontend:
     from vio.frontend.descriptors import DescriptorFrontend, MutualNearest, orb_extractor
 
-    return DescriptorFrontend(camera, settings, "orb", orb_extractor(settings.match), MutualNearest())
+    return DescriptorFrontend(
+        camera, settings, "orb", orb_extractor(settings.match), MutualNearest()
+    )
 
 
-def _build_sift(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
+def _build_sift(
+    camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None
+) -> Frontend:
     from vio.frontend.descriptors import DescriptorFrontend, MutualNearest, sift_extractor
 
-    return DescriptorFrontend(camera, settings, "sift", sift_extractor(settings.match), MutualNearest())
+    return DescriptorFrontend(
+        camera, settings, "sift", sift_extractor(settings.match), MutualNearest()
+    )
 
 
-def _build_kornia(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
+def _build_kornia(
+    camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None
+) -> Frontend:
     from vio.frontend.learned import build_learned
 
     return build_learned(camera, settings)
 
 
-def _build_precomputed(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
+def _build_precomputed(
+    camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None
+) -> Frontend:
     from vio.frontend.precomputed import PrecomputedFrontend
 
     if dataset is None:
@@ -57,7 +74,8 @@ _ONE_CAMERA = ("klt", "precomputed")
 
 @contextmanager
 def one_opencv_thread() -> Iterator[None]:
-    """Let OpenCV work in the caller's thread inside the block: waiting for helpers costs more than they save.
+    """Let OpenCV work in the caller's thread inside the block: waiting for helpers costs more than
+    they save.
 
     Measured on `klt`: 7 % of a run's CPU time at 752x480, and 4 % at 1242x375.
     """
@@ -74,20 +92,28 @@ def one_opencv_thread() -> Iterator[None]:
 def build_frontend(
     name: str, camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None = None
 ) -> Frontend:
-    """Build the front end called `name`; "auto" selects by what the recording contains, None being a live camera.
+    """Build the front end called `name`; "auto" selects by what the recording contains, None being
+    a live camera.
 
     Raises:
         ConfigError: no front end has this name, or camera or settings are of another kind.
     """
     if not isinstance(camera, StereoCamera) or not isinstance(settings, FrontendSettings):
         raise ConfigError(
-            f"build_frontend takes a StereoCamera and FrontendSettings, got {type(camera).__name__} and "
+            "build_frontend takes a StereoCamera and FrontendSettings, got "
+            f"{type(camera).__name__} and "
             f"{type(settings).__name__}"
         )
     if name == "auto":
         name = "klt" if dataset is None or dataset.recording.has_images else "precomputed"
     if name not in BUILDERS:
-        raise ConfigError(f"frontend.name: there is no front end {name!r}; choose one of auto, {', '.join(BUILDERS)}")
+        raise ConfigError(
+            f"frontend.name: there is no front end {name!r}; choose one of auto, "
+            f"{', '.join(BUILDERS)}"
+        )
     if camera.kind != "stereo" and name not in _ONE_CAMERA:
-        raise ConfigError(f"frontend.name: {name} needs a stereo pair; one camera takes {' or '.join(_ONE_CAMERA)}")
+        raise ConfigError(
+            f"frontend.name: {name} needs a stereo pair; one camera takes "
+            f"{' or '.join(_ONE_CAMERA)}"
+        )
     return BUILDERS[name](camera, settings, dataset)

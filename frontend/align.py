@@ -1,9 +1,11 @@
-"""Batched sub-pixel alignment of small templates, by Gauss-Newton over an affine warp, gain and offset.
+"""Batched sub-pixel alignment of small templates, by Gauss-Newton over an affine warp, gain and
+offset.
 
-The inverse-compositional form uses the gradients of the template in every iteration: an iteration costs one
-interpolation of the image under each template, and a template is prepared only once. A warp (2, 3) maps
-template offsets `[x, y, 1]` to image pixels `[u, v]`. Pixels count by a Gaussian window: what is at the rim may be at
-another depth. The loops over pixels are compiled; `tests/numpy_twins.py` holds the same alignment in NumPy.
+The inverse-compositional form uses the gradients of the template in every iteration: an iteration
+costs one interpolation of the image under each template, and a template is prepared only once. A
+warp (2, 3) maps template offsets `[x, y, 1]` to image pixels `[u, v]`. Pixels count by a Gaussian
+window: what is at the rim may be at another depth. The loops over pixels are compiled;
+`tests/numpy_twins.py` holds the same alignment in NumPy.
 Reference: Baker & Matthews, Lucas-Kanade 20 years on, IJCV (2004).
 """
 
@@ -26,14 +28,18 @@ _ROW_SIGMA_PX = 0.3  # standard deviation of a feature's row in the other image 
 _GRAY_SIGMA = 4.0  # standard deviation between the two images of one patch, after gain and offset
 _ROW_WEIGHT = (_GRAY_SIGMA / _ROW_SIGMA_PX) ** 2
 MAX_MOVE_PX = 2.5  # of a fitted pixel from its start; beyond, it has left the correlation peak
-_DONE_PX = 0.05  # step at which a template has converged; the remaining error is a small fraction of it
-_LEAST_SCORE, _MOST_SCORE = 0.1, 0.99999  # that a standard deviation is computed with
+# step at which a template has converged; the remaining error is a small fraction of it
+_DONE_PX = 0.05
+_LEAST_SCORE = 0.1  # that a standard deviation is computed with
+_MOST_SCORE = 0.99999
 _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
 _DAMPING = 1e-6  # relative to the diagonal: limits the step in weakly textured directions
 _WINDOW_SIGMA = 0.4  # standard deviation of the window over the radius of a template
-INSIDE = 2.0 * _WINDOW_SIGMA  # of the radius, up to which a template must be inside the image: most of its weight
-_SUBPIXELS = 32  # anchors are cut at multiples of this fraction of a pixel, where the weights of float32 are exact
+# of the radius, up to which a template must be inside the image: most of its weight
+INSIDE = 2.0 * _WINDOW_SIGMA
+# anchors are cut at multiples of this fraction of a pixel, where the weights of float32 are exact
+_SUBPIXELS = 32
 FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
 
 Pixels = npt.NDArray[np.float32]  # gray levels and what is computed from them
@@ -43,34 +49,51 @@ _PAIR = np.dtype("<u2")
 
 @dataclass(frozen=True, slots=True)
 class Templates:
-    """Discs prepared for alignment; S pixels each, those of `disc`, with the weights of `window`."""
+    """Discs prepared for alignment.
+
+    S pixels each, those of `disc`, with the weights of `window`.
+    """
 
     patch: npt.NDArray[np.float32]  # (N, S) weight times gray levels minus their weighted mean
     gradient: npt.NDArray[np.float32]  # (N, 2, S) weight times gradient along u and v
     energy: npt.NDArray[np.float32]  # (N,) weighted sum of squares of gray levels minus their mean
     inverse: npt.NDArray[np.float32]  # (N, 8, 8) of the normal matrix
     row_inverse: npt.NDArray[np.float32]  # (N, 6, 6) the same, with the expected row as a prior
-    sigma: npt.NDArray[np.float32]  # (N, 3) px, (F1) of the last alignment: of u, v, and u along a row; 0: none yet
+    # (N, 3) px, (F1) of the last alignment: of u, v, and u along a row; 0: none yet
+    sigma: npt.NDArray[np.float32]
 
 
 def empty_templates(count: int, radius: int) -> Templates:
     """Allocate `count` empty templates of a radius."""
     size = disc(radius).shape[1]
-    shapes = ((size,), (2, size), (), (_PARAMETERS, _PARAMETERS), (_ROW_PARAMETERS, _ROW_PARAMETERS), (3,))
+    shapes = (
+        (size,),
+        (2, size),
+        (),
+        (_PARAMETERS, _PARAMETERS),
+        (_ROW_PARAMETERS, _ROW_PARAMETERS),
+        (3,),
+    )
     return Templates(*(np.zeros((count, *shape), np.float32) for shape in shapes))
 
 
 @lru_cache(maxsize=8)
 def offsets(radius: int) -> Pixels:
-    """Offsets (2, (2r + 1)^2) `[x, y]` of the pixels of a square patch from its centre, row by row; read-only."""
-    out = np.mgrid[-radius : radius + 1, -radius : radius + 1][::-1].astype(np.float32).reshape(2, -1)
+    """Offsets (2, (2r + 1)^2) `[x, y]` of the pixels of a square patch from its centre, row by
+    row; read-only.
+    """
+    out = (
+        np.mgrid[-radius : radius + 1, -radius : radius + 1][::-1].astype(np.float32).reshape(2, -1)
+    )
     out.flags.writeable = False
     return out
 
 
 @lru_cache(maxsize=8)
 def disc(radius: int) -> Pixels:
-    """Offsets (2, S) `[x, y]` of the pixels of a template from its centre, row by row; read-only."""
+    """Offsets (2, S) `[x, y]` of the pixels of a template from its centre, row by row;
+    read-only.
+    """
     square = offsets(radius)
     out = np.ascontiguousarray(square[:, (square**2).sum(axis=0) <= (radius + 0.5) ** 2])
     out.flags.writeable = False
@@ -79,8 +102,12 @@ def disc(radius: int) -> Pixels:
 
 @lru_cache(maxsize=8)
 def window(radius: int) -> Pixels:
-    """Weights (S,) of a template's pixels, which sum to the number of independent pixels that they are worth."""
-    weight = np.exp(-0.5 * (disc(radius).astype(np.float64) ** 2).sum(axis=0) / (_WINDOW_SIGMA * radius) ** 2)
+    """Weights (S,) of a template's pixels, which sum to the number of independent pixels that
+    they are worth.
+    """
+    weight = np.exp(
+        -0.5 * (disc(radius).astype(np.float64) ** 2).sum(axis=0) / (_WINDOW_SIGMA * radius) ** 2
+    )
     out = (weight * weight.sum() / (weight @ weight)).astype(np.float32)
     out.flags.writeable = False
     return out
@@ -93,7 +120,9 @@ def _radius(size: int) -> int:
 
 
 def warped_patches(image: Image, warp: FloatArray, radius: int) -> Pixels:
-    """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's border is repeated."""
+    """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's
+    border is repeated.
+    """
     out = np.empty((len(warp), (2 * radius + 1) ** 2), dtype=np.float32)
     image = np.ascontiguousarray(image)
     _sample_all(image, _pairs(image), warp, offsets(radius), out)
@@ -101,14 +130,17 @@ def warped_patches(image: Image, warp: FloatArray, radius: int) -> Pixels:
 
 
 def _pairs(image: Image) -> Pairs:
-    """Each pixel of an image (H, W), row by row, and the next one, as one number; shares the image's memory."""
+    """Each pixel of an image (H, W), row by row, and the next one, as one number; shares the
+    image's memory.
+    """
     return np.ndarray(image.size - 1, _PAIR, image, strides=(1,))
 
 
 @compiled
 def _sample_all(image: Image, pairs: Pairs, warp: FloatArray, xy: Pixels, out: Pixels) -> None:
     size = xy.shape[1]
-    at, part = np.empty(size, np.int32), np.empty((2, size), np.float32)
+    at = np.empty(size, np.int32)
+    part = np.empty((2, size), np.float32)
     for n in range(len(warp)):
         _sample(image, pairs, warp[n], xy, at, part, out[n])
 
@@ -123,49 +155,73 @@ def _sample(
     part: Pixels,
     out: Pixels,
 ) -> None:
-    """Write the gray levels (S,) under one warp (2, 3) into `out`; `at` (S,) and `part` (2, S) are overwritten."""
+    """Write the gray levels (S,) under one warp (2, 3) into `out`; `at` (S,) and `part` (2, S)
+    are overwritten.
+    """
     height, width = image.shape
     radius = -xy[1, 0]
     reach_u = radius * (abs(warp[0, 0]) + abs(warp[0, 1]))
     reach_v = radius * (abs(warp[1, 0]) + abs(warp[1, 1]))
     # False also for a warp that is not finite.
-    if not (reach_u <= warp[0, 2] < width - 1.001 - reach_u and reach_v <= warp[1, 2] < height - 1.001 - reach_v):
+    if not (
+        reach_u <= warp[0, 2] < width - 1.001 - reach_u
+        and reach_v <= warp[1, 2] < height - 1.001 - reach_v
+    ):
         _sample_border(image, warp, xy, out)
         return
     # Pixels are counted from the patch's corner, where float32 is exact enough.
-    first_u, first_v = int(warp[0, 2] - reach_u), int(warp[1, 2] - reach_v)
-    u_x, u_y, u_1 = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[0, 2] - first_u)
-    v_x, v_y, v_1 = np.float32(warp[1, 0]), np.float32(warp[1, 1]), np.float32(warp[1, 2] - first_v)
+    first_u = int(warp[0, 2] - reach_u)
+    first_v = int(warp[1, 2] - reach_v)
+    u_x = np.float32(warp[0, 0])
+    u_y = np.float32(warp[0, 1])
+    u_1 = np.float32(warp[0, 2] - first_u)
+    v_x = np.float32(warp[1, 0])
+    v_y = np.float32(warp[1, 1])
+    v_1 = np.float32(warp[1, 2] - first_v)
     row = np.int32(width)
     for k in range(len(at)):
-        u, v = u_x * xy[0, k] + u_y * xy[1, k] + u_1, v_x * xy[0, k] + v_y * xy[1, k] + v_1
-        i, j = np.int32(u), np.int32(v)
-        part[0, k], part[1, k] = u - np.float32(i), v - np.float32(j)
+        u = u_x * xy[0, k] + u_y * xy[1, k] + u_1
+        v = v_x * xy[0, k] + v_y * xy[1, k] + v_1
+        i = np.int32(u)
+        j = np.int32(v)
+        part[0, k] = u - np.float32(i)
+        part[1, k] = v - np.float32(j)
         at[k] = np.int32(j * row) + i
     # Unsigned indices are not checked for being negative.
-    pixels, below_them = pairs[first_v * width + first_u :], pairs[(first_v + 1) * width + first_u :]
+    pixels = pairs[first_v * width + first_u :]
+    below_them = pairs[(first_v + 1) * width + first_u :]
     for k in range(len(at)):  # the four pixels in one number
         p = np.uint32(at[k])
         at[k] = np.int32(pixels[p]) | np.int32(below_them[p]) << np.int32(16)
     byte = np.int32(255)
     for k in range(len(at)):
         four = at[k]
-        a, b = np.float32(four & byte), np.float32(four >> np.int32(8) & byte)
-        c, d = np.float32(four >> np.int32(16) & byte), np.float32(four >> np.int32(24) & byte)
-        above, below = a + part[0, k] * (b - a), c + part[0, k] * (d - c)
+        a = np.float32(four & byte)
+        b = np.float32(four >> np.int32(8) & byte)
+        c = np.float32(four >> np.int32(16) & byte)
+        d = np.float32(four >> np.int32(24) & byte)
+        above = a + part[0, k] * (b - a)
+        below = c + part[0, k] * (d - c)
         out[k] = above + part[1, k] * (below - above)
 
 
 @compiled
 def _sample_border(image: Image, warp: FloatArray, xy: Pixels, out: Pixels) -> None:
-    """Write the gray levels (S,) under one warp (2, 3) into `out`, pixels outside the image from its border."""
+    """Write the gray levels (S,) under one warp (2, 3) into `out`, pixels outside the image from
+    its border.
+    """
     height, width = image.shape
     for k in range(len(out)):
         u = _clamped(warp[0, 0] * xy[0, k] + warp[0, 1] * xy[1, k] + warp[0, 2], width - 1.0)
         v = _clamped(warp[1, 0] * xy[0, k] + warp[1, 1] * xy[1, k] + warp[1, 2], height - 1.0)
-        i, j = min(int(u), width - 2), min(int(v), height - 2)
-        a, b, c, d = float(image[j, i]), float(image[j, i + 1]), float(image[j + 1, i]), float(image[j + 1, i + 1])
-        above, below = a + (u - i) * (b - a), c + (u - i) * (d - c)
+        i = min(int(u), width - 2)
+        j = min(int(v), height - 2)
+        a = float(image[j, i])
+        b = float(image[j, i + 1])
+        c = float(image[j + 1, i])
+        d = float(image[j + 1, i + 1])
+        above = a + (u - i) * (b - a)
+        below = c + (u - i) * (d - c)
         out[k] = above + (v - j) * (below - above)
 
 
@@ -178,7 +234,9 @@ def _clamped(value: float, most: float) -> float:
 
 
 def cut_patches(image: Image, centres: FloatArray, radius: int) -> Patches:
-    """Patches (N, 2r+3, 2r+3) around sub-pixel points (N, 2), one pixel wider than the template made of them."""
+    """Patches (N, 2r+3, 2r+3) around sub-pixel points (N, 2), one pixel wider than the template
+    made of them.
+    """
     side = 2 * radius + 3
     return warped_patches(image, shift_warps(centres), radius + 1).reshape(-1, side, side)
 
@@ -215,9 +273,12 @@ def _prepare(
     row_inverse: Pixels,
 ) -> None:
     """Write rows (N,) of the columns of templates."""
-    size, side = xy.shape[1], wide.shape[1]
-    basis, normal = np.empty((_PARAMETERS, size)), np.empty((_PARAMETERS, _PARAMETERS))
-    on_row, at = np.empty((_ROW_PARAMETERS, _ROW_PARAMETERS)), np.empty(size, np.int64)
+    size = xy.shape[1]
+    side = wide.shape[1]
+    basis = np.empty((_PARAMETERS, size))
+    normal = np.empty((_PARAMETERS, _PARAMETERS))
+    on_row = np.empty((_ROW_PARAMETERS, _ROW_PARAMETERS))
+    at = np.empty(size, np.int64)
     for k in range(size):
         at[k] = (side // 2 + int(xy[1, k])) * side + side // 2 + int(xy[0, k])
     for n, slot in enumerate(slots):
@@ -225,16 +286,28 @@ def _prepare(
         mean = _weighted_mean(pixels, at, weights)
         energy[slot] = 0.0
         for k in range(size):
-            x, y, weight, i = xy[0, k], xy[1, k], weights[k], at[k]
+            x = xy[0, k]
+            y = xy[1, k]
+            weight = weights[k]
+            i = at[k]
             centred = pixels[i] - mean
             gu = (pixels[i + 1] - pixels[i - 1]) / np.float32(2.0)
             gv = (pixels[i + side] - pixels[i - side]) / np.float32(2.0)
-            patch[slot, k], gradient[slot, 0, k], gradient[slot, 1, k] = weight * centred, weight * gu, weight * gv
+            patch[slot, k] = weight * centred
+            gradient[slot, 0, k] = weight * gu
+            gradient[slot, 1, k] = weight * gv
             energy[slot] += weight * centred * centred
             root = np.sqrt(weight)
-            gu, gv = root * gu, root * gv
-            basis[0, k], basis[1, k], basis[2, k], basis[3, k] = gu, gv, root * centred, root
-            basis[4, k], basis[5, k], basis[6, k], basis[7, k] = gu * x, gu * y, gv * x, gv * y
+            gu = root * gu
+            gv = root * gv
+            basis[0, k] = gu
+            basis[1, k] = gv
+            basis[2, k] = root * centred
+            basis[3, k] = root
+            basis[4, k] = gu * x
+            basis[5, k] = gu * y
+            basis[6, k] = gv * x
+            basis[7, k] = gv * y
         for i in range(_PARAMETERS):
             for j in range(i + 1):
                 normal[i, j] = _product(basis[i], basis[j])
@@ -281,13 +354,14 @@ def align(
         image: the image to align with.
         warp: initial warps (N, 2, 3).
         iterations: largest number of iterations.
-        rows: expected image rows (N,) of the centres, as in the other image of a rectified pair: the expected
-            row acts as a prior on the centre, and the warp shears and stretches along rows only.
+        rows: expected image rows (N,) of the centres, as in the other image of a rectified pair:
+            the expected row acts as a prior on the centre, and the warp shears and stretches along
+            rows only.
 
     Returns:
-        The refined warps (N, 2, 3), and the normalised correlation (N,) just before the last step; -1 where the
-        template's centre comes too close to the image border for most of the window to fit. `store.sigma` holds the
-        standard deviations then, equation (F1).
+        The refined warps (N, 2, 3), and the normalised correlation (N,) just before the last step;
+        -1 where the template's centre comes too close to the image border for most of the window to
+        fit. `store.sigma` holds the standard deviations then, equation (F1).
     """
     radius = _radius(store.patch.shape[1])
     warp, score = warp.copy(), np.empty(len(warp))
@@ -295,7 +369,18 @@ def align(
     expected = score if rows is None else rows  # not read without a weight
     columns = store.patch, store.gradient, store.energy, inverse, disc(radius), window(radius)
     image = np.ascontiguousarray(image)
-    _refine(*columns, slots, image, _pairs(image), warp, expected, row_weight, iterations, score, store.sigma)
+    _refine(
+        *columns,
+        slots,
+        image,
+        _pairs(image),
+        warp,
+        expected,
+        row_weight,
+        iterations,
+        score,
+        store.sigma,
+    )
     return warp, score
 
 
@@ -317,13 +402,22 @@ def _refine(
     score: FloatArray,
     sigma: Pixels,
 ) -> None:
-    """Refine the warps (N, 2, 3) in place; write the correlations (N,) into `score` and rows (N,) of `sigma` (M, 3)."""
-    pixels, parameters, size = patch.shape[1], inverse.shape[1], 0.0
+    """Refine the warps (N, 2, 3) in place; write the correlations (N,) into `score` and rows
+    (N,) of `sigma` (M, 3).
+    """
+    pixels = patch.shape[1]
+    parameters = inverse.shape[1]
+    size = 0.0
     for k in range(pixels):
         size += weights[k]
-    margin, last_u, last_v = 1.0 - INSIDE * xy[1, 0], image.shape[1] - 1.0, image.shape[0] - 1.0
-    at, part, view = np.empty(pixels, np.int32), np.empty((2, pixels), np.float32), np.empty(pixels, np.float32)
-    moments, fit = np.empty(_PARAMETERS, np.float32), np.empty(_PARAMETERS)
+    margin = 1.0 - INSIDE * xy[1, 0]
+    last_u = image.shape[1] - 1.0
+    last_v = image.shape[0] - 1.0
+    at = np.empty(pixels, np.int32)
+    part = np.empty((2, pixels), np.float32)
+    view = np.empty(pixels, np.float32)
+    moments = np.empty(_PARAMETERS, np.float32)
+    fit = np.empty(_PARAMETERS)
     for i in range(_PARAMETERS):
         fit[i] = 0.0
     for n, slot in enumerate(slots):
@@ -339,7 +433,8 @@ def _refine(
                 fit[i] = 0.0
                 for j in range(parameters):
                     fit[i] += inverse[slot, i, j] * moments[j]
-            # The image under the current warp is gain * template(step(x)) + offset, so the inverse step is applied.
+            # The image under the current warp is gain * template(step(x)) + offset, so the inverse
+            # step is applied.
             gain = max(fit[2], 0.1)
             for i in range(parameters):
                 fit[i] /= gain
@@ -351,24 +446,37 @@ def _refine(
         if row_weight > 0.0:
             sigma[slot, 2] = np.sqrt(gray2 * inverse[slot, 0, 0])
         else:
-            sigma[slot, 0], sigma[slot, 1] = np.sqrt(gray2 * inverse[slot, 0, 0]), np.sqrt(gray2 * inverse[slot, 1, 1])
-        u, v = warp[n, 0, 2], warp[n, 1, 2]
+            sigma[slot, 0] = np.sqrt(gray2 * inverse[slot, 0, 0])
+            sigma[slot, 1] = np.sqrt(gray2 * inverse[slot, 1, 1])
+        u = warp[n, 0, 2]
+        v = warp[n, 1, 2]
         if not (margin <= u <= last_u - margin and margin <= v <= last_v - margin):
             score[n] = -1.0
 
 
 @compiled_sums
-def _moments(patch: Pixels, gradient: Pixels, weights: Pixels, view: Pixels, xy: Pixels, out: Pixels) -> np.float32:
+def _moments(
+    patch: Pixels, gradient: Pixels, weights: Pixels, view: Pixels, xy: Pixels, out: Pixels
+) -> np.float32:
     """Write the weighted products (8,) of pixels (S,) with the derivatives by the parameters.
 
     Returns:
         The weighted sum of their squares.
     """
     zero = np.float32(0.0)
-    u, v, like, total, u_x, u_y, v_x, v_y, square = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    u = zero
+    v = zero
+    like = zero
+    total = zero
+    u_x = zero
+    u_y = zero
+    v_x = zero
+    v_y = zero
+    square = zero
     for k in range(len(view)):
         gray = view[k]
-        gu, gv = gradient[0, k] * gray, gradient[1, k] * gray
+        gu = gradient[0, k] * gray
+        gv = gradient[1, k] * gray
         u += gu
         v += gv
         u_x += xy[0, k] * gu
@@ -379,14 +487,22 @@ def _moments(patch: Pixels, gradient: Pixels, weights: Pixels, view: Pixels, xy:
         weighted = weights[k] * gray
         total += weighted
         square += weighted * gray
-    out[0], out[1], out[2], out[3] = u, v, like, total
-    out[4], out[5], out[6], out[7] = u_x, u_y, v_x, v_y
+    out[0] = u
+    out[1] = v
+    out[2] = like
+    out[3] = total
+    out[4] = u_x
+    out[5] = u_y
+    out[6] = v_x
+    out[7] = v_y
     return square
 
 
 @compiled
 def _undo(warp: FloatArray, fit: FloatArray) -> None:
-    """Apply the inverse of the step `x -> (I + linear) x + shift` to a warp (2, 3) in place; parameters (8,)."""
+    """Apply the inverse of the step `x -> (I + linear) x + shift` to a warp (2, 3) in place;
+    parameters (8,).
+    """
     du = min(max(fit[0], -_MAX_STEP_PX), _MAX_STEP_PX)
     dv = min(max(fit[1], -_MAX_STEP_PX), _MAX_STEP_PX)
     a = 1.0 + min(max(fit[4], -_MAX_LINEAR_STEP), _MAX_LINEAR_STEP)
@@ -395,14 +511,18 @@ def _undo(warp: FloatArray, fit: FloatArray) -> None:
     d = 1.0 + min(max(fit[7], -_MAX_LINEAR_STEP), _MAX_LINEAR_STEP)
     det = a * d - b * c
     for i in range(2):
-        x, y = (warp[i, 0] * d - warp[i, 1] * c) / det, (warp[i, 1] * a - warp[i, 0] * b) / det
-        warp[i, 0], warp[i, 1] = x, y
+        x = (warp[i, 0] * d - warp[i, 1] * c) / det
+        y = (warp[i, 1] * a - warp[i, 0] * b) / det
+        warp[i, 0] = x
+        warp[i, 1] = y
         warp[i, 2] -= x * du + y * dv
 
 
 @compiled
 def _correlation(energy: float, product: float, other: float, size: float) -> float:
-    """Normalised correlation of a patch of known energy with pixels of energy `other`; -1 if either is flat."""
+    """Normalised correlation of a patch of known energy with pixels of energy `other`; -1 if
+    either is flat.
+    """
     flat = FLAT_RMS**2 * size
     if not (other > flat and energy > flat):
         return -1.0
@@ -410,7 +530,9 @@ def _correlation(energy: float, product: float, other: float, size: float) -> fl
 
 
 def shift_warps(centres: FloatArray) -> FloatArray:
-    """Warps (N, 2, 3) that put the template's centre at image points (N, 2), without rotation or scale."""
+    """Warps (N, 2, 3) that put the template's centre at image points (N, 2), without rotation or
+    scale.
+    """
     warp = np.zeros((len(centres), 2, 3))
     warp[:, 0, 0] = warp[:, 1, 1] = 1.0
     warp[:, :, 2] = centres
@@ -418,7 +540,9 @@ def shift_warps(centres: FloatArray) -> FloatArray:
 
 
 def on_peak(pixels: FloatArray, start: FloatArray) -> BoolArray:
-    """Mask (N,) of fitted pixels (N, 2) near their start (N, 2); others have left the correlation peak."""
+    """Mask (N,) of fitted pixels (N, 2) near their start (N, 2); others have left the
+    correlation peak.
+    """
     moved = np.abs(pixels - start) <= MAX_MOVE_PX
     return moved[:, 0] & moved[:, 1]
 
@@ -430,11 +554,15 @@ def is_on_peak(du: float, dv: float) -> bool:
 
 
 def template_points(warp: FloatArray, offset: FloatArray) -> FloatArray:
-    """Image points (N, 2) of template points, given as offsets (N, 2) from the centre, under warps (N, 2, 3)."""
+    """Image points (N, 2) of template points, given as offsets (N, 2) from the centre, under
+    warps (N, 2, 3).
+    """
     return np.asarray(warp[:, :, 2] + (warp[:, :, :2] @ offset[:, :, None])[:, :, 0])
 
 
 def scale_change(warp: FloatArray) -> FloatArray:
-    """Scale (N,) of warps (N, 2, 3): the square root of the change of area; tiny where the warp is mirrored."""
+    """Scale (N,) of warps (N, 2, 3): the square root of the change of area; tiny where the warp
+    is mirrored.
+    """
     A = warp[:, :, :2]
     return np.sqrt(np.maximum(A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0], 1e-6))

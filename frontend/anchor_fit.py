@@ -1,4 +1,6 @@
-"""Alignment of the features with their anchors in the left image, which does not drift as Lucas-Kanade does."""
+"""Alignment of the features with their anchors in the left image, which does not drift as
+Lucas-Kanade does.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ class AnchorFit:
 
     def __init__(self, camera: StereoCamera, grid: GridSettings, bank: AnchorBank) -> None:
         """Prepare; the bank contains the features' anchors."""
-        self._camera, self._grid, self._bank = camera, grid, bank
+        self._camera = camera
+        self._grid = grid
+        self._bank = bank
 
     def track(
         self,
@@ -42,8 +46,9 @@ class AnchorFit:
     ) -> Tracks:
         """Align the features with their anchors; return those kept, with their new pixels.
 
-        Features that Lucas-Kanade lost are searched at the pixels predicted by the consensus motion. Features that were
-        found, but differ from their anchor, get a new anchor from the previous frame.
+        Features that Lucas-Kanade lost are searched at the pixels predicted by the consensus
+        motion. Features that were found, but differ from their anchor, get a new anchor from the
+        previous frame.
 
         Args:
             old: features of the previous frame.
@@ -53,21 +58,30 @@ class AnchorFit:
             seen: mask (N,) of the static features that it found.
             motion: consensus motion since the previous frame, if there is one.
         """
-        camera, (height, width) = camera_args(self._camera), left.full.shape
+        camera = camera_args(self._camera)
+        (height, width) = left.full.shape
         T = np.eye(4) if motion is None else motion.T_curr_prev
         point = old.point if motion is None else transform_points(T, old.point)
-        rows, start, scale = np.empty(len(old), np.int64), np.empty((len(old), 2)), np.empty(len(old))
+        rows = np.empty(len(old), np.int64)
+        start = np.empty((len(old), 2))
+        scale = np.empty(len(old))
         view = old.left, old.point, old.has_point, point, found, seen
         count = _begin(camera, T, motion is not None, width, height, *view, rows, start, scale)
-        rows, start, scale = rows[:count], start[:count], scale[:count]
-        warp, slots = old.warp.take(rows, axis=0), old.slot.take(rows)
+        rows = rows[:count]
+        start = start[:count]
+        scale = scale[:count]
+        warp = old.warp.take(rows, axis=0)
+        slots = old.slot.take(rows)
         warp[:, :, :2] *= scale[:, None, None]
         warp[:, :, 2] = start
         warp, score = align(self._bank.store, slots, left.full, warp, _ITERATIONS)
         change = scale_change(warp)
         change = np.maximum(change, 1.0 / change)
-        good = (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start) & (change <= 2 * _MAX_SCALE)
-        kept, has_point = good.copy(), old.has_point.copy()
+        good = (
+            (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start) & (change <= 2 * _MAX_SCALE)
+        )
+        kept = good.copy()
+        has_point = old.has_point.copy()
         retry = (~good & seen[rows] & (score >= _ANCHOR_LOST)).nonzero()[0]
         if len(retry):
             again = old.left.take(rows[retry], axis=0), slots[retry], start[retry], scale[retry]
@@ -77,7 +91,9 @@ class AnchorFit:
             _reject_deviating(camera, T, old.point, old.has_right, rows, warp, has_point, kept)
         _reject_crowded(warp, distance, kept)
         chosen = kept.nonzero()[0]
-        rows, slots, warp = rows[chosen], slots[chosen], warp.take(chosen, axis=0)
+        rows = rows[chosen]
+        slots = slots[chosen]
+        warp = warp.take(chosen, axis=0)
         rescaled = (good & (change > _MAX_SCALE))[chosen]
         if rescaled.any():
             centres = rounded(warp[rescaled, :, 2])
@@ -107,7 +123,8 @@ class AnchorFit:
         start: FloatArray,
         scale: FloatArray,
     ) -> tuple[FloatArray, BoolArray]:
-        """Align features with a new anchor from the previous frame; return warps (N, 2, 3) and a mask (N,).
+        """Align features with a new anchor from the previous frame; return warps (N, 2, 3) and a
+        mask (N,).
 
         Args:
             before: left image of the previous frame.
@@ -146,13 +163,17 @@ def _begin(
 ) -> int:
     """Write which of the previous frame's features are aligned, and return their number K.
 
-    Written are their rows (K,), the left pixels (K, 2) to start from, and the predicted changes of scale (K,). These
-    are `found` (N, 2) where `seen`; with a consensus motion T (4, 4) (`moved`), others with a point are at the pixels
-    where it takes that. Points (N, 3) are those before and after the motion.
+    Written are their rows (K,), the left pixels (K, 2) to start from, and the predicted changes of
+    scale (K,). These are `found` (N, 2) where `seen`; with a consensus motion T (4, 4) (`moved`),
+    others with a point are at the pixels where it takes that. Points (N, 3) are those before and
+    after the motion.
     """
-    count, margin = 0, ANCHOR_REACH_PX + 2.0
+    count = 0
+    margin = ANCHOR_REACH_PX + 2.0
     for n in range(len(left)):
-        u, v, change = found[n, 0], found[n, 1], 1.0
+        u = found[n, 0]
+        v = found[n, 1]
+        change = 1.0
         if moved and has_point[n]:
             depth = turn_to(camera, point[n, 1], point[n, 2])[4]
             if depth > _MIN_DEPTH_M:
@@ -162,10 +183,14 @@ def _begin(
                 continue
             u, v, depth = moved_pixel(camera, T, old_point[n, 0], old_point[n, 1], old_point[n, 2])
             if not depth > _MIN_DEPTH_M:
-                u, v = left[n, 0], left[n, 1]
+                u = left[n, 0]
+                v = left[n, 1]
             if not (margin <= u <= width - 1 - margin and margin <= v <= height - 1 - margin):
                 continue
-        rows[count], start[count, 0], start[count, 1], scale[count] = n, u, v, change
+        rows[count] = n
+        start[count, 0] = u
+        start[count, 1] = v
+        scale[count] = change
         count += 1
     return count
 
@@ -181,13 +206,16 @@ def _reject_deviating(
     has_point: BoolArray,
     kept: BoolArray,
 ) -> None:
-    """Clear the mask (K,) of aligned features that are not where a motion (4, 4) takes their points (N, 3).
+    """Clear the mask (K,) of aligned features that are not where a motion (4, 4) takes their points
+    (N, 3).
 
-    A point whose depth was propagated without a measurement is dropped in place of its feature: `has_point` (N,).
+    A point whose depth was propagated without a measurement is dropped in place of its feature:
+    `has_point` (N,).
     """
     for k, n in enumerate(rows):
         u, v, depth = moved_pixel(camera, T, point[n, 0], point[n, 1], point[n, 2])
-        du, dv = u - warp[k, 0, 2], v - warp[k, 1, 2]
+        du = u - warp[k, 0, 2]
+        dv = v - warp[k, 1, 2]
         if not depth > _NEAREST_M or np.sqrt(du * du + dv * dv) > INLIER_PX:
             kept[k] &= not (has_point[n] and has_right[n])
             has_point[n] = False
@@ -195,11 +223,14 @@ def _reject_deviating(
 
 @compiled
 def _reject_crowded(warp: FloatArray, distance: float, kept: BoolArray) -> None:
-    """Clear the mask (K,) of features closer than a distance, in the maximum norm, to an earlier one that has it."""
+    """Clear the mask (K,) of features closer than a distance, in the maximum norm, to an earlier
+    one that has it.
+    """
     given = kept.copy()
     for n in range(len(kept)):
         for m in range(n if given[n] else 0):
-            du, dv = warp[n, 0, 2] - warp[m, 0, 2], warp[n, 1, 2] - warp[m, 1, 2]
+            du = warp[n, 0, 2] - warp[m, 0, 2]
+            dv = warp[n, 1, 2] - warp[m, 1, 2]
             if given[m] and abs(du) < distance and abs(dv) < distance:
                 kept[n] = False
                 break

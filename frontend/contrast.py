@@ -19,11 +19,14 @@ class LostContrast(ImageCheck):
 
     def inspect(self, images: FrameImages) -> FrameImages | None:
         """Skip a frame without contrast where the previous one had some."""
-        previous, before = images.previous, self._skipped
+        previous = images.previous
+        before = self._skipped
         self._skipped = 0
         if previous is None or len(previous.tracks) == 0 or before >= _MAX_FRAMES:
             return images
-        now, last = (mean_and_contrast(view.half, _STRIDE)[1] for view in (images.left, previous.left))
+        now, last = (
+            mean_and_contrast(view.half, _STRIDE)[1] for view in (images.left, previous.left)
+        )
         if now >= _LOST_SHARE * last:
             return images
         self._skipped = before + 1

@@ -1,4 +1,6 @@
-"""Front ends that detect key points in every image and match them by descriptor, in time and from left to right."""
+"""Front ends that detect key points in every image and match them by descriptor, in time and
+from left to right.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,15 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from vio.frontend.align import align, cut_patches, on_peak, rounded, shift_warps, template_points, templates
+from vio.frontend.align import (
+    align,
+    cut_patches,
+    on_peak,
+    rounded,
+    shift_warps,
+    template_points,
+    templates,
+)
 from vio.frontend.columns import joined, take
 from vio.frontend.detect import spread_evenly
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output
@@ -29,7 +39,8 @@ Vectors: TypeAlias = npt.NDArray[np.float32]
 Descriptors: TypeAlias = Vectors | npt.NDArray[np.uint8]
 
 _MAX_RATIO = 0.8  # of a descriptor's distance to that of the second-nearest
-_SEARCH_RADIUS = 0.06  # half side of the search window around the predicted pixel, over the image width
+# half side of the search window around the predicted pixel, over the image width
+_SEARCH_RADIUS = 0.06
 _MAX_ROW_DIFFERENCE_PX = 1.5  # of a stereo match
 _INLIER_PX = 1.5  # largest reprojection error of a static feature under the consensus motion
 _REFINE_ITERATIONS = 6
@@ -62,14 +73,17 @@ class Matcher(Protocol):
     """Pairs key points of two images."""
 
     def __call__(self, a: Keypoints, b: Keypoints, allowed: BoolArray) -> IntArray:
-        """Return pairs (K, 2) of rows of `a` and `b`; only pairs in `allowed` (N, M), no row twice."""
+        """Return pairs (K, 2) of rows of `a` and `b`; only pairs in `allowed` (N, M), no row
+        twice.
+        """
 
 
 @dataclass(frozen=True, slots=True)
 class MutualNearest:
     """Mutual nearest neighbours among the allowed pairs that pass the ratio test.
 
-    Reference: Lowe, Distinctive image features from scale-invariant keypoints, IJCV (2004), section 7.1.
+    Reference: Lowe, Distinctive image features from scale-invariant keypoints, IJCV (2004), section
+    7.1.
     """
 
     ratio: float = _MAX_RATIO  # largest distance over that of the second-nearest
@@ -78,14 +92,18 @@ class MutualNearest:
         """Return pairs (K, 2); see `Matcher`."""
         if len(a) == 0 or len(b) == 0:
             return np.zeros((0, 2), dtype=np.int64)
-        best, good = np.empty(len(a), dtype=np.int64), np.empty(len(a), dtype=np.bool_)
-        bits, ratio = a.descriptors.dtype == np.uint8, np.float32(self.ratio)
+        best = np.empty(len(a), dtype=np.int64)
+        good = np.empty(len(a), dtype=np.bool_)
+        bits = a.descriptors.dtype == np.uint8
+        ratio = np.float32(self.ratio)
         _nearest(_vectors(a.descriptors), _vectors(b.descriptors), bits, allowed, ratio, best, good)
         return np.stack([good.nonzero()[0], best[good]], axis=1)
 
 
 def _vectors(descriptors: Descriptors) -> Vectors:
-    """Vectors (N, D) whose products give the distances: the descriptors, or -1 and 1 for the bits of bytes."""
+    """Vectors (N, D) whose products give the distances: the descriptors, or -1 and 1 for the
+    bits of bytes.
+    """
     if descriptors.dtype != np.uint8:
         return np.ascontiguousarray(descriptors, dtype=np.float32)
     return 2 * np.unpackbits(descriptors.astype(np.uint8), axis=1).astype(np.float32) - 1
@@ -93,16 +111,27 @@ def _vectors(descriptors: Descriptors) -> Vectors:
 
 @compiled
 def _nearest(
-    a: Vectors, b: Vectors, bits: bool, allowed: BoolArray, ratio: np.float32, best: IntArray, good: BoolArray
+    a: Vectors,
+    b: Vectors,
+    bits: bool,
+    allowed: BoolArray,
+    ratio: np.float32,
+    best: IntArray,
+    good: BoolArray,
 ) -> None:
-    """Write the nearest of the allowed rows of b (M, D) for each of a (N, D), and whether it is a match.
+    """Write the nearest of the allowed rows of b (M, D) for each of a (N, D), and whether it is a
+    match.
 
-    The distance is Euclidean for unit vectors, Hamming for `bits`. Of equal distances the first one counts.
+    The distance is Euclidean for unit vectors, Hamming for `bits`. Of equal distances the first one
+    counts.
     """
-    size, far = np.float32(a.shape[1]), np.float32(np.inf)
-    least, back = np.empty(len(b), np.float32), np.empty(len(b), np.int64)
+    size = np.float32(a.shape[1])
+    far = np.float32(np.inf)
+    least = np.empty(len(b), np.float32)
+    back = np.empty(len(b), np.int64)
     for j in range(len(b)):
-        least[j], back[j] = far, -1
+        least[j] = far
+        back[j] = -1
     for i in range(len(a)):
         first = second = far
         best[i] = 0
@@ -113,13 +142,16 @@ def _nearest(
             if bits:
                 distance = np.float32(0.5) * (size - product)
             else:
-                distance = np.sqrt(max(np.float32(2.0) - np.float32(2.0) * product, np.float32(0.0)))
+                distance = np.sqrt(
+                    max(np.float32(2.0) - np.float32(2.0) * product, np.float32(0.0))
+                )
             if distance < first:
                 first, second, best[i] = distance, first, j
             elif distance < second:
                 second = distance
             if distance < least[j]:
-                least[j], back[j] = distance, i
+                least[j] = distance
+                back[j] = i
         good[i] = first < far and first <= ratio * second
     for i in range(len(a)):
         good[i] &= back[best[i]] == i
@@ -146,25 +178,36 @@ class OpenCvExtractor:
 
     def _keypoints(self, image: Image) -> Keypoints:
         found, descriptors = self.engine.detectAndCompute(image, None)
-        described = np.zeros((0, 32), dtype=np.uint8) if descriptors is None else np.asarray(descriptors)
+        described = (
+            np.zeros((0, 32), dtype=np.uint8) if descriptors is None else np.asarray(descriptors)
+        )
         values = np.array([(*k.pt, k.response) for k in found], dtype=np.float64).reshape(-1, 3)
         order = np.lexsort((values[:, 1], values[:, 0], -values[:, 2]))
-        pixels, described = values[order, :2], described[order]
+        pixels = values[order, :2]
+        described = described[order]
         if self.name == "orb":
             return Keypoints(pixels, described.astype(np.uint8))
-        # Root-SIFT. Reference: Arandjelovic & Zisserman, Three things everyone should know, CVPR (2012).
+        # Root-SIFT. Reference: Arandjelovic & Zisserman, Three things everyone should know, CVPR
+        # (2012).
         unit = described.astype(np.float32)
         return Keypoints(pixels, np.sqrt(unit / np.maximum(unit.sum(axis=1, keepdims=True), 1e-6)))
 
 
 def orb_extractor(settings: MatchSettings) -> OpenCvExtractor:
     """ORB. Reference: Rublee et al., ORB: an efficient alternative to SIFT or SURF, ICCV (2011)."""
-    return OpenCvExtractor(cv2.ORB.create(nfeatures=settings.max_keypoints, fastThreshold=10), "orb")
+    return OpenCvExtractor(
+        cv2.ORB.create(nfeatures=settings.max_keypoints, fastThreshold=10), "orb"
+    )
 
 
 def sift_extractor(settings: MatchSettings) -> OpenCvExtractor:
-    """SIFT. Reference: Lowe, Distinctive image features from scale-invariant keypoints, IJCV (2004)."""
-    return OpenCvExtractor(cv2.SIFT.create(nfeatures=settings.max_keypoints, contrastThreshold=0.02), "sift")
+    """SIFT.
+
+    Reference: Lowe, Distinctive image features from scale-invariant keypoints, IJCV (2004).
+    """
+    return OpenCvExtractor(
+        cv2.SIFT.create(nfeatures=settings.max_keypoints, contrastThreshold=0.02), "sift"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,10 +250,17 @@ class DescriptorFrontend:
     """
 
     def __init__(
-        self, camera: StereoCamera, settings: FrontendSettings, name: str, extract: Extractor, match: Matcher
+        self,
+        camera: StereoCamera,
+        settings: FrontendSettings,
+        name: str,
+        extract: Extractor,
+        match: Matcher,
     ) -> None:
         self._camera = camera
-        self._grid, self._disparity, self._seed = settings.grid, settings.disparity, settings.consensus.seed
+        self._grid = settings.grid
+        self._disparity = settings.disparity
+        self._seed = settings.consensus.seed
         self._extract = extract
         self._match = match
         self._validator = FrameValidator(camera, name)
@@ -223,7 +273,10 @@ class DescriptorFrontend:
         watch = Stopwatch()
         images = self._validator.validate(frame)
         watch.lap("prepare")
-        left, right = (take(points, inside(images[0], points.pixels, _BORDER_PX)) for points in self._extract(*images))
+        left, right = (
+            take(points, inside(images[0], points.pixels, _BORDER_PX))
+            for points in self._extract(*images)
+        )
         watch.lap("extract")
         pair = self._stereo(left, right, images)
         watch.lap("stereo")
@@ -242,21 +295,32 @@ class DescriptorFrontend:
         watch.lap("check")
         return make_output(frame, tracks, tracked, watch)
 
-    # --- left and right -----------------------------------------------------------------------------------------------
+    # --- left and right
+    # -----------------------------------------------------------------------------------------------
 
     def _allowed(self, left: Keypoints, right: Keypoints, width: int) -> BoolArray:
         """Pairs (N, M) near one row with a disparity in range."""
         allowed = np.empty((len(left), len(right)), dtype=np.bool_)
-        _on_row(left.pixels, np.ascontiguousarray(right.pixels.T), self._disparity.max_disparity * width, allowed)
+        _on_row(
+            left.pixels,
+            np.ascontiguousarray(right.pixels.T),
+            self._disparity.max_disparity * width,
+            allowed,
+        )
         return allowed
 
-    def _stereo(self, left: Keypoints, right: Keypoints, views: tuple[Image, Image]) -> _MatchedKeypoints:
+    def _stereo(
+        self, left: Keypoints, right: Keypoints, views: tuple[Image, Image]
+    ) -> _MatchedKeypoints:
         """Match the key points of the left image into the right one."""
-        right_pixels, has_right = np.zeros((len(left), 2)), np.zeros(len(left), dtype=np.bool_)
+        right_pixels = np.zeros((len(left), 2))
+        has_right = np.zeros(len(left), dtype=np.bool_)
         pairs = self._match(left, right, self._allowed(left, right, views[0].shape[1]))
         rows = pairs[:, 0]
         target = right.pixels[pairs[:, 1]]
-        right_pixels[rows], alike = self._refine(views[0], left.pixels[rows], views[1], target, target[:, 1])
+        right_pixels[rows], alike = self._refine(
+            views[0], left.pixels[rows], views[1], target, target[:, 1]
+        )
         disparity = left.pixels[rows, 0] - right_pixels[rows, 0]
         has_right[rows] = alike & (disparity >= MIN_MATCH_DISPARITY_PX)
         return _MatchedKeypoints(left, right_pixels, has_right)
@@ -269,41 +333,60 @@ class DescriptorFrontend:
         start: FloatArray,
         rows: FloatArray | None = None,
     ) -> tuple[FloatArray, BoolArray]:
-        """Align the patches around source points with the target; return pixels (N, 2) and a mask (N,) of good fits."""
+        """Align the patches around source points with the target; return pixels (N, 2) and a
+        mask (N,) of good fits.
+        """
         if len(points) == 0:
             return start, np.ones(len(start), dtype=np.bool_)
         centres = rounded(points)
         offset = points - centres
-        store, slots = templates(cut_patches(source, centres, ANCHOR_RADIUS_PX)), np.arange(len(points))
-        warp, score = align(store, slots, target, shift_warps(start - offset), _REFINE_ITERATIONS, rows)
+        store = templates(cut_patches(source, centres, ANCHOR_RADIUS_PX))
+        slots = np.arange(len(points))
+        warp, score = align(
+            store, slots, target, shift_warps(start - offset), _REFINE_ITERATIONS, rows
+        )
         pixels = template_points(warp, offset)
         good = (score >= _REFINE_MIN_CORRELATION) & on_peak(pixels, start)
         return np.where(good[:, None], pixels, start), good
 
-    # --- tracking in time ---------------------------------------------------------------------------------------------
+    # --- tracking in time
+    # ---------------------------------------------------------------------------------------------
 
     def _track(
         self, frame: StereoFrame, pair: _MatchedKeypoints, view: Image, prior: TrackPrior | None
     ) -> tuple[_Tracks, FloatArray, BoolArray]:
-        """Match the previous tracks to key points; return tracks, motion per second, and the mask of used points."""
-        previous, used = self._previous, np.zeros(len(pair.keypoints), dtype=np.bool_)
+        """Match the previous tracks to key points; return tracks, motion per second, and the
+        mask of used points.
+        """
+        previous = self._previous
+        used = np.zeros(len(pair.keypoints), dtype=np.bool_)
         if previous is None or len(previous.tracks) == 0:
             nothing = np.zeros(0, dtype=np.int64)
             empty = _Tracks(
-                nothing, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), take(pair.keypoints, nothing)
+                nothing,
+                np.zeros((0, 2)),
+                np.zeros((0, 2)),
+                np.zeros(0, np.bool_),
+                take(pair.keypoints, nothing),
             )
             return empty, np.zeros(6) if previous is None else previous.twist_per_s, used
-        old, left = previous.tracks, pair.keypoints.pixels
+        old = previous.tracks
+        left = pair.keypoints.pixels
         seconds = (frame.time_ns - previous.time_ns) * 1e-9
         expected = se3_exp(previous.twist_per_s * seconds)
         p_prev, has_depth = triangulate(self._camera, np.concatenate([old.left, old.right], axis=1))
         has_depth &= old.has_right
         far = left_rays(self._camera, old.left) * _FAR_M
         guess = self._guess(old, np.where(has_depth[:, None], p_prev, far), expected, prior)
-        pairs = self._match(old.keypoints, pair.keypoints, self._near_guess(old, guess, left, view.shape[1]))
-        rows, found = pairs[:, 0], pairs[:, 1]
+        pairs = self._match(
+            old.keypoints, pair.keypoints, self._near_guess(old, guess, left, view.shape[1])
+        )
+        rows = pairs[:, 0]
+        found = pairs[:, 1]
         pixels, alike = self._refine(previous.left, old.left[rows], view, left[found])
-        rows, found, pixels = rows[alike], found[alike], pixels[alike]
+        rows = rows[alike]
+        found = found[alike]
+        pixels = pixels[alike]
         R_prior = T_prior = None
         if prior is not None:
             named, predicted = prior_pixels(old.ids[has_depth], prior)
@@ -311,23 +394,40 @@ class DescriptorFrontend:
             T_prior = predicted_motion(self._camera, p_prev[has_depth][named], predicted, expected)
         rng = np.random.default_rng((self._seed, frame.index))
         problem = RansacProblem(self._camera, _INLIER_PX, rng)
-        known, p_rows = has_depth[rows], p_prev[rows]
-        keep, motion = static_tracks(problem, old.left[rows], p_rows, known, pixels, expected, R_prior, T_prior)
+        known = has_depth[rows]
+        p_rows = p_prev[rows]
+        keep, motion = static_tracks(
+            problem, old.left[rows], p_rows, known, pixels, expected, R_prior, T_prior
+        )
         # The right pixel belongs to the key point; it is shifted by the refinement.
-        right = pair.right[found] + np.stack([pixels[:, 0] - left[found, 0], np.zeros(len(found))], axis=1)
-        agrees, twist = pair.has_right[found], previous.twist_per_s
+        right = pair.right[found] + np.stack(
+            [pixels[:, 0] - left[found, 0], np.zeros(len(found))], axis=1
+        )
+        agrees = pair.has_right[found]
+        twist = previous.twist_per_s
         if motion is not None:
             keep[~known] = False
             twist = se3_log(motion.T_curr_prev) / seconds
             depth = depth_of(self._camera, transform_points(motion.T_curr_prev, p_rows))
             depth = np.maximum(depth, _MIN_DEPTH_M)
-            change = np.abs(pixels[:, 0] - right[:, 0] - self._camera.fu * self._camera.baseline_m / depth)
+            change = np.abs(
+                pixels[:, 0] - right[:, 0] - self._camera.fu * self._camera.baseline_m / depth
+            )
             agrees = agrees & (~known | (change <= _INLIER_PX))
-        rows, found = rows[keep], found[keep]
+        rows = rows[keep]
+        found = found[keep]
         used[found] = True
-        return _Tracks(old.ids[rows], pixels[keep], right[keep], agrees[keep], take(pair.keypoints, found)), twist, used
+        return (
+            _Tracks(
+                old.ids[rows], pixels[keep], right[keep], agrees[keep], take(pair.keypoints, found)
+            ),
+            twist,
+            used,
+        )
 
-    def _guess(self, old: _Tracks, p_prev: FloatArray, expected: FloatArray, prior: TrackPrior | None) -> FloatArray:
+    def _guess(
+        self, old: _Tracks, p_prev: FloatArray, expected: FloatArray, prior: TrackPrior | None
+    ) -> FloatArray:
         """Predict the left pixels (N, 2) of tracks at points (N, 3) in the current frame."""
         if prior is not None and prior.R_cam_prev is not None:
             expected = se3_from_parts(prior.R_cam_prev, expected[:3, 3])
@@ -337,14 +437,20 @@ class DescriptorFrontend:
             guess[rows] = predicted
         return guess
 
-    def _near_guess(self, old: _Tracks, guess: FloatArray, points: FloatArray, width: int) -> BoolArray:
-        """Pairs (N, M) of tracks and left key points (M, 2) close to the predicted (N, 2) or the old pixel."""
+    def _near_guess(
+        self, old: _Tracks, guess: FloatArray, points: FloatArray, width: int
+    ) -> BoolArray:
+        """Pairs (N, M) of tracks and left key points (M, 2) close to the predicted (N, 2) or the
+        old pixel.
+        """
         near = np.empty((len(old), len(points)), dtype=np.bool_)
         # The last motion may be wrong, so the old pixel is a second centre of the search.
         _near_either(guess, old.left, np.ascontiguousarray(points.T), _SEARCH_RADIUS * width, near)
         return near
 
-    def _add_new_features(self, tracks: _Tracks, pair: _MatchedKeypoints, used: BoolArray, image: Image) -> _Tracks:
+    def _add_new_features(
+        self, tracks: _Tracks, pair: _MatchedKeypoints, used: BoolArray, image: Image
+    ) -> _Tracks:
         """Add new features from key points with a right match, spread evenly over the image."""
         height, width = image.shape
         left = pair.keypoints.pixels
@@ -352,27 +458,47 @@ class DescriptorFrontend:
         chosen = free[spread_evenly(left[free], tracks.left, (width, height), self._grid)]
         ids = np.arange(len(chosen), dtype=np.int64) + self._next_id
         self._next_id += len(chosen)
-        new = _Tracks(ids, left[chosen], pair.right[chosen], pair.has_right[chosen], take(pair.keypoints, chosen))
+        new = _Tracks(
+            ids,
+            left[chosen],
+            pair.right[chosen],
+            pair.has_right[chosen],
+            take(pair.keypoints, chosen),
+        )
         return joined(tracks, new)
 
 
 @compiled
 def _on_row(left: FloatArray, right: FloatArray, most: float, out: BoolArray) -> None:
-    """Write which pixels left (N, 2) and right (2, M) are near one row, with a disparity up to `most`."""
-    us, vs = right[0], right[1]
+    """Write which pixels left (N, 2) and right (2, M) are near one row, with a disparity up to
+    `most`.
+    """
+    us = right[0]
+    vs = right[1]
     for i in range(len(left)):
-        u, v, row = left[i, 0], left[i, 1], out[i]
+        u = left[i, 0]
+        v = left[i, 1]
+        row = out[i]
         for j in range(len(us)):
             in_range = (u - us[j] >= MIN_MATCH_DISPARITY_PX) & (u - us[j] <= most)
             row[j] = in_range & (abs(v - vs[j]) <= _MAX_ROW_DIFFERENCE_PX)
 
 
 @compiled
-def _near_either(one: FloatArray, other: FloatArray, points: FloatArray, reach: float, out: BoolArray) -> None:
-    """Write which points (2, M) are in the squares (half side `reach`) around one or other centres (N, 2)."""
-    us, vs = points[0], points[1]
+def _near_either(
+    one: FloatArray, other: FloatArray, points: FloatArray, reach: float, out: BoolArray
+) -> None:
+    """Write which points (2, M) are in the squares (half side `reach`) around one or other
+    centres (N, 2).
+    """
+    us = points[0]
+    vs = points[1]
     for i in range(len(one)):
-        u, v, u_other, v_other, row = one[i, 0], one[i, 1], other[i, 0], other[i, 1], out[i]
+        u = one[i, 0]
+        v = one[i, 1]
+        u_other = other[i, 0]
+        v_other = other[i, 1]
+        row = out[i]
         for j in range(len(us)):
             in_one = (abs(u - us[j]) <= reach) & (abs(v - vs[j]) <= reach)
             row[j] = in_one | ((abs(u_other - us[j]) <= reach) & (abs(v_other - vs[j]) <= reach))

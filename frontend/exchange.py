@@ -1,9 +1,10 @@
-"""Left and right images that are exchanged for a while: put back, or refused where they do not fit each other then.
+"""Left and right images that are exchanged for a while: put back, or refused where they do not fit
+each other then.
 
-Each image is compared with both of the last frame. The camera's motion shifts both images alike, so they differ from
-their own last images by about the same; from the other camera's last image, one differs by motion plus disparity and
-the other by motion minus disparity. Where it is the other way round, matches decide: exchanged images match with
-negative disparities only.
+Each image is compared with both of the last frame. The camera's motion shifts both images alike, so
+they differ from their own last images by about the same; from the other camera's last image, one
+differs by motion plus disparity and the other by motion minus disparity. Where it is the other way
+round, matches decide: exchanged images match with negative disparities only.
 """
 
 from __future__ import annotations
@@ -22,12 +23,15 @@ from vio.records import Image
 
 Order: TypeAlias = Literal["given", "exchanged", "refused"]
 
-_THUMBNAIL = (48, 30)  # width and height, so coarse that a shift of the image by some pixels changes little
+# width and height, so coarse that a shift of the image by some pixels changes little
+_THUMBNAIL = (48, 30)
 _BLOCK = 4  # averaged first: OpenCV averages whole pixels five times as fast as fractions of them
 _POINTS = 80  # that matches of either sign are counted at, at most
 _LEAST_POINTS = 20
 _MANY = 0.4  # share of points with a negative disparity that proves an exchange
-_SOME = 0.2  # share of them above which a frame that looks exchanged is refused: its rows do not fit when put back
+# share of them above which a frame that looks exchanged is refused: its rows do not fit when put
+# back
+_SOME = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +48,8 @@ class ExchangeDetector(ImageCheck):
 
     def __init__(self) -> None:
         super().__init__()
-        self._last: tuple[Image, Image] | None = None  # left and right, sparsely sampled, in their right order
+        # left and right, sparsely sampled, in their right order
+        self._last: tuple[Image, Image] | None = None
         self._since: int | None = None  # first frame of a run of exchanged ones
 
     def inspect(self, images: FrameImages) -> FrameImages | None:
@@ -55,27 +60,43 @@ class ExchangeDetector(ImageCheck):
         suspicious = not images.right_trusted
         exchanged = self._since is not None
         order = self.order(
-            images.frame.index, left.half, right.half, lambda: _count_matches(images, exchanged), suspicious=suspicious
+            images.frame.index,
+            left.half,
+            right.half,
+            lambda: _count_matches(images, exchanged),
+            suspicious=suspicious,
         )
         if order == "refused":
             return None
         return images if order == "given" else images.with_raw(images.raw[::-1])
 
     def order(
-        self, index: int, left: Image, right: Image, count: Callable[[], MatchCounts], *, suspicious: bool
+        self,
+        index: int,
+        left: Image,
+        right: Image,
+        count: Callable[[], MatchCounts],
+        *,
+        suspicious: bool,
     ) -> Order:
-        """Return whether the images (H/2, W/2) of a frame are to be used as given, exchanged, or not at all.
+        """Return whether the images (H/2, W/2) of a frame are to be used as given, exchanged, or
+        not at all.
 
         Args:
             index: frame number.
             left: left image as given, at half resolution.
             right: right image as given.
             count: counts matches; called where the images look exchanged.
-            suspicious: whether to count in any case, as the images of the last frame contradicted each other.
+            suspicious: whether to count in any case, as the images of the last frame contradicted
+                each other.
         """
         now: tuple[Image, Image] = (_thumbnail(left), _thumbnail(right))
         order: Order = "given"
-        if suspicious or self._since is not None or (self._last is not None and self._looks_exchanged(now)):
+        if (
+            suspicious
+            or self._since is not None
+            or (self._last is not None and self._looks_exchanged(now))
+        ):
             order = _judge(count(), "given" if self._since is None else "exchanged")
         if order != "refused":
             self._last = now if order == "given" else now[::-1]
@@ -97,7 +118,8 @@ class ExchangeDetector(ImageCheck):
             self._since = index
             done = "they are put back" if order == "exchanged" else "the frames are skipped"
             self._lines.append(
-                f"frame {index}: left and right images are exchanged from here on, as they match with negative "
+                f"frame {index}: left and right images are exchanged from here on, as they match "
+                "with negative "
                 f"disparities only; {done}"
             )
 
@@ -105,8 +127,8 @@ class ExchangeDetector(ImageCheck):
 def _count_matches(images: FrameImages, exchanged: bool) -> MatchCounts:
     """Count matches of either sign, at the points that the other camera saw last.
 
-    Those with a positive disparity are not counted where those with a negative one decide: while the images were not
-    `exchanged` in the last frame, too few of these leave them in order.
+    Those with a positive disparity are not counted where those with a negative one decide: while
+    the images were not `exchanged` in the last frame, too few of these leave them in order.
     """
     if images.previous is None:
         return MatchCounts(0, 0, 0)
@@ -116,9 +138,12 @@ def _count_matches(images: FrameImages, exchanged: bool) -> MatchCounts:
     points = points[inside(left.full, points, 0.0)][:_POINTS]
     negative = images.stereo.count_mirrored(left, right, points)
     if not exchanged and negative < _SOME * len(points):
-        return MatchCounts(len(points), 0, negative)  # no exchange, however many match with a positive one
+        # no exchange, however many match with a positive one
+        return MatchCounts(len(points), 0, negative)
     positive = int(images.stereo.search(left.half, right.half, points)[1].sum())
-    return MatchCounts(len(points), positive + images.stereo.count_beyond(left, right, points), negative)
+    return MatchCounts(
+        len(points), positive + images.stereo.count_beyond(left, right, points), negative
+    )
 
 
 def _thumbnail(image: Image) -> Image:
@@ -126,12 +151,16 @@ def _thumbnail(image: Image) -> Image:
     width, height = (size // _BLOCK for size in image.shape[::-1])
     if width >= _THUMBNAIL[0] and height >= _THUMBNAIL[1]:
         whole = image[: _BLOCK * height, : _BLOCK * width]
-        image = np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        image = np.asarray(
+            cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
+        )
     return np.asarray(cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _judge(found: MatchCounts, likely: Order) -> Order:
-    """Decide by matches about a frame that looks exchanged; where they are too few, the decision is as before."""
+    """Decide by matches about a frame that looks exchanged; where they are too few, the decision
+    is as before.
+    """
     if found.points < _LEAST_POINTS or max(found.negative, found.positive) < _SOME * found.points:
         return likely
     if found.negative < 2 * found.positive:

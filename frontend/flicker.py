@@ -1,8 +1,10 @@
-"""Bands of brightness that move through the images, as flickering light makes with a rolling shutter: taken out.
+"""Bands of brightness that move through the images, as flickering light makes with a rolling
+shutter: taken out.
 
-The bands are constant along a row. Rectified cameras see the same rows, so the difference of their row means changes
-slowly, whatever the scene and the motion; bands that differ between the cameras change it from frame to frame. Once
-they have been seen, each image's smoothed row means are replaced by the image's mean.
+The bands are constant along a row. Rectified cameras see the same rows, so the difference of their
+row means changes slowly, whatever the scene and the motion; bands that differ between the cameras
+change it from frame to frame. Once they have been seen, each image's smoothed row means are
+replaced by the image's mean.
 """
 
 from __future__ import annotations
@@ -17,14 +19,17 @@ from vio.frontend.patches import mean_and_contrast
 from vio.geometry.lie import FloatArray
 from vio.records import Image
 
-# Change of the difference of row means in a frame, gray levels (root mean square over the rows). Measured: up to 7 on
-# recordings without a fault, up to 19 where the right camera is late, 70 and more by bands of 25 %.
+# Change of the difference of row means in a frame, gray levels (root mean square over the rows).
+# Measured: up to 7 on recordings without a fault, up to 19 where the right camera is late, 70 and
+# more by bands of 25 %.
 _CHANGE = 25.0
 _FRAMES = 3  # such frames among the last ones before bands are taken out
 _MEMORY = 10  # frames
-_LEAST_CONTRAST = 0.3  # of an image over the other's: a camera that goes dark now and then has no bands
+# of an image over the other's: a camera that goes dark now and then has no bands
+_LEAST_CONTRAST = 0.3
 _STRIDE = 8  # of the pixels that the contrast is computed from
-_SMOOTH_ROWS = 3.0  # standard deviation: bands are wider, and horizontal edges of the scene are narrower
+# standard deviation: bands are wider, and horizontal edges of the scene are narrower
+_SMOOTH_ROWS = 3.0
 
 
 class BandRemoval(ImageCheck):
@@ -43,7 +48,8 @@ class BandRemoval(ImageCheck):
 
     def flatten(self, index: int, left: Image, right: Image) -> tuple[Image, Image]:
         """Return both images (H, W) of a frame, without bands where there are such."""
-        rows_left, rows_right = _row_means(left), _row_means(right)
+        rows_left = _row_means(left)
+        rows_right = _row_means(right)
         contrast = sorted(mean_and_contrast(image, _STRIDE)[1] for image in (left, right))
         if not self._active and contrast[0] > _LEAST_CONTRAST * contrast[1]:
             self._detect(index, _smoothed(_without_gain(rows_left, rows_right)))
@@ -55,26 +61,33 @@ class BandRemoval(ImageCheck):
         centred = difference - _mean(difference)
         if self._last is not None and self._last.shape == centred.shape:
             change = math.sqrt(_mean((centred - self._last) ** 2))
-            self._changed = [k for k in self._changed if index - k < _MEMORY] + [index] * (change > _CHANGE)
+            self._changed = [k for k in self._changed if index - k < _MEMORY] + [index] * (
+                change > _CHANGE
+            )
         self._last = centred
         if len(self._changed) >= _FRAMES:
             self._active = True
             self._lines.append(
-                f"frame {index}: bands of brightness move through the images, differently in both cameras (flickering "
+                f"frame {index}: bands of brightness move through the images, differently in both "
+                "cameras (flickering "
                 "light, or an unstable exposure); they are taken out row by row"
             )
 
 
 def _row_means(image: Image) -> FloatArray:
     """Mean gray level (H,) of each row."""
-    # Sums of integers are vectorised: a twentieth of the time of means, which OpenCV takes as these, times 1 / width.
+    # Sums of integers are vectorised: a twentieth of the time of means, which OpenCV takes as
+    # these, times 1 / width.
     sums = np.asarray(cv2.reduce(image, 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S))
     return sums.ravel() * (1.0 / image.shape[1])
 
 
 def _without_gain(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Difference (H,) of row means at one mean gray level: cameras that set their exposure alone make no bands."""
-    a, b = max(_mean(left), 1.0), max(_mean(right), 1.0)
+    """Difference (H,) of row means at one mean gray level: cameras that set their exposure alone
+    make no bands.
+    """
+    a = max(_mean(left), 1.0)
+    b = max(_mean(right), 1.0)
     return (left / a - right / b) * ((a + b) / 2)
 
 
@@ -86,7 +99,9 @@ def _mean(values: FloatArray) -> float:
 def _smoothed(rows: FloatArray) -> FloatArray:
     """Values (H,) of rows, smoothed over a few of them."""
     line = rows[None]  # filtered in a tenth of the time that a column takes
-    return np.asarray(cv2.GaussianBlur(line, (0, 1), sigmaX=_SMOOTH_ROWS, sigmaY=1.0), dtype=np.float64)[0]
+    return np.asarray(
+        cv2.GaussianBlur(line, (0, 1), sigmaX=_SMOOTH_ROWS, sigmaY=1.0), dtype=np.float64
+    )[0]
 
 
 def _flattened(image: Image, rows: FloatArray) -> Image:

@@ -1,4 +1,6 @@
-"""Forward-backward Lucas-Kanade at half resolution, with brightness matching; pixels are of the full image."""
+"""Forward-backward Lucas-Kanade at half resolution, with brightness matching; pixels are of the
+full image.
+"""
 
 from __future__ import annotations
 
@@ -27,12 +29,19 @@ _MAX_GAIN = 4.0
 
 
 def track_with_retries(
-    last: Image, view: ImageLevels, points: FloatArray, guess: FloatArray, trusted: bool, levels: int
+    last: Image,
+    view: ImageLevels,
+    points: FloatArray,
+    guess: FloatArray,
+    trusted: bool,
+    levels: int,
 ) -> tuple[FloatArray, BoolArray]:
-    """Track points from the last image into the current one; repeat with a wider search where many are lost.
+    """Track points from the last image into the current one; repeat with a wider search where many
+    are lost.
 
-    A trusted guess is searched with few pyramid levels first. If many points are lost, all levels are used. If most are
-    still lost, the guess is discarded and the search starts from the old pixels.
+    A trusted guess is searched with few pyramid levels first. If many points are lost, all levels
+    are used. If most are still lost, the guess is discarded and the search starts from the old
+    pixels.
 
     Args:
         last: last image (H/2, W/2) at half resolution.
@@ -48,7 +57,9 @@ def track_with_retries(
     last = match_brightness(last, view.half)
     few = min(_TRUSTED_LEVELS, levels) if trusted else levels
     found, good = _track_forward_backward(last, view, points, guess, few, trusted=trusted)
-    attempts = [(guess, _RETRY_SHARE), (points, _LOST_SHARE)] if trusted else [(points, _LOST_SHARE)]
+    attempts = (
+        [(guess, _RETRY_SHARE), (points, _LOST_SHARE)] if trusted else [(points, _LOST_SHARE)]
+    )
     for start, share in attempts:
         retry = (~good).nonzero()[0]
         if len(retry) <= share * len(points):
@@ -60,14 +71,22 @@ def track_with_retries(
 
 
 def match_brightness(image: Image, other: Image) -> Image:
-    """Adjust an image to another's mean and contrast if they differ clearly: Lucas-Kanade compares gray levels."""
-    (mean, contrast), (other_mean, other_contrast) = (mean_and_contrast(part, _STRIDE) for part in (image, other))
+    """Adjust an image to another's mean and contrast if they differ clearly: Lucas-Kanade
+    compares gray levels.
+    """
+    (mean, contrast), (other_mean, other_contrast) = (
+        mean_and_contrast(part, _STRIDE) for part in (image, other)
+    )
     gain = other_contrast / max(contrast, _MIN_CONTRAST)
-    if (abs(gain - 1) < _MAX_CONTRAST_CHANGE and abs(other_mean - mean) < _MAX_MEAN_CHANGE) or gain <= 0:
+    if (
+        abs(gain - 1) < _MAX_CONTRAST_CHANGE and abs(other_mean - mean) < _MAX_MEAN_CHANGE
+    ) or gain <= 0:
         return image
     gain = min(max(gain, 1 / _MAX_GAIN), _MAX_GAIN)
     levels = gain * (np.arange(256) - mean) + other_mean
-    return np.asarray(cv2.LUT(image, np.clip(np.rint(levels), 0, 255).astype(np.uint8)), dtype=np.uint8)
+    return np.asarray(
+        cv2.LUT(image, np.clip(np.rint(levels), 0, 255).astype(np.uint8)), dtype=np.uint8
+    )
 
 
 def _track_forward_backward(
@@ -79,10 +98,11 @@ def _track_forward_backward(
     *,
     trusted: bool,
 ) -> tuple[FloatArray, BoolArray]:
-    """Track points (N, 2) forward and backward; return the new pixels and the mask of consistent ones.
+    """Track points (N, 2) forward and backward; return the new pixels and the mask of consistent
+    ones.
 
-    Points found where a trusted guess expects them, to the same tolerance, are not tracked backward: two independent
-    sources agree on them, and alignment with the anchor is to come.
+    Points found where a trusted guess expects them, to the same tolerance, are not tracked
+    backward: two independent sources agree on them, and alignment with the anchor is to come.
     """
     forward, good = _flow(last, view.half, points, guess, levels)
     good &= inside(view.full, forward, ANCHOR_REACH_PX + 2)
@@ -105,7 +125,8 @@ def _apart(points: FloatArray, others: FloatArray, distance: float) -> BoolArray
 @compiled
 def _mark_apart(points: FloatArray, others: FloatArray, distance: float, out: BoolArray) -> None:
     for n in range(len(points)):
-        du, dv = points[n, 0] - others[n, 0], points[n, 1] - others[n, 1]
+        du = points[n, 0] - others[n, 0]
+        dv = points[n, 1] - others[n, 1]
         out[n] = not np.sqrt(du * du + dv * dv) <= distance
 
 

@@ -11,7 +11,15 @@ import numpy as np
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, FrontendOutput, Image, IntArray, Observations, SigmaArray, StereoFrame
+from vio.records import (
+    BoolArray,
+    FrontendOutput,
+    Image,
+    IntArray,
+    Observations,
+    SigmaArray,
+    StereoFrame,
+)
 
 
 @dataclass(slots=True)
@@ -42,10 +50,13 @@ class FrameValidator:
         """Check a frame and return both of its images, (H, W) uint8.
 
         Raises:
-            DataError: no images, images of a wrong size or type, or a time not after the previous frame's.
+            DataError: no images, images of a wrong size or type, or a time not after the previous
+                frame's.
         """
         if not isinstance(frame, StereoFrame):
-            raise DataError(f"the {self.name} front end takes a StereoFrame, got {type(frame).__name__}")
+            raise DataError(
+                f"the {self.name} front end takes a StereoFrame, got {type(frame).__name__}"
+            )
         if frame.left is None or frame.right is None:
             raise DataError(
                 f"frame {frame.index} has no images, but the {self.name} front end needs them; "
@@ -55,20 +66,32 @@ class FrameValidator:
         return frame.left, frame.right
 
     def validate_one(self, frame: StereoFrame) -> tuple[Image]:
-        """Check a frame of one camera, with its depths where it has such, and return its image, (H, W) uint8.
+        """Check a frame of one camera, with its depths where it has such, and return its image, (H,
+        W) uint8.
 
         Raises:
             DataError: as `validate`; or depths that are missing, or of another size or type.
         """
         if not isinstance(frame, StereoFrame):
-            raise DataError(f"the {self.name} front end takes a StereoFrame, got {type(frame).__name__}")
-        if frame.left is None:
-            raise DataError(f"frame {frame.index} has no image, but the {self.name} front end needs one")
-        self._check(frame, {"left": frame.left})
-        if self.camera.kind == "rgbd" and (frame.depth is None or frame.depth.shape != frame.left.shape):
-            found = "no depths" if frame.depth is None else f"depths of {frame.depth.shape[1]}x{frame.depth.shape[0]}"
             raise DataError(
-                f"frame {frame.index} has {found}; a camera with depth images needs metres for each pixel of the "
+                f"the {self.name} front end takes a StereoFrame, got {type(frame).__name__}"
+            )
+        if frame.left is None:
+            raise DataError(
+                f"frame {frame.index} has no image, but the {self.name} front end needs one"
+            )
+        self._check(frame, {"left": frame.left})
+        if self.camera.kind == "rgbd" and (
+            frame.depth is None or frame.depth.shape != frame.left.shape
+        ):
+            found = (
+                "no depths"
+                if frame.depth is None
+                else f"depths of {frame.depth.shape[1]}x{frame.depth.shape[0]}"
+            )
+            raise DataError(
+                f"frame {frame.index} has {found}; a camera with depth images needs metres for "
+                "each pixel of the "
                 f"image, {frame.left.shape[1]}x{frame.left.shape[0]}, 0 where there is none"
             )
         return (frame.left,)
@@ -77,31 +100,45 @@ class FrameValidator:
         """Check time and images of a frame, the left one first, and note them."""
         if self._time_ns is not None and frame.time_ns <= self._time_ns:
             raise DataError(
-                f"frame {frame.index} is not later than frame {self._index} ({frame.time_ns} ns after "
+                f"frame {frame.index} is not later than frame {self._index} ({frame.time_ns} ns "
+                "after "
                 f"{self._time_ns} ns); sort the frames by time"
             )
         expected = (self.camera.height, self.camera.width)
         for name, image in images.items():
-            if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8 or not image.size:
+            if (
+                not isinstance(image, np.ndarray)
+                or image.ndim != 2
+                or image.dtype != np.uint8
+                or not image.size
+            ):
                 found = (
-                    f"has shape {image.shape} and type {image.dtype}" if isinstance(image, np.ndarray) else "is none"
+                    f"has shape {image.shape} and type {image.dtype}"
+                    if isinstance(image, np.ndarray)
+                    else "is none"
                 )
                 raise DataError(
                     f"frame {frame.index}: the {name} image {found}; "
-                    f"the {self.name} front end needs 8-bit gray images: read them with vio.datasets.images.load_gray"
+                    f"the {self.name} front end needs 8-bit gray images: read them with "
+                    "vio.datasets.images.load_gray"
                 )
             size = image.shape
             if None not in expected and size != expected:
                 raise DataError(
-                    f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, but the calibration is for "
-                    f"{self.camera.width}x{self.camera.height}; check that calibration and images belong together"
+                    f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, but the "
+                    "calibration is for "
+                    f"{self.camera.width}x{self.camera.height}; check that calibration and images "
+                    "belong together"
                 )
             if size != images["left"].shape or (self._shape is not None and size != self._shape):
                 raise DataError(
-                    f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, unlike the previous images; "
+                    f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, unlike the "
+                    "previous images; "
                     "all images of a recording must have one size"
                 )
-        self._index, self._time_ns, self._shape = frame.index, frame.time_ns, images["left"].shape
+        self._index = frame.index
+        self._time_ns = frame.time_ns
+        self._shape = images["left"].shape
 
 
 class Features(Protocol):
@@ -147,9 +184,11 @@ def make_output(
     """
     rows = np.arange(len(features.ids)) if shown is None else shown.nonzero()[0]
     z = np.empty((len(rows), 4))
-    z[:, :2], z[:, 2:] = features.left[rows], features.right[rows]
+    z[:, :2] = features.left[rows]
+    z[:, 2:] = features.right[rows]
     has_right = features.has_right[rows]
-    stale, of_rows = np.zeros(len(rows), dtype=np.bool_), None if sigma is None else sigma[rows]
+    stale = np.zeros(len(rows), dtype=np.bool_)
+    of_rows = None if sigma is None else sigma[rows]
     return FrontendOutput(
         Observations(frame.index, frame.time_ns, features.ids[rows], z, has_right, stale, of_rows),
         tracked=tracked,

@@ -1,4 +1,7 @@
-"""What checks of the images have in common. A new check is a file of its own and a line in `vio.frontend.klt`."""
+"""What checks of the images have in common.
+
+A new check is a file of its own and a line in `vio.frontend.klt`.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,10 @@ class FrameImages:
     previous: PreviousFrame | None  # the last frame that was not skipped
     stereo: StereoFit
     right_trusted: bool  # the right image of the last frame was used
-    right_lives: bool = True  # False: the right image of this frame is known to be frozen, dark or covered
-    swapped: bool = False  # all frames so far were exchanged: a fault of the recording, which is not put back
+    # False: the right image of this frame is known to be frozen, dark or covered
+    right_lives: bool = True
+    # all frames so far were exchanged: a fault of the recording, which is not put back
+    swapped: bool = False
 
     @cached_property
     def views(self) -> tuple[ImageLevels, ...]:
@@ -42,17 +47,24 @@ class FrameImages:
 
     def with_raw(self, raw: tuple[Image, ...]) -> FrameImages:
         """Return the frame with other images."""
-        return self if all(a is b for a, b in zip(raw, self.raw, strict=True)) else replace(self, raw=raw)
+        return (
+            self
+            if all(a is b for a, b in zip(raw, self.raw, strict=True))
+            else replace(self, raw=raw)
+        )
 
 
 class ImageCheck:
-    """Base of the checks: sees all frames of a recording in order of time, and reports each event once."""
+    """Base of the checks: sees all frames of a recording in order of time, and reports each
+    event once.
+    """
 
     def __init__(self) -> None:
         self._lines: list[str] = []
 
     def inspect(self, images: FrameImages) -> FrameImages | None:
-        """Return the images to use, corrected where necessary; None: skip the frame. Called before tracking.
+        """Return the images to use, corrected where necessary; None: skip the frame. Called before
+        tracking.
 
         Raises:
             DataError: the recording cannot be used.
@@ -68,5 +80,6 @@ class ImageCheck:
 
     def take_lines(self) -> tuple[str, ...]:
         """Return the reports since the last call."""
-        lines, self._lines = tuple(self._lines), []
+        lines = tuple(self._lines)
+        self._lines = []
         return lines

@@ -1,4 +1,6 @@
-"""The default front end: corners tracked in time by Lucas-Kanade and matched from left to right along the row."""
+"""The default front end: corners tracked in time by Lucas-Kanade and matched from left to right
+along the row.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,22 @@ from vio.frontend.flicker import BandRemoval
 from vio.frontend.flow import track_with_retries
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output
 from vio.frontend.image_check import FrameImages, ImageCheck
-from vio.frontend.moving_object import ObjectReport, choose_motion, one_motion_explains, static_by_prediction, voters
+from vio.frontend.moving_object import (
+    ObjectReport,
+    choose_motion,
+    one_motion_explains,
+    static_by_prediction,
+    voters,
+)
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.one_camera import with_depths, with_prior_depths
-from vio.frontend.outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
+from vio.frontend.outliers import (
+    Consensus,
+    RansacProblem,
+    epipolar_distance,
+    predicted_motion,
+    static_tracks,
+)
 from vio.frontend.patches import ImageLevels, half_image
 from vio.frontend.prediction import guessed_pixels, prior_rows, usable_prior
 from vio.frontend.reappearance import contradicts_gyro, motion_across
@@ -30,13 +44,22 @@ from vio.frontend.right_match import RightMatcher
 from vio.frontend.settings import FrontendSettings
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.swap import SwapDetector
-from vio.frontend.tracks import ANCHOR_RADIUS_PX, INLIER_PX, AnchorBank, PreviousFrame, Tracks, no_tracks
+from vio.frontend.tracks import (
+    ANCHOR_RADIUS_PX,
+    INLIER_PX,
+    AnchorBank,
+    PreviousFrame,
+    Tracks,
+    no_tracks,
+)
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, FrontendOutput, Image, StereoFrame, TrackPrior
 
-_SPARE_CORNERS = 1.5  # extra corners tried, over the number of missing features; the best stereo matches are kept
-_PROBATION_FRAMES = 1  # for which a new corner must be tracked, in time and stereo, before it is output
+# extra corners tried, over the number of missing features; the best stereo matches are kept
+_SPARE_CORNERS = 1.5
+# for which a new corner must be tracked, in time and stereo, before it is output
+_PROBATION_FRAMES = 1
 _SWAP_FEW = 0.3  # share of matches below which left and right may be swapped
 _FEW_MISSING = 0.1  # share of the features; detection takes more time than it is worth for fewer
 _VERY_FEW = 0.25  # share of the target below which new features are output at once
@@ -48,24 +71,34 @@ _BANK_SPARE = 3  # templates allocated, over the number of features
 class KltFrontend:
     """Track corners from frame to frame in the left image and match them into the right one.
 
-    One instance processes one recording: ids increase and are never reused. The result is deterministic to the bit: it
-    depends on the images, the priors and the settings only.
+    One instance processes one recording: ids increase and are never reused. The result is
+    deterministic to the bit: it depends on the images, the priors and the settings only.
     """
 
     def __init__(self, camera: StereoCamera, settings: FrontendSettings | None = None) -> None:
         settings = FrontendSettings() if settings is None else settings
-        self._settings, self._grid = settings.klt, settings.grid
-        self._seed, self._disparity = settings.consensus.seed, settings.disparity
+        self._settings = settings.klt
+        self._grid = settings.grid
+        self._seed = settings.consensus.seed
+        self._disparity = settings.disparity
         self._camera = camera
         self._clahe = cv2.createCLAHE(2.0, (8, 8)) if self._settings.equalise == "clahe" else None
         self._mask = None if self._settings.mask is None else load_mask(self._settings.mask)
         self._validator = FrameValidator(camera, "klt")
-        self._right, self._delay, self._objects = RightCamera(), RightDelay(camera), ObjectReport()
+        self._right = RightCamera()
+        self._delay = RightDelay(camera)
+        self._objects = ObjectReport()
         contrast = LostContrast()
         self._checks: tuple[ImageCheck, ...] = (contrast, self._objects)  # in this order
         if camera.kind == "stereo":
             # A frozen image looks as if it were the other camera's, so that is asked first.
-            pair = (self._right, self._delay, SwapDetector(_SWAP_FEW), ExchangeDetector(), self._objects)
+            pair = (
+                self._right,
+                self._delay,
+                SwapDetector(_SWAP_FEW),
+                ExchangeDetector(),
+                self._objects,
+            )
             self._checks = (BandRemoval(), contrast, *pair)
         self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, ANCHOR_RADIUS_PX)
         self._anchor_fit = AnchorFit(camera, self._grid, self._bank)
@@ -73,37 +106,53 @@ class KltFrontend:
         self._matcher = RightMatcher(camera, self._right, self._delay)
         self._previous: PreviousFrame | None = None
         self._alone: RightAlone | None = None  # while the left camera is frozen
-        self._setup: tuple[StereoFit, BoolArray | None] | None = None  # made with the image size of the first frame
+        # made with the image size of the first frame
+        self._setup: tuple[StereoFit, BoolArray | None] | None = None
         self._next_id = 0
         self._rested = False  # whether the last frame was one in which no corners were detected
         self._step_ns: int | None = None  # between the last two frames
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
-        """Track, match and detect in one rectified stereo pair, or in one camera; see `vio.protocols.Frontend`.
+        """Track, match and detect in one rectified stereo pair, or in one camera; see
+        `vio.protocols.Frontend`.
 
         Raises:
             ConfigError: the mask is not of the images' size.
         """
-        watch, kind = Stopwatch(), self._camera.kind
-        raw = self._validator.validate(frame) if kind == "stereo" else self._validator.validate_one(frame)
+        watch = Stopwatch()
+        kind = self._camera.kind
+        raw = (
+            self._validator.validate(frame)
+            if kind == "stereo"
+            else self._validator.validate_one(frame)
+        )
         stereo, allowed = self._set_up(raw[0].shape)
         images = FrameImages(frame, raw, self._view, self._previous, stereo, self._right.usable)
         for check in self._checks:
             checked = check.inspect(images)
             if checked is None:
                 left_frozen = check is self._right
-                alone = self._follow_in_right(images, usable_prior(prior)) if left_frozen else no_tracks()
+                alone = (
+                    self._follow_in_right(images, usable_prior(prior))
+                    if left_frozen
+                    else no_tracks()
+                )
                 return make_output(frame, alone, len(alone), watch, self._take_lines())
             images = checked
-        left, right = images.left, images.right
+        left = images.left
+        right = images.right
         watch.lap("prepare")
         tracks, motion = self._track(images, usable_prior(prior), watch)
         wanted = self._wanted_corners(len(tracks))
         corners = detect_corners(left.half, tracks.left, wanted, self._grid, allowed)
         watch.lap("detect")
-        # Without a second camera no corner is searched along the row; `delayed` takes them without a depth.
-        usable, delayed = right if self._right.usable else None, right is None or self._delay.frames != 0.0
-        tracks = self._new_features.add(left, usable, tracks, corners, motion, stereo, delayed=delayed)
+        # Without a second camera no corner is searched along the row; `delayed` takes them without
+        # a depth.
+        usable = right if self._right.usable else None
+        delayed = right is None or self._delay.frames != 0.0
+        tracks = self._new_features.add(
+            left, usable, tracks, corners, motion, stereo, delayed=delayed
+        )
         if usable is not None and not delayed:
             stereo.update_rows(tracks)
         if kind == "rgbd" and frame.depth is not None:
@@ -116,7 +165,9 @@ class KltFrontend:
         self._store(images, tracks, motion)
         watch.lap("check")
         sigma = self._bank.sigma(tracks.slot, depth_image=kind == "rgbd")
-        return make_output(frame, tracks, tracked, watch, self._take_lines(), shown=tracks.shown, sigma=sigma)
+        return make_output(
+            frame, tracks, tracked, watch, self._take_lines(), shown=tracks.shown, sigma=sigma
+        )
 
     @property
     def _needs_right(self) -> bool:
@@ -124,7 +175,9 @@ class KltFrontend:
         return self._camera.kind == "stereo" and self._right.usable
 
     def _wanted_corners(self, active: int) -> int:
-        """Number of corners to detect beside active features; none in every other frame while few are missing."""
+        """Number of corners to detect beside active features; none in every other frame while
+        few are missing.
+        """
         target = self._grid.target_features
         missing = target - active
         self._rested = not self._rested and missing <= _FEW_MISSING * target
@@ -141,7 +194,9 @@ class KltFrontend:
         return ImageLevels(image, half_image(image))
 
     def _set_up(self, shape: tuple[int, ...]) -> tuple[StereoFit, BoolArray | None]:
-        """Return the stereo matcher and the mask (H/2, W/2) of allowed corners, set up with the first frame's shape."""
+        """Return the stereo matcher and the mask (H/2, W/2) of allowed corners, set up with the
+        first frame's shape.
+        """
         if self._setup is None:
             height, width = shape
             allowed = None if self._mask is None else half_mask(self._mask, shape)
@@ -150,13 +205,25 @@ class KltFrontend:
         return self._setup
 
     def _follow_in_right(self, images: FrameImages, prior: TrackPrior | None) -> Tracks:
-        """The features of the last good pair, by the right image of a frame whose left one is frozen."""
-        frame, right = images.frame, images.right
-        if self._previous is None or right is None or not self._right.usable or self._delay.frames != 0.0:
+        """The features of the last good pair, by the right image of a frame whose left one is
+        frozen.
+        """
+        frame = images.frame
+        right = images.right
+        if (
+            self._previous is None
+            or right is None
+            or not self._right.usable
+            or self._delay.frames != 0.0
+        ):
             return no_tracks()
         last = self._alone or RightAlone.after(self._camera, self._previous)
-        problem = RansacProblem(self._camera, INLIER_PX, np.random.default_rng((self._seed, frame.index)))
-        alone = last.next(frame.time_ns, problem, self._bank, right, prior, self._settings.pyramid_levels)
+        problem = RansacProblem(
+            self._camera, INLIER_PX, np.random.default_rng((self._seed, frame.index))
+        )
+        alone = last.next(
+            frame.time_ns, problem, self._bank, right, prior, self._settings.pyramid_levels
+        )
         if alone is None:
             return no_tracks()
         self._alone = alone
@@ -164,7 +231,9 @@ class KltFrontend:
 
     def _store(self, images: FrameImages, tracks: Tracks, motion: Consensus | None) -> None:
         """Store the state that the next frame needs."""
-        frame, left, right = images.frame, images.left, images.right
+        frame = images.frame
+        left = images.left
+        right = images.right
         self._bank.keep_only(tracks.slot)
         before = self._previous
         self._step_ns = None if before is None else frame.time_ns - before.time_ns
@@ -174,7 +243,9 @@ class KltFrontend:
         left = ImageLevels(left.full.copy(), left.half)  # a reader may reuse its buffer
         right_half = None if right is None else right.half
         self._alone = None
-        self._previous = PreviousFrame(frame.time_ns, left, right_half, tracks, twist, motion is not None)
+        self._previous = PreviousFrame(
+            frame.time_ns, left, right_half, tracks, twist, motion is not None
+        )
 
     def _track(
         self, images: FrameImages, prior: TrackPrior | None, watch: Stopwatch
@@ -183,21 +254,27 @@ class KltFrontend:
 
         They are matched in the right image, if there is one.
         """
-        frame, left, right, stereo = images.frame, images.left, images.right, images.stereo
+        frame = images.frame
+        left = images.left
+        right = images.right
+        stereo = images.stereo
         stereo.forget_offset()
         previous = self._previous
         if previous is None or len(previous.tracks) == 0:
             if prior is None or prior.measured_motion is None:
                 self._right.try_again(frame.index)
             return no_tracks(), None
-        old, levels = previous.tracks, self._settings.pyramid_levels
+        old = previous.tracks
+        levels = self._settings.pyramid_levels
         expected = se3_exp(previous.twist_per_s * ((frame.time_ns - previous.time_ns) * 1e-9))
-        if prior is not None and self._alone is not None:  # its motion is that since the last right image
+        # its motion is that since the last right image
+        if prior is not None and self._alone is not None:
             prior = replace(prior, R_cam_prev=None, motion=None)
         if self._after_gap(frame):
             again = self._found_again(images, previous, expected, prior)
             if again is not None:
-                expected, prior = again, None
+                expected = again
+                prior = None
             elif prior is None:
                 return no_tracks(), None
         guess = guessed_pixels(self._camera, old, prior, expected, left.full)
@@ -206,34 +283,52 @@ class KltFrontend:
         watch.lap("track")
         rng = np.random.default_rng((self._seed, frame.index))
         problem = RansacProblem(self._camera, INLIER_PX, rng)
-        seen, motion = self._reject_outliers(problem, old, found, seen, prior, expected, stereo, frame.index)
+        seen, motion = self._reject_outliers(
+            problem, old, found, seen, prior, expected, stereo, frame.index
+        )
         watch.lap("reject")
         tracks = self._anchor_fit.track(old, previous.left, left, found, seen, motion)
         watch.lap("align")
         if right is None:
             tracks = with_prior_depths(self._camera, tracks, prior)
         else:
-            tracks = self._matcher.match(frame, previous, tracks, left, right, prior, stereo, motion)
+            tracks = self._matcher.match(
+                frame, previous, tracks, left, right, prior, stereo, motion
+            )
         watch.lap("stereo")
         return tracks, motion
 
     def _found_again(
-        self, images: FrameImages, previous: PreviousFrame, expected: FloatArray, prior: TrackPrior | None
+        self,
+        images: FrameImages,
+        previous: PreviousFrame,
+        expected: FloatArray,
+        prior: TrackPrior | None,
     ) -> FloatArray | None:
-        """The motion (4, 4) since the last good pair by key points of both pairs; None: none is proved.
+        """The motion (4, 4) since the last good pair by key points of both pairs; None: none is
+        proved.
 
         A facade repeats itself at the same depth; a gyro that contradicts tells.
         """
         right = images.right
-        if right is None or previous.right_half is None or not self._right.usable or self._delay.frames != 0.0:
+        if (
+            right is None
+            or previous.right_half is None
+            or not self._right.usable
+            or self._delay.frames != 0.0
+        ):
             return None
         rng = np.random.default_rng((self._seed, images.frame.index))
         problem = RansacProblem(self._camera, 2 * INLIER_PX, rng)
-        T = motion_across(problem, images.stereo, previous, images.left, right, np.stack([expected, np.eye(4)]))
+        T = motion_across(
+            problem, images.stereo, previous, images.left, right, np.stack([expected, np.eye(4)])
+        )
         return None if T is None or (prior is not None and contradicts_gyro(T, prior.motion)) else T
 
     def _after_gap(self, frame: StereoFrame) -> bool:
-        """Whether so many frames are missing that similar patches are no evidence of the same points."""
+        """Whether so many frames are missing that similar patches are no evidence of the same
+        points.
+        """
         if self._previous is None or self._step_ns is None:
             return False
         gap_ns = frame.time_ns - self._previous.time_ns
@@ -250,18 +345,25 @@ class KltFrontend:
         stereo: StereoFit,
         index: int,
     ) -> tuple[BoolArray, Consensus | None]:
-        """Return the mask (N,) of the found features that are static, and the consensus motion if there is one."""
-        camera, rows = self._camera, seen.nonzero()[0]
+        """Return the mask (N,) of the found features that are static, and the consensus motion
+        if there is one.
+        """
+        camera = self._camera
+        rows = seen.nonzero()[0]
         has_depth = (old.has_point & (old.has_right | (not self._needs_right)))[rows]
         deep = has_depth.nonzero()[0]
-        point, deep_point = old.point.take(rows, axis=0), old.point.take(rows[deep], axis=0)
+        point = old.point.take(rows, axis=0)
+        deep_point = old.point.take(rows[deep], axis=0)
         R_prior = T_prior = None
         if prior is not None:
             known, predicted = prior_rows(old, rows[deep], prior)
             R_prior = prior.R_cam_prev
             T_prior = predicted_motion(camera, old.point[known], predicted, expected)
-        before, after = old.left.take(rows, axis=0), found.take(rows, axis=0)
-        kept, motion = static_tracks(problem, before, point, has_depth, after, expected, R_prior, T_prior)
+        before = old.left.take(rows, axis=0)
+        after = found.take(rows, axis=0)
+        kept, motion = static_tracks(
+            problem, before, point, has_depth, after, expected, R_prior, T_prior
+        )
         expected_motion = None if prior is None else prior.motion
         near_m = camera.fu * camera.baseline_m / stereo.max_disparity_px
         measured = None if prior is None else prior.measured_motion
@@ -279,26 +381,34 @@ class KltFrontend:
                 in_event=self._objects.active,
                 depths_off=stereo.rows_are_off,
             )
-            if stereo.rows_are_off and one_motion_explains(problem, chosen, before[has_depth], after_deep):
+            if stereo.rows_are_off and one_motion_explains(
+                problem, chosen, before[has_depth], after_deep
+            ):
                 chosen = replace(chosen, object_share=0.0)
-            motion, kept[has_depth] = chosen.motion, chosen.motion.inliers
+            motion = chosen.motion
+            kept[has_depth] = chosen.motion.inliers
             self._objects.frame(index, chosen)
             if self._objects.hides_scene(index, chosen) and measured is None:
                 return np.zeros(len(old), dtype=np.bool_), None
         if motion is not None and not has_depth.all():
-            distance = epipolar_distance(camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m)
+            distance = epipolar_distance(
+                camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m
+            )
             kept[~has_depth] = distance <= problem.limit_px
         keep = np.zeros(len(old), dtype=np.bool_)
         keep[rows[kept]] = True
         return keep, motion
 
     def _promote(self, tracks: Tracks) -> Tracks:
-        """Output features that passed their probation from now on, under new ids; all features if these are few."""
+        """Output features that passed their probation from now on, under new ids; all features
+        if these are few.
+        """
         proven = tracks.has_right | (not self._needs_right)
         proven = tracks.shown | ((tracks.age >= _PROBATION_FRAMES) & proven)
         if proven.sum() < _VERY_FEW * self._grid.target_features:
             proven[:] = True
-        ids, first = tracks.ids.copy(), proven & ~tracks.shown
+        ids = tracks.ids.copy()
+        first = proven & ~tracks.shown
         ids[first] = np.arange(int(first.sum())) + self._next_id
         self._next_id += int(first.sum())
         return changed(tracks, ids=ids, shown=proven)

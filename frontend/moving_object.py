@@ -1,14 +1,17 @@
-"""Which of two motions is the camera's, where an object that moves on its own covers much of the image.
+"""Which of two motions is the camera's, where an object that moves on its own covers much of the
+image.
 
-The larger consensus wins RANSAC, and that may be the object's. The prediction of a motion sensor decides: each motion
-is tested by chi-square against the predicted one, with the covariance of the prediction and that of the fit; where both
-fail, the one that is clearly nearer is used. With an
-IMU that is known to millimetres and the test decides nearly always. Otherwise the points vote that have been static
-for longest: what has come into view just now cannot outvote them. Where they are few or at odds, the prediction is that
-of a body that goes on as before, and where both motions are possible the larger consensus is used, and it is said.
+The larger consensus wins RANSAC, and that may be the object's. The prediction of a motion sensor
+decides: each motion is tested by chi-square against the predicted one, with the covariance of the
+prediction and that of the fit; where both fail, the one that is clearly nearer is used. With an
+IMU that is known to millimetres and the test decides nearly always. Otherwise the points vote that
+have been static for longest: what has come into view just now cannot outvote them. Where they are
+few or at odds, the prediction is that of a body that goes on as before, and where both motions are
+possible the larger consensus is used, and it is said.
 
-A stereo calibration that is off makes two groups of a static scene, too: its depths are wrong by their size. Where the
-rows show such a calibration, an object is reported only if the left images alone, without depths, show it as well.
+A stereo calibration that is off makes two groups of a static scene, too: its depths are wrong by
+their size. Where the rows show such a calibration, an object is reported only if the left images
+alone, without depths, show it as well.
 """
 
 from __future__ import annotations
@@ -20,7 +23,13 @@ import numpy as np
 
 from vio.frontend.columns import share_of
 from vio.frontend.image_check import ImageCheck
-from vio.frontend.outliers import Consensus, RansacProblem, bearing_consensus, best_motion, pixel_errors
+from vio.frontend.outliers import (
+    Consensus,
+    RansacProblem,
+    bearing_consensus,
+    best_motion,
+    pixel_errors,
+)
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
 from vio.numerics.statistics import chi_square_quantile
@@ -29,20 +38,26 @@ from vio.records import BoolArray, IntArray, MotionPrior
 Decision: TypeAlias = Literal["predicted", "voted", "undecided"]
 
 _PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test
-_CLEARLY_NEARER = 10.0  # ratio of two motions' squared distances from a measured one, above which the nearer agrees
+# ratio of two motions' squared distances from a measured one, above which the nearer agrees
+_CLEARLY_NEARER = 10.0
 _LEAST_POINTS = 12  # of a second motion
 _LEAST_SUPPORT = 0.1  # points of a second motion that may replace the first, over the first's
 _LARGE_SHARE = 0.25  # share of all points above which a second motion is reported
-_SEEN_SHARE = 0.5  # of the smaller group's points that must be off the epipolar lines of the others to prove an object
+# of the smaller group's points that must be off the epipolar lines of the others to prove an object
+_SEEN_SHARE = 0.5
 _PIXEL_SIGMA = 0.5  # of a point's position by its depth and its track
-_INDEPENDENT_POINTS = 50  # errors of neighbours have much in common: a fit is no better than that of so many points
+# errors of neighbours have much in common: a fit is no better than that of so many points
+_INDEPENDENT_POINTS = 50
 _LEAST_STATIC = 0.8  # share of a consensus without depths that a measured motion must explain
 _FAR_M = 1e4  # depth of what is infinitely far away
-_SCALE_SIGMA = 0.01  # of the length of a fitted translation: depths of one frame have errors in common
-_VOTERS, _VOTING_FRAMES = 50, 5  # how many points vote, and for how many frames each must have been static
+# of the length of a fitted translation: depths of one frame have errors in common
+_SCALE_SIGMA = 0.01
+_VOTERS = 50  # how many points vote, and for how many frames each must have been static
+_VOTING_FRAMES = 5
 _CLEAR_VOTE = 0.7  # share of the voting points that must follow a motion
 _FRAMES = 5  # in a row before an object is reported
-_HIDDEN_SHARE = 0.1  # of the points that the scene has, during an event, below which the object hides it …
+# of the points that the scene has, during an event, below which the object hides it …
+_HIDDEN_SHARE = 0.1
 _HIDDEN_FRAMES = 3  # … in so many frames in a row
 _CLEAR_FRAMES = 20  # without one before the next is another event
 
@@ -74,15 +89,18 @@ def choose_motion(
         p_prev: points (N, 3) triangulated in the previous frame, metres, previous cam0 frame.
         pixels: left pixels (N, 2) of the same points in the current frame.
         found: the consensus over them.
-        predicted: the motion that the filter expects, with its covariance; None: it expects nothing.
+        predicted: the motion that the filter expects, with its covariance; None: it expects
+            nothing.
         voting: (N,) which points have been static for long; None: none.
-        in_event: whether an object has been seen in the frames before. It may hide all but a few points of the scene,
-            and then the prediction is taken in place of a consensus that contradicts it.
-        depths_off: whether the points' depths are known to be off, so that no motion explains all of a static scene;
-            a prediction that is not measured is off with them.
+        in_event: whether an object has been seen in the frames before. It may hide all but a few
+            points of the scene, and then the prediction is taken in place of a consensus that
+            contradicts it.
+        depths_off: whether the points' depths are known to be off, so that no motion explains all
+            of a static scene; a prediction that is not measured is off with them.
     """
     measured = predicted is not None and predicted.measured
-    hidden = in_event and (measured or not depths_off)  # the scene may be, and then the prediction is to be believed
+    # the scene may be, and then the prediction is to be believed
+    hidden = in_event and (measured or not depths_off)
     if voting is not None and not measured:
         voted = _voted(problem, p_prev, pixels, found, voting)
         if voted is not None:
@@ -91,21 +109,32 @@ def choose_motion(
     least = max(_LEAST_POINTS, _LEAST_SUPPORT * found.inliers.sum())
     if len(others) < least and not hidden:
         return TwoMotions(found, 0.0, None)
-    second, support = np.eye(4), np.zeros(len(others), dtype=np.bool_)
+    second = np.eye(4)
+    support = np.zeros(len(others), dtype=np.bool_)
     if len(others) >= least:
         starts = np.stack([np.eye(4) if predicted is None else predicted.T_curr_prev, np.eye(4)])
         second, support = best_motion(problem, p_prev[others], pixels[others], starts)
     large = bool(support.sum() >= least)
     reported = _if_large(support.sum() / len(p_prev)) if large else 0.0
-    extrapolated = not (measured or depths_off)  # the prediction is that of a body that goes on as before
-    limit, of_first = float(chi_square_quantile(_PROBABILITY, 6)), np.inf
+    # the prediction is that of a body that goes on as before
+    extrapolated = not (measured or depths_off)
+    limit = float(chi_square_quantile(_PROBABILITY, 6))
+    of_first = np.inf
     if predicted is not None and (large or in_event or extrapolated):
-        of_first = _squared_distance(problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted)
+        of_first = _squared_distance(
+            problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted
+        )
     if predicted is not None and extrapolated and of_first > limit:
         near = _near_prediction(problem, p_prev, pixels, found, predicted, limit)
         if near is not None:
-            second, support, large = near.T_curr_prev, near.inliers[others], True
-    follows_second = _followers(problem, second, p_prev, pixels) if large else np.zeros(len(p_prev), dtype=np.bool_)
+            second = near.T_curr_prev
+            support = near.inliers[others]
+            large = True
+    follows_second = (
+        _followers(problem, second, p_prev, pixels)
+        if large
+        else np.zeros(len(p_prev), dtype=np.bool_)
+    )
     if large and not measured and voting is not None:
         elected = None if depths_off else _elected(found.inliers[voting], follows_second[voting])
         if elected == "second":
@@ -117,18 +146,29 @@ def choose_motion(
         return TwoMotions(found, reported, "undecided" if reported else None)
     if not (large or in_event):
         return TwoMotions(found, 0.0, None)
-    of_second = _squared_distance(problem.camera, second, p_prev[others[support]], predicted) if large else np.inf
+    of_second = (
+        _squared_distance(problem.camera, second, p_prev[others[support]], predicted)
+        if large
+        else np.inf
+    )
     nearer, farther = sorted((of_first, of_second))
     if measured and large and nearer * _CLEARLY_NEARER <= farther:
-        limit = max(limit, nearer)  # the sensor is worse than its covariance, but leaves no doubt which one it is
-    first_agrees, second_agrees = of_first <= limit, of_second <= limit
+        # the sensor is worse than its covariance, but leaves no doubt which one it is
+        limit = max(limit, nearer)
+    first_agrees = of_first <= limit
+    second_agrees = of_second <= limit
     if not (second_agrees or in_event or reported):
         return TwoMotions(found, 0.0, None)  # whether the first agrees or not
     if first_agrees or not (second_agrees or hidden):
-        return TwoMotions(found, reported, "predicted" if first_agrees and not second_agrees else "undecided")
+        return TwoMotions(
+            found, reported, "predicted" if first_agrees and not second_agrees else "undecided"
+        )
     if not second_agrees:
-        second, follows_second = predicted.T_curr_prev, _followers(problem, predicted.T_curr_prev, p_prev, pixels)
-    return TwoMotions(Consensus(second, follows_second), _if_large(share_of(found.inliers)), "predicted")
+        second = predicted.T_curr_prev
+        follows_second = _followers(problem, predicted.T_curr_prev, p_prev, pixels)
+    return TwoMotions(
+        Consensus(second, follows_second), _if_large(share_of(found.inliers)), "predicted"
+    )
 
 
 def _if_large(share: float) -> float:
@@ -136,7 +176,9 @@ def _if_large(share: float) -> float:
     return float(share) if share >= _LARGE_SHARE else 0.0
 
 
-def _followers(problem: RansacProblem, T: FloatArray, p_prev: FloatArray, pixels: FloatArray) -> BoolArray:
+def _followers(
+    problem: RansacProblem, T: FloatArray, p_prev: FloatArray, pixels: FloatArray
+) -> BoolArray:
     """Mask (N,) of the points whose pixels a motion (4, 4) explains."""
     return np.asarray(pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px)
 
@@ -149,17 +191,22 @@ def _near_prediction(
     predicted: MotionPrior,
     limit: float,
 ) -> Consensus | None:
-    """The motion near a predicted one that the consensus contradicts, if some points follow this one alone.
+    """The motion near a predicted one that the consensus contradicts, if some points follow this
+    one alone.
 
-    A compromise between an object and what is far away can win the consensus, and leaves no second group. `limit` is
-    that of the squared distance from the prediction.
+    A compromise between an object and what is far away can win the consensus, and leaves no second
+    group. `limit` is that of the squared distance from the prediction.
     """
-    near = pixel_errors(problem.camera, predicted.T_curr_prev, p_prev, pixels) <= 2.0 * problem.limit_px
+    near = (
+        pixel_errors(problem.camera, predicted.T_curr_prev, p_prev, pixels)
+        <= 2.0 * problem.limit_px
+    )
     if near.sum() < _LEAST_POINTS:
         return None
     T, _ = best_motion(problem, p_prev[near], pixels[near], predicted.T_curr_prev[None])
     inliers = _followers(problem, T, p_prev, pixels)
-    alone, others = inliers & ~found.inliers, found.inliers & ~inliers
+    alone = inliers & ~found.inliers
+    others = found.inliers & ~inliers
     if alone.sum() < max(_LEAST_POINTS, _LEAST_SUPPORT * others.sum()):
         return None
     agrees = _squared_distance(problem.camera, T, p_prev[inliers], predicted) <= limit
@@ -167,11 +214,13 @@ def _near_prediction(
 
 
 def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] | None:
-    """Which of two motions most of the voting points follow, of those (N,) that only one of them explains.
+    """Which of two motions most of the voting points follow, of those (N,) that only one of them
+    explains.
 
     What is far away follows both, if they turn alike, and does not vote.
     """
-    for_first, for_second = int((first & ~second).sum()), int((second & ~first).sum())
+    for_first = int((first & ~second).sum())
+    for_second = int((second & ~first).sum())
     if max(for_first, for_second) < max(_LEAST_POINTS, _CLEAR_VOTE * (for_first + for_second)):
         return None
     return "first" if for_first > for_second else "second"
@@ -183,9 +232,15 @@ def _votes_for(found: Consensus, voting: BoolArray) -> bool:
 
 
 def _voted(
-    problem: RansacProblem, p_prev: FloatArray, pixels: FloatArray, found: Consensus, voting: BoolArray
+    problem: RansacProblem,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    found: Consensus,
+    voting: BoolArray,
 ) -> Consensus | None:
-    """Return the motion that most of the voting points (N,) follow, where the consensus is not theirs; else None."""
+    """Return the motion that most of the voting points (N,) follow, where the consensus is not
+    theirs; else None.
+    """
     if voting.sum() < _LEAST_POINTS or _votes_for(found, voting):
         return None
     starts = np.stack([found.T_curr_prev, np.eye(4)])
@@ -193,7 +248,8 @@ def _voted(
     if follows.mean() < _CLEAR_VOTE:
         return None
     inliers = _followers(problem, T, p_prev, pixels)
-    T, _ = best_motion(problem, p_prev[inliers], pixels[inliers], T[None])  # the oldest points may all be far away
+    # the oldest points may all be far away
+    T, _ = best_motion(problem, p_prev[inliers], pixels[inliers], T[None])
     return Consensus(T, _followers(problem, T, p_prev, pixels))
 
 
@@ -205,9 +261,11 @@ def static_by_prediction(
     predicted: MotionPrior,
     near_m: float,
 ) -> BoolArray:
-    """Which points of unknown depth (N,) are static, if those that one motion explains contradict the predicted one.
+    """Which points of unknown depth (N,) are static, if those that one motion explains contradict
+    the predicted one.
 
-    An object ahead of a turning camera keeps its place in the image; to move sideways explains it as well.
+    An object ahead of a turning camera keeps its place in the image; to move sideways explains it
+    as well.
 
     Args:
         problem: camera, thresholds and random generator.
@@ -224,11 +282,17 @@ def static_by_prediction(
 
 
 def _agree_with(
-    camera: StereoCamera, predicted: MotionPrior, before: FloatArray, after: FloatArray, near_m: float, sigma_px: float
+    camera: StereoCamera,
+    predicted: MotionPrior,
+    before: FloatArray,
+    after: FloatArray,
+    near_m: float,
+    sigma_px: float,
 ) -> BoolArray:
     """Which of some points of unknown depth may be static under a predicted motion, by chi-square.
 
-    Each is taken at the depth, beyond `near_m`, at which the motion brings it nearest to where it is seen.
+    Each is taken at the depth, beyond `near_m`, at which the motion brings it nearest to where it
+    is seen.
 
     Args:
         camera: the rectified pair.
@@ -239,9 +303,11 @@ def _agree_with(
         sigma_px: standard deviation of a pixel.
     """
     T = predicted.T_curr_prev
-    turned, seen = left_rays(camera, before) @ T[:3, :3].T, left_rays(camera, after)
+    turned = left_rays(camera, before) @ T[:3, :3].T
+    seen = left_rays(camera, after)
     # g x (R f + t / z) = 0
-    across, off = np.cross(seen, T[:3, 3]), np.cross(seen, turned)
+    across = np.cross(seen, T[:3, 3])
+    off = np.cross(seen, turned)
     inverse = -np.sum(across * off, axis=1) / (np.sum(across * across, axis=1) + 1e-12)
     p = turned / np.clip(inverse, 1.0 / _FAR_M, 1.0 / near_m)[:, None] + T[:3, 3]
     ahead = depth_of(camera, p) > 0.0
@@ -253,11 +319,14 @@ def _agree_with(
     return np.asarray(ahead & (squared <= float(chi_square_quantile(_PROBABILITY, 1))))
 
 
-def one_motion_explains(problem: RansacProblem, chosen: TwoMotions, before: FloatArray, after: FloatArray) -> bool:
-    """Return whether one motion of the camera explains the second group of points too, at depths of their own.
+def one_motion_explains(
+    problem: RansacProblem, chosen: TwoMotions, before: FloatArray, after: FloatArray
+) -> bool:
+    """Return whether one motion of the camera explains the second group of points too, at depths of
+    their own.
 
-    An object that moves along the epipolar lines of the scene passes for static here: this is asked only where the
-    depths are known to be wrong.
+    An object that moves along the epipolar lines of the scene passes for static here: this is asked
+    only where the depths are known to be wrong.
 
     Args:
         problem: camera, thresholds and random generator.
@@ -268,12 +337,17 @@ def one_motion_explains(problem: RansacProblem, chosen: TwoMotions, before: Floa
     if chosen.object_share == 0.0:
         return False
     static = bearing_consensus(problem, before, after, chosen.motion.T_curr_prev[:3, :3], None)
-    smaller = min(chosen.object_share, share_of(chosen.motion.inliers))  # of the groups: the larger one is fitted
+    # of the groups: the larger one is fitted
+    smaller = min(chosen.object_share, share_of(chosen.motion.inliers))
     return static is not None and float((~static).mean()) < _SEEN_SHARE * smaller
 
 
-def _squared_distance(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, predicted: MotionPrior) -> float:
-    """Squared distance of a motion (4, 4), fitted to points (N, 3), from the prediction, over their covariance."""
+def _squared_distance(
+    camera: StereoCamera, T: FloatArray, p_prev: FloatArray, predicted: MotionPrior
+) -> float:
+    """Squared distance of a motion (4, 4), fitted to points (N, 3), from the prediction, over
+    their covariance.
+    """
     p = transform_points(T, p_prev)
     J = _pixel_D_motion(camera, p).reshape(-1, 6)
     points = min(len(p), _INDEPENDENT_POINTS)
@@ -284,22 +358,28 @@ def _squared_distance(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, p
 
 
 def _pixel_D_motion(camera: StereoCamera, p: FloatArray) -> FloatArray:
-    """Jacobian (N, 2, 6) of the left pixels of points (N, 3) by the camera's motion, `[rho; phi]`."""
+    """Jacobian (N, 2, 6) of the left pixels of points (N, 3) by the camera's motion,
+    `[rho; phi]`.
+    """
     J: FloatArray = z_D_p_cam(camera, p)[:, :2] @ circledot(p)[:, :3]
     return J
 
 
 def voters(age: IntArray) -> BoolArray:
-    """Which points (N,), static for some frames (N,), have a vote: the oldest of those that are not new.
+    """Which points (N,), static for some frames (N,), have a vote: the oldest of those that are not
+    new.
 
-    What has come into view, and moves slowly enough to pass for static, is younger than what was there before.
+    What has come into view, and moves slowly enough to pass for static, is younger than what was
+    there before.
     """
     oldest = np.partition(age, len(age) - _VOTERS)[len(age) - _VOTERS] if len(age) > _VOTERS else 0
     return np.asarray(age >= max(oldest, _VOTING_FRAMES))
 
 
 class ObjectReport(ImageCheck):
-    """Reports once per event that an object covers much of the image, and what decided which motion is the camera's."""
+    """Reports once per event that an object covers much of the image, and what decided which
+    motion is the camera's.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -308,17 +388,22 @@ class ObjectReport(ImageCheck):
 
     @property
     def active(self) -> bool:
-        """Whether the prediction has distinguished an object from the scene in some of the last frames."""
+        """Whether the prediction has distinguished an object from the scene in some of the last
+        frames.
+        """
         return self._active
 
     def hides_scene(self, index: int, motions: TwoMotions) -> bool:
-        """Return whether a known object has left too few points of the scene for some frames, so that none is used."""
+        """Return whether a known object has left too few points of the scene for some frames, so
+        that none is used.
+        """
         hidden = self._active and float(motions.motion.inliers.mean()) < _HIDDEN_SHARE
         self._hidden = self._hidden + 1 if hidden else 0
         if self._hidden >= _HIDDEN_FRAMES and not self._said_hidden:
             self._said_hidden = True
             self._lines.append(
-                f"frame {index}: fewer than {100 * _HIDDEN_SHARE:.0f} % of the points are left of the scene: the "
+                f"frame {index}: fewer than {100 * _HIDDEN_SHARE:.0f} % of the points are left of "
+                "the scene: the "
                 "object hides it, and no feature is used"
             )
         return self._hidden >= _HIDDEN_FRAMES
@@ -326,12 +411,14 @@ class ObjectReport(ImageCheck):
     def frame(self, index: int, motions: TwoMotions) -> None:
         """Take the motions of a frame."""
         if motions.object_share == 0.0:
-            self._frames, self._clear = 0, self._clear + 1
+            self._frames = 0
+            self._clear = self._clear + 1
             self._said = self._said and self._clear < _CLEAR_FRAMES
             self._said_hidden = self._said_hidden and self._said
             self._active = self._active and self._clear < _FRAMES
             return
-        self._frames, self._clear = self._frames + 1, 0
+        self._frames = self._frames + 1
+        self._clear = 0
         self._active = self._active or (self._frames >= _FRAMES and motions.decision != "undecided")
         if self._frames < _FRAMES or self._said:
             return
@@ -339,14 +426,17 @@ class ObjectReport(ImageCheck):
         share = round(100 * motions.object_share)
         by = "the points seen before" if motions.decision == "voted" else "its predicted motion"
         line = (
-            f"frame {index}: {share} % of the points move together, but not as the camera does by {by}: an object that "
+            f"frame {index}: {share} % of the points move together, but not as the camera does by "
+            f"{by}: an object that "
             "moves on its own covers much of the image; its points are left out"
         )
         if motions.decision == "undecided":
             rest = round(100 * float(motions.motion.inliers.mean()))
             line = (
-                f"frame {index}: two groups of points move differently, {rest} % and {share} % of all: an object that "
-                "moves on its own covers much of the image, and the predicted motion does not tell which group it is; "
+                f"frame {index}: two groups of points move differently, {rest} % and {share} % of "
+                "all: an object that "
+                "moves on its own covers much of the image, and the predicted motion does not tell "
+                "which group it is; "
                 "the larger one is taken for the scene"
             )
         self._lines.append(line)

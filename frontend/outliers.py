@@ -1,13 +1,17 @@
 """Outlier rejection for tracks: RANSAC on the camera motion between two frames.
 
-Points triangulated in the previous frame are fitted to their pixels in the current one. Minimal sets of three points
-are solved by Gauss-Newton from an expected motion, all sets at once; the best motion is refined on its inliers.
-Reference: Fischler & Bolles, Random sample consensus, CACM (1981); Torr & Zisserman, MLESAC, CVIU (2000), for the
-truncated cost; Geiger et al., StereoScan, IV (2011), for Gauss-Newton on minimal sets of stereo points.
+Points triangulated in the previous frame are fitted to their pixels in the current one. Minimal
+sets of three points are solved by Gauss-Newton from an expected motion, all sets at once; the best
+motion is refined on its inliers.
+Reference: Fischler & Bolles, Random sample consensus, CACM (1981); Torr & Zisserman, MLESAC, CVIU
+(2000), for the truncated cost; Geiger et al., StereoScan, IV (2011), for Gauss-Newton on minimal
+sets of stereo points.
 
-Without depth, left pixels of two frames give a consensus on a rotation and a direction of translation.
-Reference: Nistér, An efficient solution to the five-point relative pose problem, PAMI (2004); Kneip et al., Finding the
-exact rotation between two images independently of the translation, ECCV (2012), for the case of pure rotation.
+Without depth, left pixels of two frames give a consensus on a rotation and a direction of
+translation.
+Reference: Nistér, An efficient solution to the five-point relative pose problem, PAMI (2004); Kneip
+et al., Finding the exact rotation between two images independently of the translation, ECCV (2012),
+for the case of pure rotation.
 """
 
 from __future__ import annotations
@@ -28,22 +32,29 @@ from vio.records import BoolArray, IntArray
 _MIN_DEPTH_M = 0.05
 _SAMPLES = 96  # random minimal sets of RANSAC
 _SURE_SHARE = 0.7  # share of inliers of the refined expected motion above which RANSAC is skipped
-_PRIOR_MAX_DEVIATION_DEG = 1.0  # of the consensus rotation from the prior, before a motion near the prior is tried
-_PRIOR_MIN_SUPPORT = 0.4  # inliers of the prior motion only, over the consensus', above which it replaces the consensus
+# of the consensus rotation from the prior, before a motion near the prior is tried
+_PRIOR_MAX_DEVIATION_DEG = 1.0
+# inliers of the prior motion only, over the consensus', above which it replaces the consensus
+_PRIOR_MIN_SUPPORT = 0.4
 _MIN_POINTS = 8  # with fewer points, a consensus may be chance
 _MIN_SHARE = 0.2  # smallest share of inliers of a consensus
 _PRIOR_POINTS = 64  # predicted pixels that are used
 _PRIOR_PX = 2.0  # median distance from them below which a motion represents them
-_PRIOR_CONVERGED = 1e-4  # change of that motion, in radians and metres, below which it is not refined further
+# change of that motion, in radians and metres, below which it is not refined further
+_PRIOR_CONVERGED = 1e-4
 _SAMPLE_ITERATIONS = 5
 _REFINE_ITERATIONS = 6
 _DAMPING = 1e-4
-_CONVERGED = 3e-6  # change of a motion, in radians and metres, below which it is not refined further
-_MIN_BEARING_SHARE = 0.5  # two views constrain a track in one direction only, so most tracks must be inliers
-_SURE_BEARING_SHARE = 0.9  # share of inliers of a predicted rotation above which no other rotation is tried
+# change of a motion, in radians and metres, below which it is not refined further
+_CONVERGED = 3e-6
+# two views constrain a track in one direction only, so most tracks must be inliers
+_MIN_BEARING_SHARE = 0.5
+# share of inliers of a predicted rotation above which no other rotation is tried
+_SURE_BEARING_SHARE = 0.9
 _FIVE_POINT_CONFIDENCE = 0.999
 _EPSILON = 1e-9  # added to denominators
-_LEAST_FORWARD = 0.5  # of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as large
+# of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as large
+_LEAST_FORWARD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +63,8 @@ class RansacProblem:
 
     camera: StereoCamera
     limit_px: float  # inlier threshold on the reprojection error
-    rng: np.random.Generator  # source of the samples; the same state gives the same result to the bit
+    # source of the samples; the same state gives the same result to the bit
+    rng: np.random.Generator
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,26 +75,33 @@ class Consensus:
     inliers: BoolArray  # (N,)
 
 
-def pixel_errors(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Distances (..., N) in pixels between points (N, 3) moved by motions (..., 4, 4) and pixels (N, 2).
+def pixel_errors(
+    camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, pixels: FloatArray
+) -> FloatArray:
+    """Distances (..., N) in pixels between points (N, 3) moved by motions (..., 4, 4) and pixels
+    (N, 2).
 
     Points behind the camera have infinite distance.
     """
     T = np.ascontiguousarray(T_curr_prev).reshape(-1, 4, 4)
     out = np.empty((len(T), len(p_prev)))
-    points, seen = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels)
+    points = np.ascontiguousarray(p_prev)
+    seen = np.ascontiguousarray(pixels)
     _distances(camera_args(camera), T, points, seen, out)
     return out.reshape(*T_curr_prev.shape[:-2], len(p_prev))
 
 
 @compiled
-def _distances(camera: CameraArgs, T: FloatArray, points: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
+def _distances(
+    camera: CameraArgs, T: FloatArray, points: FloatArray, pixels: FloatArray, out: FloatArray
+) -> None:
     """Write the distances (H, N) of points (N, 3) moved by motions (H, 4, 4) from pixels (N, 2)."""
     for h in range(len(T)):
         motion = T[h]
         for n in range(len(points)):
             u, v, depth = moved_pixel(camera, motion, points[n, 0], points[n, 1], points[n, 2])
-            du, dv = u - pixels[n, 0], v - pixels[n, 1]
+            du = u - pixels[n, 0]
+            dv = v - pixels[n, 1]
             out[h, n] = np.sqrt(du * du + dv * dv) if depth > _MIN_DEPTH_M else np.inf
 
 
@@ -96,12 +115,16 @@ def _gauss_newton(
     iterations: int,
     free: slice,
 ) -> FloatArray:
-    """Refine motions (H, 4, 4), each on its own points (H, K, 3), pixels (H, K, 2) and weights (H, K).
+    """Refine motions (H, 4, 4), each on its own points (H, K, 3), pixels (H, K, 2) and weights (H,
+    K).
 
-    `free` selects the part of the twist `[rho; phi]` that is estimated: all of it, or the translation alone.
+    `free` selects the part of the twist `[rho; phi]` that is estimated: all of it, or the
+    translation alone.
     """
     T = np.array(T, order="C")  # of one layout, so that one version is compiled
-    points, seen, w = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ascontiguousarray(weight)
+    points = np.ascontiguousarray(p_prev)
+    seen = np.ascontiguousarray(pixels)
+    w = np.ascontiguousarray(weight)
     _iterate(camera_args(camera), T, points, seen, w, np.inf, iterations, free.stop, 0.0)
     return T
 
@@ -118,13 +141,17 @@ def _iterate(
     free: int,
     converged: float,
 ) -> None:
-    """Gauss-Newton on the first entries of the twists of motions (H, 4, 4), in place; see `_gauss_newton`.
+    """Gauss-Newton on the first entries of the twists of motions (H, 4, 4), in place; see
+    `_gauss_newton`.
 
-    Weights (H, K) are multiplied by those of Geman and McClure at a scale; infinite: by none. A motion is done when no
-    entry of it changes by `converged`.
+    Weights (H, K) are multiplied by those of Geman and McClure at a scale; infinite: by none. A
+    motion is done when no entry of it changes by `converged`.
     """
     fu, fv, cu, cv, _, _ = camera
-    A, xi, u_D_xi, v_D_xi = np.empty((free, free)), np.empty(6), np.empty(6), np.empty(6)
+    A = np.empty((free, free))
+    xi = np.empty(6)
+    u_D_xi = np.empty(6)
+    v_D_xi = np.empty(6)
     before = np.empty((4, 4))
     for h in range(len(T)):
         for _ in range(iterations):
@@ -134,7 +161,9 @@ def _iterate(
                 for j in range(i + 1):
                     A[i, j] = 0.0
             for n in range(points.shape[1]):
-                px, py, pz = points[h, n, 0], points[h, n, 1], points[h, n, 2]
+                px = points[h, n, 0]
+                py = points[h, n, 1]
+                pz = points[h, n, 2]
                 x = T[h, 0, 0] * px + T[h, 0, 1] * py + T[h, 0, 2] * pz + T[h, 0, 3]
                 y = T[h, 1, 0] * px + T[h, 1, 1] * py + T[h, 1, 2] * pz + T[h, 1, 3]
                 z = T[h, 2, 0] * px + T[h, 2, 1] * py + T[h, 2, 2] * pz + T[h, 2, 3]
@@ -142,23 +171,41 @@ def _iterate(
                 w2 = weight[h, n] ** 2
                 if not z > _MIN_DEPTH_M or w2 == 0.0:
                     continue
-                a, b = x / z, y / z
-                du, dv = pixels[h, n, 0] - fu * a - cu, pixels[h, n, 1] - fv * b - cv - fv * azimuth
-                u, v = fu * x / z + cu, fv * y / z + fv * azimuth + cv
-                error = np.sqrt((u - pixels[h, n, 0]) ** 2 + (v - pixels[h, n, 1]) ** 2)  # as `_distances`
+                a = x / z
+                b = y / z
+                du = pixels[h, n, 0] - fu * a - cu
+                dv = pixels[h, n, 1] - fv * b - cv - fv * azimuth
+                u = fu * x / z + cu
+                v = fv * y / z + fv * azimuth + cv
+                # as `_distances`
+                error = np.sqrt((u - pixels[h, n, 0]) ** 2 + (v - pixels[h, n, 1]) ** 2)
                 if not error < 3.0 * scale_px:
                     continue
                 robust = 1.0 / (1.0 + (error / scale_px) ** 2)
                 w2 *= robust * robust
                 # pixel_D_point circledot(point)
-                u_D_xi[0], u_D_xi[1], u_D_xi[2] = fu / z, 0.0, -fu * a / z
-                u_D_xi[3], u_D_xi[4], u_D_xi[5] = -fu * a * b, fu * (1.0 + a * a), -fu * b
-                v_D_xi[0], v_D_xi[1], v_D_xi[2] = 0.0, fv / z, -fv * b / z
-                v_D_xi[3], v_D_xi[4], v_D_xi[5] = -fv * (1.0 + b * b), fv * a * b, fv * a
+                u_D_xi[0] = fu / z
+                u_D_xi[1] = 0.0
+                u_D_xi[2] = -fu * a / z
+                u_D_xi[3] = -fu * a * b
+                u_D_xi[4] = fu * (1.0 + a * a)
+                u_D_xi[5] = -fu * b
+                v_D_xi[0] = 0.0
+                v_D_xi[1] = fv / z
+                v_D_xi[2] = -fv * b / z
+                v_D_xi[3] = -fv * (1.0 + b * b)
+                v_D_xi[4] = fv * a * b
+                v_D_xi[5] = fv * a
                 if azimuth != 0.0:
                     for i in range(1, 5, 3):  # back from the turned camera
-                        u_D_xi[i], u_D_xi[i + 1] = c * u_D_xi[i] + s * u_D_xi[i + 1], c * u_D_xi[i + 1] - s * u_D_xi[i]
-                        v_D_xi[i], v_D_xi[i + 1] = c * v_D_xi[i] + s * v_D_xi[i + 1], c * v_D_xi[i + 1] - s * v_D_xi[i]
+                        u_D_xi[i], u_D_xi[i + 1] = (
+                            c * u_D_xi[i] + s * u_D_xi[i + 1],
+                            c * u_D_xi[i + 1] - s * u_D_xi[i],
+                        )
+                        v_D_xi[i], v_D_xi[i + 1] = (
+                            c * v_D_xi[i] + s * v_D_xi[i + 1],
+                            c * v_D_xi[i + 1] - s * v_D_xi[i],
+                        )
                 for i in range(free):
                     xi[i] += w2 * (u_D_xi[i] * du + v_D_xi[i] * dv)
                     for j in range(i + 1):
@@ -194,9 +241,19 @@ def _refine(
 ) -> FloatArray:
     """Refine one motion (4, 4) on all points, with Geman-McClure weights."""
     T = np.array(T[None], order="C")
-    points, seen, equal = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ones((1, len(p_prev)))
+    points = np.ascontiguousarray(p_prev)
+    seen = np.ascontiguousarray(pixels)
+    equal = np.ones((1, len(p_prev)))
     _iterate(
-        camera_args(camera), T, points[None], seen[None], equal, scale_px, _REFINE_ITERATIONS, free.stop, converged
+        camera_args(camera),
+        T,
+        points[None],
+        seen[None],
+        equal,
+        scale_px,
+        _REFINE_ITERATIONS,
+        free.stop,
+        converged,
     )
     return T[0]
 
@@ -204,8 +261,11 @@ def _refine(
 def _ransac(
     problem: RansacProblem, p_prev: FloatArray, pixels: FloatArray, starts: FloatArray, free: slice
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the best motion (4, 4) over minimal sets and the starts (S, 4, 4) themselves, with its inliers (N,)."""
-    camera, limit = problem.camera, problem.limit_px
+    """Return the best motion (4, 4) over minimal sets and the starts (S, 4, 4) themselves, with
+    its inliers (N,).
+    """
+    camera = problem.camera
+    limit = problem.limit_px
     begin = starts[_best_start(camera, starts, p_prev, pixels, limit)]
     refined = _refine(camera, begin, p_prev, pixels, limit / 2, free)
     inliers = pixel_errors(camera, refined, p_prev, pixels) <= limit
@@ -214,7 +274,13 @@ def _ransac(
     sets = problem.rng.integers(0, len(p_prev), size=(_SAMPLES, 3))
     T = np.broadcast_to(begin, (len(sets), 4, 4))
     T = _gauss_newton(
-        camera, T, p_prev[sets], pixels[sets], np.ones(sets.shape), iterations=_SAMPLE_ITERATIONS, free=free
+        camera,
+        T,
+        p_prev[sets],
+        pixels[sets],
+        np.ones(sets.shape),
+        iterations=_SAMPLE_ITERATIONS,
+        free=free,
     )
     T = np.concatenate([starts, refined[None], T])
     cost = np.minimum(pixel_errors(camera, T, p_prev, pixels), limit) ** 2
@@ -225,15 +291,20 @@ def _ransac(
 def best_motion(
     problem: RansacProblem, p_prev: FloatArray, pixels: FloatArray, starts: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the motion (4, 4) with most inliers among points (N, 3) and pixels (N, 2), and their mask (N,).
+    """Return the motion (4, 4) with most inliers among points (N, 3) and pixels (N, 2), and their
+    mask (N,).
 
     Unlike a consensus it may have few inliers; `starts` (S, 4, 4) are tried besides minimal sets.
     """
     return _ransac(problem, p_prev, pixels, starts, slice(0, 6))
 
 
-def _best_start(camera: StereoCamera, starts: FloatArray, p_prev: FloatArray, pixels: FloatArray, limit: float) -> int:
-    """Return the index of the start with the smallest median error; errors far beyond the limit are clipped."""
+def _best_start(
+    camera: StereoCamera, starts: FloatArray, p_prev: FloatArray, pixels: FloatArray, limit: float
+) -> int:
+    """Return the index of the start with the smallest median error; errors far beyond the limit
+    are clipped.
+    """
     errors = np.minimum(pixel_errors(camera, starts, p_prev, pixels), 1e3 * limit)
     errors.sort(axis=1)
     count = errors.shape[1]
@@ -250,12 +321,14 @@ def static_tracks(
     R_prior: FloatArray | None,
     T_prior: FloatArray | None,
 ) -> tuple[BoolArray, Consensus | None]:
-    """Find the tracks of static points: by the tracks with depth, else by two-view geometry of the left images.
+    """Find the tracks of static points: by the tracks with depth, else by two-view geometry of the
+    left images.
 
     Args:
         problem: camera, thresholds and random generator.
         left: left pixels (N, 2) in the previous frame.
-        p_prev: points (N, 3) triangulated there, metres, previous cam0 frame; arbitrary where `has_depth` is False.
+        p_prev: points (N, 3) triangulated there, metres, previous cam0 frame; arbitrary where
+            `has_depth` is False.
         has_depth: mask (N,) of tracks with known depth.
         pixels: left pixels (N, 2) in the current frame.
         expected: motion (4, 4) `T_curr_prev` to start from.
@@ -263,10 +336,13 @@ def static_tracks(
         T_prior: prior motion (4, 4) `T_curr_prev`, or None.
 
     Returns:
-        Mask (N,) of the tracks to keep, and the consensus motion of the tracks with depth (its inliers are a mask over
-        these tracks), or None. With a motion, all tracks without depth are kept: the caller may check them against it.
+        Mask (N,) of the tracks to keep, and the consensus motion of the tracks with depth (its
+        inliers are a mask over these tracks), or None. With a motion, all tracks without depth are
+        kept: the caller may check them against it.
     """
-    motion = rigid_consensus(problem, p_prev[has_depth], pixels[has_depth], expected, R_prior, T_prior)
+    motion = rigid_consensus(
+        problem, p_prev[has_depth], pixels[has_depth], expected, R_prior, T_prior
+    )
     keep = np.ones(len(left), dtype=np.bool_)
     if motion is not None:
         keep[has_depth] = motion.inliers
@@ -285,10 +361,10 @@ def rigid_consensus(
 ) -> Consensus | None:
     """Estimate the camera motion from static points.
 
-    A large moving object can win the consensus. If the consensus rotation deviates from a prior rotation (`R_prior`),
-    the best motion with the prior rotation replaces it; if the consensus deviates from a prior motion (`T_prior`), the
-    motion refined from the prior does. Either needs enough inliers among the outliers of the consensus, relative to the
-    number of its inliers.
+    A large moving object can win the consensus. If the consensus rotation deviates from a prior
+    rotation (`R_prior`), the best motion with the prior rotation replaces it; if the consensus
+    deviates from a prior motion (`T_prior`), the motion refined from the prior does. Either needs
+    enough inliers among the outliers of the consensus, relative to the number of its inliers.
 
     Args:
         problem: camera, thresholds and random generator.
@@ -309,13 +385,21 @@ def rigid_consensus(
     if T_prior is not None:
         starts.append(T_prior)
     T, inliers = _ransac(problem, p_prev, pixels, np.stack(starts), slice(0, 6))
-    # Only outliers of the consensus support another motion: a prior that agrees with the consensus is not tried.
+    # Only outliers of the consensus support another motion: a prior that agrees with the consensus
+    # is not tried.
     needed = max(_MIN_POINTS, _PRIOR_MIN_SUPPORT * inliers.sum())
     if (~inliers).sum() >= needed:
         for T_near in _prior_candidates(problem, p_prev, pixels, T, expected, R_prior, T_prior):
             kept = pixel_errors(problem.camera, T_near, p_prev, pixels) <= problem.limit_px
             if (kept & ~inliers).sum() >= needed:
-                T = _refine(problem.camera, T_near, p_prev[kept], pixels[kept], problem.limit_px / 2, slice(0, 6))
+                T = _refine(
+                    problem.camera,
+                    T_near,
+                    p_prev[kept],
+                    pixels[kept],
+                    problem.limit_px / 2,
+                    slice(0, 6),
+                )
                 inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
                 break
     if inliers.sum() < max(_MIN_POINTS, _MIN_SHARE * len(inliers)):
@@ -342,7 +426,9 @@ def _prior_candidates(
     return near
 
 
-def _motions_agree(camera: StereoCamera, T: FloatArray, T_other: FloatArray, p_prev: FloatArray) -> bool:
+def _motions_agree(
+    camera: StereoCamera, T: FloatArray, T_other: FloatArray, p_prev: FloatArray
+) -> bool:
     """Whether two motions (4, 4) project most points (N, 3) to nearly the same pixels."""
     moved = transform_points(T, p_prev)
     ahead = depth_of(camera, moved) > _MIN_DEPTH_M
@@ -358,42 +444,63 @@ def _rotation_difference_deg(T: FloatArray, R: FloatArray) -> float:
 
 
 def epipolar_distance(
-    camera: StereoCamera, T_curr_prev: FloatArray, previous: FloatArray, current: FloatArray, near_m: float
+    camera: StereoCamera,
+    T_curr_prev: FloatArray,
+    previous: FloatArray,
+    current: FloatArray,
+    near_m: float,
 ) -> FloatArray:
-    """Distance (N,) in pixels from the part of the epipolar line between depth `near_m` and infinity.
+    """Distance (N,) in pixels from the part of the epipolar line between depth `near_m` and
+    infinity.
 
-    `previous` and `current` are left pixels (N, 2). Unlike the epipolar line, the segment stays defined when the
-    camera only turns or stands still: it shrinks to a point.
+    `previous` and `current` are left pixels (N, 2). Unlike the epipolar line, the segment stays
+    defined when the camera only turns or stands still: it shrinks to a point.
     """
     out = np.empty(len(previous))
     T = np.ascontiguousarray(T_curr_prev)
-    before, after = np.ascontiguousarray(previous), np.ascontiguousarray(current)
+    before = np.ascontiguousarray(previous)
+    after = np.ascontiguousarray(current)
     _epipolar_distances(camera_args(camera), T, before, after, near_m, out)
     return out
 
 
 @compiled
 def _epipolar_distances(
-    camera: CameraArgs, T: FloatArray, before: FloatArray, after: FloatArray, near_m: float, out: FloatArray
+    camera: CameraArgs,
+    T: FloatArray,
+    before: FloatArray,
+    after: FloatArray,
+    near_m: float,
+    out: FloatArray,
 ) -> None:
     """Write the distances (N,) of `epipolar_distance`."""
     fu, fv, cu, cv, _, cylinder = camera
     end = np.empty((2, 2))  # pixels of the point at infinity and of the nearest one
     for n in range(len(out)):
         x, y, z = point_at(camera, before[n, 0], before[n, 1], 1.0)
-        u, v, s, c = after[n, 0], after[n, 1], 0.0, 1.0
+        u = after[n, 0]
+        v = after[n, 1]
+        s = 0.0
+        c = 1.0
         if cylinder:  # turned as by `vio.geometry.stereo.facing`
-            s, c, v = np.sin((v - cv) / fv), np.cos((v - cv) / fv), cv
+            s = np.sin((v - cv) / fv)
+            c = np.cos((v - cv) / fv)
+            v = cv
         for i in range(2):
             length, moved = (1.0, 0.0) if i == 0 else (near_m, 1.0)
             across = length * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z) + moved * T[0, 3]
             down = length * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z) + moved * T[1, 3]
             ahead = length * (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z) + moved * T[2, 3]
             depth = max(s * down + c * ahead, 1e-3)
-            end[i, 0], end[i, 1] = fu * across / depth + cu, fv * (c * down - s * ahead) / depth + cv
-        off_u, off_v = u - end[0, 0], v - end[0, 1]
-        along_u, along_v = end[1, 0] - end[0, 0], end[1, 1] - end[0, 1]
-        position = (off_u * along_u + off_v * along_v) / max(along_u * along_u + along_v * along_v, 1e-12)
+            end[i, 0] = fu * across / depth + cu
+            end[i, 1] = fv * (c * down - s * ahead) / depth + cv
+        off_u = u - end[0, 0]
+        off_v = v - end[0, 1]
+        along_u = end[1, 0] - end[0, 0]
+        along_v = end[1, 1] - end[0, 1]
+        position = (off_u * along_u + off_v * along_v) / max(
+            along_u * along_u + along_v * along_v, 1e-12
+        )
         position = min(max(position, 0.0), 1.0)
         out[n] = np.sqrt((off_u - position * along_u) ** 2 + (off_v - position * along_v) ** 2)
 
@@ -401,24 +508,30 @@ def _epipolar_distances(
 def predicted_motion(
     camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, expected: FloatArray
 ) -> FloatArray | None:
-    """Estimate a start motion (4, 4) from some of the predicted pixels; return `expected` if it already fits them.
+    """Estimate a start motion (4, 4) from some of the predicted pixels; return `expected` if it
+    already fits them.
 
     None with too few points, or if no motion fits most of them.
     """
     few = slice(None, None, max(1, len(p_prev) // _PRIOR_POINTS))
-    p, z = p_prev[few], pixels[few]
+    p = p_prev[few]
+    z = pixels[few]
     if len(p) < _MIN_POINTS:
         return None
-    T, weight = expected, np.ones((1, len(p)))
+    T = expected
+    weight = np.ones((1, len(p)))
     for _ in range(_SAMPLE_ITERATIONS):
         if median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX:
             return T
-        T = _gauss_newton(camera, T[None], p[None], z[None], weight, iterations=1, free=slice(0, 6))[0]
+        T = _gauss_newton(
+            camera, T[None], p[None], z[None], weight, iterations=1, free=slice(0, 6)
+        )[0]
     T = _refine(camera, T, p, z, _PRIOR_PX, slice(0, 6), converged=_PRIOR_CONVERGED)
     return T if median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX else None
 
 
-# --- two views, no depth ----------------------------------------------------------------------------------------------
+# --- two views, no depth
+# ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -439,10 +552,11 @@ def bearing_consensus(
 ) -> BoolArray | None:
     """Find the tracks that are consistent with one camera motion at some depth.
 
-    A rotation and a direction of translation constrain every feature to an epipolar ray: it starts at the pixel of
-    infinite depth, given by the rotation alone, and extends towards nearer points. A feature with little parallax is
-    near the start of its ray under any translation, so that standstill and pure rotation lose no track. With known
-    rotation, two features give the direction; without, five give both.
+    A rotation and a direction of translation constrain every feature to an epipolar ray: it starts
+    at the pixel of infinite depth, given by the rotation alone, and extends towards nearer points.
+    A feature with little parallax is near the start of its ray under any translation, so that
+    standstill and pure rotation lose no track. With known rotation, two features give the
+    direction; without, five give both.
 
     Args:
         problem: camera, thresholds and random generator.
@@ -471,22 +585,28 @@ def bearing_consensus(
         and near_prior is not None
         and _rotation_difference_deg(T, R_prior) > _PRIOR_MAX_DEVIATION_DEG
     ):
-        # A wrong prior shares some inliers with the consensus: only outliers of the consensus support the prior.
+        # A wrong prior shares some inliers with the consensus: only outliers of the consensus
+        # support the prior.
         supported = (near_prior & ~kept).sum() >= max(_MIN_POINTS, _PRIOR_MIN_SUPPORT * kept.sum())
         kept = near_prior if supported else kept
     return kept if kept.sum() >= max(_MIN_POINTS, _MIN_BEARING_SHARE * len(kept)) else None
 
 
-def _ray_distance(camera: StereoCamera, seen: _TwoViews, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Distances (..., N) in pixels from the epipolar rays of rotations (..., 3, 3) and directions (..., 3).
+def _ray_distance(
+    camera: StereoCamera, seen: _TwoViews, R: FloatArray, t: FloatArray
+) -> FloatArray:
+    """Distances (..., N) in pixels from the epipolar rays of rotations (..., 3, 3) and directions
+    (..., 3).
 
-    A ray is the part of the epipolar line at positive depth; before its start, the distance to the start is used.
+    A ray is the part of the epipolar line at positive depth; before its start, the distance to the
+    start is used.
     """
     after, turned = facing(camera, seen.after, seen.before @ np.swapaxes(R, -1, -2))
     t = facing(camera, seen.after, t[..., None, :])[1]
     ahead = turned[..., 2] > _MIN_DEPTH_M
     depth = np.where(ahead, turned[..., 2], 1.0)
-    x, y = turned[..., 0] / depth, turned[..., 1] / depth
+    x = turned[..., 0] / depth
+    y = turned[..., 1] / depth
     off_u = after[:, 0] - camera.fu * x - camera.cu
     off_v = after[:, 1] - camera.fv * y - camera.cv
     way_u = camera.fu * (t[..., 0] - x * t[..., 2])
@@ -503,15 +623,22 @@ def _bearing_inliers(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> 
 
 def _cost(problem: RansacProblem, seen: _TwoViews, R: FloatArray, t: FloatArray) -> FloatArray:
     """Truncated squared distances, summed over the tracks (...)."""
-    return np.asarray((np.minimum(_ray_distance(problem.camera, seen, R, t), problem.limit_px) ** 2).sum(axis=-1))
+    return np.asarray(
+        (np.minimum(_ray_distance(problem.camera, seen, R, t), problem.limit_px) ** 2).sum(axis=-1)
+    )
 
 
 def _bearing_ransac(
-    problem: RansacProblem, seen: _TwoViews, rotations: list[FloatArray], others: FloatArray | None = None
+    problem: RansacProblem,
+    seen: _TwoViews,
+    rotations: list[FloatArray],
+    others: FloatArray | None = None,
 ) -> FloatArray:
-    """Return the best rotation and direction of translation, as a motion (4, 4) with a unit translation.
+    """Return the best rotation and direction of translation, as a motion (4, 4) with a unit
+    translation.
 
-    For each rotation, pairs of tracks give the direction; `others` (K, 4, 4) are further candidate motions.
+    For each rotation, pairs of tracks give the direction; `others` (K, 4, 4) are further candidate
+    motions.
     """
     models = [np.zeros((0, 4, 4)) if others is None else others]
     pairs = _pairs(len(seen.before), problem)
@@ -521,28 +648,43 @@ def _bearing_ransac(
         t = np.cross(normal[pairs[:, 0]], normal[pairs[:, 1]])
         length = np.linalg.norm(t, axis=1, keepdims=True)
         # A degenerate pair gives no direction; use an arbitrary one.
-        t = np.where(length > 0.0, t / np.maximum(length, np.finfo(np.float64).tiny), [0.0, 0.0, 1.0])
-        models += [se3_from_parts(np.broadcast_to(R, (len(t), 3, 3)), sign * t) for sign in (1.0, -1.0)]
+        t = np.where(
+            length > 0.0, t / np.maximum(length, np.finfo(np.float64).tiny), [0.0, 0.0, 1.0]
+        )
+        models += [
+            se3_from_parts(np.broadcast_to(R, (len(t), 3, 3)), sign * t) for sign in (1.0, -1.0)
+        ]
     T = np.concatenate(models)
     best = T[int(np.argmin(_cost(problem, seen, T[:, :3, :3], T[:, :3, 3])))]
     for _ in range(_REFINE_ITERATIONS):
         better = _bearing_step(problem, seen, best)
-        if _cost(problem, seen, better[:3, :3], better[:3, 3]) >= _cost(problem, seen, best[:3, :3], best[:3, 3]):
+        if _cost(problem, seen, better[:3, :3], better[:3, 3]) >= _cost(
+            problem, seen, best[:3, :3], best[:3, 3]
+        ):
             break
         best = better
     return best
 
 
 def _bearing_step(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> FloatArray:
-    """One Gauss-Newton step of a motion (4, 4) with unit translation, on the distances from epipolar lines."""
-    camera, limit = problem.camera, problem.limit_px
-    R, t = T[:3, :3], T[:3, 3]
+    """One Gauss-Newton step of a motion (4, 4) with unit translation, on the distances from
+    epipolar lines.
+    """
+    camera = problem.camera
+    limit = problem.limit_px
+    R = T[:3, :3]
+    t = T[:3, 3]
     turned = seen.before @ R.T
     line = np.cross(t, turned)
     normal = facing(camera, seen.after, line)[1]
     scale = np.hypot(normal[:, 0] / camera.fu, normal[:, 1] / camera.fv) + _EPSILON
     distance = _ray_distance(camera, seen, R, t)
-    weight = np.where(distance < 1.5 * limit, 1.0 / (1.0 + (np.minimum(distance, 1e6) / limit * 2) ** 2), 0.0) / scale
+    weight = (
+        np.where(
+            distance < 1.5 * limit, 1.0 / (1.0 + (np.minimum(distance, 1e6) / limit * 2) ** 2), 0.0
+        )
+        / scale
+    )
     residual = weight * np.einsum("ni,ni->n", seen.rays, line)
     plane = np.linalg.svd(t[None])[2][1:]  # two directions perpendicular to the translation
     r_D_turn = np.cross(turned, np.cross(seen.rays, t))
@@ -555,14 +697,17 @@ def _bearing_step(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> Flo
 
 
 def _pure_rotation(problem: RansacProblem, seen: _TwoViews) -> FloatArray:
-    """Estimate the pure rotation (3, 3) with most inliers: from pairs of tracks, then refined on its inliers."""
+    """Estimate the pure rotation (3, 3) with most inliers: from pairs of tracks, then refined on
+    its inliers.
+    """
     f, g = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (seen.before, seen.rays))
     pairs = _pairs(len(f), problem)
     R = _triads(g, pairs) @ np.swapaxes(_triads(f, pairs), 1, 2)
     still = np.zeros(3)
     R_best = R[int(np.argmin(_cost(problem, seen, R, np.broadcast_to(still, (len(R), 3)))))]
     near = _ray_distance(problem.camera, seen, R_best, still) <= problem.limit_px
-    # Reference: Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. (1976).
+    # Reference: Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst.
+    # (1976).
     U, _, Vt = np.linalg.svd(g[near].T @ f[near])
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
@@ -570,19 +715,29 @@ def _pure_rotation(problem: RansacProblem, seen: _TwoViews) -> FloatArray:
 def _pairs(count: int, problem: RansacProblem) -> IntArray:
     """Random pairs (H, 2) of different indices below `count`."""
     first = problem.rng.integers(0, count, size=_SAMPLES)
-    return np.stack([first, (first + problem.rng.integers(1, count, size=len(first))) % count], axis=1)
+    return np.stack(
+        [first, (first + problem.rng.integers(1, count, size=len(first))) % count], axis=1
+    )
 
 
 def _triads(rays: FloatArray, pairs: IntArray) -> FloatArray:
-    """Right-handed orthonormal axes (H, 3, 3) in columns, spanned by pairs (H, 2) of unit rays (N, 3)."""
-    a, b = rays[pairs[:, 0]], rays[pairs[:, 1]]
+    """Right-handed orthonormal axes (H, 3, 3) in columns, spanned by pairs (H, 2) of unit rays
+    (N, 3).
+    """
+    a = rays[pairs[:, 0]]
+    b = rays[pairs[:, 1]]
     across = np.cross(a, b)
     across = across / (np.linalg.norm(across, axis=1, keepdims=True) + _EPSILON)
     return np.stack([a, across, np.cross(a, across)], axis=2)
 
 
-def _five_point(problem: RansacProblem, previous: FloatArray, current: FloatArray) -> FloatArray | None:
-    """Motions (K, 4, 4) with unit translation, decomposed from the best essential matrices; None if none fits."""
+def _five_point(
+    problem: RansacProblem, previous: FloatArray, current: FloatArray
+) -> FloatArray | None:
+    """Motions (K, 4, 4) with unit translation, decomposed from the best essential matrices.
+
+    None if none fits.
+    """
     camera = problem.camera
     if camera.is_cylinder:
         previous, current = _pinhole_pixels(camera, previous, current)
@@ -606,9 +761,15 @@ def _five_point(problem: RansacProblem, previous: FloatArray, current: FloatArra
     return np.stack(motions)
 
 
-def _pinhole_pixels(camera: StereoCamera, previous: FloatArray, current: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (K, 2) and (K, 2) that a pinhole of the same intrinsics shows in the place of a cylinder's (N, 2)."""
+def _pinhole_pixels(
+    camera: StereoCamera, previous: FloatArray, current: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels (K, 2) and (K, 2) that a pinhole of the same intrinsics shows in the place of a
+    cylinder's (N, 2).
+    """
     rays = [left_rays(camera, pixels) for pixels in (previous, current)]
     ahead = np.all([r[:, 2] > _LEAST_FORWARD * np.linalg.norm(r, axis=1) for r in rays], axis=0)
-    a, b = (r[ahead, :2] / r[ahead, 2:] * [camera.fu, camera.fv] + [camera.cu, camera.cv] for r in rays)
+    a, b = (
+        r[ahead, :2] / r[ahead, 2:] * [camera.fu, camera.fv] + [camera.cu, camera.cv] for r in rays
+    )
     return a, b

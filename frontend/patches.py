@@ -29,14 +29,19 @@ def half_image(image: Image) -> Image:
 
 
 def inside(image: Image, points: npt.NDArray[np.float64], margin: float) -> BoolArray:
-    """Mask (N,) of finite points (N, 2) at least `margin` pixels away from the image's outermost pixel centres."""
+    """Mask (N,) of finite points (N, 2) at least `margin` pixels away from the image's outermost
+    pixel centres.
+    """
     height, width = image.shape
-    u, v = points[:, 0], points[:, 1]
+    u = points[:, 0]
+    v = points[:, 1]
     return (u >= margin) & (u <= width - 1 - margin) & (v >= margin) & (v <= height - 1 - margin)
 
 
 def mean_and_contrast(image: Image, stride: int) -> tuple[float, float]:
-    """Mean and standard deviation of an image's gray levels, from every `stride`-th pixel of every `stride`-th row."""
+    """Mean and standard deviation of an image's gray levels, from every `stride`-th pixel of
+    every `stride`-th row.
+    """
     mean, contrast = statistics(image, stride)
     return float(mean), float(contrast)
 
@@ -45,7 +50,9 @@ def mean_and_contrast(image: Image, stride: int) -> tuple[float, float]:
 def statistics(image: Image, stride: int) -> tuple[float, float]:
     """Return what `mean_and_contrast` does, to compiled functions."""
     height, width = image.shape
-    total, squares, count = np.int64(0), np.int64(0), 0
+    total = np.int64(0)
+    squares = np.int64(0)
+    count = 0
     for y in range(0, height, stride):
         for x in range(0, width, stride):
             gray = np.int64(image[y, x])

@@ -1,4 +1,6 @@
-"""Replay of features tracked elsewhere: from a course file, or from the observations of an earlier run."""
+"""Replay of features tracked elsewhere: from a course file, or from the observations of an
+earlier run.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,8 @@ class PrecomputedFrontend:
         found = self._source(frame.index)
         if found is None:
             raise DataError(
-                f"frame {frame.index} has no precomputed observations; use a front end that reads images, "
+                f"frame {frame.index} has no precomputed observations; use a front end that reads "
+                "images, "
                 "or a feature file that covers this frame"
             )
         tracked = int(np.isin(found.ids, self._previous, assume_unique=True).sum())

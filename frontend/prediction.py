@@ -1,4 +1,6 @@
-"""Predicted pixels of the tracked features in the next frame: from a prior, or from a camera motion."""
+"""Predicted pixels of the tracked features in the next frame: from a prior, or from a camera
+motion.
+"""
 
 from __future__ import annotations
 
@@ -19,67 +21,89 @@ _FAR_M = 1e6  # depth assumed where too few features have one
 
 
 def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
-    """Return the valid part of a prior: finite left pixels, one row per id, and the rotation if it is orthonormal."""
+    """Return the valid part of a prior: finite left pixels, one row per id, and the rotation if
+    it is orthonormal.
+    """
     if prior is None:
         return None
-    ids, z = prior.ids, prior.z
+    ids = prior.ids
+    z = prior.z
     if (ids[1:] <= ids[:-1]).any():
         ids, first = np.unique(ids, return_index=True)
         z = z[first]
     finite = np.isfinite(z[:, :2]).all(axis=1)
     R = prior.R_cam_prev
-    if R is not None and not (np.isfinite(R).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_SLACK):
+    if R is not None and not (
+        np.isfinite(R).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_SLACK
+    ):
         R = None
     if R is None and not finite.any():
         return None
     motion = prior.motion
-    if motion is not None and not (np.isfinite(motion.T_curr_prev).all() and np.isfinite(motion.covariance).all()):
+    if motion is not None and not (
+        np.isfinite(motion.T_curr_prev).all() and np.isfinite(motion.covariance).all()
+    ):
         motion = None
     return TrackPrior(ids[finite], z[finite], R, motion)
 
 
 def prior_pixels(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:
-    """Rows (K,) of the ids (N,) that a usable prior contains, and the left pixels (K, 2) that it predicts."""
+    """Rows (K,) of the ids (N,) that a usable prior contains, and the left pixels (K, 2) that it
+    predicts.
+    """
     rows, given = _common_rows(ids, prior)
     return rows, prior.z[given, :2]
 
 
 def _common_rows(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, IntArray]:
     """Rows (K,) of the ids (N,) that a usable prior contains, and its rows (K,) for them."""
-    rows, given = np.empty(len(ids), dtype=np.int64), np.empty(len(ids), dtype=np.int64)
+    rows = np.empty(len(ids), dtype=np.int64)
+    given = np.empty(len(ids), dtype=np.int64)
     count = _find(np.ascontiguousarray(ids), prior.ids, rows, given)
     return rows[:count], given[:count]
 
 
 @compiled
 def _find(ids: IntArray, increasing: IntArray, rows: IntArray, given: IntArray) -> int:
-    """Write the rows (K,) of those ids (N,) that are among others (M,), and their rows there; return K."""
+    """Write the rows (K,) of those ids (N,) that are among others (M,), and their rows there;
+    return K.
+    """
     count = 0
     for n in range(len(ids)):
         at = index_of(ids[n], increasing)
         if at >= 0:
-            rows[count], given[count] = n, at
+            rows[count] = n
+            given[count] = at
             count += 1
     return count
 
 
-def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tuple[FloatArray, BoolArray]:
-    """Depths (N,) that a usable prior predicts for ids (N,), metres, and a mask (N,) of those that it contains.
+def prior_depths(
+    camera: StereoCamera, ids: IntArray, prior: TrackPrior
+) -> tuple[FloatArray, BoolArray]:
+    """Depths (N,) that a usable prior predicts for ids (N,), metres, and a mask (N,) of those that
+    it contains.
 
     Ids below zero are in no prior; depths outside the mask are one metre.
     """
-    depth, known = np.ones(len(ids)), np.zeros(len(ids), dtype=np.bool_)
+    depth = np.ones(len(ids))
+    known = np.zeros(len(ids), dtype=np.bool_)
     named = (ids >= 0).nonzero()[0]
     rows, given = _common_rows(ids[named], prior)
     disparity = prior.z[given, 0] - prior.z[given, 2]
     ahead = np.isfinite(disparity) & (disparity > 0)
     rows = named[rows[ahead]]
-    depth[rows], known[rows] = camera.fu * camera.baseline_m / disparity[ahead], True
+    depth[rows] = camera.fu * camera.baseline_m / disparity[ahead]
+    known[rows] = True
     return depth, known
 
 
-def moved_pixels(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, left: FloatArray) -> FloatArray:
-    """Left pixels (N, 2) of points (N, 3) after a camera motion; points behind the camera keep their pixels `left`."""
+def moved_pixels(
+    camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, left: FloatArray
+) -> FloatArray:
+    """Left pixels (N, 2) of points (N, 3) after a camera motion; points behind the camera keep
+    their pixels `left`.
+    """
     out = left.copy()
     _move(camera_args(camera), np.ascontiguousarray(T_curr_prev), np.ascontiguousarray(p_prev), out)
     return out
@@ -87,17 +111,21 @@ def moved_pixels(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArr
 
 @compiled
 def _move(camera: CameraArgs, T: FloatArray, points: FloatArray, pixels: FloatArray) -> None:
-    """Replace the pixels (N, 2) of points (N, 3) that are ahead after a motion (4, 4) by those after it."""
+    """Replace the pixels (N, 2) of points (N, 3) that are ahead after a motion (4, 4) by those
+    after it.
+    """
     for n in range(len(points)):
         u, v, depth = moved_pixel(camera, T, points[n, 0], points[n, 1], points[n, 2])
         if depth > _MIN_DEPTH_M:
-            pixels[n, 0], pixels[n, 1] = u, v
+            pixels[n, 0] = u
+            pixels[n, 1] = v
 
 
 def guessed_pixels(
     camera: StereoCamera, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: Image
 ) -> FloatArray:
-    """Predict the left pixels (N, 2) of features in the current frame: from the prior, else by the last motion.
+    """Predict the left pixels (N, 2) of features in the current frame: from the prior, else by the
+    last motion.
 
     Args:
         camera: the rectified pair.
@@ -109,7 +137,14 @@ def guessed_pixels(
     if prior is not None and prior.R_cam_prev is not None:
         expected = se3_from_parts(prior.R_cam_prev, expected[:3, 3])
     guess = old.left.copy()
-    _move_all(camera_args(camera), np.ascontiguousarray(expected), old.point, old.has_point, old.left, guess)
+    _move_all(
+        camera_args(camera),
+        np.ascontiguousarray(expected),
+        old.point,
+        old.has_point,
+        old.left,
+        guess,
+    )
     if prior is not None:
         rows, predicted = prior_rows(old, np.arange(len(old)), prior)
         guess[rows] = predicted
@@ -128,25 +163,34 @@ def _move_all(
     left: FloatArray,
     pixels: FloatArray,
 ) -> None:
-    """Replace left pixels (N, 2) as `_move` does; the depth of features without a point is that of their neighbours."""
-    count, depth = 0, np.empty(len(left))
+    """Replace left pixels (N, 2) as `_move` does; the depth of features without a point is that
+    of their neighbours.
+    """
+    count = 0
+    depth = np.empty(len(left))
     for n in range(len(left)):
         depth[n] = turn_to(camera, point[n, 1], point[n, 2])[4]
         count += has_point[n]
     for n in range(len(left)):
-        x, y, z = point[n, 0], point[n, 1], point[n, 2]
+        x = point[n, 0]
+        y = point[n, 1]
+        z = point[n, 2]
         if not has_point[n]:
             away = _borrowed(left, depth, has_point, n) if count >= _NEIGHBOURS else _FAR_M
             x, y, z = point_at(camera, left[n, 0], left[n, 1], away)
         u, v, ahead = moved_pixel(camera, T, x, y, z)
         if ahead > _MIN_DEPTH_M:
-            pixels[n, 0], pixels[n, 1] = u, v
+            pixels[n, 0] = u
+            pixels[n, 1] = v
 
 
 @compiled
 def _borrowed(pixels: FloatArray, depth: FloatArray, known: BoolArray, n: int) -> float:
-    """Return the median depth of those three of the known pixels, of (N, 2), that are next to the n-th one."""
-    gap, near = np.empty(_NEIGHBOURS), np.empty(_NEIGHBOURS)
+    """Return the median depth of those three of the known pixels, of (N, 2), that are next to
+    the n-th one.
+    """
+    gap = np.empty(_NEIGHBOURS)
+    near = np.empty(_NEIGHBOURS)
     for i in range(_NEIGHBOURS):
         gap[i] = np.inf
     for k in range(len(pixels)):
@@ -155,14 +199,18 @@ def _borrowed(pixels: FloatArray, depth: FloatArray, known: BoolArray, n: int) -
             continue
         i = 2
         while i > 0 and distance < gap[i - 1]:  # kept in order
-            gap[i], near[i] = gap[i - 1], near[i - 1]
+            gap[i] = gap[i - 1]
+            near[i] = near[i - 1]
             i -= 1
-        gap[i], near[i] = distance, depth[k]
+        gap[i] = distance
+        near[i] = depth[k]
     return max(min(near[0], near[1]), min(max(near[0], near[1]), near[2]))
 
 
 def prior_rows(tracks: Tracks, rows: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:
-    """Return those of the rows that were output and are in a prior, and the left pixels (K, 2) that it predicts."""
+    """Return those of the rows that were output and are in a prior, and the left pixels (K, 2)
+    that it predicts.
+    """
     shown = rows[tracks.shown[rows]]
     named, predicted = prior_pixels(tracks.ids[shown], prior)
     return shown[named], predicted

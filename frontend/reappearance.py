@@ -1,8 +1,10 @@
-"""The camera's motion across a time without usable images: key points of the last good pair, found again after it.
+"""The camera's motion across a time without usable images: key points of the last good pair, found
+again after it.
 
-A tracker's patches prove nothing once the prediction is off by many pixels. Key points of the whole image are matched
-by descriptor, and the motion that they show must hold in both cameras: it brings the points of the last pair to their
-pixels in the left image, and to the depths that the new pair measures.
+A tracker's patches prove nothing once the prediction is off by many pixels. Key points of the whole
+image are matched by descriptor, and the motion that they show must hold in both cameras: it brings
+the points of the last pair to their pixels in the left image, and to the depths that the new pair
+measures.
 """
 
 from __future__ import annotations
@@ -30,12 +32,16 @@ _DISPARITY_PX = 2.0  # as far as whole pixels at half resolution tell
 
 
 def contradicts_gyro(T_curr_prev: FloatArray, predicted: MotionPrior | None) -> bool:
-    """Whether the rotation of a motion (4, 4) is not the one that a motion sensor has measured, where there is one."""
+    """Whether the rotation of a motion (4, 4) is not the one that a motion sensor has measured,
+    where there is one.
+    """
     if predicted is None or not predicted.measured:
         return False
     phi = so3_log(T_curr_prev[:3, :3] @ predicted.T_curr_prev[:3, :3].T)
     covariance = predicted.covariance[3:, 3:] + np.radians(_ROTATION_SIGMA_DEG) ** 2 * np.eye(3)
-    return bool(phi @ np.linalg.solve(covariance, phi) > chi_square_quantile(_ROTATION_PROBABILITY, 3))
+    return bool(
+        phi @ np.linalg.solve(covariance, phi) > chi_square_quantile(_ROTATION_PROBABILITY, 3)
+    )
 
 
 def motion_across(
@@ -46,7 +52,8 @@ def motion_across(
     right: ImageLevels,
     starts: FloatArray,
 ) -> FloatArray | None:
-    """Return the camera's motion (4, 4) `T_curr_prev` since the last good pair; None: none is proved.
+    """Return the camera's motion (4, 4) `T_curr_prev` since the last good pair; None: none is
+    proved.
 
     Args:
         problem: camera, inlier threshold for key points, and random generator.
@@ -60,10 +67,13 @@ def motion_across(
     camera = problem.camera
     before, now = sift_extractor(MatchSettings())(previous.left.full, left.full)
     pairs = MutualNearest()(before, now, np.ones((len(before), len(now)), dtype=np.bool_))
-    a, b = before.pixels[pairs[:, 0]], now.pixels[pairs[:, 1]]
+    a = before.pixels[pairs[:, 0]]
+    b = now.pixels[pairs[:, 1]]
     d_before, known = stereo.search(previous.left.half, previous.right_half, a)
     known &= d_before > 0.0
-    a, b, d_before = a[known], b[known], d_before[known]
+    a = a[known]
+    b = b[known]
+    d_before = d_before[known]
     if len(a) < _LEAST_POINTS:
         return None
     f_baseline = camera.fu * camera.baseline_m

@@ -1,9 +1,11 @@
-"""Features of the last good pair, followed in the right images alone while the left camera gives nothing new.
+"""Features of the last good pair, followed in the right images alone while the left camera gives
+nothing new.
 
-Neither the records nor the filters have views of the right camera alone, so each is moved into the left image by the
-disparity that is predicted for it: by the filter's point, else by the motion. The residual at the filter's prediction
-is then that of the right pixel; the Jacobian differs by that of the disparity, a few percent of it. Only features whose
-depth the last pair has measured are followed, and no new ones are found.
+Neither the records nor the filters have views of the right camera alone, so each is moved into the
+left image by the disparity that is predicted for it: by the filter's point, else by the motion. The
+residual at the filter's prediction is then that of the right pixel; the Jacobian differs by that of
+the disparity, a few percent of it. Only features whose depth the last pair has measured are
+followed, and no new ones are found.
 """
 
 from __future__ import annotations
@@ -21,7 +23,14 @@ from vio.frontend.patches import ImageLevels
 from vio.frontend.prediction import moved_pixels
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import AnchorBank, PreviousFrame, Tracks
-from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, transform_points
+from vio.geometry.lie import (
+    FloatArray,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    se3_log,
+    transform_points,
+)
 from vio.geometry.stereo import StereoCamera, depth_of
 from vio.records import BoolArray, Image, TrackPrior
 
@@ -43,12 +52,17 @@ class RightAlone:
     def after(cls, camera: StereoCamera, previous: PreviousFrame) -> RightAlone:
         """Begin with what the right camera saw in the last good pair."""
         assert previous.right_half is not None
-        tracks = take(previous.tracks, previous.tracks.has_right & previous.tracks.has_point & previous.tracks.shown)
+        tracks = take(
+            previous.tracks,
+            previous.tracks.has_right & previous.tracks.has_point & previous.tracks.shown,
+        )
         warp = tracks.warp.copy()
         warp[:, :, :2] += tracks.skew
         to_right = se3_from_parts(np.eye(3), np.array([-camera.baseline_m, 0.0, 0.0]))
         moved = se3_log(to_right @ se3_exp(previous.twist_per_s) @ se3_inverse(to_right))
-        tracks = replace(tracks, left=tracks.right, point=transform_points(to_right, tracks.point), warp=warp)
+        tracks = replace(
+            tracks, left=tracks.right, point=transform_points(to_right, tracks.point), warp=warp
+        )
         return cls(previous.time_ns, previous.right_half, tracks, moved)
 
     def next(
@@ -60,8 +74,13 @@ class RightAlone:
         prior: TrackPrior | None,
         levels: int,
     ) -> RightAlone | None:
-        """Follow the features in the next right image; None: no motion of the camera explains what is found."""
-        old, camera, step_s = self.tracks, problem.camera, (time_ns - self.time_ns) * 1e-9
+        """Follow the features in the next right image.
+
+        None: no motion of the camera explains what is found.
+        """
+        old = self.tracks
+        camera = problem.camera
+        step_s = (time_ns - self.time_ns) * 1e-9
         expected = se3_exp(self.twist_per_s * step_s)
         if prior is not None and prior.R_cam_prev is not None:
             expected = se3_from_parts(prior.R_cam_prev, expected[:3, 3])
@@ -72,9 +91,12 @@ class RightAlone:
             return None
         T = motion.T_curr_prev
         rows = np.flatnonzero(seen)[motion.inliers]
-        warp, start = old.warp[rows], found[rows]
+        warp = old.warp[rows]
+        start = found[rows]
         point = transform_points(T, old.point[rows])
-        warp[:, :, :2] *= (depth_of(camera, old.point[rows]) / depth_of(camera, point))[:, None, None]
+        warp[:, :, :2] *= (depth_of(camera, old.point[rows]) / depth_of(camera, point))[
+            :, None, None
+        ]
         warp[:, :, 2] = start
         warp, score = align(bank.store, old.slot[rows], right.full, warp, _ITERATIONS)
         good: BoolArray = (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start)
@@ -86,9 +108,13 @@ class RightAlone:
         return RightAlone(time_ns, right.half, tracks, se3_log(T) / step_s)
 
     def in_left(self, camera: StereoCamera, stereo: StereoFit) -> Tracks:
-        """The features at the left pixels that their right ones and their predicted disparities give."""
+        """The features at the left pixels that their right ones and their predicted disparities
+        give.
+        """
         tracks = self.tracks
         disparity = camera.fu * camera.baseline_m / depth_of(camera, tracks.point)
         left = tracks.left + np.stack([disparity, np.zeros(len(tracks))], axis=1)
         left[:, 1] -= stereo.row_differences(left)
-        return replace(tracks, left=left, right=tracks.left, has_right=np.zeros(len(tracks), dtype=np.bool_))
+        return replace(
+            tracks, left=left, right=tracks.left, has_right=np.zeros(len(tracks), dtype=np.bool_)
+        )

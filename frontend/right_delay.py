@@ -1,11 +1,13 @@
-"""How late the right camera exposes against the left one, by the rows of matches, and stereo matches at one time.
+"""How late the right camera exposes against the left one, by the rows of matches, and stereo
+matches at one time.
 
-A right image that is late by `delay` frames shows a feature where it was then: its row differs from the left one by
-`-delay` times the feature's motion along v in the last frame. The differences that a wrong rectification makes are
-constant over time instead, so both are fitted together: six terms over the image, and the delay.
+A right image that is late by `delay` frames shows a feature where it was then: its row differs from
+the left one by `-delay` times the feature's motion along v in the last frame. The differences that
+a wrong rectification makes are constant over time instead, so both are fitted together: six terms
+over the image, and the delay.
 
-Where the right camera is early by one frame, its last image belongs to the present left one, and takes the place of the
-one that came with it: they were paired wrongly.
+Where the right camera is early by one frame, its last image belongs to the present left one, and
+takes the place of the one that came with it: they were paired wrongly.
 """
 
 from __future__ import annotations
@@ -27,9 +29,11 @@ _LEAST_MATCHES = 30  # in a frame that is learned from
 _LEAST_FRAMES = 10  # before a delay is believed
 _LEAST_DELAY = 0.25  # frames; less does little harm, and small errors of the rows look like it
 _EXPLAINS = 0.5  # share of the rows' scatter about the constant field that the delay must explain
-_SIGMAS = 10.0  # standard deviations of the delay: errors of a feature's rows last for as long as the feature
+# standard deviations of the delay: errors of a feature's rows last for as long as the feature
+_SIGMAS = 10.0
 _ROW_SIGMA_PX = 0.5  # of the rows, beyond which a match counts less (Cauchy)
-_WHOLE = 0.15  # a delay this near to whole frames is one of whole frames: an image was paired with the wrong one
+# a delay this near to whole frames is one of whole frames: an image was paired with the wrong one
+_WHOLE = 0.15
 _FORGET = 0.1  # delay below which the images are taken to be simultaneous again
 _SUSPECT_SHARE = 0.4  # least share of features that match in another pairing …
 _CLEARLY = 1.5  # … over those that match in this one
@@ -61,16 +65,20 @@ class RightDelay(ImageCheck):
         self._suspected = (0.0, 0)  # delay by the pairings, and in how many frames in a row
         self.frames = 0.0  # the delay in frames to be taken out; 0: none is significant
         self._early = False  # each right image is used with the next left one
-        self._last_right: Image | None = None  # that came with the last frame, where it is used with this one
+        # that came with the last frame, where it is used with this one
+        self._last_right: Image | None = None
 
     def inspect(self, images: FrameImages) -> FrameImages | None:
         """Return the left image with the right one of its time; None: that one was not kept."""
         if not self._early:
             return images
-        right, self._last_right = self._last_right, images.raw[1].copy()
+        right = self._last_right
+        self._last_right = images.raw[1].copy()
         return None if right is None else images.with_raw((images.raw[0], right))
 
-    def update(self, index: int, left: FloatArray, flow: FloatArray, rows: FloatArray, frame_s: float) -> bool:
+    def update(
+        self, index: int, left: FloatArray, flow: FloatArray, rows: FloatArray, frame_s: float
+    ) -> bool:
         """Learn from the matches of a frame; return whether a delay has just begun or ended.
 
         Args:
@@ -83,12 +91,17 @@ class RightDelay(ImageCheck):
         if len(left) < _LEAST_MATCHES:
             return False
         camera = self._camera
-        x, y = (left[:, 0] - camera.cu) / camera.fu, (left[:, 1] - camera.cv) / camera.fv
+        x = (left[:, 0] - camera.cu) / camera.fu
+        y = (left[:, 1] - camera.cv) / camera.fv
         terms = np.array([np.ones(len(x)), x, y, x * y, x * x, y * y, flow[:, 1]]).T.copy()
-        self._normal, self._moment = _MEMORY * self._normal, _MEMORY * self._moment
+        self._normal = _MEMORY * self._normal
+        self._moment = _MEMORY * self._moment
         sigma = _ROW_SIGMA_PX if self._frames else np.inf
-        count, square = add_equations(terms, rows, self._solution, sigma, self._normal, self._moment)
-        self._square, self._count = _MEMORY * self._square + square, _MEMORY * self._count + count
+        count, square = add_equations(
+            terms, rows, self._solution, sigma, self._normal, self._moment
+        )
+        self._square = _MEMORY * self._square + square
+        self._count = _MEMORY * self._count + count
         self._frames += 1
         self._solution = self._moment.copy()
         solve_positive(self._normal + 1e-6 * np.eye(_TERMS + 1), self._solution)
@@ -116,7 +129,8 @@ class RightDelay(ImageCheck):
             self._begin(index, rounded, delay, frame_s)
 
     def suspect(self, index: int, counts: PairingCounts, frame_s: float) -> bool:
-        """Test whether a right image that contradicts the left one belongs to the frame before, or to the next one.
+        """Test whether a right image that contradicts the left one belongs to the frame before, or
+        to the next one.
 
         Args:
             index: frame number.
@@ -128,9 +142,15 @@ class RightDelay(ImageCheck):
         """
         best = max(counts.late, counts.early)
         clear = best >= _SUSPECT_SHARE * counts.points and best >= _CLEARLY * counts.same
-        clear &= counts.points >= _LEAST_MATCHES and best >= _CLEARLY * min(counts.late, counts.early)
+        clear &= counts.points >= _LEAST_MATCHES and best >= _CLEARLY * min(
+            counts.late, counts.early
+        )
         delay = 1.0 if counts.late == best else -1.0
-        self._suspected = (delay, self._suspected[1] + 1 if self._suspected[0] == delay else 1) if clear else (0.0, 0)
+        self._suspected = (
+            (delay, self._suspected[1] + 1 if self._suspected[0] == delay else 1)
+            if clear
+            else (0.0, 0)
+        )
         if self._suspected[1] < _SUSPECT_FRAMES or self.frames != 0.0:
             return False
         self._forget()
@@ -141,12 +161,14 @@ class RightDelay(ImageCheck):
         """Forget what was learned of the rows."""
         self._normal, self._moment = np.zeros_like(self._normal), np.zeros_like(self._moment)
         self._square = self._count = 0.0
-        self._frames, self._solution = 0, np.zeros(_TERMS + 1)
+        self._frames = 0
+        self._solution = np.zeros(_TERMS + 1)
         self._suspected = (0.0, 0)
 
     def _begin(self, index: int, rounded: float, delay: float, frame_s: float) -> None:
         if rounded == (1.0 if self._early else -1.0):
-            self._early, self._last_right = not self._early, None
+            self._early = not self._early
+            self._last_right = None
             self._forget()
             if not self._early:
                 self._lines.append(f"frame {index}: the right camera is no longer late or early")
@@ -155,15 +177,22 @@ class RightDelay(ImageCheck):
             self.frames = rounded
         late = "late" if delay > 0 else "early"
         self._lines.append(
-            f"frame {index}: the right camera is {late} by {1e3 * abs(delay) * frame_s:.0f} ms ({abs(delay):.2f} "
-            "frames) against the left one, by how its image moves; it is taken out of the matches; pair the images by "
+            f"frame {index}: the right camera is {late} by {1e3 * abs(delay) * frame_s:.0f} ms "
+            f"({abs(delay):.2f} "
+            "frames) against the left one, by how its image moves; it is taken out of the matches; "
+            "pair the images by "
             "their times of exposure, or synchronise the cameras"
         )
 
     def _significance(self) -> tuple[float, float, float]:
-        """The delay in frames, its standard deviation, and the share of the rows' scatter that it explains."""
-        A, b = self._normal + 1e-6 * np.eye(_TERMS + 1), self._moment
-        constant = np.linalg.solve(A[:_TERMS, :_TERMS], np.column_stack([A[:_TERMS, _TERMS], b[:_TERMS]]))
+        """The delay in frames, its standard deviation, and the share of the rows' scatter that
+        it explains.
+        """
+        A = self._normal + 1e-6 * np.eye(_TERMS + 1)
+        b = self._moment
+        constant = np.linalg.solve(
+            A[:_TERMS, :_TERMS], np.column_stack([A[:_TERMS, _TERMS], b[:_TERMS]])
+        )
         information = float(A[_TERMS, _TERMS] - A[_TERMS, :_TERMS] @ constant[:, 0])
         scatter = max(self._square - float(b[:_TERMS] @ constant[:, 1]), 1e-12)
         delay = -float(self._solution[_TERMS])
@@ -173,7 +202,8 @@ class RightDelay(ImageCheck):
 
 
 def at_exposure(tracks: Tracks, flow: FloatArray, T_curr_prev: FloatArray, delay: float) -> Tracks:
-    """Return tracks as they were when the right image was exposed, by their motion in the last frame.
+    """Return tracks as they were when the right image was exposed, by their motion in the last
+    frame.
 
     Args:
         tracks: now.
@@ -181,14 +211,18 @@ def at_exposure(tracks: Tracks, flow: FloatArray, T_curr_prev: FloatArray, delay
         T_curr_prev: motion (4, 4) of the camera since then.
         delay: of the right camera, frames.
     """
-    left, warp = tracks.left - delay * flow, tracks.warp.copy()
+    left = tracks.left - delay * flow
+    warp = tracks.warp.copy()
     warp[:, :, 2] -= delay * flow
     T_then_curr = se3_exp(-delay * se3_log(T_curr_prev))
     return replace(tracks, left=left, warp=warp, point=transform_points(T_then_curr, tracks.point))
 
 
-def at_present(camera: StereoCamera, tracks: Tracks, then: Tracks, T_curr_prev: FloatArray, delay: float) -> Tracks:
-    """Return tracks with the right pixels that they would have now, given their matches when the image was exposed.
+def at_present(
+    camera: StereoCamera, tracks: Tracks, then: Tracks, T_curr_prev: FloatArray, delay: float
+) -> Tracks:
+    """Return tracks with the right pixels that they would have now, given their matches when the
+    image was exposed.
 
     Args:
         camera: rectified pair.
@@ -201,13 +235,17 @@ def at_present(camera: StereoCamera, tracks: Tracks, then: Tracks, T_curr_prev: 
     depth = depth_of(camera, moved)
     ahead = depth > 1e-2
     depth = np.where(ahead, depth, 1.0)
-    right = tracks.left + np.stack([-camera.fu * camera.baseline_m / depth, then.right[:, 1] - then.left[:, 1]], axis=1)
+    right = tracks.left + np.stack(
+        [-camera.fu * camera.baseline_m / depth, then.right[:, 1] - then.left[:, 1]], axis=1
+    )
     matched = then.has_right & then.has_point & ahead
     return replace(
         tracks,
         right=np.where(matched[:, None], right, tracks.right),
         has_right=matched,
         skew=then.skew,
-        point=np.where(matched[:, None], left_rays(camera, tracks.left) * depth[:, None], tracks.point),
+        point=np.where(
+            matched[:, None], left_rays(camera, tracks.left) * depth[:, None], tracks.point
+        ),
         has_point=tracks.has_point | matched,
     )

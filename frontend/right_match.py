@@ -1,4 +1,6 @@
-"""Matches of the tracked features in the right image, as far as that can be used: it may be late, or another one."""
+"""Matches of the tracked features in the right image, as far as that can be used: it may be
+late, or another one.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,17 @@ _PAIRING_POINTS = 150  # features that are tried with images of other frames
 
 
 class RightMatcher:
-    """Match features of known depth in the right image, and judge by the matches whether it may be used."""
+    """Match features of known depth in the right image, and judge by the matches whether it may
+    be used.
+    """
 
     def __init__(self, camera: StereoCamera, right: RightCamera, delay: RightDelay) -> None:
-        """Prepare; what is known of the right camera and of its delay is updated with each frame."""
-        self._camera, self._right, self._delay = camera, right, delay
+        """Prepare; what is known of the right camera and of its delay is updated with each
+        frame.
+        """
+        self._camera = camera
+        self._right = right
+        self._delay = delay
 
     def match(
         self,
@@ -36,15 +44,18 @@ class RightMatcher:
         stereo: StereoFit,
         motion: Consensus | None,
     ) -> Tracks:
-        """Match features of known depth in the right image; no match where the right image cannot be used.
+        """Match features of known depth in the right image; no match where the right image cannot
+        be used.
 
         While it cannot, depths come from the prior, where it has them.
         """
         if not self._right.usable:
             tracks = with_prior_depths(self._camera, tracks, prior)
-        testable, delay = stereo.testable(tracks), self._delay.frames
+        testable = stereo.testable(tracks)
+        delay = self._delay.frames
         flow = tracks.left - previous.tracks.left[_rows_by_slot(previous.tracks, tracks)]
-        # Wrong matches, of rows far apart, contradict the right image that the search for the rows will need.
+        # Wrong matches, of rows far apart, contradict the right image that the search for the rows
+        # will need.
         tested = motion is not None and not stereo.has_few_matches
         if delay == 0.0:
             matched = stereo.track_right(tracks, right, motion is not None)
@@ -75,9 +86,16 @@ class RightMatcher:
         return matched
 
     def _count_pairings(
-        self, previous: PreviousFrame, left: ImageLevels, tracks: Tracks, right: ImageLevels, stereo: StereoFit
+        self,
+        previous: PreviousFrame,
+        left: ImageLevels,
+        tracks: Tracks,
+        right: ImageLevels,
+        stereo: StereoFit,
     ) -> PairingCounts:
-        """Count the features that match if the right image belongs to this frame, the one before, or the next one."""
+        """Count the features that match if the right image belongs to this frame, the one
+        before, or the next one.
+        """
         assert previous.right_half is not None
         before = previous.tracks.left[_rows_by_slot(previous.tracks, tracks)][:_PAIRING_POINTS]
         now = tracks.left[:_PAIRING_POINTS]
@@ -110,14 +128,18 @@ class RightMatcher:
         delay = self._delay.frames
         then = stereo.track_right(at_exposure(tracks, flow, T, delay), right, True)
         rows = np.flatnonzero(~then.has_right & ~then.has_point)
-        disparity, unique = stereo.search(previous.left.half, right.half, (tracks.left - flow)[rows])
+        disparity, unique = stereo.search(
+            previous.left.half, right.half, (tracks.left - flow)[rows]
+        )
         then = stereo.match_near(then, right, rows[unique], disparity[unique])
         stereo.update_rows(then)
         return at_present(self._camera, tracks, then, T, delay)
 
 
 def _rows_by_slot(old: Tracks, now: Tracks) -> IntArray:
-    """Rows (N,) in `old` of the features (N,) of `now`, all of which it contains: an active feature keeps its slot."""
+    """Rows (N,) in `old` of the features (N,) of `now`, all of which it contains: an active
+    feature keeps its slot.
+    """
     rows = np.empty(old.slot.max(initial=-1) + 1, dtype=np.int64)
     rows[old.slot] = np.arange(len(old))
     return rows[now.slot]

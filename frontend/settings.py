@@ -1,4 +1,7 @@
-"""Settings of the front ends. Lengths that scale with the image size are given as fractions of it."""
+"""Settings of the front ends.
+
+Lengths that scale with the image size are given as fractions of it.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,10 @@ class DisparitySettings(Section):
     section: ClassVar[str] = "frontend.disparity"
 
     max_disparity: float = setting(
-        0.16, "largest disparity, over the image width; up to 0.64 where the scene is nearer", above=0, at_most=1
+        0.16,
+        "largest disparity, over the image width; up to 0.64 where the scene is nearer",
+        above=0,
+        at_most=1,
     )
 
 
@@ -37,17 +43,25 @@ class ConsensusSettings(Section):
 
     section: ClassVar[str] = "frontend.consensus"
 
-    seed: int = setting(0, "seed of the sampling; equal seeds give identical results", at_least=0, at_most=2**32 - 1)
+    seed: int = setting(
+        0, "seed of the sampling; equal seeds give identical results", at_least=0, at_most=2**32 - 1
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class KltSettings(Section):
-    """Corners tracked by pyramidal Lucas-Kanade; the defaults suit images from 640x360 to 1242x375."""
+    """Corners tracked by pyramidal Lucas-Kanade; the defaults suit images from 640x360 to
+    1242x375.
+    """
 
     section: ClassVar[str] = "frontend.klt"
 
-    mask: Path | None = setting(None, "image of the recording's size; black pixels are excluded from corner detection")
-    equalise: Literal["none", "clahe"] = setting("none", "local contrast equalisation of the input images")
+    mask: Path | None = setting(
+        None, "image of the recording's size; black pixels are excluded from corner detection"
+    )
+    equalise: Literal["none", "clahe"] = setting(
+        "none", "local contrast equalisation of the input images"
+    )
     pyramid_levels: int = setting(
         2, "image levels coarser than half resolution when tracking in time", at_least=0, at_most=8
     )
@@ -59,7 +73,9 @@ class MatchSettings(Section):
 
     section: ClassVar[str] = "frontend.match"
 
-    max_keypoints: int = setting(1200, "key points extracted from each image", at_least=1, at_most=20000)
+    max_keypoints: int = setting(
+        1200, "key points extracted from each image", at_least=1, at_most=20000
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,15 +85,20 @@ class LearnedSettings(Section):
     section: ClassVar[str] = "frontend.learned"
 
     detector: Literal["gftt", "harris", "keynet", "aliked", "disk", "xfeat"] = setting(
-        "gftt", "detector; aliked, disk and xfeat are also the descriptor; gftt and harris need no weights"
+        "gftt",
+        "detector; aliked, disk and xfeat are also the descriptor; gftt and harris need no weights",
     )
     descriptor: Literal["sift", "mkd", "hardnet", "hynet", "sosnet"] = setting(
         "sift", "descriptor of the patches of gftt, harris and keynet; sift needs no weights"
     )
     detector_weights: Path | None = setting(None, "weights of keynet, aliked, disk or xfeat")
     descriptor_weights: Path | None = setting(None, "weights of mkd, hardnet, hynet or sosnet")
-    affine_weights: Path | None = setting(None, "weights of AffNet, for affine patches; None: upright square patches")
-    orientation_weights: Path | None = setting(None, "weights of OriNet, for oriented patches; None: upright")
+    affine_weights: Path | None = setting(
+        None, "weights of AffNet, for affine patches; None: upright square patches"
+    )
+    orientation_weights: Path | None = setting(
+        None, "weights of OriNet, for oriented patches; None: upright"
+    )
     matcher: Literal["nearest", "lightglue"] = setting(
         "nearest", "mutual nearest neighbours with ratio test, or LightGlue"
     )
@@ -98,7 +119,9 @@ class FrontendSettings(Section):
         "auto", "auto: klt where the recording has images, precomputed where it has features only"
     )
     features: Path | None = setting(
-        None, "observation log or feature file to use instead of the recording's own, for the precomputed front end"
+        None,
+        "observation log or feature file to use instead of the recording's own, for the "
+        "precomputed front end",
     )
     prior: bool = setting(True, "give the front end the filter's prediction of the feature pixels")
     grid: GridSettings = field(default_factory=GridSettings)

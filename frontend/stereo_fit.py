@@ -1,4 +1,5 @@
-"""Sub-pixel stereo matching: the anchors of features are aligned with the right image near the expected row.
+"""Sub-pixel stereo matching: the anchors of features are aligned with the right image near the
+expected row.
 
 The alignment starts at the disparity of a known depth, else at the result of a search along the row
 (`frontend.stereo_match`).
@@ -13,7 +14,12 @@ from vio.frontend.align import MAX_MOVE_PX, align, is_on_peak
 from vio.frontend.columns import changed, share_of
 from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import DisparitySettings
-from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX, EpipolarRowModel, match_rows, shifted_rows
+from vio.frontend.stereo_match import (
+    MIN_MATCH_DISPARITY_PX,
+    EpipolarRowModel,
+    match_rows,
+    shifted_rows,
+)
 from vio.frontend.tracks import ANCHOR_REACH_PX, INLIER_PX, AnchorBank, Tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, depth_of
@@ -26,20 +32,25 @@ _MIN_CORRELATION = 0.8  # normalised, of a match
 _MIN_PEAK_MARGIN = 0.03  # lead in correlation over the second-best match in the row
 _MAX_ROW_DIFFERENCE_PX = 1.0  # of a match, after the estimated row differences are subtracted
 _MAX_SKEW = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
-_COARSE_SLACK = 0.2  # how much lower the correlation of the coarse search may be than that of the alignment
+# how much lower the correlation of the coarse search may be than that of the alignment
+_COARSE_SLACK = 0.2
 _MIN_DEPTH_M = 0.05
 _MIN_DISPARITY_PX = 0.1  # below, a point is too far away to be located
-_FEW_MATCHES = 0.2  # share of features with a right match below which other row differences are tried
+# share of features with a right match below which other row differences are tried
+_FEW_MATCHES = 0.2
 _GOOD_MATCH = 0.9  # correlation of patches whose rows agree
 _LEAST_POINTS = 20
-_ROWS_OFF_PX = 0.2  # root mean square over the matches: from here on the run reports the calibration, too
+# root mean square over the matches: from here on the run reports the calibration, too
+_ROWS_OFF_PX = 0.2
 _ROW_SEARCH_FRAMES = 10  # between two such searches, while matches are few
 _MOST_REACH = 0.64  # of the image width: largest disparity that is searched where the scene is near
 _REACH_FRAMES = 10  # between two searches beyond the present reach
-_BEYOND_SHARE = 0.1  # of the points without a match that must have one beyond the reach for it to be doubled …
+# of the points without a match that must have one beyond the reach for it to be doubled …
+_BEYOND_SHARE = 0.1
 _LEAST_BEYOND = 10  # … and this many at least …
 _WITHIN_REACH = 0.9  # … until this share of them is within it
-# A pair turns so much in its mount, three times the prior of its calibration, or exposes so far apart.
+# A pair turns so much in its mount, three times the prior of its calibration, or exposes so far
+# apart.
 _MOST_TURN_RAD = 0.3 * np.pi / 180.0
 _OFFSET_GAIN = 0.2  # part of a frame's common offset that is believed
 _DEPTH_SLACK = 0.1  # standard deviation of a point's depth by motion alone, over it
@@ -48,7 +59,9 @@ _MAX_ROWS_HALF = 16  # row difference, pixels at half resolution
 
 
 class StereoFit:
-    """Match features in the right image, and estimate the row differences of matches over the image."""
+    """Match features in the right image, and estimate the row differences of matches over the
+    image.
+    """
 
     def __init__(
         self,
@@ -57,8 +70,11 @@ class StereoFit:
         bank: AnchorBank,
         size: tuple[int, int],
     ) -> None:
-        """Prepare for images of one size (width, height); the bank contains the features' anchors."""
-        self.max_disparity_px = disparity.max_disparity * size[0]  # doubled where the scene is nearer
+        """Prepare for images of one size (width, height); the bank contains the features'
+        anchors.
+        """
+        # doubled where the scene is nearer
+        self.max_disparity_px = disparity.max_disparity * size[0]
         self._most_reach_px = _MOST_REACH * size[0]
         self._reach_wait = 0  # frames until the reach is tried again
         self._camera = camera
@@ -68,10 +84,12 @@ class StereoFit:
         self._offset_px = 0.0  # that is taken out of all disparities of the present frame
 
     def track_right(self, tracks: Tracks, right: ImageLevels, moved: bool) -> Tracks:
-        """Match features of known depth; with a consensus motion (`moved`), check the disparity against the depth.
+        """Match features of known depth; with a consensus motion (`moved`), check the disparity
+        against the depth.
 
         Args:
-            tracks: features at their new left pixels; right pixels are still those of the last frame.
+            tracks: features at their new left pixels; right pixels are still those of the last
+                frame.
             right: the right image.
             moved: whether the depths were propagated with a consensus motion.
         """
@@ -83,30 +101,42 @@ class StereoFit:
             valid &= np.abs(tracks.left[rows, 0] - pixels[:, 0] - expected) <= INLIER_PX
         return self._with_right_pixels(tracks, rows, pixels, skew, valid)
 
-    def track_off_right(self, tracks: Tracks, left: ImageLevels, right: ImageLevels, *, by_motion: bool) -> Tracks:
-        """Match features of known depth anywhere on their rows, as far as a common offset explains their disparities.
+    def track_off_right(
+        self, tracks: Tracks, left: ImageLevels, right: ImageLevels, *, by_motion: bool
+    ) -> Tracks:
+        """Match features of known depth anywhere on their rows, as far as a common offset explains
+        their disparities.
 
-        A pair that turns a little in its mount, or whose cameras expose a millisecond apart while the rig turns, has
-        disparities that are off by as much at all depths, (R1). That is taken out of all matches of the frame, less a
-        small part, so that an offset that stays becomes that of all points. No match where it is more than a pair may
-        turn by.
+        A pair that turns a little in its mount, or whose cameras expose a millisecond apart while
+        the rig turns, has disparities that are off by as much at all depths, (R1). That is taken
+        out of all matches of the frame, less a small part, so that an offset that stays becomes
+        that of all points. No match where it is more than a pair may turn by.
 
         Args:
             tracks: as for `track_right`, whose matches with it are too few.
             left: the left image.
             right: the right image.
-            by_motion: whether depths come from the camera's motion alone: they have a factor in common, and are known
-                less well.
+            by_motion: whether depths come from the camera's motion alone: they have a factor in
+                common, and are known less well.
         """
         rows, expected = self._expected(tracks)
         coarse, unique = self.search(left.half, right.half, tracks.left[rows])
-        rows, expected = rows[unique], expected[unique]
+        rows = rows[unique]
+        expected = expected[unique]
         pixels, skew, valid = self._fit(tracks, rows, right, coarse[unique])
-        rows, expected, pixels, skew = rows[valid], expected[valid], pixels[valid], skew[valid]
-        off, grows = tracks.left[rows, 0] - pixels[:, 0] - expected, self._offset_growth(tracks.left[rows])
+        rows = rows[valid]
+        expected = expected[valid]
+        pixels = pixels[valid]
+        skew = skew[valid]
+        off = tracks.left[rows, 0] - pixels[:, 0] - expected
+        grows = self._offset_growth(tracks.left[rows])
         if len(off) < _LEAST_POINTS:
             return tracks
-        offset, slope = common_offset(expected / grows, off / grows) if by_motion else (median(off / grows), 0.0)
+        offset, slope = (
+            common_offset(expected / grows, off / grows)
+            if by_motion
+            else (median(off / grows), 0.0)
+        )
         if abs(offset) > self._camera.fu * _MOST_TURN_RAD:
             return tracks
         tolerance = INLIER_PX + (_DEPTH_SLACK * expected if by_motion else 0.0)
@@ -115,24 +145,34 @@ class StereoFit:
         return self._with_right_pixels(tracks, rows, pixels, skew, agree)
 
     def _offset_growth(self, left: FloatArray) -> FloatArray:
-        """By how much more (N,) a turn of the right camera moves pixels at left pixels (N, 2) than in the centre."""
+        """By how much more (N,) a turn of the right camera moves pixels at left pixels (N, 2)
+        than in the centre.
+        """
         x = (left[:, 0] - self._camera.cu) / self._camera.fu
         return 1.0 + x * x
 
     def _expected(self, tracks: Tracks) -> tuple[IntArray, FloatArray]:
-        """Rows (K,) of the features of known depth, and the disparities (K,) that follow from it."""
+        """Rows (K,) of the features of known depth, and the disparities (K,) that follow from
+        it.
+        """
         depth = depth_of(self._camera, tracks.point)
         rows = (tracks.has_point & (depth > _MIN_DEPTH_M)).nonzero()[0]
         return rows, self._camera.fu * self._camera.baseline_m / depth[rows]
 
-    def match_near(self, tracks: Tracks, right: ImageLevels, rows: IntArray, disparity: FloatArray) -> Tracks:
+    def match_near(
+        self, tracks: Tracks, right: ImageLevels, rows: IntArray, disparity: FloatArray
+    ) -> Tracks:
         """Match the given rows (K,) near their disparities (K,)."""
         if not len(rows):
             return tracks
         return self._with_right_pixels(tracks, rows, *self._fit(tracks, rows, right, disparity))
 
-    def search(self, left_half: Image, right_half: Image, points: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Coarse disparities (N,) of left pixels (N, 2), and a mask (N,) of those that are unique."""
+    def search(
+        self, left_half: Image, right_half: Image, points: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Coarse disparities (N,) of left pixels (N, 2), and a mask (N,) of those that are
+        unique.
+        """
         offset = round(self._rows.offset_px / 2)
         if self._unmatched % _ROW_SEARCH_FRAMES == 1:
             offset = self._best_offset(left_half, right_half, points, offset)
@@ -147,7 +187,9 @@ class StereoFit:
         return self._search(left_half, right_half, points, correlation)
 
     def _reaches_further(self, left_half: Image, right_half: Image, points: FloatArray) -> bool:
-        """Search further from now on if enough of the left pixels (N, 2) without a match have one beyond the reach."""
+        """Search further from now on if enough of the left pixels (N, 2) without a match have
+        one beyond the reach.
+        """
         beyond = self._beyond(left_half, right_half, points)
         if not _are_enough(len(beyond), len(points)):
             return False
@@ -158,28 +200,41 @@ class StereoFit:
 
     def _beyond(self, left_half: Image, right_half: Image, points: FloatArray) -> FloatArray:
         """Disparities (K,) of left pixels (N, 2) whose good match is beyond the present reach."""
-        reach, most = self.max_disparity_px, self._most_reach_px
+        reach = self.max_disparity_px
+        most = self._most_reach_px
         if reach >= most:
             return np.zeros(0)
-        disparity, good = match_rows(left_half, right_half, points, most, _GOOD_MATCH, _MIN_PEAK_MARGIN)
+        disparity, good = match_rows(
+            left_half, right_half, points, most, _GOOD_MATCH, _MIN_PEAK_MARGIN
+        )
         return disparity[good & (disparity > reach)]
 
     def _follow(self, expected: FloatArray) -> None:
-        """Search further from now on if enough features matched in the last frame come nearer, by disparity (K,)."""
+        """Search further from now on if enough features matched in the last frame come nearer,
+        by disparity (K,).
+        """
         if _are_enough(int((expected > self.max_disparity_px - MAX_MOVE_PX).sum()), len(expected)):
             self._double_reach()
 
     def _double_reach(self) -> None:
         self.max_disparity_px = min(2.0 * self.max_disparity_px, self._most_reach_px)
 
-    def _best_offset(self, left_half: Image, right_half: Image, points: FloatArray, offset: int) -> int:
-        """Row difference, in pixels at half resolution, at which most points match well; the present one if in doubt.
+    def _best_offset(
+        self, left_half: Image, right_half: Image, points: FloatArray, offset: int
+    ) -> int:
+        """Row difference, in pixels at half resolution, at which most points match well; the
+        present one if in doubt.
 
         Rows may be far apart where the right camera has been pitched since it was calibrated.
         """
         tried = range(-_MAX_ROWS_HALF, _MAX_ROWS_HALF + 1)
         counts = [
-            int(self._search(left_half, shifted_rows(right_half, rows), points, _GOOD_MATCH)[1].sum()) for rows in tried
+            int(
+                self._search(left_half, shifted_rows(right_half, rows), points, _GOOD_MATCH)[
+                    1
+                ].sum()
+            )
+            for rows in tried
         ]
         best = int(np.argmax(counts))
         if counts[best] < max(_LEAST_POINTS, 2 * counts[offset + _MAX_ROWS_HALF]):
@@ -188,8 +243,14 @@ class StereoFit:
         return tried[best]
 
     def count_beyond(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> int:
-        """Count the left pixels (N, 2) that have a good match beyond the present reach: the scene is near."""
-        return len(self._beyond(left.half, shifted_rows(right.half, round(self._rows.offset_px / 2)), points))
+        """Count the left pixels (N, 2) that have a good match beyond the present reach: the
+        scene is near.
+        """
+        return len(
+            self._beyond(
+                left.half, shifted_rows(right.half, round(self._rows.offset_px / 2)), points
+            )
+        )
 
     def count_mirrored(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> int:
         """Count the left pixels (N, 2) that have a match with a negative disparity."""
@@ -199,7 +260,9 @@ class StereoFit:
         return int((unique & (disparity >= 1.0)).sum())
 
     def count_on_rows(self, left_half: Image, right_half: Image, points: FloatArray) -> int:
-        """Count the left pixels (N, 2) that match well on their row between two images at half resolution."""
+        """Count the left pixels (N, 2) that match well on their row between two images at half
+        resolution.
+        """
         return int(self._search(left_half, right_half, points, _GOOD_MATCH)[1].sum())
 
     def forget_offset(self) -> None:
@@ -208,12 +271,16 @@ class StereoFit:
 
     @property
     def has_few_matches(self) -> bool:
-        """Whether hardly any feature of the last frame had a right match, so that those matches may be wrong ones."""
+        """Whether hardly any feature of the last frame had a right match, so that those matches
+        may be wrong ones.
+        """
         return self._unmatched > 0
 
     @property
     def rows_are_off(self) -> bool:
-        """Whether the rows of the matches differ by a smooth field: the calibration is off, and so are the depths."""
+        """Whether the rows of the matches differ by a smooth field: the calibration is off, and
+        so are the depths.
+        """
         return self._rows.rms_px >= _ROWS_OFF_PX
 
     def row_differences(self, left: FloatArray) -> FloatArray:
@@ -232,9 +299,12 @@ class StereoFit:
         self._reach_wait = max(0, self._reach_wait - 1)
 
     def testable(self, tracks: Tracks) -> BoolArray:
-        """Mask (N,) of the features whose known depth says that the right image shows them within the reach."""
+        """Mask (N,) of the features whose known depth says that the right image shows them
+        within the reach.
+        """
         rows, expected = self._expected(tracks)
-        in_reach, right_u = expected <= self.max_disparity_px - MAX_MOVE_PX, tracks.left[rows, 0] - expected
+        in_reach = expected <= self.max_disparity_px - MAX_MOVE_PX
+        right_u = tracks.left[rows, 0] - expected
         out = np.zeros(len(tracks), dtype=np.bool_)
         out[rows] = in_reach & (right_u >= ANCHOR_REACH_PX)
         return out
@@ -242,7 +312,9 @@ class StereoFit:
     def _search(
         self, left_half: Image, right_half: Image, points: FloatArray, min_correlation: float
     ) -> tuple[FloatArray, BoolArray]:
-        return match_rows(left_half, right_half, points, self.max_disparity_px, min_correlation, _MIN_PEAK_MARGIN)
+        return match_rows(
+            left_half, right_half, points, self.max_disparity_px, min_correlation, _MIN_PEAK_MARGIN
+        )
 
     def _fit(
         self, tracks: Tracks, rows: IntArray, right: ImageLevels, disparity: FloatArray
@@ -250,31 +322,48 @@ class StereoFit:
         """Align anchors of rows (K,) with the right image near expected disparities (K,).
 
         Returns:
-            Right pixels (K, 2), the change of the warp's linear part (K, 2, 2), and a mask (K,) of the good ones.
+            Right pixels (K, 2), the change of the warp's linear part (K, 2, 2), and a mask (K,) of
+            the good ones.
         """
         count = len(rows)
-        left, start = np.empty((count, 2)), np.empty((count, 2, 3))
+        left = np.empty((count, 2))
+        start = np.empty((count, 2, 3))
         _begin(tracks.left, tracks.warp, tracks.skew, rows, disparity, left, start)
         expected = self._rows.rows(left)
         start[:, 1, 2] = expected
-        warp, score = align(self._bank.store, tracks.slot.take(rows), right.full, start, _ITERATIONS, expected)
-        pixels, skew, valid = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, dtype=np.bool_)
-        _judge(tracks.warp, rows, left, start, warp, score, self.max_disparity_px, pixels, skew, valid)
+        warp, score = align(
+            self._bank.store, tracks.slot.take(rows), right.full, start, _ITERATIONS, expected
+        )
+        pixels = np.empty((count, 2))
+        skew = np.empty((count, 2, 2))
+        valid = np.empty(count, dtype=np.bool_)
+        _judge(
+            tracks.warp, rows, left, start, warp, score, self.max_disparity_px, pixels, skew, valid
+        )
         return pixels, skew, valid
 
     def _with_right_pixels(
         self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray, good: BoolArray
     ) -> Tracks:
-        """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of those rows (K,) that are `good`."""
+        """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of those rows (K,)
+        that are `good`.
+        """
         if self._offset_px:
             growth = self._offset_growth(tracks.left[rows])
             pixels = pixels + self._offset_px * np.stack([growth, np.zeros(len(rows))], 1)
-        right, has_right, skews = tracks.right.copy(), tracks.has_right.copy(), tracks.skew.copy()
-        point, has_point = tracks.point.copy(), tracks.has_point.copy()
+        right = tracks.right.copy()
+        has_right = tracks.has_right.copy()
+        skews = tracks.skew.copy()
+        point = tracks.point.copy()
+        has_point = tracks.has_point.copy()
         f_baseline = self._camera.fu * self._camera.baseline_m
         columns = right, has_right, skews, point, has_point
-        _match(camera_args(self._camera), f_baseline, tracks.left, rows, pixels, skew, good, *columns)
-        return changed(tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point)
+        _match(
+            camera_args(self._camera), f_baseline, tracks.left, rows, pixels, skew, good, *columns
+        )
+        return changed(
+            tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point
+        )
 
 
 def _are_enough(beyond: int, points: int) -> bool:
@@ -292,10 +381,13 @@ def _begin(
     pixels: FloatArray,
     start: FloatArray,
 ) -> None:
-    """Write the left pixels (K, 2) of rows (K,) of features, and the warps (K, 2, 3) to start from, without the row."""
+    """Write the left pixels (K, 2) of rows (K,) of features, and the warps (K, 2, 3) to start
+    from, without the row.
+    """
     for k, n in enumerate(rows):
         for i in range(2):
-            pixels[k, i], start[k, i, 2] = left[n, i], warp[n, i, 2]
+            pixels[k, i] = left[n, i]
+            start[k, i, 2] = warp[n, i, 2]
             for j in range(2):
                 start[k, i, j] = warp[n, i, j] + skew[n, i, j]
         start[k, 0, 2] -= disparity[k]
@@ -314,10 +406,12 @@ def _judge(
     skew: FloatArray,
     valid: BoolArray,
 ) -> None:
-    """Write right pixels (K, 2), skews (K, 2, 2), and a mask (K,) of matches that a point ahead of the camera may have.
+    """Write right pixels (K, 2), skews (K, 2, 2), and a mask (K,) of matches that a point ahead of
+    the camera may have.
 
-    They are given by warps (N, 2, 3) of the left image and rows (K,) of these, left pixels (K, 2), warps (K, 2, 3)
-    before and after the alignment, which starts in the expected row, and correlations (K,).
+    They are given by warps (N, 2, 3) of the left image and rows (K,) of these, left pixels (K, 2),
+    warps (K, 2, 3) before and after the alignment, which starts in the expected row, and
+    correlations (K,).
     """
     for k, n in enumerate(rows):
         steep = 0.0
@@ -326,21 +420,26 @@ def _judge(
             for j in range(2):
                 skew[k, i, j] = warp[k, i, j] - before[n, i, j]
                 steep = max(steep, abs(skew[k, i, j]))
-        du, dv = pixels[k, 0] - start[k, 0, 2], pixels[k, 1] - start[k, 1, 2]
+        du = pixels[k, 0] - start[k, 0, 2]
+        dv = pixels[k, 1] - start[k, 1, 2]
         valid[k] = score[k] >= _MIN_CORRELATION and is_on_peak(du, dv) and steep <= _MAX_SKEW
         valid[k] &= abs(dv) <= _MAX_ROW_DIFFERENCE_PX
         valid[k] &= MIN_MATCH_DISPARITY_PX <= left[k, 0] - pixels[k, 0] <= max_disparity
 
 
 def common_offset(expected: FloatArray, off: FloatArray) -> tuple[float, float]:
-    """Offset and slope of deviations (N,) over expected disparities (N,): the line through two medians.
+    """Offset and slope of deviations (N,) over expected disparities (N,): the line through two
+    medians.
 
-    The slope is the factor that is unknown of depths by the motion of one camera; the offset is what is left.
+    The slope is the factor that is unknown of depths by the motion of one camera; the offset is
+    what is left.
     Reference: Tukey, Exploratory Data Analysis (1977), resistant lines.
     """
     order = np.argsort(expected)
-    near, far = order[len(order) // 2 :], order[: len(order) // 2]
-    d_near, d_far = median(expected[near]), median(expected[far])
+    near = order[len(order) // 2 :]
+    far = order[: len(order) // 2]
+    d_near = median(expected[near])
+    d_far = median(expected[far])
     if d_near - d_far < _LEAST_SPREAD_PX:
         return median(off), 0.0
     slope = (median(off[near]) - median(off[far])) / (d_near - d_far)
@@ -362,19 +461,24 @@ def _match(
     point: FloatArray,
     has_point: BoolArray,
 ) -> None:
-    """Set the columns of features, at left pixels (N, 2), in those rows (K,) whose match is `good` (K,).
+    """Set the columns of features, at left pixels (N, 2), in those rows (K,) whose match is `good`
+    (K,).
 
     A match is a right pixel (K, 2) and a skew (K, 2, 2); a point has the mean row of both images.
     """
     for k, n in enumerate(rows):
         if not good[k]:
             continue
-        has_right[n], right[n, 0], right[n, 1] = True, pixels[k, 0], pixels[k, 1]
+        has_right[n] = True
+        right[n, 0] = pixels[k, 0]
+        right[n, 1] = pixels[k, 1]
         for i in range(2):
             for j in range(2):
                 skews[n, i, j] = skew[k, i, j]
         disparity = left[n, 0] - pixels[k, 0]
         if disparity >= _MIN_DISPARITY_PX:
             v = (left[n, 1] + pixels[k, 1]) / 2.0
-            point[n, 0], point[n, 1], point[n, 2] = point_at(camera, left[n, 0], v, f_baseline / disparity)
+            point[n, 0], point[n, 1], point[n, 2] = point_at(
+                camera, left[n, 0], v, f_baseline / disparity
+            )
             has_point[n] = True

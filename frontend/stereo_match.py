@@ -1,7 +1,9 @@
-"""Left-right matching on a rectified pair: normalised correlation along the row over all disparities.
+"""Left-right matching on a rectified pair: normalised correlation along the row over all
+disparities.
 
-The search compares zero-mean, unit-norm patches, so that exposure and gain may differ between the cameras. It runs at
-half resolution, left to right and back; `frontend.align` then finds the sub-pixel position in the full image.
+The search compares zero-mean, unit-norm patches, so that exposure and gain may differ between the
+cameras. It runs at half resolution, left to right and back; `frontend.align` then finds the
+sub-pixel position in the full image.
 """
 
 from __future__ import annotations
@@ -29,10 +31,12 @@ Scores = npt.NDArray[np.float32]  # correlations, and what they are computed fro
 
 
 class EpipolarRowModel:
-    """Row differences of matches over the image, estimated from the matches: the residual error of the rectification.
+    """Row differences of matches over the image, estimated from the matches: the residual error of
+    the rectification.
 
-    A small error of the relative rotation or principal point moves rows by a low polynomial in the pixel: 1, x, y, x y
-    and y^2 of equation (R2) of docs/math.md. At a slanted edge it causes an error of the disparity.
+    A small error of the relative rotation or principal point moves rows by a low polynomial in the
+    pixel: 1, x, y, x y and y^2 of equation (R2) of docs/math.md. At a slanted edge it causes an
+    error of the disparity.
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -54,7 +58,8 @@ class EpipolarRowModel:
 
     def restart(self, offset_px: float) -> None:
         """Begin again with the same row difference over the whole image."""
-        self._normal, self._moment = _FIELD_PRIOR * np.eye(5), np.zeros(5)
+        self._normal = _FIELD_PRIOR * np.eye(5)
+        self._moment = np.zeros(5)
         self._field = np.array([offset_px, 0.0, 0.0, 0.0, 0.0])
         self._moment[0] = _FIELD_PRIOR * offset_px
 
@@ -63,8 +68,11 @@ class EpipolarRowModel:
         return left[:, 1] + self._terms(left) @ self._field
 
     def update(self, left: FloatArray, right: FloatArray) -> None:
-        """Update the estimate with the matches (N, 2) and (N, 2) of one frame; outliers have little weight."""
-        terms, off = self._terms(left), right[:, 1] - left[:, 1]
+        """Update the estimate with the matches (N, 2) and (N, 2) of one frame; outliers have
+        little weight.
+        """
+        terms = self._terms(left)
+        off = right[:, 1] - left[:, 1]
         _learn(terms, off, self._normal, self._moment, self._field)
         if len(terms):
             fitted = terms @ self._field
@@ -75,22 +83,33 @@ class EpipolarRowModel:
 def _write_terms(pixels: FloatArray, centre: FloatArray, terms: FloatArray) -> None:
     """Write the terms (N, 5) of the row differences at pixels (N, 2)."""
     for n in range(len(pixels)):
-        x, y = (pixels[n, 0] - centre[0]) / centre[0], (pixels[n, 1] - centre[1]) / centre[0]
-        terms[n, 0], terms[n, 1], terms[n, 2], terms[n, 3], terms[n, 4] = 1.0, x, y, x * y, y * y
+        x = (pixels[n, 0] - centre[0]) / centre[0]
+        y = (pixels[n, 1] - centre[1]) / centre[0]
+        terms[n, 0] = 1.0
+        terms[n, 1] = x
+        terms[n, 2] = y
+        terms[n, 3] = x * y
+        terms[n, 4] = y * y
 
 
 @compiled
-def _learn(terms: FloatArray, off: FloatArray, normal: FloatArray, moment: FloatArray, field: FloatArray) -> None:
-    """Add the row differences (N,) of a frame's matches to the normal equations, and solve these for the field."""
+def _learn(
+    terms: FloatArray, off: FloatArray, normal: FloatArray, moment: FloatArray, field: FloatArray
+) -> None:
+    """Add the row differences (N,) of a frame's matches to the normal equations, and solve these
+    for the field.
+    """
     size = len(field)
     for i in range(size):
         for j in range(size):
             normal[i, j] *= _FIELD_MEMORY
         normal[i, i] += (1 - _FIELD_MEMORY) * _FIELD_PRIOR
         moment[i] *= _FIELD_MEMORY
-    kept, kept_moment = normal.copy(), moment.copy()
+    kept = normal.copy()
+    kept_moment = moment.copy()
     for _ in range(_FIELD_ITERATIONS):
-        normal[:], moment[:] = kept, kept_moment
+        normal[:] = kept
+        moment[:] = kept_moment
         add_equations(terms, off, field, _FIELD_SIGMA_PX, normal, moment)
         field[:] = moment
         solve_positive(normal.copy(), field)
@@ -106,22 +125,37 @@ def shifted_rows(image: Image, rows: int) -> Image:
 
 @compiled
 def correlate(
-    source: Image, target: Image, centres: IntArray, first_column: IntArray, radius: int, out: Scores
+    source: Image,
+    target: Image,
+    centres: IntArray,
+    first_column: IntArray,
+    radius: int,
+    out: Scores,
 ) -> None:
-    """Write the normalised correlations (N, count) of source patches with the target patches of the same row.
+    """Write the normalised correlations (N, count) of source patches with the target patches of the
+    same row.
 
-    Candidate k of point n is centred at column `first_column[n] + k`. Candidates whose patch leaves the image, and
-    patches without contrast, score -1. The source patches must lie inside the source image. Sums of products of 81
-    pairs of gray levels are exact in 32 bits of float.
+    Candidate k of point n is centred at column `first_column[n] + k`. Candidates whose patch leaves
+    the image, and patches without contrast, score -1. The source patches must lie inside the source
+    image. Sums of products of 81 pairs of gray levels are exact in 32 bits of float.
     """
-    width, count, side = target.shape[1], out.shape[1], 2 * radius + 1
-    size, flat = side * side, FLAT_RMS**2 * side * side
-    strip, product = np.empty(count + side - 1, np.float32), np.empty(count, np.float32)
-    total, squares = np.empty(len(strip), np.float32), np.empty(len(strip), np.float32)
-    windows, square_windows = np.empty(count, np.float32), np.empty(count, np.float32)
+    width = target.shape[1]
+    count = out.shape[1]
+    side = 2 * radius + 1
+    size = side * side
+    flat = FLAT_RMS**2 * side * side
+    strip = np.empty(count + side - 1, np.float32)
+    product = np.empty(count, np.float32)
+    total = np.empty(len(strip), np.float32)
+    squares = np.empty(len(strip), np.float32)
+    windows = np.empty(count, np.float32)
+    square_windows = np.empty(count, np.float32)
     for n in range(len(centres)):
-        column, row, first = centres[n, 0] - radius, centres[n, 1], first_column[n]
-        own_total, own_squares = 0, 0
+        column = centres[n, 0] - radius
+        row = centres[n, 1]
+        first = first_column[n]
+        own_total = 0
+        own_squares = 0
         for k in range(len(strip)):
             total[k] = squares[k] = 0.0
         for k in range(count):
@@ -136,13 +170,19 @@ def correlate(
                 own_total += gray
                 own_squares += gray * gray
             own = source[y, column:]
-            for x in range(0, side - 2, 3):  # three at once: to read and write the sums takes longer than to add
-                a, b, c = np.float32(own[x]), np.float32(own[x + 1]), np.float32(own[x + 2])
-                one, two, three = strip[x:], strip[x + 1 :], strip[x + 2 :]
+            # three at once: to read and write the sums takes longer than to add
+            for x in range(0, side - 2, 3):
+                a = np.float32(own[x])
+                b = np.float32(own[x + 1])
+                c = np.float32(own[x + 2])
+                one = strip[x:]
+                two = strip[x + 1 :]
+                three = strip[x + 2 :]
                 for k in range(count):
                     product[k] += a * one[k] + b * two[k] + c * three[k]
             for x in range(side - side % 3, side):
-                a, one = np.float32(own[x]), strip[x:]
+                a = np.float32(own[x])
+                one = strip[x:]
                 for k in range(count):
                     product[k] += a * one[k]
         energy = own_squares - own_total**2 / size
@@ -158,7 +198,9 @@ def correlate(
 
 @compiled
 def _cut_row(image: Image, y: int, first: int, strip: Scores) -> None:
-    """Write the gray levels of a row from a column on into `strip`; outside the image (H, W) its border is repeated."""
+    """Write the gray levels of a row from a column on into `strip`; outside the image (H, W) its
+    border is repeated.
+    """
     last = image.shape[1] - 1
     if first >= 0 and first + len(strip) <= image.shape[1]:
         for k in range(len(strip)):
@@ -181,15 +223,22 @@ def _sum_windows(values: Scores, side: int, out: Scores) -> None:
 
 @compiled
 def _search(
-    source: Image, target: Image, points: FloatArray, low: int, high: int, shift: FloatArray, top: FloatArray
+    source: Image,
+    target: Image,
+    points: FloatArray,
+    low: int,
+    high: int,
+    shift: FloatArray,
+    top: FloatArray,
 ) -> None:
     """Search shifts `low..high` along the row for points (N, 2).
 
-    Writes the best shift (N,), sub-pixel, and into `top` (2, N) its score, -1 too close to the border, and the best
-    score outside its peak.
+    Writes the best shift (N,), sub-pixel, and into `top` (2, N) its score, -1 too close to the
+    border, and the best score outside its peak.
     """
     height, width = source.shape
-    centres, first = np.empty((len(points), 2), np.int64), np.empty(len(points), np.int64)
+    centres = np.empty((len(points), 2), np.int64)
+    first = np.empty(len(points), np.int64)
     for n in range(len(points)):
         centres[n, 0] = min(max(int(np.rint(points[n, 0])), _RADIUS), width - _RADIUS - 1)
         centres[n, 1] = min(max(int(np.rint(points[n, 1])), _RADIUS), height - _RADIUS - 1)
@@ -209,7 +258,9 @@ def _search(
 
 @compiled
 def _peaks(score: Scores, offset: FloatArray, top: FloatArray, second: FloatArray) -> None:
-    """Write each row's best candidate (N,), sub-pixel by a parabola, its score, and the best score outside its peak."""
+    """Write each row's best candidate (N,), sub-pixel by a parabola, its score, and the best
+    score outside its peak.
+    """
     last = score.shape[1] - 1
     for n in range(len(score)):
         best = 0
@@ -220,16 +271,23 @@ def _peaks(score: Scores, offset: FloatArray, top: FloatArray, second: FloatArra
         for k in range(last + 1):
             if abs(k - best) > _PEAK_HALF_WIDTH:
                 second[n] = max(second[n], score[n, k])
-        offset[n], top[n] = best, score[n, best]
+        offset[n] = best
+        top[n] = score[n, best]
         if 0 < best < last:
-            before, after = float(score[n, best - 1]), float(score[n, best + 1])
+            before = float(score[n, best - 1])
+            after = float(score[n, best + 1])
             bend = before - 2.0 * top[n] + after
             if bend < 0.0:
                 offset[n] += min(max((before - after) / (2.0 * bend), -0.5), 0.5)
 
 
 def match_rows(
-    left_half: Image, right_half: Image, points: FloatArray, max_disparity: float, min_correlation: float, margin: float
+    left_half: Image,
+    right_half: Image,
+    points: FloatArray,
+    max_disparity: float,
+    min_correlation: float,
+    margin: float,
 ) -> tuple[FloatArray, BoolArray]:
     """Match points of the left image into the right one, to about half a pixel.
 
@@ -242,12 +300,15 @@ def match_rows(
         margin: smallest lead over the second-best match in the row.
 
     Returns:
-        Disparities (N,) in pixels of the full image, and a mask (N,) of those with sufficient correlation, unique,
-        and confirmed by the reverse search.
+        Disparities (N,) in pixels of the full image, and a mask (N,) of those with sufficient
+        correlation, unique, and confirmed by the reverse search.
     """
-    disparity, valid = np.empty(len(points)), np.empty(len(points), dtype=np.bool_)
+    disparity = np.empty(len(points))
+    valid = np.empty(len(points), dtype=np.bool_)
     images = np.ascontiguousarray(left_half), np.ascontiguousarray(right_half)
-    _match(*images, points / 2, math.ceil(max_disparity / 2), min_correlation, margin, disparity, valid)
+    _match(
+        *images, points / 2, math.ceil(max_disparity / 2), min_correlation, margin, disparity, valid
+    )
     return disparity, valid
 
 
@@ -264,14 +325,19 @@ def _match(
 ) -> None:
     """Write what `match_rows` returns, for points (N, 2) in pixels of the half image."""
     count = 0
-    shift, top, there = np.empty(len(points)), np.empty((2, len(points))), np.empty((len(points), 2))
-    backward, low, high = -reach, int(np.int64(-1)), int(np.int64(1))  # no literals: see `vio.numerics.compiled`
+    shift = np.empty(len(points))
+    top = np.empty((2, len(points)))
+    there = np.empty((len(points), 2))
+    backward = -reach  # no literals: see `vio.numerics.compiled`
+    low = int(np.int64(-1))
+    high = int(np.int64(1))
     _search(left, right, points, backward, high, shift, top)
     for n in range(len(points)):
         disparity[n] = -2.0 * shift[n]
         valid[n] = top[0, n] >= min_correlation and top[0, n] - top[1, n] >= margin
         if valid[n]:
-            there[count, 0], there[count, 1] = points[n, 0] + shift[n], points[n, 1]
+            there[count, 0] = points[n, 0] + shift[n]
+            there[count, 1] = points[n, 1]
             count += 1
     _search(right, left, there[:count], low, reach, shift, top)
     count = 0

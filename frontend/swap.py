@@ -16,14 +16,17 @@ _MANY = 0.4  # share of features matched in the mirrored images that indicates a
 
 
 class SwapDetector(ImageCheck):
-    """Detects a recording with swapped left and right images: few matches, but many in the mirrored images.
+    """Detects a recording with swapped left and right images: few matches, but many in the mirrored
+    images.
 
-    Several frames must show it; all after them are refused until one is in order. Once a few frames were in order, so
-    is the recording: `ExchangeDetector` judges later ones.
+    Several frames must show it; all after them are refused until one is in order. Once a few frames
+    were in order, so is the recording: `ExchangeDetector` judges later ones.
     """
 
     def __init__(self, few: float) -> None:
-        """Begin; `few` is the share of features with a match below which the mirrored images are checked."""
+        """Begin; `few` is the share of features with a match below which the mirrored images are
+        checked.
+        """
         super().__init__()
         self._few = few
         self._suspicious = self._in_order = 0  # frames
@@ -46,10 +49,18 @@ class SwapDetector(ImageCheck):
         matched = int(tracks.has_right.sum())
         if matched < self._few * len(tracks) and self._in_order < _FRAMES:
             matched += images.stereo.count_beyond(left, right, tracks.left[~tracks.has_right])
-        self.check(images.frame, len(tracks), matched, lambda: images.stereo.count_mirrored(left, right, tracks.left))
+        self.check(
+            images.frame,
+            len(tracks),
+            matched,
+            lambda: images.stereo.count_mirrored(left, right, tracks.left),
+        )
 
-    def check(self, frame: StereoFrame, features: int, matched: int, count_mirrored: Callable[[], int]) -> None:
-        """Check the number of matched features; `count_mirrored` counts the matches in the mirrored images.
+    def check(
+        self, frame: StereoFrame, features: int, matched: int, count_mirrored: Callable[[], int]
+    ) -> None:
+        """Check the number of matched features; `count_mirrored` counts the matches in the mirrored
+        images.
 
         Raises:
             DataError: left and right look swapped.
@@ -67,7 +78,9 @@ class SwapDetector(ImageCheck):
             self._suspicious = 0
         if self._certain:
             raise DataError(
-                f"frame {frame.index}: left and right images look swapped ({mirrored} of {features} features match "
-                f"with a negative disparity, {matched} with a positive one, in {_FRAMES} frames); exchange the "
+                f"frame {frame.index}: left and right images look swapped ({mirrored} of "
+                f"{features} features match "
+                f"with a negative disparity, {matched} with a positive one, in {_FRAMES} frames); "
+                "exchange the "
                 "image folders or the cameras' calibration"
             )

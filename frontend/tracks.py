@@ -13,7 +13,8 @@ from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray, SigmaArray
 
 ANCHOR_RADIUS_PX = 9  # of the anchor patch that a feature is aligned with
-ANCHOR_REACH_PX = round(INSIDE * ANCHOR_RADIUS_PX)  # at least so far from the image's border features stay
+# at least so far from the image's border features stay
+ANCHOR_REACH_PX = round(INSIDE * ANCHOR_RADIUS_PX)
 INLIER_PX = 1.0  # largest reprojection error of a static feature under the consensus motion
 
 
@@ -75,7 +76,9 @@ def no_tracks() -> Tracks:
 
 
 class AnchorBank:
-    """Anchor templates of the active features, in reusable slots: anchors keep their slot while rows of tracks move."""
+    """Anchor templates of the active features, in reusable slots: anchors keep their slot while
+    rows of tracks move.
+    """
 
     def __init__(self, count: int, radius_px: int) -> None:
         self.store = empty_templates(count, radius_px)
@@ -98,7 +101,9 @@ class AnchorBank:
         replace_templates(self.store, slots, cut_patches(image, centres, self._radius_px))
 
     def sigma(self, slots: IntArray, *, depth_image: bool) -> SigmaArray:
-        """Standard deviations (N, 3) of features in slots (N,) as in `Observations`; of a depth image that of `ul`."""
+        """Standard deviations (N, 3) of features in slots (N,) as in `Observations`; of a depth
+        image that of `ul`.
+        """
         out = self.store.sigma[slots]
         if depth_image:
             out[:, 2] = out[:, 0]

@@ -1,4 +1,6 @@
-"""Robustly weighted normal equations of a linear model, for what is learned from the rows of matches."""
+"""Robustly weighted normal equations of a linear model, for what is learned from the rows of
+matches.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +10,15 @@ from vio.numerics.compiled import compiled
 
 @compiled
 def add_equations(
-    terms: FloatArray, values: FloatArray, model: FloatArray, sigma: float, normal: FloatArray, moment: FloatArray
+    terms: FloatArray,
+    values: FloatArray,
+    model: FloatArray,
+    sigma: float,
+    normal: FloatArray,
+    moment: FloatArray,
 ) -> tuple[float, float]:
-    """Add the equations `terms @ x = values`, each with Cauchy's weight of its residual under a model x.
+    """Add the equations `terms @ x = values`, each with Cauchy's weight of its residual under a
+    model x.
 
     Args:
         terms: (N, K).

@@ -25,7 +25,9 @@ STORES = {
 }
 
 # ROS 1 keeps tf2_msgs apart from its common messages.
-STORES["bag"].register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+STORES["bag"].register(
+    get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +55,22 @@ class Script:
     def header(self, time_ns: int, frame: str) -> Any:
         """Return a std_msgs/Header."""
         stamp = self.make("builtin_interfaces/msg/Time", time_ns // 10**9, time_ns % 10**9)
-        return self.make("std_msgs/msg/Header", *([0] if self.storage == "bag" else []), stamp, frame)
+        return self.make(
+            "std_msgs/msg/Header", *([0] if self.storage == "bag" else []), stamp, frame
+        )
 
-    def add(self, topic: str, kind: str, time_ns: int, fields: Any, logged_ns: int | None = None) -> None:
+    def add(
+        self, topic: str, kind: str, time_ns: int, fields: Any, logged_ns: int | None = None
+    ) -> None:
         """Add a message that was logged at its stamp, or at another time."""
         self.notes.append(Note(topic, kind, time_ns if logged_ns is None else logged_ns, fields))
 
-    def image(self, topic: str, time_ns: int, pixels: np.ndarray, encoding: str = "mono8", *, cut: int = 0) -> None:
-        """Add a sensor_msgs/Image whose pixels are (H, W) or (H, W, C), without its last `cut` bytes."""
+    def image(
+        self, topic: str, time_ns: int, pixels: np.ndarray, encoding: str = "mono8", *, cut: int = 0
+    ) -> None:
+        """Add a sensor_msgs/Image whose pixels are (H, W) or (H, W, C), without its last `cut`
+        bytes.
+        """
         data = np.frombuffer(np.ascontiguousarray(pixels).tobytes(), np.uint8)
         height, width = pixels.shape[:2]
         kind = "sensor_msgs/msg/Image"
@@ -94,12 +104,19 @@ class Script:
     def pose(self, topic: str, time_ns: int, T: FloatArray) -> None:
         """Add a geometry_msgs/PoseStamped."""
         kind = "geometry_msgs/msg/PoseStamped"
-        self.add(topic, kind, time_ns, self.make(kind, self.header(time_ns, "world"), self._pose(T)))
+        self.add(
+            topic, kind, time_ns, self.make(kind, self.header(time_ns, "world"), self._pose(T))
+        )
 
-    def odometry(self, topic: str, time_ns: int, T: FloatArray, linear: FloatArray, angular: FloatArray) -> None:
+    def odometry(
+        self, topic: str, time_ns: int, T: FloatArray, linear: FloatArray, angular: FloatArray
+    ) -> None:
         """Add a nav_msgs/Odometry."""
         kind, vector = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Vector3"
-        twist = self.make("geometry_msgs/msg/Twist", *(self.make(vector, *map(float, x)) for x in (linear, angular)))
+        twist = self.make(
+            "geometry_msgs/msg/Twist",
+            *(self.make(vector, *map(float, x)) for x in (linear, angular)),
+        )
         fields = self.make(
             kind,
             self.header(time_ns, "odom"),
@@ -133,7 +150,9 @@ class Script:
         """Add a transform of /tf_static: coordinates of the child to those of the parent."""
         self.moving(time_ns, parent, child, T, "/tf_static")
 
-    def moving(self, time_ns: int, parent: str, child: str, T: FloatArray, topic: str = "/tf") -> None:
+    def moving(
+        self, time_ns: int, parent: str, child: str, T: FloatArray, topic: str = "/tf"
+    ) -> None:
         """Add a transform of /tf."""
         kind, stamped = "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/TransformStamped"
         p, q = T[:3, 3], quat_xyzw_from_rotation(T[:3, :3])
@@ -168,7 +187,9 @@ class Script:
         return path
 
 
-def of_stereo(script: Script, frames: Iterable[tuple[int, Image, Image]], *, compressed: bool = False) -> Script:
+def of_stereo(
+    script: Script, frames: Iterable[tuple[int, Image, Image]], *, compressed: bool = False
+) -> Script:
     """Add stereo frames (time, left, right)."""
     for time_ns, left, right in frames:
         for side, image in (("left", left), ("right", right)):

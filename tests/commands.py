@@ -1,4 +1,6 @@
-"""Commands as tests call them: a render, a refusal, and a condition that another process fulfils."""
+"""Commands as tests call them: a render, a refusal, and a condition that another process
+fulfils.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from typing import Any
 
 import pytest
 
-PATIENCE_S = 600.0  # ends a test that hangs; beside other work each process may take half a minute to start
+# ends a test that hangs; beside other work each process may take half a minute to start
+PATIENCE_S = 600.0
 
 
 def render(folder: Path, **options: str) -> Path:
@@ -36,7 +39,9 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 
 
 def json_of(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> Any:
-    """Return the object that a command prints with `--json`; it must succeed and print nothing else."""
+    """Return the object that a command prints with `--json`; it must succeed and print nothing
+    else.
+    """
     from vio.cli import main
 
     capsys.readouterr()

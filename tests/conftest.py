@@ -15,7 +15,8 @@ from vio.numerics.threads import one_blas_thread
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# The files that take longest. They begin first, so that no worker is left with one when the others have ended.
+# The files that take longest. They begin first, so that no worker is left with one when the others
+# have ended.
 LONGEST = (
     "test_examples", "test_inertial_check", "test_docs", "test_imu_start", "test_tutorials", "test_cli",
     "test_unfinished_runs", "test_imu_gaps",
@@ -26,16 +27,21 @@ LONGEST = (
     "test_sim_recording", "test_frozen_images",
 )  # fmt: skip
 
-# Files whose tests look at the picture of a run. All others write an empty one: drawing takes longer than a short run.
+# Files whose tests look at the picture of a run. All others write an empty one: drawing takes
+# longer than a short run.
 DRAWN = ("test_plotting",)
 
-# Tests judge the sources: numba compiles them, and no module that an earlier state of them has left.
+# Tests judge the sources: numba compiles them, and no module that an earlier state of them has
+# left.
 prebuilt.FOLDER = Path("no machine code")
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # of torch and COLMAP: other workers use the other cores
+# of torch and COLMAP: other workers use the other cores
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 settings.register_profile("vio", deadline=None)  # no test judges a machine by its speed
 # For tools/mutate.py: the same examples each time, and a failure is not made simpler.
-settings.register_profile("once", deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
+settings.register_profile(
+    "once", deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate]
+)
 settings.load_profile("vio")
 
 
@@ -47,14 +53,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_blas_thread() -> Iterator[None]:
-    """As the command line does: on small matrices a second thread costs a hundred times what it brings."""
+    """As the command line does: on small matrices a second thread costs a hundred times what it
+    brings.
+    """
     with one_blas_thread():
         yield
 
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """The folder of real recordings named by VIO_DATA (empty: not set); the test is skipped where it is absent."""
+    """The folder of real recordings named by VIO_DATA (empty: not set); the test is skipped
+    where it is absent.
+    """
     folder = Path(os.environ.get("VIO_DATA") or ROOT.parent / "shared" / "data")
     if not folder.is_dir():
         pytest.skip(f"no recordings at {folder}; set VIO_DATA to the folder that holds them")
@@ -73,13 +83,18 @@ def _no_picture(request: pytest.FixtureRequest) -> Iterator[None]:
     """Write an empty picture of each run, see `DRAWN`."""
     with pytest.MonkeyPatch.context() as patch:
         if request.path.stem not in DRAWN:
-            patch.setattr("vio.runs.picture.RunPicture.write", lambda picture, path: path.write_bytes(b"\x89PNG"))
+            patch.setattr(
+                "vio.runs.picture.RunPicture.write",
+                lambda picture, path: path.write_bytes(b"\x89PNG"),
+            )
         yield
 
 
 @pytest.fixture(autouse=True)
 def _no_make_around_us(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where `make` runs the tests, a `make` that a test runs must not take itself for a part of that one."""
+    """Where `make` runs the tests, a `make` that a test runs must not take itself for a part of
+    that one.
+    """
     for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "MAKEOVERRIDES"):
         monkeypatch.delenv(name, raising=False)
 

@@ -33,7 +33,9 @@ class Drive:
     points: FloatArray  # (M, 3) world
 
 
-def make_drive(frames: int = 12, *, seed: int = 0, pixel_sigma: float = 0.0, yaw_rate: float = 0.4) -> Drive:
+def make_drive(
+    frames: int = 12, *, seed: int = 0, pixel_sigma: float = 0.0, yaw_rate: float = 0.4
+) -> Drive:
     """Drive along a slalom between random points; the velocities integrate to the poses exactly."""
     rng = np.random.default_rng(seed)
     k = np.arange(frames)
@@ -46,7 +48,9 @@ def make_drive(frames: int = 12, *, seed: int = 0, pixel_sigma: float = 0.0, yaw
     T_world_imu = np.array(T)
     anchors = rng.integers(0, frames, 25 * frames)
     ahead = rng.uniform([5, -9, -2], [30, 9, 3], (len(anchors), 3))
-    points = np.einsum("nij,nj->ni", T_world_imu[anchors, :3, :3], ahead) + T_world_imu[anchors, :3, 3]
+    points = (
+        np.einsum("nij,nj->ni", T_world_imu[anchors, :3, :3], ahead) + T_world_imu[anchors, :3, 3]
+    )
     features = np.full((4, len(points), frames), -1.0)
     for t in range(frames):
         T_cam_world = T_CAM0_IMU @ se3_inverse(T_world_imu[t])
@@ -97,7 +101,9 @@ def make_npz(path: Path, arrays: Mapping[str, npt.NDArray[np.generic]]) -> Path:
 
 
 def utias_arrays(drive: Drive) -> dict[str, npt.NDArray[np.float64]]:
-    """The variables of a UTIAS file; velocities and poses cover three frames more than the features."""
+    """The variables of a UTIAS file; velocities and poses cover three frames more than the
+    features.
+    """
     longer = np.pad(drive.velocities, ((0, 3), (0, 0)), mode="edge")
     poses = np.concatenate([drive.T_world_imu, np.tile(drive.T_world_imu[-1:], (3, 1, 1))])
     return {
@@ -135,14 +141,23 @@ def make_images(folder: Path, frames: int, *, channels: int = 1, depth: int = 8)
 
 def calib_text(*offsets_m: float) -> str:
     """The lines `P0: …` of rectified cameras at the given places on the x axis of camera 0."""
-    lines = [f"P{k}: 7.0e+02 0 6.0e+02 {-700 * x:e} 0 7.0e+02 1.8e+02 0 0 0 1 0" for k, x in enumerate(offsets_m)]
+    lines = [
+        f"P{k}: 7.0e+02 0 6.0e+02 {-700 * x:e} 0 7.0e+02 1.8e+02 0 0 0 1 0"
+        for k, x in enumerate(offsets_m)
+    ]
     return "\n".join([*lines, "Tr: 1 0 0 0 0 1 0 0 0 0 1 0"]) + "\n"
 
 
 def make_kitti(
-    folder: Path, frames: int = 4, *, official: bool = False, gray: bool = True, colour: bool = False
+    folder: Path,
+    frames: int = 4,
+    *,
+    official: bool = False,
+    gray: bool = True,
+    colour: bool = False,
 ) -> Path:
-    """Write a KITTI folder: self-contained with velocity and extrinsics, or official with poses two levels up.
+    """Write a KITTI folder: self-contained with velocity and extrinsics, or official with poses two
+    levels up.
 
     Camera 2 is 6 cm left of camera 0, as KITTI's does.
     """
@@ -160,14 +175,20 @@ def make_kitti(
         (folder / "poses" / "07.txt").write_text(poses)
         return sequence
     (sequence / "poses.txt").write_text(poses)
-    (sequence / "T_cam0_imu.txt").write_text("\n".join(" ".join(f"{v:.17e}" for v in row) for row in T_cam0_imu))
-    rows = [f"{FRAME_S * k:.6f},{','.join(map(repr, u.tolist()))}" for k, u in enumerate(drive.velocities[:frames])]
+    (sequence / "T_cam0_imu.txt").write_text(
+        "\n".join(" ".join(f"{v:.17e}" for v in row) for row in T_cam0_imu)
+    )
+    rows = [
+        f"{FRAME_S * k:.6f},{','.join(map(repr, u.tolist()))}"
+        for k, u in enumerate(drive.velocities[:frames])
+    ]
     header = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
     (sequence / "velocity.csv").write_text("\n".join([header, *rows]) + "\n")
     return sequence
 
 
-# --- corrupting the arrays ------------------------------------------------------------------------------------------
+# --- corrupting the arrays
+# ------------------------------------------------------------------------------------------
 
 Arrays: TypeAlias = dict[str, np.ndarray]
 

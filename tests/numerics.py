@@ -1,4 +1,6 @@
-"""Tools that tests share: central differences, on manifolds too, and the list of Jacobians held against them."""
+"""Tools that tests share: central differences, on manifolds too, and the list of Jacobians held
+against them.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +12,9 @@ import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 
-# Every public function `*_D_*` of vio and frontend, as 'module.name'. Add a name here together with the test that
-# compares it with `numeric_jacobian`; tests/test_jacobian_registry.py holds this set complete and honest.
+# Every public function `*_D_*` of vio and frontend, as 'module.name'. Add a name here together with
+# the test that compares it with `numeric_jacobian`; tests/test_jacobian_registry.py holds this set
+# complete and honest.
 TESTED_JACOBIANS = {
     "vio.filters.imu_terms.accel_D_terms",
     "vio.filters.imu_terms.gyro_D_terms",
@@ -48,9 +51,11 @@ def numeric_jacobian(
         f: takes what `retract` gives; its value is flattened unless `local` is given.
         x: the point, of any shape.
         retract: moves `x` along a tangent vector (n,); None: adds it element by element.
-        local: tangent vector (m,) from its first argument, `f(x)`, to its second; None: the flattened difference.
+        local: tangent vector (m,) from its first argument, `f(x)`, to its second; None: the
+            flattened difference.
         eps: half the step, in units of the tangent vector.
-        dim: n; None: 6 for a 4x4 pose with `retract`, 3 for a 3x3 rotation with `retract`, else the size of `x`.
+        dim: n; None: 6 for a 4x4 pose with `retract`, 3 for a 3x3 rotation with `retract`, else the
+            size of `x`.
     """
     x0 = np.asarray(x, dtype=np.float64)
     if dim is None:

@@ -1,4 +1,6 @@
-"""The compiled loops once more in NumPy, many at a time: slower and, for an eye used to arrays, easier to check."""
+"""The compiled loops once more in NumPy, many at a time: slower and, for an eye used to arrays,
+easier to check.
+"""
 
 from __future__ import annotations
 
@@ -26,11 +28,16 @@ ROW_WEIGHT = (4.0 / 0.3) ** 2  # gray levels and pixels: those of `frontend.alig
 
 
 def sampled(image: FloatArray, warp: FloatArray, xy: FloatArray) -> FloatArray:
-    """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's border is repeated."""
+    """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's
+    border is repeated.
+    """
     x, y = xy.astype(np.float64)
     u, v = np.moveaxis(warp @ np.stack([x, y, np.ones_like(x)]), 1, 0)
     u, v = np.clip(u, 0, image.shape[1] - 1), np.clip(v, 0, image.shape[0] - 1)
-    i, j = np.minimum(u.astype(int), image.shape[1] - 2), np.minimum(v.astype(int), image.shape[0] - 2)
+    i, j = (
+        np.minimum(u.astype(int), image.shape[1] - 2),
+        np.minimum(v.astype(int), image.shape[0] - 2),
+    )
     a, b = u - i, v - j
     above = (1 - a) * image[j, i] + a * image[j, i + 1]
     below = (1 - a) * image[j + 1, i] + a * image[j + 1, i + 1]
@@ -42,7 +49,10 @@ def prepared(wide: FloatArray) -> Templates:
     """Templates of patches (N, 2r+3, 2r+3), in double precision."""
     n, radius = len(wide), wide.shape[1] // 2 - 1
     x, y = disc(radius).astype(np.float64)
-    weight, inside = window(radius).astype(np.float64), np.isin(_names(offsets(radius)), _names(disc(radius)))
+    weight, inside = (
+        window(radius).astype(np.float64),
+        np.isin(_names(offsets(radius)), _names(disc(radius))),
+    )
     patch, gu, gv = (
         part.reshape(n, -1)[:, inside]
         for part in (
@@ -68,7 +78,12 @@ def _names(xy: FloatArray) -> FloatArray:
 
 
 def aligned(
-    store: Templates, radius: int, image: FloatArray, warp: FloatArray, iterations: int, rows: FloatArray | None
+    store: Templates,
+    radius: int,
+    image: FloatArray,
+    warp: FloatArray,
+    iterations: int,
+    rows: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Warps (N, 2, 3) and correlations (N,) of `frontend.align.align`, all templates in step."""
     x, y = disc(radius).astype(np.float64)
@@ -84,7 +99,9 @@ def aligned(
         moments = np.stack([term.sum(axis=1) for term in terms], axis=1)
         other = (view - np.average(view, axis=1, weights=weight)[:, None]) ** 2 @ weight
         flat = (other <= FLAT_RMS**2 * size) | (energy <= FLAT_RMS**2 * size)
-        score[active] = np.where(flat, -1.0, moments[:, 2] / np.sqrt(np.where(flat, 1.0, other * energy)))
+        score[active] = np.where(
+            flat, -1.0, moments[:, 2] / np.sqrt(np.where(flat, 1.0, other * energy))
+        )
         if rows is not None:
             gain = np.maximum(moments[:, 2] / np.maximum(energy, 1.0), 0.1)
             moments[:, 1] += ROW_WEIGHT * gain * (here[:, 1, 2] - rows[active])
@@ -100,11 +117,17 @@ def aligned(
     return warp, score
 
 
-def moved_errors(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Distances (..., N) between points (N, 3) moved by motions (..., 4, 4) and left pixels (N, 2)."""
+def moved_errors(
+    camera: StereoCamera, T: FloatArray, p_prev: FloatArray, pixels: FloatArray
+) -> FloatArray:
+    """Distances (..., N) between points (N, 3) moved by motions (..., 4, 4) and left pixels (N,
+    2).
+    """
     p = p_prev @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
     ahead = depth_of(camera, p) > 0.05
-    distance = np.linalg.norm(project(camera, np.where(ahead[..., None], p, 1.0))[..., :2] - pixels, axis=-1)
+    distance = np.linalg.norm(
+        project(camera, np.where(ahead[..., None], p, 1.0))[..., :2] - pixels, axis=-1
+    )
     return np.where(ahead, distance, np.inf)
 
 
@@ -118,7 +141,9 @@ def gauss_newton(
     iterations: int,
     free: slice,
 ) -> FloatArray:
-    """Motions (H, 4, 4), each refined on its own points (H, K, 3), pixels (H, K, 2) and weights (H, K)."""
+    """Motions (H, 4, 4), each refined on its own points (H, K, 3), pixels (H, K, 2) and weights
+    (H, K).
+    """
     for _ in range(iterations):
         p = p_prev @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
         ahead = depth_of(camera, p) > 0.05
@@ -138,12 +163,21 @@ def gauss_newton(
 
 
 def refined_motion(
-    camera: StereoCamera, T: FloatArray, p_prev: FloatArray, pixels: FloatArray, scale_px: float, converged: float
+    camera: StereoCamera,
+    T: FloatArray,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    scale_px: float,
+    converged: float,
 ) -> FloatArray:
-    """A motion (4, 4) refined on all points (N, 3) and pixels (N, 2), with Geman-McClure weights."""
+    """A motion (4, 4) refined on all points (N, 3) and pixels (N, 2), with Geman-McClure
+    weights.
+    """
     for _ in range(6):
         error = moved_errors(camera, T, p_prev, pixels)
-        weight = np.where(error < 3 * scale_px, 1.0 / (1.0 + (np.minimum(error, 1e6) / scale_px) ** 2), 0.0)
+        weight = np.where(
+            error < 3 * scale_px, 1.0 / (1.0 + (np.minimum(error, 1e6) / scale_px) ** 2), 0.0
+        )
         before = T
         one = (T[None], p_prev[None], pixels[None], weight[None])
         T = gauss_newton(camera, *one, iterations=1, free=slice(0, 6))[0]
@@ -155,15 +189,25 @@ def refined_motion(
 def equations(
     terms: FloatArray, values: FloatArray, model: FloatArray, sigma: float
 ) -> tuple[FloatArray, FloatArray, float, float]:
-    """Cauchy-weighted normal equations (K, K) and (K,), the sum of the weights, and that of the squared values."""
+    """Cauchy-weighted normal equations (K, K) and (K,), the sum of the weights, and that of the
+    squared values.
+    """
     weight = 1 / (1 + ((values - terms @ model) / sigma) ** 2)
-    return (terms * weight[:, None]).T @ terms, terms.T @ (weight * values), weight.sum(), weight @ values**2
+    return (
+        (terms * weight[:, None]).T @ terms,
+        terms.T @ (weight * values),
+        weight.sum(),
+        weight @ values**2,
+    )
 
 
-# --- tracks and their views --------------------------------------------------------------------------------------
+# --- tracks and their views
+# --------------------------------------------------------------------------------------
 
 
-def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views) -> Residuals:
+def residuals(
+    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views
+) -> Residuals:
     """Compare predicted with seen pixels, equation (M1)."""
     R, t = T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3]
     F, N = len(p_world), len(T_cam0_world)
@@ -178,13 +222,18 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
     return Residuals(r, J, ahead, views.weight)
 
 
-def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, seen: BoolArray) -> InverseDepth:
-    """Return the coordinates (M5) of points (F, 3) that lie ahead of the first camera that saw them."""
+def inverse_depth(
+    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, seen: BoolArray
+) -> InverseDepth:
+    """Return the coordinates (M5) of points (F, 3) that lie ahead of the first camera that saw
+    them.
+    """
     anchor = np.argmax(seen, axis=1)
     R, t = T_cam0_world[anchor, :3, :3], T_cam0_world[anchor, :3, 3]
     centre = -np.einsum("nji,nj->ni", T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3])[anchor]
     p_cam = np.einsum("fij,fj->fi", R, p_world) + t
-    if camera.is_cylinder:  # each as the pinhole that is turned about the baseline to the point sees it
+    # each as the pinhole that is turned about the baseline to the point sees it
+    if camera.is_cylinder:
         turn = so3_exp(np.arctan2(p_cam[:, 1], p_cam[:, 2])[:, None] * [1.0, 0.0, 0.0])
         R, p_cam = turn @ R, (turn @ p_cam[..., None])[..., 0]
     z = np.maximum(p_cam[:, 2], MIN_DEPTH * camera.baseline_m)
@@ -192,13 +241,17 @@ def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: Float
     p_D_q, q_D_p = np.empty((len(z), 3, 3)), np.empty((len(z), 3, 3))
     p_D_q[:, :, :2] = np.swapaxes(R[:, :2], 1, 2) * (z / camera.fu)[:, None, None]
     p_D_q[:, :, 2] = (centre - p_world) / disparity[:, None]
-    q_D_p[:, :2] = (R[:, :2] - (p_cam[:, :2] / z[:, None])[:, :, None] * R[:, 2:]) * (camera.fu / z)[:, None, None]
+    q_D_p[:, :2] = (R[:, :2] - (p_cam[:, :2] / z[:, None])[:, :, None] * R[:, 2:]) * (
+        camera.fu / z
+    )[:, None, None]
     q_D_p[:, 2] = R[:, 2] * (-disparity / z)[:, None]
     return InverseDepth(anchor, centre, disparity, p_D_q, q_D_p)
 
 
 def moved(q: InverseDepth, dq: FloatArray, most: FloatArray | float) -> FloatArray:
-    """Points (F, 3) in the world after steps (F, 3); the disparity stays between its least value and `most`."""
+    """Points (F, 3) in the world after steps (F, 3); the disparity stays between its least value
+    and `most`.
+    """
     disparity = np.maximum(np.minimum(q.disparity + dq[:, 2], most), LEAST_DISPARITY_PX)
     across = np.squeeze(q.p_D_q[:, :, :2] @ dq[:, :2, None], axis=2)
     ray = across - q.p_D_q[:, :, 2] * q.disparity[:, None]
@@ -206,8 +259,12 @@ def moved(q: InverseDepth, dq: FloatArray, most: FloatArray | float) -> FloatArr
     return out
 
 
-def on_rays(camera: StereoCamera, T: FloatArray, pixels: FloatArray, disparity: float | FloatArray) -> FloatArray:
-    """Points (F, 3) in the world that cameras (F, 4, 4) see at left pixels (F, 2), at disparities."""
+def on_rays(
+    camera: StereoCamera, T: FloatArray, pixels: FloatArray, disparity: float | FloatArray
+) -> FloatArray:
+    """Points (F, 3) in the world that cameras (F, 4, 4) see at left pixels (F, 2), at
+    disparities.
+    """
     scale = camera.fu * camera.baseline_m / np.asarray(disparity) * np.ones(len(T))
     p_cam = left_rays(camera, pixels) * scale[:, None]
     out: FloatArray = np.einsum("fji,fj->fi", T[:, :3, :3], p_cam - T[:, :3, 3])
@@ -217,7 +274,9 @@ def on_rays(camera: StereoCamera, T: FloatArray, pixels: FloatArray, disparity: 
 def refined(
     camera: StereoCamera, T: FloatArray, p: FloatArray, views: Views, steps: int, scale_px: float
 ) -> FloatArray:
-    """Points (F, 3) after Gauss-Newton steps with Cauchy weights, ahead of all cameras that saw them."""
+    """Points (F, 3) after Gauss-Newton steps with Cauchy weights, ahead of all cameras that saw
+    them.
+    """
     seen, least = views.weight[..., 0] > 0, MIN_DEPTH * camera.baseline_m
     first = np.argmax(seen, axis=1)
     for _ in range(steps):
@@ -233,7 +292,9 @@ def refined(
         if not camera.is_cylinder:
             ray_z = (p - q.centre) @ T[:, 2, :3].T * q.disparity[:, None]
             room = 1.01 * least - (q.centre @ T[:, 2, :3].T + T[:, 2, 3])
-            most = np.divide(ray_z, room, out=np.full(room.shape, np.inf), where=seen & (room > 0) & (ray_z > 0)).min(1)
+            most = np.divide(
+                ray_z, room, out=np.full(room.shape, np.inf), where=seen & (room > 0) & (ray_z > 0)
+            ).min(1)
         p = moved(q, dq, most)
     return p
 
@@ -241,11 +302,15 @@ def refined(
 def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
     """Cauchy weights (F, N) of all views; the scale is each clone's own."""
     squares, used = np.sum(at.r**2, axis=2), np.any(at.z_D_p[:, :, 1], axis=2)
-    median = np.array([np.median(s[u]) if u.any() else 0.0 for s, u in zip(squares.T, used.T, strict=True)])
+    median = np.array(
+        [np.median(s[u]) if u.any() else 0.0 for s, u in zip(squares.T, used.T, strict=True)]
+    )
     return np.asarray(used / (1 + squares / (4 * np.maximum(sigma2, median / 2.37) * CAUCHY**2)))
 
 
-def usable_points(camera: StereoCamera, T: FloatArray, p: FloatArray, views: Views, at: Residuals) -> BoolArray:
+def usable_points(
+    camera: StereoCamera, T: FloatArray, p: FloatArray, views: Views, at: Residuals
+) -> BoolArray:
     """Which tracks (F,) have a finite point ahead, and a right view or the parallax of one."""
     q = inverse_depth(camera, T, p, views.weight[..., 0] > 0)
     J = at.z_D_p.reshape(len(p), -1, 3) @ q.p_D_q
@@ -256,7 +321,11 @@ def usable_points(camera: StereoCamera, T: FloatArray, p: FloatArray, views: Vie
 
 
 def track_information(
-    camera: StereoCamera, T_cam0_world: FloatArray, at: Residuals, p_world: FloatArray, weight: FloatArray
+    camera: StereoCamera,
+    T_cam0_world: FloatArray,
+    at: Residuals,
+    p_world: FloatArray,
+    weight: FloatArray,
 ) -> TrackInformation:
     """Collect the normal equations of tracks, equations (M2), (M3), (M5) and (M6)."""
     F, N = at.r.shape[:2]
@@ -270,7 +339,9 @@ def track_information(
     Bt = np.swapaxes(B, 1, 2)
     G_i = Bt[:, None] @ C_i
     gradient = (Bt[:, None] @ g_i[..., None]).reshape(F, 6 * N)
-    return TrackInformation(q, G_i.reshape(F, 6 * N, 3), C_i.sum(axis=1), B, gradient, g_i.sum(axis=1))
+    return TrackInformation(
+        q, G_i.reshape(F, 6 * N, 3), C_i.sum(axis=1), B, gradient, g_i.sum(axis=1)
+    )
 
 
 def moved_points(info: TrackInformation, clone_errors: FloatArray, other: FloatArray) -> FloatArray:
@@ -280,13 +351,16 @@ def moved_points(info: TrackInformation, clone_errors: FloatArray, other: FloatA
 
 
 def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Information matrix (6N, 6N) and vector (6N,) about the clones of the chosen tracks, equation (M4)."""
+    """Information matrix (6N, 6N) and vector (6N,) about the clones of the chosen tracks,
+    equation (M4).
+    """
     G, N = info.G[chosen], info.G.shape[1] // 6
     L = np.linalg.cholesky(np.linalg.inv(info.C[chosen]))
     V = G @ L  # (F, 6N, 3)
     flat = np.swapaxes(V, 1, 2).reshape(-1, 6 * N)
     A = -flat.T @ flat
-    blocks = np.swapaxes(G, 0, 1).reshape(6 * N, -1) @ info.q_D_clone[chosen].reshape(-1, 6)  # sum of G_i B
+    # sum of G_i B
+    blocks = np.swapaxes(G, 0, 1).reshape(6 * N, -1) @ info.q_D_clone[chosen].reshape(-1, 6)
     for i in range(N):
         A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += blocks[6 * i : 6 * i + 6]
     b = info.gradient[chosen].sum(axis=0)
@@ -313,9 +387,15 @@ def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
 
 
 def corrected(
-    camera: StereoCamera, rows: FloatArray, coefficients: FloatArray, z: FloatArray, weight: FloatArray
+    camera: StereoCamera,
+    rows: FloatArray,
+    coefficients: FloatArray,
+    z: FloatArray,
+    weight: FloatArray,
 ) -> FloatArray:
-    """Pixels (..., 4) without the field of (R3) and (R4), (10,), and what follows from the rows (7,) of (R2)."""
+    """Pixels (..., 4) without the field of (R3) and (R4), (10,), and what follows from the rows
+    (7,) of (R2).
+    """
     x, y = (z[..., 2] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
     out = z - field_jacobian(camera, z)[..., :8] @ coefficients[:8]
     out[..., 2] -= camera.fu * (-rows[1] * y + (rows[5] - rows[4]) * x * y - rows[3] * y * y)
@@ -329,15 +409,20 @@ def corrected(
 
 @dataclass(frozen=True)
 class StereoColumns:
-    """The part of the tracks' normal equations that concerns the field's S coefficients; pixel noise is one pixel."""
+    """The part of the tracks' normal equations that concerns the field's S coefficients; pixel
+    noise is one pixel.
+    """
 
     by_point: FloatArray  # (F, N, 3, S) `J' W H` of each view, the point in the coordinates (M5)
-    G: FloatArray  # (F, S, 3) its sum over the views, transposed: the cross information of coefficients and point
+    # (F, S, 3) its sum over the views, transposed: the cross information of coefficients and point
+    G: FloatArray
     A: FloatArray  # (F, S, S) information about the coefficients before the points are eliminated
     b: FloatArray  # (F, S) its vector
 
 
-def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: FloatArray) -> StereoColumns:
+def stereo_columns(
+    at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: FloatArray
+) -> StereoColumns:
     """Collect the normal equations of `r = J (B xi_i + dp) + H s`."""
     F, N, _, S = H.shape
     J = at.z_D_p
@@ -353,10 +438,12 @@ def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: Floa
 def eliminate_columns(
     columns: StereoColumns, info: TrackInformation, chosen: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Take the points of the chosen tracks out of the coefficients' part of the normal equations, as (M4) does.
+    """Take the points of the chosen tracks out of the coefficients' part of the normal equations,
+    as (M4) does.
 
     Returns:
-        Information about the coefficients (S, S), that with the clones (S, 6N), and the vector (S,).
+        Information about the coefficients (S, S), that with the clones (S, 6N), and the vector
+        (S,).
     """
     by_point = columns.by_point[chosen]
     F, N, _, S = by_point.shape
@@ -393,7 +480,9 @@ def whitened_correction(
 def leave_one_out_nis(
     r: FloatArray, J: FloatArray, covariance: FloatArray, weight: FloatArray, variance: float
 ) -> FloatArray:
-    """Normalised innovations squared (K,) of landmarks' pixels, predicted without these very pixels."""
+    """Normalised innovations squared (K,) of landmarks' pixels, predicted without these very
+    pixels.
+    """
     R = (variance / np.maximum(weight, 1e-6))[:, None, None]
     values, vectors = np.linalg.eigh(R * np.eye(4) - J @ covariance @ np.swapaxes(J, 1, 2))
     values = np.maximum(values, 1e-3 * R[:, 0])
@@ -403,7 +492,8 @@ def leave_one_out_nis(
     return out
 
 
-# --- poses of the window, and the IMU's samples ------------------------------------------------------------------
+# --- poses of the window, and the IMU's samples
+# ------------------------------------------------------------------
 
 
 def free_flow(s: FloatArray, gravity: FloatArray) -> FloatArray:
@@ -418,9 +508,15 @@ def free_flow(s: FloatArray, gravity: FloatArray) -> FloatArray:
 
 
 def moved_velocities(
-    gravity: FloatArray, ages_s: FloatArray, R: FloatArray, error: FloatArray, velocities: FloatArray
+    gravity: FloatArray,
+    ages_s: FloatArray,
+    R: FloatArray,
+    error: FloatArray,
+    velocities: FloatArray,
 ) -> FloatArray:
-    """Velocities (N, 3) of the past, moved by a present error (15,): (N2) back, with the accelerometer's bias."""
+    """Velocities (N, 3) of the past, moved by a present error (15,): (N2) back, with the
+    accelerometer's bias.
+    """
     xi_v = (free_flow(-ages_s, gravity) @ error[:9])[:, 6:9] + ages_s[:, None] * (R @ error[12:15])
     out: FloatArray = velocities @ so3_exp(error[3:6]).T + xi_v @ so3_left_jacobian(error[3:6]).T
     return out
@@ -436,7 +532,9 @@ def integrated(
     T: FloatArray,
     velocity: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Rotations (K, 3, 3), positions and velocities (K, 3), Phi's biases (9, 6) and noise (2, 9, 9), (N1) to (N4)."""
+    """Rotations (K, 3, 3), positions and velocities (K, 3), Phi's biases (9, 6) and noise (2, 9,
+    9), (N1) to (N4).
+    """
     dt, (gyro, accel) = np.diff(times) * 1e-9, np.split(readings - bias, 2, axis=1)
     R = np.empty((len(times), 3, 3))
     R[0] = T[:3, :3]
@@ -454,12 +552,17 @@ def integrated(
     B[:, 6:9, 0:3] = -so3_hat(0.5 * (v[:-1] + v[1:])) @ R[:-1]
     moved = free_flow(left, gravity) @ B
     variance = densities[:, None] ** 2 * dt + hidden
-    Q = [np.einsum("k,kij,klj->il", s, M, M) for s, M in zip(variance, (moved[:, :, 3:], moved[:, :, :3]), strict=True)]
+    Q = [
+        np.einsum("k,kij,klj->il", s, M, M)
+        for s, M in zip(variance, (moved[:, :, 3:], moved[:, :, :3]), strict=True)
+    ]
     return R, p, v, np.einsum("kij,k->ij", moved, dt), np.array(Q)
 
 
 def point_D_pose(p_world: FloatArray) -> FloatArray:
-    """`B = [-I, p^]` (F, 3, 6): how a clone's error `[rho; phi]` moves a point as that clone sees it."""
+    """`B = [-I, p^]` (F, 3, 6): how a clone's error `[rho; phi]` moves a point as that clone
+    sees it.
+    """
     B = np.zeros((len(p_world), 3, 6))
     B[:, :, :3] = -np.eye(3)
     B[:, :, 3:] = so3_hat(p_world)

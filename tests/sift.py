@@ -13,13 +13,16 @@ _RANSAC_PX = 1.0
 
 
 def match_sift(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
-    """Matched pixels (N, 2), (N, 2): mutual nearest SIFT descriptors, inliers of one common fundamental matrix.
+    """Matched pixels (N, 2), (N, 2): mutual nearest SIFT descriptors, inliers of one common
+    fundamental matrix.
 
     The matrix is estimated from these matches alone, without the assumption that rows agree.
     Reference: Lowe, Distinctive image features from scale-invariant keypoints (2004).
     """
     sift = cv2.SIFT.create(nfeatures=1500)
-    (points0, words0), (points1, words1) = (sift.detectAndCompute(image, None) for image in (left, right))
+    (points0, words0), (points1, words1) = (
+        sift.detectAndCompute(image, None) for image in (left, right)
+    )
     if words0 is None or words1 is None or len(words1) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
@@ -35,5 +38,7 @@ def match_sift(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
         return np.zeros((0, 2)), np.zeros((0, 2))
     cv2.setRNGSeed(0)
     _, mask = cv2.findFundamentalMat(pl, pr, cv2.FM_RANSAC, _RANSAC_PX, 0.999)
-    inlier = np.zeros(len(pl), dtype=np.bool_) if mask is None else mask.reshape(-1).astype(np.bool_)
+    inlier = (
+        np.zeros(len(pl), dtype=np.bool_) if mask is None else mask.reshape(-1).astype(np.bool_)
+    )
     return pl[inlier], pr[inlier]

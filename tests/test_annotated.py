@@ -14,8 +14,12 @@ from vio.view.annotated import AnnotatedImage
 
 def _result(index: int, *, images: bool = True) -> Any:
     left = np.full((100, 200), 10 * index, np.uint8) if images else None
-    seen = observations(index, index, [1, 2, 3], [[50, 50, 46, 50], [150, 50, 110, 50], [100, 80, 0, 0]], [1, 1, 0])
-    return SimpleNamespace(frame=StereoFrame(index, index, left, left), output=SimpleNamespace(observations=seen))
+    seen = observations(
+        index, index, [1, 2, 3], [[50, 50, 46, 50], [150, 50, 110, 50], [100, 80, 0, 0]], [1, 1, 0]
+    )
+    return SimpleNamespace(
+        frame=StereoFrame(index, index, left, left), output=SimpleNamespace(observations=seen)
+    )
 
 
 def _drawn(view: AnnotatedImage) -> np.ndarray:

@@ -15,11 +15,20 @@ from tools.draw_structure import layers, read_packages
 ROOT = Path(__file__).resolve().parent.parent
 FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")])
 
-# Only the configuration, live use, the pipeline, the simulated front end and the command line know the front end.
+# Only the configuration, live use, the pipeline, the simulated front end and the command line know
+# the front end.
 USES_FRONTEND = ("vio.config", "vio.live", "vio.runs", "vio.sim.oracle", "vio.cli", "vio.frontend")
 # The estimator, free of images and files.
-ESTIMATOR = ("vio.filters", "vio.geometry", "vio.records", "vio.selection", "vio.protocols", "vio.evaluation")
-# Imports forbidden to each package, lower layers first; the command line, forbidden to all, is tested separately.
+ESTIMATOR = (
+    "vio.filters",
+    "vio.geometry",
+    "vio.records",
+    "vio.selection",
+    "vio.protocols",
+    "vio.evaluation",
+)
+# Imports forbidden to each package, lower layers first; the command line, forbidden to all, is
+# tested separately.
 _ABOVE_READERS = ("vio.config", "vio.live", "vio.runs", "vio.filters", "vio.mapping", "vio.offline")
 MUST_NOT_IMPORT = {
     "vio.numerics": ("vio.records", "vio.calibration", "vio.files"),
@@ -67,10 +76,38 @@ def _within(name: str, package: str) -> bool:
     return name == package or name.startswith(f"{package}.")
 
 
+def _unrelated_assignment(node: ast.stmt) -> bool:
+    """Whether a statement is `a, b = x, y` whose values do not use what it assigns, unlike a swap."""
+    if not (isinstance(node, ast.Assign) and len(node.targets) == 1):
+        return False
+    target = node.targets[0]
+    value = node.value
+    if not (isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)):
+        return False
+    roots = set()
+    for element in target.elts:
+        while isinstance(element, ast.Subscript):
+            element = element.value
+        roots.add(ast.unparse(element))
+    return not roots & {ast.unparse(part) for part in ast.walk(value) if isinstance(part, ast.expr)}
+
+
+@pytest.mark.parametrize("file", FILES, ids=_name)
+def test_a_statement_assigns_one_thing(file: Path) -> None:
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    statements = [node for node in ast.walk(tree) if isinstance(node, ast.stmt)]
+    assert [node.lineno for node in statements if _unrelated_assignment(node)] == []
+
+
 def test_packages_of_import_rules_exist() -> None:
     names = [_name(file) for file in FILES]
-    packages = {*MUST_NOT_IMPORT, *(other for others in MUST_NOT_IMPORT.values() for other in others)}
-    assert {package for package in packages if not any(_within(name, package) for name in names)} == set()
+    packages = {
+        *MUST_NOT_IMPORT,
+        *(other for others in MUST_NOT_IMPORT.values() for other in others),
+    }
+    assert {
+        package for package in packages if not any(_within(name, package) for name in names)
+    } == set()
 
 
 @pytest.mark.parametrize("file", FILES, ids=_name)
@@ -81,12 +118,18 @@ def test_imports_go_one_way(file: Path) -> None:
         forbidden = {"cv2", "torch", "kornia", "matplotlib", "pycolmap"}
         assert not forbidden & {i.split(".")[0] for i in everything}
     if not any(_within(name, user) for user in USES_FRONTEND):
-        assert not any(_within(i, "vio.frontend") for i in everything), "only the pipeline imports the front end"
+        assert not any(_within(i, "vio.frontend") for i in everything), (
+            "only the pipeline imports the front end"
+        )
     for package, others in MUST_NOT_IMPORT.items():
         if _within(name, package):
-            assert not {i for i in everything for other in others if _within(i, other)}, f"{package} is below these"
+            assert not {i for i in everything for other in others if _within(i, other)}, (
+                f"{package} is below these"
+            )
     if not name.startswith(("vio.cli", "vio.__main__")):
-        assert not any(i.startswith("vio.cli") for i in everything), "nothing imports the command line"
+        assert not any(i.startswith("vio.cli") for i in everything), (
+            "nothing imports the command line"
+        )
     assert not {"torch", "kornia"} & _heads(file, top_level_only=True)
 
 
@@ -110,7 +153,9 @@ def test_detects_an_import_cycle(tmp_path: Path) -> None:
     assert layer == {"vio.a": 2, "vio.b": 1, "vio.c": 0}
 
 
-@pytest.mark.parametrize(("library", "package"), [("pycolmap", "vio.offline.colmap"), ("rosbags", "vio.datasets.bags")])
+@pytest.mark.parametrize(
+    ("library", "package"), [("pycolmap", "vio.offline.colmap"), ("rosbags", "vio.datasets.bags")]
+)
 def test_a_library_stays_in_its_package(library: str, package: str) -> None:
     users = [_name(f) for f in FILES if library in _heads(f, top_level_only=False)]
     assert users
@@ -120,7 +165,9 @@ def test_a_library_stays_in_its_package(library: str, package: str) -> None:
 def test_dask_stays_in_its_module() -> None:
     users = [_name(f) for f in FILES if {"distributed", "dask"} & _heads(f, top_level_only=False)]
     assert users == ["vio.bench.engines"]
-    assert not {"distributed", "dask"} & _heads(ROOT / "vio" / "bench" / "engines.py", top_level_only=True)
+    assert not {"distributed", "dask"} & _heads(
+        ROOT / "vio" / "bench" / "engines.py", top_level_only=True
+    )
 
 
 def test_dds_ros_and_cameras_stay_in_their_modules() -> None:
@@ -140,11 +187,25 @@ def test_matplotlib_stays_out_of_import_time() -> None:
 def _loaded(code: str, suspects: set[str]) -> set[str]:
     """Return which of these modules a new interpreter has loaded after running the code."""
     report = f"\nimport sys\nprint(*({suspects!r} & set(sys.modules)), file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", code + report], capture_output=True, text=True, cwd=ROOT, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code + report], capture_output=True, text=True, cwd=ROOT, check=True
+    )
     return set(done.stderr.split())
 
 
-HEAVY = {"numpy", "scipy", "numba", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "yaml", "threadpoolctl", "tqdm"}
+HEAVY = {
+    "numpy",
+    "scipy",
+    "numba",
+    "cv2",
+    "torch",
+    "kornia",
+    "matplotlib",
+    "pycolmap",
+    "yaml",
+    "threadpoolctl",
+    "tqdm",
+}
 HEAVY |= {"rosbags", "distributed", "dask", "cyclonedds", "pyrealsense2", "depthai"}
 HELP = """
 import contextlib, vio.cli
@@ -161,17 +222,31 @@ for parser in commands.choices.values():
 
 
 @pytest.mark.parametrize(
-    "code", ["import vio", HELP, HELP_OF_EACH], ids=["import vio", "vio --help", "vio COMMAND --help"]
+    "code",
+    ["import vio", HELP, HELP_OF_EACH],
+    ids=["import vio", "vio --help", "vio COMMAND --help"],
 )
 def test_no_heavy_import_before_a_command_runs(code: str) -> None:
     assert not _loaded(code, HEAVY)
 
 
 def test_the_estimator_does_not_import_slow_parts_of_scipy() -> None:
-    # `scipy.stats` and what it pulls in were 3.5 of the 6.1 seconds that importing the pipeline took.
-    beyond = {"cv2", "torch", "kornia", "matplotlib", "pycolmap", "scipy.stats", "scipy.optimize", "scipy.io"}
+    # `scipy.stats` and what it pulls in were 3.5 of the 6.1 seconds that importing the pipeline
+    # took.
+    beyond = {
+        "cv2",
+        "torch",
+        "kornia",
+        "matplotlib",
+        "pycolmap",
+        "scipy.stats",
+        "scipy.optimize",
+        "scipy.io",
+    }
     code = "import vio.runs.pipeline, vio.filters.msckf, vio.evaluation.trajectories"
-    assert _loaded(code, {*beyond, "scipy.linalg"}) == {"scipy.linalg"}, "which shows that the test can fail"
+    assert _loaded(code, {*beyond, "scipy.linalg"}) == {"scipy.linalg"}, (
+        "which shows that the test can fail"
+    )
 
 
 def test_no_print_or_exit_outside_the_command_line() -> None:
@@ -182,5 +257,9 @@ def test_no_print_or_exit_outside_the_command_line() -> None:
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 assert node.func.id not in ("print", "exit", "quit"), f"{file}:{node.lineno}"
             if isinstance(node, ast.ExceptHandler):
-                broad = node.type is None or (isinstance(node.type, ast.Name) and node.type.id == "BaseException")
-                assert not broad or file.name in ("atomic.py", "images.py"), f"{file}:{node.lineno}: broad except"
+                broad = node.type is None or (
+                    isinstance(node.type, ast.Name) and node.type.id == "BaseException"
+                )
+                assert not broad or file.name in ("atomic.py", "images.py"), (
+                    f"{file}:{node.lineno}: broad except"
+                )

@@ -32,7 +32,10 @@ T_BASE_IMU = se3_exp([0.3, 0.2, -0.1, 0.1, 0.0, 0.4])
 LENS = (-0.3, 0.1, 0.001, -0.002)
 RIG = Rig(CameraModel(40.0, 41.0, 31.0, 23.0, 64, 48, "radtan", LENS), T_cam0_imu=T_CAM0_IMU)
 FRAMES = [(time_ns, left) for time_ns, left, _ in noise_frames(4)]
-SAMPLES = [ImuSample(START_NS + 5_000_000 * k, np.array([0.1, 0.2, k]), np.array([0.0, 0, 9.8])) for k in range(-4, 34)]
+SAMPLES = [
+    ImuSample(START_NS + 5_000_000 * k, np.array([0.1, 0.2, k]), np.array([0.0, 0, 9.8]))
+    for k in range(-4, 34)
+]
 
 
 @pytest.fixture(scope="module")
@@ -74,11 +77,14 @@ def test_a_flight_of_one_camera_is_the_same_recording_to_the_bit(
     assert b.notes == ()
 
 
-# --- calibration ----------------------------------------------------------------------------------------------------
+# --- calibration
+# ----------------------------------------------------------------------------------------------------
 
 
 def script_of(storage: str = "mcap", *, imu: bool = True, images: bool = True) -> Script:
-    """Four frames with a CameraInfo of a lens, an IMU of 200 Hz, and its place in /tf_static by way of a base frame."""
+    """Four frames with a CameraInfo of a lens, an IMU of 200 Hz, and its place in /tf_static by
+    way of a base frame.
+    """
     script = Script(storage)
     if images:
         for time_ns, image in FRAMES:
@@ -103,14 +109,18 @@ def folder_of_one(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for time_ns, image in FRAMES:
         cv2.imwrite(str(folder / "left" / f"{time_ns}.png"), image)
     (folder / "calibration.yaml").write_text(kalibr_text(RIG))
-    rows = [",".join([str(s.time_ns), *(repr(float(x)) for x in (*s.gyro, *s.accel))]) for s in SAMPLES]
+    rows = [
+        ",".join([str(s.time_ns), *(repr(float(x)) for x in (*s.gyro, *s.accel))]) for s in SAMPLES
+    ]
     header = "#timestamp [ns],w_x [rad s^-1],w_y,w_z,a_x [m s^-2],a_y,a_z"
     (folder / "imu.csv").write_text("\n".join([header, *rows]))
     return folder
 
 
 @pytest.mark.parametrize("storage", ["bag", "mcap"])
-def test_camera_info_and_static_frames_are_the_calibration(storage: str, folder_of_one: Path, tmp_path: Path) -> None:
+def test_camera_info_and_static_frames_are_the_calibration(
+    storage: str, folder_of_one: Path, tmp_path: Path
+) -> None:
     folder = open_dataset(folder_of_one)
     bag = open_dataset(script_of(storage).write(tmp_path / ("f.bag" if storage == "bag" else "f")))
     recording = bag.recording
@@ -123,7 +133,9 @@ def test_camera_info_and_static_frames_are_the_calibration(storage: str, folder_
     assert not np.array_equal(first.left, image)  # the lens was taken out
 
 
-def test_a_file_beside_the_bag_is_read_before_camera_info(folder_of_one: Path, tmp_path: Path) -> None:
+def test_a_file_beside_the_bag_is_read_before_camera_info(
+    folder_of_one: Path, tmp_path: Path
+) -> None:
     path = script_of().write(tmp_path / "f")
     other = replace(RIG, cam0=replace(RIG.cam0, fu=50.0))
     (path / "calibration.yaml").write_text(kalibr_text(other))
@@ -147,7 +159,10 @@ def test_rectified_images_take_the_projection_matrix_alone(tmp_path: Path) -> No
 def test_camera_info_of_zeros_is_refused(tmp_path: Path) -> None:
     script = script_of(imu=False)
     script.notes[-1].fields.k = np.zeros(9)
-    with pytest.raises(CalibrationError, match=r"/left/camera_info: not calibrated \(K is zero\); give a calibration"):
+    with pytest.raises(
+        CalibrationError,
+        match=r"/left/camera_info: not calibrated \(K is zero\); give a calibration",
+    ):
         open_dataset(script.write(tmp_path / "f"))
 
 
@@ -171,13 +186,19 @@ def test_raw_and_compressed_images_of_one_camera_are_one_camera(
     bag = open_dataset(path, DatasetSettings(calibration=tmp_path / "c.yaml"))
     assert bag.recording.camera.kind == "mono"
     assert len(frames_of(bag)) == 4
-    assert any(note.startswith(f"{taken} is taken; ") and "same camera" in note for note in bag.recording.notes)
+    assert any(
+        note.startswith(f"{taken} is taken; ") and "same camera" in note
+        for note in bag.recording.notes
+    )
     for right in ("", ",right=none"):
-        named = DatasetSettings(calibration=tmp_path / "c.yaml", topics=f"left=/camera/image_raw{right}")
+        named = DatasetSettings(
+            calibration=tmp_path / "c.yaml", topics=f"left=/camera/image_raw{right}"
+        )
         assert len(frames_of(open_dataset(path, named))) == raw
 
 
-# --- topics ---------------------------------------------------------------------------------------------------------
+# --- topics
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_depth_images_beside_one_camera_leave_one(tmp_path: Path) -> None:
@@ -193,14 +214,17 @@ def test_the_only_topic_may_be_named(folder_of_one: Path, tmp_path: Path) -> Non
     """Also one whose name speaks against gray images."""
     script = script_of()
     script.notes = [
-        replace(note, topic=note.topic.replace("/left/image_raw", "/left/thermal/image_raw")) for note in script.notes
+        replace(note, topic=note.topic.replace("/left/image_raw", "/left/thermal/image_raw"))
+        for note in script.notes
     ]
     path = script.write(tmp_path / "f")
     bag = open_dataset(path, DatasetSettings(topics="left=/left/thermal/image_raw,imu=/imu"))
     assert_same_events(open_dataset(folder_of_one), bag)
 
 
-def test_without_an_imu_a_run_says_what_it_says_of_a_folder(folder_of_one: Path, tmp_path: Path) -> None:
+def test_without_an_imu_a_run_says_what_it_says_of_a_folder(
+    folder_of_one: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "folder"
     shutil.copytree(folder_of_one, folder, ignore=shutil.ignore_patterns("imu.csv"))
     named = DatasetSettings(topics="imu=none")
@@ -219,10 +243,13 @@ def test_the_left_camera_of_one_is_that_camera(tmp_path: Path) -> None:
     assert "there is one camera only: --camera left changes nothing" in alone.recording.notes
 
 
-# --- stamps ---------------------------------------------------------------------------------------------------------
+# --- stamps
+# ---------------------------------------------------------------------------------------------------------
 
 
-def test_images_logged_late_come_in_the_order_of_their_stamps(folder_of_one: Path, tmp_path: Path) -> None:
+def test_images_logged_late_come_in_the_order_of_their_stamps(
+    folder_of_one: Path, tmp_path: Path
+) -> None:
     """Image 1 is logged after image 2, and image 3 comes twice."""
     script = script_of()
     images = [note for note in script.notes if note.topic == "/left/image_raw"]

@@ -1,4 +1,7 @@
-"""`vio bench`: suites, keys of tasks, tables, whole benches on this machine. Clusters: tests/test_bench_cluster.py."""
+"""`vio bench`: suites, keys of tasks, tables, whole benches on this machine.
+
+Clusters: tests/test_bench_cluster.py.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two drives of features with ground truth, and one whose file is cut off."""
     folder = tmp_path_factory.mktemp("recordings")
     for k in range(2):
-        make_mat(folder / f"drive{k}.mat", utias_arrays(make_drive(14 + 2 * k, seed=k, pixel_sigma=0.3)))
+        make_mat(
+            folder / f"drive{k}.mat", utias_arrays(make_drive(14 + 2 * k, seed=k, pixel_sigma=0.3))
+        )
     (folder / "corrupt.mat").write_bytes((folder / "drive0.mat").read_bytes()[:3000])
     return folder
 
@@ -59,19 +64,27 @@ _GIVEN: dict[str, Any] = {
 }
 
 
-_OTHER = {"system": "Other", "source": "https://example.org/paper", "sensors": "stereo", "causal": True}
+_OTHER = {
+    "system": "Other",
+    "source": "https://example.org/paper",
+    "sensors": "stereo",
+    "causal": True,
+}
 
 
 def _suite(folder: Path, **values: Any) -> Suite:
     return suite_from({**_GIVEN, **values}, folder / "suite.yaml")
 
 
-def _keys(suite: Suite, data: Path, cache: Path, identity: Any = "content") -> dict[tuple[str, str, int | None], str]:
+def _keys(
+    suite: Suite, data: Path, cache: Path, identity: Any = "content"
+) -> dict[tuple[str, str, int | None], str]:
     digests = InputDigests(cache / "inputs.json", identity)
     return {(t.sequence, t.system, t.seed): t.key for t in tasks_of(suite, data, digests)}
 
 
-# --- suites ---------------------------------------------------------------------------------------------------------
+# --- suites
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_shipped_suites_are_read_by_name() -> None:
@@ -82,8 +95,14 @@ def test_shipped_suites_are_read_by_name() -> None:
         names = {sequence.name for sequence in suite.sequences}
         for published in suite.published:
             assert "https://" in published.source, "every published figure names where it stands"
-            assert all(set(of_sequences) <= {*names, "all"} for of_sequences in published.figures.values())
-    assert {p.system.partition(",")[0] for p in suites["euroc"].published} >= {"Basalt", "ORB-SLAM3", "VINS-Fusion"}
+            assert all(
+                set(of_sequences) <= {*names, "all"} for of_sequences in published.figures.values()
+            )
+    assert {p.system.partition(",")[0] for p in suites["euroc"].published} >= {
+        "Basalt",
+        "ORB-SLAM3",
+        "VINS-Fusion",
+    }
 
 
 def test_settings_come_from_configuration_then_sequence_then_seed(tmp_path: Path) -> None:
@@ -103,9 +122,15 @@ def test_settings_come_from_configuration_then_sequence_then_seed(tmp_path: Path
         ({"sequences": {"a": {"source": "x", "render": "--rig small"}}}, "either source or render"),
         ({"sequences": {"a": {"sorce": "x"}}}, "unknown key 'sorce'; did you mean 'source'"),
         ({"sequences": {"a": {"render": "--seed 3"}}}, "--seed is set by the bench"),
-        ({"sequences": {"a": {"source": "x", "start": "soon"}}}, "start and stop are frames or times"),
+        (
+            {"sequences": {"a": {"source": "x", "start": "soon"}}},
+            "start and stop are frames or times",
+        ),
         ({"sequences": {"a": {"source": "x", "lengths_m": [0]}}}, "lengths_m"),
-        ({"sequences": {"a": {"source": "x", "positions_only": 1}}}, "positions_only takes true or false"),
+        (
+            {"sequences": {"a": {"source": "x", "positions_only": 1}}},
+            "positions_only takes true or false",
+        ),
         ({"configurations": {"c": {"msckf.clone": 3}}}, "did you mean 'msckf.clones'"),
         ({"configurations": {"c": {"msckf.clones": 1}}}, "msckf.clones"),
         ({"seeds": [1, 1]}, "different whole numbers"),
@@ -113,9 +138,18 @@ def test_settings_come_from_configuration_then_sequence_then_seed(tmp_path: Path
         ({"published": [{"system": "X", "ate_m": {"first": 1}}]}, "a system and a source"),
         ({"published": [{**_OTHER, "ate_m": {"first": "1 cm"}}]}, "is a number, got '1 cm'"),
         ({"published": [{**_OTHER, "sensors": None}]}, "needs sensors"),
-        ({"published": [{**_OTHER, "loops": "some"}]}, "causal and loops of Other take true, false"),
-        ({"published": [{**_OTHER, "ate_cm": {"first": 1}}]}, "unknown 'ate_cm'; figures are ate_m"),
-        ({"published": [{**_OTHER, "ate_m": {"third": 1}}]}, "names third, which is no sequence of the suite"),
+        (
+            {"published": [{**_OTHER, "loops": "some"}]},
+            "causal and loops of Other take true, false",
+        ),
+        (
+            {"published": [{**_OTHER, "ate_cm": {"first": 1}}]},
+            "unknown 'ate_cm'; figures are ate_m",
+        ),
+        (
+            {"published": [{**_OTHER, "ate_m": {"third": 1}}]},
+            "names third, which is no sequence of the suite",
+        ),
         ({"time_limit_s": -1}, "time_limit_s is a number above 0"),
         ({"sequence": {}}, "did you mean 'sequences'"),
     ],
@@ -134,14 +168,17 @@ def test_a_suite_that_is_missing_or_no_yaml_is_named(tmp_path: Path) -> None:
         read_suite(str(tmp_path / "s.yaml"))
 
 
-# --- keys: what a result depends on ---------------------------------------------------------------------------------
+# --- keys: what a result depends on
+# ---------------------------------------------------------------------------------
 
 
 def test_the_key_follows_content_and_settings_not_names(data: Path, tmp_path: Path) -> None:
     key = _keys(_suite(tmp_path), data, tmp_path)["first", "images", 0]
     moved = tmp_path / "moved"
     shutil.copytree(data, moved)
-    renamed = _suite(tmp_path, sequences={"other": "drive0.mat"}, configurations={"same": {"motion": "none"}})
+    renamed = _suite(
+        tmp_path, sequences={"other": "drive0.mat"}, configurations={"same": {"motion": "none"}}
+    )
     assert _keys(renamed, moved, tmp_path)["other", "same", 0] == key
     changes: list[dict[str, Any]] = [
         {"configurations": {"images": {"motion": "none", "msckf.clones": 12}}},
@@ -159,7 +196,9 @@ def test_the_key_follows_content_and_settings_not_names(data: Path, tmp_path: Pa
     assert _keys(_suite(tmp_path), moved, tmp_path)["first", "images", 0] != key
 
 
-def test_other_code_is_another_task(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_code_is_another_task(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     keys = _keys(_suite(tmp_path), data, tmp_path)
     monkeypatch.setattr("vio.bench.tasks.code_digest", lambda: "other code")
     assert not set(keys.values()) & set(_keys(_suite(tmp_path), data, tmp_path).values())
@@ -202,17 +241,32 @@ def test_a_render_is_known_by_its_arguments_and_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("root", "later", "loaded"),
     [
-        ("vio.cli.render", ("vio.cli.render", "vio.sim."), "vio.sim.export, vio.sim.scenarios, vio.sim.sequence"),
-        ("vio.bench.worker", ("vio.",), "vio.runs.pipeline, vio.frontend.klt, vio.filters.msckf, vio.mapping.session"),
+        (
+            "vio.cli.render",
+            ("vio.cli.render", "vio.sim."),
+            "vio.sim.export, vio.sim.scenarios, vio.sim.sequence",
+        ),
+        (
+            "vio.bench.worker",
+            ("vio.",),
+            "vio.runs.pipeline, vio.frontend.klt, vio.filters.msckf, vio.mapping.session",
+        ),
     ],
 )
-def test_all_code_that_a_task_loads_is_in_its_key(root: str, later: tuple[str, ...], loaded: str) -> None:
-    """Of our modules, only those of the command line are not; a render does not depend on the filters."""
+def test_all_code_that_a_task_loads_is_in_its_key(
+    root: str, later: tuple[str, ...], loaded: str
+) -> None:
+    """Of our modules, only those of the command line are not; a render does not depend on the
+    filters.
+    """
     code = (
         f"import sys, vio.cli; before = set(sys.modules); import {root}, {loaded}\n"
-        "print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'vio' and n not in before))"
+        "print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'vio' and n not "
+        "in before))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
     names = {Path(name).relative_to(ROOT).as_posix() for name in done.stdout.split()}
     known = set(imported_code(root, later))
     assert not {name for name in names - known if not name.startswith("vio/cli/")}
@@ -221,7 +275,8 @@ def test_all_code_that_a_task_loads_is_in_its_key(root: str, later: tuple[str, .
     assert ("vio/offline/map_adjustment.py" in known) == (root == "vio.bench.worker")
 
 
-# --- figures --------------------------------------------------------------------------------------------------------
+# --- figures
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_nees_of_poses_with_errors_of_their_covariance_is_six() -> None:
@@ -238,14 +293,18 @@ def test_nees_of_poses_with_errors_of_their_covariance_is_six() -> None:
     estimate = truth @ np.array([se3_exp(xi) for xi in errors])
     covariances = np.tile(np.diag(sigma**2), (len(truth), 1, 1))
     covariances[0] = 0.0
-    T_other_world, T_cam0_imu = se3_exp([5, 1, 2, 0.3, 0.2, 2.0]), se3_exp([0.1, 0, 0.2, 1.2, -1.2, 1.2])
+    T_other_world, T_cam0_imu = (
+        se3_exp([5, 1, 2, 0.3, 0.2, 2.0]),
+        se3_exp([0.1, 0, 0.2, 1.2, -1.2, 1.2]),
+    )
     times_ns = np.arange(len(truth), dtype=np.int64) * 10**8
     reference = Trajectory(T_other_world @ truth @ se3_inverse(T_cam0_imu), times_ns, "cam0")
     score = evaluate(Trajectory(estimate, times_ns, "imu"), reference, T_cam0_imu=T_cam0_imu)
     for scale, expected in ((1, 6.0), (4, 1.5)):
         values = pose_nees(score, estimate, scale * covariances, T_cam0_imu, upright=False)
         assert values.mean() == pytest.approx(expected, rel=0.03)
-        assert np.percentile(values, 95) == pytest.approx(12.6 / scale, rel=0.05)  # chi-square of 6 degrees of freedom
+        # chi-square of 6 degrees of freedom
+        assert np.percentile(values, 95) == pytest.approx(12.6 / scale, rel=0.05)
     assert pose_nees(score, estimate, 0 * covariances, T_cam0_imu, upright=False) is None
 
 
@@ -259,7 +318,9 @@ def test_nees_of_an_upright_world_knows_that_the_first_inclination_was_uncertain
     covariances = np.tile(1e-6 * np.eye(6), (len(truth), 1, 1))
     times_ns = np.arange(len(truth), dtype=np.int64) * 10**8
     score = evaluate(Trajectory(estimate, times_ns, "imu"), Trajectory(truth, times_ns, "imu"))
-    upright, whole = (pose_nees(score, estimate, covariances, np.eye(4), upright=flag) for flag in (True, False))
+    upright, whole = (
+        pose_nees(score, estimate, covariances, np.eye(4), upright=flag) for flag in (True, False)
+    )
     assert upright.mean() == pytest.approx(6.0, rel=0.05)
     assert whole.mean() > 20
 
@@ -274,7 +335,9 @@ def test_coverage_counts_frames_with_a_pose() -> None:
 def test_positions_alone_give_no_figures_of_orientation() -> None:
     T = np.array([se3_exp([k, 0.1 * k * k, 0, 0, 0, 0.05 * k]) for k in range(30)])
     times_ns = np.arange(30, dtype=np.int64) * 10**8
-    score = evaluate(Trajectory(T, times_ns, "imu"), Trajectory(T, times_ns, "imu"), lengths_m=[5.0])
+    score = evaluate(
+        Trajectory(T, times_ns, "imu"), Trajectory(T, times_ns, "imu"), lengths_m=[5.0]
+    )
     full, bare = (figures_of(score, positions_only=flag) for flag in (False, True))
     assert all(full[name] is not None for name in ("ate_m", "rpe_m", "drift_percent", "ate_deg"))
     assert {name for name, value in bare.items() if value is None} == {
@@ -282,33 +345,50 @@ def test_positions_alone_give_no_figures_of_orientation() -> None:
     }  # fmt: skip
 
 
-# --- tables ---------------------------------------------------------------------------------------------------------
+# --- tables
+# ---------------------------------------------------------------------------------------------------------
 
 
-def outcome(sequence: str, system: str, seed: int | None, ate_m: float | None, **more: Any) -> Outcome:
+def outcome(
+    sequence: str, system: str, seed: int | None, ate_m: float | None, **more: Any
+) -> Outcome:
     """A run with an ATE; None: it failed."""
     failure = "it is corrupt" if ate_m is None else None
     figures = {} if ate_m is None else {"ate_m": ate_m, "coverage": 1.0, **more}
-    return Outcome(sequence, system, seed, f"{sequence}{system}{seed}", figures, {"cpu_ms": 20.0}, failure, None)
+    return Outcome(
+        sequence,
+        system,
+        seed,
+        f"{sequence}{system}{seed}",
+        figures,
+        {"cpu_ms": 20.0},
+        failure,
+        None,
+    )
 
 
 def test_rows_hold_median_worst_and_spread_over_seeds() -> None:
-    rows = summary_rows([outcome("a", "x", seed, value) for seed, value in enumerate([0.3, 0.1, 0.2, None])])
+    rows = summary_rows(
+        [outcome("a", "x", seed, value) for seed, value in enumerate([0.3, 0.1, 0.2, None])]
+    )
     (row,) = rows
     cell = row.cells["ate_m"]
     assert (cell.median, cell.worst, cell.spread, cell.count) == (0.2, 0.3, pytest.approx(0.2), 3)
     assert (row.runs, row.failed) == (4, 1)
     assert cell_text(cell, ATE, 3) == "0.2 (0.2 ± 0.1)"
     assert cell_text(cell, ATE, row.runs) == "0.2 (0.2 ± 0.1), n = 3"
-    covered = summary_rows([outcome("a", "x", s, 0.1, coverage=c) for s, c in enumerate([0.5, 1.0])])[0].cells[
-        "coverage"
-    ]
+    covered = summary_rows(
+        [outcome("a", "x", s, 0.1, coverage=c) for s, c in enumerate([0.5, 1.0])]
+    )[0].cells["coverage"]
     assert covered.worst == 0.5
-    assert cell_text(covered, next(m for m in METRICS if m.name == "coverage")) == "0.75 (0.75 ± 0.35)"
+    assert (
+        cell_text(covered, next(m for m in METRICS if m.name == "coverage")) == "0.75 (0.75 ± 0.35)"
+    )
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(0.00123456, "0.00123"), (12345.6, "12300"), (0.0, "0"), (4.2e-6, "0.0000042")]
+    ("value", "text"),
+    [(0.00123456, "0.00123"), (12345.6, "12300"), (0.0, "0"), (4.2e-6, "0.0000042")],
 )
 def test_numbers_have_three_digits_and_no_exponent(value: float, text: str) -> None:
     assert number(value, 3) == text
@@ -324,18 +404,28 @@ def test_the_table_is_complete_whatever_failed(tmp_path: Path) -> None:
         replace(outcome("b", "x", 0, None), succeeded=False),
         outcome("a", "peer|1", None, 0.1, coverage=0.8),
     ]
-    text = markdown(suite, summary_rows(runs), runs, {"version": "1", "commit": "abc", "packages": {}})
+    text = markdown(
+        suite, summary_rows(runs), runs, {"version": "1", "commit": "abc", "packages": {}}
+    )
     assert "| ATE m | x | peer\\|1 |" in text
     assert "| a | 0.2 | **0.1 [80 % of the frames]** |" in text
     assert "| b | failed 1 of 1 | – [1] |" in text
     assert "[1] there is no trajectory of this system." in text
     assert "- b, x, seed 0: it is corrupt" in text
-    assert "| Other | stereo | yes | Sim3 | ? | 0.5 | 0.5 over 1 | https://example.org/paper |" in text
+    assert (
+        "| Other | stereo | yes | Sim3 | ? | 0.5 | 0.5 over 1 | https://example.org/paper |" in text
+    )
     assert "[2] the way is too short" in text
     assert "[3] no result: it is corrupt" in text
     assert "| 100 % |" in text
     assert "| 50 % of 2 |" in text, "a run without a result is none below the limit"
-    dashes = [cell for line in text.splitlines() if line.startswith("| ") for cell in line.split("|") if "– [" in cell]
+    dashes = [
+        cell
+        for line in text.splitlines()
+        if line.startswith("| ")
+        for cell in line.split("|")
+        if "– [" in cell
+    ]
     assert dashes
     page = _as_html(text)
     assert "<td>peer|1</td>" in page
@@ -352,7 +442,11 @@ def test_an_undefined_figure_says_why(data: Path, tmp_path: Path) -> None:
     suite = _suite(tmp_path, sequences={"first": {"source": "drive0.mat", "lengths_m": [500]}})
     (task,) = tasks_of(suite, data, InputDigests(tmp_path / "i.json"))
     record = perform({**task.job, "scratch": str(tmp_path)})
-    undefined = {name for name in BY_NAME if record["figures"].get(name, record["measured"].get(name)) is None}
+    undefined = {
+        name
+        for name in BY_NAME
+        if record["figures"].get(name, record["measured"].get(name)) is None
+    }
     assert {"drift_percent", "nees", "nees_95"} <= undefined
     assert {name: record["absent"][name] for name in undefined}
     assert record["absent"]["drift_percent"] == "the path is shorter than the drift's lengths"
@@ -361,7 +455,11 @@ def test_an_undefined_figure_says_why(data: Path, tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
 def test_a_report_of_many_systems_is_drawn(tmp_path: Path) -> None:
     """Their names fit into the figures, which otherwise collapse with a warning."""
-    curve = {"seconds": [0, 1], "error_m": [0, 0.1], "quantiles_m": [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]}
+    curve = {
+        "seconds": [0, 1],
+        "error_m": [0, 0.1],
+        "quantiles_m": [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6],
+    }
     systems = [f"recommended_seventh_causal_{k}" for k in range(16)]
     runs = [replace(outcome("first", system, 0, 0.2), curve=curve) for system in systems]
     facts = {"version": "1", "packages": {}}
@@ -373,12 +471,15 @@ def test_success_is_a_small_error_over_most_frames() -> None:
     record = {"failure": None, "figures": {"ate_m": 0.4, "reference_m": 50.0, "coverage": 1.0}}
     assert has_succeeded(record, 1.0) is True
     assert has_succeeded(record, 0.5) is False
-    assert has_succeeded({**record, "figures": {**record["figures"], "coverage": 0.5}}, 1.0) is False  # type: ignore[dict-item]
+    assert (
+        has_succeeded({**record, "figures": {**record["figures"], "coverage": 0.5}}, 1.0) is False
+    )  # type: ignore[dict-item]
     assert has_succeeded({**record, "figures": {}}, 1.0) is None
     assert has_succeeded({**record, "failure": "lost"}, 1.0) is False
 
 
-# --- whole benches --------------------------------------------------------------------------------------------------
+# --- whole benches
+# --------------------------------------------------------------------------------------------------
 
 
 def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
@@ -394,7 +495,9 @@ def test_a_damaged_result_is_made_again(tmp_path: Path) -> None:
 def test_only_what_has_no_result_is_run(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Also after an interruption in the middle; failures of the machine are tried again, those of the data are not."""
+    """Also after an interruption in the middle; failures of the machine are tried again, those
+    of the data are not.
+    """
     done: list[str] = []
 
     def counted(job: dict[str, Any], cache: str) -> dict[str, Any]:
@@ -410,9 +513,13 @@ def test_only_what_has_no_result_is_run(
 
     monkeypatch.setattr("vio.bench.bench.run_here", engine)
     place = Place(data=data, out=tmp_path / "out", cache=tmp_path / "cache")
-    assert (data / "drive1.mat").stat().st_size > (data / "drive0.mat").stat().st_size, "the largest is done first"
+    assert (data / "drive1.mat").stat().st_size > (data / "drive0.mat").stat().st_size, (
+        "the largest is done first"
+    )
     suite = _suite(tmp_path, sequences={"b": "drive0.mat", "a": "drive1.mat"})
-    (tmp_path / "suite.yaml").write_text(json.dumps({**_GIVEN, "sequences": {"b": "drive0.mat", "a": "drive1.mat"}}))
+    (tmp_path / "suite.yaml").write_text(
+        json.dumps({**_GIVEN, "sequences": {"b": "drive0.mat", "a": "drive1.mat"}})
+    )
     argv = ["bench", str(tmp_path / "suite.yaml"), "--data", str(data), "--out", str(place.out)]
     assert main([*argv, "--cache", str(place.cache)]) == 130
     assert "the same command goes on" in capsys.readouterr().err
@@ -430,14 +537,29 @@ def test_only_what_has_no_result_is_run(
 def test_a_bench_that_is_killed_goes_on_where_it_was(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """After kill -9 no process stays, what was done is not repeated, and a run in this process gives the same bits."""
-    sequences = {"bad": "corrupt.mat", "a": {"source": "drive0.mat", "exact_truth": True}, "gone": "nothing.mat"}
+    """After kill -9 no process stays, what was done is not repeated, and a run in this process
+    gives the same bits.
+    """
+    sequences = {
+        "bad": "corrupt.mat",
+        "a": {"source": "drive0.mat", "exact_truth": True},
+        "gone": "nothing.mat",
+    }
     suite = {"sequences": sequences, "configurations": {"w": {}}}
     (tmp_path / "suite.yaml").write_text(json.dumps(suite))
-    argv = ["bench", str(tmp_path / "suite.yaml"), "--data", str(data), "--out", str(tmp_path / "out")]
+    argv = [
+        "bench",
+        str(tmp_path / "suite.yaml"),
+        "--data",
+        str(data),
+        "--out",
+        str(tmp_path / "out"),
+    ]
     argv += ["--cache", str(tmp_path / "cache"), "--workers", "1", "--quiet"]
     results = tmp_path / "cache" / "results"
-    with subprocess.Popen([sys.executable, "-m", "vio", *argv], cwd=ROOT, stderr=subprocess.PIPE) as process:
+    with subprocess.Popen(
+        [sys.executable, "-m", "vio", *argv], cwd=ROOT, stderr=subprocess.PIPE
+    ) as process:
         wait_for(lambda: len(list(results.glob("*/*.json"))) == 1)
         wait_for(lambda: len(_workers(tmp_path)) == 1)
         os.kill(process.pid, signal.SIGKILL)
@@ -456,9 +578,13 @@ def test_a_bench_that_is_killed_goes_on_where_it_was(
     assert not list((tmp_path / "cache").glob("task-*"))
     _check_files(tmp_path / "out")
     (job,) = [
-        t.job for t in tasks_of(read_suite(argv[1]), data, InputDigests(tmp_path / "i.json")) if t.sequence == "a"
+        t.job
+        for t in tasks_of(read_suite(argv[1]), data, InputDigests(tmp_path / "i.json"))
+        if t.sequence == "a"
     ]
-    assert perform({**job, "scratch": str(tmp_path)})["figures"] == outcomes["a"].figures, "to the bit"
+    assert perform({**job, "scratch": str(tmp_path)})["figures"] == outcomes["a"].figures, (
+        "to the bit"
+    )
 
 
 def _workers(folder: Path) -> list[str]:
@@ -484,13 +610,17 @@ def _check_files(out: Path) -> None:
     assert float(row["memory_mib_median"]) > 50
     page = (out / "report.html").read_text()
     assert page.count("<svg") == 3
-    assert not re.search(r'(?:src|href)="(?!https://example|#)[^"]*\.(?:js|css|png)|<script|@import', page)
+    assert not re.search(
+        r'(?:src|href)="(?!https://example|#)[^"]*\.(?:js|css|png)|<script|@import', page
+    )
     poses = read_trajectory(out / "trajectories" / "a.w.0.tum")
     assert poses.frame_indices.tolist() == list(range(14))
 
 
 def test_another_systems_trajectory_joins_the_table(data: Path, tmp_path: Path) -> None:
-    """It is evaluated as our runs are; a part of the recording is a coverage below one, a wrong file says why."""
+    """It is evaluated as our runs are; a part of the recording is a coverage below one, a wrong
+    file says why.
+    """
     drive = make_drive(14, seed=0, pixel_sigma=0.3)
     suite = _suite(tmp_path, sequences={"first": {"source": "drive0.mat", "lengths_m": [3]}})
     recording = open_dataset(str(data / "drive0.mat")).recording
@@ -500,8 +630,14 @@ def test_another_systems_trajectory_joins_the_table(data: Path, tmp_path: Path) 
     T[:, :3, 3] *= 1.02
     write_tum(peers / "first.other_imu.tum", Trajectory(T, recording.frame_times_ns[4:14], "imu"))
     (peers / "first.broken.tum").write_text("1 2 3\n")
-    tasks = {t.system: t for t in tasks_of(suite, data, InputDigests(tmp_path / "i.json"), peers) if t.seed is None}
-    good, broken = (perform({**tasks[name].job, "scratch": None}) for name in ("other_imu", "broken"))
+    tasks = {
+        t.system: t
+        for t in tasks_of(suite, data, InputDigests(tmp_path / "i.json"), peers)
+        if t.seed is None
+    }
+    good, broken = (
+        perform({**tasks[name].job, "scratch": None}) for name in ("other_imu", "broken")
+    )
     assert good["failure"] is None
     assert good["figures"]["coverage"] == pytest.approx(10 / 14)
     assert good["figures"]["drift_percent"] == pytest.approx(2.0, rel=0.15)
@@ -526,7 +662,9 @@ def test_a_process_that_is_killed_is_started_again_and_named_at_last(
     def killed(command: list[str], limit_s: float | None = None) -> tuple[int, str]:
         calls.append(command)
         if len(calls) == 5:
-            Path(command[-1], "result.json").write_text('{"figures": {"ate_m": 1}, "failure": null}')
+            Path(command[-1], "result.json").write_text(
+                '{"figures": {"ate_m": 1}, "failure": null}'
+            )
             return 0, ""
         return (-9, "") if len(calls) < 5 else (1, "Traceback\nIndexError: no such row\n")
 
@@ -553,8 +691,12 @@ def test_what_cannot_be_run_is_named_before_the_first_task(
     times_ns = open_dataset(str(data / "drive0.mat")).recording.frame_times_ns
     poses = np.tile(np.eye(4), (14, 1, 1))
     write_tum(tmp_path / "elsewhere.tum", Trajectory(poses, times_ns + 10**15, "imu"))
-    write_tum(tmp_path / "few.tum", Trajectory(poses, np.r_[times_ns[:2], times_ns[2:] + 10**15], "imu"))
-    write_tum(tmp_path / "imu.tum", Trajectory(poses[:6], np.arange(6) * round(1e9 * FRAME_S), "imu"))
+    write_tum(
+        tmp_path / "few.tum", Trajectory(poses, np.r_[times_ns[:2], times_ns[2:] + 10**15], "imu")
+    )
+    write_tum(
+        tmp_path / "imu.tum", Trajectory(poses[:6], np.arange(6) * round(1e9 * FRAME_S), "imu")
+    )
     sequences = {
         "gone": "gone.mat",
         "damaged": {"source": "drive0.mat", "reference": "truth.tum"},
@@ -567,31 +709,45 @@ def test_what_cannot_be_run_is_named_before_the_first_task(
     ready: list[str] = []
 
     def run(jobs: Any, cache: str, *, workers: int) -> Any:
-        named.extend(record.getMessage() for record in caplog.records if " cannot be run: " in record.getMessage())
+        named.extend(
+            record.getMessage()
+            for record in caplog.records
+            if " cannot be run: " in record.getMessage()
+        )
         ready.extend(jobs)
         yield from ()
 
     monkeypatch.setattr("vio.bench.bench.run_here", run)
-    result = bench(_suite(tmp_path, sequences=sequences), Place(tmp_path, tmp_path / "out", tmp_path / "cache"))
+    result = bench(
+        _suite(tmp_path, sequences=sequences), Place(tmp_path, tmp_path / "out", tmp_path / "cache")
+    )
     lines = {name: why for name, _, why in (line.partition(" cannot be run: ") for line in named)}
     assert list(lines) == ["gone", "damaged", "elsewhere", "few", "other_body"]
     assert ready == [o.key for o in result.outcomes if o.sequence == "fine"]
     assert "gone.mat does not exist" in lines["gone"]
     assert "3 columns fit no known format" in lines["damaged"]
-    assert "is not that of the recording: no poses within 0.01 s of each other" in lines["elsewhere"]
+    assert (
+        "is not that of the recording: no poses within 0.01 s of each other" in lines["elsewhere"]
+    )
     assert "it has poses of 2 of 14 frames" in lines["few"]
     assert (
-        "it describes the IMU, whose place on the rig (T_cam0_imu) the recording does not know" in lines["other_body"]
+        "it describes the IMU, whose place on the rig (T_cam0_imu) the recording does not know"
+        in lines["other_body"]
     )
     assert {o.failure for o in result.failures if o.sequence != "fine"} == set(lines.values())
 
 
 def test_ground_truth_of_another_body_is_doubted(data: Path, tmp_path: Path) -> None:
     """A reference that turns as another body does."""
-    runs = [replace(outcome("a", "x", seed, 0.2), notes=("the reference looks wrong",)) for seed in (0, 1)]
+    runs = [
+        replace(outcome("a", "x", seed, 0.2), notes=("the reference looks wrong",))
+        for seed in (0, 1)
+    ]
     text = markdown(_suite(tmp_path), summary_rows(runs), runs, {"version": "1", "packages": {}})
     assert text.count("- a, x: the reference looks wrong") == 1
-    poses = make_drive(14, seed=0, pixel_sigma=0.3).T_world_imu @ se3_exp([0.0, 0.0, 0.0, 1.2, 0.0, 0.0])
+    poses = make_drive(14, seed=0, pixel_sigma=0.3).T_world_imu @ se3_exp(
+        [0.0, 0.0, 0.0, 1.2, 0.0, 0.0]
+    )
     times_ns = open_dataset(str(data / "drive0.mat")).recording.frame_times_ns
     write_tum(tmp_path / "turned.tum", Trajectory(poses, times_ns, "imu"))
     shutil.copy(data / "drive0.mat", tmp_path)
@@ -658,9 +814,19 @@ def test_another_revision_runs_in_turns_and_is_compared(
     if commit_of(ROOT) is None:
         pytest.skip("the code is no git checkout")
     file, out = tmp_path / "mine.yaml", tmp_path / "out"
-    small = {"images": {"motion": "none", "backend": "vislam"}}  # the checkout compiles all loops of the back end anew
+    # the checkout compiles all loops of the back end anew
+    small = {"images": {"motion": "none", "backend": "vislam"}}
     file.write_text(json.dumps({"sequences": {"first": "drive0.mat"}, "configurations": small}))
-    argv = ["bench", str(file), "--data", str(data), "--out", str(out), "--cache", str(tmp_path / "cache")]
+    argv = [
+        "bench",
+        str(file),
+        "--data",
+        str(data),
+        "--out",
+        str(out),
+        "--cache",
+        str(tmp_path / "cache"),
+    ]
     assert "has no such revision" in refused(capsys, *argv, "--revision", "no-such-revision")
     assert main([*argv, "--revision", "HEAD", "--workers", "1"]) in (0, 1, 3)
     assert "ATE m" in capsys.readouterr().out
@@ -669,7 +835,9 @@ def test_another_revision_runs_in_turns_and_is_compared(
     assert (tmp_path / "out@HEAD" / "tables.md").is_file()
 
 
-@pytest.mark.parametrize("name", ["realistic", "euroc", str(ROOT / "tools" / "suites" / "maps.yaml")])
+@pytest.mark.parametrize(
+    "name", ["realistic", "euroc", str(ROOT / "tools" / "suites" / "maps.yaml")]
+)
 def test_another_revision_is_given_all_of_the_suite(name: str) -> None:
     suite = replace(read_suite(name), time_limit_s=9.0, success_percent=0.5)
     again = suite_from(_as_yaml(suite), suite.folder / "again.yaml")
@@ -695,7 +863,10 @@ def test_a_render_that_fails_is_a_failed_row_and_one_that_works_is_made_once(
     monkeypatch.setattr(execute, "_call", called)
     wrong = {"render": {"words": ["--scene", "moon"], "key": "0" * 8}}
     right = {"render": {"words": ["--rig", "small"], "key": "1" * 8}}
-    assert execute.perform_job(wrong, str(tmp_path))["failure"] == "vio render --scene moon: no such scene; choose room"
+    assert (
+        execute.perform_job(wrong, str(tmp_path))["failure"]
+        == "vio render --scene moon: no such scene; choose room"
+    )
     for _ in range(2):
         assert execute.perform_job(right, str(tmp_path))["failure"] is None
     assert ["render" in command for command in calls] == [True, True, False, False]
@@ -712,14 +883,20 @@ def test_a_render_that_fails_is_a_failed_row_and_one_that_works_is_made_once(
         (["compare", "one", "two"], "one: no results"),
     ],
 )
-def test_wrong_arguments_are_named(argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_arguments_are_named(
+    argv: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert message.lower() in refused(capsys, "bench", *argv).lower()
 
 
 def test_wrong_options_of_a_render_are_named_before_anything_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "s.yaml").write_text("sequences: {a: {render: --rig small}, b: {render: --rigg small}}\n")
+    (tmp_path / "s.yaml").write_text(
+        "sequences: {a: {render: --rig small}, b: {render: --rigg small}}\n"
+    )
     assert main(["bench", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "out")]) == 1
-    assert "s, sequence b: vio render: unrecognized arguments: --rigg small" in capsys.readouterr().err
+    assert (
+        "s, sequence b: vio render: unrecognized arguments: --rigg small" in capsys.readouterr().err
+    )
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,6 @@
-"""`vio bench` on a real Dask scheduler with two workers, one of which is killed, and which is restarted itself."""
+"""`vio bench` on a real Dask scheduler with two workers, one of which is killed, and which is
+restarted itself.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ distributed = pytest.importorskip("distributed", reason="needs the extra cluster
 
 
 class Cluster:
-    """Processes of `dask scheduler` and `dask worker` on this machine: two workers stand for two machines."""
+    """Processes of `dask scheduler` and `dask worker` on this machine: two workers stand for two
+    machines.
+    """
 
     def __init__(self, folder: Path) -> None:
         with socket.socket() as free:
@@ -41,11 +45,20 @@ class Cluster:
 
     def scheduler(self) -> subprocess.Popen[bytes]:
         """Start a scheduler on always the same port."""
-        return self._start("scheduler", "--host", "127.0.0.1", "--port", str(self._port), "--no-dashboard")
+        return self._start(
+            "scheduler", "--host", "127.0.0.1", "--port", str(self._port), "--no-dashboard"
+        )
 
     def worker(self) -> subprocess.Popen[bytes]:
         """Start a worker for one task at a time."""
-        options = ("--no-nanny", "--nthreads", "1", "--no-dashboard", "--local-directory", str(self._folder))
+        options = (
+            "--no-nanny",
+            "--nthreads",
+            "1",
+            "--no-dashboard",
+            "--local-directory",
+            str(self._folder),
+        )
         return self._start("worker", self.address, *options)
 
     def wait_for_workers(self, number: int) -> None:
@@ -54,10 +67,15 @@ class Cluster:
             client.wait_for_workers(number, timeout=PATIENCE_S)
 
     def _start(self, *words: str) -> subprocess.Popen[bytes]:
-        environment = os.environ | {"PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": "false"}
+        environment = os.environ | {
+            "PYTHONPATH": str(ROOT),
+            "DASK_DISTRIBUTED__WORKER__MEMORY__TERMINATE": "false",
+        }
         command = [sys.executable, "-m", "dask", *words]
         with (self._folder / "dask.log").open("ab") as log:
-            process = subprocess.Popen(command, env=environment, cwd=self._folder, stdout=log, stderr=log)
+            process = subprocess.Popen(
+                command, env=environment, cwd=self._folder, stdout=log, stderr=log
+            )
         self._processes.append(process)
         return process
 
@@ -84,15 +102,20 @@ class _Closing:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")
 def test_lost_workers_and_a_lost_scheduler_cost_no_row(cluster: Cluster, tmp_path: Path) -> None:
-    """Two machines' worth of workers, one killed in its task, the scheduler restarted, a corrupt recording among good.
+    """Two machines' worth of workers, one killed in its task, the scheduler restarted, a corrupt
+    recording among good.
 
-    The table is complete, the failed row says why, and all figures are those of a run in this process, to the bit.
+    The table is complete, the failed row says why, and all figures are those of a run in this
+    process, to the bit.
     """
     sequences = {f"drive{k}": f"drive{k}.mat" for k in range(2)}
     for k, name in enumerate(sequences.values()):
         make_mat(tmp_path / name, utias_arrays(make_drive(12, seed=k, pixel_sigma=0.3)))
     (tmp_path / "corrupt.mat").write_bytes((tmp_path / "drive0.mat").read_bytes()[:3000])
-    given = {"sequences": {"corrupt": "corrupt.mat", **sequences}, "configurations": {"images": {"motion": "none"}}}
+    given = {
+        "sequences": {"corrupt": "corrupt.mat", **sequences},
+        "configurations": {"images": {"motion": "none"}},
+    }
     suite = suite_from(given, tmp_path / "suite.yaml")
     scheduler = cluster.scheduler()
     workers = [cluster.worker(), cluster.worker()]
@@ -115,11 +138,16 @@ def test_lost_workers_and_a_lost_scheduler_cost_no_row(cluster: Cluster, tmp_pat
     assert "corrupt.mat" in (outcomes["corrupt"].failure or "")
     for task in tasks_of(suite, tmp_path, InputDigests(tmp_path / "inputs.json")):
         if task.sequence in sequences:
-            assert perform({**task.job, "scratch": str(tmp_path)})["figures"] == outcomes[task.sequence].figures
+            assert (
+                perform({**task.job, "scratch": str(tmp_path)})["figures"]
+                == outcomes[task.sequence].figures
+            )
 
 
 def test_no_scheduler_is_an_error_in_one_line(tmp_path: Path) -> None:
     jobs: dict[str, Any] = {"key": {}}
-    with pytest.raises(VioError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9.*start one") as error:
+    with pytest.raises(
+        VioError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9.*start one"
+    ) as error:
         list(run_on_dask(jobs, str(tmp_path), address="tcp://127.0.0.1:9", wait_s=0.3))
     assert "\n" not in str(error.value)

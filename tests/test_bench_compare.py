@@ -20,7 +20,11 @@ from vio.errors import EvaluationError
 
 
 def runs(
-    ate_m: Sequence[Sequence[float | None]], *, coverage: float = 1.0, system: str = "x", cpu_ms: float = 30.0
+    ate_m: Sequence[Sequence[float | None]],
+    *,
+    coverage: float = 1.0,
+    system: str = "x",
+    cpu_ms: float = 30.0,
 ) -> list[Outcome]:
     """Sequences with the ATE of each seed; None: that run failed."""
     return [
@@ -88,24 +92,35 @@ def test_few_or_scattered_sequences_cannot_tell_and_equal_ones_are_not_worse() -
     result = compare_outcomes(before, runs([[0.11], [0.2], [0.36]]))
     assert result.verdict == "cannot tell"
     assert compare_outcomes(before, before).verdict == "not worse"
-    assert compare_outcomes(before, runs([[0.101], [0.2], [0.299]])).verdict == "not worse", "by 10 % or more"
-    assert compare_outcomes(runs([[0.1]]), runs([[0.101]])).verdict == "cannot tell", "one sequence has no interval"
+    assert compare_outcomes(before, runs([[0.101], [0.2], [0.299]])).verdict == "not worse", (
+        "by 10 % or more"
+    )
+    assert compare_outcomes(runs([[0.1]]), runs([[0.101]])).verdict == "cannot tell", (
+        "one sequence has no interval"
+    )
 
 
 def test_a_change_of_a_thousandth_is_none_however_certain() -> None:
     before = [[0.01 * (k + 1)] for k in range(8)]
     for change, verdict in ((1.001, "not worse"), (1.02, "worse")):
-        assert compare_outcomes(runs(before), runs([[v[0] * change] for v in before])).verdict == verdict
+        assert (
+            compare_outcomes(runs(before), runs([[v[0] * change] for v in before])).verdict
+            == verdict
+        )
 
 
 def test_equal_seeds_count_once() -> None:
-    """Seeds that change nothing are no repetitions: a change of 0.1 %, or of a factor of 3, is not certain by them."""
+    """Seeds that change nothing are no repetitions: a change of 0.1 %, or of a factor of 3, is
+    not certain by them.
+    """
     small = compare_outcomes(runs([[0.1] * 5]), runs([[0.1001] * 5]))
     assert (small.sequences, small.changes[0].effect.n) == ((), 1)
     (large,) = compare_outcomes(runs([[0.1] * 5]), runs([[0.3] * 5])).sequences
     assert (large.effect.n, large.verdict) == (1, "cannot tell")
     several = runs([[0.1, 0.1, 0.2]]), runs([[0.1, 0.1, 0.4]])
-    assert compare_outcomes(*several).changes[0].effect.ratio == pytest.approx(np.sqrt(2)), "two runs, not three"
+    assert compare_outcomes(*several).changes[0].effect.ratio == pytest.approx(np.sqrt(2)), (
+        "two runs, not three"
+    )
 
 
 def test_renders_drawn_anew_with_each_seed_are_cases_of_their_own() -> None:
@@ -142,7 +157,9 @@ def test_one_sequence_that_breaks_is_always_shown() -> None:
     assert (broken.sequence, broken.verdict, broken.after) == ("sequence11", "cannot tell", 30.0)
     assert result.verdict == "cannot tell"
     assert any("sequence11, x: ATE 1.2 to 30 m" in line for line in comparison_lines(result))
-    assert not compare_outcomes(runs(before), runs([*before[:-1], [2.0]])).sequences, "a factor of 1.7"
+    assert not compare_outcomes(runs(before), runs([*before[:-1], [2.0]])).sequences, (
+        "a factor of 1.7"
+    )
     assert compare_outcomes(runs(before), runs([*before[:-1], [2.0]]), factor=1.5).sequences
     assert compare_outcomes(runs([*before[:-1], [30.0]]), runs(before)).verdict != "worse"
 
@@ -151,7 +168,9 @@ def test_a_sequence_that_breaks_with_every_seed_is_worse() -> None:
     calm = [[0.100, 0.101, 0.099, 0.100 + 1e-4]]
     (found,) = compare_outcomes(runs(calm), runs([[0.31, 0.30, 0.32, 0.31]])).sequences
     assert (found.verdict, found.effect.n) == ("worse", 4)
-    (chance,) = compare_outcomes(runs([[0.1, 0.14, 0.08, 0.12]]), runs([[0.1, 0.2, 3.0, 0.5]])).sequences
+    (chance,) = compare_outcomes(
+        runs([[0.1, 0.14, 0.08, 0.12]]), runs([[0.1, 0.2, 3.0, 0.5]])
+    ).sequences
     assert chance.verdict == "cannot tell"
 
 
@@ -171,12 +190,16 @@ def test_benches_without_a_common_run_are_refused() -> None:
         compare_outcomes(runs([[0.1]]), runs([[0.1]], system="y"))
 
 
-def test_the_command_tells_by_its_exit_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_tells_by_its_exit_status(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name, factor in (("a", 1.0), ("b", 1.9), ("c", 1.0)):
         values = [[0.1 * (k + 1) * (factor if k or name != "c" else 5.0)] for k in range(8)]
         (tmp_path / name).mkdir()
         peer = replace(runs([[0.3]])[0], system="other", seed=None)
-        outcomes = [outcome.as_dict() for outcome in [*runs(values), *runs(values[:4], system="y"), peer]]
+        outcomes = [
+            outcome.as_dict() for outcome in [*runs(values), *runs(values[:4], system="y"), peer]
+        ]
         (tmp_path / name / "bench.json").write_text(json.dumps({"outcomes": outcomes}))
     a, b, c = (str(tmp_path / name) for name in "abc")
     assert main(["bench", "compare", a, b]) == 1
@@ -192,12 +215,17 @@ def test_the_command_tells_by_its_exit_status(tmp_path: Path, capsys: pytest.Cap
     assert "x to y" in capsys.readouterr().out
     assert main(["bench", "compare", a, b, "--between", "x", "y", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["changes"][0]["effect"]["n"] == 4
-    assert main(["bench", "compare", a, "--between", "x", "other"]) == 3, "one trajectory without a seed"
+    assert main(["bench", "compare", a, "--between", "x", "other"]) == 3, (
+        "one trajectory without a seed"
+    )
     assert "ATE 0.1 to 0.3 m" in capsys.readouterr().out
-    assert "no such system; choose of x, y, other" in refused(capsys, "bench", "compare", a, "--between", "x", "z")
+    assert "no such system; choose of x, y, other" in refused(
+        capsys, "bench", "compare", a, "--between", "x", "z"
+    )
     assert "--factor must be above 1" in refused(capsys, "bench", "compare", a, b, "--factor", "1")
     (tmp_path / "b" / "bench.json").write_text('{"outcomes": [{}]}')
     assert "is damaged" in refused(capsys, "bench", "compare", a, b)
 
 
-# --- the simulation of a schedule -----------------------------------------------------------------------------------
+# --- the simulation of a schedule
+# -----------------------------------------------------------------------------------

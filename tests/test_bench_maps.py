@@ -33,7 +33,9 @@ T_CAM0_BODY = se3_exp([0.1, 0.2, -0.1, 0.3, -0.2, 0.1])
 
 
 def _cameras() -> FloatArray:
-    """Out, there, back near the start, back again looking the other way, and there again (5, 4, 4)."""
+    """Out, there, back near the start, back again looking the other way, and there again (5, 4,
+    4).
+    """
     positions = np.array([[0.0, 0, 0], [10, 0, 0], [0.5, 0, 0], [0.2, 0, 0], [10.2, 0, 0]])
     turned = np.array([np.eye(3)] * 5)
     turned[3] = so3_exp(np.array([0.0, np.pi, 0.0]))
@@ -41,17 +43,29 @@ def _cameras() -> FloatArray:
 
 
 def _store(path: Path, loops: list[tuple[int, int, float, bool]]) -> Path:
-    """A map of these cameras, a keyframe each 20 s, with loops (first, second, error in m, kept)."""
+    """A map of these cameras, a keyframe each 20 s, with loops (first, second, error in m,
+    kept).
+    """
     T = _cameras()
-    none = KeyframeFeatures(np.zeros((0, 4)), np.zeros(0, dtype=bool), np.zeros(0), np.zeros((0, 32), dtype=np.uint8))
+    none = KeyframeFeatures(
+        np.zeros((0, 4)), np.zeros(0, dtype=bool), np.zeros(0), np.zeros((0, 32), dtype=np.uint8)
+    )
     store = MapStore(path, create=True)
     store.add_session(SessionRow("here", CAMERA, True, 0))
     for k in range(5):
-        store.add_keyframe(KeyframeRow(0, 10 * k, 20 * k * NS_PER_S, T[k], T[k], np.eye(6), 0.0, None, 0.0), none)
+        store.add_keyframe(
+            KeyframeRow(0, 10 * k, 20 * k * NS_PER_S, T[k], T[k], np.eye(6), 0.0, None, 0.0), none
+        )
     for first, second, error_m, kept in loops:
         off = se3_from_parts(np.eye(3), np.array([error_m, 0.0, 0.0]))
         store.add_loop(
-            LoopRow(first, second, RelativePose(se3_inverse(T[first]) @ T[second] @ off, np.eye(6)), 30, kept)
+            LoopRow(
+                first,
+                second,
+                RelativePose(se3_inverse(T[first]) @ T[second] @ off, np.eye(6)),
+                30,
+                kept,
+            )
         )
     store.close()
     return path
@@ -63,23 +77,38 @@ def test_loops_are_scored_against_the_true_poses(tmp_path: Path) -> None:
 
     def score(*loops: tuple[int, int, float, bool]) -> tuple[float | None, ...]:
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}.map"
-        return tuple(loop_figures(_store(path, list(loops)), frames, T_world_body, T_CAM0_BODY).values())
+        return tuple(
+            loop_figures(_store(path, list(loops)), frames, T_world_body, T_CAM0_BODY).values()
+        )
 
     assert score() == (0, 0, None, 0.0)
     assert score((0, 2, 0.1, True)) == (1, 0, pytest.approx(0.1), 0.5)
     assert score((0, 2, 0.1, True), (1, 4, 2.0, True)) == (2, 1, pytest.approx(1.05), 1.0)
-    assert score((0, 2, 0.1, True), (1, 4, 2.0, False)) == (1, 0, pytest.approx(0.1), 0.5), "it was dropped"
+    assert score((0, 2, 0.1, True), (1, 4, 2.0, False)) == (1, 0, pytest.approx(0.1), 0.5), (
+        "it was dropped"
+    )
 
 
 def test_recall_is_undefined_where_no_place_is_seen_again(tmp_path: Path) -> None:
     frames, T_world_body = np.array([0, 10]), _cameras()[:2] @ T_CAM0_BODY
-    assert loop_figures(_store(tmp_path / "a.map", []), frames, T_world_body, T_CAM0_BODY)["loop_recall"] is None
+    assert (
+        loop_figures(_store(tmp_path / "a.map", []), frames, T_world_body, T_CAM0_BODY)[
+            "loop_recall"
+        ]
+        is None
+    )
 
 
 @pytest.mark.parametrize("wrong", [{"map_of": "other"}, {"map_of": "a", "map": True}, {"map": 3}])
-def test_a_map_of_what_is_not_in_the_suite_is_named(wrong: dict[str, object], tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"map_of of b names another sequence|map takes true or false"):
-        suite_from({"sequences": {"a": "a", "b": {"source": "b", **wrong}}}, tmp_path / "suite.yaml")
+def test_a_map_of_what_is_not_in_the_suite_is_named(
+    wrong: dict[str, object], tmp_path: Path
+) -> None:
+    with pytest.raises(
+        ConfigError, match=r"map_of of b names another sequence|map takes true or false"
+    ):
+        suite_from(
+            {"sequences": {"a": "a", "b": {"source": "b", **wrong}}}, tmp_path / "suite.yaml"
+        )
 
 
 @pytest.fixture
@@ -90,7 +119,9 @@ def tasks_here(monkeypatch: pytest.MonkeyPatch) -> None:
         return perform({**rendered_sources(job, Path(cache)), "scratch": cache})
 
     engine = partial(run_here, perform=perform_here)
-    monkeypatch.setattr("vio.bench.bench.run_here", lambda jobs, cache, *, workers: engine(jobs, cache, workers=1))
+    monkeypatch.setattr(
+        "vio.bench.bench.run_here", lambda jobs, cache, *, workers: engine(jobs, cache, workers=1)
+    )
 
 
 @pytest.mark.usefixtures("tasks_here")
@@ -119,11 +150,15 @@ def test_a_map_is_built_and_another_sequence_is_localised_in_it(tmp_path: Path) 
     assert second.absent["loops"] == "no map was built"
     assert second.figures["map_causal_ate_m"] < 0.1
     assert second.figures["again_s"] == 0.0, "the IMU carries the place"
-    assert lost.figures["again_s"] == pytest.approx(1.0), "from the next keyframe's result on, ten frames later"
+    assert lost.figures["again_s"] == pytest.approx(1.0), (
+        "from the next keyframe's result on, ten frames later"
+    )
     assert 0 < lost.figures["placed_again"] < second.figures["placed_again"] == 1
     assert lost.figures["placed_wrong"] == second.figures["placed_wrong"] == 0
     assert 0 < lost.figures["placed"] < second.figures["placed"] < 1
-    assert lost.figures["map_nees"] < 30, "poses that are not localised, or of a dark camera, are left out"
+    assert lost.figures["map_nees"] < 30, (
+        "poses that are not localised, or of a dark camera, are left out"
+    )
     tables = (tmp_path / "out" / "tables.md").read_text()
     assert "localised again s" in tables.partition("## Maps")[2]
 
@@ -148,7 +183,9 @@ def test_a_place_is_found_again_after_each_time_that_the_cameras_were_covered() 
 
 def test_wrong_places_are_those_off_by_half_a_metre_or_five_degrees() -> None:
     truth = np.tile(T_CAM0_BODY, (4, 1, 1))
-    off = se3_exp([[0.4, 0, 0, 0, 0, 0.05], [0.6, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0.1, 0], [0, 0, 0, 0, 0, 0]])
+    off = se3_exp(
+        [[0.4, 0, 0, 0, 0, 0.05], [0.6, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0.1, 0], [0, 0, 0, 0, 0, 0]]
+    )
     assert wrong_share(truth @ off, truth) == 0.5
 
 
@@ -169,7 +206,9 @@ def test_a_slam_systems_trajectories_stand_beside_ours_in_the_map(tmp_path: Path
     assert final["figures"]["map_ate_m"] < 1e-6
     assert "map_causal_ate_m" not in final["figures"]
     assert causal["figures"]["placed"] == pytest.approx(10 / 14)
-    assert causal["figures"]["place_s"] == pytest.approx(float(times_ns[4] - times_ns[0]) / NS_PER_S)
+    assert causal["figures"]["place_s"] == pytest.approx(
+        float(times_ns[4] - times_ns[0]) / NS_PER_S
+    )
     for record in (final, causal):
         assert "ate_m" not in record["figures"]
         assert record["absent"]["ate_m"] == "its poses are those in a map"

@@ -33,7 +33,12 @@ SIGMA_RAD = 3e-4
 
 
 def _matches(
-    *, nearest_m: float = 1.5, farthest_m: float = 12.0, per_pair: int = 120, pairs: int = 12, outliers: float = 0.1
+    *,
+    nearest_m: float = 1.5,
+    farthest_m: float = 12.0,
+    per_pair: int = 120,
+    pairs: int = 12,
+    outliers: float = 0.1,
 ) -> RayMatches:
     rng = np.random.default_rng(5)
     parts = []
@@ -46,7 +51,12 @@ def _matches(
         p1[wrong] = p1[rng.permutation(per_pair)][wrong]
         rays = [p / np.linalg.norm(p, axis=1, keepdims=True) for p in (p0, p1)]
         rays = [r + SIGMA_RAD * rng.standard_normal(r.shape) for r in rays]
-        parts.append(RayMatches(np.full(per_pair, pair), *(r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays)))
+        parts.append(
+            RayMatches(
+                np.full(per_pair, pair),
+                *(r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays),
+            )
+        )
     return join_matches(parts)
 
 
@@ -68,16 +78,26 @@ def estimate(matches: RayMatches) -> StereoEstimate:
     return found
 
 
-# --- left and right -------------------------------------------------------------------------------------------------
+# --- left and right
+# -------------------------------------------------------------------------------------------------
 
 
 def test_exact_rays_have_no_epipolar_angle() -> None:
     p0 = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 9], (50, 3))
     p1 = (p0 - T_CAM0_CAM1[:3, 3]) @ T_CAM0_CAM1[:3, :3]
-    exact = RayMatches(np.zeros(50, dtype=np.int64), *(p / np.linalg.norm(p, axis=1, keepdims=True) for p in (p0, p1)))
-    assert np.abs(epipolar_angles(T_CAM0_CAM1[:3, :3].T, _direction(T_CAM0_CAM1), exact)).max() < 1e-12
-    turned = epipolar_angles(so3_exp([0.01, 0, 0]) @ T_CAM0_CAM1[:3, :3].T, _direction(T_CAM0_CAM1), exact)
-    assert np.median(np.abs(turned)) == pytest.approx(0.01, rel=0.1), "a pitch of 10 mrad moves every ray off by that"
+    exact = RayMatches(
+        np.zeros(50, dtype=np.int64),
+        *(p / np.linalg.norm(p, axis=1, keepdims=True) for p in (p0, p1)),
+    )
+    assert (
+        np.abs(epipolar_angles(T_CAM0_CAM1[:3, :3].T, _direction(T_CAM0_CAM1), exact)).max() < 1e-12
+    )
+    turned = epipolar_angles(
+        so3_exp([0.01, 0, 0]) @ T_CAM0_CAM1[:3, :3].T, _direction(T_CAM0_CAM1), exact
+    )
+    assert np.median(np.abs(turned)) == pytest.approx(0.01, rel=0.1), (
+        "a pitch of 10 mrad moves every ray off by that"
+    )
 
 
 def test_stereo_extrinsics_have_consistent_standard_deviations(estimate: StereoEstimate) -> None:
@@ -85,7 +105,8 @@ def test_stereo_extrinsics_have_consistent_standard_deviations(estimate: StereoE
     swing = np.degrees(np.linalg.norm(np.cross(estimate.direction, _direction(T_CAM0_CAM1))))
     assert turn < max(0.05, 4 * estimate.rotation_sigma_deg)
     assert swing < max(0.1, 4 * estimate.direction_sigma_deg)
-    assert 0.15 < estimate.rotation_sigma_deg < 0.2  # what a lens model may leave, which pairs cannot tell from yaw
+    # what a lens model may leave, which pairs cannot tell from yaw
+    assert 0.15 < estimate.rotation_sigma_deg < 0.2
     assert 1000 < estimate.matches < 1350, "the gross outliers are left out"
     assert estimate.residual_deg == pytest.approx(np.degrees(SIGMA_RAD) * np.sqrt(2), rel=0.25)
 
@@ -93,9 +114,12 @@ def test_stereo_extrinsics_have_consistent_standard_deviations(estimate: StereoE
 def test_a_residual_distortion_of_a_wide_lens_is_no_wrong_baseline() -> None:
     matches = _matches(pairs=5, per_pair=300, outliers=0.0)
     off = np.arccos(matches.ray0[:, 2:])
-    cubic = np.radians(0.15) * (off / np.quantile(off, 0.95)) ** 3  # 0.15 deg at the edge, 0 on the axis
+    # 0.15 deg at the edge, 0 on the axis
+    cubic = np.radians(0.15) * (off / np.quantile(off, 0.95)) ** 3
     across = matches.ray0[:, :2] / np.linalg.norm(matches.ray0[:, :2], axis=1, keepdims=True)
-    bent = replace(matches, ray0=np.concatenate([np.sin(off + cubic) * across, np.cos(off + cubic)], axis=1))
+    bent = replace(
+        matches, ray0=np.concatenate([np.sin(off + cubic) * across, np.cos(off + cubic)], axis=1)
+    )
     found = refine_stereo(bent, T_CAM0_CAM1[:3, :3].T, _direction(T_CAM0_CAM1))
     swing = np.degrees(np.linalg.norm(np.cross(found.direction, _direction(T_CAM0_CAM1))))
     assert swing > 0.3, "the distortion passes for a direction of the baseline"
@@ -120,7 +144,9 @@ def test_unobservable_extrinsics_give_a_reason(matches: RayMatches, because: str
 
 
 def _changed(turn_deg: tuple[float, float, float] = (0, 0, 0), sign: float = 1.0) -> FloatArray:
-    return se3_from_parts(T_CAM0_CAM1[:3, :3] @ so3_exp(np.radians(turn_deg)), sign * T_CAM0_CAM1[:3, 3])
+    return se3_from_parts(
+        T_CAM0_CAM1[:3, :3] @ so3_exp(np.radians(turn_deg)), sign * T_CAM0_CAM1[:3, 3]
+    )
 
 
 @pytest.mark.parametrize(
@@ -164,11 +190,14 @@ def test_row_residuals_are_resolved_over_the_image() -> None:
     assert not isinstance(rows, NotObservable)
     assert rows.positive_disparity == 1.0
     assert np.isnan(rows.grid_px).sum() == 0
-    assert (np.diff(rows.grid_px, axis=1) > 0.1).all(), "the residual grows to the right, as it was made to"
+    assert (np.diff(rows.grid_px, axis=1) > 0.1).all(), (
+        "the residual grows to the right, as it was made to"
+    )
     assert isinstance(row_residuals(z[:20], 640, 480), NotObservable)
 
 
-# --- inertial sensor ------------------------------------------------------------------------------------------------
+# --- inertial sensor
+# ------------------------------------------------------------------------------------------------
 
 T_CAM0_IMU = se3_from_parts(
     so3_exp([0.1, -0.2, 0.05]) @ np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), [0.06, -0.04, 0.1]
@@ -178,7 +207,9 @@ RATE_HZ = 20.0
 
 def _seen(spline: MotionSpline, *, noise: float = 1.0) -> CameraMotion:
     """Return the camera's exact twists with noise like that of stereo tracks."""
-    times_ns = np.arange(spline.start_ns + 200_000_000, spline.end_ns - 200_000_000, int(1e9 / RATE_HZ))
+    times_ns = np.arange(
+        spline.start_ns + 200_000_000, spline.end_ns - 200_000_000, int(1e9 / RATE_HZ)
+    )
     state = motion_at(spline, times_ns)
     T_world_cam = state.T_world_imu @ se3_inverse(T_CAM0_IMU)
     steps = se3_inverse(T_world_cam[:-1]) @ T_world_cam[1:]
@@ -188,7 +219,11 @@ def _seen(spline: MotionSpline, *, noise: float = 1.0) -> CameraMotion:
         noise
         * RATE_HZ
         * np.concatenate(
-            [4e-4 * rng.standard_normal((len(twists), 3)), 1e-4 * rng.standard_normal((len(twists), 3))], axis=1
+            [
+                4e-4 * rng.standard_normal((len(twists), 3)),
+                1e-4 * rng.standard_normal((len(twists), 3)),
+            ],
+            axis=1,
         )
     )
     return CameraMotion(times_ns, np.arange(len(twists)), twists)
@@ -223,7 +258,9 @@ def test_estimates_rotation_offset_and_lever_arm(
     assert faults == ([] if shift_ms == 0 else ["clocks apart"])
 
 
-def test_reports_a_wrong_imu_calibration(spline: MotionSpline, samples: tuple[ImuSample, ...]) -> None:
+def test_reports_a_wrong_imu_calibration(
+    spline: MotionSpline, samples: tuple[ImuSample, ...]
+) -> None:
     motion, rates = _seen(spline), rates_of(samples)
     found = align_gyro(motion, rates)
     assert isinstance(found, ImuAlignment)
@@ -239,7 +276,9 @@ def test_reports_a_wrong_imu_calibration(spline: MotionSpline, samples: tuple[Im
         assert [f.fault for f in judge_imu(found, lever_arm, given)] == [fault]
 
 
-def test_alignment_is_unobservable_without_rotation(samples: tuple[ImuSample, ...], spline: MotionSpline) -> None:
+def test_alignment_is_unobservable_without_rotation(
+    samples: tuple[ImuSample, ...], spline: MotionSpline
+) -> None:
     motion = _seen(spline)
     straight = replace(motion, twists=motion.twists * [1, 1, 1, 0, 0, 0])
     found = align_gyro(straight, rates_of(samples))
@@ -254,13 +293,17 @@ def test_rotation_about_one_axis_leaves_the_alignment_about_it_unobservable() ->
     imu_ns = np.arange(-500_000_000, 20_500_000_000, 5_000_000)
     samples = [
         ImuSample(
-            int(t), np.array([0, 0, 0.5 * np.sin(1.3e-9 * t)]) + 1e-3 * rng.standard_normal(3), np.array([0, 0, 9.81])
+            int(t),
+            np.array([0, 0, 0.5 * np.sin(1.3e-9 * t)]) + 1e-3 * rng.standard_normal(3),
+            np.array([0, 0, 9.81]),
         )
         for t in imu_ns
     ]
     middle = (rate[1:] + rate[:-1]) / 2
     twists = np.zeros((len(middle), 6))
-    twists[:, 3:] = np.outer(middle, T_CAM0_IMU[:3, 2]) + 1e-3 * rng.standard_normal((len(middle), 3))
+    twists[:, 3:] = np.outer(middle, T_CAM0_IMU[:3, 2]) + 1e-3 * rng.standard_normal(
+        (len(middle), 3)
+    )
     motion = CameraMotion(times_ns, np.arange(len(middle)), twists)
     found = align_gyro(motion, rates_of(samples))
     assert "rotation about one axis" in found.weak

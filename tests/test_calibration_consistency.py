@@ -1,11 +1,21 @@
-"""The flights by which the calibration's NEES is measured: what is called the truth is one, and NEES of a few."""
+"""The flights by which the calibration's NEES is measured: what is called the truth is one, and
+NEES of a few.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from tools.calibration_consistency import FromStandstill, Off, _misread, _seen, calibration_nees, fly, walked_terms
+from tools.calibration_consistency import (
+    FromStandstill,
+    Off,
+    _misread,
+    _seen,
+    calibration_nees,
+    fly,
+    walked_terms,
+)
 from tools.consistency import CAMERA, T_CAM0_IMU, Flight
 from vio.filters.imu_terms import IMU_TERMS, calibrated
 from vio.filters.navigation import ImuMotion, NavState
@@ -23,7 +33,9 @@ QUIET = MsckfSettings(
 
 @pytest.mark.parametrize("flight", [Flight(), FromStandstill()])
 def test_a_flight_and_its_imu_agree(flight: Flight) -> None:
-    """Integrating the exact rates gives the exact states: what the Monte-Carlo calls the truth is one."""
+    """Integrating the exact rates gives the exact states: what the Monte-Carlo calls the truth
+    is one.
+    """
     motion = ImuMotion(QUIET)
     samples, bias = flight.imu(range(401), np.random.default_rng(0), QUIET)
     assert not bias.any()
@@ -38,12 +50,16 @@ def test_a_flight_and_its_imu_agree(flight: Flight) -> None:
 
 
 def test_samples_are_stamped_by_the_clock_of_the_imu() -> None:
-    early, late = (Flight().imu(range(20), np.random.default_rng(0), QUIET, clock_s=s)[0] for s in (0.0, 0.003))
+    early, late = (
+        Flight().imu(range(20), np.random.default_rng(0), QUIET, clock_s=s)[0] for s in (0.0, 0.003)
+    )
     assert {b.time_ns - a.time_ns for a, b in zip(early, late, strict=True)} == {3_000_000}
 
 
 def test_a_rig_that_is_off_is_off_by_what_its_errors_say() -> None:
-    """Estimates equal to the truth have no error: pixels of the true rig, and the signs of all parameters."""
+    """Estimates equal to the truth have no error: pixels of the true rig, and the signs of all
+    parameters.
+    """
     xi, turn = np.array([0.01, -0.02, 0.005, 0.004, -0.003, 0.006]), np.array([1e-3, -2e-3, 1.5e-3])
     off = Off(xi, 0.004, turn, 0.01)
     T_believed = T_CAM0_IMU @ se3_inverse(se3_exp(xi))
@@ -64,7 +80,8 @@ def test_a_rig_that_is_off_is_off_by_what_its_errors_say() -> None:
 def test_a_misread_sample_is_the_perfect_one_to_the_filter_that_knows_the_terms() -> None:
     off = Off(np.zeros(6), 0.0, np.zeros(3), 0.0, np.linspace(-0.02, 0.02, IMU_TERMS))
     walked = walked_terms(off, 50, QUIET, np.random.default_rng(0))
-    assert 0 < np.abs(walked[-1] - off.imu).max() < 1e-4  # 1 % times 0.005, over the root of a quarter of a second
+    # 1 % times 0.005, over the root of a quarter of a second
+    assert 0 < np.abs(walked[-1] - off.imu).max() < 1e-4
     perfect = Flight().imu(range(-100, 20), np.random.default_rng(0), QUIET)[0][40]
     read = _misread(perfect, walked[40])
     got = calibrated(np.concatenate([read.gyro, read.accel]), walked[40])
@@ -73,6 +90,10 @@ def test_a_misread_sample_is_the_perfect_one_to_the_filter_that_knows_the_terms(
 
 
 def test_the_baseline_is_estimated_consistently() -> None:
-    """Three seconds of four flights, each with another baseline: a mean NEES above 2.8 of 1 is a chance of 2 %."""
-    found = [fly("baseline", "standstill", seed, seconds=3.0)[-1]["baseline (1)"] for seed in range(4)]
+    """Three seconds of four flights, each with another baseline: a mean NEES above 2.8 of 1 is a
+    chance of 2 %.
+    """
+    found = [
+        fly("baseline", "standstill", seed, seconds=3.0)[-1]["baseline (1)"] for seed in range(4)
+    ]
     assert np.mean(found) < 2.8

@@ -1,4 +1,6 @@
-"""The sentence of `vio check`, and its picture: who is wrong where a run and COLMAP's reconstructions differ."""
+"""The sentence of `vio check`, and its picture: who is wrong where a run and COLMAP's
+reconstructions differ.
+"""
 
 from __future__ import annotations
 
@@ -40,20 +42,32 @@ def _poses(seed: int | None = None) -> FloatArray:
     if seed is None:
         return T
     rng = np.random.default_rng(seed)
-    return T @ se3_exp(np.column_stack([2e-3 * rng.normal(size=(COUNT, 3)), 2e-4 * rng.normal(size=(COUNT, 3))]))
+    return T @ se3_exp(
+        np.column_stack([2e-3 * rng.normal(size=(COUNT, 3)), 2e-4 * rng.normal(size=(COUNT, 3))])
+    )
 
 
 def _result(
-    mapper: Mapper, T_run: FloatArray, T_world_cam0: FloatArray, connected: Sequence[int] = range(COUNT)
+    mapper: Mapper,
+    T_run: FloatArray,
+    T_world_cam0: FloatArray,
+    connected: Sequence[int] = range(COUNT),
 ) -> MapperResult:
     path = TrackedPath(
-        Path("run"), CAMERA, Trajectory(T_run, None, "cam0", frame_indices=10 * np.arange(COUNT)), NOTHING
+        Path("run"),
+        CAMERA,
+        Trajectory(T_run, None, "cam0", frame_indices=10 * np.arange(COUNT)),
+        NOTHING,
     )
     rows = np.array(connected)
     no_pairs = np.zeros((0, 2), dtype=np.int64)
     linked = np.diff(connected) <= 3
-    model = Reconstructed(mapper, T_world_cam0[rows], rows, 1000, 0.5, np.zeros(0, dtype=np.int64), linked, no_pairs)
-    return MapperResult(mapper, COUNT, (model, compare_keyframes(path, rows, T_world_cam0[rows], linked=linked)))
+    model = Reconstructed(
+        mapper, T_world_cam0[rows], rows, 1000, 0.5, np.zeros(0, dtype=np.int64), linked, no_pairs
+    )
+    return MapperResult(
+        mapper, COUNT, (model, compare_keyframes(path, rows, T_world_cam0[rows], linked=linked))
+    )
 
 
 def _jumped(T: FloatArray, by_m: float, row: int = 20) -> FloatArray:
@@ -63,7 +77,9 @@ def _jumped(T: FloatArray, by_m: float, row: int = 20) -> FloatArray:
 
 
 def test_agreement_says_how_far_apart_they_are() -> None:
-    text = overall_verdict([_result("incremental", _poses(), _poses(1)), _result("global", _poses(), _poses(2))])
+    text = overall_verdict(
+        [_result("incremental", _poses(), _poses(1)), _result("global", _poses(), _poses(2))]
+    )
     assert text.startswith("the run and COLMAP agree: ")
     assert " mm (rms) apart over 30" in text
     assert "but" not in text
@@ -71,8 +87,13 @@ def test_agreement_says_how_far_apart_they_are() -> None:
 
 def test_a_jump_of_the_run_is_laid_at_its_door() -> None:
     run = _jumped(_poses(), 0.5)
-    text = overall_verdict([_result("incremental", run, _poses(1)), _result("global", run, _poses(2))])
-    assert re.match(r"the run is probably off by 0\.50\d m \(1\.7 m per 100 m\) at frames 190 to 200: both", text)
+    text = overall_verdict(
+        [_result("incremental", run, _poses(1)), _result("global", run, _poses(2))]
+    )
+    assert re.match(
+        r"the run is probably off by 0\.50\d m \(1\.7 m per 100 m\) at frames 190 to 200: both",
+        text,
+    )
 
 
 def test_a_jump_of_millimetres_is_negligible() -> None:
@@ -81,7 +102,10 @@ def test_a_jump_of_millimetres_is_negligible() -> None:
     assert all(result.found is not None and result.found[1].segments for result in results)
     text = overall_verdict(results)
     assert text.startswith("the run and COLMAP agree: ")
-    assert re.search(r"the difference of 3[\d.]+ mm \(0\.1 m per 100 m\) at frames 190 to 200 is negligible", text)
+    assert re.search(
+        r"the difference of 3[\d.]+ mm \(0\.1 m per 100 m\) at frames 190 to 200 is negligible",
+        text,
+    )
 
 
 def test_a_model_that_broke_in_two_is_not_held_against_the_run() -> None:
@@ -98,10 +122,13 @@ def test_a_model_that_broke_in_two_is_not_held_against_the_run() -> None:
 def test_motions_across_a_gap_are_not_compared() -> None:
     """COLMAP connected both ends of the run, which a loop joins, and nothing between them."""
     run, ends = _poses(), [*range(12), *range(18, COUNT)]
-    results = [_result(m, run, _jumped(_poses(s), 3.0, row=15), ends) for s, m in enumerate(MAPPERS)]
+    results = [
+        _result(m, run, _jumped(_poses(s), 3.0, row=15), ends) for s, m in enumerate(MAPPERS)
+    ]
     text = overall_verdict(results)
     assert text.startswith(
-        "6 of 30 keyframes not connected, the others in 2 pieces, of which frames 0 to 110 are compared; "
+        "6 of 30 keyframes not connected, the others in 2 pieces, of which frames 0 to 110 are "
+        "compared; "
     )
     assert "the run and COLMAP agree" in text
     assert "off" not in text
@@ -113,16 +140,24 @@ def test_a_run_that_bends_evenly_does_not_agree() -> None:
     run = [np.eye(4)]
     for motion in se3_inverse(_poses()[:-1]) @ _poses()[1:]:
         run.append(run[-1] @ motion @ turn)
-    results = [_result("incremental", np.array(run), _poses(1)), _result("global", np.array(run), _poses(2))]
+    results = [
+        _result("incremental", np.array(run), _poses(1)),
+        _result("global", np.array(run), _poses(2)),
+    ]
     text = overall_verdict(results)
-    assert re.match(r"the run is probably off by [\d.]+ m \(.* m per 100 m\) and 60.* deg at frames 0 to 290", text)
+    assert re.match(
+        r"the run is probably off by [\d.]+ m \(.* m per 100 m\) and 60.* deg at frames 0 to 290",
+        text,
+    )
 
 
 def test_a_missed_loop_is_named() -> None:
     result = _result("incremental", _poses(), _poses(1))
     model = replace(result.found[0], revisits=np.array([[1, 28], [2, 29]]))
     text = overall_verdict([replace(result, found=(model, result.found[1]))])
-    assert text.endswith("; frames 10 and 280 show one place, which the run did not close as a loop")
+    assert text.endswith(
+        "; frames 10 and 280 show one place, which the run did not close as a loop"
+    )
 
 
 def test_models_that_contradict_one_another_convict_nobody() -> None:
@@ -147,7 +182,9 @@ def test_a_wrong_length_is_said() -> None:
 
 
 def test_no_reconstruction_no_verdict() -> None:
-    assert overall_verdict([MapperResult("incremental", COUNT, None)]).startswith("none: not observable because")
+    assert overall_verdict([MapperResult("incremental", COUNT, None)]).startswith(
+        "none: not observable because"
+    )
 
 
 def test_a_broken_model_does_not_flatten_the_picture() -> None:
@@ -164,6 +201,8 @@ def test_a_broken_model_does_not_flatten_the_picture() -> None:
 
 
 def test_the_expected_time_grows_with_keyframes_and_mappers() -> None:
-    one, both = (expected_minutes(40, mappers) for mappers in (("global",), ("incremental", "global")))
+    one, both = (
+        expected_minutes(40, mappers) for mappers in (("global",), ("incremental", "global"))
+    )
     assert 0.5 < one < both < 10
     assert expected_minutes(20, ("global",)) < one

@@ -24,7 +24,16 @@ from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import se3_inverse
 
 FRAMES = 24
-CONTRACT = ("out", "frames", "path_length_m", "ms_per_frame", "ate_m", "rpe", "t_err_percent", "r_err_deg_per_100m")
+CONTRACT = (
+    "out",
+    "frames",
+    "path_length_m",
+    "ms_per_frame",
+    "ate_m",
+    "rpe",
+    "t_err_percent",
+    "r_err_deg_per_100m",
+)
 
 
 @pytest.fixture
@@ -44,8 +53,25 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished(truth: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     """The folder of a run with its observations, compared with the truth; tests only read it."""
     folder = tmp_path_factory.mktemp("finished")
-    recording, out = make_npz(folder / "drive.npz", ece276a_arrays(make_drive(FRAMES))), str(folder / "out")
-    assert main(["run", str(recording), "--save-observations", "--reference", str(truth), "--out", out, "--quiet"]) == 0
+    recording, out = (
+        make_npz(folder / "drive.npz", ece276a_arrays(make_drive(FRAMES))),
+        str(folder / "out"),
+    )
+    assert (
+        main(
+            [
+                "run",
+                str(recording),
+                "--save-observations",
+                "--reference",
+                str(truth),
+                "--out",
+                out,
+                "--quiet",
+            ]
+        )
+        == 0
+    )
     return out
 
 
@@ -63,9 +89,13 @@ def test_run_prints_the_contract(
     assert Path(metrics["out"], "trajectory.png").is_file()
 
 
-def test_run_without_reference_prints_null(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_without_reference_prints_null(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     metrics = json_of(capsys, "run", recording, "--out", tmp_path / "out", "--motion", "none")
-    assert [metrics[key] for key in ("ate_m", "rpe", "t_err_percent", "r_err_deg_per_100m")] == [None] * 4
+    assert [metrics[key] for key in ("ate_m", "rpe", "t_err_percent", "r_err_deg_per_100m")] == [
+        None
+    ] * 4
     assert metrics["motion"] == "none"
     assert metrics["path_length_m"] > 10
 
@@ -73,7 +103,9 @@ def test_run_without_reference_prints_null(recording: Path, tmp_path: Path, caps
 def test_reference_of_cam0_is_compared_with_the_lever_arm(
     finished: str, truth: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The filter estimates the IMU, a KITTI reference describes cam0, a metre away: rotation would show it."""
+    """The filter estimates the IMU, a KITTI reference describes cam0, a metre away: rotation
+    would show it.
+    """
     metrics = json.loads(Path(finished, "metrics.json").read_text())
     assert metrics["evaluation"]["body"] == "cam0"
     assert metrics["evaluation"]["ate_deg"] < 0.5
@@ -91,18 +123,25 @@ def test_a_range_of_frames_is_compared_with_its_own_reference(
     assert metrics["frames"] == 16
     assert (metrics["first_frame"], metrics["last_frame"]) == (6, 21)
     assert metrics["ate_m"] < 0.05
-    replayed = json_of(capsys, "run", tmp_path / "out" / "observations.npz", "--out", tmp_path / "replayed")
+    replayed = json_of(
+        capsys, "run", tmp_path / "out" / "observations.npz", "--out", tmp_path / "replayed"
+    )
     assert replayed["frames"] == 16
     assert not [line for line in replayed["warnings"] if "could not be read" in line]
 
 
 def test_slow_frames_count_as_compiling_only_where_loops_were_compiled(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    recording: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("vio.runs.folder._SLOW", 1.0)
     for compiled in (True, False):
         monkeypatch.setattr("vio.runs.folder.has_compiled", lambda compiled=compiled: compiled)
-        assert (json_of(capsys, "run", recording, "--out", tmp_path / "out")["start_s"] > 0) == compiled
+        assert (
+            json_of(capsys, "run", recording, "--out", tmp_path / "out")["start_s"] > 0
+        ) == compiled
 
 
 def test_a_shorter_reference_evaluates_the_frames_it_covers(
@@ -131,18 +170,25 @@ def test_saved_observations_replay_bit_identically(
 def test_run_and_its_kitti_file_are_compared_in_one_world(
     finished: str, truth: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The run describes the IMU in a world of its own, poses.txt and trajectory.kitti the first cam0."""
+    """The run describes the IMU in a world of its own, poses.txt and trajectory.kitti the first
+    cam0.
+    """
     kitti = json_of(capsys, "eval", f"{finished}/trajectory.kitti", truth, "--align", "none")
     first = json_of(capsys, "eval", finished, truth, "--align", "first")
     assert first["ate_m"] == pytest.approx(kitti["ate_m"], abs=1e-6)
     assert main(["eval", finished, str(truth), "--align", "none"]) == 1
     assert (
-        "describes imu and the reference cam0, whose world frames differ; take align first" in capsys.readouterr().err
+        "describes imu and the reference cam0, whose world frames differ; take align first"
+        in capsys.readouterr().err
     )
 
 
 def test_reference_of_another_recording_is_noted(
-    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    recording: Path,
+    truth: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     poses = np.loadtxt(truth)
     poses[:, 3::4] *= 3
@@ -154,39 +200,76 @@ def test_reference_of_another_recording_is_noted(
     assert caplog.text.count("is it the reference of this recording?") == 2
 
 
-def test_log_replays_the_motion_of_its_run(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_log_replays_the_motion_of_its_run(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A log holds the velocities even of a run on images alone."""
     first, again, other = (tmp_path / name for name in ("first", "again", "other"))
     json_of(capsys, "run", recording, "--motion", "none", "--save-observations", "--out", first)
     log = str(first / "observations.npz")
     assert json_of(capsys, "run", log, "--out", again)["motion"] == "none"
     assert (first / "trajectory.tum").read_bytes() == (again / "trajectory.tum").read_bytes()
-    assert json_of(capsys, "run", log, "--motion", "velocity", "--out", other)["motion"] == "velocity"
+    assert (
+        json_of(capsys, "run", log, "--motion", "velocity", "--out", other)["motion"] == "velocity"
+    )
 
 
 def test_log_of_unknown_motion_takes_its_sensor_and_says_so(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    recording: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """As logs of version 1 are."""
-    json_of(capsys, "run", recording, "--motion", "none", "--save-observations", "--out", tmp_path / "first")
+    json_of(
+        capsys,
+        "run",
+        recording,
+        "--motion",
+        "none",
+        "--save-observations",
+        "--out",
+        tmp_path / "first",
+    )
     arrays = dict(np.load(tmp_path / "first" / "observations.npz"))
     del arrays["run_motion"]
     np.savez(tmp_path / "old.npz", **(arrays | {"version": np.array(1)}))
-    assert json_of(capsys, "run", tmp_path / "old.npz", "--out", tmp_path / "again")["motion"] == "velocity"
-    assert caplog.text.count("the log does not say which motion its run used; motion auto takes its velocity") == 1
+    assert (
+        json_of(capsys, "run", tmp_path / "old.npz", "--out", tmp_path / "again")["motion"]
+        == "velocity"
+    )
+    assert (
+        caplog.text.count(
+            "the log does not say which motion its run used; motion auto takes its velocity"
+        )
+        == 1
+    )
 
 
 def test_effective_configuration_reproduces_the_run(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
-    json_of(capsys, "run", recording, "--set", "selector.name=visibility", "--motion", "none", "--out", first)
+    json_of(
+        capsys,
+        "run",
+        recording,
+        "--set",
+        "selector.name=visibility",
+        "--motion",
+        "none",
+        "--out",
+        first,
+    )
     json_of(capsys, "run", recording, "--config", first / "config.yaml", "--out", second)
     assert (first / "trajectory.tum").read_bytes() == (second / "trajectory.tum").read_bytes()
 
 
 def test_runs_without_out_are_numbered(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     outs = [json_of(capsys, "run", recording)["out"] for _ in range(2)]
@@ -212,7 +295,9 @@ def test_rejects_features_of_another_recording(
     finished: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arrays = ece276a_arrays(make_drive(9))
-    other = make_npz(tmp_path / "other.npz", {**arrays, "time_stamps": arrays["time_stamps"] + 77.7})
+    other = make_npz(
+        tmp_path / "other.npz", {**arrays, "time_stamps": arrays["time_stamps"] + 77.7}
+    )
     features = f"frontend.features={finished}/observations.npz"
     assert main(["run", str(recording), "--set", features, "--out", str(tmp_path / "again")]) == 0
     assert main(["run", str(other), "--set", features, "--out", str(tmp_path / "mixed")]) == 1
@@ -221,9 +306,17 @@ def test_rejects_features_of_another_recording(
 
 
 def test_output_on_a_terminal_without_unicode() -> None:
-    env = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
+    env = {
+        **os.environ,
+        "LC_ALL": "C",
+        "PYTHONUTF8": "0",
+        "PYTHONCOERCECLOCALE": "0",
+        "PYTHONIOENCODING": "ascii",
+    }
     for words in (["run", "--help"], ["config", "--show"]):
-        done = subprocess.run([sys.executable, "-m", "vio", *words], capture_output=True, env=env, check=False)
+        done = subprocess.run(
+            [sys.executable, "-m", "vio", *words], capture_output=True, env=env, check=False
+        )
         assert done.returncode == 0, done.stderr.decode()
         assert done.stderr == b""
 
@@ -284,7 +377,11 @@ def test_prints_a_table_with_the_path_of_the_plot(
     ],
 )
 def test_errors_are_one_line_and_write_nothing(
-    argv: list[str], message: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    argv: list[str],
+    message: str,
+    recording: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "thesis").mkdir()
@@ -334,11 +431,15 @@ def test_an_interrupt_while_the_picture_is_drawn_costs_the_picture_alone(
 
 
 def test_the_picture_is_drawn_after_the_results_are_printed_or_not_at_all(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     printed: list[str] = []
     monkeypatch.setattr(
-        "vio.runs.picture.RunPicture.write", lambda picture, path: printed.append(capsys.readouterr().out)
+        "vio.runs.picture.RunPicture.write",
+        lambda picture, path: printed.append(capsys.readouterr().out),
     )
     assert main(["run", str(recording), "--out", str(tmp_path / "a")]) == 0
     assert [text.count("results ") for text in printed] == [1]
@@ -348,7 +449,10 @@ def test_the_picture_is_drawn_after_the_results_are_printed_or_not_at_all(
 
 
 def test_a_report_is_written_and_opened_with_the_run(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", lambda uri: opened.append(uri) or True)
@@ -365,7 +469,10 @@ def test_several_trajectories_are_compared_and_drawn(
 ) -> None:
     runs = [str(tmp_path / name) for name in "ab"]
     for out, motion in zip(runs, ("none", "velocity"), strict=True):
-        assert main(["run", str(recording), "--out", out, "--motion", motion, "--no-plot", "--quiet"]) == 0
+        assert (
+            main(["run", str(recording), "--out", out, "--motion", motion, "--no-plot", "--quiet"])
+            == 0
+        )
     capsys.readouterr()
     picture = tmp_path / "eval.png"
     truth = f"{runs[0]}/trajectory.tum"
@@ -387,7 +494,9 @@ def test_debug_raises_the_expectedrefused(tmp_path: Path) -> None:
 def test_eval_reads_the_extrinsics_from_a_file(
     finished: str, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A trajectory of the IMU can be compared with one of cam0 only with the extrinsics between them."""
+    """A trajectory of the IMU can be compared with one of cam0 only with the extrinsics between
+    them.
+    """
     files = [f"{finished}/trajectory.tum", str(truth)]
     assert "give the extrinsic T_cam0_imu" in refused(capsys, "eval", *files)
     given = tmp_path / "T_cam0_imu.txt"
@@ -399,7 +508,9 @@ def test_eval_reads_the_extrinsics_from_a_file(
     )
 
 
-def test_an_unknown_option_shows_the_usage_of_its_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_option_shows_the_usage_of_its_command(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["eval", "a", "b", "--alignment", "se3"])
     assert ended.value.code == 2
@@ -413,7 +524,9 @@ def test_a_run_is_compared_with_the_truth_of_its_recording(
 ) -> None:
     assert main(["run", str(flight), "--quiet", "--json", "--out", str(tmp_path / "run")]) == 0
     ate_m = json.loads(capsys.readouterr().out)["ate_m"]
-    assert json_of(capsys, "eval", tmp_path / "run", flight)["ate_m"] == pytest.approx(ate_m, rel=1e-6)
+    assert json_of(capsys, "eval", tmp_path / "run", flight)["ate_m"] == pytest.approx(
+        ate_m, rel=1e-6
+    )
 
 
 def test_wrong_usage_exits_with_status_2() -> None:
@@ -431,7 +544,9 @@ def test_wrong_usage_exits_with_status_2() -> None:
         assert stop.value.code == 2
 
 
-def test_config_shows_every_setting_with_unit_and_default(capsys: pytest.CaptureFixture[str]) -> None:
+def test_config_shows_every_setting_with_unit_and_default(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["config", "--all"]) == 0
     out = capsys.readouterr().out
     assert "vislam.pixel_sigma_px = 0.75 px" in out
@@ -449,7 +564,9 @@ def test_config_shows_the_basic_settings_in_groups(capsys: pytest.CaptureFixture
     assert lines[-1] == f"# {len(list(describe(Config()))) - len(BASIC)} more: vio config --all"
 
 
-def test_config_prints_the_effective_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_config_prints_the_effective_configuration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["config", "--set", "vislam.iterations=7"]) == 0
     path = tmp_path / "all.yaml"
     path.write_text(capsys.readouterr().out)
@@ -457,14 +574,19 @@ def test_config_prints_the_effective_configuration(tmp_path: Path, capsys: pytes
     assert "iterations: 7" in capsys.readouterr().out
 
 
-def test_eval_aligns_as_requested(finished: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_aligns_as_requested(
+    finished: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     estimate = Path(finished, "trajectory.tum")
     trajectory = read_trajectory(estimate)
     poses = trajectory.T_world_body.copy()
     poses[:, :3, 3] *= 1.1
     larger = tmp_path / "larger.tum"
     write_tum(larger, replace(trajectory, T_world_body=poses))
-    scores = {mode: json_of(capsys, "eval", estimate, larger, "--align", mode) for mode in ("se3", "sim3", "none")}
+    scores = {
+        mode: json_of(capsys, "eval", estimate, larger, "--align", mode)
+        for mode in ("se3", "sim3", "none")
+    }
     assert scores["sim3"]["ate_m"] < 1e-6
     assert scores["sim3"]["scale"] == pytest.approx(1.1)
     assert scores["se3"]["ate_m"] < scores["none"]["ate_m"]
@@ -472,19 +594,38 @@ def test_eval_aligns_as_requested(finished: str, tmp_path: Path, capsys: pytest.
     assert main(["eval", str(estimate), str(larger), "--lengths", "5,10"]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert [line[:10].strip() for line in printed] == [
-        *("compared", "path", "alignment", "ATE", "scale", "attitude", "RPE", "drift", "5 m", "10 m"),
+        *(
+            "compared",
+            "path",
+            "alignment",
+            "ATE",
+            "scale",
+            "attitude",
+            "RPE",
+            "drift",
+            "5 m",
+            "10 m",
+        ),
     ]
     with pytest.raises(SystemExit):
         main(["eval", str(estimate), str(larger), "--lengths", "far"])
-    assert "'far' is no list of path lengths; give metres above 0, as in 25,50" in capsys.readouterr().err
+    assert (
+        "'far' is no list of path lengths; give metres above 0, as in 25,50"
+        in capsys.readouterr().err
+    )
     assert printed[7].endswith("over 5 to 10 m")
-    assert {len(line) - len(line.lstrip()) for line in (row[11:] for row in printed[8:])} <= {2, 3}, "aligned"
+    assert {len(line) - len(line.lstrip()) for line in (row[11:] for row in printed[8:])} <= {
+        2,
+        3,
+    }, "aligned"
 
 
 def test_eval_refuses_two_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     short = tmp_path / "short.tum"
     short.write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
-    assert "only 2 poses match; a comparison needs at least 3" in refused(capsys, "eval", short, short)
+    assert "only 2 poses match; a comparison needs at least 3" in refused(
+        capsys, "eval", short, short
+    )
 
 
 def test_evo_reads_every_trajectory_file(finished: str) -> None:
@@ -502,23 +643,50 @@ def test_reproduce_writes_a_table_and_a_figure(
     rows = {row["name"]: row for row in tables[0]["rows"]}
     assert rows["dead reckoning"]["ate_m"] == pytest.approx(rows["mapping only"]["ate_m"])
     assert rows["recommended"]["ate_m"] < 0.05
-    assert {f.name for f in (tmp_path / "table" / "drive").iterdir()} == {"table.md", "table.json", "trajectories.png"}
+    assert {f.name for f in (tmp_path / "table" / "drive").iterdir()} == {
+        "table.md",
+        "table.json",
+        "trajectories.png",
+    }
     assert "| recommended |" in (tmp_path / "table" / "drive" / "table.md").read_text()
 
 
 def test_the_module_runs_as_a_process(recording: Path, tmp_path: Path) -> None:
     """Logs go to stderr, so that stdout is JSON alone."""
-    argv = [sys.executable, "-m", "vio", "run", str(recording), "--out", str(tmp_path / "out"), "--no-plot", "--json"]
+    argv = [
+        sys.executable,
+        "-m",
+        "vio",
+        "run",
+        str(recording),
+        "--out",
+        str(tmp_path / "out"),
+        "--no-plot",
+        "--json",
+    ]
     done = subprocess.run(argv, capture_output=True, text=True, check=True)
     assert json.loads(done.stdout)["frames"] == FRAMES
 
 
 def test_without_pycolmap_only_its_commands_fail(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     code = "import sys; sys.modules['pycolmap'] = None; from vio.cli import main; sys.exit(main(sys.argv[1:]))"
     out = tmp_path / "out"
-    argv = [sys.executable, "-c", code, "run", str(recording), "--out", str(out), "--save-observations", "--no-plot"]
+    argv = [
+        sys.executable,
+        "-c",
+        code,
+        "run",
+        str(recording),
+        "--out",
+        str(out),
+        "--save-observations",
+        "--no-plot",
+    ]
     assert subprocess.run(argv, capture_output=True, check=False).returncode == 0
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     for name in [name for name in sys.modules if name.startswith("vio.offline.colmap")]:
@@ -538,7 +706,9 @@ def test_without_pycolmap_only_its_commands_fail(
         assert printed.err.count("\n") == 1, argv
 
 
-def test_each_finding_of_the_stereo_calibration_has_a_line_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_finding_of_the_stereo_calibration_has_a_line_of_its_own(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Three at most, all in one column."""
     from vio.cli.output import print_result
     from vio.cli.running import metric_rows
@@ -557,7 +727,13 @@ def test_each_finding_of_the_stereo_calibration_has_a_line_of_its_own(capsys: py
         "start_s": 0.0,
         "refused_share": None,
     }
-    metrics |= {"backend": "msckf", "motion": None, "camera": {}, "stereo_field": field, "out": "runs/drive"}
+    metrics |= {
+        "backend": "msckf",
+        "motion": None,
+        "camera": {},
+        "stereo_field": field,
+        "out": "runs/drive",
+    }
     print_result({}, metric_rows(metrics | dict.fromkeys(absent)), as_json=False)
     lines = capsys.readouterr().out.splitlines()
     first = next(k for k, line in enumerate(lines) if line.startswith("stereo "))
@@ -568,6 +744,10 @@ def test_each_finding_of_the_stereo_calibration_has_a_line_of_its_own(capsys: py
 @pytest.mark.skipif(shutil.which("head") is None, reason="needs head")
 def test_a_closed_pipe_is_norefused() -> None:
     done = subprocess.run(
-        f"{sys.executable} -m vio config --show | head -n 1", shell=True, capture_output=True, text=True, check=True
+        f"{sys.executable} -m vio config --show | head -n 1",
+        shell=True,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stderr == ""

@@ -1,4 +1,6 @@
-"""Models read back by pycolmap, refinement of simulated runs, and the commands `check`, `refine` and `export`."""
+"""Models read back by pycolmap, refinement of simulated runs, and the commands `check`, `refine`
+and `export`.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +21,22 @@ from vio.datasets import open_dataset
 from vio.errors import DataError, EstimationError
 from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.files.trajectories import write_tum
-from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp, transform_points
+from vio.geometry.lie import (
+    FloatArray,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+    transform_points,
+)
 from vio.geometry.stereo import project
 from vio.live.build import Parts
-from vio.offline.colmap.model import ModelImages, build_model, keyframe_images, mean_reprojection_error_px
+from vio.offline.colmap.model import (
+    ModelImages,
+    build_model,
+    keyframe_images,
+    mean_reprojection_error_px,
+)
 from vio.offline.colmap.reconstruction import linked_steps, pairs_to_match
 from vio.offline.colmap.trajectory import read_colmap_trajectory
 from vio.offline.comparison import GroundTruth, KeyframeComparison, compare_keyframes
@@ -50,16 +64,24 @@ SIGMA_PX = 0.3
 @pytest.fixture(scope="module")
 def simulation() -> Simulation:
     motion = hand_held(duration_s=6.0, seed=2)
-    return simulate(room(1), small_rig(320, 200), motion, rate_hz=10.0, imu=ImuNoise(), effects=CLEAN, seed=1)
+    return simulate(
+        room(1), small_rig(320, 200), motion, rate_hz=10.0, imu=ImuNoise(), effects=CLEAN, seed=1
+    )
 
 
-def _make_run(simulation: Simulation, folder: Path, *, stop: int | None = None, lost_after: int | None = None) -> Path:
+def _make_run(
+    simulation: Simulation, folder: Path, *, stop: int | None = None, lost_after: int | None = None
+) -> Path:
     """Make a run's folder from exact geometry with noise, without rendering."""
-    settings = OracleSettings(max_features=120, sigma_px=SIGMA_PX, outlier_fraction=0.02, max_track_length=lost_after)
+    settings = OracleSettings(
+        max_features=120, sigma_px=SIGMA_PX, outlier_fraction=0.02, max_track_length=lost_after
+    )
     dataset = SimulatedRecording(simulation)
     config = replace(Config(), backend="vislam", motion="none")
     front = OracleFrontend(simulation, settings, seed=4)
-    result = process(dataset, config, parts=Parts(frontend=front), stop=stop, keep_observations=True)
+    result = process(
+        dataset, config, parts=Parts(frontend=front), stop=stop, keep_observations=True
+    )
     write_run_folder(folder, result, dataset.recording.reference, save_observations=True)
     return folder
 
@@ -82,7 +104,9 @@ def round_trip() -> Simulation:
 
 
 def _add_loop(run: Path, ends: tuple[int, int], *, points: int = 120) -> None:
-    """Write a loop between two frames as a run with a map does, with exact geometry and noise, and poses in the map."""
+    """Write a loop between two frames as a run with a map does, with exact geometry and noise,
+    and poses in the map.
+    """
     saved, rng = read_saved_run(run), np.random.default_rng(6)
     truth = saved.truth.trajectory.in_cam0(saved.T_cam0_imu)
     rows = [int(np.flatnonzero(saved.tracked.frames == k)[0]) for k in ends]
@@ -93,7 +117,9 @@ def _add_loop(run: Path, ends: tuple[int, int], *, points: int = 120) -> None:
     z = [one + SIGMA_PX * rng.standard_normal((points, 4)) for one in z]
     every = np.ones(points, dtype=np.bool_)
     ns = times[rows].tolist()
-    loop = LoopEvent(ends[1], ns[1], 7, ns[0], points, 0.0, False, ends[0], True, LoopMatches(*z, every, every))
+    loop = LoopEvent(
+        ends[1], ns[1], 7, ns[0], points, 0.0, False, ends[0], True, LoopMatches(*z, every, every)
+    )
     write_loops(run, [loop])
     odometry = saved.tracked.trajectory.T_world_body
     closed = np.stack([odometry[rows[0]], odometry[rows[0]] @ se3_inverse(T[0]) @ T[1]])
@@ -114,10 +140,13 @@ def saved(whole_run: Path) -> TrackedPath:
 
 
 def _contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
+    }
 
 
-# --- keyframes, points, poses ---------------------------------------------------------------------------------------
+# --- keyframes, points, poses
+# ---------------------------------------------------------------------------------------
 
 
 def test_keyframes_span_the_run_and_respect_their_limit(saved: TrackedPath) -> None:
@@ -134,7 +163,10 @@ def test_points_of_exact_pixels_are_exact(saved: TrackedPath) -> None:
     T = saved.trajectory.T_world_body[keyframes]
     tracks = build_tracks(saved, keyframes, T)
     T_cam0_world = se3_inverse(T)[tracks.keyframe]
-    p = np.einsum("nij,nj->ni", T_cam0_world[:, :3, :3], tracks.p_world[tracks.point]) + T_cam0_world[:, :3, 3]
+    p = (
+        np.einsum("nij,nj->ni", T_cam0_world[:, :3, :3], tracks.p_world[tracks.point])
+        + T_cam0_world[:, :3, 3]
+    )
     exact = replace(tracks, z=project(saved.camera, p), p_world=tracks.p_world + 1.0)
     again, valid = triangulate_tracks(saved.camera, T, exact)
     assert valid.all()
@@ -175,10 +207,13 @@ def test_covariances_of_positions_and_points_match_sampling(saved: TrackedPath) 
     assert (np.linalg.eigvalsh(covariance) > 0).all()
 
 
-# --- models ---------------------------------------------------------------------------------------------------------
+# --- models
+# ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_model_projects_as_our_camera_with_an_offset_of_half_a_pixel(saved: TrackedPath, tmp_path: Path) -> None:
+def test_a_model_projects_as_our_camera_with_an_offset_of_half_a_pixel(
+    saved: TrackedPath, tmp_path: Path
+) -> None:
     keyframes = choose_keyframes(saved, most=8)
     T = saved.trajectory.T_world_body[keyframes]
     tracks = build_tracks(saved, keyframes, T)
@@ -198,7 +233,9 @@ def test_a_model_projects_as_our_camera_with_an_offset_of_half_a_pixel(saved: Tr
         rows = tracks.keyframe == k
         rows &= tracks.has_right | (side == "left")
         column = slice(0, 2) if side == "left" else slice(2, 4)
-        ours = project(saved.camera, transform_points(se3_inverse(T[k]), tracks.p_world[tracks.point[rows]]))
+        ours = project(
+            saved.camera, transform_points(se3_inverse(T[k]), tracks.p_world[tracks.point[rows]])
+        )
         np.testing.assert_allclose([p.xy for p in image.points2D], tracks.z[rows][:, column] + 0.5)
         for point, uv in zip(image.points2D, ours[:, column], strict=True):
             p_world = model.point3D(point.point3D_id).xyz
@@ -207,7 +244,9 @@ def test_a_model_projects_as_our_camera_with_an_offset_of_half_a_pixel(saved: Tr
     np.testing.assert_array_equal(model.point3D(5).color, colours[4])
     residual, _ = reprojection(saved.camera, T, tracks)
     left, right = np.linalg.norm(residual[:, :2], axis=1), np.linalg.norm(residual[:, 2:], axis=1)
-    total = np.bincount(tracks.point, left + right) / np.bincount(tracks.point, 1.0 + tracks.has_right)
+    total = np.bincount(tracks.point, left + right) / np.bincount(
+        tracks.point, 1.0 + tracks.has_right
+    )
     assert mean_reprojection_error_px(model) == pytest.approx(total.mean(), rel=1e-9)
 
 
@@ -217,7 +256,9 @@ def test_reads_a_model_as_a_trajectory(saved: TrackedPath, tmp_path: Path, stamp
     T = saved.trajectory.T_world_body[keyframes]
     tracks = build_tracks(saved, keyframes, T)
     numbers = 1403715273262142976 + 10**8 * keyframes if stamped else keyframes
-    names = ModelImages(tuple(f"cam0/{k}.png" for k in numbers), tuple(f"cam1/{k}.png" for k in numbers))
+    names = ModelImages(
+        tuple(f"cam0/{k}.png" for k in numbers), tuple(f"cam1/{k}.png" for k in numbers)
+    )
     place = tmp_path / "sparse" / "0"
     place.mkdir(parents=True)
     build_model(saved.camera, T, tracks, names).write_binary(place)
@@ -234,10 +275,13 @@ def test_reads_a_model_as_a_trajectory(saved: TrackedPath, tmp_path: Path, stamp
         read_colmap_trajectory(tmp_path)
 
 
-# --- refinement -----------------------------------------------------------------------------------------------------
+# --- refinement
+# -----------------------------------------------------------------------------------------------------
 
 
-def test_refine_lowers_the_error_and_does_not_change_the_run(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refine_lowers_the_error_and_does_not_change_the_run(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = _contents(folder)
     first = json_of(capsys, "refine", folder)
     after = _contents(folder)
@@ -253,16 +297,22 @@ def test_refine_lowers_the_error_and_does_not_change_the_run(folder: Path, capsy
     assert 0 < float(str(scores["ate_m"])) < 2 * first["ate_before_m"]
 
 
-def test_refine_warns_where_it_is_further_off_than_the_run_says(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_refine_warns_where_it_is_further_off_than_the_run_says(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     run = read_saved_run(folder)
     for sigma_m in (1.0, 1e-6):
         caplog.clear()
-        sure = replace(run, tracked=replace(run.tracked, sigmas=np.full((len(run.tracked.frames), 2), sigma_m)))
+        sure = replace(
+            run, tracked=replace(run.tracked, sigmas=np.full((len(run.tracked.frames), 2), sigma_m))
+        )
         refine_run(sure, most=5, priors=False, threads=1, progress=lambda done: None)
         assert ("times its standard deviation" in caplog.text) == (sigma_m < 1e-3)
 
 
-def test_refine_uses_the_matches_of_loops(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refine_uses_the_matches_of_loops(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Tracks of three frames drift; a loop says where the camera has come back to."""
     run = _make_run(round_trip(), tmp_path / "run", lost_after=3)
     truth = read_saved_run(run).truth
@@ -272,13 +322,17 @@ def test_refine_uses_the_matches_of_loops(tmp_path: Path, capsys: pytest.Capture
         if with_loop:
             _add_loop(run, LOOP)
         facts.append(json_of(capsys, "refine", run))
-        refined = with_poses(read_saved_run(run), run / "refined").tracked.trajectory.T_world_body[list(LOOP)]
+        refined = with_poses(read_saved_run(run), run / "refined").tracked.trajectory.T_world_body[
+            list(LOOP)
+        ]
         gap = se3_inverse(se3_inverse(true[0]) @ true[1]) @ se3_inverse(refined[0]) @ refined[1]
         errors.append(float(np.linalg.norm(gap[:3, 3])))
     assert [f["loops"] for f in facts] == [0, 1]
     assert errors[1] < 0.5 * errors[0], errors
     assert "its loops moved the poses away" in refused(capsys, "refine", run, "--priors", "filter")
-    exported = json_of(capsys, "export", "colmap", run, "--no-images", "--refined", "--keyframes", "12")
+    exported = json_of(
+        capsys, "export", "colmap", run, "--no-images", "--refined", "--keyframes", "12"
+    )
     assert exported["loops"] == 1
     model = pycolmap.Reconstruction(run / "colmap" / "sparse" / "0")
     images = [model.find_image_with_name(f"left/{k:06d}.png") for k in LOOP]
@@ -291,7 +345,9 @@ def test_a_feature_of_several_loops_is_one_point() -> None:
     both = np.ones(2, dtype=np.bool_)
 
     def loop(first: int, second: int, one: list[int], other: list[int]) -> LoopEvent:
-        return LoopEvent(second, 0, 0, 0, 2, 0.0, False, first, True, LoopMatches(z[one], z[other], both, both))
+        return LoopEvent(
+            second, 0, 0, 0, 2, 0.0, False, first, True, LoopMatches(z[one], z[other], both, both)
+        )
 
     loops = [loop(10, 30, [0, 1], [2, 3]), loop(10, 31, [0, 1], [4, 5])]
     found = loop_rows(loops, np.array([10, 20, 30, 31]))
@@ -309,10 +365,14 @@ def test_priors_need_a_filter_that_reproduces_the_run(
     held = json_of(capsys, "refine", folder, "--priors", "filter", "--keyframes", "12")
     assert held["priors"] == "filter"
     free = json_of(capsys, "refine", folder, "--keyframes", "12")
-    assert float(str(held["moved_rms_m"])) < float(str(free["moved_rms_m"])), "priors keep the poses near the filter's"
+    assert float(str(held["moved_rms_m"])) < float(str(free["moved_rms_m"])), (
+        "priors keep the poses near the filter's"
+    )
     config = (folder / "config.yaml").read_text()
     assert "pixel_sigma_px: 0.75" in config
-    (folder / "config.yaml").write_text(config.replace("pixel_sigma_px: 0.75", "pixel_sigma_px: 2.5"))
+    (folder / "config.yaml").write_text(
+        config.replace("pixel_sigma_px: 0.75", "pixel_sigma_px: 2.5")
+    )
     other = json_of(capsys, "refine", folder, "--priors", "filter", "--keyframes", "12")
     assert other["priors"] == "none"
     assert "does not reproduce" in caplog.text
@@ -348,10 +408,13 @@ def test_refine_reports_unusable_runs(
     assert "repeat its run with --save-observations" in refused(capsys, "refine", folder)
 
 
-# --- export ---------------------------------------------------------------------------------------------------------
+# --- export
+# ---------------------------------------------------------------------------------------------------------
 
 
-def test_export_without_images_is_a_reference_for_eval(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_without_images_is_a_reference_for_eval(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     facts = json_of(capsys, "export", "colmap", folder, "--no-images")
     assert float(str(facts["mean_reprojection_error_px"])) < 2 * SIGMA_PX
     scores = json_of(capsys, "eval", folder, folder / "colmap")
@@ -369,7 +432,9 @@ def test_export_without_images_is_a_reference_for_eval(folder: Path, capsys: pyt
     assert [document[k] for k in ("fl_x", "fl_y", "cx", "cy")] == pytest.approx(list(camera.params))
     json_of(capsys, "refine", folder)
     refined = json_of(capsys, "export", "colmap", folder, "--no-images", "--refined")
-    assert float(str(refined["mean_reprojection_error_px"])) < float(str(facts["mean_reprojection_error_px"]))
+    assert float(str(refined["mean_reprojection_error_px"])) < float(
+        str(facts["mean_reprojection_error_px"])
+    )
 
 
 def test_export_reports_missing_images(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -378,7 +443,8 @@ def test_export_reports_missing_images(folder: Path, capsys: pytest.CaptureFixtu
     assert "create it with `vio refine" in refused(capsys, "export", "colmap", folder, "--refined")
 
 
-# --- rendered images ------------------------------------------------------------------------------------------------
+# --- rendered images
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -386,7 +452,9 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Make a KITTI folder of 14 rendered frames, and a run on it with exact tracks."""
     place = tmp_path_factory.mktemp("rendered")
     motion = hand_held(duration_s=5.0, seed=2)
-    plan = simulate(room(1, texel_m=0.006), small_rig(320, 200), motion, rate_hz=3.0, effects=CLEAN, seed=1)
+    plan = simulate(
+        room(1, texel_m=0.006), small_rig(320, 200), motion, rate_hz=3.0, effects=CLEAN, seed=1
+    )
     export_kitti(SimulatedRecording(plan), place / "kitti")
     dataset = open_dataset(place / "kitti")
     front = OracleFrontend(plan, OracleSettings(max_features=80, sigma_px=0.1), seed=1)
@@ -413,7 +481,9 @@ def test_export_writes_images_and_colours(
     model.extract_colors_for_all_images(out / "images", num_threads=1)
     theirs = np.array([point.color for point in model.points3D.values()], dtype=float)
     mine = np.array([ours[m] for m in model.points3D], dtype=float)
-    assert np.corrcoef(mine[:, 0], theirs[:, 0])[0, 1] > 0.9, "COLMAP finds the same colours at the same places"
+    assert np.corrcoef(mine[:, 0], theirs[:, 0])[0, 1] > 0.9, (
+        "COLMAP finds the same colours at the same places"
+    )
 
 
 def test_check_agrees_with_a_correct_run_and_estimates_the_scale(
@@ -426,7 +496,11 @@ def test_check_agrees_with_a_correct_run_and_estimates_the_scale(
     assert facts["scale"] == pytest.approx(1.0, abs=0.02)
     assert facts["loops_in_model"] == facts["loops"] == 1
     assert (rendered[1] / "check" / "check.png").stat().st_size > 10_000
-    assert sorted(p.name for p in (rendered[1] / "check").iterdir()) == ["check.json", "check.png", "incremental"]
+    assert sorted(p.name for p in (rendered[1] / "check").iterdir()) == [
+        "check.json",
+        "check.png",
+        "incremental",
+    ]
 
 
 def test_keyframes_at_both_ends_of_a_loop_are_matched() -> None:
@@ -449,7 +523,15 @@ def test_a_step_that_only_a_loop_joins_is_a_gap() -> None:
     points = np.zeros((8, 8), dtype=np.int64)
     for a, b in [(0, 1), (1, 2), (2, 3), (4, 5), (5, 6), (6, 7), (0, 7)]:
         points[a, b] = points[b, a] = 20
-    assert linked_steps(points, np.arange(8)).tolist() == [True, True, True, False, True, True, True]
+    assert linked_steps(points, np.arange(8)).tolist() == [
+        True,
+        True,
+        True,
+        False,
+        True,
+        True,
+        True,
+    ]
     points[3, 4] = points[4, 3] = 20
     assert linked_steps(points, np.arange(8)).all()
     assert not linked_steps(points, np.array([0, 1, 2, 3, 30, 31, 32, 33]))[3], "far apart in time"
@@ -468,7 +550,9 @@ def test_images_without_texture_are_not_observable(
     for facts in report["mappers"].values():  # type: ignore[attr-defined]
         assert facts["verdict"].startswith("not observable because")
         assert facts["registered"] == 0
-    facts = json_of(capsys, "calibrate", blank, "--out", tmp_path / "cal", "--pairs", "3", "--frames", "6")
+    facts = json_of(
+        capsys, "calibrate", blank, "--out", tmp_path / "cal", "--pairs", "3", "--frames", "6"
+    )
     assert "have no texture" in facts["stereo"]["verdict"]  # type: ignore[index]
     assert facts["findings"] == []
 
@@ -492,7 +576,8 @@ def test_calibrate_measures_rectified_images_and_reports_swapped_ones(
     assert [f["fault"] for f in facts["findings"]] == ["cameras swapped"]  # type: ignore[attr-defined]
 
 
-# --- comparison -----------------------------------------------------------------------------------------------------
+# --- comparison
+# -----------------------------------------------------------------------------------------------------
 
 
 def test_comparison_estimates_the_scale_and_locates_a_jump(saved: TrackedPath) -> None:
@@ -503,7 +588,9 @@ def test_comparison_estimates_the_scale_and_locates_a_jump(saved: TrackedPath) -
     T[:, :3, 3] *= 1.01
     jump = len(rows) // 2
     T[jump:, :3, 3] += [0.05, 0, 0]
-    found: KeyframeComparison = compare_keyframes(saved, rows, se3_exp([1, 2, 3, 0.1, 0.2, 0.3]) @ T)
+    found: KeyframeComparison = compare_keyframes(
+        saved, rows, se3_exp([1, 2, 3, 0.1, 0.2, 0.3]) @ T
+    )
     assert found.scale == pytest.approx(1.01, abs=0.03)
     assert len(found.segments) == 1
     assert (found.segments[0].first_frame, found.segments[0].last_frame) == (
@@ -537,12 +624,20 @@ def test_pure_rotation_has_no_scale(saved: TrackedPath) -> None:
 
 
 def test_rejects_a_run_without_right_matches(saved: TrackedPath) -> None:
-    without_right = replace(saved, tracks=replace(saved.tracks, has_right=np.zeros_like(saved.tracks.has_right)))
-    with pytest.raises(EstimationError, match="not observable because no feature has a right match"):
+    without_right = replace(
+        saved, tracks=replace(saved.tracks, has_right=np.zeros_like(saved.tracks.has_right))
+    )
+    with pytest.raises(
+        EstimationError, match="not observable because no feature has a right match"
+    ):
         choose_keyframes(without_right)
 
 
-def test_noise_images_are_not_calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_noise_images_are_not_calibrated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     source = make_kitti(tmp_path / "kitti")
-    facts = json_of(capsys, "calibrate", source, "--out", tmp_path / "cal", "--pairs", "3", "--frames", "4")
+    facts = json_of(
+        capsys, "calibrate", source, "--out", tmp_path / "cal", "--pairs", "3", "--frames", "4"
+    )
     assert "not observable because" in facts["stereo"]["verdict"]  # type: ignore[index]

@@ -31,7 +31,9 @@ def test_on_and_off_need_no_quotes(word: str, tmp_path: Path) -> None:
 
 
 def test_defaults_then_file_then_command_line(tmp_path: Path) -> None:
-    path = _write(tmp_path, "vislam:\n  pixel_sigma_px: 2\n  iterations: 3\nselector:\n  name: information\n")
+    path = _write(
+        tmp_path, "vislam:\n  pixel_sigma_px: 2\n  iterations: 3\nselector:\n  name: information\n"
+    )
     config = load_config(path, ["vislam.iterations=5", "selector.keep_fraction=0.5"])
     assert config.vislam.pixel_sigma_px == 2.0
     assert isinstance(config.vislam.pixel_sigma_px, float)
@@ -42,7 +44,9 @@ def test_defaults_then_file_then_command_line(tmp_path: Path) -> None:
 
 
 def test_effective_configuration_reads_back_equal(tmp_path: Path) -> None:
-    config = load_config(None, ["vislam.gate_probability=null", "motion=none", "selector.name=visibility"])
+    config = load_config(
+        None, ["vislam.gate_probability=null", "motion=none", "selector.name=visibility"]
+    )
     assert config.vislam.gate_probability is None
     assert load_config(_write(tmp_path, to_yaml(config))) == config
 
@@ -56,25 +60,47 @@ def test_empty_file_changes_nothing(tmp_path: Path) -> None:
     [
         (
             "vislam:\n  pixel_sigma: 2\n",
-            r"my\.yaml: unknown setting 'vislam\.pixel_sigma'; did you mean 'vislam\.pixel_sigma_px'",
+            r"my\.yaml: unknown setting 'vislam\.pixel_sigma'; did you mean "
+            r"'vislam\.pixel_sigma_px'",
         ),
         ("visalm:\n  iterations: 2\n", r"did you mean 'vislam'"),
         ("zzzzqq: 1\n", r"valid here: motion, backend"),
-        ("frontend:\n  klt:\n    target_features: 300\n", r"did you mean 'frontend\.grid\.target_features'"),
-        ("frontend:\n  match:\n    consensus_seed: 9\n", r"did you mean 'frontend\.consensus\.seed'"),
-        ("frontend:\n  match:\n    max_points: 2\n", r"did you mean 'frontend\.match\.max_keypoints'"),
-        ("frontend:\n  klt:\n    window_px: 21\n", r"'frontend\.klt\.window_px'; it is fixed since 0\.3"),
-        ("msckf:\n  calibrate: both\n", r"'msckf\.calibrate'; it is 'msckf\.calibrate_camera_imu' since 0\.3"),
+        (
+            "frontend:\n  klt:\n    target_features: 300\n",
+            r"did you mean 'frontend\.grid\.target_features'",
+        ),
+        (
+            "frontend:\n  match:\n    consensus_seed: 9\n",
+            r"did you mean 'frontend\.consensus\.seed'",
+        ),
+        (
+            "frontend:\n  match:\n    max_points: 2\n",
+            r"did you mean 'frontend\.match\.max_keypoints'",
+        ),
+        (
+            "frontend:\n  klt:\n    window_px: 21\n",
+            r"'frontend\.klt\.window_px'; it is fixed since 0\.3",
+        ),
+        (
+            "msckf:\n  calibrate: both\n",
+            r"'msckf\.calibrate'; it is 'msckf\.calibrate_camera_imu' since 0\.3",
+        ),
         ("target_features: 300\n", r"did you mean 'frontend\.grid\.target_features'"),
         ("vislam: 3\n", r"'vislam' is a section"),
         ("vislam:\n  iterations: 2.5\n", r"vislam\.iterations takes a whole number, got 2\.5"),
         ("vislam:\n  iterations: true\n", r"takes a whole number, got True"),
         ("vislam:\n  pixel_sigma_px: 1e-3\n", r"to YAML 1\.1 this is text; write 0\.001"),
-        ("vislam:\n  pixel_sigma_px: 1e300\n", r"got '1e300' \(to YAML 1\.1 this is text; write 1\.0e\+300\)"),
+        (
+            "vislam:\n  pixel_sigma_px: 1e300\n",
+            r"got '1e300' \(to YAML 1\.1 this is text; write 1\.0e\+300\)",
+        ),
         ("vislam:\n  pixel_sigma_px: nan\n", r"got 'nan'$"),
         ("vislam:\n  pixel_sigma_px: .nan\n", r"must be a number, got nan"),
         ("vislam:\n  use_stale: 1\n", r"takes true or false, got 1"),
-        ("vislam:\n  noise: litral\n", r"is one of consistent, literal, not 'litral'; did you mean 'literal'"),
+        (
+            "vislam:\n  noise: litral\n",
+            r"is one of consistent, literal, not 'litral'; did you mean 'literal'",
+        ),
         ("- 1\n- 2\n", r"is a mapping of settings, not a list"),
         ("msckf:\n  clones: 5\nmsckf:\n  clones: 7\n", r"'msckf' is given twice"),
         ("vislam: [\n", r"not valid YAML"),
@@ -86,7 +112,9 @@ def test_reports_mistakes_in_the_file(tmp_path: Path, text: str, message: str) -
         load_config(_write(tmp_path, text))
 
 
-@pytest.mark.parametrize("override", ["vislam.iterations", "=3", "vislam.iterations=[", "vislam=3", "a.b.c=1"])
+@pytest.mark.parametrize(
+    "override", ["vislam.iterations", "=3", "vislam.iterations=[", "vislam=3", "a.b.c=1"]
+)
 def test_reports_mistakes_in_an_override(override: str) -> None:
     with pytest.raises(ConfigError, match="--set"):
         load_config(None, [override])
@@ -124,7 +152,11 @@ def test_shipped_files_are_valid_and_contain_deviations_only() -> None:
 
 
 def _numbers() -> list[SettingInfo]:
-    return [s for s in describe(Config()) if isinstance(s.default, (int, float)) and not isinstance(s.default, bool)]
+    return [
+        s
+        for s in describe(Config())
+        if isinstance(s.default, (int, float)) and not isinstance(s.default, bool)
+    ]
 
 
 @pytest.mark.parametrize("info", _numbers(), ids=lambda info: info.key)
@@ -133,25 +165,37 @@ def test_every_number_has_a_range_and_other_values_are_rejected(info: SettingInf
     for word in info.range.split(" and "):
         name, bound = word.rsplit(" ", 1)
         outward = -1 if name in ("at least", "above") else 1
-        step = outward if isinstance(info.default, int) else outward * max(abs(float(bound)), 1.0) * 1e-6
+        step = (
+            outward
+            if isinstance(info.default, int)
+            else outward * max(abs(float(bound)), 1.0) * 1e-6
+        )
         outside = float(bound) + (step if name.startswith("at") else 0)
         text = str(int(outside)) if isinstance(info.default, int) else f"{outside:.9f}"
-        with pytest.raises(ConfigError, match=rf"--set {info.key}.*{info.key} must be {info.range}, got"):
+        with pytest.raises(
+            ConfigError, match=rf"--set {info.key}.*{info.key} must be {info.range}, got"
+        ):
             load_config(None, [f"{info.key}={text}"])
         if name.startswith("at"):
-            load_config(None, [f"{info.key}={bound if isinstance(info.default, int) else float(bound)}"])
+            load_config(
+                None, [f"{info.key}={bound if isinstance(info.default, int) else float(bound)}"]
+            )
 
 
 def test_rejects_infinite_numbers_and_checks_ranges_in_code() -> None:
     with pytest.raises(ConfigError, match=r"msckf\.gravity_mps2 must be finite"):
         load_config(None, ["msckf.gravity_mps2=.inf"])
-    with pytest.raises(ConfigError, match=r"msckf\.clones must be at least 3 and at most 100, got 2"):
+    with pytest.raises(
+        ConfigError, match=r"msckf\.clones must be at least 3 and at most 100, got 2"
+    ):
         MsckfSettings(clones=2)
     with pytest.raises(ConfigError, match=r"msckf\.pixel_sigma_max_px must be above 0, got -3"):
         MsckfSettings(pixel_sigma_max_px=-3.0)
 
 
-def test_preset_is_found_by_its_name_and_is_packaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_preset_is_found_by_its_name_and_is_packaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     fast, default = load_config(Path("fast")), Config()
     assert fast.frontend.grid.target_features < default.frontend.grid.target_features

@@ -1,4 +1,6 @@
-"""Constants of the rig that are considered: the covariance has how the estimate follows them, which moves nothing."""
+"""Constants of the rig that are considered: the covariance has how the estimate follows them,
+which moves nothing.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def _seen_by(constant: str, off: float, seen: Observations) -> Observations:
 
 @pytest.mark.parametrize("motion", [None, "imu"])
 @pytest.mark.parametrize("field", ["off", "on"])
-def test_the_covariance_says_how_the_pose_follows_the_rig(motion: MotionSource | None, field: str) -> None:
+def test_the_covariance_says_how_the_pose_follows_the_rig(
+    motion: MotionSource | None, field: str
+) -> None:
     """Against runs on images in which one constant is off at a time."""
     settings = replace(ON, calibrate_stereo=field)
     known = replace(settings, stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
@@ -52,18 +56,24 @@ def test_the_covariance_says_how_the_pose_follows_the_rig(motion: MotionSource |
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(np.sqrt(np.diag(added)), scale, rtol=0.15)
     if motion is None:  # with an IMU, yaw is measured at a tilt that is an estimate, too
-        np.testing.assert_allclose(added / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.1)
+        np.testing.assert_allclose(
+            added / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.1
+        )
 
 
 def test_the_covariances_of_points_say_how_they_follow_the_rig() -> None:
-    """Against runs on images in which one constant is off at a time: points of tracks and landmarks of the state."""
+    """Against runs on images in which one constant is off at a time: points of tracks and
+    landmarks of the state.
+    """
     known = replace(ON, stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
     run, exact = (fly(ROUND, None, settings).filter.landmarks() for settings in (ON, known))
     np.testing.assert_array_equal(run.ids, exact.ids)
     added = np.trace(run.covariance - exact.covariance, axis1=1, axis2=2)
     expected = np.zeros(len(run.ids))
     for constant, sigma in SIGMAS.items():
-        of_rig = fly(ROUND, None, known, spoil=lambda k, seen, c=constant: _seen_by(c, OFF, seen)).filter.landmarks()  # type: ignore[misc]
+        of_rig = fly(
+            ROUND, None, known, spoil=lambda k, seen, c=constant: _seen_by(c, OFF, seen)
+        ).filter.landmarks()  # type: ignore[misc]
         np.testing.assert_array_equal(run.ids, of_rig.ids)
         expected += np.sum((of_rig.p_world - exact.p_world) ** 2, axis=1) * (sigma / OFF) ** 2
     ratio = np.sqrt(added / expected)
@@ -84,7 +94,12 @@ def test_a_prior_follows_its_constants(scaled: bool) -> None:
         prior = Prior(P.copy())
         prior.scale_test, prior.error_D_constants = ScaleTest(), V.copy()
         prior.delta = -V @ constants
-        prior.absorb(H.T @ H, H.T @ (r - columns @ constants), scaled=moved if scaled else None, considered=H.T @ C)
+        prior.absorb(
+            H.T @ H,
+            H.T @ (r - columns @ constants),
+            scaled=moved if scaled else None,
+            considered=H.T @ C,
+        )
         return prior
 
     without = absorbed(np.zeros(1 + CONSIDERED))

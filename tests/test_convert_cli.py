@@ -36,13 +36,19 @@ def test_a_converted_flight_is_the_same_recording(form: str, flight: Path, tmp_p
     for recording in (a, b):
         assert recording.reference.times_ns is not None
         at = np.searchsorted(recording.reference.times_ns, recording.frame_times_ns)
-        moved.append(np.linalg.norm(recording.reference.positions[at[9]] - recording.reference.positions[at[0]]))
+        moved.append(
+            np.linalg.norm(
+                recording.reference.positions[at[9]] - recording.reference.positions[at[0]]
+            )
+        )
     assert moved[0] == pytest.approx(moved[1], rel=1e-9)
     if form != "kitti":  # whose clock begins at zero
         assert a.camera == b.camera
         np.testing.assert_array_equal(a.T_cam0_imu, b.T_cam0_imu)
         assert_same_events(before, after)
-        ours, theirs = (run(dataset, load_config(), stop=6).trajectory for dataset in (before, after))
+        ours, theirs = (
+            run(dataset, load_config(), stop=6).trajectory for dataset in (before, after)
+        )
         np.testing.assert_array_equal(ours.T_world_body, theirs.T_world_body)
         assert after.imu_noise == before.imu_noise  # type: ignore[attr-defined]
 
@@ -55,7 +61,9 @@ def test_a_conversion_never_removes_its_source_nor_what_others_put_beside_it(
     for source, out in ((first, first), (first, tmp_path)):
         assert main(["convert", str(source), "--to", "kitti", "--out", str(out)]) == 1
         assert "itself and will not be replaced; choose another path" in capsys.readouterr().err
-    assert main(["convert", str(flight), "--to", "kitti", "--out", str(first), "--stop", "2"]) == 0, "an earlier result"
+    assert (
+        main(["convert", str(flight), "--to", "kitti", "--out", str(first), "--stop", "2"]) == 0
+    ), "an earlier result"
     (first / "run").mkdir()
     (first / "run" / "notes.txt").write_text("mine")
     assert main(["convert", str(flight), "--to", "plain", "--out", str(first), "--stop", "2"]) == 1
@@ -69,7 +77,9 @@ def _needs_rosbags(form: str) -> None:
 
 
 @pytest.mark.parametrize("form", BAGS)
-def test_a_bag_without_the_files_beside_it_has_its_calibration(form: str, flight: Path, tmp_path: Path) -> None:
+def test_a_bag_without_the_files_beside_it_has_its_calibration(
+    form: str, flight: Path, tmp_path: Path
+) -> None:
     """CameraInfo and /tf_static, whose quaternions cost the last bits of the extrinsics."""
     _needs_rosbags(form)
     out = tmp_path / "out"
@@ -85,10 +95,14 @@ def test_a_bag_without_the_files_beside_it_has_its_calibration(form: str, flight
     np.testing.assert_array_equal(alone.reference.T_world_body, beside.reference.T_world_body)
 
 
-def test_a_bag_keeps_velocities_and_says_how_they_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bag_keeps_velocities_and_says_how_they_are_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _needs_rosbags("mcap")
     source = make_kitti(tmp_path / "kitti")
-    assert json_of(capsys, "convert", source, "--to", "mcap", "--out", tmp_path / "bag")["notes"] == []
+    assert (
+        json_of(capsys, "convert", source, "--to", "mcap", "--out", tmp_path / "bag")["notes"] == []
+    )
     a, b = (
         [event for event in open_dataset(path).events() if isinstance(event, VelocitySample)]
         for path in (source, tmp_path / "bag")
@@ -101,7 +115,23 @@ def test_a_bag_keeps_velocities_and_says_how_they_are_read(tmp_path: Path, capsy
 def test_a_raw_recording_is_written_rectified(tmp_path: Path) -> None:
     source = make_euroc(tmp_path / "raw")
     out = tmp_path / "out"
-    assert main(["convert", str(source), "--to", "plain", "--out", str(out), "--start", "1", "--stop", "3"]) == 0
+    assert (
+        main(
+            [
+                "convert",
+                str(source),
+                "--to",
+                "plain",
+                "--out",
+                str(out),
+                "--start",
+                "1",
+                "--stop",
+                "3",
+            ]
+        )
+        == 0
+    )
     before, after = open_dataset(source), open_dataset(out)
     assert after.recording.camera == before.recording.camera
     ours, theirs = list(before.events(1, 3)), list(after.events())
@@ -119,7 +149,9 @@ def test_names_of_rendered_images_sort_by_time_as_text(flight: Path, tmp_path: P
 
 
 def test_names_agree_with_their_list_where_the_last_frame_is_unreadable(tmp_path: Path) -> None:
-    """Of a clock from zero, the last frame's time has more digits than those of the frames that were written."""
+    """Of a clock from zero, the last frame's time has more digits than those of the frames that
+    were written.
+    """
     source = make_plain(tmp_path / "plain")
     (source / "imu.csv").unlink(missing_ok=True)
     (source / "times.txt").write_text("0.85\n0.9\n0.95\n1.0\n")
@@ -127,19 +159,28 @@ def test_names_agree_with_their_list_where_the_last_frame_is_unreadable(tmp_path
     last.write_bytes(last.read_bytes()[:-30])
     out = tmp_path / "out"
     assert main(["convert", str(source), "--to", "euroc", "--out", str(out)]) == 0
-    assert open_dataset(out).recording.frame_times_ns.tolist() == [850_000_000, 900_000_000, 950_000_000]
+    assert open_dataset(out).recording.frame_times_ns.tolist() == [
+        850_000_000,
+        900_000_000,
+        950_000_000,
+    ]
     names = sorted(path.name for path in (out / "mav0" / "cam0" / "data").iterdir())
     assert names == ["0850000000.png", "0900000000.png", "0950000000.png"]
     assert names[0] in (out / "mav0" / "cam0" / "data.csv").read_text()
 
 
-def test_velocities_and_poses_at_the_frames_go_to_kitti(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_velocities_and_poses_at_the_frames_go_to_kitti(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     source = make_kitti(tmp_path / "kitti")
     out = tmp_path / "out"
     facts = json_of(capsys, "convert", source, "--to", "kitti", "--out", out)
     before, after = open_dataset(source), open_dataset(out)
     assert (after.recording.kind, facts["notes"]) == ("kitti", [])
-    a, b = ([event for event in dataset.events() if isinstance(event, VelocitySample)] for dataset in (before, after))
+    a, b = (
+        [event for event in dataset.events() if isinstance(event, VelocitySample)]
+        for dataset in (before, after)
+    )
     np.testing.assert_array_equal([s.linear for s in a], [s.linear for s in b])
     assert len(after.recording.reference) == len(before.recording.reference)
     assert main(["convert", str(source), "--to", "euroc", "--out", str(tmp_path / "e")]) == 0

@@ -41,14 +41,26 @@ def test_tum_and_euroc_keep_poses_and_nanoseconds(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body, atol=1e-14)
 
 
-def test_kitti_describes_the_camera_and_gets_its_times_back(tmp_path: Path, extrinsics: str) -> None:
+def test_kitti_describes_the_camera_and_gets_its_times_back(
+    tmp_path: Path, extrinsics: str
+) -> None:
     write_tum(tmp_path / "a.tum", TRUTH)
     there = convert(tmp_path / "a.tum", "kitti", tmp_path / "b.txt", "--calibration", extrinsics)
     assert (there.body, there.times_ns) == ("cam0", None)
-    np.testing.assert_allclose(there.T_world_body, TRUTH.in_cam0(T_CAM0_IMU).T_world_body, atol=1e-13)
+    np.testing.assert_allclose(
+        there.T_world_body, TRUTH.in_cam0(T_CAM0_IMU).T_world_body, atol=1e-13
+    )
     times = tmp_path / "times.txt"
     times.write_text("".join(f"{t}\n" for t in TIMES_NS))
-    back = convert(tmp_path / "b.txt", "euroc", tmp_path / "c.csv", "--times", str(times), "--calibration", extrinsics)
+    back = convert(
+        tmp_path / "b.txt",
+        "euroc",
+        tmp_path / "c.csv",
+        "--times",
+        str(times),
+        "--calibration",
+        extrinsics,
+    )
     assert back.times_ns.tolist() == TIMES_NS.tolist()
     np.testing.assert_allclose(back.T_world_body, TRUTH.T_world_body, atol=1e-13)
 
@@ -66,8 +78,18 @@ def _camera(path: Path) -> None:
 
 
 BAD = {
-    "the IMU's poses for KITTI": (lambda p: write_tum(p, TRUTH), "kitti", (), "describes imu, not cam0 as"),
-    "the camera's poses for EuRoC": (_camera, "euroc", (), "describes cam0, not imu as the form must"),
+    "the IMU's poses for KITTI": (
+        lambda p: write_tum(p, TRUTH),
+        "kitti",
+        (),
+        "describes imu, not cam0 as",
+    ),
+    "the camera's poses for EuRoC": (
+        _camera,
+        "euroc",
+        (),
+        "describes cam0, not imu as the form must",
+    ),
     "no times": (
         lambda p: write_kitti(p, Trajectory(TRUTH.T_world_body, None, "cam0")),
         "tum",
@@ -75,13 +97,26 @@ BAD = {
         "states no times, which tum form needs; name them with --times FILE",
     ),
     "too few times": (
-        lambda p: (write_kitti(p, Trajectory(TRUTH.T_world_body, None, "cam0")), (p.parent / "t").write_text("1\n2\n")),
+        lambda p: (
+            write_kitti(p, Trajectory(TRUTH.T_world_body, None, "cam0")),
+            (p.parent / "t").write_text("1\n2\n"),
+        ),
         "tum",
         ("--times", "t"),
         "t holds 2 times for 12 poses",
     ),
-    "a bag of poses alone": (lambda p: write_euroc(p, TRUTH), "mcap", (), "is a trajectory: choose --to tum, kitti"),
-    "a part": (lambda p: write_euroc(p, TRUTH), "tum", ("--start", "3"), "choose frames of a recording"),
+    "a bag of poses alone": (
+        lambda p: write_euroc(p, TRUTH),
+        "mcap",
+        (),
+        "is a trajectory: choose --to tum, kitti",
+    ),
+    "a part": (
+        lambda p: write_euroc(p, TRUTH),
+        "tum",
+        ("--start", "3"),
+        "choose frames of a recording",
+    ),
     "a column too many": (
         lambda p: p.write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1 9\n"),
         "euroc",
@@ -98,6 +133,8 @@ def test_bad_trajectories_are_refused_in_one_line(
     make, form, options, message = BAD[name]
     monkeypatch.chdir(tmp_path)
     make(tmp_path / "a.txt")
-    (line,) = refused(capsys, "convert", "a.txt", "--to", form, "--out", "out.txt", *options).splitlines()
+    (line,) = refused(
+        capsys, "convert", "a.txt", "--to", form, "--out", "out.txt", *options
+    ).splitlines()
     assert message in line
     assert not (tmp_path / "out.txt").exists()

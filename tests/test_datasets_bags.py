@@ -1,4 +1,6 @@
-"""ROS bags of both generations: the same recording to the bit, topics, encodings, stamps, and one-line errors."""
+"""ROS bags of both generations: the same recording to the bit, topics, encodings, stamps, and
+one-line errors.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ STORAGES = ("bag", "db3", "mcap")
 
 
 def bag_of(dataset: Dataset, storage: str, path: Path) -> Path:
-    """Write a recording's frames, IMU and ground truth as a bag, with a millisecond between stamp and log."""
+    """Write a recording's frames, IMU and ground truth as a bag, with a millisecond between
+    stamp and log.
+    """
     script = Script(storage)
     for event in dataset.events():
         if isinstance(event, StereoFrame):
@@ -48,7 +52,8 @@ def test_the_left_camera_alone_needs_no_right_image(flight: Path, tmp_path: Path
     script = Script("mcap")
     pairs = frames_of(open_dataset(flight), 0, 4)
     for pair in pairs:
-        of_stereo(script, [(pair.time_ns, pair.left, pair.left[:8, :8])])  # right images of a wrong size
+        # right images of a wrong size
+        of_stereo(script, [(pair.time_ns, pair.left, pair.left[:8, :8])])
     path = script.write(tmp_path / "f")
     rig = Rig.rectified(40.0, 40.0, 31.5, 23.5, 0.11, *reversed(pairs[0].left.shape))  # type: ignore[union-attr,misc]
     (tmp_path / "camchain.yaml").write_text(kalibr_text(rig))
@@ -78,11 +83,14 @@ def test_a_bag_is_the_same_recording_to_the_bit(storage: str, flight: Path, tmp_
         assert b.notes == ()
 
 
-# --- calibration and topics -----------------------------------------------------------------------------------------
+# --- calibration and topics
+# -----------------------------------------------------------------------------------------
 
 
 def plain_script(storage: str = "mcap", frames: int = 4, *, imu: bool = True) -> Script:
-    """A stereo pair with CameraInfo, an IMU of 200 Hz, and its place in /tf_static by way of a base frame."""
+    """A stereo pair with CameraInfo, an IMU of 200 Hz, and its place in /tf_static by way of a
+    base frame.
+    """
     script = of_stereo(Script(storage), noise_frames(frames))
     for side in ("left", "right"):
         script.camera_info(f"/{side}/camera_info", START_NS, RIG.camera, right=side == "right")
@@ -90,7 +98,12 @@ def plain_script(storage: str = "mcap", frames: int = 4, *, imu: bool = True) ->
         script.static(START_NS, "base", "imu", T_BASE_IMU)
         script.static(START_NS, "base", "left", T_BASE_IMU @ se3_inverse(T_CAM0_IMU))
         for k in range(-4, 10 * frames - 6):
-            script.imu("/imu", ImuSample(START_NS + 5_000_000 * k, np.array([0.1, 0.2, k]), np.array([0.0, 0, 9.8])))
+            script.imu(
+                "/imu",
+                ImuSample(
+                    START_NS + 5_000_000 * k, np.array([0.1, 0.2, k]), np.array([0.0, 0, 9.8])
+                ),
+            )
     return script
 
 
@@ -110,7 +123,9 @@ def test_without_its_pose_the_imu_is_left_out_and_it_is_said(tmp_path: Path) -> 
     script.notes = [note for note in script.notes if note.topic != "/tf_static"]
     recording = open_dataset(script.write(tmp_path / "f")).recording
     assert recording.motion == frozenset()
-    assert any("/imu cannot be used: its pose in the camera is unknown" in note for note in recording.notes)
+    assert any(
+        "/imu cannot be used: its pose in the camera is unknown" in note for note in recording.notes
+    )
 
 
 def test_compressed_images_and_empty_topics(tmp_path: Path) -> None:
@@ -148,7 +163,9 @@ def test_topics_may_be_named(tmp_path: Path) -> None:
     path = script.write(tmp_path / "f")
     calibration = tmp_path / "rig.yaml"
     calibration.write_text(kalibr_text(RIG))
-    dataset = open_dataset(path, DatasetSettings(topics="left=/a, right=b", calibration=calibration))
+    dataset = open_dataset(
+        path, DatasetSettings(topics="left=/a, right=b", calibration=calibration)
+    )
     assert [topic.name for topic in dataset.topics] == ["/a", "/b"]
     assert "not used: /left/image_raw, /right/image_raw" in dataset.recording.notes
 
@@ -157,9 +174,17 @@ def test_odometry_is_velocity_and_reference(tmp_path: Path) -> None:
     script = plain_script(imu=False)
     script.static(START_NS, "left", "base", T_CAM0_IMU)
     for k in range(4):
-        script.odometry("/odom", START_NS + 50_000_000 * k, se3_exp([k, 0, 0, 0, 0, 0]), [1.0, 0, 0], [0, 0, 0.1 * k])
+        script.odometry(
+            "/odom",
+            START_NS + 50_000_000 * k,
+            se3_exp([k, 0, 0, 0, 0, 0]),
+            [1.0, 0, 0],
+            [0, 0, 0.1 * k],
+        )
     calibration = tmp_path / "rig.yaml"
-    calibration.write_text(kalibr_text(Rig.rectified(40.0, 40.0, 31.5, 23.5, 0.11, 64, 48, T_CAM0_IMU)))
+    calibration.write_text(
+        kalibr_text(Rig.rectified(40.0, 40.0, 31.5, 23.5, 0.11, 64, 48, T_CAM0_IMU))
+    )
     settings = DatasetSettings(topics="velocity=/odom,reference=/odom", calibration=calibration)
     named = script.write(tmp_path / "f")
     dataset = open_dataset(named, settings)
@@ -169,7 +194,10 @@ def test_odometry_is_velocity_and_reference(tmp_path: Path) -> None:
     np.testing.assert_allclose(dataset.recording.reference.positions[:, 0], range(4))
     by_itself = open_dataset(named, DatasetSettings(calibration=calibration)).recording
     assert by_itself.motion == {"velocity"}
-    assert any("/odom may be ground truth: if so, give --topics reference=/NAME" in n for n in by_itself.notes)
+    assert any(
+        "/odom may be ground truth: if so, give --topics reference=/NAME" in n
+        for n in by_itself.notes
+    )
 
 
 def test_a_file_beside_the_bag_that_is_no_calibration_leaves_camera_info(tmp_path: Path) -> None:
@@ -183,7 +211,9 @@ def test_a_file_beside_the_bag_that_is_no_calibration_leaves_camera_info(tmp_pat
 
 
 def test_the_moving_frames_of_tf_are_ground_truth_where_they_are_named(tmp_path: Path) -> None:
-    """/tf moves a base, which carries the IMU; the origin of the odometry moves, too, in the frame of a map."""
+    """/tf moves a base, which carries the IMU; the origin of the odometry moves, too, in the
+    frame of a map.
+    """
     script = plain_script()
     expected = []
     for k in range(4):
@@ -206,21 +236,26 @@ def test_several_bags_of_a_folder_are_joined(storage: str, tmp_path: Path) -> No
     for name, part in zip(names, (frames[:3], frames[3:]), strict=True):
         script = of_stereo(Script(storage), part)
         for side in ("left", "right"):
-            script.camera_info(f"/{side}/camera_info", part[0][0], RIG.camera, right=side == "right")
+            script.camera_info(
+                f"/{side}/camera_info", part[0][0], RIG.camera, right=side == "right"
+            )
         script.write(tmp_path / name)
     dataset = open_dataset(tmp_path)
     assert [event.time_ns for event in dataset.events()] == [time_ns for time_ns, _, _ in frames]
     assert f"2 bags are joined: {', '.join(names)}" in dataset.recording.notes
 
 
-# --- stamps ---------------------------------------------------------------------------------------------------------
+# --- stamps
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_messages_out_of_order_are_sorted_and_said(tmp_path: Path) -> None:
     script = plain_script()
     notes = [n for n in script.notes if n.topic == "/imu"]
     first, second = notes[6], notes[7]
-    script.notes[script.notes.index(first)] = type(first)(first.topic, first.kind, second.logged_ns + 1, first.fields)
+    script.notes[script.notes.index(first)] = type(first)(
+        first.topic, first.kind, second.logged_ns + 1, first.fields
+    )
     dataset = open_dataset(script.write(tmp_path / "f"))
     times = [event.time_ns for event in dataset.events() if isinstance(event, ImuSample)]
     assert times == sorted(times)
@@ -231,7 +266,9 @@ def test_frames_logged_late_come_in_the_order_of_their_stamps(tmp_path: Path) ->
     """The right image of frame 1 is logged after both images of frame 2."""
     script = plain_script(imu=False)
     late = [n for n in script.notes if n.topic == "/right/image_raw"][1]
-    script.notes[script.notes.index(late)] = type(late)(late.topic, late.kind, START_NS + 130_000_000, late.fields)
+    script.notes[script.notes.index(late)] = type(late)(
+        late.topic, late.kind, START_NS + 130_000_000, late.fields
+    )
     frames = frames_of(open_dataset(script.write(tmp_path / "f")))
     assert [frame.index for frame in frames] == [0, 1, 2, 3]
     for frame, (_, left, right) in zip(frames, noise_frames(4), strict=True):
@@ -247,7 +284,10 @@ def test_a_right_camera_that_is_late_and_drops_frames(tmp_path: Path) -> None:
             script.image("/right/image_raw", time_ns + 2_000_000, right)
     recording = open_dataset(script.write(tmp_path / "f")).recording
     assert len(recording.frame_times_ns) == 5
-    assert "1 images of /left/image_raw and 0 of /right/image_raw have no partner and are skipped" in recording.notes
+    assert (
+        "1 images of /left/image_raw and 0 of /right/image_raw have no partner and are skipped"
+        in recording.notes
+    )
     assert any("/left/image_raw (median +2.000 ms)" in note for note in recording.notes)
 
 
@@ -256,8 +296,12 @@ def test_images_without_stamps_take_the_times_of_logging(tmp_path: Path) -> None
     for note in script.notes:
         note.fields.header.stamp.sec = note.fields.header.stamp.nanosec = 0
     dataset = open_dataset(script.write(tmp_path / "f"))
-    assert [event.time_ns for event in dataset.events()] == [time_ns for time_ns, _, _ in noise_frames(4)]
-    assert any("headers of /left/image_raw have no stamps" in note for note in dataset.recording.notes)
+    assert [event.time_ns for event in dataset.events()] == [
+        time_ns for time_ns, _, _ in noise_frames(4)
+    ]
+    assert any(
+        "headers of /left/image_raw have no stamps" in note for note in dataset.recording.notes
+    )
 
 
 def test_a_truncated_image_is_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -271,13 +315,16 @@ def test_a_truncated_image_is_skipped(tmp_path: Path, caplog: pytest.LogCaptureF
     assert "the message is truncated" in caplog.text
 
 
-# --- encodings ------------------------------------------------------------------------------------------------------
+# --- encodings
+# ------------------------------------------------------------------------------------------------------
 
 
 class Fields:
     """An image message's fields."""
 
-    def __init__(self, pixels: np.ndarray, encoding: str, *, big: bool = False, pad: int = 0) -> None:
+    def __init__(
+        self, pixels: np.ndarray, encoding: str, *, big: bool = False, pad: int = 0
+    ) -> None:
         self.height, self.width = pixels.shape[:2]
         rows = np.ascontiguousarray(pixels).reshape(self.height, -1).view(np.uint8)
         rows = np.pad(rows, ((0, 0), (0, pad)), constant_values=77)
@@ -327,7 +374,9 @@ def test_colours_are_kept_where_they_are_asked_for() -> None:
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 def test_bayer_patterns_are_told_apart(pattern: str) -> None:
-    """A uniformly red scene, mosaicked by hand: its gray is that of red under the right pattern only."""
+    """A uniformly red scene, mosaicked by hand: its gray is that of red under the right pattern
+    only.
+    """
     mosaic = np.zeros((16, 16), np.uint8)
     for k, letter in enumerate(pattern):
         if letter == "r":
@@ -352,12 +401,16 @@ def test_twelve_bits_in_sixteen_are_scaled_and_said(tmp_path: Path) -> None:
         script.image("/left/image_raw", time_ns, left.astype(np.uint16) * 16, "mono16")
         script.image("/right/image_raw", time_ns, right.astype(np.uint16) * 16, "mono16")
     dataset = open_dataset(script.write(tmp_path / "f"))
-    assert "the images have 16 bits but use 12: the levels 0 to 4095 are scaled to 8 bits" in dataset.recording.notes
+    assert (
+        "the images have 16 bits but use 12: the levels 0 to 4095 are scaled to 8 bits"
+        in dataset.recording.notes
+    )
     frame = next(iter(dataset.events()))
     np.testing.assert_allclose(frame.left, frames[0][1], atol=1)
 
 
-# --- bad bags -------------------------------------------------------------------------------------------------------
+# --- bad bags
+# -------------------------------------------------------------------------------------------------------
 
 
 def _bad(change: Callable[[Script], object]) -> Callable[[Path], Path]:
@@ -404,7 +457,9 @@ def _nan(script: Script) -> None:
 def _other_clock(script: Script) -> None:
     _without("/imu")(script)
     for k in range(100):
-        script.imu("/imu", ImuSample(5_000_000 * k + 1, np.zeros(3), np.array([0, 0, 9.8])), START_NS + k)
+        script.imu(
+            "/imu", ImuSample(5_000_000 * k + 1, np.zeros(3), np.array([0, 0, 9.8])), START_NS + k
+        )
 
 
 def _unsynchronised(script: Script) -> None:
@@ -432,7 +487,11 @@ def _other_size(script: Script) -> None:
 
 
 BAD = {
-    "truncated ROS 1 bag": (_cut("bag", 0.6), None, r"f\.bag: the bag is truncated or damaged .*; copy it"),
+    "truncated ROS 1 bag": (
+        _cut("bag", 0.6),
+        None,
+        r"f\.bag: the bag is truncated or damaged .*; copy it",
+    ),
     "truncated db3": (_cut("db3", 0.5), None, "the bag is truncated or damaged"),
     "truncated mcap": (_cut("mcap", 0.6), None, "the bag is truncated or damaged"),
     "empty file": (_cut("bag", 0.0), None, "no known recording"),
@@ -454,35 +513,86 @@ BAD = {
     "one camera without CameraInfo": (
         _bad(_without("/right/image_raw", "/left/camera_info")),
         None,
-        "holds no CameraInfo for /left/image_raw; give the camera's calibration with --calibration FILE",
+        "holds no CameraInfo for /left/image_raw; give the camera's calibration with --calibration "
+        "FILE",
     ),
     "one camera with an IMU without its pose": (
         _bad(_without("/right/image_raw", "/tf_static")),
         None,
-        "the pose of /imu in the camera is unknown, and one camera needs its IMU; give --calibration FILE with",
+        "the pose of /imu in the camera is unknown, and one camera needs its IMU; give "
+        "--calibration FILE with",
     ),
     "a /tf of other frames": (
         _bad(lambda script: script.moving(START_NS, "map", "door", np.eye(4))),
         "reference=/tf",
-        r"/tf: of its moving frames \(map to door\) none carries imu; name another reference=/TOPIC",
+        r"/tf: of its moving frames \(map to door\) none carries imu; name another "
+        r"reference=/TOPIC",
     ),
-    "two pairs": (_bad(_more_images), None, "several topics could be the pair .*; name them with --topics"),
-    "a wrong topic": (_bad(lambda s: None), "left=/nose,right=/right/image_raw", "holds no topic '/nose' for left"),
-    "a topic of another type": (_bad(lambda s: None), "imu=/left/image_raw", "sensor_msgs/msg/Image, not sensor_msgs"),
-    "a topic without a name": (_bad(lambda s: None), "left", "'left' is no ROLE=/TOPIC; roles are left, right, imu"),
+    "two pairs": (
+        _bad(_more_images),
+        None,
+        "several topics could be the pair .*; name them with --topics",
+    ),
+    "a wrong topic": (
+        _bad(lambda s: None),
+        "left=/nose,right=/right/image_raw",
+        "holds no topic '/nose' for left",
+    ),
+    "a topic of another type": (
+        _bad(lambda s: None),
+        "imu=/left/image_raw",
+        "sensor_msgs/msg/Image, not sensor_msgs",
+    ),
+    "a topic without a name": (
+        _bad(lambda s: None),
+        "left",
+        "'left' is no ROLE=/TOPIC; roles are left, right, imu",
+    ),
     "an empty topic": (
         _bad(lambda s: s.empty.append(("/e", "sensor_msgs/msg/Imu"))),
         "imu=/e",
         r"/e \(imu\) holds no message",
     ),
-    "no CameraInfo": (_bad(_without("/left/camera_info")), None, "holds no CameraInfo for /left/image_raw; give"),
-    "CameraInfo of zeros": (_bad(_uncalibrated), None, r"/left/camera_info: not calibrated \(K or P is zero\)"),
-    "mixed encodings": (_bad(_mixed), None, "/left/image_raw mixes mono8, mono16; record one encoding"),
-    "an odd encoding": (_bad(_odd_encoding), None, "images of encoding '32FC1' are not read; use mono8"),
-    "another size": (_bad(_other_size), None, r"is 64 x 40 pixels but /left/camera_info is for 64 x 48"),
-    "an IMU with a NaN": (_bad(_nan), None, "/imu: the sample at 1000000000000000001 ns is not finite"),
-    "an IMU of another clock": (_bad(_other_clock), None, "no sample is within the time of the images"),
-    "cameras without synchronisation": (_bad(_unsynchronised), None, "within 3 ms; the cameras must be synchronised"),
+    "no CameraInfo": (
+        _bad(_without("/left/camera_info")),
+        None,
+        "holds no CameraInfo for /left/image_raw; give",
+    ),
+    "CameraInfo of zeros": (
+        _bad(_uncalibrated),
+        None,
+        r"/left/camera_info: not calibrated \(K or P is zero\)",
+    ),
+    "mixed encodings": (
+        _bad(_mixed),
+        None,
+        "/left/image_raw mixes mono8, mono16; record one encoding",
+    ),
+    "an odd encoding": (
+        _bad(_odd_encoding),
+        None,
+        "images of encoding '32FC1' are not read; use mono8",
+    ),
+    "another size": (
+        _bad(_other_size),
+        None,
+        r"is 64 x 40 pixels but /left/camera_info is for 64 x 48",
+    ),
+    "an IMU with a NaN": (
+        _bad(_nan),
+        None,
+        "/imu: the sample at 1000000000000000001 ns is not finite",
+    ),
+    "an IMU of another clock": (
+        _bad(_other_clock),
+        None,
+        "no sample is within the time of the images",
+    ),
+    "cameras without synchronisation": (
+        _bad(_unsynchronised),
+        None,
+        "within 3 ms; the cameras must be synchronised",
+    ),
 }
 
 
@@ -496,11 +606,17 @@ def test_bad_bags_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
 
 
 def test_s3e(data_dir: Path, tmp_path: Path) -> None:
-    """A real ROS 2 bag: compressed images whose right stamps are 2 ms late, ten topics without a message."""
+    """A real ROS 2 bag: compressed images whose right stamps are 2 ms late, ten topics without a
+    message.
+    """
     path = data_dir / "ros2_s3e_db3"
-    with pytest.raises(CalibrationError, match="holds no CameraInfo for /Alpha/left_camera/compressed; give"):
+    with pytest.raises(
+        CalibrationError, match="holds no CameraInfo for /Alpha/left_camera/compressed; give"
+    ):
         open_dataset(path)
-    (tmp_path / "rig.yaml").write_text(kalibr_text(Rig.rectified(700, 700, 400, 300, 0.36, 1224, 1024, np.eye(4))))
+    (tmp_path / "rig.yaml").write_text(
+        kalibr_text(Rig.rectified(700, 700, 400, 300, 0.36, 1224, 1024, np.eye(4)))
+    )
     dataset = open_dataset(path, DatasetSettings(calibration=tmp_path / "rig.yaml"))
     recording = dataset.recording
     assert (len(recording.frame_times_ns), recording.motion) == (2, {"imu"})

@@ -1,4 +1,6 @@
-"""Clocks, transforms, the order of events, opening by kind or content, and the contract of all readers."""
+"""Clocks, transforms, the order of events, opening by kind or content, and the contract of all
+readers.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ def make_source(kind: str, folder: Path) -> Path:
     dataset = open_dataset(make_source("ece276a", folder))
     observed = [dataset.observations(k) for k in range(6)]
     samples = [event for event in dataset.events() if isinstance(event, VelocitySample)]
-    write_observation_log(folder / "run.npz", dataset.recording, [o for o in observed if o is not None], samples)
+    write_observation_log(
+        folder / "run.npz", dataset.recording, [o for o in observed if o is not None], samples
+    )
     return folder / "run.npz"
 
 
@@ -88,7 +92,10 @@ def test_events_of_a_range_include_its_motion_samples(kind: str, tmp_path: Path)
     assert [frame.index for frame in frames] == [2, 3, 4]
     assert all(frame.left is None and frame.right is None for frame in frames)
     assert [e.time_ns for e in events if isinstance(e, VelocitySample)] == times[2:5].tolist()
-    assert [f.index for f in dataset.events(4, 99, images=False) if isinstance(f, StereoFrame)] == [4, 5]
+    assert [f.index for f in dataset.events(4, 99, images=False) if isinstance(f, StereoFrame)] == [
+        4,
+        5,
+    ]
 
 
 @pytest.mark.parametrize(("start", "stop"), [(6, None), (-1, 3), (3, 3)])
@@ -99,12 +106,23 @@ def test_rejects_a_range_without_frames(start: int, stop: int | None, tmp_path: 
 
 
 @settings(deadline=None)
-@given(st.lists(st.integers(0, 40), max_size=30), st.integers(0, 3), st.integers(4, 6), st.sets(st.integers(0, 5)))
-def test_events_are_in_time_order_at_any_rates(ticks: list[int], start: int, stop: int, lost: set[int]) -> None:
+@given(
+    st.lists(st.integers(0, 40), max_size=30),
+    st.integers(0, 3),
+    st.integers(4, 6),
+    st.sets(st.integers(0, 5)),
+)
+def test_events_are_in_time_order_at_any_rates(
+    ticks: list[int], start: int, stop: int, lost: set[int]
+) -> None:
     recording = _recording()
     motion = [VelocitySample(10**7 * t, np.zeros(3), np.zeros(3)) for t in sorted(ticks)]
     chosen = range(start, stop)
-    frames = (StereoFrame(k, int(recording.frame_times_ns[k]), None, None) for k in chosen if k not in lost)
+    frames = (
+        StereoFrame(k, int(recording.frame_times_ns[k]), None, None)
+        for k in chosen
+        if k not in lost
+    )
     events = list(merge_events(recording, chosen, motion, frames))
     assert all(a.time_ns <= b.time_ns for a, b in pairwise(events))
     first, last = recording.frame_times_ns[start], recording.frame_times_ns[stop - 1]
@@ -121,7 +139,11 @@ def test_imu_samples_end_with_the_first_at_or_after_the_last_frame() -> None:
     def last(times_ms: list[int], stop: int) -> int:
         frames = (StereoFrame(k, int(recording.frame_times_ns[k]), None, None) for k in range(stop))
         motion = [ImuSample(1_000_000 * t, zero, zero) for t in times_ms]
-        return max(e.time_ns for e in merge_events(recording, range(stop), motion, frames) if isinstance(e, ImuSample))
+        return max(
+            e.time_ns
+            for e in merge_events(recording, range(stop), motion, frames)
+            if isinstance(e, ImuSample)
+        )
 
     assert last([-5, 5, 115, 125, 135], 3) == 125_000_000
     assert last([-5, 5, 120, 125, 135], 3) == 120_000_000
@@ -129,7 +151,9 @@ def test_imu_samples_end_with_the_first_at_or_after_the_last_frame() -> None:
 
 
 def _recording() -> Recording:
-    return Recording("made", Path("made"), CAMERA, None, np.arange(6) * 60_000_000, False, frozenset(), None)
+    return Recording(
+        "made", Path("made"), CAMERA, None, np.arange(6) * 60_000_000, False, frozenset(), None
+    )
 
 
 @settings(deadline=None)
@@ -142,7 +166,10 @@ def test_seconds_keep_their_microseconds(whole: int, micro: int) -> None:
 @pytest.mark.parametrize(
     ("seconds", "message"),
     [
-        ([0.0, 0.1, 0.1], r"times, entry 2: the clock repeats \(0\.100000000 s after 0\.100000000 s\)"),
+        (
+            [0.0, 0.1, 0.1],
+            r"times, entry 2: the clock repeats \(0\.100000000 s after 0\.100000000 s\)",
+        ),
         ([0.0, 0.2, 0.1], "times, entry 2: the clock runs backwards"),
         ([0.0, np.nan], "times, entry 1: the time nan is not a time"),
     ],
@@ -191,7 +218,9 @@ def test_a_drive_letter_is_no_kind(tmp_path: Path) -> None:
         open_dataset("C:\\data\\07")
 
 
-def test_a_path_with_a_colon_is_a_path_when_it_exists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_with_a_colon_is_a_path_when_it_exists(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     make_npz(tmp_path / "run:1", ece276a_arrays(make_drive(6)))
     assert open_dataset("run:1").recording.kind == "ece276a"
@@ -203,11 +232,18 @@ def test_a_path_with_a_colon_is_a_path_when_it_exists(tmp_path: Path, monkeypatc
         ("nowhere", "nowhere does not exist; check the path"),
         ("no/where", "no/where does not exist, nor does no; check"),
         ("empti", "empti does not exist; did you mean empty"),
-        ("holiday", "holiday: holds images, but not in folders; put those of a stereo camera into left and right"),
+        (
+            "holiday",
+            "holiday: holds images, but not in folders; put those of a stereo camera into left and "
+            "right",
+        ),
         ("holiday/IMG_1.JPG", r"IMG_1\.JPG: is one image; give a folder with left and right"),
         ("film.mp4", r"film\.mp4: is one video; give a folder with left\.mp4, right\.mp4"),
         ("half", "half: holds images in right but none of a left camera; add them"),
-        ("kiti:nowhere", "'kiti' in 'kiti:nowhere' is no kind of recording; .*did you mean 'kitti'"),
+        (
+            "kiti:nowhere",
+            "'kiti' in 'kiti:nowhere' is no kind of recording; .*did you mean 'kitti'",
+        ),
         ("kitti:nowhere", "nowhere does not exist"),
         ("kitti:", "names no path; write kitti:PATH"),
         ("empty", "empty is empty; give a KITTI folder"),
@@ -249,7 +285,9 @@ def test_settings_are_checked(name: str) -> None:
         DatasetSettings(**values)
 
 
-@pytest.mark.parametrize(("target", "message"), [("folder", "cannot list"), ("file.npz", "cannot read")])
+@pytest.mark.parametrize(
+    ("target", "message"), [("folder", "cannot list"), ("file.npz", "cannot read")]
+)
 def test_a_place_that_may_not_be_read_is_an_error_in_one_line(
     target: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,4 +1,6 @@
-"""The ECE276A reader: both key generations, mixed extrinsics, stale frames, bad input, the published files."""
+"""The ECE276A reader: both key generations, mixed extrinsics, stale frames, bad input, the
+published files.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,14 @@ from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import moving_frames, tracks_from_dense
 from vio.errors import CalibrationError, DataError
 from vio.files.trajectories import read_trajectory
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log, transform_points
+from vio.geometry.lie import (
+    FloatArray,
+    se3_adjoint,
+    se3_from_parts,
+    se3_inverse,
+    se3_log,
+    transform_points,
+)
 from vio.geometry.stereo import StereoCamera, project, triangulate
 from vio.records import BoolArray, FeatureTracks
 
@@ -45,20 +54,32 @@ def mixed(arrays: Arrays) -> Arrays:
 
 @pytest.fixture(scope="module")
 def long_drive() -> Drive:
-    """A drive with enough rotation to distinguish the two extrinsics under the noise of the course files."""
+    """A drive with enough rotation to distinguish the two extrinsics under the noise of the
+    course files.
+    """
     drive = make_drive(220, seed=3, pixel_sigma=0.3)
-    noise = np.random.default_rng(4).standard_normal(drive.velocities.shape) * [0.5, 0.5, 0.5, 0.05, 0.05, 0.05]
+    noise = np.random.default_rng(4).standard_normal(drive.velocities.shape) * [
+        0.5,
+        0.5,
+        0.5,
+        0.05,
+        0.05,
+        0.05,
+    ]
     return replace(drive, velocities=drive.velocities + noise)
 
 
 @pytest.mark.parametrize("arrays_of", [ece276a_arrays, ece276a_new_arrays])
-def test_reads_a_synthetic_file_completely(arrays_of: Callable[[Drive], Arrays], tmp_path: Path) -> None:
+def test_reads_a_synthetic_file_completely(
+    arrays_of: Callable[[Drive], Arrays], tmp_path: Path
+) -> None:
     drive = make_drive(8)
     dataset = read_ece276a(make_npz(tmp_path / "a.npz", arrays_of(drive)), DEFAULT)
     recording = dataset.recording
     np.testing.assert_allclose(recording.camera.M, CAMERA.M, rtol=1e-12)
     np.testing.assert_allclose(recording.T_cam0_imu, T_CAM0_IMU, atol=1e-12)
-    np.testing.assert_allclose(np.diff(recording.frame_times_ns), 100_000_000, atol=480)  # doubles near 1.3e9 s
+    # doubles near 1.3e9 s
+    np.testing.assert_allclose(np.diff(recording.frame_times_ns), 100_000_000, atol=480)
     for t in range(8):
         observed = dataset.observations(t)
         seen = np.flatnonzero(drive.features[0, :, t] != -1)
@@ -85,32 +106,41 @@ def test_left_only_features_have_no_right_pixel(tmp_path: Path) -> None:
     assert observed.ids[~observed.has_right].tolist() == [j]
 
 
-# --- extrinsics ---------------------------------------------------------------------------------------------------
+# --- extrinsics
+# ---------------------------------------------------------------------------------------------------
 
 
 def test_corrects_mixed_extrinsics_and_adds_a_note(long_drive: Drive, tmp_path: Path) -> None:
     path = make_npz(tmp_path / "a.npz", mixed(ece276a_arrays(long_drive)))
     recording = read_ece276a(path, DEFAULT).recording
     np.testing.assert_allclose(recording.T_cam0_imu, T_CAM0_IMU, atol=1e-12)
-    extrinsics_notes = [note for note in recording.notes if "camera's position in the IMU frame" in note]
+    extrinsics_notes = [
+        note for note in recording.notes if "camera's position in the IMU frame" in note
+    ]
     assert len(extrinsics_notes) == 1
     assert "corrected to t = -R t" in extrinsics_notes[0]
 
 
 def test_keeps_consistent_extrinsics(long_drive: Drive, tmp_path: Path) -> None:
-    recording = read_ece276a(make_npz(tmp_path / "a.npz", ece276a_arrays(long_drive)), DEFAULT).recording
+    recording = read_ece276a(
+        make_npz(tmp_path / "a.npz", ece276a_arrays(long_drive)), DEFAULT
+    ).recording
     np.testing.assert_array_equal(recording.T_cam0_imu, T_CAM0_IMU)
     assert recording.notes == ()
 
 
 def test_keeps_undetermined_extrinsics_of_a_straight_drive_and_adds_a_note(tmp_path: Path) -> None:
     drive = make_drive(60, pixel_sigma=0.3, yaw_rate=0.0)
-    recording = read_ece276a(make_npz(tmp_path / "a.npz", mixed(ece276a_arrays(drive))), DEFAULT).recording
+    recording = read_ece276a(
+        make_npz(tmp_path / "a.npz", mixed(ece276a_arrays(drive))), DEFAULT
+    ).recording
     np.testing.assert_array_equal(recording.T_cam0_imu[:3, 3], LEVER_M)
     assert "turns too little" in recording.notes[0]
 
 
-@pytest.mark.parametrize(("mode", "t"), [("literal", LEVER_M), ("corrected", -R_CAM0_IMU @ LEVER_M)])
+@pytest.mark.parametrize(
+    ("mode", "t"), [("literal", LEVER_M), ("corrected", -R_CAM0_IMU @ LEVER_M)]
+)
 def test_extrinsics_mode_is_a_setting(mode: str, t: FloatArray, tmp_path: Path) -> None:
     path = make_npz(tmp_path / "a.npz", mixed(ece276a_arrays(make_drive(6))))
     recording = read_ece276a(path, DatasetSettings(extrinsics=mode)).recording  # type: ignore[arg-type]
@@ -128,11 +158,14 @@ def test_stereo_twists_equal_the_true_motion() -> None:
     np.testing.assert_allclose(found.twists, truth, atol=1e-6)
 
 
-# --- stale frames -------------------------------------------------------------------------------------------------
+# --- stale frames
+# -------------------------------------------------------------------------------------------------
 
 
 def with_stale_frame(drive: Drive, t: int, *, changed: bool) -> FloatArray:
-    """Repeat frame t - 1 in frame t. `changed`: from there on each track shows what lay at its old pixels."""
+    """Repeat frame t - 1 in frame t. `changed`: from there on each track shows what lay at its
+    old pixels.
+    """
     features = drive.features.copy()
     carried = (features[0, :, t] != -1) & (features[0, :, t - 1] != -1)
     features[:, carried, t] = features[:, carried, t - 1]
@@ -192,7 +225,9 @@ def test_split_gives_every_track_a_new_id_from_its_stale_row_on(tmp_path: Path) 
 def test_literal_mode_keeps_repeats_and_notes_the_frames(tmp_path: Path) -> None:
     drive = make_drive(14, yaw_rate=0.1)
     arrays = {**ece276a_arrays(drive), "features": with_stale_frame(drive, 7, changed=True)}
-    dataset = read_ece276a(make_npz(tmp_path / "a.npz", arrays), DatasetSettings(repeated_tracks="literal"))
+    dataset = read_ece276a(
+        make_npz(tmp_path / "a.npz", arrays), DatasetSettings(repeated_tracks="literal")
+    )
     assert not dataset.tracks.stale.any()
     assert "1 of 14 feature frames are stale" in dataset.recording.notes[-1]
     assert "used as they are" in dataset.recording.notes[-1]
@@ -216,7 +251,8 @@ def test_distinguishes_motion_from_noise() -> None:
     assert moving_frames(still, still + np.array([0, 0, 0.3])).all()
 
 
-# --- bad input ----------------------------------------------------------------------------------------------------
+# --- bad input
+# ----------------------------------------------------------------------------------------------------
 
 
 def _swap_cameras(arrays: Arrays) -> Arrays:
@@ -229,25 +265,53 @@ BAD = [
         DataError,
         r"needs the keys time_stamps .*; found K cam_T_imu",
     ),
-    (changed("features", np.zeros((3, 5, 6))), DataError, r"features has shape 3 x 5 x 6 .*expected 4 x M x T"),
-    (changed("features", np.zeros((4, 5, 7))), DataError, r"time_stamps has shape 1 x 6 .*expected 1 x 7"),
-    (changed("linear_velocity", np.zeros((6, 3))), DataError, r"linear_velocity has shape 6 x 3 .*expected 3 x 6"),
+    (
+        changed("features", np.zeros((3, 5, 6))),
+        DataError,
+        r"features has shape 3 x 5 x 6 .*expected 4 x M x T",
+    ),
+    (
+        changed("features", np.zeros((4, 5, 7))),
+        DataError,
+        r"time_stamps has shape 1 x 6 .*expected 1 x 7",
+    ),
+    (
+        changed("linear_velocity", np.zeros((6, 3))),
+        DataError,
+        r"linear_velocity has shape 6 x 3 .*expected 3 x 6",
+    ),
     (changed("K", np.eye(4)), DataError, r"K has shape 4 x 4"),
-    (changed("K", np.ones((3, 3))), CalibrationError, r"K is no intrinsic matrix \[fu 0 cu; .* but \[\["),
+    (
+        changed("K", np.ones((3, 3))),
+        CalibrationError,
+        r"K is no intrinsic matrix \[fu 0 cu; .* but \[\[",
+    ),
     (changed("b", 0.0), CalibrationError, r"\.npz: stereo baseline must be positive, got 0 m"),
     (changed("b", -0.5), CalibrationError, r"\.npz: stereo baseline must be positive, got -0.5 m"),
     (changed("b", "wide"), DataError, r"b has shape one value and type <U4"),
     (edited("cam_T_imu", (0, 0), 2.0), CalibrationError, r"cam_T_imu: not a rotation"),
     (changed("cam_T_imu", np.diag([1.0, 1, -1, 1])), CalibrationError, r"cam_T_imu: .*reflection"),
     (edited("time_stamps", (0, 3), 0.0), DataError, r"time_stamps\[3\]: the clock runs backwards"),
-    (edited("time_stamps", (0, 3), 1317386425.7), DataError, r"time_stamps\[3\]: the clock repeats"),
+    (
+        edited("time_stamps", (0, 3), 1317386425.7),
+        DataError,
+        r"time_stamps\[3\]: the clock repeats",
+    ),
     (
         edited("rotational_velocity", (1, 4), np.nan),
         DataError,
         r"rotational_velocity is not finite in 1 of 6 frames.* 4",
     ),
-    (edited("linear_velocity", (1, 2), np.inf), DataError, r"linear_velocity is not finite in 1 of 6 frames.* 2"),
-    (edited("features", (0, 0, 0), np.nan), DataError, r"feature 0 in frame 0 is .*neither a pixel pair nor all -1"),
+    (
+        edited("linear_velocity", (1, 2), np.inf),
+        DataError,
+        r"linear_velocity is not finite in 1 of 6 frames.* 2",
+    ),
+    (
+        edited("features", (0, 0, 0), np.nan),
+        DataError,
+        r"feature 0 in frame 0 is .*neither a pixel pair nor all -1",
+    ),
     (_swap_cameras, DataError, r"left and right look swapped: \d+ of \d+ disparities"),
 ]
 
@@ -280,13 +344,16 @@ def test_rejects_half_missing_features(row: int, tmp_path: Path) -> None:
         ("extR_T_imu", se3_from_parts(np.eye(3), [0.5, 0, 0]) @ T_CAM0_IMU, "place the cameras"),
     ],
 )
-def test_newer_calibration_must_be_a_rectified_pair(key: str, value: FloatArray, message: str, tmp_path: Path) -> None:
+def test_newer_calibration_must_be_a_rectified_pair(
+    key: str, value: FloatArray, message: str, tmp_path: Path
+) -> None:
     path = make_npz(tmp_path / "bad.npz", {**ece276a_new_arrays(make_drive(6)), key: value})
     with pytest.raises(CalibrationError, match=message):
         read_ece276a(path, DEFAULT)
 
 
-# --- the published files ------------------------------------------------------------------------------------------
+# --- the published files
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -298,7 +365,9 @@ def test_published_file_0027(drive_0027: FeatureDataset) -> None:
     recording = drive_0027.recording
     assert len(recording.frame_times_ns) == 1106
     assert recording.frame_times_ns[0] == pytest.approx(1317386425562502384, abs=240)
-    assert recording.camera == StereoCamera(707.0912, 707.0912, 601.8873, 183.1104, 0.5371506532679237)
+    assert recording.camera == StereoCamera(
+        707.0912, 707.0912, 601.8873, 183.1104, 0.5371506532679237
+    )
     first = drive_0027.observations(0)
     assert len(first) == 64
     assert len(drive_0027.tracks.ids) == 75647
@@ -309,15 +378,23 @@ def test_published_file_0027(drive_0027: FeatureDataset) -> None:
 
 def test_the_second_published_file(data_dir: Path) -> None:
     dataset = read_ece276a(data_dir / "ece276a" / "0022.npz", DEFAULT)
-    assert any(note.startswith("66 of 800 feature frames are stale") for note in dataset.recording.notes)
-    np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3, 3], [-0.3141, 0.7195, -1.0891], atol=1e-4)
+    assert any(
+        note.startswith("66 of 800 feature frames are stale") for note in dataset.recording.notes
+    )
+    np.testing.assert_allclose(
+        dataset.recording.T_cam0_imu[:3, 3], [-0.3141, 0.7195, -1.0891], atol=1e-4
+    )
     assert any("corrected to t = -R t" in note for note in dataset.recording.notes)
-    assert any("continue under new ids (pixels move 1.05 steps" in note for note in dataset.recording.notes)
+    assert any(
+        "continue under new ids (pixels move 1.05 steps" in note for note in dataset.recording.notes
+    )
     assert len(np.unique(dataset.tracks.ids)) == 3220 + 3100  # one more for each stale row
 
 
 @pytest.mark.parametrize("name", ["0027", "0022"])
-def test_keeps_extrinsics_of_a_corrected_published_file(name: str, data_dir: Path, tmp_path: Path) -> None:
+def test_keeps_extrinsics_of_a_corrected_published_file(
+    name: str, data_dir: Path, tmp_path: Path
+) -> None:
     arrays = dict(read_npz(data_dir / "ece276a" / f"{name}.npz"))
     R, t = arrays["cam_T_imu"][:3, :3], arrays["cam_T_imu"][:3, 3]
     arrays["cam_T_imu"] = se3_from_parts(R, -R @ t)
@@ -327,9 +404,16 @@ def test_keeps_extrinsics_of_a_corrected_published_file(name: str, data_dir: Pat
 
 
 def _reprojection(
-    camera: StereoCamera, tracks: FeatureTracks, poses: FloatArray, source: int, target: int, ids: np.ndarray
+    camera: StereoCamera,
+    tracks: FeatureTracks,
+    poses: FloatArray,
+    source: int,
+    target: int,
+    ids: np.ndarray,
 ) -> FloatArray:
-    """Pixel error |du|, |dv| (N, 2) in `target` of points triangulated in `source`, under the true cam0 poses."""
+    """Pixel error |du|, |dv| (N, 2) in `target` of points triangulated in `source`, under the
+    true cam0 poses.
+    """
     here, there = tracks.at(source, 0), tracks.at(target, 0)
     common = np.intersect1d(np.intersect1d(here.ids, there.ids), ids)
     p, valid = triangulate(camera, here.z[np.searchsorted(here.ids, common)], min_disparity_px=1.0)
@@ -340,15 +424,24 @@ def _reprojection(
     return error
 
 
-def test_repeated_rows_show_the_new_image_but_another_point(drive_0027: FeatureDataset, data_dir: Path) -> None:
-    poses = read_trajectory(data_dir / "ece276a" / "kitti_odometry_07_poses.txt", fmt="kitti").T_world_body
-    camera, tracks, stale = drive_0027.recording.camera, drive_0027.tracks, stale_frames(drive_0027.tracks)
+def test_repeated_rows_show_the_new_image_but_another_point(
+    drive_0027: FeatureDataset, data_dir: Path
+) -> None:
+    poses = read_trajectory(
+        data_dir / "ece276a" / "kitti_odometry_07_poses.txt", fmt="kitti"
+    ).T_world_body
+    camera, tracks, stale = (
+        drive_0027.recording.camera,
+        drive_0027.tracks,
+        stale_frames(drive_0027.tracks),
+    )
     to_new, to_old, control = [], [], []
     for t in np.flatnonzero(stale):
         if not 3 <= t < len(poses) - 2 or stale[t - 2 : t + 3].sum() > 1:
             continue
         observed = tracks.at(int(t), 0)
-        assert np.array_equal(observed.stale, np.isin(observed.ids, tracks.at(int(t) - 1, 0).ids))  # all or new
+        # all or new
+        assert np.array_equal(observed.stale, np.isin(observed.ids, tracks.at(int(t) - 1, 0).ids))
         repeated = observed.ids[observed.stale]
         to_new.append(_reprojection(camera, tracks, poses, int(t) + 1, int(t), repeated))
         to_old.append(_reprojection(camera, tracks, poses, int(t) - 1, int(t) + 1, repeated))
@@ -359,9 +452,13 @@ def test_repeated_rows_show_the_new_image_but_another_point(drive_0027: FeatureD
     assert (medians[2] < 0.4).all()  # measured 0.25, 0.31 px
 
 
-def test_the_corrected_extrinsic_agrees_with_ground_truth(drive_0027: FeatureDataset, data_dir: Path) -> None:
+def test_the_corrected_extrinsic_agrees_with_ground_truth(
+    drive_0027: FeatureDataset, data_dir: Path
+) -> None:
     """The corrected lever arm fits camera velocity and body velocity to rigid-body motion best."""
-    poses = read_trajectory(data_dir / "ece276a" / "kitti_odometry_07_poses.txt", fmt="kitti").T_world_body
+    poses = read_trajectory(
+        data_dir / "ece276a" / "kitti_odometry_07_poses.txt", fmt="kitti"
+    ).T_world_body
     dt = np.diff(drive_0027.recording.frame_times_ns[: len(poses)]) * 1e-9
     truth = se3_log(se3_inverse(poses[:-1]) @ poses[1:]) / dt[:, None]
     u = np.array([[*m.linear, *m.angular] for m in drive_0027.motion[: len(poses)]])  # type: ignore[union-attr]
@@ -373,7 +470,9 @@ def test_the_corrected_extrinsic_agrees_with_ground_truth(drive_0027: FeatureDat
     corrected = -R.T @ t
     literal = -R.T @ corrected  # the file's translation is the camera's position itself
     errors = [
-        np.abs((gap - np.cross(omega, lever_arm))[turning, :2] - np.median(gap[~turning, :2], axis=0)).mean()
+        np.abs(
+            (gap - np.cross(omega, lever_arm))[turning, :2] - np.median(gap[~turning, :2], axis=0)
+        ).mean()
         for lever_arm in (corrected, literal)
     ]
     assert errors[0] < 0.75 * errors[1]

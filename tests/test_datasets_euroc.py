@@ -1,4 +1,6 @@
-"""EuRoC folders: exact calibration and clocks, rectified frames, and an error that names each defect."""
+"""EuRoC folders: exact calibration and clocks, rectified frames, and an error that names each
+defect.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,9 @@ def test_calibration_clock_and_truth_are_read(tmp_path: Path) -> None:
     assert recording.frame_times_ns.tolist() == camera_stamps(4)
     assert recording.motion == {"imu"}
     assert recording.notes == ()
-    assert dataset.imu_noise == ImuDensities(gyro=1.6968e-4, gyro_walk=1.9393e-5, accel=2e-3, accel_walk=3e-3)
+    assert dataset.imu_noise == ImuDensities(
+        gyro=1.6968e-4, gyro_walk=1.9393e-5, accel=2e-3, accel_walk=3e-3
+    )
     assert recording.reference.body == "imu"
     assert recording.reference.times_ns.tolist() == camera_stamps(4)
     np.testing.assert_allclose(recording.reference.T_world_body, truth_poses(4), atol=1e-9)
@@ -98,13 +102,23 @@ def test_events_are_in_time_order_with_imu_samples_first(tmp_path: Path) -> None
 
 
 def _opencv_maps(rig: StereoRig) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Lookup maps from OpenCV's undistortion, with this package's rotations and rectified camera."""
+    """Lookup maps from OpenCV's undistortion, with this package's rotations and rectified
+    camera.
+    """
     camera = rectified_cameras(rig).camera
     rotations = rectifying_rotations(rig)[:2]
     maps = []
     for model, R in zip((rig.cam0, rig.cam1), rotations, strict=True):
-        make = cv2.fisheye.initUndistortRectifyMap if model.model == "equidistant" else cv2.initUndistortRectifyMap
-        maps.append(make(model.K, np.array([model.coefficients]), R, camera.K, (WIDTH, HEIGHT), cv2.CV_32FC1))
+        make = (
+            cv2.fisheye.initUndistortRectifyMap
+            if model.model == "equidistant"
+            else cv2.initUndistortRectifyMap
+        )
+        maps.append(
+            make(
+                model.K, np.array([model.coefficients]), R, camera.K, (WIDTH, HEIGHT), cv2.CV_32FC1
+            )
+        )
     return maps
 
 
@@ -113,12 +127,18 @@ def test_frames_are_rectified_as_opencv_would(rig: StereoRig, tmp_path: Path) ->
     dataset = _read(make_euroc(tmp_path, rig=rig))
     maps = _opencv_maps(rig)
     for frame in frames_of(dataset):
-        for image, path, (u, v) in zip((frame.left, frame.right), dataset.pairs[frame.index], maps, strict=True):
-            expected = cv2.remap(load_gray(path)[0], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for image, path, (u, v) in zip(
+            (frame.left, frame.right), dataset.pairs[frame.index], maps, strict=True
+        ):
+            expected = cv2.remap(
+                load_gray(path)[0], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
             difference = np.abs(image.astype(int) - expected.astype(int))
             assert difference.max() <= 3
             assert (difference > 1).mean() < 0.002
-            assert np.abs(image.astype(int) - load_gray(path)[0]).mean() > 5, "the raw image is another one"
+            assert np.abs(image.astype(int) - load_gray(path)[0]).mean() > 5, (
+                "the raw image is another one"
+            )
 
 
 def test_interpolation_is_a_setting(tmp_path: Path) -> None:
@@ -132,10 +152,16 @@ def test_interpolation_is_a_setting(tmp_path: Path) -> None:
 
 
 def _rounded(rig: StereoRig, digits: int) -> StereoRig:
-    return replace(rig, T_imu_cam0=np.round(rig.T_imu_cam0, digits), T_imu_cam1=np.round(rig.T_imu_cam1, digits))
+    return replace(
+        rig,
+        T_imu_cam0=np.round(rig.T_imu_cam0, digits),
+        T_imu_cam1=np.round(rig.T_imu_cam1, digits),
+    )
 
 
-@pytest.mark.parametrize("rig", [RECTIFIED_RIG, _rounded(RECTIFIED_RIG, 6)], ids=["exact", "six digits"])
+@pytest.mark.parametrize(
+    "rig", [RECTIFIED_RIG, _rounded(RECTIFIED_RIG, 6)], ids=["exact", "six digits"]
+)
 def test_a_rectified_folder_passes_through_unchanged(rig: StereoRig, tmp_path: Path) -> None:
     dataset = _read(make_euroc(tmp_path, rig=rig))
     camera = dataset.recording.camera
@@ -156,15 +182,23 @@ def test_a_pair_that_is_nearly_rectified_is_rectified(turn: list[float], tmp_pat
 
 
 def test_the_imu_frame_is_the_body_frame(tmp_path: Path) -> None:
-    """The same rig in another body frame: only the world-to-body poses of the ground truth change."""
+    """The same rig in another body frame: only the world-to-body poses of the ground truth
+    change.
+    """
     T_body_imu = se3_from_parts(so3_exp([0.3, -0.2, 0.5]), [0.1, 0.2, -0.05])
     moved = replace(
-        RADTAN_RIG, T_imu_cam0=T_body_imu @ RADTAN_RIG.T_imu_cam0, T_imu_cam1=T_body_imu @ RADTAN_RIG.T_imu_cam1
+        RADTAN_RIG,
+        T_imu_cam0=T_body_imu @ RADTAN_RIG.T_imu_cam0,
+        T_imu_cam1=T_body_imu @ RADTAN_RIG.T_imu_cam1,
     )
     write_imu(make_euroc(tmp_path, rig=moved) / "mav0" / "imu0", 4, T_body_imu)
     recording = _read(tmp_path).recording
-    np.testing.assert_allclose(recording.T_cam0_imu, rectified_cameras(RADTAN_RIG).T_rect0_imu, atol=1e-9)
-    np.testing.assert_allclose(recording.reference.T_world_body, truth_poses(4) @ T_body_imu, atol=1e-9)
+    np.testing.assert_allclose(
+        recording.T_cam0_imu, rectified_cameras(RADTAN_RIG).T_rect0_imu, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        recording.reference.T_world_body, truth_poses(4) @ T_body_imu, atol=1e-9
+    )
 
 
 def test_truth_of_the_raw_camera_is_moved_to_the_imu(tmp_path: Path) -> None:
@@ -172,7 +206,9 @@ def test_truth_of_the_raw_camera_is_moved_to_the_imu(tmp_path: Path) -> None:
     path.write_text("# body: cam0\n" + path.read_text())
     reference = _read(tmp_path).recording.reference
     assert reference.body == "imu"
-    np.testing.assert_allclose(reference.T_world_body, truth_poses(4) @ se3_inverse(T_IMU_CAM0), atol=1e-9)
+    np.testing.assert_allclose(
+        reference.T_world_body, truth_poses(4) @ se3_inverse(T_IMU_CAM0), atol=1e-9
+    )
 
 
 def test_folder_without_imu_and_ground_truth(tmp_path: Path) -> None:
@@ -184,7 +220,8 @@ def test_folder_without_imu_and_ground_truth(tmp_path: Path) -> None:
     assert len(list(dataset.events())) == 4
 
 
-# --- lists and clocks that do not quite agree -----------------------------------------------------------------------
+# --- lists and clocks that do not quite agree
+# -----------------------------------------------------------------------
 
 
 def test_finds_images_with_another_extension(tmp_path: Path) -> None:
@@ -195,8 +232,12 @@ def test_finds_images_with_another_extension(tmp_path: Path) -> None:
     assert len(frames_of(dataset)) == 4
 
 
-def test_a_copy_that_ended_early_is_used_as_far_as_it_goes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Right images are missing at the end, and the last line of the IMU's record is cut: both are said."""
+def test_a_copy_that_ended_early_is_used_as_far_as_it_goes(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Right images are missing at the end, and the last line of the IMU's record is cut: both
+    are said.
+    """
     mav = make_euroc(tmp_path, 6) / "mav0"
     for image in sorted((mav / "cam1" / "data").iterdir())[-2:]:
         image.unlink()
@@ -207,11 +248,19 @@ def test_a_copy_that_ended_early_is_used_as_far_as_it_goes(tmp_path: Path, caplo
     assert len(dataset.recording.frame_times_ns) == 4
     notes = dataset.recording.notes
     assert "the last 2 of 6 listed images of cam1 are missing; 4 pairs are used" in notes
-    assert any(f"line {len(lines)}: the last line ends too early (3 of 7 values); left out" in note for note in notes)
+    assert any(
+        f"line {len(lines)}: the last line ends too early (3 of 7 values); left out" in note
+        for note in notes
+    )
     for motion, said in (("imu", 1), ("none", 0)):
         caplog.clear()
         with caplog.at_level(NOTE):
-            process(str(tmp_path), load_config(overrides=[f"motion={motion}"]), out=tmp_path / motion, plot=False)
+            process(
+                str(tmp_path),
+                load_config(overrides=[f"motion={motion}"]),
+                out=tmp_path / motion,
+                plot=False,
+            )
         assert sum("ends too early" in record.getMessage() for record in caplog.records) == said
     samples = [event for event in dataset.events() if isinstance(event, ImuSample)]
     assert samples[-1].time_ns <= int(lines[-2].split(",")[0])
@@ -263,10 +312,13 @@ def test_pairing_single_stamps() -> None:
     assert [len(x) for x in pair_stamps(one, one + 5_000_000)] == [0, 0]
 
 
-# --- sensor.yaml ----------------------------------------------------------------------------------------------------
+# --- sensor.yaml
+# ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rig", [RADTAN_RIG, EQUIDISTANT_RIG, RECTIFIED_RIG], ids=["radtan", "equidistant", "pinhole"])
+@pytest.mark.parametrize(
+    "rig", [RADTAN_RIG, EQUIDISTANT_RIG, RECTIFIED_RIG], ids=["radtan", "equidistant", "pinhole"]
+)
 def test_camera_yaml_round_trips(rig: StereoRig, tmp_path: Path) -> None:
     path = tmp_path / "sensor.yaml"
     path.write_text(camera_yaml(rig.cam0, rig.T_imu_cam0, comment="written", rate_hz=20))
@@ -283,7 +335,9 @@ def test_other_spellings_of_a_calibration_are_read(tmp_path: Path) -> None:
         text.replace("%YAML:1.0\n", ""),
         text.replace("%YAML:1.0\n", "%YAML:1.0\n---\n").replace("T_BS:", "T_BS: !!opencv-matrix"),
         re.sub(r"T_BS:.*?\]\n", f"T_BS: {rows}\n", text, flags=re.DOTALL),
-        text.replace("radial-tangential", "radtan").replace("2e-05", "2e-5").replace("camera_model: pinhole\n", ""),
+        text.replace("radial-tangential", "radtan")
+        .replace("2e-05", "2e-5")
+        .replace("camera_model: pinhole\n", ""),
     ):
         path.write_text(changed)
         camera, T = read_camera_yaml(path)
@@ -291,7 +345,8 @@ def test_other_spellings_of_a_calibration_are_read(tmp_path: Path) -> None:
         np.testing.assert_allclose(T, T_IMU_CAM0, atol=1e-12)
 
 
-# --- bad input ------------------------------------------------------------------------------------------------------
+# --- bad input
+# ------------------------------------------------------------------------------------------------------
 
 Corruption = Callable[[Path], object]
 
@@ -336,9 +391,21 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         DataError,
         r"mav0: holds no cam1; give an EuRoC folder",
     ),
-    "no sensor.yaml": (lambda mav: (mav / "cam1/sensor.yaml").unlink(), CalibrationError, _NO_YAML_MESSAGE),
-    "no list of images": (lambda mav: (mav / "cam0/data.csv").unlink(), DataError, r"cannot read .*cam0/data.csv"),
-    "yaml is a list": (lambda mav: (mav / "cam0/sensor.yaml").write_text("- 1\n"), CalibrationError, "no calibration"),
+    "no sensor.yaml": (
+        lambda mav: (mav / "cam1/sensor.yaml").unlink(),
+        CalibrationError,
+        _NO_YAML_MESSAGE,
+    ),
+    "no list of images": (
+        lambda mav: (mav / "cam0/data.csv").unlink(),
+        DataError,
+        r"cannot read .*cam0/data.csv",
+    ),
+    "yaml is a list": (
+        lambda mav: (mav / "cam0/sensor.yaml").write_text("- 1\n"),
+        CalibrationError,
+        "no calibration",
+    ),
     "yaml is broken": (
         _edit("cam0/sensor.yaml", "T_BS:", "T_BS: ["),
         CalibrationError,
@@ -347,14 +414,19 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "unknown lens": (
         _edit("cam0/sensor.yaml", "radial-tangential", "double-sphere"),
         CalibrationError,
-        "'double-sphere' is not read; known: radial-tangential, radtan, plumb_bob, rational_polynomial, equidistant",
+        "'double-sphere' is not read; known: radial-tangential, radtan, plumb_bob, "
+        "rational_polynomial, equidistant",
     ),
     "unknown camera": (
         _edit("cam0/sensor.yaml", "camera_model: pinhole", "camera_model: omni"),
         CalibrationError,
         "camera_model 'omni' is not supported",
     ),
-    "no intrinsics": (_edit("cam0/sensor.yaml", "intrinsics", "extras"), CalibrationError, "has no entry 'intrinsics'"),
+    "no intrinsics": (
+        _edit("cam0/sensor.yaml", "intrinsics", "extras"),
+        CalibrationError,
+        "has no entry 'intrinsics'",
+    ),
     "three intrinsics": (
         _edit("cam0/sensor.yaml", "intrinsics: [41.0, ", "intrinsics: ["),
         CalibrationError,
@@ -371,48 +443,86 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         r"cam0/sensor.yaml: focal lengths and image size must be positive",
     ),
     "three coefficients": (
-        _edit("cam0/sensor.yaml", "distortion_coefficients: [-0.28, ", "distortion_coefficients: ["),
+        _edit(
+            "cam0/sensor.yaml", "distortion_coefficients: [-0.28, ", "distortion_coefficients: ["
+        ),
         CalibrationError,
         r"cam0/sensor.yaml: the radtan model takes 4 distortion coefficients or 5 or 8, got 3",
     ),
-    "short T_BS": (_edit("cam0/sensor.yaml", "data: [", "data: [0]\n  rest: ["), CalibrationError, "T_BS must hold 16"),
+    "short T_BS": (
+        _edit("cam0/sensor.yaml", "data: [", "data: [0]\n  rest: ["),
+        CalibrationError,
+        "T_BS must hold 16",
+    ),
     "T_BS mirrors": (
-        lambda mav: (mav / "cam0/sensor.yaml").write_text(sensor_yaml(RADTAN_RIG.cam0, np.diag([1.0, 1, -1, 1]))),
+        lambda mav: (mav / "cam0/sensor.yaml").write_text(
+            sensor_yaml(RADTAN_RIG.cam0, np.diag([1.0, 1, -1, 1]))
+        ),
         CalibrationError,
         r"cam0/sensor.yaml, T_BS: not a rotation but a reflection",
     ),
     "T_BS stretches": (
-        lambda mav: (mav / "cam0/sensor.yaml").write_text(sensor_yaml(RADTAN_RIG.cam0, np.diag([1.0, 1.1, 1, 1]))),
+        lambda mav: (mav / "cam0/sensor.yaml").write_text(
+            sensor_yaml(RADTAN_RIG.cam0, np.diag([1.0, 1.1, 1, 1]))
+        ),
         CalibrationError,
         r"cam0/sensor.yaml, T_BS: not a rotation",
     ),
     "swapped cameras": (_swap_cameras, CalibrationError, r"mav0: .*the cameras may be swapped"),
-    "no baseline": (_same_place, CalibrationError, r"mav0: .*the baseline is zero; check both T_BS"),
+    "no baseline": (
+        _same_place,
+        CalibrationError,
+        r"mav0: .*the baseline is zero; check both T_BS",
+    ),
     "image missing": (
         lambda mav: (mav / f"cam1/data/{_T1}.png").unlink(),
         DataError,
         rf"cam1/data.csv, line 3: .*{_T1}.png is missing \(1 of 4 listed images are\)",
     ),
-    "clock repeats": (_line("cam0/data.csv", 3, f"{_T0},{_T0}.png"), DataError, r"line 3: the clock repeats"),
-    "clock backwards": (_line("cam0/data.csv", 3, f"12,{_T0}.png"), DataError, r"line 3: the clock runs backwards"),
-    "float stamp": (_line("cam0/data.csv", 3, f"1.4e18,{_T1}.png"), DataError, "'1.4e18' is no time in whole nano"),
+    "clock repeats": (
+        _line("cam0/data.csv", 3, f"{_T0},{_T0}.png"),
+        DataError,
+        r"line 3: the clock repeats",
+    ),
+    "clock backwards": (
+        _line("cam0/data.csv", 3, f"12,{_T0}.png"),
+        DataError,
+        r"line 3: the clock runs backwards",
+    ),
+    "float stamp": (
+        _line("cam0/data.csv", 3, f"1.4e18,{_T1}.png"),
+        DataError,
+        "'1.4e18' is no time in whole nano",
+    ),
     "stamps in seconds": (
         _line("imu0/data.csv", 4, "1403715273.257142976,0,0,0,0,0,9.8"),
         DataError,
-        r"line 4: '1403715273.257142976' is no time .*; write seconds times 1e9, without a point or exponent",
+        r"line 4: '1403715273.257142976' is no time .*; write seconds times 1e9, without a point "
+        r"or exponent",
     ),
     "gravity among the gyro's columns": (
-        lambda mav: (mav / "imu0/data.csv").write_text("".join(f"{_T0 + k},0,0,9.8,0,0,0.1\n" for k in range(9))),
+        lambda mav: (mav / "imu0/data.csv").write_text(
+            "".join(f"{_T0 + k},0,0,9.8,0,0,0.1\n" for k in range(9))
+        ),
         DataError,
-        r"imu0/data.csv: gravity is in the columns 2 to 4 \(median 9.80\).*; exchange these columns with 5 to 7",
+        r"imu0/data.csv: gravity is in the columns 2 to 4 \(median 9.80\).*; exchange these "
+        r"columns with 5 to 7",
     ),
-    "three columns": (_line("cam0/data.csv", 3, f"{_T1},a,b"), DataError, r"line 3: 3 values instead of 2"),
+    "three columns": (
+        _line("cam0/data.csv", 3, f"{_T1},a,b"),
+        DataError,
+        r"line 3: 3 values instead of 2",
+    ),
     "empty list": (
         lambda mav: (mav / "cam0/data.csv").write_text("#timestamp [ns],filename\n"),
         DataError,
         r"cam0/data.csv: holds no line of data",
     ),
-    "no partners": (_shift_clock("cam1", 20_000_000), DataError, r"no image of cam0 .* has one of cam1 .* within 3 ms"),
+    "no partners": (
+        _shift_clock("cam1", 20_000_000),
+        DataError,
+        r"no image of cam0 .* has one of cam1 .* within 3 ms",
+    ),
     "a NaN in the IMU readings": (
         _line("imu0/data.csv", 4, f"{imu_stamps(4)[2]},0,nan,0,0,0,9.8"),
         DataError,
@@ -438,10 +548,22 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         DataError,
         r"imu0/data.csv: holds no line",
     ),
-    "an IMU without data": (lambda mav: (mav / "imu0/data.csv").unlink(), DataError, r"cannot read .*imu0/data.csv"),
-    "an IMU of another time": (_shift_clock("imu0", 10**12), DataError, r"no sample is within the time of the images"),
+    "an IMU without data": (
+        lambda mav: (mav / "imu0/data.csv").unlink(),
+        DataError,
+        r"cannot read .*imu0/data.csv",
+    ),
+    "an IMU of another time": (
+        _shift_clock("imu0", 10**12),
+        DataError,
+        r"no sample is within the time of the images",
+    ),
     "IMU noise of zero": (
-        _edit("imu0/sensor.yaml", "accelerometer_random_walk: 3.0000e-3", "accelerometer_random_walk: 0"),
+        _edit(
+            "imu0/sensor.yaml",
+            "accelerometer_random_walk: 3.0000e-3",
+            "accelerometer_random_walk: 0",
+        ),
         CalibrationError,
         "accelerometer_random_walk is 0; a noise density must be positive",
     ),
@@ -463,11 +585,14 @@ def test_rejects_bad_folders_with_one_line_error(case: str, tmp_path: Path) -> N
     corrupt, kind, message = BAD[case]
     corrupt(make_euroc(tmp_path) / "mav0")
     with pytest.raises(kind, match=message) as caught:
-        open_dataset(f"euroc:{tmp_path}")  # of itself, a folder without cam1 is a recording of one camera
+        # of itself, a folder without cam1 is a recording of one camera
+        open_dataset(f"euroc:{tmp_path}")
     assert "\n" not in str(caught.value)
 
 
-def test_unreadable_images_are_skipped_up_to_a_limit(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_unreadable_images_are_skipped_up_to_a_limit(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     make_euroc(tmp_path)
     file = tmp_path / "mav0" / "cam1" / "data" / f"{_T1}.png"
     file.write_bytes(file.read_bytes()[:300])
@@ -491,10 +616,14 @@ def test_an_imu_without_calibration_is_noted(tmp_path: Path) -> None:
     (make_euroc(tmp_path) / "mav0" / "imu0" / "sensor.yaml").unlink()
     dataset = _read(tmp_path)
     assert dataset.imu_noise is None
-    assert "imu0/sensor.yaml is missing; the IMU is assumed to be the body frame" in dataset.recording.notes[0]
+    assert (
+        "imu0/sensor.yaml is missing; the IMU is assumed to be the body frame"
+        in dataset.recording.notes[0]
+    )
 
 
-# --- real recordings ------------------------------------------------------------------------------------------------
+# --- real recordings
+# ------------------------------------------------------------------------------------------------
 
 
 def _real(data_dir: Path, name: str) -> ImageDataset:
@@ -538,7 +667,9 @@ def test_real_stationary_start_measures_gravity(data_dir: Path) -> None:
 
 
 def test_a_rectified_pair_is_read_from_its_poses_to_the_last_bit() -> None:
-    """EuRoC's calibration, whose printed rotation is one to 13 digits only: inverting twice moved it by 2e-14 m."""
+    """EuRoC's calibration, whose printed rotation is one to 13 digits only: inverting twice
+    moved it by 2e-14 m.
+    """
     pair = rectified_cameras(euroc_like_rig())
     again = rectifier_of(rig_read_as(pair.camera, pair.T_rect0_imu))
     assert again.camera == pair.camera
@@ -548,7 +679,9 @@ def test_a_rectified_pair_is_read_from_its_poses_to_the_last_bit() -> None:
 def test_poses_that_no_inverse_gives_are_read_to_their_last_place() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
-        T = se3_from_parts(np.round(so3_exp(rng.normal(0, 2, 3)), 12), np.round(rng.normal(0, 0.3, 3), 12))
+        T = se3_from_parts(
+            np.round(so3_exp(rng.normal(0, 2, 3)), 12), np.round(rng.normal(0, 0.3, 3), 12)
+        )
         camera = StereoCamera(431.7, 431.7, 364.3, 254.2, float(rng.uniform(0.05, 0.6)), 752, 480)
         again = rectifier_of(rig_read_as(camera, T))
         np.testing.assert_array_equal(again.T_rect0_imu[:3, :3], T[:3, :3])

@@ -32,7 +32,9 @@ def T_world_cam(drive: Drive) -> np.ndarray:
 
 
 def make_factors(folder: Path, name: str = FACTORS) -> Path:
-    """Write the features of a drive, ordered by landmark as GTSAM does, with calibration and poses beside them."""
+    """Write the features of a drive, ordered by landmark as GTSAM does, with calibration and
+    poses beside them.
+    """
     rows = []
     for landmark in range(DRIVE.features.shape[1]):
         for frame in np.flatnonzero(DRIVE.features[0, landmark] != -1):
@@ -41,7 +43,10 @@ def make_factors(folder: Path, name: str = FACTORS) -> Path:
     (folder / name).write_text("\n".join(rows))
     c = CAMERA
     (folder / "VO_calibration.txt").write_text(f"{c.fu} {c.fv} 0.0 {c.cu} {c.cv} {c.baseline_m}")
-    poses = [f"{k + FIRST} {' '.join(f'{x:.9g}' for x in T.ravel())}" for k, T in enumerate(T_world_cam(DRIVE))]
+    poses = [
+        f"{k + FIRST} {' '.join(f'{x:.9g}' for x in T.ravel())}"
+        for k, T in enumerate(T_world_cam(DRIVE))
+    ]
     (folder / name.replace("stereo_factors", "camera_poses")).write_text("\n".join(poses) + "\n")
     return folder / name
 
@@ -67,10 +72,16 @@ def test_factors_are_the_features_of_the_drive(tmp_path: Path) -> None:
 
 def test_numbers_with_gaps_keep_their_times(tmp_path: Path) -> None:
     path = make_factors(tmp_path)
-    lines = [line for line in path.read_text().splitlines() if int(line.split()[0]) not in (FIRST + 3, FIRST + 4)]
+    lines = [
+        line
+        for line in path.read_text().splitlines()
+        if int(line.split()[0]) not in (FIRST + 3, FIRST + 4)
+    ]
     path.write_text("\n".join(lines))
     recording = read_gtsam(path).recording
-    assert recording.frame_times_ns.tolist() == [100_000_000 * k for k in range(12) if k not in (3, 4)]
+    assert recording.frame_times_ns.tolist() == [
+        100_000_000 * k for k in range(12) if k not in (3, 4)
+    ]
     assert recording.reference.times_ns.tolist() == recording.frame_times_ns.tolist()
 
 
@@ -114,24 +125,48 @@ def _swapped(lines: list[str]) -> list[str]:
 
 _POSES = "VO_camera_poses_small.txt"
 BAD = {
-    "several factor files": (_two, r"holds VO_stereo_factors00s\.txt, VO_stereo_factors_small\.txt; name one"),
-    "no calibration": (_without("VO_calibration.txt"), "no calibration; put its 'fx fy s u0 v0 b' beside it"),
+    "several factor files": (
+        _two,
+        r"holds VO_stereo_factors00s\.txt, VO_stereo_factors_small\.txt; name one",
+    ),
+    "no calibration": (
+        _without("VO_calibration.txt"),
+        "no calibration; put its 'fx fy s u0 v0 b' beside it",
+    ),
     "a calibration with skew": (
         _with(lambda _: ["700 700 3 600 180 0.5"], "VO_calibration.txt"),
         "expected one line 'fx fy s u0 v0 b' with a skew s of zero",
     ),
-    "seven columns": (_with(lambda lines: [*lines[:3], "7 1 2 3 4 5 6"]), "line 4: 7 values instead of 8"),
-    "a landmark without a number": (_with(lambda lines: [*lines, "7 1.5 2 1 4 0 0 1"]), "is no row 'pose landmark uL"),
-    "a pixel that is no number": (_with(lambda lines: [*lines, "7 9999 nan 1 4 0 0 1"]), "is no row 'pose landmark uL"),
-    "a landmark seen twice": (_with(lambda lines: [*lines, lines[0]]), "sees landmark 0 more than once"),
+    "seven columns": (
+        _with(lambda lines: [*lines[:3], "7 1 2 3 4 5 6"]),
+        "line 4: 7 values instead of 8",
+    ),
+    "a landmark without a number": (
+        _with(lambda lines: [*lines, "7 1.5 2 1 4 0 0 1"]),
+        "is no row 'pose landmark uL",
+    ),
+    "a pixel that is no number": (
+        _with(lambda lines: [*lines, "7 9999 nan 1 4 0 0 1"]),
+        "is no row 'pose landmark uL",
+    ),
+    "a landmark seen twice": (
+        _with(lambda lines: [*lines, lines[0]]),
+        "sees landmark 0 more than once",
+    ),
     "exchanged cameras": (_with(_swapped), "left and right look swapped"),
     "one pose": (_with(lambda lines: lines[:1]), "holds one pose; visual odometry needs"),
     "poses that are no transforms": (
         _with(lambda lines: [lines[0].replace(" 1 ", " 2 ", 1), *lines[1:]], _POSES),
         r"poses_small\.txt, line 1: not a rotation",
     ),
-    "poses of other frames": (_with(lambda lines: [f"9{line}" for line in lines], _POSES), "numbers none of the"),
-    "poses out of order": (_with(lambda lines: lines[::-1], _POSES), "line 2: its number does not increase"),
+    "poses of other frames": (
+        _with(lambda lines: [f"9{line}" for line in lines], _POSES),
+        "numbers none of the",
+    ),
+    "poses out of order": (
+        _with(lambda lines: lines[::-1], _POSES),
+        "line 2: its number does not increase",
+    ),
 }
 
 
@@ -151,6 +186,9 @@ def test_gtsams_own_examples(name: str, frames: int, length_m: float, data_dir: 
     reference = dataset.recording.reference
     assert len(reference) == frames
     if name == "00s":  # the other has 300 features a frame and takes ten seconds
-        as_given = load_config(overrides=["msckf.calibrate_stereo=off"])  # as the published poses take the cameras
+        # as the published poses take the cameras
+        as_given = load_config(overrides=["msckf.calibrate_stereo=off"])
         assert evaluate(run(dataset, as_given, stop=30).trajectory, reference).ate_m.rmse < 0.02
-    assert float(np.linalg.norm(np.diff(reference.positions, axis=0), axis=1).sum()) == pytest.approx(length_m, abs=0.1)
+    assert float(
+        np.linalg.norm(np.diff(reference.positions, axis=0), axis=1).sum()
+    ) == pytest.approx(length_m, abs=0.1)

@@ -60,10 +60,14 @@ def _png(tmp_path: Path) -> bytes:
 
 
 @pytest.mark.parametrize("kept", [0.03, 0.5, 0.9, 0.999])
-def test_truncated_png_is_unreadable_although_opencv_may_decode_it(kept: float, tmp_path: Path) -> None:
+def test_truncated_png_is_unreadable_although_opencv_may_decode_it(
+    kept: float, tmp_path: Path
+) -> None:
     data = _png(tmp_path)
     (tmp_path / "cut.png").write_bytes(data[: int(kept * len(data))])
-    with pytest.raises(UnreadableImageError, match=r"cut\.png: the PNG is truncated; copy the image again"):
+    with pytest.raises(
+        UnreadableImageError, match=r"cut\.png: the PNG is truncated; copy the image again"
+    ):
         load_gray(tmp_path / "cut.png")
 
 
@@ -71,7 +75,9 @@ def test_damaged_png_is_unreadable(tmp_path: Path) -> None:
     data = bytearray(_png(tmp_path))
     data[len(data) // 2] ^= 0xFF
     (tmp_path / "bent.png").write_bytes(bytes(data))
-    with pytest.raises(UnreadableImageError, match=r"bent\.png: the PNG is damaged \(wrong checksum in its 'IDAT'"):
+    with pytest.raises(
+        UnreadableImageError, match=r"bent\.png: the PNG is damaged \(wrong checksum in its 'IDAT'"
+    ):
         load_gray(tmp_path / "bent.png")
 
 
@@ -90,7 +96,9 @@ def test_lists_images_in_order_without_other_files(tmp_path: Path) -> None:
     make_images(tmp_path / "images", 11)
     for name in ("notes.txt", ".hidden.png"):
         (tmp_path / "images" / name).write_text("x")
-    assert [path.name for path in list_images(tmp_path / "images")] == [f"{k:06d}.png" for k in range(11)]
+    assert [path.name for path in list_images(tmp_path / "images")] == [
+        f"{k:06d}.png" for k in range(11)
+    ]
 
 
 def test_rejects_folders_without_images(tmp_path: Path) -> None:
@@ -101,11 +109,15 @@ def test_rejects_folders_without_images(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("side", "counts"), [("left", (4, 5)), ("right", (5, 4))])
-def test_error_names_the_first_missing_partner(side: str, counts: tuple[int, int], tmp_path: Path) -> None:
+def test_error_names_the_first_missing_partner(
+    side: str, counts: tuple[int, int], tmp_path: Path
+) -> None:
     for name in ("left", "right"):
         make_images(tmp_path / name, 5)
     (tmp_path / side / "000003.png").unlink()
-    message = rf"left holds {counts[0]} images and .*right {counts[1]}: .*{side}.000003\.png is missing"
+    message = (
+        rf"left holds {counts[0]} images and .*right {counts[1]}: .*{side}.000003\.png is missing"
+    )
     with pytest.raises(DataError, match=message):
         pair_images(tmp_path / "left", tmp_path / "right")
 
@@ -128,7 +140,8 @@ def test_pairs_hold_names_and_not_paths(tmp_path: Path) -> None:
     ]
 
 
-# --- prefetching --------------------------------------------------------------------------------------------------
+# --- prefetching
+# --------------------------------------------------------------------------------------------------
 
 
 def _prefetch_threads() -> list[threading.Thread]:

@@ -1,4 +1,6 @@
-"""The KITTI reader: both layouts, gray and colour, skipped images, bad input, the real recordings."""
+"""The KITTI reader: both layouts, gray and colour, skipped images, bad input, the real
+recordings.
+"""
 
 from __future__ import annotations
 
@@ -55,14 +57,18 @@ def test_reads_a_self_contained_folder_completely(tmp_path: Path) -> None:
     assert recording.motion == {"velocity"}
     assert recording.notes == ()
     drive = make_drive(5)
-    in_imu = se3_inverse(recording.T_cam0_imu) @ recording.reference.T_world_body @ recording.T_cam0_imu
+    in_imu = (
+        se3_inverse(recording.T_cam0_imu) @ recording.reference.T_world_body @ recording.T_cam0_imu
+    )
     np.testing.assert_allclose(in_imu, drive.T_world_imu, atol=1e-9)
     events = list(dataset.events())
     samples = [event for event in events if isinstance(event, VelocitySample)]
     np.testing.assert_array_equal([[*s.linear, *s.angular] for s in samples], drive.velocities)
     for frame in events[1::2]:
         assert frame.right is not None
-        stored = cv2.imread(str(folder / "image_0" / f"{frame.index:06d}.png"), cv2.IMREAD_UNCHANGED)
+        stored = cv2.imread(
+            str(folder / "image_0" / f"{frame.index:06d}.png"), cv2.IMREAD_UNCHANGED
+        )
         np.testing.assert_array_equal(frame.left, stored)
     assert dataset.observations(0) is None
 
@@ -83,7 +89,11 @@ def test_reads_a_folder_with_images_only(tmp_path: Path) -> None:
     for name in ("poses.txt", "velocity.csv", "T_cam0_imu.txt"):
         (folder / name).unlink()
     recording = read_kitti(folder, DEFAULT).recording
-    assert (recording.reference, recording.T_cam0_imu, recording.motion) == (None, None, frozenset())
+    assert (recording.reference, recording.T_cam0_imu, recording.motion) == (
+        None,
+        None,
+        frozenset(),
+    )
     assert len(frames_in(folder)) == 4
 
 
@@ -105,7 +115,8 @@ def test_velocities_may_have_their_own_rate(tmp_path: Path) -> None:
     assert kinds == "vfvvvvf"
 
 
-# --- colour -------------------------------------------------------------------------------------------------------
+# --- colour
+# -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -121,11 +132,16 @@ def test_chooses_the_gray_or_colour_pair(
     assert dataset.recording.camera.baseline_m == pytest.approx(0.54 if first == 0 else 0.53)
 
 
-@pytest.mark.parametrize(("gray", "colour", "requested"), [(True, False, True), (False, True, False)])
-def test_error_names_a_missing_pair(gray: bool, colour: bool, requested: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("gray", "colour", "requested"), [(True, False, True), (False, True, False)]
+)
+def test_error_names_a_missing_pair(
+    gray: bool, colour: bool, requested: bool, tmp_path: Path
+) -> None:
     folder = make_kitti(tmp_path / "seq", gray=gray, colour=colour)
     with pytest.raises(
-        DataError, match=rf"holds no image_\d with image_\d \(dataset.colour is {str(requested).lower()}\)"
+        DataError,
+        match=rf"holds no image_\d with image_\d \(dataset.colour is {str(requested).lower()}\)",
     ):
         read_kitti(folder, DatasetSettings(colour=requested))
 
@@ -136,7 +152,8 @@ def test_colour_moves_extrinsics_and_reference_to_camera_2(tmp_path: Path) -> No
     colour = read_kitti(folder, DatasetSettings(colour=True)).recording
     T_cam2_cam0 = se3_from_parts(np.eye(3), [0.06, 0, 0])  # camera 2 is 6 cm left of camera 0
     np.testing.assert_allclose(colour.T_cam0_imu, T_cam2_cam0 @ gray.T_cam0_imu, atol=1e-12)
-    # Both describe one motion of the body: relative poses in the imu frame agree, whichever camera was watched.
+    # Both describe one motion of the body: relative poses in the imu frame agree, whichever camera
+    # was watched.
     relative = [
         se3_inverse(poses[0]) @ poses[-1]
         for poses in (
@@ -148,18 +165,26 @@ def test_colour_moves_extrinsics_and_reference_to_camera_2(tmp_path: Path) -> No
     np.testing.assert_allclose(relative[0], relative[1], atol=1e-12)
     np.testing.assert_allclose(colour.reference.T_world_body[0], np.eye(4), atol=1e-12)
     assert np.abs(colour.reference.positions[-1] - gray.reference.positions[-1]).max() > 1e-4
-    frame = next(e for e in read_kitti(folder, DatasetSettings(colour=True)).events() if isinstance(e, StereoFrame))
+    frame = next(
+        e
+        for e in read_kitti(folder, DatasetSettings(colour=True)).events()
+        if isinstance(e, StereoFrame)
+    )
     assert frame.left.ndim == 2
 
 
 def test_official_calibration_of_sequence_00(tmp_path: Path) -> None:
-    """By hand: b = 386.1448 / 718.856; camera 2 is (45.38225 - 607.1928 * .003779761) / 718.856 m to the left."""
+    """By hand: b = 386.1448 / 718.856; camera 2 is (45.38225 - 607.1928 * .003779761) / 718.856
+    m to the left.
+    """
     (tmp_path / "calib.txt").write_text(OFFICIAL_00)
     gray = read_calibration(tmp_path / "calib.txt", (0, 1))
     assert gray.camera.baseline_m == pytest.approx(0.5371657, abs=1e-6)
     np.testing.assert_array_equal(gray.T_left_cam0, np.eye(4))
     colour = read_calibration(tmp_path / "calib.txt", (2, 3))
-    np.testing.assert_allclose(colour.T_left_cam0[:3, 3], [0.0599385, -0.0011312, 0.0037798], atol=1e-6)
+    np.testing.assert_allclose(
+        colour.T_left_cam0[:3, 3], [0.0599385, -0.0011312, 0.0037798], atol=1e-6
+    )
     assert colour.camera.baseline_m == pytest.approx(0.5332909, abs=1e-6)
     assert colour.off_axis_m == pytest.approx(0.0033, abs=3e-4)
 
@@ -172,7 +197,8 @@ def test_a_pair_off_its_axis_is_noted(tmp_path: Path) -> None:
     assert "image_3 is 3." in notes[0]
 
 
-# --- images that cannot be used -----------------------------------------------------------------------------------
+# --- images that cannot be used
+# -----------------------------------------------------------------------------------
 
 
 def cut(path: Path) -> None:
@@ -180,7 +206,9 @@ def cut(path: Path) -> None:
     path.write_bytes(data[: len(data) // 2])
 
 
-def test_truncated_images_are_skipped_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_truncated_images_are_skipped_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     folder = make_kitti(tmp_path / "seq", frames=8)
     cut(folder / "image_0" / "000000.png")
     cut(folder / "image_1" / "000007.png")
@@ -202,12 +230,18 @@ def test_too_many_unreadable_images_are_an_error(prefetch: int, tmp_path: Path) 
     for k in (2, 4, 5):
         cut(folder / "image_1" / f"{k:06d}.png")
     assert len(frames_in(folder, DatasetSettings(max_bad_frames=3, prefetch_frames=prefetch))) == 5
-    with pytest.raises(DataError, match=r"000005\.png: the PNG is truncated.*\(3 unusable frames, .* allows 2\)"):
+    with pytest.raises(
+        DataError, match=r"000005\.png: the PNG is truncated.*\(3 unusable frames, .* allows 2\)"
+    ):
         frames_in(folder, DatasetSettings(max_bad_frames=2, prefetch_frames=prefetch))
 
 
-def test_unreadable_frames_have_no_limit_but_all_of_them(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Seven of eight frames are damaged: the run goes on with the one left; five are named, all are counted."""
+def test_unreadable_frames_have_no_limit_but_all_of_them(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Seven of eight frames are damaged: the run goes on with the one left; five are named, all
+    are counted.
+    """
     folder = make_kitti(tmp_path / "seq", frames=8)
     for k in range(7):
         cut(folder / "image_1" / f"{k:06d}.png")
@@ -218,7 +252,8 @@ def test_unreadable_frames_have_no_limit_but_all_of_them(tmp_path: Path, caplog:
     cut(folder / "image_1" / "000007.png")
     caplog.clear()
     with pytest.raises(
-        DataError, match=r"none of 8 frames can be used; the first: .*000000\.png: the PNG is truncated"
+        DataError,
+        match=r"none of 8 frames can be used; the first: .*000000\.png: the PNG is truncated",
     ):
         frames_in(folder)
     assert not caplog.records, "the error says it all"
@@ -257,7 +292,8 @@ def test_closing_the_generator_ends_the_thread(tmp_path: Path) -> None:
     assert not any(thread.name.startswith("vio-prefetch") for thread in threading.enumerate())
 
 
-# --- bad input ----------------------------------------------------------------------------------------------------
+# --- bad input
+# ----------------------------------------------------------------------------------------------------
 
 
 def _write(name: str, text: str) -> Callable[[Path], object]:
@@ -274,15 +310,47 @@ def _replace(name: str, old: str, new: str) -> Callable[[Path], object]:
 
 GOOD = calib_text(0.0, 0.54)
 BAD = [
-    (_remove("image_1/000002.png"), DataError, r"image_0 holds 4 images and .*image_1 3: .*000002\.png is missing"),
-    (_remove("calib.txt"), CalibrationError, r"calib\.txt is missing; it holds the projection matrices"),
-    (_write("calib.txt", calib_text(0.0)), CalibrationError, r"calib\.txt: 0 lines begin with 'P1:'"),
+    (
+        _remove("image_1/000002.png"),
+        DataError,
+        r"image_0 holds 4 images and .*image_1 3: .*000002\.png is missing",
+    ),
+    (
+        _remove("calib.txt"),
+        CalibrationError,
+        r"calib\.txt is missing; it holds the projection matrices",
+    ),
+    (
+        _write("calib.txt", calib_text(0.0)),
+        CalibrationError,
+        r"calib\.txt: 0 lines begin with 'P1:'",
+    ),
     (_write("calib.txt", GOOD + GOOD), CalibrationError, r"calib\.txt: 2 lines begin with 'P0:'"),
-    (_write("calib.txt", calib_text(0.0, 0.0)), CalibrationError, r"P0 and P1 imply a stereo baseline of 0 m"),
-    (_write("calib.txt", calib_text(0.54, 0.0)), CalibrationError, r"stereo baseline of -0\.54 m.*exchanged"),
-    (_write("calib.txt", GOOD.replace("6.0e+02", "x", 1)), CalibrationError, r"line 1: P0 holds no number"),
-    (_write("calib.txt", GOOD.replace(" 1 0", " 1", 1)), CalibrationError, r"line 1: P0 holds 11 values, expected 12"),
-    (_write("calib.txt", GOOD.replace(" 1 0", " 2 0", 1)), CalibrationError, r"line 1: P0 is no intrinsic matrix"),
+    (
+        _write("calib.txt", calib_text(0.0, 0.0)),
+        CalibrationError,
+        r"P0 and P1 imply a stereo baseline of 0 m",
+    ),
+    (
+        _write("calib.txt", calib_text(0.54, 0.0)),
+        CalibrationError,
+        r"stereo baseline of -0\.54 m.*exchanged",
+    ),
+    (
+        _write("calib.txt", GOOD.replace("6.0e+02", "x", 1)),
+        CalibrationError,
+        r"line 1: P0 holds no number",
+    ),
+    (
+        _write("calib.txt", GOOD.replace(" 1 0", " 1", 1)),
+        CalibrationError,
+        r"line 1: P0 holds 11 values, expected 12",
+    ),
+    (
+        _write("calib.txt", GOOD.replace(" 1 0", " 2 0", 1)),
+        CalibrationError,
+        r"line 1: P0 is no intrinsic matrix",
+    ),
     (
         _write("calib.txt", GOOD.replace("P0: 7", "P0: -7")),
         CalibrationError,
@@ -293,19 +361,67 @@ BAD = [
         CalibrationError,
         r"P0 is no intrinsic matrix .* fu and fv positive",
     ),
-    (_write("calib.txt", GOOD.replace("6.0e+02", "5.0e+02", 1)), CalibrationError, r"P0 and P1 differ in focal length"),
-    (_write("calib.txt", GOOD.replace("1.8e+02 0 0 0 1 0\nTr", "1.8e+02 99 0 0 1 0\nTr")), CalibrationError, "off the"),
+    (
+        _write("calib.txt", GOOD.replace("6.0e+02", "5.0e+02", 1)),
+        CalibrationError,
+        r"P0 and P1 differ in focal length",
+    ),
+    (
+        _write("calib.txt", GOOD.replace("1.8e+02 0 0 0 1 0\nTr", "1.8e+02 99 0 0 1 0\nTr")),
+        CalibrationError,
+        "off the",
+    ),
     (_remove("times.txt"), DataError, r"times\.txt is missing"),
-    (_write("times.txt", "0\n0.1\n0.2\n"), DataError, r"times\.txt holds 3 times for 4 image pairs"),
-    (_write("times.txt", "0\n0.1\n0.1\n0.2\n"), DataError, r"times\.txt, line 3: the clock repeats"),
-    (_write("times.txt", "0\n0.1\n0.05\n0.2\n"), DataError, r"times\.txt, line 3: the clock runs backwards"),
-    (_write("times.txt", "0\n0.1\nsoon\n0.2\n"), DataError, r"times\.txt, line 3: 'soon' is no time"),
-    (_write("times.txt", "0\n0.1 0.2\n0.3\n0.4\n"), DataError, r"holds 4 times for 4 image pairs; there must"),
-    (_remove("T_cam0_imu.txt"), CalibrationError, r"velocity\.csv: needs the pose of its sensor; add T_cam0_imu\.txt"),
-    (_write("T_cam0_imu.txt", "1 0 0 0\n0 1 0 0\n0 0 2 0\n"), CalibrationError, r"T_cam0_imu\.txt: not a rotation"),
-    (_write("T_cam0_imu.txt", "1 0 0\n"), CalibrationError, r"T_cam0_imu\.txt: expected three or four lines"),
-    (_write("T_cam0_imu.txt", ""), CalibrationError, r"T_cam0_imu\.txt: expected three or four lines"),
-    (_replace("velocity.csv", "time_s", "t"), DataError, r"velocity\.csv, line 1: expected the header time_s,vx_mps"),
+    (
+        _write("times.txt", "0\n0.1\n0.2\n"),
+        DataError,
+        r"times\.txt holds 3 times for 4 image pairs",
+    ),
+    (
+        _write("times.txt", "0\n0.1\n0.1\n0.2\n"),
+        DataError,
+        r"times\.txt, line 3: the clock repeats",
+    ),
+    (
+        _write("times.txt", "0\n0.1\n0.05\n0.2\n"),
+        DataError,
+        r"times\.txt, line 3: the clock runs backwards",
+    ),
+    (
+        _write("times.txt", "0\n0.1\nsoon\n0.2\n"),
+        DataError,
+        r"times\.txt, line 3: 'soon' is no time",
+    ),
+    (
+        _write("times.txt", "0\n0.1 0.2\n0.3\n0.4\n"),
+        DataError,
+        r"holds 4 times for 4 image pairs; there must",
+    ),
+    (
+        _remove("T_cam0_imu.txt"),
+        CalibrationError,
+        r"velocity\.csv: needs the pose of its sensor; add T_cam0_imu\.txt",
+    ),
+    (
+        _write("T_cam0_imu.txt", "1 0 0 0\n0 1 0 0\n0 0 2 0\n"),
+        CalibrationError,
+        r"T_cam0_imu\.txt: not a rotation",
+    ),
+    (
+        _write("T_cam0_imu.txt", "1 0 0\n"),
+        CalibrationError,
+        r"T_cam0_imu\.txt: expected three or four lines",
+    ),
+    (
+        _write("T_cam0_imu.txt", ""),
+        CalibrationError,
+        r"T_cam0_imu\.txt: expected three or four lines",
+    ),
+    (
+        _replace("velocity.csv", "time_s", "t"),
+        DataError,
+        r"velocity\.csv, line 1: expected the header time_s,vx_mps",
+    ),
     (
         _replace("velocity.csv", "\n0.100000,", "\n0.100000,nan,"),
         DataError,
@@ -316,9 +432,21 @@ BAD = [
         DataError,
         r"velocity\.csv, line 2: a reading is not a finite number .*1 lines in all",
     ),
-    (_replace("velocity.csv", "\n0.200000,", "\n0.100000,"), DataError, r"velocity\.csv, line 4: the clock repeats"),
-    (_replace("velocity.csv", "\n0.200000,", "\n0.010000,"), DataError, r"velocity\.csv, line 4: the clock runs back"),
-    (_write("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 5), DataError, r"poses\.txt holds 5 poses for 4 images"),
+    (
+        _replace("velocity.csv", "\n0.200000,", "\n0.100000,"),
+        DataError,
+        r"velocity\.csv, line 4: the clock repeats",
+    ),
+    (
+        _replace("velocity.csv", "\n0.200000,", "\n0.010000,"),
+        DataError,
+        r"velocity\.csv, line 4: the clock runs back",
+    ),
+    (
+        _write("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n" * 5),
+        DataError,
+        r"poses\.txt holds 5 poses for 4 images",
+    ),
     (_write("poses.txt", "1 0 0 0 0 1 0 0 0 0 1\n"), DataError, r"poses\.txt"),
 ]
 
@@ -337,18 +465,29 @@ def test_rejects_bad_folder_with_one_line_error(
 def test_rejects_velocities_of_another_clock(tmp_path: Path) -> None:
     folder = make_kitti(tmp_path / "seq")
     (folder / "times.txt").write_text("".join(f"{1000 + 0.1 * k:.6f}\n" for k in range(4)))
-    with pytest.raises(DataError, match=r"velocity\.csv: no sample is within the time of the images"):
+    with pytest.raises(
+        DataError, match=r"velocity\.csv: no sample is within the time of the images"
+    ):
         read_kitti(folder, DEFAULT)
 
 
-# --- the real recordings ------------------------------------------------------------------------------------------
+# --- the real recordings
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("name", "count", "camera"),
     [
-        ("kitti_0039", 110, StereoCamera(721.5377, 721.5377, 609.5593, 172.854, 0.5371505882506209, 1242, 375)),
-        ("kitti_06_head", 30, StereoCamera(707.0912, 707.0912, 601.8873, 183.1104, 0.5371506532679237, 1226, 370)),
+        (
+            "kitti_0039",
+            110,
+            StereoCamera(721.5377, 721.5377, 609.5593, 172.854, 0.5371505882506209, 1242, 375),
+        ),
+        (
+            "kitti_06_head",
+            30,
+            StereoCamera(707.0912, 707.0912, 601.8873, 183.1104, 0.5371506532679237, 1226, 370),
+        ),
     ],
 )
 def test_real_recording(name: str, count: int, camera: StereoCamera, data_dir: Path) -> None:
@@ -358,7 +497,10 @@ def test_real_recording(name: str, count: int, camera: StereoCamera, data_dir: P
     assert recording.camera == camera
     assert recording.notes == ()
     assert len(recording.reference) == count
-    assert int(recording.frame_times_ns[1]) == {"kitti_0039": 103783000, "kitti_06_head": 104506000}[name]
+    assert (
+        int(recording.frame_times_ns[1])
+        == {"kitti_0039": 103783000, "kitti_06_head": 104506000}[name]
+    )
     events = list(dataset.events(0, 3))
     assert len(events) == 6
     for frame in events[1::2]:
@@ -367,9 +509,11 @@ def test_real_recording(name: str, count: int, camera: StereoCamera, data_dir: P
 
 @pytest.mark.parametrize("name", ["kitti_0039", "kitti_06_head"])
 def test_real_extrinsics_relate_velocities_to_the_reference(name: str, data_dir: Path) -> None:
-    """The reference, moved to the IMU, agrees with the velocities; with the inverse rotation it does not.
+    """The reference, moved to the IMU, agrees with the velocities; with the inverse rotation it
+    does not.
 
-    These drives rotate too little to verify the translation too; the ECE276A and UTIAS tests do that for the same rig.
+    These drives rotate too little to verify the translation too; the ECE276A and UTIAS tests do
+    that for the same rig.
     """
     dataset = read_kitti(data_dir / name, DEFAULT)
     recording = dataset.recording
@@ -386,14 +530,25 @@ def test_real_extrinsics_relate_velocities_to_the_reference(name: str, data_dir:
 
 
 def test_real_images_match_along_rows(data_dir: Path) -> None:
-    """The left image's patches are found in the right image on the same row, to the left: the pair is not swapped."""
-    frame = next(e for e in read_kitti(data_dir / "kitti_0039", DEFAULT).events() if isinstance(e, StereoFrame))
-    corners = cv2.goodFeaturesToTrack(frame.left[:, 200:-50], 60, 0.05, 20).reshape(-1, 2).astype(int)
+    """The left image's patches are found in the right image on the same row, to the left: the
+    pair is not swapped.
+    """
+    frame = next(
+        e
+        for e in read_kitti(data_dir / "kitti_0039", DEFAULT).events()
+        if isinstance(e, StereoFrame)
+    )
+    corners = (
+        cv2.goodFeaturesToTrack(frame.left[:, 200:-50], 60, 0.05, 20).reshape(-1, 2).astype(int)
+    )
     disparities = []
     for u, v in corners + np.array([200, 0]):
         if not 10 <= v < 365:
             continue
-        patch, strip = frame.left[v - 7 : v + 8, u - 7 : u + 8], frame.right[v - 7 : v + 8, u - 130 : u + 40]
+        patch, strip = (
+            frame.left[v - 7 : v + 8, u - 7 : u + 8],
+            frame.right[v - 7 : v + 8, u - 130 : u + 40],
+        )
         score = cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED)[0]
         if score.max() > 0.9:
             disparities.append(130 - 7 - int(score.argmax()))

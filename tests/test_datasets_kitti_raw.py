@@ -1,4 +1,6 @@
-"""KITTI raw drives: calibration consistent with KITTI's images, exact clocks, an error that names each defect."""
+"""KITTI raw drives: calibration consistent with KITTI's images, exact clocks, an error that
+names each defect.
+"""
 
 from __future__ import annotations
 
@@ -35,19 +37,25 @@ def _read(path: Path) -> ImageDataset:
 def test_calibration_is_read(above: bool, tmp_path: Path) -> None:
     path = make_kitti_raw(tmp_path, above=above)
     recording = open_dataset(path).recording
-    expected = rectified_cameras(replace(KITTI_RIG, T_imu_cam0=np.eye(4), T_imu_cam1=KITTI_RIG.T_cam0_cam1))
+    expected = rectified_cameras(
+        replace(KITTI_RIG, T_imu_cam0=np.eye(4), T_imu_cam1=KITTI_RIG.T_cam0_cam1)
+    )
     assert recording.kind == "kitti_raw"
     assert recording.motion == frozenset()
     assert recording.reference is None
     assert recording.camera.fu == pytest.approx(expected.camera.fu, rel=1e-9)
     assert recording.camera.baseline_m == pytest.approx(expected.camera.baseline_m, rel=1e-9)
     assert (recording.camera.width, recording.camera.height) == (64, 48)
-    np.testing.assert_allclose(recording.T_cam0_imu, expected.T_rect0_imu @ T_CAM0_VELO @ T_VELO_IMU, atol=1e-9)
+    np.testing.assert_allclose(
+        recording.T_cam0_imu, expected.T_rect0_imu @ T_CAM0_VELO @ T_VELO_IMU, atol=1e-9
+    )
     assert open_dataset(f"kitti_raw:{path}").recording.camera == recording.camera
 
 
 @pytest.mark.parametrize("lines", [4, 110], ids=["a line an image", "a line a frame of the drive"])
-def test_a_drive_keeps_its_clock_with_a_calibration_that_a_run_saved(lines: int, tmp_path: Path) -> None:
+def test_a_drive_keeps_its_clock_with_a_calibration_that_a_run_saved(
+    lines: int, tmp_path: Path
+) -> None:
     path = make_kitti_raw(tmp_path)
     rig = _read(path).rectifier.rig
     kept = tmp_path / "camchain.yaml"
@@ -72,7 +80,9 @@ def test_frames_are_rectified_as_opencv_would(tmp_path: Path) -> None:
         ):
             D = np.array([model.coefficients])
             maps = cv2.initUndistortRectifyMap(model.K, D, R, camera.K, (64, 48), cv2.CV_32FC1)
-            expected = cv2.remap(load_gray(path)[0], *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            expected = cv2.remap(
+                load_gray(path)[0], *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
             difference = np.abs(image.astype(int) - expected.astype(int))
             assert difference.max() <= 3
             assert (difference > 1).mean() < 0.002
@@ -85,7 +95,10 @@ def test_images_rectified_by_kitti_pass_through(tmp_path: Path) -> None:
     assert camera.baseline_m == pytest.approx(0.11, abs=1e-9)
     assert (camera.width, camera.height) == RECT_SIZE
     R_rect = so3_exp([0.004, 0.01, -0.002])
-    expected = (R_rect @ (T_CAM0_VELO @ T_VELO_IMU)[:3, :3], R_rect @ (T_CAM0_VELO @ T_VELO_IMU)[:3, 3])
+    expected = (
+        R_rect @ (T_CAM0_VELO @ T_VELO_IMU)[:3, :3],
+        R_rect @ (T_CAM0_VELO @ T_VELO_IMU)[:3, 3],
+    )
     np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3, :3], expected[0], atol=1e-9)
     np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3, 3], expected[1], atol=1e-9)
     for frame in frames_of(dataset):
@@ -100,30 +113,39 @@ def test_without_the_laser_scanner_the_body_is_the_camera(tmp_path: Path) -> Non
     assert any("calib_imu_to_velo.txt not found" in note for note in recording.notes)
 
 
-# --- clock ----------------------------------------------------------------------------------------------------------
+# --- clock
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_times_follow_from_frame_numbers_where_there_are_none(tmp_path: Path) -> None:
     recording = _read(make_kitti_raw(tmp_path, [7, 8, 10])).recording
     assert recording.frame_times_ns.tolist() == [700_000_000, 800_000_000, 1_000_000_000]
-    assert "timestamps.txt is missing; times follow from the frame numbers at 10 Hz" in recording.notes[0]
+    assert (
+        "timestamps.txt is missing; times follow from the frame numbers at 10 Hz"
+        in recording.notes[0]
+    )
 
 
 def _stamp(k: int) -> str:
     return f"2011-09-26 14:02:{25 + k // 10}.{k % 10}51199337"
 
 
-@pytest.mark.parametrize(("lines", "rows"), [(3, [0, 1, 2]), (12, [7, 8, 10])], ids=["an image", "whole drive"])
+@pytest.mark.parametrize(
+    ("lines", "rows"), [(3, [0, 1, 2]), (12, [7, 8, 10])], ids=["an image", "whole drive"]
+)
 def test_timestamps_are_read_to_the_nanosecond(lines: int, rows: list[int], tmp_path: Path) -> None:
     path = make_kitti_raw(tmp_path, [7, 8, 10])
-    (path / "image_00" / "timestamps.txt").write_text("".join(f"{_stamp(k)}\n" for k in range(lines)))
+    (path / "image_00" / "timestamps.txt").write_text(
+        "".join(f"{_stamp(k)}\n" for k in range(lines))
+    )
     recording = _read(path).recording
     assert recording.notes == ()
     first = 1317045745_051199337  # 2011-09-26 14:02:25.051199337 UTC
     assert recording.frame_times_ns.tolist() == [first + 100_000_000 * k for k in rows]
 
 
-# --- bad input ------------------------------------------------------------------------------------------------------
+# --- bad input
+# ------------------------------------------------------------------------------------------------------
 
 Corruption = Callable[[Path], object]
 
@@ -132,7 +154,10 @@ def _entry(name: str, values: str | None) -> Corruption:
     def corrupt(folder: Path) -> None:
         path = folder / "calib_cam_to_cam.txt"
         text, count = re.subn(
-            rf"^{name}:.*\n", "" if values is None else f"{name}: {values}\n", path.read_text(), flags=re.M
+            rf"^{name}:.*\n",
+            "" if values is None else f"{name}: {values}\n",
+            path.read_text(),
+            flags=re.M,
         )
         assert count == 1
         path.write_text(text)
@@ -141,7 +166,9 @@ def _entry(name: str, values: str | None) -> Corruption:
 
 
 def _times(*lines: str) -> Corruption:
-    return lambda folder: (folder / "image_00" / "timestamps.txt").write_text("\n".join(lines) + "\n")
+    return lambda folder: (folder / "image_00" / "timestamps.txt").write_text(
+        "\n".join(lines) + "\n"
+    )
 
 
 def _images(folder: Path, camera: int) -> list[Path]:
@@ -165,20 +192,42 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         "calib_cam_to_cam.txt is neither there nor in the folders above",
     ),
     "no K": (_entry("K_01", None), CalibrationError, "calib_cam_to_cam.txt: has no entry K_01"),
-    "short D": (_entry("D_00", "-0.3 0.2 0 0"), CalibrationError, "D_00 holds 4 values, expected 5"),
-    "NaN in T": (_entry("T_01", "-0.5 nan 0"), CalibrationError, "T_01 holds values that are not finite"),
+    "short D": (
+        _entry("D_00", "-0.3 0.2 0 0"),
+        CalibrationError,
+        "D_00 holds 4 values, expected 5",
+    ),
+    "NaN in T": (
+        _entry("T_01", "-0.5 nan 0"),
+        CalibrationError,
+        "T_01 holds values that are not finite",
+    ),
     "text for a number": (_entry("T_01", "-0.5 a 0"), CalibrationError, "T_01 holds no number"),
-    "no matrix": (_entry("K_00", "1 2 3 4 5 6 7 8 9"), CalibrationError, "camera 00 is no intrinsic matrix"),
+    "no matrix": (
+        _entry("K_00", "1 2 3 4 5 6 7 8 9"),
+        CalibrationError,
+        "camera 00 is no intrinsic matrix",
+    ),
     "negative focal": (
         _entry("K_00", "-40 0 31 0 40 24 0 0 1"),
         CalibrationError,
         "camera 00 is no intrinsic matrix .* fu and fv positive",
     ),
-    "mirrored": (_entry("R_01", "1 0 0 0 1 0 0 0 -1"), CalibrationError, "R_01: not a rotation but a reflection"),
-    "swapped": (_entry("T_01", "0.11 0 0"), CalibrationError, "cam_to_cam.txt: .*the cameras may be swapped"),
+    "mirrored": (
+        _entry("R_01", "1 0 0 0 1 0 0 0 -1"),
+        CalibrationError,
+        "R_01: not a rotation but a reflection",
+    ),
+    "swapped": (
+        _entry("T_01", "0.11 0 0"),
+        CalibrationError,
+        "cam_to_cam.txt: .*the cameras may be swapped",
+    ),
     "no baseline": (_entry("T_01", "0 0 0"), CalibrationError, "the baseline is zero"),
     "an entry twice": (
-        lambda d: (d / "calib_cam_to_cam.txt").write_text((d / "calib_cam_to_cam.txt").read_text() * 2),
+        lambda d: (d / "calib_cam_to_cam.txt").write_text(
+            (d / "calib_cam_to_cam.txt").read_text() * 2
+        ),
         CalibrationError,
         "repeats an entry",
     ),
@@ -198,16 +247,26 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         r"is for images of 100 x 80 \(raw\) or 56 x 40 \(rectified\), not 64 x 48 pixels",
     ),
     "images without frame numbers": (
-        lambda d: [(d / f"image_0{k}/data/0000000101.png").rename(d / f"image_0{k}/data/b.png") for k in (0, 1)],
+        lambda d: [
+            (d / f"image_0{k}/data/0000000101.png").rename(d / f"image_0{k}/data/b.png")
+            for k in (0, 1)
+        ],
         DataError,
         "b.png: an image of KITTI raw is named by its frame number",
     ),
     "numbers of several lengths": (
-        lambda d: [(d / f"image_0{k}/data/0000000101.png").rename(d / f"image_0{k}/data/0100.png") for k in (0, 1)],
+        lambda d: [
+            (d / f"image_0{k}/data/0000000101.png").rename(d / f"image_0{k}/data/0100.png")
+            for k in (0, 1)
+        ],
         DataError,
         "0100.png: its frame number does not increase after 0000000100.png",
     ),
-    "too few times": (_times(_stamp(0), _stamp(1)), DataError, "holds 2 times for 4 images up to number 103"),
+    "too few times": (
+        _times(_stamp(0), _stamp(1)),
+        DataError,
+        "holds 2 times for 4 images up to number 103",
+    ),
     "times repeat": (
         _times(_stamp(0), _stamp(1), _stamp(1), _stamp(2)),
         DataError,
@@ -245,7 +304,8 @@ def test_rejects_bad_drives_with_one_line_error(case: str, tmp_path: Path) -> No
     assert "\n" not in str(caught.value)
 
 
-# --- the real drive -------------------------------------------------------------------------------------------------
+# --- the real drive
+# -------------------------------------------------------------------------------------------------
 
 
 def _real(data_dir: Path) -> tuple[ImageDataset, KittiRawCalibration]:
@@ -253,11 +313,16 @@ def _real(data_dir: Path) -> tuple[ImageDataset, KittiRawCalibration]:
     return _read(folder), read_cam_to_cam(folder / "calib_cam_to_cam.txt")
 
 
-def test_real_rectification_agrees_with_kitti_up_to_a_rotation_about_the_baseline(data_dir: Path) -> None:
+def test_real_rectification_agrees_with_kitti_up_to_a_rotation_about_the_baseline(
+    data_dir: Path,
+) -> None:
     dataset, published = _real(data_dir)
     R_rect_cam0, R_rect_cam1, baseline_m = rectifying_rotations(dataset.rectifier.rig)
     turns = []
-    for ours, theirs in ((R_rect_cam0, published.R_rect_cam0), (R_rect_cam1, published.R_rect_cam1)):
+    for ours, theirs in (
+        (R_rect_cam0, published.R_rect_cam0),
+        (R_rect_cam1, published.R_rect_cam1),
+    ):
         np.testing.assert_allclose(ours[0], theirs[0], atol=2e-6)  # KITTI prints seven digits
         turns.append(so3_log(ours @ theirs.T))
     np.testing.assert_allclose(turns[0], turns[1], atol=5e-6)
@@ -265,7 +330,9 @@ def test_real_rectification_agrees_with_kitti_up_to_a_rotation_about_the_baselin
     assert baseline_m == pytest.approx(-published.T_rect1_rect0[0, 3], abs=2e-5)
 
 
-def _kitti_maps(model: CameraModel, rect: CameraModel, R: FloatArray) -> tuple[np.ndarray, np.ndarray]:
+def _kitti_maps(
+    model: CameraModel, rect: CameraModel, R: FloatArray
+) -> tuple[np.ndarray, np.ndarray]:
     v, u = np.mgrid[0 : rect.height, 0 : rect.width]
     rays = np.stack([(u - rect.cu) / rect.fu, (v - rect.cv) / rect.fv, np.ones(u.shape)], axis=-1)
     uv, valid = project_point(model, rays @ R)
@@ -274,7 +341,9 @@ def _kitti_maps(model: CameraModel, rect: CameraModel, R: FloatArray) -> tuple[n
 
 
 def test_the_lens_model_reproduces_the_rectified_image_of_kitti(data_dir: Path) -> None:
-    """Frame 100 of the drive is image 76 of the rectified clip: equal to rounding, so order and signs are KITTI's."""
+    """Frame 100 of the drive is image 76 of the rectified clip: equal to rounding, so order and
+    signs are KITTI's.
+    """
     dataset, published = _real(data_dir)
     models = (
         (published.cam0, published.rect0, published.R_rect_cam0),
@@ -288,7 +357,9 @@ def test_the_lens_model_reproduces_the_rectified_image_of_kitti(data_dir: Path) 
 
 
 def test_real_extrinsics_agree_with_the_odometry_folder(data_dir: Path) -> None:
-    """`T_cam0_imu` of the rectified clip is R_rect_00 T_cam0_velo T_velo_imu; this one differs by a known rotation."""
+    """`T_cam0_imu` of the rectified clip is R_rect_00 T_cam0_velo T_velo_imu; this one differs
+    by a known rotation.
+    """
     dataset, published = _real(data_dir)
     other = open_dataset(data_dir / "kitti_0039").recording.T_cam0_imu
     R_rect_cam0 = rectifying_rotations(dataset.rectifier.rig)[0]
@@ -297,7 +368,9 @@ def test_real_extrinsics_agree_with_the_odometry_folder(data_dir: Path) -> None:
 
 
 def test_real_rectified_images_show_features_where_those_of_kitti_do(data_dir: Path) -> None:
-    """Corners of our images of frame 100, turned as KITTI's, are found by their texture where KITTI's own show them."""
+    """Corners of our images of frame 100, turned as KITTI's, are found by their texture where
+    KITTI's own show them.
+    """
     dataset, published = _real(data_dir)
     frame = next(e for e in dataset.events(0, 1) if isinstance(e, StereoFrame))
     clip = open_dataset(data_dir / "kitti_0039")
@@ -306,7 +379,10 @@ def test_real_rectified_images_show_features_where_those_of_kitti_do(data_dir: P
     K_ours, K_theirs = dataset.recording.camera.K, clip.recording.camera.K
     window = {"winSize": (21, 21), "maxLevel": 2}
     moved = []
-    pairs = ((frame.left, theirs.left, published.R_rect_cam0), (frame.right, theirs.right, published.R_rect_cam1))
+    pairs = (
+        (frame.left, theirs.left, published.R_rect_cam0),
+        (frame.right, theirs.right, published.R_rect_cam1),
+    )
     for (ours, other, R_theirs), R in zip(pairs, R_ours, strict=True):
         H = K_theirs @ R_theirs @ R.T @ np.linalg.inv(K_ours)
         turned = cv2.warpPerspective(ours, H, other.shape[::-1])

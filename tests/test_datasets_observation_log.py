@@ -52,10 +52,20 @@ def logs(draw: st.DrawFn) -> tuple[Recording, list[Observations], list[MotionSam
         n = draw(st.integers(0, 4))
         ids = draw(st.lists(st.integers(0, 2**62), min_size=n, max_size=n, unique=True))
         z = draw(st.lists(finite, min_size=4 * n, max_size=4 * n))
-        flags = np.array(draw(st.lists(st.booleans(), min_size=2 * n, max_size=2 * n)), dtype=np.bool_)
-        sigma = draw(st.none() | st.lists(st.floats(0.125, 8.0, width=32), min_size=3 * n, max_size=3 * n))
+        flags = np.array(
+            draw(st.lists(st.booleans(), min_size=2 * n, max_size=2 * n)), dtype=np.bool_
+        )
+        sigma = draw(
+            st.none() | st.lists(st.floats(0.125, 8.0, width=32), min_size=3 * n, max_size=3 * n)
+        )
         sigmas = None if sigma is None else np.array(sigma, dtype=np.float32).reshape(n, 3)
-        columns = np.array(ids, dtype=np.int64), np.array(z).reshape(n, 4), flags[:n], flags[n:], sigmas
+        columns = (
+            np.array(ids, dtype=np.int64),
+            np.array(z).reshape(n, 4),
+            flags[:n],
+            flags[n:],
+            sigmas,
+        )
         observed.append(Observations(k, int(times[k]), *columns))
     ticks = sorted(draw(st.lists(st.integers(int(times[0]), int(times[-1])), max_size=5)))
     maker = st.sampled_from([ImuSample, VelocitySample])
@@ -66,11 +76,15 @@ def logs(draw: st.DrawFn) -> tuple[Recording, list[Observations], list[MotionSam
             [
                 None,
                 Trajectory(np.tile(T_CAM0_IMU, (3, 1, 1)), None, "cam0"),
-                Trajectory(np.tile(T_CAM0_IMU, (2, 1, 1)), np.array([5, 7]), "imu", np.array([0, 3])),
+                Trajectory(
+                    np.tile(T_CAM0_IMU, (2, 1, 1)), np.array([5, 7]), "imu", np.array([0, 3])
+                ),
             ]
         )
     )
-    landmarks = draw(st.sampled_from([None, Landmarks(np.array([4]), np.ones((1, 3)), np.zeros((1, 3, 3)))]))
+    landmarks = draw(
+        st.sampled_from([None, Landmarks(np.array([4]), np.ones((1, 3)), np.zeros((1, 3, 3)))])
+    )
     recording = Recording(
         kind="made",
         path=Path("somewhere"),
@@ -90,21 +104,33 @@ def _same_bits(a: object, b: object) -> bool:
     if a is None or b is None:
         return a is b
     first, second = np.asarray(a), np.asarray(b)
-    return first.dtype == second.dtype and first.shape == second.shape and first.tobytes() == second.tobytes()
+    return (
+        first.dtype == second.dtype
+        and first.shape == second.shape
+        and first.tobytes() == second.tobytes()
+    )
 
 
 @settings(deadline=None)
 @given(logs())
 def test_round_trip_keeps_every_bit(
-    tmp_path_factory: pytest.TempPathFactory, log: tuple[Recording, list[Observations], list[MotionSample]]
+    tmp_path_factory: pytest.TempPathFactory,
+    log: tuple[Recording, list[Observations], list[MotionSample]],
 ) -> None:
     recording, observed, samples = log
     path = tmp_path_factory.mktemp("log") / "run.npz"
     write_observation_log(path, recording, observed, samples)
     dataset = open_dataset(path)
     read = dataset.recording
-    assert (read.kind, read.has_images, read.camera, read.notes) == ("log", False, recording.camera, recording.notes)
-    assert read.motion == {"imu" if isinstance(sample, ImuSample) else "velocity" for sample in samples}
+    assert (read.kind, read.has_images, read.camera, read.notes) == (
+        "log",
+        False,
+        recording.camera,
+        recording.notes,
+    )
+    assert read.motion == {
+        "imu" if isinstance(sample, ImuSample) else "velocity" for sample in samples
+    }
     assert _same_bits(read.frame_times_ns, recording.frame_times_ns)
     assert _same_bits(read.T_cam0_imu, recording.T_cam0_imu)
     for name in ("reference", "landmarks_reference"):
@@ -122,7 +148,9 @@ def test_round_trip_keeps_every_bit(
         assert (found.frame_index, found.time_ns) == (expected.frame_index, expected.time_ns)
         for field in ("ids", "z", "has_right", "stale"):
             assert _same_bits(getattr(found, field), getattr(expected, field))
-        given = np.zeros((len(expected), 3), np.float32) if expected.sigma is None else expected.sigma
+        given = (
+            np.zeros((len(expected), 3), np.float32) if expected.sigma is None else expected.sigma
+        )
         assert _same_bits(np.zeros_like(given) if found.sigma is None else found.sigma, given)
     replayed = [event for event in events if not isinstance(event, StereoFrame)]
     assert [type(sample) for sample in replayed] == [type(sample) for sample in samples]
@@ -138,7 +166,9 @@ def _recording(count: int = 3) -> Recording:
 
 
 def _seen(k: int, time_ns: int) -> Observations:
-    return Observations(k, time_ns, np.array([7]), np.array([[3.0, 2, 1, 2]]), np.array([True]), np.array([False]))
+    return Observations(
+        k, time_ns, np.array([7]), np.array([[3.0, 2, 1, 2]]), np.array([True]), np.array([False])
+    )
 
 
 def test_a_left_only_feature_keeps_its_arbitrary_right_pixels(tmp_path: Path) -> None:
@@ -164,8 +194,12 @@ def test_the_bytes_do_not_depend_on_when_they_are_written(tmp_path: Path) -> Non
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-@pytest.mark.parametrize("observed", [[_seen(2, 200), _seen(1, 100)], [_seen(1, 100), _seen(1, 100)], [_seen(1, 101)]])
-def test_rejects_observations_of_another_recording(observed: list[Observations], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "observed", [[_seen(2, 200), _seen(1, 100)], [_seen(1, 100), _seen(1, 100)], [_seen(1, 101)]]
+)
+def test_rejects_observations_of_another_recording(
+    observed: list[Observations], tmp_path: Path
+) -> None:
     with pytest.raises(ValueError, match="not in the order of the recording's frames"):
         write_observation_log(tmp_path / "a.npz", _recording(), observed, [])
     assert list(tmp_path.iterdir()) == []
@@ -179,9 +213,13 @@ def test_error_names_an_unwritable_path_and_leaves_no_file(tmp_path: Path) -> No
 
 def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
     write_observation_log(tmp_path / "good.npz", _recording(), [_seen(0, 0), _seen(2, 200)], [])
-    arrays = {**read_npz(tmp_path / "good.npz"), **{k: np.asarray(v) for k, v in changes.items() if v is not None}}
+    arrays = {
+        **read_npz(tmp_path / "good.npz"),
+        **{k: np.asarray(v) for k, v in changes.items() if v is not None},
+    }
     return make_npz(
-        tmp_path / "bad.npz", {k: v for k, v in arrays.items() if k not in changes or changes[k] is not None}
+        tmp_path / "bad.npz",
+        {k: v for k, v in arrays.items() if k not in changes or changes[k] is not None},
     )
 
 
@@ -203,9 +241,18 @@ def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
         ({"sigma": np.ones((1, 2))}, "but sigma is"),
         ({"run_motion": "wheels"}, "run_motion is 'wheels', none of imu, velocity, none"),
         ({"landmark_ids": [1]}, "landmark_ids lacks landmark_p_world"),
-        ({"reference_T_world_body": np.zeros((2, 3, 4)), "reference_body": "imu"}, "reference poses"),
-        ({"reference_T_world_body": np.zeros((2, 4)), "reference_body": "imu"}, "reference_T_world_body of the .* 2-D"),
-        ({"reference_times_ns": "x"}, "reference_times_ns of the observation log has type <U1, 0-D"),
+        (
+            {"reference_T_world_body": np.zeros((2, 3, 4)), "reference_body": "imu"},
+            "reference poses",
+        ),
+        (
+            {"reference_T_world_body": np.zeros((2, 4)), "reference_body": "imu"},
+            "reference_T_world_body of the .* 2-D",
+        ),
+        (
+            {"reference_times_ns": "x"},
+            "reference_times_ns of the observation log has type <U1, 0-D",
+        ),
         ({"T_cam0_imu": "x"}, "T_cam0_imu of the observation log has type <U1"),
         ({"version": [1, 2]}, "version of the observation log has type int64, 1-D"),
     ],
@@ -223,7 +270,9 @@ def test_rejects_a_corrupt_log(changes: dict[str, object], message: str, tmp_pat
         ({"T_cam0_imu": np.diag([1.0, 2, 1, 1])}, "T_cam0_imu: not a rotation"),
     ],
 )
-def test_rejects_a_log_with_corrupt_calibration(changes: dict[str, object], message: str, tmp_path: Path) -> None:
+def test_rejects_a_log_with_corrupt_calibration(
+    changes: dict[str, object], message: str, tmp_path: Path
+) -> None:
     with pytest.raises(CalibrationError, match=message):
         read_observation_log(_corrupt_log(tmp_path, **changes))
 
@@ -271,7 +320,9 @@ def test_features_of_another_program_are_written_and_read(tmp_path: Path) -> Non
         ([0], [([1], [[1, 2, 0]], None)], "frame 0"),
     ],
 )
-def test_malformed_features_are_not_written(times: object, frames: object, message: str, tmp_path: Path) -> None:
+def test_malformed_features_are_not_written(
+    times: object, frames: object, message: str, tmp_path: Path
+) -> None:
     with pytest.raises(DataError, match=message):
         vio.write_observations(tmp_path / "a.npz", CAMERA, times, frames)
     assert list(tmp_path.iterdir()) == []
@@ -280,7 +331,9 @@ def test_malformed_features_are_not_written(times: object, frames: object, messa
 def test_the_tutorial_describes_every_array() -> None:
     page = (Path(__file__).parent.parent / "docs/tutorials/features.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (`[^|]+`) \| ([^|]*) \|.*\| (yes|no)[^|]*\|$", page, re.MULTILINE)
-    named = {name: needed == "yes" for names, _, needed in rows for name in re.findall(r"`(\w+)`", names)}
+    named = {
+        name: needed == "yes" for names, _, needed in rows for name in re.findall(r"`(\w+)`", names)
+    }
     known = {**dict.fromkeys(_REQUIRED, True), **dict.fromkeys([*_DEFAULTED, *_OPTIONAL], False)}
     assert named == known
 

@@ -1,4 +1,6 @@
-"""Plain folders: names, numbers, times, samples, calibrations, what is not used, and one-line errors."""
+"""Plain folders: names, numbers, times, samples, calibrations, what is not used, and one-line
+errors.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,14 @@ import numpy as np
 import pytest
 
 from tests.dataset_makers import calib_text, edit, make_kitti
-from tests.euroc_maker import KITTI_RIG, RADTAN_RIG, RECTIFIED_RIG, make_euroc, make_kitti_raw, truth_poses
+from tests.euroc_maker import (
+    KITTI_RIG,
+    RADTAN_RIG,
+    RECTIFIED_RIG,
+    make_euroc,
+    make_kitti_raw,
+    truth_poses,
+)
 from tests.plain_maker import STEP_S, make_plain, rig_of
 from tests.same_events import frames_of
 from vio.datasets import DatasetSettings, open_dataset
@@ -25,7 +34,8 @@ from vio.records import ImuSample
 DEFAULT = DatasetSettings()
 
 
-# --- images ---------------------------------------------------------------------------------------------------------
+# --- images
+# ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -54,7 +64,9 @@ def test_usual_folder_names_are_found(folders: tuple[str, str], tmp_path: Path) 
 
 def test_numbers_without_padding_are_sorted_as_numbers(tmp_path: Path) -> None:
     """left1, left2, …, left12: as text, left10 would come second."""
-    folder = make_plain(tmp_path, 12, name=lambda side, k: f"{('left', 'right')[side]}{k + 1}.jpg", imu=False)
+    folder = make_plain(
+        tmp_path, 12, name=lambda side, k: f"{('left', 'right')[side]}{k + 1}.jpg", imu=False
+    )
     pairs = read_plain(folder, DEFAULT).pairs
     assert [left.name for left, _ in pairs] == [f"left{k + 1}.jpg" for k in range(12)]
     assert [right.name for _, right in pairs] == [f"right{k + 1}.jpg" for k in range(12)]
@@ -105,14 +117,18 @@ def test_images_without_a_partner_are_skipped_and_said(tmp_path: Path) -> None:
 def test_stamps_of_two_clocks_in_names_are_paired(tmp_path: Path) -> None:
     stamp = 1700000000_000000000
     folder = make_plain(
-        tmp_path, times=False, name=lambda side, k: f"{stamp + 50_000_000 * k + 1_000_000 * side}.png", reference=False
+        tmp_path,
+        times=False,
+        name=lambda side, k: f"{stamp + 50_000_000 * k + 1_000_000 * side}.png",
+        reference=False,
     )
     dataset = read_plain(folder, DEFAULT)
     assert dataset.recording.frame_times_ns.tolist() == [stamp + 50_000_000 * k for k in range(4)]
     assert [int(b.stem) - int(a.stem) for a, b in dataset.pairs] == [1_000_000] * 4
 
 
-# --- times and samples ----------------------------------------------------------------------------------------------
+# --- times and samples
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -122,7 +138,10 @@ def test_stamps_of_two_clocks_in_names_are_paired(tmp_path: Path) -> None:
         (["1700000000.000000001", "1700000000.1"], [1700000000_000000001, 1700000000_100000000]),
         (["1700000000123", "1700000000223"], [1700000000_123000000, 1700000000_223000000]),
         (["1700000000123456", "1700000000223456"], [1700000000_123456000, 1700000000_223456000]),
-        (["1700000000123456789", "1700000000223456789"], [1700000000_123456789, 1700000000_223456789]),
+        (
+            ["1700000000123456789", "1700000000223456789"],
+            [1700000000_123456789, 1700000000_223456789],
+        ),
         (["1.7e9", "1.7000000001e9"], [1700000000_000000000, 1700000000_100000000]),
     ],
 )
@@ -132,7 +151,9 @@ def test_stamps_keep_every_digit_in_any_unit(texts: list[str], expected: list[in
 
 def test_times_may_name_the_images(tmp_path: Path) -> None:
     folder = make_plain(tmp_path, times=False)
-    (folder / "times.txt").write_text("# name time\n" + "".join(f"{k}.png 1700000000.{5 * k:02d}\n" for k in range(9)))
+    (folder / "times.txt").write_text(
+        "# name time\n" + "".join(f"{k}.png 1700000000.{5 * k:02d}\n" for k in range(9))
+    )
     assert np.diff(open_dataset(folder).recording.frame_times_ns).tolist() == [50_000_000] * 3
 
 
@@ -140,21 +161,32 @@ def test_times_in_milliseconds_since_the_start_are_doubted(tmp_path: Path) -> No
     folder = make_plain(tmp_path, times=False, imu=False, reference=False)
     (folder / "times.txt").write_text("0\n50\n100\n150\n")
     (note,) = open_dataset(folder).recording.notes
-    assert note.endswith("frames are 50 s apart, as its times are taken for seconds; if they are not, write seconds")
+    assert note.endswith(
+        "frames are 50 s apart, as its times are taken for seconds; if they are not, write seconds"
+    )
 
 
 def test_without_times_images_alone_are_read_and_it_is_said(tmp_path: Path) -> None:
-    recording = open_dataset(make_plain(tmp_path, times=False, imu=False, reference=False)).recording
+    recording = open_dataset(
+        make_plain(tmp_path, times=False, imu=False, reference=False)
+    ).recording
     assert np.diff(recording.frame_times_ns).tolist() == [100_000_000] * 3
     assert "frames are taken to be 0.1 s apart" in recording.notes[0]
 
 
 @pytest.mark.parametrize(
-    "header", ["# timestamp[ns] a.x a.y a.z w.x w.y w.z", "time_ns,ax_mps2,ay_mps2,az_mps2,gyro_x,gyro_y,gyro_z"]
+    "header",
+    [
+        "# timestamp[ns] a.x a.y a.z w.x w.y w.z",
+        "time_ns,ax_mps2,ay_mps2,az_mps2,gyro_x,gyro_y,gyro_z",
+    ],
 )
 def test_a_header_names_the_order_of_the_readings(header: str, tmp_path: Path) -> None:
     separator = "," if "," in header else " "
-    rows = [separator.join(map(str, [10**18 + 5_000_000 * k, 1, 2, 9.8, 0.1, 0.2, 0.3])) for k in range(3)]
+    rows = [
+        separator.join(map(str, [10**18 + 5_000_000 * k, 1, 2, 9.8, 0.1, 0.2, 0.3]))
+        for k in range(3)
+    ]
     (tmp_path / "imu.csv").write_text("\n".join([header, *rows]) + "\n")
     record, notes = read_imu_table(tmp_path / "imu.csv")
     assert notes == ()
@@ -174,7 +206,9 @@ def test_units_of_the_header_are_converted_and_said(tmp_path: Path) -> None:
 
 
 def test_the_clock_offset_of_the_calibration_moves_the_imu(tmp_path: Path) -> None:
-    """Kalibr: t_imu = t_cam + shift, so a sample's time on the camera's clock is its stamp less the shift."""
+    """Kalibr: t_imu = t_cam + shift, so a sample's time on the camera's clock is its stamp less
+    the shift.
+    """
     folder = make_plain(tmp_path)
     path = folder / "camchain-imucam.yaml"
     path.write_text(path.read_text().replace("timeshift_cam_imu: 0.0", "timeshift_cam_imu: 0.0025"))
@@ -182,7 +216,10 @@ def test_the_clock_offset_of_the_calibration_moves_the_imu(tmp_path: Path) -> No
     first = next(iter(dataset.events()))
     assert isinstance(first, ImuSample)
     assert first.time_ns == 1700000000_000000000 - 12_500_000
-    assert "the IMU's stamps are moved by -2.500 ms, as the calibration states" in dataset.recording.notes
+    assert (
+        "the IMU's stamps are moved by -2.500 ms, as the calibration states"
+        in dataset.recording.notes
+    )
 
 
 def test_a_slow_imu_is_said(tmp_path: Path) -> None:
@@ -190,7 +227,8 @@ def test_a_slow_imu_is_said(tmp_path: Path) -> None:
     lines = (folder / "imu.csv").read_text().splitlines()
     (folder / "imu.csv").write_text("\n".join([lines[0], *lines[1::20]]) + "\n")
     assert (
-        "the IMU has 10 Hz, too few to integrate the motion between images" in open_dataset(folder).recording.notes[0]
+        "the IMU has 10 Hz, too few to integrate the motion between images"
+        in open_dataset(folder).recording.notes[0]
     )
 
 
@@ -216,10 +254,13 @@ def test_poses_of_a_raw_camera_are_turned_to_the_rectified_one(tmp_path: Path) -
     R_rect_cam0 = dataset.rectifier.T_rect0_imu[:3, :3]
     assert np.abs(R_rect_cam0 - np.eye(3)).max() > 1e-3
     expected = truth_poses(4)[:, :3, :3] @ R_rect_cam0.T
-    np.testing.assert_allclose(dataset.recording.reference.T_world_body[:, :3, :3], expected, atol=1e-12)
+    np.testing.assert_allclose(
+        dataset.recording.reference.T_world_body[:, :3, :3], expected, atol=1e-12
+    )
 
 
-# --- what is used and what is not -----------------------------------------------------------------------------------
+# --- what is used and what is not
+# -----------------------------------------------------------------------------------
 
 
 def test_what_is_not_used_is_named_once(tmp_path: Path) -> None:
@@ -238,7 +279,9 @@ def test_another_calibration_may_be_named(tmp_path: Path) -> None:
     ):
         rig = rig_of(KITTI_RIG if kind == "kitti_raw" else RADTAN_RIG)
         (tmp_path / "mine.yaml").write_text(kalibr_text(rig))
-        recording = open_dataset(folder, DatasetSettings(calibration=tmp_path / "mine.yaml")).recording
+        recording = open_dataset(
+            folder, DatasetSettings(calibration=tmp_path / "mine.yaml")
+        ).recording
         assert recording.kind == "plain", kind
         assert recording.camera.baseline_m == pytest.approx(rig.camera.baseline_m), kind
 
@@ -250,11 +293,16 @@ def test_tumvi_export_without_sensor_yaml_is_read(tmp_path: Path) -> None:
     (folder / "dso").mkdir()
     (folder / "dso" / "camchain.yaml").write_text(kalibr_text(rig_of(RADTAN_RIG)))
     recording = open_dataset(folder).recording
-    assert (recording.kind, recording.motion, len(recording.frame_times_ns)) == ("plain", {"imu"}, 4)
+    assert (recording.kind, recording.motion, len(recording.frame_times_ns)) == (
+        "plain",
+        {"imu"},
+        4,
+    )
     assert recording.reference is not None
 
 
-# --- bad folders ----------------------------------------------------------------------------------------------------
+# --- bad folders
+# ----------------------------------------------------------------------------------------------------
 
 
 def _break(change: Callable[[Path], object], **options: bool) -> Callable[[Path], Path]:
@@ -279,50 +327,102 @@ def _without_extrinsics(folder: Path) -> None:
 
 def _shifted(folder: Path) -> None:
     lines = (folder / "imu.csv").read_text().splitlines()
-    moved = [",".join([str(int(line.split(",")[0]) // 1000), *line.split(",")[1:]]) for line in lines[1:]]
+    moved = [
+        ",".join([str(int(line.split(",")[0]) // 1000), *line.split(",")[1:]]) for line in lines[1:]
+    ]
     (folder / "imu.csv").write_text("\n".join([lines[0], *moved]) + "\n")
 
 
 BAD = {
-    "no calibration": (lambda f: make_plain(f, calibration=False), "no calibration; add one as calibration.yaml"),
+    "no calibration": (
+        lambda f: make_plain(f, calibration=False),
+        "no calibration; add one as calibration.yaml",
+    ),
     "names that fit nothing": (
         lambda f: make_plain(f, name=lambda side, k: f"{'ab'[side]}.png", frames=1),
         "no name of the one fits one of the other",
     ),
     "too few times": (_write("times.txt", "1\n2\n"), r"times\.txt holds 2 times for 4 image pairs"),
-    "times that run backwards": (_write("times.txt", "1\n3\n2\n4\n"), "line 3: the clock runs backwards"),
+    "times that run backwards": (
+        _write("times.txt", "1\n3\n2\n4\n"),
+        "line 3: the clock runs backwards",
+    ),
     "times that are no numbers": (_write("times.txt", "1\nx\n2\n4\n"), "line 2: 'x' is no time"),
-    "times out of range": (_write("times.txt", "1\n2\n3\n1e99\n"), "line 4: '1e99' is out of range"),
-    "times out of reach": (_write("times.txt", "1\n2\n3\n1e999999999\n"), "line 4: '1e999999999' is out of range"),
-    "an IMU without times": (lambda f: make_plain(f, times=False), r"imu\.csv: needs the times of the images"),
-    "an IMU without its pose": (_break(_without_extrinsics), r"imu\.csv: needs the pose of its sensor; add T_cam0_imu"),
-    "unsorted IMU stamps": (_edit("imu.csv", "1699999999995000000", "1699999999985000000"), "runs backwards"),
-    "an IMU of another epoch": (_break(_shifted), "no sample is within the time of the images; clocks without overlap"),
-    "an IMU with six columns": (_edit("imu.csv", ",0.25,9.81,0", ",0.25,9.81"), "line 2: 6 values instead of 7"),
-    "an IMU with a digit separator": (_edit("imu.csv", "9.81", "9_81"), "line 2: a reading is not a finite number"),
-    "an IMU with a NaN": (_edit("imu.csv", "9.81", "nan"), "line 2: a reading is not a finite number"),
-    "an IMU with other names": (_edit("imu.csv", "wx,wy,wz", "mx,my,mz"), "does not name gyro and accel"),
+    "times out of range": (
+        _write("times.txt", "1\n2\n3\n1e99\n"),
+        "line 4: '1e99' is out of range",
+    ),
+    "times out of reach": (
+        _write("times.txt", "1\n2\n3\n1e999999999\n"),
+        "line 4: '1e999999999' is out of range",
+    ),
+    "an IMU without times": (
+        lambda f: make_plain(f, times=False),
+        r"imu\.csv: needs the times of the images",
+    ),
+    "an IMU without its pose": (
+        _break(_without_extrinsics),
+        r"imu\.csv: needs the pose of its sensor; add T_cam0_imu",
+    ),
+    "unsorted IMU stamps": (
+        _edit("imu.csv", "1699999999995000000", "1699999999985000000"),
+        "runs backwards",
+    ),
+    "an IMU of another epoch": (
+        _break(_shifted),
+        "no sample is within the time of the images; clocks without overlap",
+    ),
+    "an IMU with six columns": (
+        _edit("imu.csv", ",0.25,9.81,0", ",0.25,9.81"),
+        "line 2: 6 values instead of 7",
+    ),
+    "an IMU with a digit separator": (
+        _edit("imu.csv", "9.81", "9_81"),
+        "line 2: a reading is not a finite number",
+    ),
+    "an IMU with a NaN": (
+        _edit("imu.csv", "9.81", "nan"),
+        "line 2: a reading is not a finite number",
+    ),
+    "an IMU with other names": (
+        _edit("imu.csv", "wx,wy,wz", "mx,my,mz"),
+        "does not name gyro and accel",
+    ),
     "an empty IMU": (_write("imu.csv", "#timestamp,wx,wy,wz,ax,ay,az\n"), "holds no line of data"),
     "an IMU with decimal commas": (
         _write("imu.csv", "time;wx;wy;wz;ax;ay;az\n1700000000;0,1;0,1;0,1;0,1;9,8;0,1\n"),
-        r"line 2, '1700000000;0,1;0,1;0,1;0,1;9,8;0,1', does not begin with a number \(decimals need a point\)",
+        r"line 2, '1700000000;0,1;0,1;0,1;0,1;9,8;0,1', does not begin with a number \(decimals "
+        r"need a point\)",
     ),
     "gravity among the gyro's columns": (
-        _write("imu.csv", "".join(f"{1700000000 + k / 200:.3f},0,0,9.8,0,0,0.1\n" for k in range(40))),
+        _write(
+            "imu.csv", "".join(f"{1700000000 + k / 200:.3f},0,0,9.8,0,0,0.1\n" for k in range(40))
+        ),
         "gravity is in the columns 2 to 4",
     ),
-    "a velocity without header": (_write("velocity.csv", "0,1,2,3,4,5,6\n"), "line 1: expected the header time_s"),
+    "a velocity without header": (
+        _write("velocity.csv", "0,1,2,3,4,5,6\n"),
+        "line 1: expected the header time_s",
+    ),
     "more poses than images": (
         _break(
-            lambda f: ((f / "reference.tum").unlink(), (f / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 9))
+            lambda f: (
+                (f / "reference.tum").unlink(),
+                (f / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 9),
+            )
         ),
         "holds 9 poses for 4 pairs",
     ),
     "images of another size": (
-        _break(lambda f: [cv2.imwrite(str(p), np.zeros((40, 50), np.uint8)) for p in f.glob("*/*.png")]),
+        _break(
+            lambda f: [cv2.imwrite(str(p), np.zeros((40, 50), np.uint8)) for p in f.glob("*/*.png")]
+        ),
         r"is 50 x 40 pixels but .*camchain-imucam\.yaml is for 64 x 48",
     ),
-    "a calibration that is missing": (lambda f: make_plain(f) and f / "none", "none does not exist"),
+    "a calibration that is missing": (
+        lambda f: make_plain(f) and f / "none",
+        "none does not exist",
+    ),
     "swapped cameras": (
         _write("calib.txt", calib_text(0.0, -0.5), calibration=False),
         r"calib\.txt: P0 and P1 imply a stereo baseline of -0.5 m",
@@ -341,7 +441,9 @@ def test_bad_folders_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
 
 def test_settings_that_a_recording_cannot_take_are_refused(tmp_path: Path) -> None:
     folder = make_plain(tmp_path)
-    with pytest.raises(DataError, match="--topics names topics of a ROS bag, but this is of kind plain"):
+    with pytest.raises(
+        DataError, match="--topics names topics of a ROS bag, but this is of kind plain"
+    ):
         open_dataset(folder, DatasetSettings(topics="left=/a"))
     with pytest.raises(CalibrationError, match=r"none\.yaml does not exist"):
         open_dataset(folder, DatasetSettings(calibration=tmp_path / "none.yaml"))
@@ -350,10 +452,15 @@ def test_settings_that_a_recording_cannot_take_are_refused(tmp_path: Path) -> No
 def test_tumvi(data_dir: Path) -> None:
     """The `dso` form: 16 bits, fisheye, stamps in the names, Kalibr's files beside."""
     recording = open_dataset(data_dir / "tumvi_room1_head").recording
-    assert (recording.kind, len(recording.frame_times_ns), recording.motion) == ("plain", 5, {"imu"})
+    assert (recording.kind, len(recording.frame_times_ns), recording.motion) == (
+        "plain",
+        5,
+        {"imu"},
+    )
     assert len(recording.reference) > 16000
     assert recording.notes[-2:] == (
-        "photometric calibration is not applied, as the tracks gain nothing by it: cam0/pcalib.txt, cam0/vignette.png, "
+        "photometric calibration is not applied, as the tracks gain nothing by it: "
+        "cam0/pcalib.txt, cam0/vignette.png, "
         "cam1/pcalib.txt, cam1/vignette.png",
         "not used: cam0/camera_left.txt, cam1/camera_right.txt, cam1/times.txt",
     )

@@ -34,7 +34,14 @@ def filtered(pixels: Image, kinds: list[int]) -> bytes:
     return bytes(out)
 
 
-def png(pixels: Image, kinds: list[int], *, extra: bytes = b"", raw: bytes | None = None, cut_end: int = 0) -> bytes:
+def png(
+    pixels: Image,
+    kinds: list[int],
+    *,
+    extra: bytes = b"",
+    raw: bytes | None = None,
+    cut_end: int = 0,
+) -> bytes:
     height, width = pixels.shape
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
     data = zlib.compress(filtered(pixels, kinds) if raw is None else raw)
@@ -52,7 +59,9 @@ def test_all_filters_are_undone_to_the_bit(size: tuple[int, int]) -> None:
         data = png(pixels, kinds)
         found = decode_gray8(data)
         np.testing.assert_array_equal(found, pixels)
-        np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), pixels)
+        np.testing.assert_array_equal(
+            cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), pixels
+        )
 
 
 def test_other_kinds_are_left_to_opencv() -> None:

@@ -1,4 +1,6 @@
-"""What lies in a recording's folder and is not read is named once, whatever the kind of the recording."""
+"""What lies in a recording's folder and is not read is named once, whatever the kind of the
+recording.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ def notes_of(folder: Path, kind: str) -> list[str]:
 
 
 @pytest.mark.parametrize("relative", [False, True])
-def test_kitti_names_what_it_does_not_read(relative: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kitti_names_what_it_does_not_read(
+    relative: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = make_kitti(tmp_path / "kitti")
     assert notes_of(folder, "kitti") == []
     make_images(folder / "image_2", 1)
@@ -37,7 +41,9 @@ def test_kitti_raw_names_the_inertial_record_that_it_does_not_read(tmp_path: Pat
     (folder / "oxts" / "data").mkdir(parents=True)
     (folder / "velodyne_points").mkdir()
     (folder / "image_00" / "exposure.txt").write_text("1\n")
-    assert notes_of(folder, "kitti_raw") == ["not used: oxts/, velodyne_points/, image_00/exposure.txt"]
+    assert notes_of(folder, "kitti_raw") == [
+        "not used: oxts/, velodyne_points/, image_00/exposure.txt"
+    ]
 
 
 def test_euroc_names_other_sensors_and_counts_images_that_no_list_names(tmp_path: Path) -> None:

@@ -56,7 +56,9 @@ def test_reads_a_synthetic_file_completely(tmp_path: Path) -> None:
 
 
 def test_pose_arrays_may_be_absent(tmp_path: Path) -> None:
-    arrays = {k: v for k, v in utias_arrays(make_drive(8)).items() if k not in ("r_i_vk_i", "theta_vk_i")}
+    arrays = {
+        k: v for k, v in utias_arrays(make_drive(8)).items() if k not in ("r_i_vk_i", "theta_vk_i")
+    }
     assert read_utias(make_mat(tmp_path / "a.mat", arrays), DEFAULT).recording.reference is None
 
 
@@ -64,23 +66,39 @@ def test_pose_arrays_may_be_absent(tmp_path: Path) -> None:
     ("corrupt", "kind", "message"),
     [
         (without("b", "t"), DataError, r"lacks t b; a UTIAS file needs y_k_j .*, found C_c_v"),
-        (changed("y_k_j", np.zeros((4, 6))), DataError, r"y_k_j has shape 4 x 6; expected 4 x T x M"),
+        (
+            changed("y_k_j", np.zeros((4, 6))),
+            DataError,
+            r"y_k_j has shape 4 x 6; expected 4 x T x M",
+        ),
         (changed("y_k_j", "text"), DataError, r"y_k_j is not an array of real numbers"),
         (
             changed("v_vk_vk_i", np.zeros((3, 4))),
             DataError,
             r"v_vk_vk_i has shape 3 x 4; expected 3 x T with T at least 6",
         ),
-        (lambda a: {**a, "theta_vk_i": "text"}, DataError, r"theta_vk_i is not an array of real numbers"),
+        (
+            lambda a: {**a, "theta_vk_i": "text"},
+            DataError,
+            r"theta_vk_i is not an array of real numbers",
+        ),
         (changed("theta_vk_i", np.zeros((3, 4))), DataError, r"theta_vk_i has shape 3 x 4"),
-        (edited("w_vk_vk_i", (0, 2), np.nan), DataError, r"w_vk_vk_i is not finite in 1 of 6 frames, first in frame 2"),
+        (
+            edited("w_vk_vk_i", (0, 2), np.nan),
+            DataError,
+            r"w_vk_vk_i is not finite in 1 of 6 frames, first in frame 2",
+        ),
         (edited("t", (0, 2), 0.0), DataError, r"t\[2\]: the clock runs backwards"),
         (changed("b", 0.0), CalibrationError, r"\.mat: stereo baseline must be positive, got 0 m"),
         (changed("fu", [1.0, 2.0]), DataError, r"fu has shape 1 x 2; expected 1 finite"),
         (changed("C_c_v", np.diag([1.0, 1, 2])), CalibrationError, r"C_c_v: not a rotation"),
         (changed("C_c_v", np.eye(2)), DataError, r"C_c_v has shape 2 x 2"),
         (changed("rho_v_c_v", np.zeros(2)), DataError, r"rho_v_c_v has shape 1 x 2; expected 3"),
-        (lambda a: {**a, "y_k_j": a["y_k_j"][[2, 3, 0, 1]]}, DataError, r"left and right look swapped"),
+        (
+            lambda a: {**a, "y_k_j": a["y_k_j"][[2, 3, 0, 1]]},
+            DataError,
+            r"left and right look swapped",
+        ),
     ],
 )
 def test_rejects_bad_files_with_one_line_error(
@@ -103,12 +121,15 @@ def test_rejects_a_truncated_file(size: int, tmp_path: Path) -> None:
 
 def test_error_for_newer_matlab_files_states_the_remedy(tmp_path: Path) -> None:
     path = tmp_path / "new.mat"
-    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n" + bytes(600))
+    path.write_bytes(
+        b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n" + bytes(600)
+    )
     with pytest.raises(DataError, match=r"MATLAB 7\.3 file; save it again with `save -v7`"):
         read_utias(path, DEFAULT)
 
 
-# --- the published files ------------------------------------------------------------------------------------------
+# --- the published files
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -155,11 +176,15 @@ def test_theta_is_the_rotation_vector_from_vehicle_to_inertial_axes(
     assert errors[1] > 3 * errors[0]
 
 
-@pytest.mark.parametrize("name", ["2011_09_26_drive_0005_sync_KLT.mat", "2011_09_26_drive_0036_sync_KLT.mat"])
+@pytest.mark.parametrize(
+    "name", ["2011_09_26_drive_0005_sync_KLT.mat", "2011_09_26_drive_0036_sync_KLT.mat"]
+)
 def test_features_reproject_under_the_reference_with_these_extrinsics(
     name: str, drives: dict[str, FeatureDataset]
 ) -> None:
-    """Three frames ahead; the translation of the other convention (position in place of -R position) is worse."""
+    """Three frames ahead; the translation of the other convention (position in place of -R
+    position) is worse.
+    """
     dataset = drives[name]
     recording = dataset.recording
     other = recording.T_cam0_imu.copy()
@@ -167,7 +192,11 @@ def test_features_reproject_under_the_reference_with_these_extrinsics(
     medians = []
     for T_cam0_imu in (recording.T_cam0_imu, other):
         poses = recording.reference.T_world_body @ se3_inverse(T_cam0_imu)
-        medians.append(np.median(np.concatenate([_ahead(dataset, poses, t) for t in range(0, len(poses) - 3, 2)])))
+        medians.append(
+            np.median(
+                np.concatenate([_ahead(dataset, poses, t) for t in range(0, len(poses) - 3, 2)])
+            )
+        )
     assert medians[0] < 2.5
     assert medians[0] < 0.95 * medians[1]
 
@@ -193,10 +222,13 @@ def test_starry_night(starry_night: FeatureDataset) -> None:
     )
     assert recording.landmarks_reference.p_world.shape == (20, 3)
     assert not recording.landmarks_reference.covariance.any()
-    assert not starry_night.tracks.stale.any()  # it repeats integer pixels, but only while stationary
+    # it repeats integer pixels, but only while stationary
+    assert not starry_night.tracks.stale.any()
 
 
-def test_starry_night_reprojects_with_the_published_variance(data_dir: Path, starry_night: FeatureDataset) -> None:
+def test_starry_night_reprojects_with_the_published_variance(
+    data_dir: Path, starry_night: FeatureDataset
+) -> None:
     """Reprojection of the known landmarks from the known poses has exactly the file's `y_var`."""
     recording = starry_night.recording
     y_var = loadmat(data_dir / "utias_starry_night" / "dataset3.mat")["y_var"].reshape(-1)

@@ -1,4 +1,6 @@
-"""Two video files: the same recording to the bit where they are lossless, times, and one-line errors."""
+"""Two video files: the same recording to the bit where they are lossless, times, and one-line
+errors.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ from vio.geometry.distortion import rig_from_rectified
 def write_video(path: Path, images: list[np.ndarray], rate_hz: float = 20.0) -> None:
     """Write gray images without loss."""
     size = images[0].shape[1], images[0].shape[0]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), rate_hz, size, isColor=True)
+    writer = cv2.VideoWriter(
+        str(path), cv2.VideoWriter_fourcc(*"FFV1"), rate_hz, size, isColor=True
+    )
     assert writer.isOpened(), "this OpenCV has no FFV1"
     for image in images:
         writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
@@ -42,8 +46,12 @@ def make_videos(flight: Path, folder: Path) -> Path:
     folder.mkdir()
     for camera, side in (("cam0", "left"), ("cam1", "right")):
         files = sorted((flight / "mav0" / camera / "data").iterdir(), key=lambda f: int(f.stem))
-        write_video(folder / f"{side}.avi", [cv2.imread(str(f), cv2.IMREAD_GRAYSCALE) for f in files])
-        (folder / "times.txt").write_text("# [ns]\n" + "".join(f"{int(f.stem) / 1e9:.9f}\n" for f in files))
+        write_video(
+            folder / f"{side}.avi", [cv2.imread(str(f), cv2.IMREAD_GRAYSCALE) for f in files]
+        )
+        (folder / "times.txt").write_text(
+            "# [ns]\n" + "".join(f"{int(f.stem) / 1e9:.9f}\n" for f in files)
+        )
     (folder / "camchain-imucam.yaml").write_text(kalibr_text(load_rig(flight)))
     shutil.copyfile(flight / "mav0" / "imu0" / "data.csv", folder / "imu.csv")
     return folder
@@ -84,7 +92,9 @@ def test_the_left_camera_alone_needs_no_right_image(flight: Path, tmp_path: Path
         np.testing.assert_array_equal(one.left, pair.left)
 
 
-def test_the_left_video_alone_is_decoded(videos: Path, flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_left_video_alone_is_decoded(
+    videos: Path, flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pairs = frames_of(open_dataset(flight), 0, 4)
     left = open_dataset(videos, DatasetSettings(camera="left"))
     opened, real = [], cv2.VideoCapture
@@ -100,10 +110,17 @@ def copy_of(videos: Path, folder: Path, *leave_out: str) -> Path:
     return Path(shutil.copytree(videos, folder, ignore=shutil.ignore_patterns(*leave_out)))
 
 
-def test_without_times_the_rate_of_the_file_counts_and_it_is_said(videos: Path, tmp_path: Path) -> None:
+def test_without_times_the_rate_of_the_file_counts_and_it_is_said(
+    videos: Path, tmp_path: Path
+) -> None:
     recording = open_dataset(copy_of(videos, tmp_path / "v", "times.txt", "imu.csv")).recording
-    assert np.diff(recording.frame_times_ns).tolist() == [50_000_000] * (len(recording.frame_times_ns) - 1)
-    assert "no times.txt: frames are 50 ms apart, as left.avi states; real cameras jitter" in recording.notes
+    assert np.diff(recording.frame_times_ns).tolist() == [50_000_000] * (
+        len(recording.frame_times_ns) - 1
+    )
+    assert (
+        "no times.txt: frames are 50 ms apart, as left.avi states; real cameras jitter"
+        in recording.notes
+    )
 
 
 def _truncate(folder: Path) -> None:
@@ -124,12 +141,24 @@ def _other_size(folder: Path) -> None:
 
 BAD = {
     "no calibration": (lambda f: (f / "camchain-imucam.yaml").unlink(), "no calibration; add one"),
-    "not a video": (lambda f: (f / "left.avi").write_bytes(b"no video" * 99), r"left\.avi: no frame can be decoded"),
-    "a truncated video": (_truncate, r"right\.avi: (frame \d+ of 16 cannot be decoded|no frame can be decoded)"),
+    "not a video": (
+        lambda f: (f / "left.avi").write_bytes(b"no video" * 99),
+        r"left\.avi: no frame can be decoded",
+    ),
+    "a truncated video": (
+        _truncate,
+        r"right\.avi: (frame \d+ of 16 cannot be decoded|no frame can be decoded)",
+    ),
     "another rate": (_other_rate, r"left\.avi has 20 and right\.avi 25 frames per second"),
     "another size": (_other_size, "is 160 x .* pixels but .* is for 99 x"),
-    "an IMU without times": (lambda f: (f / "times.txt").unlink(), r"imu\.csv: needs the times of the images"),
-    "too many times": (lambda f: (f / "times.txt").write_text("1\n" * 99), "holds 99 times for 16 image pairs"),
+    "an IMU without times": (
+        lambda f: (f / "times.txt").unlink(),
+        r"imu\.csv: needs the times of the images",
+    ),
+    "too many times": (
+        lambda f: (f / "times.txt").write_text("1\n" * 99),
+        "holds 99 times for 16 image pairs",
+    ),
 }
 
 
@@ -146,7 +175,8 @@ def test_bad_videos_are_refused_in_one_line(
     assert "\n" not in str(caught.value).strip()
 
 
-# --- seconds instead of frames --------------------------------------------------------------------------------------
+# --- seconds instead of frames
+# --------------------------------------------------------------------------------------
 
 
 def test_bounds_in_seconds(videos: Path) -> None:
@@ -164,7 +194,17 @@ def test_bounds_in_seconds(videos: Path) -> None:
 
 def test_run_takes_seconds(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    arguments = ["run", str(flight), "--start", "0.1s", "--end", "0.25s", "--out", str(out), "--quiet"]
+    arguments = [
+        "run",
+        str(flight),
+        "--start",
+        "0.1s",
+        "--end",
+        "0.25s",
+        "--out",
+        str(out),
+        "--quiet",
+    ]
     assert main(arguments) == 0
     text = (out / "trajectory.tum").read_text()
     assert "# frames: 2-4" in text

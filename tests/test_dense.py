@@ -30,13 +30,16 @@ from vio.sim.world import room
 
 CAMERA = StereoCamera(200.0, 200.0, 159.5, 119.5, 0.2, 320, 240)
 CENTRE, RADIUS_M = np.array([0.1, -0.05, 2.0]), 0.7
-UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # of a camera that looks ahead: right, ahead, up
+# of a camera that looks ahead: right, ahead, up
+UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def _sphere_depth(T_world_cam: FloatArray) -> np.ndarray:
     """Exact depth (H, W) of a sphere, 0 beside it."""
     u, v = np.meshgrid(np.arange(320.0), np.arange(240.0))
-    rays = np.stack([(u - CAMERA.cu) / CAMERA.fu, (v - CAMERA.cv) / CAMERA.fv, np.ones_like(u)], axis=-1)
+    rays = np.stack(
+        [(u - CAMERA.cu) / CAMERA.fu, (v - CAMERA.cv) / CAMERA.fv, np.ones_like(u)], axis=-1
+    )
     c = T_world_cam[:3, :3].T @ (CENTRE - T_world_cam[:3, 3])
     a, b = np.sum(rays**2, axis=-1), rays @ c
     root = b**2 - a * (c @ c - RADIUS_M**2)
@@ -45,7 +48,9 @@ def _sphere_depth(T_world_cam: FloatArray) -> np.ndarray:
 
 def _around() -> list[FloatArray]:
     """Poses on an arc that look at the sphere."""
-    return [se3_exp(np.array([0.4 * k, 0.0, 0.03 * k * k, 0.0, -0.2 * k, 0.0])) for k in range(-2, 3)]
+    return [
+        se3_exp(np.array([0.4 * k, 0.0, 0.03 * k * k, 0.0, -0.2 * k, 0.0])) for k in range(-2, 3)
+    ]
 
 
 def _fused(voxel_m: float, most_blocks: int) -> Mesh:
@@ -70,7 +75,8 @@ def test_fuses_a_sphere_to_a_fraction_of_a_voxel(sphere: Mesh) -> None:
     assert abs(np.median(off)) < 0.002
     assert np.percentile(np.abs(off), 90) < 0.006
     agree = np.sum(sphere.normals * outwards, axis=1) / np.linalg.norm(outwards, axis=1)
-    assert np.percentile(agree, 5) > 0.95  # outwards, so the corners run counter-clockwise seen from outside
+    # outwards, so the corners run counter-clockwise seen from outside
+    assert np.percentile(agree, 5) > 0.95
     assert np.abs(sphere.colours.astype(int) - (200, 100, 50)).max() <= 4
 
 
@@ -88,7 +94,9 @@ def test_packs_block_coordinates_in_their_order() -> None:
 
 def test_distance_from_a_slanted_plane_is_along_its_normal() -> None:
     u, v = np.meshgrid(np.arange(320.0), np.arange(240.0))
-    rays = np.stack([(u - CAMERA.cu) / CAMERA.fu, (v - CAMERA.cv) / CAMERA.fv, np.ones_like(u)], axis=-1)
+    rays = np.stack(
+        [(u - CAMERA.cu) / CAMERA.fu, (v - CAMERA.cv) / CAMERA.fv, np.ones_like(u)], axis=-1
+    )
     n = np.array([0.0, 1.0, 0.08])  # a floor 1 m below, which rises a little
     z = np.where(rays @ n > 0.15, 1.0 / np.maximum(rays @ n, 1e-6), 0).astype(np.float32)
     factor = slant(z, CAMERA)
@@ -99,7 +107,9 @@ def test_distance_from_a_slanted_plane_is_along_its_normal() -> None:
 
 
 def test_depth_of_rendered_images_is_as_exact_as_stated() -> None:
-    simulation = simulate(room(1, texel_m=0.008), small_rig(320, 240), hand_held(duration_s=2.0), rate_hz=10.0)
+    simulation = simulate(
+        room(1, texel_m=0.008), small_rig(320, 240), hand_held(duration_s=2.0), rate_hz=10.0
+    )
     recording, camera = SimulatedRecording(simulation), rectified_camera(simulation.rig)
     depth = StereoMatcher(camera, 320).depth(*recording.images(3))
     truth, _ = recording.depth(0, int(simulation.taken_ns[3]))
@@ -115,16 +125,25 @@ def test_floor_plan_of_a_box_on_a_floor() -> None:
     x, y = (g.ravel() for g in np.meshgrid(np.arange(0, 4, 0.05), np.arange(0, 3, 0.05)))
     floor = np.stack([x, y, np.where((x > 3.5) & (y > 2.5), np.nan, 0.0)], axis=1)
     wall = np.array([[1.0, b, c] for b in np.arange(0.5, 2, 0.05) for c in np.arange(0, 1, 0.05)])
-    lamp = np.array([[2.0 + a, 1.0 + b, 2.6] for a in np.arange(0, 0.3, 0.05) for b in np.arange(0, 0.3, 0.05)])
+    lamp = np.array(
+        [[2.0 + a, 1.0 + b, 2.6] for a in np.arange(0, 0.3, 0.05) for b in np.arange(0, 0.3, 0.05)]
+    )
     p = np.concatenate([floor[np.isfinite(floor).all(axis=1)], wall, lamp]).astype(np.float32)
     p += 1e-3
-    plan = occupancy_grid(Mesh(p, p, np.zeros_like(p, np.uint8), np.zeros((0, 3), np.uint32)), np.eye(3), 0.05)
+    plan = occupancy_grid(
+        Mesh(p, p, np.zeros_like(p, np.uint8), np.zeros((0, 3), np.uint32)), np.eye(3), 0.05
+    )
 
     def at(x_m: float, y_m: float) -> int:
         column, row = np.floor((np.array([x_m, y_m]) - plan.origin_m) / plan.cell_m).astype(int)
         return int(plan.levels[row, column])
 
-    assert (at(1.0, 1.2), at(2.1, 1.1), at(0.3, 0.3), at(3.8, 2.8)) == (OCCUPIED, FREE, FREE, UNKNOWN)
+    assert (at(1.0, 1.2), at(2.1, 1.1), at(0.3, 0.3), at(3.8, 2.8)) == (
+        OCCUPIED,
+        FREE,
+        FREE,
+        UNKNOWN,
+    )
 
 
 def test_glb_holds_the_mesh_with_y_up(sphere: Mesh) -> None:
@@ -162,7 +181,10 @@ def test_preview_shows_the_surface_and_the_path(sphere: Mesh) -> None:
 @pytest.fixture(scope="module")
 def run_folder(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("mesh") / "run"
-    assert main(["run", str(flight), "--out", str(out), "--map", str(out.parent / "m.map"), "--json"]) == 0
+    assert (
+        main(["run", str(flight), "--out", str(out), "--map", str(out.parent / "m.map"), "--json"])
+        == 0
+    )
     return out
 
 
@@ -172,25 +194,52 @@ def test_makes_a_mesh_of_a_run(run_folder: Path, capsys: pytest.CaptureFixture[s
     assert facts["stopped"] is None
     names = {path.name for path in (run_folder / "mesh").iterdir()}
     assert names == {
-        *("mesh.json", "mesh.ply", "points.ply", "mesh.glb", "preview.png", "occupancy.pgm", "occupancy.yaml"),
+        *(
+            "mesh.json",
+            "mesh.ply",
+            "points.ply",
+            "mesh.glb",
+            "preview.png",
+            "occupancy.pgm",
+            "occupancy.yaml",
+        ),
     }
     plan = yaml.safe_load((run_folder / "mesh" / "occupancy.yaml").read_text())
-    assert (255 - FREE) / 255 < plan["free_thresh"] < (255 - UNKNOWN) / 255 < plan["occupied_thresh"]
+    assert (
+        (255 - FREE) / 255 < plan["free_thresh"] < (255 - UNKNOWN) / 255 < plan["occupied_thresh"]
+    )
     assert plan["image"] == "occupancy.pgm"
     assert plan["resolution"] >= 0.05
     page = run_folder / "report.html"
     assert main(["report", str(run_folder)]) == 0
     assert "<h2>Mesh</h2>" in page.read_text()
     in_map = run_folder.parent / "in_map"
-    assert main(["mesh", str(run_folder), "--map", str(run_folder.parent / "m.map"), "--out", str(in_map)]) == 0
+    assert (
+        main(
+            [
+                "mesh",
+                str(run_folder),
+                "--map",
+                str(run_folder.parent / "m.map"),
+                "--out",
+                str(in_map),
+            ]
+        )
+        == 0
+    )
     assert json.loads((in_map / "mesh.json").read_text())["poses"] == "map"
 
 
-def test_interrupted_it_keeps_what_is_fused(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_it_keeps_what_is_fused(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from vio.cli.output import ProgressBar
 
-    monkeypatch.setattr(ProgressBar, "update", lambda self, done, total=None: signal.raise_signal(signal.SIGINT))
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    monkeypatch.setattr(
+        ProgressBar, "update", lambda self, done, total=None: signal.raise_signal(signal.SIGINT)
+    )
+    # a shell's background jobs ignore it
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         assert main(["mesh", str(run_folder), "--out", str(tmp_path / "m"), "--voxel", "0.1"]) == 0
     finally:
@@ -200,7 +249,9 @@ def test_interrupted_it_keeps_what_is_fused(run_folder: Path, tmp_path: Path, mo
     assert facts["chosen"] > 1
 
 
-def test_refusals_are_one_line(run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refusals_are_one_line(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     moved = tmp_path / "run"
     shutil.copytree(run_folder, moved)
     metrics = json.loads((moved / "metrics.json").read_text())
@@ -226,7 +277,10 @@ def test_exports_keep_the_colours_of_the_images(flight: Path, tmp_path: Path) ->
         gray = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
         cv2.imwrite(str(file), np.stack([gray // 2, gray, gray], axis=2))  # blue, green, red
     run = tmp_path / "run"
-    assert main(["run", str(tinted), "--save-observations", "--out", str(run), "--no-plot", "--json"]) == 0
+    assert (
+        main(["run", str(tinted), "--save-observations", "--out", str(run), "--no-plot", "--json"])
+        == 0
+    )
     assert main(["export", "colmap", str(run), "--keyframes", "3"]) == 0
     image = cv2.imread(str(next((run / "colmap" / "images").rglob("*.png"))), cv2.IMREAD_UNCHANGED)
     assert image.shape[2] == 3

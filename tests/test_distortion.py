@@ -1,4 +1,6 @@
-"""The radial-tangential model with its optional further radial coefficients, against itself; see test_sim_cameras."""
+"""The radial-tangential model with its optional further radial coefficients, against itself; see
+test_sim_cameras.
+"""
 
 from __future__ import annotations
 
@@ -37,9 +39,9 @@ KITTI = CameraModel(
 
 def _points(n: int = 200) -> np.ndarray:
     rng = np.random.default_rng(1)
-    return np.column_stack([rng.uniform(-0.75, 0.75, n), rng.uniform(-0.3, 0.3, n), np.ones(n)]) * rng.uniform(
-        1, 40, (n, 1)
-    )
+    return np.column_stack(
+        [rng.uniform(-0.75, 0.75, n), rng.uniform(-0.3, 0.3, n), np.ones(n)]
+    ) * rng.uniform(1, 40, (n, 1))
 
 
 def test_a_third_coefficient_of_zero_changes_nothing() -> None:
@@ -77,12 +79,17 @@ def test_points_are_valid_up_to_the_fold_of_the_polynomial(k: tuple[float, float
 
 @pytest.mark.parametrize("count", [1, 3, 6, 12])
 def test_rejects_other_numbers_of_coefficients(count: int) -> None:
-    with pytest.raises(CalibrationError, match=f"takes 4 distortion coefficients or 5 or 8, got {count}"):
+    with pytest.raises(
+        CalibrationError, match=f"takes 4 distortion coefficients or 5 or 8, got {count}"
+    ):
         CameraModel(400, 400, 320, 240, 640, 480, "radtan", (0.01,) * count)
 
 
 def test_rejects_invalid_cameras() -> None:
-    with pytest.raises(CalibrationError, match="unknown distortion model 'fisheye'; use one of pinhole, radtan, equi"):
+    with pytest.raises(
+        CalibrationError,
+        match="unknown distortion model 'fisheye'; use one of pinhole, radtan, equi",
+    ):
         CameraModel(400, 400, 320, 240, 640, 480, "fisheye", (0.1,))  # type: ignore[arg-type]
     with pytest.raises(CalibrationError, match="are not finite"):
         CameraModel(400, np.nan, 320, 240, 640, 480)

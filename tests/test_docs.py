@@ -1,8 +1,8 @@
 """The documentation's commands and Python blocks run, and all that they name exists.
 
-The README's commands run word for word in a folder where every path that they name exists, small. A line added to the
-README therefore fails here unless it works, and a line that is too long for a test needs an entry in `_SMALLER` or
-`_ELSEWHERE`.
+The README's commands run word for word in a folder where every path that they name exists, small. A
+line added to the README therefore fails here unless it works, and a line that is too long for a
+test needs an entry in `_SMALLER` or `_ELSEWHERE`.
 """
 
 from __future__ import annotations
@@ -33,12 +33,17 @@ from vio.sim.sequence import SimulatedRecording
 
 ROOT = Path(__file__).resolve().parent.parent
 README, COMMANDS = "README.md", "docs/commands.md"
-DOCS = (README, "CHANGELOG.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))))
+DOCS = (
+    README,
+    "CHANGELOG.md",
+    *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))),
+)
 NOTES = tuple(f"docs/notes/{path.name}" for path in sorted((ROOT / "docs" / "notes").glob("*.md")))
 
 # Options behind a command of the README that make it small; the command itself is run as written.
 _SMALLER = {
-    "vio render --scene room --trajectory handheld --duration 10 --out room": "--duration 0.2 --rig small --width 200",
+    "vio render --scene room --trajectory handheld --duration 10 --out room": "--duration 0.2 "
+    "--rig small --width 200",
     "vio calibrate FOLDER": "--pairs 3",
     "vio check RUN": "--keyframes 4",
     "vio run FOLDER --map yard.map": "--stop 20",
@@ -50,7 +55,9 @@ def _make(target: str) -> list[str]:
     if shutil.which("make") is None:
         pytest.skip("needs make")
     argv = ["make", "--dry-run", "--always-make", target]
-    return subprocess.run(argv, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    return subprocess.run(
+        argv, cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
 
 
 def _make_demo() -> None:
@@ -83,13 +90,21 @@ def _pytest_renders() -> None:
 
 
 def _installs() -> None:
-    """What is installed exists: the project here, the wheel's name with the present version, the extras."""
+    """What is installed exists: the project here, the wheel's name with the present version, the
+    extras.
+    """
     for command in (command for command in _commands(README) if "-m pip install" in command):
         target = shlex.split(command)[4]
         if target.endswith(".whl"):
             assert target == f"stereo_vio-{vio.__version__}-py3-none-any.whl"
-    table = re.findall(r"^\| `(\w+)` \|", _text(README).partition("## Install")[2].partition("\n## ")[0], re.MULTILINE)
-    declared = _text("pyproject.toml").partition("[project.optional-dependencies]")[2].partition("\n[")[0]
+    table = re.findall(
+        r"^\| `(\w+)` \|",
+        _text(README).partition("## Install")[2].partition("\n## ")[0],
+        re.MULTILINE,
+    )
+    declared = (
+        _text("pyproject.toml").partition("[project.optional-dependencies]")[2].partition("\n[")[0]
+    )
     assert sorted(table) == sorted(re.findall(r"^(\w+) = \[", declared, re.MULTILINE))
 
 
@@ -99,7 +114,9 @@ def _vio_demo() -> None:
 
 
 def _docker() -> None:
-    """The image is built from this folder, and its default command is the demo with results in the mounted folder."""
+    """The image is built from this folder, and its default command is the demo with results in
+    the mounted folder.
+    """
     assert 'CMD ["demo", "--out", "/data/demo"]' in _text("Dockerfile")
 
 
@@ -117,7 +134,8 @@ _ELSEWHERE: dict[str, Callable[[], None]] = {
 }
 
 
-# --- contents of the documents --------------------------------------------------------------------------------------
+# --- contents of the documents
+# --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,9 +156,18 @@ def _blocks(name: str) -> Iterator[_Block]:
     text = _text(name)
     for found in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
         yield _Block(found.group(1), text[: found.start(2)].count("\n"), found.group(2))
-    without = re.sub(r"^```.*?^```$", lambda m: "\n" * m.group().count("\n"), text, flags=re.DOTALL | re.MULTILINE)
+    without = re.sub(
+        r"^```.*?^```$",
+        lambda m: "\n" * m.group().count("\n"),
+        text,
+        flags=re.DOTALL | re.MULTILINE,
+    )
     for found in re.finditer(r"(?<=\n\n)((?: {4}\S.*\n)+)(?=\n)", without):
-        yield _Block("", without[: found.start()].count("\n"), re.sub(r"^ {4}", "", found.group(), flags=re.MULTILINE))
+        yield _Block(
+            "",
+            without[: found.start()].count("\n"),
+            re.sub(r"^ {4}", "", found.group(), flags=re.MULTILINE),
+        )
 
 
 def _python(name: str) -> list[_Block]:
@@ -149,10 +176,18 @@ def _python(name: str) -> list[_Block]:
 
 def _commands(name: str) -> list[str]:
     """Every command line of a document's blocks, without its comment; `a ; b` are two."""
-    lines = [line for block in _blocks(name) if block.language in ("", "bash") for line in block.text.splitlines()]
+    lines = [
+        line
+        for block in _blocks(name)
+        if block.language in ("", "bash")
+        for line in block.text.splitlines()
+    ]
     bare = (re.sub(r"\s+# .*", "", line) for line in lines)
     return [
-        part.strip() for line in bare for part in line.split(" ; ") if re.match(r"(vio|make|python|docker)\b", part)
+        part.strip()
+        for line in bare
+        for part in line.split(" ; ")
+        if re.match(r"(vio|make|python|docker)\b", part)
     ]
 
 
@@ -162,12 +197,15 @@ def _snippets(name: str) -> list[str]:
     return [" ".join(found.split()) for found in re.findall(r"`([^`]+)`", text)]
 
 
-# --- the README, executed -------------------------------------------------------------------------------------------
+# --- the README, executed
+# -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def readme_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with everything that the README's commands name: a short drive, a short flight, a course file, runs."""
+    """A folder with everything that the README's commands name: a short drive, a short flight, a
+    course file, runs.
+    """
     root = tmp_path_factory.mktemp("readme_folder")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
@@ -181,7 +219,8 @@ def readme_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         sequence = Path("path/to/sequences/07")
         sequence.mkdir(parents=True)
         Path("path/to/poses").mkdir()
-        for part in ("image_0", "image_1", "calib.txt", "times.txt"):  # as KITTI publishes it: no motion, no extrinsics
+        # as KITTI publishes it: no motion, no extrinsics
+        for part in ("image_0", "image_1", "calib.txt", "times.txt"):
             Path(sequence / part).symlink_to((drive / part).resolve())
         shutil.copy(drive / "poses.txt", "path/to/poses/07.txt")
         Path("path/to/folder").symlink_to(drive.resolve())
@@ -193,14 +232,18 @@ def readme_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cam0 = course.T_world_imu @ se3_inverse(T_CAM0_IMU)
         np.savetxt("poses_07.txt", (se3_inverse(cam0[0]) @ cam0)[:, :3].reshape(-1, 12))
         assert main(["run", "FOLDER", "--save-observations", "--out", "RUN"]) == 0
-        shutil.copytree("RUN", "results")  # of the lines before; made here so that each test runs alone
+        # of the lines before; made here so that each test runs alone
+        shutil.copytree("RUN", "results")
         shutil.copytree("RUN", "first")
     return root
 
 
 @pytest.mark.parametrize("command", dict.fromkeys([*_commands(README), *_commands(COMMANDS)]))
 def test_readme_commands_run(
-    command: str, readme_folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    command: str,
+    readme_folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.chdir(readme_folder)
     program, *argv = shlex.split(f"{command} {_SMALLER.get(command, '')}")
@@ -236,10 +279,17 @@ def test_readme_shows_what_the_demo_prints(
 
     monkeypatch.chdir(readme_folder)
     metrics = yaml.safe_load((readme_folder / "demo/run/metrics.json").read_text(encoding="utf-8"))
-    shown_drift = {"start_s": 0.0, "t_err_percent": 0.05, "r_err_deg_per_100m": 0.039, "drift_lengths_m": [100]}
+    shown_drift = {
+        "start_s": 0.0,
+        "t_err_percent": 0.05,
+        "r_err_deg_per_100m": 0.039,
+        "drift_lengths_m": [100],
+    }
     print_result({}, metric_rows({**metrics, **shown_drift}), as_json=False)
     shown = next(block.text for block in _blocks(README) if block.text.startswith("frames "))
-    printed, shown = (re.sub(r"[+-]?[\d.]+\d( m?m\b)?", "#", text) for text in (capsys.readouterr().out, shown))
+    printed, shown = (
+        re.sub(r"[+-]?[\d.]+\d( m?m\b)?", "#", text) for text in (capsys.readouterr().out, shown)
+    )
     assert printed == shown
 
 
@@ -273,11 +323,13 @@ def test_the_output_files_of_a_run_exist(readme_folder: Path) -> None:
     assert named <= {path.name for path in (readme_folder / "RUN").iterdir()}
 
 
-# --- Python blocks of the other documents ---------------------------------------------------------------------------
+# --- Python blocks of the other documents
+# ---------------------------------------------------------------------------
 
 
 def _execute(name: str, block: _Block, scope: dict[str, object]) -> None:
-    exec(compile("\n" * block.line + block.text, name, "exec"), scope)  # so that a failure names its line
+    # so that a failure names its line
+    exec(compile("\n" * block.line + block.text, name, "exec"), scope)
 
 
 @pytest.fixture(scope="module")
@@ -310,7 +362,9 @@ def test_simulation_along_a_flight_runs(data_dir: Path) -> None:
     assert state.gyro_bias is None, "of a recorded IMU"
 
 
-def test_inertial_check_runs(simulation: dict[str, object], caplog: pytest.LogCaptureFixture) -> None:
+def test_inertial_check_runs(
+    simulation: dict[str, object], caplog: pytest.LogCaptureFixture
+) -> None:
     from vio.monitor.inertial import InertialCheck
 
     dataset, oracle = simulation["recording"], simulation["oracle"]
@@ -344,12 +398,19 @@ def test_client_of_a_served_map_runs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_every_python_block_is_run_by_one_of_the_tests_above() -> None:
     counts = {name: len(_python(name)) for name in DOCS}
-    tested = {README: 1, "docs/live.md": 2, "docs/simulation.md": 2, "docs/inertial.md": 1, "docs/maps.md": 1}
+    tested = {
+        README: 1,
+        "docs/live.md": 2,
+        "docs/simulation.md": 2,
+        "docs/inertial.md": 1,
+        "docs/maps.md": 1,
+    }
     tested["docs/conventions.md"] = 8
     assert {name: count for name, count in counts.items() if count} == tested
 
 
-# --- what the documents name exists ---------------------------------------------------------------------------------
+# --- what the documents name exists
+# ---------------------------------------------------------------------------------
 
 
 def _subcommands() -> dict[str, argparse.ArgumentParser]:
@@ -374,28 +435,41 @@ def test_commands_of_the_docs_parse(name: str, command: str) -> None:
         config_from(args)
 
 
-@pytest.mark.parametrize(("name", "command"), [c for c in _ALL_COMMANDS if c[1].startswith("make ")])
+@pytest.mark.parametrize(
+    ("name", "command"), [c for c in _ALL_COMMANDS if c[1].startswith("make ")]
+)
 def test_make_of_the_docs_knows_its_targets_and_variables(name: str, command: str) -> None:
     _, target, *assignments = shlex.split(command)
     makefile = _text("Makefile")
     assert re.search(rf"^{target}:", makefile, re.MULTILINE)
     for assignment in assignments:
-        assert re.search(rf"^{assignment.partition('=')[0]} \?=", makefile, re.MULTILINE), assignment
+        assert re.search(rf"^{assignment.partition('=')[0]} \?=", makefile, re.MULTILINE), (
+            assignment
+        )
 
 
-@pytest.mark.parametrize(("name", "command"), [c for c in _ALL_COMMANDS if c[1].startswith("python tools")])
+@pytest.mark.parametrize(
+    ("name", "command"), [c for c in _ALL_COMMANDS if c[1].startswith("python tools")]
+)
 def test_tools_of_the_docs_take_their_options(name: str, command: str) -> None:
     _, tool, *argv = shlex.split(command)
     source = (ROOT / tool).read_text(encoding="utf-8")
-    assert [option for option in argv if option.startswith("--") and f'"{option}"' not in source] == []
+    assert [
+        option for option in argv if option.startswith("--") and f'"{option}"' not in source
+    ] == []
 
 
 def test_every_dependency_has_its_row() -> None:
     tomllib = pytest.importorskip("tomllib", reason="part of Python 3.11")
     project = tomllib.loads(_text("pyproject.toml"))["project"]
-    declared = [*project["dependencies"], *(r for extra in project["optional-dependencies"].values() for r in extra)]
+    declared = [
+        *project["dependencies"],
+        *(r for extra in project["optional-dependencies"].values() for r in extra),
+    ]
     plain = [requirement.partition(";")[0].strip() for requirement in declared]
-    rows = re.findall(r"^\| ([\w-]+) \| ([<>=][^|]*) \|", _text("docs/dependencies.md"), re.MULTILINE)
+    rows = re.findall(
+        r"^\| ([\w-]+) \| ([<>=][^|]*) \|", _text("docs/dependencies.md"), re.MULTILINE
+    )
     assert sorted("".join(row) for row in rows) == sorted(plain)
 
 
@@ -409,23 +483,37 @@ def test_inline_code_names_what_exists(name: str) -> None:
         words = code.split()
         if words[0] == "vio" and len(words) > 1:
             known = commands.get(words[1])
-            options = [] if known is None else [o for action in known._actions for o in action.option_strings]
-            if known is None or any(word.startswith("--") and word not in options for word in words):
+            options = (
+                []
+                if known is None
+                else [o for action in known._actions for o in action.option_strings]
+            )
+            if known is None or any(
+                word.startswith("--") and word not in options for word in words
+            ):
                 wrong.append(code)
         elif words[0] == "python" and len(words) > 1 and words[1].startswith("tools/"):
-            source = (ROOT / words[1]).read_text(encoding="utf-8") if (ROOT / words[1]).is_file() else ""
-            if any(f'"{option}"' not in source for option in re.findall(r"--[\w-]+", code)) or not source:
+            source = (
+                (ROOT / words[1]).read_text(encoding="utf-8") if (ROOT / words[1]).is_file() else ""
+            )
+            if (
+                any(f'"{option}"' not in source for option in re.findall(r"--[\w-]+", code))
+                or not source
+            ):
                 wrong.append(code)
         elif words[0] == "make":
             if not re.search(rf"^{words[1]}:", _text("Makefile"), re.MULTILINE):
                 wrong.append(code)
         elif found := re.fullmatch(
-            r"(?:--set )?((?:frontend|selector|vislam|msckf|dataset)(?:\.[a-z]\w*)+)(?:[=:].*)?", code
+            r"(?:--set )?((?:frontend|selector|vislam|msckf|dataset)(?:\.[a-z]\w*)+)(?:[=:].*)?",
+            code,
         ):
             is_module = (ROOT / (found.group(1).replace(".", "/") + ".py")).is_file()
             if found.group(1) not in _SETTINGS | sections and not is_module:
                 wrong.append(code)
-        elif found := re.fullmatch(r"((?:vio|frontend|tools|tests|docs|configs)/[\w./]*)(?:::\w+)?", code):
+        elif found := re.fullmatch(
+            r"((?:vio|frontend|tools|tests|docs|configs)/[\w./]*)(?:::\w+)?", code
+        ):
             if not (ROOT / found.group(1)).exists():
                 wrong.append(code)
         elif (found := re.fullmatch(r"(\w+): \S+", code)) and found.group(1) not in {
@@ -435,7 +523,9 @@ def test_inline_code_names_what_exists(name: str) -> None:
     assert not wrong
 
 
-@pytest.mark.parametrize("name", [name for name in DOCS if any(b.language == "yaml" for b in _blocks(name))])
+@pytest.mark.parametrize(
+    "name", [name for name in DOCS if any(b.language == "yaml" for b in _blocks(name))]
+)
 def test_yaml_of_the_docs_is_a_configuration(name: str) -> None:
     for block in _blocks(name):
         if block.language == "yaml":
@@ -456,8 +546,14 @@ def test_links_are_valid(name: str) -> None:
 
 
 def test_every_page_is_reached_from_the_readme() -> None:
-    linked = {target for name in (README, *DOCS) for target in re.findall(r"\]\(([^)\s#]+\.md)", _text(name))}
-    assert {Path(name).name for name in (*DOCS[2:], *NOTES)} <= {Path(target).name for target in linked}
+    linked = {
+        target
+        for name in (README, *DOCS)
+        for target in re.findall(r"\]\(([^)\s#]+\.md)", _text(name))
+    }
+    assert {Path(name).name for name in (*DOCS[2:], *NOTES)} <= {
+        Path(target).name for target in linked
+    }
 
 
 def _anchors(file: Path) -> set[str]:

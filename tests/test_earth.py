@@ -1,4 +1,6 @@
-"""A trajectory on the earth: geodesy against PROJ, fusion with simulated GNSS, readers, and `vio georeference`."""
+"""A trajectory on the earth: geodesy against PROJ, fusion with simulated GNSS, readers, and
+`vio georeference`.
+"""
 
 from __future__ import annotations
 
@@ -41,13 +43,31 @@ SIGMA = 2.0  # m, of each axis
 @pytest.mark.parametrize(
     ("geodetic", "earth_centred", "zone", "grid"),
     [  # by PROJ 9.5
-        ((49.01, 8.43, 112.0), (4146381.0132, 614502.8304, 4791372.8167), 32, (458317.2031, 5428723.9409)),
-        ((-33.86, 151.2, 40.0), (-4646142.5241, 2554238.4674, -3533584.1652), 56, (333491.2299, 6251909.206)),
-        ((78.2, 15.6, 500.0), (1260403.6833, 351911.0315, 6222030.3055), 33, (513696.9454, 8680760.0532)),
+        (
+            (49.01, 8.43, 112.0),
+            (4146381.0132, 614502.8304, 4791372.8167),
+            32,
+            (458317.2031, 5428723.9409),
+        ),
+        (
+            (-33.86, 151.2, 40.0),
+            (-4646142.5241, 2554238.4674, -3533584.1652),
+            56,
+            (333491.2299, 6251909.206),
+        ),
+        (
+            (78.2, 15.6, 500.0),
+            (1260403.6833, 351911.0315, 6222030.3055),
+            33,
+            (513696.9454, 8680760.0532),
+        ),
     ],
 )
 def test_geodesy_agrees_with_proj(
-    geodetic: tuple[float, ...], earth_centred: tuple[float, ...], zone: int, grid: tuple[float, ...]
+    geodetic: tuple[float, ...],
+    earth_centred: tuple[float, ...],
+    zone: int,
+    grid: tuple[float, ...],
 ) -> None:
     g = np.array([geodetic])
     np.testing.assert_allclose(ecef(g)[0], earth_centred, atol=1e-4)
@@ -72,19 +92,27 @@ class Drive:
         return found.T_enu_body[:, :3, 3] - truth
 
 
-Jump = tuple[int, int, tuple[float, float, float]]  # first and last position, and what is added to them
+# first and last position, and what is added to them
+Jump = tuple[int, int, tuple[float, float, float]]
 
 
 def _drive(*, seed: int, poses: int = 1000, jumps: Sequence[Jump] = ()) -> Drive:
     """Errors of GNSS last five seconds; `jumps` are added."""
     rng = np.random.default_rng(seed)
-    turn = np.array([(np.pi / 32) * (1 if (k // 250) % 2 else -1) * (60 < k % 250 < 76) for k in range(poses - 1)])
+    turn = np.array(
+        [
+            (np.pi / 32) * (1 if (k // 250) % 2 else -1) * (60 < k % 250 < 76)
+            for k in range(poses - 1)
+        ]
+    )
     true, odometry = [se3_from_parts(so3_exp(np.array([0, 0, YAW_RAD])), np.zeros(3))], [np.eye(4)]
     for w in turn:
         step = se3_exp(np.array([1.0, 0, 0, 0, 0, w]))
         true.append(true[-1] @ step)
         step[:3, 3] *= 1.005
-        noise = np.concatenate([0.01 * rng.normal(size=3), np.radians([5e-4, 5e-4, 0.03]) * rng.normal(size=3)])
+        noise = np.concatenate(
+            [0.01 * rng.normal(size=3), np.radians([5e-4, 5e-4, 0.03]) * rng.normal(size=3)]
+        )
         odometry.append(odometry[-1] @ step @ se3_exp(noise))
     T = np.array(true)
     rows = np.arange(0, poses, 10)
@@ -101,7 +129,9 @@ def _drive(*, seed: int, poses: int = 1000, jumps: Sequence[Jump] = ()) -> Drive
     fixes = checked_fixes(times_ns[rows], LocalFrame(ORIGIN).geodetic(antenna), C, "simulated")
     none = np.zeros(0, dtype=np.int64)
     up = np.array([0, 0, 1.0])
-    return Drive(GraphPath(times_ns, np.array(odometry), none, none, up, np.radians(0.3), none), T, fixes)
+    return Drive(
+        GraphPath(times_ns, np.array(odometry), none, none, up, np.radians(0.3), none), T, fixes
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -115,7 +145,9 @@ def _drive(*, seed: int, poses: int = 1000, jumps: Sequence[Jump] = ()) -> Drive
     ],
     ids=["clean", "jumps", "a jump to the end", "wrong height"],
 )
-def test_a_kilometre_is_as_good_as_its_gnss(jumps: Sequence[Jump], refused: int, heights: int, seed: int) -> None:
+def test_a_kilometre_is_as_good_as_its_gnss(
+    jumps: Sequence[Jump], refused: int, heights: int, seed: int
+) -> None:
     drive = _drive(seed=seed, jumps=jumps)
     found = georeference(drive.path, drive.fixes, LEVER_M)
     error = drive.error_m(found)
@@ -154,9 +186,15 @@ def test_without_a_fix_in_height_the_place_is_still_found() -> None:
 
 
 def test_covariance_of_the_rigid_transform_covers_it() -> None:
-    found = [georeference(d.path, d.fixes, LEVER_M) for d in (_drive(seed=s, poses=300) for s in range(8))]
+    found = [
+        georeference(d.path, d.fixes, LEVER_M)
+        for d in (_drive(seed=s, poses=300) for s in range(8))
+    ]
     exact = _drive(seed=0, poses=300).T_enu[0]
-    headings = [np.arctan2(f.T_enu_map[1, 0], f.T_enu_map[0, 0]) - np.arctan2(exact[1, 0], exact[0, 0]) for f in found]
+    headings = [
+        np.arctan2(f.T_enu_map[1, 0], f.T_enu_map[0, 0]) - np.arctan2(exact[1, 0], exact[0, 0])
+        for f in found
+    ]
     sigmas = np.array([heading_deg(f.T_enu_map, f.covariance)[1] for f in found])
     assert 0.3 < np.sqrt(np.mean((np.degrees(headings) / sigmas) ** 2)) < 2.5
 
@@ -167,13 +205,20 @@ def test_normal_matrix_is_the_jacobian_of_the_gradient_without_residuals() -> No
     before, share, _ = _between(path, drive.fixes.times_ns)
     C, has_height = drive.fixes.covariance, drive.fixes.has_height
     nowhere = np.zeros((len(C), 3))
-    measured = _Problem(path, before, share, nowhere, C, has_height, LEVER_M).antenna(path.T_map_body)
-    problem, weight = _Problem(path, before, share, measured, C, has_height, LEVER_M), np.ones((len(C), 2))
+    measured = _Problem(path, before, share, nowhere, C, has_height, LEVER_M).antenna(
+        path.T_map_body
+    )
+    problem, weight = (
+        _Problem(path, before, share, measured, C, has_height, LEVER_M),
+        np.ones((len(C), 2)),
+    )
     H, g = problem._normal(path.T_map_body, 0.0, weight)
     assert np.abs(g).max() < 1e-6
 
     def gradient(x: FloatArray) -> FloatArray:
-        return problem._normal(path.T_map_body @ se3_exp(x[:-1].reshape(-1, 6)), float(x[-1]), weight)[1]
+        return problem._normal(
+            path.T_map_body @ se3_exp(x[:-1].reshape(-1, 6)), float(x[-1]), weight
+        )[1]
 
     numeric = -numeric_jacobian(gradient, np.zeros(len(g)))
     scale = np.sqrt(np.outer(H.diagonal(), H.diagonal()))
@@ -182,19 +227,27 @@ def test_normal_matrix_is_the_jacobian_of_the_gradient_without_residuals() -> No
 
 def test_too_few_positions_are_refused_with_both_spans() -> None:
     drive = _drive(seed=0, poses=100)
-    with pytest.raises(EstimationError, match=r"only 0 GNSS positions .* are within the trajectory .*--time-offset"):
+    with pytest.raises(
+        EstimationError, match=r"only 0 GNSS positions .* are within the trajectory .*--time-offset"
+    ):
         georeference(drive.path, drive.fixes, LEVER_M, time_offset_ns=10**12)
 
 
-# --- readers --------------------------------------------------------------------------------------------------------
+# --- readers
+# --------------------------------------------------------------------------------------------------------
 
 
 def _csv(path: Path, fixes: GnssFixes, *, sigmas: bool = True, offset_s: float = 0.0) -> Path:
     rows = []
-    for t, g, C in zip(fixes.times_ns.tolist(), fixes.geodetic.tolist(), fixes.covariance, strict=True):
+    for t, g, C in zip(
+        fixes.times_ns.tolist(), fixes.geodetic.tolist(), fixes.covariance, strict=True
+    ):
         values = [t * 1e-9 + offset_s, *g, *(np.sqrt(np.diag(C)).tolist() if sigmas else [])]
         rows.append(",".join(f"{v:.9f}" for v in values))
-    names = "time_s,latitude_deg,longitude_deg,height_m" + ",sigma_east_m,sigma_north_m,sigma_up_m" * sigmas
+    names = (
+        "time_s,latitude_deg,longitude_deg,height_m"
+        + ",sigma_east_m,sigma_north_m,sigma_up_m" * sigmas
+    )
     path.write_text("\n".join([names, *rows]) + "\n")
     return path
 
@@ -260,7 +313,9 @@ def _navsat(script: Script, time_ns: int, status: int, kind: int) -> None:
     state = script.make("sensor_msgs/msg/NavSatStatus", status, 1)
     C = np.diag([1.0, 4.0, 9.0]).ravel()
     values = (49.0 + 1e-13 * time_ns, 8.4, 115.0, C, kind)
-    script.add("/fix", name, time_ns, script.make(name, script.header(time_ns, "gps"), state, *values))
+    script.add(
+        "/fix", name, time_ns, script.make(name, script.header(time_ns, "gps"), state, *values)
+    )
 
 
 @pytest.mark.parametrize("storage", ["bag", "mcap"])
@@ -278,11 +333,14 @@ def test_reads_navsatfix_of_a_bag(tmp_path: Path, storage: str) -> None:
         read_gnss(path, "/other")
 
 
-# --- the command ----------------------------------------------------------------------------------------------------
+# --- the command
+# ----------------------------------------------------------------------------------------------------
 
 
 def _map_of(path: Path, drive: Drive, up_map: FloatArray | None = None) -> Path:
-    """Write a map with a keyframe every second of a drive, in its frame; `up_map` (3,) is the vertical, if known."""
+    """Write a map with a keyframe every second of a drive, in its frame; `up_map` (3,) is the
+    vertical, if known.
+    """
     store = MapStore(path, create=True)
     store.add_session(SessionRow("a drive", CAMERA, True, 0))
     for k in range(0, len(drive.T_enu), 10):
@@ -316,23 +374,38 @@ def test_places_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert {**after, "earth": None, "bytes": 0} == {**before, "bytes": 0}
     run = tmp_path / "run"  # in the frame of the map
     run.mkdir()
-    track = Trajectory(drive.path.T_map_body, drive.path.times_ns, "imu", frame_indices=np.arange(300))
+    track = Trajectory(
+        drive.path.T_map_body, drive.path.times_ns, "imu", frame_indices=np.arange(300)
+    )
     for name in ("trajectory.tum", "map_trajectory.tum"):
         write_tum(run / name, track)
     (run / "landmarks.ply").write_bytes(b"ply\nend_header\n")
     metrics = {"T_cam0_imu": np.eye(4).tolist(), "motion": "imu", "map": {"joined": True}}
     (run / "metrics.json").write_text(json.dumps(metrics))
     own, T = np.arange(0, 300, 10), drive.path.T_map_body
-    write_keyframes(run, MapKeyframes(own // 10, own, drive.path.times_ns[own], own < 0, T[own], np.zeros((30, 6, 6))))
+    write_keyframes(
+        run,
+        MapKeyframes(
+            own // 10, own, drive.path.times_ns[own], own < 0, T[own], np.zeros((30, 6, 6))
+        ),
+    )
     assert main(["georeference", str(run), str(file)]) == 0
     assert "GNSS" not in capsys.readouterr().out
     placed_run = read_trajectory(run / "earth" / "trajectory_enu.tum").T_world_body
-    np.testing.assert_allclose(placed_run, np.array(saved["T_enu_map"]) @ track.T_world_body, atol=1e-5)
+    np.testing.assert_allclose(
+        placed_run, np.array(saved["T_enu_map"]) @ track.T_world_body, atol=1e-5
+    )
     extract_map(file, tmp_path / "part.map", tuple(drive.path.T_map_body[0, :3, 3]), 50.0)
     assert describe_map(tmp_path / "part.map")["earth"] == after["earth"]
-    # The same map in another frame, as of a merge, and a map of another path with the same frames and times.
+    # The same map in another frame, as of a merge, and a map of another path with the same frames
+    # and times.
     moved, other = se3_exp([40.0, -7.0, 2.0, 0.0, 0.0, 1.0]), tmp_path / "other.map"
-    _keep_earth(_map_of(tmp_path / "moved.map", replace(drive, path=replace(drive.path, T_map_body=moved @ T))), file)
+    _keep_earth(
+        _map_of(
+            tmp_path / "moved.map", replace(drive, path=replace(drive.path, T_map_body=moved @ T))
+        ),
+        file,
+    )
     assert main(["georeference", str(run), str(tmp_path / "moved.map")]) == 0
     found = read_trajectory(run / "earth" / "trajectory_enu.tum").T_world_body
     np.testing.assert_allclose(found, np.array(saved["T_enu_map"]) @ moved @ T, atol=1e-4)
@@ -341,20 +414,30 @@ def test_places_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     (run / "metrics.json").write_text(json.dumps({**metrics, "map": None}))
     for arguments, message in (
         ([str(run), str(file)], "is no run that found its place in a map"),
-        ([str(file), str(_map_of(tmp_path / "b.map", drive))], "nothing says where it is on the earth"),
+        (
+            [str(file), str(_map_of(tmp_path / "b.map", drive))],
+            "nothing says where it is on the earth",
+        ),
     ):
         assert message in refused(capsys, "georeference", *arguments)
 
 
 def test_places_a_run(
-    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    flight: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     run = tmp_path / "run"
     assert main(["run", str(flight), "--out", str(run), "--no-plot", "--json"]) == 0
     before = (run / "trajectory.tum").read_bytes()
     reference = read_trajectory(run / "reference.tum")
     assert reference.times_ns is not None
-    T = se3_exp(np.array([5.0, 6.0, 7.0, 0, 0, 2.0])) @ se3_inverse(reference.T_world_body[0]) @ reference.T_world_body
+    T = (
+        se3_exp(np.array([5.0, 6.0, 7.0, 0, 0, 2.0]))
+        @ se3_inverse(reference.T_world_body[0])
+        @ reference.T_world_body
+    )
     geodetic = LocalFrame(ORIGIN).geodetic(T[:, :3, 3])
     C = np.tile(0.02**2 * np.eye(3), (len(T), 1, 1))
     gnss = _csv(tmp_path / "gnss.csv", checked_fixes(reference.times_ns, geodetic, C, "x"))
@@ -363,9 +446,9 @@ def test_places_a_run(
     assert np.array(facts["covariance"]).shape == (6, 6)
     saved = json.loads((run / "earth" / "earth.json").read_text())
     assert saved["origin"]["datum"] == "WGS84"
-    lon, lat, _ = json.loads((run / "earth" / "trajectory.geojson").read_text())["features"][0]["geometry"][
-        "coordinates"
-    ][0]
+    lon, lat, _ = json.loads((run / "earth" / "trajectory.geojson").read_text())["features"][0][
+        "geometry"
+    ]["coordinates"][0]
     assert abs(lat - geodetic[0, 0]) < 1e-5
     assert abs(lon - geodetic[0, 1]) < 1e-5
     assert "EPSG:32632" in (run / "earth" / "trajectory_utm.csv").read_text()
@@ -378,8 +461,11 @@ def test_places_a_run(
         ([str(tmp_path), str(gnss)], "no run folder"),
     ):
         assert message in refused(capsys, "georeference", *arguments)
-    loop = LoopEvent(5, 0, 0, 0, 30, 0.1, joined=False, keyframe_frame=0)  # the first frame, seen again
-    monkeypatch.setattr("vio.offline.georeference.read_loops", lambda _: [loop, replace(loop, keyframe_frame=None)])
+    # the first frame, seen again
+    loop = LoopEvent(5, 0, 0, 0, 30, 0.1, joined=False, keyframe_frame=0)
+    monkeypatch.setattr(
+        "vio.offline.georeference.read_loops", lambda _: [loop, replace(loop, keyframe_frame=None)]
+    )
     path = placed(run).path
     assert (path.first.tolist(), path.second.tolist()) == ([0], [5])
 
@@ -389,7 +475,9 @@ def test_landmarks_and_vertical_of_a_run_are_in_its_map(tmp_path: Path) -> None:
     T[:, 0, 3] = 2.0 * np.arange(50)
     M = np.eye(4)
     M[:3, :3], M[:3, 3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]], [100, 50, 7]
-    (tmp_path / "metrics.json").write_text(json.dumps({"T_cam0_imu": np.eye(4).tolist(), "motion": "imu"}))
+    (tmp_path / "metrics.json").write_text(
+        json.dumps({"T_cam0_imu": np.eye(4).tolist(), "motion": "imu"})
+    )
     times, frames = np.arange(50) * 10**8, np.arange(50)
     for name, poses in (("trajectory.tum", T), ("map_trajectory.tum", M @ T)):
         write_tum(tmp_path / name, Trajectory(poses, times, "imu", frame_indices=frames))
@@ -399,20 +487,28 @@ def test_landmarks_and_vertical_of_a_run_are_in_its_map(tmp_path: Path) -> None:
     np.testing.assert_allclose(of.points, [[101, 50, 10]], atol=1e-6)
     np.testing.assert_allclose(of.path.up_map, M[:3, 2], atol=1e-9)
     g = np.array([0.981, 0.0, -9.76])  # better known than at the start
-    np.save(tmp_path / "estimates.npy", estimate_row(49, Estimate(0, T[-1], np.eye(6), gravity_world=g)))
-    np.testing.assert_allclose(placed(tmp_path).path.up_map, -M[:3, :3] @ g / np.linalg.norm(g), atol=1e-9)
+    np.save(
+        tmp_path / "estimates.npy", estimate_row(49, Estimate(0, T[-1], np.eye(6), gravity_world=g))
+    )
+    np.testing.assert_allclose(
+        placed(tmp_path).path.up_map, -M[:3, :3] @ g / np.linalg.norm(g), atol=1e-9
+    )
 
 
 def test_keyframes_say_what_is_up_in_a_map_without_loops(tmp_path: Path) -> None:
     drive, up = _drive(seed=0, poses=300), np.array([0.6, 0.0, 0.8])
     assert placed(_map_of(tmp_path / "a.map", drive)).path.up_map.tolist() == [0, 0, 1]
-    np.testing.assert_allclose(placed(_map_of(tmp_path / "b.map", drive, up)).path.up_map, up, atol=1e-9)
+    np.testing.assert_allclose(
+        placed(_map_of(tmp_path / "b.map", drive, up)).path.up_map, up, atol=1e-9
+    )
 
 
 def test_a_drive_that_never_moves_is_refused_in_words() -> None:
     none, n = np.zeros(0, dtype=np.int64), 60
     t = np.arange(n) * 10**9
-    path = GraphPath(t, np.tile(np.eye(4), (n, 1, 1)), none, none, np.array([0, 0, 1.0]), np.radians(0.3), none)
+    path = GraphPath(
+        t, np.tile(np.eye(4), (n, 1, 1)), none, none, np.array([0, 0, 1.0]), np.radians(0.3), none
+    )
     noise = np.random.default_rng(0).normal(size=(n, 3))
     fixes = checked_fixes(t, LocalFrame(ORIGIN).geodetic(noise), None, "x")
     with pytest.raises(EstimationError, match="do not determine"):

@@ -1,4 +1,6 @@
-"""Evaluation: equal to evo, to brute force and to hand-computed cases; association, degenerate motion, NEES."""
+"""Evaluation: equal to evo, to brute force and to hand-computed cases; association, degenerate
+motion, NEES.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,14 @@ REAL = ("kitti_0039/poses.txt", "kitti_06_head/poses.txt", "ece276a/kitti_odomet
 def wander(n: int, seed: int = 0, step_m: float = 1.0) -> FloatArray:
     """A smooth random motion (n, 4, 4)."""
     rng = np.random.default_rng(seed)
-    twist = np.array([0, 0, step_m, 0, 0.01, 0]) + rng.normal(size=(n, 6)) * [0.1, 0.1, 0.2, 0.02, 0.05, 0.02]
+    twist = np.array([0, 0, step_m, 0, 0.01, 0]) + rng.normal(size=(n, 6)) * [
+        0.1,
+        0.1,
+        0.2,
+        0.02,
+        0.05,
+        0.02,
+    ]
     T = np.empty((n, 4, 4))
     T[0] = se3_exp(rng.normal(size=6))
     for k in range(1, n):
@@ -74,7 +83,9 @@ def kitti_form(T: FloatArray, body: BodyFrame = "cam0") -> Trajectory:
     return Trajectory(T, None, body)
 
 
-def timed(T: FloatArray, step_ns: int = 100_000_000, start_ns: int = 0, body: BodyFrame = "cam0") -> Trajectory:
+def timed(
+    T: FloatArray, step_ns: int = 100_000_000, start_ns: int = 0, body: BodyFrame = "cam0"
+) -> Trajectory:
     return Trajectory(T, start_ns + step_ns * np.arange(len(T), dtype=np.int64), body)
 
 
@@ -97,16 +108,25 @@ def evo_statistics(metric: Any, pair: tuple[Any, Any]) -> dict[str, float]:
     return dict(metric.get_all_statistics())
 
 
-def assert_equals_evo(T_est: FloatArray, T_ref: FloatArray, align: AlignMode, *, straight: bool = False) -> None:
-    """All figures but those of orientations on a straight path, where evo leaves the rotation about it open."""
+def assert_equals_evo(
+    T_est: FloatArray, T_ref: FloatArray, align: AlignMode, *, straight: bool = False
+) -> None:
+    """All figures but those of orientations on a straight path, where evo leaves the rotation
+    about it open.
+    """
     from evo.core import metrics
 
-    ours = evaluate(kitti_form(T_est), kitti_form(T_ref), align=align, rpe_delta_frames=3, rpe_delta_m=7.0)
+    ours = evaluate(
+        kitti_form(T_est), kitti_form(T_ref), align=align, rpe_delta_frames=3, rpe_delta_m=7.0
+    )
     pair = evo_pair(T_est, T_ref, align)
     relation = metrics.PoseRelation
     settled = straight and align in ("se3", "sim3")
     assert (ours.rotation_from == "direction and orientations") == settled
-    for mine, which in ((ours.ate_m, relation.translation_part), (ours.ate_deg, relation.rotation_angle_deg)):
+    for mine, which in (
+        (ours.ate_m, relation.translation_part),
+        (ours.ate_deg, relation.rotation_angle_deg),
+    ):
         if settled and mine is ours.ate_deg:
             continue
         theirs = evo_statistics(metrics.APE(which), pair)
@@ -121,11 +141,16 @@ def assert_equals_evo(T_est: FloatArray, T_ref: FloatArray, align: AlignMode, *,
             (rpe.rot_rmse_deg, relation.rotation_angle_deg),
         ):
             metric = metrics.RPE(which, delta, unit, all_pairs=True, pairs_from_reference=True)
-            assert value == pytest.approx(evo_statistics(metric, pair)["rmse"], rel=1e-9), (which, unit)
+            assert value == pytest.approx(evo_statistics(metric, pair)["rmse"], rel=1e-9), (
+                which,
+                unit,
+            )
             assert rpe.pairs == len(metric.error)
     if not settled:
         np.testing.assert_allclose(ours.aligned.T_world_body, pair[1].poses_se3, atol=1e-9)
-    assert ours.path_length_m == pytest.approx(evo_pair(T_est, T_ref, "none")[1].path_length, rel=1e-12)
+    assert ours.path_length_m == pytest.approx(
+        evo_pair(T_est, T_ref, "none")[1].path_length, rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("align", MODES)
@@ -153,7 +178,9 @@ def test_association_by_time_pairs_what_evo_pairs() -> None:
     b = np.sort(a[::2] + rng.integers(-6_000_000, 6_000_000, size=50))
     rows, reference_rows = associate_times(a, b, max_difference_ns=4_000_000)
     identity = np.tile(np.eye(4), (100, 1, 1))
-    first, second = (PoseTrajectory3D(poses_se3=list(identity[: len(t)]), timestamps=t / 1e9) for t in (a, b))
+    first, second = (
+        PoseTrajectory3D(poses_se3=list(identity[: len(t)]), timestamps=t / 1e9) for t in (a, b)
+    )
     theirs = sync.associate_trajectories(first, second, max_diff=0.004)
     np.testing.assert_allclose(a[rows] / 1e9, theirs[0].timestamps)
     np.testing.assert_allclose(b[reference_rows] / 1e9, theirs[1].timestamps)
@@ -163,7 +190,9 @@ def test_association_by_time_pairs_what_evo_pairs() -> None:
 # The KITTI metric
 
 
-def brute_force_kitti(T_est: FloatArray, T_ref: FloatArray, lengths: Sequence[float]) -> tuple[float, float, int]:
+def brute_force_kitti(
+    T_est: FloatArray, T_ref: FloatArray, lengths: Sequence[float]
+) -> tuple[float, float, int]:
     """The metric written from its definition: loops, 4x4 inverses, and angles by scipy."""
     errors_t, errors_r = [], []
     for first in range(0, len(T_ref), 10):
@@ -209,7 +238,10 @@ def test_kitti_error_equals_brute_force_on_sequence_07(data_dir: Path) -> None:
     T_est = drift(T_ref, sigma=0.003)
     ours = evaluate(kitti_form(T_est), kitti_form(T_ref)).kitti
     t_err, r_err, segments = brute_force_kitti(T_est, T_ref, range(100, 801, 100))
-    assert (ours.segments, [row.segments for row in ours.per_length]) == (segments, [89, 79, 58, 44, 30, 17, 0, 0])
+    assert (ours.segments, [row.segments for row in ours.per_length]) == (
+        segments,
+        [89, 79, 58, 44, 30, 17, 0, 0],
+    )
     assert ours.t_err_percent == pytest.approx(t_err, rel=1e-9)
     assert ours.r_err_deg_per_100m == pytest.approx(r_err, rel=1e-9)
 
@@ -221,7 +253,8 @@ def straight(n: int, step_m: float = 1.0) -> FloatArray:
 
 
 def test_a_scale_error_of_one_percent_is_one_percent_drift() -> None:
-    # A step of 1 m: the first pose more than 100 m away is the 101st, so the error is 1.01 m per 100 m.
+    # A step of 1 m: the first pose more than 100 m away is the 101st, so the error is 1.01 m per
+    # 100 m.
     ours = evaluate(kitti_form(straight(301, 1.01)), kitti_form(straight(301)), align="none").kitti
     assert ours.per_length[0].t_err_percent == pytest.approx(1.01)
     assert ours.per_length[1].t_err_percent == pytest.approx(0.01 * 201 / 200 * 100)
@@ -256,7 +289,8 @@ def test_a_record_shorter_than_every_length_asked_for_has_no_kitti_metric(data_d
 
 
 @pytest.mark.parametrize(
-    ("path_m", "lengths"), [(250, (100, 200)), (95, (10, 20, 30, 40, 50, 60, 70, 80)), (4.5, (1, 2, 3, 4)), (0.9, ())]
+    ("path_m", "lengths"),
+    [(250, (100, 200)), (95, (10, 20, 30, 40, 50, 60, 70, 80)), (4.5, (1, 2, 3, 4)), (0.9, ())],
 )
 def test_the_drift_of_a_short_path_is_that_over_tenths_of_the_lengths(
     path_m: float, lengths: tuple[float, ...]
@@ -300,7 +334,9 @@ def test_exactly_the_length_is_not_yet_a_segment() -> None:
     assert kitti_error(straight(102), straight(102), ()) is None
 
 
-@pytest.mark.parametrize(("lengths", "step"), [((0.0,), 10), ((100.0, -1.0), 10), ((float("nan"),), 10), ((50.0,), 0)])
+@pytest.mark.parametrize(
+    ("lengths", "step"), [((0.0,), 10), ((100.0, -1.0), 10), ((float("nan"),), 10), ((50.0,), 0)]
+)
 def test_rejects_invalid_segment_lengths(lengths: tuple[float, ...], step: int) -> None:
     with pytest.raises(EvaluationError, match="must be positive"):
         kitti_error(straight(200), straight(200), lengths, step)
@@ -311,7 +347,9 @@ def test_rejects_invalid_segment_lengths(lengths: tuple[float, ...], step: int) 
 
 @properties
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 20), st.sampled_from(MODES[:2]))
-def test_errors_do_not_depend_on_the_world_frame_nor_sim3_on_scale(seed: int, scale: float, align: AlignMode) -> None:
+def test_errors_do_not_depend_on_the_world_frame_nor_sim3_on_scale(
+    seed: int, scale: float, align: AlignMode
+) -> None:
     T_ref = wander(40, seed)
     T_est = drift(T_ref, seed + 1)
     first = evaluate(kitti_form(T_est), kitti_form(T_ref), align=align)
@@ -378,7 +416,9 @@ def degenerate(kind: str) -> FloatArray:
             return se3_from_parts(rotations, np.full((8, 3), 5.0))
 
 
-@pytest.mark.parametrize("kind", ["one pose", "two poses", "straight", "stationary", "stationary to rounding"])
+@pytest.mark.parametrize(
+    "kind", ["one pose", "two poses", "straight", "stationary", "stationary to rounding"]
+)
 @pytest.mark.parametrize("seed", range(3))
 def test_orientations_determine_alignment_where_positions_do_not(kind: str, seed: int) -> None:
     T_ref = degenerate(kind)
@@ -415,7 +455,9 @@ def test_a_motionless_estimate_of_a_motion_has_the_spread_of_the_reference_as_er
     T_ref = wander(50)
     found = evaluate(kitti_form(np.tile(T_ref[0], (50, 1, 1))), kitti_form(T_ref))
     p = T_ref[:, :3, 3]
-    assert found.ate_m.rmse == pytest.approx(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
+    assert found.ate_m.rmse == pytest.approx(
+        np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1)))
+    )
 
 
 def test_alignment_none_is_the_identity() -> None:
@@ -434,7 +476,9 @@ def test_different_bodies_have_different_worlds(own: BodyFrame, other: BodyFrame
     truth = timed(wander(60), body=other)
     seen = truth.in_imu(T_CAM0_IMU) if own == "imu" else truth.in_cam0(T_CAM0_IMU)
     estimate = replace(seen, T_world_body=se3_inverse(seen.T_world_body[0]) @ seen.T_world_body)
-    with pytest.raises(EvaluationError, match=rf"describes {own} and the reference {other}, .* take align first"):
+    with pytest.raises(
+        EvaluationError, match=rf"describes {own} and the reference {other}, .* take align first"
+    ):
         evaluate(estimate, truth, align="none", T_cam0_imu=T_CAM0_IMU)
     assert evaluate(estimate, truth, align="first", T_cam0_imu=T_CAM0_IMU).ate_m.max < 1e-12
 
@@ -472,14 +516,20 @@ def test_straight_path_does_not_leave_the_rotation_about_it_open(align: AlignMod
     T_ref = road()
     T_est = drifting_aside(T_ref)
     least_squares = align_poses(T_est, T_ref, align)
-    wrong_deg = rotation_angle_deg(np.swapaxes(T_ref[:, :3, :3], 1, 2) @ least_squares.R @ T_est[:, :3, :3])
+    wrong_deg = rotation_angle_deg(
+        np.swapaxes(T_ref[:, :3, :3], 1, 2) @ least_squares.R @ T_est[:, :3, :3]
+    )
     assert wrong_deg.min() > 30
     found = evaluate(kitti_form(T_est), kitti_form(T_ref), align=align)
     assert found.ate_deg.max < 0.6
     assert found.rotation_from == found.as_dict()["rotation_from"] == "direction and orientations"
-    distances = np.linalg.norm(apply_alignment(least_squares, T_est)[:, :3, 3] - T_ref[:, :3, 3], axis=1)
+    distances = np.linalg.norm(
+        apply_alignment(least_squares, T_est)[:, :3, 3] - T_ref[:, :3, 3], axis=1
+    )
     np.testing.assert_array_equal(found.errors_m, distances)  # the ATE stays that of least squares
-    np.testing.assert_allclose(found.T_ref_est[:3, :3] @ T_est[0, :3, :3], T_ref[0, :3, :3], atol=0.02)
+    np.testing.assert_allclose(
+        found.T_ref_est[:3, :3] @ T_est[0, :3, :3], T_ref[0, :3, :3], atol=0.02
+    )
 
 
 @pytest.mark.parametrize("name", REAL[:2])
@@ -487,11 +537,15 @@ def test_straight_drives_on_real_ground_truth(data_dir: Path, name: str) -> None
     T_ref = read_trajectory(data_dir / name).T_world_body
     T_est = drift(T_ref, sigma=0.005)
     least_squares = align_poses(T_est, T_ref, "se3")
-    wrong_deg = rotation_angle_deg(np.swapaxes(T_ref[:, :3, :3], 1, 2) @ least_squares.R @ T_est[:, :3, :3])
+    wrong_deg = rotation_angle_deg(
+        np.swapaxes(T_ref[:, :3, :3], 1, 2) @ least_squares.R @ T_est[:, :3, :3]
+    )
     assert np.median(wrong_deg) > 50
     best = nearest_rotation(np.einsum("nij,nkj->ik", T_ref[:, :3, :3], T_est[:, :3, :3]))
     drifted_deg = rotation_angle_deg(np.swapaxes(T_ref[:, :3, :3], 1, 2) @ best @ T_est[:, :3, :3])
-    assert evaluate(kitti_form(T_est), kitti_form(T_ref)).ate_deg.rmse < 1.5 * np.sqrt(np.mean(drifted_deg**2))
+    assert evaluate(kitti_form(T_est), kitti_form(T_ref)).ate_deg.rmse < 1.5 * np.sqrt(
+        np.mean(drifted_deg**2)
+    )
 
 
 def test_curved_path_is_aligned_by_its_positions_alone() -> None:
@@ -503,12 +557,16 @@ def test_curved_path_is_aligned_by_its_positions_alone() -> None:
 
 
 def test_orientations_that_contradict_the_positions_are_not_taken() -> None:
-    """A reference from GPS carries no orientations: identities, constant as those of a straight drive are."""
+    """A reference from GPS carries no orientations: identities, constant as those of a straight
+    drive are.
+    """
     T_ref = road(curve_m=20)
     T_est = se3_inverse(se3_exp([0, 0, 0, 0, 0, 2.0])) @ T_ref
     T_est[:, :3, :3] = np.eye(3)
     T_est[:, :3, 3] += np.random.default_rng(0).normal(size=(len(T_ref), 3)) * 0.3
-    assert settle_rotation(align_poses(T_est, T_ref, "se3"), T_est, T_ref).rotation_from == "positions"
+    assert (
+        settle_rotation(align_poses(T_est, T_ref, "se3"), T_est, T_ref).rotation_from == "positions"
+    )
 
 
 # Association
@@ -528,11 +586,14 @@ def test_orientations_that_contradict_the_positions_are_not_taken() -> None:
         ([10, 11, 12], [0, 11, 30], 5, [(1, 1)]),
         ([], [1, 2], 5, []),
         ([1, 2], [], 5, []),
-        ([1403715273262142976], [1403715273262142977], 1, [(0, 0)]),  # not distinguishable as floats
+        # not distinguishable as floats
+        ([1403715273262142976], [1403715273262142977], 1, [(0, 0)]),
         ([1403715273262142976], [1403715273262142977], 0, []),
     ],
 )
-def test_association_by_time(a: list[int], b: list[int], limit: int, expected: list[tuple[int, int]]) -> None:
+def test_association_by_time(
+    a: list[int], b: list[int], limit: int, expected: list[tuple[int, int]]
+) -> None:
     rows, reference_rows = associate_times(a, b, max_difference_ns=limit)
     assert list(zip(rows.tolist(), reference_rows.tolist(), strict=True)) == expected
 
@@ -542,7 +603,9 @@ times = st.lists(st.integers(0, 200), max_size=25, unique=True).map(sorted)
 
 @properties
 @given(times, times, st.integers(0, 40))
-def test_association_is_one_to_one_in_order_and_leaves_no_close_pair(a: list[int], b: list[int], limit: int) -> None:
+def test_association_is_one_to_one_in_order_and_leaves_no_close_pair(
+    a: list[int], b: list[int], limit: int
+) -> None:
     rows, reference_rows = (r.tolist() for r in associate_times(a, b, max_difference_ns=limit))
     assert rows == sorted(set(rows))
     assert reference_rows == sorted(set(reference_rows))
@@ -552,7 +615,9 @@ def test_association_is_one_to_one_in_order_and_leaves_no_close_pair(a: list[int
     for i, time in enumerate(a):
         for j, other in enumerate(b):
             d = abs(time - other)
-            if d < min(limit + 1, distances.get(i, limit + 1), distances.get(partner.get(j, -1), limit + 1)):
+            if d < min(
+                limit + 1, distances.get(i, limit + 1), distances.get(partner.get(j, -1), limit + 1)
+            ):
                 # A closer pair may stay apart only where it would cross one that is closer still.
                 crossing = [
                     d2
@@ -588,14 +653,18 @@ def test_coverage_reports_a_late_start_and_a_gap() -> None:
 def test_time_association_respects_the_limit() -> None:
     T = wander(10)
     late = timed(T, start_ns=15_000_000)
-    with pytest.raises(EvaluationError, match=r"no poses within 0.01 s.*closest pair 0.015 s; check the clocks"):
+    with pytest.raises(
+        EvaluationError, match=r"no poses within 0.01 s.*closest pair 0.015 s; check the clocks"
+    ):
         evaluate(late, timed(T))
     assert evaluate(late, timed(T), max_time_difference_s=0.015).matched == 10
 
 
 def test_error_reports_different_clocks() -> None:
     T = wander(10)
-    with pytest.raises(EvaluationError, match=r"estimate covers 0.000 to 0.900 s, the reference 1403715273.000 to"):
+    with pytest.raises(
+        EvaluationError, match=r"estimate covers 0.000 to 0.900 s, the reference 1403715273.000 to"
+    ):
         evaluate(timed(T), timed(T, start_ns=1_403_715_273 * 10**9))
 
 
@@ -631,14 +700,18 @@ def test_frame_numbers_of_the_reference_are_honoured() -> None:
 
 def test_no_common_frame_is_an_error() -> None:
     T = wander(10)
-    with pytest.raises(EvaluationError, match="estimate has frames 100 to 109, the reference 0 to 9"):
+    with pytest.raises(
+        EvaluationError, match="estimate has frames 100 to 109, the reference 0 to 9"
+    ):
         evaluate(replace(timed(T), frame_indices=np.arange(100, 110)), kitti_form(T))
 
 
 def test_an_estimate_without_times_needs_as_many_poses_as_a_timed_reference() -> None:
     T = wander(10)
     assert evaluate(kitti_form(T), timed(T)).association == "frame"
-    with pytest.raises(EvaluationError, match="9 poses without times and the reference 10 poses with times"):
+    with pytest.raises(
+        EvaluationError, match="9 poses without times and the reference 10 poses with times"
+    ):
         evaluate(kitti_form(T[:9]), timed(T))
 
 
@@ -661,7 +734,9 @@ def test_lever_arm_does_not_enter_the_error(own: BodyFrame, other: BodyFrame) ->
     assert found.body == found.aligned.body == other
     assert found.ate_m.max < 1e-12
     assert found.ate_deg.max < 1e-6
-    with pytest.raises(EvaluationError, match=f"describes {own} and the reference {other}; give the extrinsic"):
+    with pytest.raises(
+        EvaluationError, match=f"describes {own} and the reference {other}; give the extrinsic"
+    ):
         evaluate(estimate, truth)
     with pytest.raises(EvaluationError, match="finite 4x4"):
         evaluate(estimate, truth, T_cam0_imu=np.eye(3))
@@ -675,7 +750,12 @@ def test_lever_arm_does_not_enter_the_error(own: BodyFrame, other: BodyFrame) ->
 def test_notes_of_the_right_reference_are_empty() -> None:
     T = wander(100)
     assert evaluate(timed(drift(T)), timed(T)).notes == ()
-    assert evaluate(timed(T), Trajectory(T[10:90:10], 100_000_000 * np.arange(10, 90, 10), "cam0")).notes == ()
+    assert (
+        evaluate(
+            timed(T), Trajectory(T[10:90:10], 100_000_000 * np.arange(10, 90, 10), "cam0")
+        ).notes
+        == ()
+    )
     assert evaluate(timed(T[:20]), kitti_form(T)).notes == ()
     small = se3_from_parts(T[:, :3, :3], 1e-3 * T[:, :3, 3])
     assert evaluate(timed(small), timed(se3_from_parts(T[:, :3, :3], np.ones(3)))).notes == ()
@@ -686,56 +766,81 @@ def test_reference_of_another_path_length_is_noted() -> None:
     fast = wander(300, seed=3, step_m=2.0)
     note = evaluate(timed(T), kitti_form(fast)).as_dict()["notes"][0]
     assert re.fullmatch(
-        r"over the same poses the estimate travels 9\d\.\d m and the reference 1\d\d\.\d m; is .*", note
+        r"over the same poses the estimate travels 9\d\.\d m and the reference 1\d\d\.\d m; is .*",
+        note,
     )
     large = se3_from_parts(T[:, :3, :3], 2 * T[:, :3, 3])
-    assert evaluate(kitti_form(large), kitti_form(T), align="sim3").notes == ()  # the scale is known to be open
+    # the scale is known to be open
+    assert evaluate(kitti_form(large), kitti_form(T), align="sim3").notes == ()
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1000, "millimetres"), (100, "centimetres")])
 def test_a_reference_in_another_unit_is_named(factor: float, unit: str) -> None:
     T = wander(100)
     large = se3_from_parts(T[:, :3, :3], factor * T[:, :3, 3])
-    assert evaluate(timed(drift(T)), timed(large)).notes[0].endswith(f"; the reference seems to be in {unit}")
-    assert evaluate(timed(large), timed(T)).notes[0].endswith(f"; the estimate seems to be in {unit}")
+    assert (
+        evaluate(timed(drift(T)), timed(large))
+        .notes[0]
+        .endswith(f"; the reference seems to be in {unit}")
+    )
+    assert (
+        evaluate(timed(large), timed(T)).notes[0].endswith(f"; the estimate seems to be in {unit}")
+    )
 
 
 def test_reference_that_hardly_matches_is_noted() -> None:
     T = wander(100)
     found = evaluate(timed(T), timed(T, start_ns=7_000_000_000))
-    assert any(note.startswith("only 30 poses match, of 100 of the estimate and 100") for note in found.notes)
+    assert any(
+        note.startswith("only 30 poses match, of 100 of the estimate and 100")
+        for note in found.notes
+    )
 
 
 def test_conventions_of_a_references_orientations_are_named() -> None:
     """Positions agree, whatever the orientations mean, so that the alignment does not show it."""
     T = wander(200)
     R, p, estimate = T[:, :3, :3], T[:, :3, 3], timed(drift(T, sigma=0.001))
-    turned, upside, tilted = (so3_exp(np.radians(v)) for v in ([0, 0, 90], [180, 0, 0], [0, 35, 10]))
+    turned, upside, tilted = (
+        so3_exp(np.radians(v)) for v in ([0, 0, 90], [180, 0, 0], [0, 35, 10])
+    )
     w_first = quat_xyzw_from_rotation(R)[:, [3, 0, 1, 2]]
     for other, words in (
-        (R @ turned, r"differ by (8|9)\d deg .*its x, y, z are the estimate's \+y -x \+z\): .* body with other axes"),
+        (
+            R @ turned,
+            r"differ by (8|9)\d deg .*its x, y, z are the estimate's \+y -x \+z\): .* body with "
+            r"other axes",
+        ),
         (R @ upside, r"differ by 1(79|80) deg .* \+x -y -z\)"),
         (R @ tilted, r"differ by 3\d deg .* -3\d -\d+ deg about x y z\)"),
         (turned @ R, "in a world with other axes than its positions"),
         (np.swapaxes(R, 1, 2), r"inverse \(body from world\)"),
         (rotation_from_quat_xyzw(w_first), "quaternions with w first"),
         (np.tile(np.eye(3), (len(R), 1, 1)), "never change; its orientations are placeholders"),
-        (so3_exp(np.random.default_rng(0).normal(0, 2, (len(R), 3))), "no exchange of axes explains it"),
+        (
+            so3_exp(np.random.default_rng(0).normal(0, 2, (len(R), 3))),
+            "no exchange of axes explains it",
+        ),
     ):
         found = evaluate(estimate, timed(se3_from_parts(other, p)))
         assert found.ate_m.rmse < 0.5
         (note,) = found.notes
         assert re.search(words, note), note
         explained = "no exchange" not in words
-        assert ("attitude, RPE and drift, which use them, say nothing of the error" in note) == explained
+        assert (
+            "attitude, RPE and drift, which use them, say nothing of the error" in note
+        ) == explained
 
 
 def test_a_rotation_that_straight_paths_leave_open_is_no_convention() -> None:
-    """With noise about a straight path, positions determine the rotation about it to tens of degrees only."""
+    """With noise about a straight path, positions determine the rotation about it to tens of
+    degrees only.
+    """
     n, rng = 200, np.random.default_rng(0)
     p = np.stack([np.zeros(n), np.zeros(n), 0.1 * np.arange(n)], axis=1)
     truth = se3_from_parts(np.tile(np.eye(3), (n, 1, 1)), p + rng.normal(0, 0.02, (n, 3)))
-    wobble = so3_exp(rng.normal(0, [0.02, 0.02, 0.3], (n, 3)))  # not better about the path than the positions
+    # not better about the path than the positions
+    wobble = so3_exp(rng.normal(0, [0.02, 0.02, 0.3], (n, 3)))
     estimate = se3_from_parts(wobble, p + rng.normal(0, 0.02, (n, 3)))
     found = evaluate(timed(estimate), timed(truth))
     assert found.ate_deg.median > 90
@@ -747,7 +852,9 @@ def test_a_rotation_that_straight_paths_leave_open_is_no_convention() -> None:
 
 def test_as_dict_is_json_with_null_where_undefined() -> None:
     T = wander(5)
-    scores = json.loads(json.dumps(evaluate(timed(T), timed(T), lengths_m=(100,)).as_dict(), allow_nan=False))
+    scores = json.loads(
+        json.dumps(evaluate(timed(T), timed(T), lengths_m=(100,)).as_dict(), allow_nan=False)
+    )
     assert scores["ate_m"] == pytest.approx(0, abs=1e-12)
     assert scores["t_err_percent"] is None
     assert scores["r_err_deg_per_100m"] is None
@@ -757,7 +864,9 @@ def test_as_dict_is_json_with_null_where_undefined() -> None:
     assert single["rpe"] is None
     assert single["coverage"] == {"estimate": 1.0, "reference_span": None, "longest_gap_s": None}
     T = wander(200)
-    scores = json.loads(json.dumps(evaluate(timed(drift(T)), timed(T), rpe_delta_m=5.0).as_dict(), allow_nan=False))
+    scores = json.loads(
+        json.dumps(evaluate(timed(drift(T)), timed(T), rpe_delta_m=5.0).as_dict(), allow_nan=False)
+    )
     assert scores["t_err_percent"] > 0
     assert scores["kitti_per_length"][0]["length_m"] == 100
     assert scores["rpe_distance"]["unit"] == "m"
@@ -770,7 +879,9 @@ def test_series_match_the_statistics_and_the_rows() -> None:
     assert found.errors_m.shape == found.errors_deg.shape == found.rows.shape == (30,)
     assert len(found.aligned) == 50
     assert len(found.reference) == 30
-    distance = np.linalg.norm(found.aligned.positions[found.rows] - found.reference.positions, axis=1)
+    distance = np.linalg.norm(
+        found.aligned.positions[found.rows] - found.reference.positions, axis=1
+    )
     np.testing.assert_allclose(found.errors_m, distance)
     assert found.ate_m.rmse == pytest.approx(np.sqrt(np.mean(distance**2)))
     assert found.ate_m.max == pytest.approx(distance.max())
@@ -791,7 +902,9 @@ def test_non_finite_poses_are_named(which: str) -> None:
     broken = T.copy()
     broken[7:, 1, 3] = np.nan
     pair = (timed(broken), timed(T)) if which == "estimate" else (timed(T), timed(broken))
-    with pytest.raises(EvaluationError, match=rf"pose 7 of the {which} is not finite \(3 of 10 are not\)"):
+    with pytest.raises(
+        EvaluationError, match=rf"pose 7 of the {which} is not finite \(3 of 10 are not\)"
+    ):
         evaluate(*pair)
 
 
@@ -829,7 +942,8 @@ def test_relative_error_over_a_distance_on_uneven_steps_and_stops() -> None:
     T_ref[:, 0, 3] = [0, 0, 1.0, 2.05, 2.05, 4.0, 4.1]
     T_est = T_ref.copy()
     T_est[3:, 1, 3] = 1.0  # a jump of 1 m between poses 2 and 3
-    # Of delta 2 m, within 0.2 m: 0-3, 1-3, 3-5, 4-5; pose 2 has 2.05 - 1 = 1.05 m and 3 m, neither close.
+    # Of delta 2 m, within 0.2 m: 0-3, 1-3, 3-5, 4-5; pose 2 has 2.05 - 1 = 1.05 m and 3 m, neither
+    # close.
     found = relative_error_distance(T_est, T_ref, 2.0)
     assert found.pairs == 4
     assert found.trans_rmse_m == pytest.approx(np.sqrt(2 / 4))
@@ -852,7 +966,9 @@ def test_nees_equals_the_quadratic_form_with_the_inverse() -> None:
     rng = np.random.default_rng(0)
     A = rng.normal(size=(20, 6, 6))
     P, e = A @ A.transpose(0, 2, 1) + np.eye(6), rng.normal(size=(20, 6))
-    np.testing.assert_allclose(nees(e, P), np.einsum("ni,nij,nj->n", e, np.linalg.inv(P), e), rtol=1e-10)
+    np.testing.assert_allclose(
+        nees(e, P), np.einsum("ni,nij,nj->n", e, np.linalg.inv(P), e), rtol=1e-10
+    )
     assert nees([[2.0, 0.0]], [np.diag([4.0, 1.0])])[0] == pytest.approx(1.0)
     assert nees(np.zeros((0, 3)), np.zeros((0, 3, 3))).shape == (0,)
 
@@ -875,13 +991,19 @@ def test_nees_bounds_are_quantiles_of_chi_square(d: int, runs: int) -> None:
 @pytest.mark.parametrize(
     ("errors", "covariances", "match"),
     [
-        (np.zeros((2, 2)), np.stack([np.eye(2), np.diag([1.0, -1.0])]), "covariance 1 is not positive definite"),
+        (
+            np.zeros((2, 2)),
+            np.stack([np.eye(2), np.diag([1.0, -1.0])]),
+            "covariance 1 is not positive definite",
+        ),
         (np.zeros((2, 2)), np.zeros((2, 3, 3)), "needs errors"),
         (np.zeros(2), np.eye(2), "needs errors"),
         (np.full((1, 2), np.nan), np.eye(2)[None], "not finite"),
     ],
 )
-def test_rejects_invalid_nees_arguments(errors: FloatArray, covariances: FloatArray, match: str) -> None:
+def test_rejects_invalid_nees_arguments(
+    errors: FloatArray, covariances: FloatArray, match: str
+) -> None:
     with pytest.raises(EvaluationError, match=match):
         nees(errors, covariances)
 

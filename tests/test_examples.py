@@ -1,4 +1,6 @@
-"""The examples run as their first lines say, and are short; the bench for front ends tells good from bad ones."""
+"""The examples run as their first lines say, and are short; the bench for front ends tells good
+from bad ones.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def _run(name: str, *arguments: object, process: bool = False) -> str:
     argv, printed = [str(ROOT / "examples" / name), *map(str, arguments)], io.StringIO()
     if process:
         env = {**os.environ, "PYTHONPATH": str(ROOT)}
-        ended = subprocess.run([sys.executable, *argv], env=env, capture_output=True, text=True, timeout=600)
+        ended = subprocess.run(
+            [sys.executable, *argv], env=env, capture_output=True, text=True, timeout=600
+        )
         assert ended.returncode == 0, ended.stderr
         return ended.stdout
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
@@ -68,7 +72,9 @@ def test_precomputed_features_run_again(flight: Path) -> None:
 
 
 def test_features_of_another_program_give_the_path(tmp_path: Path) -> None:
-    ahead = re.search(r"at the end ([\d.]+) m ahead", _run("foreign_features.py", tmp_path / "features.npz"))
+    ahead = re.search(
+        r"at the end ([\d.]+) m ahead", _run("foreign_features.py", tmp_path / "features.npz")
+    )
     assert float(ahead[1]) == pytest.approx(29, abs=0.1)
 
 
@@ -95,11 +101,16 @@ def test_a_viewer_of_ones_own_makes_an_animated_picture(flight: Path, tmp_path: 
         found.seek(7)
         last = np.array(found.convert("RGB"))
     assert first[:, :480].std() > 10
-    blue = [(picture[:, 480:, 2].astype(int) - picture[:, 480:, 0] > 60).sum() for picture in (first, last)]
+    blue = [
+        (picture[:, 480:, 2].astype(int) - picture[:, 480:, 0] > 60).sum()
+        for picture in (first, last)
+    ]
     assert blue[1] > max(2 * blue[0], 10), "the path grows"
 
 
-@pytest.mark.parametrize(("name", "shorter"), [("rendered_recording", ('"6"', '"1.5"')), ("frontend_under_test", None)])
+@pytest.mark.parametrize(
+    ("name", "shorter"), [("rendered_recording", ('"6"', '"1.5"')), ("frontend_under_test", None)]
+)
 def test_notebooks_run_from_top_to_bottom(
     name: str, shorter: tuple[str, str] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,14 +119,18 @@ def test_notebooks_run_from_top_to_bottom(
     cells = json.loads((ROOT / "examples" / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
     scope: dict[str, object] = {}
     for cell in (cell for cell in cells if cell["cell_type"] == "code"):
-        assert cell["outputs"] or "print" not in "".join(cell["source"]), "saved with what it printed"
+        assert cell["outputs"] or "print" not in "".join(cell["source"]), (
+            "saved with what it printed"
+        )
         text = re.sub(r"frames=\d+", "frames=4", "".join(cell["source"]))
         exec(text if shorter is None else text.replace(*shorter), scope)
 
 
 @pytest.fixture(scope="module")
 def klt() -> object:
-    return check_frontend(lambda camera: build_frontend("klt", camera, FrontendSettings()), frames=12)
+    return check_frontend(
+        lambda camera: build_frontend("klt", camera, FrontendSettings()), frames=12
+    )
 
 
 def test_the_bench_finds_the_built_in_front_end_good(klt: object) -> None:
@@ -136,8 +151,11 @@ class Shifted:
     def process(self, frame: StereoFrame, prior: object = None) -> FrontendOutput:
         seen = self._inner.process(frame).observations
         z = seen.z + np.array([0.3 * (frame.index % 2), 0.0, 0.3 * (frame.index % 2) - 0.2, 0.0])
-        shown = (seen.ids % 2 == 0) | (frame.index % 3 > 0)  # every third frame half of them are lost, and come back
-        found = observations(frame.index, frame.time_ns, seen.ids[shown], z[shown], seen.has_right[shown])
+        # every third frame half of them are lost, and come back
+        shown = (seen.ids % 2 == 0) | (frame.index % 3 > 0)
+        found = observations(
+            frame.index, frame.time_ns, seen.ids[shown], z[shown], seen.has_right[shown]
+        )
         return FrontendOutput(found, 0, 0, 0)
 
 

@@ -1,4 +1,6 @@
-"""Left and right images exchanged for some frames: put back, refused where they do not fit, and named."""
+"""Left and right images exchanged for some frames: put back, refused where they do not fit, and
+named.
+"""
 
 from __future__ import annotations
 
@@ -49,13 +51,17 @@ def test_exchanged_frames_are_put_back_and_named_once() -> None:
 
 
 def test_exchanged_frames_that_do_not_fit_when_put_back_are_refused() -> None:
-    """As with cameras whose images were rectified with each other's maps: rows differ, and a part matches only."""
+    """As with cameras whose images were rectified with each other's maps: rows differ, and a
+    part matches only.
+    """
     orders, lines, _ = run(range(4, 7), CROOKED)
     assert orders == ["given"] * 4 + ["refused"] * 3 + ["given"] * 3
     assert lines[0].endswith("the frames are skipped")
 
 
-@pytest.mark.parametrize("there", [IN_ORDER, FEW, MatchCounts(5, 0, 5)], ids=["in order", "few", "few points"])
+@pytest.mark.parametrize(
+    "there", [IN_ORDER, FEW, MatchCounts(5, 0, 5)], ids=["in order", "few", "few points"]
+)
 def test_what_looks_exchanged_but_does_not_match_so_is_used_as_given(there: MatchCounts) -> None:
     orders, lines, counted = run(range(4, 7), there)
     assert orders == ["given"] * 10
@@ -67,7 +73,8 @@ def test_front_end_gives_the_same_output_to_the_bit_where_two_frames_are_exchang
     def outputs(swapped: range) -> list[FrontendOutput]:
         frontend = KltFrontend(CAMERA, SETTINGS)
         return [
-            frontend.process(replace(f, left=f.right, right=f.left) if f.index in swapped else f) for f in FRAMES[:5]
+            frontend.process(replace(f, left=f.right, right=f.left) if f.index in swapped else f)
+            for f in FRAMES[:5]
         ]
 
     for expected, found in zip(outputs(range(0)), outputs(range(2, 4)), strict=True):

@@ -24,7 +24,9 @@ def finished(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("form", ["rosbag2", "mcap"])
-def test_the_bag_holds_the_run(form: str, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_bag_holds_the_run(
+    form: str, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     from rosbags.highlevel import AnyReader
 
     facts = json_of(capsys, "export", form, finished, "--out", tmp_path / "bag")
@@ -32,7 +34,9 @@ def test_the_bag_holds_the_run(form: str, finished: Path, tmp_path: Path, capsys
     messages: dict[str, list[tuple[int, object]]] = {}
     with AnyReader([tmp_path / "bag"]) as reader:
         for connection, time_ns, data in reader.messages():
-            messages.setdefault(connection.topic, []).append((time_ns, reader.deserialize(data, connection.msgtype)))
+            messages.setdefault(connection.topic, []).append(
+                (time_ns, reader.deserialize(data, connection.msgtype))
+            )
         late = {c.topic for c in reader.connections if "TRANSIENT_LOCAL" in str(c.ext)}
     assert {topic: len(found) for topic, found in messages.items()} == {
         "/tf_static": 1,
@@ -54,7 +58,12 @@ def test_the_bag_holds_the_run(form: str, finished: Path, tmp_path: Path, capsys
     np.testing.assert_array_equal(points[:, :3], run.points.astype(np.float32))
     assert facts["points"] == len(points) > 0
     path, truth = (
-        np.array([[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in messages[topic][0][1].poses])  # type: ignore[attr-defined]
+        np.array(
+            [
+                [p.pose.position.x, p.pose.position.y, p.pose.position.z]
+                for p in messages[topic][0][1].poses
+            ]
+        )  # type: ignore[attr-defined]
         for topic in ("/vio/path", "/reference/path")
     )
     distances = np.linalg.norm(truth[:, None] - path[None], axis=2).min(axis=0)
@@ -69,12 +78,18 @@ def test_covariances_are_those_of_ros() -> None:
     columns = []
     for axis in range(6):
         moved = se3_inverse(se3_exp(h * np.eye(6)[axis]) @ T_body_world)
-        columns.append(np.concatenate([moved[:3, 3] - T[:3, 3], so3_log(moved[:3, :3] @ T[:3, :3].T)]) / h)
+        columns.append(
+            np.concatenate([moved[:3, 3] - T[:3, 3], so3_log(moved[:3, :3] @ T[:3, :3].T)]) / h
+        )
     ros_D_xi = np.array(columns).T
     root = np.random.default_rng(0).normal(size=(6, 6))
     expected = ros_D_xi @ root @ root.T @ ros_D_xi.T
     np.testing.assert_allclose(ros_covariance(T, root @ root.T), expected, atol=1e-4)
 
 
-def test_options_of_another_form_are_refused(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "are for colmap; leave them out" in refused(capsys, "export", "mcap", finished, "--refined")
+def test_options_of_another_form_are_refused(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "are for colmap; leave them out" in refused(
+        capsys, "export", "mcap", finished, "--refined"
+    )

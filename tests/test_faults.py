@@ -1,4 +1,6 @@
-"""The faults and healthy variants of `tools.faults`: what they do to events, calibration and reference."""
+"""The faults and healthy variants of `tools.faults`: what they do to events, calibration and
+reference.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ from vio.records import Event, ImuSample, Observations, Recording, StereoFrame, 
 
 FRAMES, STEP_NS = 20, 50_000_000
 T_CAM0_IMU = se3_exp(np.array([0.05, -0.02, 0.01, 0.3, -0.2, 1.2]))
-POSES = np.array([se3_exp(k * np.array([0.02, -0.01, 0.05, 0.01, -0.02, 0.004])) for k in range(FRAMES)])
+POSES = np.array(
+    [se3_exp(k * np.array([0.02, -0.01, 0.05, 0.01, -0.02, 0.004])) for k in range(FRAMES)]
+)
 PERIOD = Period(8 * STEP_NS, 16 * STEP_NS)
 
 
@@ -37,13 +41,20 @@ class _Flight:
     def recording(self) -> Recording:
         times = STEP_NS * np.arange(FRAMES)
         truth = Trajectory(T_world_body=POSES, times_ns=times, body="imu", frame_indices=None)
-        return Recording("fake", Path("flight"), CAMERA, T_CAM0_IMU, times, True, frozenset({"imu"}), truth)
+        return Recording(
+            "fake", Path("flight"), CAMERA, T_CAM0_IMU, times, True, frozenset({"imu"}), truth
+        )
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
         for k in range(start, FRAMES if stop is None else stop):
             for part in range(16):
                 rng = np.random.default_rng([k, part])
-                yield ImuSample(k * STEP_NS - part * STEP_NS // 16 + 15 * STEP_NS // 16, *rng.normal(0, 1, (2, 3)))
+                yield ImuSample(
+                    k * STEP_NS - part * STEP_NS // 16 + 15 * STEP_NS // 16,
+                    *rng.normal(0, 1, (2, 3)),
+                )
             left, right = np.random.default_rng(k).integers(0, 256, (2, 300, 480), dtype=np.uint8)
             yield StereoFrame(k, k * STEP_NS + 15 * STEP_NS // 16, left, right)
 
@@ -57,11 +68,15 @@ def _events() -> list[Event]:
 
 
 class _Sorted(_Flight):
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
         yield from _events()
 
 
-@pytest.mark.parametrize(("group", "name"), [(g, n) for g, variants in GROUPS.items() for n in variants])
+@pytest.mark.parametrize(
+    ("group", "name"), [(g, n) for g, variants in GROUPS.items() for n in variants]
+)
 def test_every_variant_gives_valid_events_of_its_recording(group: str, name: str) -> None:
     changed = GROUPS[group][name](_Sorted(), PERIOD)
     events, recording = list(changed.events()), changed.recording
@@ -80,7 +95,9 @@ def test_every_variant_gives_valid_events_of_its_recording(group: str, name: str
 
 
 def _equal(a: list[Event], b: list[Event]) -> bool:
-    if [type(x) for x in a] != [type(x) for x in b] or [x.time_ns for x in a] != [x.time_ns for x in b]:
+    if [type(x) for x in a] != [type(x) for x in b] or [x.time_ns for x in a] != [
+        x.time_ns for x in b
+    ]:
         return False
     return all(
         np.array_equal(x.left, y.left) and np.array_equal(x.right, y.right)
@@ -99,7 +116,9 @@ def test_faults_leave_what_is_outside_their_period() -> None:
                 assert same == (not PERIOD.holds(old.time_ns))
 
 
-def _pixels(camera: StereoCamera, T_cam0_imu: FloatArray, T_world_imu: FloatArray, p_world: FloatArray) -> FloatArray:
+def _pixels(
+    camera: StereoCamera, T_cam0_imu: FloatArray, T_world_imu: FloatArray, p_world: FloatArray
+) -> FloatArray:
     return project(camera, transform_points(T_cam0_imu @ se3_inverse(T_world_imu), p_world))
 
 
@@ -108,7 +127,9 @@ def test_the_reference_of_the_mirrored_pair_is_the_path_of_its_images() -> None:
     changed = HEALTHY["mirror"](_Sorted(), PERIOD).recording
     assert changed.T_cam0_imu is not None
     M = np.diag([-1.0, 1.0, 1.0])
-    points = transform_points(POSES[5] @ se3_inverse(T_CAM0_IMU), np.array([[0.3, -0.2, 4.0], [-1.0, 0.5, 7.0]]))
+    points = transform_points(
+        POSES[5] @ se3_inverse(T_CAM0_IMU), np.array([[0.3, -0.2, 4.0], [-1.0, 0.5, 7.0]])
+    )
     old = _pixels(CAMERA, T_CAM0_IMU, POSES[5], points)
     new = _pixels(changed.camera, changed.T_cam0_imu, changed.reference.T_world_body[5], points @ M)
     np.testing.assert_allclose(new[:, [0, 2]], CAMERA.width - 1 - old[:, [2, 0]], atol=1e-9)
@@ -117,7 +138,9 @@ def test_the_reference_of_the_mirrored_pair_is_the_path_of_its_images() -> None:
 
 @pytest.mark.parametrize("name", ["mirror", "reverse"])
 def test_the_imu_of_a_mirrored_or_reversed_flight_measures_its_motion(name: str) -> None:
-    """Readings of a turn at a constant rate: the changed reference turns as the changed gyro says."""
+    """Readings of a turn at a constant rate: the changed reference turns as the changed gyro
+    says.
+    """
     rate, dt = np.array([0.3, -0.2, 0.5]), STEP_NS * 1e-9
     poses = np.array([se3_exp(np.concatenate([np.zeros(3), k * dt * rate])) for k in range(FRAMES)])
     times = STEP_NS * np.arange(FRAMES)
@@ -126,9 +149,13 @@ def test_the_imu_of_a_mirrored_or_reversed_flight_measures_its_motion(name: str)
         @property
         def recording(self) -> Recording:
             truth = Trajectory(T_world_body=poses, times_ns=times, body="imu", frame_indices=None)
-            return Recording("fake", Path("turn"), CAMERA, T_CAM0_IMU, times, True, frozenset({"imu"}), truth)
+            return Recording(
+                "fake", Path("turn"), CAMERA, T_CAM0_IMU, times, True, frozenset({"imu"}), truth
+            )
 
-        def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+        def events(
+            self, start: int = 0, stop: int | None = None, *, images: bool = True
+        ) -> Iterator[Event]:
             image = np.zeros((300, 480), dtype=np.uint8)
             for k in range(FRAMES):
                 yield ImuSample(k * STEP_NS, rate, np.zeros(3))
@@ -156,16 +183,42 @@ def test_a_wrong_unit_is_on_every_sample() -> None:
 
 
 def test_the_table_shows_errors_ratios_and_what_was_said() -> None:
-    row = {"recording": "r", "motion": "none", "group": "healthy", "variant": "clean", "ate_m": 0.004, "ratio": 1.0}
+    row = {
+        "recording": "r",
+        "motion": "none",
+        "group": "healthy",
+        "variant": "clean",
+        "ate_m": 0.004,
+        "ratio": 1.0,
+    }
     usual = "frame 3: rows differ by 0.3 px: known"
     rows = [
         row | {"said": [usual]},
         row
-        | {"variant": "night", "ate_m": 0.0051, "said": ["frame 9: rows differ by 0.4 px: known", "frame 7: alarm"]},
-        row | {"group": "cameras", "variant": "black", "ratio": 0.25, "said": ["frame 5: images are black; left out"]},
+        | {
+            "variant": "night",
+            "ate_m": 0.0051,
+            "said": ["frame 9: rows differ by 0.4 px: known", "frame 7: alarm"],
+        },
+        row
+        | {
+            "group": "cameras",
+            "variant": "black",
+            "ratio": 0.25,
+            "said": ["frame 5: images are black; left out"],
+        },
         row | {"group": "imu", "variant": "zero", "said": [], "error": "DataError: refused"},
     ]
-    text = page({"version": "1", "commit": "abc", "machine": "m", "written": "2026", "packages": {}, "runs": rows})
+    text = page(
+        {
+            "version": "1",
+            "commit": "abc",
+            "machine": "m",
+            "written": "2026",
+            "packages": {},
+            "runs": rows,
+        }
+    )
     assert "commit abc" in text
     assert "| clean | 4 |" in text
     assert "| night | 5.1 [1] |" in text
@@ -186,11 +239,15 @@ def test_the_page_shows_what_was_run() -> None:
 def test_a_part_of_the_runs_is_named() -> None:
     some = list(tasks(["MH_01_head"], ["imu", "nothing"]))
     assert [name for s, group, name in some if s.motion == "imu"] == ["nothing", *IMU]
-    assert [(group, name) for s, group, name in some if s.motion == "none"] == [("cameras", "nothing")]
+    assert [(group, name) for s, group, name in some if s.motion == "none"] == [
+        ("cameras", "nothing")
+    ]
     assert len(list(tasks())) == sum(len(GROUPS[group]) for s in RUNS for group in s.groups)
 
 
-def test_an_interrupted_call_goes_on_after_its_last_whole_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_call_goes_on_after_its_last_whole_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     wanted = list(tasks())[:3]
     monkeypatch.setattr(command, "tasks", lambda *some: wanted)
     monkeypatch.setattr(command, "commit_of", lambda root: "abc")
@@ -210,4 +267,6 @@ def test_an_interrupted_call_goes_on_after_its_last_whole_row(tmp_path: Path, mo
     assert command.main() == 0
     assert asked == wanted[2:]
     assert written[0]["runs"] == rows
-    assert [json.loads(line) for line in (tmp_path / "faults-abc.jsonl").read_text().splitlines()] == rows
+    assert [
+        json.loads(line) for line in (tmp_path / "faults-abc.jsonl").read_text().splitlines()
+    ] == rows

@@ -1,4 +1,6 @@
-"""What the filters, records and front ends refuse from Python, with the package's own errors, and stay usable."""
+"""What the filters, records and front ends refuse from Python, with the package's own errors,
+and stay usable.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def _velocity(k: float) -> VelocitySample:
 def _seen(k: int, frame: int | None = None) -> Observations:
     z = DRIVE.features[:, :, k].T
     ids = np.flatnonzero(z[:, 0] >= 0)
-    return observations(k if frame is None else frame, (k if frame is None else frame) * STEP_NS, ids, z[ids])
+    return observations(
+        k if frame is None else frame, (k if frame is None else frame) * STEP_NS, ids, z[ids]
+    )
 
 
 def _with_pixel(value: float, column: int, *, has_right: bool = True) -> Observations:
@@ -68,11 +72,26 @@ def _nan_sample(k: int) -> VelocitySample:
 WRONG: dict[str, tuple[Callable[[Filter], object], str]] = {
     "sample doubled": (lambda f: f.propagate(_velocity(2)), "is not after the last one"),
     "sample swapped": (lambda f: f.propagate(_velocity(1.5)), "is not after the last one"),
-    "sample not finite": (lambda f: f.propagate(_nan_sample(3)), "the velocity sample at 300000000 ns holds .*nan"),
-    "frame doubled": (lambda f: f.update(_seen(2)), "frame 2 at 200000000 ns is not after the last frame"),
-    "frame backwards": (lambda f: f.update(_seen(1)), "frame 1 at 100000000 ns is not after the last frame"),
-    "pixel not finite": (lambda f: f.update(_with_pixel(np.nan, 1)), "frame 3: feature .* is at the pixels"),
-    "right pixel infinite": (lambda f: f.update(_with_pixel(np.inf, 2)), "frame 3: feature .* is at the pixels"),
+    "sample not finite": (
+        lambda f: f.propagate(_nan_sample(3)),
+        "the velocity sample at 300000000 ns holds .*nan",
+    ),
+    "frame doubled": (
+        lambda f: f.update(_seen(2)),
+        "frame 2 at 200000000 ns is not after the last frame",
+    ),
+    "frame backwards": (
+        lambda f: f.update(_seen(1)),
+        "frame 1 at 100000000 ns is not after the last frame",
+    ),
+    "pixel not finite": (
+        lambda f: f.update(_with_pixel(np.nan, 1)),
+        "frame 3: feature .* is at the pixels",
+    ),
+    "right pixel infinite": (
+        lambda f: f.update(_with_pixel(np.inf, 2)),
+        "frame 3: feature .* is at the pixels",
+    ),
     "ids doubled": (lambda f: f.update(_doubled()), "frame 3 observes feature .* twice"),
 }
 
@@ -105,7 +124,9 @@ def test_wrong_input_is_refused_and_changes_nothing(make: Callable[[], Filter], 
 
 
 @pytest.mark.parametrize("make", [_msckf, _vislam])
-def test_right_pixels_are_arbitrary_where_there_is_no_right_match(make: Callable[[], Filter]) -> None:
+def test_right_pixels_are_arbitrary_where_there_is_no_right_match(
+    make: Callable[[], Filter],
+) -> None:
     f, other = _after_three_frames(make), _after_three_frames(make)
     f.update(_with_pixel(np.nan, 2, has_right=False))
     other.update(_with_pixel(7.0, 2, has_right=False))
@@ -192,7 +213,15 @@ def test_records_of_wrong_types_are_refused(build: Callable[[], object]) -> None
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"fu": "700"}, {"cu": None}, {"fv": np.zeros(2)}, {"width": -1}, {"height": 3.5}, {"width": "640"}]
+    "wrong",
+    [
+        {"fu": "700"},
+        {"cu": None},
+        {"fv": np.zeros(2)},
+        {"width": -1},
+        {"height": 3.5},
+        {"width": "640"},
+    ],
 )
 def test_cameras_of_wrong_types_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(CalibrationError):
@@ -221,5 +250,7 @@ def test_front_ends_refuse_what_is_no_frame(name: str, frame: Any) -> None:
 
 def test_front_ends_refuse_wrong_parts() -> None:
     for camera, settings in ((CAMERA, Config()), (CAMERA.K, FrontendSettings())):
-        with pytest.raises(ConfigError, match="build_frontend takes a StereoCamera and FrontendSettings"):
+        with pytest.raises(
+            ConfigError, match="build_frontend takes a StereoCamera and FrontendSettings"
+        ):
             build_frontend("klt", camera, settings, None)  # type: ignore[arg-type]

@@ -1,7 +1,8 @@
-"""What the filter claims of itself holds where it is tempted to claim more: standstill, rows, movers, smoothing.
+"""What the filter claims of itself holds where it is tempted to claim more: standstill, rows,
+movers, smoothing.
 
-An exact world, constant motion, noise as the filter is told it. Bounds are chi-square quantiles of the filter's own
-covariance, or the physics of the scenario.
+An exact world, constant motion, noise as the filter is told it. Bounds are chi-square quantiles of
+the filter's own covariance, or the physics of the scenario.
 """
 
 from __future__ import annotations
@@ -21,20 +22,41 @@ from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
 from vio.filters.window_tracks import LinearTracks, WindowTracks
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp, transform_points
+from vio.geometry.lie import (
+    FloatArray,
+    se3_from_parts,
+    se3_inverse,
+    se3_log,
+    so3_exp,
+    transform_points,
+)
 from vio.geometry.stereo import StereoCamera, project
-from vio.records import BoolArray, Estimate, ImuSample, IntArray, MotionSource, Observations, UpdateReport, observations
+from vio.records import (
+    BoolArray,
+    Estimate,
+    ImuSample,
+    IntArray,
+    MotionSource,
+    Observations,
+    UpdateReport,
+    observations,
+)
 
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
-T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
-SETTINGS = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)  # the rig is exact
+T_CAM0_IMU = se3_from_parts(
+    np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1])
+)
+# the rig is exact
+SETTINGS = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
 _IMU_HZ = 200
 Spoil = Callable[[int, Observations], Observations]
 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """A body of constant velocity and yaw rate, ahead of it points at random; what its camera and IMU measure."""
+    """A body of constant velocity and yaw rate, ahead of it points at random; what its camera
+    and IMU measure.
+    """
 
     hz: int
     seconds: float
@@ -64,7 +86,11 @@ class Course:
 
     def points(self, t: float) -> FloatArray:
         """Points of the world (800, 3) at a time."""
-        d, y, z = np.random.default_rng(99).uniform([self.depth[0], -1, -0.5], [self.depth[1], 1, 0.5], (800, 3)).T
+        d, y, z = (
+            np.random.default_rng(99)
+            .uniform([self.depth[0], -1, -0.5], [self.depth[1], 1, 0.5], (800, 3))
+            .T
+        )
         moved = max(t - self.movers_from_s, 0.0) * np.array(self.movers_velocity)
         return np.column_stack([d, y * d, z * d]) + np.outer(self.moving(np.arange(800)), moved)
 
@@ -74,15 +100,27 @@ class Course:
         p = transform_points(T_CAM0_IMU @ se3_inverse(self.pose(t)), self.points(t))
         ahead = p[:, 2] > 0.5
         z = project(CAMERA, np.where(ahead[:, None], p, [0.0, 0.0, 10.0]))
-        ids = np.flatnonzero(ahead & (z[:, 2] > 2) & (z[:, 0] < 750) & (z[:, 1] > 2) & (z[:, 1] < 478))
+        ids = np.flatnonzero(
+            ahead & (z[:, 2] > 2) & (z[:, 0] < 750) & (z[:, 1] > 2) & (z[:, 1] < 478)
+        )
         ids = ids[: self.features]
-        return observations(k, k * 10**9 // self.hz, ids, z[ids] + rng.normal(0, self.pixel_sigma_px, (len(ids), 4)))
+        return observations(
+            k, k * 10**9 // self.hz, ids, z[ids] + rng.normal(0, self.pixel_sigma_px, (len(ids), 4))
+        )
 
     def imu(self, k: int, settings: MsckfSettings, rng: np.random.Generator) -> ImuSample:
         """IMU sample k, with white noise and constant biases."""
         R, root = self.pose(k / _IMU_HZ)[:3, :3], np.sqrt(_IMU_HZ)
-        gyro = np.array([0, 0, self.yaw_rate]) + rng.normal(0, settings.gyro_noise_density * root, 3) + self.bias[:3]
-        accel = R.T @ [0, 0, 9.81] + rng.normal(0, settings.accel_noise_density * root, 3) + self.bias[3:]
+        gyro = (
+            np.array([0, 0, self.yaw_rate])
+            + rng.normal(0, settings.gyro_noise_density * root, 3)
+            + self.bias[:3]
+        )
+        accel = (
+            R.T @ [0, 0, 9.81]
+            + rng.normal(0, settings.accel_noise_density * root, 3)
+            + self.bias[3:]
+        )
         return ImuSample(k * 10**9 // _IMU_HZ, gyro, accel)
 
 
@@ -92,7 +130,8 @@ class Run:
 
     filter: Msckf
     course: Course
-    T_world_estimated: list[FloatArray] = field(default_factory=list)  # (4, 4) of each frame's world in the true one
+    # (4, 4) of each frame's world in the true one
+    T_world_estimated: list[FloatArray] = field(default_factory=list)
     estimates: list[Estimate] = field(default_factory=list)
     reports: list[UpdateReport] = field(default_factory=list)
     navigation: list[FloatArray] = field(default_factory=list)  # (15, 15) covariances
@@ -150,7 +189,9 @@ def squared(error: FloatArray, covariance: FloatArray) -> float:
 
 
 def zero_velocities(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Count the measurements of the navigation state; there is no other than zero velocity without velocity samples."""
+    """Count the measurements of the navigation state; there is no other than zero velocity
+    without velocity samples.
+    """
     applied: list[int] = []
     absorb = Window.absorb_measurement
 
@@ -187,10 +228,16 @@ def test_slow_motion_before_a_far_scene_is_no_standstill(
     assert yaw < chi2.ppf(0.999, len(runs))
 
 
-def test_a_motion_that_images_cannot_tell_is_no_standstill_either(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two pixels of noise: the motion over a window is smaller than its standard deviation, and yet 0.2 m/s."""
+def test_a_motion_that_images_cannot_tell_is_no_standstill_either(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two pixels of noise: the motion over a window is smaller than its standard deviation, and
+    yet 0.2 m/s.
+    """
     applied = zero_velocities(monkeypatch)
-    run = fly(replace(FAR, pixel_sigma_px=2.0, features=20), None, replace(SETTINGS, pixel_sigma_px=2.0))
+    run = fly(
+        replace(FAR, pixel_sigma_px=2.0, features=20), None, replace(SETTINGS, pixel_sigma_px=2.0)
+    )
     assert not applied
     last = FAR.frames - 1
     assert squared(run.velocity_error(last), run.navigation[last][6:9, 6:9]) < chi2.ppf(0.999, 3)
@@ -210,12 +257,15 @@ def test_slow_turn_leaves_the_gyro_bias_alone(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("motion", [None, "imu"])
 @pytest.mark.parametrize(
-    ("velocity", "yaw_rate"), [((1e-3, 0.0, 0.0), 0.0), ((0.0, 1e-3, 0.0), 0.0), ((0.0, 0.0, 0.0), np.radians(0.05))]
+    ("velocity", "yaw_rate"),
+    [((1e-3, 0.0, 0.0), 0.0), ((0.0, 1e-3, 0.0), 0.0), ((0.0, 0.0, 0.0), np.radians(0.05))],
 )
 def test_creep_and_slow_turns_are_followed(
     motion: MotionSource | None, velocity: tuple[float, float, float], yaw_rate: float
 ) -> None:
-    """1 mm/s and 0.05 deg/s: taken for rest or not, pose and gyro bias stay within their covariance."""
+    """1 mm/s and 0.05 deg/s: taken for rest or not, pose and gyro bias stay within their
+    covariance.
+    """
     course = Course(20, 6.0, velocity=velocity, yaw_rate=yaw_rate, features=40)
     run = fly(course, motion)
     last = course.frames - 1
@@ -233,9 +283,11 @@ def test_creep_and_slow_turns_are_followed(
 def test_standstill_is_found_and_holds_the_position(
     monkeypatch: pytest.MonkeyPatch, motion: MotionSource | None
 ) -> None:
-    """The position scatters by less than 0.2 mm on each axis and does not drift, with 0.05 px of noise.
+    """The position scatters by less than 0.2 mm on each axis and does not drift, with 0.05 px of
+    noise.
 
-    Zero velocity is measured once per window of frames, and, at a test level of 95 %, in nearly every one.
+    Zero velocity is measured once per window of frames, and, at a test level of 95 %, in nearly
+    every one.
     """
     applied = zero_velocities(monkeypatch)
     course = Course(20, 7.0, features=120)
@@ -262,7 +314,9 @@ WALK = Course(20, 2.0, velocity=(0.5, 0.3, 0.0), yaw_rate=0.3, depth=(2.0, 6.0),
 def test_a_field_of_row_errors_in_the_right_image_changes_no_bit(
     motion: MotionSource | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`vl - vr = -7 xn yn` pixels, as a pair whose calibration is off shows it: `v` is measured once, on the left."""
+    """`vl - vr = -7 xn yn` pixels, as a pair whose calibration is off shows it: `v` is measured
+    once, on the left.
+    """
 
     def field_of_rows(k: int, seen: Observations) -> Observations:
         z = seen.z.copy()
@@ -297,10 +351,11 @@ CROWD = Course(
 
 @pytest.mark.parametrize("motion", [None, "imu"])
 def test_points_that_begin_to_move_do_not_steer(motion: MotionSource | None) -> None:
-    """Three points in ten begin to move at 0.3 m/s; three seconds later the landmarks are of those that stand.
+    """Three points in ten begin to move at 0.3 m/s; three seconds later the landmarks are of those
+    that stand.
 
-    The NEES is averaged over the second half of two flights; frames of a flight are correlated over a window, so the
-    two stretches of 30 frames hold about six independent poses.
+    The NEES is averaged over the second half of two flights; frames of a flight are correlated over
+    a window, so the two stretches of 30 frames hold about six independent poses.
     """
     values = []
     for seed in range(2):
@@ -308,7 +363,9 @@ def test_points_that_begin_to_move_do_not_steer(motion: MotionSource | None) -> 
         window = run.filter._window
         assert len(window.landmark_ids) > 20
         assert CROWD.moving(window.landmark_ids).sum() <= 1
-        values += [squared(run.error(k), run.estimates[k].covariance) for k in range(70, CROWD.frames)]
+        values += [
+            squared(run.error(k), run.estimates[k].covariance) for k in range(70, CROWD.frames)
+        ]
     assert np.mean(values) < chi2.ppf(0.999, 6 * 6) / 6
 
 
@@ -318,7 +375,9 @@ def walked() -> Run:
     return fly(replace(WALK, seconds=1.95), None)
 
 
-def _next_frame(run: Run, moved: BoolArray | None = None, px: float = 0.0) -> tuple[Msckf, UpdateReport, Observations]:
+def _next_frame(
+    run: Run, moved: BoolArray | None = None, px: float = 0.0
+) -> tuple[Msckf, UpdateReport, Observations]:
     """The filter after the next frame, in which rows (F,) are moved by pixels along u."""
     filt, k = copy.deepcopy(run.filter), run.course.frames
     seen = run.course.observe(k, np.random.default_rng(77))
@@ -328,7 +387,9 @@ def _next_frame(run: Run, moved: BoolArray | None = None, px: float = 0.0) -> tu
 
 
 def test_landmarks_out_of_place_are_gated_reported_and_without_effect(walked: Run) -> None:
-    """Five landmarks jump by 15 px: they are used no more, each is counted, and the estimate stays where it was."""
+    """Five landmarks jump by 15 px: they are used no more, each is counted, and the estimate
+    stays where it was.
+    """
     clean, report, seen = _next_frame(walked)
     chosen = walked.filter._window.landmark_ids[:5]
     moved = np.isin(seen.ids, chosen)
@@ -344,7 +405,9 @@ def test_landmarks_out_of_place_are_gated_reported_and_without_effect(walked: Ru
 
 
 def test_gated_tracks_do_not_steer(walked: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same tracks fail the gate twice, once with a bias of a pixel in the newest frame: the same estimate."""
+    """The same tracks fail the gate twice, once with a bias of a pixel in the newest frame: the
+    same estimate.
+    """
     linearised: list[IntArray] = []
     without_wrong_views, gate = WindowTracks.without_wrong_views, WindowTracks.gate
 
@@ -367,7 +430,8 @@ def test_gated_tracks_do_not_steer(walked: Run, monkeypatch: pytest.MonkeyPatch)
     assert spoiled.used == report.used
     a, b = clean.estimate(), biased.estimate()
     difference = se3_log(se3_inverse(a.T_world_imu) @ b.T_world_imu)
-    # They change where the others are linearised, and the pixel noise by a step of its slow learning.
+    # They change where the others are linearised, and the pixel noise by a step of its slow
+    # learning.
     assert squared(difference, a.covariance) < 0.01
 
 
@@ -378,10 +442,11 @@ def test_gated_tracks_do_not_steer(walked: Run, monkeypatch: pytest.MonkeyPatch)
 def test_smoothed_estimates_carry_their_own_covariance_and_velocity(
     motion: MotionSource | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Five frames later a pose is known better, by as much as its covariance says: NEES over six seeded runs.
+    """Five frames later a pose is known better, by as much as its covariance says: NEES over six
+    seeded runs.
 
-    Velocities: images alone know them better from both sides. With an IMU the newest velocity is carried back, which
-    adds the accelerometer's noise over the lag and no more.
+    Velocities: images alone know them better from both sides. With an IMU the newest velocity is
+    carried back, which adds the accelerometer's noise over the lag and no more.
     """
     monkeypatch.setattr(imu_start, "START_TILT_SIGMA_DEG", 1.0)
     monkeypatch.setattr(navigation, "START_VELOCITY_SIGMA_MPS", 2.0)
@@ -411,7 +476,8 @@ def test_smoothed_estimates_carry_their_own_covariance_and_velocity(
     mean = np.mean(nees, axis=0)
     low, high = chi2.ppf([0.025, 0.975], 6 * runs) / runs
     assert np.mean(mean < high) >= 0.9
-    assert mean.mean() > 0.6 * low  # the filter starts with five times the IMU's noise by its data sheet
+    # the filter starts with five times the IMU's noise by its data sheet
+    assert mean.mean() > 0.6 * low
     causal, late = (float(np.mean(np.square(e))) for e in (causal_mps, smoothed_mps))
     extra = settings.accel_noise_density**2 * lag / course.hz if motion == "imu" else 0.0
     assert late < causal + extra
@@ -432,7 +498,8 @@ def test_the_newest_smoothed_estimate_is_the_causal_one(walked: Run) -> None:
 
 @pytest.mark.usefixtures("white_noise")
 def test_blurred_frames_count_less() -> None:
-    """Twelve frames with five times the variance that the first thirty have taught: errors as their covariance says.
+    """Twelve frames with five times the variance that the first thirty have taught: errors as their
+    covariance says.
 
     With the information of sharp frames their NEES is 14 of 6.
     """
@@ -456,13 +523,18 @@ def test_blurred_frames_count_less() -> None:
 def test_landmarks_are_gated_with_the_variance_that_they_entered_with(
     factor: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Half of the measurements are those of landmarks; none is out of place. Of white noise 1 % is refused, at most."""
+    """Half of the measurements are those of landmarks; none is out of place.
+
+    Of white noise 1 % is refused, at most.
+    """
     monkeypatch.setattr("vio.filters.overdispersion.PRIOR_FACTOR", factor)
     monkeypatch.setattr("vio.filters.overdispersion._PRIOR_TRACKS", 1e9)
     course = Course(20, 3.0, (0.4, 0.5, 0.0), yaw_rate=0.2, depth=(2.0, 8.0), features=40)
     refused = offered = 0
     for seed in range(4):
-        for report in fly(course, None, replace(SETTINGS, max_landmarks=20, max_features=10), seed=seed).reports:
+        for report in fly(
+            course, None, replace(SETTINGS, max_landmarks=20, max_features=10), seed=seed
+        ).reports:
             offered += len(report.landmark_ids)
             refused += len(np.intersect1d(report.gated_ids, report.landmark_ids))
     assert refused < 0.02 * offered

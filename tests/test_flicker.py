@@ -1,4 +1,6 @@
-"""Bands of brightness that move through the images: named and taken out; images without them stay as they are."""
+"""Bands of brightness that move through the images: named and taken out; images without them
+stay as they are.
+"""
 
 from __future__ import annotations
 
@@ -43,12 +45,17 @@ def test_a_late_right_camera_makes_no_bands() -> None:
 
 
 def test_cameras_that_set_their_exposure_alone_make_no_bands() -> None:
-    """Bright sky above dark ground: a gain of one camera alone changes the difference of their row means."""
+    """Bright sky above dark ground: a gain of one camera alone changes the difference of their
+    row means.
+    """
     light = np.repeat([190.0, 20.0], 75)[:, None]
     removal = BandRemoval()
     for k in range(12):
         gains = np.random.default_rng(k).uniform(0.4, 1.3, 2)
-        left, right = (np.asarray(gain * light * (0.9 + 0.1 * np.cos(np.arange(200))), np.uint8) for gain in gains)
+        left, right = (
+            np.asarray(gain * light * (0.9 + 0.1 * np.cos(np.arange(200))), np.uint8)
+            for gain in gains
+        )
         assert removal.flatten(k, left, right)[0] is left
     assert removal.take_lines() == ()
 
@@ -74,7 +81,9 @@ def test_features_are_tracked_through_bands(removed: bool, monkeypatch: pytest.M
 
     def process(frame: StereoFrame) -> FrontendOutput:
         k = frame.index
-        return frontend.process(replace(frame, left=banded(frame.left, k, 0), right=banded(frame.right, k, 1)))
+        return frontend.process(
+            replace(frame, left=banded(frame.left, k, 0), right=banded(frame.right, k, 1))
+        )
 
     outputs = [process(frame) for frame in FRAMES]
     tracked = outputs[-1].tracked

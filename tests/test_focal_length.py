@@ -54,11 +54,18 @@ def test_real_gyros_turn_as_their_cameras_do(data_dir: Path, flight: str) -> Non
 
 
 def test_a_focal_length_that_is_off_shows_in_the_turns() -> None:
-    """By more or by less: what moves the image may pass for motion, so the share itself measures nothing."""
-    near, motion = _recording("room", 0), rotate_body_axes(hand_held(duration_s=20, seed=0), R_FLU_EUROC_IMU)
+    """By more or by less: what moves the image may pass for motion, so the share itself measures
+    nothing.
+    """
+    near, motion = (
+        _recording("room", 0),
+        rotate_body_axes(hand_held(duration_s=20, seed=0), R_FLU_EUROC_IMU),
+    )
     times = [seen.time_ns for seen in near.frames]
     T_world_imu = motion_at(motion, np.array(times)).T_world_imu
-    it = replace(near, frames=_observe(near.camera, T_world_imu, near.T_cam0_imu, times, 8.0, 0, 0.1))
+    it = replace(
+        near, frames=_observe(near.camera, T_world_imu, near.T_cam0_imu, times, 8.0, 0, 0.1)
+    )
     turns, found = _compared(it, _longer(it.camera))
     assert turns.differ
     assert turns.gyro_agrees

@@ -28,16 +28,23 @@ def test_files_of_others_are_not_replaced(
     for name, arguments in (
         ("notes.txt", ["convert", str(flight), "--to", "tum", "--out"]),
         ("page.html", ["report", str(run), "--out"]),
-        ("rig.yaml", ["run", str(flight), "--quiet", "--out", str(tmp_path / "out"), "--save-calibration"]),
+        (
+            "rig.yaml",
+            ["run", str(flight), "--quiet", "--out", str(tmp_path / "out"), "--save-calibration"],
+        ),
     ):
         file = tmp_path / name
         file.write_text("mine\n")
-        assert "was not made by this command; remove it, or choose another name" in refused(capsys, *arguments, file)
+        assert "was not made by this command; remove it, or choose another name" in refused(
+            capsys, *arguments, file
+        )
         assert file.read_text() == "mine\n"
         file.unlink()
         assert main([*arguments, str(file)]) == 0
         capsys.readouterr()
-    assert main(["report", str(run), "--out", str(tmp_path / "page.html")]) == 0, "our own page may be replaced"
+    assert main(["report", str(run), "--out", str(tmp_path / "page.html")]) == 0, (
+        "our own page may be replaced"
+    )
 
 
 def test_results_are_no_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -48,7 +55,8 @@ def test_results_are_no_recording(run: Path, capsys: pytest.CaptureFixture[str])
 def test_images_without_a_calibration_are_named(flight: Path, tmp_path: Path) -> None:
     shutil.copytree(flight / "mav0" / "cam0" / "data", tmp_path / "left")
     with pytest.raises(
-        DataError, match=r"holds images in left but no right camera's and no calibration; add the right"
+        DataError,
+        match=r"holds images in left but no right camera's and no calibration; add the right",
     ):
         open_dataset(tmp_path)
 
@@ -59,7 +67,9 @@ def test_a_run_that_can_go_on_is_not_said_to_be_lost(
     shutil.copytree(run, tmp_path / "run")
     (tmp_path / "run" / "unfinished").mkdir()
     (tmp_path / "run" / "estimates.npy").rename(tmp_path / "run" / "unfinished" / "estimates.npy")
-    assert f"`vio run --resume {tmp_path / 'run'}` goes on with it" in refused(capsys, "report", tmp_path / "run")
+    assert f"`vio run --resume {tmp_path / 'run'}` goes on with it" in refused(
+        capsys, "report", tmp_path / "run"
+    )
 
 
 def test_settings_of_a_left_camera_serve_its_observations(run: Path) -> None:
@@ -68,7 +78,9 @@ def test_settings_of_a_left_camera_serve_its_observations(run: Path) -> None:
     assert pair.recording.camera.kind == "mono"
 
 
-def test_an_euroc_folder_of_one_camera_takes_its_times_from_its_list(flight: Path, tmp_path: Path) -> None:
+def test_an_euroc_folder_of_one_camera_takes_its_times_from_its_list(
+    flight: Path, tmp_path: Path
+) -> None:
     """Rendered files are named by the nanoseconds since the start, which are no dates."""
     shutil.copytree(flight, tmp_path / "flight")
     shutil.rmtree(tmp_path / "flight" / "mav0" / "cam1")

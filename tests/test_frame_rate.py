@@ -1,4 +1,6 @@
-"""A limit on the frame rate: which frames are used, that the others are not read, and the same poses live."""
+"""A limit on the frame rate: which frames are used, that the others are not read, and the same
+poses live.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +80,8 @@ def test_every_reader_leaves_the_same_frames_out(name: str, flight: Path, tmp_pa
     cut = open_dataset(path, DatasetSettings(calibration=calibration, max_frame_rate=10.0))
     frames = {e.index: e for e in whole.events() if isinstance(e, StereoFrame)}
     found = frames_of(cut, 3, 12)
-    assert [e.index for e in found] == [4, 6, 8, 10]  # the frames that a run from the first one on takes
+    # the frames that a run from the first one on takes
+    assert [e.index for e in found] == [4, 6, 8, 10]
     for frame in found:
         np.testing.assert_array_equal(frame.left, frames[frame.index].left)
 
@@ -112,7 +115,9 @@ def test_a_live_run_leaves_out_what_a_recorded_one_does() -> None:
 def test_the_summary_says_how_many_frames_were_used(
     flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["run", str(flight), "--config", "fast", "--out", str(tmp_path / "r"), "--quiet"]) == 0
+    assert (
+        main(["run", str(flight), "--config", "fast", "--out", str(tmp_path / "r"), "--quiet"]) == 0
+    )
     assert "8 of 15, path" in capsys.readouterr().out
 
 

@@ -1,4 +1,6 @@
-"""Contract tests for every front end: properties of the observations, and behaviour on bad input."""
+"""Contract tests for every front end: properties of the observations, and behaviour on bad
+input.
+"""
 
 from __future__ import annotations
 
@@ -48,8 +50,12 @@ class _NoDataset:
 
 def make(name: str, camera: StereoCamera = CAMERA) -> Frontend:
     if name == "oracle":
-        simulation = simulate(room(seed=1), small_rig(320, 180), hand_held(duration_s=3.0), rate_hz=10.0)
-        return OracleFrontend(simulation, OracleSettings(max_features=60, left_only_fraction=0.1), seed=2)
+        simulation = simulate(
+            room(seed=1), small_rig(320, 180), hand_held(duration_s=3.0), rate_hz=10.0
+        )
+        return OracleFrontend(
+            simulation, OracleSettings(max_features=60, left_only_fraction=0.1), seed=2
+        )
     if name == "precomputed":
         klt = KltFrontend(CAMERA, SETTINGS)
         rows = [klt.process(frame).observations for frame in FRAMES]
@@ -60,7 +66,9 @@ def make(name: str, camera: StereoCamera = CAMERA) -> Frontend:
     return build_frontend(name, camera, settings, _NoDataset())  # type: ignore[arg-type]
 
 
-def run(name: str, frames: list[StereoFrame], camera: StereoCamera = CAMERA) -> list[FrontendOutput]:
+def run(
+    name: str, frames: list[StereoFrame], camera: StereoCamera = CAMERA
+) -> list[FrontendOutput]:
     frontend = make(name, camera)
     return [frontend.process(frame) for frame in frames]
 
@@ -99,8 +107,8 @@ def test_observations_fulfil_the_contract(name: str, ran: Ran) -> None:
         assert np.isfinite(seen.z[seen.has_right]).all()
         stereo = seen.z[seen.has_right]
         assert (
-            stereo[:, 0] > stereo[:, 2]
-        ).all() or name == "oracle"  # the oracle's noise may make the disparity of far points negative
+            (stereo[:, 0] > stereo[:, 2]).all() or name == "oracle"
+        )  # the oracle's noise may make the disparity of far points negative
         assert not seen.stale.any()
         assert output.tracked + output.detected == len(seen)
         assert output.matched == seen.has_right.sum()
@@ -171,7 +179,11 @@ def test_frozen_camera_gives_few_stereo_matches(name: str, side: str, ran: Ran) 
 @pytest.mark.parametrize("name", IMAGE_BASED)
 def test_rejects_colour_and_16_bit_images(name: str) -> None:
     gray = np.zeros((300, 480), dtype=np.uint8)
-    for image in (np.zeros((300, 480, 3), dtype=np.uint8), gray.astype(np.uint16), gray.astype(np.float32)):
+    for image in (
+        np.zeros((300, 480, 3), dtype=np.uint8),
+        gray.astype(np.uint16),
+        gray.astype(np.float32),
+    ):
         with pytest.raises(DataError, match=r"frame 7: the left image .* needs 8-bit gray images"):
             make(name).process(StereoFrame(7, 0, image, gray))  # type: ignore[arg-type]
 
@@ -193,7 +205,10 @@ def test_odd_and_tiny_sizes_work(name: str, width: int, height: int) -> None:
     frames = []
     for frame in FRAMES[:2]:
         u, v = (480 - width) // 2, (300 - height) // 2
-        pair = [np.ascontiguousarray(image[v : v + height, u : u + width]) for image in (frame.left, frame.right)]
+        pair = [
+            np.ascontiguousarray(image[v : v + height, u : u + width])
+            for image in (frame.left, frame.right)
+        ]
         frames.append(replace(frame, left=pair[0], right=pair[1]))
     outputs = run(name, frames, camera)
     if width > 400:

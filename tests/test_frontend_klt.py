@@ -10,7 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.test_frontend_scene import CAMERA, SLANTED, Wall, eight_bit, flight, right_of, stereo_frame, truth, view
+from tests.test_frontend_scene import (
+    CAMERA,
+    SLANTED,
+    Wall,
+    eight_bit,
+    flight,
+    right_of,
+    stereo_frame,
+    truth,
+    view,
+)
 from vio.errors import ConfigError, DataError
 from vio.frontend import contrast, detect, flow, klt, new_features, one_opencv_thread, stereo_fit
 from vio.frontend.detect import cell_index, grid_shape, min_distance_px
@@ -50,8 +60,12 @@ def common(a: FrontendOutput, b: FrontendOutput) -> tuple[FloatArray, FloatArray
     return a.observations.z[i], b.observations.z[j]
 
 
-def track_errors(a: FrontendOutput, b: FrontendOutput, T_world_a: FloatArray, T_world_b: FloatArray) -> FloatArray:
-    """Distances (N,) in pixels between the tracked and the true pixels in `b` of the features of `a`."""
+def track_errors(
+    a: FrontendOutput, b: FrontendOutput, T_world_a: FloatArray, T_world_b: FloatArray
+) -> FloatArray:
+    """Distances (N,) in pixels between the tracked and the true pixels in `b` of the features of
+    `a`.
+    """
     before, after = common(a, b)
     expected = truth(SLANTED, T_world_a, before[:, :2], T_world_b)[:, :2]
     return np.asarray(np.linalg.norm(after[:, :2] - expected, axis=1))
@@ -62,7 +76,9 @@ def step_errors(outputs: list[FrontendOutput], k: int) -> FloatArray:
     return track_errors(outputs[k], outputs[k + 1], POSES[k], POSES[k + 1])
 
 
-def test_temporal_tracks_are_accurate_to_a_twentieth_of_a_pixel(outputs: list[FrontendOutput]) -> None:
+def test_temporal_tracks_are_accurate_to_a_twentieth_of_a_pixel(
+    outputs: list[FrontendOutput],
+) -> None:
     error = np.concatenate([step_errors(outputs, k) for k in range(len(POSES) - 1)])
     assert len(error) > 700
     assert np.median(error) < 0.05
@@ -76,7 +92,9 @@ def test_tracks_do_not_drift_over_five_frames(outputs: list[FrontendOutput]) -> 
 
 
 def test_tracks_do_not_drift_while_the_camera_oscillates() -> None:
-    """After 24 frames features are as accurate as after six: each is aligned with its first patch, not its last."""
+    """After 24 frames features are as accurate as after six: each is aligned with its first
+    patch, not its last.
+    """
     oscillation = 4 * np.sin(2 * np.pi * np.arange(25) / 24)
     poses = [se3_exp(share * se3_log(POSES[1])) for share in oscillation]
     outputs = run([stereo_frame(k, pose) for k, pose in enumerate(poses)])
@@ -125,7 +143,12 @@ def _with_black_frames(n: int) -> list[StereoFrame]:
     """Two frames, n black ones, and the second frame again."""
     black = np.zeros_like(FRAMES[0].left)
     dark = [StereoFrame(2 + k, (2 + k) * 50_000_000, black, black) for k in range(n)]
-    return [FRAMES[0], FRAMES[1], *dark, replace(FRAMES[1], index=2 + n, time_ns=(2 + n) * 50_000_000)]
+    return [
+        FRAMES[0],
+        FRAMES[1],
+        *dark,
+        replace(FRAMES[1], index=2 + n, time_ns=(2 + n) * 50_000_000),
+    ]
 
 
 @pytest.mark.parametrize("n", [1, 5])
@@ -164,7 +187,10 @@ def test_images_without_contrast_give_no_features(level: int) -> None:
 def test_noise_alone_gives_no_tracks() -> None:
     """Corners of noise are uncorrelated between frames and between left and right."""
     rng = np.random.default_rng(1)
-    frames = [StereoFrame(k, k * 50_000_000, *rng.integers(0, 255, (2, 300, 480), dtype=np.uint8)) for k in range(3)]
+    frames = [
+        StereoFrame(k, k * 50_000_000, *rng.integers(0, 255, (2, 300, 480), dtype=np.uint8))
+        for k in range(3)
+    ]
     for output in run(frames)[1:]:
         assert output.tracked < 5
         assert output.matched < 5
@@ -182,8 +208,12 @@ def test_features_keep_their_distance_and_fill_the_grid(outputs: list[FrontendOu
         assert np.mean(held > 0) > 0.85
 
 
-def test_features_without_right_match_stay_as_left_only_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A part of the right image is covered; its tracks continue in the left one for a limited number of frames."""
+def test_features_without_right_match_stay_as_left_only_rows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A part of the right image is covered; its tracks continue in the left one for a limited
+    number of frames.
+    """
     monkeypatch.setattr(new_features, "_MAX_LEFT_ONLY_FRAMES", 2)
 
     def covered(frame: StereoFrame) -> StereoFrame:
@@ -203,8 +233,12 @@ def test_features_without_right_match_stay_as_left_only_rows(monkeypatch: pytest
     assert not later.has_right[np.isin(later.ids, upper)].any()
 
 
-def test_tracks_outlast_a_right_camera_that_loses_its_contrast(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The limit on frames without a right match is for features, not for a camera: tracks continue in the left one."""
+def test_tracks_outlast_a_right_camera_that_loses_its_contrast(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The limit on frames without a right match is for features, not for a camera: tracks
+    continue in the left one.
+    """
     monkeypatch.setattr(new_features, "_MAX_LEFT_ONLY_FRAMES", 2)
     gray = np.full_like(FRAMES[0].right, 128)
     outputs = run([FRAMES[0], *(replace(frame, right=gray) for frame in FRAMES[1:5])])
@@ -216,8 +250,12 @@ def test_tracks_outlast_a_right_camera_that_loses_its_contrast(monkeypatch: pyte
 
 
 @pytest.mark.parametrize("with_prior", [False, True])
-def test_moving_features_without_depth_are_rejected(with_prior: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The right camera has no contrast; in the fourth frame a part of the left image jumps up by 8 px."""
+def test_moving_features_without_depth_are_rejected(
+    with_prior: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The right camera has no contrast; in the fourth frame a part of the left image jumps up by
+    8 px.
+    """
     gray = np.full_like(FRAMES[0].right, 128)
     frames = [replace(frame, right=gray) for frame in FRAMES[:4]]
     left = frames[3].left
@@ -254,7 +292,9 @@ def test_occluded_tracks_are_dropped() -> None:
     before, _ = common(*outputs)
     expected = truth(SLANTED, POSES[0], before[:, :2], POSES[1])[:, :2]
     margin = 8
-    hidden = (np.abs(expected[:, 0] - 239.5) < 90 - margin) & (np.abs(expected[:, 1] - 139.5) < 80 - margin)
+    hidden = (np.abs(expected[:, 0] - 239.5) < 90 - margin) & (
+        np.abs(expected[:, 1] - 139.5) < 80 - margin
+    )
     started = outputs[0].observations.z[:, :2]
     behind = (np.abs(started[:, 0] - 239.5) < 70) & (np.abs(started[:, 1] - 139.5) < 60)
     assert behind.sum() > 15
@@ -265,17 +305,25 @@ def test_prior_bridges_a_jump_too_large_for_tracking_alone() -> None:
     """Between the two frames the camera turns by 12 degrees, about 64 pixels."""
     first, second = POSES[0], POSES[0].copy()
     angle = np.radians(12.0)
-    second[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    second[:3, :3] = [
+        [np.cos(angle), 0, np.sin(angle)],
+        [0, 1, 0],
+        [-np.sin(angle), 0, np.cos(angle)],
+    ]
     frames = [stereo_frame(0, first), stereo_frame(1, second)]
     settings = with_klt(pyramid_levels=1)
     without_prior = run(frames, settings)[1]
     frontend = KltFrontend(CAMERA, settings)
     seen = frontend.process(frames[0]).observations
-    z = truth(SLANTED, first, seen.z[:, :2], second) + np.random.default_rng(0).normal(0, 2, (len(seen), 4))
+    z = truth(SLANTED, first, seen.z[:, :2], second) + np.random.default_rng(0).normal(
+        0, 2, (len(seen), 4)
+    )
     by_pixels = frontend.process(frames[1], TrackPrior(seen.ids, z))
     frontend = KltFrontend(CAMERA, settings)
     frontend.process(frames[0])
-    nothing = TrackPrior(np.zeros(0, dtype=np.int64), np.zeros((0, 4)), (se3_inverse(second) @ first)[:3, :3])
+    nothing = TrackPrior(
+        np.zeros(0, dtype=np.int64), np.zeros((0, 4)), (se3_inverse(second) @ first)[:3, :3]
+    )
     by_rotation = frontend.process(frames[1], nothing)
     assert without_prior.tracked < 0.3 * len(seen)
     for output in (by_pixels, by_rotation):
@@ -284,7 +332,9 @@ def test_prior_bridges_a_jump_too_large_for_tracking_alone() -> None:
 
 
 def test_last_motion_is_scaled_by_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three frames 10 ms apart, the next one 150 ms later: 50 pixels that only the last motion predicts."""
+    """Three frames 10 ms apart, the next one 150 ms later: 50 pixels that only the last motion
+    predicts.
+    """
     step = np.array([0.4, -0.1, 0.1, 0.01, -0.02, 0.01])
     frames = [
         replace(stereo_frame(k, se3_exp(share * step)), time_ns=ms * 1_000_000)
@@ -302,7 +352,9 @@ def after_gap(wall: Wall, right_wall: Wall, pose: FloatArray) -> FrontendOutput:
 
 
 def test_features_are_found_again_after_a_long_gap(outputs: list[FrontendOutput]) -> None:
-    """The camera has come nearer by 0.5 m and turned by 5 degrees; nothing predicts where the features are."""
+    """The camera has come nearer by 0.5 m and turned by 5 degrees; nothing predicts where the
+    features are.
+    """
     pose = POSES[2] @ se3_exp(np.array([0.3, -0.1, 0.5, 0.03, -0.06, 0.06]))
     again = after_gap(SLANTED, SLANTED, pose)
     error = track_errors(outputs[2], again, POSES[2], pose)
@@ -318,7 +370,11 @@ def test_features_are_found_again_after_a_long_gap(outputs: list[FrontendOutput]
         (SLANTED, replace(SLANTED, offset=5.0)),
         (SLANTED, replace(SLANTED, seed=77)),
     ],
-    ids=["another scene", "the left scene at another depth", "a right camera that shows something else"],
+    ids=[
+        "another scene",
+        "the left scene at another depth",
+        "a right camera that shows something else",
+    ],
 )
 def test_similar_patches_after_a_long_gap_are_no_evidence(wall: Wall, right_wall: Wall) -> None:
     """Where one of the cameras does not show the same scene at its depths, features begin anew."""
@@ -331,14 +387,22 @@ def test_similar_patches_after_a_long_gap_are_no_evidence(wall: Wall, right_wall
 @pytest.mark.parametrize(
     ("off_deg", "measured", "refused"), [(3.0, True, True), (0.1, True, False), (3.0, False, False)]
 )
-def test_a_motion_across_a_gap_must_not_contradict_the_gyro(off_deg: float, measured: bool, refused: bool) -> None:
-    moved, off = se3_exp([0.3, 0.0, 0.2, 0.0, 0.1, 0.0]), se3_exp([0, 0, 0, 0, np.radians(off_deg), 0])
+def test_a_motion_across_a_gap_must_not_contradict_the_gyro(
+    off_deg: float, measured: bool, refused: bool
+) -> None:
+    moved, off = (
+        se3_exp([0.3, 0.0, 0.2, 0.0, 0.1, 0.0]),
+        se3_exp([0, 0, 0, 0, np.radians(off_deg), 0]),
+    )
     assert contradicts_gyro(moved, MotionPrior(off @ moved, 1e-6 * np.eye(6), measured)) is refused
     assert not contradicts_gyro(moved, None)
 
 
 def test_a_prediction_bridges_a_long_gap() -> None:
-    assert run([*FRAMES[:3], replace(FRAMES[3], time_ns=FRAMES[2].time_ns + 600_000_000)])[-1].tracked > 100
+    assert (
+        run([*FRAMES[:3], replace(FRAMES[3], time_ns=FRAMES[2].time_ns + 600_000_000)])[-1].tracked
+        > 100
+    )
     frontend = KltFrontend(CAMERA, SETTINGS)
     seen = [frontend.process(frame) for frame in FRAMES[:3]][-1].observations
     prior = TrackPrior(seen.ids, truth(SLANTED, POSES[2], seen.z[:, :2], POSES[3]))
@@ -346,7 +410,9 @@ def test_a_prediction_bridges_a_long_gap() -> None:
     assert frontend.process(late, prior).tracked > 100
 
 
-def test_features_failing_the_forward_backward_check_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_features_failing_the_forward_backward_check_are_dropped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(flow, "_MAX_FORWARD_BACKWARD_PX", 1e-4)
     assert run(FRAMES[:2])[1].tracked < 10
 
@@ -362,8 +428,13 @@ def test_swapped_images_are_detected() -> None:
 
 
 def test_unrelated_right_image_is_not_reported_as_swapped() -> None:
-    other = [eight_bit(view(Wall(SLANTED.normal, SLANTED.offset, seed=77), right_of(pose)), 50) for pose in POSES[:5]]
-    outputs = run([replace(frame, right=image) for frame, image in zip(FRAMES[:5], other, strict=True)])
+    other = [
+        eight_bit(view(Wall(SLANTED.normal, SLANTED.offset, seed=77), right_of(pose)), 50)
+        for pose in POSES[:5]
+    ]
+    outputs = run(
+        [replace(frame, right=image) for frame, image in zip(FRAMES[:5], other, strict=True)]
+    )
     assert max(output.matched for output in outputs) < 20
 
 
@@ -382,7 +453,10 @@ def test_rejects_invalid_images() -> None:
     image = np.zeros((300, 480), dtype=np.uint8)
     cases = [
         (StereoFrame(4, 0, image, None), "frame 4 has no images"),
-        (StereoFrame(4, 0, image[:, :400], image[:, :400]), "400x300, but the calibration is for 480x300"),
+        (
+            StereoFrame(4, 0, image[:, :400], image[:, :400]),
+            "400x300, but the calibration is for 480x300",
+        ),
         (StereoFrame(4, 0, image, image[:200]), "right image is 480x200"),
     ]
     for frame, message in cases:
@@ -402,7 +476,9 @@ def test_darker_right_camera_keeps_accuracy() -> None:
     """Different gain left and right, as in EuRoC V2_03: the patches are normalised."""
     dark = []
     for frame in FRAMES[:3]:
-        dark.append(replace(frame, right=(0.6 * frame.right.astype(np.float64) + 5).astype(np.uint8)))
+        dark.append(
+            replace(frame, right=(0.6 * frame.right.astype(np.float64) + 5).astype(np.uint8))
+        )
     for pose, output in zip(POSES[:3], run(dark), strict=True):
         seen = output.observations.take(output.observations.has_right)
         assert output.matched > 0.7 * GRID.target_features
@@ -416,7 +492,9 @@ def test_images_may_be_overwritten_after_the_call(outputs: list[FrontendOutput])
     left, right = FRAMES[0].left.copy(), FRAMES[0].right.copy()
     frontend.process(StereoFrame(0, 0, left, right))
     left[:], right[:] = 0, 0
-    np.testing.assert_array_equal(frontend.process(FRAMES[1]).observations.z, outputs[1].observations.z)
+    np.testing.assert_array_equal(
+        frontend.process(FRAMES[1]).observations.z, outputs[1].observations.z
+    )
 
 
 def test_new_features_are_output_after_probation(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -425,12 +503,17 @@ def test_new_features_are_output_after_probation(monkeypatch: pytest.MonkeyPatch
     held = run(FRAMES, settings)
     monkeypatch.setattr(klt, "_PROBATION_FRAMES", 0)
     free = run(FRAMES, settings)
-    late = [later.observations.ids[later.observations.ids > held[0].observations.ids.max()] for later in held[1:]]
+    late = [
+        later.observations.ids[later.observations.ids > held[0].observations.ids.max()]
+        for later in held[1:]
+    ]
     assert sum(map(len, late)) > 0
     assert held[1].detected <= free[1].detected + free[0].detected
     shares = []
     for frames in (held, free):
-        ids, counts = np.unique(np.concatenate([o.observations.ids for o in frames]), return_counts=True)
+        ids, counts = np.unique(
+            np.concatenate([o.observations.ids for o in frames]), return_counts=True
+        )
         # Those first output in the last two frames cannot live for three.
         early = np.isin(ids, np.concatenate([o.observations.ids for o in frames[:-2]]))
         shares.append(np.mean(counts[early] == 1))
@@ -445,7 +528,9 @@ def test_rectification_error_is_estimated_and_does_not_bias_disparity() -> None:
         turn = np.array([[np.cos(roll), -np.sin(roll), 0.0], [np.sin(roll), np.cos(roll), 0.0]])
         centre = np.array([CAMERA.cu, CAMERA.cv])
         turn[:, 2] = centre - turn[:, :2] @ centre
-        rolled = cv2.warpAffine(frame.right, turn, (480, 300), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        rolled = cv2.warpAffine(
+            frame.right, turn, (480, 300), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+        )
         frames.append(replace(frame, right=np.asarray(rolled, dtype=np.uint8)))
     for pose, output in list(zip(POSES, run(frames), strict=True))[2:]:
         seen = output.observations.take(output.observations.has_right)
@@ -460,7 +545,10 @@ def test_tracks_survive_exposure_steps(outputs: list[FrontendOutput]) -> None:
     brighter = []
     for k, frame in enumerate(FRAMES[:4]):
         gain = 1.0 if k % 2 == 0 else 0.7
-        pair = [np.rint(gain * image.astype(np.float64)).astype(np.uint8) for image in (frame.left, frame.right)]
+        pair = [
+            np.rint(gain * image.astype(np.float64)).astype(np.uint8)
+            for image in (frame.left, frame.right)
+        ]
         brighter.append(replace(frame, left=pair[0], right=pair[1]))
     stepped = run(brighter)
     for k in range(3):
@@ -474,7 +562,11 @@ def at_night(share: float, read_noise: float) -> list[StereoFrame]:
     rng, frames = np.random.default_rng(11), []
     for k, pose in enumerate(POSES[:4]):
         pair = [
-            np.clip(np.rint(share * view(SLANTED, T) + read_noise * rng.standard_normal((300, 480))), 0, 255)
+            np.clip(
+                np.rint(share * view(SLANTED, T) + read_noise * rng.standard_normal((300, 480))),
+                0,
+                255,
+            )
             for T in (pose, right_of(pose))
         ]
         frames.append(StereoFrame(k, k * 50_000_000, *(image.astype(np.uint8) for image in pair)))
@@ -543,24 +635,37 @@ def test_prior_with_unknown_ids_and_nan_is_harmless() -> None:
 
 def kitti(folder: Path, count: int) -> tuple[StereoCamera, list[StereoFrame], FloatArray]:
     """Camera, frames and cam0 poses of the first frames of a folder in KITTI odometry layout."""
-    rows = [line.split() for line in (folder / "calib.txt").read_text().splitlines() if line.strip()]
+    rows = [
+        line.split() for line in (folder / "calib.txt").read_text().splitlines() if line.strip()
+    ]
     P0, P1 = (np.array(row[1:13], dtype=np.float64).reshape(3, 4) for row in rows[:2])
     frames = []
     for k in range(count):
-        images = [cv2.imread(str(folder / f"image_{i}" / f"{k:06d}.png"), cv2.IMREAD_GRAYSCALE) for i in (0, 1)]
-        frames.append(StereoFrame(k, k * 100_000_000, *(np.asarray(image, dtype=np.uint8) for image in images)))
+        images = [
+            cv2.imread(str(folder / f"image_{i}" / f"{k:06d}.png"), cv2.IMREAD_GRAYSCALE)
+            for i in (0, 1)
+        ]
+        frames.append(
+            StereoFrame(
+                k, k * 100_000_000, *(np.asarray(image, dtype=np.uint8) for image in images)
+            )
+        )
     height, width = frames[0].left.shape
-    camera = StereoCamera(P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2], -P1[0, 3] / P0[0, 0], width, height)
+    camera = StereoCamera(
+        P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2], -P1[0, 3] / P0[0, 0], width, height
+    )
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3] = np.loadtxt(folder / "poses.txt")[:count].reshape(-1, 3, 4)
     return camera, frames, poses
 
 
 def test_real_drive_agrees_with_ground_truth(data_dir: Path) -> None:
-    """Stereo points of one frame, moved by one rigid motion per pair, must agree with the tracks in the next frame.
+    """Stereo points of one frame, moved by one rigid motion per pair, must agree with the tracks in
+    the next frame.
 
-    The motion is fitted to the tracks and then compared with the ground truth, because the reference poses of this
-    drive (GPS and inertial, not synchronised with the camera) jump by up to 50 mm per frame.
+    The motion is fitted to the tracks and then compared with the ground truth, because the
+    reference poses of this drive (GPS and inertial, not synchronised with the camera) jump by up to
+    50 mm per frame.
     """
     camera, frames, poses = kitti(data_dir / "kitti_0039", 8)
     frontend = KltFrontend(camera)
@@ -569,7 +674,9 @@ def test_real_drive_agrees_with_ground_truth(data_dir: Path) -> None:
     fitted, raw = [], []
     for k in range(len(frames) - 1):
         a, b = outputs[k], outputs[k + 1]
-        before, after = common(replace(a, observations=a.observations.take(a.observations.has_right)), b)
+        before, after = common(
+            replace(a, observations=a.observations.take(a.observations.has_right)), b
+        )
         p, valid = triangulate(camera, before)
         assert valid.all()
         T_true = se3_inverse(poses[k + 1]) @ poses[k]
@@ -580,7 +687,11 @@ def test_real_drive_agrees_with_ground_truth(data_dir: Path) -> None:
         for motion, errors in ((T, fitted), (T_true, raw)):
             q = p @ motion[:3, :3].T + motion[:3, 3]
             uv = np.stack(
-                [camera.fu * q[:, 0] / q[:, 2] + camera.cu, camera.fv * q[:, 1] / q[:, 2] + camera.cv], axis=1
+                [
+                    camera.fu * q[:, 0] / q[:, 2] + camera.cu,
+                    camera.fv * q[:, 1] / q[:, 2] + camera.cv,
+                ],
+                axis=1,
             )
             errors.append(np.linalg.norm(uv - after[:, :2], axis=1))
     assert np.median(np.concatenate(fitted)) < 0.35
@@ -589,7 +700,9 @@ def test_real_drive_agrees_with_ground_truth(data_dir: Path) -> None:
 
 
 def test_only_doubtful_points_are_tracked_backward(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the last motion predicts the pixels, the way back confirms nothing new; without a motion it is needed."""
+    """Where the last motion predicts the pixels, the way back confirms nothing new; without a
+    motion it is needed.
+    """
     tracked: list[int] = []
     flow = cv2.calcOpticalFlowPyrLK
 
@@ -610,11 +723,20 @@ def test_only_doubtful_points_are_tracked_backward(monkeypatch: pytest.MonkeyPat
     assert outputs.tracked > 0.8 * GRID.target_features
 
 
-def test_corners_are_detected_in_every_other_frame_while_few_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_corners_are_detected_in_every_other_frame_while_few_are_missing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(klt, "_SPARE_CORNERS", 0.0)
     frontend = KltFrontend(CAMERA, SETTINGS)
     few, many = GRID.target_features - 10, GRID.target_features // 2
-    assert [frontend._wanted_corners(active) for active in (few, few, few, many, many, few)] == [0, 10, 0, 100, 100, 0]
+    assert [frontend._wanted_corners(active) for active in (few, few, few, many, many, few)] == [
+        0,
+        10,
+        0,
+        100,
+        100,
+        0,
+    ]
 
 
 def test_opencv_has_its_threads_back_after_a_run_that_failed() -> None:
@@ -634,6 +756,8 @@ def test_opencv_has_its_threads_back_after_a_run_that_failed() -> None:
 
 def test_each_image_is_halved_once(monkeypatch: pytest.MonkeyPatch) -> None:
     halved: list[object] = []
-    monkeypatch.setattr(klt, "half_image", lambda image: (halved.append(image), half_image(image))[1])
+    monkeypatch.setattr(
+        klt, "half_image", lambda image: (halved.append(image), half_image(image))[1]
+    )
     run(FRAMES[:3])
     assert len(halved) == 6

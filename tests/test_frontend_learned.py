@@ -1,4 +1,6 @@
-"""The parts that need torch: weights from files only, clear errors, and Lucas-Kanade that agrees with OpenCV."""
+"""The parts that need torch: weights from files only, clear errors, and Lucas-Kanade that agrees
+with OpenCV.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,8 @@ def small_frame(index: int, pose: FloatArray) -> StereoFrame:
     return replace(frame, left=left, right=right)
 
 
-# --- without torch ----------------------------------------------------------------------------------------------------
+# --- without torch
+# ----------------------------------------------------------------------------------------------------
 
 
 def test_error_without_torch_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,7 +67,8 @@ def test_rejects_kornia_without_the_networks(monkeypatch: pytest.MonkeyPatch) ->
         build(LearnedSettings())
 
 
-# --- weights and devices ----------------------------------------------------------------------------------------------
+# --- weights and devices
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -106,7 +110,9 @@ def test_weights_file_cannot_run_code(torch: Any, tmp_path: Path) -> None:
         build(LearnedSettings(detector="aliked", detector_weights=path))
 
 
-def test_rejects_weights_of_another_network(torch: Any, files: dict[str, Path], tmp_path: Path) -> None:
+def test_rejects_weights_of_another_network(
+    torch: Any, files: dict[str, Path], tmp_path: Path
+) -> None:
     path = tmp_path / "hardnet.pth"
     torch.save({"state_dict": torch.load(files["hardnet"])}, path)
     for settings in (
@@ -143,17 +149,22 @@ def test_rejects_lightglue_weights_for_other_descriptors(files: dict[str, Path])
         )
         with pytest.raises(DataError, match="holds no weights of LightGlue"):
             build(settings)
-    small = LearnedSettings(detector="aliked", detector_weights=files["aliked"], matcher="lightglue")
+    small = LearnedSettings(
+        detector="aliked", detector_weights=files["aliked"], matcher="lightglue"
+    )
     with pytest.raises(ConfigError, match="aliked-t16 gives 64"):
         build(replace(small, matcher_weights=files["lightglue"]))
 
 
-# --- networks filled from files ---------------------------------------------------------------------------------------
+# --- networks filled from files
+# ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def files(torch: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Files of random weights of every supported network; the results are meaningless, but of the right form."""
+    """Files of random weights of every supported network; the results are meaningless, but of
+    the right form.
+    """
     import kornia.feature as kf
 
     folder = tmp_path_factory.mktemp("weights")
@@ -174,12 +185,17 @@ def files(torch: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pat
     return paths
 
 
-@pytest.mark.parametrize("name", ["aliked", "disk", "xfeat", "hardnet", "hynet", "sosnet", "lightglue"])
+@pytest.mark.parametrize(
+    "name", ["aliked", "disk", "xfeat", "hardnet", "hynet", "sosnet", "lightglue"]
+)
 def test_every_network_runs_with_weights_from_a_file(name: str, files: dict[str, Path]) -> None:
     settings = LearnedSettings(descriptor_weights=files.get(name))
     if name == "lightglue":
         settings = LearnedSettings(
-            detector="disk", detector_weights=files["disk"], matcher="lightglue", matcher_weights=files[name]
+            detector="disk",
+            detector_weights=files["disk"],
+            matcher="lightglue",
+            matcher_weights=files[name],
         )
     elif name in ("aliked", "disk", "xfeat"):
         settings = LearnedSettings(detector=name, detector_weights=files[name])  # type: ignore[arg-type]
@@ -194,7 +210,11 @@ def test_every_network_runs_with_weights_from_a_file(name: str, files: dict[str,
 
 WEIGHTS: dict[str, dict[str, str]] = {
     "aliked-t16": {"detector": "aliked", "detector_weights": "aliked/aliked-t16.pth"},
-    "aliked-n16": {"detector": "aliked", "aliked_model": "aliked-n16", "detector_weights": "aliked/aliked-n16.pth"},
+    "aliked-n16": {
+        "detector": "aliked",
+        "aliked_model": "aliked-n16",
+        "detector_weights": "aliked/aliked-n16.pth",
+    },
     "keynet-affnet-mkd": {
         "detector": "keynet",
         "detector_weights": "keynet/keynet_pytorch.pth",
@@ -212,7 +232,9 @@ def test_real_weights_track_and_match(torch: Any, data_dir: Path, name: str) -> 
     folder = data_dir / "weights"
     if not folder.is_dir():
         pytest.skip("no weights in VIO_DATA")
-    options: Any = {k: folder / v if k.endswith("_weights") else v for k, v in WEIGHTS[name].items()}
+    options: Any = {
+        k: folder / v if k.endswith("_weights") else v for k, v in WEIGHTS[name].items()
+    }
     frontend = build(LearnedSettings(**options), replace(MATCH, max_keypoints=120))
     poses = flight(2)
     a, b = (frontend.process(small_frame(k, pose)).observations for k, pose in enumerate(poses))
@@ -222,12 +244,19 @@ def test_real_weights_track_and_match(torch: Any, data_dir: Path, name: str) -> 
     assert np.median(np.linalg.norm(b.z[j, :2] - expected, axis=1)) < 0.08
     stereo = a.take(a.has_right)
     assert len(stereo) > 25
-    assert np.median(np.abs(stereo.z[:, 2] - truth(SLANTED, poses[0], stereo.z[:, :2], poses[0])[:, 2])) < 0.05
+    assert (
+        np.median(
+            np.abs(stereo.z[:, 2] - truth(SLANTED, poses[0], stereo.z[:, :2], poses[0])[:, 2])
+        )
+        < 0.05
+    )
 
 
 @pytest.mark.parametrize("detector", ["gftt", "harris"])
 def test_corner_positions_are_unbiased(torch: Any, detector: str) -> None:
-    """White squares: the errors of the four corners cancel, so that a shift of half a pixel would be detected."""
+    """White squares: the errors of the four corners cancel, so that a shift of half a pixel
+    would be detected.
+    """
     from vio.frontend.learned.extractors import build_extractor
     from vio.frontend.learned.weights import pick_device
 
@@ -245,7 +274,8 @@ def test_corner_positions_are_unbiased(torch: Any, detector: str) -> None:
     assert np.abs(offset.mean(axis=0)).max() < 0.01
 
 
-# --- matching ---------------------------------------------------------------------------------------------------------
+# --- matching
+# ---------------------------------------------------------------------------------------------------------
 
 
 def points_of(descriptors: FloatArray) -> Keypoints:
@@ -258,7 +288,11 @@ def matched_by_a_loop(gap: FloatArray, allowed: BoolArray, ratio: float) -> list
     for i in range(len(gap)):
         order = np.argsort(gap[i], kind="stable")
         j = int(order[0])
-        if np.isfinite(gap[i, j]) and np.argmin(gap[:, j]) == i and gap[i, j] <= ratio * gap[i, order[1]]:
+        if (
+            np.isfinite(gap[i, j])
+            and np.argmin(gap[:, j]) == i
+            and gap[i, j] <= ratio * gap[i, order[1]]
+        ):
             pairs.append([i, j])
     assert len(pairs) > 5
     return pairs
@@ -268,22 +302,34 @@ def test_mutual_nearest_equals_a_loop() -> None:
     rng = np.random.default_rng(3)
     a, b = points_of(rng.normal(size=(40, 8))), points_of(rng.normal(size=(50, 8)))
     allowed = rng.random((40, 50)) < 0.5
-    gap = np.linalg.norm(a.descriptors[:, None].astype(float) - b.descriptors[None].astype(float), axis=2)
-    np.testing.assert_array_equal(MutualNearest(0.9)(a, b, allowed), matched_by_a_loop(gap, allowed, 0.9))
+    gap = np.linalg.norm(
+        a.descriptors[:, None].astype(float) - b.descriptors[None].astype(float), axis=2
+    )
+    np.testing.assert_array_equal(
+        MutualNearest(0.9)(a, b, allowed), matched_by_a_loop(gap, allowed, 0.9)
+    )
 
 
 def test_binary_descriptors_use_hamming_distance() -> None:
     """Two bytes have many equal distances, of which the first one counts."""
     rng = np.random.default_rng(4)
-    a, b = (Keypoints(np.zeros((n, 2)), rng.integers(0, 256, (n, 2), dtype=np.uint8)) for n in (40, 50))
+    a, b = (
+        Keypoints(np.zeros((n, 2)), rng.integers(0, 256, (n, 2), dtype=np.uint8)) for n in (40, 50)
+    )
     allowed = rng.random((40, 50)) < 0.5
-    gap = np.array([[sum(int(x).bit_count() for x in p ^ q) for q in b.descriptors] for p in a.descriptors], float)
-    np.testing.assert_array_equal(MutualNearest(1.0)(a, b, allowed), matched_by_a_loop(gap, allowed, 1.0))
+    gap = np.array(
+        [[sum(int(x).bit_count() for x in p ^ q) for q in b.descriptors] for p in a.descriptors],
+        float,
+    )
+    np.testing.assert_array_equal(
+        MutualNearest(1.0)(a, b, allowed), matched_by_a_loop(gap, allowed, 1.0)
+    )
 
 
 def test_pairs_in_a_window_equal_a_formula() -> None:
     rng = np.random.default_rng(5)
-    a, b, guess = (rng.integers(0, 2 * np.array([40, 12]), (n, 2)) / 2 for n in (60, 70, 60))  # many at the limits
+    # many at the limits
+    a, b, guess = (rng.integers(0, 2 * np.array([40, 12]), (n, 2)) / 2 for n in (60, 70, 60))
     found = np.empty((60, 70), dtype=np.bool_)
     descriptors._on_row(a, np.ascontiguousarray(b.T), 6.0, found)
     disparity, rows = a[:, :1] - b[:, 0], np.abs(a[:, 1:] - b[:, 1])
@@ -294,11 +340,16 @@ def test_pairs_in_a_window_equal_a_formula() -> None:
     assert 0.01 < found.mean() < 0.5
 
 
-# --- CUDA -------------------------------------------------------------------------------------------------------------
+# --- CUDA
+# -------------------------------------------------------------------------------------------------------------
 
 
-def test_cuda_is_warmed_up_by_a_front_end_of_its_own(torch: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With both kinds of matches, in images of the camera's size; without CUDA here, all runs on the CPU."""
+def test_cuda_is_warmed_up_by_a_front_end_of_its_own(
+    torch: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With both kinds of matches, in images of the camera's size; without CUDA here, all runs on
+    the CPU.
+    """
     from vio.frontend import learned
 
     process, outputs = DescriptorFrontend.process, []
@@ -316,8 +367,12 @@ def test_cuda_is_warmed_up_by_a_front_end_of_its_own(torch: Any, monkeypatch: py
     assert frontend.process(small_frame(0, flight(1)[0])).observations.ids[0] == 0
 
 
-def test_network_recorded_on_cuda_gives_the_same_key_points(torch: Any, files: dict[str, Path]) -> None:
-    """Left and right at once, in a recording of the network's calls that is made anew for another size."""
+def test_network_recorded_on_cuda_gives_the_same_key_points(
+    torch: Any, files: dict[str, Path]
+) -> None:
+    """Left and right at once, in a recording of the network's calls that is made anew for
+    another size.
+    """
     if not torch.cuda.is_available():
         pytest.skip("no CUDA here")
     from vio.frontend.learned.extractors import _Replayed, build_extractor

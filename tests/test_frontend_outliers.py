@@ -1,4 +1,6 @@
-"""RANSAC on the camera motion, with depth and without: robust to outliers and to large moving objects."""
+"""RANSAC on the camera motion, with depth and without: robust to outliers and to large moving
+objects.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ from vio.geometry.stereo import StereoCamera, project
 
 CAMERA = StereoCamera(fu=720.0, fv=720.0, cu=610.0, cv=170.0, baseline_m=0.54)
 LIMIT_PX = 1.0
-T_TRUE = se3_exp([0.05, -0.02, -1.1, 0.004, -0.02, 0.003])  # a car driving 1.1 m forward and turning
+# a car driving 1.1 m forward and turning
+T_TRUE = se3_exp([0.05, -0.02, -1.1, 0.004, -0.02, 0.003])
 
 
 def make_problem(seed: int = 0) -> RansacProblem:
@@ -44,7 +47,10 @@ def test_ransac_separates_outliers_from_inliers(share: float) -> None:
     p = scene(300, 1)
     uv = pixels(T_TRUE, p, 2)
     bad = np.arange(300) < 300 * share
-    uv[bad] += np.random.default_rng(3).choice([-1, 1], (bad.sum(), 2)) * np.linspace(8, 60, bad.sum())[:, None]
+    uv[bad] += (
+        np.random.default_rng(3).choice([-1, 1], (bad.sum(), 2))
+        * np.linspace(8, 60, bad.sum())[:, None]
+    )
     found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
     assert not found.inliers[bad].any()
     assert found.inliers[~bad].mean() > 0.99
@@ -81,7 +87,9 @@ def test_scattered_pixels_give_no_consensus() -> None:
 
 
 def crossing_truck() -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Points, pixels and the mask of the truck: 65 % of the points, crossing in front of a stationary camera."""
+    """Points, pixels and the mask of the truck: 65 % of the points, crossing in front of a
+    stationary camera.
+    """
     wall, truck = scene(70, 12, (15.0, 40.0)), scene(130, 13, (7.0, 8.0))
     uv = np.concatenate(
         [pixels(np.eye(4), wall, 14), pixels(se3_exp([0.8, 0.0, 0.0, 0.0, 0.0, 0.0]), truck, 15)],
@@ -97,7 +105,9 @@ def test_crossing_truck_wins_consensus_without_prior() -> None:
 
 
 def turning_truck() -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """As above, but the truck also turns, so that its apparent motion is a wrong camera rotation."""
+    """As above, but the truck also turns, so that its apparent motion is a wrong camera
+    rotation.
+    """
     p, uv, truck = crossing_truck()
     uv[truck] = pixels(se3_exp([0.8, 0.0, 0.0, 0.0, 0.1, 0.0]), p[truck], 16)
     return p, uv, truck
@@ -137,17 +147,25 @@ def test_wrong_prior_motion_does_not_override_consensus() -> None:
 def test_prior_rejects_truck_that_turns_the_other_way() -> None:
     """The camera turns by 3 degrees one way, the truck's points by 3 degrees the other way."""
     wall, truck = scene(70, 12, (15.0, 40.0)), scene(130, 13, (7.0, 8.0))
-    T_wall, T_truck = (se3_exp([x, 0.0, 0.0, 0.0, turn, 0.0]) for x, turn in ((0.0, -0.05), (0.8, 0.05)))
+    T_wall, T_truck = (
+        se3_exp([x, 0.0, 0.0, 0.0, turn, 0.0]) for x, turn in ((0.0, -0.05), (0.8, 0.05))
+    )
     uv = np.concatenate([pixels(T_wall, wall, 14), pixels(T_truck, truck, 15)])
-    found = rigid_consensus(make_problem(), np.concatenate([wall, truck]), uv, np.eye(4), T_wall[:3, :3], None)
+    found = rigid_consensus(
+        make_problem(), np.concatenate([wall, truck]), uv, np.eye(4), T_wall[:3, :3], None
+    )
     assert found.inliers[:70].mean() > 0.95
     assert not found.inliers[70:].any()
 
 
 def test_wrong_rotation_that_shares_the_inliers_does_not_override_consensus() -> None:
-    """Half of the static points are at one depth, where translation resembles rotation; many others are outliers."""
+    """Half of the static points are at one depth, where translation resembles rotation; many
+    others are outliers.
+    """
     rng = np.random.default_rng(0)
-    board = np.stack([rng.uniform(-0.6, 0.6, 70), rng.uniform(-0.5, 0.5, 70), rng.uniform(7.9, 8.1, 70)], axis=1)
+    board = np.stack(
+        [rng.uniform(-0.6, 0.6, 70), rng.uniform(-0.5, 0.5, 70), rng.uniform(7.9, 8.1, 70)], axis=1
+    )
     p = np.concatenate([board, scene(60, 100, (15.0, 60.0)), scene(80, 200)])
     uv = pixels(T_TRUE, p, 0)
     uv[130:] += rng.choice([-1, 1], (80, 2)) * rng.uniform(20, 80, (80, 2))
@@ -168,7 +186,11 @@ def test_fit_converges_near_its_start_at_any_rotation(turn: float) -> None:
     T = se3_exp([0.5, -0.3, 0.8, 0.2 * turn, turn, -0.3 * turn])
     after = scene(60, 30)
     start = se3_exp([0.1, 0.05, -0.1, 0.02, -0.05, 0.03]) @ T
-    before, seen, free = transform_points(np.linalg.inv(T), after), project(CAMERA, after)[:, :2], slice(0, 6)
+    before, seen, free = (
+        transform_points(np.linalg.inv(T), after),
+        project(CAMERA, after)[:, :2],
+        slice(0, 6),
+    )
     near = outliers._gauss_newton(
         CAMERA, start[None], before[None], seen[None], np.ones((1, 60)), iterations=5, free=free
     )
@@ -182,18 +204,23 @@ def test_epipolar_distance_is_zero_at_any_allowed_depth_and_grows_across_the_lin
     distance = epipolar_distance(CAMERA, T_TRUE, before, after, near_m=3.0)
     np.testing.assert_allclose(distance, 0.0, atol=1e-6)
     along = after - project(CAMERA, p @ T_TRUE[:3, :3].T)[:, :2]
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(
+        along, axis=1, keepdims=True
+    )
     shifted = epipolar_distance(CAMERA, T_TRUE, before, after + 5 * across, near_m=3.0)
     np.testing.assert_allclose(shifted, 5.0, atol=1e-6)
 
 
 def test_epipolar_distance_at_standstill_is_the_pixel_distance() -> None:
     before = scene(20, 23)[:, :2] + 100
-    distance = epipolar_distance(CAMERA, np.eye(4), before, before + np.array([3.0, 4.0]), near_m=3.0)
+    distance = epipolar_distance(
+        CAMERA, np.eye(4), before, before + np.array([3.0, 4.0]), near_m=3.0
+    )
     np.testing.assert_allclose(distance, 5.0)
 
 
-# --- two views, no depth ----------------------------------------------------------------------------------------------
+# --- two views, no depth
+# ----------------------------------------------------------------------------------------------
 
 MOTIONS = {
     "driving": T_TRUE,
@@ -210,7 +237,9 @@ def turned(T: FloatArray, degrees: float) -> FloatArray:
     return se3_exp([0.0, 0.0, 0.0, 0.0, np.radians(degrees), 0.0])[:3, :3] @ T[:3, :3]
 
 
-def two_views(T: FloatArray, seed: int, share: float, noise: float = 0.2) -> tuple[FloatArray, FloatArray, np.ndarray]:
+def two_views(
+    T: FloatArray, seed: int, share: float, noise: float = 0.2
+) -> tuple[FloatArray, FloatArray, np.ndarray]:
     """Noisy pixels in two frames, and the mask of outliers, 8 to 60 px off in all directions."""
     p = scene(300, seed)
     before, after = pixels(np.eye(4), p, seed + 100, noise), pixels(T, p, seed + 200, noise)
@@ -221,17 +250,22 @@ def two_views(T: FloatArray, seed: int, share: float, noise: float = 0.2) -> tup
     return before, after, bad
 
 
-def agreeing(before: FloatArray, after: FloatArray, R_prior: FloatArray | None, seed: int = 0) -> np.ndarray | None:
+def agreeing(
+    before: FloatArray, after: FloatArray, R_prior: FloatArray | None, seed: int = 0
+) -> np.ndarray | None:
     return bearing_consensus(make_problem(seed), before, after, np.eye(3), R_prior)
 
 
 @pytest.mark.parametrize("prior_error_deg", [None, 0.0, 1.0, 5.0])
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.45])
 @pytest.mark.parametrize("name", MOTIONS)
-def test_two_views_reject_outliers_and_keep_inliers(name: str, share: float, prior_error_deg: float | None) -> None:
+def test_two_views_reject_outliers_and_keep_inliers(
+    name: str, share: float, prior_error_deg: float | None
+) -> None:
     """Holds without parallax and with a wrong prior rotation, too.
 
-    An outlier on its epipolar ray cannot be detected: 16 of 360 degrees at 8 px, fewer at larger errors.
+    An outlier on its epipolar ray cannot be detected: 16 of 360 degrees at 8 px, fewer at larger
+    errors.
     """
     R_prior = None if prior_error_deg is None else turned(MOTIONS[name], prior_error_deg)
     good, missed = [], []
@@ -285,7 +319,8 @@ def test_two_views_of_identical_pixels_do_not_fail() -> None:
 def test_prior_rotation_rejects_turning_truck_in_two_views(with_prior: bool) -> None:
     """The truck wins the two-view consensus unless a rotation is predicted.
 
-    The camera is stationary, so its direction of translation is arbitrary and part of the truck is on epipolar rays.
+    The camera is stationary, so its direction of translation is arbitrary and part of the truck is
+    on epipolar rays.
     """
     p, after, truck = turning_truck()
     kept = agreeing(project(CAMERA, p)[:, :2], after, np.eye(3) if with_prior else None)
@@ -298,11 +333,14 @@ def test_prior_rotation_rejects_turning_truck_in_two_views(with_prior: bool) -> 
         assert kept[truck].mean() > 0.9
 
 
-# --- depth and two views ----------------------------------------------------------------------------------------------
+# --- depth and two views
+# ----------------------------------------------------------------------------------------------
 
 
 def test_static_tracks_use_depth_or_fall_back_to_two_views() -> None:
-    """With enough depth, tracks without depth are all kept; otherwise two views reject moving tracks."""
+    """With enough depth, tracks without depth are all kept; otherwise two views reject moving
+    tracks.
+    """
     before, after, bad = two_views(T_TRUE, 9, 0.3)
     p = scene(300, 9)
     deep = np.arange(300) % 2 == 0
@@ -315,6 +353,8 @@ def test_static_tracks_use_depth_or_fall_back_to_two_views() -> None:
     assert motion is None
     assert kept[bad].mean() < 0.15
     assert kept[~bad].mean() > 0.97
-    kept, motion = static_tracks(make_problem(), before[:5], p[:5], few[:5], after[:5], np.eye(4), None, None)
+    kept, motion = static_tracks(
+        make_problem(), before[:5], p[:5], few[:5], after[:5], np.eye(4), None, None
+    )
     assert motion is None
     assert kept.all()  # too few for a consensus: nothing is dropped

@@ -37,7 +37,10 @@ from vio.records import BoolArray, Image, IntArray, TrackPrior
 def waves(u: FloatArray, v: FloatArray, seed: int = 0) -> FloatArray:
     """A random texture, defined at every real-valued pixel; wavelengths 6 to 50 px."""
     rng = np.random.default_rng(seed)
-    wavelength, angle, phase = np.exp(rng.uniform(np.log(6), np.log(50), 30)), *rng.uniform(0, 2 * np.pi, (2, 30))
+    wavelength, angle, phase = (
+        np.exp(rng.uniform(np.log(6), np.log(50), 30)),
+        *rng.uniform(0, 2 * np.pi, (2, 30)),
+    )
     total = np.zeros(np.broadcast_shapes(u.shape, v.shape))
     for w, a, s in zip(wavelength, angle, phase, strict=True):
         total += np.sqrt(w) * np.cos(2 * np.pi / w * (np.cos(a) * u + np.sin(a) * v) + s)
@@ -59,17 +62,27 @@ POINTS = np.random.default_rng(5).uniform([40, 40], [260, 160], (60, 2))
 def test_stated_standard_deviations_follow_the_noise_of_the_patches() -> None:
     """They are short of the errors by a factor that is the same whatever the noise is (F1).
 
-    Noise of the template is in its gradients too, and neighbouring pixels of an interpolated image share theirs.
+    Noise of the template is in its gradients too, and neighbouring pixels of an interpolated image
+    share theirs.
     """
     rng, shift, centres = np.random.default_rng(8), np.array([0.3, -0.2]), rounded(POINTS)
-    there, slots = picture(np.array([[1.0, 0.0, -shift[0]], [0.0, 1.0, -shift[1]]])), np.arange(len(POINTS))
+    there, slots = (
+        picture(np.array([[1.0, 0.0, -shift[0]], [0.0, 1.0, -shift[1]]])),
+        np.arange(len(POINTS)),
+    )
     median_px, ratio = [], []
     for gray in (2.0, 6.0):
-        noisy = [np.clip(np.rint(i + rng.normal(0, gray, i.shape)), 0, 255).astype(np.uint8) for i in (PLAIN, there)]
+        noisy = [
+            np.clip(np.rint(i + rng.normal(0, gray, i.shape)), 0, 255).astype(np.uint8)
+            for i in (PLAIN, there)
+        ]
         store = templates(cut_patches(noisy[0], centres, 7))
         left, _ = align(store, slots, noisy[1], shift_warps(centres), 8)
         right, _ = align(store, slots, noisy[1], shift_warps(centres), 8, centres[:, 1] + shift[1])
-        error = np.concatenate([left[:, :, 2], right[:, :1, 2]], axis=1) - (centres + shift)[:, [0, 1, 0]]
+        error = (
+            np.concatenate([left[:, :, 2], right[:, :1, 2]], axis=1)
+            - (centres + shift)[:, [0, 1, 0]]
+        )
         ratio.append(np.sqrt(np.mean((error / store.sigma) ** 2, axis=0)))
         median_px.append(np.median(store.sigma, axis=0))
     assert (np.array(ratio) > 1.0).all()
@@ -88,8 +101,13 @@ def test_warped_patches_equal_a_loop() -> None:
             for dx in range(-2, 3):
                 u, v = np.rint(32 * (W @ [dx, dy, 1])) / 32
                 i, j, a, b = int(u), int(v), u % 1, v % 1
-                rows = [(1 - a) * float(PLAIN[j + k, i]) + a * float(PLAIN[j + k, i + 1]) for k in (0, 1)]
-                assert patch[dy + 2, dx + 2] == pytest.approx((1 - b) * rows[0] + b * rows[1], abs=2.0)
+                rows = [
+                    (1 - a) * float(PLAIN[j + k, i]) + a * float(PLAIN[j + k, i + 1])
+                    for k in (0, 1)
+                ]
+                assert patch[dy + 2, dx + 2] == pytest.approx(
+                    (1 - b) * rows[0] + b * rows[1], abs=2.0
+                )
 
 
 def test_patches_cut_at_rounded_points_hold_exact_pixels() -> None:
@@ -97,7 +115,10 @@ def test_patches_cut_at_rounded_points_hold_exact_pixels() -> None:
     centre = cut_patches(PLAIN, points, 4)[:, 5, 5]
     i, j = np.floor(points).astype(int).T
     a, b = (points % 1).T
-    rows = [(1 - a) * PLAIN[j + k, i].astype(float) + a * PLAIN[j + k, i + 1].astype(float) for k in (0, 1)]
+    rows = [
+        (1 - a) * PLAIN[j + k, i].astype(float) + a * PLAIN[j + k, i + 1].astype(float)
+        for k in (0, 1)
+    ]
     np.testing.assert_allclose(centre, (1 - b) * rows[0] + b * rows[1], atol=1e-3)
 
 
@@ -110,7 +131,9 @@ def test_inside_rejects_nan() -> None:
 def test_affine_alignment_finds_a_known_warp(gain: float, offset: float) -> None:
     """The second image is rotated, scaled, shifted and differs in exposure."""
     linear = np.array([[1.04, 0.03, -4.0], [-0.02, 0.97, 3.0], [0.0, 0.0, 1.0]])
-    other = np.clip(np.rint(gain * picture(linear).astype(np.float64) + offset), 0, 255).astype(np.uint8)
+    other = np.clip(np.rint(gain * picture(linear).astype(np.float64) + offset), 0, 255).astype(
+        np.uint8
+    )
     expected = POINTS @ np.linalg.inv(linear)[:2, :2].T + np.linalg.inv(linear)[:2, 2]
     start = expected + np.random.default_rng(1).uniform(-1.5, 1.5, POINTS.shape)
     warp, score = fitted(PLAIN, other, ANCHOR_RADIUS_PX, start, 15)
@@ -118,11 +141,18 @@ def test_affine_alignment_finds_a_known_warp(gain: float, offset: float) -> None
     assert np.median(error) < 0.02
     assert np.mean(error < 0.1) > 0.9
     assert np.median(score) > 0.99
-    np.testing.assert_allclose(np.median(warp[:, :, :2], axis=0), np.linalg.inv(linear)[:2, :2], atol=0.01)
+    np.testing.assert_allclose(
+        np.median(warp[:, :, :2], axis=0), np.linalg.inv(linear)[:2, :2], atol=0.01
+    )
 
 
 def fitted(
-    source: Image, target: Image, radius: int, start: FloatArray, steps: int, rows: FloatArray | None = None
+    source: Image,
+    target: Image,
+    radius: int,
+    start: FloatArray,
+    steps: int,
+    rows: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Templates cut at POINTS of one image, aligned with another."""
     centres = rounded(POINTS)
@@ -142,7 +172,9 @@ def test_what_is_at_another_depth_at_the_rim_hardly_moves_the_centre() -> None:
         pictures = []
         for moved in (0.0, 1.0):
             layers = [cv2.GaussianBlur(layer, (0, 0), 2.0) * 5 - 512 for layer in (near, far)]
-            below, above = (cv2.remap(*layer, cv2.INTER_LINEAR) for layer in _moved(layers, u, v, moved))
+            below, above = (
+                cv2.remap(*layer, cv2.INTER_LINEAR) for layer in _moved(layers, u, v, moved)
+            )
             seen = np.where(v > row - 0.5 * radius + moved, below, above)
             pictures.append(np.clip(np.rint(seen), 0, 255).astype(np.uint8))
         at = np.array([[150.0, row]])
@@ -167,12 +199,17 @@ def test_alignment_with_expected_rows_leaves_the_rows_straight() -> None:
 
 
 def test_expected_row_resolves_the_aperture_problem() -> None:
-    """On a slanted edge the patch determines only the shift across it; the expected row determines the rest."""
+    """On a slanted edge the patch determines only the shift across it; the expected row
+    determines the rest.
+    """
     v, u = np.mgrid[0:200, 0:300].astype(np.float64)
     edge = 128 + 80 * np.tanh((u - 0.5 * v - 60 + 12) / 2)
     moved = 128 + 80 * np.tanh((u - 0.5 * v - 60) / 2)
     noise = np.random.default_rng(2).normal(0, 2, (2, 200, 300))
-    pictures = [np.clip(np.rint(p + n), 0, 255).astype(np.uint8) for p, n in zip((edge, moved), noise, strict=True)]
+    pictures = [
+        np.clip(np.rint(p + n), 0, 255).astype(np.uint8)
+        for p, n in zip((edge, moved), noise, strict=True)
+    ]
     row = np.arange(60.0, 140.0, 5)
     on_edge = np.stack([0.5 * row + 48, row], axis=1)
     store = templates(cut_patches(pictures[0], on_edge, 6))
@@ -186,7 +223,9 @@ def test_expected_row_resolves_the_aperture_problem() -> None:
     assert np.abs(held[:, 0, 2] - on_edge[:, 0] - 12).max() < 0.25
 
 
-def row_correlation(target: Image, centres: list[list[int]], first: list[int], count: int) -> FloatArray:
+def row_correlation(
+    target: Image, centres: list[list[int]], first: list[int], count: int
+) -> FloatArray:
     """Correlations (N, count) of patches of PLAIN, 7 x 7."""
     score = np.empty((len(centres), count), np.float32)
     correlate(PLAIN, target, np.array(centres), np.array(first), 3, score)
@@ -247,7 +286,9 @@ def _wall(stereo: StereoFit, disparity: float) -> Tracks:
 
 def test_the_search_reaches_further_where_the_scene_is_near() -> None:
     """A wall at 0.4 of the image width, beyond the setting."""
-    stereo = StereoFit(NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200))
+    stereo = StereoFit(
+        NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200)
+    )
     half, points = half_image(PLAIN), POINTS[POINTS[:, 0] > 170]
     disparity, unique = stereo.search(half, _moved_right(120.0).half, points)
     assert unique.mean() > 0.8
@@ -256,29 +297,44 @@ def test_the_search_reaches_further_where_the_scene_is_near() -> None:
 
 
 def test_the_search_follows_features_that_come_nearer() -> None:
-    """A wall at 0.15 of the width comes to 0.2: its points know their depth, and matched in the last frame."""
-    stereo = StereoFit(NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200))
+    """A wall at 0.15 of the width comes to 0.2: its points know their depth, and matched in the
+    last frame.
+    """
+    stereo = StereoFit(
+        NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200)
+    )
     near = _wall(stereo, 60.0)
-    stereo.track_right(changed(near, has_right=np.zeros(len(near), dtype=np.bool_)), _moved_right(60.0), moved=True)
+    stereo.track_right(
+        changed(near, has_right=np.zeros(len(near), dtype=np.bool_)), _moved_right(60.0), moved=True
+    )
     assert stereo.max_disparity_px == 48.0  # depths that no pair has confirmed
     stereo.track_right(near, _moved_right(60.0), moved=True)
     assert stereo.max_disparity_px == 96.0
 
 
 def test_chance_matches_do_not_make_the_search_reach_further() -> None:
-    stereo = StereoFit(NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200))
+    stereo = StereoFit(
+        NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200)
+    )
     other = half_image(picture(np.eye(3), seed=1))
     first = stereo.max_disparity_px
-    stereo.search(half_image(PLAIN), other, np.random.default_rng(1).uniform([40, 40], [260, 160], (400, 2)))
+    stereo.search(
+        half_image(PLAIN), other, np.random.default_rng(1).uniform([40, 40], [260, 160], (400, 2))
+    )
     assert stereo.max_disparity_px == first
 
 
 def test_a_near_scene_with_repeated_texture_does_not_look_exchanged() -> None:
     """Each point has its match beyond the reach, and one with a negative disparity within it."""
-    stereo = StereoFit(NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200))
+    stereo = StereoFit(
+        NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200)
+    )
     near, again = _moved_right(120.0).full, _moved_right(-15.0).full
     right = np.where(np.arange(300) < 150, near, again)
-    views, points = [ImageLevels(i, half_image(i)) for i in (PLAIN, right)], POINTS[POINTS[:, 0] > 170]
+    views, points = (
+        [ImageLevels(i, half_image(i)) for i in (PLAIN, right)],
+        POINTS[POINTS[:, 0] > 170],
+    )
     assert stereo.count_mirrored(*views, points) > 0.7 * len(points)
     assert stereo.count_beyond(*views, points) > 0.7 * len(points)
     unlike = [views[0], *(ImageLevels(i, half_image(i)) for i in [picture(np.eye(3), seed=1)])]
@@ -286,7 +342,9 @@ def test_a_near_scene_with_repeated_texture_does_not_look_exchanged() -> None:
 
 
 def test_points_beside_the_right_image_or_beyond_the_reach_are_not_testable() -> None:
-    stereo = StereoFit(NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200))
+    stereo = StereoFit(
+        NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200)
+    )
     tracks = _wall(stereo, 30.0)
     assert stereo.testable(tracks).all()
     assert not stereo.testable(_wall(stereo, 60.0)).any()
@@ -295,14 +353,18 @@ def test_points_beside_the_right_image_or_beyond_the_reach_are_not_testable() ->
 
 
 def test_a_match_at_the_end_of_the_searched_row_is_none() -> None:
-    """The correlation of a smooth texture still grows there: the point is nearer than the search reaches."""
+    """The correlation of a smooth texture still grows there: the point is nearer than the search
+    reaches.
+    """
     for shift in (41.0, 43.0):
         _, valid = match_rows(half_image(PLAIN), _moved_right(shift).half, POINTS, 40.0, 0.6, 0.03)
         assert valid.mean() < 0.1
 
 
 def test_matching_no_points_gives_no_disparities() -> None:
-    disparity, valid = match_rows(half_image(PLAIN), half_image(PLAIN), np.zeros((0, 2)), 48.0, 0.6, 0.03)
+    disparity, valid = match_rows(
+        half_image(PLAIN), half_image(PLAIN), np.zeros((0, 2)), 48.0, 0.6, 0.03
+    )
     assert disparity.shape == valid.shape == (0,)
 
 
@@ -316,7 +378,9 @@ def test_row_field_estimates_rectification_error() -> None:
         right = left + np.stack([np.full(150, -20.0), off + rng.normal(0, 0.15, 150)], axis=1)
         right[:15, 1] += rng.uniform(-5, 5, 15)
         field.update(left, right)
-    grid = np.stack(np.meshgrid(np.arange(20.0, 640, 60), np.arange(20.0, 360, 40)), axis=-1).reshape(-1, 2)
+    grid = np.stack(
+        np.meshgrid(np.arange(20.0, 640, 60), np.arange(20.0, 360, 40)), axis=-1
+    ).reshape(-1, 2)
     expected = 0.3 + 0.001 * (grid[:, 0] - 320) + 5e-6 * (grid[:, 0] - 320) * (grid[:, 1] - 180)
     assert np.abs(field.rows(grid) - grid[:, 1] - expected).max() < 0.1
 
@@ -349,13 +413,17 @@ def test_local_maxima_keep_their_distance_from_each_other_and_from_tracks() -> N
 
 @pytest.mark.parametrize("width", [31, 32, 37, 40])
 def test_local_maxima_are_all_there_are(width: int) -> None:
-    """Against each pixel's neighbourhood, in equal steps with many ties, and in rows of any length."""
+    """Against each pixel's neighbourhood, in equal steps with many ties, and in rows of any
+    length.
+    """
     response = np.random.default_rng(width).integers(0, 9, (29, width)).astype(np.float32)
     for distance, border, least in ((1, 1, 3.0), (2, 4, 0.0), (5, 7, 8.0)):
         found = local_maxima(response, np.zeros((0, 2)), distance, border, least)
         padded = np.pad(response, distance)
         shape = (2 * distance + 1, 2 * distance + 1)
-        largest = response >= np.lib.stride_tricks.sliding_window_view(padded, shape).max(axis=(2, 3))
+        largest = response >= np.lib.stride_tricks.sliding_window_view(padded, shape).max(
+            axis=(2, 3)
+        )
         largest &= response >= max(least, 1e-12)
         inner = np.zeros_like(largest)
         inner[border:-border, border:-border] = True
@@ -375,12 +443,16 @@ def test_new_corners_go_where_tracks_are_missing() -> None:
 
 
 def test_corners_are_found_at_corners_of_squares() -> None:
-    """White squares on black: the corners found at half resolution are those of the squares, to about a pixel."""
+    """White squares on black: the corners found at half resolution are those of the squares, to
+    about a pixel.
+    """
     image = np.zeros((200, 300), dtype=np.uint8)
     for v in range(30, 170, 50):
         for u in range(30, 270, 60):
             image[v : v + 20, u : u + 24] = 200
-    found = detect_corners(half_image(image), np.zeros((0, 2)), 200, GridSettings(target_features=200))
+    found = detect_corners(
+        half_image(image), np.zeros((0, 2)), 200, GridSettings(target_features=200)
+    )
     true = np.array(
         [
             [u + a, v + b]
@@ -430,7 +502,9 @@ def test_defaults_scale_with_the_image(width: int, height: int) -> None:
     assert 0.75 < (width / columns) / (height / rows) < 1.35
     assert min_distance_px(width, height, grid) < 0.5 * feature_spacing(width, height, grid)
     corners = np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
-    np.testing.assert_array_equal(cell_index(corners, width, height, (rows, columns)), [0, rows * columns - 1])
+    np.testing.assert_array_equal(
+        cell_index(corners, width, height, (rows, columns)), [0, rows * columns - 1]
+    )
 
 
 def noisy(level: float, sigma: float, seed: int) -> Image:
@@ -440,11 +514,15 @@ def noisy(level: float, sigma: float, seed: int) -> Image:
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 6.0])
 def test_noise_gradient_is_estimated_from_the_image(sigma: float) -> None:
-    """Compared with the Sobel derivative of pure noise; gradients and straight edges have no effect."""
+    """Compared with the Sobel derivative of pure noise; gradients and straight edges have no
+    effect.
+    """
     image = noisy(100, sigma, 1).astype(np.float64)
     du = image[:, 2:] - image[:, :-2]
     sobel = (du[:-2] + 2 * du[1:-1] + du[2:]) / 8
-    assert noise_gradient(noisy(100, sigma, 1)) == pytest.approx(np.sqrt(np.mean(sobel**2)), rel=0.05)
+    assert noise_gradient(noisy(100, sigma, 1)) == pytest.approx(
+        np.sqrt(np.mean(sobel**2)), rel=0.05
+    )
     slope = np.linspace(-60, 60, 320) + np.where(np.arange(320) > 160, 30.0, 0.0)
     sloped = np.clip(np.rint(image + slope), 0, 255).astype(np.uint8)
     assert noise_gradient(sloped) == pytest.approx(noise_gradient(noisy(100, sigma, 1)), rel=0.1)
@@ -461,7 +539,8 @@ def test_noise_in_the_dark_gives_few_corners(monkeypatch: pytest.MonkeyPatch) ->
         assert found > (30 if sigma > 1 else 3)  # control: without the threshold there are corners
 
 
-# --- records, anchors, predictions ------------------------------------------------------------------------------------
+# --- records, anchors, predictions
+# ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -477,7 +556,9 @@ class Outer:
 
 
 def test_take_and_joined_work_on_nested_records() -> None:
-    record = Outer(np.arange(4), np.arange(8.0).reshape(4, 2), Inner(np.array([True, False, True, False])))
+    record = Outer(
+        np.arange(4), np.arange(8.0).reshape(4, 2), Inner(np.array([True, False, True, False]))
+    )
     odd = take(record, np.array([3, 1]))
     assert odd.names.tolist() == [3, 1]
     np.testing.assert_array_equal(odd.places, [[6.0, 7.0], [2.0, 3.0]])
@@ -495,7 +576,9 @@ def test_anchors_keep_their_slots_when_the_bank_grows() -> None:
     more = bank.add(image, POINTS[3:20])
     assert not set(first) & set(more)
     np.testing.assert_array_equal(bank.store.patch[first], before)
-    np.testing.assert_array_equal(bank.store.patch[more], templates(cut_patches(image, POINTS[3:20], 3)).patch)
+    np.testing.assert_array_equal(
+        bank.store.patch[more], templates(cut_patches(image, POINTS[3:20], 3)).patch
+    )
     bank.keep_only(first)
     again = bank.add(image, POINTS[20:22])
     assert not set(first) & set(again)
@@ -509,7 +592,9 @@ def test_points_behind_the_camera_keep_their_pixels() -> None:
     left = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
     found = moved_pixels(camera, T_curr_prev, p_prev, left)
     p = p_prev @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
-    expected = np.stack([300.0 * p[:, 0] / p[:, 2] + 150.0, 310.0 * p[:, 1] / p[:, 2] + 100.0], axis=1)
+    expected = np.stack(
+        [300.0 * p[:, 0] / p[:, 2] + 150.0, 310.0 * p[:, 1] / p[:, 2] + 100.0], axis=1
+    )
     np.testing.assert_allclose(found[[0, 2]], expected[[0, 2]])
     np.testing.assert_array_equal(found[1], left[1])
 
@@ -517,12 +602,18 @@ def test_points_behind_the_camera_keep_their_pixels() -> None:
 def test_prior_pixels_are_matched_by_id() -> None:
     prior = TrackPrior(np.array([3, 7, 9]), np.arange(12.0).reshape(3, 4))
     rows, predicted = prior_pixels(np.array([9, 1, 3]), prior)
-    assert dict(zip(rows.tolist(), predicted.tolist(), strict=True)) == {0: [8.0, 9.0], 2: [0.0, 1.0]}
+    assert dict(zip(rows.tolist(), predicted.tolist(), strict=True)) == {
+        0: [8.0, 9.0],
+        2: [0.0, 1.0],
+    }
 
 
 def test_spread_evenly_equals_a_greedy_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(12)
-    points, occupied = rng.uniform([0, 0], [400, 300], (120, 2)), rng.uniform([0, 0], [400, 300], (10, 2))
+    points, occupied = (
+        rng.uniform([0, 0], [400, 300], (120, 2)),
+        rng.uniform([0, 0], [400, 300], (10, 2)),
+    )
     monkeypatch.setattr(detect, "_CELL_FEATURES", 3)
     monkeypatch.setattr(detect, "_MIN_DISTANCE", 0.0)
     grid = GridSettings(target_features=60)
@@ -531,7 +622,11 @@ def test_spread_evenly_equals_a_greedy_loop(monkeypatch: pytest.MonkeyPatch) -> 
     cell = cell_index(points, 400, 300, shape)
     held = np.bincount(cell_index(occupied, 400, 300, shape), minlength=shape[0] * shape[1])
     apart, taken = min_distance_px(400, 300, grid), list(occupied)
-    far = [p for p in range(120) if np.abs(np.concatenate([points[:p], taken]) - points[p]).max(axis=1).min() >= apart]
+    far = [
+        p
+        for p in range(120)
+        if np.abs(np.concatenate([points[:p], taken]) - points[p]).max(axis=1).min() >= apart
+    ]
     expected: list[int] = []
     while len(expected) < 50 and far:
         best = min(far, key=lambda p: (held[cell[p]], p))

@@ -24,7 +24,11 @@ def recorded(index: int, ids: list[int], has_right: list[bool] | None = None) ->
     return observations(index, index * 1000, ids, z, has_right)
 
 
-RECORD = {0: recorded(0, [3, 5, 9]), 1: recorded(1, [5, 9, 11, 12], [True, False, True, True]), 2: recorded(2, [])}
+RECORD = {
+    0: recorded(0, [3, 5, 9]),
+    1: recorded(1, [5, 9, 11, 12], [True, False, True, True]),
+    2: recorded(2, []),
+}
 
 
 def frame(index: int) -> StereoFrame:
@@ -39,7 +43,9 @@ def test_recorded_observations_come_back_unchanged() -> None:
 
 def test_counts_new_and_continued_features() -> None:
     frontend = PrecomputedFrontend(RECORD.get)
-    counts = [(o.tracked, o.matched, o.detected) for o in (frontend.process(frame(k)) for k in range(3))]
+    counts = [
+        (o.tracked, o.matched, o.detected) for o in (frontend.process(frame(k)) for k in range(3))
+    ]
     assert counts == [(0, 3, 3), (2, 3, 2), (0, 0, 0)]
 
 
@@ -56,9 +62,20 @@ class FakeDataset:
 
     @property
     def recording(self) -> Recording:
-        return Recording("fake", Path(), CAMERA, None, np.array([0]), self._has_images, frozenset(), reference=None)
+        return Recording(
+            "fake",
+            Path(),
+            CAMERA,
+            None,
+            np.array([0]),
+            self._has_images,
+            frozenset(),
+            reference=None,
+        )
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
         yield frame(start)
 
     def observations(self, index: int) -> Observations | None:
@@ -73,7 +90,9 @@ def test_builders_create_the_named_front_end() -> None:
 
 
 def test_auto_selects_by_content_of_the_recording() -> None:
-    assert isinstance(build_frontend("auto", CAMERA, FrontendSettings(), FakeDataset(True)), KltFrontend)
+    assert isinstance(
+        build_frontend("auto", CAMERA, FrontendSettings(), FakeDataset(True)), KltFrontend
+    )
     without = build_frontend("auto", CAMERA, FrontendSettings(), FakeDataset(False))
     assert isinstance(without, PrecomputedFrontend)
     assert without.process(frame(0)).observations is RECORD[0]

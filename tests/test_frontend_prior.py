@@ -1,4 +1,6 @@
-"""Effect of a prior on the front ends: a good one bridges jumps, a bad one of any kind does no harm."""
+"""Effect of a prior on the front ends: a good one bridges jumps, a bad one of any kind does no
+harm.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ from vio.sim.sequence import SimulatedRecording, Simulation, views
 FRAMES = 7
 NOISE_PX = 0.7
 OFF_PX = 30.0
-SETTINGS = FrontendSettings(grid=GridSettings(target_features=150), match=MatchSettings(max_keypoints=400))
+SETTINGS = FrontendSettings(
+    grid=GridSettings(target_features=150), match=MatchSettings(max_keypoints=400)
+)
 NAMES = ["klt", "orb", "sift"]
 
 Corruption = Callable[[TrackPrior, np.random.Generator], TrackPrior]
@@ -40,14 +44,20 @@ class Clip:
 def clip() -> Clip:
     """Frames of a flight through the room at full speed."""
     simulation = plan(accuracy_scenario(None, frames=40 + FRAMES, width=376))
-    simulation = replace(simulation, taken_ns=simulation.taken_ns[-FRAMES:], stamps_ns=simulation.stamps_ns[-FRAMES:])
+    simulation = replace(
+        simulation, taken_ns=simulation.taken_ns[-FRAMES:], stamps_ns=simulation.stamps_ns[-FRAMES:]
+    )
     recording = SimulatedRecording(simulation)
     return Clip(simulation, [recording.frame(k) for k in range(FRAMES)])
 
 
 def true_prior(clip: Clip, seen: Observations, now: int, rng: np.random.Generator) -> TrackPrior:
-    """True pixels of the previous frame's features with the noise of a filter, and the true rotation."""
-    before, (left, right) = (views(clip.simulation, int(clip.simulation.taken_ns[k])) for k in (now - 1, now))
+    """True pixels of the previous frame's features with the noise of a filter, and the true
+    rotation.
+    """
+    before, (left, right) = (
+        views(clip.simulation, int(clip.simulation.taken_ns[k])) for k in (now - 1, now)
+    )
     to_left, _ = correspondence(clip.simulation.world, before[0], left, seen.z[:, :2])
     to_right, _ = correspondence(clip.simulation.world, before[0], right, seen.z[:, :2])
     z = np.concatenate([to_left, to_right], axis=1) + NOISE_PX * rng.standard_normal((len(seen), 4))
@@ -59,7 +69,10 @@ def moved(prior: TrackPrior, off: FloatArray) -> TrackPrior:
 
 
 def turned(prior: TrackPrior) -> TrackPrior:
-    return replace(prior, R_cam_prev=se3_exp([0.0, 0.0, 0.0, 0.0, np.radians(5.0), 0.0])[:3, :3] @ prior.R_cam_prev)
+    return replace(
+        prior,
+        R_cam_prev=se3_exp([0.0, 0.0, 0.0, 0.0, np.radians(5.0), 0.0])[:3, :3] @ prior.R_cam_prev,
+    )
 
 
 def nothing_but_rotation(prior: TrackPrior) -> TrackPrior:
@@ -125,7 +138,11 @@ def run(clip: Clip, name: str, corrupt: Corruption | None) -> Quality:
     frontend = build_frontend(name, rectified_camera(clip.simulation.rig), SETTINGS, recording)
     rng, outputs = np.random.default_rng(3), [frontend.process(clip.frames[0])]
     for k in range(1, FRAMES):
-        prior = None if corrupt is None else corrupt(true_prior(clip, outputs[-1].observations, k, rng), rng)
+        prior = (
+            None
+            if corrupt is None
+            else corrupt(true_prior(clip, outputs[-1].observations, k, rng), rng)
+        )
         outputs.append(frontend.process(clip.frames[k], prior))
     return quality(clip, outputs)
 
@@ -138,8 +155,12 @@ def alone(clip: Clip) -> dict[str, Quality]:
 
 @pytest.mark.parametrize("kind", CORRUPTIONS)
 @pytest.mark.parametrize("name", NAMES)
-def test_prior_of_any_kind_does_not_degrade_tracks(name: str, kind: str, clip: Clip, alone: dict[str, Quality]) -> None:
-    """Within 0.01 px in the median, 1 % of outliers, 2 % of the tracks and 4 % of the stereo matches."""
+def test_prior_of_any_kind_does_not_degrade_tracks(
+    name: str, kind: str, clip: Clip, alone: dict[str, Quality]
+) -> None:
+    """Within 0.01 px in the median, 1 % of outliers, 2 % of the tracks and 4 % of the stereo
+    matches.
+    """
     plain, with_prior = alone[name], run(clip, name, CORRUPTIONS[kind])
     assert with_prior.median_px < plain.median_px + 0.01
     assert with_prior.outliers < plain.outliers + 0.01
@@ -151,16 +172,23 @@ def test_prior_of_any_kind_does_not_degrade_tracks(name: str, kind: str, clip: C
 def test_prior_bridges_a_gap_too_wide_for_tracking_alone(
     name: str, clip: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Five consecutive frames are lost; Lucas-Kanade has one level, and the search radius of descriptors is small."""
+    """Five consecutive frames are lost.
+
+    Lucas-Kanade has one level, and the search radius of descriptors is small.
+    """
     simulation = replace(
-        clip.simulation, taken_ns=clip.simulation.taken_ns[::6], stamps_ns=clip.simulation.stamps_ns[::6]
+        clip.simulation,
+        taken_ns=clip.simulation.taken_ns[::6],
+        stamps_ns=clip.simulation.stamps_ns[::6],
     )
     apart = Clip(simulation, [replace(clip.frames[k], index=i) for i, k in enumerate((0, 6))])
     monkeypatch.setattr(descriptors, "_SEARCH_RADIUS", 0.02)
     settings = replace(SETTINGS, klt=replace(SETTINGS.klt, pyramid_levels=0))
     kept = []
     for with_prior in (False, True):
-        frontend = build_frontend(name, rectified_camera(simulation.rig), settings, SimulatedRecording(simulation))
+        frontend = build_frontend(
+            name, rectified_camera(simulation.rig), settings, SimulatedRecording(simulation)
+        )
         seen = frontend.process(apart.frames[0]).observations
         prior = true_prior(apart, seen, 1, np.random.default_rng(4)) if with_prior else None
         kept.append(frontend.process(apart.frames[1], prior).tracked / len(seen))
@@ -195,14 +223,19 @@ def test_predicted_motion_reuses_an_expected_motion_that_fits() -> None:
 
 
 @pytest.mark.parametrize("share", [0.5, 0.65, 0.75])
-def test_prior_overrides_truck_of_any_size_with_enough_support(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prior_overrides_truck_of_any_size_with_enough_support(
+    share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With a required support of 30 %, a third of the truck's points is enough."""
     monkeypatch.setattr(outliers, "_PRIOR_MIN_SUPPORT", 0.3)
     wall, truck = scene(200, 32, (15.0, 40.0)), scene(200, 33, (7.0, 8.0))
     still, passing = round(200 * (1 - share)), round(200 * share)
     p = np.concatenate([wall[:still], truck[:passing]])
     uv = np.concatenate(
-        [pixels(np.eye(4), wall[:still], 34), pixels(se3_exp([0.8, 0.0, 0.0, 0.0, 0.1, 0.0]), truck[:passing], 35)]
+        [
+            pixels(np.eye(4), wall[:still], 34),
+            pixels(se3_exp([0.8, 0.0, 0.0, 0.0, 0.1, 0.0]), truck[:passing], 35),
+        ]
     )
     predicted = se3_exp([0.05, 0.0, -0.1, 0.0, 0.002, 0.0])
     for R_prior, T_prior in ((np.eye(3), None), (None, predicted)):

@@ -1,4 +1,6 @@
-"""The KLT front end on rendered images with known ground truth: errors, effects, occlusion, ids, determinism."""
+"""The KLT front end on rendered images with known ground truth: errors, effects, occlusion, ids,
+determinism.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ class Case:
 def run(simulation: Simulation, frames: list[StereoFrame]) -> Case:
     recording = SimulatedRecording(simulation)
     settings = FrontendSettings(grid=GridSettings(target_features=FEATURES))
-    recorder = Recorder(build_frontend("klt", rectified_camera(simulation.rig), settings, recording))
+    recorder = Recorder(
+        build_frontend("klt", rectified_camera(simulation.rig), settings, recording)
+    )
     tally = evaluate(simulation, frames, recorder)
     return Case(simulation, frames, recorder.outputs, tally, figures(tally))
 
@@ -68,7 +72,9 @@ def rendered(simulation: Simulation) -> list[StereoFrame]:
 
 def latest(simulation: Simulation) -> Simulation:
     """The last frames only."""
-    return replace(simulation, taken_ns=simulation.taken_ns[-FRAMES:], stamps_ns=simulation.stamps_ns[-FRAMES:])
+    return replace(
+        simulation, taken_ns=simulation.taken_ns[-FRAMES:], stamps_ns=simulation.stamps_ns[-FRAMES:]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +84,9 @@ def world() -> World:
 
 @pytest.fixture(scope="module")
 def case(world: World) -> Callable[[str | None], Case]:
-    """The last frames of a two-second flight, at full speed, under an effect; each is rendered once."""
+    """The last frames of a two-second flight, at full speed, under an effect; each is rendered
+    once.
+    """
     made: dict[str | None, Case] = {}
 
     def build(effect: str | None) -> Case:
@@ -93,12 +101,17 @@ def case(world: World) -> Callable[[str | None], Case]:
     return build
 
 
-# --- accuracy ---------------------------------------------------------------------------------------------------------
+# --- accuracy
+# ---------------------------------------------------------------------------------------------------------
 
 
-def test_tracks_and_disparities_in_the_room_are_accurate(case: Callable[[str | None], Case]) -> None:
+def test_tracks_and_disparities_in_the_room_are_accurate(
+    case: Callable[[str | None], Case],
+) -> None:
     measured = case(None).figures
-    step, birth, disparity, row = (measured[name] for name in ("step", "since_birth", "disparity", "row"))
+    step, birth, disparity, row = (
+        measured[name] for name in ("step", "since_birth", "disparity", "row")
+    )
     assert step["count"] > 0.8 * FEATURES * (FRAMES - 1)
     assert step["median_px"] < 0.06
     assert step["outliers"] < 0.01
@@ -112,16 +125,23 @@ def test_tracks_and_disparities_in_the_room_are_accurate(case: Callable[[str | N
     assert row["median_px"] < 0.03
 
 
-def test_tracks_in_the_room_are_long_and_corners_repeatable(case: Callable[[str | None], Case]) -> None:
+def test_tracks_in_the_room_are_long_and_corners_repeatable(
+    case: Callable[[str | None], Case],
+) -> None:
     measured = case(None).figures
     assert measured["recall"] > 0.97
     assert measured["life_mean"] > 0.5 * FRAMES
-    assert measured["corner_recall"] > 0.25  # the strongest 150 corners are closer together than tracks may be
+    # the strongest 150 corners are closer together than tracks may be
+    assert measured["corner_recall"] > 0.25
 
 
 @pytest.mark.parametrize("effect", ON_THE_IMAGE)
-def test_errors_stay_small_under_every_effect(effect: str, case: Callable[[str | None], Case]) -> None:
-    """Noise doubles the error; darkness, with a signal of 8 gray levels, makes it six times as large."""
+def test_errors_stay_small_under_every_effect(
+    effect: str, case: Callable[[str | None], Case]
+) -> None:
+    """Noise doubles the error; darkness, with a signal of 8 gray levels, makes it six times as
+    large.
+    """
     measured = case(effect).figures
     if effect == "dark" and measured["step"] is None:
         return  # no corners, so no errors
@@ -133,7 +153,9 @@ def test_errors_stay_small_under_every_effect(effect: str, case: Callable[[str |
 
 
 @pytest.mark.parametrize("effect", [name for name in ON_THE_IMAGE if name != "dark"])
-def test_tracks_survive_every_effect_but_darkness(effect: str, case: Callable[[str | None], Case]) -> None:
+def test_tracks_survive_every_effect_but_darkness(
+    effect: str, case: Callable[[str | None], Case]
+) -> None:
     measured = case(effect).figures
     assert measured["features_least"] > 0.7 * FEATURES
     assert measured["stereo_least"] > 0.6 * FEATURES
@@ -146,7 +168,8 @@ def test_darkness_gives_few_tracks(case: Callable[[str | None], Case]) -> None:
 
 def test_bare_wall_has_no_tracks() -> None:
     """Noise on an untextured surface gives no corners: all features are near an outline."""
-    facing = plan(accuracy_scenario("bare-wall", frames=100, width=SIZE_PX))  # ends before a bare wall
+    # ends before a bare wall
+    facing = plan(accuracy_scenario("bare-wall", frames=100, width=SIZE_PX))
     tracked = run(last := latest(facing), rendered(last))
     recording = SimulatedRecording(last)
     share, on_wall, features = [], 0, 0
@@ -162,11 +185,14 @@ def test_bare_wall_has_no_tracks() -> None:
     assert on_wall <= 0.01 * features
 
 
-# --- dropped and duplicated frames ------------------------------------------------------------------------------------
+# --- dropped and duplicated frames
+# ------------------------------------------------------------------------------------
 
 
 def with_times(simulation: Simulation, source: list[int]) -> Simulation:
-    """The simulation with the frames `source`; with duplicates, stamps continue at the frame rate."""
+    """The simulation with the frames `source`; with duplicates, stamps continue at the frame
+    rate.
+    """
     taken = simulation.taken_ns[source]
     stamps = simulation.stamps_ns[: len(source)] if len(set(source)) < len(source) else taken
     return replace(simulation, taken_ns=taken, stamps_ns=stamps)
@@ -186,7 +212,10 @@ def test_tracks_do_not_move_in_duplicated_frames(case: Callable[[str | None], Ca
     plain = case(None)
     source = [0, 1, 2, 2, 3, 4, 5, 5, 5, 6, 7, 8]
     simulation = with_times(plain.simulation, source)
-    frames = [replace(plain.frames[k], index=i, time_ns=int(simulation.stamps_ns[i])) for i, k in enumerate(source)]
+    frames = [
+        replace(plain.frames[k], index=i, time_ns=int(simulation.stamps_ns[i]))
+        for i, k in enumerate(source)
+    ]
     repeated = run(simulation, frames)
     assert repeated.figures["recall"] > 0.97
     assert repeated.figures["step"]["median_px"] < 0.06
@@ -201,7 +230,8 @@ def test_tracks_do_not_move_in_duplicated_frames(case: Callable[[str | None], Ca
             assert moved.max() < 0.5
 
 
-# --- occlusion --------------------------------------------------------------------------------------------------------
+# --- occlusion
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_tracks_end_at_occlusions() -> None:
@@ -209,8 +239,12 @@ def test_tracks_end_at_occlusions() -> None:
     y = np.linspace(-0.9, 0.9, 19)
     R = look_rotation(np.tile([1.0, 0.0, 0.0], (len(y), 1)))
     T = se3_from_parts(R, np.stack([-0.4 + 0.2 * y, y, 1.4 + 0.2 * np.sin(5 * y)], axis=1))
-    scene = room(3, moving=[_pole(side) for side in (-0.9, -0.3, 0.3, 0.9)], furniture=0, texel_m=0.004)
-    simulation = simulate(scene, small_rig(SIZE_PX, 240), spline_from_waypoints(T, 0.1), rate_hz=20.0, seed=3)
+    scene = room(
+        3, moving=[_pole(side) for side in (-0.9, -0.3, 0.3, 0.9)], furniture=0, texel_m=0.004
+    )
+    simulation = simulate(
+        scene, small_rig(SIZE_PX, 240), spline_from_waypoints(T, 0.1), rate_hz=20.0, seed=3
+    )
     passed = run(simulation, rendered(simulation))
     hidden = _hidden(passed)
     assert hidden > 30
@@ -232,13 +266,16 @@ def _hidden(case: Case) -> int:
     for k, output in enumerate(case.outputs[:-1]):
         times = case.simulation.taken_ns[k : k + 2].tolist()
         last, now = (views(case.simulation, time_ns)[0] for time_ns in times)
-        there, visible = correspondence(case.simulation.world, last, now, output.observations.z[:, :2])
+        there, visible = correspondence(
+            case.simulation.world, last, now, output.observations.z[:, :2]
+        )
         inside = ((there > 12) & (there < [SIZE_PX - 13, 227])).all(axis=1)
         count += int((inside & ~visible).sum())
     return count
 
 
-# --- contract ---------------------------------------------------------------------------------------------------------
+# --- contract
+# ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("effect", [None, *ON_THE_IMAGE])
@@ -262,4 +299,6 @@ def test_equal_images_give_identical_output(case: Callable[[str | None], Case]) 
     again = run(once.simulation, rendered(once.simulation))
     for a, b in zip(once.outputs, again.outputs, strict=True):
         for name in ("ids", "z", "has_right", "stale"):
-            np.testing.assert_array_equal(getattr(a.observations, name), getattr(b.observations, name))
+            np.testing.assert_array_equal(
+                getattr(a.observations, name), getattr(b.observations, name)
+            )

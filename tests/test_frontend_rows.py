@@ -1,4 +1,6 @@
-"""A right camera that was pitched after its calibration: rows apart by more than the search along the row allows."""
+"""A right camera that was pitched after its calibration: rows apart by more than the search
+along the row allows.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ def _run(rows: int) -> list[FrontendOutput]:
     return out
 
 
-@pytest.mark.parametrize("rows", [-20, -12, 7, 24])  # -20: the wrong matches of frame 0 are 28, all contradicted
+# -20: the wrong matches of frame 0 are 28, all contradicted
+@pytest.mark.parametrize("rows", [-20, -12, 7, 24])
 def test_finds_the_rows_of_a_pitched_camera_within_a_few_frames(rows: int) -> None:
     plain, pitched = _run(0), _run(rows)
     assert pitched[0].matched < 0.3 * plain[0].matched  # without the search it stays so

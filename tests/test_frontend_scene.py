@@ -16,7 +16,9 @@ NOISE = 1.5  # gray levels
 
 @dataclass(frozen=True, slots=True)
 class Wall:
-    """The plane `normal . p = offset` in the world frame, textured with a sum of cosines over world x and y."""
+    """The plane `normal . p = offset` in the world frame, textured with a sum of cosines over
+    world x and y.
+    """
 
     normal: FloatArray  # (3,)
     offset: float
@@ -38,8 +40,12 @@ class Wall:
             )
         return 128.0 + 40.0 * total / np.sqrt((amplitude**2).sum() / 2)
 
-    def hit(self, T_world_cam: FloatArray, pixels: FloatArray, camera: StereoCamera = CAMERA) -> FloatArray:
-        """Points (..., 3) in the world where the rays of left pixels (..., 2) intersect the wall."""
+    def hit(
+        self, T_world_cam: FloatArray, pixels: FloatArray, camera: StereoCamera = CAMERA
+    ) -> FloatArray:
+        """Points (..., 3) in the world where the rays of left pixels (..., 2) intersect the
+        wall.
+        """
         rays = np.stack(
             [
                 (pixels[..., 0] - camera.cu) / camera.fu,
@@ -56,9 +62,13 @@ class Wall:
 SLANTED = Wall(normal=np.array([0.1, -0.35, 1.0]), offset=4.0, seed=3)
 
 
-def truth(wall: Wall, T_world_cam: FloatArray, pixels: FloatArray, T_world_other: FloatArray) -> FloatArray:
+def truth(
+    wall: Wall, T_world_cam: FloatArray, pixels: FloatArray, T_world_other: FloatArray
+) -> FloatArray:
     """Stereo pixels (N, 4) at another pose of the points at left pixels (N, 2)."""
-    return project(CAMERA, transform_points(se3_inverse(T_world_other), wall.hit(T_world_cam, pixels)))
+    return project(
+        CAMERA, transform_points(se3_inverse(T_world_other), wall.hit(T_world_cam, pixels))
+    )
 
 
 def view(wall: Wall, T_world_cam: FloatArray, camera: StereoCamera = CAMERA) -> FloatArray:
@@ -96,7 +106,9 @@ def flight(frames: int) -> list[FloatArray]:
 def test_left_and_right_images_agree_at_true_pixels() -> None:
     pose = flight(3)[2]
     left, right = view(SLANTED, pose), view(SLANTED, right_of(pose))
-    pixels = np.stack(np.meshgrid(np.arange(60.0, 420.0, 7), np.arange(10.0, 290.0, 7)), axis=-1).reshape(-1, 2)
+    pixels = np.stack(
+        np.meshgrid(np.arange(60.0, 420.0, 7), np.arange(10.0, 290.0, 7)), axis=-1
+    ).reshape(-1, 2)
     z = truth(SLANTED, pose, pixels, pose)
     np.testing.assert_allclose(z[:, :2], pixels, atol=1e-9)
     nearest = np.rint(z[:, 2]).astype(int)

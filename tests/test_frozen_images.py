@@ -1,4 +1,6 @@
-"""Pairs that are given again: told from a rig at standstill, left out, named, and without effect on the poses."""
+"""Pairs that are given again: told from a rig at standstill, left out, named, and without effect
+on the poses.
+"""
 
 from __future__ import annotations
 
@@ -53,10 +55,17 @@ def _noisy(image: Image, seed: int, level: int = 1) -> Image:
 
 
 def _shifted(image: Image, px: float) -> Image:
-    return np.asarray(cv2.warpAffine(image, np.array([[1.0, 0, px], [0, 1, 0]]), image.shape[::-1]), dtype=np.uint8)
+    return np.asarray(
+        cv2.warpAffine(image, np.array([[1.0, 0, px], [0, 1, 0]]), image.shape[::-1]),
+        dtype=np.uint8,
+    )
 
 
-GRID = np.stack(np.meshgrid(np.arange(60, 340, 30), np.arange(40, 200, 30)), axis=-1).reshape(-1, 2).astype(float)
+GRID = (
+    np.stack(np.meshgrid(np.arange(60, 340, 30), np.arange(40, 200, 30)), axis=-1)
+    .reshape(-1, 2)
+    .astype(float)
+)
 Z = np.concatenate([GRID, GRID - [12.0, 0.0]], axis=1)
 IDS = np.arange(len(GRID))
 LEFT, RIGHT = _texture(0), _texture(1)
@@ -100,7 +109,9 @@ def test_a_bit_equal_pair_is_used_at_standstill() -> None:
 def test_a_nearly_equal_pair_is_a_repetition_where_the_prediction_moves(how: str) -> None:
     def again(image: Image, seed: int) -> Image:
         if how == "jpeg":
-            return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image)[1], cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+            return np.asarray(
+                cv2.imdecode(cv2.imencode(".jpg", image)[1], cv2.IMREAD_GRAYSCALE), dtype=np.uint8
+            )
         return _noisy(image, seed) if how == "noise" else image + np.uint8(3)
 
     repeated = _watching().check(_frame(1, again(LEFT, 5), again(RIGHT, 6)), _expected())
@@ -108,21 +119,30 @@ def test_a_nearly_equal_pair_is_a_repetition_where_the_prediction_moves(how: str
 
 
 def test_a_rig_at_standstill_is_not_frozen() -> None:
-    """Read noise differs from frame to frame; the prediction agrees with no motion, or the IMU reads none."""
+    """Read noise differs from frame to frame; the prediction agrees with no motion, or the IMU
+    reads none.
+    """
     pair = _frame(1, _noisy(LEFT, 5), _noisy(RIGHT, 6))
     assert _watching().check(pair, _expected(0.1)) is None  # no corner is predicted to move
-    assert _watching().check(pair, _expected(2.0, sigma_m=0.05)) is None  # the prediction knows little
-    assert _watching(off_px=1.0).check(pair, _expected(2.0)) is None  # it was off by as much shortly before
+    # the prediction knows little
+    assert _watching().check(pair, _expected(2.0, sigma_m=0.05)) is None
+    # it was off by as much shortly before
+    assert _watching(off_px=1.0).check(pair, _expected(2.0)) is None
     assert _watching(shaking=False).check(pair, _expected(2.0)) is None  # a velocity that is wrong
 
 
 def test_a_pair_that_moved_is_used_whatever_the_prediction() -> None:
     for px in (0.5, 2.0, 11.0):
-        assert _watching().check(_frame(1, _shifted(LEFT, px), _shifted(RIGHT, px)), _expected(2.0)) is None
+        assert (
+            _watching().check(_frame(1, _shifted(LEFT, px), _shifted(RIGHT, px)), _expected(2.0))
+            is None
+        )
 
 
 def test_images_of_another_size_are_no_repetition() -> None:
-    """They are compared with nothing: the front end refuses them, and the next pair is compared with no error."""
+    """They are compared with nothing: the front end refuses them, and the next pair is compared
+    with no error.
+    """
     frozen = _watching()
     assert frozen.check(_frame(1, LEFT[::2, ::2].copy(), RIGHT), _expected()) is None
     assert frozen.check(_frame(2, LEFT, RIGHT), _expected()) is None
@@ -152,9 +172,13 @@ def test_without_an_imu_the_prediction_alone_decides() -> None:
     assert frozen.check(_frame(2, LEFT, RIGHT), _expected()) is not None
 
 
-@pytest.mark.parametrize(("gray", "words"), [(0, "have one gray value everywhere"), (None, "gave them again")])
+@pytest.mark.parametrize(
+    ("gray", "words"), [(0, "have one gray value everywhere"), (None, "gave them again")]
+)
 def test_black_images_are_not_laid_on_a_driver_that_repeats(gray: int | None, words: str) -> None:
-    left, right = (LEFT, RIGHT) if gray is None else (np.full_like(LEFT, gray), np.full_like(RIGHT, gray))
+    left, right = (
+        (LEFT, RIGHT) if gray is None else (np.full_like(LEFT, gray), np.full_like(RIGHT, gray))
+    )
     (line,) = RepeatReport(IMAGES).frame(_frame(2, left, right), Repeated(1, True))
     assert words in line
 
@@ -175,10 +199,17 @@ Flight: TypeAlias = tuple[list[Event], Recording]
 class Played:
     """A rendered flight, its frames changed on the way."""
 
-    def __init__(self, events: list[Event], recording: Recording, change: Callable[[StereoFrame], StereoFrame]) -> None:
+    def __init__(
+        self,
+        events: list[Event],
+        recording: Recording,
+        change: Callable[[StereoFrame], StereoFrame],
+    ) -> None:
         self._events, self.recording, self._change = events, recording, change
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
         yield from (self._change(e) if isinstance(e, StereoFrame) else e for e in self._events)
 
     def observations(self, index: int) -> Observations | None:
@@ -187,7 +218,9 @@ class Played:
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    simulation = simulate(room(1), small_rig(320, 200), hand_held(duration_s=FRAMES / 20), imu=ImuNoise(), seed=2)
+    simulation = simulate(
+        room(1), small_rig(320, 200), hand_held(duration_s=FRAMES / 20), imu=ImuNoise(), seed=2
+    )
     recording = SimulatedRecording(simulation)
     return list(recording.events()), recording.recording
 
@@ -212,20 +245,27 @@ def test_a_frozen_camera_does_not_move_the_poses_and_is_named(flight: Flight, no
         if not FIRST <= frame.index <= LAST:
             return frame
         if noisy:
-            return replace(frame, left=_noisy(left, frame.index), right=_noisy(right, 1000 + frame.index))
+            return replace(
+                frame, left=_noisy(left, frame.index), right=_noisy(right, 1000 + frame.index)
+            )
         return replace(frame, left=left.copy(), right=right.copy())
 
     error, lines = _ate(flight, frozen)
     assert error < 0.003
     assert any(f"frame {FIRST}: both images" in line for line in lines), lines
-    assert any(f"frame {LAST + 1}: the images change again, after 10 repetitions (0.50 s)" in line for line in lines)
+    assert any(
+        f"frame {LAST + 1}: the images change again, after 10 repetitions (0.50 s)" in line
+        for line in lines
+    )
     assert not any("diverged" in line for line in lines)
 
 
 @pytest.fixture(scope="module")
 def flight_with_depth(flight: Flight) -> Flight:
     """The left camera of the flight with the noisy depths of a sensor."""
-    simulation = simulate(room(1), small_rig(320, 200), hand_held(duration_s=FRAMES / 20), imu=ImuNoise(), seed=2)
+    simulation = simulate(
+        room(1), small_rig(320, 200), hand_held(duration_s=FRAMES / 20), imu=ImuNoise(), seed=2
+    )
     rendered, rng = SimulatedRecording(simulation), np.random.default_rng(3)
     events: list[Event] = []
     for event in flight[0]:
@@ -239,9 +279,13 @@ def flight_with_depth(flight: Flight) -> Flight:
     return events, replace(flight[1], kind="rgbd", camera=camera)
 
 
-def test_a_stuck_depth_camera_does_not_move_the_poses_and_is_named(flight_with_depth: Flight) -> None:
+def test_a_stuck_depth_camera_does_not_move_the_poses_and_is_named(
+    flight_with_depth: Flight,
+) -> None:
     """Half a second of the same depth image beside new images."""
-    depth = {e.index: e for e in flight_with_depth[0] if isinstance(e, StereoFrame)}[FIRST - 1].depth
+    depth = {e.index: e for e in flight_with_depth[0] if isinstance(e, StereoFrame)}[
+        FIRST - 1
+    ].depth
     stuck, kept = depth, depth.copy()
 
     def frozen(frame: StereoFrame) -> StereoFrame:
@@ -251,8 +295,14 @@ def test_a_stuck_depth_camera_does_not_move_the_poses_and_is_named(flight_with_d
     assert lines == []
     error, lines = _ate(flight_with_depth, frozen)
     assert error < 2 * right
-    assert f"frame {FIRST}: the depth image is the same to the last bit since frame {FIRST - 1}" in lines[0]
-    assert f"frame {LAST + 1}: the depth images change again, after 10 repetitions (0.50 s)" in lines[1]
+    assert (
+        f"frame {FIRST}: the depth image is the same to the last bit since frame {FIRST - 1}"
+        in lines[0]
+    )
+    assert (
+        f"frame {LAST + 1}: the depth images change again, after 10 repetitions (0.50 s)"
+        in lines[1]
+    )
     assert lines[2:] == ["10 frames repeated earlier depth images, which were left out"]
     np.testing.assert_array_equal(stuck, kept)
 
@@ -262,7 +312,9 @@ def test_the_same_depth_image_is_used_at_standstill() -> None:
     for shaking, repeated in ((False, False), (True, True)):
         frozen = _watching(shaking=shaking)
         for k in (1, 2):
-            frame = replace(_frame(k, _shifted(LEFT, 5.0 * k), LEFT), right=None, depth=depth.copy())
+            frame = replace(
+                _frame(k, _shifted(LEFT, 5.0 * k), LEFT), right=None, depth=depth.copy()
+            )
             assert frozen.check(frame, _expected()) is None
             found = frozen.check_depth(frame)
         assert (found is not None) == repeated

@@ -23,11 +23,14 @@ def _estimate(k: int, x: float | None = None, **more: object) -> Estimate:
 
 def _lines(reports: list[UpdateReport]) -> list[str]:
     health = RunHealth()
-    return [line for k, report in enumerate(reports) for line in health.frame(k, report, _estimate(k))]
+    return [
+        line for k, report in enumerate(reports) for line in health.frame(k, report, _estimate(k))
+    ]
 
 
 def test_a_plausible_run_gives_no_warning() -> None:
-    assert _lines([GOOD] * 50 + [EMPTY] * 10 + [GOOD] * 50) == []  # half a second without features is tolerated
+    # half a second without features is tolerated
+    assert _lines([GOOD] * 50 + [EMPTY] * 10 + [GOOD] * 50) == []
 
 
 def test_reports_when_features_are_missing_and_when_they_are_back() -> None:
@@ -38,28 +41,37 @@ def test_reports_when_features_are_missing_and_when_they_are_back() -> None:
 
 
 @pytest.mark.parametrize(
-    ("percent", "sigma", "word"), [(5.0, 0.1, "longer"), (-5.0, 0.1, "shorter"), (0.9, 0.1, None), (5.0, 2.0, None)]
+    ("percent", "sigma", "word"),
+    [(5.0, 0.1, "longer"), (-5.0, 0.1, "shorter"), (0.9, 0.1, None), (5.0, 2.0, None)],
 )
 def test_reports_once_a_focal_length_that_differs_beyond_doubt_and_beyond_harm(
     percent: float, sigma: float, word: str | None
 ) -> None:
-    scale = StereoScaleEstimate(np.array([0.0, np.log1p(percent / 100)]), np.diag([0.0, (sigma / 100) ** 2]))
+    scale = StereoScaleEstimate(
+        np.array([0.0, np.log1p(percent / 100)]), np.diag([0.0, (sigma / 100) ** 2])
+    )
     health = RunHealth()
     lines = [line for k in range(5) for line in health.scale(k, _estimate(k, stereo_scale=scale))]
-    assert [f"frame 0: the focal length is 5.0 % {word} than calibrated" in line for line in lines] == [True] * (
-        word is not None
-    )
+    assert [
+        f"frame 0: the focal length is 5.0 % {word} than calibrated" in line for line in lines
+    ] == [True] * (word is not None)
 
 
-def test_a_scale_that_is_off_is_laid_on_baseline_or_focal_length_where_nothing_tells_them_apart() -> None:
+def test_a_scale_that_is_off_is_laid_on_baseline_or_focal_length_where_nothing_tells_them_apart() -> (
+    None
+):
     scale = StereoScaleEstimate(np.array([np.log(1.1), 0.0]), np.diag([0.01**2, 0.0]))
     (line,) = RunHealth().scale(0, _estimate(0, stereo_scale=scale))
     assert "the baseline, or the focal length, is 10.0 % longer than calibrated" in line
     assert "check the sensor (unit, axes, clock)" in line
 
 
-@pytest.mark.parametrize(("rows_px", "words"), [(4.3, "in a smooth pattern"), (26.0, "left and right are exchanged")])
-def test_rows_that_no_rig_comes_to_are_not_laid_on_the_calibration_alone(rows_px: float, words: str) -> None:
+@pytest.mark.parametrize(
+    ("rows_px", "words"), [(4.3, "in a smooth pattern"), (26.0, "left and right are exchanged")]
+)
+def test_rows_that_no_rig_comes_to_are_not_laid_on_the_calibration_alone(
+    rows_px: float, words: str
+) -> None:
     field = StereoFieldEstimate(np.zeros(8), np.eye(8), rows_px)
     (line,) = RunHealth().frame(0, GOOD, _estimate(0, stereo_field=field))
     assert f"frame 0: the rows of left and right images differ by {rows_px:.2f} px (rms)" in line
@@ -70,7 +82,9 @@ def test_a_restart_is_one_event_and_its_jump_is_not_reported_as_a_speed() -> Non
     health = RunHealth()
     assert health.frame(0, GOOD, _estimate(0)) == ()
     (line,) = health.restarted(1, "msckf diverged at frame 1", _estimate(1, x=50.0))
-    assert line.startswith("frame 1: msckf diverged at frame 1; started again from the last good pose")
+    assert line.startswith(
+        "frame 1: msckf diverged at frame 1; started again from the last good pose"
+    )
     assert "standard deviation of its position is 0.02 m" in line
     assert health.frame(1, GOOD, _estimate(1, x=50.0)) == ()
     assert health.restarted(5, "again", _estimate(5, x=50.0)) == ()
@@ -91,7 +105,9 @@ def _gaps(times_s: list[float]) -> list[str]:
 
 def test_reports_a_time_without_frames_once() -> None:
     (line,) = _gaps([0.05 * k for k in range(20)] + [3.95 + 0.05 * k for k in range(20)])
-    assert line.startswith("frame 20: no frame for 3.00 s since frame 19; the motion in between is a prediction")
+    assert line.startswith(
+        "frame 20: no frame for 3.00 s since frame 19; the motion in between is a prediction"
+    )
     assert "standard deviation of the position is 0.017 m" in line
 
 
@@ -110,8 +126,14 @@ def test_two_gaps_without_features_are_two_events() -> None:
     ("more", "message"),
     [
         ({"x": 400.0}, "m/s: the filter has diverged"),
-        ({"gyro_bias": np.array([0.0, 0.9, 0.0])}, "gyro bias is estimated as 0.9 rad/s, which no working sensor has"),
-        ({"accel_bias": np.array([0.0, 0.0, -6.0])}, "accelerometer bias is estimated as 6 m/s^2, which no"),
+        (
+            {"gyro_bias": np.array([0.0, 0.9, 0.0])},
+            "gyro bias is estimated as 0.9 rad/s, which no working sensor has",
+        ),
+        (
+            {"accel_bias": np.array([0.0, 0.0, -6.0])},
+            "accelerometer bias is estimated as 6 m/s^2, which no",
+        ),
     ],
 )
 def test_reports_an_implausible_state_once(more: dict[str, object], message: str) -> None:

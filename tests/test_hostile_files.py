@@ -1,4 +1,6 @@
-"""Files and settings made to exhaust memory or stack, or to block: each is an error in one line, at once."""
+"""Files and settings made to exhaust memory or stack, or to block: each is an error in one line,
+at once.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,14 @@ import numpy as np
 import pytest
 
 from tests.commands import refused
-from tests.dataset_makers import ece276a_arrays, make_drive, make_kitti, make_mat, make_npz, utias_arrays
+from tests.dataset_makers import (
+    ece276a_arrays,
+    make_drive,
+    make_kitti,
+    make_mat,
+    make_npz,
+    utias_arrays,
+)
 from tests.same_events import frames_of
 from tests.test_config import _numbers
 from tests.test_datasets_png import chunk
@@ -35,9 +44,16 @@ PIXELS = np.random.default_rng(5).integers(0, 256, (24, 32)).astype(np.uint8)
 
 
 def png_stating(width: int, height: int) -> bytes:
-    """A complete PNG, with right checksums, whose header states a size that its pixels do not have."""
+    """A complete PNG, with right checksums, whose header states a size that its pixels do not
+    have.
+    """
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + header
+        + chunk(b"IDAT", zlib.compress(bytes(1000)))
+        + chunk(b"IEND", b"")
+    )
 
 
 def _jpeg(path: Path) -> bytes:
@@ -48,7 +64,10 @@ def _jpeg(path: Path) -> bytes:
 @pytest.mark.parametrize(("width", "height"), [(2**15, 2**15), (2**30, 1), (2**31 - 1, 2**31 - 1)])
 def test_image_size_is_checked_before_decoding(width: int, height: int, tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(png_stating(width, height))
-    with pytest.raises(UnreadableImageError, match=rf"a\.png: its header states {width} x {height} pixels, more than"):
+    with pytest.raises(
+        UnreadableImageError,
+        match=rf"a\.png: its header states {width} x {height} pixels, more than",
+    ):
         load_gray(tmp_path / "a.png")
 
 
@@ -61,7 +80,9 @@ def test_jpeg_size_is_checked_before_decoding(tmp_path: Path) -> None:
         load_gray(tmp_path / "a.jpg")
 
 
-@pytest.mark.parametrize("tail", [b"\0\0", b"a preview \xff\xd8 or a video", b"\xff\xff\xd9 padding"])
+@pytest.mark.parametrize(
+    "tail", [b"\0\0", b"a preview \xff\xd8 or a video", b"\xff\xff\xd9 padding"]
+)
 def test_bytes_after_the_end_of_a_jpeg_are_passed_over(tail: bytes, tmp_path: Path) -> None:
     whole = _jpeg(tmp_path / "a.jpg")
     expected, _ = load_gray(tmp_path / "a.jpg")
@@ -78,7 +99,8 @@ def test_truncated_jpegs_are_still_refused(kept: float, tail: bytes, tmp_path: P
         load_gray(tmp_path / "a.jpg")
 
 
-# --- 16 bits --------------------------------------------------------------------------------------------------------
+# --- 16 bits
+# --------------------------------------------------------------------------------------------------------
 
 
 def _deep_recording(folder: Path, top: int) -> Path:
@@ -94,19 +116,25 @@ def _deep_recording(folder: Path, top: int) -> Path:
 
 
 @pytest.mark.parametrize(("top", "bits"), [(1023, 10), (4095, 12), (16383, 14)])
-def test_bits_in_use_are_scaled_by_one_factor_for_the_whole_run(top: int, bits: int, tmp_path: Path) -> None:
+def test_bits_in_use_are_scaled_by_one_factor_for_the_whole_run(
+    top: int, bits: int, tmp_path: Path
+) -> None:
     dataset = open_dataset(_deep_recording(tmp_path / "deep", top))
-    assert f"the images have 16 bits but use {bits}: the levels 0 to {top}" in " ".join(dataset.recording.notes)
+    assert f"the images have 16 bits but use {bits}: the levels 0 to {top}" in " ".join(
+        dataset.recording.notes
+    )
     frames = frames_of(dataset)
     brightest = [int(frame.left.max()) for frame in frames if frame.left is not None]
-    assert brightest == [51] * 3 + [255] * 9  # the dark ones stay darker: the brightness does not jump
+    # the dark ones stay darker: the brightness does not jump
+    assert brightest == [51] * 3 + [255] * 9
 
 
 def test_no_image_is_taken_for_one_of_16_bits() -> None:
     assert white_level([]) == full_scale(())[0] == 65535
 
 
-# --- archives -------------------------------------------------------------------------------------------------------
+# --- archives
+# -------------------------------------------------------------------------------------------------------
 
 
 def add_bomb(path: Path, name: str, gib: float) -> None:
@@ -116,7 +144,9 @@ def add_bomb(path: Path, name: str, gib: float) -> None:
         info = zipfile.ZipInfo(f"{name}.npy")
         info.compress_type = zipfile.ZIP_BZIP2
         with archive.open(info, "w", force_zip64=True) as stream:
-            np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": shape})
+            np.lib.format.write_array_header_1_0(
+                stream, {"descr": "<f8", "fortran_order": False, "shape": shape}
+            )
             stream.write(bytes(2**20))  # as if it were more: the tests never get to its end
 
 
@@ -136,7 +166,8 @@ def test_needed_arrays_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         open_dataset(mat)
 
 
-# --- YAML -----------------------------------------------------------------------------------------------------------
+# --- YAML
+# -----------------------------------------------------------------------------------------------------------
 
 ALIASES = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{chr(98 + k)}: &{chr(98 + k)} [{', '.join([f'*{chr(97 + k)}'] * 9)}]\n" for k in range(9)
@@ -173,7 +204,11 @@ def test_hostile_yaml_is_one_line(text: str, message: str, tmp_path: Path) -> No
 
 
 def test_plain_aliases_are_read() -> None:
-    assert read_yaml("a: &a [1, 2]\nb: *a\nc: {d: *a}") == {"a": [1, 2], "b": [1, 2], "c": {"d": [1, 2]}}
+    assert read_yaml("a: &a [1, 2]\nb: *a\nc: {d: *a}") == {
+        "a": [1, 2],
+        "b": [1, 2],
+        "c": {"d": [1, 2]},
+    }
     with pytest.raises(ValueError, match="found undefined alias"):
         read_yaml("a: *b")
 
@@ -185,7 +220,8 @@ def test_long_wrong_values_are_cut(tmp_path: Path) -> None:
         assert len(str(error.value)) < 2000
 
 
-# --- pipes and devices ----------------------------------------------------------------------------------------------
+# --- pipes and devices
+# ----------------------------------------------------------------------------------------------
 
 
 def test_pipes_and_devices_do_not_block(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -213,12 +249,17 @@ def test_pipes_and_devices_do_not_block(tmp_path: Path, capsys: pytest.CaptureFi
     assert [frame.index for frame in frames] == [1, 3]
 
 
-# --- settings -------------------------------------------------------------------------------------------------------
+# --- settings
+# -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("info", _numbers(), ids=lambda info: info.key)
 def test_huge_and_vanishing_settings_are_refused(info: SettingInfo) -> None:
-    for text in ("1000000000000", "1" + 400 * "0") if isinstance(info.default, int) else ("1.0e+12", "1" + 400 * "0"):
+    for text in (
+        ("1000000000000", "1" + 400 * "0")
+        if isinstance(info.default, int)
+        else ("1.0e+12", "1" + 400 * "0")
+    ):
         with pytest.raises(ConfigError, match=rf"{info.key} must be .*, got"):
             load_config(None, [f"{info.key}={text}"])
     if isinstance(info.default, float):
@@ -228,7 +269,13 @@ def test_huge_and_vanishing_settings_are_refused(info: SettingInfo) -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"clones": "11"}, {"clones": 5.5}, {"clones": True}, {"zero_velocity": 1}, {"calibrate_camera_imu": "all"}],
+    [
+        {"clones": "11"},
+        {"clones": 5.5},
+        {"clones": True},
+        {"zero_velocity": 1},
+        {"calibrate_camera_imu": "all"},
+    ],
 )
 def test_settings_built_in_python_are_checked(wrong: dict[str, object]) -> None:
     (name,) = wrong
@@ -239,7 +286,8 @@ def test_settings_built_in_python_are_checked(wrong: dict[str, object]) -> None:
         DatasetSettings(colour="yes")  # type: ignore[arg-type]
 
 
-# --- a stranger's command lines -------------------------------------------------------------------------------------
+# --- a stranger's command lines
+# -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -250,15 +298,25 @@ def test_settings_built_in_python_are_checked(wrong: dict[str, object]) -> None:
         (["run", "{tmp}/loop"], "loop is a link to .*, which leads nowhere"),
         (["run", "utias:{tmp}"], "it is a folder"),
         (["run", "{npz}", "--set", "msckf..clones=5"], r"and \d\d more, see vio config --all"),
-        (["run", "{far}"], "T_cam0_imu puts the camera 1e.297 km from the IMU; translations are in metres"),
+        (
+            ["run", "{far}"],
+            "T_cam0_imu puts the camera 1e.297 km from the IMU; translations are in metres",
+        ),
         (["run", "{fast}"], r"holds \[1000000000.0, 0.0, 0.0\] and"),
         (["eval", "{tmp}/huge.tum", "{tmp}/huge.tum"], "is not finite"),
-        (["eval", "{tmp}/est.tum", "{tmp}/est.tum", "--max-time-difference", "1e300"], "0 to 1e.09 s, got 1e.300 s"),
+        (
+            ["eval", "{tmp}/est.tum", "{tmp}/est.tum", "--max-time-difference", "1e300"],
+            "0 to 1e.09 s, got 1e.300 s",
+        ),
     ],
     ids=lambda value: " ".join(value)[:30] if isinstance(value, list) else "",
 )
 def test_strange_arguments_are_one_line(
-    argv: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    argv: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     import re
 
@@ -282,7 +340,9 @@ def test_strange_arguments_are_one_line(
 
 
 def test_a_header_of_zeros_is_one_line(tmp_path: Path) -> None:
-    """NumPy tokenises a header that it cannot parse, as one of Python 2, and then raises an error of the tokenizer."""
+    """NumPy tokenises a header that it cannot parse, as one of Python 2, and then raises an
+    error of the tokenizer.
+    """
     stream = io.BytesIO()
     np.save(stream, np.zeros(2, dtype=ESTIMATE))
     broken = stream.getvalue()[:50] + bytes(50) + stream.getvalue()[100:]

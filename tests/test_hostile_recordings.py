@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.dataset_makers import ece276a_arrays, make_drive, make_kitti, make_mat, make_npz, utias_arrays
+from tests.dataset_makers import (
+    ece276a_arrays,
+    make_drive,
+    make_kitti,
+    make_mat,
+    make_npz,
+    utias_arrays,
+)
 from tests.plain_maker import make_plain
 from tests.test_hostile_files import add_bomb, png_stating
 from vio.datasets import open_dataset
@@ -80,7 +87,10 @@ BAD = {
         _npz(features=np.array([{}], dtype=object)),
         r"a\.npz: holds pickled objects .*save it again as plain numeric arrays",
     ),
-    "an array of gigabytes in kilobytes": (_bomb, r"a\.npz: is damaged \(features\.npy states the shape"),
+    "an array of gigabytes in kilobytes": (
+        _bomb,
+        r"a\.npz: is damaged \(features\.npy states the shape",
+    ),
     "a truncated npz": (_cut(_npz()), r"a\.npz: is damaged"),
     "a truncated mat": (_cut(_mat), r"cannot read .*a\.mat: could not read bytes; copy it again"),
     "images that state 2^31 pixels a side": (

@@ -1,4 +1,6 @@
-"""IMU samples that are spikes or repeat to the last bit: left out, named, and without effect on the poses."""
+"""IMU samples that are spikes or repeat to the last bit: left out, named, and without effect on
+the poses.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ from vio.records import Event, ImuSample, StereoFrame
 
 FRAMES = 60
 AXES = np.eye(3)
-Change = Callable[[int, ImuSample, ImuSample], ImuSample]  # number, sample, the last one before 1.5 s
+# number, sample, the last one before 1.5 s
+Change = Callable[[int, ImuSample, ImuSample], ImuSample]
 
 
 class Faulty(Flight):
@@ -30,7 +33,9 @@ class Faulty(Flight):
         super().__init__(FRAMES)
         self.change = change
 
-    def imu(self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray) -> list[ImuSample]:
+    def imu(
+        self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
+    ) -> list[ImuSample]:
         samples = super().imu(noise, settings, bias)
         return [self.change(k, x, samples[300]) for k, x in enumerate(samples)]
 
@@ -50,7 +55,11 @@ def _one_gyro_spike(k: int, x: ImuSample, _: ImuSample) -> ImuSample:
 
 
 def _two_per_mille(k: int, x: ImuSample, _: ImuSample) -> ImuSample:
-    return replace(x, gyro=x.gyro - 30.0 * AXES[2], accel=x.accel + 100.0 * AXES[1]) if k % 187 == 110 else x
+    return (
+        replace(x, gyro=x.gyro - 30.0 * AXES[2], accel=x.accel + 100.0 * AXES[1])
+        if k % 187 == 110
+        else x
+    )
 
 
 def _zeros(k: int, x: ImuSample, _: ImuSample) -> ImuSample:
@@ -67,7 +76,9 @@ def _dead_gyro(k: int, x: ImuSample, _: ImuSample) -> ImuSample:
 
 @pytest.mark.parametrize("fault", [_two_per_mille, _dead_gyro])
 def test_faulty_samples_do_not_move_the_poses(fault: Change) -> None:
-    """0.5 px of noise alone leave a centimetre; before, spikes brought 0.4 m and a dead IMU metres."""
+    """0.5 px of noise alone leave a centimetre; before, spikes brought 0.4 m and a dead IMU
+    metres.
+    """
     assert _rms(Faulty(fault)) < 1.3 * _clean()
 
 
@@ -107,7 +118,9 @@ def test_a_real_step_and_a_real_shock_pass() -> None:
 
 
 def test_vibration_that_fills_the_band_passes() -> None:
-    """The spike's limit follows the record: what vibrates by 4 rad/s is not called a spike at 10."""
+    """The spike's limit follows the record: what vibrates by 4 rad/s is not called a spike at
+    10.
+    """
     values = _noise(1000)
     values[:, :3] += np.random.default_rng(4).normal(0, 4.0, (1000, 3))
     assert _passed(_samples(values)) == (list(range(1000)), [])
@@ -122,7 +135,9 @@ def test_a_spike_is_left_out_and_the_rest_passes() -> None:
 
 
 def test_coarse_quantisation_at_standstill_is_not_stuck() -> None:
-    """Readings rounded so that most repeat, from the start on, or held by the driver to a lower rate."""
+    """Readings rounded so that most repeat, from the start on, or held by the driver to a lower
+    rate.
+    """
     coarse = np.round(_noise(2000, 0.01) / 0.05) * 0.05
     assert np.mean(np.all(coarse[1:] == coarse[:-1], axis=1)) > 0.7
     assert _passed(_samples(coarse)) == (list(range(2000)), [])
@@ -143,7 +158,10 @@ def _lines(samples: list[ImuSample]) -> list[str]:
     """All lines of a run monitor, with the flight's features at every tenth sample."""
     monitor, flight = RunMonitor(CAMERA, T_CAM0_IMU, imu=True), Flight(FRAMES)
     rng = np.random.default_rng(0)
-    events: list[Event] = [*samples, *(StereoFrame(k, k * 50_000_000, None, None) for k in range(FRAMES))]
+    events: list[Event] = [
+        *samples,
+        *(StereoFrame(k, k * 50_000_000, None, None) for k in range(FRAMES)),
+    ]
     order = EventOrder(wait_for_imu=True)
     ready = [e for event in sorted(events, key=lambda e: e.time_ns) for e in order.add(event)]
     for event in [*ready, *order.flush()]:
@@ -166,10 +184,18 @@ def test_a_clean_imu_gives_no_line() -> None:
 @pytest.mark.parametrize(
     ("fault", "expected"),
     [
-        (_one_gyro_spike, ["gyro spike: one sample at 1775000000 ns is 30 rad/s from both its neighbours"]),
+        (
+            _one_gyro_spike,
+            ["gyro spike: one sample at 1775000000 ns is 30 rad/s from both its neighbours"],
+        ),
         (
             _two_per_mille,
-            ["gyro spike: one sample at", "accelerometer spike: one", "3 of 601 IMU samples were gyro spikes", "3 of"],
+            [
+                "gyro spike: one sample at",
+                "accelerometer spike: one",
+                "3 of 601 IMU samples were gyro spikes",
+                "3 of",
+            ],
         ),
         (_zeros, ["the IMU read zero in all axes for 0.99 s from 1505000000 ns"]),
         (_stuck, ["the IMU repeated one reading to the last bit for 1.00 s from 1500000000 ns"]),
@@ -184,12 +210,16 @@ def test_each_fault_is_named_and_no_other_cause(fault: Change, expected: list[st
 
 
 def test_an_imu_that_is_stuck_to_the_end_is_reported() -> None:
-    (line,) = _lines(_faulty(lambda k, x, last: x if k <= 300 else replace(x, gyro=last.gyro, accel=last.accel)))
+    (line,) = _lines(
+        _faulty(lambda k, x, last: x if k <= 300 else replace(x, gyro=last.gyro, accel=last.accel))
+    )
     assert "repeated one reading to the last bit for 1.50 s" in line
 
 
 def test_samples_that_are_missing_for_seconds_are_no_matter_of_clocks() -> None:
-    """Frames without samples between others that have them; at either end the clocks may be shifted."""
+    """Frames without samples between others that have them; at either end the clocks may be
+    shifted.
+    """
 
     def at_end(covered_s: Callable[[float], bool]) -> list[str]:
         coverage, last_ns = SampleCoverage(), None

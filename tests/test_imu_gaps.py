@@ -1,4 +1,6 @@
-"""Samples that are late, lost, or have not come: asynchronous frames, gaps, an IMU that begins late or ends early."""
+"""Samples that are late, lost, or have not come: asynchronous frames, gaps, an IMU that begins
+late or ends early.
+"""
 
 from __future__ import annotations
 
@@ -46,9 +48,9 @@ def _ordered(events: list[Event]) -> list[Event]:
 
 
 def test_a_frame_waits_for_the_sample_after_it() -> None:
-    assert _order([_sample(10), _frame(1, 15), _sample(20), _sample(30), _frame(2, 35), _sample(40)]) == [
-        *(10, 20, -1, 30, 40, -2)
-    ]
+    assert _order(
+        [_sample(10), _frame(1, 15), _sample(20), _sample(30), _frame(2, 35), _sample(40)]
+    ) == [*(10, 20, -1, 30, 40, -2)]
 
 
 def test_a_frame_waits_for_the_sample_after_its_exposure_by_the_estimated_offset() -> None:
@@ -63,7 +65,9 @@ def test_a_frame_waits_for_the_sample_after_its_exposure_by_the_estimated_offset
 def test_a_frame_waits_until_one_a_tenth_of_a_second_newer_has_come() -> None:
     ms = 1_000_000
     early = [_frame(1, 5 * ms), _frame(2, 55 * ms), _frame(3, 104 * ms)]
-    assert _order([*early, _sample(110 * ms)]) == [110 * ms, -1, -2, -3], "the sample may still come"
+    assert _order([*early, _sample(110 * ms)]) == [110 * ms, -1, -2, -3], (
+        "the sample may still come"
+    )
     assert _order([*early, _frame(4, 105 * ms), _sample(110 * ms)]) == [-1, 110 * ms, -2, -3, -4]
 
 
@@ -87,11 +91,16 @@ def test_without_an_imu_a_frame_passes_at_once() -> None:
 
 @given(st.integers(-90, 90))
 def test_the_order_does_not_depend_on_the_arrival(late_ms: int) -> None:
-    """Frames and IMU samples arrive on two streams, one behind the other by up to the longest wait."""
+    """Frames and IMU samples arrive on two streams, one behind the other by up to the longest
+    wait.
+    """
     ms = 1_000_000
     samples: list[Event] = [_sample(5 * ms * k) for k in range(60)]
     frames: list[Event] = [_frame(k + 1, ms * (33 * k + 7)) for k in range(8)]
-    arrival = {id(e): e.time_ns + (late_ms * ms if isinstance(e, StereoFrame) else 0) for e in [*samples, *frames]}
+    arrival = {
+        id(e): e.time_ns + (late_ms * ms if isinstance(e, StereoFrame) else 0)
+        for e in [*samples, *frames]
+    }
     mixed = sorted([*samples, *frames], key=lambda e: arrival[id(e)])
     assert _order(mixed) == _order(sorted([*samples, *frames], key=lambda e: e.time_ns))
 
@@ -107,10 +116,11 @@ def _brisk(t: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, Fl
 
 @cache
 def _step_errors() -> dict[tuple[float, bool], list[float]]:
-    """Squared errors of rotation, velocity and position (9 numbers) by their Q, of steps that end between samples.
+    """Squared errors of rotation, velocity and position (9 numbers) by their Q, of steps that end
+    between samples.
 
-    100 Hz, white noise as in the data sheet; a frame lies `phase` of a period after a sample, and the sample after it
-    has come or not. The samples before are the same for all phases.
+    100 Hz, white noise as in the data sheet; a frame lies `phase` of a period after a sample, and
+    the sample after it has come or not. The samples before are the same for all phases.
     """
     rate, out = 100.0, dict[tuple[float, bool], list[float]]()
     for start_s, seed in product((2.2, 3.1, 4.7, 6.3), range(20)):
@@ -121,18 +131,26 @@ def _step_errors() -> dict[tuple[float, bool], list[float]]:
                 _step(motion, last, False, out)
             R, _, _, a, omega = _brisk(k / rate)
             gyro = omega + rng.normal(0, QUIET.gyro_noise_density * np.sqrt(rate), 3)
-            accel = R.T @ (a + np.array([0, 0, 9.81])) + rng.normal(0, QUIET.accel_noise_density * np.sqrt(rate), 3)
+            accel = R.T @ (a + np.array([0, 0, 9.81])) + rng.normal(
+                0, QUIET.accel_noise_density * np.sqrt(rate), 3
+            )
             motion.take(ImuSample(k * 10_000_000, gyro, accel))
         _step(motion, last, True, out)
     return out
 
 
-def _step(fed: ImuMotion, last: int, wait: bool, out: dict[tuple[float, bool], list[float]]) -> None:
-    """Add the squared errors of the steps from five samples before the last one to each phase after it."""
+def _step(
+    fed: ImuMotion, last: int, wait: bool, out: dict[tuple[float, bool], list[float]]
+) -> None:
+    """Add the squared errors of the steps from five samples before the last one to each phase
+    after it.
+    """
     R, p, v, *_ = _brisk(t0 := (last - 5) / 100.0)
     nav = NavState(se3_from_parts(R, p), v, *np.zeros((3, 3)))
     for phase in PHASES:
-        step = deepcopy(fed).advance(nav, round(t0 * 1e9), round((t1 := (last + phase) / 100.0) * 1e9))
+        step = deepcopy(fed).advance(
+            nav, round(t0 * 1e9), round((t1 := (last + phase) / 100.0) * 1e9)
+        )
         R, p, v, *_ = _brisk(t1)
         xi = se3_log(se3_from_parts(R, p) @ se3_inverse(step.nav.T_world_imu))
         error = np.concatenate([xi, v - step.nav.velocity])
@@ -142,8 +160,12 @@ def _step(fed: ImuMotion, last: int, wait: bool, out: dict[tuple[float, bool], l
 
 @pytest.mark.parametrize("wait", [True, False])
 @pytest.mark.parametrize("phase", PHASES)
-def test_a_step_that_ends_between_two_samples_is_as_good_as_its_noise(phase: float, wait: bool) -> None:
-    """Interpolated, or held with the noise grown: the squared error stays below the 95 % bound of its Q."""
+def test_a_step_that_ends_between_two_samples_is_as_good_as_its_noise(
+    phase: float, wait: bool
+) -> None:
+    """Interpolated, or held with the noise grown: the squared error stays below the 95 % bound
+    of its Q.
+    """
     values = _step_errors()[phase, wait]
     assert np.mean(values) < 9 * 1.25, np.mean(values)  # without, 15 and 40 at the later two phases
 
@@ -155,7 +177,9 @@ def _without(first_s: float, length_s: float) -> type[Flight]:
     """A flight whose IMU is silent for a while."""
 
     class Gappy(Flight):
-        def imu(self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray) -> list[ImuSample]:
+        def imu(
+            self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
+        ) -> list[ImuSample]:
             samples = super().imu(noise, settings, bias)
             return [x for x in samples if not first_s < x.time_ns * 1e-9 < first_s + length_s]
 
@@ -164,10 +188,16 @@ def _without(first_s: float, length_s: float) -> type[Flight]:
 
 @pytest.mark.parametrize("length_s", [0.1, 0.4, 1.0, 3.0])
 def test_images_carry_a_gap_while_turning_and_accelerating(length_s: float) -> None:
-    """Errors stay those of images, and the NEES of the motion since before the gap stays within its bound."""
-    # A mount known to 1 cm, seen for two seconds, adds 6 mm, and a stereo field that is not known yet as much.
+    """Errors stay those of images, and the NEES of the motion since before the gap stays within
+    its bound.
+    """
+    # A mount known to 1 cm, seen for two seconds, adds 6 mm, and a stereo field that is not known
+    # yet as much.
     settings = MsckfSettings(
-        calibrate_camera_imu="none", calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0
+        calibrate_camera_imu="none",
+        calibrate_stereo="off",
+        stereo_baseline_sigma=0.0,
+        stereo_focal_sigma=0.0,
     )
     seeds, first = 5, 40
     errors, covariances = [], []
@@ -177,7 +207,8 @@ def test_images_carry_a_gap_while_turning_and_accelerating(length_s: float) -> N
         errors.append(e)
         covariances.append(C)
     e, C = np.array(errors), np.array(covariances)
-    since = e[:, first:, :3] - e[:, first - 1 : first, :3]  # the start's error, before the gap, is not its doing
+    # the start's error, before the gap, is not its doing
+    since = e[:, first:, :3] - e[:, first - 1 : first, :3]
     assert np.linalg.norm(since, axis=-1).max() < 0.05
     values = np.array([nees(e[s, first:], C[s, first:]) for s in range(seeds)]).mean(axis=0)
     assert np.mean(values < nees_bounds(6, seeds)[1]) >= 0.9, values
@@ -195,7 +226,9 @@ def test_a_clean_imu_is_integrated_as_ever() -> None:
 
 
 def test_a_gap_hides_what_a_brownian_bridge_hides_and_a_hold_what_brownian_motion_does() -> None:
-    """Signals that are random walks of known diffusion: q T^3 / 12 between samples, q T^3 / 3 after the last."""
+    """Signals that are random walks of known diffusion: q T^3 / 12 between samples, q T^3 / 3
+    after the last.
+    """
     rng, q, T = np.random.default_rng(1), 4.0, 0.08
     settings = replace(QUIET, gyro_noise_density=1e-9, accel_noise_density=1e-9)
     zero = np.zeros(3)
@@ -217,7 +250,9 @@ def test_a_gap_hides_what_a_brownian_bridge_hides_and_a_hold_what_brownian_motio
 
 
 def test_a_gap_longer_than_the_memory_hides_what_the_signal_did_before_it() -> None:
-    """After three seconds of silence come ten quiet samples: what was learned before is not forgotten for them."""
+    """After three seconds of silence come ten quiet samples: what was learned before is not
+    forgotten for them.
+    """
     rng, found = np.random.default_rng(2), []
     loud, quiet = rng.normal(0, 0.5, (400, 2, 3)), rng.normal(0, 1e-3, (10, 2, 3))
     for silence in (100, 600):  # periods of 5 ms
@@ -229,7 +264,8 @@ def test_a_gap_longer_than_the_memory_hides_what_the_signal_did_before_it() -> N
         state = NavState(np.eye(4), zero, zero, zero, zero)
         end = 5_000_000 * (399 + silence)
         step = motion.advance(state, 1_995_000_000, end)
-        found.append(np.sqrt(step.Q[3, 3]) / (5e-3 * silence))  # white noise: the mean rate is off by as much
+        # white noise: the mean rate is off by as much
+        found.append(np.sqrt(step.Q[3, 3]) / (5e-3 * silence))
     assert 0.5 < found[1] / found[0] < 2.0
 
 
@@ -243,7 +279,9 @@ def _lines(times_s: list[float], frames_s: list[float]) -> list[str]:
     events += [_frame(k, round(1e9 * t)) for k, t in enumerate(frames_s)]
     for event in _ordered(sorted(events, key=lambda e: e.time_ns)):
         if isinstance(event, StereoFrame):
-            monitor.observations(replace(flight.observe(0, 0.5, rng), frame_index=event.index, time_ns=event.time_ns))
+            monitor.observations(
+                replace(flight.observe(0, 0.5, rng), frame_index=event.index, time_ns=event.time_ns)
+            )
         else:
             monitor.sample(event)
     monitor.close()
@@ -272,14 +310,18 @@ def test_every_gap_is_told_once_with_its_length(length_s: float) -> None:
 
 def test_an_imu_that_ends_early_is_told() -> None:
     lines = _lines(_imu_s((3.0, 99.0)), FRAMES_S)
-    assert lines == ["frame 99: no IMU sample for 1.95 s from 3000000000 ns to the end of the run; carried by images"]
+    assert lines == [
+        "frame 99: no IMU sample for 1.95 s from 3000000000 ns to the end of the run; carried by "
+        "images"
+    ]
 
 
 def test_an_imu_that_begins_late_or_never_is_told() -> None:
     lines = _lines(_imu_s((-1.0, 2.02)), FRAMES_S)
     (line,) = lines
     assert line.startswith(
-        "frame 39: the first IMU sample came 2.02 s after frame 0; until then 39 frames were carried by"
+        "frame 39: the first IMU sample came 2.02 s after frame 0; until then 39 frames were "
+        "carried by"
     )
     lines = _lines([], FRAMES_S)
     assert lines == ["no IMU sample in any of 100 frames: all were carried by images alone"]
@@ -297,12 +339,17 @@ def test_frames_wait_for_an_imu_that_begins_late() -> None:
         if 59 * STEP_NS < sample.time_ns <= 60 * STEP_NS:
             filt.propagate(sample)
     filt.update(flight.observe(60, 0.5, rng))
-    assert filt.update(flight.observe(61, 0.5, rng)).used > 30  # a filter that has started, on a held sample
+    # a filter that has started, on a held sample
+    assert filt.update(flight.observe(61, 0.5, rng)).used > 30
 
 
 @pytest.mark.parametrize(("motion", "useful"), [(None, False), ("imu", True)])
-def test_a_prediction_over_seconds_is_made_by_an_imu_alone(motion: str | None, useful: bool) -> None:
-    """Images alone know nothing of a turn after three seconds, so no track is searched where they put it."""
+def test_a_prediction_over_seconds_is_made_by_an_imu_alone(
+    motion: str | None, useful: bool
+) -> None:
+    """Images alone know nothing of a turn after three seconds, so no track is searched where
+    they put it.
+    """
     flight = Flight(8)
     _, _, filt = flight.run(MsckfSettings(), motion, limit=30)
     assert filt.predict(8 * STEP_NS) is not None

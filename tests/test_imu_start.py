@@ -1,4 +1,6 @@
-"""The start with an IMU: at standstill, turning, and while accelerating; on an exact world with pixel noise."""
+"""The start with an IMU: at standstill, turning, and while accelerating; on an exact world with
+pixel noise.
+"""
 
 from __future__ import annotations
 
@@ -22,28 +24,50 @@ FRAMES = 21  # 20 Hz: the last one is a second after the first
 
 
 class Start(Flight):
-    """A start with a second of IMU before it: steady acceleration and turn, or standstill up to a take-off."""
+    """A start with a second of IMU before it: steady acceleration and turn, or standstill up to
+    a take-off.
+    """
 
-    def __init__(self, accel: FloatArray, turn: FloatArray, take_off_s: float | None = None) -> None:
+    def __init__(
+        self, accel: FloatArray, turn: FloatArray, take_off_s: float | None = None
+    ) -> None:
         super().__init__(FRAMES)
         self.accel, self.turn, self.take_off_s = accel, turn, take_off_s
 
     def state(self, t: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """R, p, v, a, omega (body) at a time; at 0.5 s the velocity is zero, so that the points stay in view."""
+        """R, p, v, a, omega (body) at a time; at 0.5 s the velocity is zero, so that the points
+        stay in view.
+        """
         attitude = so3_exp([0.1, -0.15, 0.0])
         if self.take_off_s is not None:
             s = max(t - self.take_off_s, 0.0)
             moving = float(s > 0)
             R = attitude @ so3_exp(self.turn * s)
-            return R, 0.5 * self.accel * s**2, self.accel * s, self.accel * moving, self.turn * moving
+            return (
+                R,
+                0.5 * self.accel * s**2,
+                self.accel * s,
+                self.accel * moving,
+                self.turn * moving,
+            )
         s = t - 0.5
-        return attitude @ so3_exp(self.turn * t), 0.5 * self.accel * s**2, self.accel * s, self.accel, self.turn
+        return (
+            attitude @ so3_exp(self.turn * t),
+            0.5 * self.accel * s**2,
+            self.accel * s,
+            self.accel,
+            self.turn,
+        )
 
-    def imu(self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray) -> list[ImuSample]:
+    def imu(
+        self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
+    ) -> list[ImuSample]:
         out = []
         for k in range(-round(RATE), FRAMES * 10):
             R, _, _, a, omega = self.state(k / RATE)
-            gyro = omega + bias[:3] + noise.normal(0, settings.gyro_noise_density * np.sqrt(RATE), 3)
+            gyro = (
+                omega + bias[:3] + noise.normal(0, settings.gyro_noise_density * np.sqrt(RATE), 3)
+            )
             force = R.T @ (a + np.array([0, 0, settings.gravity_mps2])) + bias[3:]
             force = force + noise.normal(0, settings.accel_noise_density * np.sqrt(RATE), 3)
             out.append(ImuSample(k * 5_000_000, gyro, force))
@@ -73,7 +97,9 @@ def _after_a_second(start: Start, settings: MsckfSettings = SETTINGS) -> Outcome
 
 
 def _tilt_and_velocity(start: Start, filt: Msckf) -> tuple[float, float, float]:
-    """Error of the vertical in the body frame (degrees), its NEES, and that of the velocity in the body frame."""
+    """Error of the vertical in the body frame (degrees), its NEES, and that of the velocity in
+    the body frame.
+    """
     R_true, _, v_true, *_ = start.state((FRAMES - 1) * 0.05)
     window = filt._window
     R = window.nav.T_world_imu[:3, :3]
@@ -107,20 +133,28 @@ STARTS = {
 
 @pytest.mark.parametrize("name", STARTS)
 def test_a_start_is_solved_within_a_second(name: str) -> None:
-    """Vertical to a degree, and pose, vertical and velocity within what their covariance says, over 20 seeds.
+    """Vertical to a degree, and pose, vertical and velocity within what their covariance says, over
+    20 seeds.
 
-    Without a turn, an accelerometer bias looks like a tilt: it leaves 1.75 degrees (its prior over gravity) open.
+    Without a turn, an accelerometer bias looks like a tilt: it leaves 1.75 degrees (its prior over
+    gravity) open.
     """
     found = _after_a_second(STARTS[name])
     assert np.median(found.tilt_deg) < 1.0, found
-    assert np.sqrt(np.mean(found.tilt_deg**2)) < np.degrees(SETTINGS.accel_bias_sigma_mps2 / 9.81), found
+    assert np.sqrt(np.mean(found.tilt_deg**2)) < np.degrees(
+        SETTINGS.accel_bias_sigma_mps2 / 9.81
+    ), found
     for value, dof in ((found.pose, 6), (found.tilt, 2), (found.velocity, 3)):
         assert value < nees_bounds(dof, SEEDS)[1], found
 
 
-@pytest.mark.parametrize(("name", "still"), [(n, n in ("standstill", "slow constant turn")) for n in STARTS])
+@pytest.mark.parametrize(
+    ("name", "still"), [(n, n in ("standstill", "slow constant turn")) for n in STARTS]
+)
 def test_the_first_tilt_is_covered_by_its_standard_deviation(name: str, still: bool) -> None:
-    """Within three sigma in all directions; a standstill is told from what the readings show to be motion."""
+    """Within three sigma in all directions; a standstill is told from what the readings show to
+    be motion.
+    """
     start = STARTS[name]
     bias = np.array([0.02, -0.01, 0.03, 0.05, -0.05, 0.05])
     samples = [x for x in start.imu(np.random.default_rng(0), SETTINGS, bias) if x.time_ns <= 0]
@@ -142,7 +176,11 @@ def test_vibration_is_no_standstill_and_neither_is_a_start_without_samples() -> 
     rng = np.random.default_rng(0)
     gravity = np.array([0, 0, SETTINGS.gravity_mps2])
     swaying = [
-        ImuSample(k * 5_000_000, np.zeros(3), gravity + np.array([np.sin(0.1 * k), 0, 0]) + rng.normal(0, 0.1, 3))
+        ImuSample(
+            k * 5_000_000,
+            np.zeros(3),
+            gravity + np.array([np.sin(0.1 * k), 0, 0]) + rng.normal(0, 0.1, 3),
+        )
         for k in range(100)
     ]
     assert not imu_start(swaying, 10**9, SETTINGS).still

@@ -1,4 +1,6 @@
-"""An IMU in a wrong unit or with wrong axes: the frames so far are estimated again, with what is left of it."""
+"""An IMU in a wrong unit or with wrong axes: the frames so far are estimated again, with what is
+left of it.
+"""
 
 from __future__ import annotations
 
@@ -32,20 +34,35 @@ class _Features:
     samples: list[ImuSample]
     recording: Recording
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
-        frames = [StereoFrame(seen.frame_index, seen.time_ns, None, None) for seen in self.it.frames[start:FRAMES]]
-        yield from sorted([*self.samples, *frames], key=lambda e: (e.time_ns, isinstance(e, StereoFrame)))
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
+        frames = [
+            StereoFrame(seen.frame_index, seen.time_ns, None, None)
+            for seen in self.it.frames[start:FRAMES]
+        ]
+        yield from sorted(
+            [*self.samples, *frames], key=lambda e: (e.time_ns, isinstance(e, StereoFrame))
+        )
 
     def observations(self, index: int) -> Observations | None:
         return self.it.frames[index]
 
 
-def _flight(gyro: float = 1.0, accel: float = 1.0, axes: tuple[int, int, int] = (0, 1, 2)) -> _Features:
+def _flight(
+    gyro: float = 1.0, accel: float = 1.0, axes: tuple[int, int, int] = (0, 1, 2)
+) -> _Features:
     it = _recording("room")
     times = np.array([seen.time_ns for seen in it.frames[:FRAMES]])
-    samples = [_changed(s, gyro, accel, list(axes)) for s in it.samples if s.time_ns <= times[-1] + 10_000_000]
+    samples = [
+        _changed(s, gyro, accel, list(axes))
+        for s in it.samples
+        if s.time_ns <= times[-1] + 10_000_000
+    ]
     sensors = frozenset({"imu"})
-    recording = Recording("fake", Path("flight"), it.camera, it.T_cam0_imu, times, False, sensors, None)  # type: ignore[arg-type]
+    recording = Recording(
+        "fake", Path("flight"), it.camera, it.T_cam0_imu, times, False, sensors, None
+    )  # type: ignore[arg-type]
     return _Features(it, samples, recording)
 
 
@@ -69,15 +86,21 @@ def _worst_m(found: Trajectory, expected: Trajectory) -> float:
     return evaluate(found, expected).ate_m.max
 
 
-@pytest.mark.parametrize(("gyro", "accel"), [(180 / np.pi, 1.0), (1.0, 1 / 9.80665)], ids=["deg/s", "g"])
-def test_a_unit_is_applied_from_the_start(gyro: float, accel: float, as_recorded: RunResult, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("gyro", "accel"), [(180 / np.pi, 1.0), (1.0, 1 / 9.80665)], ids=["deg/s", "g"]
+)
+def test_a_unit_is_applied_from_the_start(
+    gyro: float, accel: float, as_recorded: RunResult, tmp_path: Path
+) -> None:
     result = _run(_flight(gyro, accel), folder=tmp_path / "run")
     assert _worst_m(result.trajectory, as_recorded.trajectory) < 0.01
     (line,) = [line for line in result.warnings if "estimated again" in line]
     assert "readings are multiplied by" in line
     written = (tmp_path / "run" / "trajectory.tum").read_text().splitlines()
     assert sum(not row.startswith("#") for row in written) == FRAMES
-    assert np.allclose(np.array(written[-FRAMES].split()[1:4], float), result.trajectory.positions[0], atol=1e-6)
+    assert np.allclose(
+        np.array(written[-FRAMES].split()[1:4], float), result.trajectory.positions[0], atol=1e-6
+    )
 
 
 def test_without_a_factor_images_alone_go_on(alone: Trajectory) -> None:
@@ -93,7 +116,9 @@ def test_a_right_imu_is_used_to_the_bit_as_without_a_trial(
 ) -> None:
     assert not [line for line in as_recorded.warnings if "again" in line]
     monkeypatch.setattr("vio.live.build.ImuTrial", lambda backend: None)
-    np.testing.assert_array_equal(_run(_flight()).trajectory.T_world_body, as_recorded.trajectory.T_world_body)
+    np.testing.assert_array_equal(
+        _run(_flight()).trajectory.T_world_body, as_recorded.trajectory.T_world_body
+    )
 
 
 def test_live_estimates_are_right_once_the_unit_is_known(as_recorded: RunResult) -> None:
@@ -129,10 +154,18 @@ def test_verdict_follows_from_what_is_certain(
     assert ImuVerdict().after(finding) == expected
 
 
-def test_images_carry_on_by_the_depths_of_before_when_the_right_camera_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_carry_on_by_the_depths_of_before_when_the_right_camera_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("tests.test_imu_trial.FRAMES", 80)
     it = _recording("slow", 2)
-    frames = [replace(seen, has_right=seen.has_right & (seen.frame_index < 40)) for seen in it.frames]
-    recording = replace(_flight().recording, frame_times_ns=np.array([seen.time_ns for seen in frames[:80]]))
-    used = np.array(_run(_Features(replace(it, frames=frames), [], recording), "none").frames.column("used"))
+    frames = [
+        replace(seen, has_right=seen.has_right & (seen.frame_index < 40)) for seen in it.frames
+    ]
+    recording = replace(
+        _flight().recording, frame_times_ns=np.array([seen.time_ns for seen in frames[:80]])
+    )
+    used = np.array(
+        _run(_Features(replace(it, frames=frames), [], recording), "none").frames.column("used")
+    )
     assert used[40:].min() > 10

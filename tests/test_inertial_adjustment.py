@@ -1,4 +1,6 @@
-"""Bundle adjustment with an IMU: derivatives by finite differences, a blind stretch, a rig that is off."""
+"""Bundle adjustment with an IMU: derivatives by finite differences, a blind stretch, a rig that
+is off.
+"""
 
 from __future__ import annotations
 
@@ -37,12 +39,15 @@ def _pose(t: FloatArray) -> FloatArray:
     """Poses (N, 4, 4) of the body at times (N,) on a path with changing accelerations."""
     T = np.tile(np.eye(4), (len(t), 1, 1))
     T[:, :3, 3] = np.stack([np.sin(1.3 * t), np.cos(1.1 * t), 0.5 * np.sin(0.9 * t)], axis=1)
-    T[:, :3, :3] = so3_exp(np.stack([0.3 * np.sin(1.1 * t), 0.3 * np.sin(0.7 * t), 0.4 * np.sin(0.5 * t)], axis=1))
+    T[:, :3, :3] = so3_exp(
+        np.stack([0.3 * np.sin(1.1 * t), 0.3 * np.sin(0.7 * t), 0.4 * np.sin(0.5 * t)], axis=1)
+    )
     return T
 
 
 def _flight(blind: range, longer: float) -> tuple[InertialAdjustment, Fit, FloatArray]:
-    """A problem of 6 s with the true baseline longer by a share, no tracks across the blind keyframes, and its truth.
+    """A problem of 6 s with the true baseline longer by a share, no tracks across the blind
+    keyframes, and its truth.
 
     Returns the problem, what it begins with, and the true poses of the left camera.
     """
@@ -51,8 +56,12 @@ def _flight(blind: range, longer: float) -> tuple[InertialAdjustment, Fit, Float
     R = _pose(t)[:, :3, :3]
     a = (_pose(t + h)[:, :3, 3] - 2 * _pose(t)[:, :3, 3] + _pose(t - h)[:, :3, 3]) / h**2
     rate = so3_log(np.swapaxes(_pose(t - h)[:, :3, :3], 1, 2) @ _pose(t + h)[:, :3, :3]) / (2 * h)
-    values = np.concatenate([rate, np.einsum("nji,nj->ni", R, a + np.array([0, 0, _G]))], axis=1) + _BIAS
-    values += rng.normal(0, np.sqrt(200.0), values.shape) * np.repeat([_DENSITIES.gyro, _DENSITIES.accel], 3)
+    values = (
+        np.concatenate([rate, np.einsum("nji,nj->ni", R, a + np.array([0, 0, _G]))], axis=1) + _BIAS
+    )
+    values += rng.normal(0, np.sqrt(200.0), values.shape) * np.repeat(
+        [_DENSITIES.gyro, _DENSITIES.accel], 3
+    )
     T_world_imu, K = _pose(seconds), len(seconds)
     cameras = T_world_imu @ se3_inverse(_T_CAM0_IMU)
     # Each point is ahead of one keyframe, and of those near it that see it.
@@ -66,7 +75,9 @@ def _flight(blind: range, longer: float) -> tuple[InertialAdjustment, Fit, Float
         q = p @ T[:3, :3].T + T[:3, 3]
         z = project(true, np.where(q[:, 2:] > 0.5, q, [0, 0, 1.0]))
         seen = (q[:, 2] > 0.5) & (z[:, 2] > 0) & (z[:, 0] < 480) & (z[:, 1] > 0) & (z[:, 1] < 300)
-        seen &= (np.abs(born - k) <= 3) & (k not in blind) & ((born < blind.start) == (k < blind.start))
+        seen &= (
+            (np.abs(born - k) <= 3) & (k not in blind) & ((born < blind.start) == (k < blind.start))
+        )
         rows += [(m, k, *z[m]) for m in np.flatnonzero(seen)]
     point, keyframe = np.array([r[:2] for r in rows], dtype=np.int64).T
     z = np.array([r[2:] for r in rows]) + rng.normal(0, 0.15, (len(rows), 4))
@@ -77,12 +88,22 @@ def _flight(blind: range, longer: float) -> tuple[InertialAdjustment, Fit, Float
     tracks = PointTracks(names, p[names] + moved, point, keyframe, z, has_right)
     readings = Readings(t, values[:, :3], values[:, 3:], _DENSITIES)
     problem = InertialAdjustment(
-        _CAMERA, tracks, seconds, readings, _T_CAM0_IMU, _PRIOR, np.full(len(z), 0.15), np.repeat([0.1, 0.3], 3), _G
+        _CAMERA,
+        tracks,
+        seconds,
+        readings,
+        _T_CAM0_IMU,
+        _PRIOR,
+        np.full(len(z), 0.15),
+        np.repeat([0.1, 0.3], 3),
+        _G,
     )
     off = rng.normal(0, [0.02] * 3 + [0.01] * 3, (K, 6))
     off[0] = 0
     velocity = (_pose(seconds + h)[:, :3, 3] - _pose(seconds - h)[:, :3, 3]) / (2 * h)
-    body = BodyStates(T_world_imu @ se3_exp(off), velocity + rng.normal(0, 0.03, (K, 3)), np.zeros((K, 6)))
+    body = BodyStates(
+        T_world_imu @ se3_exp(off), velocity + rng.normal(0, 0.03, (K, 3)), np.zeros((K, 6))
+    )
     return problem, Fit(body, tracks.p_world, np.zeros(27)), cameras
 
 
@@ -109,7 +130,9 @@ def test_derivatives_match_finite_differences() -> None:
     np.testing.assert_allclose(by_pixels, (e1 - e0) / (2 * h), rtol=1e-5, atol=1e-2)
     by_others = system.others @ np.concatenate([x.ravel(), s])
     gauge = len(by_others) - 4
-    np.testing.assert_allclose(by_others[:gauge], ((o1 - o0) / (2 * h))[:gauge], rtol=1e-4, atol=2e-2)
+    np.testing.assert_allclose(
+        by_others[:gauge], ((o1 - o0) / (2 * h))[:gauge], rtol=1e-4, atol=2e-2
+    )
 
 
 def test_covariance_counts_all_that_is_unknown_and_errors_that_pixels_share() -> None:
@@ -147,7 +170,9 @@ def test_cameras_follow_from_body_extrinsics_and_clock_as_their_derivatives_say(
     x, s = rng.normal(0, 1, (K, 15)), rng.normal(0, 1, 27)
     x[:, 6:] = 0  # velocity and bias act by the twist alone, to second order
     none, before = np.zeros(at.p_world.shape), problem.cameras(at)
-    moved = se3_log(se3_inverse(before) @ problem.cameras(problem._moved(at, h * x, none, h * s))) / h
+    moved = (
+        se3_log(se3_inverse(before) @ problem.cameras(problem._moved(at, h * x, none, h * s))) / h
+    )
     chosen = np.array([2, 9, 24])
     by_states = problem._cameras_by_states(at, chosen) @ np.concatenate([x.ravel(), s])
     np.testing.assert_allclose(by_states.reshape(-1, 6), moved[chosen], atol=2e-3)
@@ -170,11 +195,15 @@ def test_finds_poses_across_a_blind_stretch_and_the_baseline(longer: float) -> N
 
 
 def test_noise_of_the_pixels_makes_no_longer_baseline() -> None:
-    """Derivatives at the noisy pixels would: a longer baseline would pass for less noise in the disparity."""
+    """Derivatives at the noisy pixels would: a longer baseline would pass for less noise in the
+    disparity.
+    """
     problem, start, _ = _flight(range(12, 12), 0.0)
     rng = np.random.default_rng(3)
     noisy = problem.tracks.z + rng.normal(0, 1.0, problem.tracks.z.shape)
-    weak = replace(problem, tracks=replace(problem.tracks, z=noisy), sigma_px=np.full(len(noisy), 1.0))
+    weak = replace(
+        problem, tracks=replace(problem.tracks, z=noisy), sigma_px=np.full(len(noisy), 1.0)
+    )
     fit = weak.solve(start.body).at
     assert abs(fit.rig[15]) < 1.5
 

@@ -22,9 +22,23 @@ from vio.imu.clocks import judge_clocks
 from vio.imu.findings import InertialFinding
 from vio.monitor.inertial import InertialCheck
 from vio.monitor.run import RunMonitor
-from vio.records import Estimate, ImuSample, Observations, StereoScaleEstimate, UpdateReport, observations
+from vio.records import (
+    Estimate,
+    ImuSample,
+    Observations,
+    StereoScaleEstimate,
+    UpdateReport,
+    observations,
+)
 from vio.sim.imu import ImuNoise, simulate_imu
-from vio.sim.motion import MotionSpline, car_loop, fit_spline, hand_held, motion_at, rotate_body_axes
+from vio.sim.motion import (
+    MotionSpline,
+    car_loop,
+    fit_spline,
+    hand_held,
+    motion_at,
+    rotate_body_axes,
+)
 from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_rectified_rig, small_rig
 
 _FRAME_NS = 50_000_000
@@ -64,7 +78,9 @@ def _observe(
         seen = (z[:, [0, 2]] > 0).all(axis=1) & (z[:, [0, 2]] < camera.width).all(axis=1)
         seen &= (z[:, 1] > 0) & (z[:, 1] < camera.height)
         ids = ahead[seen][:200]
-        frames.append(observations(k, time_ns, ids, z[seen][:200] + rng.normal(0, sigma_px, (len(ids), 4))))
+        frames.append(
+            observations(k, time_ns, ids, z[seen][:200] + rng.normal(0, sigma_px, (len(ids), 4)))
+        )
     return frames
 
 
@@ -91,7 +107,9 @@ def _recording(name: str, seed: int = 0, mount: str = "euroc") -> Watched:
     T_cam0_imu = se3_inverse(rig.T_imu_cam0)
     camera = rectified_camera(rig)
     reach = 15.0 if name == "car" else 3.0
-    frames = _observe(camera, motion_at(motion, times).T_world_imu, T_cam0_imu, times.tolist(), reach, seed)
+    frames = _observe(
+        camera, motion_at(motion, times).T_world_imu, T_cam0_imu, times.tolist(), reach, seed
+    )
     gravity = 9.81 * motion_at(motion, imu.times_ns).T_world_imu[:, 2, :3]
     return Watched(camera, T_cam0_imu, list(imu_samples(imu)), list(gravity), frames)
 
@@ -109,7 +127,9 @@ def _real(folder: Path, seconds: float) -> Watched:
     times = np.arange(start, end, _FRAME_NS)
     rig = euroc_rectified_rig()
     camera, T_cam0_imu = rectified_camera(rig), se3_inverse(rig.T_imu_cam0)
-    frames = _observe(camera, motion_at(motion, times).T_world_imu, T_cam0_imu, times.tolist(), 3.0, 0, 0.2)
+    frames = _observe(
+        camera, motion_at(motion, times).T_world_imu, T_cam0_imu, times.tolist(), 3.0, 0, 0.2
+    )
     return Watched(camera, T_cam0_imu, samples, [], frames)
 
 
@@ -151,7 +171,9 @@ def _accel(it: Watched, change: Callable[[FloatArray], FloatArray]) -> list[ImuS
 
 
 def _gravity(it: Watched, factor: float) -> list[ImuSample]:
-    return [replace(s, accel=s.accel + factor * g) for s, g in zip(it.samples, it.gravity, strict=True)]
+    return [
+        replace(s, accel=s.accel + factor * g) for s, g in zip(it.samples, it.gravity, strict=True)
+    ]
 
 
 def _shifted(it: Watched, seconds: float) -> list[ImuSample]:
@@ -187,14 +209,20 @@ def test_wrong_matches_and_black_images_give_no_finding() -> None:
         keep = np.arange(len(seen)) < (0 if k % 100 > 90 else 150)
         frames.append(replace(seen, z=z, has_right=right).take(keep))
     assert _watch(it, frames=frames) == []
-    assert _faults(_watch(it, frames=frames, samples=_accel(it, lambda a: -a))) == ["accelerometer sign"]
+    assert _faults(_watch(it, frames=frames, samples=_accel(it, lambda a: -a))) == [
+        "accelerometer sign"
+    ]
 
 
 def test_poor_sensor_gives_no_finding() -> None:
     it = _recording("room", 1)
     rng = np.random.default_rng(1)
     poor = [
-        replace(s, gyro=s.gyro + rng.normal([0.1, -0.05, 0.08], 0.05), accel=s.accel + rng.normal(0.3, 0.5, 3))
+        replace(
+            s,
+            gyro=s.gyro + rng.normal([0.1, -0.05, 0.08], 0.05),
+            accel=s.accel + rng.normal(0.3, 0.5, 3),
+        )
         for s in it.samples
     ]
     assert _watch(it, samples=poor) == []
@@ -204,22 +232,48 @@ def test_poor_sensor_gives_no_finding() -> None:
 
 _CYCLE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 _CORRUPTED: dict[str, tuple[Callable[[Watched], list[ImuSample]], list[str], str]] = {
-    "g": (lambda it: _accel(it, lambda a: a / 9.80665), ["accelerometer units"], "in g: multiply by 9.81"),
+    "g": (
+        lambda it: _accel(it, lambda a: a / 9.80665),
+        ["accelerometer units"],
+        "in g: multiply by 9.81",
+    ),
     "mg": (lambda it: _accel(it, lambda a: a / 9.80665e-3), ["accelerometer units"], "mg"),
-    "odd": (lambda it: _accel(it, lambda a: a * 5), ["accelerometer units"], "the unit or scale is unknown"),
+    "odd": (
+        lambda it: _accel(it, lambda a: a * 5),
+        ["accelerometer units"],
+        "the unit or scale is unknown",
+    ),
     "no gravity": (lambda it: _gravity(it, -1), ["gravity removed"], "taken out"),
-    "degrees": (lambda it: _gyro(it, np.degrees), ["gyro units"], "deg/s: multiply its readings by pi/180"),
+    "degrees": (
+        lambda it: _gyro(it, np.degrees),
+        ["gyro units"],
+        "deg/s: multiply its readings by pi/180",
+    ),
     "half": (lambda it: _gyro(it, lambda w: 0.5 * w), ["gyro units"], "multiplied by "),
     "left-handed": (lambda it: _gyro(it, lambda w: -w), ["gyro sign"], "left-handed"),
     "cycled gyro": (lambda it: _gyro(it, lambda w: _CYCLE @ w), ["gyro axes"], "[+y +z +x]"),
     "mirrored gyro": (lambda it: _gyro(it, lambda w: w * [1, 1, -1]), ["gyro axes"], "[+x +y -z]"),
     "turned gyro": (lambda it: _gyro(it, lambda w: w * [-1, -1, 1]), ["gyro axes"], "[-x -y +z]"),
     "dead gyro": (lambda it: _gyro(it, lambda w: 0 * w), ["gyro disagrees"], "dead"),
-    "inverted accelerometer": (lambda it: _accel(it, lambda a: -a), ["accelerometer sign"], "wrong sign"),
-    "cycled accelerometer": (lambda it: _accel(it, lambda a: _CYCLE @ a), ["accelerometer axes"], "[+y +z +x]"),
-    "gravity alone inverted": (lambda it: _gravity(it, -2), ["upside down"], "a + g in place of a - g"),
+    "inverted accelerometer": (
+        lambda it: _accel(it, lambda a: -a),
+        ["accelerometer sign"],
+        "wrong sign",
+    ),
+    "cycled accelerometer": (
+        lambda it: _accel(it, lambda a: _CYCLE @ a),
+        ["accelerometer axes"],
+        "[+y +z +x]",
+    ),
+    "gravity alone inverted": (
+        lambda it: _gravity(it, -2),
+        ["upside down"],
+        "a + g in place of a - g",
+    ),
     "g and degrees": (
-        lambda it: [replace(s, gyro=np.degrees(s.gyro), accel=s.accel / 9.80665) for s in it.samples],
+        lambda it: [
+            replace(s, gyro=np.degrees(s.gyro), accel=s.accel / 9.80665) for s in it.samples
+        ],
         ["accelerometer units", "gyro units"],
         "",
     ),
@@ -234,14 +288,18 @@ def test_corrupted_samples_give_exactly_their_finding(name: str, seed: int, moun
     found = _watch(it, samples=corrupt(it))
     assert _faults(found) == faults
     assert words in found[0].explanation + found[0].seen
-    assert all("\n" not in f.message and f.seen in f.message and f.explanation in f.message for f in found)
+    assert all(
+        "\n" not in f.message and f.seen in f.message and f.explanation in f.message for f in found
+    )
     assert [f.certain for f in found] == [f.fault != "upside down" for f in found]
 
 
 def test_biased_accelerations_without_gravity_are_not_taken_for_g() -> None:
     it = _recording("room")
     bias = np.array([0.6, -0.6, 0.55])
-    removed = [replace(s, accel=s.accel - g + bias) for s, g in zip(it.samples, it.gravity, strict=True)]
+    removed = [
+        replace(s, accel=s.accel - g + bias) for s, g in zip(it.samples, it.gravity, strict=True)
+    ]
     sizes = [np.linalg.norm(s.accel) for s in removed]
     assert 0.8 < np.median(sizes) < 1.3  # as in g
     assert _faults(_watch(it, samples=removed)) == ["gravity removed"]
@@ -256,28 +314,42 @@ def test_slow_motion_is_enough(name: str) -> None:
 
 def test_reports_degrees_when_the_run_ends_after_two_seconds() -> None:
     it = _recording("room")
-    assert _faults(_watch(it, samples=_gyro(it, np.degrees), frames=it.frames[:40])) == ["gyro units"]
+    assert _faults(_watch(it, samples=_gyro(it, np.degrees), frames=it.frames[:40])) == [
+        "gyro units"
+    ]
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_names_an_inverted_axis_of_the_accelerometer_when_the_run_ends_after_four_seconds(axis: int) -> None:
+def test_names_an_inverted_axis_of_the_accelerometer_when_the_run_ends_after_four_seconds(
+    axis: int,
+) -> None:
     it, signs = _recording("room"), 1.0 - 2.0 * np.eye(3)[axis]
-    assert _faults(_watch(it, samples=_accel(it, lambda a: signs * a), frames=it.frames[:90])) == ["accelerometer axes"]
+    assert _faults(_watch(it, samples=_accel(it, lambda a: signs * a), frames=it.frames[:90])) == [
+        "accelerometer axes"
+    ]
 
 
 @pytest.mark.parametrize(("name", "said"), [("", True), ("cycled accelerometer", False)])
-def test_a_run_blames_the_baseline_only_once_the_accelerometers_axes_are_right(name: str, said: bool) -> None:
+def test_a_run_blames_the_baseline_only_once_the_accelerometers_axes_are_right(
+    name: str, said: bool
+) -> None:
     it = _recording("room")
     monitor = RunMonitor(it.camera, it.T_cam0_imu, imu=True)
     off = StereoScaleEstimate(np.array([np.log(1.3), 0.0]), np.diag([1e-4, 0.0]))
     lines_at = []
-    for event in sorted([*(_CORRUPTED[name][0](it) if name else it.samples), *it.frames], key=lambda e: e.time_ns):
+    for event in sorted(
+        [*(_CORRUPTED[name][0](it) if name else it.samples), *it.frames], key=lambda e: e.time_ns
+    ):
         if isinstance(event, ImuSample):
             monitor.sample(event)
             continue
         monitor.observations(event)
         used = UpdateReport(50, 2, 1, 30, 0.3, 1.0)
-        monitor.update(event.frame_index, used, Estimate(event.time_ns, np.eye(4), 1e-4 * np.eye(6), stereo_scale=off))
+        monitor.update(
+            event.frame_index,
+            used,
+            Estimate(event.time_ns, np.eye(4), 1e-4 * np.eye(6), stereo_scale=off),
+        )
         lines_at.append(sum("the baseline" in line for line in monitor.lines))
     monitor.close()
     assert lines_at[60] == 0
@@ -286,10 +358,13 @@ def test_a_run_blames_the_baseline_only_once_the_accelerometers_axes_are_right(n
 
 
 @pytest.mark.parametrize(
-    ("name", "at"), [("", 20), ("g", 0), ("no gravity", 0), ("cycled gyro", 60), ("inverted accelerometer", 240)]
+    ("name", "at"),
+    [("", 20), ("g", 0), ("no gravity", 0), ("cycled gyro", 60), ("inverted accelerometer", 240)],
 )
 def test_the_filter_judges_no_baseline_by_an_imu_that_looks_faulty(name: str, at: int) -> None:
-    """From the frame on in which the fault shows; units show at once, axes and signs with motion."""
+    """From the frame on in which the fault shows; units show at once, axes and signs with
+    motion.
+    """
     it = _recording("room")
     samples = _CORRUPTED[name][0](it) if name else it.samples
     monitor = RunMonitor(it.camera, it.T_cam0_imu, imu=True)
@@ -299,17 +374,25 @@ def test_the_filter_judges_no_baseline_by_an_imu_that_looks_faulty(name: str, at
             monitor.sample(event)
         else:
             monitor.observations(event)
-            agree.append(monitor.rotation_comparison is not None and monitor.rotation_comparison.agree)
+            agree.append(
+                monitor.rotation_comparison is not None and monitor.rotation_comparison.agree
+            )
     assert any(agree[at + 20 :]) == (name == "")
 
 
 @pytest.mark.parametrize("factor", [1.0, 1000.0])
 def test_a_run_says_once_that_its_baseline_is_in_another_unit(factor: float) -> None:
     it = _recording("room")
-    monitor = RunMonitor(replace(it.camera, baseline_m=factor * it.camera.baseline_m), it.T_cam0_imu, imu=False)
+    monitor = RunMonitor(
+        replace(it.camera, baseline_m=factor * it.camera.baseline_m), it.T_cam0_imu, imu=False
+    )
     for seen in it.frames[:3]:
         monitor.observations(seen)
-    said = [line for line in monitor.lines if "m is implausible; translations are metres: check the unit" in line]
+    said = [
+        line
+        for line in monitor.lines
+        if "m is implausible; translations are metres: check the unit" in line
+    ]
     assert len(said) == (factor > 1)
 
 
@@ -318,7 +401,9 @@ def test_standstill_gives_no_finding_about_motion() -> None:
     standstill = [f for f in it.frames if f.time_ns < 9_900_000_000]
     for corrupt in ("degrees", "left-handed", "cycled gyro"):
         assert _watch(it, samples=_CORRUPTED[corrupt][0](it), frames=standstill) == []
-    assert _faults(_watch(it, samples=_CORRUPTED["g"][0](it), frames=standstill)) == ["accelerometer units"]
+    assert _faults(_watch(it, samples=_CORRUPTED["g"][0](it), frames=standstill)) == [
+        "accelerometer units"
+    ]
     hint = _watch(it, samples=_CORRUPTED["inverted accelerometer"][0](it), frames=standstill)
     assert _faults(hint) == ["upside down"]
     assert "too small to decide" in hint[0].explanation
@@ -330,7 +415,9 @@ def test_standstill_gives_no_finding_about_motion() -> None:
 
 @pytest.mark.parametrize("mount", ["euroc", "forward"])
 def test_distinguishes_wrong_extrinsics_from_a_wrong_gyro(mount: str) -> None:
-    """The inverse of either mount only exchanges axes, as a miswired gyro does; the accelerometer decides."""
+    """The inverse of either mount only exchanges axes, as a miswired gyro does; the
+    accelerometer decides.
+    """
     it = _recording("room", 0, mount)
     T = it.T_cam0_imu
     assert _faults(_watch(it, T_cam0_imu=se3_inverse(T))) == ["extrinsics inverted"]
@@ -437,7 +524,8 @@ def test_reports_saturation_and_no_wrong_scale() -> None:
 def test_coarse_and_held_samples_are_not_saturated() -> None:
     it = _recording("room")
     coarse = [
-        replace(s, gyro=np.round(s.gyro / 0.01) * 0.01, accel=np.round(s.accel / 0.05) * 0.05) for s in it.samples
+        replace(s, gyro=np.round(s.gyro / 0.01) * 0.01, accel=np.round(s.accel / 0.05) * 0.05)
+        for s in it.samples
     ]
     assert _watch(it, samples=coarse) == []
     held = [replace(s, gyro=it.samples[k - k % 5].gyro) for k, s in enumerate(it.samples)]
@@ -464,7 +552,9 @@ def test_check_ends_and_can_be_reset() -> None:
         samples = iter(it.samples)
         for seen in it.frames:
             for sample in samples:
-                check.imu(replace(sample, gyro=corrupt * sample.gyro, time_ns=sample.time_ns + shift_ns))
+                check.imu(
+                    replace(sample, gyro=corrupt * sample.gyro, time_ns=sample.time_ns + shift_ns)
+                )
                 if sample.time_ns >= seen.time_ns:
                     break
             found += check.frame(replace(seen, time_ns=seen.time_ns + shift_ns))
@@ -506,7 +596,9 @@ def test_memory_is_bounded() -> None:
         ("MH_03", ("g", "turned gyro", "inverted accelerometer")),
     ],
 )
-def test_real_imu_gives_a_finding_only_when_corrupted(data_dir: Path, flight: str, mistakes: tuple[str, ...]) -> None:
+def test_real_imu_gives_a_finding_only_when_corrupted(
+    data_dir: Path, flight: str, mistakes: tuple[str, ...]
+) -> None:
     it = _real(data_dir / "euroc_real_imu" / flight, 30.0)
     T = it.T_cam0_imu
     assert _watch(it) == []
@@ -517,12 +609,16 @@ def test_real_imu_gives_a_finding_only_when_corrupted(data_dir: Path, flight: st
 
 
 def test_tumvi_agrees_with_its_motion_capture(data_dir: Path) -> None:
-    """Readings at 200 Hz, and between them those that the publishers interpolated at the cameras' times.
+    """Readings at 200 Hz, and between them those that the publishers interpolated at the cameras'
+    times.
 
     Two windows of 20 s; the five others of the record give no finding either.
     """
     folder = data_dir / "tumvi_room1_head"
-    truth, record = read_trajectory(folder / "gt_imu.csv"), imu_samples(read_imu_table(folder / "imu.txt")[0])
+    truth, record = (
+        read_trajectory(folder / "gt_imu.csv"),
+        imu_samples(read_imu_table(folder / "imu.txt")[0]),
+    )
     rig = load_rig(folder)
     T, camera = rig.T_cam0_imu, StereoCamera(365.0, 365.0, 512.0, 512.0, 0.101, 1024, 1024)
     for start_s in (0, 120):
@@ -530,8 +626,12 @@ def test_tumvi_agrees_with_its_motion_capture(data_dir: Path) -> None:
         used = (truth.times_ns >= begin) & (truth.times_ns <= begin + 21 * 10**9)
         motion, _ = fit_spline(truth.times_ns[used], truth.T_world_body[used], knot_s=0.05)
         times = np.arange(motion.start_ns, motion.start_ns + 20 * 10**9, _FRAME_NS)
-        frames = _observe(camera, motion_at(motion, times).T_world_imu, T, times.tolist(), 2.5, 0, 0.2)
-        it = Watched(camera, T, [s for s in record if times[0] <= s.time_ns <= times[-1]], [], frames)
+        frames = _observe(
+            camera, motion_at(motion, times).T_world_imu, T, times.tolist(), 2.5, 0, 0.2
+        )
+        it = Watched(
+            camera, T, [s for s in record if times[0] <= s.time_ns <= times[-1]], [], frames
+        )
         assert len(it.samples) > 4300
         assert _watch(it) == []
         if start_s == 0:

@@ -1,4 +1,6 @@
-"""Information of features on a motion, and the greedy choice among them, against independent derivations."""
+"""Information of features on a motion, and the greedy choice among them, against independent
+derivations.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ BROAD = prior_information(None)
 def _points(n: int, seed: int) -> FloatArray:
     rng = np.random.default_rng(seed)
     depth = rng.uniform(1, 20, n)
-    return np.stack([rng.uniform(-0.8, 0.8, n) * depth, rng.uniform(-0.5, 0.5, n) * depth, depth], axis=1)
+    return np.stack(
+        [rng.uniform(-0.8, 0.8, n) * depth, rng.uniform(-0.5, 0.5, n) * depth, depth], axis=1
+    )
 
 
 def _factors(n: int, motions: int, seed: int) -> FloatArray:
@@ -56,7 +60,9 @@ def _plain_greedy(prior: FloatArray, L: FloatArray, ids: FloatArray, budget: int
         best = max(gains.values(), default=0.0)
         if best <= 1e-12:
             break
-        chosen.append(min((i for i, g in gains.items() if g >= best * (1 - 1e-9)), key=lambda i: ids[i]))
+        chosen.append(
+            min((i for i, g in gains.items() if g >= best * (1 - 1e-9)), key=lambda i: ids[i])
+        )
     return chosen
 
 
@@ -75,7 +81,9 @@ def test_motion_rows_are_the_derivative_of_the_pixels() -> None:
 @pytest.mark.parametrize("right", [True, False])
 @pytest.mark.parametrize("n", [1, 2, 7])
 def test_information_is_that_of_pixels_and_an_uncertain_point(n: int, right: bool) -> None:
-    """`H' S^-1 H` in full: S is pixel noise plus the covariance of a point triangulated from n stereo sightings."""
+    """`H' S^-1 H` in full: S is pixel noise plus the covariance of a point triangulated from n
+    stereo sightings.
+    """
     sigma2 = 0.25
     for p in _points(10, n):
         J = z_D_p_cam(CAMERA, p)
@@ -85,7 +93,9 @@ def test_information_is_that_of_pixels_and_an_uncertain_point(n: int, right: boo
         H = (J @ np.concatenate([np.eye(3), -_hat(p)], axis=1))[seen]
         S = sigma2 * np.eye(len(H)) + J[seen] @ point @ J[seen].T
         rows = motion_rows(CAMERA, p) * np.sqrt(row_weights(n, np.array(right)))[:, None]
-        np.testing.assert_allclose(rows.T @ rows / sigma2, H.T @ np.linalg.solve(S, H), rtol=1e-9, atol=1e-6)
+        np.testing.assert_allclose(
+            rows.T @ rows / sigma2, H.T @ np.linalg.solve(S, H), rtol=1e-9, atol=1e-6
+        )
 
 
 def _hat(p: FloatArray) -> FloatArray:
@@ -104,16 +114,23 @@ def test_a_new_point_has_no_information_on_the_last_motion() -> None:
     seed=st.integers(0, 10**6),
     strength=st.floats(-2, 8),
 )
-def test_lazy_greedy_is_plain_greedy(n: int, budget: int, motions: int, seed: int, strength: float) -> None:
+def test_lazy_greedy_is_plain_greedy(
+    n: int, budget: int, motions: int, seed: int, strength: float
+) -> None:
     L, prior = _factors(n, motions, seed), np.repeat(10.0**strength * BROAD[None], motions, axis=0)
     ids = np.random.default_rng(seed).permutation(n)
     found = lazy_greedy(prior, L, ids, budget)
     assert found.order.tolist() == _plain_greedy(prior, L, ids, budget)
     chosen = found.order.tolist()
     assert np.sum(found.gain[chosen]) == pytest.approx(_gain(prior, L, chosen), rel=1e-8, abs=1e-9)
-    assert log_det_gain(prior, L[chosen]) == pytest.approx(_gain(prior, L, chosen), rel=1e-8, abs=1e-9)
+    assert log_det_gain(prior, L[chosen]) == pytest.approx(
+        _gain(prior, L, chosen), rel=1e-8, abs=1e-9
+    )
     for left in set(range(n)) - set(chosen):  # the gains of the others are upper bounds
-        assert found.gain[left] >= (_gain(prior, L, [*chosen, left]) - _gain(prior, L, chosen)) * (1 - 1e-9) - 1e-9
+        assert (
+            found.gain[left]
+            >= (_gain(prior, L, [*chosen, left]) - _gain(prior, L, chosen)) * (1 - 1e-9) - 1e-9
+        )
 
 
 @settings(max_examples=15, deadline=None)
@@ -147,8 +164,12 @@ def test_prior_of_a_motion_known_exactly_can_be_inverted() -> None:
 
 
 @pytest.mark.parametrize(("sigma_rad", "consistent"), [(1e-4, False), (1e-1, True)])
-def test_a_feature_off_the_predicted_motion_has_less_weight(sigma_rad: float, consistent: bool) -> None:
-    """A feature ten pixels off its prediction has almost no weight, unless the motion is that uncertain."""
+def test_a_feature_off_the_predicted_motion_has_less_weight(
+    sigma_rad: float, consistent: bool
+) -> None:
+    """A feature ten pixels off its prediction has almost no weight, unless the motion is that
+    uncertain.
+    """
     z = project(CAMERA, _points(2, 11))
     beside = z + np.array([[0.0, 0.0, 0.0, 0.0], [10.0, 0.0, 10.0, 0.0]])
     model = MotionInformation(CAMERA, 4, 0.5)
@@ -160,7 +181,9 @@ def test_a_feature_off_the_predicted_motion_has_less_weight(sigma_rad: float, co
     alike = MotionInformation(CAMERA, 4, 0.5)
     alike.add_frame(observations(0, 0, [0, 1], z), None)
     alike.mark_used(observations(0, 0, [0, 1], z), np.ones(2, dtype=np.bool_))
-    without = np.sum(alike.add_frame(observations(1, 1, [0, 1], beside), None)[:, 0] ** 2, axis=(1, 2))
+    without = np.sum(
+        alike.add_frame(observations(1, 1, [0, 1], beside), None)[:, 0] ** 2, axis=(1, 2)
+    )
     ratio = strength / without
     assert ratio[0] == pytest.approx(1.0, abs=1e-9)
     assert ratio[1] > 0.9 if consistent else ratio[1] < 0.1
@@ -179,11 +202,17 @@ def test_only_used_observations_count() -> None:
 
 
 def test_future_information_is_weighted_by_survival_of_the_age_group() -> None:
-    """One feature lives for eight frames; in every frame a new one appears that is not observed again."""
-    z, model = np.repeat(project(CAMERA, _points(1, 13)), 2, axis=0), MotionInformation(CAMERA, 3, 0.5)
+    """One feature lives for eight frames; in every frame a new one appears that is not observed
+    again.
+    """
+    z, model = (
+        np.repeat(project(CAMERA, _points(1, 13)), 2, axis=0),
+        MotionInformation(CAMERA, 3, 0.5),
+    )
     for k in range(8):
         L = model.add_frame(observations(k, k, [0, 100 + k], z), None)
-    # The prior survival is nine of ten; of the new features, only the first survived, and seven did not.
+    # The prior survival is nine of ten; of the new features, only the first survived, and seven did
+    # not.
     old, new = 9 / 10, (9 + 1) / (10 + 1 + 7)
     strength = np.sum(L**2, axis=(2, 3))
     np.testing.assert_allclose(strength[0, 1] / strength[1, 1], old / new)  # the next frame

@@ -1,4 +1,6 @@
-"""`vio inspect`: what it says of sound recordings, and that each fault is found, with exit status 1 and a remedy."""
+"""`vio inspect`: what it says of sound recordings, and that each fault is found, with exit
+status 1 and a remedy.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ from vio.inspection.inspect import clock_facts
 from vio.records import ImuDensities, ImuRecord
 
 
-def inspect(folder: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[str, Any]]:
+def inspect(
+    folder: Path, capsys: pytest.CaptureFixture[str], *options: str
+) -> tuple[int, dict[str, Any]]:
     """Run the command and return its status and facts."""
     capsys.readouterr()
     status = main(["inspect", str(folder), "--json", "--pairs", "3", "--frames", "8", *options])
@@ -45,7 +49,9 @@ def test_a_sound_recording(flight: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert parts["missing"]["missing"] == []
 
 
-def test_the_clock_of_velocities_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_clock_of_velocities_is_described(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _, facts = inspect(make_kitti(tmp_path / "kitti", frames=6), capsys)
     velocity = facts["parts"]["velocity"]
     assert (velocity["count"], velocity["covered"]) == (6, 1.0)
@@ -54,7 +60,9 @@ def test_the_clock_of_velocities_is_described(tmp_path: Path, capsys: pytest.Cap
 
 def _turn_right_camera(folder: Path, w_deg: list[float]) -> None:
     """Turn the right camera of an EuRoC folder, not its calibration."""
-    sheet = yaml.safe_load((folder / "mav0" / "cam1" / "sensor.yaml").read_text().removeprefix("%YAML:1.0"))
+    sheet = yaml.safe_load(
+        (folder / "mav0" / "cam1" / "sensor.yaml").read_text().removeprefix("%YAML:1.0")
+    )
     fu, fv, cu, cv = sheet["intrinsics"]
     K = np.array([[fu, 0, cu], [0, fv, cv], [0, 0, 1]])
     H = K @ so3_exp(np.radians(w_deg)) @ np.linalg.inv(K)
@@ -82,7 +90,20 @@ def test_a_turned_right_camera_is_named_before_and_in_the_run(
     main(["inspect", str(folder), "--pairs", "3", "--frames", "0"])
     assert where in capsys.readouterr().out
     assert (
-        main(["run", str(folder), "--motion", "none", "--stop", "12", "--out", str(tmp_path / "out"), "--quiet"]) == 0
+        main(
+            [
+                "run",
+                str(folder),
+                "--motion",
+                "none",
+                "--stop",
+                "12",
+                "--out",
+                str(tmp_path / "out"),
+                "--quiet",
+            ]
+        )
+        == 0
     )
     named = [line for line in caplog.messages if "the stereo calibration is off" in line]
     assert len(named) == 1
@@ -92,7 +113,10 @@ def test_one_screen_for_people(flight: Path, capsys: pytest.CaptureFixture[str])
     assert main(["inspect", str(flight), "--pairs", "2", "--frames", "0"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 24
-    assert lines[-2:] == ["verdict              can be run", f"next                 vio run {flight}"]
+    assert lines[-2:] == [
+        "verdict              can be run",
+        f"next                 vio run {flight}",
+    ]
 
 
 def _imu(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
@@ -141,11 +165,23 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
         _imu(_scaled_accel),
         "rest: accelerometer units: .* in g: multiply by 9.81",
     ),
-    "IMU at 10 Hz": (_imu(lambda rows: rows[::20]), "IMU: 10 Hz are too few to integrate .*; record at least 50 Hz"),
-    "black images": (_black, "images: .* are black, white or without content; correct the exposure"),
-    "exchanged cameras": (_swapped, "stereo: .* left and right images are exchanged; exchange the folders"),
+    "IMU at 10 Hz": (
+        _imu(lambda rows: rows[::20]),
+        "IMU: 10 Hz are too few to integrate .*; record at least 50 Hz",
+    ),
+    "black images": (
+        _black,
+        "images: .* are black, white or without content; correct the exposure",
+    ),
+    "exchanged cameras": (
+        _swapped,
+        "stereo: .* left and right images are exchanged; exchange the folders",
+    ),
     "one camera twice": (_same, "images: left and right are the same images"),
-    "rows shifted": (_shifted_rows, r"stereo: rows differ by -6\.. px .* exchanged, .*; run `vio calibrate`"),
+    "rows shifted": (
+        _shifted_rows,
+        r"stereo: rows differ by -6\.. px .* exchanged, .*; run `vio calibrate`",
+    ),
 }
 
 
@@ -163,7 +199,8 @@ def test_faults_are_found_with_their_remedy(
     assert all("\n" not in fault for fault in facts["faults"])
 
 
-# --- figures --------------------------------------------------------------------------------------------------------
+# --- figures
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_rates_jitter_and_gaps() -> None:
@@ -177,11 +214,15 @@ def test_rates_jitter_and_gaps() -> None:
 
 
 def test_allan_deviation_of_white_noise_falls_with_the_root_of_time() -> None:
-    """White noise of density d has a deviation of d / sqrt(tau); the estimate is within a few percent."""
+    """White noise of density d has a deviation of d / sqrt(tau); the estimate is within a few
+    percent.
+    """
     density, step_s = 2e-3, 0.005
     values = np.random.default_rng(1).normal(0, density / np.sqrt(step_s), (20000, 3))
     for tau in (0.05, 0.2, 1.0):
-        assert allan_deviation(values, step_s, tau) == pytest.approx(density / np.sqrt(tau), rel=0.1)
+        assert allan_deviation(values, step_s, tau) == pytest.approx(
+            density / np.sqrt(tau), rel=0.1
+        )
 
 
 def record_at_rest(density: float, seconds: float = 6.0) -> ImuRecord:
@@ -189,24 +230,32 @@ def record_at_rest(density: float, seconds: float = 6.0) -> ImuRecord:
     rng = np.random.default_rng(2)
     count = int(200 * seconds)
     noise = rng.normal(0, density / np.sqrt(0.005), (2, count, 3))
-    return ImuRecord(np.arange(count, dtype=np.int64) * 5_000_000, noise[0], noise[1] + [0, 0, 9.81])
+    return ImuRecord(
+        np.arange(count, dtype=np.int64) * 5_000_000, noise[0], noise[1] + [0, 0, 9.81]
+    )
 
 
 def test_noise_at_rest_is_compared_with_the_data_sheet() -> None:
     part = noise_part(record_at_rest(5e-4), ImuDensities(1e-4, 1e-5, 5e-4, 1e-4))
     assert part.facts["gyro_density"] == pytest.approx(5e-4, rel=0.2)
-    assert re.search(r"gyro .* \([45]\.\d times the stated\); state the measured one, accel [^;]*, at rest", part.text)
+    assert re.search(
+        r"gyro .* \([45]\.\d times the stated\); state the measured one, accel [^;]*, at rest",
+        part.text,
+    )
     assert noise_part(record_at_rest(5e-4, 2.0), None) is None, "too short"
 
 
 def test_rest_and_the_direction_of_gravity() -> None:
-    upright = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # the IMU's z is the camera's -y
+    # the IMU's z is the camera's -y
+    upright = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     part = rest_part(record_at_rest(5e-4), upright)
     assert part.facts["still_share"] == 1.0
     assert part.facts["camera_tilt_deg"] == pytest.approx(0, abs=0.1)
     assert part.faults == []
     moving = record_at_rest(5e-4)
-    shaken = ImuRecord(moving.times_ns, moving.gyro + np.sin(np.arange(1200) / 9)[:, None], moving.accel)
+    shaken = ImuRecord(
+        moving.times_ns, moving.gyro + np.sin(np.arange(1200) / 9)[:, None], moving.accel
+    )
     assert rest_part(shaken, None).facts["still_share"] == 0.0
 
 

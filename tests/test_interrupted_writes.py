@@ -34,7 +34,9 @@ sys.exit(vio.cli.main([]))
 
 
 def _take_interrupts() -> None:
-    """Undo what shell and nohup do to background jobs: they ignore Ctrl-C and hang-ups, and so do their children."""
+    """Undo what shell and nohup do to background jobs: they ignore Ctrl-C and hang-ups, and so
+    do their children.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
@@ -52,7 +54,9 @@ def _writing(out: Path) -> subprocess.Popen[str]:
     return process
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 130)]
+)
 def test_signals_end_orderly(number: signal.Signals, status: int, tmp_path: Path) -> None:
     process = _writing(tmp_path / "deep" / "out")
     process.send_signal(number)
@@ -82,11 +86,14 @@ def test_next_write_removes_what_a_killed_process_left(tmp_path: Path) -> None:
     ]
 
 
-def test_leftover_files_are_removed_and_the_only_copy_is_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_leftover_files_are_removed_and_the_only_copy_is_kept(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / ".a.txt.0123456789ab.partial").write_text("ha")
     atomic_write_text(tmp_path / "a.txt", "whole")
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
-    (tmp_path / ".out.0123456789ab.old").mkdir()  # killed between moving the old folder away and the new one in
+    # killed between moving the old folder away and the new one in
+    (tmp_path / ".out.0123456789ab.old").mkdir()
     with atomic_folder(tmp_path / "out", replace=True):
         assert (tmp_path / ".out.0123456789ab.old").is_dir()
     assert "kept when a process was killed" in caplog.text
@@ -107,7 +114,9 @@ def test_full_disk_is_said_before_the_first_frame(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
     try:
-        with pytest.raises(DataError, match=r"cannot write .*out: File too large; choose .* enough free space"):
+        with pytest.raises(
+            DataError, match=r"cannot write .*out: File too large; choose .* enough free space"
+        ):
             check_writable(tmp_path / "deep" / "out")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -1,4 +1,6 @@
-"""The gate of landmarks: predictions without their own pixels, and a running sum for what moves slowly."""
+"""The gate of landmarks: predictions without their own pixels, and a running sum for what moves
+slowly.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,12 @@ def _case(seed: int, stereo: bool) -> tuple[FloatArray, FloatArray]:
 
 @pytest.mark.parametrize("stereo", [True, False])
 @pytest.mark.parametrize("weight", [1.0, 0.3])
-def test_residuals_after_the_fit_give_the_prediction_without_them(stereo: bool, weight: float) -> None:
-    """Predict, then update by Kalman's equations; from what is left, find the innovation and its covariance again."""
+def test_residuals_after_the_fit_give_the_prediction_without_them(
+    stereo: bool, weight: float
+) -> None:
+    """Predict, then update by Kalman's equations; from what is left, find the innovation and its
+    covariance again.
+    """
     variance = 0.25
     for seed in range(5):
         J, prior = _case(seed, stereo)
@@ -59,7 +65,9 @@ def test_what_fails_a_little_in_every_frame_is_dropped() -> None:
     gate, rng, ids = LandmarkGate(0.99), np.random.default_rng(0), np.array([7, 3])
     gone = None
     for k in range(40):
-        used, dropped = gate.check(ids, np.array([10.5, min(rng.chisquare(3), 11.0)]), np.array([3, 3]))
+        used, dropped = gate.check(
+            ids, np.array([10.5, min(rng.chisquare(3), 11.0)]), np.array([3, 3])
+        )
         assert used[1] == (not dropped[1])
         if dropped[0]:
             assert not used[0]
@@ -71,7 +79,9 @@ def test_what_fails_a_little_in_every_frame_is_dropped() -> None:
 
 
 def test_a_right_landmark_is_seldom_dropped() -> None:
-    """Squared innovations drawn from chi-square: of 1000 landmarks in 30 frames, fewer than one in 2000 tests drops."""
+    """Squared innovations drawn from chi-square: of 1000 landmarks in 30 frames, fewer than one
+    in 2000 tests drops.
+    """
     gate, rng, drops = LandmarkGate(0.99), np.random.default_rng(1), 0
     ids, dof = np.arange(1000), np.full(1000, 3)
     for _ in range(30):
@@ -82,6 +92,7 @@ def test_a_right_landmark_is_seldom_dropped() -> None:
 def test_a_dropped_or_unseen_landmark_is_forgotten() -> None:
     gate, dof = LandmarkGate(0.99), np.array([3])
     assert gate.check(np.array([5]), np.array([100.0]), dof)[1].tolist() == [True]
-    assert gate.check(np.array([5]), np.array([3.0]), dof)[1].tolist() == [False]  # a new one under its id
+    # a new one under its id
+    assert gate.check(np.array([5]), np.array([3.0]), dof)[1].tolist() == [False]
     gate.check(np.array([6]), np.array([10.0]), dof)
     assert gate._score.keys() == {6}

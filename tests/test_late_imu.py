@@ -11,7 +11,9 @@ from vio.geometry.lie import se3_inverse, se3_log, transform_points
 
 
 def test_images_carry_the_frames_before_an_imu_that_begins_late() -> None:
-    """The world stays that of the first frame: no jump at the handover, and gravity is known in that world."""
+    """The world stays that of the first frame: no jump at the handover, and gravity is known in
+    that world.
+    """
     flight, settings, rng = Flight(64), EXACT_RIG, np.random.default_rng(3)
     filt = LateImuMsckf(CAMERA, T_CAM0_IMU, settings)
     samples = [x for x in flight.imu(rng, settings, np.zeros(6)) if x.time_ns > 1_480_000_000]

@@ -1,4 +1,6 @@
-"""SO(3) and SE(3): group axioms, exp and log near 0 and near pi, and independent twins of every operator."""
+"""SO(3) and SE(3): group axioms, exp and log near 0 and near pi, and independent twins of every
+operator.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,9 @@ def test_so3_log_undoes_exp(phi: FloatArray) -> None:
     assert np.linalg.norm(back) <= np.pi + 1e-15
 
 
-@pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [-1, 2, -3], [0, -1, 1e-9]])
+@pytest.mark.parametrize(
+    "axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [-1, 2, -3], [0, -1, 1e-9]]
+)
 @pytest.mark.parametrize("below_pi", [0.0, 1e-12, 1e-9, 1e-6, 1e-3])
 def test_so3_log_near_pi_keeps_full_precision(axis: list[float], below_pi: float) -> None:
     unit = np.array(axis, dtype=np.float64) / np.linalg.norm(axis)
@@ -81,7 +85,9 @@ def test_so3_log_near_pi_keeps_full_precision(axis: list[float], below_pi: float
     close(back, phi, atol=3e-14)
 
 
-@pytest.mark.parametrize("angle", [1e-300, 1e-20, 1e-12, 1e-8, 1e-7, 1e-6, 1e-4, 9.999e-3, 1.0001e-2])
+@pytest.mark.parametrize(
+    "angle", [1e-300, 1e-20, 1e-12, 1e-8, 1e-7, 1e-6, 1e-4, 9.999e-3, 1.0001e-2]
+)
 def test_so3_log_near_zero_is_relatively_exact(angle: float) -> None:
     phi = angle * np.array([2.0, -1.0, 2.0]) / 3
     close(lie.so3_log(lie.so3_exp(phi)), phi, atol=0, rtol=1e-12)
@@ -145,7 +151,11 @@ def test_se3_exp_of_the_negative_is_the_inverse(xi: FloatArray) -> None:
 @given(twists)
 def test_adjoint_is_the_exponential_of_the_curly_hat(xi: FloatArray) -> None:
     xi = xi * np.array([1e-2, 1e-2, 1e-2, 1, 1, 1])  # expm of a large nilpotent part loses digits
-    close(lie.se3_adjoint(lie.se3_exp(xi)), expm(lie.se3_curly_hat(xi)), atol=1e-12 * (1 + np.abs(xi).max()))
+    close(
+        lie.se3_adjoint(lie.se3_exp(xi)),
+        expm(lie.se3_curly_hat(xi)),
+        atol=1e-12 * (1 + np.abs(xi).max()),
+    )
 
 
 @properties
@@ -201,8 +211,13 @@ def test_quaternions_equal_scipy(phi: FloatArray) -> None:
 
 
 @properties
-@given(st.tuples(*[st.floats(-1, 1)] * 4).map(np.array).filter(lambda q: np.linalg.norm(q) > 1e-2), st.floats(0.1, 9))
-def test_rotation_from_quaternion_normalises_and_ignores_the_sign(q: FloatArray, scale: float) -> None:
+@given(
+    st.tuples(*[st.floats(-1, 1)] * 4).map(np.array).filter(lambda q: np.linalg.norm(q) > 1e-2),
+    st.floats(0.1, 9),
+)
+def test_rotation_from_quaternion_normalises_and_ignores_the_sign(
+    q: FloatArray, scale: float
+) -> None:
     R = lie.rotation_from_quat_xyzw(q)
     close(R, Rotation.from_quat(q).as_matrix(), atol=1e-14)
     close(lie.rotation_from_quat_xyzw(-scale * q), R, atol=1e-14)
@@ -216,7 +231,9 @@ def test_half_turns_give_exact_quaternions(diagonal: tuple[int, int, int]) -> No
 
 @properties
 @given(rotation_vectors, st.integers(0, 2**32 - 1))
-def test_nearest_rotation_keeps_rotations_and_beats_its_neighbours(phi: FloatArray, seed: int) -> None:
+def test_nearest_rotation_keeps_rotations_and_beats_its_neighbours(
+    phi: FloatArray, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     R = lie.so3_exp(phi)
     close(lie.nearest_rotation(R), R, atol=1e-14)
@@ -285,7 +302,11 @@ def test_single_arguments_and_batches_give_the_same(xi: FloatArray) -> None:
         close(function(xi[3:]), function(batch[:, 3:])[0], atol=4e-15)
     close(T, lie.se3_exp(batch)[0], rtol=1e-14)
     close(lie.se3_inverse(T), lie.se3_inverse(np.stack([T, T]))[1], rtol=1e-14)
-    close(np.abs(lie.so3_log(T[:3, :3])), np.abs(lie.so3_log(np.stack([T, T])[:, :3, :3])[0]), rtol=1e-13)
+    close(
+        np.abs(lie.so3_log(T[:3, :3])),
+        np.abs(lie.so3_log(np.stack([T, T])[:, :3, :3])[0]),
+        rtol=1e-13,
+    )
 
 
 def test_what_is_not_finite_stays_so_without_an_error() -> None:

@@ -1,4 +1,6 @@
-"""Live use with a worker: the poses of `Odometry` to the bit, calls that never wait, frames left out, orderly ends."""
+"""Live use with a worker: the poses of `Odometry` to the bit, calls that never wait, frames left
+out, orderly ends.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ from vio.live.worker import EventQueue, QueuedCall
 from vio.records import Estimate, FrameResult, FrontendOutput, ImuSample, StereoFrame
 
 IMAGES_ALONE = replace(Config(), motion="none")
-IMAGES = np.random.default_rng(0).integers(0, 255, (6, 480, 752), dtype=np.uint8)  # equal ones would be left out
+# equal ones would be left out
+IMAGES = np.random.default_rng(0).integers(0, 255, (6, 480, 752), dtype=np.uint8)
 IMAGE = IMAGES[0]
 FRAMES = 12
 _PATIENCE_S = 60  # so that what blocks where it must not fails, and does not hang
@@ -57,7 +60,9 @@ def held() -> Iterator[Held]:
 
 
 def _images(held: Held, **options: Any) -> LiveOdometry:
-    return LiveOdometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, parts=Parts(frontend=held), **options)
+    return LiveOdometry(
+        CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, parts=Parts(frontend=held), **options
+    )
 
 
 def _events(frames: int = FRAMES) -> tuple[list[ImuSample], list[Any]]:
@@ -67,12 +72,16 @@ def _events(frames: int = FRAMES) -> tuple[list[ImuSample], list[Any]]:
 
 
 @pytest.mark.parametrize(("warm", "most_hz"), [(False, None), (True, None), (False, 10.0)])
-def test_threads_give_the_poses_of_one_call_after_the_other(flight: Path, warm: bool, most_hz: float | None) -> None:
+def test_threads_give_the_poses_of_one_call_after_the_other(
+    flight: Path, warm: bool, most_hz: float | None
+) -> None:
     config = replace(Config(), dataset=replace(Config().dataset, max_frame_rate=most_hz))
     dataset = vio.open_dataset(flight)
     recording, events = dataset.recording, list(dataset.events())
     expected: list[FrameResult] = []
-    one = Odometry(recording.camera, config, T_cam0_imu=recording.T_cam0_imu, on_frame=expected.append)
+    one = Odometry(
+        recording.camera, config, T_cam0_imu=recording.T_cam0_imu, on_frame=expected.append
+    )
     for event in events:
         if isinstance(event, StereoFrame):
             one.add_stereo(event.time_ns, event.left, event.right)
@@ -81,7 +90,12 @@ def test_threads_give_the_poses_of_one_call_after_the_other(flight: Path, warm: 
     one.finish()
     results: list[FrameResult] = []
     with LiveOdometry(
-        recording.camera, config, T_cam0_imu=recording.T_cam0_imu, on_frame=results.append, drop="block", queue_frames=1
+        recording.camera,
+        config,
+        T_cam0_imu=recording.T_cam0_imu,
+        on_frame=results.append,
+        drop="block",
+        queue_frames=1,
     ) as live:
         if warm:
             live.warm_up()
@@ -100,12 +114,18 @@ def test_threads_give_the_poses_of_one_call_after_the_other(flight: Path, warm: 
         assert c is b.estimate
         assert a.frame.index == b.frame.index
     assert live.latest() is results[-1].estimate
-    assert (live.figures.results, live.figures.dropped, live.figures.waiting) == (len(expected), 0, 0)
+    assert (live.figures.results, live.figures.dropped, live.figures.waiting) == (
+        len(expected),
+        0,
+        0,
+    )
     assert live.warnings == one.warnings
 
 
 def _drive(live: LiveOdometry, events: list[Any]) -> None:
-    """Add images in this thread, and samples in another one, which is up to a frame ahead or behind."""
+    """Add images in this thread, and samples in another one, which is up to a frame ahead or
+    behind.
+    """
     turn, sampled = threading.Semaphore(2), threading.Semaphore(1)
 
     def samples() -> None:
@@ -155,7 +175,9 @@ def test_images_are_copied_unless_the_caller_leaves_them_alone(copied: bool) -> 
 
     left, right = IMAGES[0].copy(), IMAGES[1][::-1]
     parts = Parts(frontend=Noting())
-    with LiveOdometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, parts=parts, copy_images=copied) as live:
+    with LiveOdometry(
+        CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, parts=parts, copy_images=copied
+    ) as live:
         live.add_stereo(0, left, right)
     (frame,) = taken
     assert (frame.left is left) != copied
@@ -182,7 +204,9 @@ def test_blocking_waits_for_room() -> None:
 
 def test_the_limit_on_the_rate_leaves_frames_out_before_the_queue(held: Held) -> None:
     config = replace(IMAGES_ALONE, dataset=replace(Config().dataset, max_frame_rate=10.0))
-    live = LiveOdometry(CAMERA, config, T_cam0_imu=T_CAM0_IMU, parts=Parts(frontend=held), queue_frames=1)
+    live = LiveOdometry(
+        CAMERA, config, T_cam0_imu=T_CAM0_IMU, parts=Parts(frontend=held), queue_frames=1
+    )
     live.add_stereo(0, IMAGE, IMAGE)
     held.entered.acquire()
     live.add_stereo(100_000_000, IMAGES[1], IMAGES[1])
@@ -351,7 +375,10 @@ def test_a_slow_computer_is_named_once(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_warming_up_changes_no_pose_and_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
     thresholds = gc.get_threshold()
     small = replace(CAMERA, width=320, height=200, cu=160.0, cv=100.0)
-    with caplog.at_level(logging.DEBUG, logger="vio"), LiveOdometry(small, T_cam0_imu=T_CAM0_IMU) as live:
+    with (
+        caplog.at_level(logging.DEBUG, logger="vio"),
+        LiveOdometry(small, T_cam0_imu=T_CAM0_IMU) as live,
+    ):
         live.warm_up()
         assert live.latest() is None
         assert live.figures.results == 0
@@ -383,7 +410,9 @@ def test_warming_up_reaches_what_a_run_reaches() -> None:
 
 def test_points_that_do_not_change_are_kept_up_to_a_number() -> None:
     _, seen = _events(24)
-    live = LiveOdometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, drop="block", keep_landmarks=200)
+    live = LiveOdometry(
+        CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, drop="block", keep_landmarks=200
+    )
     all_of_them = Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU)
     for k, one in enumerate(seen):
         ids = one.ids + 1000 * (k // 3)  # after three frames, all features are other ones
@@ -394,11 +423,16 @@ def test_points_that_do_not_change_are_kept_up_to_a_number() -> None:
     live.close()
     assert len(np.unique(ours.ids)) == len(ours.ids)
     assert 0 < len(ours.ids) < len(theirs.ids)
-    assert set(ours.ids) >= set(theirs.ids[theirs.ids >= theirs.ids.max() - 999])  # the newest ones are there
-    np.testing.assert_array_equal(ours.p_world, theirs.p_world[np.searchsorted(theirs.ids, ours.ids)])
+    # the newest ones are there
+    assert set(ours.ids) >= set(theirs.ids[theirs.ids >= theirs.ids.max() - 999])
+    np.testing.assert_array_equal(
+        ours.p_world, theirs.p_world[np.searchsorted(theirs.ids, ours.ids)]
+    )
 
 
-def test_a_map_that_is_behind_holds_up_no_frame(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_that_is_behind_holds_up_no_frame(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from vio.mapping import session
 
     go_on, extract = threading.Event(), session.extract

@@ -74,7 +74,9 @@ def test_check_reads_features_too(tmp_path: Path, capsys: pytest.CaptureFixture[
     fill(path).close()
     assert check_map(path)["keyframes"] == 4
     with closing(sqlite3.connect(path)) as database:
-        database.execute("UPDATE features SET sigma_px = zeroblob(length(sigma_px)) WHERE keyframe = 2")
+        database.execute(
+            "UPDATE features SET sigma_px = zeroblob(length(sigma_px)) WHERE keyframe = 2"
+        )
         database.commit()
     assert main(["map", "show", str(path)]) == 0
     assert main(["map", "check", str(path)]) == 1
@@ -85,7 +87,9 @@ def test_check_reads_places_too(tmp_path: Path) -> None:
     path = tmp_path / "a.map"
     with closing(fill(path)) as store:
         words = Segment(np.zeros((4, 2**14 + 1), dtype=np.uint32), np.zeros((4, 0), dtype=np.uint8))
-        store.add_places(PlacesRow(words, np.zeros((SEGMENT, 32, 3)), np.zeros(SEGMENT, dtype=np.int64)))
+        store.add_places(
+            PlacesRow(words, np.zeros((SEGMENT, 32, 3)), np.zeros(SEGMENT, dtype=np.int64))
+        )
     check_map(path)
     with closing(sqlite3.connect(path)) as database:
         database.execute("UPDATE places SET points = zeroblob(8)")
@@ -133,7 +137,17 @@ def test_a_part_of_a_map_is_taken_out(tmp_path: Path) -> None:
     with closing(MapStore(path)) as store:
         store.set_poses({k: se3_exp([2.0 * k, 0, 0, 0, 0, 0]) for k in range(6)})
     before = path.read_bytes()
-    arguments = ["map", "extract", str(path), "--around", "7,0,0", "--radius", "2", "--out", str(out)]
+    arguments = [
+        "map",
+        "extract",
+        str(path),
+        "--around",
+        "7,0,0",
+        "--radius",
+        "2",
+        "--out",
+        str(out),
+    ]
     assert main(arguments) == 0
     assert path.read_bytes() == before
     with closing(MapStore(out, read_only=True)) as part:
@@ -156,9 +170,17 @@ def test_a_recording_is_not_merged_twice(tmp_path: Path) -> None:
                 f = _features(k)
                 store.add_keyframe(
                     replace(_row(k), time_ns=k + 10**9 * seeds.start),
-                    replace(f, z=f.z[rows], has_right=f.has_right[rows], sigma_px=f.sigma_px[rows], descriptors=rich),
+                    replace(
+                        f,
+                        z=f.z[rows],
+                        has_right=f.has_right[rows],
+                        sigma_px=f.sigma_px[rows],
+                        descriptors=rich,
+                    ),
                 )
-    with pytest.raises(DataError, match=r"1 of its keyframes are in .* already: both hold one recording"):
+    with pytest.raises(
+        DataError, match=r"1 of its keyframes are in .* already: both hold one recording"
+    ):
         merge_maps(a, b, out)
     assert not out.exists()
 

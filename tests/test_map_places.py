@@ -1,4 +1,6 @@
-"""Places recognised by features: words, pairs, and the motion between two views with its covariance."""
+"""Places recognised by features: words, pairs, and the motion between two views with its
+covariance.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ import pytest
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project
 from vio.mapping import place_index
-from vio.mapping.features import KeyframeFeatures, _most_alike, _near_rows, extract, no_keyframe_features
+from vio.mapping.features import (
+    KeyframeFeatures,
+    _most_alike,
+    _near_rows,
+    extract,
+    no_keyframe_features,
+)
 from vio.mapping.loop_geometry import LEAST_INLIERS, match, verify
 from vio.mapping.map_store import MapStore, PlacesRow
 from vio.mapping.place_index import SEGMENT, PlaceIndex, Segment, words_of
@@ -34,15 +42,27 @@ def _flipped(descriptors: np.ndarray, share: float, rng: np.random.Generator) ->
 def _views(
     seed: int, sigma_px: float = 1.0, outliers: float = 0.0, stated_px: float | None = None
 ) -> tuple[KeyframeFeatures, KeyframeFeatures]:
-    """Two views of one place, the second at T_I_J, with pixel noise and wrong positions of some features."""
+    """Two views of one place, the second at T_I_J, with pixel noise and wrong positions of some
+    features.
+    """
     rng = np.random.default_rng(seed)
-    p = np.stack([rng.uniform(-3, 3, POINTS), rng.uniform(-1.5, 1.5, POINTS), rng.uniform(3, 9, POINTS)], axis=1)
+    p = np.stack(
+        [rng.uniform(-3, 3, POINTS), rng.uniform(-1.5, 1.5, POINTS), rng.uniform(3, 9, POINTS)],
+        axis=1,
+    )
     bits = _bits(POINTS, rng)
     out = []
-    for points, names in ((p, bits), (transform_points(se3_inverse(T_I_J), p), _flipped(bits, 0.08, rng))):
+    for points, names in (
+        (p, bits),
+        (transform_points(se3_inverse(T_I_J), p), _flipped(bits, 0.08, rng)),
+    ):
         z = project(CAMERA, points) + sigma_px * rng.standard_normal((POINTS, 4))
         z[rng.random(POINTS) < outliers, :2] += 80.0
-        out.append(KeyframeFeatures(z, rng.random(POINTS) < 0.8, np.full(POINTS, stated_px or sigma_px), names))
+        out.append(
+            KeyframeFeatures(
+                z, rng.random(POINTS) < 0.8, np.full(POINTS, stated_px or sigma_px), names
+            )
+        )
     return out[0], out[1]
 
 
@@ -60,14 +80,18 @@ def test_pairs_are_those_of_the_same_points() -> None:
 
 
 def test_the_motion_between_two_views_is_found_within_its_covariance() -> None:
-    """Normalised errors of 15 pairs; the covariance is inflated fourfold on purpose, so 6 is not reached."""
+    """Normalised errors of 15 pairs; the covariance is inflated fourfold on purpose, so 6 is not
+    reached.
+    """
     squared = [float(r @ np.linalg.solve(C, r)) for r, C, _ in (_error(seed) for seed in range(15))]
     assert 0.5 < np.mean(squared) < 6.0
     assert max(squared) < 16.8  # the 99 % quantile of six degrees of freedom
 
 
 def test_the_covariance_of_a_motion_follows_the_noise_of_its_pixels() -> None:
-    """Key points whose pixels are better than stated, as those of rendered and of compressed images are."""
+    """Key points whose pixels are better than stated, as those of rendered and of compressed
+    images are.
+    """
     ratios = []
     for seed in range(8):
         stated, exact = (_error(seed, sigma_px=0.4, stated_px=px)[1] for px in (1.0, 0.4))
@@ -104,9 +128,15 @@ def test_too_few_features_do_not_verify() -> None:
 
 
 def test_the_best_of_near_rows_is_that_of_all_pairs() -> None:
-    """Against OpenCV's matcher with a mask; some descriptors are equal, so that the first of them counts."""
+    """Against OpenCV's matcher with a mask; some descriptors are equal, so that the first of
+    them counts.
+    """
     rng = np.random.default_rng(0)
-    v, there, reach = rng.uniform(0, 60, 50), rng.uniform(0, 60, 80).round(), rng.uniform(0.5, 5.0, 50)
+    v, there, reach = (
+        rng.uniform(0, 60, 50),
+        rng.uniform(0, 60, 80).round(),
+        rng.uniform(0.5, 5.0, 50),
+    )
     b = _bits(80, rng)
     b[40:] = b[:40]
     a = _flipped(b[rng.integers(0, 80, 50)], 0.15, rng)
@@ -116,16 +146,28 @@ def test_the_best_of_near_rows_is_that_of_all_pairs() -> None:
     assert len(i) == mask.sum()
     expected = [m for m in cv2.BFMatcher(cv2.NORM_HAMMING).match(a, b, mask) if m.distance <= 64]
     assert len(expected) > 5
-    assert [(m.queryIdx, m.trainIdx) for m in expected] == list(zip(rows.tolist(), best.tolist(), strict=True))
+    assert [(m.queryIdx, m.trainIdx) for m in expected] == list(
+        zip(rows.tolist(), best.tolist(), strict=True)
+    )
 
 
 def _pair(gain: float) -> list[np.ndarray]:
-    """Left and right image (180, 320) of a textured wall at 6.3 px of disparity; the right camera's gain falls off."""
+    """Left and right image (180, 320) of a textured wall at 6.3 px of disparity; the right
+    camera's gain falls off.
+    """
     rng = np.random.default_rng(3)
-    wall = cv2.resize(rng.uniform(40, 200, (60, 110)).astype(np.float32), (340, 180), interpolation=cv2.INTER_CUBIC)
-    left, right = (cv2.warpAffine(wall, np.array([[1.0, 0, -u], [0, 1, 0]]), (320, 180)) for u in (5.0, 11.3))
+    wall = cv2.resize(
+        rng.uniform(40, 200, (60, 110)).astype(np.float32),
+        (340, 180),
+        interpolation=cv2.INTER_CUBIC,
+    )
+    left, right = (
+        cv2.warpAffine(wall, np.array([[1.0, 0, -u], [0, 1, 0]]), (320, 180)) for u in (5.0, 11.3)
+    )
     right = right * np.linspace(1.0, gain, 320)
-    return [np.clip(im + rng.normal(0, 1.5, im.shape), 0, 255).astype(np.uint8) for im in (left, right)]
+    return [
+        np.clip(im + rng.normal(0, 1.5, im.shape), 0, 255).astype(np.uint8) for im in (left, right)
+    ]
 
 
 def test_a_darker_right_camera_leaves_the_disparities_exact() -> None:
@@ -160,7 +202,9 @@ def test_the_index_finds_the_place_that_shares_most_features() -> None:
 
 
 def test_scores_do_not_depend_on_what_of_the_index_is_merged() -> None:
-    """The weight of all shared words, counted one by one, for keyframes in the index and in its tail."""
+    """The weight of all shared words, counted one by one, for keyframes in the index and in its
+    tail.
+    """
     rng = np.random.default_rng(8)
     places = [_bits(int(rng.integers(0, 60)), rng) for _ in range(150)]
     places[7] = np.concatenate([places[7], places[7][:5]])  # a word twice
@@ -183,7 +227,9 @@ def test_scores_do_not_depend_on_what_of_the_index_is_merged() -> None:
 
 
 def test_places_of_a_file_give_the_same_scores(tmp_path: Path) -> None:
-    """Two segments come from the file, the rest is added again; one whose words are not in order is refused."""
+    """Two segments come from the file, the rest is added again; one whose words are not in order
+    is refused.
+    """
     rng = np.random.default_rng(9)
     places = [_bits(int(rng.integers(0, 20)), rng) for _ in range(2 * SEGMENT + 40)]
     whole, again, path = PlaceIndex(), PlaceIndex(), tmp_path / "a.map"
@@ -227,14 +273,19 @@ def test_an_empty_index_and_an_empty_view_have_no_candidates() -> None:
     assert index.candidates(bits, np.zeros(0, dtype=np.bool_), 3).tolist() == []
     index.add(no_keyframe_features().descriptors)
     assert index.candidates(bits, np.ones(1, dtype=np.bool_), 3).tolist() == []
-    assert index.candidates(no_keyframe_features().descriptors, np.ones(1, dtype=np.bool_), 3).tolist() == []
+    assert (
+        index.candidates(no_keyframe_features().descriptors, np.ones(1, dtype=np.bool_), 3).tolist()
+        == []
+    )
 
 
 def test_words_are_the_chosen_bits_and_counted_once_a_keyframe() -> None:
     rng = np.random.default_rng(0)
     descriptors = rng.integers(0, 256, (300, 32), dtype=np.uint8)
     bits, index = np.unpackbits(descriptors, axis=1).astype(np.int64), place_index.PlaceIndex()
-    expected = np.stack([bits[:, columns] @ (1 << np.arange(14)) for columns in place_index._chosen_bits()])
+    expected = np.stack(
+        [bits[:, columns] @ (1 << np.arange(14)) for columns in place_index._chosen_bits()]
+    )
     np.testing.assert_array_equal(place_index.words_of(descriptors), expected)
     index.add(descriptors)
     index.add(descriptors[:100])

@@ -1,4 +1,6 @@
-"""A map over HTTP: poses of image pairs, for several clients at once, and one line for requests that cannot be used."""
+"""A map over HTTP: poses of image pairs, for several clients at once, and one line for requests
+that cannot be used.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def _recording(seed: int, radius: float) -> SimulatedRecording:
     """Nine pairs along a quarter of a circle in a room."""
     angle = np.linspace(0, 0.5 * np.pi, 9)
     R = look_rotation(np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1))
-    p = np.stack([radius * np.cos(angle), 0.8 * radius * np.sin(angle), np.full_like(angle, 1.4)], axis=1)
+    p = np.stack(
+        [radius * np.cos(angle), 0.8 * radius * np.sin(angle), np.full_like(angle, 1.4)], axis=1
+    )
     motion = spline_from_waypoints(se3_from_parts(R, p), 1.0)
     return SimulatedRecording(simulate(room(seed=seed, texel_m=0.006), RIG, motion, rate_hz=1.0))
 
@@ -48,7 +52,13 @@ def _recording(seed: int, radius: float) -> SimulatedRecording:
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of a room, in the frame of its simulation."""
     file, recording = tmp_path_factory.mktemp("maps") / "room.map", _recording(1, 1.1)
-    builder = MapBuilder(MapStore(file, create=True), "room", recording.recording.camera, upright=True, localise=False)
+    builder = MapBuilder(
+        MapStore(file, create=True),
+        "room",
+        recording.recording.camera,
+        upright=True,
+        localise=False,
+    )
     truth = recording.recording.reference
     before = None
     for k, T in enumerate(truth.T_world_body @ RIG.T_imu_cam0):
@@ -78,8 +88,12 @@ def _url(server: MapServer) -> str:
     return f"http://127.0.0.1:{server.server_address[1]}"
 
 
-def test_clients_get_poses_with_covariances_and_the_map_stays(server: MapServer, path: Path) -> None:
-    """Pairs of another path through the room, from four clients at once, and one of another room."""
+def test_clients_get_poses_with_covariances_and_the_map_stays(
+    server: MapServer, path: Path
+) -> None:
+    """Pairs of another path through the room, from four clients at once, and one of another
+    room.
+    """
     before, flight, other = path.read_bytes(), _recording(1, 1.2), _recording(2, 1.2)
     truth = flight.recording.reference
     with ThreadPoolExecutor(4) as pool:
@@ -105,7 +119,12 @@ def test_bad_requests_are_one_line_and_the_server_goes_on(server: MapServer) -> 
     good, damaged = _png(gray), base64.b64encode(base64.b64decode(_png(gray))[:-40]).decode()
     requests: list[tuple[str, Any, int, str]] = [
         ("/localise", {"left": good, "right": good}, 200, ""),
-        ("/localise", {"left": good, "right": good, "camera": {"baseline_m": 0.5}}, 409, "camera: baseline_m is 0.5"),
+        (
+            "/localise",
+            {"left": good, "right": good, "camera": {"baseline_m": 0.5}},
+            409,
+            "camera: baseline_m is 0.5",
+        ),
         ("/localise", {"left": good, "right": good, "camera": {"fu": "wide"}}, 400, "give JSON"),
         ("/localise", {"left": good, "right": good, "camera": {"fu": 10**400}}, 400, "give JSON"),
         ("/localise", {"left": good, "right": _png(gray[:90])}, 409, "right: is of 320x90 pixels"),
@@ -120,7 +139,9 @@ def test_bad_requests_are_one_line_and_the_server_goes_on(server: MapServer) -> 
     ]
     for where, request, status, message in requests:
         connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=20)
-        connection.request("POST", where, request if isinstance(request, bytes) else json.dumps(request))
+        connection.request(
+            "POST", where, request if isinstance(request, bytes) else json.dumps(request)
+        )
         answer = connection.getresponse()
         facts = json.load(answer)
         assert answer.status == status, facts

@@ -1,4 +1,6 @@
-"""The map's file: what is written comes back, a crash leaves the last good state, foreign files are refused."""
+"""The map's file: what is written comes back, a crash leaves the last good state, foreign files
+are refused.
+"""
 
 from __future__ import annotations
 
@@ -36,13 +38,17 @@ CAMERA = StereoCamera(400.0, 401.0, 319.5, 179.5, 0.12, 640, 360)
 def _features(seed: int) -> KeyframeFeatures:
     rng = np.random.default_rng(seed)
     z = rng.uniform(0, 300, (13, 4)).astype(np.float32).astype(np.float64)
-    return KeyframeFeatures(z, rng.random(13) < 0.5, np.full(13, 1.5), rng.integers(0, 256, (13, 32), dtype=np.uint8))
+    return KeyframeFeatures(
+        z, rng.random(13) < 0.5, np.full(13, 1.5), rng.integers(0, 256, (13, 32), dtype=np.uint8)
+    )
 
 
 def _row(k: int) -> KeyframeRow:
     T = se3_exp(np.full(6, 0.1 * k))
     up = np.array([0.0, 0.6, 0.8]) if k % 2 else None
-    return KeyframeRow(0, 5 * k, 10**18 + k, T, se3_exp(np.full(6, 0.2)), 0.1 * np.eye(6), 1.5 * k, up, 0.01)
+    return KeyframeRow(
+        0, 5 * k, 10**18 + k, T, se3_exp(np.full(6, 0.2)), 0.1 * np.eye(6), 1.5 * k, up, 0.01
+    )
 
 
 def _pose(k: int) -> RelativePose:
@@ -78,7 +84,11 @@ def test_what_is_written_comes_back_to_the_bit(tmp_path: Path) -> None:
     rows = store.keyframes()
     for k, row in enumerate(rows):
         expected = _row(k)
-        assert (row.frame, row.time_ns, row.path_m) == (expected.frame, expected.time_ns, expected.path_m)
+        assert (row.frame, row.time_ns, row.path_m) == (
+            expected.frame,
+            expected.time_ns,
+            expected.path_m,
+        )
         np.testing.assert_array_equal(row.T_map_cam, expected.T_map_cam)
         np.testing.assert_array_equal(row.drift, expected.drift)
         assert (row.up_cam is None) == (expected.up_cam is None)
@@ -160,7 +170,9 @@ def test_a_map_of_another_version_is_refused(tmp_path: Path) -> None:
     database = sqlite3.connect(path)
     database.execute(f"PRAGMA user_version = {VERSION + 1}")
     database.close()
-    with pytest.raises(DataError, match=f"is a map of version {VERSION + 1}, this program reads {VERSION}"):
+    with pytest.raises(
+        DataError, match=f"is a map of version {VERSION + 1}, this program reads {VERSION}"
+    ):
         MapStore(path)
 
 
@@ -172,7 +184,10 @@ def _make_older(path: Path, version: int) -> None:
             if map_database.SINCE.get(table, 1) > version:
                 database.execute(f"DROP TABLE {table}")
                 continue
-            columns = [name for (name,) in database.execute("SELECT name FROM pragma_table_info(?)", (table,))]
+            columns = [
+                name
+                for (name,) in database.execute("SELECT name FROM pragma_table_info(?)", (table,))
+            ]
             newer = [name for name in columns if map_database.SINCE.get(name, 1) > version]
             for column in newer:
                 database.execute(f"ALTER TABLE {table} DROP COLUMN {column}")
@@ -185,7 +200,9 @@ def _make_older(path: Path, version: int) -> None:
 
 @pytest.mark.parametrize("version", [1, 2, 3, 4])
 def test_a_map_of_an_older_version_is_read_and_continued(version: int, tmp_path: Path) -> None:
-    """The first one did not say of what cameras its images were; none what the calibration is off by."""
+    """The first one did not say of what cameras its images were; none what the calibration is
+    off by.
+    """
     path = tmp_path / "a.map"
     fill(path).close()
     _make_older(path, version)
@@ -199,19 +216,25 @@ def test_a_map_of_an_older_version_is_read_and_continued(version: int, tmp_path:
     assert MapStore(path, read_only=True).version == VERSION
 
 
-@pytest.mark.parametrize(("session", "recording"), [({"kind": "rgbd"}, {}), ({}, {"projection": "cylinder"})])
+@pytest.mark.parametrize(
+    ("session", "recording"), [({"kind": "rgbd"}, {}), ({}, {"projection": "cylinder"})]
+)
 def test_another_kind_of_camera_is_refused_in_a_line(
     session: dict[str, Any], recording: dict[str, Any], tmp_path: Path
 ) -> None:
     store = MapStore(tmp_path / "a.map", create=True)
     store.add_session(SessionRow("a place", replace(CAMERA, **session), True, 0))
-    with pytest.raises(VioError, match=r"a\.map: (is a map of one camera|a map is made of .* pinhole)") as error:
+    with pytest.raises(
+        VioError, match=r"a\.map: (is a map of one camera|a map is made of .* pinhole)"
+    ) as error:
         MapBuilder(store, "here", replace(CAMERA, **recording), upright=True, localise=False)
     assert "\n" not in str(error.value)
     assert isinstance(error.value, ConfigError if recording else DataError)
 
 
-@pytest.mark.parametrize(("change", "warned"), [({"fu": 1.01 * CAMERA.fu}, False), ({"baseline_m": 0.5}, True)])
+@pytest.mark.parametrize(
+    ("change", "warned"), [({"fu": 1.01 * CAMERA.fu}, False), ({"baseline_m": 0.5}, True)]
+)
 def test_another_rig_is_warned_of(
     change: dict[str, Any], warned: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -221,7 +244,9 @@ def test_another_rig_is_warned_of(
     store.close()
 
 
-def test_a_merge_of_two_rigs_names_files_that_the_user_knows(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_merge_of_two_rigs_names_files_that_the_user_knows(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     fill(tmp_path / "a.map").close()
     store = MapStore(tmp_path / "b.map", create=True)
     store.add_session(SessionRow("there", replace(CAMERA, baseline_m=0.5), True, 0))
@@ -300,7 +325,10 @@ def test_a_file_with_another_schema_is_refused(change: str, tmp_path: Path) -> N
     ("change", "message"),
     [
         ("UPDATE keyframes SET T_map_cam = x'00' WHERE id = 1", "row 1 of keyframes"),
-        ("UPDATE keyframes SET T_map_cam = zeroblob(128) WHERE id = 1", "row 1 of keyframes: a pose is none"),
+        (
+            "UPDATE keyframes SET T_map_cam = zeroblob(128) WHERE id = 1",
+            "row 1 of keyframes: a pose is none",
+        ),
         ("UPDATE keyframes SET drift = 'text' WHERE id = 1", "row 1 of keyframes"),
         ("UPDATE keyframes SET session = 77 WHERE id = 2", "belongs to no session"),
         ("UPDATE keyframes SET time_ns = 'soon' WHERE id = 2", "soon is no integer"),
@@ -312,7 +340,10 @@ def test_a_file_with_another_schema_is_refused(change: str, tmp_path: Path) -> N
         ("UPDATE odometry SET covariance = x'' WHERE second = 2", "row 2 of odometry"),
         ("DELETE FROM features WHERE keyframe = 3", "has no features"),
         ("UPDATE features SET z = substr(z, 1, 20) WHERE keyframe = 1", "row 1 of features"),
-        ("UPDATE features SET has_right = x'' WHERE keyframe = 1", "row 1 of features: its arrays are of different"),
+        (
+            "UPDATE features SET has_right = x'' WHERE keyframe = 1",
+            "row 1 of features: its arrays are of different",
+        ),
         (
             "UPDATE features SET sigma_px = substr(sigma_px, 5) WHERE keyframe = 1",
             "its arrays are of different lengths",
@@ -322,7 +353,9 @@ def test_a_file_with_another_schema_is_refused(change: str, tmp_path: Path) -> N
     ],
 )
 @pytest.mark.parametrize("version", [2, VERSION])
-def test_values_that_do_not_fit_together_are_one_line(version: int, change: str, message: str, tmp_path: Path) -> None:
+def test_values_that_do_not_fit_together_are_one_line(
+    version: int, change: str, message: str, tmp_path: Path
+) -> None:
     """Version 2 has no checksums, which find any change."""
     path = tmp_path / "a.map"
     fill(path).close()
@@ -331,10 +364,15 @@ def test_values_that_do_not_fit_together_are_one_line(version: int, change: str,
     with contextlib.closing(sqlite3.connect(path)) as database:
         database.execute(change)
         database.commit()
-    with pytest.raises(DataError, match=r"a\.map: is damaged or no map \(.*\); restore a copy") as error:
+    with pytest.raises(
+        DataError, match=r"a\.map: is damaged or no map \(.*\); restore a copy"
+    ) as error:
         _content(path)
     assert "\n" not in str(error.value)
-    assert re.search(message if version == 2 or "DELETE" in change else "checksum does not agree", str(error.value))
+    assert re.search(
+        message if version == 2 or "DELETE" in change else "checksum does not agree",
+        str(error.value),
+    )
 
 
 def _is_same_or_refused(path: Path, expected: list[Any]) -> bool:
@@ -361,7 +399,9 @@ def test_a_map_whose_bytes_have_flipped_is_refused_or_the_same(tmp_path: Path) -
     assert refused > 20
 
 
-def test_a_long_step_ends_with_a_signal_and_with_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_step_ends_with_a_signal_and_with_its_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def stop(number: int, frame: Any) -> None:
         raise KeyboardInterrupt
 

@@ -9,11 +9,19 @@ from scipy.stats import chi2, kstest
 from vio.filters.noise import MotionNoise, StepErrors, whitened_correction
 from vio.geometry.lie import FloatArray
 
-_AXES = {"isotropic": (1.0, 1.0, 1.0), "one axis": (100.0, 1.0, 1.0), "two axes": (100.0, 100.0, 1.0)}
+_AXES = {
+    "isotropic": (1.0, 1.0, 1.0),
+    "one axis": (100.0, 1.0, 1.0),
+    "two axes": (100.0, 100.0, 1.0),
+}
 
 
 def _step(
-    correction: FloatArray, *, expected: float = 4e-4, process: float = 1e-4, remaining: float = 1e-6
+    correction: FloatArray,
+    *,
+    expected: float = 4e-4,
+    process: float = 1e-4,
+    remaining: float = 1e-6,
 ) -> StepErrors:
     """A step whose covariances are those of one axis, the same on all."""
     return StepErrors(correction, np.eye(6) * expected, np.eye(6) * process, np.eye(6) * remaining)
@@ -29,12 +37,14 @@ def _covariance(axes: tuple[float, float, float], seed: int) -> FloatArray:
 def _draw(rng: np.random.Generator, P: FloatArray, truth: float, remaining: float) -> StepErrors:
     """A step whose sensor is noisier than P (6, 6) says by a factor; the images leave a share of P.
 
-    The correction is what the images say of the prediction's error, a share `1 - remaining` of it and noise of their
-    own, with covariance `P_true - P_remaining` where the factor is one.
+    The correction is what the images say of the prediction's error, a share `1 - remaining` of it
+    and noise of their own, with covariance `P_true - P_remaining` where the factor is one.
     """
     gain = 1 - remaining
     images = rng.multivariate_normal(np.zeros(6), P * remaining / gain, method="cholesky")
-    correction = gain * (rng.multivariate_normal(np.zeros(6), P * truth**2, method="cholesky") + images)
+    correction = gain * (
+        rng.multivariate_normal(np.zeros(6), P * truth**2, method="cholesky") + images
+    )
     return StepErrors(correction, P, P, P * remaining)
 
 
@@ -46,7 +56,8 @@ def test_noise_that_is_missing_would_have_explained_the_correction() -> None:
     squared = 0.3**2 / (4e-4 - 1e-6)
     explained = 4e-4 + missing[0] * 1e-4  # variance on each axis of a step that knew it
     np.testing.assert_allclose(explained / 4e-4, squared / 3)
-    assert not _step(np.array([0.09, 0, 0, 0, 0, 0])).missing_noise().any()  # 4.5 sigma, chi-square 20.3 of 21.1
+    # 4.5 sigma, chi-square 20.3 of 21.1
+    assert not _step(np.array([0.09, 0, 0, 0, 0, 0])).missing_noise().any()
     assert _step(np.array([0.093, 0, 0, 0, 0, 0])).missing_noise()[0] > 0
 
 
@@ -63,12 +74,15 @@ def test_missing_noise_is_bounded_where_the_model_claims_none() -> None:
 def test_the_whitened_correction_is_chi_square_in_the_informed_directions(
     axes: tuple[float, float, float], informed: int
 ) -> None:
-    """Any covariance, images that know only some directions: Kolmogorov-Smirnov on 2000 corrections."""
+    """Any covariance, images that know only some directions: Kolmogorov-Smirnov on 2000
+    corrections.
+    """
     rng = np.random.default_rng(1)
     B = 1e-4 * _covariance(axes, 2)
     L = np.linalg.cholesky(B)
     Q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    removed = np.where(np.arange(3) < informed, [0.9, 0.6, 0.4], 0.1)  # shares of the predicted variance
+    # shares of the predicted variance
+    removed = np.where(np.arange(3) < informed, [0.9, 0.6, 0.4], 0.1)
     gained = L @ (Q * removed) @ Q.T @ L.T
     expected, remaining = np.eye(6), np.eye(6)
     expected[:3, :3], remaining[:3, :3] = B, B - gained
@@ -77,7 +91,9 @@ def test_the_whitened_correction_is_chi_square_in_the_informed_directions(
     values = []
     for _ in range(2000):
         correction = np.concatenate([root @ rng.normal(size=3), np.zeros(3)])
-        test = whitened_correction(StepErrors(correction, expected, process, remaining), slice(0, 3))
+        test = whitened_correction(
+            StepErrors(correction, expected, process, remaining), slice(0, 3)
+        )
         assert test.dof == informed
         np.testing.assert_allclose(test.share, 0.25, rtol=1e-6)
         values.append(test.squared)
@@ -85,17 +101,24 @@ def test_the_whitened_correction_is_chi_square_in_the_informed_directions(
 
 
 def test_a_correction_without_covariance_or_information_says_nothing() -> None:
-    for step in (_step(np.ones(6), expected=0.0, remaining=0.0), _step(np.ones(6), remaining=3.9e-4)):
+    for step in (
+        _step(np.ones(6), expected=0.0, remaining=0.0),
+        _step(np.ones(6), remaining=3.9e-4),
+    ):
         test = whitened_correction(step, slice(0, 3))
         assert (test.squared, test.dof, test.share) == (0.0, 0, 0.0)
 
 
 @pytest.mark.parametrize("axes", _AXES.values(), ids=_AXES)
 @pytest.mark.parametrize("truth", [0.5, 1.0, 6.0])
-def test_factors_find_how_much_noisier_the_sensor_is(axes: tuple[float, float, float], truth: float) -> None:
-    """Corrections as a sensor makes them whose noise is `truth` times the data sheet's; the filter uses the factor.
+def test_factors_find_how_much_noisier_the_sensor_is(
+    axes: tuple[float, float, float], truth: float
+) -> None:
+    """Corrections as a sensor makes them whose noise is `truth` times the data sheet's; the filter
+    uses the factor.
 
-    Whatever the shape of the covariance: with one dominant axis an isotropic statistic settles at 0.73.
+    Whatever the shape of the covariance: with one dominant axis an isotropic statistic settles at
+    0.73.
     """
     noise, rng = MotionNoise(1.0, 0.1, 50.0), np.random.default_rng(0)
     sheet = np.zeros((6, 6))
@@ -112,7 +135,9 @@ def test_factors_find_how_much_noisier_the_sensor_is(axes: tuple[float, float, f
 
 @pytest.mark.parametrize("remaining", [0.1, 0.5])
 def test_a_right_factor_stays_where_the_images_are_no_exact_truth(remaining: float) -> None:
-    """The covariance of a correction is what the images removed, not all of the predicted variance."""
+    """The covariance of a correction is what the images removed, not all of the predicted
+    variance.
+    """
     noise, rng, logs = MotionNoise(1.0, 0.1, 50.0), np.random.default_rng(5), []
     sheet = np.zeros((6, 6))
     sheet[:3, :3], sheet[3:, 3:] = 1e-4 * _covariance((100.0, 1.0, 1.0), 3), 1e-6 * np.eye(3)
@@ -137,9 +162,11 @@ def test_factors_wait_for_the_sum_and_pass_over_what_tells_little() -> None:
         noise.update(_step(np.full(6, 1.0)))
     np.testing.assert_array_equal(noise.factors, [5.0, 5.0])
     noise.update(_step(np.full(6, 1.0)))
-    # Equation (N8): the first of the sums, whose probability is one; a quarter of the variance is the steps' own.
+    # Equation (N8): the first of the sums, whose probability is one; a quarter of the variance is
+    # the steps' own.
     variance, H = 1.5**2 + 0.15**2, 2 / np.pi / 4
-    change = variance * H / (H * variance * H + 1 / 3)  # of the logarithm of the squared factor; the innovation is one
+    # of the logarithm of the squared factor; the innovation is one
+    change = variance * H / (H * variance * H + 1 / 3)
     np.testing.assert_allclose(noise.factors, 5.0 * np.exp(0.5 * change))
     learned = noise.factors.copy()
     for _ in range(10):
@@ -152,7 +179,14 @@ def test_a_single_wild_sum_moves_a_settled_factor_little() -> None:
     noise, rng = MotionNoise(1.0, 0.1, 50.0), np.random.default_rng(6)
     P = np.eye(6) * 1e-4
     for _ in range(3000):
-        noise.update(StepErrors(rng.normal(0, 1e-2, 6), P * noise.factors[0] ** 2, P * noise.factors[0] ** 2, P * 1e-6))
+        noise.update(
+            StepErrors(
+                rng.normal(0, 1e-2, 6),
+                P * noise.factors[0] ** 2,
+                P * noise.factors[0] ** 2,
+                P * 1e-6,
+            )
+        )
     before = noise.factors.copy()
     for _ in range(10):
         noise.update(StepErrors(np.full(6, 1e3), P, P, P * 1e-6))

@@ -1,4 +1,6 @@
-"""An object over most of the image: the predicted motion tells it from the scene, and it is said."""
+"""An object over most of the image: the predicted motion tells it from the scene, and it is
+said.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,10 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, s
 from vio.geometry.stereo import project, triangulate
 from vio.records import BoolArray, MotionPrior, TrackPrior
 
-T_OBJECT = se3_exp([0.4, 0.1, -0.6, 0.0, 0.01, 0.0])  # what the camera would have done by the object's points
-IMU = np.diag(np.repeat([0.003, 0.0003], 3) ** 2)  # covariance of a prediction over one frame, m and rad
+# what the camera would have done by the object's points
+T_OBJECT = se3_exp([0.4, 0.1, -0.6, 0.0, 0.01, 0.0])
+# covariance of a prediction over one frame, m and rad
+IMU = np.diag(np.repeat([0.003, 0.0003], 3) ** 2)
 NOTHING = np.diag(np.repeat([3.0, 0.3], 3) ** 2)
 
 
@@ -53,7 +57,9 @@ def choose(
 
 
 def test_prediction_chooses_the_smaller_group_that_agrees_with_it() -> None:
-    """One point in five is of the scene, the others are of an object: the consensus is the object's."""
+    """One point in five is of the scene, the others are of an object: the consensus is the
+    object's.
+    """
     chosen, found, truck = choose(60, 240, prediction())
     assert found.inliers[truck].mean() > 0.95  # control: the test would be trivial otherwise
     assert chosen.motion.inliers[~truck].mean() > 0.95
@@ -66,10 +72,15 @@ def test_an_object_over_the_smaller_part_is_reported_and_changes_nothing() -> No
     chosen, found, truck = choose(160, 140, prediction())
     assert not found.inliers[truck].any()
     assert chosen.motion is found
-    assert (chosen.decision, chosen.object_share) == ("predicted", pytest.approx(140 / 300, abs=0.03))
+    assert (chosen.decision, chosen.object_share) == (
+        "predicted",
+        pytest.approx(140 / 300, abs=0.03),
+    )
 
 
-@pytest.mark.parametrize("predicted", [None, prediction(covariance=NOTHING)], ids=["none", "of no use"])
+@pytest.mark.parametrize(
+    "predicted", [None, prediction(covariance=NOTHING)], ids=["none", "of no use"]
+)
 def test_without_a_useful_prediction_the_larger_group_is_used_and_called_undecided(
     predicted: MotionPrior | None,
 ) -> None:
@@ -91,7 +102,9 @@ def test_a_wrong_prediction_does_not_override_the_consensus() -> None:
 
 
 @pytest.mark.parametrize("static", [40, 200])
-def test_without_depths_an_object_ahead_of_a_turning_camera_contradicts_the_imu(static: int) -> None:
+def test_without_depths_an_object_ahead_of_a_turning_camera_contradicts_the_imu(
+    static: int,
+) -> None:
     """It keeps its place in the image, which a camera that moves sideways as it turns sees, too."""
     turn = se3_exp([0.02, 0.0, -0.8, 0.0, 0.05, 0.0])
     wall, truck = scene(static, 12, (8.0, 40.0)), scene(160, 13, (6.0, 8.0)) * [0.3, 1.0, 1.0]
@@ -103,13 +116,19 @@ def test_without_depths_an_object_ahead_of_a_turning_camera_contradicts_the_imu(
         used = static_by_prediction(make_problem(), before, after, kept, imu, 1.0)
         assert used[~moves].mean() > 0.95
         assert used[moves].mean() < 0.2
-    np.testing.assert_array_equal(static_by_prediction(make_problem(), before, after, ~moves, imu, 1.0), ~moves)
+    np.testing.assert_array_equal(
+        static_by_prediction(make_problem(), before, after, ~moves, imu, 1.0), ~moves
+    )
     useless = replace(imu, covariance=1e3 * NOTHING)
-    np.testing.assert_array_equal(static_by_prediction(make_problem(), before, after, moves, useless, 1.0), moves)
+    np.testing.assert_array_equal(
+        static_by_prediction(make_problem(), before, after, moves, useless, 1.0), moves
+    )
 
 
 def test_of_two_motions_off_the_prediction_the_one_far_nearer_is_used() -> None:
-    """The IMU is ten times worse than it says, by a late stamp say: the scene contradicts it, the object far more."""
+    """The IMU is ten times worse than it says, by a late stamp say: the scene contradicts it,
+    the object far more.
+    """
     late = prediction(se3_exp([0.02, 0.0, 0.0, 0.0, 0.003, 0.0]) @ T_TRUE)
     for static, moving in ((60, 240), (240, 60)):
         chosen, found, truck = choose(static, moving, late)
@@ -121,7 +140,9 @@ def test_of_two_motions_off_the_prediction_the_one_far_nearer_is_used() -> None:
 
 
 def test_an_object_that_hides_the_scene_does_not_become_the_scene() -> None:
-    """Six points of the scene are left, too few for a motion: while the object is known, the prediction is used."""
+    """Six points of the scene are left, too few for a motion: while the object is known, the
+    prediction is used.
+    """
     before, found, truck = choose(6, 300, prediction())
     assert before.motion is found  # control
     for measured in (True, False):
@@ -132,7 +153,9 @@ def test_an_object_that_hides_the_scene_does_not_become_the_scene() -> None:
 
 
 def test_points_seen_before_outvote_what_has_come_into_view() -> None:
-    """No sensor, and a prediction that fits the object: the older points of the scene decide, four of five or one."""
+    """No sensor, and a prediction that fits the object: the older points of the scene decide,
+    four of five or one.
+    """
     for static, moving in ((60, 240), (240, 60)):
         p, uv, truck = scenery(static, moving)
         found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
@@ -140,14 +163,20 @@ def test_points_seen_before_outvote_what_has_come_into_view() -> None:
         age = np.where(truck, 9, 30)
         age[-5:] = 30  # some wrong ones
         guess = replace(prediction(T_OBJECT), measured=False)
-        chosen = choose_motion(make_problem(), p, uv, found, guess, voting=voters(age), in_event=True)
+        chosen = choose_motion(
+            make_problem(), p, uv, found, guess, voting=voters(age), in_event=True
+        )
         assert chosen.motion.inliers[~truck].mean() > 0.95
         assert not chosen.motion.inliers[truck].any()
-        assert (chosen.decision, chosen.object_share > 0) == (("voted", True) if moving > static else (None, False))
+        assert (chosen.decision, chosen.object_share > 0) == (
+            ("voted", True) if moving > static else (None, False)
+        )
 
 
 def test_a_compromise_between_slow_object_and_scene_is_outvoted() -> None:
-    """One motion fits the object and a part of the scene, so that no second group of points is left that agrees."""
+    """One motion fits the object and a part of the scene, so that no second group of points is
+    left that agrees.
+    """
     wall, truck = scene(100, 12, (8.0, 40.0)), scene(260, 13, (6.0, 8.0))
     slow = pixels(T_TRUE, truck, 15)
     slow[:, 0] += 5.0
@@ -155,24 +184,36 @@ def test_a_compromise_between_slow_object_and_scene_is_outvoted() -> None:
     p, on_truck = np.concatenate([wall, truck]), np.arange(360) >= 100
     found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
     assert 0.3 < found.inliers[~on_truck].mean() < 0.7  # control
-    chosen = choose_motion(make_problem(), p, uv, found, None, voting=voters(np.where(on_truck, 6, 30)))
+    chosen = choose_motion(
+        make_problem(), p, uv, found, None, voting=voters(np.where(on_truck, 6, 30))
+    )
     assert chosen.motion.inliers[~on_truck].mean() > 0.95
     assert np.linalg.norm(se3_log(chosen.motion.T_curr_prev @ se3_inverse(T_TRUE))) < 0.02
 
 
 def compromise() -> tuple[FloatArray, FloatArray, Consensus, FloatArray]:
-    """An object, and a scene most of which is so far away that a turn explains it under the object's motion, too."""
-    far, near, truck = scene(110, 12, (400.0, 900.0)), scene(25, 13, (5.0, 9.0)), scene(115, 14, (6.0, 8.0))
+    """An object, and a scene most of which is so far away that a turn explains it under the
+    object's motion, too.
+    """
+    far, near, truck = (
+        scene(110, 12, (400.0, 900.0)),
+        scene(25, 13, (5.0, 9.0)),
+        scene(115, 14, (6.0, 8.0)),
+    )
     of_object = se3_exp([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]) @ T_TRUE
     p = np.concatenate([far, near, truck])
-    uv = np.concatenate([pixels(T_TRUE, far, 15), pixels(T_TRUE, near, 16), pixels(of_object, truck, 17)])
+    uv = np.concatenate(
+        [pixels(T_TRUE, far, 15), pixels(T_TRUE, near, 16), pixels(of_object, truck, 17)]
+    )
     found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
     assert found is not None
     return p, uv, found, np.repeat([0, 1, 2], [110, 25, 115])
 
 
 def test_the_prediction_outweighs_an_object_that_shares_what_is_far_away_with_the_scene() -> None:
-    """The oldest points are all far away and follow both motions, so that their votes say nothing."""
+    """The oldest points are all far away and follow both motions, so that their votes say
+    nothing.
+    """
     p, uv, found, part = compromise()
     assert found.inliers[part == 2].mean() > 0.9  # control
     assert found.inliers[part == 0].mean() > 0.9
@@ -202,7 +243,11 @@ def test_few_or_divided_votes_decide_nothing() -> None:
     found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
     assert found is not None
     without = choose_motion(make_problem(), p, uv, found, None)
-    for age in (np.where(np.arange(300) < 11, 30, 2), np.full(300, 30), np.zeros(300, dtype=np.int64)):
+    for age in (
+        np.where(np.arange(300) < 11, 30, 2),
+        np.full(300, 30),
+        np.zeros(300, dtype=np.int64),
+    ):
         voting = voters(age) & ((np.arange(300) < 120) | (age < 30))
         chosen = choose_motion(make_problem(), p, uv, found, None, voting=voting)
         assert (chosen.decision, chosen.object_share) == (without.decision, without.object_share)
@@ -212,13 +257,14 @@ def test_a_scene_that_is_nearly_hidden_is_not_used_and_it_is_said() -> None:
     report = ObjectReport()
     half = TwoMotions(Consensus(np.eye(4), np.arange(100) < 40), 0.5, "voted")
     little = TwoMotions(Consensus(np.eye(4), np.arange(100) < 8), 0.9, "voted")
-    assert not any(report.hides_scene(k, little) for k in range(5))  # no object is known: wrong matches, say
+    # no object is known: wrong matches, say
+    assert not any(report.hides_scene(k, little) for k in range(5))
     for k in range(5, 10):
         report.frame(k, half)
     assert report.active
-    assert [report.hides_scene(k, motions) for k, motions in enumerate([half, *[little] * 5, half])] == (
-        [False] * 3 + [True] * 3 + [False]
-    )
+    assert [
+        report.hides_scene(k, motions) for k, motions in enumerate([half, *[little] * 5, half])
+    ] == ([False] * 3 + [True] * 3 + [False])
     (line,) = [line for line in report.take_lines() if "hides it" in line]
     assert line.startswith("frame 3: fewer than 10 % of the points are left of the scene")
 
@@ -261,7 +307,9 @@ def _lines(p: FloatArray, z: FloatArray, uv: FloatArray) -> list[str]:
     for _ in range(20):
         stereo.update_rows(tracks)
     for k in range(6):
-        frontend._reject_outliers(make_problem(), tracks, uv, everything, None, np.eye(4), stereo, k)
+        frontend._reject_outliers(
+            make_problem(), tracks, uv, everything, None, np.eye(4), stereo, k
+        )
     return list(frontend._take_lines())
 
 
@@ -283,7 +331,9 @@ def _two_walls() -> FloatArray:
 
 
 def test_wrong_depths_of_a_yawed_right_camera_are_no_moving_object() -> None:
-    """With 12.6 px of disparity too much, 16 m become 10 and 6 m become 5: the walls seem to move apart."""
+    """With 12.6 px of disparity too much, 16 m become 10 and 6 m become 5: the walls seem to
+    move apart.
+    """
     p = _two_walls()
     z, uv = _yawed(project(CAMERA, p)), pixels(T_TRUE, p, 14)
     wrong, _ = triangulate(CAMERA, z)
@@ -310,7 +360,9 @@ def test_left_images_show_an_object_that_covers_most_of_them() -> None:
 
 
 def test_an_object_that_moves_along_the_road_is_reported_where_the_rows_agree() -> None:
-    """Its points stay on the epipolar lines of the scene: without its depths it would pass for static."""
+    """Its points stay on the epipolar lines of the scene: without its depths it would pass for
+    static.
+    """
     p = np.concatenate([scene(180, 12, (12.0, 40.0)), scene(120, 13, (6.0, 8.0))])
     T_car = se3_from_parts(T_TRUE[:3, :3], 0.4 * T_TRUE[:3, 3])
     uv = np.concatenate([pixels(T_TRUE, p[:180], 14), pixels(T_car, p[180:], 15)])
@@ -320,7 +372,11 @@ def test_an_object_that_moves_along_the_road_is_reported_where_the_rows_agree() 
 
 def test_a_prediction_that_is_no_number_is_not_used() -> None:
     broken = MotionPrior(np.full((4, 4), np.nan), IMU)
-    prior = usable_prior(TrackPrior(np.array([1]), np.array([[1.0, 2.0, 0.0, 2.0]]), np.eye(3), broken))
+    prior = usable_prior(
+        TrackPrior(np.array([1]), np.array([[1.0, 2.0, 0.0, 2.0]]), np.eye(3), broken)
+    )
     assert prior.motion is None
-    good = usable_prior(TrackPrior(np.array([1]), np.array([[1.0, 2.0, 0.0, 2.0]]), np.eye(3), prediction()))
+    good = usable_prior(
+        TrackPrior(np.array([1]), np.array([[1.0, 2.0, 0.0, 2.0]]), np.eye(3), prediction())
+    )
     assert good.motion is not None

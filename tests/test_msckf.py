@@ -1,4 +1,6 @@
-"""The sliding-window filter: its Jacobians, the algebra it rests on, consistency, and behaviour under trouble."""
+"""The sliding-window filter: its Jacobians, the algebra it rests on, consistency, and behaviour
+under trouble.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,14 @@ from vio.errors import ConfigError, DataError, DivergedError, EstimationError
 from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters import imu_start
 from vio.filters.msckf import Msckf
-from vio.filters.multiview import Residuals, Views, first_points, refine_points, residuals, track_information
+from vio.filters.multiview import (
+    Residuals,
+    Views,
+    first_points,
+    refine_points,
+    residuals,
+    track_information,
+)
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.prior import posterior
 from vio.filters.restart import restarted
@@ -34,11 +43,20 @@ from vio.geometry.lie import (
     transform_points,
 )
 from vio.geometry.stereo import StereoCamera, project
-from vio.records import ImuSample, IntArray, Observations, UpdateReport, VelocitySample, observations
+from vio.records import (
+    ImuSample,
+    IntArray,
+    Observations,
+    UpdateReport,
+    VelocitySample,
+    observations,
+)
 
 EXACT_RIG = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
-T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
+T_CAM0_IMU = se3_from_parts(
+    np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1])
+)
 STEP_NS = 50_000_000
 
 
@@ -51,7 +69,9 @@ def _poses(n: int, seed: int = 0) -> FloatArray:
 
 def _world_points(T_cam0_world: FloatArray, n: int, seed: int = 1) -> FloatArray:
     rng = np.random.default_rng(seed)
-    p_cam = np.column_stack([rng.uniform(-1.2, 1.2, n), rng.uniform(-0.8, 0.8, n), rng.uniform(2, 6, n)])
+    p_cam = np.column_stack(
+        [rng.uniform(-1.2, 1.2, n), rng.uniform(-0.8, 0.8, n), rng.uniform(2, 6, n)]
+    )
     return transform_points(se3_inverse(T_cam0_world[0]), p_cam)
 
 
@@ -96,7 +116,9 @@ def test_clone_jacobian_is_that_of_the_right_invariant_error() -> None:
         return project(CAMERA, transform_points(moved, p[0]))
 
     analytic = at.z_D_p[0, 0] @ point_D_pose(p)[0]
-    np.testing.assert_allclose(analytic, numeric_jacobian(pixels, np.zeros(6)), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(
+        analytic, numeric_jacobian(pixels, np.zeros(6)), rtol=1e-5, atol=1e-4
+    )
 
 
 def test_points_are_found_from_noisy_views() -> None:
@@ -109,7 +131,9 @@ def test_points_are_found_from_noisy_views() -> None:
     at = residuals(CAMERA, T, refined, views)
     gradient = np.einsum("fnki,fnk->fi", at.z_D_p, at.r)
     assert np.abs(gradient).max() < 1e-2  # a minimum
-    assert np.median(np.linalg.norm(refined - p, axis=1)) < np.median(np.linalg.norm(start - p, axis=1))
+    assert np.median(np.linalg.norm(refined - p, axis=1)) < np.median(
+        np.linalg.norm(start - p, axis=1)
+    )
 
 
 def _stacked(at: Residuals, p: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
@@ -126,11 +150,15 @@ def _stacked(at: Residuals, p: FloatArray) -> list[tuple[FloatArray, FloatArray,
 
 
 def test_elimination_equals_the_left_null_space() -> None:
-    """The MSCKF's projection onto the left null space of H_point, done by QR, gives the same information."""
+    """The MSCKF's projection onto the left null space of H_point, done by QR, gives the same
+    information.
+    """
     T = _poses(5)
     p = _world_points(T, 8)
     at = residuals(CAMERA, T, p, _views(T, p, noise=0.5))
-    A, b = eliminate_points(track_information(CAMERA, T, at, p, np.ones((8, 5))), np.ones(8, dtype=np.bool_))
+    A, b = eliminate_points(
+        track_information(CAMERA, T, at, p, np.ones((8, 5))), np.ones(8, dtype=np.bool_)
+    )
     A_null, b_null = np.zeros_like(A), np.zeros_like(b)
     for H, H_point, r in _stacked(at, p):
         Q, _ = np.linalg.qr(H_point, mode="complete")
@@ -150,7 +178,9 @@ def test_elimination_equals_a_marginalised_landmark() -> None:
     H, H_point, r = _stacked(at, p)[0]
     root = np.random.default_rng(4).normal(size=(24, 24)) * 0.02
     P = root @ root.T
-    A, b = eliminate_points(track_information(CAMERA, T, at, p, np.ones((1, 4))), np.ones(1, dtype=np.bool_))
+    A, b = eliminate_points(
+        track_information(CAMERA, T, at, p, np.ones((1, 4))), np.ones(1, dtype=np.bool_)
+    )
     P_new, shift = posterior(P, A, b)
     J = np.concatenate([H, H_point], axis=1)
     flat = np.linalg.inv(P)
@@ -192,12 +222,16 @@ def test_posterior_is_the_kalman_update_also_for_a_singular_prior() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_unobservable_directions_gain_nothing_whatever_the_estimate(seed: int) -> None:
-    """Moving and yawing the whole world leaves all pixels alone: with right-invariant errors exactly, everywhere."""
+    """Moving and yawing the whole world leaves all pixels alone: with right-invariant errors
+    exactly, everywhere.
+    """
     T = _poses(5, seed) @ se3_exp(np.random.default_rng(seed).normal(0, 3, 6))
     p = _world_points(T, 20, seed)
     estimate = p + np.random.default_rng(seed + 50).normal(0, 0.3, p.shape)
     at = residuals(CAMERA, T, estimate, _views(T, p, noise=2.0))
-    A, _ = eliminate_points(track_information(CAMERA, T, at, estimate, np.ones((20, 5))), np.ones(20, dtype=np.bool_))
+    A, _ = eliminate_points(
+        track_information(CAMERA, T, at, estimate, np.ones((20, 5))), np.ones(20, dtype=np.bool_)
+    )
     for direction in np.eye(6):
         world_moves = np.tile(direction, 5)
         assert abs(world_moves @ A @ world_moves) < 1e-6 * np.abs(A).max()
@@ -220,7 +254,11 @@ def _spin(n: int = 11, seed: int = 3) -> list[ImuSample]:
 def _imu_nav() -> NavState:
     T = se3_exp([3.0, -2.0, 1.0, 0.4, -0.8, 1.1])
     return NavState(
-        T, np.array([1.0, -0.5, 0.3]), np.zeros(3), np.array([0.01, -0.02, 0.03]), np.array([0.1, 0.05, -0.1])
+        T,
+        np.array([1.0, -0.5, 0.3]),
+        np.zeros(3),
+        np.array([0.01, -0.02, 0.03]),
+        np.array([0.1, 0.05, -0.1]),
     )
 
 
@@ -228,7 +266,9 @@ def _difference(motion: ImuMotion | TwistMotion, a: NavState, b: NavState) -> Fl
     """The error that takes b to a: the inverse of `corrected`."""
     xi = se3_log(a.T_world_imu @ se3_inverse(b.T_world_imu))
     if isinstance(motion, TwistMotion):
-        return np.concatenate([xi, a.velocity - b.velocity, a.rate - b.rate, a.gyro_bias - b.gyro_bias])
+        return np.concatenate(
+            [xi, a.velocity - b.velocity, a.rate - b.rate, a.gyro_bias - b.gyro_bias]
+        )
     phi = xi[3:]
     v = so3_left_jacobian_inverse(phi) @ (a.velocity - so3_exp(phi) @ b.velocity)
     return np.concatenate([xi, v, a.gyro_bias - b.gyro_bias, a.accel_bias - b.accel_bias])
@@ -257,9 +297,14 @@ def test_imu_transition_equals_central_differences() -> None:
 
 
 def test_navigation_part_of_the_imu_transition_does_not_depend_on_the_state() -> None:
-    """The point of the invariant error: (position, attitude, velocity) flow the same from every state."""
+    """The point of the invariant error: (position, attitude, velocity) flow the same from every
+    state.
+    """
     Phis = []
-    for nav in (_imu_nav(), NavState(np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))):
+    for nav in (
+        _imu_nav(),
+        NavState(np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)),
+    ):
         motion = ImuMotion(_imu_settings())
         for sample in _spin():
             motion.take(sample)
@@ -291,7 +336,9 @@ def test_twist_transition_equals_central_differences() -> None:
     step = motion.advance(nav, 0, 100_000_000)
 
     def flow(error: FloatArray) -> FloatArray:
-        return _difference(motion, motion.advance(motion.corrected(nav, error), 0, 100_000_000).nav, step.nav)
+        return _difference(
+            motion, motion.advance(motion.corrected(nav, error), 0, 100_000_000).nav, step.nav
+        )
 
     np.testing.assert_allclose(step.Phi, numeric_jacobian(flow, np.zeros(DIM)), atol=1e-6)
 
@@ -327,7 +374,9 @@ def test_clone_is_a_copy_with_all_its_correlations() -> None:
 
 
 def test_new_anchor_of_the_landmarks_changes_no_prediction() -> None:
-    """Errors of a landmark in the newest clone's camera: the same distribution before and after the anchor moves."""
+    """Errors of a landmark in the newest clone's camera: the same distribution before and after
+    the anchor moves.
+    """
     window = _window()
     p = np.array([[4.0, 1.0, 0.5], [6.0, -2.0, 1.0]])
     A = np.random.default_rng(1).normal(size=(6, len(window.prior.P))) * 0.3
@@ -357,7 +406,9 @@ def test_relinearising_moves_the_means_and_not_the_prior() -> None:
     np.testing.assert_allclose(window.prior.delta, error)
     window.relinearise(-window.prior.delta)
     np.testing.assert_allclose(window.prior.delta, 0, atol=1e-15)
-    np.testing.assert_allclose(window.clones[2].T_world_imu, _window().clones[2].T_world_imu, atol=1e-4)
+    np.testing.assert_allclose(
+        window.clones[2].T_world_imu, _window().clones[2].T_world_imu, atol=1e-4
+    )
 
 
 def test_commit_in_two_parts_equals_commit_at_once() -> None:
@@ -377,12 +428,15 @@ def test_track_table_keeps_rows_apart_and_grows() -> None:
     table = TrackTable(4)
     z = np.arange(4 * 600, dtype=np.float64).reshape(600, 4)
     table.add_frame(0, observations(0, 0, np.arange(600), z))
-    table.add_frame(1, observations(1, 1, np.arange(300, 600), z[300:] + 1, has_right=np.arange(300) % 2 == 0))
+    table.add_frame(
+        1, observations(1, 1, np.arange(300, 600), z[300:] + 1, has_right=np.arange(300) % 2 == 0)
+    )
     rows = table.rows()
     np.testing.assert_array_equal(table.ids(rows), np.arange(600))
     views = table.views(rows, 2)
     np.testing.assert_array_equal(views.z[450, 1], z[450] + 1)
-    assert views.weight[[300, 301], 1].tolist() == [[1, 1, 1, 0], [1, 1, 0, 0]]  # the right row is never measured
+    # the right row is never measured
+    assert views.weight[[300, 301], 1].tolist() == [[1, 1, 1, 0], [1, 1, 0, 0]]
     table.remove(rows[:300])
     table.shift()
     rows = table.rows()
@@ -393,23 +447,31 @@ def test_track_table_keeps_rows_apart_and_grows() -> None:
 
 
 def test_precisions_are_relative_to_the_frames_median_and_bounded() -> None:
-    seen = observations(0, 0, np.arange(5), np.zeros((5, 4)), has_right=[True, False, True, True, True])
+    seen = observations(
+        0, 0, np.arange(5), np.zeros((5, 4)), has_right=[True, False, True, True, True]
+    )
     sigma = np.float32([[2, 2, 4], [2, 1, 99], [2, np.nan, 2], [0.01, 0, 2], [2, 2, 2e9]])
     weight = precision(replace(seen, sigma=sigma))
     expected = [[1, 1, 0.5, 0], [1, 2, 0, 0], [1, 1, 1, 0], [3, 1, 1, 0], [1, 1, 0.1, 0]]
     np.testing.assert_allclose(weight, expected, rtol=1e-6)
-    np.testing.assert_array_equal(precision(seen), precision(replace(seen, sigma=np.ones((5, 3), np.float32))))
+    np.testing.assert_array_equal(
+        precision(seen), precision(replace(seen, sigma=np.ones((5, 3), np.float32)))
+    )
     few = np.full((5, 3), np.inf, np.float32)
     few[0] = 2
     expected = [[1, 1, 1, 0], [0.1, 0.1, 0, 0], *[[0.1, 0.1, 0.1, 0]] * 3]
     np.testing.assert_allclose(precision(replace(seen, sigma=few)), expected, rtol=1e-6)
-    np.testing.assert_array_equal(precision(seen), precision(replace(seen, sigma=np.full_like(few, np.inf))))
+    np.testing.assert_array_equal(
+        precision(seen), precision(replace(seen, sigma=np.full_like(few, np.inf)))
+    )
     with pytest.raises(DataError, match="sigma"):
         replace(seen, sigma=np.ones((5, 3)))
 
 
 def test_rows_of_a_frame_are_found_by_ids_in_any_order() -> None:
-    seen = observations(0, 0, [9, 2, 5], np.arange(12.0).reshape(3, 4), has_right=[True, False, True])
+    seen = observations(
+        0, 0, [9, 2, 5], np.arange(12.0).reshape(3, 4), has_right=[True, False, True]
+    )
     rows, found = rows_of(seen, np.array([5, 7, 2]))
     assert found.tolist() == [True, False, True]
     assert rows.tolist() == [2, 1]
@@ -423,7 +485,9 @@ def test_rows_of_a_frame_are_found_by_ids_in_any_order() -> None:
 
 
 class Flight:
-    """A smooth flight among points, with exact states, an IMU that follows from them, and pixels with noise."""
+    """A smooth flight among points, with exact states, an IMU that follows from them, and pixels
+    with noise.
+    """
 
     def __init__(self, frames: int = 60, *, still: bool = False) -> None:
         self.frames, self.still = frames, still
@@ -439,19 +503,25 @@ class Flight:
         p, v, a = scale * np.sin(w * t), scale * w * np.cos(w * t), -scale * w**2 * np.sin(w * t)
 
         def attitude(s: float) -> FloatArray:
-            return so3_exp([0, 0, 0.5 * np.sin(0.8 * s)]) @ so3_exp([0.1 * np.sin(1.1 * s), 0.12 * np.sin(0.9 * s), 0])
+            return so3_exp([0, 0, 0.5 * np.sin(0.8 * s)]) @ so3_exp(
+                [0.1 * np.sin(1.1 * s), 0.12 * np.sin(0.9 * s), 0]
+            )
 
         h = 1e-5
         omega = so3_log(attitude(t - h).T @ attitude(t + h)) / (2 * h)
         return attitude(t), p, v, a, omega
 
-    def imu(self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray) -> list[ImuSample]:
+    def imu(
+        self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
+    ) -> list[ImuSample]:
         """Samples at 200 Hz with white noise and constant biases (6,)."""
         rate = 200.0
         out = []
         for k in range(int(self.frames * 10) + 1):
             R, _, _, a, omega = self.state(k / rate)
-            gyro = omega + bias[:3] + noise.normal(0, settings.gyro_noise_density * np.sqrt(rate), 3)
+            gyro = (
+                omega + bias[:3] + noise.normal(0, settings.gyro_noise_density * np.sqrt(rate), 3)
+            )
             accel = (
                 R.T @ (a + np.array([0, 0, 9.81]))
                 + bias[3:]
@@ -464,7 +534,9 @@ class Flight:
         R, p, *_ = self.state(k * 0.05)
         return se3_from_parts(R, p)
 
-    def observe(self, k: int, sigma: float, noise: np.random.Generator, limit: int = 60) -> Observations:
+    def observe(
+        self, k: int, sigma: float, noise: np.random.Generator, limit: int = 60
+    ) -> Observations:
         p = transform_points(T_CAM0_IMU @ se3_inverse(self.T_world_imu(k)), self.points)
         near = (p[:, 2] > 1.0) & (p[:, 2] < self.farthest)
         z = project(CAMERA, np.where(near[:, None], p, [0.0, 0.0, 10.0]))
@@ -484,13 +556,18 @@ class Flight:
         limit: int = 60,
         filter_class: type[Msckf] = Msckf,
     ) -> tuple[FloatArray, FloatArray, Msckf]:
-        """Return pose errors xi (frames, 6) and covariances (frames, 6, 6), as `Estimate` defines them, and the filter.
+        """Return pose errors xi (frames, 6) and covariances (frames, 6, 6), as `Estimate` defines
+        them, and the filter.
 
         The estimate's world is put onto the truth as `TrueWorld` does.
         """
         noise = np.random.default_rng(seed)
         filt = filter_class(CAMERA, T_CAM0_IMU, settings, motion=motion)  # type: ignore[arg-type]
-        samples = self.imu(noise, settings, np.zeros(6) if bias is None else bias) if motion == "imu" else []
+        samples = (
+            self.imu(noise, settings, np.zeros(6) if bias is None else bias)
+            if motion == "imu"
+            else []
+        )
         errors, covariances = [], []
         fed = 0
         world = TrueWorld(filt, upright=motion == "imu")
@@ -513,8 +590,12 @@ class Flight:
 
 
 @pytest.mark.parametrize("motion", [None, "imu"])
-def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion: str | None) -> None:
-    """What is told then is the last covariance carried by each step's transition, and each step's noise on top."""
+def test_frames_without_features_grow_the_covariance_by_the_motion_model(
+    motion: str | None,
+) -> None:
+    """What is told then is the last covariance carried by each step's transition, and each
+    step's noise on top.
+    """
     flight, settings = Flight(frames=6), replace(EXACT_RIG, calibrate_camera_imu="none")
     _, _, filt = flight.run(settings, motion)
     window, noise = filt._window, np.random.default_rng(1)
@@ -527,7 +608,9 @@ def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion:
             filt.propagate(sample)
     nothing = flight.observe(0, 0.0, noise, 0)
     for k in (6, 7):
-        step = other.advance(window.nav, (k - 1) * STEP_NS, k * STEP_NS, filt._propagation.noise.factors)
+        step = other.advance(
+            window.nav, (k - 1) * STEP_NS, k * STEP_NS, filt._propagation.noise.factors
+        )
         P = step.Phi @ P @ step.Phi.T + step.Q
         filt.update(replace(nothing, frame_index=k, time_ns=k * STEP_NS))
     estimate = filt.estimate()
@@ -537,11 +620,17 @@ def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion:
         return se3_log(se3_inverse(estimate.T_world_imu) @ se3_exp(xi) @ estimate.T_world_imu)
 
     J = numeric_jacobian(on_the_body, np.zeros(6))
-    np.testing.assert_allclose(estimate.covariance, J @ P[:6, :6] @ J.T, rtol=1e-4, atol=1e-5 * np.abs(P[:6, :6]).max())
+    np.testing.assert_allclose(
+        estimate.covariance, J @ P[:6, :6] @ J.T, rtol=1e-4, atol=1e-5 * np.abs(P[:6, :6]).max()
+    )
 
 
-def test_the_world_stays_where_the_first_window_left_it_while_gravity_becomes_known_better() -> None:
-    """An accelerometer bias passes for a tilt until the body turns; learning it moves gravity, not the path (N14)."""
+def test_the_world_stays_where_the_first_window_left_it_while_gravity_becomes_known_better() -> (
+    None
+):
+    """An accelerometer bias passes for a tilt until the body turns; learning it moves gravity,
+    not the path (N14).
+    """
     flight, settings = Flight(frames=140), replace(EXACT_RIG, clones=5, calibrate_camera_imu="none")
     bias = np.array([0.0, 0, 0, 0.25, -0.2, 0.1])
     errors, covariances, filt = flight.run(settings, "imu", bias=bias)
@@ -549,12 +638,16 @@ def test_the_world_stays_where_the_first_window_left_it_while_gravity_becomes_kn
     R = window.calibration.R_upright_world
     learned_deg = np.degrees(np.linalg.norm(so3_log(R)))
     assert learned_deg > 0.3, learned_deg  # else there is nothing to see
-    np.testing.assert_allclose(estimate.T_world_imu[:3, 3], R.T @ window.nav.T_world_imu[:3, 3], atol=1e-12)
+    np.testing.assert_allclose(
+        estimate.T_world_imu[:3, 3], R.T @ window.nav.T_world_imu[:3, 3], atol=1e-12
+    )
     np.testing.assert_allclose(np.linalg.norm(estimate.gravity_world), settings.gravity_mps2)
 
     # Gravity, seen from the body, is what it is, within its standard deviation.
     down = estimate.T_world_imu[:3, :3].T @ estimate.gravity_world / settings.gravity_mps2
-    tilt = np.linalg.norm(np.cross(down, flight.state((flight.frames - 1) * 0.05)[0].T @ [0.0, 0, -1]))
+    tilt = np.linalg.norm(
+        np.cross(down, flight.state((flight.frames - 1) * 0.05)[0].T @ [0.0, 0, -1])
+    )
     assert tilt < 3.5 * estimate.tilt_sigma_rad, (tilt, estimate.tilt_sigma_rad)
 
     # The path since is as exact as it is said to be, and does not turn with gravity.
@@ -563,7 +656,9 @@ def test_the_world_stays_where_the_first_window_left_it_while_gravity_becomes_kn
     smoothed = filt.smoothed(flight.frames - 3)
     np.testing.assert_array_equal(smoothed.gravity_world, estimate.gravity_world)
     moved = se3_log(se3_inverse(smoothed.T_world_imu) @ estimate.T_world_imu)
-    true = se3_log(se3_inverse(flight.T_world_imu(flight.frames - 3)) @ flight.T_world_imu(flight.frames - 1))
+    true = se3_log(
+        se3_inverse(flight.T_world_imu(flight.frames - 3)) @ flight.T_world_imu(flight.frames - 1)
+    )
     np.testing.assert_allclose(moved, true, atol=0.02)
 
 
@@ -571,7 +666,8 @@ def test_tracks_have_their_say_when_the_oldest_clone_leaves_and_not_before() -> 
     settings = replace(EXACT_RIG, clones=4, max_landmarks=0)
 
     def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
-        return seen.take(seen.ids % 2 == 0) if k == 0 else seen  # odd ones begin in the second frame
+        # odd ones begin in the second frame
+        return seen.take(seen.ids % 2 == 0) if k == 0 else seen
 
     flight, exact = Flight(frames=5), np.random.default_rng(0)
     _, _, filt = flight.run(settings, None, spoil=spoil)
@@ -585,7 +681,9 @@ def test_tracks_have_their_say_when_the_oldest_clone_leaves_and_not_before() -> 
     assert table.seen(np.array([left[i] for i in odd]))[:, :4].all()
 
 
-def test_a_new_landmark_hangs_on_the_poses_as_its_triangulation_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_landmark_hangs_on_the_poses_as_its_triangulation_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Its Jacobian by the clones' errors, against triangulating again from moved clones."""
     made: list[tuple[FloatArray, FloatArray, FloatArray, Views]] = []
     add = Window.add_landmarks
@@ -602,11 +700,17 @@ def test_a_new_landmark_hangs_on_the_poses_as_its_triangulation_does(monkeypatch
         rows = table.rows()
         views = table.views(rows[np.isin(table.ids(rows), ids[:1])], len(window.clones))
         T = window.clones.T_world_imu
-        made.append((T, p_world[:1], A[:3, window.state.clones.start : window.state.landmarks.start], views))
+        made.append(
+            (T, p_world[:1], A[:3, window.state.clones.start : window.state.landmarks.start], views)
+        )
         add(window, ids, p_world, A, covariance, by_considered)
 
     monkeypatch.setattr(Window, "add_landmarks", spy)
-    settings, flight, noise = replace(EXACT_RIG, clones=5), Flight(frames=6), np.random.default_rng(0)
+    settings, flight, noise = (
+        replace(EXACT_RIG, clones=5),
+        Flight(frames=6),
+        np.random.default_rng(0),
+    )
     filt = Msckf(CAMERA, T_CAM0_IMU, settings, motion=None)
     for k in range(6):
         filt.update(flight.observe(k, 0.01, noise))
@@ -634,8 +738,8 @@ def test_flight_that_starts_in_motion_is_followed(motion: str | None) -> None:
 def test_covariance_can_be_believed(motion: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """NEES of the pose over 20 seeded runs: inside its 95 % band in at least 90 % of the steps.
 
-    The first tilt is doubted by one degree only: with more, yaw about the true and about the estimated vertical
-    differ to second order, and the comparison would measure that instead.
+    The first tilt is doubted by one degree only: with more, yaw about the true and about the
+    estimated vertical differ to second order, and the comparison would measure that instead.
     """
     runs, frames = 20, 20
     monkeypatch.setattr(imu_start, "START_TILT_SIGMA_DEG", 1.0)
@@ -647,8 +751,12 @@ def test_covariance_can_be_believed(motion: str | None, monkeypatch: pytest.Monk
         values.append(nees(errors[1:], covariances[1:]))
     mean = np.mean(values, axis=0)
     low, high = nees_bounds(6, runs)
-    assert np.mean(mean < high) >= 0.9, f"overconfident: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
-    assert mean.mean() > 0.6 * low, f"far too cautious: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
+    assert np.mean(mean < high) >= 0.9, (
+        f"overconfident: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
+    )
+    assert mean.mean() > 0.6 * low, (
+        f"far too cautious: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
+    )
 
 
 def test_biases_are_found() -> None:
@@ -661,7 +769,9 @@ def test_biases_are_found() -> None:
 
 @pytest.mark.parametrize("motion", [None, "velocity", "imu"])
 def test_a_frame_that_shows_nothing_ends_no_track(motion: str | None) -> None:
-    """Every tenth frame is empty: the others lose nothing, and the covariance says that the empty ones do."""
+    """Every tenth frame is empty: the others lose nothing, and the covariance says that the
+    empty ones do.
+    """
 
     def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
         return seen.take(np.zeros(len(seen), dtype=np.bool_)) if k % 10 == 9 else seen
@@ -681,18 +791,25 @@ def test_wrong_matches_do_not_capture_it() -> None:
 
     def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
         wrong = noise.random(len(seen)) < 0.3
-        z = seen.z + np.where(wrong[:, None], noise.uniform(-40, 40, (len(seen), 1)) * [1, 0.3, 1, 0.3], 0)
+        z = seen.z + np.where(
+            wrong[:, None], noise.uniform(-40, 40, (len(seen), 1)) * [1, 0.3, 1, 0.3], 0
+        )
         return replace(seen, z=z)
 
     errors, _, _ = Flight().run(EXACT_RIG, "imu", spoil=spoil, limit=120)
     distances = np.linalg.norm(errors[:, :3], axis=1)
     assert distances.max() < 0.4  # without the rejection of views: 5.2
-    # The harm is done in the first frames, where tracks have two views and nothing identifies the wrong one.
+    # The harm is done in the first frames, where tracks have two views and nothing identifies the
+    # wrong one.
     assert np.linalg.norm(errors[-1, :3] - errors[10, :3]) < 0.15
 
 
 def test_the_ids_of_rejected_features_are_those_of_tracks_and_landmarks() -> None:
-    settings, flight, noise = replace(EXACT_RIG, clones=5), Flight(frames=6), np.random.default_rng(0)
+    settings, flight, noise = (
+        replace(EXACT_RIG, clones=5),
+        Flight(frames=6),
+        np.random.default_rng(0),
+    )
     filt = Msckf(CAMERA, T_CAM0_IMU, settings, motion=None)
     for k in range(6):
         report = filt.update(flight.observe(k, 0.1, noise))
@@ -737,7 +854,9 @@ def test_window_and_map_stay_bounded() -> None:
 
 
 def test_the_map_is_the_same_however_often_it_is_merged(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Standing still, all features are told again every few frames; the map holds each of them once, or twice."""
+    """Standing still, all features are told again every few frames; the map holds each of them
+    once, or twice.
+    """
     settings, maps, held = replace(EXACT_RIG, clones=4), [], []
     for least in (0, 10**9):
         monkeypatch.setattr("vio.filters.point_map._LEAST_MERGE", least)
@@ -750,9 +869,11 @@ def test_the_map_is_the_same_however_often_it_is_merged(monkeypatch: pytest.Monk
 
 
 def test_people_before_the_camera_do_not_move_it_against_its_imu() -> None:
-    """In three frames two groups of points go their own ways, and a fifth stands: the IMU knows better.
+    """In three frames two groups of points go their own ways, and a fifth stands: the IMU knows
+    better.
 
-    The fit to them all ended 35 standard deviations off its prediction and was believed: 13 mm, and 8 for good.
+    The fit to them all ended 35 standard deviations off its prediction and was believed: 13 mm, and
+    8 for good.
     """
 
     def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
@@ -776,7 +897,9 @@ def test_left_only_views_count() -> None:
 
     def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
         has_right = seen.ids % 2 == 0 if k else np.ones(len(seen), dtype=np.bool_)
-        return replace(seen, has_right=has_right, z=np.where(has_right[:, None], seen.z, [1, 1, 0, 0] * seen.z))
+        return replace(
+            seen, has_right=has_right, z=np.where(has_right[:, None], seen.z, [1, 1, 0, 0] * seen.z)
+        )
 
     with_left, _, _ = Flight(frames=40).run(EXACT_RIG, None, spoil=spoil)
     assert np.linalg.norm(with_left[:, :3], axis=1).max() < 0.05
@@ -818,8 +941,12 @@ def _start_in_flight(monkeypatch: pytest.MonkeyPatch, flight: Flight, seed: int)
 
 @pytest.mark.usefixtures("white_noise")
 @pytest.mark.parametrize("world", ["left images alone", "far away, 5 cm baseline"])
-def test_covariance_can_be_believed_where_depth_is_hard_to_tell(world: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """NEES over 20 runs of 1.5 s with an IMU: parallax alone gives depth, or most points have none."""
+def test_covariance_can_be_believed_where_depth_is_hard_to_tell(
+    world: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """NEES over 20 runs of 1.5 s with an IMU: parallax alone gives depth, or most points have
+    none.
+    """
     runs, frames, left = 20, 30, world == "left images alone"
     flight = Flight(frames) if left else FarFlight(frames)
     if not left:
@@ -834,12 +961,18 @@ def test_covariance_can_be_believed_where_depth_is_hard_to_tell(world: str, monk
             _start_in_flight(patch, flight, seed)
             bias = np.random.default_rng(1000 + seed).normal(0, [0.02] * 3 + [0.05] * 3)
             patch.setattr(imu_start, "START_TILT_SIGMA_DEG", 1.0)
-            errors, covariances, _ = flight.run(EXACT_RIG, "imu", seed, bias=bias, limit=40, spoil=spoil)
+            errors, covariances, _ = flight.run(
+                EXACT_RIG, "imu", seed, bias=bias, limit=40, spoil=spoil
+            )
         values.append(nees(errors[1:], covariances[1:]))
     mean = np.mean(values, axis=0)
     low, high = nees_bounds(6, runs)
-    assert np.mean(mean < high) >= 0.9, f"overconfident: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
-    assert mean.mean() > 0.6 * low, f"far too cautious: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
+    assert np.mean(mean < high) >= 0.9, (
+        f"overconfident: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
+    )
+    assert mean.mean() > 0.6 * low, (
+        f"far too cautious: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
+    )
 
 
 @pytest.mark.parametrize("world", ["left images alone", "far away, 5 cm baseline"])
@@ -865,13 +998,17 @@ def test_tracks_without_disparity_are_used(world: str, monkeypatch: pytest.Monke
 
 
 def test_left_only_tracks_improve_what_few_stereo_tracks_tell() -> None:
-    """Images alone, eight stereo tracks in forty: with the left-only ones the error is less than without them."""
+    """Images alone, eight stereo tracks in forty: with the left-only ones the error is less than
+    without them.
+    """
     rms = []
     for keep_left in (True, False):
         squares = []
         for seed in range(5):
 
-            def spoil(k: int, seen: Observations, noise: np.random.Generator, keep: bool = keep_left) -> Observations:
+            def spoil(
+                k: int, seen: Observations, noise: np.random.Generator, keep: bool = keep_left
+            ) -> Observations:
                 left_only = seen.ids % 100 < 80
                 return _without_right(seen, left_only) if keep else seen.take(~left_only)
 
@@ -901,7 +1038,9 @@ def test_settings_out_of_range(change: dict[str, int]) -> None:
 def test_restarts_from_the_last_good_pose_after_a_divergence(
     motion: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Frame 12 leaves a state of NaN: the filter raises, restarts, and its error stays within its covariance."""
+    """Frame 12 leaves a state of NaN: the filter raises, restarts, and its error stays within
+    its covariance.
+    """
     monkeypatch.setattr(imu_start, "START_TILT_SIGMA_DEG", 1.0)
     flight = Flight(frames=40)
     events: list[str] = []
@@ -920,15 +1059,21 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(
     assert [event[:27] for event in events] == ["msckf diverged at frame 12:"]
     assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.15
     assert np.sqrt(covariances[12, 0, 0]) > 3 * np.sqrt(covariances[11, 0, 0])
-    chi_square = np.einsum("ki,kij,kj->k", errors[12:], np.linalg.inv(covariances[12:]), errors[12:])
+    chi_square = np.einsum(
+        "ki,kij,kj->k", errors[12:], np.linalg.inv(covariances[12:]), errors[12:]
+    )
     assert np.mean(chi_square < 22.5) > 0.9  # the 99.9 % quantile for six degrees of freedom
     assert filt.estimate().velocity_world is not None
     assert np.isfinite(filt.landmarks().p_world).all()
 
 
 @pytest.mark.parametrize("unseen_frames", [10, 100])
-def test_images_alone_begin_anew_after_a_time_in_which_the_rotation_was_lost(unseen_frames: int) -> None:
-    """Errors of the poses before and after five seconds are not linear in each other; with half of one, they are."""
+def test_images_alone_begin_anew_after_a_time_in_which_the_rotation_was_lost(
+    unseen_frames: int,
+) -> None:
+    """Errors of the poses before and after five seconds are not linear in each other; with half
+    of one, they are.
+    """
     events: list[str] = []
 
     class Restarting(Msckf):
@@ -947,12 +1092,15 @@ def test_images_alone_begin_anew_after_a_time_in_which_the_rotation_was_lost(uns
     errors, covariances, _ = flight.run(EXACT_RIG, None, spoil=covered, filter_class=Restarting)
     lost = f"msckf has lost its way in {(unseen_frames + 1) * 0.05:.1f} s without a feature or a motion sensor"
     assert events == ([lost] if unseen_frames == 100 else [])
-    chi_square = np.einsum("ki,kij,kj->k", errors[first:], np.linalg.inv(covariances[first:]), errors[first:])
+    chi_square = np.einsum(
+        "ki,kij,kj->k", errors[first:], np.linalg.inv(covariances[first:]), errors[first:]
+    )
     assert np.mean(chi_square < 22.5) > 0.9  # the 99.9 % quantile for six degrees of freedom
     begin, end = first + unseen_frames + 5, flight.frames - 1
     true_motion = se3_inverse(flight.T_world_imu(begin)) @ flight.T_world_imu(end)
     motion = se3_exp(-errors[begin]) @ true_motion @ se3_exp(errors[end])
-    assert np.linalg.norm(se3_log(se3_inverse(true_motion) @ motion)) < 0.1  # of a radian, or a metre of several
+    # of a radian, or a metre of several
+    assert np.linalg.norm(se3_log(se3_inverse(true_motion) @ motion)) < 0.1
 
 
 def test_a_restart_carries_the_pose_on_and_grows_its_covariance_with_the_time_in_between() -> None:
@@ -960,7 +1108,9 @@ def test_a_restart_carries_the_pose_on_and_grows_its_covariance_with_the_time_in
     good = filt._good
     sigmas = []
     for elapsed_s in (0.05, 0.2):
-        nav, P = restarted(good, good.time_ns + round(1e9 * elapsed_s), TwistMotion(EXACT_RIG), EXACT_RIG)
+        nav, P = restarted(
+            good, good.time_ns + round(1e9 * elapsed_s), TwistMotion(EXACT_RIG), EXACT_RIG
+        )
         moved = nav.T_world_imu[:3, 3] - good.nav.T_world_imu[:3, 3]
         expected = elapsed_s * (good.nav.T_world_imu[:3, :3] @ good.nav.velocity)
         np.testing.assert_allclose(moved, expected, rtol=0.1, atol=1e-3)
@@ -998,7 +1148,9 @@ def test_before_the_first_frame_there_is_no_map() -> None:
 @pytest.mark.parametrize("gap", [1, 10**9])
 @pytest.mark.parametrize("seed", range(3))
 def test_garbage_ends_in_an_error_of_ours_or_in_numbers(seed: int, gap: int) -> None:
-    """Features that jump about at random, with gaps: never a NaN passed on, never a foreign exception."""
+    """Features that jump about at random, with gaps: never a NaN passed on, never a foreign
+    exception.
+    """
     rng = np.random.default_rng(seed)
     filt = Msckf(CAMERA, T_CAM0_IMU, replace(EXACT_RIG, clones=5), motion=None)
     for k in range(40):

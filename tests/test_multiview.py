@@ -1,4 +1,6 @@
-"""Points from many views: where they begin, how they converge, how far views are believed, and their elimination."""
+"""Points from many views: where they begin, how they converge, how far views are believed, and
+their elimination.
+"""
 
 from __future__ import annotations
 
@@ -45,9 +47,11 @@ def test_first_points_of_exact_views_are_the_points() -> None:
     views.weight[3, :, 2:] = 0.0  # none: parallax
     views.z[3, :, 2:] = 0.0
     views.z[3, -1, 0] += 200.0
-    views.weight[5, :2] = 0.0  # left views of the newest clone and one other: no pose that is known well
+    # left views of the newest clone and one other: no pose that is known well
+    views.weight[5, :2] = 0.0
     views.weight[5, :, 2:] = 0.0
-    views.z[4, -1, 0] += 200.0  # the newest view's disparity is the largest, and its pose is not yet corrected
+    # the newest view's disparity is the largest, and its pose is not yet corrected
+    views.z[4, -1, 0] += 200.0
     found, known = first_points(CAMERA, T_CAM0_WORLD, views)
     assert known.tolist() == [True, True, True, True, True, False]
     np.testing.assert_allclose(found[known], p[known], atol=1e-6)
@@ -59,14 +63,20 @@ def test_a_view_is_believed_less_the_worse_it_fits_beside_the_others_of_its_clon
     r[:, 1, 0] = 10.0  # a pose that is off as a whole
     J = np.ones((5, 2, 4, 3))
     J[1, 0] = 0.0  # not seen
-    weights = robust_weights(Residuals(r, J, np.ones(5, dtype=np.bool_), np.ones(r.shape)), sigma2=0.25)
-    scale2 = 1.0 / 2.37  # the median of 0, 1, 1, 144 over that of chi-square with 3 degrees of freedom
+    weights = robust_weights(
+        Residuals(r, J, np.ones(5, dtype=np.bool_), np.ones(r.shape)), sigma2=0.25
+    )
+    # the median of 0, 1, 1, 144 over that of chi-square with 3 degrees of freedom
+    scale2 = 1.0 / 2.37
     expected = 1 / (1 + np.array([0.0, 1.0, 1.0, 144.0]) / (4 * scale2 * CAUCHY**2))
     np.testing.assert_allclose(weights[[0, 2, 3, 4], 0], expected)
     assert weights[1, 0] == 0.0
     np.testing.assert_allclose(weights[:, 1], 1 / (1 + 2.37 / (4 * CAUCHY**2)))
-    quiet = robust_weights(Residuals(r * 1e-3, J, np.ones(5, dtype=np.bool_), np.ones(r.shape)), sigma2=0.25)
-    np.testing.assert_allclose(quiet[4, 0], 1 / (1 + 144e-6 / (4 * 0.25 * CAUCHY**2)))  # never below the noise
+    quiet = robust_weights(
+        Residuals(r * 1e-3, J, np.ones(5, dtype=np.bool_), np.ones(r.shape)), sigma2=0.25
+    )
+    # never below the noise
+    np.testing.assert_allclose(quiet[4, 0], 1 / (1 + 144e-6 / (4 * 0.25 * CAUCHY**2)))
 
 
 def test_rays_of_left_views_meet_before_any_iteration(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,7 +98,9 @@ def test_points_follow_the_clones_as_their_triangulation_does() -> None:
         return refine_points(CAMERA, moved, p, views, 10, 1e6)[0]
 
     numeric = numeric_jacobian(triangulated, np.zeros(24), eps=1e-5)
-    np.testing.assert_allclose(info.point_D_clones(np.arange(1))[0], numeric, atol=1e-4 * np.abs(numeric).max())
+    np.testing.assert_allclose(
+        info.point_D_clones(np.arange(1))[0], numeric, atol=1e-4 * np.abs(numeric).max()
+    )
 
 
 @pytest.mark.parametrize("disparity", [0.0, -0.4])
@@ -122,7 +134,9 @@ def test_points_converge_from_poor_starts_and_stay_ahead(factor: float, left_onl
 
 @pytest.mark.parametrize("depth_m", [3.3, 4.5, 20.0])
 def test_a_step_from_far_away_does_not_pass_a_camera_that_came_nearer(depth_m: float) -> None:
-    """Cameras drive forwards; to first order in the inverse depth the point would lie behind the last of them."""
+    """Cameras drive forwards; to first order in the inverse depth the point would lie behind the
+    last of them.
+    """
     T = np.tile(np.eye(4), (4, 1, 1))
     T[:, 2, 3] = [0.0, -1.0, -2.0, -3.0]
     p = np.array([[0.3, -0.2, depth_m]])
@@ -135,10 +149,16 @@ def test_a_step_from_far_away_does_not_pass_a_camera_that_came_nearer(depth_m: f
     np.testing.assert_allclose(found, p, rtol=1e-4)
 
 
-def _sideways(spread_m: float, depth_m: float, left_only: bool) -> tuple[FloatArray, FloatArray, Residuals]:
-    """Five cameras within a spread, eight points at a depth, and their residuals with half a pixel of noise."""
+def _sideways(
+    spread_m: float, depth_m: float, left_only: bool
+) -> tuple[FloatArray, FloatArray, Residuals]:
+    """Five cameras within a spread, eight points at a depth, and their residuals with half a
+    pixel of noise.
+    """
     rng = np.random.default_rng(3)
-    twists = np.column_stack([rng.uniform(-0.5, 0.5, (5, 3)) * spread_m, rng.normal(0, 0.02, (5, 3))])
+    twists = np.column_stack(
+        [rng.uniform(-0.5, 0.5, (5, 3)) * spread_m, rng.normal(0, 0.02, (5, 3))]
+    )
     T = se3_exp(twists) @ se3_exp([3.0, -2.0, 1.0, 0.4, -0.8, 1.1])
     p_cam = np.column_stack([rng.uniform(-0.4, 0.4, (8, 2)), np.ones(8)]) * depth_m
     p = transform_points(se3_inverse(T[0]), p_cam)
@@ -168,11 +188,14 @@ def _by_null_space(T: FloatArray, p: FloatArray, at: Residuals) -> FloatArray:
 @pytest.mark.parametrize("left_only", [False, True])
 @pytest.mark.parametrize("depth_m", [0.5, 5.0, 1e3, 1e5])
 @pytest.mark.parametrize("spread_m", [1e-8, 1e-6, 1e-5, 1e-3, 0.1, 10.0])
-def test_elimination_holds_whatever_the_parallax(spread_m: float, depth_m: float, left_only: bool) -> None:
-    """No failure, no information on where or how the world lies, and what a QR of the same system gives.
+def test_elimination_holds_whatever_the_parallax(
+    spread_m: float, depth_m: float, left_only: bool
+) -> None:
+    """No failure, no information on where or how the world lies, and what a QR of the same system
+    gives.
 
-    Without scaled coordinates and a prior, cameras 1e-5 m apart gave 60 per m^2 on their common translation, and
-    1e-6 m a Cholesky factorisation that failed.
+    Without scaled coordinates and a prior, cameras 1e-5 m apart gave 60 per m^2 on their common
+    translation, and 1e-6 m a Cholesky factorisation that failed.
     """
     T, p, at = _sideways(spread_m, depth_m, left_only)
     seen = at.z_D_p[:, :, 1].any(axis=2)
@@ -185,7 +208,9 @@ def test_elimination_holds_whatever_the_parallax(spread_m: float, depth_m: float
         assert abs(common @ A @ common) <= 1e-7 * sum(direction @ D @ direction for D in before)
         assert abs(common @ b) <= 1e-7 * np.abs(info.gradient).sum()
     unit = 1 / np.sqrt(np.concatenate([np.diag(D) for D in before]) + 1e-30)
-    np.testing.assert_allclose(A * np.outer(unit, unit), _by_null_space(T, p, at) * np.outer(unit, unit), atol=1e-7)
+    np.testing.assert_allclose(
+        A * np.outer(unit, unit), _by_null_space(T, p, at) * np.outer(unit, unit), atol=1e-7
+    )
     assert np.linalg.eigvalsh(A * np.outer(unit, unit))[0] > -1e-7
 
 
@@ -198,7 +223,9 @@ def test_coordinates_of_a_point_equal_central_differences(left_only: bool) -> No
 
     def coordinates(x: FloatArray) -> FloatArray:
         x_cam = transform_points(T_0, x)
-        return CAMERA.fu * np.array([x_cam[0] / x_cam[2], x_cam[1] / x_cam[2], CAMERA.baseline_m / x_cam[2]])
+        return CAMERA.fu * np.array(
+            [x_cam[0] / x_cam[2], x_cam[1] / x_cam[2], CAMERA.baseline_m / x_cam[2]]
+        )
 
     for f in range(8):
         np.testing.assert_allclose(q.q_D_p[f], numeric_jacobian(coordinates, p[f]), atol=1e-5)
@@ -208,8 +235,12 @@ def test_coordinates_of_a_point_equal_central_differences(left_only: bool) -> No
         np.testing.assert_allclose(after, coordinates(p[f]) + dq, atol=1e-9)
 
 
-@pytest.mark.parametrize(("spread_m", "enough"), [(1e-3, False), (0.02, False), (0.5, True), (1.45, True)])
-def test_left_views_need_the_parallax_of_a_baseline_and_stereo_views_none(spread_m: float, enough: bool) -> None:
+@pytest.mark.parametrize(
+    ("spread_m", "enough"), [(1e-3, False), (0.02, False), (0.5, True), (1.45, True)]
+)
+def test_left_views_need_the_parallax_of_a_baseline_and_stereo_views_none(
+    spread_m: float, enough: bool
+) -> None:
     for left_only in (True, False):
         T, p, at = _sideways(spread_m, 5.0, left_only)
         views = Views(np.zeros_like(at.r), np.ones_like(at.r))
@@ -230,7 +261,9 @@ def test_depth_sigma_and_covariance_are_those_of_the_inverted_information() -> N
     at = residuals(CAMERA, T_CAM0_WORLD, p, _views(p))
     info = track_information(CAMERA, T_CAM0_WORLD, at, p, np.ones((5, 4)))
     inverse = np.linalg.inv(info.C)
-    np.testing.assert_allclose(info.relative_depth_sigma(), np.sqrt(inverse[:, 2, 2]) / info.q.disparity, rtol=1e-9)
+    np.testing.assert_allclose(
+        info.relative_depth_sigma(), np.sqrt(inverse[:, 2, 2]) / info.q.disparity, rtol=1e-9
+    )
     p_D_q, chosen = info.q.p_D_q, np.array([3, 1])
     expected = (p_D_q @ inverse @ np.swapaxes(p_D_q, 1, 2))[chosen]
     np.testing.assert_allclose(info.point_covariance(chosen), expected, rtol=1e-9)

@@ -1,4 +1,6 @@
-"""The mutations of `tools/mutations.txt` apply to the present code; `tools/mutate.py` runs the tests on them."""
+"""The mutations of `tools/mutations.txt` apply to the present code; `tools/mutate.py` runs the
+tests on them.
+"""
 
 from __future__ import annotations
 

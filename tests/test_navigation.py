@@ -1,4 +1,6 @@
-"""The motion models of the sliding-window filter: their noise against closed forms, their measurements, odd starts."""
+"""The motion models of the sliding-window filter: their noise against closed forms, their
+measurements, odd starts.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ MOVING = NavState(
 ORIGIN = NavState(np.eye(4), *np.zeros((4, 3)))
 
 
-def _imu(hz: int, seconds: float, settings: MsckfSettings = SETTINGS, *, moving: bool = False) -> ImuMotion:
+def _imu(
+    hz: int, seconds: float, settings: MsckfSettings = SETTINGS, *, moving: bool = False
+) -> ImuMotion:
     motion = ImuMotion(settings)
     for k in range(round(hz * seconds) + 1):
         t = k / hz
@@ -38,7 +42,9 @@ def _imu(hz: int, seconds: float, settings: MsckfSettings = SETTINGS, *, moving:
 
 @pytest.mark.parametrize("hz", [100, 400])
 def test_imu_noise_at_rest_is_that_of_integrated_white_noise(hz: int) -> None:
-    """Whatever the rate of the samples: T for angle and velocity, T^3 / 3 for position, T for the biases."""
+    """Whatever the rate of the samples: T for angle and velocity, T^3 / 3 for position, T for
+    the biases.
+    """
     T = 0.5
     Q = _imu(hz, T).advance(ORIGIN, 0, round(1e9 * T)).Q
     s = SETTINGS
@@ -48,7 +54,9 @@ def test_imu_noise_at_rest_is_that_of_integrated_white_noise(hz: int) -> None:
     np.testing.assert_allclose(np.diag(Q)[6:9], s.accel_noise_density**2 * T + tilting, rtol=2e-3)
     np.testing.assert_allclose(Q[2, 2], s.accel_noise_density**2 * T**3 / 3, rtol=2e-3)
     np.testing.assert_allclose(Q[2, 8], s.accel_noise_density**2 * T**2 / 2, rtol=2e-3)
-    np.testing.assert_allclose(np.diag(Q)[9:], np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) ** 2 * T, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.diag(Q)[9:], np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) ** 2 * T, rtol=1e-9
+    )
 
 
 def test_imu_noise_does_not_depend_on_how_the_time_is_cut() -> None:
@@ -74,13 +82,17 @@ def test_twist_noise_does_not_depend_on_how_the_time_is_cut() -> None:
 
 @pytest.mark.parametrize("kind", ["imu", "twist"])
 def test_factors_scale_their_own_part_of_the_noise(kind: str) -> None:
-    """The first is the translation's, the second the rotation's; the biases' walk is no part of either."""
+    """The first is the translation's, the second the rotation's; the biases' walk is no part of
+    either.
+    """
     motion = _imu(200, 0.1, moving=True) if kind == "imu" else TwistMotion(SETTINGS)
     plain = motion.advance(MOVING, 0, 100_000_000)
     scaled = motion.advance(MOVING, 0, 100_000_000, np.array([2.0, 3.0]))
     np.testing.assert_allclose(scaled.Q_parts[0], 4 * plain.Q_parts[0], atol=1e-18)
     np.testing.assert_allclose(scaled.Q_parts[1], 9 * plain.Q_parts[1], atol=1e-18)
-    np.testing.assert_allclose(scaled.Q - scaled.Q_parts.sum(axis=0), plain.Q - plain.Q_parts.sum(axis=0), atol=1e-18)
+    np.testing.assert_allclose(
+        scaled.Q - scaled.Q_parts.sum(axis=0), plain.Q - plain.Q_parts.sum(axis=0), atol=1e-18
+    )
     if kind == "imu":  # noise of the accelerometer turns nothing
         assert not plain.Q_parts[0][3:6].any()
         assert plain.Q_parts[1][3:6, 3:6].any()
@@ -116,7 +128,10 @@ def test_rest_is_denied_where_the_gyro_turns_or_is_not_known() -> None:
 
 
 def test_velocities_are_measured_by_the_twist_and_the_rates_bias() -> None:
-    motion, sample = TwistMotion(SETTINGS), VelocitySample(0, np.array([1.2, -0.4, 0.0]), np.array([0.3, 0.2, 0.1]))
+    motion, sample = (
+        TwistMotion(SETTINGS),
+        VelocitySample(0, np.array([1.2, -0.4, 0.0]), np.array([0.3, 0.2, 0.1])),
+    )
     motion.take(sample)
     measurement = motion.measurement(MOVING)
 
@@ -139,7 +154,9 @@ def test_start_turns_the_accelerometers_up_to_the_worlds(up: list[float]) -> Non
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) > 0
     from_bias = SETTINGS.accel_bias_sigma_mps2 / SETTINGS.gravity_mps2
-    np.testing.assert_allclose(np.diag(P)[3:5], np.radians(START_TILT_SIGMA_DEG) ** 2 + from_bias**2)
+    np.testing.assert_allclose(
+        np.diag(P)[3:5], np.radians(START_TILT_SIGMA_DEG) ** 2 + from_bias**2
+    )
 
 
 def test_an_accelerometer_that_reads_nothing_is_named() -> None:

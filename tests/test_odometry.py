@@ -1,4 +1,6 @@
-"""The front door for live use: the same poses as a recorded run, however events arrive, and refusals without harm."""
+"""The front door for live use: the same poses as a recorded run, however events arrive, and
+refusals without harm.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,15 @@ IMAGES_ALONE = replace(Config(), motion="none")
 def recording() -> SimulatedRecording:
     motion = hand_held(duration_s=2.0)
     return SimulatedRecording(
-        simulate(room(seed=1), small_rig(320, 200), motion, rate_hz=10.0, imu=ImuNoise(), effects=CLEAN, seed=1)
+        simulate(
+            room(seed=1),
+            small_rig(320, 200),
+            motion,
+            rate_hz=10.0,
+            imu=ImuNoise(),
+            effects=CLEAN,
+            seed=1,
+        )
     )
 
 
@@ -49,7 +59,15 @@ def events(recording: SimulatedRecording) -> list[Any]:
 @pytest.fixture(scope="module")
 def rig(recording: SimulatedRecording) -> Rig:
     camera = recording.recording.camera
-    numbers = (camera.fu, camera.fv, camera.cu, camera.cv, camera.baseline_m, camera.width, camera.height)
+    numbers = (
+        camera.fu,
+        camera.fv,
+        camera.cu,
+        camera.cv,
+        camera.baseline_m,
+        camera.width,
+        camera.height,
+    )
     return Rig.rectified(*numbers, recording.recording.T_cam0_imu)
 
 
@@ -197,7 +215,10 @@ IMAGE = np.zeros((200, 320), dtype=np.uint8)
         (lambda o: o.add_imu(100, ONE, ONE), "not after the last one"),
         (lambda o: o.add_imu([300, 200], [ONE, ONE], [ONE, ONE]), "must increase"),
         (lambda o: o.add_imu([200, 200], [ONE, ONE], [ONE, ONE]), "must increase"),
-        (lambda o: o.add_imu(np.array([300, 200], np.uint64), [ONE, ONE], [ONE, ONE]), "must increase"),
+        (
+            lambda o: o.add_imu(np.array([300, 200], np.uint64), [ONE, ONE], [ONE, ONE]),
+            "must increase",
+        ),
         (lambda o: o.add_imu(1e9, ONE, ONE), "integer nanoseconds"),
         (lambda o: o.add_imu(200, np.zeros(4), ONE), r"gyro has shape \(4,\)"),
         (lambda o: o.add_imu([200, 300], ONE, ONE), "gyro has shape"),
@@ -209,11 +230,20 @@ IMAGE = np.zeros((200, 320), dtype=np.uint8)
         (lambda o: o.add_stereo(1.5, IMAGE, IMAGE), "integer number of nanoseconds"),
         (lambda o: o.add_stereo(2**70, IMAGE, IMAGE), "is no time of a clock"),
         (lambda o: o.add_imu(2**63 - 1, ONE, ONE), "no time of a clock"),
-        (lambda o: o.add_stereo(200, IMAGE.astype(np.float64), IMAGE), "the left image has shape .* float64"),
-        (lambda o: o.add_stereo(200, IMAGE, IMAGE[:, :300]), "the right image is 300x200, .* 320x200"),
+        (
+            lambda o: o.add_stereo(200, IMAGE.astype(np.float64), IMAGE),
+            "the left image has shape .* float64",
+        ),
+        (
+            lambda o: o.add_stereo(200, IMAGE, IMAGE[:, :300]),
+            "the right image is 300x200, .* 320x200",
+        ),
         (lambda o: o.add_stereo(200, IMAGE[:10], IMAGE[:10]), "calibration is for 320x200"),
         (lambda o: o.add_stereo(200, None, IMAGE), "the left image"),
-        (lambda o: o.add_stereo(200, np.zeros((200, 320, 4), dtype=np.uint8), IMAGE), "the left image"),
+        (
+            lambda o: o.add_stereo(200, np.zeros((200, 320, 4), dtype=np.uint8), IMAGE),
+            "the left image",
+        ),
         (lambda o: o.add_observations(200, [1], [[1, 2, 0, 2]]), "observations came after images"),
     ],
 )
@@ -286,7 +316,9 @@ def test_slow_cameras_have_no_jumps() -> None:
 @pytest.mark.parametrize("T", [np.full((4, 4), np.nan), np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(3)])
 def test_wrong_extrinsics_are_refused_with_a_back_end_of_the_callers_own(T: Any) -> None:
     with pytest.raises(VioError, match="T_cam0_imu"):
-        Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T, parts=Parts(frontend=Picky(), backend=object()))
+        Odometry(
+            CAMERA, IMAGES_ALONE, T_cam0_imu=T, parts=Parts(frontend=Picky(), backend=object())
+        )
 
 
 def test_a_pixel_that_is_not_seen_may_be_anything() -> None:
@@ -310,7 +342,9 @@ def test_frames_that_the_front_end_refuses_are_skipped_and_said() -> None:
     given = [odometry.add_stereo(k * STEP_NS, images[k], images[k]) is not None for k in range(12)]
     assert given == [not 3 <= k < 8 for k in range(12)]
     assert odometry.frames_refused == 5
-    assert [line for line in odometry.warnings if "skipped" in line] == ["frame skipped: frame 3: too dark"]
+    assert [line for line in odometry.warnings if "skipped" in line] == [
+        "frame skipped: frame 3: too dark"
+    ]
 
 
 def test_colour_images_are_taken(rig: Rig, events: list[Any]) -> None:
@@ -325,7 +359,16 @@ def test_colour_images_are_taken(rig: Rig, events: list[Any]) -> None:
 def test_raw_images_are_rectified_inside() -> None:
     K = np.array([[200.0, 0, 160], [0, 200, 100], [0, 0, 1]])
     T_cam1_cam0 = se3_from_parts(np.eye(3), [-0.1, 0.0, 0.0])
-    raw = Rig.raw(K, K, T_cam1_cam0, 320, 200, model="radtan", distortion0=(-0.2, 0, 0, 0), distortion1=(-0.2, 0, 0, 0))
+    raw = Rig.raw(
+        K,
+        K,
+        T_cam1_cam0,
+        320,
+        200,
+        model="radtan",
+        distortion0=(-0.2, 0, 0, 0),
+        distortion1=(-0.2, 0, 0, 0),
+    )
     odometry = Odometry(raw)
     assert odometry.motion is None
     assert odometry.camera != raw.cam0
@@ -341,8 +384,11 @@ def test_what_the_rig_does_not_have_is_refused_at_once() -> None:
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_one_blas_thread_inside_and_the_callers_number_outside(fails: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vio.numerics.threads._pinned", 0)  # as outside of these tests, which hold one thread
+def test_one_blas_thread_inside_and_the_callers_number_outside(
+    fails: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # as outside of these tests, which hold one thread
+    monkeypatch.setattr("vio.numerics.threads._pinned", 0)
     inside: list[int] = []
 
     def threads() -> list[int]:
@@ -376,6 +422,8 @@ def test_within_a_run_the_number_of_blas_threads_is_not_asked_for_again() -> Non
 
 
 def test_the_public_names_are_there() -> None:
-    assert {"Odometry", "Rig", "load_rig", "run", "open_dataset", "load_config", "evaluate"} <= set(dir(vio))
+    assert {"Odometry", "Rig", "load_rig", "run", "open_dataset", "load_config", "evaluate"} <= set(
+        dir(vio)
+    )
     for name in vio.__all__:
         assert getattr(vio, name) is not None

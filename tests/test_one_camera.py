@@ -63,7 +63,11 @@ class Path3(Flight):
         s = max(t - 1.0, 0.0)  # a take-off after a second at rest
         w = np.array([1.1, 1.5, 1.3])
         size = np.array([0.8, 1.0, 0.5])
-        ramp, ramp_v, ramp_a = s**2 / (1 + s**2), 2 * s / (1 + s**2) ** 2, (2 - 6 * s**2) / (1 + s**2) ** 3
+        ramp, ramp_v, ramp_a = (
+            s**2 / (1 + s**2),
+            2 * s / (1 + s**2) ** 2,
+            (2 - 6 * s**2) / (1 + s**2) ** 3,
+        )
         wave, wave_v, wave_a = np.sin(w * s), w * np.cos(w * s), -(w**2) * np.sin(w * s)
         p = size * ramp * wave
         v = size * (ramp_v * wave + ramp * wave_v)
@@ -104,7 +108,8 @@ class Flown:
                     float(np.sqrt(np.linalg.eigvalsh(C)[-1])),
                 ]
             )
-        # (N, 5) NEES of position and of velocity, error of position, sigma of the scale, largest sigma of the position
+        # (N, 5) NEES of position and of velocity, error of position, sigma of the scale, largest
+        # sigma of the position
         self.rows = np.array(rows)
 
 
@@ -117,11 +122,14 @@ def _curves() -> tuple[Flown, ...]:
     return tuple(Flown(Path3(50, "curve"), seed) for seed in range(3))
 
 
-# --- the start ------------------------------------------------------------------------------------------------------
+# --- the start
+# ------------------------------------------------------------------------------------------------------
 
 
 def test_start_in_motion_waits_and_is_as_good_as_it_says() -> None:
-    """No pose before the scale is known to 10 %; then velocities are within their covariance, over all seeds."""
+    """No pose before the scale is known to 10 %; then velocities are within their covariance,
+    over all seeds.
+    """
     for flown in _curves():
         assert 10 <= flown.begun <= 35
         start = flown.filter._begun
@@ -131,7 +139,9 @@ def test_start_in_motion_waits_and_is_as_good_as_it_says() -> None:
 
 
 def test_flight_after_the_start_is_consistent() -> None:
-    """Position and velocity, whose scale the IMU alone gives, agree with their covariance at the end of the flights."""
+    """Position and velocity, whose scale the IMU alone gives, agree with their covariance at the
+    end of the flights.
+    """
     last = np.array([flown.rows[-1] for flown in _curves()])
     assert np.all(last[:, :2].mean(axis=0) < nees_bounds(3, len(last))[1])
     assert np.all(last[:, 2] < 0.15)
@@ -143,7 +153,9 @@ class Turning(Path3):
 
     rate_radps = 0.5
 
-    def observe(self, k: int, sigma: float, noise: np.random.Generator, limit: int = 60) -> Observations:
+    def observe(
+        self, k: int, sigma: float, noise: np.random.Generator, limit: int = 60
+    ) -> Observations:
         still, centre = self.points, self.points.mean(axis=0)
         self.points = centre + (still - centre) @ so3_exp([0.0, 0.0, self.rate_radps * 0.05 * k]).T
         seen = super().observe(k, sigma, noise, limit)
@@ -152,13 +164,17 @@ class Turning(Path3):
 
 
 def test_features_that_contradict_the_imu_start_nothing() -> None:
-    """They fit each other and some motion, but one that the gyro's bias cannot explain: the start would be wrong."""
+    """They fit each other and some motion, but one that the gyro's bias cannot explain: the
+    start would be wrong.
+    """
     flown = Flown(Turning(40, "curve"), 0)
     assert flown.begun is None
     assert "features and IMU contradict each other" in str(flown.filter.initialisation.waits_for)
 
 
-def test_a_contradiction_that_stays_is_taken_with_what_it_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_contradiction_that_stays_is_taken_with_what_it_costs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A clock that is off contradicts for good: the start comes, and says how little is known."""
     monkeypatch.setattr(mono_start, "_PATIENCE_S", 0.4)
     monkeypatch.setattr(Turning, "rate_radps", 0.45)
@@ -170,7 +186,9 @@ def test_a_contradiction_that_stays_is_taken_with_what_it_costs(monkeypatch: pyt
     assert squared < 0.5 * sure.rows[0, 1]
 
 
-def test_a_contradiction_that_costs_too_much_starts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_contradiction_that_costs_too_much_starts_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(mono_start, "_PATIENCE_S", 0.4)
     flown = Flown(Turning(50, "curve"), 0)
     assert flown.begun is None
@@ -181,7 +199,9 @@ def test_tracks_on_a_moving_object_are_left_out_of_the_start() -> None:
     """A quarter of the features drifts sideways; the others begin as they would without."""
 
     class Passed(Path3):
-        def observe(self, k: int, sigma: float, noise: np.random.Generator, limit: int = 60) -> Observations:
+        def observe(
+            self, k: int, sigma: float, noise: np.random.Generator, limit: int = 60
+        ) -> Observations:
             seen = super().observe(k, sigma, noise, limit)
             z = seen.z.copy()
             z[seen.ids % 4 == 0, ::2] += 1.5 * k
@@ -199,9 +219,12 @@ def test_steady_flight_never_begins_as_nothing_shows_its_scale() -> None:
 
 
 def test_steady_flight_tells_nothing_more_of_the_scale() -> None:
-    """The scale stays as uncertain as it was where the acceleration ended; the position becomes so with the path."""
+    """The scale stays as uncertain as it was where the acceleration ended; the position becomes
+    so with the path.
+    """
     flown = Flown(Path3(75, "coasting"), 2)
-    early, last = flown.rows[62 - flown.begun], flown.rows[-1]  # the window holds no acceleration in either
+    # the window holds no acceleration in either
+    early, last = flown.rows[62 - flown.begun], flown.rows[-1]
     assert last[3] > 0.9 * early[3]
     assert last[4] > 1.1 * early[4]
 
@@ -248,7 +271,8 @@ def test_one_camera_without_imu_is_refused() -> None:
         build_frontend("orb", LEFT, FrontendSettings())
 
 
-# --- the front end --------------------------------------------------------------------------------------------------
+# --- the front end
+# --------------------------------------------------------------------------------------------------
 
 
 def _pose(k: int) -> FloatArray:
@@ -272,7 +296,10 @@ def _walls() -> tuple[tuple[np.ndarray, FloatArray], ...]:
 def test_front_end_tracks_one_camera_without_a_right_image() -> None:
     camera = left_alone(WALL_CAMERA)
     frontend = build_frontend("klt", camera, FrontendSettings())
-    seen = [frontend.process(StereoFrame(k, k * STEP_NS, _walls()[k][0], None)).observations for k in range(4)]
+    seen = [
+        frontend.process(StereoFrame(k, k * STEP_NS, _walls()[k][0], None)).observations
+        for k in range(4)
+    ]
     assert not any(s.has_right.any() for s in seen)
     common, a, b = np.intersect1d(seen[1].ids, seen[3].ids, return_indices=True)
     assert len(common) > 60
@@ -304,23 +331,30 @@ def test_depths_across_an_outline_are_not_used() -> None:
     camera = with_virtual_baseline(one_camera(300.0, 300.0, 9.5, 9.5, 20, 20), 1.5e-3)
     depth = np.full((20, 20), 2.0)
     depth[:, 10:] = 4.0
-    d, known = disparities(camera, np.array([[5.3, 5.7], [9.5, 5.0], [14.2, 3.0], [25.0, 3.0]]), depth)
+    d, known = disparities(
+        camera, np.array([[5.3, 5.7], [9.5, 5.0], [14.2, 3.0], [25.0, 3.0]]), depth
+    )
     assert known.tolist() == [True, False, True, False]
     np.testing.assert_allclose(d[[0, 2]], camera.fu * camera.baseline_m / np.array([2.0, 4.0]))
 
 
 @pytest.mark.parametrize("depth_m", [0.8, 5.0])
 def test_virtual_baseline_makes_the_noise_of_depths_that_of_disparities(depth_m: float) -> None:
-    """`sigma_z = k z^2` is one standard deviation of the disparity, whatever the depth: sqrt(2) of a pixel's 0.2 px."""
+    """`sigma_z = k z^2` is one standard deviation of the disparity, whatever the depth: sqrt(2)
+    of a pixel's 0.2 px.
+    """
     camera = with_virtual_baseline(one_camera(500.0, 500.0, 320.0, 240.0), 1.5e-3)
     d = camera.fu * camera.baseline_m / np.array([depth_m, depth_m + 1e-4])
     sigma_px = abs(d[1] - d[0]) / 1e-4 * 1.5e-3 * depth_m**2
     assert sigma_px == pytest.approx(0.2 * np.sqrt(2), rel=1e-3)
 
 
-# --- recordings -----------------------------------------------------------------------------------------------------
+# --- recordings
+# -----------------------------------------------------------------------------------------------------
 
-RIG = Rig(CameraModel(300.0, 300.0, 239.5, 149.5, 480, 300), T_cam0_imu=np.eye(4), depth_factor=1000.0)
+RIG = Rig(
+    CameraModel(300.0, 300.0, 239.5, 149.5, 480, 300), T_cam0_imu=np.eye(4), depth_factor=1000.0
+)
 
 
 def _mono_folder(folder: Path) -> Path:
@@ -358,7 +392,10 @@ def test_folder_with_depth_images_is_read_in_metres(tmp_path: Path) -> None:
     assert (dataset.recording.kind, dataset.recording.camera.kind) == ("rgbd", "rgbd")
     assert not any("depth_factor" in note for note in dataset.recording.notes)
     other = open_dataset(folder, DatasetSettings(depth_factor=2000.0))
-    assert any("depth_factor 2000 takes the place of the calibration's 1000" in n for n in other.recording.notes)
+    assert any(
+        "depth_factor 2000 takes the place of the calibration's 1000" in n
+        for n in other.recording.notes
+    )
     frame = next(e for e in dataset.events() if isinstance(e, StereoFrame))
     np.testing.assert_allclose(frame.depth, _walls()[0][1], atol=6e-4)
     (folder / "calibration.yaml").write_text(kalibr_text(replace(RIG, depth_factor=None)))
@@ -398,8 +435,18 @@ def test_tum_rgbd_is_associated_by_stamps_and_its_camera_is_known(tmp_path: Path
     [
         (lambda f: (f / "depth.txt").write_text("# nothing\n"), "holds no line of data"),
         (lambda f: (f / "depth.txt").write_text("9.0 depth/a.png\n"), "one clock"),
-        (lambda f: [cv2.imwrite(str(p), np.zeros((300, 480), np.uint8)) for p in (f / "depth").iterdir()], "16 bits"),
-        (lambda f: [cv2.imwrite(str(p), np.ones((30, 48), np.uint16)) for p in (f / "depth").iterdir()], "registered"),
+        (
+            lambda f: [
+                cv2.imwrite(str(p), np.zeros((300, 480), np.uint8)) for p in (f / "depth").iterdir()
+            ],
+            "16 bits",
+        ),
+        (
+            lambda f: [
+                cv2.imwrite(str(p), np.ones((30, 48), np.uint16)) for p in (f / "depth").iterdir()
+            ],
+            "registered",
+        ),
     ],
 )
 def test_wrong_depth_recordings_are_refused(tmp_path: Path, spoil: object, message: str) -> None:
@@ -413,7 +460,9 @@ def test_euroc_folder_with_cam0_alone_is_one_camera(tmp_path: Path) -> None:
     cam = tmp_path / "mav0" / "cam0"
     (cam / "data").mkdir(parents=True)
     for k in range(3):
-        cv2.imwrite(str(cam / "data" / f"{1403636579763555584 + k * 50_000_000}.png"), _walls()[k][0])
+        cv2.imwrite(
+            str(cam / "data" / f"{1403636579763555584 + k * 50_000_000}.png"), _walls()[k][0]
+        )
     (cam / "sensor.yaml").write_text(
         "camera_model: pinhole\nintrinsics: [300, 300, 239.5, 149.5]\nresolution: [480, 300]\n"
         "distortion_model: radial-tangential\ndistortion_coefficients: [-0.1, 0.01, 0, 0]\n"
@@ -423,10 +472,13 @@ def test_euroc_folder_with_cam0_alone_is_one_camera(tmp_path: Path) -> None:
     dataset = open_dataset(tmp_path)
     assert dataset.recording.camera.kind == "mono"
     assert len(list(dataset.events())) == 3
-    assert not any("data.csv" in note for note in dataset.recording.notes), "the names of the images say the same"
+    assert not any("data.csv" in note for note in dataset.recording.notes), (
+        "the names of the images say the same"
+    )
     (cam / "data.csv").write_text("#timestamp [ns],filename\n" + "1,a.png\n" * 5)
     assert any(
-        "data.csv lists 5 images; the 3 that are there are used" in n for n in open_dataset(tmp_path).recording.notes
+        "data.csv lists 5 images; the 3 that are there are used" in n
+        for n in open_dataset(tmp_path).recording.notes
     )
 
 
@@ -449,7 +501,10 @@ def test_left_camera_of_a_pair_has_no_right_side(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", [["calibrate"], ["convert", "--to", "euroc", "--out", "x"]])
 def test_commands_for_pairs_say_so_in_one_line(
-    tmp_path: Path, command: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    command: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     from vio.cli import main
 
@@ -480,7 +535,11 @@ def test_an_accelerometer_in_g_is_named_before_the_start_that_it_prevents(
     folder = _mono_folder(tmp_path / "r")
     (folder / "times.txt").write_text("\n".join(f"{0.5 * k:.2f}" for k in range(4)))
     rng = np.random.default_rng(0)
-    rows = [f"{int(k * 5e6)},{a[0]},{a[1]},{a[2]},{a[3]},{a[4]},{1 + a[5]}" for k in range(320) for a in [_shake(rng)]]
+    rows = [
+        f"{int(k * 5e6)},{a[0]},{a[1]},{a[2]},{a[3]},{a[4]},{1 + a[5]}"
+        for k in range(320)
+        for a in [_shake(rng)]
+    ]
     (folder / "imu.csv").write_text("\n".join(["#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z", *rows]))
     assert main(["run", str(folder), "--out", str(tmp_path / "out")]) == 1
     lines = [m for m in caplog.messages if "accelerometer" in m or "no pose" in m]
@@ -514,11 +573,14 @@ def test_inspect_shows_one_camera(tmp_path: Path, capsys: pytest.CaptureFixture[
     status, report = _inspected(folder, capsys)
     assert status == 1
     assert report["faults"] == [
-        "missing: one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu), depth images or a second camera"
+        "missing: one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu), depth "
+        "images or a second camera"
     ]
 
 
-def test_inspect_shows_depth_images_and_a_wrong_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspect_shows_depth_images_and_a_wrong_unit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = _mono_folder(tmp_path / "r")
     (folder / "depth").mkdir()
     for k in range(4):
@@ -535,7 +597,8 @@ def test_inspect_shows_depth_images_and_a_wrong_unit(tmp_path: Path, capsys: pyt
     assert "check depth_factor" in report["faults"][0]
 
 
-# --- live -----------------------------------------------------------------------------------------------------------
+# --- live
+# -----------------------------------------------------------------------------------------------------------
 
 
 def test_odometry_takes_single_images_and_depths() -> None:
@@ -545,7 +608,9 @@ def test_odometry_takes_single_images_and_depths() -> None:
         estimate = odometry.add_images(k * STEP_NS, image, depth_m=depth)
     expected = se3_inverse(_pose(0)) @ _pose(3)
     np.testing.assert_allclose(estimate.T_world_imu[:3, 3], expected[:3, 3], atol=3e-3)
-    with pytest.raises(DataError, match="one image came, but this rig takes an image with its depth_m"):
+    with pytest.raises(
+        DataError, match="one image came, but this rig takes an image with its depth_m"
+    ):
         odometry.add_images(10 * STEP_NS, _walls()[0][0])
     with pytest.raises(DataError, match="two images came"):
         odometry.add_stereo(10 * STEP_NS, _walls()[0][0], _walls()[0][0])

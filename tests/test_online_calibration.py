@@ -1,4 +1,6 @@
-"""Online calibration of camera and IMU: its Jacobians, what it finds on exact flights, and that off means off."""
+"""Online calibration of camera and IMU: its Jacobians, what it finds on exact flights, and that
+off means off.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ from vio.geometry.lie import (
 from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate, ImuSample
 
-EXACT = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)  # the stereo pair
+# the stereo pair
+EXACT = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
 BOTH = replace(EXACT, calibrate_camera_imu="both")
 OFF = replace(EXACT, calibrate_camera_imu="none")
 
@@ -40,12 +43,18 @@ OFF = replace(EXACT, calibrate_camera_imu="none")
 @pytest.fixture
 def no_walk(monkeypatch: pytest.MonkeyPatch) -> None:
     """Estimate the calibration as constants."""
-    for name in ("_EXTRINSIC_ROTATION_WALK_DEG", "_EXTRINSIC_TRANSLATION_WALK_M", "_TIME_OFFSET_WALK_S"):
+    for name in (
+        "_EXTRINSIC_ROTATION_WALK_DEG",
+        "_EXTRINSIC_TRANSLATION_WALK_M",
+        "_TIME_OFFSET_WALK_S",
+    ):
         monkeypatch.setattr(online_calibration, name, 0.0)
 
 
 class Shaking(Flight):
-    """A flight that turns about all axes as fast as a hand does, so that everything is observable."""
+    """A flight that turns about all axes as fast as a hand does, so that everything is
+    observable.
+    """
 
     def state(self, t: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         if self.still:
@@ -53,7 +62,9 @@ class Shaking(Flight):
         _, p, v, a, _ = super().state(t)
 
         def attitude(s: float) -> FloatArray:
-            return so3_exp([0, 0, 0.5 * np.sin(2.3 * s)]) @ so3_exp([0.4 * np.sin(2.9 * s), 0.4 * np.sin(1.9 * s), 0])
+            return so3_exp([0, 0, 0.5 * np.sin(2.3 * s)]) @ so3_exp(
+                [0.4 * np.sin(2.9 * s), 0.4 * np.sin(1.9 * s), 0]
+            )
 
         h = 1e-5
         omega = so3_log(attitude(t - h).T @ attitude(t + h)) / (2 * h)
@@ -83,20 +94,30 @@ class Run:
         return float(np.sqrt(np.mean(np.sum(self.positions[100:] ** 2, axis=1))))
 
     def calibration_nees(self, k: int) -> float:
-        """Squared error of all seven at a frame, over their covariance; offset and extrinsics taken one by one."""
+        """Squared error of all seven at a frame, over their covariance; offset and extrinsics
+        taken one by one.
+        """
         e, xi = self.estimates[k], self.T_cam0_imu_error[k]
         out = xi @ np.linalg.solve(e.T_cam0_imu_covariance, xi)
         return float(out + (self.time_offset_error_s[k] / e.time_offset_sigma_s) ** 2)
 
 
-def _samples(flight: Flight, settings: MsckfSettings, offset_s: float, noise: np.random.Generator) -> list[ImuSample]:
+def _samples(
+    flight: Flight, settings: MsckfSettings, offset_s: float, noise: np.random.Generator
+) -> list[ImuSample]:
     """IMU samples at 200 Hz whose stamps are `offset_s` ahead of the frames' clock."""
     bias = noise.normal(0, [0.02] * 3 + [0.05] * 3)
-    sigmas = np.repeat([settings.gyro_noise_density, settings.accel_noise_density], 3) * np.sqrt(200.0)
+    sigmas = np.repeat([settings.gyro_noise_density, settings.accel_noise_density], 3) * np.sqrt(
+        200.0
+    )
     out = []
     for k in range(-20, 10 * flight.frames + 20):
         R, _, _, a, omega = flight.state(k / 200)
-        reading = np.concatenate([omega, R.T @ (a + np.array([0, 0, 9.81]))]) + bias + noise.normal(0, sigmas)
+        reading = (
+            np.concatenate([omega, R.T @ (a + np.array([0, 0, 9.81]))])
+            + bias
+            + noise.normal(0, sigmas)
+        )
         out.append(ImuSample(5_000_000 * k + round(1e9 * offset_s), reading[:3], reading[3:]))
     return out
 
@@ -104,12 +125,17 @@ def _samples(flight: Flight, settings: MsckfSettings, offset_s: float, noise: np
 def fly_with(
     filt: Msckf, flight: Flight, samples: list[ImuSample], noise: np.random.Generator, sigma: float
 ) -> tuple[list[Estimate], FloatArray]:
-    """Feed a filter with a flight; return its estimates and the errors of their positions (frames, 3), m."""
+    """Feed a filter with a flight; return its estimates and the errors of their positions
+    (frames, 3), m.
+    """
     estimates: list[Estimate] = []
     positions, fed, world = [], 0, TrueWorld(filt, upright=True)
     for k in range(flight.frames):
-        # As in the pipeline: with the sample at or after the exposure, by the offset estimated so far.
-        exposed_ns = k * STEP_NS + round(1e9 * max((estimates[-1].time_offset_s or 0.0) if estimates else 0.0, 0.0))
+        # As in the pipeline: with the sample at or after the exposure, by the offset estimated so
+        # far.
+        exposed_ns = k * STEP_NS + round(
+            1e9 * max((estimates[-1].time_offset_s or 0.0) if estimates else 0.0, 0.0)
+        )
         while fed == 0 or samples[fed - 1].time_ns < exposed_ns:
             filt.propagate(samples[fed])
             fed += 1
@@ -131,10 +157,14 @@ def _fly(
     sigma: float = 0.5,
     camera: StereoCamera = CAMERA,
 ) -> Run:
-    """Run the filter with extrinsics off by xi, clocks off by a time, and another camera than the one that sees."""
+    """Run the filter with extrinsics off by xi, clocks off by a time, and another camera than
+    the one that sees.
+    """
     noise = np.random.default_rng(seed)
     filt = Msckf(camera, T_CAM0_IMU @ se3_exp(xi), settings, motion="imu")
-    estimates, positions = fly_with(filt, flight, _samples(flight, settings, offset_s, noise), noise, sigma)
+    estimates, positions = fly_with(
+        filt, flight, _samples(flight, settings, offset_s, noise), noise, sigma
+    )
     found = [T_CAM0_IMU if e.T_cam0_imu is None else e.T_cam0_imu for e in estimates]
     offsets = np.array([e.time_offset_s or 0.0 for e in estimates])
     return Run(
@@ -156,7 +186,9 @@ def _off_by(seed: int) -> FloatArray:
     """An error (6,) of 2 cm and 1 degree in some direction."""
     rng = np.random.default_rng(seed)
     rho, phi = rng.normal(size=(2, 3))
-    return np.concatenate([0.02 * rho / np.linalg.norm(rho), np.radians(1.0) * phi / np.linalg.norm(phi)])
+    return np.concatenate(
+        [0.02 * rho / np.linalg.norm(rho), np.radians(1.0) * phi / np.linalg.norm(phi)]
+    )
 
 
 # Jacobians
@@ -167,7 +199,9 @@ def _window(clones: int = 5, late_s: float = 0.0) -> Window:
     calibration = first_calibration(T_CAM0_IMU, BOTH, "imu")
     zero = np.zeros(3)
     root = np.random.default_rng(0).normal(size=(DIM + 7, DIM + 7)) * 0.01
-    window = Window(ImuMotion(BOTH), NavState(np.eye(4), zero, zero, zero, zero), root @ root.T, calibration)
+    window = Window(
+        ImuMotion(BOTH), NavState(np.eye(4), zero, zero, zero, zero), root @ root.T, calibration
+    )
     window.clocks_compared = True
     for k in range(clones):
         _add_clone(window, k, late_s)
@@ -206,14 +240,20 @@ def test_jacobian_of_the_cloned_camera_equals_central_differences() -> None:
 
     def camera(error: FloatArray) -> FloatArray:
         corrected = calibration.corrected(error[DIM:], window.nav.T_world_imu)
-        body = se3_exp(error[:6]) @ window.nav.T_world_imu @ se3_exp(twist.mean * (corrected.time_offset_s - 0.004))
+        body = (
+            se3_exp(error[:6])
+            @ window.nav.T_world_imu
+            @ se3_exp(twist.mean * (corrected.time_offset_s - 0.004))
+        )
         return _camera_error(T_before, corrected.T_cam0_imu @ se3_inverse(body))
 
     numeric = numeric_jacobian(camera, np.zeros(DIM + 7))
     np.testing.assert_allclose(analytic, numeric, atol=1e-6)
     np.testing.assert_array_equal(noise, 0.0)
     for name in ("extrinsics", "time_offset"):
-        column = online_calibration.BLOCKS[name].camera_D_error(window.nav.T_world_imu, exposed, twist)
+        column = online_calibration.BLOCKS[name].camera_D_error(
+            window.nav.T_world_imu, exposed, twist
+        )
         np.testing.assert_allclose(column, numeric[:, window.state[name]], atol=1e-6)
 
 
@@ -223,8 +263,13 @@ def test_moving_the_means_moves_cameras_and_bodies_as_their_errors_say() -> None
 
     def moves(error: FloatArray) -> FloatArray:
         moved = _moved(window, np.concatenate([error[:6], np.zeros(9), error[6:]]))
-        by_camera = [_camera_error(a, b) for a, b in zip(cameras, moved.T_cam0_world(), strict=True)]
-        by_body = [se3_log(b @ se3_inverse(a)) for a, b in zip(bodies, moved.clones.T_world_imu, strict=True)]
+        by_camera = [
+            _camera_error(a, b) for a, b in zip(cameras, moved.T_cam0_world(), strict=True)
+        ]
+        by_body = [
+            se3_log(b @ se3_inverse(a))
+            for a, b in zip(bodies, moved.clones.T_world_imu, strict=True)
+        ]
         return np.concatenate([*by_camera, *by_body])
 
     numeric = numeric_jacobian(moves, np.zeros(6 + 7 + 30))
@@ -244,7 +289,9 @@ def test_the_extrinsics_error_moves_with_the_body() -> None:
     P[np.ix_(rows, rows)], window.prior.delta[rows] = np.outer(before, before), before
     window.prior.P = P
     walk = np.r_[np.full(6, 1e-6), 0.0]
-    window.propagate(Transition(nav, np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM))), walk)
+    window.propagate(
+        Transition(nav, np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM))), walk
+    )
     back = se3_adjoint(se3_inverse(nav.T_world_imu))
     np.testing.assert_allclose(back @ window.prior.delta[rows], delta, atol=1e-12)
     own = back @ window.prior.P[np.ix_(rows, rows)] @ back.T
@@ -252,7 +299,9 @@ def test_the_extrinsics_error_moves_with_the_body() -> None:
 
 
 def test_exposures_are_where_the_images_saw_them_when_the_clocks_are_first_compared() -> None:
-    """Whatever the offset: the body's pose and velocity at the IMU's time are what it makes uncertain."""
+    """Whatever the offset: the body's pose and velocity at the IMU's time are what it makes
+    uncertain.
+    """
     window = _window(clones=1)
     row = window.state.clones.start - 1
     window.prior.P[row], window.prior.P[:, row] = 0.0, 0.0
@@ -273,7 +322,9 @@ def test_exposures_are_where_the_images_saw_them_when_the_clocks_are_first_compa
         T = late.T_world_imu @ se3_exp(twist.mean * offset_s)
         xi = se3_log(late.T_world_imu @ se3_inverse(T))
         acceleration = (late.velocity - early.velocity) / 0.05
-        return np.concatenate([xi, late.velocity - so3_exp(xi[3:]) @ (late.velocity + acceleration * offset_s)])
+        return np.concatenate(
+            [xi, late.velocity - so3_exp(xi[3:]) @ (late.velocity + acceleration * offset_s)]
+        )
 
     lever = (moved(1e-6) - moved(-1e-6)) / 2e-6
     np.testing.assert_allclose(window.prior.P[:9, row] / sigma2, lever, atol=1e-6)
@@ -285,7 +336,9 @@ def _nav_parts(t: float) -> tuple[FloatArray, ...]:
 
 
 def test_a_twist_within_its_noise_teaches_nothing_and_adds_its_noise() -> None:
-    """(C3): a twist of one standard deviation has no lever on the offset, one of fifty nearly its whole."""
+    """(C3): a twist of one standard deviation has no lever on the offset, one of fifty nearly
+    its whole.
+    """
     sigma = np.diag([1e-2, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3])
     unknown, known = (Twist(np.full(6, k) * np.diag(sigma), sigma**2) for k in (1.0, 50.0))
     np.testing.assert_array_equal(unknown.significant(), 0.0)
@@ -298,7 +351,9 @@ def test_a_twist_within_its_noise_teaches_nothing_and_adds_its_noise() -> None:
 
 
 def test_new_anchor_of_the_landmarks_changes_no_prediction() -> None:
-    """Where the camera will see a landmark, by all errors together: the same before and after the anchor moves."""
+    """Where the camera will see a landmark, by all errors together: the same before and after
+    the anchor moves.
+    """
     window = _window()
     points = _world_points(window.T_cam0_world(), 2)
     A = np.random.default_rng(1).normal(size=(6, len(window.prior.P))) * 0.3
@@ -319,11 +374,15 @@ def test_new_anchor_of_the_landmarks_changes_no_prediction() -> None:
 
 
 def test_velocities_follow_the_flow_back_in_time() -> None:
-    """Correct a state and integrate, or integrate and correct: the earlier velocity is the same to first order."""
+    """Correct a state and integrate, or integrate and correct: the earlier velocity is the same
+    to first order.
+    """
     motion = ImuMotion(MsckfSettings())
     for k in range(41):
         motion.take(ImuSample(5_000_000 * k, np.array([0.3, -0.2, 0.5]), np.array([0.4, 0.1, 9.7])))
-    early = NavState(se3_exp([1, 2, 3, 0.1, -0.2, 0.3]), np.array([1.0, -0.5, 0.3]), *np.zeros((3, 3)))
+    early = NavState(
+        se3_exp([1, 2, 3, 0.1, -0.2, 0.3]), np.array([1.0, -0.5, 0.3]), *np.zeros((3, 3))
+    )
     step = motion.advance(early, 0, 200_000_000)
     rng = np.random.default_rng(0)
     e = np.concatenate([rng.normal(0, 1e-4, 9), np.zeros(3), rng.normal(0, 1e-3, 3)])
@@ -336,12 +395,16 @@ def test_velocities_follow_the_flow_back_in_time() -> None:
 
 def test_pose_at_an_exposure_follows_the_time_offset() -> None:
     window = _window(clones=1, late_s=0.0)
-    window.calibration = window.calibration.corrected(np.array([0.0, 0, 0, 0, 0, 0, 0.006]), np.eye(4))
+    window.calibration = window.calibration.corrected(
+        np.array([0.0, 0, 0, 0, 0, 0, 0.006]), np.eye(4)
+    )
     R, p, *_ = Shaking().state(0.3 + 0.002)
     exposed, *_ = window.camera_D_own(0.004, _twist(window.nav))
     np.testing.assert_allclose(exposed, se3_from_parts(R, p), atol=2e-5)
     fixed = Window(window.motion, window.nav, np.eye(DIM))
-    np.testing.assert_array_equal(fixed.camera_D_own(0.004, _twist(window.nav))[0], window.nav.T_world_imu)
+    np.testing.assert_array_equal(
+        fixed.camera_D_own(0.004, _twist(window.nav))[0], window.nav.T_world_imu
+    )
 
 
 # On exact flights
@@ -350,7 +413,9 @@ def test_pose_at_an_exposure_follows_the_time_offset() -> None:
 @pytest.mark.usefixtures("no_walk")
 @pytest.mark.parametrize("seed", range(2))
 def test_wrong_calibration_is_found(seed: int) -> None:
-    """One degree, two centimetres, eight milliseconds, either way round, after 10 s of motion about all axes."""
+    """One degree, two centimetres, eight milliseconds, either way round, after 10 s of motion
+    about all axes.
+    """
     flight, offset_s = Shaking(200), 0.008 * (-1) ** seed
     run = _fly(flight, BOTH, seed, xi=_off_by(seed), offset_s=offset_s)
     e, xi = run.estimates[-1], run.T_cam0_imu_error[-1]
@@ -365,7 +430,9 @@ def test_wrong_calibration_is_found(seed: int) -> None:
 
 @pytest.mark.usefixtures("no_walk")
 def test_a_baseline_that_is_off_by_10_percent_is_found_where_it_is_in_doubt() -> None:
-    """The accelerometer tells the scale; without landmarks until it does, as they bias what is open."""
+    """The accelerometer tells the scale; without landmarks until it does, as they bias what is
+    open.
+    """
     wide = replace(BOTH, calibrate_scale="on", stereo_baseline_sigma=0.05)
     short = replace(CAMERA, baseline_m=CAMERA.baseline_m / 1.1)
     run = _fly(Shaking(160), wide, 0, xi=np.zeros(6), offset_s=0.0, camera=short)
@@ -396,11 +463,15 @@ def test_right_calibration_is_not_made_worse() -> None:
 
 @pytest.mark.usefixtures("no_walk")
 def test_standing_still_says_nothing_of_camera_and_imu() -> None:
-    """Neither arm nor mount nor clock shows without motion, and no correction of the first tilt stands in for it."""
+    """Neither arm nor mount nor clock shows without motion, and no correction of the first tilt
+    stands in for it.
+    """
     run = _fly(Shaking(100, still=True), BOTH, 0, xi=np.zeros(6), offset_s=0.0, sigma=0.1)
     e = run.estimates[-1]
     # No direction may shrink, whatever the axes.
-    prior = np.repeat([BOTH.extrinsic_translation_sigma_m, np.radians(BOTH.extrinsic_rotation_sigma_deg)], 3)
+    prior = np.repeat(
+        [BOTH.extrinsic_translation_sigma_m, np.radians(BOTH.extrinsic_rotation_sigma_deg)], 3
+    )
     assert np.linalg.eigvalsh(e.T_cam0_imu_covariance / np.outer(prior, prior))[0] > 0.95**2
     assert e.time_offset_sigma_s > 0.98 * BOTH.time_offset_sigma_s
     assert np.all(np.abs(run.T_cam0_imu_error[-1]) < 0.1 * prior)
@@ -408,7 +479,8 @@ def test_standing_still_says_nothing_of_camera_and_imu() -> None:
 
 
 @pytest.mark.parametrize(
-    ("calibrate", "extrinsics", "timing"), [("extrinsics", True, False), ("time_offset", False, True)]
+    ("calibrate", "extrinsics", "timing"),
+    [("extrinsics", True, False), ("time_offset", False, True)],
 )
 def test_each_alone(calibrate: str, extrinsics: bool, timing: bool) -> None:
     settings = replace(EXACT, calibrate_camera_imu=calibrate)  # type: ignore[arg-type]
@@ -431,15 +503,20 @@ def test_off_tells_nothing_and_needs_an_imu_when_on() -> None:
 
 
 def test_auto_estimates_the_time_offset_where_there_is_an_imu() -> None:
-    run = _fly(Shaking(3), replace(EXACT, calibrate_camera_imu="auto"), 0, xi=np.zeros(6), offset_s=0.0)
+    run = _fly(
+        Shaking(3), replace(EXACT, calibrate_camera_imu="auto"), 0, xi=np.zeros(6), offset_s=0.0
+    )
     assert run.estimates[-1].T_cam0_imu is None
     assert run.estimates[-1].time_offset_sigma_s is not None
-    assert not first_calibration(T_CAM0_IMU, replace(EXACT, calibrate_camera_imu="auto"), None).moves_camera
+    assert not first_calibration(
+        T_CAM0_IMU, replace(EXACT, calibrate_camera_imu="auto"), None
+    ).moves_camera
 
 
 @pytest.mark.usefixtures("no_walk")
 def test_constant_velocity_says_nothing_of_the_clocks() -> None:
-    """The first velocities are not known, and their product with the offset's error is no measurement of it.
+    """The first velocities are not known, and their product with the offset's error is no
+    measurement of it.
 
     With exposures that follow the offset from the first frame on, 5 ms became 2; 4.66 are left.
     """

@@ -1,4 +1,6 @@
-"""The pipeline with fakes in its boxes: what flows where, in which order, and what a run leaves behind."""
+"""The pipeline with fakes in its boxes: what flows where, in which order, and what a run leaves
+behind.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ from vio.runs.pipeline import run
 from vio.runs.tables import ESTIMATE, FRAME
 
 CAMERA = StereoCamera(700.0, 700.0, 600.0, 180.0, 0.54, 1242, 375)
-T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.1, 0.7, -1.1]))
+T_CAM0_IMU = se3_from_parts(
+    np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.1, 0.7, -1.1])
+)
 STEP_NS = 100_000_000
 
 
@@ -52,7 +56,9 @@ class FakeDrive:
         poses = np.array([se3_exp(0.1 * k * self.u) for k in range(frames)])
         times = np.arange(frames, dtype=np.int64) * STEP_NS
         rng = np.random.default_rng(0)
-        self.points = np.column_stack([rng.uniform(0, 50, 500), rng.uniform(-20, 30, 500), rng.uniform(-1, 6, 500)])
+        self.points = np.column_stack(
+            [rng.uniform(0, 50, 500), rng.uniform(-20, 30, 500), rng.uniform(-1, 6, 500)]
+        )
         self.poses = poses
         self._recording = Recording(
             kind="fake",
@@ -69,7 +75,9 @@ class FakeDrive:
     def recording(self) -> Recording:
         return self._recording
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
         for k in range(start, min(stop or len(self.poses), len(self.poses))):
             if self._recording.motion:
                 yield VelocitySample(k * STEP_NS, self.u[:3], self.u[3:])
@@ -79,14 +87,17 @@ class FakeDrive:
         p = transform_points(T_CAM0_IMU @ se3_inverse(self.poses[index]), self.points)
         near = (p[:, 2] > 2) & (p[:, 2] < 40)
         z = project(CAMERA, np.where(near[:, None], p, [0.0, 0.0, 10.0]))
-        ids = np.flatnonzero(near & (z[:, 2] > 0) & (z[:, 0] < 1242) & (z[:, 1] > 0) & (z[:, 1] < 375))
+        ids = np.flatnonzero(
+            near & (z[:, 2] > 0) & (z[:, 0] < 1242) & (z[:, 1] > 0) & (z[:, 1] < 375)
+        )
         return observations(index, index * STEP_NS, ids, z[ids])
 
 
 def test_perfect_features_give_a_perfect_trajectory() -> None:
     drive = FakeDrive()
     result = run(drive, Config())
-    # The velocity at the start is measured to 0.5 m/s only; three Gauss-Newton steps leave a tenth of a millimetre.
+    # The velocity at the start is measured to 0.5 m/s only; three Gauss-Newton steps leave a tenth
+    # of a millimetre.
     np.testing.assert_allclose(result.trajectory.positions, drive.poses[:, :3, 3], atol=1e-3)
     np.testing.assert_allclose(result.dead_reckoning.positions, drive.poses[:, :3, 3], atol=1e-9)
     assert result.trajectory.frame_indices.tolist() == list(range(30))
@@ -117,13 +128,16 @@ def test_a_lag_gives_each_pose_what_later_frames_know() -> None:
     )  # which no later frame makes better
     causal = run(drive, exact)
     late = run(FakeDrive(velocity=False), replace(exact, lag_frames=3))
-    np.testing.assert_allclose(late.trajectory.T_world_body[-1], causal.trajectory.T_world_body[-1], atol=1e-9)
+    np.testing.assert_allclose(
+        late.trajectory.T_world_body[-1], causal.trajectory.T_world_body[-1], atol=1e-9
+    )
     revised = np.any(late.trajectory.T_world_body != causal.trajectory.T_world_body, axis=(1, 2))
     assert revised[1:-1].all()
     shift = np.linalg.norm(late.trajectory.positions - causal.trajectory.positions, axis=1)
     assert shift.max() < 0.05
-    # Everything is the smoothed estimate's, the covariance and the velocity too. The pixel noise falls as it is learned
-    # from perfect features, and jumps as landmarks begin, so single covariances may be larger.
+    # Everything is the smoothed estimate's, the covariance and the velocity too. The pixel noise
+    # falls as it is learned from perfect features, and jumps as landmarks begin, so single
+    # covariances may be larger.
     ratios = []
     for k in range(2, len(late.estimates) - 1):
         was, now = causal.estimates[k], late.estimates[k]
@@ -141,7 +155,9 @@ def test_a_lag_gives_each_pose_what_later_frames_know() -> None:
 
 @pytest.mark.parametrize("backend", ["msckf", "vislam"])
 def test_only_selected_rows_reach_the_filter(backend: Literal["msckf", "vislam"]) -> None:
-    """Left views are enough for the sliding window, whose motion gives them a depth, but not for the paper's filter."""
+    """Left views are enough for the sliding window, whose motion gives them a depth, but not for
+    the paper's filter.
+    """
 
     class Half:
         def select(self, rows: Observations, motion=None):  # type: ignore[no-untyped-def]
@@ -185,13 +201,17 @@ def test_the_viewer_sees_each_frame_and_is_closed_even_after_an_error() -> None:
 
 
 def test_memory_does_not_grow_with_frames_beyond_the_map() -> None:
-    """Standing still, the map is complete after the first frame; only poses and log rows may be added."""
+    """Standing still, the map is complete after the first frame; only poses and log rows may be
+    added.
+    """
     import tracemalloc
 
     class Standing(FakeDrive):
         def observations(self, index: int) -> Observations | None:
             seen = super().observations(0)
-            return None if seen is None else replace(seen, frame_index=index, time_ns=index * STEP_NS)
+            return (
+                None if seen is None else replace(seen, frame_index=index, time_ns=index * STEP_NS)
+            )
 
     class Watch:
         sizes: ClassVar[list[int]] = []
@@ -214,7 +234,8 @@ def test_memory_does_not_grow_with_frames_beyond_the_map() -> None:
 
 def _blas_threads() -> set[int]:
     libraries = [library for library in threadpool_info() if library["user_api"] == "blas"]
-    return {library["num_threads"] for library in libraries if "opencv" not in library["filepath"]}  # 4.10 has its own
+    # 4.10 has its own
+    return {library["num_threads"] for library in libraries if "opencv" not in library["filepath"]}
 
 
 @pytest.mark.parametrize("fails", [False, True])
@@ -239,7 +260,9 @@ def test_run_uses_one_blas_thread_and_restores_the_callers_number(fails: bool) -
 
 
 def test_a_divergence_is_an_event_and_not_the_end_of_the_run() -> None:
-    """The filter's state is no number in frame 8: the run goes on from the pose of frame 7, and says so once."""
+    """The filter's state is no number in frame 8: the run goes on from the pose of frame 7, and
+    says so once.
+    """
 
     class Fragile(Msckf):
         def update(self, seen: Observations) -> UpdateReport:
@@ -264,7 +287,9 @@ def test_a_divergence_is_an_event_and_not_the_end_of_the_run() -> None:
         (["motion=imu", "backend=vislam"], True, "no model for --motion imu"),
     ],
 )
-def test_motion_that_cannot_be_had_is_an_error(overrides: list[str], velocity: bool, message: str) -> None:
+def test_motion_that_cannot_be_had_is_an_error(
+    overrides: list[str], velocity: bool, message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         resolve_motion(FakeDrive(velocity=velocity).recording, load_config(None, overrides))
 
@@ -278,8 +303,15 @@ def test_motion_that_cannot_be_had_is_an_error(overrides: list[str], velocity: b
         ("imu", "vislam", "velocity"),
     ],
 )
-def test_motion_auto_takes_that_of_the_logged_run(run_motion: RunMotion, backend: str, expected: str | None) -> None:
-    both = replace(FakeDrive().recording, kind="log", motion=frozenset({"imu", "velocity"}), run_motion=run_motion)
+def test_motion_auto_takes_that_of_the_logged_run(
+    run_motion: RunMotion, backend: str, expected: str | None
+) -> None:
+    both = replace(
+        FakeDrive().recording,
+        kind="log",
+        motion=frozenset({"imu", "velocity"}),
+        run_motion=run_motion,
+    )
     assert resolve_motion(both, load_config(None, [f"backend={backend}"])) == expected
 
 
@@ -292,7 +324,9 @@ def test_frame_ranges_that_hold_nothing_are_errors(start: int, stop: int | None)
 def test_run_folder_holds_what_it_promises(tmp_path: Path) -> None:
     drive = FakeDrive()
     result = run(drive, Config())
-    metrics = write_run_folder(tmp_path / "out", result, drive.recording.reference, lengths_m=(5.0,))
+    metrics = write_run_folder(
+        tmp_path / "out", result, drive.recording.reference, lengths_m=(5.0,)
+    )
     names = {f.name for f in (tmp_path / "out").iterdir()}
     assert names == {
         "config.yaml",
@@ -312,7 +346,15 @@ def test_run_folder_holds_what_it_promises(tmp_path: Path) -> None:
     assert metrics["t_err_percent"] < 1e-3
     rows = list(csv.DictReader((tmp_path / "out" / "frames.csv").read_text().splitlines()))
     assert len(rows) == 30
-    assert {"index", "read_ms", "tracked", "matched", "selected", "gated", "innovation_median_px"} <= set(rows[0])
+    assert {
+        "index",
+        "read_ms",
+        "tracked",
+        "matched",
+        "selected",
+        "gated",
+        "innovation_median_px",
+    } <= set(rows[0])
     read, T_cam0_imu = read_run(tmp_path / "out")
     np.testing.assert_allclose(read.T_world_body, result.trajectory.T_world_body, atol=1e-9)
     np.testing.assert_allclose(T_cam0_imu, T_CAM0_IMU)
@@ -322,7 +364,9 @@ def test_run_folder_holds_what_it_promises(tmp_path: Path) -> None:
     np.testing.assert_allclose(kitti.positions, (se3_inverse(cam0[0]) @ cam0)[:, :3, 3], atol=1e-9)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"T_cam0_imu": "x"}', '{"T_cam0_imu": [[1], [2, 3]]}'])
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"T_cam0_imu": "x"}', '{"T_cam0_imu": [[1], [2, 3]]}']
+)
 def test_damaged_metrics_of_a_run_are_named(text: str, tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text(text)
     with pytest.raises(DataError, match=r"metrics\.json: is damaged .*; repeat the run"):
@@ -340,11 +384,15 @@ def test_landmarks_in_the_ply_are_the_true_points(tmp_path: Path) -> None:
     np.testing.assert_allclose(points[:, :3], drive.points[result.landmarks.ids], atol=0.05)
 
 
-def test_surveyed_landmarks_are_compared_after_the_alignment_of_the_trajectory(tmp_path: Path) -> None:
+def test_surveyed_landmarks_are_compared_after_the_alignment_of_the_trajectory(
+    tmp_path: Path,
+) -> None:
     drive = FakeDrive()
     moved = se3_exp([4.0, -3.0, 1.0, 0.1, 0.2, -0.5])
     known = np.arange(0, 500, 2)
-    truth = Landmarks(known, transform_points(moved, drive.points[known]), np.zeros((len(known), 3, 3)))
+    truth = Landmarks(
+        known, transform_points(moved, drive.points[known]), np.zeros((len(known), 3, 3))
+    )
     result = run(drive, Config())
     result = replace(result, recording=replace(result.recording, landmarks_reference=truth))
     reference = replace(drive.recording.reference, T_world_body=moved @ drive.poses)
@@ -358,7 +406,9 @@ def test_velocities_that_begin_after_the_images_end_no_run(tmp_path: Path) -> No
     """Nothing is reckoned before the first one; from it on, as the velocities say."""
 
     class Late(FakeDrive):
-        def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+        def events(
+            self, start: int = 0, stop: int | None = None, *, images: bool = True
+        ) -> Iterator[Event]:
             for event in super().events(start, stop, images=images):
                 if isinstance(event, StereoFrame) or event.time_ns >= 10 * STEP_NS:
                     yield event
@@ -370,7 +420,9 @@ def test_velocities_that_begin_after_the_images_end_no_run(tmp_path: Path) -> No
     assert len(reckoned) == len(result.estimates) == 30
     np.testing.assert_array_equal(reckoned[:10], np.tile(np.eye(4), (10, 1, 1)))
     np.testing.assert_allclose(
-        se3_inverse(reckoned[12]) @ reckoned[29], se3_inverse(drive.poses[12]) @ drive.poses[29], atol=1e-6
+        se3_inverse(reckoned[12]) @ reckoned[29],
+        se3_inverse(drive.poses[12]) @ drive.poses[29],
+        atol=1e-6,
     )
     assert write_run_folder(tmp_path / "out", result, drive.recording.reference)["ate_m"] < 0.05
 
@@ -403,19 +455,28 @@ def test_a_recording_that_shows_nothing_is_said_so() -> None:
             return observations(index, index * STEP_NS, [], np.zeros((0, 4)))
 
     result = run(Dark(frames=4, velocity=False), Config())
-    assert result.warnings[-1] == "no feature in any of 4 frames: the trajectory contains no information on the motion"
-    assert not any("no feature in any" in line for line in run(FakeDrive(frames=4), Config()).warnings)
+    assert (
+        result.warnings[-1]
+        == "no feature in any of 4 frames: the trajectory contains no information on the motion"
+    )
+    assert not any(
+        "no feature in any" in line for line in run(FakeDrive(frames=4), Config()).warnings
+    )
 
 
 def test_an_error_of_refused_frames_gives_their_reason_and_not_the_last_warning() -> None:
     class Hollow(FakeDrive):
         """Most frames have no features, and the last ones do not come."""
 
-        def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+        def events(
+            self, start: int = 0, stop: int | None = None, *, images: bool = True
+        ) -> Iterator[Event]:
             yield from super().events(start, 20, images=images)
 
         def observations(self, index: int) -> Observations | None:
             return super().observations(index) if index < 5 else None
 
-    with pytest.raises(DataError, match=r"^most frames were refused: frame \d+ has no precomputed observations"):
+    with pytest.raises(
+        DataError, match=r"^most frames were refused: frame \d+ has no precomputed observations"
+    ):
         run(Hollow(), Config())

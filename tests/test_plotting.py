@@ -1,4 +1,6 @@
-"""The picture of a run: which plane the map shows, and that it never decides about the run; names that are no text."""
+"""The picture of a run: which plane the map shows, and that it never decides about the run;
+names that are no text.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,10 @@ def test_the_map_holds_the_path_however_small() -> None:
     drive = np.stack([np.zeros(50), np.linspace(0, 200, 50)], axis=1)
     for scale in (1.0, 0.005):
         low, high = _view(scale * drive, 0.5)
-        assert (low, high) == (pytest.approx(scale * np.array([-60, -20])), pytest.approx(scale * np.array([60, 220])))
+        assert (low, high) == (
+            pytest.approx(scale * np.array([-60, -20])),
+            pytest.approx(scale * np.array([60, 220])),
+        )
     low, high = _view(drive[:, ::-1], 0.5)
     assert (low, high) == (pytest.approx([-20, -240]), pytest.approx([220, 240]))
     assert np.allclose(_view(drive[:1], 1.0), ([-0.02, -0.02], [0.02, 0.02]))
@@ -48,7 +53,9 @@ def test_names_that_are_no_text_do_not_fail_the_run(
     assert metrics["source"].endswith(r"a$1_$2 \frac{ b\xff\x1b[31m.npz")
     assert main(["run", str(strange), "--out", os.fsdecode(b"%s\xff" % os.fsencode(out))]) == 0
     assert r"out\xff" in capsys.readouterr().out
-    assert r"b\xff\x1b[31m.npzx does not exist" in refused(capsys, "run", str(strange) + "x", "--out", out)
+    assert r"b\xff\x1b[31m.npzx does not exist" in refused(
+        capsys, "run", str(strange) + "x", "--out", out
+    )
 
 
 def test_config_with_a_foreign_byte_reads_back(strange: Path, tmp_path: Path) -> None:
@@ -76,4 +83,6 @@ def test_a_picture_that_cannot_be_drawn_is_one_warning(
 def test_printable_escapes_what_a_terminal_would_obey() -> None:
     assert printable("Straße ±1.npz") == "Straße ±1.npz"
     assert printable(os.fsdecode(b"a\xffb\n\x1b[2J")) == r"a\xffb\n\x1b[2J"
-    assert json.loads(json_text({"a": [os.fsdecode(b"\xff"), 1, None]})) == {"a": [r"\xff", 1, None]}
+    assert json.loads(json_text({"a": [os.fsdecode(b"\xff"), 1, None]})) == {
+        "a": [r"\xff", 1, None]
+    }

@@ -1,4 +1,6 @@
-"""The optimum of a pose graph: Jacobians, exact recovery, false loops, gravity, and consistency of the result."""
+"""The optimum of a pose graph: Jacobians, exact recovery, false loops, gravity, and consistency
+of the result.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,15 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from tests.numerics import numeric_jacobian, right_retract
-from vio.geometry.lie import FloatArray, nearest_rotation, se3_adjoint, se3_exp, se3_from_parts, se3_inverse, se3_log
+from vio.geometry.lie import (
+    FloatArray,
+    nearest_rotation,
+    se3_adjoint,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    se3_log,
+)
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.builder import Keyframe, MapBuilder
@@ -24,7 +34,15 @@ from vio.mapping.loop_geometry import Verified
 from vio.mapping.map_graph import MapGraph, _nearest
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.place_finder import FoundPlace
-from vio.mapping.pose_graph import Edges, UpDirections, marginals, optimise, r_D_poses, residual, up_residual
+from vio.mapping.pose_graph import (
+    Edges,
+    UpDirections,
+    marginals,
+    optimise,
+    r_D_poses,
+    residual,
+    up_residual,
+)
 from vio.records import LoopMatches
 
 COUNT = 60
@@ -34,8 +52,11 @@ RNG = np.random.default_rng
 CAMERA = StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360)
 ROUND, ROUNDS = 100, 3  # keyframes of a round of a circle of 50 m, and rounds
 NO_MATCHES = LoopMatches(*(np.zeros((0, 4)),) * 2, *(np.zeros(0, np.bool_),) * 2)
-NOTHING = KeyframeFeatures(np.zeros((0, 4)), np.zeros(0, np.bool_), np.zeros(0), np.zeros((0, 32), np.uint8))
-NO_UP_DIRECTIONS = UpDirections(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0))  # as without an IMU
+NOTHING = KeyframeFeatures(
+    np.zeros((0, 4)), np.zeros(0, np.bool_), np.zeros(0), np.zeros((0, 32), np.uint8)
+)
+# as without an IMU
+NO_UP_DIRECTIONS = UpDirections(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0))
 
 
 def _circle() -> FloatArray:
@@ -55,20 +76,26 @@ def _rounds() -> FloatArray:
     return T
 
 
-def _measured(T: FloatArray, i: int, j: int, sigma: FloatArray, rng: np.random.Generator) -> RelativePose:
+def _measured(
+    T: FloatArray, i: int, j: int, sigma: FloatArray, rng: np.random.Generator
+) -> RelativePose:
     noise = se3_exp(sigma * rng.standard_normal(6))
     return RelativePose(se3_inverse(T[i]) @ T[j] @ noise, np.diag(sigma**2))
 
 
 def _problem(seed: int, false_loops: int = 0) -> tuple[FloatArray, FloatArray, Edges, Edges]:
-    """Truth, start by odometry, odometry and loops; the last `false_loops` loops are wrong by metres."""
+    """Truth, start by odometry, odometry and loops; the last `false_loops` loops are wrong by
+    metres.
+    """
     rng, T = RNG(seed), _circle()
     odometry = [(k, k + 1, _measured(T, k, k + 1, SIGMA, rng)) for k in range(COUNT - 1)]
     start = [T[0]]
     for _, _, motion in odometry:
         start.append(start[-1] @ motion.T_i_j)
     period = round((COUNT - 1) / 1.1)
-    loops = [(k, k + period, _measured(T, k, k + period, LOOP_SIGMA, rng)) for k in range(COUNT - period)]
+    loops = [
+        (k, k + period, _measured(T, k, k + period, LOOP_SIGMA, rng)) for k in range(COUNT - period)
+    ]
     for _ in range(false_loops):
         i, j = sorted(rng.choice(COUNT, 2, replace=False).tolist())
         wrong = se3_exp(np.concatenate([rng.uniform(-5, 5, 3), rng.uniform(-1, 1, 3)]))
@@ -94,7 +121,9 @@ def test_jacobians_of_a_motion_agree_with_differences_far_from_the_optimum() -> 
         def moved(X: FloatArray, number: int = number) -> FloatArray:
             return residual(np.array([X, T[1]] if number == 0 else [T[0], X]), edges)[0]
 
-        np.testing.assert_allclose(D[0], numeric_jacobian(moved, T[number], right_retract), atol=1e-7)
+        np.testing.assert_allclose(
+            D[0], numeric_jacobian(moved, T[number], right_retract), atol=1e-7
+        )
 
 
 def test_jacobian_of_the_vertical_agrees_with_differences() -> None:
@@ -130,12 +159,16 @@ def test_false_loops_end_without_weight_and_change_nothing() -> None:
 
 @pytest.mark.parametrize("wrong", [1, 3])
 def test_wrong_loops_that_the_odometry_lets_pass_change_little(wrong: int) -> None:
-    """Of 15 loops some are off by 0.1 to 0.3 m and a few degrees, which the odometry since does not contradict."""
+    """Of 15 loops some are off by 0.1 to 0.3 m and a few degrees, which the odometry since does
+    not contradict.
+    """
     clean, mixed = [], []
     for seed in range(6):
         T, start, odometry, _ = _problem(seed)
         rng, period = RNG([seed, 1]), round((COUNT - 1) / 1.1)
-        pairs = [(k, k + period + d) for k in range(1, COUNT - period - 1) for d in (-1, 0, 1)] + [(0, period)] * 3
+        pairs = [(k, k + period + d) for k in range(1, COUNT - period - 1) for d in (-1, 0, 1)] + [
+            (0, period)
+        ] * 3
         loops = [(i, j, _measured(T, i, j, LOOP_SIGMA, rng)) for i, j in pairs]
         right = loops[wrong:]
         for n in range(wrong):
@@ -173,11 +206,15 @@ def test_covariance_in_the_frame_of_all_poses_does_not_depend_on_the_pose_that_i
     P, Q = (marginals(T, odometry, loops, NO_UP_DIRECTIONS, h, poses, frame=weights) for h in held)
     np.testing.assert_allclose(P, Q, rtol=1e-6, atol=1e-12)
     alone = marginals(T, odometry, loops, NO_UP_DIRECTIONS, held[0], poses)
-    assert np.trace(P[1]) < np.trace(alone[1]), "the first pose is no part of what the frame is uncertain by"
+    assert np.trace(P[1]) < np.trace(alone[1]), (
+        "the first pose is no part of what the frame is uncertain by"
+    )
 
 
 def test_error_in_the_frame_of_all_poses_is_that_of_its_covariance() -> None:
-    """Normalised squared errors of the last pose, 6 expected, where the optimum stands as the truth does on average."""
+    """Normalised squared errors of the last pose, 6 expected, where the optimum stands as the
+    truth does on average.
+    """
     weights, last, squared = np.full(COUNT, 1 / COUNT), np.array([COUNT - 1]), []
     for seed in range(20):
         T, start, odometry, loops = _problem(seed)
@@ -196,7 +233,9 @@ def test_the_vertical_keeps_the_map_upright() -> None:
     ups = UpDirections(np.arange(COUNT), T[:, 2, :3], np.full(COUNT, 0.002))
     tilt = [
         np.abs(best.T_map_cam[:, 2, :3] - T[:, 2, :3]).max()
-        for best in (optimise(start, odometry, loops, given, _fixed()) for given in (NO_UP_DIRECTIONS, ups))
+        for best in (
+            optimise(start, odometry, loops, given, _fixed()) for given in (NO_UP_DIRECTIONS, ups)
+        )
     ]
     assert tilt[1] < 0.3 * tilt[0]
     assert tilt[1] < 0.004
@@ -215,7 +254,8 @@ def test_a_tilt_of_the_first_pose_does_not_bend_the_map() -> None:
     """The filter's vertical was 5 mrad off at its first frame, and later ones agree on another."""
     truth = _circle()
     exact = [
-        (k, k + 1, RelativePose(se3_inverse(truth[k]) @ truth[k + 1], np.diag(SIGMA**2))) for k in range(COUNT - 1)
+        (k, k + 1, RelativePose(se3_inverse(truth[k]) @ truth[k + 1], np.diag(SIGMA**2)))
+        for k in range(COUNT - 1)
     ]
     odometry = Edges.of(exact)
     tilt = np.eye(4)
@@ -226,14 +266,20 @@ def test_a_tilt_of_the_first_pose_does_not_bend_the_map() -> None:
     best = optimise(start, odometry, Edges.of([]), ups, _fixed(), levelled=0).T_map_cam
     bent, straight = (float(np.abs(residual(T, odometry)).max()) for T in (held, best))
     assert straight < 0.1 * bent
-    np.testing.assert_allclose(best[:, 2, :3], truth[:, 2, :3], atol=1e-5, err_msg="z is up everywhere")
+    np.testing.assert_allclose(
+        best[:, 2, :3], truth[:, 2, :3], atol=1e-5, err_msg="z is up everywhere"
+    )
     np.testing.assert_allclose(best[0, :3, 3], start[0, :3, 3], atol=1e-12)
     heading = [np.arctan2(T[1, 0], T[0, 0]) for T in (best[0], start[0])]
     assert abs(heading[0] - heading[1]) < 1e-4
 
 
-def test_a_new_loop_moves_what_is_around_it_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three times around a circle: loops of the second round are settled, one of the third is new."""
+def test_a_new_loop_moves_what_is_around_it_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three times around a circle: loops of the second round are settled, one of the third is
+    new.
+    """
     monkeypatch.setattr("vio.mapping.map_graph._WINDOW", 80)
     count, period, T, rng = ROUNDS * ROUND, ROUND, _rounds(), RNG(5)
     store = MapStore(tmp_path / "a.map", create=True)
@@ -246,7 +292,9 @@ def test_a_new_loop_moves_what_is_around_it_alone(tmp_path: Path, monkeypatch: p
             start = start @ motion.T_i_j
         graph.append(KeyframeRow(0, k, k, start, start, np.eye(6), 0.0, None, 0.0))
     for k in range(0, 190, 3):
-        graph.add_loops([LoopRow(k, k + period, _measured(T, k, k + period, LOOP_SIGMA, rng), 50, True)])
+        graph.add_loops(
+            [LoopRow(k, k + period, _measured(T, k, k + period, LOOP_SIGMA, rng), 50, True)]
+        )
     for _ in range(3):  # far from the optimum at first
         graph.optimise_part(0)
     before = graph.T_map_cam.rows.copy()
@@ -268,7 +316,12 @@ def test_a_new_loop_moves_what_is_around_it_alone(tmp_path: Path, monkeypatch: p
 
 def _store_of_rounds(rng: np.random.Generator) -> SimpleNamespace:
     """A map at its optimum, with a loop at each tenth keyframe."""
-    T, drift, rows, motions = _rounds(), np.zeros((6, 6)), list[KeyframeRow](), list[tuple[int, int, RelativePose]]()
+    T, drift, rows, motions = (
+        _rounds(),
+        np.zeros((6, 6)),
+        list[KeyframeRow](),
+        list[tuple[int, int, RelativePose]](),
+    )
     odom = T[0]
     for k in range(len(T)):
         if k:
@@ -283,7 +336,9 @@ def _store_of_rounds(rng: np.random.Generator) -> SimpleNamespace:
         sessions=lambda: [SessionRow("rounds", CAMERA, False, 0)],
         keyframes=lambda: rows,
         odometry=lambda: motions,
-        loops=lambda: [LoopRow(i, k, _measured(T, i, k, LOOP_SIGMA, rng), 50, True) for i, k in pairs],
+        loops=lambda: [
+            LoopRow(i, k, _measured(T, i, k, LOOP_SIGMA, rng), 50, True) for i, k in pairs
+        ],
         show_something=lambda: np.ones(len(T), dtype=np.bool_),
         places=list,
         features=lambda _: NOTHING,
@@ -295,14 +350,19 @@ def _store_of_rounds(rng: np.random.Generator) -> SimpleNamespace:
     return store
 
 
-def test_covariance_in_a_map_above_the_window_is_that_of_the_dense_inverse(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_covariance_in_a_map_above_the_window_is_that_of_the_dense_inverse(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("vio.mapping.map_graph._WINDOW", 60)
     store = _store_of_rounds(RNG(1))
     graph = MapGraph(store)
     assert not graph.optimise_near(0, 1)
     T, w = graph.T_map_cam.rows, graph.frame_weights(graph.part == 0)
     rows = list[FloatArray]()
-    for i, j, pose in [*store.odometry(), *((o.first, o.second, o.pose) for o in graph.loops if o.kept)]:
+    for i, j, pose in [
+        *store.odometry(),
+        *((o.first, o.second, o.pose) for o in graph.loops if o.kept),
+    ]:
         edge, row = Edges.of([(i, j, pose)]), np.zeros((6, 6 * len(T)))
         A, B = r_D_poses(T, edge, residual(T, edge))
         row[:, 6 * i : 6 * i + 6], row[:, 6 * j : 6 * j + 6] = A[0], B[0]
@@ -320,28 +380,39 @@ def test_covariance_in_a_map_above_the_window_is_that_of_the_dense_inverse(monke
 def test_errors_of_a_session_in_a_map_above_the_window_are_as_its_covariance_says(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Normalised squared errors (6 expected) in the frame in which the map's keyframes stand on average.
+    """Normalised squared errors (6 expected) in the frame in which the map's keyframes stand on
+    average.
 
-    The map of 300 keyframes counts as one of 5000, whose factors are made for each fifth keyframe at most.
+    The map of 300 keyframes counts as one of 5000, whose factors are made for each fifth keyframe
+    at most.
     """
     monkeypatch.setattr("vio.mapping.map_graph._WINDOW", 60)
     truth, first, size, computed = _rounds(), 20, ROUNDS * ROUND, list[int]()
     exact = MapGraph._marginals
-    monkeypatch.setattr(MapGraph, "_marginals", lambda *a, **named: computed.append(len(a[0])) or exact(*a, **named))
+    monkeypatch.setattr(
+        MapGraph, "_marginals", lambda *a, **named: computed.append(len(a[0])) or exact(*a, **named)
+    )
     squared = list[float]()
     for seed in range(15):
         rng, T = RNG([seed, 7]), np.eye(4)
         builder = MapBuilder(_store_of_rounds(rng), "on", CAMERA, upright=False, localise=True)
         graph, found = builder.graph, dict[int, FoundPlace]()
-        monkeypatch.setattr(builder.places, "find", lambda number, _, found=found: found.get(number))
+        monkeypatch.setattr(
+            builder.places, "find", lambda number, _, found=found: found.get(number)
+        )
         for n in range(20):
             motion = _measured(truth, first + n - 1, first + n, SIGMA, rng) if n else None
             T = T if motion is None else T @ motion.T_i_j
             if n % 2 == 0:
                 pose = _measured(truth, first + n, first + n, 4 * LOOP_SIGMA, rng)
-                found[size + n] = FoundPlace(first + n, size + n, Verified(pose, 50, 60, NO_MATCHES), 0)
+                found[size + n] = FoundPlace(
+                    first + n, size + n, Verified(pose, 50, 60, NO_MATCHES), 0
+                )
             update = builder.add(Keyframe(n, n, T, motion, None, 0.0), NOTHING)
-            stated, true = graph.T_map_cam.rows.copy(), np.concatenate([truth, truth[first : first + n + 1]])
+            stated, true = (
+                graph.T_map_cam.rows.copy(),
+                np.concatenate([truth, truth[first : first + n + 1]]),
+            )
             graph.keep_place(0, np.arange(len(graph)) < size, true, level=False)
             xi = se3_log(se3_inverse(true[-1]) @ graph.T_map_cam[-1])
             graph.T_map_cam.rows[:] = stated
@@ -354,7 +425,9 @@ def test_loops_that_contradict_each_other_leave_a_piece_where_it_is() -> None:
     """Nothing but two loops holds the second half, and neither is more likely than the other."""
     T = np.array([se3_exp([k % 5, 0, 0, 0, 0, 0]) for k in range(10)])
     steps = [k for k in range(9) if k != 4]
-    odometry = Edges.of([(k, k + 1, RelativePose(se3_exp([1.0, 0, 0, 0, 0, 0]), 1e-4 * np.eye(6))) for k in steps])
+    odometry = Edges.of(
+        [(k, k + 1, RelativePose(se3_exp([1.0, 0, 0, 0, 0, 0]), 1e-4 * np.eye(6))) for k in steps]
+    )
     aside = [RelativePose(se3_exp([0, y, 0, 0, 0, 0]), 1e-4 * np.eye(6)) for y in (-3.0, 3.0)]
     loops = Edges.of([(0, 5, aside[0]), (1, 6, aside[1])])
     best = optimise(T, odometry, loops, NO_UP_DIRECTIONS, np.arange(10) == 0)
@@ -375,7 +448,9 @@ def test_a_loop_in_a_piece_without_the_first_keyframe_is_settled(
         T = np.eye(4)
         for k in range(count):
             if k:
-                graph.add_motions([(len(graph) - 1, len(graph), RelativePose(step, 1e-4 * np.eye(6)))])
+                graph.add_motions(
+                    [(len(graph) - 1, len(graph), RelativePose(step, 1e-4 * np.eye(6)))]
+                )
                 T = T @ step
             graph.append(KeyframeRow(session, k, k, T, T, np.eye(6), 0.0, None, 0.0))
     before = graph.T_map_cam.rows.copy()
@@ -384,14 +459,18 @@ def test_a_loop_in_a_piece_without_the_first_keyframe_is_settled(
     assert not graph.optimise_near(0, 2)
     moved = (graph.T_map_cam.rows - before)[:, :3, 3]
     np.testing.assert_array_equal(moved[:100], 0.0)
-    np.testing.assert_allclose(moved[100:], [[0.0, 0.1 * (k >= 20), 0.0] for k in range(40)], atol=1e-6)
+    np.testing.assert_allclose(
+        moved[100:], [[0.0, 0.1 * (k >= 20), 0.0] for k in range(40)], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("ends", [[(20, 900)], [(5, 1990), (400, 700)], [(700, 705)]])
 def test_the_keyframes_near_new_loops_are_those_of_a_search_of_the_whole_map(
     ends: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A chain of 2000 keyframes with 100 loops, motions of all sizes, and a piece that nothing joins to it."""
+    """A chain of 2000 keyframes with 100 loops, motions of all sizes, and a piece that nothing
+    joins to it.
+    """
     monkeypatch.setattr("vio.mapping.map_graph._WINDOW", 80)
     rng, count = np.random.default_rng(len(ends)), 2000
     chain = np.delete(np.stack([np.arange(count - 1), np.arange(1, count)], axis=1), 1899, axis=0)
@@ -409,14 +488,22 @@ def test_the_keyframes_near_new_loops_are_those_of_a_search_of_the_whole_map(
     expected = np.sort(least)[: 80 + on_cycle]
     found = _nearest(links, new, rows)
     assert len(set(found.tolist())) == len(found)
-    # All keyframes of another way between two of the cycle have one detour, so that which of them is taken is open.
+    # All keyframes of another way between two of the cycle have one detour, so that which of them
+    # is taken is open.
     np.testing.assert_allclose(np.sort(least[found]), expected[np.isfinite(expected)], atol=1e-9)
 
 
 def test_verticals_do_not_pull_at_a_map_whose_z_is_not_up(tmp_path: Path) -> None:
-    """A new session in a map that no loop has levelled yet: by its world of the first seconds, up is 2 deg off z."""
-    graph, step = MapGraph(MapStore(tmp_path / "a.map", create=True)), se3_exp([1.0, 0, 0, 0, 0, 0.1])
-    graph.sessions = [SessionRow("tilted", StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360), True, 0)]
+    """A new session in a map that no loop has levelled yet: by its world of the first seconds,
+    up is 2 deg off z.
+    """
+    graph, step = (
+        MapGraph(MapStore(tmp_path / "a.map", create=True)),
+        se3_exp([1.0, 0, 0, 0, 0, 0.1]),
+    )
+    graph.sessions = [
+        SessionRow("tilted", StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360), True, 0)
+    ]
     up, T = np.array([np.sin(np.radians(2.0)), 0.0, np.cos(np.radians(2.0))]), np.eye(4)
     for k in range(30):
         if k:
@@ -424,25 +511,45 @@ def test_verticals_do_not_pull_at_a_map_whose_z_is_not_up(tmp_path: Path) -> Non
             T = T @ step
         graph.append(KeyframeRow(0, k, k, T, T, np.eye(6), 0.0, T[:3, :3].T @ up, np.radians(0.1)))
     before = graph.T_map_cam.rows.copy()
-    graph.add_loops([LoopRow(3, 25, RelativePose(se3_inverse(before[3]) @ before[25], 1e-4 * np.eye(6)), 50, True)])
+    graph.add_loops(
+        [
+            LoopRow(
+                3, 25, RelativePose(se3_inverse(before[3]) @ before[25], 1e-4 * np.eye(6)), 50, True
+            )
+        ]
+    )
     fixed = np.arange(30) == 3
     graph._optimise(fixed | (np.arange(30) >= 20), fixed)
     np.testing.assert_allclose(graph.T_map_cam.rows, before, atol=1e-9)
     graph.optimise_part(0)  # the whole may be levelled
-    np.testing.assert_allclose(graph.T_map_cam.rows[-1, :3, :3] @ (T[:3, :3].T @ up), [0.0, 0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(
+        graph.T_map_cam.rows[-1, :3, :3] @ (T[:3, :3].T @ up), [0.0, 0.0, 1.0], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("level", [False, True])
-def test_the_frame_of_a_map_stays_where_its_keyframes_are_known_to_stand(tmp_path: Path, level: bool) -> None:
-    """The last ten of thirty came after a gap in the odometry, and were 100 m off until a loop placed them."""
-    graph, step = MapGraph(MapStore(tmp_path / "a.map", create=True)), se3_exp([1.0, 0.2, 0, 0.02, 0, 0.1])
-    graph.sessions = [SessionRow("walk", StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360), True, 0)]
+def test_the_frame_of_a_map_stays_where_its_keyframes_are_known_to_stand(
+    tmp_path: Path, level: bool
+) -> None:
+    """The last ten of thirty came after a gap in the odometry, and were 100 m off until a loop
+    placed them.
+    """
+    graph, step = (
+        MapGraph(MapStore(tmp_path / "a.map", create=True)),
+        se3_exp([1.0, 0.2, 0, 0.02, 0, 0.1]),
+    )
+    graph.sessions = [
+        SessionRow("walk", StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360), True, 0)
+    ]
     T = se3_exp([0.0, 0.0, 0.0, 0.3, 0.0, 0.0])
     for k in range(30):
         variance = 1e-4 * k + (1e3 if k >= 20 else 0.0)
         graph.append(KeyframeRow(0, k, k, T, T, variance * np.eye(6), 0.0, None, 0.0))
         T = T @ step
-    stated = se3_exp([3.0, -2.0, 1.0, *((0, 0, 0.2) if level else (0.1, 0.3, 0.2))]) @ graph.T_map_cam.rows
+    stated = (
+        se3_exp([3.0, -2.0, 1.0, *((0, 0, 0.2) if level else (0.1, 0.3, 0.2))])
+        @ graph.T_map_cam.rows
+    )
     expected, up = stated.copy(), graph.T_map_cam.rows[:, 2, :3].copy()
     stated[20:, 0, 3] += 100.0
     graph.keep_place(0, np.ones(30, dtype=np.bool_), stated, level=level)
@@ -454,18 +561,28 @@ def test_the_frame_of_a_map_stays_where_its_keyframes_are_known_to_stand(tmp_pat
 def test_no_call_holds_the_interpreter_for_a_frame_while_a_loop_is_settled_in_a_large_map(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A hundred rounds of a circle, 100,000 keyframes: CPU time of each call but SuperLU's, which lets others run."""
+    """A hundred rounds of a circle, 100,000 keyframes: CPU time of each call but SuperLU's,
+    which lets others run.
+    """
     count, period = 100_000, 1000
     angle = 2 * np.pi * np.arange(count) / period
     T = se3_exp(np.stack([*(0 * angle for _ in range(5)), angle], axis=1))
-    T[:, :3, 3] = np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle], axis=1) * 5 * period / (2 * np.pi)
-    step, near = (RelativePose(se3_inverse(T[0]) @ T[k], v * np.eye(6)) for k, v in ((1, 3e-4), (0, 3e-3)))
+    T[:, :3, 3] = (
+        np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle], axis=1) * 5 * period / (2 * np.pi)
+    )
+    step, near = (
+        RelativePose(se3_inverse(T[0]) @ T[k], v * np.eye(6)) for k, v in ((1, 3e-4), (0, 3e-3))
+    )
     camera = StereoCamera(400.0, 400.0, 320.0, 180.0, 0.1, 640, 360)
     store = SimpleNamespace(
         sessions=lambda: [SessionRow("rounds", camera, False, 0)],
-        keyframes=lambda: [KeyframeRow(0, k, k, T[k], T[k], np.eye(6), 5.0 * k, None, 0.0) for k in range(count)],
+        keyframes=lambda: [
+            KeyframeRow(0, k, k, T[k], T[k], np.eye(6), 5.0 * k, None, 0.0) for k in range(count)
+        ],
         odometry=lambda: [(k - 1, k, step) for k in range(1, count)],
-        loops=lambda: [LoopRow(k, k + period, near, 50, True) for k in range(0, count - period, 10)],
+        loops=lambda: [
+            LoopRow(k, k + period, near, 50, True) for k in range(0, count - period, 10)
+        ],
     )
     graph = MapGraph(store)
     graph.add_loops([LoopRow(count - 2 * period - 5, count - 5, near, 50, True)])
@@ -478,7 +595,8 @@ def test_no_call_holds_the_interpreter_for_a_frame_while_a_loop_is_settled_in_a_
             name, spent = call.__name__, time.thread_time() - began.pop()
             longest[name] = max(longest.get(name, 0.0), spent)
 
-    def watched(*arguments: Any, **named: Any) -> FloatArray:  # Python's profiler sees no functions of Cython
+    # Python's profiler sees no functions of Cython
+    def watched(*arguments: Any, **named: Any) -> FloatArray:
         start = time.thread_time()
         away = dijkstra(*arguments, **named)
         longest["dijkstra"] = max(longest.get("dijkstra", 0.0), time.thread_time() - start)
@@ -491,4 +609,5 @@ def test_no_call_holds_the_interpreter_for_a_frame_while_a_loop_is_settled_in_a_
     finally:
         sys.setprofile(None)
     longest.pop("gstrf")
-    assert max(longest.values()) < 0.008, longest  # s, a quarter of a frame; a search of the whole map takes 11 ms
+    # s, a quarter of a frame; a search of the whole map takes 11 ms
+    assert max(longest.values()) < 0.008, longest

@@ -1,4 +1,6 @@
-"""Machine code in an extension module is used for the loops and on the machines that it was made for, nowhere else."""
+"""Machine code in an extension module is used for the loops and on the machines that it was made
+for, nowhere else.
+"""
 
 from __future__ import annotations
 
@@ -205,7 +207,9 @@ def _another_processor(folder: Path) -> None:
         *map(_another_environment, prebuilt.environment()),
     ],
 )
-def test_code_that_is_damaged_or_for_another_machine_is_not_used(change: Callable[[Path], None], folder: Path) -> None:
+def test_code_that_is_damaged_or_for_another_machine_is_not_used(
+    change: Callable[[Path], None], folder: Path
+) -> None:
     change(folder)
     loop = _fresh("total")
     assert not _is_loaded(loop, np.arange(3.0), 0)
@@ -214,23 +218,30 @@ def test_code_that_is_damaged_or_for_another_machine_is_not_used(change: Callabl
 
 @pytest.mark.parametrize("name", ["flags\t\t", "Features\t"])
 def test_instruction_sets_are_those_that_linux_lists(name: str, tmp_path: Path) -> None:
-    (tmp_path / "cpuinfo").write_text(f"processor\t: 0\n{name}: fpu sse avx2\nbugs\t: some\n{name}: fpu\n")
+    (tmp_path / "cpuinfo").write_text(
+        f"processor\t: 0\n{name}: fpu sse avx2\nbugs\t: some\n{name}: fpu\n"
+    )
     assert prebuilt.processor_flags(tmp_path / "cpuinfo") == {"fpu", "sse", "avx2"}
     assert prebuilt.processor_flags(tmp_path / "no file") == {platform.node()}
 
 
-def test_settings_of_numba_are_for_what_numba_compiles(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_of_numba_are_for_what_numba_compiles(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert _is_loaded(_fresh("total"), np.arange(3.0), 0)
     monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
     assert not _is_loaded(_fresh("total"), np.arange(3.0), 0)
 
 
-def test_a_loop_that_was_edited_is_compiled_anew(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_that_was_edited_is_compiled_anew(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert _is_loaded(_fresh("add_halves"), np.arange(3.0), np.zeros(3))
     monkeypatch.setattr(sys.modules[__name__], "HALF", 0.25)
     monkeypatch.setattr(sys.modules[__name__], "halved", _fresh("halved"))
     loop, out = _fresh("add_halves"), np.zeros(3)
-    assert not _is_loaded(loop, np.arange(3.0), out)  # as a constant of a function that it calls is another
+    # as a constant of a function that it calls is another
+    assert not _is_loaded(loop, np.arange(3.0), out)
 
 
 def test_options_belong_to_a_loop(folder: Path) -> None:

@@ -42,7 +42,11 @@ def test_derivatives_match_finite_differences() -> None:
     bias = rng.normal(0, 0.01, (2, 6))
     done = preintegrate(seen, start, end, bias)
     i, j = (
-        BodyStates(se3_exp(rng.normal(0, 0.8, (2, 6))), rng.normal(0, 1, (2, 3)), bias + rng.normal(0, 0.03, (2, 6)))
+        BodyStates(
+            se3_exp(rng.normal(0, 0.8, (2, 6))),
+            rng.normal(0, 1, (2, 3)),
+            bias + rng.normal(0, 0.03, (2, 6)),
+        )
         for _ in range(2)
     )
     r, A, B = done.linearised(i, j, 9.81)
@@ -65,10 +69,16 @@ def test_derivatives_by_the_bias_are_those_of_integrating_again() -> None:
     for k in range(6):
         plus, minus = (preintegrate(seen, start, end, bias + s * h * np.eye(6)[k]) for s in (1, -1))
         np.testing.assert_allclose(
-            done.D_bias[0, :3, k], so3_log(np.swapaxes(minus.R, 1, 2) @ plus.R)[0] / (2 * h), atol=1e-8
+            done.D_bias[0, :3, k],
+            so3_log(np.swapaxes(minus.R, 1, 2) @ plus.R)[0] / (2 * h),
+            atol=1e-8,
         )
-        np.testing.assert_allclose(done.D_bias[0, 3:6, k], (plus.v - minus.v)[0] / (2 * h), atol=1e-8)
-        np.testing.assert_allclose(done.D_bias[0, 6:, k], (plus.p - minus.p)[0] / (2 * h), atol=1e-8)
+        np.testing.assert_allclose(
+            done.D_bias[0, 3:6, k], (plus.v - minus.v)[0] / (2 * h), atol=1e-8
+        )
+        np.testing.assert_allclose(
+            done.D_bias[0, 6:, k], (plus.p - minus.p)[0] / (2 * h), atol=1e-8
+        )
 
 
 def test_covariance_is_that_of_many_draws() -> None:
@@ -76,10 +86,17 @@ def test_covariance_is_that_of_many_draws() -> None:
     t = np.arange(draws * samples + 1) / rate
     phase = 2 * np.pi * t * rate / samples
     clean = np.stack([np.sin(phase + k) for k in range(6)], axis=1) * np.repeat([1.0, 5.0], 3)
-    white = rng.normal(0, np.sqrt(rate), clean.shape) * np.repeat([_DENSITIES.gyro, _DENSITIES.accel], 3)
+    white = rng.normal(0, np.sqrt(rate), clean.shape) * np.repeat(
+        [_DENSITIES.gyro, _DENSITIES.accel], 3
+    )
     start = np.arange(draws) * samples / rate
     truth, drawn = (
-        preintegrate(Readings(t, x[:, :3], x[:, 3:], _DENSITIES), start, start + samples / rate, np.zeros((draws, 6)))
+        preintegrate(
+            Readings(t, x[:, :3], x[:, 3:], _DENSITIES),
+            start,
+            start + samples / rate,
+            np.zeros((draws, 6)),
+        )
         for x in (clean, clean + white)
     )
     phi = so3_log(np.swapaxes(truth.R, 1, 2) @ drawn.R)
@@ -94,7 +111,9 @@ def test_missing_samples_leave_the_motion_open() -> None:
     whole = preintegrate(replace(seen, seconds=t[:200]), *ends, np.zeros((2, 6))).covariance
     kept = (t[:200] < 0.22) | (t[:200] > 0.28)
     cut = Readings(t[:200][kept], seen.gyro[kept], seen.accel[kept], _DENSITIES)
-    sigma = np.sqrt(np.diagonal(preintegrate(cut, *ends, np.zeros((2, 6))).covariance, axis1=1, axis2=2))
+    sigma = np.sqrt(
+        np.diagonal(preintegrate(cut, *ends, np.zeros((2, 6))).covariance, axis1=1, axis2=2)
+    )
     assert sigma[0, 0] == pytest.approx(0.06, rel=0.3), "1 rad/s for 0.06 s"
     assert np.sqrt(whole[0, 0, 0]) < 1e-3
     assert sigma[1, 0] == pytest.approx(0.2, rel=0.3), "and 0.2 s after the last sample"

@@ -25,12 +25,19 @@ from vio.geometry.rectify import (
 from vio.geometry.stereo import Projection, left_rays, project
 from vio.sim.rigs import euroc_like_rig, fisheye_rig, kitti_like_rig, small_rig, wide_rig
 
-RIGS = {"radtan": euroc_like_rig, "equidistant": fisheye_rig, "rectified": small_rig, "cylinder": wide_rig}
+RIGS = {
+    "radtan": euroc_like_rig,
+    "equidistant": fisheye_rig,
+    "rectified": small_rig,
+    "cylinder": wide_rig,
+}
 
 
 def _points_imu(rig: StereoRig, n: int, *, around: bool = False) -> np.ndarray:
     rng = np.random.default_rng(0)
-    direction = np.column_stack([rng.uniform(-0.5, 0.5, n), rng.uniform(-0.35, 0.35, n), np.ones(n)])
+    direction = np.column_stack(
+        [rng.uniform(-0.5, 0.5, n), rng.uniform(-0.35, 0.35, n), np.ones(n)]
+    )
     if around:  # the baseline, up to 75 degrees above and below
         azimuth = rng.uniform(-1.3, 1.3, n)
         direction[:, 1:] = np.column_stack([np.sin(azimuth), np.cos(azimuth)])
@@ -39,7 +46,9 @@ def _points_imu(rig: StereoRig, n: int, *, around: bool = False) -> np.ndarray:
 
 @pytest.mark.parametrize("name", RIGS)
 def test_rectified_raw_pixels_equal_the_rectified_projection(name: str) -> None:
-    """The whole chain against the stereo model: distort, undistort, rotate; rows agree and so does the disparity."""
+    """The whole chain against the stereo model: distort, undistort, rotate; rows agree and so
+    does the disparity.
+    """
     rig = RIGS[name]()
     done = rectified_cameras(rig, "auto")
     points = _points_imu(rig, 300, around=name == "cylinder")
@@ -51,7 +60,9 @@ def test_rectified_raw_pixels_equal_the_rectified_projection(name: str) -> None:
         raw, seen = project_point(camera, transform_points(se3_inverse(T_imu_cam), points))
         rectified, valid = rectify_pixels(camera, R, done.camera, raw)
         assert seen.mean() > 0.9
-        np.testing.assert_allclose(rectified[seen & valid], expected[seen & valid][:, columns], atol=1e-5)
+        np.testing.assert_allclose(
+            rectified[seen & valid], expected[seen & valid][:, columns], atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -81,7 +92,9 @@ def test_a_rectified_rig_is_unchanged() -> None:
 
 
 def test_rotations_agree_with_opencv() -> None:
-    """OpenCV splits the rotation between the cameras differently, which leaves a rotation about the baseline."""
+    """OpenCV splits the rotation between the cameras differently, which leaves a rotation about
+    the baseline.
+    """
     rig = euroc_like_rig()
     R_rect_cam0, R_rect_cam1, baseline = rectifying_rotations(rig)
     T_cam1_cam0 = se3_inverse(rig.T_cam0_cam1)
@@ -136,7 +149,10 @@ def test_only_lenses_that_a_pinhole_would_crop_above_and_below_get_a_cylinder(
 
 def test_a_cylinder_keeps_more_of_a_wide_lens_at_no_lower_resolution() -> None:
     rig = wide_rig()
-    pinhole, cylinder = rectified_cameras(rig, "pinhole").camera, rectified_cameras(rig, "cylinder").camera
+    pinhole, cylinder = (
+        rectified_cameras(rig, "pinhole").camera,
+        rectified_cameras(rig, "cylinder").camera,
+    )
     assert (cylinder.width, cylinder.height) == (rig.cam0.width, rig.cam0.height)
     assert cylinder.fu >= max(pinhole.fu, rig.cam0.fu)
     up, down = (left_rays(cylinder, [[cylinder.cu, v]])[0] for v in (0.0, 511.0))
@@ -145,7 +161,9 @@ def test_a_cylinder_keeps_more_of_a_wide_lens_at_no_lower_resolution() -> None:
 
 
 def test_a_cylinder_becomes_the_pinhole_inside_it() -> None:
-    """For programs that know no cylinder: pixels and images of a pinhole of the same pose, nothing from outside."""
+    """For programs that know no cylinder: pixels and images of a pinhole of the same pose,
+    nothing from outside.
+    """
     cylinder = rectified_cameras(wide_rig(), "cylinder").camera
     pinhole = pinhole_within(cylinder)
     assert pinhole.projection == "pinhole"

@@ -53,10 +53,14 @@ def test_an_euroc_folder_becomes_a_rectified_one(
     np.testing.assert_allclose(done.recording.T_cam0_imu, raw.recording.T_cam0_imu, atol=1e-12)
     _same_frames(raw, done)
     copied = ["imu0/data.csv", "imu0/sensor.yaml"]
-    copied += ["state_groundtruth_estimate0/data.csv"] if truth == "state" else ["../groundtruth_tum.txt"]
+    copied += (
+        ["state_groundtruth_estimate0/data.csv"] if truth == "state" else ["../groundtruth_tum.txt"]
+    )
     for name in copied:
         assert (out / "mav0" / name).read_bytes() == (source / "mav0" / name).read_bytes()
-    np.testing.assert_array_equal(done.recording.reference.T_world_body, raw.recording.reference.T_world_body)
+    np.testing.assert_array_equal(
+        done.recording.reference.T_world_body, raw.recording.reference.T_world_body
+    )
 
 
 def _same_frames(raw: Dataset, done: Dataset) -> None:
@@ -81,7 +85,14 @@ def test_a_kitti_raw_drive_becomes_an_odometry_folder(
     assert facts["frames"] == 3
     assert done.recording.kind == "kitti"
     a, b = raw.recording.camera, done.recording.camera
-    assert (a.fu, a.fv, a.cu, a.cv, a.width, a.height) == (b.fu, b.fv, b.cu, b.cv, b.width, b.height)
+    assert (a.fu, a.fv, a.cu, a.cv, a.width, a.height) == (
+        b.fu,
+        b.fv,
+        b.cu,
+        b.cv,
+        b.width,
+        b.height,
+    )
     assert a.baseline_m == pytest.approx(b.baseline_m, rel=1e-12)
     if imu_known:
         np.testing.assert_allclose(done.recording.T_cam0_imu, raw.recording.T_cam0_imu, atol=1e-12)
@@ -91,9 +102,23 @@ def test_a_kitti_raw_drive_becomes_an_odometry_folder(
     _same_frames(raw, done)
 
 
-def test_the_table_names_what_was_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_names_what_was_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "rect"
-    assert main(["rectify", str(make_euroc(tmp_path / "raw")), "--out", str(out), "--interpolation", "cubic"]) == 0
+    assert (
+        main(
+            [
+                "rectify",
+                str(make_euroc(tmp_path / "raw")),
+                "--out",
+                str(out),
+                "--interpolation",
+                "cubic",
+            ]
+        )
+        == 0
+    )
     captured = capsys.readouterr()
     rows = dict(line.split(maxsplit=1) for line in captured.out.splitlines())
     assert list(rows) == ["folder", "frames", "size", "focal", "baseline"]
@@ -115,7 +140,9 @@ def test_replaces_only_an_older_result(tmp_path: Path, capsys: pytest.CaptureFix
     assert (other / "thesis.txt").read_text() == "mine"
 
 
-def test_rejects_a_recording_that_is_rectified_already(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rejects_a_recording_that_is_rectified_already(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     sources = (
         make_euroc(tmp_path / "euroc", rig=RECTIFIED_RIG),
         make_kitti_raw(tmp_path / "sync", rectified=True),
@@ -137,7 +164,9 @@ def test_skips_a_corrupt_image_and_none_left_leaves_no_folder(
     (data / f"{stamps[2]}.png").write_bytes(b"")
     assert json_of(capsys, "rectify", source, "--out", out)["frames"] == 7
     assert "frame 2 is skipped" in caplog.text
-    assert open_dataset(out).recording.frame_times_ns.tolist() == [t for k, t in enumerate(stamps) if k != 2]
+    assert open_dataset(out).recording.frame_times_ns.tolist() == [
+        t for k, t in enumerate(stamps) if k != 2
+    ]
     for stamp in stamps:
         (data / f"{stamp}.png").write_bytes(b"")
     again = tmp_path / "again"
@@ -145,7 +174,8 @@ def test_skips_a_corrupt_image_and_none_left_leaves_no_folder(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["raw", "rect"], "nothing half-written"
 
 
-# --- rendered folders, end to end -----------------------------------------------------------------------------------
+# --- rendered folders, end to end
+# -----------------------------------------------------------------------------------
 
 
 def _bent(rig: StereoRig) -> StereoRig:
@@ -184,7 +214,9 @@ def folder(flight: SimulatedRecording, tmp_path_factory: pytest.TempPathFactory)
 def test_a_rendered_folder_reads_as_the_rectified_cameras_would_see_it(
     flight: SimulatedRecording, folder: Path
 ) -> None:
-    """The whole chain (renderer, yaml, maps, resampling) against images rendered by the rectified cameras."""
+    """The whole chain (renderer, yaml, maps, resampling) against images rendered by the
+    rectified cameras.
+    """
     dataset = open_dataset(folder)
     simulation = flight.simulation
     done = rectified_cameras(simulation.rig)
@@ -193,7 +225,9 @@ def test_a_rendered_folder_reads_as_the_rectified_cameras_would_see_it(
     ideal = replace(simulation, rig=rig_from_rectified(done.camera, done.T_rect0_imu))
     frame = frames_of(dataset)[3]
     for image, view in zip((frame.left, frame.right), views(ideal, frame.time_ns), strict=True):
-        expected = render(simulation.world, camera_rays(view.camera), view.T_world_cam, frame.time_ns)
+        expected = render(
+            simulation.world, camera_rays(view.camera), view.T_world_cam, frame.time_ns
+        )
         difference = (image - expected)[4:-4, 4:-4]
         assert np.sqrt(np.mean(difference**2)) < 0.15 * expected.std()
         shifted = (np.roll(image, 1, axis=1) - expected)[4:-4, 4:-4]
@@ -206,7 +240,11 @@ def test_run_takes_an_unrectified_folder_like_a_rectified_one(
     metrics = json_of(capsys, "run", folder, "--out", tmp_path / "run", "--backend", "vislam")
     assert metrics["frames"] == 8
     assert metrics["ate_m"] < 0.02, "the ground truth of the IMU is found and honoured"
-    assert metrics["motion"] == "none", "the paper's filter has no IMU model and uses the images alone"
+    assert metrics["motion"] == "none", (
+        "the paper's filter has no IMU model and uses the images alone"
+    )
     assert json_of(capsys, "rectify", folder, "--out", tmp_path / "rect")["frames"] == 8
-    again = json_of(capsys, "run", tmp_path / "rect", "--out", tmp_path / "run2", "--backend", "vislam")
+    again = json_of(
+        capsys, "run", tmp_path / "rect", "--out", tmp_path / "run2", "--backend", "vislam"
+    )
     assert again["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-6)

@@ -33,7 +33,9 @@ def test_a_release_is_held_back_where_the_version_disagrees(
     name: str, old: str, new: str, found: list[str], tmp_path: Path
 ) -> None:
     for file, text in _READY.items():
-        (tmp_path / file).write_text(text.replace(old, new) if file == name else text, encoding="utf-8")
+        (tmp_path / file).write_text(
+            text.replace(old, new) if file == name else text, encoding="utf-8"
+        )
     assert [line.partition(":")[0] for line in problems(tmp_path, "1.2.3")] == found
 
 

@@ -1,4 +1,6 @@
-"""`vio render`: folders that read back, identical output from any number of processes, and clear errors."""
+"""`vio render`: folders that read back, identical output from any number of processes, and clear
+errors.
+"""
 
 from __future__ import annotations
 
@@ -52,16 +54,22 @@ def straight(path: Path, start: FloatArray, end: FloatArray) -> Path:
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder like a recorded flight: ground truth, image times and IMU, all with irregular times."""
+    """A folder like a recorded flight: ground truth, image times and IMU, all with irregular
+    times.
+    """
     folder = tmp_path_factory.mktemp("flight")
     motion = rotate_body_axes(hand_held(duration_s=2.0, start_ns=START_NS), R_FLU_EUROC_IMU)
     times = START_NS + np.arange(200) * 10_000_000
     T = motion_at(motion, times).T_world_imu
     (folder / "groundtruth_tum.txt").write_text(tum_text(times, T), encoding="utf-8")
     frames = START_NS + np.array([40, 91, 139, 190, 240]) * 1_000_000
-    (folder / "image_timestamps_ns.txt").write_text("\n".join(map(str, frames.tolist())) + "\n", encoding="utf-8")
+    (folder / "image_timestamps_ns.txt").write_text(
+        "\n".join(map(str, frames.tolist())) + "\n", encoding="utf-8"
+    )
     imu = [f"{START_NS + 5_000_000 * k},0.25,{k}.5,-1,0.125,9.75,{-k}" for k in range(200)]
-    (folder / "imu0.csv").write_text("\n".join(["#timestamp,w,w,w,a,a,a", *imu]) + "\n", encoding="utf-8")
+    (folder / "imu0.csv").write_text(
+        "\n".join(["#timestamp,w,w,w,a,a,a", *imu]) + "\n", encoding="utf-8"
+    )
     return folder
 
 
@@ -69,7 +77,8 @@ def render(out: Path, *arguments: str) -> int:
     return main(["render", "--out", str(out), *arguments])
 
 
-# --- whole folders --------------------------------------------------------------------------------------------------
+# --- whole folders
+# --------------------------------------------------------------------------------------------------
 
 
 def test_the_summary_describes_the_folder_and_the_folder_reads_back(
@@ -79,7 +88,11 @@ def test_the_summary_describes_the_folder_and_the_folder_reads_back(
     assert render(out, *SMALL, "--json", "--seed", "3") == 0
     summary = json.loads(capsys.readouterr().out)
     assert (summary["frames"], summary["width"], summary["height"]) == (4, 96, 61)
-    assert (summary["format"], summary["rig"], summary["imu"]) == ("euroc", "euroc-rectified", "simulated")
+    assert (summary["format"], summary["rig"], summary["imu"]) == (
+        "euroc",
+        "euroc-rectified",
+        "simulated",
+    )
     assert summary["bytes"] == sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     dataset = open_dataset(str(out), DatasetSettings())
     assert len(dataset.recording.frame_times_ns) == 4
@@ -93,7 +106,9 @@ def test_the_summary_describes_the_folder_and_the_folder_reads_back(
     assert dataset.recording.reference is not None
 
 
-def test_a_kitti_folder_has_the_velocities_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_kitti_folder_has_the_velocities_of_the_paper(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "kitti"
     assert render(out, *SMALL, "--format", "kitti", "--rate", "30", "--duration", "0.1") == 0
     printed = capsys.readouterr()
@@ -110,14 +125,21 @@ def test_a_kitti_folder_has_the_velocities_of_the_paper(tmp_path: Path, capsys: 
 def test_car_trajectory_defaults_to_kitti_cameras_rate_and_format() -> None:
     argv = ["render", "--out", "x", "--scene", "street", "--trajectory", "car", "--duration", "20"]
     scenario, form = scenario_from(build_parser().parse_args(argv))
-    assert (scenario.rig, scenario.rate_hz, scenario.velocity, form) == ("kitti", 10.0, "paper", "kitti")
+    assert (scenario.rig, scenario.rate_hz, scenario.velocity, form) == (
+        "kitti",
+        10.0,
+        "paper",
+        "kitti",
+    )
     simulation = plan(scenario)
     assert len(simulation.taken_ns) == 200
     speed = np.linalg.norm([sample.linear for sample in simulation.velocity], axis=1)
     assert 3 < np.median(speed) < 12
 
 
-def test_flight_folder_provides_ground_truth_image_times_and_imu(tmp_path: Path, flight: Path) -> None:
+def test_flight_folder_provides_ground_truth_image_times_and_imu(
+    tmp_path: Path, flight: Path
+) -> None:
     out = tmp_path / "flight"
     assert render(out, "--trajectory", str(flight), "--width", "96", "--workers", "1") == 0
     stamps = [int(line) for line in (flight / "image_timestamps_ns.txt").read_text().split()]
@@ -133,8 +155,13 @@ def test_flight_folder_provides_ground_truth_image_times_and_imu(tmp_path: Path,
 def test_rate_duration_and_imu_options_override_the_flight(tmp_path: Path, flight: Path) -> None:
     common = ["render", "--out", str(tmp_path / "x"), "--trajectory", str(flight)]
     default, _ = scenario_from(build_parser().parse_args(common))
-    assert (default.frame_times, default.imu) == (flight / "image_timestamps_ns.txt", flight / "imu0.csv")
-    other, _ = scenario_from(build_parser().parse_args([*common, "--rate", "4", "--imu", "simulated"]))
+    assert (default.frame_times, default.imu) == (
+        flight / "image_timestamps_ns.txt",
+        flight / "imu0.csv",
+    )
+    other, _ = scenario_from(
+        build_parser().parse_args([*common, "--rate", "4", "--imu", "simulated"])
+    )
     assert (other.frame_times, other.imu) == (None, "simulated")
     assert np.all(np.diff(plan(other).taken_ns) == 250_000_000)
     short, _ = scenario_from(build_parser().parse_args([*common, "--duration", "0.12"]))
@@ -150,7 +177,9 @@ def test_replaces_an_older_render_folder(tmp_path: Path) -> None:
 
 
 def test_parallel_rendering_is_identical_and_reports_a_dead_process() -> None:
-    scenario = Scenario(width=96, duration_s=0.3, conditions=conditions_of(["noise", "duplicated"]), seed=2)
+    scenario = Scenario(
+        width=96, duration_s=0.3, conditions=conditions_of(["noise", "duplicated"]), seed=2
+    )
     alone = SimulatedRecording(plan(scenario))
     with ParallelRecording(scenario, workers=2) as together:
         for index in range(len(alone)):
@@ -162,10 +191,13 @@ def test_parallel_rendering_is_identical_and_reports_a_dead_process() -> None:
             together.images(0)
 
 
-# --- scenes and effects ---------------------------------------------------------------------------------------------
+# --- scenes and effects
+# ---------------------------------------------------------------------------------------------
 
 
-def test_the_help_names_every_effect(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_names_every_effect(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setenv("COLUMNS", "1000")
     with pytest.raises(SystemExit):
         main(["render", "--help"])
@@ -175,12 +207,18 @@ def test_the_help_names_every_effect(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 @pytest.fixture(scope="module")
 def plain() -> Simulation:
-    """One frame without effects, far enough into the motion for exposure changes and blur to be visible."""
+    """One frame without effects, far enough into the motion for exposure changes and blur to be
+    visible.
+    """
     simulation = plan(Scenario(width=96, duration_s=2.0, seed=1))
-    return replace(simulation, taken_ns=simulation.taken_ns[-1:], stamps_ns=simulation.stamps_ns[-1:])
+    return replace(
+        simulation, taken_ns=simulation.taken_ns[-1:], stamps_ns=simulation.stamps_ns[-1:]
+    )
 
 
-@pytest.mark.parametrize("effect", ["clean", "exposure", "gain", "gain-high", "blur", "noise", "dark"])
+@pytest.mark.parametrize(
+    "effect", ["clean", "exposure", "gain", "gain-high", "blur", "noise", "dark"]
+)
 def test_sensor_effects_change_the_expected_images(plain: Simulation, effect: str) -> None:
     changed = replace(plain, effects=conditions_of([effect]).effects)
     before, after = SimulatedRecording(plain).images(0), SimulatedRecording(changed).images(0)
@@ -191,7 +229,13 @@ def test_sensor_effects_change_the_expected_images(plain: Simulation, effect: st
 
 def test_bare_walls_have_no_texture_and_moving_boxes_are_seen() -> None:
     hard = plan(
-        Scenario(width=96, duration_s=12.0, rate_hz=0.5, seed=1, conditions=conditions_of(["bare-wall", "moving"]))
+        Scenario(
+            width=96,
+            duration_s=12.0,
+            rate_hz=0.5,
+            seed=1,
+            conditions=conditions_of(["bare-wall", "moving"]),
+        )
     )
     recording = SimulatedRecording(replace(hard, effects=conditions_of(["clean"]).effects))
     movers = hard.world.surfaces.mover
@@ -201,7 +245,13 @@ def test_bare_walls_have_no_texture_and_moving_boxes_are_seen() -> None:
         seen |= set(movers[surface].ravel().tolist())
         shown, count = np.unique(surface, return_counts=True)
         largest = surface == shown[count.argmax()]
-        inner = largest[1:-1, 1:-1] & largest[:-2, 1:-1] & largest[2:, 1:-1] & largest[1:-1, :-2] & largest[1:-1, 2:]
+        inner = (
+            largest[1:-1, 1:-1]
+            & largest[:-2, 1:-1]
+            & largest[2:, 1:-1]
+            & largest[1:-1, :-2]
+            & largest[1:-1, 2:]
+        )
         flat += float(recording.images(index)[0][1:-1, 1:-1][inner].std()) < 1.0
     assert flat >= 2
     assert len(seen - {0}) >= 2
@@ -211,7 +261,8 @@ def test_effects_on_frames_and_clocks() -> None:
     base = Scenario(width=96, duration_s=10.0, seed=1)
     plain = plan(base)
     dropped, duplicated, shifted = (
-        plan(replace(base, conditions=conditions_of([name]))) for name in ("dropped", "duplicated", "time-offset")
+        plan(replace(base, conditions=conditions_of([name])))
+        for name in ("dropped", "duplicated", "time-offset")
     )
     assert len(plain.taken_ns) == 200
     assert 165 < len(dropped.taken_ns) < 195
@@ -220,7 +271,15 @@ def test_effects_on_frames_and_clocks() -> None:
 
 
 def test_set_options_override_named_effects(tmp_path: Path) -> None:
-    argv = ["render", "--out", str(tmp_path), "--effects", "noise, dropped", "--set", "effects.read_noise=2"]
+    argv = [
+        "render",
+        "--out",
+        str(tmp_path),
+        "--effects",
+        "noise, dropped",
+        "--set",
+        "effects.read_noise=2",
+    ]
     args = build_parser().parse_args([*argv, "--set", "faults.dropped=0.5", "--set", "moving=true"])
     conditions = scenario_from(args)[0].conditions
     assert (conditions.effects.read_noise, conditions.effects.full_well) == (2.0, 5000.0)
@@ -240,7 +299,9 @@ def test_set_options_override_named_effects(tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("seed", [0, 5])
 def test_predefined_motions_avoid_moving_boxes(scenario: Scenario, seed: int) -> None:
-    simulation = plan(replace(scenario, seed=seed, rate_hz=1.0, conditions=conditions_of(["moving"])))
+    simulation = plan(
+        replace(scenario, seed=seed, rate_hz=1.0, conditions=conditions_of(["moving"]))
+    )
     assert simulation.world.movers
     for time_ns in simulation.taken_ns.tolist():
         T = motion_at(simulation.motion, time_ns).T_world_imu[0]
@@ -259,7 +320,9 @@ def test_boxes_move_in_a_room_around_a_flight_too(flight: Path) -> None:
 
 @pytest.mark.parametrize("rig", ["euroc", "euroc-rectified", "kitti", "fisheye", "small"])
 def test_every_rig_looks_forward_at_any_width(rig: str) -> None:
-    """Hand-held cameras look along the horizon, for all IMU axes; the field of view is unchanged."""
+    """Hand-held cameras look along the horizon, for all IMU axes; the field of view is
+    unchanged.
+    """
     wide, narrow = (plan(Scenario(rig=rig, width=width, duration_s=0.05)) for width in (None, 200))  # type: ignore[arg-type]
     T = motion_at(narrow.motion, narrow.taken_ns[0]).T_world_imu[0] @ narrow.rig.T_imu_cam0
     assert abs(T[2, 2]) < 0.5  # the optical axis is about level
@@ -268,7 +331,8 @@ def test_every_rig_looks_forward_at_any_width(rig: str) -> None:
     assert narrow.rig.cam0.fu / 200 == pytest.approx(wide.rig.cam0.fu / wide.rig.cam0.width)
 
 
-# --- refusals -------------------------------------------------------------------------------------------------------
+# --- refusals
+# -------------------------------------------------------------------------------------------------------
 
 
 def in_a_box(folder: Path) -> list[str]:
@@ -343,7 +407,10 @@ def command_line(*arguments: str) -> Callable[[Path], list[str]]:
     ids=lambda value: value.__name__ if callable(value) and value.__name__ != "<lambda>" else None,
 )
 def test_rejects_bad_input_with_one_line_error_before_writing(
-    arguments: Callable[[Path], list[str]], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: Callable[[Path], list[str]],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()
@@ -373,7 +440,11 @@ def _below_a_file(folder: Path) -> Path:
 
 @pytest.mark.parametrize(
     ("target", "message"),
-    [(_half_full, "was not made by this program"), (_a_file, "not a folder"), (_below_a_file, "cannot write")],
+    [
+        (_half_full, "was not made by this program"),
+        (_a_file, "not a folder"),
+        (_below_a_file, "cannot write"),
+    ],
 )
 def test_keeps_an_unusable_target_unchanged(
     target: Callable[[Path], Path], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -387,7 +458,14 @@ def test_keeps_an_unusable_target_unchanged(
     assert sorted(path.name for path in tmp_path.rglob("*")) == before
 
 
-COMMAND = [sys.executable, "-c", "import sys; from vio.cli import main; sys.exit(main())", "render", "--width", "200"]
+COMMAND = [
+    sys.executable,
+    "-c",
+    "import sys; from vio.cli import main; sys.exit(main())",
+    "render",
+    "--width",
+    "200",
+]
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="needs POSIX file limits")
@@ -395,7 +473,17 @@ def test_full_disk_leaves_no_partial_output(tmp_path: Path) -> None:
     """Files are limited to 4 kB, which calibration and headers stay below and images do not."""
     import resource
 
-    command = [*COMMAND, "--rig", "kitti", "--format", "kitti", "--duration", "0.2", "--out", str(tmp_path / "out")]
+    command = [
+        *COMMAND,
+        "--rig",
+        "kitti",
+        "--format",
+        "kitti",
+        "--duration",
+        "0.2",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     done = subprocess.run(
         command,
         capture_output=True,

@@ -27,7 +27,9 @@ from vio.report.words import run_figures, summary
 from vio.runs.curves import curves_of
 from vio.runs.finished import _read_frames, read_finished_run, with_distinct_names
 
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+BROWSER = (
+    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+)
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +39,20 @@ def runs(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
     folders = out / "imu" / "run", out / "images" / "run"
     exact = "--set", "msckf.calibrate_stereo=off"  # the rig is
     for folder, motion in zip(folders, ("imu", "none"), strict=True):
-        assert main(["run", str(flight), "--motion", motion, "--quiet", "--out", str(folder), *exact]) == 0
+        assert (
+            main(["run", str(flight), "--motion", motion, "--quiet", "--out", str(folder), *exact])
+            == 0
+        )
     return folders
 
 
-def test_the_folder_of_a_run_tells_its_errors_without_the_recording(runs: tuple[Path, Path]) -> None:
+def test_the_folder_of_a_run_tells_its_errors_without_the_recording(
+    runs: tuple[Path, Path],
+) -> None:
     metrics = json.loads((runs[0] / "metrics.json").read_text())
-    own, reference = (read_trajectory(runs[0] / f"{name}.tum") for name in ("trajectory", "reference"))
+    own, reference = (
+        read_trajectory(runs[0] / f"{name}.tum") for name in ("trajectory", "reference")
+    )
     again = evaluate(own, reference, T_cam0_imu=np.array(metrics["T_cam0_imu"]))
     assert again.ate_m.rmse == pytest.approx(metrics["ate_m"], rel=1e-6)
     run = read_finished_run(runs[0])
@@ -75,8 +84,24 @@ def test_a_page_needs_no_network_and_shows_every_part(runs: tuple[Path, Path]) -
     text = page([run])
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=(?!\"data:image)", text)
     assert text.count("plotly.js v") == 1
-    drawn = ("Path", "Position and height", "Attitude", "Velocity", "Errors", "Features", "Innovations", "IMU biases")
-    for title in ("Summary", "Figures", "Features and disparities", *drawn, "Path in three dimensions", "Time"):
+    drawn = (
+        "Path",
+        "Position and height",
+        "Attitude",
+        "Velocity",
+        "Errors",
+        "Features",
+        "Innovations",
+        "IMU biases",
+    )
+    for title in (
+        "Summary",
+        "Figures",
+        "Features and disparities",
+        *drawn,
+        "Path in three dimensions",
+        "Time",
+    ):
         assert f"<h2>{title}</h2>" in text
     assert f"<code>{escape(run.metrics['command'])}</code>" in text
     assert "stamps off by" in text.partition("<h2>Calibration</h2>")[2].partition("</section>")[0]
@@ -85,7 +110,9 @@ def test_a_page_needs_no_network_and_shows_every_part(runs: tuple[Path, Path]) -
 
 
 def test_a_run_with_a_map_is_drawn_in_it_with_its_loops(runs: tuple[Path, Path]) -> None:
-    """The map's own frame does not matter: the picture begins where the run does, or lies on the reference."""
+    """The map's own frame does not matter: the picture begins where the run does, or lies on the
+    reference.
+    """
     plain = read_finished_run(runs[0])
     moved = se3_from_parts(so3_exp([0.0, 0.0, 1.0]), [5.0, 6.0, 7.0])
     T_map = moved @ plain.trajectory.T_world_body
@@ -94,7 +121,9 @@ def test_a_run_with_a_map_is_drawn_in_it_with_its_loops(runs: tuple[Path, Path])
     run = replace(
         plain,
         mapped=replace(plain.trajectory, T_world_body=T_map),
-        map_keyframes=MapKeyframes(*3 * (frames[:1],), np.array([True]), T_map[:1], np.zeros((1, 6, 6))),
+        map_keyframes=MapKeyframes(
+            *3 * (frames[:1],), np.array([True]), T_map[:1], np.zeros((1, 6, 6))
+        ),
         loops=(loop, replace(loop, kept=False), replace(loop, keyframe_frame=None)),
     )
     for shown in (run, replace(run, evaluation=None)):
@@ -106,7 +135,9 @@ def test_a_run_with_a_map_is_drawn_in_it_with_its_loops(runs: tuple[Path, Path])
     assert "<h2>Map</h2>" not in page([plain])
 
 
-def test_names_of_files_cannot_bring_script_into_a_page(runs: tuple[Path, Path], tmp_path: Path) -> None:
+def test_names_of_files_cannot_bring_script_into_a_page(
+    runs: tuple[Path, Path], tmp_path: Path
+) -> None:
     folder = tmp_path / "<script>alert(1)"
     shutil.copytree(runs[1], folder)
     text = page([read_finished_run(folder)])
@@ -119,7 +150,8 @@ def test_curves_lie_on_the_truth_and_bands_hold_it(runs: tuple[Path, Path]) -> N
     (curve,) = curves_of([run])
     assert np.array_equal(curve.truth.seconds, curve.seconds)
     distance = np.linalg.norm(curve.position - curve.truth.position, axis=1)
-    assert np.abs(distance - curve.truth.error_m).max() < 2e-3  # two alignments of nearly the same path
+    # two alignments of nearly the same path
+    assert np.abs(distance - curve.truth.error_m).max() < 2e-3
     # With OpenCV 5 the attitude of this small flight is off by 1.2 degrees.
     assert np.abs(curve.attitude - curve.truth.attitude).max() < 1.5
     assert curve.truth.position[0] == pytest.approx(np.zeros(3), abs=1e-12)
@@ -131,20 +163,25 @@ def test_runs_of_one_recording_are_drawn_in_one_frame(runs: tuple[Path, Path]) -
     curves = curves_of([read_finished_run(folder) for folder in runs])
     assert np.linalg.norm(curves[0].position - curves[1].position, axis=1).max() < 0.02
     assert [c.draws_truth for c in curves] == [True, False]
-    assert [run.name for run in with_distinct_names([read_finished_run(folder) for folder in runs])] == [
+    assert [
+        run.name for run in with_distinct_names([read_finished_run(folder) for folder in runs])
+    ] == [
         "imu/run",
         "images/run",
     ]
 
 
 def test_heading_pitch_and_roll_have_the_signs_that_they_say() -> None:
-    ahead = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # a level camera: x right, y down, z ahead; as columns
+    # a level camera: x right, y down, z ahead; as columns
+    ahead = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     down, right, back = np.eye(3)[2] * -1, np.eye(3)[0], np.eye(3)[1]
     turned = so3_exp(0.1 * down) @ ahead  # about down: to the right
     lifted = so3_exp(0.1 * right) @ ahead
     rolled = so3_exp(0.1 * back) @ ahead  # about ahead: the right side down
     found = np.radians(attitude_deg(np.stack([ahead, turned, lifted, rolled])))
-    assert found == pytest.approx(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), abs=1e-12)
+    assert found == pytest.approx(
+        np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), abs=1e-12
+    )
 
 
 def test_up_is_that_of_gravity_else_that_of_the_first_image() -> None:
@@ -161,16 +198,23 @@ def test_up_is_that_of_gravity_else_that_of_the_first_image() -> None:
 
 
 @pytest.mark.parametrize("model", [ImuMotion, TwistMotion])
-def test_the_velocity_covariance_is_that_of_the_filters_error(model: type[ImuMotion | TwistMotion]) -> None:
+def test_the_velocity_covariance_is_that_of_the_filters_error(
+    model: type[ImuMotion | TwistMotion],
+) -> None:
     rng = np.random.default_rng(0)
     motion = model(MsckfSettings())
     T = se3_from_parts(so3_exp(rng.normal(size=3)), rng.normal(size=3))
     nav = NavState(T, rng.normal(size=3), rng.normal(size=3), np.zeros(3), np.zeros(3))
     root = 1e-4 * rng.normal(size=(15, 15))
     found = motion.uncertainty(nav, root @ root.T)
-    steps = [motion.velocity_world(motion.corrected(nav, column)) - motion.velocity_world(nav) for column in root.T]
+    steps = [
+        motion.velocity_world(motion.corrected(nav, column)) - motion.velocity_world(nav)
+        for column in root.T
+    ]
     numeric = np.einsum("ka,kb->ab", steps, steps)
-    assert found.velocity_covariance == pytest.approx(numeric, rel=1e-2, abs=1e-3 * np.trace(numeric))
+    assert found.velocity_covariance == pytest.approx(
+        numeric, rel=1e-2, abs=1e-3 * np.trace(numeric)
+    )
 
 
 def test_the_command_writes_into_the_run_and_a_new_run_may_replace_it(
@@ -180,7 +224,22 @@ def test_the_command_writes_into_the_run_and_a_new_run_may_replace_it(
     out = runs[1] / "report.html"
     assert capsys.readouterr().out.strip() == str(out)
     assert out.stat().st_size < 8_000_000
-    assert main(["run", str(flight), "--motion", "none", "--stop", "6", "--quiet", "--out", str(runs[1])]) == 0
+    assert (
+        main(
+            [
+                "run",
+                str(flight),
+                "--motion",
+                "none",
+                "--stop",
+                "6",
+                "--quiet",
+                "--out",
+                str(runs[1]),
+            ]
+        )
+        == 0
+    )
     assert not out.exists()
 
 
@@ -194,7 +253,12 @@ def test_the_command_writes_into_the_run_and_a_new_run_may_replace_it(
     ],
 )
 def test_damaged_folders_are_named(
-    runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, content: bytes, says: str
+    runs: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    content: bytes,
+    says: str,
 ) -> None:
     folder = tmp_path / "run"
     shutil.copytree(runs[0], folder)
@@ -210,9 +274,21 @@ def test_a_browser_draws_all_figures(runs: tuple[Path, Path], tmp_path: Path) ->
     assert main(["report", *map(str, runs), "--out", str(out)]) == 0
     figures = len(re.findall(r'id="figure-\d+"', out.read_text(encoding="utf-8")))
     assert BROWSER is not None
-    arguments = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--virtual-time-budget=9000"]
+    arguments = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--enable-logging=stderr",
+        "--virtual-time-budget=9000",
+    ]
     shown = subprocess.run(
-        [BROWSER, *arguments, f"--user-data-dir={tmp_path / 'browser'}", "--dump-dom", out.as_uri()],
+        [
+            BROWSER,
+            *arguments,
+            f"--user-data-dir={tmp_path / 'browser'}",
+            "--dump-dom",
+            out.as_uri(),
+        ],
         capture_output=True,
         text=True,
         timeout=300,

@@ -16,7 +16,8 @@ from vio.runs.pipeline import run
 
 ROOT = Path(__file__).resolve().parent.parent
 rows = pytest.mark.parametrize(
-    ("file", "row"), [("paper.yaml", "paper, all features"), ("paper_one_seventh.yaml", "paper, most seen 1/7")]
+    ("file", "row"),
+    [("paper.yaml", "paper, all features"), ("paper_one_seventh.yaml", "paper, most seen 1/7")],
 )
 
 
@@ -27,7 +28,9 @@ def test_configuration_file_is_a_row_of_the_table(file: str, row: str) -> None:
 
 
 @rows
-def test_configuration_file_gives_the_published_figures(file: str, row: str, data_dir: Path) -> None:
+def test_configuration_file_gives_the_published_figures(
+    file: str, row: str, data_dir: Path
+) -> None:
     recording = data_dir / "ece276a" / "0027.npz"
     if not recording.is_file():
         pytest.skip(f"{recording} is not there")

@@ -1,4 +1,6 @@
-"""The rig of a recording or a caller: built from matrices, read from the calibration files that people have."""
+"""The rig of a recording or a caller: built from matrices, read from the calibration files that
+people have.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +27,22 @@ from vio.geometry.sphere_models import double_sphere, unified
 from vio.records import ImuDensities
 
 LENSES = {
-    "unified": CameraModel(660.0, 661.0, 320.0, 240.0, 640, 480, "unified", (1.4, -0.2, 0.05, 1e-3, -2e-3)),
+    "unified": CameraModel(
+        660.0, 661.0, 320.0, 240.0, 640, 480, "unified", (1.4, -0.2, 0.05, 1e-3, -2e-3)
+    ),
     "unified, no distortion": CameraModel(300.0, 301.0, 320.0, 240.0, 640, 480, "unified", (0.9,)),
-    "double sphere": CameraModel(170.0, 171.0, 320.0, 240.0, 640, 480, "double_sphere", (-0.25, 0.57)),
+    "double sphere": CameraModel(
+        170.0, 171.0, 320.0, 240.0, 640, 480, "double_sphere", (-0.25, 0.57)
+    ),
     "rational": CameraModel(
-        400.0, 401.0, 320.0, 240.0, 640, 480, "radtan", (0.3, -0.1, 1e-4, 2e-4, 0.01, 0.6, -0.12, 0.03)
+        400.0,
+        401.0,
+        320.0,
+        240.0,
+        640,
+        480,
+        "radtan",
+        (0.3, -0.1, 1e-4, 2e-4, 0.01, 0.6, -0.12, 0.03),
     ),
 }
 T_CAM1_CAM0 = se3_from_parts(so3_exp([0.004, -0.006, 0.003]), [-0.11, 0.0004, -0.0006])
@@ -51,7 +64,8 @@ def assert_same(a: Rig, b: Rig, atol: float = 1e-9) -> None:
     assert a.time_offset_s == pytest.approx(b.time_offset_s)
 
 
-# --- lens models ----------------------------------------------------------------------------------------------------
+# --- lens models
+# ----------------------------------------------------------------------------------------------------
 
 
 def _points() -> FloatArray:
@@ -66,11 +80,15 @@ def test_pixels_of_every_lens_lead_back_to_their_rays(name: str) -> None:
     ray, found = unproject_pixel(camera, uv)
     assert valid.all()
     assert found.all()
-    np.testing.assert_allclose(ray, points / np.linalg.norm(points, axis=1, keepdims=True), atol=1e-8)
+    np.testing.assert_allclose(
+        ray, points / np.linalg.norm(points, axis=1, keepdims=True), atol=1e-8
+    )
 
 
 def test_double_sphere_with_one_centre_is_the_unified_model_in_other_parameters() -> None:
-    """Usenko et al., section 2: `alpha / (1 - alpha)` is Mei's xi, and focal lengths scale by `1 - alpha`."""
+    """Usenko et al., section 2: `alpha / (1 - alpha)` is Mei's xi, and focal lengths scale by
+    `1 - alpha`.
+    """
     points = np.random.default_rng(4).normal(size=(200, 3))
     a, valid_a = double_sphere((0.0, 0.6), points)
     b, valid_b = unified(1.5, points)
@@ -109,13 +127,16 @@ def test_rejects_impossible_spheres() -> None:
             CameraModel(300, 300, 320, 240, 640, 480, model, coefficients)  # type: ignore[arg-type]
 
 
-# --- from matrices --------------------------------------------------------------------------------------------------
+# --- from matrices
+# --------------------------------------------------------------------------------------------------
 
 
 def test_rectified_rig_from_numbers_passes_images_through() -> None:
     rig = vio.Rig.rectified(400.0, 410.0, 320.0, 240.0, 0.12, 640, 480, T_CAM0_IMU[:3])
     assert rig.is_rectified
-    assert rig.camera == replace(rig.camera, fu=400.0, fv=410.0, cu=320.0, cv=240.0, width=640, height=480)
+    assert rig.camera == replace(
+        rig.camera, fu=400.0, fv=410.0, cu=320.0, cv=240.0, width=640, height=480
+    )
     assert rig.camera.baseline_m == pytest.approx(0.12, abs=1e-15)
     np.testing.assert_array_equal(rig.T_rect0_imu, T_CAM0_IMU)
     left, right = np.random.default_rng(0).integers(0, 256, (2, 480, 640)).astype(np.uint8)
@@ -128,7 +149,14 @@ def test_rectified_rig_from_numbers_passes_images_through() -> None:
 def test_raw_rig_from_matrices_is_rectified_as_a_recording_of_these_cameras() -> None:
     a, b = RADTAN_RIG.cam0, RADTAN_RIG.cam1
     rig = Rig.raw(
-        a.K, b.K, T_CAM1_CAM0, a.width, a.height, model="radtan", distortion0=a.coefficients, distortion1=b.coefficients
+        a.K,
+        b.K,
+        T_CAM1_CAM0,
+        a.width,
+        a.height,
+        model="radtan",
+        distortion0=a.coefficients,
+        distortion1=b.coefficients,
     )
     assert not rig.is_rectified
     rectifier = rig.rectifier()
@@ -142,24 +170,44 @@ def test_raw_rig_from_matrices_is_rectified_as_a_recording_of_these_cameras() ->
     for interpolation in ("linear", "cubic", "lanczos4"):
         rectified = replace(rectifier, interpolation=interpolation)(*raw)
         for image, done, maps in zip(raw, rectified, both, strict=True):
-            again = remap(image, maps, interpolation)  # by maps of floats, which OpenCV 5 does not round to 1/32 px
-            np.testing.assert_allclose(done.astype(int), again, rtol=0, atol=0 if cv2.__version__ < "5" else 8)
+            # by maps of floats, which OpenCV 5 does not round to 1/32 px
+            again = remap(image, maps, interpolation)
+            np.testing.assert_allclose(
+                done.astype(int), again, rtol=0, atol=0 if cv2.__version__ < "5" else 8
+            )
 
 
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: Rig.rectified(400, 400, 320, 240, -0.1, 640, 480), "stereo baseline must be positive, got -0.1 m"),
+        (
+            lambda: Rig.rectified(400, 400, 320, 240, -0.1, 640, 480),
+            "stereo baseline must be positive, got -0.1 m",
+        ),
         (lambda: Rig.rectified(0, 400, 320, 240, 0.1, 640, 480), "focal lengths must be positive"),
         (lambda: Rig.raw(np.eye(4), np.eye(3), np.eye(4), 640, 480), "K0 is no intrinsic matrix"),
-        (lambda: Rig.raw(np.eye(3).T * 400, np.eye(3), np.eye(4), 640, 480), "K0 is no intrinsic matrix"),
-        (lambda: Rig.raw([[400, 3, 320], [0, 400, 240], [0, 0, 1]], np.eye(3), np.eye(4), 640, 480), "a skew of 3 px"),
-        (lambda: Rig.rectified(400, 400, 320, 240, 0.1, 640, 480, np.eye(3)), "T_cam0_imu: not a finite 3x4 or 4x4"),
+        (
+            lambda: Rig.raw(np.eye(3).T * 400, np.eye(3), np.eye(4), 640, 480),
+            "K0 is no intrinsic matrix",
+        ),
+        (
+            lambda: Rig.raw(
+                [[400, 3, 320], [0, 400, 240], [0, 0, 1]], np.eye(3), np.eye(4), 640, 480
+            ),
+            "a skew of 3 px",
+        ),
+        (
+            lambda: Rig.rectified(400, 400, 320, 240, 0.1, 640, 480, np.eye(3)),
+            "T_cam0_imu: not a finite 3x4 or 4x4",
+        ),
         (
             lambda: Rig.rectified(400, 400, 320, 240, 0.1, 640, 480, 2 * np.eye(4)),
             "T_cam0_imu: the last row of the transform is",
         ),
-        (lambda: replace(RIG, T_cam1_cam0=np.diag([1.0, 1, -1, 1])), "T_cam1_cam0: not a rotation but a reflection"),
+        (
+            lambda: replace(RIG, T_cam1_cam0=np.diag([1.0, 1, -1, 1])),
+            "T_cam1_cam0: not a rotation but a reflection",
+        ),
         (lambda: replace(RIG, time_offset_s=float("nan")), "give finite seconds"),
     ],
 )
@@ -168,7 +216,8 @@ def test_rejects_impossible_rigs(build: Callable[[], Rig], message: str) -> None
         build()
 
 
-# --- files ----------------------------------------------------------------------------------------------------------
+# --- files
+# ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("lens", ["radtan", "equidistant", "pinhole", "unified", "double sphere"])
@@ -176,13 +225,17 @@ def test_camchain_is_read_as_written(lens: str, tmp_path: Path) -> None:
     cameras = {
         "radtan": (RADTAN_RIG.cam0, RADTAN_RIG.cam1),
         "equidistant": (EQUIDISTANT_RIG.cam0, EQUIDISTANT_RIG.cam1),
-        "pinhole": (CameraModel(400, 401, 320, 240, 640, 480), CameraModel(402, 403, 321, 241, 640, 480)),
+        "pinhole": (
+            CameraModel(400, 401, 320, 240, 640, 480),
+            CameraModel(402, 403, 321, 241, 640, 480),
+        ),
     }
     cam0, cam1 = cameras.get(lens) or (LENSES[lens], LENSES[lens])
     rig = replace(RIG, cam0=cam0, cam1=cam1)
     (tmp_path / "camchain-imucam.yaml").write_text(kalibr_text(rig))
     (tmp_path / "imu.yaml").write_text(
-        "accelerometer_noise_density: 2e-3\naccelerometer_random_walk: 3.0e-3\ngyroscope_noise_density: 1.7e-04\n"
+        "accelerometer_noise_density: 2e-3\naccelerometer_random_walk: "
+        "3.0e-3\ngyroscope_noise_density: 1.7e-04\n"
         "gyroscope_random_walk: 1.9e-05\nrostopic: /imu0\nupdate_rate: 200.0\n"
     )
     for path in (tmp_path, tmp_path / "camchain-imucam.yaml"):
@@ -231,7 +284,9 @@ def test_kitti_calibrations(tmp_path: Path) -> None:
     rig = Rig.rectified(700.0, 700.0, 600.0, 180.0, 0.54, 1242, 375, T_CAM0_IMU)
     write_calibration(tmp_path, rig.camera, T_CAM0_IMU)
     assert_same(vio.load_rig(tmp_path, image_size=(1242, 375)), rig)
-    with pytest.raises(CalibrationError, match=r"calib\.txt: states no image size; pass image_size=\(W, H\)"):
+    with pytest.raises(
+        CalibrationError, match=r"calib\.txt: states no image size; pass image_size=\(W, H\)"
+    ):
         vio.load_rig(tmp_path)
 
 
@@ -241,7 +296,9 @@ def test_kitti_raw_calibration_is_chosen_by_the_image_size(tmp_path: Path) -> No
     rectified = vio.load_rig(tmp_path, image_size=(56, 40))
     assert rectified.camera.baseline_m == pytest.approx(0.11)
     assert rectified.T_cam0_imu is None
-    with pytest.raises(CalibrationError, match=r"is for images of 64 x 48 \(raw\) or 56 x 40 .*, not 10 x 10"):
+    with pytest.raises(
+        CalibrationError, match=r"is for images of 64 x 48 \(raw\) or 56 x 40 .*, not 10 x 10"
+    ):
         vio.load_rig(tmp_path, image_size=(10, 10))
     (tmp_path / "calib_velo_to_cam.txt").write_text(rigid_text(se3_inverse(T_CAM0_IMU)))
     (tmp_path / "calib_imu_to_velo.txt").write_text(rigid_text(T_CAM0_IMU @ T_CAM0_IMU))
@@ -255,7 +312,18 @@ def opencv_matrices() -> dict[str, FloatArray]:
     D = [np.array([*c.coefficients, 0.0]) for c in (a, b)]
     R, T = T_CAM1_CAM0[:3, :3], T_CAM1_CAM0[:3, 3]
     R1, R2, P1, P2, *_ = cv2.stereoRectify(a.K, D[0], b.K, D[1], (a.width, a.height), R, T[:, None])
-    return {"M1": a.K, "D1": D[0], "M2": b.K, "D2": D[1], "R": R, "T": T, "R1": R1, "R2": R2, "P1": P1, "P2": P2}
+    return {
+        "M1": a.K,
+        "D1": D[0],
+        "M2": b.K,
+        "D2": D[1],
+        "R": R,
+        "T": T,
+        "R1": R1,
+        "R2": R2,
+        "P1": P1,
+        "P2": P2,
+    }
 
 
 def write_storage(path: Path, entries: dict[str, FloatArray], size: tuple[int, int] | None) -> Path:
@@ -281,10 +349,14 @@ def test_opencv_names_of_other_scripts_and_two_files(tmp_path: Path) -> None:
     whole = opencv_matrices()
     intrinsics = {k: v for k, v in whole.items() if k[0] in "MD"}
     write_storage(tmp_path / "intrinsics.yml", intrinsics, None)
-    write_storage(tmp_path / "extrinsics.yml", {k: v for k, v in whole.items() if k[0] not in "MD"}, None)
+    write_storage(
+        tmp_path / "extrinsics.yml", {k: v for k, v in whole.items() if k[0] not in "MD"}, None
+    )
     rig = vio.load_rig(tmp_path, image_size=(64, 48))
     np.testing.assert_allclose(rig.T_cam1_cam0, T_CAM1_CAM0, atol=1e-12)
-    with pytest.raises(CalibrationError, match=r"intrinsics\.yml: states no image size; add 'image_width: W'"):
+    with pytest.raises(
+        CalibrationError, match=r"intrinsics\.yml: states no image size; add 'image_width: W'"
+    ):
         vio.load_rig(tmp_path)
     # ORB-SLAM's names, where the pose follows from the rectification alone.
     names = {"M1": "LEFT.K", "D1": "LEFT.D", "R1": "LEFT.R", "P1": "LEFT.P"}
@@ -295,7 +367,9 @@ def test_opencv_names_of_other_scripts_and_two_files(tmp_path: Path) -> None:
         text += f"{theirs}: !!opencv-matrix\n  rows: {rows.shape[0]}\n  cols: {rows.shape[1]}\n  dt: d\n"
         text += f"  data: {np.ravel(rows).tolist()}\n"
     (tmp_path / "orb.yaml").write_text(text)
-    np.testing.assert_allclose(vio.load_rig(tmp_path / "orb.yaml").T_cam1_cam0, T_CAM1_CAM0, atol=1e-9)
+    np.testing.assert_allclose(
+        vio.load_rig(tmp_path / "orb.yaml").T_cam1_cam0, T_CAM1_CAM0, atol=1e-9
+    )
 
 
 def test_opencv_rectified_matrices_alone_and_a_board_in_millimetres(tmp_path: Path) -> None:
@@ -306,10 +380,15 @@ def test_opencv_rectified_matrices_alone_and_a_board_in_millimetres(tmp_path: Pa
     assert rig.camera.baseline_m == pytest.approx(0.11, abs=1e-3)
     assert "taken to be rectified" in rig.notes[0]
     path = write_storage(tmp_path / "mm.yml", {**whole, "T": 1000 * whole["T"]}, (64, 48))
-    assert "the cameras are 110.002 m apart; where the board was measured in millimetres" in vio.load_rig(path).notes[0]
+    assert (
+        "the cameras are 110.002 m apart; where the board was measured in millimetres"
+        in vio.load_rig(path).notes[0]
+    )
 
 
-def test_four_opencv_coefficients_are_said_to_be_read_as_radial_and_tangential(tmp_path: Path) -> None:
+def test_four_opencv_coefficients_are_said_to_be_read_as_radial_and_tangential(
+    tmp_path: Path,
+) -> None:
     whole = {k: v[:4] if k in ("D1", "D2") else v for k, v in opencv_matrices().items()}
     path = write_storage(tmp_path / "s.yml", whole, (64, 48))
     rig = vio.load_rig(path)
@@ -323,7 +402,9 @@ def test_four_opencv_coefficients_are_said_to_be_read_as_radial_and_tangential(t
 
 def ros_yaml(K: FloatArray, D: FloatArray, R: FloatArray, P: FloatArray, name: str) -> str:
     def block(value: FloatArray, rows: int) -> str:
-        return f"\n  rows: {rows}\n  cols: {value.size // rows}\n  data: {np.ravel(value).tolist()}\n"
+        return (
+            f"\n  rows: {rows}\n  cols: {value.size // rows}\n  data: {np.ravel(value).tolist()}\n"
+        )
 
     return (
         f"image_width: 64\nimage_height: 48\ncamera_name: {name}\ncamera_matrix:{block(K, 3)}"
@@ -367,7 +448,8 @@ def test_boofcv_is_read(tmp_path: Path) -> None:
     assert rig.cam0.coefficients == (-0.36, 0.17, 0.0, 0.0)
 
 
-# --- bad files ------------------------------------------------------------------------------------------------------
+# --- bad files
+# ------------------------------------------------------------------------------------------------------
 
 
 def _camchain(change: Callable[[dict[str, dict[str, object]]], object]) -> Callable[[Path], Path]:
@@ -409,26 +491,47 @@ def _lonely_ros(folder: Path) -> Path:
 
 
 BAD = {
-    "no such file": (lambda f: f / "none.yaml", r"none\.yaml does not exist; give Kalibr's camchain"),
+    "no such file": (
+        lambda f: f / "none.yaml",
+        r"none\.yaml does not exist; give Kalibr's camchain",
+    ),
     "empty folder": (lambda f: f, "holds no calibration; looked for Kalibr's"),
-    "another YAML file": (_text("a.yaml", "colour: green\n"), "is no calibration of a known format"),
+    "another YAML file": (
+        _text("a.yaml", "colour: green\n"),
+        "is no calibration of a known format",
+    ),
     "no YAML": (_text("a.yaml", "cam0: [1, 2\n"), "not a YAML file"),
     "a list": (_text("a.yaml", "- 1\n- 2\n"), "holds no calibration"),
-    "YAML with tags": (_text("a.yaml", "cam0: !!python/object/apply:os.system ['ls']\n"), "write plain numbers"),
+    "YAML with tags": (
+        _text("a.yaml", "cam0: !!python/object/apply:os.system ['ls']\n"),
+        "write plain numbers",
+    ),
     "deeply nested YAML": (_text("a.yaml", "a: " + "[" * 1200 + "]" * 1200), "not a YAML file"),
     "binary": (_text("a.yaml", "\0\1\2"), "not a YAML file"),
-    "one camera": (_camchain(lambda c: c.pop("cam1")), "is the calibration of one camera; name the pair"),
+    "one camera": (
+        _camchain(lambda c: c.pop("cam1")),
+        "is the calibration of one camera; name the pair",
+    ),
     "no pose": (
         _camchain(lambda c: (c["cam1"].pop("T_cn_cnm1"), c["cam1"].pop("T_cam_imu"))),
         "states no pose of cam1; add T_cn_cnm1",
     ),
-    "no resolution": (_camchain(lambda c: c["cam0"].pop("resolution")), "cam0: has no entry 'resolution'"),
+    "no resolution": (
+        _camchain(lambda c: c["cam0"].pop("resolution")),
+        "cam0: has no entry 'resolution'",
+    ),
     "three intrinsics": (
         _camchain(lambda c: c["cam0"].update(intrinsics=[1, 2, 3])),
         r"cam0: 'intrinsics' is \[1, 2, 3\] instead of 4 finite numbers",
     ),
-    "unknown projection": (_camchain(lambda c: c["cam1"].update(camera_model="eucm")), "'eucm' is not read"),
-    "unknown distortion": (_camchain(lambda c: c["cam1"].update(distortion_model="fov")), "'fov' is not read"),
+    "unknown projection": (
+        _camchain(lambda c: c["cam1"].update(camera_model="eucm")),
+        "'eucm' is not read",
+    ),
+    "unknown distortion": (
+        _camchain(lambda c: c["cam1"].update(distortion_model="fov")),
+        "'fov' is not read",
+    ),
     "a reflection": (
         _camchain(lambda c: c["cam1"].update(T_cn_cnm1=np.diag([1.0, 1, -1, 1]).tolist())),
         "T_cn_cnm1: not a rotation but a reflection",
@@ -441,15 +544,25 @@ BAD = {
         _camchain(lambda c: c["cam0"].update(intrinsics=[0, 400, 320, 240])),
         "focal lengths and image size must be positive",
     ),
-    "notes as .txt": (_text("notes.txt", "fx=458 b=0.11\n"), "and KITTI's calib.txt has one; give that file"),
+    "notes as .txt": (
+        _text("notes.txt", "fx=458 b=0.11\n"),
+        "and KITTI's calib.txt has one; give that file",
+    ),
     "OpenCV without T": (_storage(T=None, R2=None), "has no entry R2"),
     "OpenCV with a rotation vector": (_storage(R=np.zeros((3, 1))), "R holds 3 numbers"),
     "OpenCV of larger images": (
         _storage(M2=np.array([[400.0, 0, 70], [0, 400, 24], [0, 0, 1]])),
-        "the principal point 70, 24 lies outside images of 64 x 48 pixels; it is the calibration of images of another",
+        "the principal point 70, 24 lies outside images of 64 x 48 pixels; it is the calibration "
+        "of images of another",
     ),
-    "OpenCV with six coefficients": (_storage(D1=np.ones(6)), "6 distortion coefficients; OpenCV has 4, 5"),
-    "OpenCV with a tilted sensor": (_storage(D1=np.ones(14)), "thin-prism or tilt coefficients are not read"),
+    "OpenCV with six coefficients": (
+        _storage(D1=np.ones(6)),
+        "6 distortion coefficients; OpenCV has 4, 5",
+    ),
+    "OpenCV with a tilted sensor": (
+        _storage(D1=np.ones(14)),
+        "thin-prism or tilt coefficients are not read",
+    ),
     "XML with entities": (
         _text("stereo.xml", '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>'),
         "declares entities",
@@ -479,12 +592,17 @@ def test_disagreeing_poses_of_a_camchain_are_said(tmp_path: Path) -> None:
     assert "disagree; T_cn_cnm1 is used" in vio.load_rig(tmp_path).notes[0]
 
 
-# --- real data ------------------------------------------------------------------------------------------------------
+# --- real data
+# ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("name", "baseline_m", "imu"),
-    [("tumvi_room1_head", 0.10095, True), ("boofcv_library", 0.12005, False), ("euroc/MH_01_head", 0.11008, True)],
+    [
+        ("tumvi_room1_head", 0.10095, True),
+        ("boofcv_library", 0.12005, False),
+        ("euroc/MH_01_head", 0.11008, True),
+    ],
 )
 def test_real_calibrations(name: str, baseline_m: float, imu: bool, data_dir: Path) -> None:
     rig = vio.load_rig(data_dir / name)

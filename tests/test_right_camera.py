@@ -1,4 +1,6 @@
-"""A right camera that is frozen, dark or displaced: named, and not used until it agrees with the left one again."""
+"""A right camera that is frozen, dark or displaced: named, and not used until it agrees with the
+left one again.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,16 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.test_frontend_scene import CAMERA, SLANTED, eight_bit, flight, right_of, stereo_frame, truth, view
+from tests.test_frontend_scene import (
+    CAMERA,
+    SLANTED,
+    eight_bit,
+    flight,
+    right_of,
+    stereo_frame,
+    truth,
+    view,
+)
 from vio.frontend.klt import KltFrontend
 from vio.frontend.prediction import prior_depths
 from vio.frontend.right_camera import RightCamera
@@ -29,7 +40,9 @@ Pair = tuple[Image, Image]
 
 
 def pair(k: int) -> Pair:
-    """Images of frame k of a camera that moves sideways, with sensor noise, and a right camera of another gain."""
+    """Images of frame k of a camera that moves sideways, with sensor noise, and a right camera
+    of another gain.
+    """
     rng = np.random.default_rng(k)
     crops = (TEXTURE[:, 100 + 3 * k : 300 + 3 * k], TEXTURE[:, 110 + 3 * k : 310 + 3 * k] * 0.6)
     left, right = (np.clip(c + rng.normal(0, 1.0, c.shape), 0, 255).astype(np.uint8) for c in crops)
@@ -43,7 +56,9 @@ def noisy(image: Image, seed: int) -> Image:
 
 
 def run(frames: list[Pair]) -> tuple[list[bool], list[bool], list[str]]:
-    """Whether the right image could be used, whether the left one was frozen, and the lines, frame by frame."""
+    """Whether the right image could be used, whether the left one was frozen, and the lines,
+    frame by frame.
+    """
     camera = RightCamera()
     usable, frozen, lines = [], [], []
     for k, (left, right) in enumerate(frames):
@@ -64,14 +79,19 @@ def test_moving_and_standing_cameras_are_silent() -> None:
         assert (all(usable), any(frozen), lines) == (True, False, [])
 
 
-@pytest.mark.parametrize("repeat", [lambda image, k: image, noisy], ids=["equal to the bit", "re-encoded"])
-def test_a_frozen_right_image_is_not_used_and_named_once(repeat: Callable[[Image, int], Image]) -> None:
+@pytest.mark.parametrize(
+    "repeat", [lambda image, k: image, noisy], ids=["equal to the bit", "re-encoded"]
+)
+def test_a_frozen_right_image_is_not_used_and_named_once(
+    repeat: Callable[[Image, int], Image],
+) -> None:
     frames = [pair(k) for k in range(14)]
     for k in FROZEN:
         frames[k] = frames[k][0], repeat(frames[2][1], k)
     usable, frozen, lines = run(frames)
     assert not any(frozen)
-    assert [k for k, good in enumerate(usable) if not good] == [*FROZEN, 8, 9]  # three frames must agree before it is
+    # three frames must agree before it is
+    assert [k for k, good in enumerate(usable) if not good] == [*FROZEN, 8, 9]
     said, again = lines
     assert said.startswith("frame 5: the right camera is frozen")
     assert "since frame 2; going on with the left images" in said
@@ -94,11 +114,15 @@ def test_a_frozen_left_image_is_known_and_named_once() -> None:
     _, frozen, lines = run(frames)
     assert [k for k, bad in enumerate(frozen) if bad] == [*FROZEN]
     (line,) = lines
-    assert line.startswith("frame 5: the left camera is frozen: its image does not change since frame 2")
+    assert line.startswith(
+        "frame 5: the left camera is frozen: its image does not change since frame 2"
+    )
 
 
 def test_an_exposure_of_its_own_that_clips_the_left_image_freezes_no_camera() -> None:
-    """The rig stands still; the left camera's exposure is long in one frame, so that a fifth of its pixels clip."""
+    """The rig stands still; the left camera's exposure is long in one frame, so that a fifth of
+    its pixels clip.
+    """
     smooth = cv2.GaussianBlur(TEXTURE, (0, 0), 3.0)
     frames = [(noisy(smooth[:, :200], k), noisy(smooth[:, 10:210], 20 + k)) for k in range(7)]
     bright = np.clip(frames[4][0] * 1.8, 0, 255).astype(np.uint8)
@@ -118,7 +142,9 @@ def test_a_dark_right_image_is_named() -> None:
 
 
 def test_matches_decide_where_the_images_are_plausible() -> None:
-    """Most points of known depth are not where they should be, for six frames: said once, and when it is over."""
+    """Most points of known depth are not where they should be, for six frames: said once, and
+    when it is over.
+    """
     camera, lines = RightCamera(), []
     for k in range(16):
         camera.left_is_frozen(k, *pair(k))
@@ -156,7 +182,10 @@ def test_six_points_suffice_to_agree_again() -> None:
 
 
 def test_where_no_feature_is_left_the_right_image_is_tried_again() -> None:
-    """By images alone: depths that the left images give from then on are of any scale. A frozen image stays one."""
+    """By images alone: depths that the left images give from then on are of any scale.
+
+    A frozen image stays one.
+    """
     camera = _contradicted()
     camera.try_again(4)
     assert camera.usable
@@ -172,16 +201,23 @@ def test_where_no_feature_is_left_the_right_image_is_tried_again() -> None:
 
 def test_prior_gives_the_depth_of_the_features_that_it_names() -> None:
     z = np.array([[100.0, 50.0, 80.0, 50.0], [200.0, 60.0, 200.0, 60.0]])
-    depth, known = prior_depths(CAMERA, np.array([-1, 7, 5, -1, 9]), TrackPrior(np.array([7, 9]), z[::-1]))
+    depth, known = prior_depths(
+        CAMERA, np.array([-1, 7, 5, -1, 9]), TrackPrior(np.array([7, 9]), z[::-1])
+    )
     assert known.tolist() == [False, False, False, False, True]  # a disparity of zero is no depth
     assert depth[4] == pytest.approx(CAMERA.fu * CAMERA.baseline_m / 20.0)
 
 
 def run_frozen(camera: str) -> tuple[list[StereoFrame], list[FrontendOutput]]:
-    """A flight with a camera that is frozen in some frames; the prior knows the true pixels, as a filter does."""
+    """A flight with a camera that is frozen in some frames; the prior knows the true pixels, as
+    a filter does.
+    """
     poses = flight(FRAMES)
     frames = [stereo_frame(k, pose) for k, pose in enumerate(poses)]
-    frames = [replace(f, **{camera: getattr(frames[2], camera)}) if f.index in FROZEN else f for f in frames]
+    frames = [
+        replace(f, **{camera: getattr(frames[2], camera)}) if f.index in FROZEN else f
+        for f in frames
+    ]
     frontend = KltFrontend(CAMERA, SETTINGS)
     outputs: list[FrontendOutput] = []
     for k, frame in enumerate(frames):
@@ -199,7 +235,9 @@ def frozen_run() -> tuple[list[StereoFrame], list[FrontendOutput]]:
 
 
 def test_the_right_images_carry_the_features_of_a_frozen_left_camera() -> None:
-    """They are output at the left pixels where that camera would see them, and go on in it afterwards."""
+    """They are output at the left pixels where that camera would see them, and go on in it
+    afterwards.
+    """
     poses, (_, outputs) = flight(FRAMES), run_frozen("left")
     first = outputs[2].observations
     for k in [*FROZEN, 8]:
@@ -216,10 +254,15 @@ def test_the_right_images_carry_the_features_of_a_frozen_left_camera() -> None:
 
 @pytest.mark.parametrize("camera", ["left", "right"])
 def test_a_frozen_image_is_not_taken_for_the_other_cameras(camera: str) -> None:
-    """The rig moves by more than a baseline, so that a frozen image is one from the other camera's far side."""
+    """The rig moves by more than a baseline, so that a frozen image is one from the other
+    camera's far side.
+    """
     step = np.array([0.08 if camera == "right" else -0.08, 0.0, 0.0, 0.0, 0.0, 0.0])
     frames = [stereo_frame(k, se3_exp(k * step)) for k in range(FRAMES)]
-    frames = [replace(f, **{camera: getattr(frames[2], camera)}) if f.index in FROZEN else f for f in frames]
+    frames = [
+        replace(f, **{camera: getattr(frames[2], camera)}) if f.index in FROZEN else f
+        for f in frames
+    ]
     frontend = KltFrontend(CAMERA, SETTINGS)
     lines = [line for frame in frames for line in frontend.process(frame).warnings]
     assert lines
@@ -229,7 +272,9 @@ def test_a_frozen_image_is_not_taken_for_the_other_cameras(camera: str) -> None:
 def test_front_end_goes_on_with_the_left_images_of_a_frozen_pair(
     frozen_run: tuple[list[StereoFrame], list[FrontendOutput]],
 ) -> None:
-    """No right pixel of a frozen image is output, no track is lost for it, and right pixels are right again later."""
+    """No right pixel of a frozen image is output, no track is lost for it, and right pixels are
+    right again later.
+    """
     poses, (_, outputs) = flight(FRAMES), frozen_run
     for k in range(1, FRAMES):
         seen = outputs[k].observations
@@ -254,12 +299,16 @@ def turned_frame(index: int, pose: FloatArray, yaw_deg: float) -> StereoFrame:
 
 def flight_with_turns(yaw_deg: Callable[[int], float]) -> list[FrontendOutput]:
     frontend = KltFrontend(CAMERA, SETTINGS)
-    return [frontend.process(turned_frame(k, pose, yaw_deg(k))) for k, pose in enumerate(flight(FRAMES))]
+    return [
+        frontend.process(turned_frame(k, pose, yaw_deg(k))) for k, pose in enumerate(flight(FRAMES))
+    ]
 
 
 @pytest.mark.parametrize("yaw_deg", [0.26, -0.26])
 def test_a_right_camera_that_turns_a_little_is_used_without_the_offset(yaw_deg: float) -> None:
-    """A quarter of a degree moves all disparities by 1.4 px and more, for single frames and for good."""
+    """A quarter of a degree moves all disparities by 1.4 px and more, for single frames and for
+    good.
+    """
     outputs = flight_with_turns(lambda k: yaw_deg if k == 3 or k >= 6 else 0.0)
     assert [line for output in outputs for line in output.warnings] == []
     for k, pose in enumerate(flight(FRAMES)):
@@ -273,13 +322,17 @@ def test_a_right_camera_that_turns_a_little_is_used_without_the_offset(yaw_deg: 
 
 def test_a_right_camera_that_turns_far_is_not_used() -> None:
     outputs = flight_with_turns(lambda k: 1.0 if k >= 5 else 0.0)
-    assert [output.observations.has_right.any() for output in outputs] == [k < 5 for k in range(FRAMES)]
+    assert [output.observations.has_right.any() for output in outputs] == [
+        k < 5 for k in range(FRAMES)
+    ]
     (line,) = [line for output in outputs for line in output.warnings]
     assert line.startswith("frame 8: the right image contradicts the left one")
 
 
 def test_offset_and_factor_of_disparities_are_told_apart() -> None:
-    """Depths of one camera's motion have a factor in common; a tenth of wrong matches changes little."""
+    """Depths of one camera's motion have a factor in common; a tenth of wrong matches changes
+    little.
+    """
     rng = np.random.default_rng(5)
     expected = rng.uniform(3.0, 60.0, 150)
     off = 1.2 + 0.15 * expected + rng.normal(0.0, 0.2, 150)
@@ -288,4 +341,5 @@ def test_offset_and_factor_of_disparities_are_told_apart() -> None:
     assert offset == pytest.approx(1.2, abs=0.3)
     assert slope == pytest.approx(0.15, abs=0.02)
     near = np.full(50, 20.0)
-    assert common_offset(near, near * 0.0 + 0.7) == (pytest.approx(0.7), 0.0)  # at one depth nothing tells them apart
+    # at one depth nothing tells them apart
+    assert common_offset(near, near * 0.0 + 0.7) == (pytest.approx(0.7), 0.0)

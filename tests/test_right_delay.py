@@ -1,4 +1,6 @@
-"""A right camera that is late or early against the left one: measured, named, and taken out of the matches."""
+"""A right camera that is late or early against the left one: measured, named, and taken out of
+the matches.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,12 @@ FRAME_S = 0.05
 FRAMES = 18
 
 
-def feed(delay: float, *, field: float = 0.3, noise: float = 0.2, flow_px: float = 4.0) -> tuple[RightDelay, list[str]]:
-    """Matches of 40 frames: rows off by a constant field over the image, by noise, and by the delay."""
+def feed(
+    delay: float, *, field: float = 0.3, noise: float = 0.2, flow_px: float = 4.0
+) -> tuple[RightDelay, list[str]]:
+    """Matches of 40 frames: rows off by a constant field over the image, by noise, and by the
+    delay.
+    """
     rng, estimator, lines = np.random.default_rng(0), RightDelay(CAMERA), []
     for k in range(40):
         left = rng.uniform([0, 0], [480, 300], (80, 2))
@@ -34,8 +40,12 @@ def feed(delay: float, *, field: float = 0.3, noise: float = 0.2, flow_px: float
     return estimator, lines
 
 
-@pytest.mark.parametrize(("delay", "found", "text"), [(1.0, 1.0, "late by "), (-0.4, -0.4, "early by ")])
-def test_finds_the_delay_beside_a_wrong_rectification(delay: float, found: float, text: str) -> None:
+@pytest.mark.parametrize(
+    ("delay", "found", "text"), [(1.0, 1.0, "late by "), (-0.4, -0.4, "early by ")]
+)
+def test_finds_the_delay_beside_a_wrong_rectification(
+    delay: float, found: float, text: str
+) -> None:
     estimator, lines = feed(delay)
     assert estimator.frames == pytest.approx(found, abs=0.05)
     (line,) = lines
@@ -64,7 +74,11 @@ def test_the_pairing_that_matches_names_a_whole_frame() -> None:
         assert estimator.suspect(1, counts, FRAME_S)
         assert estimator.frames == frames
         assert len(estimator.take_lines()) == 1
-    for counts in (PairingCounts(150, 100, 120, 90), PairingCounts(150, 5, 30, 5), PairingCounts(150, 90, 120, 119)):
+    for counts in (
+        PairingCounts(150, 100, 120, 90),
+        PairingCounts(150, 5, 30, 5),
+        PairingCounts(150, 90, 120, 119),
+    ):
         estimator = RightDelay(CAMERA)
         assert not any(estimator.suspect(k, counts, FRAME_S) for k in range(5))
 
@@ -79,13 +93,19 @@ def test_an_early_camera_that_is_on_time_again_is_late_against_its_repair() -> N
 
 
 def test_matches_of_a_late_image_are_brought_to_the_present_exactly() -> None:
-    """The right pixels that a point has now follow from those that it had a frame ago and from the motion since."""
+    """The right pixels that a point has now follow from those that it had a frame ago and from
+    the motion since.
+    """
     T = se3_exp([0.05, -0.02, -0.3, 0.01, -0.02, 0.03])
     rng = np.random.default_rng(1)
-    p_then = np.stack([rng.uniform(-1, 1, 30), rng.uniform(-0.6, 0.6, 30), rng.uniform(2, 6, 30)], axis=1)
+    p_then = np.stack(
+        [rng.uniform(-1, 1, 30), rng.uniform(-0.6, 0.6, 30), rng.uniform(2, 6, 30)], axis=1
+    )
     p_now = transform_points(T, p_then)
     z_then, z_now = project(CAMERA, p_then), project(CAMERA, p_now)
-    tracks = replace(new_tracks(z_now[:, :2], np.arange(30)), point=p_now, has_point=np.ones(30, dtype=np.bool_))
+    tracks = replace(
+        new_tracks(z_now[:, :2], np.arange(30)), point=p_now, has_point=np.ones(30, dtype=np.bool_)
+    )
     then = at_exposure(tracks, z_now[:, :2] - z_then[:, :2], T, 1.0)
     np.testing.assert_allclose(then.left, z_then[:, :2], atol=1e-9)
     np.testing.assert_allclose(then.warp[:, :, 2], then.left, atol=1e-9)
@@ -97,7 +117,9 @@ def test_matches_of_a_late_image_are_brought_to_the_present_exactly() -> None:
 
 
 def late_flight(frames_late: int) -> tuple[list[FloatArray], list[StereoFrame]]:
-    """A flight with vertical motion that comes and goes, whose right images are those of another frame."""
+    """A flight with vertical motion that comes and goes, whose right images are those of another
+    frame.
+    """
     heights = 0.06 * np.sin(0.6 * np.arange(FRAMES))
     poses = [se3_exp([0.02 * k, heights[k], 0.02 * k, 0.0, 0.0, 0.0]) for k in range(FRAMES)]
     frames = [stereo_frame(k, pose) for k, pose in enumerate(poses)]
@@ -106,7 +128,9 @@ def late_flight(frames_late: int) -> tuple[list[FloatArray], list[StereoFrame]]:
 
 
 @pytest.mark.parametrize(("frames_late", "named"), [(1, "late"), (-1, "early")])
-def test_front_end_matches_a_late_or_early_right_camera_as_if_it_were_on_time(frames_late: int, named: str) -> None:
+def test_front_end_matches_a_late_or_early_right_camera_as_if_it_were_on_time(
+    frames_late: int, named: str
+) -> None:
     poses, frames = late_flight(frames_late)
     frontend = KltFrontend(CAMERA, FrontendSettings(grid=GridSettings(target_features=150)))
     outputs: list[FrontendOutput] = [frontend.process(frame) for frame in frames]
@@ -122,6 +146,7 @@ def test_front_end_matches_a_late_or_early_right_camera_as_if_it_were_on_time(fr
     begun = int(line.split()[1].rstrip(":"))
     assert begun < 12
     assert not outputs[begun - 1].observations.has_right.any()  # control: the fault does harm
-    # An early image is kept from the second frame on; the last frame of the flight has no later right image.
+    # An early image is kept from the second frame on; the last frame of the flight has no later
+    # right image.
     first, last = (begun + 1, FRAMES) if frames_late > 0 else (begun + 3, FRAMES - 1)
     assert max(median_error(k) for k in range(first, last)) < 0.1

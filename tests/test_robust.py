@@ -11,7 +11,11 @@ from vio.numerics.robust import jackknife, median, robust_sigma
 @pytest.mark.parametrize("count", [1, 2, 3, 100, 101])
 def test_the_median_is_numpys_to_the_bit(count: int) -> None:
     rng = np.random.default_rng(count)
-    for values in (rng.standard_normal(count), np.round(rng.standard_normal(count)), rng.standard_normal((count, 2))):
+    for values in (
+        rng.standard_normal(count),
+        np.round(rng.standard_normal(count)),
+        rng.standard_normal((count, 2)),
+    ):
         assert median(values) == np.median(values)
         values.flat[0] = np.nan
         assert np.isnan(median(values))
@@ -22,8 +26,12 @@ def test_the_median_is_numpys_to_the_bit(count: int) -> None:
 def test_the_jackknife_of_a_mean_is_its_standard_error() -> None:
     values = np.random.default_rng(0).standard_normal((40, 3)) * [1.0, 2.0, 5.0]
     again = [np.delete(values, k, axis=0).mean(axis=0) for k in range(40)]
-    np.testing.assert_allclose(jackknife(again), values.std(axis=0, ddof=1) / np.sqrt(40), rtol=1e-12)
-    assert float(jackknife([a[0] for a in again])) == pytest.approx(float(jackknife(again)[0]), rel=1e-12)
+    np.testing.assert_allclose(
+        jackknife(again), values.std(axis=0, ddof=1) / np.sqrt(40), rtol=1e-12
+    )
+    assert float(jackknife([a[0] for a in again])) == pytest.approx(
+        float(jackknife(again)[0]), rel=1e-12
+    )
 
 
 def test_jackknife_accounts_for_correlation_within_blocks() -> None:

@@ -1,4 +1,6 @@
-"""The ROS 2 node: over a graph made up in one process, and over DDS with three processes on the loopback interface."""
+"""The ROS 2 node: over a graph made up in one process, and over DDS with three processes on the
+loopback interface.
+"""
 
 from __future__ import annotations
 
@@ -58,9 +60,15 @@ class Member:
     """A participant, see `Transport`."""
 
     def __init__(self, graph: Graph) -> None:
-        self._graph, self._come, self._changed = graph, list[tuple[Any, bytes]](), threading.Condition()
+        self._graph, self._come, self._changed = (
+            graph,
+            list[tuple[Any, bytes]](),
+            threading.Condition(),
+        )
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[bytes], None], quality: Quality) -> None:
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[bytes], None], quality: Quality
+    ) -> None:
         self._graph.takers.setdefault(topic, []).append((self, take))
         if quality == "latched" and topic in self._graph.last:
             self.hand(take, self._graph.last[topic])
@@ -131,14 +139,21 @@ def test_the_node_gives_the_poses_of_the_file_run(
     def node() -> None:
         try:
             rig = load_rig(flight) if calibrated else None
-            run_node(Member(graph), settings, Config(), rig, should_stop=done.is_set, say=lambda _: None)
+            run_node(
+                Member(graph), settings, Config(), rig, should_stop=done.is_set, say=lambda _: None
+            )
         except Exception as error:  # noqa: BLE001 # shown by the main thread
             failures.append(error)
 
     thread = threading.Thread(target=node)
     thread.start()
     played = play(
-        Member(graph), vio.open_dataset(flight), TOPICS, rate=None, quality="reliable", should_stop=lambda: failures
+        Member(graph),
+        vio.open_dataset(flight),
+        TOPICS,
+        rate=None,
+        quality="reliable",
+        should_stop=lambda: failures,
     )
     assert played.frames == len(times)
     while len(taken["/vio/odometry"]) < len(times) and not failures:
@@ -156,10 +171,15 @@ def test_the_node_gives_the_poses_of_the_file_run(
     received = [_pose(data) for data in taken["/vio/odometry"]]
     assert [t for t, _ in received] == times
     tolerance = 0.0 if calibrated else 1e-4
-    np.testing.assert_allclose([T[:3, 3] for _, T in received], poses[:, :3, 3], rtol=0, atol=tolerance)
+    np.testing.assert_allclose(
+        [T[:3, 3] for _, T in received], poses[:, :3, 3], rtol=0, atol=tolerance
+    )
     np.testing.assert_allclose([T for _, T in received], poses, rtol=0, atol=tolerance + 1e-12)
     moved: Any = decoded(taken["/tf"][-1], "tf2_msgs/msg/TFMessage", "tf")
-    assert (moved.transforms[0].header.frame_id, moved.transforms[0].child_frame_id) == ("odom", "base_link")
+    assert (moved.transforms[0].header.frame_id, moved.transforms[0].child_frame_id) == (
+        "odom",
+        "base_link",
+    )
     cloud: Any = decoded(taken["/vio/landmarks"][-1], "sensor_msgs/msg/PointCloud2", "points")
     assert cloud.width > 10
     status: Any = decoded(taken["/diagnostics"][-1], "diagnostic_msgs/msg/DiagnosticArray", "d")
@@ -248,7 +268,16 @@ def test_stamps_that_go_back_begin_anew_or_are_refused(caplog: pytest.LogCapture
     graph = Graph()
     taken, sensors, member = _sent(graph)
     out = publisher(Member(graph), {})
-    for time_ns in (10**10, 10**10 + 5, 10**10 + 5, 10**10 + 3, 10**9, 10**10 + 8, 10**9, 10**9 + 7):
+    for time_ns in (
+        10**10,
+        10**10 + 5,
+        10**10 + 5,
+        10**10 + 3,
+        10**9,
+        10**10 + 8,
+        10**9,
+        10**9 + 7,
+    ):
         out.imu("/imu0", "imu", ImuSample(time_ns, np.zeros(3), np.ones(3)))
     out.imu("/imu0", "imu", ImuSample(10**9 + 9, np.full(3, np.nan), np.ones(3)))
     member.spin(0.0)
@@ -287,7 +316,9 @@ def test_one_stamp_a_little_ahead_costs_the_frames_up_to_it(flight: Path) -> Non
 
 
 @pytest.mark.parametrize("what", ["reset", "clock"])
-def test_the_node_goes_on_after_a_reset_and_after_a_step_of_the_clock(flight: Path, tmp_path: Path, what: str) -> None:
+def test_the_node_goes_on_after_a_reset_and_after_a_step_of_the_clock(
+    flight: Path, tmp_path: Path, what: str
+) -> None:
     graph, taken, done = Graph(), list[bytes](), threading.Event()
     receiver, player, asks = Member(graph), Member(graph), Member(graph)
     receiver.subscribe("/vio/odometry", "", taken.append, "reliable")
@@ -314,7 +345,9 @@ def test_the_node_goes_on_after_a_reset_and_after_a_step_of_the_clock(flight: Pa
     else:
         step_ns = 3600 * 10**9
     moved = Shifted(dataset, step_ns)
-    play(player, moved, TOPICS, rate=None, quality="reliable", should_stop=lambda: False, wait=False)
+    play(
+        player, moved, TOPICS, rate=None, quality="reliable", should_stop=lambda: False, wait=False
+    )
     poses = received(len(before) + 7)
     done.set()
     node.join()
@@ -364,7 +397,9 @@ def test_images_of_another_size_end_the_node(flight: Path) -> None:
         Sensors(member, TOPICS, odometry, "reliable")
         for topic in TOPICS.cameras:
             _send(graph, topic, 10**9, "mono8", GRAY)
-        with pytest.raises(DataError, match="left image is 16x12, but the calibration is for 160x90"):
+        with pytest.raises(
+            DataError, match="left image is 16x12, but the calibration is for 160x90"
+        ):
             member.spin(0.0)
 
 
@@ -380,14 +415,21 @@ def test_silent_unknown_and_wrong_topics_are_named(monkeypatch: pytest.MonkeyPat
     clock[0], received["/cam1/image_raw"] = 6.0, 3
     left, imu = silence.check(received, member)
     assert left == (
-        "no message on /cam0/image_raw for 5 s: nobody publishes it; topics of its type are /camera/image_raw"
+        "no message on /cam0/image_raw for 5 s: nobody publishes it; topics of its type are "
+        "/camera/image_raw"
     )
-    assert "/imu0 for 5 s: its publisher sends nothing, or cannot be reached; check the driver" in imu
+    assert (
+        "/imu0 for 5 s: its publisher sends nothing, or cannot be reached; check the driver" in imu
+    )
     assert silence.check(received, member) == []  # once
     clock[0] = 12.0
-    assert ["its publisher" in line or "nobody" in line for line in silence.check(received, member)] == [True]
+    assert [
+        "its publisher" in line or "nobody" in line for line in silence.check(received, member)
+    ] == [True]
     member.advertise("/cam0/image_raw", COMPRESSED, "sensor")
-    with pytest.raises(DataError, match=r"/cam0/image_raw has sensor_msgs/msg/CompressedImage, not sensor_msgs"):
+    with pytest.raises(
+        DataError, match=r"/cam0/image_raw has sensor_msgs/msg/CompressedImage, not sensor_msgs"
+    ):
         check_types(TOPICS.kinds, member)
 
 
@@ -400,7 +442,10 @@ def test_silent_unknown_and_wrong_topics_are_named(monkeypatch: pytest.MonkeyPat
         (["ros2", "--left", "/a"], "one camera needs an IMU"),
         (["ros2", "--left", "/a", "--right", "/b", "--localise"], "--localise needs --map"),
         (["ros2", "--left", "/a", "--right", "/b", "--frames", "map"], "give three names"),
-        (["ros2", "--left", "/a", "--right", "/b", "--calibration", "nowhere"], "nowhere does not exist"),
+        (
+            ["ros2", "--left", "/a", "--right", "/b", "--calibration", "nowhere"],
+            "nowhere does not exist",
+        ),
         (["play", "nowhere", "--ros2", "--rate", "0"], "--rate 0: give a positive number, or max"),
         (["play", "nowhere", "--ros2", "--rate", "x"], "--rate x: give a number, or max"),
     ],
@@ -415,13 +460,17 @@ def test_wrong_arguments_are_named_in_one_line(
 def test_without_the_extra_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     hidden = ("cyclonedds", "rclpy")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name, *a: None if name in hidden else find(name, *a))
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name, *a: None if name in hidden else find(name, *a)
+    )
     with pytest.raises(MissingDependencyError, match=r"pip install 'stereo-vio\[ros2\]'"):
         open_transport()
 
 
 def test_the_way_by_rclpy_passes_messages_as_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against a stand-in with the signatures of rclpy's reference: ROS itself is not installed here."""
+    """Against a stand-in with the signatures of rclpy's reference: ROS itself is not installed
+    here.
+    """
     made: dict[str, Any] = {"subscriptions": [], "published": []}
 
     class Publisher:
@@ -435,7 +484,9 @@ def test_the_way_by_rclpy_passes_messages_as_bytes(monkeypatch: pytest.MonkeyPat
         def get_name(self) -> str:
             return "vio"
 
-        def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any, *, raw: bool = False) -> None:
+        def create_subscription(
+            self, kind: Any, topic: str, callback: Any, qos: Any, *, raw: bool = False
+        ) -> None:
             made["subscriptions"].append((kind, topic, callback, qos, raw))
 
         def create_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
@@ -463,7 +514,9 @@ def test_the_way_by_rclpy_passes_messages_as_bytes(monkeypatch: pytest.MonkeyPat
     policies = types.SimpleNamespace(KEEP_LAST=1, BEST_EFFORT=2, RELIABLE=3, TRANSIENT_LOCAL=4)
     modules = {
         "rclpy": {
-            "init": lambda *, context, domain_id, signal_handler_options: made.update(domain=domain_id),
+            "init": lambda *, context, domain_id, signal_handler_options: made.update(
+                domain=domain_id
+            ),
             "create_node": lambda name, *, context: Node(),
             "shutdown": lambda *, context: made.update(shut=True),
         },
@@ -503,8 +556,12 @@ def test_the_way_by_rclpy_passes_messages_as_bytes(monkeypatch: pytest.MonkeyPat
 
 # DDS
 
-needs_dds = pytest.mark.skipif(importlib.util.find_spec("cyclonedds") is None, reason="cyclonedds is not installed")
-needs_loopback = pytest.mark.skipif(not Path("/sys/class/net/lo").exists(), reason="no interface named lo")
+needs_dds = pytest.mark.skipif(
+    importlib.util.find_spec("cyclonedds") is None, reason="cyclonedds is not installed"
+)
+needs_loopback = pytest.mark.skipif(
+    not Path("/sys/class/net/lo").exists(), reason="no interface named lo"
+)
 
 
 @pytest.fixture
@@ -547,22 +604,36 @@ def test_messages_pass_over_dds_and_late_ones_get_the_last(domain: int) -> None:
 @needs_dds
 @needs_loopback
 def test_three_processes_give_the_poses_of_the_file_run(flight: Path, domain: int) -> None:
-    """Recording, node and this process, which receives; nothing is lost, and the poses are equal to the bit."""
+    """Recording, node and this process, which receives; nothing is lost, and the poses are equal
+    to the bit.
+    """
     times, poses = _file_run(flight)
     receiver, taken = open_transport("dds"), list[bytes]()
     receiver.subscribe("/vio/odometry", "nav_msgs/msg/Odometry", taken.append, "reliable")
     command = [sys.executable, "-m", "vio"]
-    arguments = ["--left", TOPICS.left, "--right", str(TOPICS.right), "--imu", str(TOPICS.imu), "--reliable"]
+    arguments = [
+        "--left",
+        TOPICS.left,
+        "--right",
+        str(TOPICS.right),
+        "--imu",
+        str(TOPICS.imu),
+        "--reliable",
+    ]
     node = subprocess.Popen(
-        [*command, "ros2", *arguments, "--calibration", str(flight), "--drop", "block"], stderr=subprocess.PIPE
+        [*command, "ros2", *arguments, "--calibration", str(flight), "--drop", "block"],
+        stderr=subprocess.PIPE,
     )
     try:
-        source = subprocess.run([*command, "play", str(flight), "--ros2", "--reliable", "--rate", "max"], check=True)
+        source = subprocess.run(
+            [*command, "play", str(flight), "--ros2", "--reliable", "--rate", "max"], check=True
+        )
         assert source.returncode == 0
         deadline = time.monotonic() + 240
         while len(taken) < len(times) and time.monotonic() < deadline:
             receiver.spin(0.2)
-        node.send_signal(signal.SIGTERM)  # SIGINT is ignored where a shell started the tests behind it
+        # SIGINT is ignored where a shell started the tests behind it
+        node.send_signal(signal.SIGTERM)
         assert node.wait(timeout=60) == 0
     finally:
         receiver.close()
@@ -577,7 +648,9 @@ def test_the_files_for_colcon_name_the_command() -> None:
     folder = Path(__file__).resolve().parent.parent / "ros2" / "stereo_vio"
     launch = (folder / "launch" / "stereo_vio.launch.py").read_text(encoding="utf-8")
     compile(launch, "launch", "exec")
-    options = {f"--{name}" for name in re.findall(r'^    "(\w+)": ', launch, re.MULTILINE)} | {"--transport"}
+    options = {f"--{name}" for name in re.findall(r'^    "(\w+)": ', launch, re.MULTILINE)} | {
+        "--transport"
+    }
     text = (Path(vio.__file__).parent / "cli" / "ros2.py").read_text(encoding="utf-8")
     shared = text + (Path(vio.__file__).parent / "cli" / "play.py").read_text(encoding="utf-8")
     assert len(options) == 6

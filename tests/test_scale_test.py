@@ -1,4 +1,6 @@
-"""The scale of the calibrated baseline against that of IMU or velocities: found where it is off, silent where not."""
+"""The scale of the calibrated baseline against that of IMU or velocities: found where it is off,
+silent where not.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from vio.filters.scale_test import ScaleTest
 from vio.geometry.stereo import StereoCamera
 from vio.records import Observations, StereoScaleEstimate, VelocitySample
 
-CAR = Course(10, 4.0, velocity=(4.0, 0.5, 0.0), yaw_rate=0.05, depth=(4.0, 40.0), pixel_sigma_px=0.3)
+CAR = Course(
+    10, 4.0, velocity=(4.0, 0.5, 0.0), yaw_rate=0.05, depth=(4.0, 40.0), pixel_sigma_px=0.3
+)
 
 
 def _drive(camera: StereoCamera) -> StereoScaleEstimate | None:
@@ -51,7 +55,9 @@ def test_an_imu_finds_a_baseline_that_is_off_by_10_percent() -> None:
 
 
 def test_relinearised_images_alone_say_nothing_of_the_scale() -> None:
-    """With errors of a world that keeps its scale, whose direction follows the estimates, 2 of the 10 % were left."""
+    """With errors of a world that keeps its scale, whose direction follows the estimates, 2 of
+    the 10 % were left.
+    """
     sigmas: list[float] = []
 
     def each(run: object) -> None:
@@ -60,12 +66,16 @@ def test_relinearised_images_alone_say_nothing_of_the_scale() -> None:
             window.prior.scale_test = ScaleTest()
         sigmas.append(window.prior.scale_test.estimate()[1])
 
-    fly(Course(20, 2.5, velocity=(0.5, 0.3, 0.0), yaw_rate=0.3, pixel_sigma_px=0.3), None, each=each)
+    fly(
+        Course(20, 2.5, velocity=(0.5, 0.3, 0.0), yaw_rate=0.3, pixel_sigma_px=0.3), None, each=each
+    )
     assert sigmas[-1] > 0.99 * sigmas[0]
 
 
 def test_nothing_is_said_of_the_baseline_without_right_views() -> None:
-    """The scale is the sensor's then; 6 s of a flight from left images ended 17 % off, laid on the baseline."""
+    """The scale is the sensor's then; 6 s of a flight from left images ended 17 % off, laid on
+    the baseline.
+    """
 
     def left_only(k: int, seen: Observations) -> Observations:
         return replace(seen, has_right=np.zeros(len(seen), dtype=np.bool_))
@@ -75,7 +85,9 @@ def test_nothing_is_said_of_the_baseline_without_right_views() -> None:
 
 
 def test_the_noise_of_a_standstill_is_no_motion() -> None:
-    """Zero velocity is zero at any scale; the accelerometer's noise is worth less than one of information a frame."""
+    """Zero velocity is zero at any scale; the accelerometer's noise is worth less than one of
+    information a frame.
+    """
     run = fly(Course(20, 2.0, pixel_sigma_px=0.3), "imu")
     test = run.filter._window.prior.scale_test  # type: ignore[union-attr]
     assert test.estimate()[1] ** -2 - 0.1**-2 < run.course.frames
@@ -84,7 +96,9 @@ def test_the_noise_of_a_standstill_is_no_motion() -> None:
 
 @pytest.mark.parametrize("scaled", [False, True])
 def test_the_test_equals_a_filter_with_the_scale_as_a_state(scaled: bool) -> None:
-    """Two measurements of four errors, some of which depend on the scale; against dense equations in five unknowns."""
+    """Two measurements of four errors, some of which depend on the scale; against dense
+    equations in five unknowns.
+    """
     rng, D, sigma = np.random.default_rng(3), 4, 0.1
     P, moved = np.diag(rng.uniform(0.5, 2.0, D)), rng.normal(size=D) * scaled
     prior = Prior(P)

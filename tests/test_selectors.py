@@ -33,7 +33,9 @@ def least_kept() -> Iterator[None]:
         yield
 
 
-def _build(name: str, record: list[Observations], fraction: float = 0.3, budget: int | None = None) -> Selector:
+def _build(
+    name: str, record: list[Observations], fraction: float = 0.3, budget: int | None = None
+) -> Selector:
     settings = SelectorSettings(
         name=name,  # type: ignore[arg-type]
         keep_fraction=fraction,
@@ -43,7 +45,9 @@ def _build(name: str, record: list[Observations], fraction: float = 0.3, budget:
 
 
 def _scene(frames: int, points: int = 120, seed: int = 0) -> list[Observations]:
-    """A camera that moves sideways past points ahead of it; a point out of the image is not seen."""
+    """A camera that moves sideways past points ahead of it; a point out of the image is not
+    seen.
+    """
     rng = np.random.default_rng(seed)
     p = rng.uniform([-6, -2, 2], [12, 2, 9], (points, 3))
     record = []
@@ -51,13 +55,17 @@ def _scene(frames: int, points: int = 120, seed: int = 0) -> list[Observations]:
         p_cam = transform_points(se3_exp([-0.1 * k, 0, 0, 0, 0, 0]), p)
         z = project(CAMERA, p_cam)
         inside = (z[:, 0] >= 0) & (z[:, 0] < 640) & (z[:, 1] >= 0) & (z[:, 1] < 360)
-        record.append(observations(k, k * 10**8, np.flatnonzero(inside), z[inside], z[inside, 2] >= 0))
+        record.append(
+            observations(k, k * 10**8, np.flatnonzero(inside), z[inside], z[inside, 2] >= 0)
+        )
     return record
 
 
 @pytest.mark.parametrize("name", ["all", "visibility", "visibility_whole", "information"])
 @settings(max_examples=40)
-@given(seen=st.lists(st.lists(st.integers(0, 40), unique=True, max_size=30), min_size=1, max_size=8))
+@given(
+    seen=st.lists(st.lists(st.integers(0, 40), unique=True, max_size=30), min_size=1, max_size=8)
+)
 def test_contract(name: str, seen: list[list[int]]) -> None:
     """A mask of the right length, within the budget, and reproducible."""
     record = [_frame(k, ids) for k, ids in enumerate(seen)]
@@ -74,7 +82,9 @@ def test_contract(name: str, seen: list[list[int]]) -> None:
             assert a.chosen.all()
 
 
-def test_causal_visibility_prefers_the_most_observed_features(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_causal_visibility_prefers_the_most_observed_features(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(selectors, "_LEAST_KEPT", 1)
     record = [_frame(0, [1, 2]), _frame(1, [2, 3]), _frame(2, [1, 2, 3, 4])]
     selector = _build("visibility", record, fraction=0.25)
@@ -110,7 +120,9 @@ def test_budget_is_an_absolute_number(name: str) -> None:
 
 
 def test_information_spreads_over_the_image_and_chooses_near_points() -> None:
-    """Many far points in one corner add little more than one of them; a near one elsewhere adds translation."""
+    """Many far points in one corner add little more than one of them; a near one elsewhere adds
+    translation.
+    """
     far = np.stack([np.linspace(10, 12, 30), np.linspace(-8, -7, 30), np.full(30, 30.0)], axis=1)
     near = np.array([[-1.0, 0.5, 2.0], [0.2, 0.6, 2.0], [-0.8, -0.5, 2.0]])
     z = project(CAMERA, np.concatenate([far, near]))
@@ -122,7 +134,9 @@ def test_information_spreads_over_the_image_and_chooses_near_points() -> None:
 
 
 def test_information_predicts_features_that_leave_the_image() -> None:
-    """Of two points symmetric in the image, the camera's rotation will hide one: the other is chosen."""
+    """Of two points symmetric in the image, the camera's rotation will hide one: the other is
+    chosen.
+    """
     p = np.array([[-3.2, 0.0, 5.0], [3.2, 0.0, 5.0]])
     z = project(CAMERA, p)
     turn = MotionPrior(se3_exp([0, 0, 0, 0, 0.1, 0]), 1e-4 * np.eye(6))  # points move to the right
@@ -139,7 +153,9 @@ def test_information_needs_no_stereo_once_the_point_is_triangulated() -> None:
         stereo = np.ones(len(record[0]), dtype=np.bool_)
         first = observations(0, 0, record[0].ids, record[0].z, stereo if placed_before else ~stereo)
         selector.select(first)
-        left_only = observations(1, 1, record[1].ids, record[1].z, np.zeros(len(record[1]), dtype=np.bool_))
+        left_only = observations(
+            1, 1, record[1].ids, record[1].z, np.zeros(len(record[1]), dtype=np.bool_)
+        )
         chosen = selector.select(left_only).chosen
         old = np.isin(record[1].ids, record[0].ids)
         assert chosen[old].all() == placed_before

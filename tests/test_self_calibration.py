@@ -1,4 +1,6 @@
-"""Bundle adjustment with the calibration free, against exact tracks of rigs that are off by known amounts."""
+"""Bundle adjustment with the calibration free, against exact tracks of rigs that are off by
+known amounts.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,14 @@ import pytest
 from vio.calibration.findings import NotObservable
 from vio.calibration.intrinsics import Intrinsics, judge_intrinsics, judged_observable
 from vio.errors import EstimationError
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp, so3_log, transform_points
+from vio.geometry.lie import (
+    FloatArray,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+    so3_log,
+    transform_points,
+)
 from vio.geometry.stereo import StereoCamera, project
 from vio.offline.points import PointTracks
 from vio.offline.self_calibration import (
@@ -33,15 +42,21 @@ def _off(**values: float) -> FloatArray:
 
 
 def _poses(turning: float) -> FloatArray:
-    """Left cameras `T_world_cam0` (K, 4, 4) that move ahead and aside, and turn about all axes by up to an angle."""
+    """Left cameras `T_world_cam0` (K, 4, 4) that move ahead and aside, and turn about all axes
+    by up to an angle.
+    """
     s = np.linspace(0, 1, KEYFRAMES)
-    turns = turning * np.stack([np.sin(5 * s), np.sin(4 * s + 1) - np.sin(1), 0.5 * np.sin(6 * s)], axis=1)
+    turns = turning * np.stack(
+        [np.sin(5 * s), np.sin(4 * s + 1) - np.sin(1), 0.5 * np.sin(6 * s)], axis=1
+    )
     places = np.stack([0.6 * np.sin(3 * s), 0.2 * s, 1.5 * s], axis=1)
     return np.array([se3_from_parts(so3_exp(w), t) for w, t in zip(turns, places, strict=True)])
 
 
 def _segment(x: FloatArray, turning: float, seed: int = 0) -> Segment:
-    """Noisy rows of a pair that is off by parameters (18,), with poses and points as the given calibration has them."""
+    """Noisy rows of a pair that is off by parameters (18,), with poses and points as the given
+    calibration has them.
+    """
     rng = np.random.default_rng(seed)
     T = _poses(turning)
     p = rng.uniform([-1.2, -0.8, 3.0], [1.2, 0.8, 12.0], (POINTS, 3)) * [1, 1, 1]
@@ -51,7 +66,11 @@ def _segment(x: FloatArray, turning: float, seed: int = 0) -> Segment:
         q = transform_points(se3_inverse(T_world_cam0), p)
         q = np.where((q[:, 2] > 1.0)[:, None], q, [0.0, 0.0, -1.0])
         seen = project_off(CAMERA, x, np.where(q[:, 2:] > 0, q, [0.0, 0.0, 1.0]))
-        good = (q[:, 2] > 0) & (np.abs(seen[:, ::2] - 376) < 376).all(axis=1) & (np.abs(seen[:, 1] - 240) < 240)
+        good = (
+            (q[:, 2] > 0)
+            & (np.abs(seen[:, ::2] - 376) < 376).all(axis=1)
+            & (np.abs(seen[:, 1] - 240) < 240)
+        )
         ids = np.flatnonzero(good)
         point.append(ids)
         keyframe.append(np.full(len(ids), k))
@@ -101,7 +120,9 @@ def test_a_wrong_focal_length_is_named_and_a_right_one_is_not(focal: float) -> N
     assert found.focal_off == pytest.approx(focal, abs=0.01)
     assert [f.fault for f in judge_intrinsics(found)] == (["focal length wrong"] if focal else [])
     if focal:
-        assert f"{460 * (1 + found.focal_off):.0f} px in place of 460" in str(judge_intrinsics(found)[0])
+        assert f"{460 * (1 + found.focal_off):.0f} px in place of 460" in str(
+            judge_intrinsics(found)[0]
+        )
 
 
 def test_a_wrong_principal_point_is_named() -> None:
@@ -132,7 +153,9 @@ def test_rows_of_a_region_share_their_error() -> None:
     cell = (segment.tracks.z[:, 0] // 94 + 8 * (segment.tracks.z[:, 1] // 120)).astype(int)
     shared = np.random.default_rng(3).normal(0, 0.3, 32)[cell]
     z = segment.tracks.z + np.outer(shared, [0.0, 0.0, 1.0, 0.0])
-    off = self_calibrate(CAMERA, [replace(segment, tracks=replace(segment.tracks, z=z))], intrinsics=False)
+    off = self_calibrate(
+        CAMERA, [replace(segment, tracks=replace(segment.tracks, z=z))], intrinsics=False
+    )
     k = NAMES.index("right_fu")
     assert off.sigmas[k] > 2 * alone.sigmas[k]
     assert abs(off.values[k]) < 3.5 * off.sigmas[k]
@@ -151,7 +174,9 @@ def test_what_is_no_rigid_scene_is_refused() -> None:
     segment = _segment(_off(), 0.3)
     z = segment.tracks.z + np.random.default_rng(0).normal(0, 20, segment.tracks.z.shape)
     with pytest.raises(EstimationError, match=r"disagree by|no track"):
-        self_calibrate(CAMERA, [replace(segment, tracks=replace(segment.tracks, z=z))], intrinsics=False)
+        self_calibrate(
+            CAMERA, [replace(segment, tracks=replace(segment.tracks, z=z))], intrinsics=False
+        )
     empty = replace(segment.tracks, ids=np.zeros(0, dtype=np.int64))
     with pytest.raises(EstimationError, match="no track is consistent"):
         self_calibrate(CAMERA, [replace(segment, tracks=empty)], intrinsics=False)

@@ -1,4 +1,6 @@
-"""docs/settings.md lists the settings that there are: no more, no fewer, with today's defaults and units."""
+"""docs/settings.md lists the settings that there are: no more, no fewer, with today's defaults
+and units.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ PAGE = Path(__file__).resolve().parent.parent / "docs" / "settings.md"
 
 
 def test_page_is_that_of_todays_settings() -> None:
-    assert PAGE.read_text(encoding="utf-8") == page(), "run: python tools/settings_page.py > docs/settings.md"
+    assert PAGE.read_text(encoding="utf-8") == page(), (
+        "run: python tools/settings_page.py > docs/settings.md"
+    )
 
 
 def test_every_setting_has_one_row_and_about_twenty_are_basic() -> None:

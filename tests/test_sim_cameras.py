@@ -1,4 +1,6 @@
-"""Distortion models against OpenCV, their own inverse and central differences; the predefined rigs."""
+"""Distortion models against OpenCV, their own inverse and central differences; the predefined
+rigs.
+"""
 
 from __future__ import annotations
 
@@ -29,11 +31,14 @@ RIGS = {
     "small": small_rig(),
 }
 CAMERAS = {name: rig.cam0 for name, rig in RIGS.items()} | {"kitti_raw": KITTI}
-_NEAR, _WIDE = ((-2, -1.2, 2), (2, 1.2, 6)), ((-6, -4, 1), (6, 4, 3))  # corners of boxes of points, m
+# corners of boxes of points, m
+_NEAR, _WIDE = ((-2, -1.2, 2), (2, 1.2, 6)), ((-6, -4, 1), (6, 4, 3))
 
 
 def _pixels(camera: CameraModel, n: int = 15) -> FloatArray:
-    u, v = np.meshgrid(np.linspace(-0.5, camera.width - 0.5, n), np.linspace(-0.5, camera.height - 0.5, n))
+    u, v = np.meshgrid(
+        np.linspace(-0.5, camera.width - 0.5, n), np.linspace(-0.5, camera.height - 0.5, n)
+    )
     return np.stack([u, v], axis=-1).reshape(-1, 2)
 
 
@@ -55,7 +60,9 @@ def test_projection_agrees_with_opencv(name: str) -> None:
     corners, opencv = (_WIDE, cv2.fisheye) if name == "fisheye" else (_NEAR, cv2)
     points = np.random.default_rng(1).uniform(*corners, (200, 3))
     distortion = np.array(camera.coefficients or (0.0,) * 4)
-    expected, _ = opencv.projectPoints(points[:, None], np.zeros(3), np.zeros(3), camera.K, distortion)
+    expected, _ = opencv.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), camera.K, distortion
+    )
     np.testing.assert_allclose(project_point(camera, points)[0], expected[:, 0], atol=1e-9)
 
 
@@ -64,7 +71,10 @@ def test_points_behind_the_camera_and_beyond_the_model_are_invalid() -> None:
     _, valid = project_point(folding, [[0, 0, -1.0], [0.1, 0, 1.0], [1.2, 0, 1.0]])
     assert valid.tolist() == [False, True, False]
     # The polynomial x (1 - 0.4 x^2) never gets beyond 0.61, that is 563 px.
-    assert unproject_pixel(folding, [[320 + 0.7 * 400, 240.0], [330.0, 240.0]])[1].tolist() == [False, True]
+    assert unproject_pixel(folding, [[320 + 0.7 * 400, 240.0], [330.0, 240.0]])[1].tolist() == [
+        False,
+        True,
+    ]
 
 
 def test_a_raw_rig_has_no_rectified_camera() -> None:

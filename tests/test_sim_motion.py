@@ -1,4 +1,6 @@
-"""Splines against finite differences and their samples; simulated IMU data integrates back to the trajectory."""
+"""Splines against finite differences and their samples; simulated IMU data integrates back to
+the trajectory.
+"""
 
 from __future__ import annotations
 
@@ -75,12 +77,16 @@ def test_spline_passes_through_waypoints() -> None:
 def test_a_constant_twist_is_reproduced() -> None:
     t = np.arange(0, 3_000_000_000, 20_000_000)
     omega = np.array([0.0, 0.0, 0.7])
-    T = se3_from_parts(so3_exp(omega * t[:, None] * 1e-9), np.array([2.0, -1.0, 0.5]) * t[:, None] * 1e-9)
+    T = se3_from_parts(
+        so3_exp(omega * t[:, None] * 1e-9), np.array([2.0, -1.0, 0.5]) * t[:, None] * 1e-9
+    )
     spline, report = fit_spline(t, T, knot_s=0.1)
     state = motion_at(spline, t[5:-5])
     assert report.position_max_m < 1e-8
     assert report.rotation_max_rad < 1e-9
-    np.testing.assert_allclose(state.angular_velocity, np.broadcast_to(omega, (len(t) - 10, 3)), atol=1e-6)
+    np.testing.assert_allclose(
+        state.angular_velocity, np.broadcast_to(omega, (len(t) - 10, 3)), atol=1e-6
+    )
     np.testing.assert_allclose(state.acceleration_world, 0, atol=1e-5)
 
 
@@ -105,7 +111,9 @@ def test_rotate_body_axes_changes_the_axes_only() -> None:
     t = np.linspace(spline.start_ns, spline.end_ns, 7).astype(np.int64)
     a, b = motion_at(spline, t), motion_at(other, t)
     np.testing.assert_allclose(b.angular_velocity, a.angular_velocity @ R_FLU_EUROC_IMU, atol=1e-9)
-    np.testing.assert_allclose(b.T_world_imu[:, :3, :3], a.T_world_imu[:, :3, :3] @ R_FLU_EUROC_IMU, atol=1e-9)
+    np.testing.assert_allclose(
+        b.T_world_imu[:, :3, :3], a.T_world_imu[:, :3, :3] @ R_FLU_EUROC_IMU, atol=1e-9
+    )
 
 
 def test_hand_held_starts_stationary_and_car_moves_like_kitti() -> None:
@@ -121,7 +129,8 @@ def test_hand_held_starts_stationary_and_car_moves_like_kitti() -> None:
     assert 330 < path < 360
     forward = np.einsum("nji,nj->ni", state.T_world_imu[:, :3, :3], state.velocity_world)
     assert np.abs(forward[:, 1]).max() < 0.1 * speed.max()  # no sideslip
-    assert np.linalg.norm(state.T_world_imu[-1, :3, 3] - state.T_world_imu[0, :3, 3]) < 1.5  # a closed loop
+    # a closed loop
+    assert np.linalg.norm(state.T_world_imu[-1, :3, 3] - state.T_world_imu[0, :3, 3]) < 1.5
 
 
 def test_rejects_bad_trajectories(tmp_path: Path) -> None:
@@ -133,7 +142,9 @@ def test_rejects_bad_trajectories(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"gt\.txt, line 3: the clock runs backwards"):
         recorded_motion(path)
     path.write_text("1.0 0 0 0 0 0 0 1\n")
-    with pytest.raises(DataError, match=r"gt\.txt: describes 1 poses of imu; give two or more of the IMU"):
+    with pytest.raises(
+        DataError, match=r"gt\.txt: describes 1 poses of imu; give two or more of the IMU"
+    ):
         recorded_motion(path)
     path.write_text("# body: cam0\n1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
     with pytest.raises(DataError, match=r"gt\.txt: describes 2 poses of cam0"):
@@ -152,13 +163,16 @@ def _integrate(spline: MotionSpline, rate_hz: float) -> tuple[float, float]:
         a = 0.5 * (R @ imu.accel[i] + R_next @ imu.accel[i + 1]) + GRAVITY_WORLD
         p, v, R = p + v * dt + 0.5 * a * dt * dt, v + a * dt, R_next
     last = state.T_world_imu[-1]
-    return float(np.linalg.norm(p - last[:3, 3])), float(np.linalg.norm(so3_log(R.T @ last[:3, :3])))
+    return float(np.linalg.norm(p - last[:3, 3])), float(
+        np.linalg.norm(so3_log(R.T @ last[:3, :3]))
+    )
 
 
 def test_imu_integrates_back_to_the_trajectory() -> None:
     errors = np.array([_integrate(MOTIONS["hand"], rate) for rate in (50.0, 100.0, 200.0, 400.0)])
     ratios = errors[:-1] / errors[1:]
-    assert np.all((ratios > 3.3) & (ratios < 4.7)), ratios  # second order: halving the step quarters the error
+    # second order: halving the step quarters the error
+    assert np.all((ratios > 3.3) & (ratios < 4.7)), ratios
     assert errors[-1, 0] < 2e-4
     assert errors[-1, 1] < 2e-5
 
@@ -166,7 +180,9 @@ def test_imu_integrates_back_to_the_trajectory() -> None:
 def test_stationary_imu_measures_gravity() -> None:
     spline = spline_from_waypoints(np.broadcast_to(np.eye(4), (6, 4, 4)), 0.5)
     imu = simulate_imu(spline, noise=NO_IMU_NOISE)
-    np.testing.assert_allclose(imu.accel, np.broadcast_to([0, 0, GRAVITY_MPS2], imu.accel.shape), atol=1e-9)
+    np.testing.assert_allclose(
+        imu.accel, np.broadcast_to([0, 0, GRAVITY_MPS2], imu.accel.shape), atol=1e-9
+    )
     np.testing.assert_allclose(imu.gyro, 0, atol=1e-12)
 
 
@@ -219,5 +235,7 @@ def test_spline_fits_a_real_flight_within_its_noise(data_dir: Path, flight: str)
     # The real sensors agree with the spline but for bias and vibration.
     gyro = imu.gyro[inside] - state.angular_velocity
     assert np.all((gyro - np.median(gyro, axis=0)).std(axis=0) < 0.1)
-    gravity = np.einsum("nji,nj->ni", state.T_world_imu[:, :3, :3], state.acceleration_world - GRAVITY_WORLD)
+    gravity = np.einsum(
+        "nji,nj->ni", state.T_world_imu[:, :3, :3], state.acceleration_world - GRAVITY_WORLD
+    )
     assert np.all(np.abs(np.median(imu.accel[inside] - gravity, axis=0)) < 0.3)

@@ -1,4 +1,6 @@
-"""`--realism real`: exposure control, blur, noise, light, glare, people, and a calibration that is off as stated."""
+"""`--realism real`: exposure control, blur, noise, light, glare, people, and a calibration that
+is off as stated.
+"""
 
 from __future__ import annotations
 
@@ -59,13 +61,18 @@ def flight() -> SimulatedRecording:
     return SimulatedRecording(plan(scenario()))
 
 
-# --- the level ------------------------------------------------------------------------------------------------------
+# --- the level
+# ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scene", ["room", "street", "corridor"])
 def test_every_effect_can_be_switched_off(scene: str) -> None:
-    """With all of them off the plain conditions are left, apart from limits that nothing uses then."""
-    switches = [word for settings in OFF.values() for setting in settings for word in ("--set", setting)]
+    """With all of them off the plain conditions are left, apart from limits that nothing uses
+    then.
+    """
+    switches = [
+        word for settings in OFF.values() for setting in settings for word in ("--set", setting)
+    ]
     argv = ["render", "--out", "x", "--scene", scene, "--realism", "real"]
     real = scenario_from(build_parser().parse_args(argv))[0].conditions
     assert real == real_conditions(scene)  # type: ignore[arg-type]
@@ -87,7 +94,8 @@ def test_frames_are_the_same_in_any_order_and_process() -> None:
             np.testing.assert_array_equal(one, other)
 
 
-# --- exposure -------------------------------------------------------------------------------------------------------
+# --- exposure
+# -------------------------------------------------------------------------------------------------------
 
 
 def _loop(radiance: FloatArray, **settings: float) -> tuple[FloatArray, ...]:
@@ -95,7 +103,9 @@ def _loop(radiance: FloatArray, **settings: float) -> tuple[FloatArray, ...]:
 
 
 def test_exposure_follows_the_light_with_a_lag() -> None:
-    """Light falls to a quarter: two frames and more pass before anything changes, then the mean comes back."""
+    """Light falls to a quarter: two frames and more pass before anything changes, then the mean
+    comes back.
+    """
     light = np.where(np.arange(80) < 40, 200.0, 50.0)
     shutter, gain, mean = _loop(light, shutter_max_ms=40.0)
     assert mean[39] == pytest.approx(95.0, rel=0.08)
@@ -125,7 +135,9 @@ def test_cameras_run_loops_of_their_own() -> None:
     exposures = flight().simulation.exposures
     assert np.ptp(np.log2(exposures.shutter_ms[:, 0])) > 0.1
     assert not np.allclose(exposures.shutter_ms[:, 0] / exposures.shutter_ms[:, 1], 0.85, rtol=0.02)
-    left, right = (np.mean([flight().images(k)[camera].mean() for k in (4, 14, 24)]) for camera in (0, 1))
+    left, right = (
+        np.mean([flight().images(k)[camera].mean() for k in (4, 14, 24)]) for camera in (0, 1)
+    )
     assert min(left, right) > 60
     assert max(left, right) < 130
     assert abs(left - right) > 1
@@ -139,14 +151,21 @@ def test_planned_brightness_is_that_of_the_images() -> None:
 
 
 def test_blur_is_as_long_as_the_shutter_is_open() -> None:
-    """Of exact averages over the shutter time, half and twice it, the blurred image is nearest to the first."""
-    simulation = replace(flight().simulation, effects=replace(flight().simulation.effects, glare=0.0))
-    recording, camera, shutter_ms = SimulatedRecording(simulation), 1, 60.0  # several pixels at this size
+    """Of exact averages over the shutter time, half and twice it, the blurred image is nearest
+    to the first.
+    """
+    simulation = replace(
+        flight().simulation, effects=replace(flight().simulation.effects, glare=0.0)
+    )
+    # several pixels at this size
+    recording, camera, shutter_ms = SimulatedRecording(simulation), 1, 60.0
     time_ns = int(simulation.taken_ns[15])
     blurred = recording._seen(camera, time_ns, Exposure(shutter_ms))
 
     def error(factor: float) -> float:
-        exact = average_exposures(lambda t: recording._sharp(camera, t), time_ns, factor * shutter_ms, 9)
+        exact = average_exposures(
+            lambda t: recording._sharp(camera, t), time_ns, factor * shutter_ms, 9
+        )
         return float(np.abs(blurred - exact).mean())
 
     assert error(1.0) < 0.6 * min(error(0.5), error(2.0))
@@ -160,7 +179,13 @@ def test_noise_grows_with_gain(gain: float) -> None:
     """Photon variance of 255 gain / full_well gray levels a level, read noise times the gain."""
     effects = SensorEffects(read_noise=0.8, full_well=8000.0, shutter_ms=10.0)
     image = apply_effects(
-        GRAY, effects, time_ns=0, frame_index=1, camera=0, seed=3, exposure=Exposure(10.0 / gain, gain)
+        GRAY,
+        effects,
+        time_ns=0,
+        frame_index=1,
+        camera=0,
+        seed=3,
+        exposure=Exposure(10.0 / gain, gain),
     ).astype(np.float64)
     expected = 60.0 * 255 * gain / 8000 + (0.8 * gain) ** 2 + 1 / 12  # and rounding
     assert image.mean() == pytest.approx(60.0, abs=0.15)
@@ -171,14 +196,17 @@ def test_vignetting_differs_between_the_cameras() -> None:
     effects = SensorEffects(read_noise=0.0, vignetting=0.4, camera_difference=0.3)
     falls = []
     for camera in (0, 1):
-        image = apply_effects(GRAY, effects, time_ns=0, frame_index=0, camera=camera, seed=1).astype(np.float64)
+        image = apply_effects(
+            GRAY, effects, time_ns=0, frame_index=0, camera=camera, seed=1
+        ).astype(np.float64)
         assert image.max() >= 59
         falls.append(image[0, 0] / image.max())
     assert 0.3 < min(falls) < max(falls) < 0.9
     assert falls[1] - falls[0] != pytest.approx(0, abs=0.01)
 
 
-# --- light and glare ------------------------------------------------------------------------------------------------
+# --- light and glare
+# ------------------------------------------------------------------------------------------------
 
 
 def _pane(middle: tuple[float, float, float]) -> Light:
@@ -198,8 +226,12 @@ def test_the_sun_casts_shadows_of_boxes() -> None:
     pose[:3, 3] = [0.0, 0.0, 1.0]
     towards = sun(0.0, np.pi / 4, power=1.0, radiance=1e4)  # from +x, 45 degrees high
     light = Lighting((towards,), 0.4, pose[None], np.array([[0.5, 0.5, 1.0]]))
-    ground = illumination(light, [[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 2.0, 0.0], [-4.0, 0.0, 0.0]], [0, 0, 1])
-    assert ground == pytest.approx([0.4, 0.4 + np.sin(np.pi / 4), 0.4 + np.sin(np.pi / 4), 0.4 + np.sin(np.pi / 4)])
+    ground = illumination(
+        light, [[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 2.0, 0.0], [-4.0, 0.0, 0.0]], [0, 0, 1]
+    )
+    assert ground == pytest.approx(
+        [0.4, 0.4 + np.sin(np.pi / 4), 0.4 + np.sin(np.pi / 4), 0.4 + np.sin(np.pi / 4)]
+    )
 
 
 @lru_cache(maxsize=1)
@@ -243,7 +275,8 @@ def test_without_lighting_worlds_are_as_they_were() -> None:
     assert blank == [True, False, False, True], "one house in three, of three faces each"
 
 
-# --- people ---------------------------------------------------------------------------------------------------------
+# --- people
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_people_walk_step_by_step_and_keep_off_the_camera() -> None:
@@ -263,7 +296,8 @@ def test_people_walk_step_by_step_and_keep_off_the_camera() -> None:
     assert len(walking_people(walks, seed=1)) == 3 * len(walks)
 
 
-# --- calibration ----------------------------------------------------------------------------------------------------
+# --- calibration
+# ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", sorted(CALIBRATIONS))
@@ -296,24 +330,41 @@ def test_drawn_rigs_have_the_stated_standard_deviations() -> None:
         pitch, yaw, roll = np.rad2deg(so3_log(off[:3, :3]))
         lengths = [float(np.linalg.norm(r.T_cam0_cam1[:3, 3])) for r in (rig, true)]
         lenses = [
-            x for c in (true.cam0, true.cam1) for x in (c.cu - rig.cam0.cu, c.cv - rig.cam0.cv, *c.coefficients[:2])
+            x
+            for c in (true.cam0, true.cam1)
+            for x in (c.cu - rig.cam0.cu, c.cv - rig.cam0.cv, *c.coefficients[:2])
         ]
         zoom = [true.cam0.fu / rig.cam0.fu - 1, true.cam1.fu / true.cam0.fu - 1]
         seen.append([lengths[1] / lengths[0] - 1, *zoom, yaw, pitch, roll, *lenses])
     lens = [s.cx_px, s.cy_px, s.k1, s.k2]
-    stated = [s.baseline, s.focal_length, s.focal_difference, s.yaw_deg, s.pitch_deg, s.roll_deg, *lens, *lens]
-    np.testing.assert_allclose(np.std(seen, axis=0), stated, rtol=0.12)  # 3.4 sigma of a deviation of 400
+    stated = [
+        s.baseline,
+        s.focal_length,
+        s.focal_difference,
+        s.yaw_deg,
+        s.pitch_deg,
+        s.roll_deg,
+        *lens,
+        *lens,
+    ]
+    # 3.4 sigma of a deviation of 400
+    np.testing.assert_allclose(np.std(seen, axis=0), stated, rtol=0.12)
     np.testing.assert_array_less(np.abs(np.mean(seen, axis=0)), 0.2 * np.array(stated))
     assert np.abs(np.corrcoef(np.transpose(seen)) - np.eye(len(stated))).max() < 0.2
 
 
 @pytest.mark.parametrize("rows", [0.0, 1.0])
 def test_drawn_rigs_with_good_rows_have_disparities_that_are_off(rows: float) -> None:
-    """Pixels of points 3 to 30 m away in the true rig, read by the calibration: rows agree, disparities do not."""
+    """Pixels of points 3 to 30 m away in the true rig, read by the calibration: rows agree,
+    disparities do not.
+    """
     rig, off = euroc_rectified_rig(), []
     for seed in range(20):
         true = drawn_rig(rig, CalibrationSigmas(scale=1.0, rows=rows), seed=seed)
-        rays = np.stack([*np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.3, 0.3, 5)), np.ones((5, 5))], axis=-1)
+        rays = np.stack(
+            [*np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.3, 0.3, 5)), np.ones((5, 5))],
+            axis=-1,
+        )
         points = rays.reshape(-1, 3) * np.linspace(3.0, 30.0, 25)[:, None]
         pixels = [
             project_point(camera, points @ T[:3, :3].T + T[:3, 3])[0]
@@ -336,15 +387,22 @@ def _true_rig(folder: Path) -> dict[str, object]:
 
 
 def test_folders_hold_the_calibration_and_keep_the_truth_beside_it(tmp_path: Path) -> None:
-    """The images are those of the true rig, which simulation.json states; sensor.yaml and calib.txt are nominal."""
+    """The images are those of the true rig, which simulation.json states; sensor.yaml and
+    calib.txt are nominal.
+    """
     common = ["--width", "160", "--duration", "0.1", "--set", "calibration.scale=1"]
     euroc, kitti = tmp_path / "euroc", tmp_path / "kitti"
     assert main(["render", "--out", str(euroc), "--rig", "euroc-rectified", *common]) == 0
-    assert main(["render", "--out", str(kitti), "--format", "kitti", "--rig", "small", *common]) == 0
+    assert (
+        main(["render", "--out", str(kitti), "--format", "kitti", "--rig", "small", *common]) == 0
+    )
     written = read_camera_yaml(euroc / "mav0/cam1/sensor.yaml")[0]
     conditions = Conditions(calibration=CalibrationErrors(scale=1))
     simulation = plan(Scenario(width=160, duration_s=0.1, conditions=conditions))
-    assert (written.cu, written.cv) == (simulation.calibration.cam1.cu, simulation.calibration.cam1.cv)
+    assert (written.cu, written.cv) == (
+        simulation.calibration.cam1.cu,
+        simulation.calibration.cam1.cv,
+    )
     true = _true_rig(euroc)
     assert true["cam1"]["cu"] == simulation.rig.cam1.cu != written.cu  # type: ignore[index]
     np.testing.assert_array_equal(true["T_imu_cam1"], simulation.rig.T_imu_cam1)
@@ -354,25 +412,36 @@ def test_folders_hold_the_calibration_and_keep_the_truth_beside_it(tmp_path: Pat
 
 
 def test_the_error_moves_the_images_as_much_as_it_says() -> None:
-    """A pixel of the true camera looks elsewhere than the same pixel of its calibration: some tenths of a pixel."""
+    """A pixel of the true camera looks elsewhere than the same pixel of its calibration: some
+    tenths of a pixel.
+    """
     rig: StereoRig = euroc_like_rig()
     true = miscalibrated(rig, CalibrationErrors(scale=1.0), seed=5)
-    grid = np.stack(np.meshgrid(np.linspace(20, 730, 9), np.linspace(20, 460, 7)), axis=-1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(np.linspace(20, 730, 9), np.linspace(20, 460, 7)), axis=-1).reshape(
+        -1, 2
+    )
     rays = [unproject_pixel(camera, grid)[0] for camera in (rig.cam0, true.cam0)]
     angle = np.linalg.norm(np.cross(*rays), axis=1)
     assert 0.1 < np.median(angle) * rig.cam0.fu < 0.6
 
 
-# --- end to end -----------------------------------------------------------------------------------------------------
+# --- end to end
+# -----------------------------------------------------------------------------------------------------
 
 
 def test_odometry_follows_real_looking_flights() -> None:
-    """Three seconds by hand with everything at once: one flight to 1 % of the way, one with people in front to 4 %.
+    """Three seconds by hand with everything at once: one flight to 1 % of the way, one with people
+    in front to 4 %.
 
-    Measured: 6.7 and, with people before a blank wall, 20 to 31 mm, which small changes of the front end move.
+    Measured: 6.7 and, with people before a blank wall, 20 to 31 mm, which small changes of the
+    front end move.
     """
     for seed, share in ((0, 0.01), (2, 0.04)):
-        simulated = flight() if seed == scenario().seed else SimulatedRecording(plan(replace(scenario(), seed=seed)))
+        simulated = (
+            flight()
+            if seed == scenario().seed
+            else SimulatedRecording(plan(replace(scenario(), seed=seed)))
+        )
         recording = simulated.recording
         result = run(simulated, Config(motion="imu"))
         scores = evaluate(result.trajectory, recording.reference, T_cam0_imu=recording.T_cam0_imu)

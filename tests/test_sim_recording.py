@@ -1,4 +1,6 @@
-"""Camera effects, simulated recordings, statistics of the oracle front end, and round trips of exported folders."""
+"""Camera effects, simulated recordings, statistics of the oracle front end, and round trips of
+exported folders.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,14 @@ from vio.sim.motion import car_loop, hand_held, rotate_body_axes
 from vio.sim.oracle import OracleFrontend, OracleSettings
 from vio.sim.render import Radiance, correspondence
 from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_like_rig, kitti_like_rig, small_rig
-from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, simulate, views
+from vio.sim.sequence import (
+    FrameFaults,
+    SimulatedRecording,
+    Simulation,
+    read_flight,
+    simulate,
+    views,
+)
 from vio.sim.world import World, room, street
 
 RIG = small_rig(192, 120)
@@ -38,20 +47,25 @@ def world() -> World:
 
 @pytest.fixture(scope="module")
 def plain(world: World) -> Simulation:
-    return simulate(world, RIG, MOTION, rate_hz=10.0, imu=ImuNoise(), velocity=VelocityNoise(), effects=CLEAN)
+    return simulate(
+        world, RIG, MOTION, rate_hz=10.0, imu=ImuNoise(), velocity=VelocityNoise(), effects=CLEAN
+    )
 
 
 def _recording(plain: Simulation, effects: SensorEffects) -> SimulatedRecording:
     return SimulatedRecording(replace(plain, effects=effects))
 
 
-# --- effects --------------------------------------------------------------------------------------------------------
+# --- effects
+# --------------------------------------------------------------------------------------------------------
 
 
 GRAY: Radiance = np.full((80, 100), 100.0, dtype=np.float32)
 
 
-def _with_effects(effects: SensorEffects, *, camera: int = 0, time_ns: int = 0, frame: int = 0) -> FloatArray:
+def _with_effects(
+    effects: SensorEffects, *, camera: int = 0, time_ns: int = 0, frame: int = 0
+) -> FloatArray:
     image = apply_effects(GRAY, effects, time_ns=time_ns, frame_index=frame, camera=camera, seed=1)
     return image.astype(np.float64)
 
@@ -85,7 +99,10 @@ def test_noise_has_the_specified_standard_deviation() -> None:
     electrons = 100 / 255 * 5000
     photon = _with_effects(replace(CLEAN, full_well=5000.0))
     assert photon.std() == pytest.approx(np.hypot(100 / np.sqrt(electrons), 12**-0.5), rel=0.03)
-    same, other = _with_effects(replace(CLEAN, read_noise=3.0)), _with_effects(replace(CLEAN, read_noise=3.0), frame=1)
+    same, other = (
+        _with_effects(replace(CLEAN, read_noise=3.0)),
+        _with_effects(replace(CLEAN, read_noise=3.0), frame=1),
+    )
     assert np.array_equal(same, read)
     assert not np.array_equal(other, read)
     right = _with_effects(replace(CLEAN, read_noise=3.0), camera=1)
@@ -129,7 +146,8 @@ def test_flow_is_the_exact_map(plain: Simulation) -> None:
     assert np.mean(error > 0.5) < 0.1  # where the grid straddles an outline
 
 
-# --- recordings -----------------------------------------------------------------------------------------------------
+# --- recordings
+# -----------------------------------------------------------------------------------------------------
 
 
 def test_events_are_in_time_order_with_ground_truth(plain: Simulation) -> None:
@@ -141,7 +159,9 @@ def test_events_are_in_time_order_with_ground_truth(plain: Simulation) -> None:
     assert [frame.index for frame in frames] == [3, 4, 5]
     assert isinstance(events[-1], StereoFrame)
     inertial = [event.time_ns for event in events if isinstance(event, ImuSample)]
-    assert inertial == list(range(0, 500_000_001, 5_000_000)), "up to a second before the first frame, as all readers"
+    assert inertial == list(range(0, 500_000_001, 5_000_000)), (
+        "up to a second before the first frame, as all readers"
+    )
     velocities = [event.time_ns for event in events if isinstance(event, VelocitySample)]
     assert velocities == [300_000_000, 400_000_000, 500_000_000]
     with pytest.raises(DataError, match="none is between"):
@@ -179,7 +199,9 @@ def test_dropped_and_repeated_frames_and_clock_offset(world: World) -> None:
     k = int(repeated[0])
     recording = SimulatedRecording(replace(faulty, effects=SensorEffects(read_noise=3.0)))
     assert np.array_equal(recording.images(k)[0], recording.images(k - 1)[0])
-    assert not np.array_equal(recording.images(k + 1 if k + 1 not in repeated else k - 2)[0], recording.images(k)[0])
+    assert not np.array_equal(
+        recording.images(k + 1 if k + 1 not in repeated else k - 2)[0], recording.images(k)[0]
+    )
 
 
 def test_rejects_image_times_outside_the_ground_truth(tmp_path: Path) -> None:
@@ -189,15 +211,21 @@ def test_rejects_image_times_outside_the_ground_truth(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no image time is within the ground truth"):
         read_flight(gt, times)
     times.write_text("100\nabc\n")
-    with pytest.raises(DataError, match=r"times\.txt, line 2: 'abc' is no time in whole nanoseconds"):
+    with pytest.raises(
+        DataError, match=r"times\.txt, line 2: 'abc' is no time in whole nanoseconds"
+    ):
         read_flight(gt, times)
 
 
-# --- oracle ---------------------------------------------------------------------------------------------------------
+# --- oracle
+# ---------------------------------------------------------------------------------------------------------
 
 
 def _run(oracle: OracleFrontend, simulation: Simulation) -> list[FrontendOutput]:
-    return [oracle.process(StereoFrame(i, int(t), None, None)) for i, t in enumerate(simulation.stamps_ns)]
+    return [
+        oracle.process(StereoFrame(i, int(t), None, None))
+        for i, t in enumerate(simulation.stamps_ns)
+    ]
 
 
 def test_perfect_observations_are_projections_of_the_points(plain: Simulation) -> None:
@@ -214,7 +242,9 @@ def test_perfect_observations_are_projections_of_the_points(plain: Simulation) -
 
 
 def test_oracle_noise_outliers_and_ids(plain: Simulation) -> None:
-    settings = OracleSettings(max_features=80, sigma_px=0.7, outlier_fraction=0.1, left_only_fraction=0.2)
+    settings = OracleSettings(
+        max_features=80, sigma_px=0.7, outlier_fraction=0.1, left_only_fraction=0.2
+    )
     oracle = OracleFrontend(plain, settings, seed=3)
     outputs = _run(oracle, plain)
     residuals, wrong, gone, last = [], [], set(), set[int]()
@@ -234,7 +264,10 @@ def test_oracle_noise_outliers_and_ids(plain: Simulation) -> None:
     has_right = np.concatenate([output.observations.has_right for output in outputs])
     assert has_right.mean() == pytest.approx(0.8, abs=0.03)
     again = _run(OracleFrontend(plain, settings, seed=3), plain)
-    assert all(np.array_equal(a.observations.z, b.observations.z) for a, b in zip(outputs, again, strict=True))
+    assert all(
+        np.array_equal(a.observations.z, b.observations.z)
+        for a, b in zip(outputs, again, strict=True)
+    )
     other = _run(OracleFrontend(plain, settings, seed=4), plain)
     assert not np.array_equal(outputs[0].observations.z, other[0].observations.z)
 
@@ -254,18 +287,23 @@ def test_oracle_spreads_features_and_limits_their_age(plain: Simulation) -> None
 
 
 def test_oracle_and_recording_need_a_rectified_rig(world: World) -> None:
-    simulation = simulate(world, euroc_like_rig(), rotate_body_axes(hand_held(duration_s=1.0), R_FLU_EUROC_IMU))
+    simulation = simulate(
+        world, euroc_like_rig(), rotate_body_axes(hand_held(duration_s=1.0), R_FLU_EUROC_IMU)
+    )
     with pytest.raises(SimulationError, match="rectified"):
         OracleFrontend(simulation)
     with pytest.raises(SimulationError, match="unrectified rig"):
         _ = SimulatedRecording(simulation).recording
 
 
-# --- export ---------------------------------------------------------------------------------------------------------
+# --- export
+# ---------------------------------------------------------------------------------------------------------
 
 
 def _short(plain: Simulation, frames: int = 3) -> SimulatedRecording:
-    return SimulatedRecording(replace(plain, taken_ns=plain.taken_ns[:frames], stamps_ns=plain.stamps_ns[:frames]))
+    return SimulatedRecording(
+        replace(plain, taken_ns=plain.taken_ns[:frames], stamps_ns=plain.stamps_ns[:frames])
+    )
 
 
 def test_a_kitti_folder_reads_back(plain: Simulation, tmp_path: Path) -> None:
@@ -275,11 +313,17 @@ def test_a_kitti_folder_reads_back(plain: Simulation, tmp_path: Path) -> None:
     assert done == [(1, 3), (2, 3), (3, 3)]
     dataset = read_kitti(tmp_path / "out", DatasetSettings())
     mine, read = recording.recording, dataset.recording
-    assert (read.camera.fu, read.camera.cu, read.camera.width) == (mine.camera.fu, mine.camera.cu, 192)
+    assert (read.camera.fu, read.camera.cu, read.camera.width) == (
+        mine.camera.fu,
+        mine.camera.cu,
+        192,
+    )
     assert read.camera.baseline_m == pytest.approx(mine.camera.baseline_m)
     np.testing.assert_allclose(read.T_cam0_imu, mine.T_cam0_imu, atol=1e-12)
     truth = recording.reference.in_cam0(se3_inverse(RIG.T_imu_cam0)).T_world_body
-    np.testing.assert_allclose(read.reference.T_world_body, se3_inverse(truth[0]) @ truth, atol=1e-9)
+    np.testing.assert_allclose(
+        read.reference.T_world_body, se3_inverse(truth[0]) @ truth, atol=1e-9
+    )
     events = list(dataset.events())
     frames = [event for event in events if isinstance(event, StereoFrame)]
     velocities = [event for event in events if isinstance(event, VelocitySample)]
@@ -292,7 +336,9 @@ def test_a_kitti_folder_reads_back(plain: Simulation, tmp_path: Path) -> None:
 
 
 def test_an_euroc_folder_reads_back(world: World, tmp_path: Path) -> None:
-    motion = rotate_body_axes(hand_held(duration_s=1.0, start_ns=1_403_715_524_907_143_219), R_FLU_EUROC_IMU)
+    motion = rotate_body_axes(
+        hand_held(duration_s=1.0, start_ns=1_403_715_524_907_143_219), R_FLU_EUROC_IMU
+    )
     rig = euroc_like_rig()
     simulation = simulate(world, rig, motion, rate_hz=2.0, imu=ImuNoise())
     recording = SimulatedRecording(simulation)
@@ -312,11 +358,15 @@ def test_an_euroc_folder_reads_back(world: World, tmp_path: Path) -> None:
         assert np.array_equal(image, recording.images(1)[int(name[-1])])
     imu = np.loadtxt(mav / "imu0" / "data.csv", delimiter=",", comments="#", usecols=range(1, 7))
     np.testing.assert_array_equal(imu, np.hstack([simulation.imu.gyro, simulation.imu.accel]))
-    state = np.loadtxt(mav / "state_groundtruth_estimate0" / "data.csv", delimiter=",", comments="#")
+    state = np.loadtxt(
+        mav / "state_groundtruth_estimate0" / "data.csv", delimiter=",", comments="#"
+    )
     assert state.shape[1] == 17
     truth = recording.true_state(motion.start_ns)
     np.testing.assert_allclose(state[0, 1:4], truth.T_world_imu[:3, 3])
-    np.testing.assert_allclose(rotation_from_quat_xyzw(state[0, [5, 6, 7, 4]]), truth.T_world_imu[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(
+        rotation_from_quat_xyzw(state[0, [5, 6, 7, 4]]), truth.T_world_imu[:3, :3], atol=1e-12
+    )
     np.testing.assert_allclose(state[0, 8:11], truth.velocity_world, atol=1e-12)
     np.testing.assert_allclose(state[0, 11:14], truth.gyro_bias)
 

@@ -1,4 +1,6 @@
-"""Rendered images against exact geometry computed independently: photometry, OpenCV, brute force."""
+"""Rendered images against exact geometry computed independently: photometry, OpenCV, brute
+force.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,11 @@ def small_room() -> World:
     return room(1, texel_m=0.005)
 
 
-RIGS = {"pinhole": small_rig(320, 200), "radtan": _radtan_rig(), "equidistant": fisheye_rig(320, 240)}
+RIGS = {
+    "pinhole": small_rig(320, 200),
+    "radtan": _radtan_rig(),
+    "equidistant": fisheye_rig(320, 240),
+}
 
 
 def _simulation(world: World, rig: StereoRig) -> Simulation:
@@ -67,14 +73,20 @@ def _simulation(world: World, rig: StereoRig) -> Simulation:
 
 def _sample(image: Radiance, uv: FloatArray) -> FloatArray:
     maps = uv.astype(np.float32).reshape(-1, 1, 2)
-    out = np.concatenate([cv2.remap(image, part, None, cv2.INTER_CUBIC) for part in np.array_split(maps, 12)])
+    out = np.concatenate(
+        [cv2.remap(image, part, None, cv2.INTER_CUBIC) for part in np.array_split(maps, 12)]
+    )
     return out.ravel().astype(np.float64)
 
 
 def _photometric(world: World, a: View, b: View) -> tuple[FloatArray, FloatArray, float]:
-    """Gray differences of points seen in both views, the equivalent image shift, and the share seen in both."""
+    """Gray differences of points seen in both views, the equivalent image shift, and the share
+    seen in both.
+    """
     rays = camera_rays(a.camera), camera_rays(b.camera)
-    image_a, image_b = (render(world, r, v.T_world_cam, v.time_ns) for r, v in zip(rays, (a, b), strict=True))
+    image_a, image_b = (
+        render(world, r, v.T_world_cam, v.time_ns) for r, v in zip(rays, (a, b), strict=True)
+    )
     u, v = np.meshgrid(np.arange(4, a.camera.width - 4), np.arange(4, a.camera.height - 4))
     uv = np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64)
     there, visible = correspondence(world, a, b, uv)
@@ -112,20 +124,35 @@ def test_reprojection_reproduces_the_other_image_of_the_street() -> None:
 def _wall(texture_seed: int) -> World:
     """One large wall across the x axis, 3 m ahead of the origin."""
     patch = Patch(
-        np.array([3.0, 4.0, 3.0]), np.array([0.0, -1, 0]), np.array([0.0, 0, -1]), np.array([8.0, 6.0]), "wall", 0.004
+        np.array([3.0, 4.0, 3.0]),
+        np.array([0.0, -1, 0]),
+        np.array([0.0, 0, -1]),
+        np.array([8.0, 6.0]),
+        "wall",
+        0.004,
     )
     arrays = (patch.origin[None], patch.axis_s[None], patch.axis_t[None], patch.size[None])
     surfaces = Surfaces(*arrays, np.zeros(1, dtype=np.int64))
-    return World("wall", surfaces, TextureStore([patch], texture_seed), (), np.array([[-9.0] * 3, [2.9, 9, 9]]))
+    return World(
+        "wall",
+        surfaces,
+        TextureStore([patch], texture_seed),
+        (),
+        np.array([[-9.0] * 3, [2.9, 9, 9]]),
+    )
 
 
 def test_a_plane_is_rendered_where_opencv_projects_it() -> None:
-    """Warp the wall's texture with the homography that cv2.projectPoints gives; compare image and rendering."""
+    """Warp the wall's texture with the homography that cv2.projectPoints gives; compare image
+    and rendering.
+    """
     world = _wall(5)
     camera = CameraModel(300.0, 310.0, 158.0, 101.0, 320, 200)
     T = se3_from_parts(so3_exp([0.05, -0.1, 0.2]) @ R_BODY_CAM, [0.3, -0.2, 0.1])
     image = render(world, camera_rays(camera), T)
-    texture = paint("wall", np.array([8.0, 6.0]), 0.004, np.random.default_rng([5, 0])).astype(np.float32)
+    texture = paint("wall", np.array([8.0, 6.0]), 0.004, np.random.default_rng([5, 0])).astype(
+        np.float32
+    )
     corners = np.array([[0.0, 0], [8, 0], [8, 6], [0, 6]])
     surfaces = world.surfaces
     p_world = surface_points(surfaces, np.zeros(4, dtype=np.int64), corners)
@@ -170,7 +197,9 @@ def test_correspondence_is_invertible(small_room: World) -> None:
 
 
 def test_occluded_points_are_invisible(small_room: World) -> None:
-    """A point is occluded exactly when the other camera's ray to it hits something nearer, by ray marching."""
+    """A point is occluded exactly when the other camera's ray to it hits something nearer, by
+    ray marching.
+    """
     camera = RIGS["pinhole"].cam0
     a = View(camera, se3_from_parts(R_BODY_CAM, [-2.0, 0.8, 1.1]))
     b = View(camera, se3_from_parts(so3_exp([0.0, 0.0, 0.3]) @ R_BODY_CAM, [-1.6, -1.3, 0.6]))
@@ -180,7 +209,9 @@ def test_occluded_points_are_invisible(small_room: World) -> None:
     hits = cast(surfaces, a.T_world_cam, rays)
     p = surface_points(surfaces, hits.surface, hits.coordinates)
     there, visible = correspondence(small_room, a, b, uv)
-    in_view = inside_image(b.camera, there) & ((p - b.T_world_cam[:3, 3]) @ b.T_world_cam[:3, 2] > 0)
+    in_view = inside_image(b.camera, there) & (
+        (p - b.T_world_cam[:3, 3]) @ b.T_world_cam[:3, 2] > 0
+    )
     steps = np.linspace(0.002, 0.998, 400)[:, None, None]
     path = b.T_world_cam[:3, 3] + steps * (p[in_view] - b.T_world_cam[:3, 3])
     blocked = np.zeros(int(in_view.sum()), dtype=bool)
@@ -205,7 +236,9 @@ def test_depth_map_equals_brute_force(small_room: World, name: str) -> None:
 
 
 def test_every_pixel_shows_the_surface_that_its_ray_hits(small_room: World) -> None:
-    """Paint each surface with its own gray level: away from outlines the image equals the map of surfaces."""
+    """Paint each surface with its own gray level: away from outlines the image equals the map of
+    surfaces.
+    """
     count = len(small_room.surfaces.size)
     level = (np.arange(count) * 67 % 200 + 20).astype(np.uint8)
 
@@ -238,7 +271,9 @@ def test_the_same_seed_gives_the_same_bits(small_room: World) -> None:
 
 
 def test_textures_have_detail_at_every_scale_and_do_not_repeat() -> None:
-    texture = paint("wall", np.array([6.0, 3.0]), 0.006, np.random.default_rng(0)).astype(np.float32)
+    texture = paint("wall", np.array([6.0, 3.0]), 0.006, np.random.default_rng(0)).astype(
+        np.float32
+    )
     spectrum = np.fft.rfft2(texture - cv2.GaussianBlur(texture, (0, 0), 20))
     correlation = np.fft.irfft2(np.abs(spectrum) ** 2, s=texture.shape)
     correlation /= correlation[0, 0]
@@ -247,7 +282,9 @@ def test_textures_have_detail_at_every_scale_and_do_not_repeat() -> None:
     away[:near, :near] = away[-near:, :near] = away[:near, -near:] = away[-near:, -near:] = 0
     assert away.max() < 0.1, "the texture repeats"
     for sigma in (1, 3, 9, 27):  # detail at every scale
-        band = cv2.GaussianBlur(texture, (0, 0), sigma) - cv2.GaussianBlur(texture, (0, 0), 2 * sigma)
+        band = cv2.GaussianBlur(texture, (0, 0), sigma) - cv2.GaussianBlur(
+            texture, (0, 0), 2 * sigma
+        )
         assert band.std() > 2.0, f"nothing to see at {sigma} texels"
 
 
@@ -261,9 +298,17 @@ def test_a_bare_wall_has_no_texture() -> None:
 
 def test_a_moving_box_moves_and_carries_its_points() -> None:
     def motion(time_ns: int) -> FloatArray:
-        return se3_from_parts(so3_exp([0.0, 0.0, 0.3 * time_ns * 1e-9]), [1.5, -0.5 + time_ns * 1e-9, 1.3])
+        return se3_from_parts(
+            so3_exp([0.0, 0.0, 0.3 * time_ns * 1e-9]), [1.5, -0.5 + time_ns * 1e-9, 1.3]
+        )
 
-    world = room(3, furniture=0, pictures=0, moving=[MovingBox(np.array([0.5, 0.5, 0.5]), motion)], texel_m=0.01)
+    world = room(
+        3,
+        furniture=0,
+        pictures=0,
+        moving=[MovingBox(np.array([0.5, 0.5, 0.5]), motion)],
+        texel_m=0.01,
+    )
     camera = small_rig(320, 200).cam0
     T = se3_from_parts(R_BODY_CAM, [-1.0, 0.0, 1.3])
     a, b = View(camera, T, 0), View(camera, T, 300_000_000)
@@ -274,9 +319,9 @@ def test_a_moving_box_moves_and_carries_its_points() -> None:
     uv = np.stack([u, v], axis=1).astype(np.float64)
     there, visible = correspondence(world, a, b, uv)
     rays, _ = unproject_pixel(camera, uv)
-    p_box = (T[:3, 3] + (rays * (depth[v, u] / rays[:, 2])[:, None]) @ T[:3, :3].T - motion(0)[:3, 3]) @ motion(0)[
-        :3, :3
-    ]
+    p_box = (
+        T[:3, 3] + (rays * (depth[v, u] / rays[:, 2])[:, None]) @ T[:3, :3].T - motion(0)[:3, 3]
+    ) @ motion(0)[:3, :3]
     p_later = p_box @ motion(b.time_ns)[:3, :3].T + motion(b.time_ns)[:3, 3]
     p_cam = (p_later - T[:3, 3]) @ T[:3, :3]
     expected = p_cam[:, :2] / p_cam[:, 2:] * (camera.fu, camera.fv) + (camera.cu, camera.cv)

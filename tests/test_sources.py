@@ -1,4 +1,6 @@
-"""Live sources: videos by OpenCV, a RealSense made by its library, and recordings that repeat the run to the bit."""
+"""Live sources: videos by OpenCV, a RealSense made by its library, and recordings that repeat
+the run to the bit.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +109,9 @@ class Replayed:
 
 
 @pytest.mark.parametrize("form", get_args(Form))
-def test_recordings_have_all_digits_and_ending_early_keeps_everything(form: Form, flight: Path, tmp_path: Path) -> None:
+def test_recordings_have_all_digits_and_ending_early_keeps_everything(
+    form: Form, flight: Path, tmp_path: Path
+) -> None:
     source = Replayed(flight)
     kept, out = tmp_path / "kept", tmp_path / "out"
     run = run_source(
@@ -195,15 +199,20 @@ def test_absent_sources_are_named(name: str, error: type[Exception], message: st
 
 
 @pytest.mark.parametrize(
-    ("name", "package", "extra"), [("realsense:", "pyrealsense2", "realsense"), ("oak:", "depthai", "oak")]
+    ("name", "package", "extra"),
+    [("realsense:", "pyrealsense2", "realsense"), ("oak:", "depthai", "oak")],
 )
-def test_without_the_extra_it_is_named(name: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_it_is_named(
+    name: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(MissingDependencyError, match=rf"pip install 'stereo-vio\[{extra}\]'"):
         open_source(name)
 
 
-def test_what_a_run_needs_is_named(video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_run_needs_is_named(
+    video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["live", f"video:{video}"]) == 1
     assert "no calibration of its own; give --calibration FILE" in capsys.readouterr().err
     assert main(["live", f"video:{video}", "--localise"]) == 1
@@ -225,8 +234,12 @@ def test_the_accelerometer_is_interpolated_at_the_times_of_the_gyro() -> None:
         np.testing.assert_array_equal(sample.gyro, float(sample.time_ns))
 
 
-def test_a_realsense_made_by_its_library_gives_pairs_samples_and_calibration(tmp_path: Path) -> None:
-    pytest.importorskip("pyrealsense2", reason="pyrealsense2 or libusb is not installed", exc_type=ImportError)
+def test_a_realsense_made_by_its_library_gives_pairs_samples_and_calibration(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip(
+        "pyrealsense2", reason="pyrealsense2 or libusb is not installed", exc_type=ImportError
+    )
     path = tmp_path / "camera.db3"
     _record_realsense(path)
     source = open_source(f"realsense:{path}")
@@ -259,10 +272,28 @@ def _record_realsense(path: Path) -> None:
     videos = []
     for index in (1, 2):
         stream, lens = rs.video_stream(), rs.intrinsics()
-        lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy = width, height, 100.0, 100.0, 79.5, 44.5
+        lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy = (
+            width,
+            height,
+            100.0,
+            100.0,
+            79.5,
+            44.5,
+        )
         lens.model, lens.coeffs = rs.distortion.brown_conrady, [0.0] * 5
-        stream.type, stream.index, stream.uid, stream.fmt = rs.stream.infrared, index, index, rs.format.y8
-        stream.width, stream.height, stream.fps, stream.bpp, stream.intrinsics = width, height, 20, 1, lens
+        stream.type, stream.index, stream.uid, stream.fmt = (
+            rs.stream.infrared,
+            index,
+            index,
+            rs.format.y8,
+        )
+        stream.width, stream.height, stream.fps, stream.bpp, stream.intrinsics = (
+            width,
+            height,
+            20,
+            1,
+            lens,
+        )
         videos.append(stereo.add_video_stream(stream))
     moved = rs.extrinsics()
     moved.rotation, moved.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [-0.05, 0, 0]
@@ -270,7 +301,13 @@ def _record_realsense(path: Path) -> None:
     inertial = []
     for uid, kind in ((3, rs.stream.gyro), (4, rs.stream.accel)):
         stream = rs.motion_stream()
-        stream.type, stream.index, stream.uid, stream.fps, stream.fmt = kind, 0, uid, 200, rs.format.motion_xyz32f
+        stream.type, stream.index, stream.uid, stream.fps, stream.fmt = (
+            kind,
+            0,
+            uid,
+            200,
+            rs.format.motion_xyz32f,
+        )
         stream.intrinsics = rs.motion_device_intrinsic()
         inertial.append(motion.add_motion_stream(stream))
     recorder, kept = rs.recorder(str(path), device), rs.frame_queue(1000)
@@ -316,7 +353,9 @@ class _OakQueue:
 
 
 class _OakDevice:
-    """Stands in for depthai's module, its device, pipeline and nodes: with the names of depthai 3.12."""
+    """Stands in for depthai's module, its device, pipeline and nodes: with the names of depthai
+    3.12.
+    """
 
     CameraBoardSocket = SimpleNamespace(CAM_B="left", CAM_C="right")
     CameraModel = SimpleNamespace(Perspective=0, Fisheye=1)
@@ -326,9 +365,15 @@ class _OakDevice:
     out = property(lambda self: self)
 
     def __init__(self) -> None:
-        self.coefficients, self.is_open, self.socket = [0.1, 0.0, 0.0, 0.0, 0.0] + [0.0] * 9, False, ""
+        self.coefficients, self.is_open, self.socket = (
+            [0.1, 0.0, 0.0, 0.0, 0.0] + [0.0] * 9,
+            False,
+            "",
+        )
         self.Device = lambda info: self
-        self.Device.getAllAvailableDevices = lambda: [SimpleNamespace(getDeviceId=lambda: "14442C", name="1.1")]  # type: ignore[attr-defined]
+        self.Device.getAllAvailableDevices = lambda: [
+            SimpleNamespace(getDeviceId=lambda: "14442C", name="1.1")
+        ]  # type: ignore[attr-defined]
         self.Pipeline = lambda device: self
 
     def create(self, kind: str) -> Any:
@@ -400,7 +445,9 @@ def _oak_image(k: int, value: int) -> Any:
     return SimpleNamespace(getCvFrame=lambda: image, getTimestampDevice=lambda: stamp)
 
 
-def test_an_oak_gives_pairs_samples_and_calibration_in_metres(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_oak_gives_pairs_samples_and_calibration_in_metres(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Against a stand-in: no device was at hand."""
     device = _OakDevice()
     monkeypatch.setitem(sys.modules, "depthai", device)  # type: ignore[arg-type]
@@ -436,7 +483,10 @@ def test_the_stand_in_has_only_names_of_depthai() -> None:
         (dai.Pipeline, ("create", "start", "stop")),
         (dai.node.Camera, ("build", "requestOutput")),
         (dai.node.IMU, ("enableIMUSensor", "setBatchReportThreshold", "setMaxBatchReports")),
-        (dai.CalibrationHandler, [name for name in dir(_OakDevice) if name.startswith("get") and "IMU" not in name]),
+        (
+            dai.CalibrationHandler,
+            [name for name in dir(_OakDevice) if name.startswith("get") and "IMU" not in name],
+        ),
         (dai.MessageQueue, ("tryGetAll",)),
         (dai.IMUPacket, ("acceleroMeter", "gyroscope")),
         (dai.ImgFrame, ("getCvFrame", "getTimestampDevice")),

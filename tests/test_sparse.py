@@ -20,14 +20,19 @@ def test_marginals_are_blocks_of_the_inverse() -> None:
     found = sparse.marginals(csc_matrix(H), csr_matrix(D), 3)
     assert found.shape == (70, 3, 3)
     for k in range(70):
-        np.testing.assert_allclose(found[k], expected[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(
+            found[k], expected[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rtol=1e-8, atol=1e-10
+        )
 
 
-def test_a_large_matrix_that_is_ordered_by_its_blocks_has_the_same_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_matrix_that_is_ordered_by_its_blocks_has_the_same_solution(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rng = np.random.default_rng(2)
     J = kron(random(80, 40, 0.05, rng=rng) + eye(80, 40), np.ones((6, 6))).tocsr()
     J.data *= rng.normal(size=len(J.data))
-    H, b = (J.T @ J + eye(240)).tocsc()[:239, :239], rng.normal(size=(239, 3))  # the last block is a part of one
+    # the last block is a part of one
+    H, b = (J.T @ J + eye(240)).tocsc()[:239, :239], rng.normal(size=(239, 3))
     plain = sparse.factors(H, 6)(b)
     monkeypatch.setattr("vio.numerics.sparse._LARGE", 200)
     np.testing.assert_allclose(sparse.factors(H, 6)(b), plain, rtol=1e-9, atol=1e-12)
@@ -45,7 +50,14 @@ def test_errors_of_a_graph_are_as_large_as_its_covariance_says() -> None:
     fixed, values = np.arange(12) == 0, []
     for _ in range(60):
         rows = [
-            (i, j, RelativePose(se3_inverse(T[i]) @ T[j] @ se3_exp(sigma * rng.normal(size=6)), np.diag(sigma**2)))
+            (
+                i,
+                j,
+                RelativePose(
+                    se3_inverse(T[i]) @ T[j] @ se3_exp(sigma * rng.normal(size=6)),
+                    np.diag(sigma**2),
+                ),
+            )
             for i, j in pairs
         ]
         edges = Edges.of(rows[:11]), Edges.of(rows[11:])
@@ -54,4 +66,5 @@ def test_errors_of_a_graph_are_as_large_as_its_covariance_says() -> None:
         P = marginals(best, *edges, none, fixed, chosen)
         e = se3_log(se3_inverse(T[chosen]) @ best[chosen])
         values.append(np.einsum("ki,ki->k", e, np.linalg.solve(P, e[:, :, None])[:, :, 0]))
-    np.testing.assert_allclose(np.mean(values, axis=0), 6.0, atol=1.5)  # of 60 chi-squares: 6 ± 0.45
+    # of 60 chi-squares: 6 ± 0.45
+    np.testing.assert_allclose(np.mean(values, axis=0), 6.0, atol=1.5)

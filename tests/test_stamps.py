@@ -1,4 +1,6 @@
-"""Jitter of camera stamps, told from intervals that truly vary, by the gyro's rotation between the exposures."""
+"""Jitter of camera stamps, told from intervals that truly vary, by the gyro's rotation between
+the exposures.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from vio.monitor.motion import Intervals, Record, record_of
 STEP_S = 0.05
 
 
-def _record(stamps_s: FloatArray, exposures_s: FloatArray, *, rate: float = 0.6, noise_rad: float = 2e-4) -> Record:
+def _record(
+    stamps_s: FloatArray, exposures_s: FloatArray, *, rate: float = 0.6, noise_rad: float = 2e-4
+) -> Record:
     """A turn that swings about one axis, seen at exposures that carry stamps."""
     rng = np.random.default_rng(4)
     t = np.arange(0, 12, 0.005)
@@ -24,7 +28,11 @@ def _record(stamps_s: FloatArray, exposures_s: FloatArray, *, rate: float = 0.6,
     stamps_ns = np.round(stamps_s * 1e9).astype(np.int64)
     twists = np.zeros((len(turned), 6))
     twists[:, 4] = turned / np.diff(stamps_ns * 1e-9)
-    return record_of(Intervals(stamps_ns[:-1], stamps_ns[1:], twists), np.round(t * 1e9).astype(np.int64), readings)
+    return record_of(
+        Intervals(stamps_ns[:-1], stamps_ns[1:], twists),
+        np.round(t * 1e9).astype(np.int64),
+        readings,
+    )
 
 
 STEADY = 1.0 + STEP_S * np.arange(200)

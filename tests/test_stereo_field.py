@@ -45,7 +45,9 @@ from vio.runs.picture import has_calibration_panel
 
 CAMERA = replace(test_filter_truth.CAMERA, width=752, height=480)
 RECTIFIED = Rig.rectified(718.0, 715.0, 607.0, 185.0, 0.54, 1242, 375)
-OFF = np.array([0.009, -0.012, 0.006, 1e-3, -2e-3, 1e-3, -1e-3, 1e-3, -5e-4, 3e-3, -2e-3, 5e-4, -1e-3, 4e-3])
+OFF = np.array(
+    [0.009, -0.012, 0.006, 1e-3, -2e-3, 1e-3, -1e-3, 1e-3, -5e-4, 3e-3, -2e-3, 5e-4, -1e-3, 4e-3]
+)
 TURN = np.radians(0.5)
 
 
@@ -72,7 +74,9 @@ def test_rig_of_a_field_is_the_one_that_made_it(given: Rig) -> None:
     moved = frame.as_seen(found.parameters) - frame.as_seen(OFF)
     assert np.sqrt(np.mean(moved**2)) < 0.05
     assert found.left_px < 0.03
-    assert np.linalg.norm(so3_log(found.rig.T_cam1_cam0[:3, :3] @ true.T_cam1_cam0[:3, :3].T)) < 2e-3
+    assert (
+        np.linalg.norm(so3_log(found.rig.T_cam1_cam0[:3, :3] @ true.T_cam1_cam0[:3, :3].T)) < 2e-3
+    )
 
 
 def test_a_turn_is_named_and_nothing_else() -> None:
@@ -84,7 +88,9 @@ def test_a_turn_is_named_and_nothing_else() -> None:
 
 
 def test_a_turn_that_the_principal_point_takes_back_is_none() -> None:
-    """As on KITTI: 1.15 deg of yaw against 14 px of principal point leave the image's centre where it is."""
+    """As on KITTI: 1.15 deg of yaw against 14 px of principal point leave the image's centre
+    where it is.
+    """
     off = np.zeros(14)
     off[[PARAMETERS.index(name) for name in ("wy", "cu", "p2")]] = 0.02, -0.02, -5e-3
     found = calibrated_rig(RECTIFIED, _estimate(_Frame.of(RECTIFIED).coefficients(off)))
@@ -110,13 +116,17 @@ def test_what_a_lens_model_cannot_express_is_said() -> None:
 def test_baseline_and_focal_length_found_go_into_the_rig(given: Rig) -> None:
     """A pixel's ray comes nearer to the axis by the focal length's factor, whatever the lens."""
     scale = StereoScaleEstimate(np.log([1.03, 0.95]), np.diag([4e-6, 1e-6]))
-    found = calibrated_rig(given, replace(_estimate(np.zeros(15)), stereo_field=None, stereo_scale=scale))
+    found = calibrated_rig(
+        given, replace(_estimate(np.zeros(15)), stereo_field=None, stereo_scale=scale)
+    )
     np.testing.assert_allclose(found.rig.T_cam1_cam0[:3, 3], 1.03 * given.T_cam1_cam0[:3, 3])
     np.testing.assert_array_equal(found.rig.T_cam1_cam0[:3, :3], given.T_cam1_cam0[:3, :3])
     rays = np.stack([*np.random.default_rng(0).uniform(-0.3, 0.3, (2, 50)), np.ones(50)], axis=1)
     for lens, before in ((found.rig.cam0, given.cam0), (found.rig.cam1, given.cam1)):
         np.testing.assert_allclose(
-            project_point(lens, rays / [0.95, 0.95, 1.0])[0], project_point(before, rays)[0], atol=1e-9
+            project_point(lens, rays / [0.95, 0.95, 1.0])[0],
+            project_point(before, rays)[0],
+            atol=1e-9,
         )
     assert found.lines() == ("baseline off by +3.00 ± 0.20 %", "focal length off by -5.00 ± 0.10 %")
 
@@ -152,10 +162,13 @@ def test_pixels_and_images_lose_the_field() -> None:
     np.testing.assert_array_equal(left_only[:, 2:], seen[:, 2:])
 
     (u0, v0), (u1, v1) = field.maps()
-    image = np.stack(np.meshgrid(np.arange(1242), np.arange(375)), axis=-1).astype(np.float32)  # shows its own pixels
+    # shows its own pixels
+    image = np.stack(np.meshgrid(np.arange(1242), np.arange(375)), axis=-1).astype(np.float32)
     warped = [cv2.remap(image, u, v, cv2.INTER_LINEAR) for u, v in ((u0, v0), (u1, v1))]
     inner = grid[(np.abs(grid[:, 0] - 621) < 500) & (np.abs(grid[:, 1] - 187) < 150)].astype(int)
-    shown = np.concatenate([warped[0][inner[:, 1], inner[:, 0]], warped[1][inner[:, 1], inner[:, 0]]], axis=1)
+    shown = np.concatenate(
+        [warped[0][inner[:, 1], inner[:, 0]], warped[1][inner[:, 1], inner[:, 0]]], axis=1
+    )
     back = field.without(shown.astype(np.float64), np.ones(len(shown), dtype=np.bool_))
     np.testing.assert_allclose(back[:, :3], inner[:, :3], atol=0.15)
 
@@ -166,7 +179,9 @@ def test_pixels_and_images_lose_the_field() -> None:
 @pytest.fixture(scope="module")
 def turned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Observations of 3 s with the right camera yawed by half a degree."""
-    course = Course(20, 3.0, velocity=(0.5, 0.3, 0.0), depth=(3.0, 12.0), pixel_sigma_px=0.15, features=100)
+    course = Course(
+        20, 3.0, velocity=(0.5, 0.3, 0.0), depth=(3.0, 12.0), pixel_sigma_px=0.15, features=100
+    )
     rng = np.random.default_rng(0)
     seen = [course.observe(k, rng) for k in range(course.frames)]
     seen = [replace(o, z=_turned_right(o.z, CAMERA, np.array([0.0, TURN, 0.0]))) for o in seen]
@@ -185,14 +200,33 @@ def _write(path: Path, camera: StereoCamera, seen: list[Observations]) -> None:
 def ran(turned: Path) -> Path:
     """Folder of the first run, with its calibration."""
     out = turned.parent / "first"
-    assert main(["run", str(turned), "--save-calibration", "--save-observations", "--out", str(out), "--quiet"]) == 0
+    assert (
+        main(
+            [
+                "run",
+                str(turned),
+                "--save-calibration",
+                "--save-observations",
+                "--out",
+                str(out),
+                "--quiet",
+            ]
+        )
+        == 0
+    )
     return out
 
 
-def test_the_next_run_from_a_saved_calibration_has_nothing_to_correct(turned: Path, ran: Path) -> None:
-    """Rows within 0.25 px, the field within three standard deviations of zero, right after the first run's file."""
+def test_the_next_run_from_a_saved_calibration_has_nothing_to_correct(
+    turned: Path, ran: Path
+) -> None:
+    """Rows within 0.25 px, the field within three standard deviations of zero, right after the
+    first run's file.
+    """
     text = (ran / "camchain-imucam.yaml").read_text()
-    angle, sigma = re.findall(r"# right camera turned by (\S+) ± (\S+) deg about its vertical axis", text)[0]
+    angle, sigma = re.findall(
+        r"# right camera turned by (\S+) ± (\S+) deg about its vertical axis", text
+    )[0]
     assert abs(float(angle) - 0.5) < 2 * float(sigma) < 0.2
     rig = vio.load_rig(ran / "camchain-imucam.yaml")
     pair = rectified_cameras(rig.stereo)
@@ -216,16 +250,26 @@ def test_the_next_run_from_a_saved_calibration_has_nothing_to_correct(turned: Pa
 
 
 @pytest.mark.parametrize("residual_px", [0.0, 0.4])
-def test_what_a_saved_calibration_leaves_widens_the_prior_of_the_lenses(tmp_path: Path, residual_px: float) -> None:
-    """Its rows agree, so that only the file can tell: a run that trusted it was worse than the one that wrote it."""
+def test_what_a_saved_calibration_leaves_widens_the_prior_of_the_lenses(
+    tmp_path: Path, residual_px: float
+) -> None:
+    """Its rows agree, so that only the file can tell: a run that trusted it was worse than the
+    one that wrote it.
+    """
     rig = replace(RECTIFIED, residual_px=residual_px)
     file = tmp_path / "camchain-imucam.yaml"
     file.write_text(kalibr_text(rig))
     read = vio.load_rig(file)
     assert read.camera.residual_px == read.rectifier().camera.residual_px == residual_px
-    course = Course(20, 0.3, velocity=(0.5, 0.3, 0.0), depth=(3.0, 12.0), pixel_sigma_px=0.1, features=60)
+    course = Course(
+        20, 0.3, velocity=(0.5, 0.3, 0.0), depth=(3.0, 12.0), pixel_sigma_px=0.1, features=60
+    )
     rng, path = np.random.default_rng(0), tmp_path / "log.npz"
-    _write(path, replace(CAMERA, residual_px=residual_px), [course.observe(k, rng) for k in range(course.frames)])
+    _write(
+        path,
+        replace(CAMERA, residual_px=residual_px),
+        [course.observe(k, rng) for k in range(course.frames)],
+    )
     result = vio.run(vio.open_dataset(path), load_config())
     field = result.estimates[0].stereo_field
     sigma = np.sqrt(field.covariance[3, 3])
@@ -256,12 +300,18 @@ def test_a_live_user_gets_the_calibrated_rig(turned: Path) -> None:
 def test_picture_shows_a_calibration_that_moved(turned: Path) -> None:
     result = vio.run(vio.open_dataset(turned), load_config(), stop=20)
     assert has_calibration_panel(result)
-    off = vio.run(vio.open_dataset(turned), load_config(overrides=['msckf.calibrate_stereo="off"']), stop=5)
+    off = vio.run(
+        vio.open_dataset(turned), load_config(overrides=['msckf.calibrate_stereo="off"']), stop=5
+    )
     assert not has_calibration_panel(off)
 
 
-def test_check_refine_and_export_take_the_calibration_of_the_run(ran: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The turn moves right rows by up to 1.4 px; tracks and images that later commands read are without it."""
+def test_check_refine_and_export_take_the_calibration_of_the_run(
+    ran: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The turn moves right rows by up to 1.4 px; tracks and images that later commands read are
+    without it.
+    """
     run = read_saved_run(ran)
     rows = [t.z[t.has_right] @ [0, -1, 0, 1] for t in (run.dataset.tracks, run.tracked.tracks)]
     before, after = (float(np.sqrt(np.mean(r**2))) for r in rows)
@@ -289,7 +339,9 @@ def test_metrics_of_earlier_runs_have_no_field(ran: Path, tmp_path: Path) -> Non
     metrics = json.loads((ran / "metrics.json").read_text())
     for name in ("observations.npz", "trajectory.tum"):
         (tmp_path / name).write_bytes((ran / name).read_bytes())
-    (tmp_path / "metrics.json").write_text(json.dumps({**metrics, "stereo_field": {"rows_rms_px": 0.3}}))
+    (tmp_path / "metrics.json").write_text(
+        json.dumps({**metrics, "stereo_field": {"rows_rms_px": 0.3}})
+    )
     assert read_saved_run(tmp_path).field is None
     damaged = {**metrics["stereo_field"], "rows_px": [1.0, 2.0]}
     (tmp_path / "metrics.json").write_text(json.dumps({**metrics, "stereo_field": damaged}))
@@ -305,7 +357,9 @@ def test_a_file_that_cannot_be_written_is_refused_before_the_run(
     name: str, message: str, turned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert message in refused(capsys, "run", turned, "--save-calibration", tmp_path / name, "--out", out)
+    assert message in refused(
+        capsys, "run", turned, "--save-calibration", tmp_path / name, "--out", out
+    )
     assert not out.exists()
 
 
@@ -315,16 +369,29 @@ def test_features_without_an_image_size_have_no_calibration_to_save(
     course, rng = Course(20, 0.2), np.random.default_rng(0)
     sizeless = replace(CAMERA, width=None, height=None)
     _write(tmp_path / "log.npz", sizeless, [course.observe(k, rng) for k in range(4)])
-    assert main(["run", str(tmp_path / "log.npz"), "--save-calibration", "--out", str(tmp_path / "out")]) == 1
-    assert "states no image size, which a calibration needs; leave --save-calibration out" in capsys.readouterr().err
+    assert (
+        main(
+            ["run", str(tmp_path / "log.npz"), "--save-calibration", "--out", str(tmp_path / "out")]
+        )
+        == 1
+    )
+    assert (
+        "states no image size, which a calibration needs; leave --save-calibration out"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("bend", [-0.5, -1.0])
 def test_a_field_that_no_rig_has_is_refused(bend: float) -> None:
-    """Half or all of a radian over the image: the fit leaves the possible rigs, or misses the field by 1e5 px."""
+    """Half or all of a radian over the image: the fit leaves the possible rigs, or misses the
+    field by 1e5 px.
+    """
     field = np.array([0.0] * 4 + [bend] + [0.0] * 10)
-    with pytest.raises(CalibrationError, match=r"^made: no rig .* \(rows by 0\.30 px rms\); .* calibrate the cameras"):
+    with pytest.raises(
+        CalibrationError,
+        match=r"^made: no rig .* \(rows by 0\.30 px rms\); .* calibrate the cameras",
+    ):
         estimated_rig(RECTIFIED, _estimate(field), CAMERA, "made")
 
 
@@ -332,11 +399,21 @@ def test_results_are_written_where_no_rig_has_the_field_that_was_found(
     ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def without_rig(*_: object) -> None:
-        raise CalibrationError("focal lengths and image size must be positive, got fu=-4e10, fv=-4e11, 752x480")
+        raise CalibrationError(
+            "focal lengths and image size must be positive, got fu=-4e10, fv=-4e11, 752x480"
+        )
 
     monkeypatch.setattr("vio.calibration.stereo_field._with_field", without_rig)
     out = tmp_path / "out"
-    arguments = ["run", str(ran / "observations.npz"), "--stop", "20", "--save-calibration", "--out", str(out)]
+    arguments = [
+        "run",
+        str(ran / "observations.npz"),
+        "--stop",
+        "20",
+        "--save-calibration",
+        "--out",
+        str(out),
+    ]
     assert main([*arguments, "--quiet"]) == 1
     assert "no calibration was saved, all other results were" in capsys.readouterr().err
     metrics = json.loads((out / "metrics.json").read_text())
@@ -347,6 +424,8 @@ def test_results_are_written_where_no_rig_has_the_field_that_was_found(
 
 
 def test_pixel_field_of_an_estimate_without_rows_has_none() -> None:
-    field = DisplacementField.of(CAMERA, StereoFieldEstimate(np.array([1e-3, *[0.0] * 7]), np.eye(8)))
+    field = DisplacementField.of(
+        CAMERA, StereoFieldEstimate(np.array([1e-3, *[0.0] * 7]), np.eye(8))
+    )
     moved = field.at(np.array([[300.0, 100.0, 290.0, 100.0]]))
     np.testing.assert_allclose(moved, [[0, 0, 1e-3 * CAMERA.fu, 0]], atol=1e-12)

@@ -57,7 +57,9 @@ def test_triangulate_undoes_project(seen: tuple[StereoCamera, FloatArray]) -> No
 def test_left_rays_lead_to_the_points(seen: tuple[StereoCamera, FloatArray]) -> None:
     camera, p = seen
     pixels, depth = np.broadcast_to(project(camera, p)[:2], (2, 3, 2)), depth_of(camera, p)
-    np.testing.assert_allclose(left_rays(camera, pixels) * depth, np.broadcast_to(p, (2, 3, 3)), rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(
+        left_rays(camera, pixels) * depth, np.broadcast_to(p, (2, 3, 3)), rtol=1e-8, atol=1e-8
+    )
 
 
 @properties
@@ -79,7 +81,9 @@ def test_project_is_two_pinholes_a_baseline_apart(camera: StereoCamera, p: Float
 @given(both)
 def test_z_D_p_cam_equals_central_differences(seen: tuple[StereoCamera, FloatArray]) -> None:
     camera, p = seen
-    numeric = numeric_jacobian(lambda x: project(camera, x), p, eps=1e-5 * float(depth_of(camera, p)))
+    numeric = numeric_jacobian(
+        lambda x: project(camera, x), p, eps=1e-5 * float(depth_of(camera, p))
+    )
     analytic = z_D_p_cam(camera, p)
     np.testing.assert_allclose(analytic, numeric, rtol=1e-6, atol=1e-6 * np.abs(analytic).max())
 
@@ -96,7 +100,9 @@ def test_derivatives_of_rows_and_depths_equal_central_differences(name: Projecti
     np.testing.assert_allclose(
         [rows.depth_D_yz(y, z, depth)], numeric_jacobian(lambda at: rows.depth(*at), yz), atol=1e-8
     )
-    np.testing.assert_allclose([rows.row_D_yz(y, z, depth, 300.0)], numeric_jacobian(row, yz), atol=1e-5)
+    np.testing.assert_allclose(
+        [rows.row_D_yz(y, z, depth, 300.0)], numeric_jacobian(row, yz), atol=1e-5
+    )
     numeric = numeric_jacobian(lambda at: np.stack(rows.ray(at[0])), np.array([0.7]))
     np.testing.assert_allclose(np.array([rows.ray_D_row(np.float64(0.7))]).T, numeric, atol=1e-8)
 
@@ -107,14 +113,18 @@ def test_p_cam_D_z_equals_central_differences(seen: tuple[StereoCamera, FloatArr
     camera, p = seen
     z = project(camera, p)
     eps = 1e-5 * (z[0] - z[2])
-    numeric = numeric_jacobian(lambda x: triangulate(camera, x[None], min_disparity_px=1e-6)[0][0], z, eps=eps)
+    numeric = numeric_jacobian(
+        lambda x: triangulate(camera, x[None], min_disparity_px=1e-6)[0][0], z, eps=eps
+    )
     analytic = p_cam_D_z(camera, z)
     np.testing.assert_allclose(analytic, numeric, rtol=1e-6, atol=1e-6 * np.abs(analytic).max())
 
 
 @properties
 @given(both)
-def test_the_two_jacobians_are_inverse_on_the_image_of_a_point(seen: tuple[StereoCamera, FloatArray]) -> None:
+def test_the_two_jacobians_are_inverse_on_the_image_of_a_point(
+    seen: tuple[StereoCamera, FloatArray],
+) -> None:
     camera, p = seen
     product = p_cam_D_z(camera, project(camera, p)) @ z_D_p_cam(camera, p)
     np.testing.assert_allclose(product, np.eye(3), atol=1e-7)
@@ -122,15 +132,23 @@ def test_the_two_jacobians_are_inverse_on_the_image_of_a_point(seen: tuple[Stere
 
 @properties
 @given(cylinders, around)
-def test_a_cylinder_is_the_pinhole_turned_about_the_baseline_to_each_row(camera: StereoCamera, p: FloatArray) -> None:
-    """Columns are those of the turned pinhole exactly, also beyond 90 degrees; the row is its middle row."""
+def test_a_cylinder_is_the_pinhole_turned_about_the_baseline_to_each_row(
+    camera: StereoCamera, p: FloatArray
+) -> None:
+    """Columns are those of the turned pinhole exactly, also beyond 90 degrees; the row is its
+    middle row.
+    """
     z, pinhole = project(camera, p), replace(camera, projection="pinhole")
     pixels, turned = facing(camera, z[None, :2], p[None])
-    np.testing.assert_allclose(project(pinhole, turned[0]), [z[0], camera.cv, z[2], camera.cv], rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(
+        project(pinhole, turned[0]), [z[0], camera.cv, z[2], camera.cv], rtol=1e-9, atol=1e-6
+    )
     np.testing.assert_allclose(pixels, [[z[0], camera.cv]], rtol=1e-12)
     assert turned[0, 2] > 0
     ahead = np.array([p[0], 0.0, np.hypot(p[1], p[2])])
-    np.testing.assert_allclose(project(camera, ahead), project(pinhole, ahead), rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(
+        project(camera, ahead), project(pinhole, ahead), rtol=1e-9, atol=1e-6
+    )
 
 
 @properties
@@ -143,11 +161,15 @@ def test_a_pinhole_faces_ahead(camera: StereoCamera, p: FloatArray) -> None:
 
 @pytest.fixture
 def camera() -> StereoCamera:
-    return StereoCamera(fu=700.0, fv=690.0, cu=600.0, cv=180.0, baseline_m=0.54, width=1242, height=375)
+    return StereoCamera(
+        fu=700.0, fv=690.0, cu=600.0, cv=180.0, baseline_m=0.54, width=1242, height=375
+    )
 
 
 def test_hand_computed_pixels(camera: StereoCamera) -> None:
-    np.testing.assert_allclose(project(camera, [1.0, -2.0, 10.0]), [670.0, 42.0, 670.0 - 37.8, 42.0], atol=1e-12)
+    np.testing.assert_allclose(
+        project(camera, [1.0, -2.0, 10.0]), [670.0, 42.0, 670.0 - 37.8, 42.0], atol=1e-12
+    )
 
 
 def test_batches_equal_single_calls(camera: StereoCamera) -> None:

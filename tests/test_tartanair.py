@@ -13,12 +13,19 @@ import pytest
 
 from vio.datasets.images import load_gray
 from vio.frontend import FrontendSettings, build_frontend
-from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, se3_inverse, transform_points
+from vio.geometry.lie import (
+    FloatArray,
+    rotation_from_quat_xyzw,
+    se3_from_parts,
+    se3_inverse,
+    transform_points,
+)
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, FrontendOutput, StereoFrame
 
-# Pixel centres are at integer coordinates, so the principal point of the 640x640 images is at 319.5: with it, flow
-# computed from depth and poses agrees with the flow of the files up to rounding.
+# Pixel centres are at integer coordinates, so the principal point of the 640x640 images is at
+# 319.5: with it, flow computed from depth and poses agrees with the flow of the files up to
+# rounding.
 CAMERA = StereoCamera(320.0, 320.0, 319.5, 319.5, 0.25, 640, 640)
 FLOW_STEP_PX = 1 / 64  # of the 16-bit values in the files, with an offset of 32768
 VISIBLE = 0  # in the third channel of a flow file; other values: occluded or outside the next image
@@ -46,7 +53,10 @@ def clip(data_dir: Path) -> Clip:
         StereoFrame(k, k * 100_000_000, *(load_gray(path)[0] for path in pair))
         for k, pair in enumerate(zip(*images, strict=True))
     ]
-    depth = [_png(path).view("<f4")[..., 0].astype(float) for path in sorted((folder / "depth_lcam_front").glob("*"))]
+    depth = [
+        _png(path).view("<f4")[..., 0].astype(float)
+        for path in sorted((folder / "depth_lcam_front").glob("*"))
+    ]
     encoded = [_png(path) for path in sorted((folder / "flow_lcam_front").glob("*"))]
     poses = np.loadtxt(folder / "pose_lcam_front.txt")
     T = se3_from_parts(rotation_from_quat_xyzw(poses[:, 3:]) @ R_BODY_CAM, poses[:, :3])
@@ -68,8 +78,12 @@ def outputs(clip: Clip) -> list[FrontendOutput]:
 
 
 def moved(clip: Clip, k: int, uv: FloatArray, depth: FloatArray) -> FloatArray:
-    """Pixels (N, 2) in the next left image of pixels (N, 2) with depths (N,) in this one, from the poses."""
-    rays = np.concatenate([(uv - [CAMERA.cu, CAMERA.cv]) / CAMERA.fu, np.ones((len(uv), 1))], axis=1)
+    """Pixels (N, 2) in the next left image of pixels (N, 2) with depths (N,) in this one, from
+    the poses.
+    """
+    rays = np.concatenate(
+        [(uv - [CAMERA.cu, CAMERA.cv]) / CAMERA.fu, np.ones((len(uv), 1))], axis=1
+    )
     T = se3_inverse(clip.T_world_cam[k + 1]) @ clip.T_world_cam[k]
     p = transform_points(T, rays * depth[:, None])
     out: FloatArray = p[:, :2] / p[:, 2:] * CAMERA.fu + [CAMERA.cu, CAMERA.cv]
@@ -79,7 +93,9 @@ def moved(clip: Clip, k: int, uv: FloatArray, depth: FloatArray) -> FloatArray:
 def at(dense: FloatArray, uv: FloatArray) -> FloatArray:
     """Bilinear values (N, ...) of a dense field at pixels (N, 2)."""
     u, v = uv.astype(np.float32).T
-    return np.asarray(cv2.remap(dense.astype(np.float32), u[None], v[None], cv2.INTER_LINEAR)[0], dtype=np.float64)
+    return np.asarray(
+        cv2.remap(dense.astype(np.float32), u[None], v[None], cv2.INTER_LINEAR)[0], dtype=np.float64
+    )
 
 
 def smooth(clip: Clip, k: int, uv: FloatArray) -> BoolArray:
@@ -104,9 +120,11 @@ def test_flow_and_depth_agree_with_the_poses(clip: Clip) -> None:
 
 
 def test_temporal_tracks_follow_the_true_flow(clip: Clip, outputs: list[FrontendOutput]) -> None:
-    """Measured: median 0.154 px, 95 % below 0.40, none of a thousand above 1 px; at depth edges, 7 % above 1 px.
+    """Measured: median 0.154 px, 95 % below 0.40, none of a thousand above 1 px; at depth edges, 7
+    % above 1 px.
 
-    This is three times the error on our own rendered images: the game engine adds aliasing and specular surfaces.
+    This is three times the error on our own rendered images: the game engine adds aliasing and
+    specular surfaces.
     """
     errors, everywhere = [], []
     for k, (a, b) in enumerate(pairwise(outputs)):
@@ -124,7 +142,9 @@ def test_temporal_tracks_follow_the_true_flow(clip: Clip, outputs: list[Frontend
     assert _figures(everywhere)[3] < 0.12
 
 
-def disparity_errors(clip: Clip, outputs: list[FrontendOutput]) -> tuple[list[FloatArray], list[FloatArray]]:
+def disparity_errors(
+    clip: Clip, outputs: list[FrontendOutput]
+) -> tuple[list[FloatArray], list[FloatArray]]:
     """Errors (N,) in each frame, measured minus true, on smooth surfaces and everywhere."""
     errors, everywhere = [], []
     for k, output in enumerate(outputs):
@@ -138,7 +158,9 @@ def disparity_errors(clip: Clip, outputs: list[FrontendOutput]) -> tuple[list[Fl
 
 
 def test_disparities_follow_the_true_depth(clip: Clip, outputs: list[FrontendOutput]) -> None:
-    """Measured: median 0.120 px (0.097 of it is a bias of the clip), 95 % below 0.33; at edges, 7 % above 1 px."""
+    """Measured: median 0.120 px (0.097 of it is a bias of the clip), 95 % below 0.33; at edges,
+    7 % above 1 px.
+    """
     errors, everywhere = disparity_errors(clip, outputs)
     count, median, most, outliers = _figures(errors)
     assert count > 1200
@@ -149,7 +171,9 @@ def test_disparities_follow_the_true_depth(clip: Clip, outputs: list[FrontendOut
 
 
 def test_disparity_bias_is_that_of_the_clip(clip: Clip, outputs: list[FrontendOutput]) -> None:
-    """The right images are shifted left by 0.08 to 0.12 px against depth, as a fit to all smooth pixels shows."""
+    """The right images are shifted left by 0.08 to 0.12 px against depth, as a fit to all smooth
+    pixels shows.
+    """
     errors, _ = disparity_errors(clip, outputs)
     found = [float(np.median(error)) for error in errors]
     fitted = [_dense_shift(clip, k) for k in range(len(clip.frames))]
@@ -159,17 +183,23 @@ def test_disparity_bias_is_that_of_the_clip(clip: Clip, outputs: list[FrontendOu
 
 
 def test_matches_are_on_one_row(outputs: list[FrontendOutput]) -> None:
-    rows = np.concatenate([o.observations.z[o.observations.has_right] @ [0.0, 1.0, 0.0, -1.0] for o in outputs])
+    rows = np.concatenate(
+        [o.observations.z[o.observations.has_right] @ [0.0, 1.0, 0.0, -1.0] for o in outputs]
+    )
     assert abs(np.median(rows)) < 0.05
     assert np.median(np.abs(rows)) < 0.15
 
 
 def _dense_shift(clip: Clip, k: int) -> float:
-    """Mean disparity bias of all smooth pixels: one least-squares step, without features or windows."""
+    """Mean disparity bias of all smooth pixels: one least-squares step, without features or
+    windows.
+    """
     v, u = np.mgrid[0:640, 0:640].astype(np.float32)
     disparity = (CAMERA.fu * CAMERA.baseline_m / clip.depth[k]).astype(np.float32)
     left, right = clip.frames[k].left, clip.frames[k].right
-    warped = cv2.GaussianBlur(cv2.remap(right, u - disparity, v, cv2.INTER_CUBIC).astype(np.float64), (0, 0), 1)
+    warped = cv2.GaussianBlur(
+        cv2.remap(right, u - disparity, v, cv2.INTER_CUBIC).astype(np.float64), (0, 0), 1
+    )
     difference = cv2.GaussianBlur(left.astype(np.float64), (0, 0), 1) - warped
     slope = cv2.Sobel(warped, cv2.CV_64F, 1, 0) / 8
     near, far = (f(clip.depth[k], np.ones((7, 7), np.uint8)) for f in (cv2.erode, cv2.dilate))
@@ -181,4 +211,9 @@ def _dense_shift(clip: Clip, k: int) -> float:
 def _figures(parts: list[FloatArray]) -> tuple[int, float, float, float]:
     """Count, median, 95 % and the share above 1 px."""
     error = np.abs(np.concatenate(parts))
-    return len(error), float(np.median(error)), float(np.percentile(error, 95)), float(np.mean(error > 1))
+    return (
+        len(error),
+        float(np.median(error)),
+        float(np.percentile(error, 95)),
+        float(np.mean(error > 1)),
+    )

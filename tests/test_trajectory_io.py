@@ -1,4 +1,6 @@
-"""Trajectory files and atomic writes: exact round trips, compatibility with evo, every kind of bad file."""
+"""Trajectory files and atomic writes: exact round trips, compatibility with evo, every kind of
+bad file.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +25,14 @@ EUROC_HEADER = "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z
 TUM_ROW = "0 0 0 0 0 0 1"
 KITTI_ROW = "1 0 0 0 0 1 0 0 0 0 1 0"
 
-properties = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+properties = settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 
-def make(n: int = 20, *, seed: int = 0, body: str = "imu", start_ns: int = 1_403_715_273_262_142_976) -> Trajectory:
+def make(
+    n: int = 20, *, seed: int = 0, body: str = "imu", start_ns: int = 1_403_715_273_262_142_976
+) -> Trajectory:
     rng = np.random.default_rng(seed)
     T = np.tile(np.eye(4), (n, 1, 1))
     T[:, :3, :3] = so3_exp(rng.normal(size=(n, 3)))
@@ -48,7 +54,9 @@ def write(path: Path, text: str) -> Path:
     st.lists(st.integers(-(2**63) + 1, 2**63 - 1), min_size=1, max_size=8, unique=True).map(sorted),
     st.lists(st.floats(-1e9, 1e9), min_size=24, max_size=24),
 )
-def test_tum_round_trip_is_exact_in_time_and_position(tmp_path: Path, times: list[int], xyz: list[float]) -> None:
+def test_tum_round_trip_is_exact_in_time_and_position(
+    tmp_path: Path, times: list[int], xyz: list[float]
+) -> None:
     trajectory = replace(make(len(times)), times_ns=np.array(times, dtype=np.int64))
     trajectory.T_world_body[:, :3, 3] = np.reshape(xyz, (8, 3))[: len(times)]
     write_tum(tmp_path / "t.tum", trajectory)
@@ -60,7 +68,9 @@ def test_tum_round_trip_is_exact_in_time_and_position(tmp_path: Path, times: lis
 
 @pytest.mark.parametrize("body", ["imu", "cam0"])
 @pytest.mark.parametrize("frames", [None, [0, 1, 2, 3], [5, 6, 9, 20], [0, 2, 4, 6]])
-def test_tum_carries_body_and_frame_numbers(tmp_path: Path, body: str, frames: list[int] | None) -> None:
+def test_tum_carries_body_and_frame_numbers(
+    tmp_path: Path, body: str, frames: list[int] | None
+) -> None:
     numbers = None if frames is None else np.array(frames, dtype=np.int64)
     trajectory = replace(make(4, body=body), frame_indices=numbers)
     write_tum(tmp_path / "t.tum", trajectory)
@@ -102,7 +112,9 @@ def test_writes_an_empty_trajectory_and_rejects_reading_it(tmp_path: Path) -> No
         ("9223372035.999999999", 9223372035999999999),
     ],
 )
-def test_tum_times_are_read_from_the_decimal_text(tmp_path: Path, text: str, expected_ns: int) -> None:
+def test_tum_times_are_read_from_the_decimal_text(
+    tmp_path: Path, text: str, expected_ns: int
+) -> None:
     times = read_trajectory(write(tmp_path / "t.txt", f"{text} {TUM_ROW}\n")).times_ns
     assert times.tolist() == [expected_ns]
 
@@ -110,7 +122,10 @@ def test_tum_times_are_read_from_the_decimal_text(tmp_path: Path, text: str, exp
 def test_euroc_quaternions_are_w_first_and_describe_the_imu(tmp_path: Path) -> None:
     R = Rotation.from_rotvec([0.1, -0.7, 2.0])
     x, y, z, w = R.as_quat().tolist()
-    rows = [f"{t},1.5,-2,3,{w!r},{x!r},{y!r},{z!r},0,0,0" for t in (1403715273262142976, 1403715273267143168)]
+    rows = [
+        f"{t},1.5,-2,3,{w!r},{x!r},{y!r},{z!r},0,0,0"
+        for t in (1403715273262142976, 1403715273267143168)
+    ]
     trajectory = read_trajectory(write(tmp_path / "data.csv", EUROC_HEADER + "\r\n".join(rows)))
     assert trajectory.body == "imu"
     assert trajectory.times_ns.tolist() == [1403715273262142976, 1403715273267143168]
@@ -128,7 +143,9 @@ def test_accepts_bom_tabs_blank_lines_and_comments(tmp_path: Path, text: str) ->
 # The body
 
 
-def test_the_body_argument_overrides_the_file_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_body_argument_overrides_the_file_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = write(tmp_path / "t.txt", f"# body: cam0\n1 {TUM_ROW}\n")
     assert read_trajectory(path).body == "cam0"
     assert read_trajectory(path, body="cam0").body == "cam0"
@@ -145,7 +162,9 @@ def test_rejects_writing_imu_poses_as_kitti(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_kitti_form_warns_when_rows_are_not_frames(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_kitti_form_warns_when_rows_are_not_frames(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     write_kitti(tmp_path / "a", replace(make(3, body="cam0"), frame_indices=np.arange(3)))
     assert not caplog.records
     write_kitti(tmp_path / "b", replace(make(3, body="cam0"), frame_indices=np.array([10, 11, 13])))
@@ -161,7 +180,9 @@ def test_kitti_form_warns_when_rows_are_not_frames(tmp_path: Path, caplog: pytes
 
 @pytest.mark.parametrize("steps", [[2], [1], [3, 3, 2], [1, 2, 1, 5], [2, 2, 1]])
 def test_frame_numbers_come_back(steps: list[int], tmp_path: Path) -> None:
-    """As comments of any length before the first row, and such a file is told from others by its first row."""
+    """As comments of any length before the first row, and such a file is told from others by its
+    first row.
+    """
     frames = np.cumsum(np.resize(steps, 4000))
     trajectory = replace(make(4000), frame_indices=frames)
     write_tum(tmp_path / "t.tum", trajectory)
@@ -197,39 +218,107 @@ def test_a_rounded_quaternion_is_normalised(tmp_path: Path) -> None:
 BAD = {
     "nan": (f"1 {TUM_ROW}\n2 nan 0 0 0 0 0 1\n", None, "line 2: a pose is not finite.*remove"),
     "infinite": (f"1 {TUM_ROW}\n2 0 inf 0 0 0 0 1\n", None, "line 2: a pose is not finite"),
-    "text": (f"1 {TUM_ROW}\n2 0 0 zero 0 0 0 1\n", None, "line 2: could not convert.*'zero'.*numbers"),
-    "missing column": (f"1 {TUM_ROW}\n2 0 0 0 0 0 1\n", None, "line 2: 7 columns instead of 8; tum form has"),
+    "text": (
+        f"1 {TUM_ROW}\n2 0 0 zero 0 0 0 1\n",
+        None,
+        "line 2: could not convert.*'zero'.*numbers",
+    ),
+    "missing column": (
+        f"1 {TUM_ROW}\n2 0 0 0 0 0 1\n",
+        None,
+        "line 2: 7 columns instead of 8; tum form has",
+    ),
     "unknown form": ("1 2 3\n", None, "line 1: 3 columns fit no known format.*tum.*kitti.*euroc"),
-    "comments count": (f"# one\n\n1 {TUM_ROW}\n# four\n1.5 0 0 0 0 0 1\n", None, "line 5: 7 columns"),
+    "comments count": (
+        f"# one\n\n1 {TUM_ROW}\n# four\n1.5 0 0 0 0 0 1\n",
+        None,
+        "line 5: 7 columns",
+    ),
     "time repeats": (f"1 {TUM_ROW}\n1.0 {TUM_ROW}\n", None, "line 2: the clock repeats.*reorder"),
-    "time backwards": (f"2 {TUM_ROW}\n1 {TUM_ROW}\n", None, "line 2: the clock runs backwards.*reorder"),
+    "time backwards": (
+        f"2 {TUM_ROW}\n1 {TUM_ROW}\n",
+        None,
+        "line 2: the clock runs backwards.*reorder",
+    ),
     "time not a number": (f"one {TUM_ROW}\n", None, "line 1: 'one' is no time"),
     "time nan": (f"nan {TUM_ROW}\n", None, "line 1: 'nan' is no time"),
     "time huge": (f"1e999999999 {TUM_ROW}\n", None, "line 1: .* is out of range for a time"),
-    "time in ns": (f"1403715273262142976 {TUM_ROW}\n", None, "is out of range for a time; divide nanoseconds by 1e9"),
-    "quaternion norm": (f"1 {TUM_ROW}\n2 0 0 0 0 0 0 1.1\n", None, "line 2: the quaternion has norm 1.1.*column order"),
+    "time in ns": (
+        f"1403715273262142976 {TUM_ROW}\n",
+        None,
+        "is out of range for a time; divide nanoseconds by 1e9",
+    ),
+    "quaternion norm": (
+        f"1 {TUM_ROW}\n2 0 0 0 0 0 0 1.1\n",
+        None,
+        "line 2: the quaternion has norm 1.1.*column order",
+    ),
     "quaternion zero": ("1 0 0 0 0 0 0 0\n", None, "line 1: the quaternion has norm 0, not 1"),
     "quaternion huge": ("1 0 0 0 0 0 0 1e300\n", None, "line 1: a pose is not finite, or beyond"),
-    "unknown body": (f"# body: left_wing\n1 {TUM_ROW}\n", None, "names the body 'left_wing'; use '# body: imu'"),
-    "frames: too many": (f"# frames: 0-999999999\n1 {TUM_ROW}\n", None, "does not number its 1 poses"),
+    "unknown body": (
+        f"# body: left_wing\n1 {TUM_ROW}\n",
+        None,
+        "names the body 'left_wing'; use '# body: imu'",
+    ),
+    "frames: too many": (
+        f"# frames: 0-999999999\n1 {TUM_ROW}\n",
+        None,
+        "does not number its 1 poses",
+    ),
     "frames: text": (f"# frames: all\n1 {TUM_ROW}\n", None, "does not number its 1 poses"),
-    "frames: backwards": (f"# frames: 5-5 2-2\n1 {TUM_ROW}\n2 {TUM_ROW}\n", None, "does not number its 2 poses"),
-    "kitti not orthonormal": (f"{KITTI_ROW}\n1.01 0 0 0 0 1 0 0 0 0 1 0\n", None, "line 2: .*off orthonormal by 0.02"),
+    "frames: backwards": (
+        f"# frames: 5-5 2-2\n1 {TUM_ROW}\n2 {TUM_ROW}\n",
+        None,
+        "does not number its 2 poses",
+    ),
+    "kitti not orthonormal": (
+        f"{KITTI_ROW}\n1.01 0 0 0 0 1 0 0 0 0 1 0\n",
+        None,
+        "line 2: .*off orthonormal by 0.02",
+    ),
     "kitti mirrored": ("1 0 0 0 0 1 0 0 0 0 -1 0\n", None, "line 1: the rotation mirrors"),
-    "kitti huge": ("1e300 0 0 0 0 1 0 0 0 0 1 0\n", None, "line 1: a pose is not finite, or beyond"),
-    "kitti nan": (f"{KITTI_ROW}\nnan 0 0 0 0 1 0 0 0 0 1 0\n", None, "line 2: a pose is not finite"),
+    "kitti huge": (
+        "1e300 0 0 0 0 1 0 0 0 0 1 0\n",
+        None,
+        "line 1: a pose is not finite, or beyond",
+    ),
+    "kitti nan": (
+        f"{KITTI_ROW}\nnan 0 0 0 0 1 0 0 0 0 1 0\n",
+        None,
+        "line 2: a pose is not finite",
+    ),
     "kitti columns": (f"{KITTI_ROW}\n1 2 3\n", None, "line 2: 3 columns instead of 12"),
     "euroc columns": (f"{EUROC_HEADER}1,2,3\n", None, "line 2: 3 columns instead of 8"),
-    "euroc uneven": (f"{EUROC_HEADER}1,0,0,0,1,0,0,0\n2,0,0,0,1,0,0\n", None, "line 3: 7 columns instead of 8"),
-    "euroc seconds": (f"{EUROC_HEADER}1.5,0,0,0,1,0,0,0\n", None, "line 2: '1.5' is no time in whole nanoseconds"),
-    "euroc overflow": (f"{EUROC_HEADER}9223372036854775808,0,0,0,1,0,0,0\n", None, "is no time in whole nanoseconds"),
-    "euroc quaternion": (f"{EUROC_HEADER}1,0,0,0,2,0,0,0\n", None, "line 2: the quaternion has norm 2"),
+    "euroc uneven": (
+        f"{EUROC_HEADER}1,0,0,0,1,0,0,0\n2,0,0,0,1,0,0\n",
+        None,
+        "line 3: 7 columns instead of 8",
+    ),
+    "euroc seconds": (
+        f"{EUROC_HEADER}1.5,0,0,0,1,0,0,0\n",
+        None,
+        "line 2: '1.5' is no time in whole nanoseconds",
+    ),
+    "euroc overflow": (
+        f"{EUROC_HEADER}9223372036854775808,0,0,0,1,0,0,0\n",
+        None,
+        "is no time in whole nanoseconds",
+    ),
+    "euroc quaternion": (
+        f"{EUROC_HEADER}1,0,0,0,2,0,0,0\n",
+        None,
+        "line 2: the quaternion has norm 2",
+    ),
     "empty": ("", None, "holds no poses"),
     "only comments": ("# timestamp\n", None, "holds no poses"),
     "requested tum": (KITTI_ROW, "tum", "line 1: 12 columns instead of 8; tum form"),
     "requested kitti": (f"1 {TUM_ROW}", "kitti", "line 1: 8 columns instead of 12; kitti form"),
     "requested euroc": ("1 2 3", "euroc", "line 1: 3 columns instead of 8; euroc form"),
-    "requested nonsense": ("1 2 3", "csv", "unknown trajectory format 'csv'; choose one of tum, kitti, euroc"),
+    "requested nonsense": (
+        "1 2 3",
+        "csv",
+        "unknown trajectory format 'csv'; choose one of tum, kitti, euroc",
+    ),
 }
 
 
@@ -275,7 +364,9 @@ def test_reads_files_written_by_evo(tmp_path: Path) -> None:
     from evo.tools import file_interface
 
     trajectory = make(50, start_ns=0)
-    theirs = PoseTrajectory3D(poses_se3=list(trajectory.T_world_body), timestamps=trajectory.times_ns / 1e9)
+    theirs = PoseTrajectory3D(
+        poses_se3=list(trajectory.T_world_body), timestamps=trajectory.times_ns / 1e9
+    )
     file_interface.write_tum_trajectory_file(str(tmp_path / "t.tum"), theirs)
     file_interface.write_kitti_poses_file(str(tmp_path / "t.kitti"), theirs)
     tum, kitti = read_trajectory(tmp_path / "t.tum"), read_trajectory(tmp_path / "t.kitti")
@@ -353,7 +444,9 @@ def test_atomic_folder_appears_at_the_end_with_ordinary_permissions(tmp_path: Pa
     assert target.stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-def fill(target: Path, text: str, *, replace: bool = False, error: BaseException | None = None) -> None:
+def fill(
+    target: Path, text: str, *, replace: bool = False, error: BaseException | None = None
+) -> None:
     """Make a folder whose marker holds `text`, and fail half-way if requested."""
     with atomic_folder(target, replace=replace, marker="m") as inside:
         (inside / "m").write_text(text)
@@ -362,7 +455,9 @@ def fill(target: Path, text: str, *, replace: bool = False, error: BaseException
         (inside / text).write_text("")
 
 
-@pytest.mark.parametrize("error", [ValueError("boom"), KeyboardInterrupt("boom"), SystemExit("boom")])
+@pytest.mark.parametrize(
+    "error", [ValueError("boom"), KeyboardInterrupt("boom"), SystemExit("boom")]
+)
 def test_a_failure_inside_leaves_no_folder(tmp_path: Path, error: BaseException) -> None:
     with pytest.raises(type(error), match="boom"):
         fill(tmp_path / "x" / "y" / "run", "new", error=error)
@@ -392,7 +487,9 @@ def test_replacing_swaps_the_whole_folder(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
-def test_a_failed_swap_puts_the_old_folder_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_swap_puts_the_old_folder_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     fill(tmp_path / "run", "old")
     rename = Path.rename
 
@@ -421,9 +518,15 @@ def test_never_replaces_foreign_files(tmp_path: Path) -> None:
         (tmp_path / "link", True, "is not a folder"),
     ]
     for path, replaced, match in cases:
-        with pytest.raises(VioError, match=match), atomic_folder(path, replace=replaced, marker="m"):
+        with (
+            pytest.raises(VioError, match=match),
+            atomic_folder(path, replace=replaced, marker="m"),
+        ):
             raise AssertionError("must not be entered")
-    with pytest.raises(VioError, match="was not made by this program"), atomic_folder(theirs, replace=True):
+    with (
+        pytest.raises(VioError, match="was not made by this program"),
+        atomic_folder(theirs, replace=True),
+    ):
         raise AssertionError("must not be entered")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "link", "photos"]
     assert (theirs / "holiday.jpg").exists()

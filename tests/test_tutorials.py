@@ -60,15 +60,22 @@ def _write_bag(flight: Path, path: Path) -> None:
         if isinstance(event, ImuSample):
             script.imu("/imu0", event)
         elif isinstance(event, StereoFrame) and event.left is not None and event.right is not None:
-            for topic, image, right in (("/cam0/left", event.left, False), ("/cam1/right", event.right, True)):
+            for topic, image, right in (
+                ("/cam0/left", event.left, False),
+                ("/cam1/right", event.right, True),
+            ):
                 name = topic.rpartition("/")[0]
                 script.image(f"{name}/image_raw", event.time_ns, image)
-                script.camera_info(f"{name}/camera_info", event.time_ns, recording.camera, right=right)
+                script.camera_info(
+                    f"{name}/camera_info", event.time_ns, recording.camera, right=right
+                )
     script.write(path)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_the_commands_of_a_tutorial_run(page: Path, workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_commands_of_a_tutorial_run(
+    page: Path, workplace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(workplace)
     for command in _commands(page):
         if not command.startswith(_SLOW):
@@ -78,19 +85,24 @@ def test_the_commands_of_a_tutorial_run(page: Path, workplace: Path, monkeypatch
 def test_every_page_is_in_the_menu() -> None:
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     named = set(re.findall(r"[\w/]+\.md", text))
-    assert named == {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    assert named == {
+        path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")
+    }
     yaml.safe_load(text)
 
 
 def test_tutorials_show_every_example_as_it_is() -> None:
     """The code is in the pages, so that a forge shows it."""
     shown = {fence: text for page in PAGES for fence, text in _blocks(page) if "title=" in fence}
-    files = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "examples").glob("*.py")}
+    files = {
+        path.name: path.read_text(encoding="utf-8") for path in (ROOT / "examples").glob("*.py")
+    }
     assert shown == {f'python title="examples/{name}"': text for name, text in files.items()}
 
 
 @pytest.mark.skipif(
-    any(importlib.util.find_spec(name) is None for name in ("mkdocs", "latex2mathml")), reason="needs the extra docs"
+    any(importlib.util.find_spec(name) is None for name in ("mkdocs", "latex2mathml")),
+    reason="needs the extra docs",
 )
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     built: Any = subprocess.run(

@@ -1,4 +1,6 @@
-"""Nothing computed is lost: runs that are interrupted, killed, out of disk, or diverge, and how they go on."""
+"""Nothing computed is lost: runs that are interrupted, killed, out of disk, or diverge, and how
+they go on.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,9 @@ def test_a_table_in_a_file_can_be_read_by_others_after_each_flush(tmp_path: Path
     for k in range(5):
         table.append(_rows(k, k))
         table.flush()
-        np.testing.assert_array_equal(np.load(tmp_path / "t.npy")["a"], np.repeat(np.arange(k + 1), 2))
+        np.testing.assert_array_equal(
+            np.load(tmp_path / "t.npy")["a"], np.repeat(np.arange(k + 1), 2)
+        )
     table.replace(3, _rows(77))
     table.append(_rows(9))
     assert table.rows()["a"].tolist() == [0, 0, 1, 77, 2, 2, 3, 3, 4, 4, 9]
@@ -111,12 +115,18 @@ class Stop:
         return "interrupted" if self.left <= 0 else None
 
 
-def _flight_log(path: Path, frames: int = FRAMES, imu_from_ns: int = 0, camera: StereoCamera = CAMERA) -> Path:
+def _flight_log(
+    path: Path, frames: int = FRAMES, imu_from_ns: int = 0, camera: StereoCamera = CAMERA
+) -> Path:
     """An observation log of a flight with an IMU, which may begin late."""
     flight, noise = Flight(frames=frames), np.random.default_rng(0)
     times = np.arange(frames, dtype=np.int64) * STEP_NS
-    recording = Recording("flight", Path("flight"), camera, T_CAM0_IMU, times, False, frozenset({"imu"}), None)
-    samples = [s for s in flight.imu(noise, Config().msckf, np.zeros(6)) if s.time_ns >= imu_from_ns]
+    recording = Recording(
+        "flight", Path("flight"), camera, T_CAM0_IMU, times, False, frozenset({"imu"}), None
+    )
+    samples = [
+        s for s in flight.imu(noise, Config().msckf, np.zeros(6)) if s.time_ns >= imu_from_ns
+    ]
     seen = [flight.observe(k, 0.3, noise) for k in range(frames)]
     write_observation_log(path, recording, seen, samples, run_motion="imu")  # type: ignore[arg-type]
     return path
@@ -132,7 +142,15 @@ def _rendered() -> SimulatedRecording:
     """A flight whose images are rendered once, however often it is read."""
     motion = hand_held(duration_s=2.0)
     recording = SimulatedRecording(
-        simulate(room(seed=1), small_rig(320, 200), motion, rate_hz=10.0, imu=ImuNoise(), effects=CLEAN, seed=1)
+        simulate(
+            room(seed=1),
+            small_rig(320, 200),
+            motion,
+            rate_hz=10.0,
+            imu=ImuNoise(),
+            effects=CLEAN,
+            seed=1,
+        )
     )
     recording.images = lru_cache(recording.images)  # type: ignore[method-assign]
     return recording
@@ -143,7 +161,9 @@ def _assert_same(a: RunResult, b: RunResult) -> None:
         np.testing.assert_array_equal(a.estimates.column(name), b.estimates.column(name))
     order = np.argsort(a.landmarks.ids), np.argsort(b.landmarks.ids)
     for name in ("ids", "p_world", "covariance"):
-        np.testing.assert_array_equal(*(getattr(r.landmarks, name)[k] for r, k in zip((a, b), order, strict=True)))
+        np.testing.assert_array_equal(
+            *(getattr(r.landmarks, name)[k] for r, k in zip((a, b), order, strict=True))
+        )
     if a.dead_reckoning is not None:
         np.testing.assert_array_equal(a.dead_reckoning.T_world_body, b.dead_reckoning.T_world_body)
     assert a.warnings == b.warnings
@@ -154,7 +174,11 @@ def _assert_same(a: RunResult, b: RunResult) -> None:
     [
         (lambda log: open_dataset(log), Config(), 300),
         (lambda log: open_dataset(log), replace(Config(), lag_frames=4), 411),
-        (lambda log: open_dataset(log), replace(Config(), dataset=DatasetSettings(max_frame_rate=10.0)), 300),
+        (
+            lambda log: open_dataset(log),
+            replace(Config(), dataset=DatasetSettings(max_frame_rate=10.0)),
+            300,
+        ),
         (lambda log: FakeDrive(), Config(), 29),
         (lambda log: _rendered(), Config(), 150),
     ],
@@ -165,10 +189,17 @@ def test_a_run_goes_on_to_the_same_bits(
 ) -> None:
     whole = run(make(flight_log), config, keep_observations=True)
     folder = GrowingFolder(tmp_path / "run", {})
-    first = run(make(flight_log), config, keep_observations=True, control=RunControl(folder, should_stop=Stop(events)))
+    first = run(
+        make(flight_log),
+        config,
+        keep_observations=True,
+        control=RunControl(folder, should_stop=Stop(events)),
+    )
     assert first.stopped == "interrupted"
     assert 5 < len(first.frames) < len(whole.frames)
-    second = run(make(flight_log), config, keep_observations=True, control=RunControl(folder, resume=True))
+    second = run(
+        make(flight_log), config, keep_observations=True, control=RunControl(folder, resume=True)
+    )
     assert second.stopped is None
     _assert_same(whole, second)
     for a, b in zip(whole.observations, second.observations, strict=True):
@@ -182,7 +213,9 @@ def test_points_put_away_while_running_stay_in_the_map(
 ) -> None:
     monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 0.05)
     whole = run(open_dataset(flight_log), Config())
-    grown = run(open_dataset(flight_log), Config(), control=RunControl(GrowingFolder(tmp_path / "run", {})))
+    grown = run(
+        open_dataset(flight_log), Config(), control=RunControl(GrowingFolder(tmp_path / "run", {}))
+    )
     assert len(grown.landmarks.ids) > 50
     _assert_same(whole, grown)
 
@@ -191,11 +224,15 @@ def test_points_put_away_while_running_stay_in_the_map(
 def test_a_checkpoint_does_not_wait_for_an_imu_that_begins_late(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, imu_from_s: int
 ) -> None:
-    """The points put away are those of one world: that of the first frame, which knows no gravity."""
+    """The points put away are those of one world: that of the first frame, which knows no
+    gravity.
+    """
     monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 0.05)
     log = _flight_log(tmp_path / "late.npz", imu_from_ns=imu_from_s * 10**9)
     whole = run(open_dataset(log), Config())
-    grown = run(open_dataset(log), Config(), control=RunControl(GrowingFolder(tmp_path / "run", {})))
+    grown = run(
+        open_dataset(log), Config(), control=RunControl(GrowingFolder(tmp_path / "run", {}))
+    )
     assert grown.stopped is None
     assert len(grown.landmarks.ids) > 50
     _assert_same(whole, grown)
@@ -209,14 +246,25 @@ def test_a_run_in_memory_that_is_stopped_keeps_its_map(flight_log: Path) -> None
 
 def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
     rng = np.random.default_rng(0)
-    shapes = {"T_world_imu": (4, 4), "covariance": (6, 6), "T_cam0_imu": (4, 4), "T_cam0_imu_covariance": (6, 6)}
+    shapes = {
+        "T_world_imu": (4, 4),
+        "covariance": (6, 6),
+        "T_cam0_imu": (4, 4),
+        "T_cam0_imu_covariance": (6, 6),
+    }
     shapes |= {"velocity_covariance": (3, 3), "imu_terms": (15,), "imu_terms_sigma": (15,)}
-    kept = [f.name for f in fields(Estimate) if not f.name.startswith("T_map")]  # those have a table of their own
+    # those have a table of their own
+    kept = [f.name for f in fields(Estimate) if not f.name.startswith("T_map")]
     values: dict[str, Any] = {name: rng.normal(size=shapes.get(name, (3,))) for name in kept}
     rows, rows_P = rng.normal(size=7), rng.normal(size=(7, 7))
     field = StereoFieldEstimate(rng.normal(size=8), rng.normal(size=(8, 8)), 0.3, rows, rows_P)
     scale = StereoScaleEstimate(rng.normal(size=2), rng.normal(size=(2, 2)))
-    values |= {"time_ns": 2**60 + 1, "time_offset_s": 0.1, "time_offset_sigma_s": 0.2, "scale_sigma": 0.02}
+    values |= {
+        "time_ns": 2**60 + 1,
+        "time_offset_s": 0.1,
+        "time_offset_sigma_s": 0.2,
+        "scale_sigma": 0.02,
+    }
     values |= {"tilt_sigma_rad": 0.01, "stereo_field": field, "stereo_scale": scale}
     back = estimate_of(estimate_row(0, Estimate(**values))[0])
     for name, value in values.items():
@@ -234,8 +282,10 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
 # Processes that end
 
 PATCHED = (  # as is the picture in this process, see tests/conftest.py
-    "import sys, vio.runs.recorder as r, vio.runs.picture as p, vio.cli; r._FLUSH_S = 0.0; r._CHECKPOINT_S = 0.1; "
-    "p.RunPicture.write = lambda picture, path: path.write_bytes(b'PNG'); sys.exit(vio.cli.main(sys.argv[1:]))"
+    "import sys, vio.runs.recorder as r, vio.runs.picture as p, vio.cli; r._FLUSH_S = 0.0; "
+    "r._CHECKPOINT_S = 0.1; "
+    "p.RunPicture.write = lambda picture, path: path.write_bytes(b'PNG'); "
+    "sys.exit(vio.cli.main(sys.argv[1:]))"
 )
 
 
@@ -247,7 +297,9 @@ def undisturbed(flight_log: Path, tmp_path_factory: pytest.TempPathFactory) -> s
 
 
 def _take_interrupts() -> None:
-    """Undo what a shell does to its background jobs: they ignore Ctrl-C, and so do their children."""
+    """Undo what a shell does to its background jobs: they ignore Ctrl-C, and so do their
+    children.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -258,7 +310,11 @@ def test_a_process_that_ends_loses_a_second_at_most(
     out = tmp_path / "run"
     command = [sys.executable, "-c", PATCHED, "run", str(flight_log), "--out", str(out)]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=_take_interrupts
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=_take_interrupts,
     ) as process:
         wait_for((out / "unfinished" / "checkpoint").is_file)
         process.send_signal(number)
@@ -283,12 +339,25 @@ def test_two_runs_into_one_folder_are_refused(
     flight_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    command = [sys.executable, "-c", PATCHED, "run", str(flight_log), "--stop", "20", "--out", str(out)]
+    command = [
+        sys.executable,
+        "-c",
+        PATCHED,
+        "run",
+        str(flight_log),
+        "--stop",
+        "20",
+        "--out",
+        str(out),
+    ]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as first:
         wait_for((out / "unfinished" / "run.json").is_file)
         first.send_signal(signal.SIGSTOP)
         try:
-            for again in (["run", str(flight_log), "--out", str(out)], ["run", "--resume", str(out)]):
+            for again in (
+                ["run", str(flight_log), "--out", str(out)],
+                ["run", "--resume", str(out)],
+            ):
                 assert "another process is writing into this folder" in refused(capsys, *again)
         finally:
             first.send_signal(signal.SIGCONT)
@@ -296,7 +365,9 @@ def test_two_runs_into_one_folder_are_refused(
     assert len(read_trajectory(out / "trajectory.tum")) == 20
 
 
-def test_an_earlier_run_stays_until_the_new_one_has_a_frame(flight_log: Path, tmp_path: Path) -> None:
+def test_an_earlier_run_stays_until_the_new_one_has_a_frame(
+    flight_log: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "run"
     assert main(["run", str(flight_log), "--stop", "20", "--out", str(out)]) == 0
     assert main(["run", str(flight_log), "--start", "900", "--out", str(out)]) == 1
@@ -306,7 +377,10 @@ def test_an_earlier_run_stays_until_the_new_one_has_a_frame(flight_log: Path, tm
 
 
 def test_a_divergence_keeps_the_results_so_far(
-    flight_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    flight_log: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     update = Msckf.update
 
@@ -319,14 +393,20 @@ def test_a_divergence_keeps_the_results_so_far(
     monkeypatch.setattr(Msckf, "restart", None, raising=False)
     out = tmp_path / "run"
     assert main(["run", str(flight_log), "--out", str(out)]) == 1
-    assert f"msckf diverged at frame 30; the results of 30 of {FRAMES} frames are in {out}" in capsys.readouterr().err
+    assert (
+        f"msckf diverged at frame 30; the results of 30 of {FRAMES} frames are in {out}"
+        in capsys.readouterr().err
+    )
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["stopped"] == "msckf diverged at frame 30"
     assert len(read_trajectory(out / "trajectory.tum")) == 30
 
 
 def test_a_disk_that_fills_keeps_what_is_written(
-    flight_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    flight_log: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("vio.runs.recorder._FLUSH_S", 0.0)
     append, room_left = Table.append, iter(range(100))
@@ -347,12 +427,23 @@ def test_a_disk_that_fills_keeps_what_is_written(
 
 @pytest.fixture(scope="module")
 def interrupted(flight_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A place with a recording and the folder of its run that was interrupted, and a copy of the place."""
-    place, kept = tmp_path_factory.mktemp("interrupted") / "place", tmp_path_factory.mktemp("kept") / "place"
+    """A place with a recording and the folder of its run that was interrupted, and a copy of the
+    place.
+    """
+    place, kept = (
+        tmp_path_factory.mktemp("interrupted") / "place",
+        tmp_path_factory.mktemp("kept") / "place",
+    )
     place.mkdir()
     shutil.copy(flight_log, place / "flight.npz")
     dataset, config = open_dataset(place / "flight.npz"), Config()
-    request = {"source": f"log:{place / 'flight.npz'}", "start": 0, "stop": None, "reference": None, "map": None}
+    request = {
+        "source": f"log:{place / 'flight.npz'}",
+        "start": 0,
+        "stop": None,
+        "reference": None,
+        "map": None,
+    }
     request |= {"save_observations": True, "lengths_m": None}
     folder = growing_folder(place / "run", dataset, config, request)
     run(dataset, config, keep_observations=True, control=RunControl(folder, should_stop=Stop(300)))
@@ -362,14 +453,18 @@ def interrupted(flight_log: Path, tmp_path_factory: pytest.TempPathFactory) -> t
 
 @pytest.fixture
 def stopped(interrupted: tuple[Path, Path]) -> Path:
-    """The folder of a run that was interrupted, with a recording of its own; each test gets it as it was."""
+    """The folder of a run that was interrupted, with a recording of its own; each test gets it
+    as it was.
+    """
     place, kept = interrupted
     shutil.rmtree(place)
     shutil.copytree(kept, place)
     return place / "run"
 
 
-def test_settings_that_name_files_are_kept_in_a_checkpoint(flight_log: Path, tmp_path: Path) -> None:
+def test_settings_that_name_files_are_kept_in_a_checkpoint(
+    flight_log: Path, tmp_path: Path
+) -> None:
     """A run with one of them ended at its first checkpoint, after some seconds."""
     dataset = open_dataset(flight_log)
     config = replace(Config(), frontend=replace(Config().frontend, features=flight_log))
@@ -402,7 +497,9 @@ def test_a_damaged_table_is_not_gone_on_with(
     name: str, spoil: Callable[[Path], Any], stopped: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     spoil(stopped / "unfinished" / f"{name}.npy")
-    _refused(stopped, capsys, rf"{name}\.npy: .*(is damaged|No such file).*repeat the run from its start")
+    _refused(
+        stopped, capsys, rf"{name}\.npy: .*(is damaged|No such file).*repeat the run from its start"
+    )
 
 
 @pytest.mark.parametrize(
@@ -413,7 +510,12 @@ def test_a_damaged_table_is_not_gone_on_with(
     ],
 )
 def test_a_run_whose_settings_were_edited_names_them(
-    name: str, before: str, after: str, pattern: str, stopped: Path, capsys: pytest.CaptureFixture[str]
+    name: str,
+    before: str,
+    after: str,
+    pattern: str,
+    stopped: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     text = (stopped / name).read_text()
     assert before in text
@@ -421,7 +523,9 @@ def test_a_run_whose_settings_were_edited_names_them(
     _refused(stopped, capsys, f"what the run depends on has changed.*{pattern}")
 
 
-def test_a_run_whose_recording_was_edited_names_what(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_whose_recording_was_edited_names_what(
+    stopped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _flight_log(stopped.parent / "flight.npz", frames=FRAMES - 1)
     _refused(stopped, capsys, f"number of frames was {FRAMES}, now {FRAMES - 1}")
     _flight_log(stopped.parent / "flight.npz", camera=replace(CAMERA, fu=CAMERA.fu + 1))
@@ -434,7 +538,8 @@ def test_a_run_that_dies_after_its_checkpoint_goes_on_with_estimates_that_were_s
     config, folder = replace(Config(), lag_frames=4), GrowingFolder(tmp_path / "run", {})
     whole = run(open_dataset(flight_log), config)
     gravity = whole.estimates.column("gravity_world")[-4:]
-    np.testing.assert_array_equal(gravity, gravity[-1:].repeat(4, axis=0))  # as known at the end, as are the poses
+    # as known at the end, as are the poses
+    np.testing.assert_array_equal(gravity, gravity[-1:].repeat(4, axis=0))
     assert np.isfinite(gravity).all()
     stop = Stop(350)
 
@@ -449,11 +554,15 @@ def test_a_run_that_dies_after_its_checkpoint_goes_on_with_estimates_that_were_s
 
     with pytest.raises(RuntimeError, match="died"):
         run(open_dataset(flight_log), config, control=RunControl(folder, should_stop=died))
-    _assert_same(whole, run(open_dataset(flight_log), config, control=RunControl(folder, resume=True)))
+    _assert_same(
+        whole, run(open_dataset(flight_log), config, control=RunControl(folder, resume=True))
+    )
 
 
 @pytest.mark.parametrize("kind", ["symbolic", "hard"])
-@pytest.mark.parametrize("name", ["trajectory.tum", "frames.csv", "unfinished/estimates.npy", "unfinished"])
+@pytest.mark.parametrize(
+    "name", ["trajectory.tum", "frames.csv", "unfinished/estimates.npy", "unfinished"]
+)
 def test_links_in_a_run_folder_are_not_followed(
     name: str, kind: str, stopped: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -465,7 +574,9 @@ def test_links_in_a_run_folder_are_not_followed(
         path.hardlink_to(foreign)
     names = sorted(foreign.rglob("*")) if foreign.is_dir() else [foreign]
     before = [(part, part.read_bytes()) for part in names]
-    assert re.search(f"{path.name}: is a link", refused(capsys, "run", "--resume", stopped, "--quiet"))
+    assert re.search(
+        f"{path.name}: is a link", refused(capsys, "run", "--resume", stopped, "--quiet")
+    )
     assert [(part, part.read_bytes()) for part in names] == before
 
 
@@ -500,7 +611,9 @@ def _forge(path: Path, tree: Any, blobs: bytes = b"") -> None:
         "vio:load_rig",
     ],
 )
-def test_a_checkpoint_holds_objects_of_our_own_classes_only(name: str, state: tuple[Path, Dataset]) -> None:
+def test_a_checkpoint_holds_objects_of_our_own_classes_only(
+    name: str, state: tuple[Path, Dataset]
+) -> None:
     path, dataset = state
     _forge(path, ["dict", "run", ["object", name, {"args": ["list", "touch", "owned"]}]])
     with pytest.raises(DataError, match=r"is damaged \(.*repeat the run from its start"):
@@ -532,21 +645,29 @@ def test_a_checkpoint_holds_objects_of_our_own_classes_only(name: str, state: tu
 def test_a_forged_tree_is_one_line(tree: Any, state: tuple[Path, Dataset]) -> None:
     path, dataset = state
     _forge(path, ["list", tree] if tree is not None else json.loads("[" * 900 + "]" * 900))
-    with pytest.raises(DataError, match=r"c: is damaged \(.*\); repeat the run from its start") as error:
+    with pytest.raises(
+        DataError, match=r"c: is damaged \(.*\); repeat the run from its start"
+    ) as error:
         load_checkpoint(path, dataset)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("dtype", ["|O", [["a", "|O"]], [["a", [["b", "|O", [2]]]]]], ids=str)
-def test_bytes_of_a_forged_checkpoint_do_not_become_references(dtype: Any, state: tuple[Path, Dataset]) -> None:
-    """NumPy takes the bytes of a buffer for addresses of objects where the type says so; zeros are None."""
+def test_bytes_of_a_forged_checkpoint_do_not_become_references(
+    dtype: Any, state: tuple[Path, Dataset]
+) -> None:
+    """NumPy takes the bytes of a buffer for addresses of objects where the type says so; zeros
+    are None.
+    """
     path, dataset = state
     _forge(path, ["list", ["array", dtype, [1], "C", 0, True]], blobs=bytes(16))
     with pytest.raises(DataError, match="is damaged"):
         load_checkpoint(path, dataset)
 
 
-def test_what_a_checkpoint_holds_comes_back_with_its_types_layouts_and_references(state: tuple[Path, Dataset]) -> None:
+def test_what_a_checkpoint_holds_comes_back_with_its_types_layouts_and_references(
+    state: tuple[Path, Dataset],
+) -> None:
     path, dataset = state
     fixed = np.arange(6.0).reshape(2, 3)
     fixed.flags.writeable = False
@@ -599,14 +720,21 @@ def test_what_a_checkpoint_holds_comes_back_with_its_types_layouts_and_reference
     [Path("x"), print, lambda: 0, np.array([{}]), int, threading.Lock()],
     ids=["path", "function", "lambda", "objects", "class", "lock"],
 )
-def test_what_a_checkpoint_cannot_hold_is_named_when_it_is_saved(value: Any, state: tuple[Path, Dataset]) -> None:
+def test_what_a_checkpoint_cannot_hold_is_named_when_it_is_saved(
+    value: Any, state: tuple[Path, Dataset]
+) -> None:
     with pytest.raises(NotSavableError, match="does not belong into a checkpoint"):
         save_checkpoint(state[0], [value], state[1])
 
 
 @pytest.mark.parametrize(
     "spoil",
-    [lambda b: b[:-5], lambda b: b"", lambda b: b"{}\n" + b.split(b"\n", 1)[1], lambda b: b[:-9] + b"\x07" + b[-8:]],
+    [
+        lambda b: b[:-5],
+        lambda b: b"",
+        lambda b: b"{}\n" + b.split(b"\n", 1)[1],
+        lambda b: b[:-9] + b"\x07" + b[-8:],
+    ],
 )
 def test_a_damaged_or_foreign_checkpoint_is_refused(
     state: tuple[Path, Dataset], spoil: Callable[[bytes], bytes]

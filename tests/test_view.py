@@ -31,7 +31,9 @@ class Recorder:
         self.flushed = 0
         self._frame: int | None = None
 
-    def set_time(self, timeline: str, *, sequence: int | None = None, duration: float | None = None) -> None:
+    def set_time(
+        self, timeline: str, *, sequence: int | None = None, duration: float | None = None
+    ) -> None:
         if timeline == "frame":
             self._frame = sequence
 
@@ -66,26 +68,39 @@ def test_a_viewer_changes_nothing(shown: tuple[Recorder, RunResult, RunResult]) 
     assert np.array_equal(seen.trajectory.T_world_body, plain.trajectory.T_world_body)
 
 
-def test_every_frame_shows_pose_path_image_features_and_curves(shown: tuple[Recorder, RunResult, RunResult]) -> None:
+def test_every_frame_shows_pose_path_image_features_and_curves(
+    shown: tuple[Recorder, RunResult, RunResult],
+) -> None:
     stream, result, _ = shown
     frames = [log.index for log in result.frames]
     moved = [k for k, what in stream.sent["world/run/camera"] if isinstance(what, rr.Transform3D)]
     assert moved == frames
-    for entity in ("world/run/camera/image", "world/run/camera/features", "world/run/camera/tracks_by_age"):
+    for entity in (
+        "world/run/camera/image",
+        "world/run/camera/features",
+        "world/run/camera/tracks_by_age",
+    ):
         assert [k for k, _ in stream.sent[entity]] == frames, entity
     path = stream.sent["world/run/path/00000"][-1][1].strips.as_arrow_array().to_pylist()[0]
     assert np.array(path) == pytest.approx(result.trajectory.positions, abs=1e-5)
-    scalars = {name: len(stream.sent[f"plots/{name}"]) for name in ("features", "velocity", "gyro_bias", "accel_bias")}
+    scalars = {
+        name: len(stream.sent[f"plots/{name}"])
+        for name in ("features", "velocity", "gyro_bias", "accel_bias")
+    }
     assert scalars == dict.fromkeys(scalars, len(frames) + 1)  # and the names of the curves
     assert stream.flushed == 1
     assert stream.sent["world/run/reference"][0][0] is None  # drawn once
 
 
-def test_marks_lie_on_the_pixels_of_the_shown_image(shown: tuple[Recorder, RunResult, RunResult], flight: Path) -> None:
+def test_marks_lie_on_the_pixels_of_the_shown_image(
+    shown: tuple[Recorder, RunResult, RunResult], flight: Path
+) -> None:
     """The centre of our first pixel is (0, 0), of rerun's (0.5, 0.5); so is the principal point."""
     stream, _, _ = shown
     camera = open_dataset(flight).recording.camera
-    (pinhole,) = [what for _, what in stream.sent["world/run/camera"] if isinstance(what, rr.Pinhole)]
+    (pinhole,) = [
+        what for _, what in stream.sent["world/run/camera"] if isinstance(what, rr.Pinhole)
+    ]
     matrix = np.array(pinhole.image_from_camera.as_arrow_array().to_pylist()).reshape(3, 3).T
     assert matrix[:2, 2] == pytest.approx([camera.cu + 0.5, camera.cv + 0.5], abs=1e-4)
     seen = RerunViewer._pixels
@@ -93,14 +108,17 @@ def test_marks_lie_on_the_pixels_of_the_shown_image(shown: tuple[Recorder, RunRe
 
 
 def test_a_cylinder_is_outlined_as_a_cylinder(flight: Path) -> None:
-    """Rows of 200 degrees, which no pinhole has: the border lies about the baseline, behind the camera as well."""
+    """Rows of 200 degrees, which no pinhole has: the border lies about the baseline, behind the
+    camera as well.
+    """
     stream = Recorder()
     camera = StereoCamera(100.0, 100.0, 100.0, 174.5, 0.2, 200, 350, "cylinder")
     RerunViewer(stream, ViewedRig(camera, np.eye(4), None, None))  # type: ignore[arg-type]
     assert not any(isinstance(what, rr.Pinhole) for _, what in stream.sent["world/run/camera"])
     ((_, lines),) = stream.sent["world/run/camera/outline"]
     border, *edges = (np.array(strip) for strip in lines.strips.as_arrow_array().to_pylist())
-    np.testing.assert_allclose(np.hypot(border[:, 1], border[:, 2]), 1.0, rtol=1e-6)  # five baselines
+    # five baselines
+    np.testing.assert_allclose(np.hypot(border[:, 1], border[:, 2]), 1.0, rtol=1e-6)
     azimuth = np.degrees(np.arctan2(border[:, 1], border[:, 2]))
     assert (azimuth.min(), azimuth.max()) == pytest.approx((-100.3, 100.3), abs=0.1)
     assert len(edges) == 4
@@ -114,7 +132,9 @@ class _Half:
 def test_keyframes_and_loops_of_a_map_are_drawn(flight: Path) -> None:
     recording, stream = open_dataset(flight).recording, Recorder()
     viewer = RerunViewer(stream, ViewedRig(recording.camera, np.eye(4), None, None))  # type: ignore[arg-type]
-    again = LoopEvent(frame=20, time_ns=2, keyframe=0, keyframe_time_ns=0, inliers=40, gap_m=0.1, joined=False)
+    again = LoopEvent(
+        frame=20, time_ns=2, keyframe=0, keyframe_time_ns=0, inliers=40, gap_m=0.1, joined=False
+    )
     for index, loops in ((0, ()), (20, ()), (21, (replace(again, keyframe_frame=0), again))):
         T = np.eye(4)
         T[0, 3] = index
@@ -139,16 +159,21 @@ def test_the_world_is_upright(shown: tuple[Recorder, RunResult, RunResult]) -> N
 def test_without_time_for_it_images_are_left_out(flight: Path) -> None:
     stream, result, _ = _shown(flight, 0.0)
     assert len(stream.sent["world/run/camera/image"]) <= 1
-    assert len([1 for _, what in stream.sent["world/run/camera"] if isinstance(what, rr.Transform3D)]) == len(
-        result.frames
-    )
+    assert len(
+        [1 for _, what in stream.sent["world/run/camera"] if isinstance(what, rr.Transform3D)]
+    ) == len(result.frames)
 
 
 def test_the_state_of_a_feature_is_what_the_filter_made_of_it() -> None:
-    seen = observations(0, 0, [1, 2, 3, 4, 5], np.ones((5, 4)), has_right=[True, True, True, False, True])
-    report = UpdateReport(2, 1, 0, 1, None, None, gated_ids=np.array([2]), landmark_ids=np.array([5]))
+    seen = observations(
+        0, 0, [1, 2, 3, 4, 5], np.ones((5, 4)), has_right=[True, True, True, False, True]
+    )
+    report = UpdateReport(
+        2, 1, 0, 1, None, None, gated_ids=np.array([2]), landmark_ids=np.array([5])
+    )
     states = states_of(seen, np.array([True, True, False, False, True]), report)
-    assert states.tolist() == [0, 2, 3, 4, 1]  # used, gated, stereo but not used, left only, landmark
+    # used, gated, stereo but not used, left only, landmark
+    assert states.tolist() == [0, 2, 3, 4, 1]
 
 
 def test_colours_of_tracks_go_from_new_to_old() -> None:
@@ -192,17 +217,29 @@ def test_a_wrong_place_is_named_before_the_run(
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems always have a screen")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="other systems always have a screen"
+)
 def test_without_a_screen_a_window_is_refused(
-    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    flight: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    assert "--view web" in refused(capsys, "run", flight, "--quiet", "--out", tmp_path / "run", "--view")
+    assert "--view web" in refused(
+        capsys, "run", flight, "--quiet", "--out", tmp_path / "run", "--view"
+    )
 
 
 def test_without_rerun_the_extra_is_named(
-    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    flight: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    assert "stereo-vio[view]" in refused(capsys, "run", flight, "--quiet", "--out", tmp_path / "run", "--view", "web")
+    assert "stereo-vio[view]" in refused(
+        capsys, "run", flight, "--quiet", "--out", tmp_path / "run", "--view", "web"
+    )

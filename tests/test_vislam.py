@@ -1,4 +1,6 @@
-"""The paper's filter: Jacobians, the dense forms it must equal, noise readings, and a simulated drive."""
+"""The paper's filter: Jacobians, the dense forms it must equal, noise readings, and a simulated
+drive.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +15,33 @@ from vio.errors import ConfigError, EstimationError
 from vio.filters.settings import VislamSettings
 from vio.filters.vislam import Vislam, update_landmarks, update_pose, z_D_landmark, z_D_xi
 from vio.filters.vislam_motion import predict, predict_twist
-from vio.geometry.lie import FloatArray, se3_curly_hat, se3_exp, se3_from_parts, se3_inverse, se3_log, transform_points
+from vio.geometry.lie import (
+    FloatArray,
+    se3_curly_hat,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    se3_log,
+    transform_points,
+)
 from vio.geometry.stereo import StereoCamera, project, triangulate
 from vio.offline.reproduce import PAPER
 from vio.records import ImuSample, Observations, VelocitySample, observations
 
 CAMERA = StereoCamera(700.0, 710.0, 600.0, 180.0, 0.54, 1242, 375)
 # The usual mounting: camera z is the body's x, camera x the body's -y.
-T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.1, 0.7, -1.1]))
+T_CAM0_IMU = se3_from_parts(
+    np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.1, 0.7, -1.1])
+)
 TAU_NS = 100_000_000
 
 
 def _points_ahead(n: int, seed: int) -> FloatArray:
     """Points in the cam0 frame that both cameras see."""
     rng = np.random.default_rng(seed)
-    z = np.column_stack([rng.uniform(300, 1100, n), rng.uniform(20, 350, n), np.zeros(n), np.zeros(n)])
+    z = np.column_stack(
+        [rng.uniform(300, 1100, n), rng.uniform(20, 350, n), np.zeros(n), np.zeros(n)]
+    )
     z[:, 3], z[:, 2] = z[:, 1], z[:, 0] - rng.uniform(8, 60, n)
     points, valid = triangulate(CAMERA, z)
     assert valid.all()
@@ -43,7 +57,9 @@ def test_landmark_jacobian_equals_central_differences() -> None:
     m = transform_points(se3_inverse(T_CAM0_IMU @ U), _points_ahead(5, 0))
     analytic = z_D_landmark(CAMERA, T_CAM0_IMU, U, m)
     for i in range(len(m)):
-        numeric = numeric_jacobian(lambda p: project(CAMERA, transform_points(T_CAM0_IMU @ U, p)), m[i])
+        numeric = numeric_jacobian(
+            lambda p: project(CAMERA, transform_points(T_CAM0_IMU @ U, p)), m[i]
+        )
         np.testing.assert_allclose(analytic[i], numeric, rtol=1e-6, atol=1e-5)
 
 
@@ -55,11 +71,15 @@ def test_pose_jacobian_equals_central_differences() -> None:
     def pixels(xi: FloatArray) -> FloatArray:
         return project(CAMERA, transform_points(T_CAM0_IMU @ se3_exp(xi) @ U, m)).reshape(-1)
 
-    np.testing.assert_allclose(analytic.reshape(-1, 6), numeric_jacobian(pixels, np.zeros(6)), rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(
+        analytic.reshape(-1, 6), numeric_jacobian(pixels, np.zeros(6)), rtol=1e-6, atol=1e-5
+    )
 
 
 def test_prediction_transports_the_error_as_the_covariance_says() -> None:
-    """Perturb, then predict: the new error is F times the old one, exactly, as the flow is group-affine."""
+    """Perturb, then predict: the new error is F times the old one, exactly, as the flow is
+    group-affine.
+    """
     U, u, tau = _some_pose(), np.array([8.0, 0.3, -0.1, 0.02, -0.03, 0.4]), 0.1
     xi = np.array([0.3, -0.2, 0.1, 0.05, -0.02, 0.08])
     nominal, Sigma = predict(U, np.outer(xi, xi), u, tau, np.zeros((6, 6)))
@@ -74,11 +94,15 @@ def test_prediction_uses_the_curly_hat_of_the_paper() -> None:
     u, tau, W = np.array([8.0, 0.3, -0.1, 0.02, -0.03, 0.4]), 0.1, np.diag(np.arange(1.0, 7.0))
     Sigma = np.diag([1.0, 2, 3, 4, 5, 6])
     F = expm(-tau * se3_curly_hat(u))
-    np.testing.assert_allclose(predict(_some_pose(), Sigma, u, tau, W)[1], F @ Sigma @ F.T + W, rtol=1e-12)
+    np.testing.assert_allclose(
+        predict(_some_pose(), Sigma, u, tau, W)[1], F @ Sigma @ F.T + W, rtol=1e-12
+    )
 
 
 def test_block_diagonal_mapping_equals_the_dense_filter() -> None:
-    """The paper writes one 3M x 3M covariance; with a known pose only the diagonal blocks ever differ from zero."""
+    """The paper writes one 3M x 3M covariance; with a known pose only the diagonal blocks ever
+    differ from zero.
+    """
     U, n, variance = _some_pose(), 6, 4.0
     rng = np.random.default_rng(3)
     m = transform_points(se3_inverse(T_CAM0_IMU @ U), _points_ahead(n, 2))
@@ -91,7 +115,9 @@ def test_block_diagonal_mapping_equals_the_dense_filter() -> None:
 
     for seen in (np.array([0, 2, 5]), np.array([1, 2, 3, 4]), np.arange(n)):
         H_blocks = z_D_landmark(CAMERA, T_CAM0_IMU, U, block_m[seen])
-        z = project(CAMERA, transform_points(T_CAM0_IMU @ U, m[seen])) + rng.normal(0, 2, (len(seen), 4))
+        z = project(CAMERA, transform_points(T_CAM0_IMU @ U, m[seen])) + rng.normal(
+            0, 2, (len(seen), 4)
+        )
         residual = z - project(CAMERA, transform_points(T_CAM0_IMU @ U, block_m[seen]))
         H = np.zeros((4 * len(seen), 3 * n))
         for row, landmark in enumerate(seen):
@@ -100,12 +126,16 @@ def test_block_diagonal_mapping_equals_the_dense_filter() -> None:
         K = dense_P @ H.T @ np.linalg.inv(S)
         dense_m = dense_m + K @ residual.reshape(-1)
         dense_P = (np.eye(3 * n) - K @ H) @ dense_P
-        block_m[seen], block_P[seen] = update_landmarks(block_m[seen], block_P[seen], H_blocks, residual, variance)
+        block_m[seen], block_P[seen] = update_landmarks(
+            block_m[seen], block_P[seen], H_blocks, residual, variance
+        )
         np.testing.assert_allclose(block_m.reshape(-1), dense_m, atol=1e-9)
         for i in range(n):
             for j in range(n):
                 expected = block_P[i] if i == j else np.zeros((3, 3))
-                np.testing.assert_allclose(dense_P[3 * i : 3 * i + 3, 3 * j : 3 * j + 3], expected, atol=1e-9)
+                np.testing.assert_allclose(
+                    dense_P[3 * i : 3 * i + 3, 3 * j : 3 * j + 3], expected, atol=1e-9
+                )
 
 
 def test_pose_update_equals_the_gain_form_of_the_paper() -> None:
@@ -154,7 +184,10 @@ def test_new_landmarks_doubt_is_that_of_its_pixels_seen_from_the_world() -> None
 
 @pytest.mark.parametrize("tau_s", [0.05, 0.2])
 def test_noise_readings_differ_as_named(tau_s: float) -> None:
-    """Literal: the paper's numbers are variances per step. Consistent: standard deviations times the step."""
+    """Literal: the paper's numbers are variances per step.
+
+    Consistent: standard deviations times the step.
+    """
     expected = {
         "literal": np.repeat([0.5, 0.05], 3),
         "consistent": (np.repeat([0.5, 0.05], 3) * tau_s) ** 2,
@@ -170,7 +203,9 @@ def test_noise_readings_differ_as_named(tau_s: float) -> None:
 
 
 def test_literal_noise_counts_once_per_frame_however_many_samples() -> None:
-    """The step of the paper is from frame to frame; two half steps must not add W twice in the literal reading."""
+    """The step of the paper is from frame to frame; two half steps must not add W twice in the
+    literal reading.
+    """
     covariances = []
     for times in ([0, TAU_NS], [0, TAU_NS // 2, TAU_NS]):
         filt = Vislam(CAMERA, T_CAM0_IMU, PAPER, motion_sensor=True)
@@ -188,22 +223,40 @@ class _Drive:
 
     def __init__(self, frames: int = 60, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
-        self.u = np.column_stack([np.full(frames, 8.0), np.zeros((frames, 4)), 0.3 * np.sin(np.arange(frames) / 15)])
+        self.u = np.column_stack(
+            [np.full(frames, 8.0), np.zeros((frames, 4)), 0.3 * np.sin(np.arange(frames) / 15)]
+        )
         poses = [np.eye(4)]
         for k in range(frames - 1):
             poses.append(poses[-1] @ se3_exp(0.1 * self.u[k]))
         self.T_world_imu = np.array(poses)
-        self.points = np.column_stack([rng.uniform(0, 70, 900), rng.uniform(-25, 25, 900), rng.uniform(-1, 6, 900)])
+        self.points = np.column_stack(
+            [rng.uniform(0, 70, 900), rng.uniform(-25, 25, 900), rng.uniform(-1, 6, 900)]
+        )
 
     def observe(self, k: int, sigma_px: float, rng: np.random.Generator) -> Observations:
         p = transform_points(T_CAM0_IMU @ se3_inverse(self.T_world_imu[k]), self.points)
         near = (p[:, 2] > 2) & (p[:, 2] < 60)
         z = project(CAMERA, np.where(near[:, None], p, [0.0, 0.0, 10.0]))
-        inside = near & (z[:, 0] > 0) & (z[:, 2] > 0) & (z[:, 0] < 1242) & (z[:, 1] > 0) & (z[:, 1] < 375)
+        inside = (
+            near
+            & (z[:, 0] > 0)
+            & (z[:, 2] > 0)
+            & (z[:, 0] < 1242)
+            & (z[:, 1] > 0)
+            & (z[:, 1] < 375)
+        )
         ids = np.flatnonzero(inside)
         return observations(k, k * TAU_NS, ids, z[ids] + rng.normal(0, sigma_px, (len(ids), 4)))
 
-    def run(self, settings: VislamSettings, *, motion: bool, sigma_px: float = 0.5, noisy_input: bool = False) -> float:
+    def run(
+        self,
+        settings: VislamSettings,
+        *,
+        motion: bool,
+        sigma_px: float = 0.5,
+        noisy_input: bool = False,
+    ) -> float:
         """Return the largest position error over the drive, metres."""
         rng = np.random.default_rng(1)
         filt = Vislam(CAMERA, T_CAM0_IMU, settings, motion_sensor=motion)
@@ -230,7 +283,9 @@ def test_poses_are_not_stored_one_step_late() -> None:
 
 def test_fusion_beats_dead_reckoning_with_the_noise_of_the_paper() -> None:
     drive = _Drive()
-    alone = drive.run(replace(VislamSettings(), mode="dead_reckoning"), motion=True, noisy_input=True)
+    alone = drive.run(
+        replace(VislamSettings(), mode="dead_reckoning"), motion=True, noisy_input=True
+    )
     fused = drive.run(VislamSettings(), motion=True, noisy_input=True)
     assert fused < 0.5 * alone
     assert fused < 0.4
@@ -241,7 +296,9 @@ def test_images_alone_follow_a_drive_that_starts_in_motion() -> None:
 
 
 def test_the_twist_model_moves_the_error_as_its_covariance_says() -> None:
-    """Perturb pose and twist, predict both, and compare with F times the perturbation, to first order."""
+    """Perturb pose and twist, predict both, and compare with F times the perturbation, to first
+    order.
+    """
     U, u, tau = _some_pose(), np.array([8.0, 0.3, -0.1, 0.02, -0.03, 0.4]), 0.1
 
     def moved(error: FloatArray) -> FloatArray:
@@ -265,7 +322,9 @@ def test_the_noise_of_the_twist_model_does_not_depend_on_how_the_time_is_cut() -
 
 
 def test_a_sudden_turn_is_followed_although_the_motion_model_denies_it() -> None:
-    """Full speed to standstill and half a radian of yaw within one frame: the features outvote the model."""
+    """Full speed to standstill and half a radian of yaw within one frame: the features outvote
+    the model.
+    """
     drive = _Drive(frames=40)
     drive.T_world_imu[20:] = drive.T_world_imu[20] @ se3_exp(np.array([0.0, 0, 0, 0, 0, 0.5]))
     rng = np.random.default_rng(1)
@@ -288,15 +347,21 @@ def test_gate_keeps_wrong_matches_out() -> None:
     drive, rng = _Drive(frames=25), np.random.default_rng(9)
     errors = {}
     for probability in (0.95, None):
-        filt = Vislam(CAMERA, T_CAM0_IMU, VislamSettings(gate_probability=probability), motion_sensor=True)
+        filt = Vislam(
+            CAMERA, T_CAM0_IMU, VislamSettings(gate_probability=probability), motion_sensor=True
+        )
         gated = 0
         for k in range(25):
             filt.propagate(VelocitySample(k * TAU_NS, drive.u[k, :3], drive.u[k, 3:]))
             seen = drive.observe(k, 0.5, rng)
             wrong = rng.random(len(seen)) < 0.15
-            z = seen.z + np.where(wrong[:, None], rng.uniform(10, 40, (len(seen), 1)) * [1, 0, 1, 0], 0)
+            z = seen.z + np.where(
+                wrong[:, None], rng.uniform(10, 40, (len(seen), 1)) * [1, 0, 1, 0], 0
+            )
             gated += filt.update(observations(k, k * TAU_NS, seen.ids, z)).gated
-        errors[probability] = np.linalg.norm(filt.estimate().T_world_imu[:3, 3] - drive.T_world_imu[24][:3, 3])
+        errors[probability] = np.linalg.norm(
+            filt.estimate().T_world_imu[:3, 3] - drive.T_world_imu[24][:3, 3]
+        )
         assert gated > 0  # without a gate these are landmarks that ended up behind the camera
     assert errors[0.95] < 0.5 * errors[None]
 
@@ -306,7 +371,9 @@ def test_left_only_stale_and_negative_disparities_do_not_enter() -> None:
     z[3, [0, 2]] = z[3, [2, 0]]  # the point would lie behind the cameras
     flags = np.array([True, False, False, False])
     filt = Vislam(CAMERA, T_CAM0_IMU, VislamSettings(), motion_sensor=False)
-    report = filt.update(observations(0, 0, [5, 6, 7, 8], z, has_right=~flags, stale=np.roll(flags, 1)))
+    report = filt.update(
+        observations(0, 0, [5, 6, 7, 8], z, has_right=~flags, stale=np.roll(flags, 1))
+    )
     assert report.initialised == 1
     np.testing.assert_array_equal(filt.landmarks().ids, [7])
 
@@ -370,7 +437,9 @@ def test_the_map_grows_without_losing_a_landmark() -> None:
 @pytest.mark.parametrize("gap", [7, 10**9])
 @pytest.mark.parametrize("seed", range(6))
 def test_garbage_ends_in_an_error_of_ours_or_in_numbers(seed: int, gap: int) -> None:
-    """Features that jump about at random, with gaps: never a NaN passed on, never a foreign exception."""
+    """Features that jump about at random, with gaps: never a NaN passed on, never a foreign
+    exception.
+    """
     rng = np.random.default_rng(seed)
     filt = Vislam(CAMERA, T_CAM0_IMU, VislamSettings(), motion_sensor=False)
     for k in range(120):

@@ -24,11 +24,15 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sources")
     for name in _SOURCES:
         if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(
+                ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__")
+            )
         else:
             shutil.copy(ROOT / name, folder / name)
     code = "from setuptools import build_meta; print(build_meta.build_wheel('dist'))"
-    subprocess.run([sys.executable, "-c", code], cwd=folder, check=True, capture_output=True, timeout=300)
+    subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, check=True, capture_output=True, timeout=300
+    )
     (built,) = (folder / "dist").glob("*.whl")
     return built
 
@@ -39,7 +43,9 @@ def test_the_wheel_holds_the_packages_and_their_data_only(wheel: Path) -> None:
     assert {"vio/py.typed", "vio/frontend/py.typed"} <= set(names)
     assert any(name.endswith("licenses/LICENSE") for name in names)
     sources = {
-        path.relative_to(ROOT).as_posix() for part in ("vio", "vio/frontend") for path in (ROOT / part).rglob("*.py")
+        path.relative_to(ROOT).as_posix()
+        for part in ("vio", "vio/frontend")
+        for path in (ROOT / part).rglob("*.py")
     }
     assert {name for name in names if name.endswith(".py")} == sources
 
@@ -49,11 +55,17 @@ def test_the_unpacked_wheel_runs_outside_the_repository(wheel: Path, tmp_path: P
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
     code = (
         "import vio, vio.frontend, vio.config; from vio.cli import main; "
-        "assert all('site' in m.__file__ for m in (vio, vio.frontend)), vio.__file__; vio.config.load_config(); "
+        "assert all('site' in m.__file__ for m in (vio, vio.frontend)), vio.__file__; "
+        "vio.config.load_config(); "
         "raise SystemExit(main(['config', '--show']))"
     )
     shown = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert shown.returncode == 0, shown.stderr
     assert "msckf.clones" in shown.stdout
@@ -64,7 +76,9 @@ def test_a_shell_completes_every_command(shell: str, capsys: pytest.CaptureFixtu
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out
     for module in COMMANDS:
-        name = {"evaluate": "eval"}.get(module.__name__.rpartition(".")[2], module.__name__.rpartition(".")[2])
+        name = {"evaluate": "eval"}.get(
+            module.__name__.rpartition(".")[2], module.__name__.rpartition(".")[2]
+        )
         assert name in script
     program = shutil.which(shell)
     if program is not None:

@@ -1,4 +1,6 @@
-"""Wide lenses: what they see above and below a pinhole's image reaches the filter, and other programs get a pinhole."""
+"""Wide lenses: what they see above and below a pinhole's image reaches the filter, and other
+programs get a pinhole.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,8 @@ from vio.sim.rigs import wide_rig
 CYLINDER = StereoCamera(200.0, 200.0, 300.0, 314.0, 0.11, 600, 628, "cylinder")
 
 
-# --- the recording of a wide pair, from the reader to other programs -------------------------------------------------
+# --- the recording of a wide pair, from the reader to other programs
+# -------------------------------------------------
 
 
 _EXACT = "--set", "msckf.calibrate_stereo=off"  # pixels stay as they were measured
@@ -58,12 +61,28 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def wide_run(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("wide") / "run"
-    assert main(["run", str(flight), "--save-observations", "--out", str(out), "--json", "--quiet", *_EXACT]) == 0
+    assert (
+        main(
+            [
+                "run",
+                str(flight),
+                "--save-observations",
+                "--out",
+                str(out),
+                "--json",
+                "--quiet",
+                *_EXACT,
+            ]
+        )
+        == 0
+    )
     return out
 
 
 def test_a_run_uses_what_a_wide_lens_sees_above_and_below(wide_run: Path) -> None:
-    """A pinhole ends 54 degrees above and below the axis; a third of what this lens shows lies beyond."""
+    """A pinhole ends 54 degrees above and below the axis; a third of what this lens shows lies
+    beyond.
+    """
     metrics = json.loads((wide_run / "metrics.json").read_text())
     assert metrics["camera"]["projection"] == "cylinder"
     log = read_observation_log(wide_run / "observations.npz")
@@ -72,13 +91,30 @@ def test_a_run_uses_what_a_wide_lens_sees_above_and_below(wide_run: Path) -> Non
     assert azimuth.max() > np.radians(65)
     assert metrics["ate_m"] < 0.005
     (note,) = [note for note in log.recording.notes if "deg" in note]
-    assert note.startswith("the lens shows 153 x 153 deg; rectified to a cylinder about the baseline, 105 x 150 deg")
+    assert note.startswith(
+        "the lens shows 153 x 153 deg; rectified to a cylinder about the baseline, 105 x 150 deg"
+    )
     assert note.endswith("are kept, at 61 px per radian in the middle (the lens: 60)")
 
 
-def test_saved_observations_of_a_cylinder_replay_to_the_same_bits(wide_run: Path, tmp_path: Path) -> None:
+def test_saved_observations_of_a_cylinder_replay_to_the_same_bits(
+    wide_run: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "again"
-    assert main(["run", str(wide_run / "observations.npz"), "--out", str(out), "--json", "--quiet", *_EXACT]) == 0
+    assert (
+        main(
+            [
+                "run",
+                str(wide_run / "observations.npz"),
+                "--out",
+                str(out),
+                "--json",
+                "--quiet",
+                *_EXACT,
+            ]
+        )
+        == 0
+    )
     for name in ("trajectory.tum", "landmarks.ply"):
         assert (out / name).read_bytes() == (wide_run / name).read_bytes()
 
@@ -100,14 +136,34 @@ def test_the_projection_is_a_setting(flight: Path) -> None:
     def read(**settings: str) -> StereoCamera:
         return open_dataset(str(flight), DatasetSettings(**settings)).recording.camera  # type: ignore[arg-type]
 
-    assert [read(projection=name).projection for name in ("auto", "pinhole")] == ["cylinder", "pinhole"]
+    assert [read(projection=name).projection for name in ("auto", "pinhole")] == [
+        "cylinder",
+        "pinhole",
+    ]
 
 
-def test_maps_and_rectified_folders_of_wide_lenses_are_those_of_pinholes(flight: Path, tmp_path: Path) -> None:
+def test_maps_and_rectified_folders_of_wide_lenses_are_those_of_pinholes(
+    flight: Path, tmp_path: Path
+) -> None:
     for_maps = _opened(str(flight), Config(), mapped=True).recording.camera
     assert for_maps.projection == "pinhole"
-    assert main(["convert", str(flight), "--to", "euroc", "--out", str(tmp_path / "converted"), "--json"]) == 0
-    assert open_dataset(str(tmp_path / "converted")).recording.camera.fu == pytest.approx(for_maps.fu)
+    assert (
+        main(
+            [
+                "convert",
+                str(flight),
+                "--to",
+                "euroc",
+                "--out",
+                str(tmp_path / "converted"),
+                "--json",
+            ]
+        )
+        == 0
+    )
+    assert open_dataset(str(tmp_path / "converted")).recording.camera.fu == pytest.approx(
+        for_maps.fu
+    )
     assert open_source(str(flight)).dataset.recording.camera == for_maps  # type: ignore[union-attr]
     rig = wide_rig(160)
     live = Rig(rig.cam0, rig.cam1, se3_inverse(rig.T_cam0_cam1), se3_inverse(rig.T_imu_cam0))
@@ -115,7 +171,9 @@ def test_maps_and_rectified_folders_of_wide_lenses_are_those_of_pinholes(flight:
     assert vio.Odometry(live, map=tmp_path / "b.map").camera.projection == "pinhole"
 
 
-def test_a_saved_run_shows_other_programs_a_pinhole(flight: Path, wide_run: Path, tmp_path: Path) -> None:
+def test_a_saved_run_shows_other_programs_a_pinhole(
+    flight: Path, wide_run: Path, tmp_path: Path
+) -> None:
     """Pixels are where that pinhole sees the points, and its images are those of the raw lens."""
     run = read_saved_run(wide_run)
     camera, tracks = run.tracked.camera, run.tracked.tracks
@@ -132,8 +190,12 @@ def test_a_saved_run_shows_other_programs_a_pinhole(flight: Path, wide_run: Path
     other = open_dataset(str(flight), DatasetSettings(projection="pinhole"))
     (theirs,) = frames_of(other, frame, frame + 1)
     v, u = np.mgrid[10:150:3, 10:150:3].astype(np.float64)
-    expected = project(other.recording.camera, left_rays(camera, np.stack([u, v], axis=-1)))[..., :2].astype(np.float32)
-    image = cv2.remap(theirs.right, expected[..., 0], expected[..., 1], cv2.INTER_LINEAR).astype(np.float64)
+    expected = project(other.recording.camera, left_rays(camera, np.stack([u, v], axis=-1)))[
+        ..., :2
+    ].astype(np.float32)
+    image = cv2.remap(theirs.right, expected[..., 0], expected[..., 1], cv2.INTER_LINEAR).astype(
+        np.float64
+    )
     gap = ours.right[v.astype(int), u.astype(int)] - image
     assert np.sqrt(np.mean(gap[5:-5, 5:-5] ** 2)) < 0.2 * image.std()
 
@@ -147,7 +209,8 @@ def test_a_log_with_an_unknown_projection_is_refused(wide_run: Path, tmp_path: P
     assert read_observation_log(tmp_path / "same.npz").recording.camera.projection == "cylinder"
 
 
-# --- geometry all about the baseline ---------------------------------------------------------------------------------
+# --- geometry all about the baseline
+# ---------------------------------------------------------------------------------
 
 
 def _around(n: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
@@ -160,7 +223,9 @@ def _around(n: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
 def test_consensus_without_depth_holds_beyond_ninety_degrees() -> None:
     pixels, p = _around(150)
     T = se3_exp([0.15, 0.05, -0.08, 0.05, 0.1, -0.06])
-    now = project(CYLINDER, transform_points(T, p))[:, :2] + np.random.default_rng(1).normal(0, 0.2, (150, 2))
+    now = project(CYLINDER, transform_points(T, p))[:, :2] + np.random.default_rng(1).normal(
+        0, 0.2, (150, 2)
+    )
     now[:30] += 40.0
     problem = RansacProblem(CYLINDER, 1.5, np.random.default_rng(2))
     kept = bearing_consensus(problem, pixels, now, np.eye(3), None)
@@ -190,30 +255,40 @@ def test_points_all_about_the_baseline_are_triangulated(left_only: bool) -> None
     assert known.all()
     np.testing.assert_allclose(start, p, rtol=1e-3, atol=1e-3)
     noisy = Views(z + np.random.default_rng(4).normal(0, 0.3, z.shape), weight)
-    found = multiview.refine_points(CYLINDER, T, multiview.first_points(CYLINDER, T, noisy)[0], noisy, 5, 3.0)
+    found = multiview.refine_points(
+        CYLINDER, T, multiview.first_points(CYLINDER, T, noisy)[0], noisy, 5, 3.0
+    )
     assert np.median(np.linalg.norm(found - p, axis=1) / depth_of(CYLINDER, p)) < 0.03
 
 
 class WideFlight(test_msckf.Flight):
-    """The flight of `test_msckf`, seen through a cylinder's image: points beside and behind the axis, too."""
+    """The flight of `test_msckf`, seen through a cylinder's image: points beside and behind the
+    axis, too.
+    """
 
     def __init__(self, frames: int) -> None:
         """Put the points all about the flight."""
         super().__init__(frames)
         self.points = np.random.default_rng(0).uniform(-5, 5, (400, 3))
 
-    def observe(self, k: int, sigma: float, noise: np.random.Generator, limit: int = 60) -> Observations:
+    def observe(
+        self, k: int, sigma: float, noise: np.random.Generator, limit: int = 60
+    ) -> Observations:
         """Return noisy pixels of the first points that are seen."""
         p = transform_points(test_msckf.T_CAM0_IMU @ se3_inverse(self.T_world_imu(k)), self.points)
         depth = depth_of(CYLINDER, p)
         z = project(CYLINDER, np.where((depth > 0.5)[:, None], p, [0.0, 0.0, 1.0]))
         inside = (z[:, 2] > 5) & (z[:, 0] < 595) & (z[:, 1] > 5) & (z[:, 1] < 623)
         ids = np.flatnonzero(inside & (depth > 0.5) & (depth < self.farthest))[:limit]
-        return observations(k, k * test_msckf.STEP_NS, ids, z[ids] + noise.normal(0, sigma, (len(ids), 4)))
+        return observations(
+            k, k * test_msckf.STEP_NS, ids, z[ids] + noise.normal(0, sigma, (len(ids), 4))
+        )
 
 
 def test_the_window_is_consistent_on_a_cylinder(monkeypatch: pytest.MonkeyPatch) -> None:
-    """NEES of the pose over 6 seeded runs of 0.8 s with an IMU: inside its 95 % band in at least 90 % of the steps."""
+    """NEES of the pose over 6 seeded runs of 0.8 s with an IMU: inside its 95 % band in at least
+    90 % of the steps.
+    """
     monkeypatch.setattr(test_msckf, "CAMERA", CYLINDER)
     settings, runs, values = MsckfSettings(), 6, []
     for seed in range(runs):
@@ -221,23 +296,30 @@ def test_the_window_is_consistent_on_a_cylinder(monkeypatch: pytest.MonkeyPatch)
         values.append(nees(errors[1:], covariances[1:]))
     mean = np.mean(values, axis=0)
     low, high = nees_bounds(6, runs)
-    assert np.mean(mean < high) >= 0.9, f"overconfident: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
+    assert np.mean(mean < high) >= 0.9, (
+        f"overconfident: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
+    )
     assert mean.mean() > 0.6 * low
     seen = WideFlight(1).observe(0, 0.0, np.random.default_rng(0))
     beside = int((np.abs(seen.z[:, 1] - CYLINDER.cv) / CYLINDER.fv > np.radians(60)).sum())
     assert beside >= 10
 
 
-# --- what the calibration of a wide pair is off by, equation (R6) ----------------------------------------------------
+# --- what the calibration of a wide pair is off by, equation (R6)
+# ----------------------------------------------------
 
 
 def _on_cylinder(rays: FloatArray) -> FloatArray:
     """Coordinates (N, 2) of rays (N, 3): tangent along the baseline, azimuth about it."""
-    return np.stack([rays[:, 0] / np.hypot(rays[:, 1], rays[:, 2]), np.arctan2(rays[:, 1], rays[:, 2])], axis=1)
+    return np.stack(
+        [rays[:, 0] / np.hypot(rays[:, 1], rays[:, 2]), np.arctan2(rays[:, 1], rays[:, 2])], axis=1
+    )
 
 
 def _through_lens(rays: FloatArray, shift: FloatArray) -> FloatArray:
-    """Rays (N, 3) whose angles off the axis, along u and v, are shifted by (N, 2) or (2,) radians."""
+    """Rays (N, 3) whose angles off the axis, along u and v, are shifted by (N, 2) or (2,)
+    radians.
+    """
     sine = np.hypot(rays[:, 0], rays[:, 1])
     angles = rays[:, :2] * (np.arctan2(sine, rays[:, 2]) / sine)[:, None] + shift
     theta = np.linalg.norm(angles, axis=1)
@@ -245,14 +327,20 @@ def _through_lens(rays: FloatArray, shift: FloatArray) -> FloatArray:
 
 
 def _field(a: FloatArray, v: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Pixels (N, 4) without a field of states (8,), and the baseline's behind them, and rows (7,)."""
+    """Pixels (N, 4) without a field of states (8,), and the baseline's behind them, and rows
+    (7,).
+    """
     z = np.column_stack([left, right[:, 0], left[:, 1]])
-    field = StereoCorrection(CYLINDER, v, np.concatenate([a, np.zeros(TERMS - len(a))]), np.arange(TERMS))
+    field = StereoCorrection(
+        CYLINDER, v, np.concatenate([a, np.zeros(TERMS - len(a))]), np.arange(TERMS)
+    )
     return field.corrected(Views(z, np.tile([1.0, 1.0, 1.0, 0.0], (len(z), 1)))).z
 
 
 def test_the_field_takes_out_turns_and_lens_errors_of_the_right_camera() -> None:
-    """Rows and states of (R6) are exact for a small turn, for a shifted principal point and for a radial error."""
+    """Rows and states of (R6) are exact for a small turn, for a shifted principal point and for
+    a radial error.
+    """
     pixels, _ = _around(200)
     rays = left_rays(CYLINDER, pixels)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -311,6 +399,7 @@ def test_derivatives_by_the_field_are_those_of_the_correction() -> None:
     for j in range(9):
         a = step * np.eye(9)[j]
         change = z[:, :3] - _field(a, np.zeros(7), pixels, z[:, 2:])[:, :3]
-        np.testing.assert_allclose(H[:, :3, j], change / step, rtol=1e-4, atol=1e-6)  # the baseline's is no line
+        # the baseline's is no line
+        np.testing.assert_allclose(H[:, :3, j], change / step, rtol=1e-4, atol=1e-6)
     assert not H[:, 3].any()
     assert not H[:, :, 9:].any()

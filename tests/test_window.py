@@ -1,4 +1,6 @@
-"""The window's covariance and means: invariants that hold whatever the motion and the landmarks are."""
+"""The window's covariance and means: invariants that hold whatever the motion and the landmarks
+are.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,10 @@ def _window(clones: int = 4) -> Window:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(DIM, DIM)) * 0.05
     nav = NavState(
-        se3_exp([1.0, -2, 0.5, 0.3, -0.2, 0.8]), np.array([8.0, 0.2, -0.1]), np.full(3, 0.4), *np.zeros((2, 3))
+        se3_exp([1.0, -2, 0.5, 0.3, -0.2, 0.8]),
+        np.array([8.0, 0.2, -0.1]),
+        np.full(3, 0.4),
+        *np.zeros((2, 3)),
     )
     window = Window(TwistMotion(MsckfSettings()), nav, root @ root.T)
     for k in range(clones):
@@ -56,7 +61,9 @@ def test_every_change_keeps_the_covariance_symmetric_and_positive() -> None:
 
 
 def test_a_landmark_whose_error_is_its_anchors_moves_with_it() -> None:
-    """Both errors are of one kind: the newest camera sees the landmark where it did, also after a large move."""
+    """Both errors are of one kind: the newest camera sees the landmark where it did, also after
+    a large move.
+    """
     window = _window()
     before = transform_points(se3_inverse(window.clones[-1].T_world_imu), LANDMARKS)
     error = np.zeros(len(window.prior.P))
@@ -64,7 +71,9 @@ def test_a_landmark_whose_error_is_its_anchors_moves_with_it() -> None:
     error[window.state.clone(3)] = move
     error[window.state.landmarks.start :] = np.tile(move[:3], 2)
     window.relinearise(error)
-    np.testing.assert_allclose(window.clones[3].T_world_imu, se3_exp(move) @ _window().clones[3].T_world_imu)
+    np.testing.assert_allclose(
+        window.clones[3].T_world_imu, se3_exp(move) @ _window().clones[3].T_world_imu
+    )
     after = transform_points(se3_inverse(window.clones[-1].T_world_imu), window.landmarks)
     np.testing.assert_allclose(after, before, atol=1e-12)
 
@@ -86,10 +95,14 @@ def test_covariance_of_the_last_move_counts_what_both_poses_share() -> None:
     J = np.zeros((6, len(window.prior.P)))
     J[:, window.state.clone(3)], J[:, window.state.clone(2)] = np.eye(6), -np.eye(6)
     prior = fit(factor(window.prior.P), np.zeros_like(window.prior.P))
-    np.testing.assert_allclose(move_covariance(window, 2, prior), J @ window.prior.P @ J.T, atol=1e-12)
+    np.testing.assert_allclose(
+        move_covariance(window, 2, prior), J @ window.prior.P @ J.T, atol=1e-12
+    )
     for index in (2, -2):
         move = window.camera_move_since(index)
-        np.testing.assert_allclose(window.clones[2].T_world_imu @ move, window.clones[3].T_world_imu, atol=1e-12)
+        np.testing.assert_allclose(
+            window.clones[2].T_world_imu @ move, window.clones[3].T_world_imu, atol=1e-12
+        )
     assert not move_covariance(window, 3, prior).any()
     np.testing.assert_allclose(window.camera_move_since(3), np.eye(4), atol=1e-12)
 
@@ -152,18 +165,23 @@ def test_fit_by_factors_equals_the_dense_covariance() -> None:
     rng = np.random.default_rng(2)
     root, J, b = rng.normal(size=(9, 9)), rng.normal(size=(2, 3, 9)), rng.normal(size=9)
     H = rng.normal(size=(5, 9))
-    for prior in (root @ root.T, root[:, :6] @ root[:, :6].T - 1e-9 * np.eye(9)):  # the second one is no covariance
+    # the second one is no covariance
+    for prior in (root @ root.T, root[:, :6] @ root[:, :6].T - 1e-9 * np.eye(9)):
         fitted = fit(factor(prior), H.T @ H)
         P_new, shift = posterior(prior, H.T @ H, b)
         np.testing.assert_allclose(fitted.covariance(), P_new, atol=1e-12)
         np.testing.assert_allclose(fitted.move(b), shift, atol=1e-9)
         S = fitted.whitened(J @ fitted.prior.L)
-        np.testing.assert_allclose(S @ np.swapaxes(S, 1, 2), J @ P_new @ np.swapaxes(J, 1, 2), atol=1e-9)
+        np.testing.assert_allclose(
+            S @ np.swapaxes(S, 1, 2), J @ P_new @ np.swapaxes(J, 1, 2), atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("about_all", [False, True])
 def test_a_fit_of_some_errors_equals_the_one_of_all(about_all: bool) -> None:
-    """Of pixels, which navigation state and calibration follow by their correlation, and of everything."""
+    """Of pixels, which navigation state and calibration follow by their correlation, and of
+    everything.
+    """
     window, rng = _window(), np.random.default_rng(5)
     D = len(window.prior.P)
     root = rng.normal(size=(D, D))

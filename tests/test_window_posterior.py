@@ -30,7 +30,9 @@ def _window(xi: FloatArray, n: int = 5, motion: str = "twist") -> Window:
 
 
 def _posterior(xi: FloatArray, sigma: FloatArray) -> WindowPosterior:
-    """The window's posterior whose motion from first to last has standard deviations (6,) on the first body."""
+    """The window's posterior whose motion from first to last has standard deviations (6,) on the
+    first body.
+    """
     window, A = _window(xi), se3_adjoint(_START)
     P = np.zeros((len(window.prior.P), len(window.prior.P)))
     newest = window.state.clone(4)
@@ -43,12 +45,18 @@ def test_stationary_is_a_chi_square_test_of_the_motion_over_the_window(axis: int
     sigma = np.array([1e-3, 2e-3, 3e-3, 5e-4, 1e-3, 2e-3])
     limit = sigma[axis] * np.sqrt(chi2.ppf(0.95, 6))
     for factor, expected in ((0.99, True), (1.01, False)):
-        assert _posterior(np.eye(6)[axis] * limit * factor, sigma).is_stationary(*_LIMITS) is expected
+        assert (
+            _posterior(np.eye(6)[axis] * limit * factor, sigma).is_stationary(*_LIMITS) is expected
+        )
 
 
 @pytest.mark.parametrize(("part", "limit"), [(slice(0, 3), 0.02), (slice(3, 6), 0.01)])
-def test_a_window_that_knows_its_motion_badly_is_never_stationary(part: slice, limit: float) -> None:
-    """The mean velocity and rate over 0.4 s must be known to the standard deviations of the measurement."""
+def test_a_window_that_knows_its_motion_badly_is_never_stationary(
+    part: slice, limit: float
+) -> None:
+    """The mean velocity and rate over 0.4 s must be known to the standard deviations of the
+    measurement.
+    """
     for factor, expected in ((0.99, True), (1.01, False)):
         sigma = np.full(6, 1e-4)
         sigma[part.start] = limit * 0.4 * factor
@@ -76,7 +84,9 @@ def test_what_both_poses_share_does_not_blur_their_motion() -> None:
     P[rows, rows] = np.tile(np.eye(6), (5, 5))
     P[window.state.clone(4), window.state.clone(4)] += np.eye(6) * 1e-8
     assert WindowPosterior.of(window, P).is_stationary(*_LIMITS)
-    P[window.state.clone(0), window.state.clone(4)] = P[window.state.clone(4), window.state.clone(0)] = 0.0
+    P[window.state.clone(0), window.state.clone(4)] = P[
+        window.state.clone(4), window.state.clone(0)
+    ] = 0.0
     assert not WindowPosterior.of(window, P).is_stationary(*_LIMITS)
 
 
@@ -103,10 +113,16 @@ def test_without_imu_the_velocity_is_that_of_the_poses_around() -> None:
     window = _window(np.zeros(6))
     t = np.arange(5) * 0.1
     p = np.column_stack([3 * t**2, 1 - 2 * t, 0 * t])
-    window.clones = replace(window.clones, T_world_imu=se3_from_parts(window.clones.T_world_imu[:, :3, :3], p))
+    window.clones = replace(
+        window.clones, T_world_imu=se3_from_parts(window.clones.T_world_imu[:, :3, :3], p)
+    )
     posterior = WindowPosterior.of(window, window.prior.P)
     smoothed = [posterior.estimate(index) for index in posterior.clones.frame_indices.tolist()]
-    velocities = np.array([estimate.velocity_world for estimate in smoothed if estimate is not None])
+    velocities = np.array(
+        [estimate.velocity_world for estimate in smoothed if estimate is not None]
+    )
     exact = np.column_stack([6 * t, np.full(5, -2.0), 0 * t])
     np.testing.assert_allclose(velocities[1:-1], exact[1:-1], atol=1e-12)
-    np.testing.assert_allclose(velocities[[0, -1]], exact[[0, -1]] + [[0.3, 0, 0], [-0.3, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(
+        velocities[[0, -1]], exact[[0, -1]] + [[0.3, 0, 0], [-0.3, 0, 0]], atol=1e-12
+    )

@@ -27,16 +27,21 @@ def _points(n: int) -> FloatArray:
     return transform_points(se3_inverse(T_CAM0_WORLD[0]), p_cam)
 
 
-def _tracks(p: FloatArray, frames: int = 4, noise_px: float = 0.0, settings: MsckfSettings = SETTINGS) -> WindowTracks:
+def _tracks(
+    p: FloatArray, frames: int = 4, noise_px: float = 0.0, settings: MsckfSettings = SETTINGS
+) -> WindowTracks:
     tracks, rng = WindowTracks(CAMERA, settings), np.random.default_rng(2)
     for k in range(frames):
-        z = project(CAMERA, transform_points(T_CAM0_WORLD[k], p)) + rng.normal(0, noise_px, (len(p), 4))
+        z = project(CAMERA, transform_points(T_CAM0_WORLD[k], p)) + rng.normal(
+            0, noise_px, (len(p), 4)
+        )
         tracks.table.add_frame(k, observations(k, k, np.arange(len(p)), z))
     return tracks
 
 
 def test_the_gate_knows_how_many_pixels_were_seen() -> None:
-    """Three stereo views of three pixels each, less the three of the point: 6 degrees of freedom; left views alone: 3.
+    """Three stereo views of three pixels each, less the three of the point: 6 degrees of freedom;
+    left views alone: 3.
 
     The right row is measured in none.
     """
@@ -47,19 +52,27 @@ def test_the_gate_knows_how_many_pixels_were_seen() -> None:
     r = np.zeros((4, 3, 4))
     limits = tracks.variance * np.repeat(chi2.ppf(SETTINGS.gate_probability, [6, 3]), 2)
     r[:, 1, 0] = np.sqrt(limits * [0.999, 1.001, 0.999, 1.001])
-    passed, squares, dof = tracks.gate(Residuals(r, J, np.ones(4, dtype=np.bool_), np.ones(r.shape)))
+    passed, squares, dof = tracks.gate(
+        Residuals(r, J, np.ones(4, dtype=np.bool_), np.ones(r.shape))
+    )
     assert passed.tolist() == [True, False, True, False]
     assert dof.tolist() == [6, 6, 3, 3]
     np.testing.assert_allclose(squares, r[:, 1, 0] ** 2 / tracks.variance)
 
 
 @pytest.mark.parametrize(("ending", "going_on"), [(300, 15), (100, 50), (0, 150)])
-def test_the_newest_pose_is_not_left_to_a_few_tracks_where_nearly_all_end(ending: int, going_on: int) -> None:
-    """Behind a cover hundreds of tracks end at once, and a wrong one among a few that go on would decide."""
+def test_the_newest_pose_is_not_left_to_a_few_tracks_where_nearly_all_end(
+    ending: int, going_on: int
+) -> None:
+    """Behind a cover hundreds of tracks end at once, and a wrong one among a few that go on
+    would decide.
+    """
     tracks, p = WindowTracks(CAMERA, SETTINGS), _points(500)
     for k in range(1, 4):
         ids = np.arange(ending if k == 3 else 0, 500)
-        tracks.table.add_frame(k, observations(k, k, ids, project(CAMERA, transform_points(T_CAM0_WORLD[k], p[ids]))))
+        tracks.table.add_frame(
+            k, observations(k, k, ids, project(CAMERA, transform_points(T_CAM0_WORLD[k], p[ids])))
+        )
     chosen = tracks.choose(4)
     assert len(chosen) == SETTINGS.max_features == 150
     assert int((tracks.table.ids(chosen) >= ending).sum()) == going_on
@@ -68,21 +81,23 @@ def test_the_newest_pose_is_not_left_to_a_few_tracks_where_nearly_all_end(ending
 def test_the_gate_of_a_track_as_long_as_the_table_of_quantiles_or_longer() -> None:
     tracks = WindowTracks(CAMERA, SETTINGS)
     J = np.ones((1, 80, 4, 3))
-    assert tracks.gate(Residuals(np.zeros((1, 80, 4)), J, np.ones(1, np.bool_), np.ones((1, 80, 4))))[2].tolist() == [
-        199
-    ]
+    assert tracks.gate(
+        Residuals(np.zeros((1, 80, 4)), J, np.ones(1, np.bool_), np.ones((1, 80, 4)))
+    )[2].tolist() == [199]
 
 
 @pytest.mark.parametrize("moving", [0, 40, 65])
 def test_a_blurred_frame_is_no_frame_of_outliers(moving: int) -> None:
-    """All residuals have three times the variance that is believed; of 80 tracks, some are on what moves.
+    """All residuals have three times the variance that is believed; of 80 tracks, some are on what
+    moves.
 
     The others pass as they do with the noise known, and what moves does not.
     """
     tracks, rng = WindowTracks(CAMERA, SETTINGS), np.random.default_rng(3)
     J = np.ones((80, 3, 4, 3))
     J[:, :, 3] = 0.0
-    r = rng.normal(0.0, np.sqrt(3 * tracks.variance * 6 / 9), (80, 3, 4))  # nine pixels, six degrees of freedom
+    # nine pixels, six degrees of freedom
+    r = rng.normal(0.0, np.sqrt(3 * tracks.variance * 6 / 9), (80, 3, 4))
     r[:, :, 3] = 0.0
     r[80 - moving :] += 20.0 * np.sqrt(tracks.variance)
     passed, _, _ = tracks.gate(Residuals(r, J, np.ones(80, dtype=np.bool_), np.ones(r.shape)))
@@ -93,7 +108,9 @@ def test_a_blurred_frame_is_no_frame_of_outliers(moving: int) -> None:
 
 
 def test_what_moves_slowly_is_no_blur() -> None:
-    """Half of 80 tracks are off by two standard deviations in every pixel, and the others by what is believed."""
+    """Half of 80 tracks are off by two standard deviations in every pixel, and the others by
+    what is believed.
+    """
     tracks, rng = WindowTracks(CAMERA, SETTINGS), np.random.default_rng(4)
     J = np.ones((80, 3, 4, 3))
     J[:, :, 3] = 0.0
@@ -107,11 +124,15 @@ def test_what_moves_slowly_is_no_blur() -> None:
 
 @pytest.mark.parametrize(("off", "noise_px"), [(0.0, 0.1), (5e-4, 0.1), (5e-4, 0.15)])
 def test_a_pose_that_is_off_is_no_noise_of_all_tracks(off: float, noise_px: float) -> None:
-    """A tenth of a pixel is believed; pixels have more, or the newest pose is off by half a millimetre and milliradian.
+    """A tenth of a pixel is believed; pixels have more, or the newest pose is off by half a
+    millimetre and milliradian.
 
-    The common noise is that of the pixels within a sixth, where the pose makes it 1.5 to 3 times as much.
+    The common noise is that of the pixels within a sixth, where the pose makes it 1.5 to 3 times as
+    much.
     """
-    tracks = _tracks(_points(300), noise_px=noise_px, settings=replace(SETTINGS, pixel_sigma_px=0.1))
+    tracks = _tracks(
+        _points(300), noise_px=noise_px, settings=replace(SETTINGS, pixel_sigma_px=0.1)
+    )
     T = T_CAM0_WORLD.copy()
     T[-1] = se3_exp(np.full(6, off)) @ T[-1]
     linear = tracks.linearise(T, tracks.choose(4), 5)
@@ -124,10 +145,21 @@ def test_a_pose_that_is_off_is_no_noise_of_all_tracks(off: float, noise_px: floa
 @pytest.mark.parametrize("dof", [1, 3, 6, 45, 199])
 @pytest.mark.parametrize(
     ("ratio", "count", "change"),
-    [(1.0, 15, 1.0), (2.0, 15, 2.0), (0.5, 15, 0.5), (9e9, 15, 4.0), (0.0, 15, 0.25), (9.0, 14, 1.0)],
+    [
+        (1.0, 15, 1.0),
+        (2.0, 15, 2.0),
+        (0.5, 15, 0.5),
+        (9e9, 15, 4.0),
+        (0.0, 15, 0.25),
+        (9.0, 14, 1.0),
+    ],
 )
-def test_pixel_noise_follows_the_median_slowly(ratio: float, count: int, change: float, dof: int) -> None:
-    """By the twentieth root of its ratio to the median of chi-square, at most four; not where few tracks tell."""
+def test_pixel_noise_follows_the_median_slowly(
+    ratio: float, count: int, change: float, dof: int
+) -> None:
+    """By the twentieth root of its ratio to the median of chi-square, at most four; not where
+    few tracks tell.
+    """
     tracks = WindowTracks(CAMERA, SETTINGS)
     for _ in range(20):
         tracks.update_pixel_noise(np.full(600, chi2.ppf(0.5, 45)), np.full(600, 45), -3.0)
@@ -149,7 +181,9 @@ def test_pixel_noise_is_learned_in_the_first_frame() -> None:
 
 @pytest.mark.parametrize("spent", [0, 30, 1000])
 def test_pixel_noise_counts_what_was_spent_on_the_poses(spent: float) -> None:
-    """60 tracks, 180 degrees of freedom; three go to the noise itself, at most three in four are believed spent."""
+    """60 tracks, 180 degrees of freedom; three go to the noise itself, at most three in four are
+    believed spent.
+    """
     tracks = WindowTracks(CAMERA, SETTINGS)
     tracks.update_pixel_noise(np.full(60, chi2.ppf(0.5, 3)), np.full(60, 3), spent)
     change = 180 / max(180 - 3 - spent, 45)
@@ -157,11 +191,15 @@ def test_pixel_noise_counts_what_was_spent_on_the_poses(spent: float) -> None:
 
 
 @pytest.mark.parametrize("dofs", [(3, 3), (4, 8), (45, 45), (3, 45)])
-def test_pixel_noise_is_learned_without_bias_whatever_the_degrees_of_freedom(dofs: tuple[int, int]) -> None:
-    """Squared residuals of tracks of 3 to 45 degrees of freedom, drawn from chi-square for a noise of 0.4 px.
+def test_pixel_noise_is_learned_without_bias_whatever_the_degrees_of_freedom(
+    dofs: tuple[int, int],
+) -> None:
+    """Squared residuals of tracks of 3 to 45 degrees of freedom, drawn from chi-square for a noise
+    of 0.4 px.
 
-    The median of 60 ratios has a standard deviation of 14 % at 3 degrees of freedom. The gain of 0.05 makes 2.3 % of
-    it, and the mean over 600 frames, of which about 40 count as one, 0.6 %: the bound is three standard deviations.
+    The median of 60 ratios has a standard deviation of 14 % at 3 degrees of freedom. The gain of
+    0.05 makes 2.3 % of it, and the mean over 600 frames, of which about 40 count as one, 0.6 %: the
+    bound is three standard deviations.
     """
     tracks, rng, values = WindowTracks(CAMERA, SETTINGS), np.random.default_rng(0), []
     for _ in range(800):
@@ -182,14 +220,20 @@ def test_pixel_noise_stays_in_its_bounds() -> None:
 
 
 def test_tracks_that_end_come_first_then_the_longest() -> None:
-    """Ids 0, 1: ended; 2, 3: begun later; 4, 5: there all along, the oldest view leaves; 6: one view alone."""
+    """Ids 0, 1: ended; 2, 3: begun later; 4, 5: there all along, the oldest view leaves; 6: one
+    view alone.
+    """
     tracks = WindowTracks(CAMERA, replace(SETTINGS, max_features=4))
     for k, ids in enumerate([[4, 5], [0, 1, 4, 5], [0, 1, 2, 3, 4, 5], [2, 3, 4, 5, 6]]):
-        tracks.table.add_frame(k, observations(k, k, ids, np.tile([300.0, 200, 280, 200], (len(ids), 1))))
+        tracks.table.add_frame(
+            k, observations(k, k, ids, np.tile([300.0, 200, 280, 200], (len(ids), 1)))
+        )
     assert tracks.table.ids(tracks.choose(4)).tolist() == [0, 1, 4, 5]
     tracks = WindowTracks(CAMERA, replace(SETTINGS, max_features=2))
     for k, ids in enumerate([[9], [1, 2, 3], [1, 2, 3], [2, 3]]):
-        tracks.table.add_frame(k, observations(k, k, ids, np.tile([300.0, 200, 280, 200], (len(ids), 1))))
+        tracks.table.add_frame(
+            k, observations(k, k, ids, np.tile([300.0, 200, 280, 200], (len(ids), 1)))
+        )
     assert tracks.table.ids(tracks.choose(4)).tolist() == [1, 2]  # 1 has ended; 2 and 3 are as long
 
 
@@ -227,8 +271,11 @@ def test_nothing_wrong_changes_nothing() -> None:
 
 
 def test_points_follow_the_poses_as_the_joint_problem_says() -> None:
-    """Eliminate the points, solve for the poses, move the points: the same as solving for both at once."""
-    tracks = _tracks(_points(5), noise_px=1e-4)  # points step in inverse depth, so the same to first order
+    """Eliminate the points, solve for the poses, move the points: the same as solving for both
+    at once.
+    """
+    # points step in inverse depth, so the same to first order
+    tracks = _tracks(_points(5), noise_px=1e-4)
     linear = tracks.linearise(T_CAM0_WORLD, tracks.choose(4), 2)
     A, b = eliminate_points(linear.information, np.ones(5, dtype=np.bool_))
     prior = np.eye(24) * 1e3
@@ -237,7 +284,9 @@ def test_points_follow_the_poses_as_the_joint_problem_says() -> None:
     tracks.move_points(linear, linear.stereo, poses, np.zeros(0))
     H, r = np.zeros((5 * 16, 24 + 15)), np.zeros(5 * 16)
     lever = point_D_pose(before)
-    weight = 1 / (1 + np.sum(linear.at.r**2, axis=2) / (4 * _scales(linear.at, tracks.variance) * 9.0))
+    weight = 1 / (
+        1 + np.sum(linear.at.r**2, axis=2) / (4 * _scales(linear.at, tracks.variance) * 9.0)
+    )
     for f in range(5):
         for n in range(4):
             rows = slice(16 * f + 4 * n, 16 * f + 4 * n + 4)
@@ -249,7 +298,9 @@ def test_points_follow_the_poses_as_the_joint_problem_says() -> None:
     joint[:24, :24] += prior
     expected = np.linalg.solve(joint, H.T @ r)
     np.testing.assert_allclose(poses, expected[:24], atol=1e-8)
-    np.testing.assert_allclose(tracks.table.points[linear.rows] - before, expected[24:].reshape(5, 3), atol=1e-7)
+    np.testing.assert_allclose(
+        tracks.table.points[linear.rows] - before, expected[24:].reshape(5, 3), atol=1e-7
+    )
 
 
 def _scales(at: Residuals, variance: float) -> FloatArray:
@@ -265,13 +316,19 @@ def test_images_agree_where_four_fifths_of_the_newest_views_fit() -> None:
     assert tracks.agree(Residuals(r, J, np.ones(10, dtype=np.bool_), np.ones(r.shape)))
     r[1, -1, 0] = 50.0
     assert not tracks.agree(Residuals(r, J, np.ones(10, dtype=np.bool_), np.ones(r.shape)))
-    assert not tracks.agree(Residuals(r * 0, J * 0, np.ones(10, dtype=np.bool_), np.ones(r.shape)))  # nothing seen
+    # nothing seen
+    assert not tracks.agree(Residuals(r * 0, J * 0, np.ones(10, dtype=np.bool_), np.ones(r.shape)))
 
 
 def test_a_frame_ends_what_it_does_not_show() -> None:
     tracks = _tracks(_points(4), frames=3)
-    tracks.table.add_frame(3, observations(3, 3, [1, 2, 3], np.tile([300.0, 200, 280, 200], (3, 1))))
-    row = {int(i): r for i, r in zip(tracks.table.ids(tracks.table.rows()), tracks.table.rows(), strict=True)}
+    tracks.table.add_frame(
+        3, observations(3, 3, [1, 2, 3], np.tile([300.0, 200, 280, 200], (3, 1)))
+    )
+    row = {
+        int(i): r
+        for i, r in zip(tracks.table.ids(tracks.table.rows()), tracks.table.rows(), strict=True)
+    }
     tracks.end_frame(spent=np.array([row[1]]), promoted=np.array([row[2]]), newest=3)
     assert tracks.table.ids(tracks.table.rows()).tolist() == [1, 3]
     assert not tracks.table.seen(np.array([row[1]])).any()  # lives on, its pixels have been used

@@ -2,7 +2,8 @@
 
     python -m tools.bad_inputs
 
-The cases are the dictionaries `BAD` of the tests of the readers; `tests/test_bad_inputs.py` compares the page's rows.
+The cases are the dictionaries `BAD` of the tests of the readers; `tests/test_bad_inputs.py`
+compares the page's rows.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ from vio.errors import VioError
 from vio.files.trajectories import read_trajectory
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "bad_inputs.md"
-_MAKERS = {"tests.test_datasets_euroc": "make_euroc", "tests.test_datasets_kitti_raw": "make_kitti_raw"}
+_MAKERS = {
+    "tests.test_datasets_euroc": "make_euroc",
+    "tests.test_datasets_kitti_raw": "make_kitti_raw",
+}
 MODULES = {
     "tests.test_rig": "Calibration files (`vio.load_rig`)",
     "tests.test_datasets_plain": "Plain folders",
@@ -97,9 +101,22 @@ def _videos(root: Path) -> Path:
     from vio.cli import main as vio
 
     flight = root / "flight"
-    options = ["--rig", "small", "--width", "160", "--rate", "20", "--duration", "0.8", "--format", "euroc"]
+    options = [
+        "--rig",
+        "small",
+        "--width",
+        "160",
+        "--rate",
+        "20",
+        "--duration",
+        "0.8",
+        "--format",
+        "euroc",
+    ]
     assert vio(["render", "--out", str(flight), "--workers", "1", "--json", *options]) == 0
-    folder: Path = importlib.import_module("tests.test_datasets_videos").make_videos(flight, root / "videos")
+    folder: Path = importlib.import_module("tests.test_datasets_videos").make_videos(
+        flight, root / "videos"
+    )
     return folder
 
 

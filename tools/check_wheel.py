@@ -1,9 +1,11 @@
-"""Install a wheel into a new environment outside the repository, and run there what the README shows.
+"""Install a wheel into a new environment outside the repository, and run there what the README
+shows.
 
 python tools/check_wheel.py dist
 
-What the wheel needs is installed as a user gets it: the newest versions that it allows. On Linux x86-64, the
-loops are compiled for these versions into a second wheel (tools/prebuild.py); that one is run and must compile nothing.
+What the wheel needs is installed as a user gets it: the newest versions that it allows. On Linux
+x86-64, the loops are compiled for these versions into a second wheel (tools/prebuild.py); that one
+is run and must compile nothing.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from pathlib import Path
 
 _COMMANDS = (
     "demo --out demo",
-    "render --scene room --trajectory handheld --realism real --duration 0.5 --rig small --out room",
+    "render --scene room --trajectory handheld --realism real --duration 0.5 --rig small --out "
+    "room",
     "inspect demo/street",
     "run demo/street --stop 40 --out first --save-observations --report",
     "run first/observations.npz --out again",
@@ -41,22 +44,53 @@ def main(argv: list[str]) -> int:
         environment = Path(folder) / "env"
         venv.create(environment, with_pip=True)
         programs = environment / ("Scripts" if os.name == "nt" else "bin")
-        pip = [str(programs / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-        clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "NUMBA_CPU_NAME")}
+        pip = [
+            str(programs / "python"),
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--disable-pip-version-check",
+        ]
+        clean = {
+            name: value
+            for name, value in os.environ.items()
+            if name not in ("PYTHONPATH", "NUMBA_CPU_NAME")
+        }
         clean["NUMBA_CACHE_DIR"] = f"{folder}/compiled"
         installed = [[str(programs / "vio"), *command.split()] for command in _COMMANDS]
         prebuilt = sys.platform == "linux" and platform.machine() == "x86_64"
         commands = [[*pip, str(wheels[0])], *installed]
         if prebuilt:
-            prebuild = [str(programs / "python"), str(Path(__file__).with_name("prebuild.py")), str(dist)]
-            again = [*pip, "--no-deps", "--force-reinstall", "--no-index", "--find-links", str(dist), "stereo-vio"]
+            prebuild = [
+                str(programs / "python"),
+                str(Path(__file__).with_name("prebuild.py")),
+                str(dist),
+            ]
+            again = [
+                *pip,
+                "--no-deps",
+                "--force-reinstall",
+                "--no-index",
+                "--find-links",
+                str(dist),
+                "stereo-vio",
+            ]
             commands[1:1] = [[*pip, "setuptools"], prebuild, again]
         for command in commands:
             subprocess.run(command, cwd=folder, env=clean, check=True)
-        if prebuilt and (anew := sorted(path.name for path in Path(folder, "compiled").rglob("*.nbi"))):
+        if prebuilt and (
+            anew := sorted(path.name for path in Path(folder, "compiled").rglob("*.nbi"))
+        ):
             print(f"error: the wheel holds no machine code of {', '.join(anew)}", file=sys.stderr)
             return 1
-        made = ("first/report.html", "first/features.jpg", "first/trajectory.png", "eval.png", "flight/trajectory.tum")
+        made = (
+            "first/report.html",
+            "first/features.jpg",
+            "first/trajectory.png",
+            "eval.png",
+            "flight/trajectory.tum",
+        )
         if missing := [name for name in made if not (Path(folder) / name).is_file()]:
             print(f"error: not written: {', '.join(missing)}", file=sys.stderr)
             return 1

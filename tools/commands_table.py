@@ -1,4 +1,5 @@
-"""Write the table of all commands by purpose into docs/commands.md, from what `vio --help` says of them.
+"""Write the table of all commands by purpose into docs/commands.md, from what `vio --help` says of
+them.
 
 python -m tools.commands_table
 """
@@ -12,7 +13,8 @@ from pathlib import Path
 from vio.cli import BY_PURPOSE
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "commands.md"
-_BEGIN, _END = "<!-- commands -->\n", "<!-- end commands -->\n"
+_BEGIN = "<!-- commands -->\n"
+_END = "<!-- end commands -->\n"
 
 
 def table() -> str:

@@ -1,11 +1,14 @@
 """Consistency of the sliding-window filter, with the noise known and learned.
 
-    python -m tools.consistency [--motions imu none velocity] [--variants VARIANT …] [--runs 20] [--seconds 7.5]
-        [--pixel-sigma 1.0] [--features 60] [--landmarks 30] [--outliers 0.0] [--imu-offset-ms 0.0] [--jobs 2]
+    python -m tools.consistency [--motions imu none velocity] [--variants VARIANT …] [--runs 20]
+    [--seconds 7.5]
+        [--pixel-sigma 1.0] [--features 60] [--landmarks 30] [--outliers 0.0] [--imu-offset-ms 0.0]
+        [--jobs 2]
 
-Monte-Carlo flights through exact points, with exact noise: pixels, IMU and its biases, velocities, and the place and
-yaw of the start are drawn from the very distributions that the filter assumes. Each flight is flown once by every
-variant, with the same noise. Prints tables in Markdown; docs/notes/consistency.md shows them.
+Monte-Carlo flights through exact points, with exact noise: pixels, IMU and its biases, velocities,
+and the place and yaw of the start are drawn from the very distributions that the filter assumes.
+Each flight is flown once by every variant, with the same noise. Prints tables in Markdown;
+docs/notes/consistency.md shows them.
 """
 
 from __future__ import annotations
@@ -67,14 +70,28 @@ Variant = Literal["right-invariant", "right-invariant, noise learned"]
 Group = tuple[Motion, Start, Variant]
 
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
-T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
-_FRAME_NS, _IMU_NS = 50_000_000, 5_000_000
+T_CAM0_IMU = se3_from_parts(
+    np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1])
+)
+_FRAME_NS = 50_000_000
+_IMU_NS = 5_000_000
 SAMPLES = _FRAME_NS // _IMU_NS  # of the IMU in a frame
 # Standard deviations of the first position, m, and of the first yaw, rad.
-_START: dict[Start, tuple[float, float]] = {"uncertain": (0.05, np.radians(1.0)), "known": (0.0, 0.0)}
+_START: dict[Start, tuple[float, float]] = {
+    "uncertain": (0.05, np.radians(1.0)),
+    "known": (0.0, 0.0),
+}
 _MOTIONS: tuple[Motion, ...] = get_args(Motion)
 _VARIANTS: tuple[Variant, ...] = get_args(Variant)
-_MEASURES = {"pose": 6, "position": 3, "orientation": 3, "yaw": 1, "velocity": 3, "gyro bias": 3, "accel bias": 3}
+_MEASURES = {
+    "pose": 6,
+    "position": 3,
+    "orientation": 3,
+    "yaw": 1,
+    "velocity": 3,
+    "gyro bias": 3,
+    "accel bias": 3,
+}
 
 
 class JudgedTracks(WindowTracks):
@@ -95,10 +112,17 @@ class UncertainStart(Msckf):
     """The sliding-window filter, uncertain of its first place and yaw."""
 
     def __init__(
-        self, settings: MsckfSettings, motion: MotionSource | None, *, start: Start, learn_noise: bool
+        self,
+        settings: MsckfSettings,
+        motion: MotionSource | None,
+        *,
+        start: Start,
+        learn_noise: bool,
     ) -> None:
         super().__init__(CAMERA, T_CAM0_IMU, settings, motion=motion)
-        self._start, self._begun, self._learn_noise = _START[start], False, learn_noise
+        self._start = _START[start]
+        self._begun = False
+        self._learn_noise = learn_noise
         self._frame.tracks = self._judged = JudgedTracks(CAMERA, settings)
 
     @property
@@ -152,7 +176,9 @@ class Scenario:
         return round(self.seconds * 1e9 / _FRAME_NS)
 
     def settings(self, *, learn_noise: bool) -> MsckfSettings:
-        """Return the filter's settings: the truth about all noise, or, to learn it, where learning starts."""
+        """Return the filter's settings: the truth about all noise, or, to learn it, where
+        learning starts.
+        """
         s = MsckfSettings(
             max_landmarks=self.landmarks,
             pixel_sigma_px=self.pixel_sigma_px,
@@ -169,7 +195,9 @@ class Scenario:
 
     @contextmanager
     def priors(self, *, learn_noise: bool) -> Iterator[None]:
-        """Inside the block, use the priors of these flights and, unless it is learned, the true pixel noise."""
+        """Inside the block, use the priors of these flights and, unless it is learned, the true
+        pixel noise.
+        """
         least_px = window_tracks.LEAST_PIXEL_SIGMA_PX if learn_noise else self.pixel_sigma_px
         with (
             patch.object(imu_start, "START_TILT_SIGMA_DEG", 1.0),
@@ -192,10 +220,12 @@ class Flight:
 
     def state(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Rotations (K, 3, 3), positions (K, 3) and velocities (K, 3) at times (K,), s."""
-        w, h = 2 * np.pi / 16.0, 1e-4
+        w = 2 * np.pi / 16.0
+        h = 1e-4
 
         def position(s: FloatArray) -> FloatArray:
-            x, y = 3.5 * np.sin(w * s), 1.7 * np.sin(2 * w * s)
+            x = 3.5 * np.sin(w * s)
+            y = 1.7 * np.sin(2 * w * s)
             return np.stack([x, y, 0.5 * np.sin(0.9 * s)], axis=1)
 
         yaw = 2 * np.pi * t / 25.0 + 0.3 * np.sin(0.7 * t)
@@ -205,16 +235,24 @@ class Flight:
         return R, position(t), (position(t + h) - position(t - h)) / (2 * h)
 
     def rates(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Angular rates (K, 3), rad/s, and specific forces (K, 3), m/s^2, of the body at times (K,)."""
+        """Angular rates (K, 3), rad/s, and specific forces (K, 3), m/s^2, of the body at times
+        (K,).
+        """
         h = 1e-4
         R, _, _ = self.state(t)
-        (R0, _, v0), (R1, _, v1) = self.state(t - h), self.state(t + h)
+        (R0, _, v0) = self.state(t - h)
+        (R1, _, v1) = self.state(t + h)
         omega = so3_log(np.swapaxes(R0, 1, 2) @ R1) / (2 * h)
         a = (v1 - v0) / (2 * h) + [0.0, 0.0, 9.81]
         return omega, (np.swapaxes(R, 1, 2) @ a[..., None])[..., 0]
 
     def imu(
-        self, samples: range, noise: np.random.Generator, s: MsckfSettings, offset_s: float = 0.0, clock_s: float = 0.0
+        self,
+        samples: range,
+        noise: np.random.Generator,
+        s: MsckfSettings,
+        offset_s: float = 0.0,
+        clock_s: float = 0.0,
     ) -> tuple[list[ImuSample], FloatArray]:
         """Samples at 200 Hz, and the biases (K, 6) in them: drawn from the prior, then walking.
 
@@ -225,7 +263,9 @@ class Flight:
             offset_s: of the samples against the frames.
             clock_s: by which their stamps are ahead of the frames' clock.
         """
-        k, n, dt = np.array(samples), len(samples), _IMU_NS * 1e-9
+        k = np.array(samples)
+        n = len(samples)
+        dt = _IMU_NS * 1e-9
         walk = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) * np.sqrt(dt)
         steps = noise.normal(0, 1, (n, 6)) * walk
         steps[0] = noise.normal(0, np.repeat([s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2], 3))
@@ -234,19 +274,29 @@ class Flight:
         exact = np.concatenate(self.rates(k.astype(np.float64) * dt + offset_s), axis=1)
         read = exact + bias + noise.normal(0, 1, (n, 6)) * white
         stamps = k * _IMU_NS + round(1e9 * offset_s) + round(1e9 * clock_s)
-        return [ImuSample(t, x[:3], x[3:]) for t, x in zip(stamps.tolist(), read, strict=True)], bias
+        return [
+            ImuSample(t, x[:3], x[3:]) for t, x in zip(stamps.tolist(), read, strict=True)
+        ], bias
 
-    def velocities(self, frames: int, noise: np.random.Generator, s: MsckfSettings) -> list[VelocitySample]:
+    def velocities(
+        self, frames: int, noise: np.random.Generator, s: MsckfSettings
+    ) -> list[VelocitySample]:
         """Samples at the frames, with white noise and a constant bias of the rate."""
         t = _times(frames)
         R, _, v = self.state(t)
-        linear = (np.swapaxes(R, 1, 2) @ v[..., None])[..., 0] + noise.normal(0, s.linear_velocity_sigma_mps, v.shape)
+        linear = (np.swapaxes(R, 1, 2) @ v[..., None])[..., 0] + noise.normal(
+            0, s.linear_velocity_sigma_mps, v.shape
+        )
         bias = noise.normal(0, navigation.RATE_BIAS_SIGMA_RADPS, 3)
         angular = self.rates(t)[0] + bias + noise.normal(0, s.angular_rate_sigma_radps, v.shape)
         return [VelocitySample(k * _FRAME_NS, linear[k], angular[k]) for k in range(frames)]
 
-    def frame(self, k: int, T_world_imu: FloatArray, scenario: Scenario, noise: np.random.Generator) -> Observations:
-        """What the cameras see: of the points in view those with the lowest numbers, so that tracks last."""
+    def frame(
+        self, k: int, T_world_imu: FloatArray, scenario: Scenario, noise: np.random.Generator
+    ) -> Observations:
+        """What the cameras see: of the points in view those with the lowest numbers, so that
+        tracks last.
+        """
         p = transform_points(T_CAM0_IMU @ se3_inverse(T_world_imu), self.points)
         near = (p[:, 2] > 0.8) & (p[:, 2] < 14)
         z = project(CAMERA, np.where(near[:, None], p, [0.0, 0.0, 10.0]))
@@ -298,7 +348,8 @@ def fly(job: Job) -> Record:
 
 
 def _fly(job: Job, learn: bool) -> Record:
-    scenario, flight = job.scenario, Flight()
+    scenario = job.scenario
+    flight = Flight()
     settings = scenario.settings(learn_noise=learn)
     source = None if job.motion == "none" else job.motion
     filt = UncertainStart(settings, source, start=job.start, learn_noise=learn)
@@ -308,15 +359,21 @@ def _fly(job: Job, learn: bool) -> Record:
     samples: list[MotionSample] = []
     bias: FloatArray = np.zeros((scenario.frames, 6))
     if job.motion == "imu":
-        imu, walked = flight.imu(range(SAMPLES * scenario.frames + 1), noise, settings, scenario.imu_offset_s)
-        samples, bias = list(imu), walked[::SAMPLES][: scenario.frames]
+        imu, walked = flight.imu(
+            range(SAMPLES * scenario.frames + 1), noise, settings, scenario.imu_offset_s
+        )
+        samples = list(imu)
+        bias = walked[::SAMPLES][: scenario.frames]
     elif job.motion == "velocity":
         samples = list(flight.velocities(scenario.frames, noise, settings))
     start = np.zeros(6)
     position_sigma, yaw_sigma = _START[job.start]
-    start[:3], start[5] = noise.normal(0, position_sigma, 3), noise.normal(0, yaw_sigma)
+    start[:3] = noise.normal(0, position_sigma, 3)
+    start[5] = noise.normal(0, yaw_sigma)
 
-    navs, covariances, fed_ns = [], [], -1
+    navs = []
+    covariances = []
+    fed_ns = -1
     for k in range(scenario.frames):
         # As in the pipeline, a frame waits for the first IMU sample at or after its exposure.
         while samples and fed_ns < k * _FRAME_NS:
@@ -326,12 +383,15 @@ def _fly(job: Job, learn: bool) -> Record:
         navs.append(filt.nav)
         covariances.append(filt.nav_covariance)
     shift = se3_exp(start) @ _start_shift(T[0], navs[0].T_world_imu, upright=job.motion == "imu")
-    T, v = shift @ T, v @ shift[:3, :3].T
+    T = shift @ T
+    v = v @ shift[:3, :3].T
     return _record(job, T, v, bias, navs, np.array(covariances), filt.nis)
 
 
 def _start_shift(T_true: FloatArray, T_estimate: FloatArray, *, upright: bool) -> FloatArray:
-    """The transform that puts the first true pose onto the estimate's; upright: by position and yaw alone."""
+    """The transform that puts the first true pose onto the estimate's; upright: by position and
+    yaw alone.
+    """
     shift = T_estimate @ se3_inverse(T_true)
     if not upright:
         return shift
@@ -350,7 +410,9 @@ def _record(
     P: FloatArray,
     nis: list[float],
 ) -> Record:
-    """Errors against what the filter said of them, P (F, 15, 15), in the world that gravity keeps upright."""
+    """Errors against what the filter said of them, P (F, 15, 15), in the world that gravity
+    keeps upright.
+    """
     T_hat = np.array([n.T_world_imu for n in navs])
     to_body = se3_adjoint(se3_inverse(T_hat))
     pose_covariance = to_body @ P[:, :6, :6] @ np.swapaxes(to_body, 1, 2)
@@ -366,8 +428,12 @@ def _record(
         v_hat = np.array([n.velocity for n in navs])
         H = np.concatenate([-so3_hat(v_hat), np.tile(np.eye(3), (len(navs), 1, 1))], axis=2)
         values["velocity"] = nees(v - v_hat, H @ P[:, 3:9, 3:9] @ np.swapaxes(H, 1, 2))
-        values["gyro bias"] = nees(bias[:, :3] - np.array([n.gyro_bias for n in navs]), P[:, 9:12, 9:12])
-        values["accel bias"] = nees(bias[:, 3:] - np.array([n.accel_bias for n in navs]), P[:, 12:, 12:])
+        values["gyro bias"] = nees(
+            bias[:, :3] - np.array([n.gyro_bias for n in navs]), P[:, 9:12, 9:12]
+        )
+        values["accel bias"] = nees(
+            bias[:, 3:] - np.array([n.accel_bias for n in navs]), P[:, 12:, 12:]
+        )
     last = se3_log(se3_inverse(se3_inverse(T[0]) @ T[-1]) @ se3_inverse(T_hat[0]) @ T_hat[-1])
     return Record(
         job,
@@ -386,24 +452,41 @@ def _record(
 
 def main() -> int:
     """Fly everything and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     usual = Scenario()
     parser.add_argument("--motions", nargs="+", default=list(_MOTIONS), choices=_MOTIONS)
     parser.add_argument("--variants", nargs="+", default=list(_VARIANTS), choices=_VARIANTS)
     parser.add_argument("--runs", type=int, default=20, help="flights per motion model and variant")
     parser.add_argument("--seconds", type=float, default=usual.seconds, help="length of a flight")
-    parser.add_argument("--pixel-sigma", type=float, default=usual.pixel_sigma_px, help="noise of a pixel")
-    parser.add_argument("--features", type=int, default=usual.features, help="points seen in a frame")
-    parser.add_argument("--landmarks", type=int, default=usual.landmarks, help="most landmarks in the state")
+    parser.add_argument(
+        "--pixel-sigma", type=float, default=usual.pixel_sigma_px, help="noise of a pixel"
+    )
+    parser.add_argument(
+        "--features", type=int, default=usual.features, help="points seen in a frame"
+    )
+    parser.add_argument(
+        "--landmarks", type=int, default=usual.landmarks, help="most landmarks in the state"
+    )
     parser.add_argument("--outliers", type=float, default=0.0, help="share of mismatched features")
-    parser.add_argument("--imu-offset-ms", type=float, default=0.0, help="of the IMU's samples against the frames")
+    parser.add_argument(
+        "--imu-offset-ms", type=float, default=0.0, help="of the IMU's samples against the frames"
+    )
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     args = parser.parse_args()
     scenario = Scenario(
-        args.seconds, args.pixel_sigma, args.features, args.landmarks, args.outliers, args.imu_offset_ms * 1e-3
+        args.seconds,
+        args.pixel_sigma,
+        args.features,
+        args.landmarks,
+        args.outliers,
+        args.imu_offset_ms * 1e-3,
     )
     # Every motion model from an uncertain start, the IMU from a known one too.
-    groups: list[Group] = [(motion, "uncertain", variant) for motion, variant in product(args.motions, args.variants)]
+    groups: list[Group] = [
+        (motion, "uncertain", variant) for motion, variant in product(args.motions, args.variants)
+    ]
     groups += [("imu", "known", variant) for variant in args.variants if "imu" in args.motions]
     jobs = [Job(scenario, *group, seed=seed) for seed, group in product(range(args.runs), groups)]
     records: dict[Group, list[Record]] = {group: [] for group in groups}
@@ -421,16 +504,22 @@ def main() -> int:
 
 
 def _nees_table(records: Mapping[Group, Sequence[Record]]) -> str:
-    """Return NEES by measure in Markdown, without the first frame, where the pose is what was drawn."""
+    """Return NEES by measure in Markdown, without the first frame, where the pose is what was
+    drawn.
+    """
     lines = [
         "Mean NEES ± its standard error over the runs (share of the frames inside the 95 % band)",
         "",
-        "| motion, start | variant | " + " | ".join(f"{m} ({d})" for m, d in _MEASURES.items()) + " | NIS (1) |",
+        "| motion, start | variant | "
+        + " | ".join(f"{m} ({d})" for m, d in _MEASURES.items())
+        + " | NIS (1) |",
         "|---|---" + "|---:" * (len(_MEASURES) + 1) + "|",
     ]
     for (motion, start, variant), runs in records.items():
         cells = [
-            _nees_cell(np.array([r.nees[m][1:] for r in runs]), dimension) if m in runs[0].nees else "–"
+            _nees_cell(np.array([r.nees[m][1:] for r in runs]), dimension)
+            if m in runs[0].nees
+            else "–"
             for m, dimension in _MEASURES.items()
         ]
         nis = np.nanmean([r.nis[1:] for r in runs])
@@ -440,7 +529,8 @@ def _nees_table(records: Mapping[Group, Sequence[Record]]) -> str:
 
 def _nees_cell(values: FloatArray, dimension: int) -> str:
     """Tell NEES (R, F) over runs and frames."""
-    runs, mean = len(values), values.mean(axis=0)
+    runs = len(values)
+    mean = values.mean(axis=0)
     low, high = nees_bounds(dimension, runs)
     inside = np.mean((mean >= low) & (mean <= high))
     error = values.mean(axis=1).std(ddof=min(runs - 1, 1)) / np.sqrt(runs)
@@ -451,14 +541,23 @@ def _nees_cell(values: FloatArray, dimension: int) -> str:
 def _error_table(records: Mapping[Group, Sequence[Record]]) -> str:
     """Return what the filter estimates for yaw beside the errors, likewise."""
     lines = [
-        "| motion, start | variant | yaw sigma at 1 s (deg) | least | at the end | yaw error at the end, RMS "
+        "| motion, start | variant | yaw sigma at 1 s (deg) | least | at the end | yaw error at "
+        "the end, RMS "
         "| position RMSE (m) | orientation RMSE (deg) | drift at the end, RMS (m) |",
         "|---|---" + "|---:" * 7 + "|",
     ]
     for (motion, start, variant), runs in records.items():
         sigma = np.sqrt(np.mean([r.yaw_sigma_deg[1:] ** 2 for r in runs], axis=0))
         second = min(round(1e9 / _FRAME_NS), len(sigma)) - 1
-        cells = [f"{x:.3f}" for x in (sigma[second], sigma.min(), sigma[-1], _rms(r.yaw_error_deg[-1] for r in runs))]
+        cells = [
+            f"{x:.3f}"
+            for x in (
+                sigma[second],
+                sigma.min(),
+                sigma[-1],
+                _rms(r.yaw_error_deg[-1] for r in runs),
+            )
+        ]
         cells.append(f"{_rms(r.position_m[1:] for r in runs):.4f}")
         cells.append(f"{_rms(r.orientation_deg[1:] for r in runs):.3f}")
         cells.append(f"{_rms(r.drift_m for r in runs):.4f}")

@@ -2,10 +2,11 @@
 
     python tools/draw_structure.py docs/images/structure.png [--root CHECKOUT]
 
-A package here is a package or a single module directly in `vio/`; `frontend/` is `vio.frontend`. It is one layer above
-the highest one that it imports. Arrows point at what is imported; those that a longer path implies are left out, and so
-are those to the foundation (records, protocols, geometry, errors, setting, numerics, files), which nearly everything
-imports. Imports inside functions count. An import that closes a cycle is red.
+A package here is a package or a single module directly in `vio/`; `frontend/` is `vio.frontend`. It
+is one layer above the highest one that it imports. Arrows point at what is imported; those that a
+longer path implies are left out, and so are those to the foundation (records, protocols, geometry,
+errors, setting, numerics, files), which nearly everything imports. Imports inside functions count.
+An import that closes a cycle is red.
 """
 
 from __future__ import annotations
@@ -23,10 +24,26 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
-FOUNDATION = ("vio.records", "vio.protocols", "vio.geometry", "vio.errors", "vio.setting", "vio.numerics", "vio.files")
-_COLOURS = {"vio.cli": "#e8d5b5", "vio.frontend": "#f0c9c9", "vio.filters": "#cfe3cf", "vio.sim": "#dcd3ea"}
-_PLAIN, _GROUND, _CLOSING = "#d6e2f0", "#e9e9e9", "#c23b5a"
-_WIDTH, _HEIGHT = 1.0, 0.62
+FOUNDATION = (
+    "vio.records",
+    "vio.protocols",
+    "vio.geometry",
+    "vio.errors",
+    "vio.setting",
+    "vio.numerics",
+    "vio.files",
+)
+_COLOURS = {
+    "vio.cli": "#e8d5b5",
+    "vio.frontend": "#f0c9c9",
+    "vio.filters": "#cfe3cf",
+    "vio.sim": "#dcd3ea",
+}
+_PLAIN = "#d6e2f0"
+_GROUND = "#e9e9e9"
+_CLOSING = "#c23b5a"
+_WIDTH = 1.0
+_HEIGHT = 0.62
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +67,9 @@ def read_packages(root: Path) -> dict[str, Package]:
     packages = {}
     for name, paths in files.items():
         texts = [path.read_text(encoding="utf-8") for path in paths]
-        imported = frozenset({_package_of(module) for text in texts for module in _imports(text)} & set(files))
+        imported = frozenset(
+            {_package_of(module) for text in texts for module in _imports(text)} & set(files)
+        )
         lines = sum(len(text.splitlines()) for text in texts)
         packages[name] = Package(name, lines, len(paths), imported - {name})
     return packages
@@ -66,17 +85,33 @@ def _imports(text: str) -> Iterator[str]:
     skipped: set[int] = set()
     tree = ast.parse(text)
     for node in ast.walk(tree):
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+        if (
+            isinstance(node, ast.If)
+            and isinstance(node.test, ast.Name)
+            and node.test.id == "TYPE_CHECKING"
+        ):
             skipped.update(id(child) for statement in node.body for child in ast.walk(statement))
         elif id(node) not in skipped and isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif id(node) not in skipped and isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            # `from vio import calibration` names a package, `from vio.records import Image` something in one.
-            yield from (f"vio.{alias.name}" for alias in node.names) if node.module == "vio" else [node.module]
+        elif (
+            id(node) not in skipped
+            and isinstance(node, ast.ImportFrom)
+            and node.module
+            and not node.level
+        ):
+            # `from vio import calibration` names a package, `from vio.records import Image`
+            # something in one.
+            yield from (
+                (f"vio.{alias.name}" for alias in node.names)
+                if node.module == "vio"
+                else [node.module]
+            )
 
 
 def layers(packages: Mapping[str, Package]) -> tuple[dict[str, int], list[tuple[str, str]]]:
-    """Return the layer of each package, 0 the lowest, and the imports (from, to) that close a cycle."""
+    """Return the layer of each package, 0 the lowest, and the imports (from, to) that close a
+    cycle.
+    """
     layer: dict[str, int] = {}
     closing: list[tuple[str, str]] = []
 
@@ -113,9 +148,16 @@ def drawn_arrows(packages: Mapping[str, Package]) -> list[tuple[str, str]]:
 
 def draw(packages: Mapping[str, Package], path: Path) -> None:
     """Write the figure as PNG."""
-    upper = {n: replace(r, imports=r.imports - set(FOUNDATION)) for n, r in packages.items() if n not in FOUNDATION}
+    upper = {
+        n: replace(r, imports=r.imports - set(FOUNDATION))
+        for n, r in packages.items()
+        if n not in FOUNDATION
+    }
     level, closing = layers(upper)
-    straight = {n: replace(r, imports=r.imports - {b for a, b in closing if a == n}) for n, r in upper.items()}
+    straight = {
+        n: replace(r, imports=r.imports - {b for a, b in closing if a == n})
+        for n, r in upper.items()
+    }
     place = _places(straight, level, [n for n in FOUNDATION if n in packages])
     across = max(x for x, _ in place.values()) + 1.3
     up = max(y for _, y in place.values()) + 1.0
@@ -126,31 +168,53 @@ def draw(packages: Mapping[str, Package], path: Path) -> None:
     axes.axis("off")
     for name, other in [*drawn_arrows(straight), *closing]:
         colour = _CLOSING if (name, other) in closing else "#8a93a0"
-        (x0, y0), (x1, y1) = place[name], place[other]
+        (x0, y0) = place[name]
+        (x1, y1) = place[other]
         rad = 0.12 if y0 - y1 > 1.5 else 0  # a long way goes around the packages between
-        style: dict[str, Any] = {"connectionstyle": f"arc3,rad={rad}", "arrowstyle": "-|>", "shrinkA": 0, "shrinkB": 0}
-        end, start = (x1 + _WIDTH / 2, y1 + _HEIGHT), (x0 + _WIDTH / 2, y0)
+        style: dict[str, Any] = {
+            "connectionstyle": f"arc3,rad={rad}",
+            "arrowstyle": "-|>",
+            "shrinkA": 0,
+            "shrinkB": 0,
+        }
+        end = (x1 + _WIDTH / 2, y1 + _HEIGHT)
+        start = (x0 + _WIDTH / 2, y0)
         axes.annotate("", end, start, arrowprops={**style, "color": colour, "lw": 0.9}, zorder=1)
     for name, (x, y) in place.items():
         colour = _GROUND if name in FOUNDATION else _COLOURS.get(name, _PLAIN)
         corners = "round,pad=0,rounding_size=0.06"
-        axes.add_patch(FancyBboxPatch((x, y), _WIDTH, _HEIGHT, boxstyle=corners, fc=colour, ec="#55606e"))
+        axes.add_patch(
+            FancyBboxPatch((x, y), _WIDTH, _HEIGHT, boxstyle=corners, fc=colour, ec="#55606e")
+        )
         package = packages[name]
         label = name.removeprefix("vio.") + ("/" if package.files > 1 else "")
-        axes.text(x + _WIDTH / 2, y + 0.39, label, ha="center", va="center", fontsize=9, weight="bold")
+        axes.text(
+            x + _WIDTH / 2, y + 0.39, label, ha="center", va="center", fontsize=9, weight="bold"
+        )
         files = f", {package.files} files" if package.files > 1 else ""
-        axes.text(x + _WIDTH / 2, y + 0.17, f"{package.lines} lines{files}", ha="center", va="center", fontsize=6.5)
+        axes.text(
+            x + _WIDTH / 2,
+            y + 0.17,
+            f"{package.lines} lines{files}",
+            ha="center",
+            va="center",
+            fontsize=6.5,
+        )
     figure.savefig(path)
 
 
 def _places(
     packages: Mapping[str, Package], level: Mapping[str, int], ground: list[str]
 ) -> dict[str, tuple[float, float]]:
-    """Lower left corners: the foundation as one row, above it a row a layer, packages near those they are tied to."""
+    """Lower left corners: the foundation as one row, above it a row a layer, packages near those
+    they are tied to.
+    """
     rows = [[n for n in sorted(packages) if level[n] == k] for k in range(max(level.values()) + 1)]
     across = 1.25 * max(len(row) for row in [ground, *rows])
     arrows = drawn_arrows(packages)
-    tied = {n: [b for a, b in arrows if a == n] + [a for a, b in arrows if b == n] for n in packages}
+    tied = {
+        n: [b for a, b in arrows if a == n] + [a for a, b in arrows if b == n] for n in packages
+    }
 
     def spread(row: list[str]) -> dict[str, float]:
         return {name: across / len(row) * (i + 0.5) - _WIDTH / 2 for i, name in enumerate(row)}
@@ -166,13 +230,19 @@ def _places(
 
 def main() -> int:
     """Draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path, help="PNG to write")
-    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[1], help="the checkout")
+    parser.add_argument(
+        "--root", type=Path, default=Path(__file__).resolve().parents[1], help="the checkout"
+    )
     args = parser.parse_args()
     packages = read_packages(args.root)
     draw(packages, args.out)
-    sys.stdout.write(f"{len(packages)} packages, {sum(r.lines for r in packages.values())} lines: {args.out}\n")
+    sys.stdout.write(
+        f"{len(packages)} packages, {sum(r.lines for r in packages.values())} lines: {args.out}\n"
+    )
     return 0
 
 

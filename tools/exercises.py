@@ -2,7 +2,8 @@
 
 python -m tools.exercises
 
-What stands between `# begin solution` and `# end solution` is left out, and so is what the cells printed.
+What stands between `# begin solution` and `# end solution` is left out, and so is what the cells
+printed.
 """
 
 from __future__ import annotations
@@ -24,13 +25,17 @@ def exercise(solution: str) -> str:
     for cell in notebook["cells"]:
         if cell["cell_type"] == "code":
             cell["source"] = _SOLUTION.sub(_TASK, "".join(cell["source"])).splitlines(keepends=True)
-            cell["outputs"], cell["execution_count"] = [], None
+            cell["outputs"] = []
+            cell["execution_count"] = None
     return json.dumps(notebook, indent=1, ensure_ascii=False) + "\n"
 
 
 def pairs() -> list[tuple[Path, Path]]:
     """Return the files of solutions, each with that of its exercise."""
-    return [(path, path.with_name(path.name.replace("_solution", ""))) for path in FOLDER.glob("*_solution.ipynb")]
+    return [
+        (path, path.with_name(path.name.replace("_solution", "")))
+        for path in FOLDER.glob("*_solution.ipynb")
+    ]
 
 
 def main() -> int:

@@ -1,4 +1,6 @@
-"""Print the exact versions of this environment as a constraints file; it must hold every extra of the project."""
+"""Print the exact versions of this environment as a constraints file; it must hold every extra
+of the project.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,10 @@ def main() -> int:
     """Print the file to stdout."""
     missing = [name for name in EXTRAS if importlib.util.find_spec(name) is None]
     if missing:
-        print(f"error: {', '.join(missing)} not installed here; run `make constraints`", file=sys.stderr)
+        print(
+            f"error: {', '.join(missing)} not installed here; run `make constraints`",
+            file=sys.stderr,
+        )
         return 1
     command = [sys.executable, "-m", "pip", "freeze", "--all", "--exclude-editable"]
     frozen = subprocess.run(command, check=True, capture_output=True, text=True).stdout
@@ -29,7 +34,10 @@ def main() -> int:
     print(f"{sys.version_info.major}.{sys.version_info.minor}.")
     for name in sorted(pins, key=str.lower):
         # Versions for another Python are that Python's own choice.
-        print(f'{name}=={pins[name]} ; python_version == "{sys.version_info.major}.{sys.version_info.minor}"')
+        print(
+            f"{name}=={pins[name]} ; python_version == "
+            f'"{sys.version_info.major}.{sys.version_info.minor}"'
+        )
     return 0
 
 

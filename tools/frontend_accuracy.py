@@ -1,10 +1,13 @@
-"""Measure the accuracy of a front end on rendered images with known ground truth; print a table, or JSON.
+"""Measure the accuracy of a front end on rendered images with known ground truth; print a table, or
+JSON.
 
-    python tools/frontend_accuracy.py [--frontend klt] [--set frontend.grid.target_features=800] [--json FILE]
+    python tools/frontend_accuracy.py [--frontend klt] [--set frontend.grid.target_features=800]
+    [--json FILE]
 
-Renders a room along a hand-held flight with a rectified 752x480 rig like EuRoC's: 300 frames, then 100 under each
-effect. Errors are relative to the exact correspondence: of the pixel in the previous frame (`step`), of the first pixel
-of the track (`since birth`), and of the left pixel in the right image (`disparity`).
+Renders a room along a hand-held flight with a rectified 752x480 rig like EuRoC's: 300 frames, then
+100 under each effect. Errors are relative to the exact correspondence: of the pixel in the previous
+frame (`step`), of the first pixel of the track (`since birth`), and of the left pixel in the right
+image (`disparity`).
 """
 
 from __future__ import annotations
@@ -29,7 +32,14 @@ from vio.numerics.threads import one_blas_thread
 from vio.protocols import Frontend
 from vio.records import Image, IntArray, Observations, StereoFrame
 from vio.sim.render import View, cast, correspondence, observe, surface_points
-from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_of, default_workers, plan
+from vio.sim.scenarios import (
+    EFFECTS,
+    ParallelRecording,
+    Scenario,
+    conditions_of,
+    default_workers,
+    plan,
+)
 from vio.sim.sequence import SimulatedRecording, Simulation, views
 from vio.sim.world import Surfaces, surfaces_at
 from vio.testing import FrontendErrors, compare
@@ -39,7 +49,8 @@ SHOWN_EFFECTS = (
 )  # fmt: skip
 
 _OUTLIER_PX = 1.0
-_CROSSED_PX = 1.5  # error above which a track at another depth than its point has moved to another surface
+# error above which a track at another depth than its point has moved to another surface
+_CROSSED_PX = 1.5
 _OTHER_DEPTH = 0.02  # relative
 _RIM_PX = 3.0  # a feature this close to a nearer surface may be a point of its outline
 _CROSSED_FRAMES = 3  # a track on the wrong surface for more frames counts as kept
@@ -51,10 +62,13 @@ _COVERED_PX = 3.0  # distance up to which a track covers a corner
 
 @dataclass(slots=True)
 class Tally(FrontendErrors):
-    """Errors and counts of a front end; arrays have one entry per observation, one array per frame."""
+    """Errors and counts of a front end; arrays have one entry per observation, one array per
+    frame.
+    """
 
     since_birth: list[FloatArray] = field(default_factory=list)  # (N, 2) px
-    age: list[IntArray] = field(default_factory=list)  # (N,) frames since birth, beside `since_birth`
+    # (N,) frames since birth, beside `since_birth`
+    age: list[IntArray] = field(default_factory=list)
     frames_of: dict[int, int] = field(default_factory=dict)  # number of frames of each feature
     # Largest number of consecutive frames of each feature on another surface.
     crossed: dict[int, int] = field(default_factory=dict)
@@ -64,17 +78,23 @@ class Tally(FrontendErrors):
 
 @dataclass
 class _Birth:
-    """Scene point of each feature's first observation, and of the nearest surface around its pixel."""
+    """Scene point of each feature's first observation, and of the nearest surface around its
+    pixel.
+    """
 
     frame: dict[int, int] = field(default_factory=dict)
     surface: dict[int, tuple[int, int]] = field(default_factory=dict)  # own, rim
-    coordinates: dict[int, FloatArray] = field(default_factory=dict)  # (2, 2) m on the own surface, on the rim
-    offset: dict[int, FloatArray] = field(default_factory=dict)  # (2,) px from the rim's point to the feature
+    # (2, 2) m on the own surface, on the rim
+    coordinates: dict[int, FloatArray] = field(default_factory=dict)
+    # (2,) px from the rim's point to the feature
+    offset: dict[int, FloatArray] = field(default_factory=dict)
 
 
 def evaluate(simulation: Simulation, frames: Iterable[StereoFrame], frontend: Frontend) -> Tally:
     """Run a front end over rendered frames and compare its outputs with the ground truth."""
-    tally, birth, beyond = Tally(), _Birth(), dict[int, int]()
+    tally = Tally()
+    birth = _Birth()
+    beyond = dict[int, int]()
     before: Observations | None = None
     image_before: Image | None = None
     for frame in frames:
@@ -85,10 +105,18 @@ def evaluate(simulation: Simulation, frames: Iterable[StereoFrame], frontend: Fr
             tally.frames_of[name] = tally.frames_of.get(name, 0) + 1
         left = _left_view(simulation, frame.index)
         _evaluate_life(tally, birth, beyond, simulation, now, left, frame.index)
-        if before is not None and image_before is not None and frame.left is not None and frame.index % 5 == 0:
+        if (
+            before is not None
+            and image_before is not None
+            and frame.left is not None
+            and frame.index % 5 == 0
+        ):
             last = _left_view(simulation, before.frame_index)
-            _evaluate_corners(tally, simulation, (before, image_before, last), (now, frame.left, left))
-        before, image_before = now, frame.left
+            _evaluate_corners(
+                tally, simulation, (before, image_before, last), (now, frame.left, left)
+            )
+        before = now
+        image_before = frame.left
     return tally
 
 
@@ -107,8 +135,9 @@ def _evaluate_life(
 ) -> None:
     """Compare each feature with the scene point of its first observation.
 
-    A corner on an outline may be on the background by a fraction of a pixel and yet be a point of the outline: features
-    detected within a few pixels of a nearer surface may follow either surface.
+    A corner on an outline may be on the background by a fraction of a pixel and yet be a point of
+    the outline: features detected within a few pixels of a nearer surface may follow either
+    surface.
     """
     names = now.ids.tolist()
     if not names:
@@ -132,7 +161,8 @@ def _evaluate_life(
     tally.age.append(age[old])
     distance = np.linalg.norm(p_world - left.T_world_cam[:3, 3], axis=1)
     elsewhere = np.abs(hits.distance - distance) > _OTHER_DEPTH * distance
-    # Just behind an outline a point is occluded although its feature has a small error: that is not a crossing yet.
+    # Just behind an outline a point is occluded although its feature has a small error: that is not
+    # a crossing yet.
     away = elsewhere & ((np.linalg.norm(error, axis=1) > _CROSSED_PX) | ~visible)
     away &= np.linalg.norm(rim_error, axis=1) > _CROSSED_PX
     for name, crossed in zip(names, away.tolist(), strict=True):
@@ -141,19 +171,34 @@ def _evaluate_life(
             tally.crossed[name] = max(tally.crossed.get(name, 0), beyond[name])
 
 
-def _begin(birth: _Birth, names: list[int], surfaces: Surfaces, left: View, uv: FloatArray, frame_index: int) -> None:
-    """Store the scene points of features (N,) at pixels (N, 2), and of the nearest surface around each."""
+def _begin(
+    birth: _Birth,
+    names: list[int],
+    surfaces: Surfaces,
+    left: View,
+    uv: FloatArray,
+    frame_index: int,
+) -> None:
+    """Store the scene points of features (N,) at pixels (N, 2), and of the nearest surface
+    around each.
+    """
     if not names:
         return
     ring = np.concatenate(
-        [[[0.0, 0.0]], _RIM_PX * np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y])]
+        [
+            [[0.0, 0.0]],
+            _RIM_PX * np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y]),
+        ]
     )
     around = uv[:, None] + ring
     rays, _ = unproject_pixel(left.camera, around.reshape(-1, 2))
     hits = cast(surfaces, left.T_world_cam, rays)
     distance = np.where(hits.found, hits.distance, np.inf).reshape(len(uv), -1)
-    surface, coordinates = hits.surface.reshape(len(uv), -1), hits.coordinates.reshape(len(uv), -1, 2)
-    nearest = np.where(distance.min(axis=1) < (1 - _OTHER_DEPTH) * distance[:, 0], distance.argmin(axis=1), 0)
+    surface = hits.surface.reshape(len(uv), -1)
+    coordinates = hits.coordinates.reshape(len(uv), -1, 2)
+    nearest = np.where(
+        distance.min(axis=1) < (1 - _OTHER_DEPTH) * distance[:, 0], distance.argmin(axis=1), 0
+    )
     for k, name in enumerate(names):
         rim = int(nearest[k])
         birth.frame[name] = frame_index
@@ -168,8 +213,11 @@ def _evaluate_corners(
     before: tuple[Observations, Image, View],
     now: tuple[Observations, Image, View],
 ) -> None:
-    """Count strong corners that are repeated in both images, and those that one track covers in both."""
-    corners, again = _corners(before[1]), _corners(now[1])
+    """Count strong corners that are repeated in both images, and those that one track covers in
+    both.
+    """
+    corners = _corners(before[1])
+    again = _corners(now[1])
     if len(corners) == 0 or len(again) == 0:
         return
     true, visible = correspondence(simulation.world, before[2], now[2], corners)
@@ -193,11 +241,14 @@ def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
-# --- figures ----------------------------------------------------------------------------------------------------------
+# --- figures
+# ----------------------------------------------------------------------------------------------------------
 
 
 def figures(tally: Tally) -> dict[str, Any]:
-    """Reduce a tally to plain numbers; errors in pixels, shares from 0 to 1, None without observations."""
+    """Reduce a tally to plain numbers; errors in pixels, shares from 0 to 1, None without
+    observations.
+    """
     lives = np.array(list(tally.frames_of.values()) or [0])
     tracked = int((lives > 1).sum())
     crossed = np.array(list(tally.crossed.values()), dtype=int)
@@ -220,7 +271,9 @@ def figures(tally: Tally) -> dict[str, Any]:
 
 
 def _errors(parts: Sequence[FloatArray]) -> dict[str, Any] | None:
-    """Median, 95 % and outlier share of the absolute errors (N,) or (N, 2) of all frames, and their signed median."""
+    """Median, 95 % and outlier share of the absolute errors (N,) or (N, 2) of all frames, and
+    their signed median.
+    """
     if not any(map(len, parts)):
         return None
     error = np.concatenate(parts)
@@ -235,19 +288,32 @@ def _errors(parts: Sequence[FloatArray]) -> dict[str, Any] | None:
     }
 
 
-def accuracy_scenario(effect: str | None, *, frames: int, width: int | None = None, seed: int = 1) -> Scenario:
-    """The room along a hand-held flight at 20 Hz; `effect` is a name of `vio.sim.scenarios.EFFECTS`."""
+def accuracy_scenario(
+    effect: str | None, *, frames: int, width: int | None = None, seed: int = 1
+) -> Scenario:
+    """The room along a hand-held flight at 20 Hz; `effect` is a name of
+    `vio.sim.scenarios.EFFECTS`.
+    """
     conditions = conditions_of([] if effect is None else [effect])
-    return Scenario(width=width, duration_s=frames / 20.0, conditions=conditions, imu="none", seed=seed)
+    return Scenario(
+        width=width, duration_s=frames / 20.0, conditions=conditions, imu="none", seed=seed
+    )
 
 
 def measure(scenario: Scenario, config: Config, *, workers: int) -> dict[str, Any]:
     """Render a scenario, run the configured front end over it, and return the figures."""
     simulation = plan(scenario)
-    with ParallelRecording(scenario, workers=workers, simulation=simulation) as parallel, one_blas_thread():
+    with (
+        ParallelRecording(scenario, workers=workers, simulation=simulation) as parallel,
+        one_blas_thread(),
+    ):
         recording: SimulatedRecording = parallel if workers > 1 else SimulatedRecording(simulation)
-        frontend = build_frontend(config.frontend.name, rectified_camera(simulation.rig), config.frontend, recording)
-        return figures(evaluate(simulation, (recording.frame(k) for k in range(len(recording))), frontend))
+        frontend = build_frontend(
+            config.frontend.name, rectified_camera(simulation.rig), config.frontend, recording
+        )
+        return figures(
+            evaluate(simulation, (recording.frame(k) for k in range(len(recording))), frontend)
+        )
 
 
 def table(results: dict[str, dict[str, Any]]) -> str:
@@ -259,7 +325,8 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     )
     lines = [head, "|" + "---|" * head.count(" |")]
     for name, f in results.items():
-        step, row = f["step"], f["disparity"]
+        step = f["step"]
+        row = f["disparity"]
         bias = "-" if step is None else f"{step['bias_px'][0]:.3f}, {step['bias_px'][1]:.3f}"
         cells = [
             name,
@@ -290,15 +357,25 @@ def _percent(share: float | None) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--frontend", default="klt", metavar="NAME", help="front end (default klt)")
-    parser.add_argument("--set", action="append", default=[], metavar="a.b=c", help="change a setting of it")
-    parser.add_argument("--effects", default=",".join(SHOWN_EFFECTS), metavar="NAME,…", help="'' for none")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="a.b=c", help="change a setting of it"
+    )
+    parser.add_argument(
+        "--effects", default=",".join(SHOWN_EFFECTS), metavar="NAME,…", help="'' for none"
+    )
     parser.add_argument("--frames", type=int, default=300, help="without effects (default 300)")
-    parser.add_argument("--effect-frames", type=int, default=100, help="under each effect (default 100)")
+    parser.add_argument(
+        "--effect-frames", type=int, default=100, help="under each effect (default 100)"
+    )
     parser.add_argument("--width", type=int, metavar="PX", help="image width (default 752)")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=default_workers(300), help="rendering processes")
+    parser.add_argument(
+        "--workers", type=int, default=default_workers(300), help="rendering processes"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all figures")
     args = parser.parse_args(argv)
     effects = [name for name in args.effects.split(",") if name]

@@ -2,10 +2,11 @@
 
     python -m tools.mutate [WORD …] [--list]
 
-Each mutation of `tools/mutations.txt` (with WORDs, those whose name or file contains one) is applied to a copy of the
-repository, and its test files run there until the first failure. The table says which test that was. A mutation that
-no test detects is a survivor: the exit status is then 1, and a test is missing. At the end the tests that detected
-something run on an unchanged copy, where all must pass. Recordings are taken from VIO_DATA.
+Each mutation of `tools/mutations.txt` (with WORDs, those whose name or file contains one) is
+applied to a copy of the repository, and its test files run there until the first failure. The table
+says which test that was. A mutation that no test detects is a survivor: the exit status is then 1,
+and a test is missing. At the end the tests that detected something run on an unchanged copy, where
+all must pass. Recordings are taken from VIO_DATA.
 """
 
 from __future__ import annotations
@@ -24,7 +25,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-_COPIED = ("configs", "docs", "frontend", "tests", "tools", "vio", "Makefile", "README.md", "pyproject.toml")
+_COPIED = (
+    "configs",
+    "docs",
+    "frontend",
+    "tests",
+    "tools",
+    "vio",
+    "Makefile",
+    "README.md",
+    "pyproject.toml",
+)
 _MOST_S = 900.0
 # The profile is one of tests/conftest.py.
 _PYTEST = ("-q", "--tb=no", "-p", "no:cacheprovider", "--hypothesis-profile=once")
@@ -47,7 +58,9 @@ class Mutation:
 
 def read_mutations(text: str) -> tuple[Mutation, ...]:
     """Read a list of mutations, in the form that `tools/mutations.txt` explains."""
-    out, file, tests = list[Mutation](), "", tuple[str, ...]()
+    out = list[Mutation]()
+    file = ""
+    tests = tuple[str, ...]()
     lines = [line for line in text.splitlines() if line and not line.startswith("#")]
     while lines:
         if not lines[0].startswith("  "):
@@ -72,7 +85,8 @@ def mutated(mutation: Mutation, text: str) -> str:
     count = text.count(mutation.old)
     if count != 1:
         raise MutationError(
-            f"{mutation.name!r}: {mutation.old!r} occurs {count} times in {mutation.file}; correct tools/mutations.txt"
+            f"{mutation.name!r}: {mutation.old!r} occurs {count} times in {mutation.file}; correct "
+            "tools/mutations.txt"
         )
     return text.replace(mutation.old, mutation.new)
 
@@ -84,7 +98,12 @@ def repository_copy() -> Iterator[Path]:
         for name in _COPIED:
             source = ROOT / name
             if source.is_dir():
-                shutil.copytree(source, Path(folder, name), symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+                shutil.copytree(
+                    source,
+                    Path(folder, name),
+                    symlinks=True,
+                    ignore=shutil.ignore_patterns("__pycache__"),
+                )
             else:
                 shutil.copy2(source, Path(folder, name))
         yield Path(folder)
@@ -116,20 +135,33 @@ def run_tests(copy: Path, tests: Sequence[str], *options: str) -> tuple[list[str
     seconds = time.perf_counter() - begin
     imported = done.stdout.partition("\n")[0].split()
     if len(imported) != 2 or not all(Path(file).is_relative_to(copy) for file in imported):
-        raise MutationError(f"{' '.join(imported) or done.stderr.strip()[-300:]} was imported instead of {copy}")
-    failed = re.findall(r"^(?:FAILED|ERROR) (tests/\S+?::.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
+        raise MutationError(
+            f"{' '.join(imported) or done.stderr.strip()[-300:]} was imported instead of {copy}"
+        )
+    failed = re.findall(
+        r"^(?:FAILED|ERROR) (tests/\S+?::.+?)(?: - .*)?$", done.stdout, re.MULTILINE
+    )
     if done.returncode not in (0, 1) or (done.returncode == 1) != bool(failed):
-        raise MutationError(f"pytest ended with status {done.returncode}: {(done.stdout + done.stderr).strip()[-900:]}")
+        raise MutationError(
+            f"pytest ended with status {done.returncode}: "
+            f"{(done.stdout + done.stderr).strip()[-900:]}"
+        )
     return failed, seconds
 
 
 def main() -> int:
     """Run the mutations and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("words", nargs="*", metavar="WORD", help="only mutations whose name or file contains it")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "words", nargs="*", metavar="WORD", help="only mutations whose name or file contains it"
+    )
     parser.add_argument("--list", action="store_true", help="name the mutations and change nothing")
     args = parser.parse_args()
-    chosen = [m for m in MUTATIONS if not args.words or any(w in f"{m.name} {m.file}" for w in args.words)]
+    chosen = [
+        m for m in MUTATIONS if not args.words or any(w in f"{m.name} {m.file}" for w in args.words)
+    ]
     if not chosen:
         parser.error("no mutation has such a name or file; see --list")
     if args.list:
@@ -146,7 +178,8 @@ def _run(chosen: Sequence[Mutation]) -> int:
     for mutation in chosen:  # an entry that no longer applies is reported before an hour is spent
         mutated(mutation, (ROOT / mutation.file).read_text(encoding="utf-8"))
     print("| mutation | file | detected by | s |\n|---|---|---|---:|", flush=True)
-    detected, survivors = set[str](), list[str]()
+    detected = set[str]()
+    survivors = list[str]()
     for mutation in chosen:
         with repository_copy() as copy:
             file = copy / mutation.file
@@ -157,7 +190,10 @@ def _run(chosen: Sequence[Mutation]) -> int:
             survivors.append(mutation.name)
         by = f"`{failed[0].removeprefix('tests/')}`" if failed else "**nothing**"
         print(f"| {mutation.name} | `{mutation.file}` | {by} | {seconds:.0f} |", flush=True)
-    print(f"\n{len(chosen)} mutations, {len(survivors)} survived" + "".join(f"\n- {name}" for name in survivors))
+    print(
+        f"\n{len(chosen)} mutations, {len(survivors)} survived"
+        + "".join(f"\n- {name}" for name in survivors)
+    )
     if detected:
         with repository_copy() as copy:
             failed, _ = run_tests(copy, sorted(detected))

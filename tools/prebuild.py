@@ -1,11 +1,12 @@
 """Compile the loops ahead of the first run: into the wheel, or for a checkout.
 
-python -m tools.prebuild dist     # beside the wheel in dist/, write one for this Python on Linux x86-64
-python -m tools.prebuild          # for this checkout: numba's cache, and with a C++ compiler the extension module
+python -m tools.prebuild dist     # beside the wheel in dist/, write one for this Python on Linux
+x86-64 python -m tools.prebuild          # for this checkout: numba's cache, and with a C++ compiler
+the extension module
 
-`vio/numerics/prebuilt.py` loads the module. numba's ahead-of-time compiler writes it. That takes no options for a
-function, trusts the types of arguments, and takes the address of an exception for the exception: replacements mend it
-while it works. It needs a C++ compiler and setuptools.
+`vio/numerics/prebuilt.py` loads the module. numba's ahead-of-time compiler writes it. That takes no
+options for a function, trusts the types of arguments, and takes the address of an exception for the
+exception: replacements mend it while it works. It needs a C++ compiler and setuptools.
 """
 
 from __future__ import annotations
@@ -34,7 +35,14 @@ from vio.numerics.compiled import Loop
 # Imported without numba's types, which are incomplete; `boxing` registers what is mended here.
 boxing, cgutils, types, cpu, pythonapi, numpy_support = (
     importlib.import_module(f"numba.{name}")
-    for name in ("core.boxing", "core.cgutils", "core.types", "core.cpu", "core.pythonapi", "np.numpy_support")
+    for name in (
+        "core.boxing",
+        "core.cgutils",
+        "core.types",
+        "core.cpu",
+        "core.pythonapi",
+        "np.numpy_support",
+    )
 )
 PythonAPI: Any = pythonapi.PythonAPI
 
@@ -49,7 +57,8 @@ _COMMANDS = (
     "run flight --map flight.map --out mapped",
     "mesh mapped",
     "localise flight --map flight.map --out localised",
-    "run flight --no-plot --out landmarks --set msckf.calibrate_stereo=off --set msckf.calibrate_camera_imu=both",
+    "run flight --no-plot --out landmarks --set msckf.calibrate_stereo=off --set "
+    "msckf.calibrate_camera_imu=both",
     "run wide --no-plot --out cylinder --set dataset.projection=cylinder",
     "run flight --no-plot --out mono --camera left",
     "run drive --out driven",
@@ -62,14 +71,27 @@ _CPU_NAME = "x86-64-v3"
 _FEATURES = "sse3 ssse3 sse4.1 sse4.2 popcnt cx16 sahf avx avx2 bmi bmi2 f16c fma lzcnt movbe xsave"
 _FLAGS = "pni ssse3 sse4_1 sse4_2 popcnt cx16 lahf_lm avx avx2 bmi1 bmi2 f16c fma abm movbe xsave"
 
-# Bytes from the start of an object, as NumPy's and Python's headers have them: ndarray, dtype, type.
-_TYPE, _NDIM, _DTYPE, _FLAG_BITS, _ORDER, _TYPE_NUMBER, _NAME = 8, 24, 56, 64, 26, 28, 24
-_C_CONTIGUOUS, _F_CONTIGUOUS, _WRITEABLE = 0x1, 0x2, 0x400
-_BYTE, _INT, _POINTER = ir.IntType(8), ir.IntType(32), ir.IntType(8).as_pointer()
+# Bytes from the start of an object, as NumPy's and Python's headers have them: ndarray, dtype,
+# type.
+_TYPE = 8
+_NDIM = 24
+_DTYPE = 56
+_FLAG_BITS = 64
+_ORDER = 26
+_TYPE_NUMBER = 28
+_NAME = 24
+_C_CONTIGUOUS = 0x1
+_F_CONTIGUOUS = 0x2
+_WRITEABLE = 0x400
+_BYTE = ir.IntType(8)
+_INT = ir.IntType(32)
+_POINTER = ir.IntType(8).as_pointer()
 
 
 def compile_loops() -> None:
-    """Run small recordings, so that all loops of usual runs are compiled; results are thrown away."""
+    """Run small recordings, so that all loops of usual runs are compiled; results are thrown
+    away.
+    """
     from vio.cli import main as vio
 
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(sys.stderr):
@@ -92,22 +114,31 @@ def write_code(folder: Path, loops: Iterable[Loop], processor: str, flags: Itera
 
     Args:
         folder: of the module.
-        loops: those that this process has called are written, for the types that they were called with.
+        loops: those that this process has called are written, for the types that they were called
+            with.
         processor: to compile for, LLVM's name; "host" for this one.
         flags: instruction sets without which the module must not be used, Linux' names.
     """
     folder.mkdir(parents=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # numba plans to replace its ahead-of-time compiler
-        module = importlib.import_module("numba.pycc").CC(prebuilt.MODULE, source_module=prebuilt.__name__)
-    module.target_cpu, module.output_dir = processor, str(folder)
+        module = importlib.import_module("numba.pycc").CC(
+            prebuilt.MODULE, source_module=prebuilt.__name__
+        )
+    module.target_cpu = processor
+    module.output_dir = str(folder)
     places: dict[str, dict[str, Any]] = {}
     options: dict[Callable[..., Any], dict[str, Any]] = {}
     for loop in loops:
-        signatures = [s for s in loop.by_numba.nopython_signatures if _has_plain_types(s)] if loop.is_called else []
+        signatures = (
+            [s for s in loop.by_numba.nopython_signatures if _has_plain_types(s)]
+            if loop.is_called
+            else []
+        )
         if not signatures:
             continue
-        name, options[loop.function] = prebuilt.name_of(loop.function), loop.options
+        name = prebuilt.name_of(loop.function)
+        options[loop.function] = loop.options
         symbols = [f"{name.replace('.', '_')}_{k}" for k in range(len(signatures))]
         for symbol, signature in zip(symbols, signatures, strict=True):
             module.export(symbol, signature)(loop.function)
@@ -132,45 +163,58 @@ def _has_plain_types(signature: Any) -> bool:
 
 @contextmanager
 def _mended(options: dict[Callable[..., Any], dict[str, Any]]) -> Iterator[None]:
-    """Let numba's ahead-of-time compiler use options of functions, check arguments and raise exceptions."""
+    """Let numba's ahead-of-time compiler use options of functions, check arguments and raise
+    exceptions.
+    """
     ahead_of_time: Any = importlib.import_module("numba.pycc.compiler")
-    compile_extra, get_c_object, number_long = (
-        ahead_of_time.compile_extra,
-        PythonAPI.get_c_object,
-        PythonAPI.number_long,
-    )
+    compile_extra = ahead_of_time.compile_extra
+    get_c_object = PythonAPI.get_c_object
+    number_long = PythonAPI.number_long
     unboxers = dict(pythonapi._unboxers.functions)
 
-    def with_options(typing: Any, target: Any, function: Any, args: Any, result: Any, flags: Any, **rest: Any) -> Any:
-        flags, chosen = flags.copy(), options[function]
-        flags.error_model, flags.release_gil, flags.nrt = chosen["error_model"], chosen["nogil"], chosen["_nrt"]
+    def with_options(
+        typing: Any, target: Any, function: Any, args: Any, result: Any, flags: Any, **rest: Any
+    ) -> Any:
+        flags = flags.copy()
+        chosen = options[function]
+        flags.error_model = chosen["error_model"]
+        flags.release_gil = chosen["nogil"]
+        flags.nrt = chosen["_nrt"]
         flags.fastmath = cpu.FastMathOptions(chosen["fastmath"])
         return compile_extra(typing, target, function, args, result, flags, **rest)
 
     def c_object(api: Any, name: str) -> Any:
         place = get_c_object(api, name)
         is_variable = name.startswith("PyExc_")
-        return api.builder.load(api.builder.bitcast(place, api.pyobj.as_pointer())) if is_variable else place
+        return (
+            api.builder.load(api.builder.bitcast(place, api.pyobj.as_pointer()))
+            if is_variable
+            else place
+        )
 
     def whole_number(api: Any, number: Any) -> Any:
         function = ir.FunctionType(api.pyobj, [api.pyobj])
         return api.builder.call(api._get_function(function, "PyNumber_Index"), [number])
 
     def checked_array(kind: Any, argument: Any, c: Any) -> Any:
-        return _if(_fits(kind, argument, c), kind, c, lambda: unboxers[types.Array](kind, argument, c))
+        return _if(
+            _fits(kind, argument, c), kind, c, lambda: unboxers[types.Array](kind, argument, c)
+        )
 
     def checked_none(kind: Any, argument: Any, c: Any) -> Any:
         is_none = c.builder.icmp_unsigned("==", argument, c.pyapi.borrow_none())
         return _if(is_none, kind, c, lambda: unboxers[types.NoneType](kind, argument, c))
 
     ahead_of_time.compile_extra = with_options
-    PythonAPI.get_c_object, PythonAPI.number_long = c_object, whole_number
+    PythonAPI.get_c_object = c_object
+    PythonAPI.number_long = whole_number
     pythonapi._unboxers.functions |= {types.Array: checked_array, types.NoneType: checked_none}
     try:
         yield
     finally:
         ahead_of_time.compile_extra = compile_extra
-        PythonAPI.get_c_object, PythonAPI.number_long = get_c_object, number_long
+        PythonAPI.get_c_object = get_c_object
+        PythonAPI.number_long = number_long
         pythonapi._unboxers.functions |= unboxers
 
 
@@ -189,7 +233,9 @@ def _if(fits: Any, kind: Any, c: Any, unbox: Callable[[], Any]) -> Any:
 
 
 def _fits(kind: Any, argument: Any, c: Any) -> Any:
-    """Emit: whether an argument is an array of a kind: its type, dimensions, order in memory and bytes."""
+    """Emit: whether an argument is an array of a kind: its type, dimensions, order in memory and
+    bytes.
+    """
     builder = c.builder
 
     def field(place: Any, offset: int, type_: Any) -> Any:
@@ -201,14 +247,20 @@ def _fits(kind: Any, argument: Any, c: Any) -> Any:
 
     compare = c.pyapi._get_function(ir.FunctionType(_INT, [_POINTER, _POINTER]), "strcmp")
     name = c.context.insert_const_string(c.pyapi.module, "numpy.ndarray")
-    is_array = equal(builder.call(compare, [field(field(argument, _TYPE, _POINTER), _NAME, _POINTER), name]), 0)
+    is_array = equal(
+        builder.call(compare, [field(field(argument, _TYPE, _POINTER), _NAME, _POINTER), name]), 0
+    )
     fits = cgutils.alloca_once_value(builder, cgutils.false_bit)
-    needed = {"C": _C_CONTIGUOUS, "F": _F_CONTIGUOUS, "A": 0}[kind.layout] | _WRITEABLE * kind.mutable
+    needed = {"C": _C_CONTIGUOUS, "F": _F_CONTIGUOUS, "A": 0}[
+        kind.layout
+    ] | _WRITEABLE * kind.mutable
     with builder.if_then(is_array):
         dtype = field(argument, _DTYPE, _POINTER)
         good = equal(builder.and_(field(argument, _FLAG_BITS, _INT), _INT(needed)), needed)
         good = builder.and_(good, equal(field(argument, _NDIM, _INT), kind.ndim))
-        good = builder.and_(good, equal(field(dtype, _TYPE_NUMBER, _INT), numpy_support.as_dtype(kind.dtype).num))
+        good = builder.and_(
+            good, equal(field(dtype, _TYPE_NUMBER, _INT), numpy_support.as_dtype(kind.dtype).num)
+        )
         good = builder.and_(good, builder.not_(equal(field(dtype, _ORDER, _BYTE), ord(">"))))
         builder.store(good, fits)
     return builder.load(fits)
@@ -219,7 +271,8 @@ def write_wheel(plain: Path) -> Path:
     name, version, *_ = plain.name.split("-")
     made = plain.with_name(f"{name}-{version}-{_TAG}.whl")
     with tempfile.TemporaryDirectory() as temporary:
-        site, code = Path(temporary) / "site", Path(temporary) / "code"
+        site = Path(temporary) / "site"
+        code = Path(temporary) / "code"
         with zipfile.ZipFile(plain) as archive:
             archive.extractall(site)
         environment = os.environ | {
@@ -229,21 +282,28 @@ def write_wheel(plain: Path) -> Path:
             "NUMBA_CPU_FEATURES": ",".join(f"+{name}" for name in _FEATURES.split()),
             "NUMBA_DISABLE_INTEL_SVML": "1",
         }
-        subprocess.run([sys.executable, __file__, "--write", str(code)], env=environment, check=True)
+        subprocess.run(
+            [sys.executable, __file__, "--write", str(code)], env=environment, check=True
+        )
         target = site / "vio" / "numerics" / prebuilt.FOLDER.name
         code.rename(target)
         info = f"{name}-{version}.dist-info"
         header = site / info / "WHEEL"
         text = header.read_text(encoding="utf-8").replace("Tag: py3-none-any", f"Tag: {_TAG}")
-        header.write_text(text.replace("Root-Is-Purelib: true", "Root-Is-Purelib: false"), encoding="utf-8")
+        header.write_text(
+            text.replace("Root-Is-Purelib: true", "Root-Is-Purelib: false"), encoding="utf-8"
+        )
         record = f"{info}/RECORD"
         lines = []
         with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
             for path in sorted(p for p in site.rglob("*") if p.is_file()):
-                inside, content = path.relative_to(site).as_posix(), path.read_bytes()
+                inside = path.relative_to(site).as_posix()
+                content = path.read_bytes()
                 if inside == record or "__pycache__" in inside:
                     continue
-                digest = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+                digest = (
+                    base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+                )
                 lines.append(f"{inside},sha256={digest},{len(content)}\n")
                 _add(archive, inside, content)
             _add(archive, record, "".join([*lines, f"{record},,\n"]).encode())
@@ -253,12 +313,15 @@ def write_wheel(plain: Path) -> Path:
 def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
     """Add a file that everybody may read; without a date, so that equal files give equal wheels."""
     entry = zipfile.ZipInfo(name)
-    entry.external_attr, entry.compress_type = 0o644 << 16, zipfile.ZIP_DEFLATED
+    entry.external_attr = 0o644 << 16
+    entry.compress_type = zipfile.ZIP_DEFLATED
     archive.writestr(entry, content)
 
 
 def build_here() -> None:
-    """Compile the loops of this checkout for this processor, in place of the extension module that it has."""
+    """Compile the loops of this checkout for this processor, in place of the extension module
+    that it has.
+    """
     final = prebuilt.FOLDER
     prebuilt.FOLDER = final.with_name(f"{final.name}.new")
     shutil.rmtree(prebuilt.FOLDER, ignore_errors=True)
@@ -266,7 +329,10 @@ def build_here() -> None:
     try:
         write_code(prebuilt.FOLDER, compiled.LOOPS, "host", prebuilt.processor_flags())
     except Exception as error:  # noqa: BLE001  of setuptools or the compiler, each with classes of its own
-        print(f"no extension module ({error}): each process loads the loops from numba's cache", file=sys.stderr)
+        print(
+            f"no extension module ({error}): each process loads the loops from numba's cache",
+            file=sys.stderr,
+        )
     else:
         shutil.rmtree(final, ignore_errors=True)
         prebuilt.FOLDER.rename(final)

@@ -1,4 +1,5 @@
-"""Everything of a release but the upload: names of the version agree, the archives build, are valid, install and run.
+"""Everything of a release but the upload: names of the version agree, the archives build, are
+valid, install and run.
 
 python -m tools.release            # in dist/; needs `pip install build twine`
 """
@@ -20,7 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent
 def problems(root: Path, version: str) -> list[str]:
     """Return what disagrees with the version that is to be released, one line each."""
     changes, citation, readme = (
-        (root / name).read_text(encoding="utf-8") for name in ("CHANGELOG.md", "CITATION.cff", "README.md")
+        (root / name).read_text(encoding="utf-8")
+        for name in ("CHANGELOG.md", "CITATION.cff", "README.md")
     )
     found = []
     section = re.search(rf"^## \[{re.escape(version)}\] - (\S+)$", changes, re.MULTILINE)
@@ -40,7 +42,9 @@ def problems(root: Path, version: str) -> list[str]:
 def main() -> int:
     """Return 0 where only the upload is left to do."""
     found = problems(ROOT, __version__)
-    changed = subprocess.run(["git", "status", "--porcelain"], cwd=ROOT, capture_output=True, text=True, check=True)
+    changed = subprocess.run(
+        ["git", "status", "--porcelain"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
     if changed.stdout:
         found.append("git: there are changes that are not committed")
     for line in found:
@@ -54,7 +58,11 @@ def main() -> int:
     subprocess.run([sys.executable, "-m", "twine", "check", "--strict", *archives], check=True)
     if check_wheel.main([str(dist)]):
         return 1
-    print("not ready: see above" if found else f"ready: git tag v{__version__} && git push origin v{__version__}")
+    print(
+        "not ready: see above"
+        if found
+        else f"ready: git tag v{__version__} && git push origin v{__version__}"
+    )
     return 1 if found else 0
 
 

@@ -3,16 +3,17 @@
     python -m tools.results --data DIR [--peers DIR] [--work DIR] [--only SUITE …] [--workers N]
     python -m tools.results --tables
 
-Each suite is run by `vio bench` among the recordings (docs/results.md says what lies where), which keeps the results
-of tasks: an interrupted call goes on where it stopped. docs/results.json holds the figures with commit, machine and
-date. A table of a document stands between `<!-- suite: NAME key=value … -->` and `<!-- end -->`:
+Each suite is run by `vio bench` among the recordings (docs/results.md says what lies where), which
+keeps the results of tasks: an interrupted call goes on where it stopped. docs/results.json holds
+the figures with commit, machine and date. A table of a document stands between
+`<!-- suite: NAME key=value … -->` and `<!-- end -->`:
 
     figure=ate_m              sequences down, systems across
-    figures=ate_m,cpu_ms      a line for each sequence and system, a column for each figure, or for `success`
-    sequences=… systems=…     these alone, in this order
+    figures=ate_m,cpu_ms      a line for each sequence and system, a column for each figure, or for
+    `success` sequences=… systems=…     these alone, in this order
 
-and a figure in a sentence between `<!-- figure: SUITE/SEQUENCE/SYSTEM/FIGURE/DECIMALS -->` and `<!-- end figure -->`.
-`--tables` writes them from docs/results.json.
+and a figure in a sentence between `<!-- figure: SUITE/SEQUENCE/SYSTEM/FIGURE/DECIMALS -->` and
+`<!-- end figure -->`. `--tables` writes them from docs/results.json.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ SUITES: Mapping[str, tuple[str, ...]] = {  # by name: what `vio bench` is called
     "maps": (str(OWN / "maps.yaml"),),
     "speed": (str(OWN / "speed.yaml"), "--workers", "1"),
 }
-PEERS = ("real", "real_imu", "flights", "maps")  # suites beside trajectories of other systems, where there are any
+# suites beside trajectories of other systems, where there are any
+PEERS = ("real", "real_imu", "flights", "maps")
 _KEPT = ("suite", "version", "commit", "machine", "written", "packages", "titles")
 _DIGITS = 6  # significant, of figures in the file
 _TABLE = re.compile(r"(<!-- suite: (\w+)((?: \w+=\S+)+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -60,9 +62,13 @@ class Results:
 
     def __init__(self, suites: Mapping[str, Any]) -> None:
         self.suites = suites
-        self._rows = {name: summary_rows(map(_outcome, facts["runs"])) for name, facts in suites.items()}
+        self._rows = {
+            name: summary_rows(map(_outcome, facts["runs"])) for name, facts in suites.items()
+        }
 
-    def rows(self, suite: str, sequences: Sequence[str] = (), systems: Sequence[str] = ()) -> list[Row]:
+    def rows(
+        self, suite: str, sequences: Sequence[str] = (), systems: Sequence[str] = ()
+    ) -> list[Row]:
         """Return the rows of a suite, or those asked for, in that order.
 
         Raises:
@@ -73,11 +79,21 @@ class Results:
             (s, [r.system for r in rows]) for s in systems
         ]:
             if name not in known:
-                raise KeyError(f"{FIGURES} has no {name} in suite {suite}; it holds {', '.join(dict.fromkeys(known))}")
+                raise KeyError(
+                    f"{FIGURES} has no {name} in suite {suite}; it holds "
+                    f"{', '.join(dict.fromkeys(known))}"
+                )
         order = [list(names) for names in (sequences, systems)]
-        own = [r for r in rows if (not sequences or r.sequence in sequences) and (not systems or r.system in systems)]
+        own = [
+            r
+            for r in rows
+            if (not sequences or r.sequence in sequences) and (not systems or r.system in systems)
+        ]
         return sorted(
-            own, key=lambda r: [o.index(n) if o else 0 for o, n in zip(order, (r.sequence, r.system), strict=True)]
+            own,
+            key=lambda r: [
+                o.index(n) if o else 0 for o, n in zip(order, (r.sequence, r.system), strict=True)
+            ],
         )
 
     def table(self, suite: str, words: str) -> str:
@@ -85,11 +101,18 @@ class Results:
         if suite in SUITES and suite not in self.suites:
             return f"*Suite `{suite}` has not been run yet: `make results`.*\n"
         given = dict(word.split("=", 1) for word in words.split())
-        lists = {key: given.pop(key).split(",") if key in given else [] for key in ("sequences", "systems", "figures")}
+        lists = {
+            key: given.pop(key).split(",") if key in given else []
+            for key in ("sequences", "systems", "figures")
+        }
         figure = given.pop("figure", None)
         if given or bool(lists["figures"]) == bool(figure):
-            raise KeyError(f"table of {suite}: figure= or figures=, sequences= and systems=; not '{words.strip()}'")
-        rows, facts = self.rows(suite, lists["sequences"], lists["systems"]), self.suites[suite]
+            raise KeyError(
+                f"table of {suite}: figure= or figures=, sequences= and systems=; not "
+                f"'{words.strip()}'"
+            )
+        rows = self.rows(suite, lists["sequences"], lists["systems"])
+        facts = self.suites[suite]
         if figure:
             lines = matrix(rows, BY_NAME[figure], lists["systems"], facts["titles"])
         else:
@@ -99,7 +122,10 @@ class Results:
         return "\n".join([*lines, "", f"*Suite `{suite}`: {provenance(facts)}.*", ""])
 
     def figure(self, address: str) -> str:
-        """Return the median of a figure by SUITE/SEQUENCE/SYSTEM/FIGURE/DECIMALS; KeyError where there is none."""
+        """Return the median of a figure by SUITE/SEQUENCE/SYSTEM/FIGURE/DECIMALS.
+
+        KeyError where there is none.
+        """
         suite, sequence, system, name, decimals = address.split("/")
         (row,) = self.rows(suite, [sequence], [system])
         return f"{row.cells[name].median:.{int(decimals)}f}"
@@ -108,7 +134,18 @@ class Results:
 def _outcome(values: Sequence[Any]) -> Outcome:
     sequence, system, seed, figures, measured, failure, absent = values
     succeeded = has_succeeded({"figures": figures, "failure": failure}, SUCCESS_PERCENT)
-    return Outcome(sequence, system, seed, "", figures, measured, failure, None, absent=absent, succeeded=succeeded)
+    return Outcome(
+        sequence,
+        system,
+        seed,
+        "",
+        figures,
+        measured,
+        failure,
+        None,
+        absent=absent,
+        succeeded=succeeded,
+    )
 
 
 def read_results(root: Path = ROOT) -> Results:
@@ -120,7 +157,15 @@ def taken(folder: Path) -> dict[str, Any]:
     """Return what is kept of a bench's folder."""
     outcomes, facts = read_bench(folder)
     runs = [
-        [o.sequence, o.system, o.seed, _rounded(o.figures), _rounded(o.measured), o.failure, dict(o.absent)]
+        [
+            o.sequence,
+            o.system,
+            o.seed,
+            _rounded(o.figures),
+            _rounded(o.measured),
+            o.failure,
+            dict(o.absent),
+        ]
         for o in outcomes
     ]
     return {**{name: facts[name] for name in _KEPT}, "runs": runs}
@@ -146,7 +191,8 @@ def write_json(suites: Mapping[str, Any], root: Path = ROOT) -> None:
 
 
 def with_figures(text: str, results: Results) -> str:
-    """Return a document's text with its marked tables and figures as measured; nothing else changes.
+    """Return a document's text with its marked tables and figures as measured; nothing else
+    changes.
 
     Raises:
         KeyError: a suite, sequence, system or figure is not known.
@@ -159,7 +205,9 @@ def write_documents(results: Results, root: Path = ROOT) -> None:
     """Write the marked tables and figures of all documents."""
     for name in DOCUMENTS:
         path = root / name
-        path.write_text(with_figures(path.read_text(encoding="utf-8"), results), encoding="utf-8", newline="\n")
+        path.write_text(
+            with_figures(path.read_text(encoding="utf-8"), results), encoding="utf-8", newline="\n"
+        )
 
 
 def run_suite(name: str, args: argparse.Namespace) -> dict[str, Any]:
@@ -169,11 +217,25 @@ def run_suite(name: str, args: argparse.Namespace) -> dict[str, Any]:
         SystemExit: it wrote no results.
     """
     out = args.work / name
-    words = [*SUITES[name], "--data", str(args.data), "--out", str(out), "--cache", str(args.work / "cache")]
+    words = [
+        *SUITES[name],
+        "--data",
+        str(args.data),
+        "--out",
+        str(out),
+        "--cache",
+        str(args.work / "cache"),
+    ]
     names = {s.name for s in read_suite(SUITES[name][0]).sequences if name in PEERS}
-    if args.peers is not None and any(path.name.split(".")[0] in names for path in args.peers.glob("*.tum")):
+    if args.peers is not None and any(
+        path.name.split(".")[0] in names for path in args.peers.glob("*.tum")
+    ):
         words += ["--peers", str(args.peers)]
-    words += ["--workers", str(args.workers)] if args.workers is not None and "--workers" not in words else []
+    words += (
+        ["--workers", str(args.workers)]
+        if args.workers is not None and "--workers" not in words
+        else []
+    )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     (out / "bench.json").unlink(missing_ok=True)
     subprocess.run([sys.executable, "-m", "vio", "bench", *words], env=environment, check=False)
@@ -184,18 +246,37 @@ def run_suite(name: str, args: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> int:
     """Run the suites, then write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     folder = partial(_folder, parser)
-    parser.add_argument("--data", type=folder, metavar="DIR", help="the recordings (make results VIO_DATA=DIR)")
+    parser.add_argument(
+        "--data", type=folder, metavar="DIR", help="the recordings (make results VIO_DATA=DIR)"
+    )
     parser.add_argument("--peers", type=folder, metavar="DIR", help="trajectories of other systems")
-    parser.add_argument("--work", type=Path, default=Path("results"), metavar="DIR", help="renders and results, kept")
-    parser.add_argument("--only", nargs="+", choices=SUITES, metavar="SUITE", help=f"of {' '.join(SUITES)}")
+    parser.add_argument(
+        "--work",
+        type=Path,
+        default=Path("results"),
+        metavar="DIR",
+        help="renders and results, kept",
+    )
+    parser.add_argument(
+        "--only", nargs="+", choices=SUITES, metavar="SUITE", help=f"of {' '.join(SUITES)}"
+    )
     parser.add_argument("--workers", type=int, metavar="N", help="as of vio bench")
-    parser.add_argument("--tables", action="store_true", help="run nothing, write the documents from docs/results.json")
+    parser.add_argument(
+        "--tables",
+        action="store_true",
+        help="run nothing, write the documents from docs/results.json",
+    )
     args = parser.parse_args()
     if not args.tables:
         if args.data is None:
-            parser.error("--data takes the folder of recordings; the head of docs/results.md says what lies there")
+            parser.error(
+                "--data takes the folder of recordings; the head of docs/results.md says what lies "
+                "there"
+            )
         write_json({name: run_suite(name, args) for name in args.only or SUITES})
     results = read_results()
     write_documents(results)
@@ -208,7 +289,10 @@ def main() -> int:
 def _folder(parser: argparse.ArgumentParser, text: str) -> Path:
     path = Path(text)
     if not text or not path.is_dir():
-        parser.error(f"'{text}' is no folder; the head of docs/results.md says what lies in the folder of recordings")
+        parser.error(
+            f"'{text}' is no folder; the head of docs/results.md says what lies in the folder of "
+            "recordings"
+        )
     return path.resolve()
 
 

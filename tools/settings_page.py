@@ -23,7 +23,10 @@ def page() -> str:
     """Return the text of the page."""
     rows = list(describe(Config()))
     others = [row for row in rows if row.key not in BASIC]
-    parts = [_INTRODUCTION, "## Basic settings\n\n" + _table([row for row in rows if row.key in BASIC])]
+    parts = [
+        _INTRODUCTION,
+        "## Basic settings\n\n" + _table([row for row in rows if row.key in BASIC]),
+    ]
     for section in dict.fromkeys(row.key.rpartition(".")[0] for row in others):
         chosen = [row for row in others if row.key.rpartition(".")[0] == section]
         parts.append(f"## Others: `{section}`\n\n{chosen[0].group}.\n\n" + _table(chosen))
@@ -32,7 +35,9 @@ def page() -> str:
 
 def _table(rows: list[SettingInfo]) -> str:
     cells = ((row.key, _default(row.default), row.unit, _meaning(row)) for row in rows)
-    return _HEAD + "".join(f"| `{key}` | {default} | {unit} | {doc} |\n" for key, default, unit, doc in cells)
+    return _HEAD + "".join(
+        f"| `{key}` | {default} | {unit} | {doc} |\n" for key, default, unit, doc in cells
+    )
 
 
 def _default(value: object) -> str:

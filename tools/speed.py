@@ -2,10 +2,11 @@
 
     python -m tools.speed RECORDING [--write]
 
-The least cost of a stereo frame is decoding its two images and four passes of Lucas-Kanade (to the last frame and to
-the right image, and back) with 400 points, in OpenCV on one thread. Runs and these passes take turns, so that the ratio
-holds on any machine. Beside it stands that of the last commit, `tools/speed.json`, which `--write` replaces. The exit
-status is 1 where a frame needs a tenth more calls than that, or twice the ratio of CPU time.
+The least cost of a stereo frame is decoding its two images and four passes of Lucas-Kanade (to the
+last frame and to the right image, and back) with 400 points, in OpenCV on one thread. Runs and
+these passes take turns, so that the ratio holds on any machine. Beside it stands that of the last
+commit, `tools/speed.json`, which `--write` replaces. The exit status is 1 where a frame needs a
+tenth more calls than that, or twice the ratio of CPU time.
 """
 
 from __future__ import annotations
@@ -30,20 +31,31 @@ from vio.runs.pipeline import run
 
 REFERENCE = Path(__file__).with_suffix(".json")
 _ROUNDS = 3
-_POINTS, _WINDOW_PX, _LEVELS = 400, 21, 3
-_MOST = {"calls": 1.1, "cpu": 2.0}  # times the last commit's; calls hardly vary, times do between machines
+_POINTS = 400
+_WINDOW_PX = 21
+_LEVELS = 3
+# times the last commit's; calls hardly vary, times do between machines
+_MOST = {"calls": 1.1, "cpu": 2.0}
 
 
 def measured(path: Path) -> dict[str, float]:
-    """Return calls a frame, and the ratios of CPU and wall time, of a recording of rectified or raw stereo images."""
-    dataset, config = open_dataset(path), load_config()
+    """Return calls a frame, and the ratios of CPU and wall time, of a recording of rectified or
+    raw stereo images.
+    """
+    dataset = open_dataset(path)
+    config = load_config()
     pairs = [(e.left, e.right) for e in dataset.events() if isinstance(e, StereoFrame)]
-    encoded = [cv2.imencode(".png", image)[1] for pair in pairs for image in pair if image is not None]
+    encoded = [
+        cv2.imencode(".png", image)[1] for pair in pairs for image in pair if image is not None
+    ]
     points = [cv2.goodFeaturesToTrack(np.asarray(left), _POINTS, 0.001, 7) for left, _ in pairs]
 
     def lucas_kanade(one: Any, other: Any, corners: Any) -> Any:
         size = _WINDOW_PX, _WINDOW_PX
-        return cv2.calcOpticalFlowPyrLK(one, other, corners, None, winSize=size, maxLevel=_LEVELS)[0]  # type: ignore[call-overload]
+        moved, _, _ = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
+            one, other, corners, None, winSize=size, maxLevel=_LEVELS
+        )
+        return moved
 
     def frames() -> None:
         run(open_dataset(path), config)
@@ -102,13 +114,20 @@ def slower(now: dict[str, float], last: dict[str, float]) -> list[str]:
 
 def main(argv: list[str]) -> int:
     """Return 0 where no figure is beyond its bound."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("recording", type=Path)
     parser.add_argument("--write", action="store_true", help="keep the figures for later commits")
     args = parser.parse_args(argv)
-    now, last = measured(args.recording), json.loads(REFERENCE.read_text(encoding="utf-8"))
+    now = measured(args.recording)
+    last = json.loads(REFERENCE.read_text(encoding="utf-8"))
     print("                        now   last commit")
-    for name, text in (("calls", "calls a frame"), ("cpu", "CPU over the least"), ("wall", "wall over the least")):
+    for name, text in (
+        ("calls", "calls a frame"),
+        ("cpu", "CPU over the least"),
+        ("wall", "wall over the least"),
+    ):
         print(f"{text:20} {now[name]:>6g} {last[name]:>13g}")
     if args.write:
         REFERENCE.write_text(json.dumps(now) + "\n", encoding="utf-8")

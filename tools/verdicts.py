@@ -1,9 +1,10 @@
-"""How often `vio bench compare` calls a change that is none, and sees one that is: simulated comparisons.
+"""How often `vio bench compare` calls a change that is none, and sees one that is: simulated
+comparisons.
 
     python -m tools.verdicts [--repeat 1000]
 
-The ATE of A is log-normal over the sequences, and B is A times the change times noise. The other judged figures
-change with the ATE (correlation 0.7). Prints the table of docs/bench.md.
+The ATE of A is log-normal over the sequences, and B is A times the change times noise. The other
+judged figures change with the ATE (correlation 0.7). Prints the table of docs/bench.md.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ def simulated(n: int, change: float, noise: Noise, rng: np.random.Generator) -> 
 
 def verdicts(n: int, change: float, noise: str, repeat: int) -> tuple[Counter[str], Counter[str]]:
     """Count what is said of the ATE alone, and of the whole."""
-    rng, ate, whole = np.random.default_rng([0, n, round(100 * change)]), Counter[str](), Counter[str]()
+    rng = np.random.default_rng([0, n, round(100 * change)])
+    ate = Counter[str]()
+    whole = Counter[str]()
     for _ in range(repeat):
         result = simulated(n, change, NOISES[noise], rng)
         ate[result.changes[0].verdict] += 1
@@ -62,17 +65,27 @@ def verdicts(n: int, change: float, noise: str, repeat: int) -> tuple[Counter[st
 
 def main() -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--repeat", type=int, default=1000, help="comparisons of each case")
     repeat = parser.parse_args().repeat
-    print("| ratios | true change | " + " | ".join(f"n = {n}" for n in SIZES) + " |\n|---|---:|" + "---:|" * len(SIZES))
+    print(
+        "| ratios | true change | "
+        + " | ".join(f"n = {n}" for n in SIZES)
+        + " |\n|---|---:|"
+        + "---:|" * len(SIZES)
+    )
     for noise in NOISES:
         for change in CHANGES:
             cells = []
             for n in SIZES:
                 ate, whole = verdicts(n, change, noise, repeat)
                 cells.append(
-                    " / ".join(f"{100 * c / repeat:.0f}" for c in (ate["worse"], whole["worse"], ate["cannot tell"]))
+                    " / ".join(
+                        f"{100 * c / repeat:.0f}"
+                        for c in (ate["worse"], whole["worse"], ate["cannot tell"])
+                    )
                 )
             print(f"| {noise} | {change:g} | {' | '.join(cells)} |")
     return 0

@@ -1,7 +1,8 @@
-"""The configuration: nested frozen dataclasses, filled from defaults < file < `--set a.b=c`, strictly checked.
+"""The configuration: nested frozen dataclasses, filled from defaults < file < `--set a.b=c`,
+strictly checked.
 
-YAML files hold deviations only. An unknown key or a wrong type is an error that names the file, the key and the
-nearest valid key.
+YAML files hold deviations only. An unknown key or a wrong type is an error that names the file, the
+key and the nearest valid key.
 """
 
 from __future__ import annotations
@@ -47,19 +48,32 @@ _FIXED = {
     "frontend.grid": "cell_features min_distance",
     "frontend.disparity": "min_disparity_px",
     "frontend.consensus": "samples sure_share prior_max_deviation_deg prior_min_support",
-    "frontend.klt": "min_gradient min_relative_gradient min_gradient_over_noise spare_corners window_px trusted_levels "
-    "iterations max_forward_backward_px consensus_px anchor_radius_px min_anchor_correlation max_anchor_scale "
-    "max_epipolar_px min_correlation min_peak_margin probation_frames wanted_life_frames least_features "
+    "frontend.klt": "min_gradient min_relative_gradient min_gradient_over_noise spare_corners "
+    "window_px trusted_levels "
+    "iterations max_forward_backward_px consensus_px anchor_radius_px min_anchor_correlation "
+    "max_anchor_scale "
+    "max_epipolar_px min_correlation min_peak_margin probation_frames wanted_life_frames "
+    "least_features "
     "max_blind_frames max_left_only_frames",
     "frontend.match": "ratio search_radius max_epipolar_px refine consensus_px",
     "selector": "minimum horizon_frames pixel_sigma_px sticky",
-    "vislam": "start_velocity_sigma_mps start_rate_sigma_radps landmark_prior_sigma_m max_landmark_distance_m",
-    "msckf": "pixel_sigma_min_px start_tilt_sigma_deg start_velocity_sigma_mps zero_velocity_sigma_mps "
-    "zero_rate_sigma_radps rate_bias_sigma_radps rate_bias_walk stereo_yaw_sigma_deg stereo_field_sigma "
-    "imu_scale_sigma imu_misalignment_sigma_deg extrinsic_rotation_walk extrinsic_translation_walk time_offset_walk",
+    "vislam": "start_velocity_sigma_mps start_rate_sigma_radps landmark_prior_sigma_m "
+    "max_landmark_distance_m",
+    "msckf": "pixel_sigma_min_px start_tilt_sigma_deg start_velocity_sigma_mps "
+    "zero_velocity_sigma_mps "
+    "zero_rate_sigma_radps rate_bias_sigma_radps rate_bias_walk stereo_yaw_sigma_deg "
+    "stereo_field_sigma "
+    "imu_scale_sigma imu_misalignment_sigma_deg extrinsic_rotation_walk extrinsic_translation_walk "
+    "time_offset_walk",
 }
 _PRESETS = Path(__file__).parent / "presets"  # packaged configurations, by name
-_TYPES = {float: "a number", int: "a whole number", bool: "true or false", str: "text", Path: "a path"}
+_TYPES = {
+    float: "a number",
+    int: "a whole number",
+    bool: "true or false",
+    str: "text",
+    Path: "a path",
+}
 _MOST_NAMED = 8  # settings in the message on an unknown one
 _MOST_SHOWN = 200  # characters of a wrong value in a message
 
@@ -72,7 +86,8 @@ class Config(Section):
 
     motion: MotionName = setting(
         "auto",
-        "motion input for propagation: imu, velocity, none (images alone), or auto: the best that the recording "
+        "motion input for propagation: imu, velocity, none (images alone), or auto: the best that "
+        "the recording "
         "contains and the back end supports (an observation log: what its run used)",
     )
     backend: BackendName = setting(
@@ -80,7 +95,8 @@ class Config(Section):
     )
     lag_frames: int = setting(
         0,
-        "output each pose this many frames late, smoothed by the window (msckf, up to its clones); 0: causal",
+        "output each pose this many frames late, smoothed by the window (msckf, up to its clones); "
+        "0: causal",
         at_least=0,
         at_most=100,
     )
@@ -92,7 +108,8 @@ class Config(Section):
 
 
 def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -> Config:
-    """Build the configuration from the defaults, a YAML file and `a.b=value` overrides, in that order.
+    """Build the configuration from the defaults, a YAML file and `a.b=value` overrides, in that
+    order.
 
     A bare name of which there is no file, such as `fast`, is that of a preset in `vio/presets`.
 
@@ -114,7 +131,10 @@ def _preset_or(path: Path) -> Path:
     preset = _PRESETS / f"{path}.yaml"
     if not preset.is_file():
         known = ", ".join(sorted(file.stem for file in _PRESETS.glob("*.yaml")))
-        raise ConfigError(f"--config {path}: there is no such file, nor a preset of this name; presets are: {known}")
+        raise ConfigError(
+            f"--config {path}: there is no such file, nor a preset of this name; presets are: "
+            f"{known}"
+        )
     return preset
 
 
@@ -122,7 +142,8 @@ def merge_override(section: _Section, override: str, *, example: str) -> _Sectio
     """Return a copy of a section with one setting replaced, given as `a.b=value` as after `--set`.
 
     Raises:
-        ConfigError: the text is no such pair (the message gives the example), or a key or value is wrong.
+        ConfigError: the text is no such pair (the message gives the example), or a key or value is
+            wrong.
     """
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
@@ -130,13 +151,17 @@ def merge_override(section: _Section, override: str, *, example: str) -> _Sectio
     try:
         nested: Any = read_yaml(text)
     except ValueError as error:
-        raise ConfigError(f"--set {_short(override)}: the value is not valid YAML ({error})") from error
+        raise ConfigError(
+            f"--set {_short(override)}: the value is not valid YAML ({error})"
+        ) from error
     for part in reversed(key.strip().split(".")):
         nested = {part: nested}
     return merge(section, nested, where=f"--set {_short(override)}")
 
 
-def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: str = "", root: Any = None) -> _Section:
+def merge(
+    section: _Section, values: Mapping[str, Any], *, where: str, prefix: str = "", root: Any = None
+) -> _Section:
     """Return a copy of a section with some settings replaced.
 
     Args:
@@ -156,12 +181,17 @@ def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: s
     for key, value in values.items():
         path = f"{prefix}{_short(str(key))}"
         if key not in names:
-            raise ConfigError(f"{where}: unknown setting '{path}'{_suggestion(_short(str(key)), names, prefix, root)}")
+            raise ConfigError(
+                f"{where}: unknown setting "
+                f"'{path}'{_suggestion(_short(str(key)), names, prefix, root)}"
+            )
         current = getattr(section, key)
         if is_dataclass(current):
             if not isinstance(value, Mapping):
                 example = f"{path}.{fields(current)[0].name}"
-                raise ConfigError(f"{where}: '{path}' is a section; give its settings, such as {example}")
+                raise ConfigError(
+                    f"{where}: '{path}' is a section; give its settings, such as {example}"
+                )
             changes[key] = merge(current, value, where=where, prefix=f"{path}.", root=root)
         else:
             changes[key] = _checked(value, hints[key], path, where)
@@ -208,7 +238,8 @@ def describe(section: Any, prefix: str = "") -> Iterator[SettingInfo]:
         else:
             hint = hints[f.name]
             choices = tuple(map(str, get_args(hint))) if get_origin(hint) is Literal else ()
-            unit, doc = f.metadata.get("unit", ""), f.metadata.get("doc", "")
+            unit = f.metadata.get("unit", "")
+            doc = f.metadata.get("doc", "")
             allowed = str(f.metadata.get("range", Range()))
             yield SettingInfo(f"{prefix}{f.name}", group, value, unit, choices, allowed, doc)
 
@@ -217,7 +248,9 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     try:
         text = read_input(path, MOST_BYTES).decode("utf-8-sig")
     except OSError as error:
-        raise ConfigError(f"{path}: cannot read the configuration ({error.strerror}); check the path") from error
+        raise ConfigError(
+            f"{path}: cannot read the configuration ({error.strerror}); check the path"
+        ) from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: the configuration is not UTF-8 text") from error
     try:
@@ -227,7 +260,9 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     if values is None:
         return {}
     if not isinstance(values, dict):
-        raise ConfigError(f"{path}: a configuration is a mapping of settings, not a {type(values).__name__}")
+        raise ConfigError(
+            f"{path}: a configuration is a mapping of settings, not a {type(values).__name__}"
+        )
     return values
 
 
@@ -241,13 +276,16 @@ def _checked(value: Any, hint: Any, path: str, where: str) -> Any:
         return _checked(value, members[0], path, where)
     if origin is Literal:
         choices = get_args(hint)
-        if isinstance(value, bool) and {"on", "off"} <= set(choices):  # YAML reads the bare words as truth values
+        # YAML reads the bare words as truth values
+        if isinstance(value, bool) and {"on", "off"} <= set(choices):
             value = "on" if value else "off"
         if value in choices and type(value) in {type(c) for c in choices}:
             return value
         near = difflib.get_close_matches(_short(str(value)), choices, 1)
         hint_text = f"; did you mean '{near[0]}'?" if near else ""
-        raise ConfigError(f"{where}: {path} is one of {', '.join(choices)}, not {_short(repr(value))}{hint_text}")
+        raise ConfigError(
+            f"{where}: {path} is one of {', '.join(choices)}, not {_short(repr(value))}{hint_text}"
+        )
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value) if abs(value) < 2**1000 else math.inf  # which no range allows
     if hint is Path and isinstance(value, str):
@@ -273,7 +311,8 @@ def _number_hint(value: Any, hint: Any) -> str:
 
 
 def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
-    """Suggest a setting: the same name in a sibling section, a similar one here, or the same name anywhere.
+    """Suggest a setting: the same name in a sibling section, a similar one here, or the same name
+    anywhere.
 
     A name may be split over section and setting: `consensus_samples` is `consensus.samples`.
     """
@@ -281,13 +320,19 @@ def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
         return f"; it is '{_RENAMED[prefix + key]}' since 0.3"
     if key in _FIXED.get(prefix[:-1], "").split():
         return "; it is fixed since 0.3: remove it"
-    same_name = [row.key for row in describe(root) if f".{row.key}".replace(".", "_").endswith(f"_{key}")]
+    same_name = [
+        row.key for row in describe(root) if f".{row.key}".replace(".", "_").endswith(f"_{key}")
+    ]
     siblings = [name for name in same_name if name.startswith(prefix[: prefix.find(".") + 1])]
     similar = [prefix + name for name in difflib.get_close_matches(key, names, 1, cutoff=0.4)]
     for found in (siblings, similar, same_name):
         if found:
             return f"; did you mean '{found[0]}'?"
-    more = f" and {len(names) - _MOST_NAMED} more, see vio config --all" if len(names) > _MOST_NAMED else ""
+    more = (
+        f" and {len(names) - _MOST_NAMED} more, see vio config --all"
+        if len(names) > _MOST_NAMED
+        else ""
+    )
     return f"; valid here: {', '.join(prefix + name for name in names[:_MOST_NAMED])}{more}"
 
 

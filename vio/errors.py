@@ -28,7 +28,9 @@ class EstimationError(VioError):
 
 
 class DivergedError(EstimationError):
-    """The filter's state is no longer usable; a filter that can restart goes on from its last good state."""
+    """The filter's state is no longer usable; a filter that can restart goes on from its last
+    good state.
+    """
 
 
 class EvaluationError(VioError):

@@ -35,7 +35,8 @@ from vio.records import (
 if TYPE_CHECKING:
     from vio.cameras.rig import Rectifier
 
-Progress: TypeAlias = Callable[[int, int], None]  # called after each frame: frames done, frames in all
+# called after each frame: frames done, frames in all
+Progress: TypeAlias = Callable[[int, int], None]
 
 
 class Dataset(Protocol):
@@ -45,12 +46,14 @@ class Dataset(Protocol):
     def recording(self) -> Recording:
         """Calibration, times and ground truth, known without reading any frame."""
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order.
 
-        A motion sample with the time of a frame comes before it. Motion samples from the time of frame `start` (raw
-        IMU: from a second before it) to the time of frame `stop - 1` (raw IMU: to the first sample at or after it) are
-        included. With `images=False` frames carry
+        A motion sample with the time of a frame comes before it. Motion samples from the time of
+        frame `start` (raw IMU: from a second before it) to the time of frame `stop - 1` (raw IMU:
+        to the first sample at or after it) are included. With `images=False` frames carry
         None for both images.
 
         Raises:
@@ -58,7 +61,10 @@ class Dataset(Protocol):
         """
 
     def observations(self, index: int) -> Observations | None:
-        """Return the precomputed features of one frame; None where the recording holds images only."""
+        """Return the precomputed features of one frame.
+
+        None where the recording holds images only.
+        """
 
 
 @runtime_checkable
@@ -81,12 +87,14 @@ class Frontend(Protocol):
         """Track, match and detect in one frame; frames come in time order.
 
         Args:
-            frame: a rectified pair, 8-bit gray, of the size that the camera states, for front ends that look at images.
-            prior: predicted pixels by id and predicted rotation since the last frame, where the filter has them.
+            frame: a rectified pair, 8-bit gray, of the size that the camera states, for front ends
+                that look at images.
+            prior: predicted pixels by id and predicted rotation since the last frame, where the
+                filter has them.
 
         Raises:
-            DataError: the frame lacks what the front end needs, its images have a wrong size or type, its time is not
-                after the last one's, or left and right look swapped.
+            DataError: the frame lacks what the front end needs, its images have a wrong size or
+                type, its time is not after the last one's, or left and right look swapped.
         """
 
 
@@ -98,7 +106,8 @@ class Selector(Protocol):
 
         Args:
             observations: all that the front end saw in the frame.
-            motion: what the back end expects of the motion since the last frame, where it can predict it.
+            motion: what the back end expects of the motion since the last frame, where it can
+                predict it.
         """
 
 
@@ -109,14 +118,21 @@ class Backend(Protocol):
     `vio.filters.BACKENDS`.
     """
 
-    motion_sources: ClassVar[tuple[MotionSource, ...]] = ()  # what it has a motion model for, the best first
-    stereo_only: ClassVar[bool] = False  # whether observations without a right match are of no use to it
+    # what it has a motion model for, the best first
+    motion_sources: ClassVar[tuple[MotionSource, ...]] = ()
+    # whether observations without a right match are of no use to it
+    stereo_only: ClassVar[bool] = False
 
     @classmethod
     def build(
-        cls, camera: StereoCamera, T_cam0_body: FloatArray, settings: Any, motion: MotionSource | None
+        cls,
+        camera: StereoCamera,
+        T_cam0_body: FloatArray,
+        settings: Any,
+        motion: MotionSource | None,
     ) -> Backend:
-        """Build the back end of a run; without an implementation, by the constructor with these arguments.
+        """Build the back end of a run; without an implementation, by the constructor with these
+        arguments.
 
         Args:
             camera: the rectified camera or pair.
@@ -139,7 +155,8 @@ class Backend(Protocol):
         """Move to the time of the observations and take them in.
 
         Raises:
-            DivergedError: the state is lost, and `restart` may be called with the same observations.
+            DivergedError: the state is lost, and `restart` may be called with the same
+                observations.
             EstimationError: the state is lost for good.
         """
 
@@ -152,7 +169,10 @@ class Backend(Protocol):
         """Return the current map, less what `take_landmarks` has returned."""
 
     def predict(self, time_ns: int) -> Prediction | None:
-        """Predict a frame at a coming time, without changing anything; None where no prediction is possible."""
+        """Predict a frame at a coming time, without changing anything.
+
+        None where no prediction is possible.
+        """
         return None
 
     def take_landmarks(self) -> Landmarks:
@@ -160,7 +180,8 @@ class Backend(Protocol):
         return no_landmarks()
 
     def restart(self, observations: Observations) -> UpdateReport:
-        """Go on from the last plausible state after a divergence, with the frame that `update` failed at.
+        """Go on from the last plausible state after a divergence, with the frame that `update`
+        failed at.
 
         Raises:
             EstimationError: there is no such state.
@@ -173,20 +194,31 @@ class Backend(Protocol):
         return Initialisation()
 
     def take_rotation_comparison(self, comparison: RotationComparison | None) -> None:
-        """Take how the camera's rotation compares with the gyro's so far; None: not compared yet."""
+        """Take how the camera's rotation compares with the gyro's so far.
+
+        None: not compared yet.
+        """
         return
 
     @property
     def window_frames(self) -> int:
-        """How many past frames `smoothed` and `relative` know at most; a map and `lag_frames` need some."""
+        """How many past frames `smoothed` and `relative` know at most; a map and `lag_frames`
+        need some.
+        """
         return 0
 
     def smoothed(self, frame_index: int) -> Estimate | None:
-        """Return the estimate at a past frame with all frames since taken into account; None where it is not kept."""
+        """Return the estimate at a past frame with all frames since taken into account.
+
+        None where it is not kept.
+        """
         return None
 
     def relative(self, older: int, newer: int) -> RelativePose | None:
-        """Return the body's motion between two past frames, by index; None where one is not kept."""
+        """Return the body's motion between two past frames, by index.
+
+        None where one is not kept.
+        """
         return None
 
 

@@ -1,7 +1,7 @@
 """The records that travel between the parts: plain frozen data, no behaviour beyond slicing.
 
-Frames, units and pixel conventions are those of docs/conventions.md. Images are uint8 (H, W); ids int64;
-everything else float64. Missing is `None` or a mask, never a special number.
+Frames, units and pixel conventions are those of docs/conventions.md. Images are uint8 (H, W); ids
+int64; everything else float64. Missing is `None` or a mask, never a special number.
 """
 
 from __future__ import annotations
@@ -28,9 +28,13 @@ MotionSource: TypeAlias = Literal["imu", "velocity"]
 RunMotion: TypeAlias = Literal["imu", "velocity", "none"]  # none: images alone
 
 # Rigs are calibrated to 1 % of a focal length, and gyros to 1 or 2 % of their scale.
-_RATES_DIFFER, _RATES_SIGMAS, _RATES_SIGMA = 0.03, 5.0, 0.01
+_RATES_DIFFER = 0.03
+_RATES_SIGMAS = 5.0
+_RATES_SIGMA = 0.01
 _KNOWN = 1e-8  # a standard deviation below it is rounding
-_INT64, _FLOAT64, _BOOL = np.dtype(np.int64), np.dtype(np.float64), np.dtype(np.bool_)
+_INT64 = np.dtype(np.int64)
+_FLOAT64 = np.dtype(np.float64)
+_BOOL = np.dtype(np.bool_)
 
 
 def _type_text(value: object) -> str:
@@ -49,7 +53,8 @@ def _check_sample(name: str, time_ns: object, **vectors: object) -> None:
     for key, value in vectors.items():
         if not _is_vector(value):
             raise DataError(
-                f"{name}: {key} is {_type_text(value)}, not an array (3,) of float64; use numpy.array(…, float)"
+                f"{name}: {key} is {_type_text(value)}, not an array (3,) of float64; use "
+                "numpy.array(…, float)"
             )
 
 
@@ -112,7 +117,8 @@ class StereoFrame:
     time_ns: int
     left: Image | None  # (H, W) rectified
     right: Image | None  # (H, W) rectified; None for one camera
-    depth: FloatArray | None = None  # (H, W) metres along the optical axis, 0 where unknown; with depth images only
+    # (H, W) metres along the optical axis, 0 where unknown; with depth images only
+    depth: FloatArray | None = None
 
 
 MotionSample: TypeAlias = ImuSample | VelocitySample
@@ -125,14 +131,20 @@ class Observations:
 
     frame_index: int
     time_ns: int
-    ids: IntArray  # (N,) unique within the frame; an id names one feature for ever and is never reused
-    z: FloatArray  # (N, 4) rectified pixels [ul vl ur vr]; ur, vr are arbitrary where has_right is False
+    # (N,) unique within the frame; an id names one feature for ever and is never reused
+    ids: IntArray
+    # (N, 4) rectified pixels [ul vl ur vr]; ur, vr are arbitrary where has_right is False
+    z: FloatArray
     has_right: BoolArray  # (N,) False: seen in the left image only
-    stale: BoolArray  # (N,) True: the pixels are known to be old (repeated by the source) and must not be trusted
-    sigma: SigmaArray | None = None  # (N, 3) of [ul vl ur], px, relative to one another; 0: not known; None: all alike
+    # (N,) True: the pixels are known to be old (repeated by the source) and must not be trusted
+    stale: BoolArray
+    # (N, 3) of [ul vl ur], px, relative to one another; 0: not known; None: all alike
+    sigma: SigmaArray | None = None
 
     def __post_init__(self) -> None:
-        """Raise DataError unless types and lengths are those above; the filters check the values."""
+        """Raise DataError unless types and lengths are those above; the filters check the
+        values.
+        """
         shape = getattr(self.ids, "shape", None)
         for name, dtype, expected in (
             ("ids", _INT64, shape if shape is not None and len(shape) == 1 else ("N",)),
@@ -143,25 +155,34 @@ class Observations:
             value = getattr(self, name)
             if not isinstance(value, np.ndarray) or value.dtype != dtype or value.shape != expected:
                 raise DataError(
-                    f"Observations of frame {self.frame_index}: {name} is {_type_text(value)}, not an array {expected} "
+                    f"Observations of frame {self.frame_index}: {name} is {_type_text(value)}, not "
+                    f"an array {expected} "
                     f"of {dtype}; vio.records.observations builds them from lists"
                 )
         sigma = self.sigma
         if sigma is not None and (sigma.dtype != np.float32 or sigma.shape != (len(self.ids), 3)):
             raise DataError(
-                f"Observations of frame {self.frame_index}: sigma is {_type_text(sigma)}, not (N, 3) of float32"
+                f"Observations of frame {self.frame_index}: sigma is {_type_text(sigma)}, not (N, "
+                "3) of float32"
             )
         if not isinstance(self.time_ns, (int, np.integer)):
-            raise DataError(f"Observations: time_ns is {_type_text(self.time_ns)}, not whole nanoseconds")
+            raise DataError(
+                f"Observations: time_ns is {_type_text(self.time_ns)}, not whole nanoseconds"
+            )
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def take(self, index: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Observations:
-        """Return the rows named by a mask (N,) or by indices (K,); the record itself where a mask names all."""
+        """Return the rows named by a mask (N,) or by indices (K,); the record itself where a
+        mask names all.
+        """
         if index.dtype == np.bool_ and index.all():
             return self
-        ids, z, has_right, stale = self.ids[index], self.z[index], self.has_right[index], self.stale[index]
+        ids = self.ids[index]
+        z = self.z[index]
+        has_right = self.has_right[index]
+        stale = self.stale[index]
         sigma = None if self.sigma is None else self.sigma[index]
         return Observations(self.frame_index, self.time_ns, ids, z, has_right, stale, sigma)
 
@@ -174,7 +195,8 @@ def observations(
     has_right: npt.ArrayLike | None = None,
     stale: npt.ArrayLike | None = None,
 ) -> Observations:
-    """Build `Observations` from array-likes; without masks, every row is a fresh stereo observation.
+    """Build `Observations` from array-likes; without masks, every row is a fresh stereo
+    observation.
 
     Raises:
         DataError: shapes disagree, an id occurs twice, or a value is no number.
@@ -183,15 +205,26 @@ def observations(
         given = np.asarray(ids).reshape(-1)
         if given.size and given.dtype.kind not in "iu":
             raise DataError(f"frame {frame_index}: ids are whole numbers, got {given.dtype}")
-        ids_, n = given.astype(np.int64), given.size
+        ids_ = given.astype(np.int64)
+        n = given.size
         z_ = np.asarray(z, dtype=np.float64).reshape(-1, 4)
-        right = np.ones(n, dtype=np.bool_) if has_right is None else np.asarray(has_right, dtype=np.bool_)
+        right = (
+            np.ones(n, dtype=np.bool_)
+            if has_right is None
+            else np.asarray(has_right, dtype=np.bool_)
+        )
         old = np.zeros(n, dtype=np.bool_) if stale is None else np.asarray(stale, dtype=np.bool_)
-        index, stamp_ns = int(frame_index), int(time_ns)
+        index = int(frame_index)
+        stamp_ns = int(time_ns)
     except (ValueError, TypeError, OverflowError) as error:
-        raise DataError(f"frame {frame_index}: no observations can be made of this ({error})") from error
+        raise DataError(
+            f"frame {frame_index}: no observations can be made of this ({error})"
+        ) from error
     if not (len(z_) == n and right.shape == (n,) and old.shape == (n,)):
-        raise DataError(f"observations disagree in length: {n} ids, {len(z_)} z, {right.shape}, {old.shape} masks")
+        raise DataError(
+            f"observations disagree in length: {n} ids, {len(z_)} z, {right.shape}, {old.shape} "
+            "masks"
+        )
     if len(np.unique(ids_)) != n:
         raise DataError(f"frame {frame_index}: an id occurs twice among {n} observations")
     return Observations(index, stamp_ns, ids_, z_, right, old)
@@ -222,7 +255,9 @@ class FeatureTracks:
 
 
 def feature_tracks(seen: Mapping[int, Observations], frames: int) -> FeatureTracks:
-    """Join the observations of some of `frames` frames, named by their numbers; the others show nothing."""
+    """Join the observations of some of `frames` frames, named by their numbers; the others show
+    nothing.
+    """
     counts = np.zeros(frames + 1, dtype=np.int64)
     for k, shown in seen.items():
         counts[k + 1] = len(shown)
@@ -241,7 +276,9 @@ def joined_sigmas(parts: Sequence[Observations]) -> SigmaArray | None:
     """The standard deviations (R, 3) of all rows of some frames; None where no frame has any."""
     if all(o.sigma is None for o in parts):
         return None
-    return np.concatenate([np.zeros((len(o), 3), np.float32) if o.sigma is None else o.sigma for o in parts])
+    return np.concatenate(
+        [np.zeros((len(o), 3), np.float32) if o.sigma is None else o.sigma for o in parts]
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,8 +287,10 @@ class TrackPrior:
 
     ids: IntArray  # (N,)
     z: FloatArray  # (N, 4) predicted pixels
-    R_cam_prev: FloatArray | None = None  # (3, 3) rotation that maps the previous cam0 frame into the coming one
-    motion: MotionPrior | None = None  # the whole motion since the previous frame, with its covariance
+    # (3, 3) rotation that maps the previous cam0 frame into the coming one
+    R_cam_prev: FloatArray | None = None
+    # the whole motion since the previous frame, with its covariance
+    motion: MotionPrior | None = None
 
     @property
     def measured_motion(self) -> MotionPrior | None:
@@ -261,7 +300,9 @@ class TrackPrior:
 
 @dataclass(frozen=True, slots=True)
 class MotionPrior:
-    """What the back end expects of the left camera's motion from the last frame to the coming one."""
+    """What the back end expects of the left camera's motion from the last frame to the coming
+    one.
+    """
 
     T_curr_prev: FloatArray  # (4, 4) maps the previous cam0 frame into the coming one
     covariance: FloatArray  # (6, 6) of xi in T_curr_prev = exp(xi) T_hat, [rho; phi], m and rad
@@ -316,42 +357,55 @@ def no_landmarks() -> Landmarks:
     return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
-RIGHT_TERMS = 4  # coefficients of a rectification error: a0 to a3 of the right columns, equation (R3) of docs/math.md
+# coefficients of a rectification error: a0 to a3 of the right columns, equation (R3) of
+# docs/math.md
+RIGHT_TERMS = 4
 FIELD_TERMS = 8  # those, and k1, k2, q1, q2 of both lenses
 ROW_TERMS = 7  # coefficients of the right rows, equation (R2)
 
 
 @dataclass(frozen=True, slots=True)
 class StereoFieldEstimate:
-    """What the stereo calibration is off by, as coefficients of equations (R2) and (R3) of docs/math.md.
+    """What the stereo calibration is off by, as coefficients of equations (R2) and (R3) of
+    docs/math.md.
 
     All are in focal lengths.
     """
 
-    coefficients: FloatArray  # (8,) a0, a1, a2, a3 of the right columns; k1, k2, q1, q2 of both lenses
+    # (8,) a0, a1, a2, a3 of the right columns; k1, k2, q1, q2 of both lenses
+    coefficients: FloatArray
     covariance: FloatArray  # (8, 8)
-    rows_rms_px: float = 0.0  # root mean square over the features of what the rows of left and right differ by
-    rows: FloatArray | None = None  # (7,) of 1, x, y, x y, x^2, y^2, d in the right rows (R2); None: not learned
+    # root mean square over the features of what the rows of left and right differ by
+    rows_rms_px: float = 0.0
+    # (7,) of 1, x, y, x y, x^2, y^2, d in the right rows (R2); None: not learned
+    rows: FloatArray | None = None
     rows_covariance: FloatArray | None = None  # (7, 7)
 
 
 @dataclass(frozen=True, slots=True)
 class RotationComparison:
-    """How the camera's rotation about the axes of its image compares with the gyro's; (I5) of docs/inertial.md."""
+    """How the camera's rotation about the axes of its image compares with the gyro's; (I5) of
+    docs/inertial.md.
+    """
 
     excess: float  # by what share the camera rotates more than the gyro measures
     sigma: float  # its standard deviation; inf: there is no rotation
-    gyro_agrees: bool  # about the optical axis, where no focal length matters: the gyro's scale is not the cause
+    # about the optical axis, where no focal length matters: the gyro's scale is not the cause
+    gyro_agrees: bool
 
     @property
     def differ(self) -> bool:
         """Whether they differ beyond doubt, and beyond what calibrations leave."""
-        return self.sigma < _RATES_SIGMA and abs(self.excess) > max(_RATES_DIFFER, _RATES_SIGMAS * self.sigma)
+        return self.sigma < _RATES_SIGMA and abs(self.excess) > max(
+            _RATES_DIFFER, _RATES_SIGMAS * self.sigma
+        )
 
     @property
     def agree(self) -> bool:
         """Whether no focal length that is off shows in them, be it that there are none."""
-        return self.sigma == np.inf or (self.sigma < 2 * _RATES_SIGMA and abs(self.excess) < _RATES_DIFFER)
+        return self.sigma == np.inf or (
+            self.sigma < 2 * _RATES_SIGMA and abs(self.excess) < _RATES_DIFFER
+        )
 
 
 ROTATION_NOT_COMPARABLE = RotationComparison(0.0, np.inf, False)
@@ -359,36 +413,51 @@ ROTATION_NOT_COMPARABLE = RotationComparison(0.0, np.inf, False)
 
 @dataclass(frozen=True, slots=True)
 class StereoScaleEstimate:
-    """By what baseline and focal length differ from the calibration, equation (R4) of docs/math.md."""
+    """By what baseline and focal length differ from the calibration, equation (R4) of
+    docs/math.md.
+    """
 
-    logs: FloatArray  # (2,) of baseline over calibrated baseline, focal length over calibrated focal length
+    # (2,) of baseline over calibrated baseline, focal length over calibrated focal length
+    logs: FloatArray
     covariance: FloatArray  # (2, 2); zero for the baseline where it counts as known
 
     def percent(self) -> dict[str, tuple[float, float]]:
-        """What differs by how much from the calibration and its standard deviation, %, of what is estimated."""
+        """What differs by how much from the calibration and its standard deviation, %, of what
+        is estimated.
+        """
         sigmas = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return {
             name: (100 * float(np.expm1(log)), 100 * float(sigma))
-            for name, log, sigma in zip(("baseline", "focal length"), self.logs, sigmas, strict=True)
+            for name, log, sigma in zip(
+                ("baseline", "focal length"), self.logs, sigmas, strict=True
+            )
             if sigma > _KNOWN
         }
 
 
-# Entries (sensor, row, column) of the matrices of equation (A1) that are terms: accelerometer, then gyro.
+# Entries (sensor, row, column) of the matrices of equation (A1) that are terms: accelerometer, then
+# gyro.
 _UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-IMU_ENTRIES = (*((0, *at) for at in _UPPER), *((1, *at) for at in (*_UPPER, (1, 0), (2, 0), (2, 1))))
+IMU_ENTRIES = (
+    *((0, *at) for at in _UPPER),
+    *((1, *at) for at in (*_UPPER, (1, 0), (2, 0), (2, 1))),
+)
 _SENSORS, _ROWS, _COLUMNS = np.array(IMU_ENTRIES).T
 
 
 def imu_matrices(terms: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return `M_a` and `M_g` (3, 3) of equation (A1), which take readings to truth plus bias, from 15 terms."""
+    """Return `M_a` and `M_g` (3, 3) of equation (A1), which take readings to truth plus bias,
+    from 15 terms.
+    """
     M = np.tile(np.eye(3), (2, 1, 1))
     M[_SENSORS, _ROWS, _COLUMNS] += terms
     return M[0], M[1]
 
 
 def _kept(*shape: int) -> dict[str, tuple[int, ...]]:
-    """Metadata of a field that may be missing, and that a run keeps as an array of a shape, () for a number."""
+    """Metadata of a field that may be missing, and that a run keeps as an array of a shape, ()
+    for a number.
+    """
     return {"shape": shape}
 
 
@@ -398,24 +467,29 @@ class Estimate:
 
     time_ns: int
     T_world_imu: FloatArray  # (4, 4)
-    covariance: FloatArray  # (6, 6) of xi in T_imu_world = exp(xi) T_imu_world_hat, [rho; phi], m and rad
+    # (6, 6) of xi in T_imu_world = exp(xi) T_imu_world_hat, [rho; phi], m and rad
+    covariance: FloatArray
     velocity_world: FloatArray | None = field(default=None, metadata=_kept(3))  # m/s
-    velocity_covariance: FloatArray | None = field(default=None, metadata=_kept(3, 3))  # of velocity_world, (m/s)^2
+    # of velocity_world, (m/s)^2
+    velocity_covariance: FloatArray | None = field(default=None, metadata=_kept(3, 3))
     gyro_bias: FloatArray | None = field(default=None, metadata=_kept(3))  # rad/s
-    gyro_bias_sigma: FloatArray | None = field(default=None, metadata=_kept(3))  # standard deviations, rad/s
+    # standard deviations, rad/s
+    gyro_bias_sigma: FloatArray | None = field(default=None, metadata=_kept(3))
     accel_bias: FloatArray | None = field(default=None, metadata=_kept(3))  # m/s^2
     # Standard deviations, m/s^2; zero where it is not estimated.
     accel_bias_sigma: FloatArray | None = field(default=None, metadata=_kept(3))
-    # m/s^2, where the world is not that of the vertical known at present: it stays that of the first seconds, or of the
-    # images before an IMU that began late. None: along -z.
+    # m/s^2, where the world is not that of the vertical known at present: it stays that of the
+    # first seconds, or of the images before an IMU that began late. None: along -z.
     gravity_world: FloatArray | None = field(default=None, metadata=_kept(3))
-    # Standard deviation of the vertical seen from the body, rad, each horizontal axis; None: no IMU has shown it.
+    # Standard deviation of the vertical seen from the body, rad, each horizontal axis; None: no IMU
+    # has shown it.
     tilt_sigma_rad: float | None = field(default=None, metadata=_kept())
     # The calibration, where the filter estimates it.
     T_cam0_imu: FloatArray | None = field(default=None, metadata=_kept(4, 4))
     # Of xi in T_cam0_imu = T_hat exp(xi), [rho; phi], m and rad.
     T_cam0_imu_covariance: FloatArray | None = field(default=None, metadata=_kept(6, 6))
-    # Scale and misalignment of accelerometer and gyro, as IMU_ENTRIES; standard deviations, zero where not estimated.
+    # Scale and misalignment of accelerometer and gyro, as IMU_ENTRIES; standard deviations, zero
+    # where not estimated.
     imu_terms: FloatArray | None = field(default=None, metadata=_kept(15))
     imu_terms_sigma: FloatArray | None = field(default=None, metadata=_kept(15))
     # A frame stamped t was exposed at t + offset of the IMU's clock.
@@ -439,7 +513,8 @@ class Initialisation:
     """How a back end's state was initialised, or what it waits for."""
 
     waits_for: str | None = None  # what is not observable yet; None: the state is initialised
-    scale_sigma: float | None = None  # standard deviation of the scale over it; None: at standstill, or it is known
+    # standard deviation of the scale over it; None: at standstill, or it is known
+    scale_sigma: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -450,11 +525,16 @@ class UpdateReport:
     gated: int  # observations rejected by the chi-square gate
     initialised: int  # landmarks created
     landmarks: int  # landmarks in the map
-    innovation_median_px: float | None  # median absolute innovation before the update, all gated-in rows
-    nis_per_dof: float | None  # normalised innovation squared over its degrees of freedom; about 1 when consistent
-    gated_ids: IntArray = field(default_factory=_no_ids, compare=False)  # of those rejected, where the back end says it
-    landmark_ids: IntArray = field(default_factory=_no_ids, compare=False)  # of the landmarks in the map, likewise
-    innovation_ratio: float | None = None  # median innovation over its standard deviation; about 1 when consistent
+    # median absolute innovation before the update, all gated-in rows
+    innovation_median_px: float | None
+    # normalised innovation squared over its degrees of freedom; about 1 when consistent
+    nis_per_dof: float | None
+    # of those rejected, where the back end says it
+    gated_ids: IntArray = field(default_factory=_no_ids, compare=False)
+    # of the landmarks in the map, likewise
+    landmark_ids: IntArray = field(default_factory=_no_ids, compare=False)
+    # median innovation over its standard deviation; about 1 when consistent
+    innovation_ratio: float | None = None
     started: bool = True  # False: nothing can be estimated yet, and the frame has no pose
 
 
@@ -463,7 +543,8 @@ class Trajectory:
     """Poses over time of one named frame in some world frame."""
 
     T_world_body: FloatArray  # (N, 4, 4)
-    times_ns: IntArray | None  # (N,) strictly increasing; None: poses are numbered by frame, as in KITTI files
+    # (N,) strictly increasing; None: poses are numbered by frame, as in KITTI files
+    times_ns: IntArray | None
     body: BodyFrame  # what the poses describe
     frame_indices: IntArray | None = None  # (N,) frame number of each pose where known
 
@@ -476,7 +557,9 @@ class Trajectory:
         return self.T_world_body[:, :3, 3]
 
     def numbered(self) -> Trajectory:
-        """Return a trajectory without times numbered by frame: pose k belongs to frame k of the recording."""
+        """Return a trajectory without times numbered by frame: pose k belongs to frame k of the
+        recording.
+        """
         if self.times_ns is not None or self.frame_indices is not None:
             return self
         return replace(self, frame_indices=np.arange(len(self), dtype=np.int64))
@@ -509,24 +592,33 @@ class Recording:
     landmarks_reference: Landmarks | None = None  # surveyed landmark positions, covariance zero
     notes: tuple[str, ...] = ()  # what the reader found and corrected; a command logs each once
     motion_notes: tuple[str, ...] = ()  # those of them that are on motion samples only
-    run_motion: RunMotion | None = None  # observation logs: what the run behind the log used; None: not known
+    # observation logs: what the run behind the log used; None: not known
+    run_motion: RunMotion | None = None
 
     @property
     def T_cam0_body(self) -> FloatArray:
-        """Extrinsics (4, 4) of the body that a run estimates: the IMU, or cam0 itself where there is none."""
+        """Extrinsics (4, 4) of the body that a run estimates: the IMU, or cam0 itself where
+        there is none.
+        """
         return np.eye(4) if self.T_cam0_imu is None else self.T_cam0_imu
 
 
 def need_stereo(recording: Recording, what: str) -> None:
     """Raise DataError unless a recording has two cameras, which `what` needs."""
     if recording.camera.kind != "stereo":
-        cameras = "one camera" if recording.camera.kind == "mono" else "one camera with depth images"
-        raise DataError(f"{recording.path}: {what} needs a stereo pair, and this recording has {cameras}")
+        cameras = (
+            "one camera" if recording.camera.kind == "mono" else "one camera with depth images"
+        )
+        raise DataError(
+            f"{recording.path}: {what} needs a stereo pair, and this recording has {cameras}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class LoopMatches:
-    """The features that agree with a loop: what the keyframe and the frame show of the same points."""
+    """The features that agree with a loop: what the keyframe and the frame show of the same
+    points.
+    """
 
     z_keyframe: FloatArray  # (P, 4) rectified pixels [ul vl ur vr] in the keyframe
     z_frame: FloatArray  # (P, 4) likewise in the frame that shows the place again
@@ -548,8 +640,10 @@ class LoopEvent:
     inliers: int  # corners of the frame that agree, with this keyframe or with those around it
     gap_m: float  # by which the loop moved the position of the frame, before the optimisation
     joined: bool  # whether it is the first link between two sessions
-    keyframe_frame: int | None = None  # number of the keyframe's frame in this run; None: an earlier session's
-    kept: bool = True  # at the end of a run: whether it agrees with the other loops; those that do not move nothing
+    # number of the keyframe's frame in this run; None: an earlier session's
+    keyframe_frame: int | None = None
+    # at the end of a run: whether it agrees with the other loops; those that do not move nothing
+    kept: bool = True
     matches: LoopMatches | None = field(default=None, compare=False, repr=False)
 
 
@@ -561,14 +655,17 @@ class MapKeyframes:
     frame: IntArray  # (K,) number of the frame in its own recording
     time_ns: IntArray  # (K,)
     own: BoolArray  # (K,) whether it is of this run
-    T_map_body: FloatArray  # (K, 4, 4) pose in the map of this run's body with its left camera at the keyframe's
+    # (K, 4, 4) pose in the map of this run's body with its left camera at the keyframe's
+    T_map_body: FloatArray
     covariance: FloatArray  # (K, 6, 6) of xi in `T_map_body exp(xi)`, relative to the first one
 
 
 def no_map_keyframes() -> MapKeyframes:
     """Return none, as of a run without a map."""
     none = np.zeros(0, dtype=np.int64)
-    return MapKeyframes(none, none, none, np.zeros(0, dtype=np.bool_), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
+    return MapKeyframes(
+        none, none, none, np.zeros(0, dtype=np.bool_), np.zeros((0, 4, 4)), np.zeros((0, 6, 6))
+    )
 
 
 STAGES = ("read", "frontend", "monitor", "select", "filter")  # of a frame's wall time
@@ -595,7 +692,8 @@ class FrameLog:
     landmarks: int
     innovation_median_px: float | None
     nis_per_dof: float | None
-    disparity_median_px: float | None = None  # of the features with a right match; None: there is none
+    # of the features with a right match; None: there is none
+    disparity_median_px: float | None = None
     innovation_ratio: float | None = None
     stages_ms: dict[str, float] = field(default_factory=dict)  # the front end's own stages
 
@@ -615,5 +713,6 @@ class FrameResult:
     report: UpdateReport
     estimate: Estimate
     log: FrameLog
-    loops: tuple[LoopEvent, ...] = ()  # places of the map seen again, whose results have come with this frame
+    # places of the map seen again, whose results have come with this frame
+    loops: tuple[LoopEvent, ...] = ()
     is_keyframe: bool = False  # whether the frame becomes a keyframe of the map

@@ -14,8 +14,10 @@ from vio.errors import ConfigError
 T = TypeVar("T")
 _hints = cache(get_type_hints)
 
-# No setting means anything beyond these sizes, in its unit; their squares would overflow, vanish or fill the memory.
-_LARGEST, _SMALLEST = 10**6, 1e-9
+# No setting means anything beyond these sizes, in its unit; their squares would overflow, vanish or
+# fill the memory.
+_LARGEST = 10**6
+_SMALLEST = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +58,8 @@ def setting(
     at_most: float | None = None,
     below: float | None = None,
 ) -> T:
-    """Declare a dataclass field with default, one-line description, unit and range, as shown by `vio config --show`.
+    """Declare a dataclass field with default, one-line description, unit and range, as shown by
+    `vio config --show`.
 
     A `Section` rejects numbers out of their range and numbers that are not finite.
     """
@@ -65,7 +68,9 @@ def setting(
 
 
 class Section:
-    """Base of the configuration's sections: frozen dataclasses whose settings are checked at construction."""
+    """Base of the configuration's sections: frozen dataclasses whose settings are checked at
+    construction.
+    """
 
     __slots__ = ()
     section: ClassVar[str] = ""  # its path in the configuration, as used by --set
@@ -80,12 +85,20 @@ class Section:
         for f in fields(self):  # type: ignore[arg-type]
             if not _fits(value := getattr(self, f.name), hints[f.name]):
                 key = f"{self.section}.{f.name}".lstrip(".")
-                raise ConfigError(f"{key} does not take {repr(value)[:100]}; it takes {_wanted(hints[f.name])}")
-            _check(f"{self.section}.{f.name}".lstrip("."), getattr(self, f.name), f.metadata.get("range", Range()))
+                raise ConfigError(
+                    f"{key} does not take {repr(value)[:100]}; it takes {_wanted(hints[f.name])}"
+                )
+            _check(
+                f"{self.section}.{f.name}".lstrip("."),
+                getattr(self, f.name),
+                f.metadata.get("range", Range()),
+            )
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value is of a setting's type; a whole number is a number, and NumPy's numbers are."""
+    """Return whether a value is of a setting's type; a whole number is a number, and NumPy's
+    numbers are.
+    """
     if get_origin(hint) in (Union, UnionType):
         return any(_fits(value, member) for member in get_args(hint))
     if get_origin(hint) is Literal:
@@ -114,7 +127,10 @@ def _check(key: str, value: Any, allowed: Range) -> None:
     if allowed.at_most is None and abs(value) > _LARGEST:
         raise ConfigError(f"{key} must be at most {_LARGEST} in size, got {_number(value)}")
     if 0 < abs(value) < _SMALLEST:
-        raise ConfigError(f"{key} must be at least {_SMALLEST:g} in size, or 0 where that is allowed, got {value:g}")
+        raise ConfigError(
+            f"{key} must be at least {_SMALLEST:g} in size, or 0 where that is allowed, got "
+            f"{value:g}"
+        )
 
 
 def _number(value: float) -> str:

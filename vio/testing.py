@@ -38,7 +38,8 @@ class FrontendReport:
     frames: int
     features: float  # median number in a frame
     matched: float  # median number with a right match
-    survival: float  # share of features, visible in the next frame too, that are followed there within 1 px
+    # share of features, visible in the next frame too, that are followed there within 1 px
+    survival: float
     wrong: float  # share of followed features that are off by more than 1 px
     step_error_px: float  # median error of a step to the next frame, of those within 1 px
     step_bias_px: tuple[float, float]  # their median error in u and v: a bias becomes drift
@@ -79,7 +80,8 @@ def check_frontend(
 
     Args:
         build: called with the rectified camera; returns the front end.
-        frames: at 20 Hz along a hand-held flight (`room`, `corridor`), at 10 Hz along a drive (`street`).
+        frames: at 20 Hz along a hand-held flight (`room`, `corridor`), at 10 Hz along a drive
+            (`street`).
         width: of the images, pixels.
         scene: what is rendered.
         effects: names of `vio render --effects`, such as blur, noise, dark, moving.
@@ -87,7 +89,8 @@ def check_frontend(
 
     Raises:
         VioError: an argument is invalid.
-        DataError: the front end returned something else than observations of the frame that it was given.
+        DataError: the front end returned something else than observations of the frame that it was
+            given.
     """
     rate_hz = 10.0 if scene == "street" else 20.0
     scenario = Scenario(
@@ -102,7 +105,8 @@ def check_frontend(
     )
     simulation = plan(scenario)
     recording = SimulatedRecording(simulation)
-    frontend, errors = build(rectified_camera(simulation.rig)), FrontendErrors()
+    frontend = build(rectified_camera(simulation.rig))
+    errors = FrontendErrors()
     before: Observations | None = None
     for frame in recording.events():
         if isinstance(frame, StereoFrame):
@@ -117,14 +121,23 @@ def _process(frontend: Frontend, frame: StereoFrame) -> Observations:
     output = frontend.process(frame)
     found = getattr(output, "observations", None)
     if not isinstance(found, Observations):
-        raise DataError(f"process() returned {type(output).__name__}; it returns a FrontendOutput with observations")
+        raise DataError(
+            f"process() returned {type(output).__name__}; it returns a FrontendOutput with "
+            "observations"
+        )
     if (found.frame_index, found.time_ns) != (frame.index, frame.time_ns):
-        raise DataError(f"observations of frame {found.frame_index} were returned for frame {frame.index}")
+        raise DataError(
+            f"observations of frame {found.frame_index} were returned for frame {frame.index}"
+        )
     return found.take(~found.stale)
 
 
-def compare(errors: FrontendErrors, simulation: Simulation, before: Observations | None, now: Observations) -> None:
-    """Add the errors of a frame's fresh observations, and of the step from those of the frame before."""
+def compare(
+    errors: FrontendErrors, simulation: Simulation, before: Observations | None, now: Observations
+) -> None:
+    """Add the errors of a frame's fresh observations, and of the step from those of the frame
+    before.
+    """
     left, right = _views(simulation, now)
     seen = now.take(now.has_right)
     true, visible = correspondence(simulation.world, left, right, seen.z[:, :2])
@@ -134,7 +147,9 @@ def compare(errors: FrontendErrors, simulation: Simulation, before: Observations
     errors.reused += sum(name in errors.lost for name in now.ids.tolist())
     if before is None:
         return
-    true, visible = correspondence(simulation.world, _views(simulation, before)[0], left, before.z[:, :2])
+    true, visible = correspondence(
+        simulation.world, _views(simulation, before)[0], left, before.z[:, :2]
+    )
     _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
     error = now.z[j, :2] - true[i]
     expected = visible & inside_image(left.camera, true, margin_px=_MARGIN_PX)
@@ -149,8 +164,12 @@ def _views(simulation: Simulation, seen: Observations) -> tuple[View, View]:
 
 
 def _report(errors: FrontendErrors) -> FrontendReport:
-    step, right = (np.concatenate(part) if part else np.zeros((0, 2)) for part in (errors.step, errors.right))
-    good_step, good_right = (part[np.linalg.norm(part, axis=1) <= _CORRECT_PX] for part in (step, right))
+    step, right = (
+        np.concatenate(part) if part else np.zeros((0, 2)) for part in (errors.step, errors.right)
+    )
+    good_step, good_right = (
+        part[np.linalg.norm(part, axis=1) <= _CORRECT_PX] for part in (step, right)
+    )
     return FrontendReport(
         frames=len(errors.features),
         features=float(np.median(errors.features)),

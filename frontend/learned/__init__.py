@@ -1,8 +1,8 @@
 """Parts that need torch (extra `learned`): the front end `kornia`.
 
-Nothing is ever downloaded: networks are built without weights and loaded from a file with `weights_only=True`.
-Detectors gftt and harris with descriptor sift need no weights. torch and kornia are imported only when a part that
-needs them is built.
+Nothing is ever downloaded: networks are built without weights and loaded from a file with
+`weights_only=True`. Detectors gftt and harris with descriptor sift need no weights. torch and
+kornia are imported only when a part that needs them is built.
 """
 
 from __future__ import annotations
@@ -24,11 +24,13 @@ def build_learned(camera: StereoCamera, settings: FrontendSettings) -> Descripto
 
     Raises:
         MissingDependencyError: torch or kornia is not installed, or kornia is too old.
-        ConfigError: a required weights file is not set, CUDA is requested but absent, or parts do not fit together.
+        ConfigError: a required weights file is not set, CUDA is requested but absent, or parts do
+            not fit together.
         DataError: a file of weights cannot be read, or is of another network.
     """
     _require_torch()
-    match, learned = settings.match, settings.learned
+    match = settings.match
+    learned = settings.learned
     device = pick_device(learned.device)
     extract = build_extractor(learned, match, device)
     matcher: Matcher = MutualNearest()
@@ -40,7 +42,9 @@ def build_learned(camera: StereoCamera, settings: FrontendSettings) -> Descripto
 
 
 def _warm_up(frontend: DescriptorFrontend, camera: StereoCamera) -> None:
-    """Process two frames of noise: the first call of CUDA loads its libraries, which takes seconds."""
+    """Process two frames of noise: the first call of CUDA loads its libraries, which takes
+    seconds.
+    """
     if camera.width is None or camera.height is None:
         return
     left = np.random.default_rng(0).integers(0, 256, (camera.height, camera.width), dtype=np.uint8)
@@ -54,6 +58,7 @@ def _require_torch() -> None:
         from kornia.feature import ALIKED, XFeat  # noqa: F401  (the newest that are used)
     except ImportError as error:
         raise MissingDependencyError(
-            f"the kornia front end needs torch and kornia 0.8.3 or newer, on Python 3.11 or newer ({error}); "
+            "the kornia front end needs torch and kornia 0.8.3 or newer, on Python 3.11 or newer "
+            f"({error}); "
             "install them with: pip install 'stereo-vio[learned]'"
         ) from error

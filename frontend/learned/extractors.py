@@ -25,7 +25,9 @@ _PATCH_PX = {"sift": 41}
 _NMS_PX = 5
 
 
-def build_extractor(learned: LearnedSettings, match: MatchSettings, device: torch.device) -> Extractor:
+def build_extractor(
+    learned: LearnedSettings, match: MatchSettings, device: torch.device
+) -> Extractor:
     """Build the detector and descriptor of key points.
 
     Raises:
@@ -34,15 +36,23 @@ def build_extractor(learned: LearnedSettings, match: MatchSettings, device: torc
     """
     import kornia.feature as kf
 
-    name, count = learned.detector, match.max_keypoints
+    name = learned.detector
+    count = match.max_keypoints
     if name == "aliked":
-        aliked: Any = kf.ALIKED(learned.aliked_model, max_num_keypoints=count, detection_threshold=0.0)
+        aliked: Any = kf.ALIKED(
+            learned.aliked_model, max_num_keypoints=count, detection_threshold=0.0
+        )
         filled(aliked, learned.detector_weights, "detector_weights").to(device)
         if device.type == "cuda":
             aliked.extract_dense_map = _Replayed(aliked.extract_dense_map)
         return _Whole(aliked, name, count, device)
     if name == "disk":
-        return _Whole(filled(kf.DISK(), learned.detector_weights, "detector_weights").to(device), name, count, device)
+        return _Whole(
+            filled(kf.DISK(), learned.detector_weights, "detector_weights").to(device),
+            name,
+            count,
+            device,
+        )
     if name == "xfeat":
         xfeat = kf.XFeat(top_k=count)
         filled(xfeat.net, learned.detector_weights, "detector_weights")
@@ -51,7 +61,10 @@ def build_extractor(learned: LearnedSettings, match: MatchSettings, device: torc
     patch_px = _PATCH_PX.get(learned.descriptor, 32)
     if name == "keynet":
         keynet = kf.KeyNetDetector(
-            pretrained=False, num_features=count, aff_module=_affine(learned), ori_module=_orienter(learned)
+            pretrained=False,
+            num_features=count,
+            aff_module=_affine(learned),
+            ori_module=_orienter(learned),
         )
         filled(keynet.model, learned.detector_weights, "detector_weights")
         return _Patches(keynet.eval().to(device), describe, patch_px, device)
@@ -64,7 +77,9 @@ def _affine(learned: LearnedSettings) -> Module | None:
 
     if learned.affine_weights is None:
         return None
-    return filled(kf.LAFAffNetShapeEstimator(pretrained=False), learned.affine_weights, "affine_weights")
+    return filled(
+        kf.LAFAffNetShapeEstimator(pretrained=False), learned.affine_weights, "affine_weights"
+    )
 
 
 def _orienter(learned: LearnedSettings) -> Module | None:
@@ -79,7 +94,8 @@ def _orienter(learned: LearnedSettings) -> Module | None:
 def _descriptor(learned: LearnedSettings) -> Module:
     import kornia.feature as kf
 
-    name, path = learned.descriptor, learned.descriptor_weights
+    name = learned.descriptor
+    path = learned.descriptor_weights
     if name == "sift":
         return kf.SIFTDescriptor(_PATCH_PX["sift"]).eval()
     if name == "mkd":
@@ -99,16 +115,22 @@ def _mkd(path: Path | None) -> Module:
     models = load_weights(path, "descriptor_weights")
     whitening = models.get("liberty")
     if not isinstance(whitening, dict) or "pca" not in whitening:
-        raise DataError(f"{path} ({SECTION}.descriptor_weights) holds no whitening of MKD; give one of its .pth files")
+        raise DataError(
+            f"{path} ({SECTION}.descriptor_weights) holds no whitening of MKD; give one of its "
+            ".pth files"
+        )
     size = len(whitening["pca"]["mean"])
     for kernel in ("cart", "polar", "concat"):
         module = kf.MKDDescriptor(patch_size=32, kernel_type=kernel, whitening=cast(Any, None))
         if module.odims == size:
-            module.whitening_layer = Whitening("pcawt", whitening, in_dims=size, output_dims=min(128, size))
+            module.whitening_layer = Whitening(
+                "pcawt", whitening, in_dims=size, output_dims=min(128, size)
+            )
             module.whitening = "pcawt"
             return module.eval()
     raise DataError(
-        f"{path} ({SECTION}.descriptor_weights) whitens {size} numbers, as no kernel of MKD has; give another file"
+        f"{path} ({SECTION}.descriptor_weights) whitens {size} numbers, as no kernel of MKD has; "
+        "give another file"
     )
 
 
@@ -120,8 +142,12 @@ def _as_tensor(images: Sequence[Image], device: torch.device) -> Tensor:
 
 
 def _keypoints(pixels: Tensor, descriptors: Tensor, strength: Tensor) -> Keypoints:
-    """Move key points (N, ...) to NumPy, strongest first, descriptors as unit vectors; non-finite ones are dropped."""
-    columns = (np.asarray(t.detach().float().cpu().numpy()) for t in (pixels, descriptors, strength))
+    """Move key points (N, ...) to NumPy, strongest first, descriptors as unit vectors;
+    non-finite ones are dropped.
+    """
+    columns = (
+        np.asarray(t.detach().float().cpu().numpy()) for t in (pixels, descriptors, strength)
+    )
     uv, described, weight = columns
     order = np.argsort(-weight, kind="stable")
     order = order[np.isfinite(described[order]).all(axis=1) & np.isfinite(uv[order]).all(axis=1)]
@@ -130,7 +156,8 @@ def _keypoints(pixels: Tensor, descriptors: Tensor, strength: Tensor) -> Keypoin
 
 
 class _Replayed:
-    """A network's calls of CUDA kernels, recorded at the first call for a shape and then made as one.
+    """A network's calls of CUDA kernels, recorded at the first call for a shape and then made as
+    one.
 
     To make them takes longer than to run them. What is returned is overwritten by the next call.
     """
@@ -143,10 +170,13 @@ class _Replayed:
         import torch
 
         if self._input is None or self._input.shape != images.shape:
-            self._input, self._graph = images.clone(), torch.cuda.CUDAGraph()
-            # Weights of half precision that autocast keeps for a while would be read after they are freed.
+            self._input = images.clone()
+            self._graph = torch.cuda.CUDAGraph()
+            # Weights of half precision that autocast keeps for a while would be read after they are
+            # freed.
             with torch.autocast("cuda", dtype=torch.float16, cache_enabled=False):
-                self._network(self._input)  # the libraries choose their kernels before the recording
+                # the libraries choose their kernels before the recording
+                self._network(self._input)
                 with torch.cuda.graph(self._graph):
                     self._output = self._network(self._input)
         self._input.copy_(images)
@@ -158,7 +188,8 @@ class _Replayed:
 class _Whole:
     """A network that detects and describes: ALIKED, DISK, XFeat.
 
-    Reference: Zhao et al., ALIKED (2023); Tyszkiewicz et al., DISK (2020); Potje et al., XFeat (2024).
+    Reference: Zhao et al., ALIKED (2023); Tyszkiewicz et al., DISK (2020); Potje et al., XFeat
+    (2024).
     """
 
     network: Any
@@ -169,7 +200,8 @@ class _Whole:
     def __call__(self, *images: Image) -> list[Keypoints]:
         import torch
 
-        # Calls of the network's kernels take longer than the kernels on a GPU, so that all images share them.
+        # Calls of the network's kernels take longer than the kernels on a GPU, so that all images
+        # share them.
         batches = [images] if self.device.type == "cuda" else [(image,) for image in images]
         with torch.inference_mode(), half_precision(self.device):
             return [_keypoints(*columns) for batch in batches for columns in self._found(batch)]
@@ -232,15 +264,21 @@ class _Corners:
         import torch
 
         response = (
-            kf.gftt_response(pixels) if self.name == "gftt" else kf.harris_response(pixels, torch.tensor(0.04))
+            kf.gftt_response(pixels)
+            if self.name == "gftt"
+            else kf.harris_response(pixels, torch.tensor(0.04))
         )[0, 0]
         peak = torch.nn.functional.max_pool2d(response[None, None], _NMS_PX, 1, _NMS_PX // 2)[0, 0]
         border = torch.zeros_like(response, dtype=torch.bool)
         border[2:-2, 2:-2] = True
-        rows, columns = torch.nonzero((response == peak) & (response > 1e-8) & border, as_tuple=True)
+        rows, columns = torch.nonzero(
+            (response == peak) & (response > 1e-8) & border, as_tuple=True
+        )
         strength = response[rows, columns]
         order = torch.argsort(-strength, stable=True)[: self.count]
-        rows, columns, strength = rows[order], columns[order], strength[order]
+        rows = rows[order]
+        columns = columns[order]
+        strength = strength[order]
         middle = response[rows, columns]
 
         def offset(before: Tensor, after: Tensor) -> Tensor:

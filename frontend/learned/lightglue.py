@@ -24,7 +24,8 @@ _DETECTORS = ("aliked", "disk", "xfeat")  # kornia names the weights after their
 
 @dataclass(frozen=True, slots=True)
 class _LightGlueMatcher:
-    """Matches key points by attention over both images; pairs that are not allowed are dropped afterwards.
+    """Matches key points by attention over both images; pairs that are not allowed are dropped
+    afterwards.
 
     Reference: Lindenberger et al., LightGlue: local feature matching at light speed, ICCV (2023).
     """
@@ -41,7 +42,9 @@ class _LightGlueMatcher:
 
         def view(points: Keypoints) -> dict[str, Tensor]:
             uv = torch.from_numpy(points.pixels.astype(np.float32))[None].to(self.device)
-            described = torch.from_numpy(points.descriptors.astype(np.float32))[None].to(self.device)
+            described = torch.from_numpy(points.descriptors.astype(np.float32))[None].to(
+                self.device
+            )
             size = self.size if self.size is not None else tuple(points.pixels.max(axis=0))
             return {
                 "keypoints": uv,
@@ -55,7 +58,9 @@ class _LightGlueMatcher:
         return np.asarray(pairs[allowed[pairs[:, 0], pairs[:, 1]]], dtype=np.int64)
 
 
-def build_lightglue(learned: LearnedSettings, camera: StereoCamera, device: torch.device) -> Matcher:
+def build_lightglue(
+    learned: LearnedSettings, camera: StereoCamera, device: torch.device
+) -> Matcher:
     """Build the matcher for the key points of the detector in use.
 
     Raises:
@@ -66,7 +71,8 @@ def build_lightglue(learned: LearnedSettings, camera: StereoCamera, device: torc
 
     if learned.detector not in _DETECTORS:
         raise ConfigError(
-            f"{SECTION}.matcher is lightglue, which goes with the detectors {', '.join(_DETECTORS)} here, not with "
+            f"{SECTION}.matcher is lightglue, which goes with the detectors "
+            f"{', '.join(_DETECTORS)} here, not with "
             f"{learned.detector}; set matcher to nearest"
         )
     options = dict(kf.LightGlue.features[learned.detector])
@@ -80,16 +86,21 @@ def build_lightglue(learned: LearnedSettings, camera: StereoCamera, device: torc
     state = {key.removeprefix("matcher."): value for key, value in state.items()}
     for i in range(network.conf.n_layers):
         for part in ("self_attn", "cross_attn"):
-            state = {key.replace(f"{part}.{i}.", f"transformers.{i}.{part}."): value for key, value in state.items()}
+            state = {
+                key.replace(f"{part}.{i}.", f"transformers.{i}.{part}."): value
+                for key, value in state.items()
+            }
     try:
         missing = (
-            set(network.load_state_dict(state, strict=False).missing_keys) & dict(network.named_parameters()).keys()
+            set(network.load_state_dict(state, strict=False).missing_keys)
+            & dict(network.named_parameters()).keys()
         )
     except (RuntimeError, AttributeError) as error:
         missing = {" ".join(str(error).split())[:120]}
     if missing:
         raise DataError(
-            f"{learned.matcher_weights} ({SECTION}.matcher_weights) holds no weights of LightGlue for "
+            f"{learned.matcher_weights} ({SECTION}.matcher_weights) holds no weights of LightGlue "
+            "for "
             f"{learned.detector}: {min(missing)}; give the file that belongs to it"
         )
     size = None if camera.width is None or camera.height is None else (camera.width, camera.height)

@@ -25,7 +25,9 @@ def pick_device(name: str) -> torch.device:
     import torch
 
     if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(f"{SECTION}.device is cuda, but torch finds no CUDA device here; set it to cpu")
+        raise ConfigError(
+            f"{SECTION}.device is cuda, but torch finds no CUDA device here; set it to cpu"
+        )
     return torch.device(name)
 
 
@@ -50,19 +52,25 @@ def load_weights(path: Path | None, setting: str) -> dict[str, Any]:
     import torch
 
     if path is None:
-        raise ConfigError(f"{SECTION}.{setting} is not set; give the path of a file of weights (none is downloaded)")
+        raise ConfigError(
+            f"{SECTION}.{setting} is not set; give the path of a file of weights (none is "
+            "downloaded)"
+        )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
         reason = str(error).strip().split("\n", 1)[0][:120]
         raise DataError(
-            f"{path} ({SECTION}.{setting}) cannot be read as weights of torch: {reason}; give a .pth file"
+            f"{path} ({SECTION}.{setting}) cannot be read as weights of torch: {reason}; give a "
+            ".pth file"
         ) from error
     for key in ("state_dict", "extractor", "model"):
         if isinstance(content, dict) and isinstance(content.get(key), dict):
             content = content[key]
     if not isinstance(content, dict):
-        raise DataError(f"{path} ({SECTION}.{setting}) holds no named weights; give a .pth file of a state dict")
+        raise DataError(
+            f"{path} ({SECTION}.{setting}) holds no named weights; give a .pth file of a state dict"
+        )
     return dict(content)
 
 
@@ -72,14 +80,17 @@ def filled(module: Any, path: Path | None, setting: str) -> Module:
     try:
         result = module.load_state_dict(state, strict=False)
         # Buffers that the constructor computes need not be in the file; learned parameters must be.
-        learned = dict(module.named_parameters()).keys() | {k for k in module.state_dict() if k.endswith("running_var")}
+        learned = dict(module.named_parameters()).keys() | {
+            k for k in module.state_dict() if k.endswith("running_var")
+        }
         wrong = sorted(set(result.missing_keys) & learned) + sorted(result.unexpected_keys)
         problem = f"{len(wrong)} entries do not fit, such as {wrong[0]}" if wrong else None
     except (RuntimeError, TypeError, AttributeError) as error:
         problem = " ".join(str(error).split())[:140]
     if problem is not None:
         raise DataError(
-            f"{path} ({SECTION}.{setting}) holds weights of another network than {type(module).__name__} ({problem}); "
+            f"{path} ({SECTION}.{setting}) holds weights of another network than "
+            f"{type(module).__name__} ({problem}); "
             "give the file that belongs to it"
         )
     return module.eval()

@@ -1,4 +1,6 @@
-"""Recordings with faults of camera and IMU, and in healthy variants, run and tabled: `python -m tools.faults`."""
+"""Recordings with faults of camera and IMU, and in healthy variants, run and tabled:
+`python -m tools.faults`.
+"""
 
 from tools.faults.cameras import CAMERAS
 from tools.faults.changes import Variant

@@ -52,10 +52,14 @@ def _frozen(dataset: Dataset, period: Period, *cameras: int) -> PairChange:
 
 
 def _moving_object(dataset: Dataset, period: Period, speed_px: float) -> PairChange:
-    """A textured wall that covers the middle half of both images and moves sideways, pixels a frame."""
+    """A textured wall that covers the middle half of both images and moves sideways, pixels a
+    frame.
+    """
     disparity_px = 30
     texture = blurred(np.random.default_rng(7).integers(0, 256, (1200, 6000)).astype(np.uint8), 3.0)
-    texture = np.asarray(cv2.normalize(texture, texture.copy(), 20, 235, cv2.NORM_MINMAX), dtype=np.uint8)
+    texture = np.asarray(
+        cv2.normalize(texture, texture.copy(), 20, 235, cv2.NORM_MINMAX), dtype=np.uint8
+    )
     first: list[int] = []
 
     def covered(frame: StereoFrame, left: Image, right: Image) -> Pair:
@@ -64,7 +68,9 @@ def _moving_object(dataset: Dataset, period: Period, speed_px: float) -> PairCha
         first.append(frame.index)
         height, width = left.shape
         at = 1000 + round(speed_px * (frame.index - first[0]))
-        wall, left, right = texture[:height, at : at + width // 2], left.copy(), right.copy()
+        wall = texture[:height, at : at + width // 2]
+        left = left.copy()
+        right = right.copy()
         for image, begin in ((left, width // 4), (right, width // 4 - disparity_px)):
             image[:, begin : begin + width // 2] = wall
         return left, right
@@ -73,7 +79,12 @@ def _moving_object(dataset: Dataset, period: Period, speed_px: float) -> PairCha
 
 
 def _turned_right(
-    dataset: Dataset, period: Period, degrees: float, axis: tuple[float, float, float], *, all_along: bool
+    dataset: Dataset,
+    period: Period,
+    degrees: float,
+    axis: tuple[float, float, float],
+    *,
+    all_along: bool,
 ) -> PairChange:
     """The right camera is turned in its mount, from the start or from the fault's begin on."""
     camera = dataset.recording.camera
@@ -91,12 +102,15 @@ def _turned_right(
 
 def _shaking_right(dataset: Dataset, period: Period, degrees: float) -> PairChange:
     """The right camera turns about its vertical axis by a random angle of its own in each frame."""
-    fu, rng = dataset.recording.camera.fu, np.random.default_rng(1)
+    fu = dataset.recording.camera.fu
+    rng = np.random.default_rng(1)
 
     def shaken(frame: StereoFrame, left: Image, right: Image) -> Pair:
         shift = np.array([[1.0, 0.0, fu * np.radians(rng.normal(0.0, degrees))], [0.0, 1.0, 0.0]])
         border = cv2.BORDER_REPLICATE
-        return left, np.asarray(cv2.warpAffine(right, shift, right.shape[::-1], borderMode=border), dtype=np.uint8)
+        return left, np.asarray(
+            cv2.warpAffine(right, shift, right.shape[::-1], borderMode=border), dtype=np.uint8
+        )
 
     return shaken
 

@@ -1,8 +1,9 @@
-"""Recordings with faults of camera and IMU, and healthy variants of them, made in memory; `tools.faults` runs them.
+"""Recordings with faults of camera and IMU, and healthy variants of them, made in memory;
+`tools.faults` runs them.
 
-A variant changes the events of a recording: the images after rectification, the samples of the IMU, the stamps, the
-calibration. *Healthy* ones are what a good rig may deliver, so no check may act on them. A *fault* lasts for a period,
-unless its name says otherwise.
+A variant changes the events of a recording: the images after rectification, the samples of the IMU,
+the stamps, the calibration. *Healthy* ones are what a good rig may deliver, so no check may act on
+them. A *fault* lasts for a period, unless its name says otherwise.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ class Changed:
     recording: Recording
     change: EventChange
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
         """Yield the changed events of some frames."""
         return self.change(self.source.events(start, stop, images=images))
 
@@ -80,9 +83,15 @@ def with_pairs(change: PairChange) -> EventChange:
 
     def changed(events: Iterable[Event]) -> Iterator[Event]:
         for event in events:
-            if isinstance(event, StereoFrame) and event.left is not None and event.right is not None:
+            if (
+                isinstance(event, StereoFrame)
+                and event.left is not None
+                and event.right is not None
+            ):
                 left, right = change(event, event.left, event.right)
-                event = replace(event, left=np.ascontiguousarray(left), right=np.ascontiguousarray(right))
+                event = replace(
+                    event, left=np.ascontiguousarray(left), right=np.ascontiguousarray(right)
+                )
             yield event
 
     return changed
@@ -90,7 +99,9 @@ def with_pairs(change: PairChange) -> EventChange:
 
 def pairs(make: Callable[..., PairChange], *args: Any, **options: Any) -> Variant:
     """The pairs changed by what `make(dataset, period, …)` returns for a recording."""
-    return lambda dataset, period: with_events(dataset, with_pairs(make(dataset, period, *args, **options)))
+    return lambda dataset, period: with_events(
+        dataset, with_pairs(make(dataset, period, *args, **options))
+    )
 
 
 def every_pair(change: PairChange) -> Variant:
@@ -111,12 +122,16 @@ def seeded(variant: Callable[[np.random.Generator], Variant]) -> Variant:
 def pairs_during(change: PairChange) -> Variant:
     """The pairs of the fault's period changed."""
     return pairs(
-        lambda dataset, period: lambda frame, *pair: change(frame, *pair) if period.holds(frame.time_ns) else pair
+        lambda dataset, period: (
+            lambda frame, *pair: change(frame, *pair) if period.holds(frame.time_ns) else pair
+        )
     )
 
 
 def imu_samples(change: SampleChange, *, during: bool = False, after: bool = False) -> Variant:
-    """IMU samples changed or, by None, lost: all of them, those during the fault's period, or all after its begin."""
+    """IMU samples changed or, by None, lost: all of them, those during the fault's period, or
+    all after its begin.
+    """
 
     def variant(dataset: Dataset, period: Period) -> Changed:
         def affected(time_ns: int) -> bool:
@@ -124,7 +139,11 @@ def imu_samples(change: SampleChange, *, during: bool = False, after: bool = Fal
 
         def changed(events: Iterable[Event]) -> Iterator[Event]:
             for event in events:
-                new = change(event) if isinstance(event, ImuSample) and affected(event.time_ns) else event
+                new = (
+                    change(event)
+                    if isinstance(event, ImuSample) and affected(event.time_ns)
+                    else event
+                )
                 if new is not None:
                     yield new
 
@@ -133,7 +152,9 @@ def imu_samples(change: SampleChange, *, during: bool = False, after: bool = Fal
     return variant
 
 
-def imu_readings(gyro: Callable[[FloatArray], FloatArray], accel: Callable[[FloatArray], FloatArray]) -> SampleChange:
+def imu_readings(
+    gyro: Callable[[FloatArray], FloatArray], accel: Callable[[FloatArray], FloatArray]
+) -> SampleChange:
     """Change of both readings of a sample."""
     return lambda s: ImuSample(s.time_ns, gyro(s.gyro), accel(s.accel))
 
@@ -161,7 +182,11 @@ def gap(*, frames: bool, samples: bool) -> Variant:
         kept = np.array([not (frames and period.holds(time_ns)) for time_ns in times_ns.tolist()])
 
         def silent(events: Iterable[Event]) -> Iterator[Event]:
-            return (e for e in events if not (samples and isinstance(e, ImuSample) and period.holds(e.time_ns)))
+            return (
+                e
+                for e in events
+                if not (samples and isinstance(e, ImuSample) and period.holds(e.time_ns))
+            )
 
         return with_frames(dataset, kept, silent)
 

@@ -33,9 +33,13 @@ _MIRROR = np.diag([-1.0, 1.0, 1.0])
 
 
 def _mirror(dataset: Dataset, period: Period) -> Changed:
-    """Both images mirrored and exchanged; the path of the mirrored right camera is the reference."""
+    """Both images mirrored and exchanged; the path of the mirrored right camera is the
+    reference.
+    """
     recording = dataset.recording
-    camera, T_cam0_imu, reference = recording.camera, recording.T_cam0_imu, recording.reference
+    camera = recording.camera
+    T_cam0_imu = recording.T_cam0_imu
+    reference = recording.reference
     assert camera.width is not None
     T_cam1_cam0 = se3_from_parts(np.eye(3), np.array([-camera.baseline_m, 0.0, 0.0]))
     M = se3_from_parts(_MIRROR, np.zeros(3))
@@ -46,7 +50,8 @@ def _mirror(dataset: Dataset, period: Period) -> Changed:
 
     def changed(events: Iterable[Event]) -> Iterator[Event]:
         exchange = with_pairs(lambda frame, left, right: (right[:, ::-1], left[:, ::-1]))
-        sample = imu_readings(lambda gyro: -_MIRROR @ gyro, lambda accel: _MIRROR @ accel)  # axial and polar vectors
+        # axial and polar vectors
+        sample = imu_readings(lambda gyro: -_MIRROR @ gyro, lambda accel: _MIRROR @ accel)
         for event in exchange(events):
             yield sample(event) or event if isinstance(event, ImuSample) else event
 
@@ -57,24 +62,32 @@ def _mirror(dataset: Dataset, period: Period) -> Changed:
 def _reverse(dataset: Dataset, period: Period) -> Changed:
     """From the end to the start: velocities and rates change their sign, accelerations do not."""
     recording = dataset.recording
-    times_ns, reference = recording.frame_times_ns, recording.reference
+    times_ns = recording.frame_times_ns
+    reference = recording.reference
     both_ends = int(times_ns[0] + times_ns[-1])
     if reference is not None:
-        back, times = reference.T_world_body[::-1], reference.times_ns
+        back = reference.T_world_body[::-1]
+        times = reference.times_ns
         frames = np.arange(len(back)) if times is None else None
         times = None if times is None else both_ends - times[::-1]
-        reference = Trajectory(T_world_body=back, times_ns=times, body=reference.body, frame_indices=frames)
+        reference = Trajectory(
+            T_world_body=back, times_ns=times, body=reference.body, frame_indices=frames
+        )
 
     def changed(events: Iterable[Event]) -> Iterator[Event]:
         held = list(events)
         number = sum(isinstance(event, StereoFrame) for event in held) - 1
-        for event in sorted(held, key=lambda event: (-event.time_ns, isinstance(event, StereoFrame))):
+        for event in sorted(
+            held, key=lambda event: (-event.time_ns, isinstance(event, StereoFrame))
+        ):
             if isinstance(event, ImuSample):
                 yield ImuSample(both_ends - event.time_ns, -event.gyro, event.accel)
             elif isinstance(event, StereoFrame):
                 yield replace(event, index=number - event.index, time_ns=both_ends - event.time_ns)
 
-    return with_events(dataset, changed, frame_times_ns=both_ends - times_ns[::-1], reference=reference)
+    return with_events(
+        dataset, changed, frame_times_ns=both_ends - times_ns[::-1], reference=reference
+    )
 
 
 def _half(dataset: Dataset, period: Period) -> Changed:
@@ -82,11 +95,14 @@ def _half(dataset: Dataset, period: Period) -> Changed:
     camera = dataset.recording.camera
     assert camera.width is not None
     assert camera.height is not None
-    width, height = camera.width // 2, camera.height // 2
+    width = camera.width // 2
+    height = camera.height // 2
 
     def smaller(image: Image) -> Image:
         whole = image[: 2 * height, : 2 * width]
-        return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return np.asarray(
+            cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
+        )
 
     other = replace(
         camera,
@@ -97,7 +113,9 @@ def _half(dataset: Dataset, period: Period) -> Changed:
         width=width,
         height=height,
     )
-    return with_events(dataset, with_pairs(lambda frame, *pair: (smaller(pair[0]), smaller(pair[1]))), camera=other)
+    return with_events(
+        dataset, with_pairs(lambda frame, *pair: (smaller(pair[0]), smaller(pair[1]))), camera=other
+    )
 
 
 def _every_second(dataset: Dataset, period: Period) -> Changed:
@@ -122,7 +140,9 @@ def _snow(rng: np.random.Generator, image: Image) -> Image:
     return out
 
 
-def _places(rng: np.random.Generator, image: Image, count: int, ranges: list[tuple[int, int]]) -> list[list[int]]:
+def _places(
+    rng: np.random.Generator, image: Image, count: int, ranges: list[tuple[int, int]]
+) -> list[list[int]]:
     """Random pixels of an image, each with further random numbers."""
     within = [(0, image.shape[1]), (0, image.shape[0]), *ranges]
     return np.column_stack([rng.integers(low, high, count) for low, high in within]).tolist()

@@ -51,9 +51,17 @@ def _restamped(shift_s: float, jitter_s: float = 0.0) -> Variant:
             held = list(events)
             old = np.array([e.time_ns for e in held if isinstance(e, ImuSample)], dtype=np.int64)
             scatter = np.random.default_rng(10).normal(shift_s, jitter_s, len(old)) / _NS
-            new = np.sort(old + scatter.astype(np.int64)) if jitter_s else old + scatter.astype(np.int64)
-            times = iter((np.maximum.accumulate(new - np.arange(len(new))) + np.arange(len(new))).tolist())
-            moved = [replace(e, time_ns=next(times)) if isinstance(e, ImuSample) else e for e in held]
+            new = (
+                np.sort(old + scatter.astype(np.int64))
+                if jitter_s
+                else old + scatter.astype(np.int64)
+            )
+            times = iter(
+                (np.maximum.accumulate(new - np.arange(len(new))) + np.arange(len(new))).tolist()
+            )
+            moved = [
+                replace(e, time_ns=next(times)) if isinstance(e, ImuSample) else e for e in held
+            ]
             yield from sorted(moved, key=lambda e: (e.time_ns, isinstance(e, StereoFrame)))
 
         return with_events(dataset, changed)
@@ -62,7 +70,9 @@ def _restamped(shift_s: float, jitter_s: float = 0.0) -> Variant:
 
 
 def _noisy_imu(rng: np.random.Generator, gyro: float, accel: float) -> SampleChange:
-    return imu_readings(lambda g: g + rng.normal(0.0, gyro, 3), lambda a: a + rng.normal(0.0, accel, 3))
+    return imu_readings(
+        lambda g: g + rng.normal(0.0, gyro, 3), lambda a: a + rng.normal(0.0, accel, 3)
+    )
 
 
 def _as_is(values: FloatArray) -> FloatArray:
@@ -93,7 +103,9 @@ IMU: dict[str, Variant] = {
     "gyro in deg/s": imu_samples(imu_readings(np.degrees, _as_is)),
     "accelerometer bias": imu_samples(imu_readings(_as_is, _plus(0.7, 0.5, -0.5))),
     "gyro bias": imu_samples(imu_readings(_plus(0.2, -0.2, 0.1), _as_is)),
-    "bias jump": imu_samples(imu_readings(_plus(0.1, -0.1, 0.05), _plus(0.5, 0.3, -0.3)), after=True),
+    "bias jump": imu_samples(
+        imu_readings(_plus(0.1, -0.1, 0.05), _plus(0.5, 0.3, -0.3)), after=True
+    ),
     "gyro clipped": imu_samples(imu_readings(lambda g: np.clip(g, -0.3, 0.3), _as_is)),
     "vibration": seeded(lambda rng: imu_samples(_noisy_imu(rng, 0.3, 5.0))),
     "turned 5 deg": imu_samples(imu_readings(lambda g: _ROT5 @ g, lambda a: _ROT5 @ a)),

@@ -1,4 +1,6 @@
-"""The page of the documentation on faults and healthy variants, made of the figures of their runs."""
+"""The page of the documentation on faults and healthy variants, made of the figures of their
+runs.
+"""
 
 from __future__ import annotations
 
@@ -36,12 +38,17 @@ def page(facts: Mapping[str, Any]) -> str:
     """Return the page, Markdown: healthy variants, and faults."""
     healthy = [row for row in facts["runs"] if row["group"] == "healthy"]
     faults = [row for row in facts["runs"] if row["group"] != "healthy"]
-    tables = {"healthy": "\n".join(_healthy_table(healthy)), "faults": "\n".join(_fault_table(faults))}
+    tables = {
+        "healthy": "\n".join(_healthy_table(healthy)),
+        "faults": "\n".join(_fault_table(faults)),
+    }
     return _PAGE.format(provenance=provenance(facts), **tables)
 
 
 def _healthy_table(rows: Sequence[Row]) -> list[str]:
-    """ATE of each variant on each recording, with the lines that are said of it but not of the recording as it is."""
+    """ATE of each variant on each recording, with the lines that are said of it but not of the
+    recording as it is.
+    """
     heads = list(dict.fromkeys((row["recording"], row["motion"]) for row in rows))
     cells = {(row["recording"], row["motion"], row["variant"]): row for row in rows}
     lines = ["| variant | " + " | ".join(f"{name}, {motion}" for name, motion in heads) + " |"]
@@ -50,8 +57,13 @@ def _healthy_table(rows: Sequence[Row]) -> list[str]:
     for variant in dict.fromkeys(row["variant"] for row in rows):
         shown = []
         for head in heads:
-            row, clean = cells.get((*head, variant), {}), cells.get((*head, "clean"), {})
-            extra = [row["error"]] if "error" in row else _unlike(row.get("said", []), clean.get("said", []))
+            row = cells.get((*head, variant), {})
+            clean = cells.get((*head, "clean"), {})
+            extra = (
+                [row["error"]]
+                if "error" in row
+                else _unlike(row.get("said", []), clean.get("said", []))
+            )
             marks = "".join(f" [{len(notes) + k}]" for k in range(1, len(extra) + 1))
             notes += [f"{head[0]}, {head[1]}, {variant}: {line}" for line in extra]
             shown.append(_millimetres(row) + marks if row else "")
@@ -62,8 +74,13 @@ def _healthy_table(rows: Sequence[Row]) -> list[str]:
 def _fault_table(rows: Sequence[Row]) -> list[str]:
     lines = ["| recording | fault | ATE mm | ratio | said |", "|---|---|---|---|---|"]
     for row in rows:
-        lines_said = [re.sub(r"^(frame \d+|gyro \w+|accelerometer \w+): ", "", line) for line in row.get("said", [])]
-        said = row.get("error") or "; ".join(dict.fromkeys(re.split(r"[:;,] ", line)[0] for line in lines_said))
+        lines_said = [
+            re.sub(r"^(frame \d+|gyro \w+|accelerometer \w+): ", "", line)
+            for line in row.get("said", [])
+        ]
+        said = row.get("error") or "; ".join(
+            dict.fromkeys(re.split(r"[:;,] ", line)[0] for line in lines_said)
+        )
         ratio = f"{row['ratio']:.1f}" if "ratio" in row else ""
         name = f"{row['recording']}, {row['motion']} | {row['group']}: {row['variant']}"
         lines.append(f"| {name} | {_millimetres(row)} | {ratio} | {said} |")

@@ -1,1 +1,4 @@
-"""Many recordings, configurations and seeds: one table. The implementation of `vio bench`; docs/bench.md says how."""
+"""Many recordings, configurations and seeds: one table.
+
+The implementation of `vio bench`; docs/bench.md says how.
+"""

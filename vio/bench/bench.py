@@ -1,4 +1,6 @@
-"""A whole bench: tasks from the store or an engine, and the tables, the report and the list of results."""
+"""A whole bench: tasks from the store or an engine, and the tables, the report and the list of
+results.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,14 @@ from vio.bench.identity import (
 from vio.bench.report import latex_of, write_bench_report
 from vio.bench.store import Record, Store
 from vio.bench.suite import Suite
-from vio.bench.tables import SUCCESS_COVERAGE, Outcome, csv_of_rows, csv_of_runs, markdown, summary_rows
+from vio.bench.tables import (
+    SUCCESS_COVERAGE,
+    Outcome,
+    csv_of_rows,
+    csv_of_runs,
+    markdown,
+    summary_rows,
+)
 from vio.bench.tasks import Task, tasks_of
 from vio.bench.worker import reference_fault
 from vio.errors import DataError
@@ -81,7 +90,8 @@ def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: N
     with locked_folder(place.out):
         records: dict[str, Record] = {}
         missing: dict[str, dict[str, Any]] = {}
-        for task in sorted(tasks, key=lambda task: -task.size):  # a long one that begins last keeps all others waiting
+        # a long one that begins last keeps all others waiting
+        for task in sorted(tasks, key=lambda task: -task.size):
             if task.failure is None and task.key not in records:
                 record = store.get(task.key)
                 if record is None:
@@ -92,7 +102,9 @@ def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: N
         wrong = _wrong_references(missing)
         missing = {key: job for key, job in missing.items() if key not in wrong}
         tasks = [replace(task, failure=wrong.get(task.key, task.failure)) for task in tasks]
-        for sequence, why in {task.sequence: task.failure for task in tasks if task.failure is not None}.items():
+        for sequence, why in {
+            task.sequence: task.failure for task in tasks if task.failure is not None
+        }.items():
             log.warning("%s cannot be run: %s", sequence, why)
         progress(len(tasks) - len(missing), len(tasks))
         cache = str(place.cache.absolute())
@@ -119,14 +131,20 @@ def read_bench(folder: Path) -> tuple[tuple[Outcome, ...], dict[str, Any]]:
         facts = json.loads(read_input(path))
         outcomes = tuple(Outcome(**{**values, "curve": None}) for values in facts["outcomes"])
     except FileNotFoundError as error:
-        raise DataError(f"{folder}: no results (it has no {RESULTS}); give the --out folder of a vio bench") from error
+        raise DataError(
+            f"{folder}: no results (it has no {RESULTS}); give the --out folder of a vio bench"
+        ) from error
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise DataError(f"{path}: is damaged ({error}); repeat the bench, finished tasks are not run again") from error
+        raise DataError(
+            f"{path}: is damaged ({error}); repeat the bench, finished tasks are not run again"
+        ) from error
     return outcomes, facts
 
 
 def _wrong_references(jobs: Mapping[str, dict[str, Any]]) -> dict[str, str]:
-    """Return why the ground truth of some tasks cannot be that of their recording; each is read once."""
+    """Return why the ground truth of some tasks cannot be that of their recording; each is read
+    once.
+    """
     faults: dict[str, str | None] = {}
     wrong = {}
     for key, job in jobs.items():
@@ -145,7 +163,12 @@ def _without_poses(record: Record) -> Record:
 
 
 def _write(
-    suite: Suite, place: Place, tasks: Sequence[Task], records: Mapping[str, Record], store: Store, reused: int
+    suite: Suite,
+    place: Place,
+    tasks: Sequence[Task],
+    records: Mapping[str, Record],
+    store: Store,
+    reused: int,
 ) -> Result:
     outcomes = tuple(_outcome(task, records, suite.success_percent) for task in tasks)
     facts = {
@@ -178,7 +201,10 @@ def _write(
     for task in tasks:
         poses = (store.get(task.key) or {}).get("trajectory") if task.key in records else None
         if poses is not None:
-            atomic_write_text(trajectories / f"{task.sequence}.{task.system}.{task.seed}.tum", "\n".join([*poses, ""]))
+            atomic_write_text(
+                trajectories / f"{task.sequence}.{task.system}.{task.seed}.tum",
+                "\n".join([*poses, ""]),
+            )
     return Result(outcomes, reused, facts)
 
 
@@ -203,10 +229,17 @@ def _outcome(task: Task, records: Mapping[str, Record], success_percent: float) 
 
 
 def has_succeeded(record: Record, percent: float) -> bool | None:
-    """Whether a run ended with a small error over most frames; None: without a reference, or at rest."""
+    """Whether a run ended with a small error over most frames.
+
+    None: without a reference, or at rest.
+    """
     if record["failure"] is not None:
         return False
-    ate_m, length_m, covered = (record["figures"].get(name) for name in ("ate_m", "reference_m", "coverage"))
+    ate_m, length_m, covered = (
+        record["figures"].get(name) for name in ("ate_m", "reference_m", "coverage")
+    )
     if ate_m is None or not length_m:
         return None
-    return bool(ate_m < percent / 100 * length_m and covered is not None and covered >= SUCCESS_COVERAGE)
+    return bool(
+        ate_m < percent / 100 * length_m and covered is not None and covered >= SUCCESS_COVERAGE
+    )

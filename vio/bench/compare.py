@@ -1,12 +1,15 @@
-"""What became better or worse from one bench, configuration or system to another: effect sizes, intervals, tests.
+"""What became better or worse from one bench, configuration or system to another: effect sizes,
+intervals, tests.
 
-Runs are paired by sequence and seed. Of each figure the logarithm of the ratio B / A is averaged over the seeds of a
-sequence, where pairs of runs that are equal count once. Where each seed has a render of its own, each is a case of its
-own. Over the cases, Student's t gives the interval of the mean and the test: under the hypothesis of no change A and B
-are exchangeable, so the differences are symmetric about zero, and tails that are heavier than normal make the test
-conservative. ATE is the primary figure; the p-values of the others are adjusted together.
+Runs are paired by sequence and seed. Of each figure the logarithm of the ratio B / A is averaged
+over the seeds of a sequence, where pairs of runs that are equal count once. Where each seed has a
+render of its own, each is a case of its own. Over the cases, Student's t gives the interval of the
+mean and the test: under the hypothesis of no change A and B are exchangeable, so the differences
+are symmetric about zero, and tails that are heavier than normal make the test conservative. ATE is
+the primary figure; the p-values of the others are adjusted together.
 
-Reference: Holm, A simple sequentially rejective multiple test procedure, Scand. J. Statist. 6 (1979).
+Reference: Holm, A simple sequentially rejective multiple test procedure, Scand. J. Statist. 6
+(1979).
 """
 
 from __future__ import annotations
@@ -25,14 +28,18 @@ from vio.bench.tables import METRICS, Metric, Outcome, number
 from vio.errors import EvaluationError
 
 Verdict: TypeAlias = Literal["better", "worse", "not worse", "cannot tell"]
-LEVEL = 0.05  # chance of calling the primary figure changed when nothing has; the same for all others together
-EXIT_STATUS: Mapping[Verdict, int] = {"better": 0, "not worse": 0, "worse": 1, "cannot tell": 3}  # 2 is wrong usage
+# chance of calling the primary figure changed when nothing has; the same for all others together
+LEVEL = 0.05
+# 2 is wrong usage
+EXIT_STATUS: Mapping[Verdict, int] = {"better": 0, "not worse": 0, "worse": 1, "cannot tell": 3}
 _PRIMARY = METRICS[0]
 _JUDGED = ("ate_m", "rpe_m", "drift_percent", "drift_deg_per_100m", "coverage")
-# Reported, but no regression: times depend on the machine, the others say why the judged figures changed.
+# Reported, but no regression: times depend on the machine, the others say why the judged figures
+# changed.
 _NOT_JUDGED = ("ate_sim3_m", "refused_share", "cpu_ms", "memory_mib")
 _LEAST_CHANGE = 0.01  # a mean change below is none, however certain
-# Below this, in the unit of the figure, two values are the same: ATE of 0.01 mm is that of a recording at rest.
+# Below this, in the unit of the figure, two values are the same: ATE of 0.01 mm is that of a
+# recording at rest.
 _FLOOR = 1e-5
 
 _Pair: TypeAlias = tuple[Outcome, Outcome]
@@ -56,7 +63,8 @@ class Change:
     system: str
     metric: str
     effect: Effect
-    p_adjusted: float  # by Holm: the primary figure over the configurations, the others over all of them
+    # by Holm: the primary figure over the configurations, the others over all of them
+    p_adjusted: float
     verdict: Verdict
 
     @property
@@ -83,15 +91,20 @@ class Comparison:
 
     changes: tuple[Change, ...]
     sequences: tuple[SequenceChange, ...]
-    lost: tuple[tuple[str, str, str], ...]  # sequence, system, why: had a result in A, and has none in B
+    # sequence, system, why: had a result in A, and has none in B
+    lost: tuple[tuple[str, str, str], ...]
     won: tuple[tuple[str, str], ...]
     only_in_one: int  # runs without a partner
     margin: float  # "not worse" is a change that is below this factor with 97.5 % confidence
 
     @property
     def verdict(self) -> Verdict:
-        """Worse where anything judged is; else as the ATE says, over all sequences and of single ones."""
-        verdicts = [c.verdict for c in self.changes if c.is_judged] + [s.verdict for s in self.sequences]
+        """Worse where anything judged is; else as the ATE says, over all sequences and of single
+        ones.
+        """
+        verdicts = [c.verdict for c in self.changes if c.is_judged] + [
+            s.verdict for s in self.sequences
+        ]
         if self.lost or "worse" in verdicts:
             return "worse"
         primary = [c.verdict for c in self.changes if c.metric == _PRIMARY.name]
@@ -106,15 +119,20 @@ class Comparison:
 
 
 def compare(
-    a: Path, b: Path, *, between: tuple[str, str] | None = None, factor: float = 2.0, margin: float = 1.1
+    a: Path,
+    b: Path,
+    *,
+    between: tuple[str, str] | None = None,
+    factor: float = 2.0,
+    margin: float = 1.1,
 ) -> Comparison:
     """Compare the results of two output folders, or two systems of them.
 
     Args:
         a: before.
         b: after; the same folder where two of its systems are compared.
-        between: the system of A and the system of B, each a configuration or another system's name; None: each
-            configuration of A with that of the same name of B.
+        between: the system of A and the system of B, each a configuration or another system's name;
+            None: each configuration of A with that of the same name of B.
         factor: by which the ATE of a single sequence must change to be shown.
         margin: a change below this factor counts as none where the interval says so.
 
@@ -124,19 +142,24 @@ def compare(
     for name, value in (("--factor", factor), ("--margin", margin)):
         if not 1 < value < math.inf:
             raise EvaluationError(f"{name} must be above 1, got {value:g}")
-    (before, facts), (after, _) = read_bench(a), read_bench(b)
+    (before, facts) = read_bench(a)
+    (after, _) = read_bench(b)
     what = f"{a} and {b}"
     if between is not None:
         before, after = _sides(before, after, between)
         what = f"{between[0]} of {a} and {between[1]} of {b}"
     drawn = facts.get("drawn_each_seed", ())
-    return compare_outcomes(before, after, drawn_each_seed=drawn, factor=factor, margin=margin, what=what)
+    return compare_outcomes(
+        before, after, drawn_each_seed=drawn, factor=factor, margin=margin, what=what
+    )
 
 
 def _sides(
     a: Iterable[Outcome], b: Iterable[Outcome], between: tuple[str, str]
 ) -> tuple[tuple[Outcome, ...], tuple[Outcome, ...]]:
-    """Return the runs of two systems under one name; a trajectory of another system stands for all seeds."""
+    """Return the runs of two systems under one name; a trajectory of another system stands for
+    all seeds.
+    """
     sides = []
     for runs, system in zip((a, b), between, strict=True):
         known = tuple(runs)
@@ -146,7 +169,10 @@ def _sides(
             raise EvaluationError(f"--between {system}: there is no such system; choose of {names}")
         sides.append(own)
     seeds = sorted({o.seed for side in sides for o in side if o.seed is not None}) or [0]
-    spread = ([replace(o, seed=s) for o in side for s in (seeds if o.seed is None else [o.seed])] for side in sides)
+    spread = (
+        [replace(o, seed=s) for o in side for s in (seeds if o.seed is None else [o.seed])]
+        for side in sides
+    )
     before, after = map(tuple, spread)
     return before, after
 
@@ -160,15 +186,20 @@ def compare_outcomes(
     margin: float = 1.1,
     what: str = "the two",
 ) -> Comparison:
-    """Compare two lists of runs; `drawn_each_seed` are the sequences of which each seed has a render of its own.
+    """Compare two lists of runs; `drawn_each_seed` are the sequences of which each seed has a
+    render of its own.
 
     Raises:
         EvaluationError: they have no run in common.
     """
-    before, after = ({(o.sequence, o.system, o.seed): o for o in runs if o.seed is not None} for runs in (a, b))
+    before, after = (
+        {(o.sequence, o.system, o.seed): o for o in runs if o.seed is not None} for runs in (a, b)
+    )
     common = [key for key in before if key in after]
     if not common:
-        raise EvaluationError(f"{what} have no run of the same sequence, configuration and seed; compare one suite")
+        raise EvaluationError(
+            f"{what} have no run of the same sequence, configuration and seed; compare one suite"
+        )
     pairs = [(before[key], after[key]) for key in common]
     systems = list(dict.fromkeys(old.system for old, _ in pairs))
     changes: list[Change] = []
@@ -178,28 +209,43 @@ def compare_outcomes(
             for system in systems
             for metric in METRICS
             if metric.name in metrics
-            if (cases := _cases([p for p in pairs if p[0].system == system], metric, drawn_each_seed))
+            if (
+                cases := _cases(
+                    [p for p in pairs if p[0].system == system], metric, drawn_each_seed
+                )
+            )
         ]
         adjusted = holm([effect.p for _, _, effect in tested])
         changes += [
-            Change(system, metric.name, effect, p, _verdict(effect, p, margin, metric.larger_is_better))
+            Change(
+                system, metric.name, effect, p, _verdict(effect, p, margin, metric.larger_is_better)
+            )
             for (system, metric, effect), p in zip(tested, adjusted, strict=True)
         ]
     return Comparison(
         tuple(sorted(changes, key=lambda c: systems.index(c.system))),
         tuple(_sequence_changes(pairs, systems, factor)),
-        tuple((o.sequence, o.system, n.failure or "") for o, n in pairs if o.failure is None and n.failure is not None),
-        tuple((o.sequence, o.system) for o, n in pairs if o.failure is not None and n.failure is None),
+        tuple(
+            (o.sequence, o.system, n.failure or "")
+            for o, n in pairs
+            if o.failure is None and n.failure is not None
+        ),
+        tuple(
+            (o.sequence, o.system) for o, n in pairs if o.failure is not None and n.failure is None
+        ),
         len(before) + len(after) - 2 * len(common),
         margin,
     )
 
 
-def _cases(pairs: Sequence[_Pair], metric: Metric, drawn_each_seed: Collection[str] = ()) -> dict[Any, list[float]]:
+def _cases(
+    pairs: Sequence[_Pair], metric: Metric, drawn_each_seed: Collection[str] = ()
+) -> dict[Any, list[float]]:
     """Return log ratios B / A by case, those of equal pairs of values once; above 0 B is larger."""
     found: dict[Any, set[tuple[float, float]]] = {}
     for old, new in pairs:
-        x, y = old.value(metric), new.value(metric)
+        x = old.value(metric)
+        y = new.value(metric)
         if x is not None and y is not None:
             case = (old.sequence, old.seed) if old.sequence in drawn_each_seed else old.sequence
             found.setdefault(case, set()).add((max(x, _FLOOR), max(y, _FLOOR)))
@@ -211,7 +257,8 @@ def effect_of(logs: npt.ArrayLike, metric: Metric = _PRIMARY) -> Effect:
     from scipy import stats
 
     d = np.asarray(logs, dtype=np.float64)
-    ratio, n = math.exp(float(d.mean())), len(d)
+    ratio = math.exp(float(d.mean()))
+    n = len(d)
     if not d.any():
         return Effect(n, 1.0, 1.0, 1.0, 1.0)
     if n == 1:
@@ -220,12 +267,17 @@ def effect_of(logs: npt.ArrayLike, metric: Metric = _PRIMARY) -> Effect:
         return Effect(n, ratio, ratio, ratio, 0.0)
     test = stats.ttest_1samp(d, 0.0)
     interval = test.confidence_interval(1 - LEVEL)
-    return Effect(n, ratio, math.exp(float(interval.low)), math.exp(float(interval.high)), float(test.pvalue))
+    return Effect(
+        n, ratio, math.exp(float(interval.low)), math.exp(float(interval.high)), float(test.pvalue)
+    )
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Return p-values adjusted for their number: below a level with at most its probability if nothing has changed."""
-    adjusted, largest = [0.0] * len(p), 0.0
+    """Return p-values adjusted for their number: below a level with at most its probability if
+    nothing has changed.
+    """
+    adjusted = [0.0] * len(p)
+    largest = 0.0
     for rank, k in enumerate(sorted(range(len(p)), key=lambda k: p[k])):
         largest = max(largest, min(1.0, (len(p) - rank) * p[k]))
         adjusted[k] = largest
@@ -242,8 +294,12 @@ def _verdict(effect: Effect, p: float, margin: float, larger_is_better: bool = F
     return "not worse" if worst <= margin else "cannot tell"
 
 
-def _sequence_changes(pairs: Sequence[_Pair], systems: Sequence[str], factor: float) -> Iterator[SequenceChange]:
-    """Yield sequences whose ATE changed by more than the factor, with what a test over their seeds says."""
+def _sequence_changes(
+    pairs: Sequence[_Pair], systems: Sequence[str], factor: float
+) -> Iterator[SequenceChange]:
+    """Yield sequences whose ATE changed by more than the factor, with what a test over their
+    seeds says.
+    """
     tested = []
     for system in systems:
         own = [p for p in pairs if p[0].system == system]
@@ -251,14 +307,21 @@ def _sequence_changes(pairs: Sequence[_Pair], systems: Sequence[str], factor: fl
     for (system, name, effect), p in zip(tested, holm([e.p for _, _, e in tested]), strict=True):
         if abs(math.log(effect.ratio)) > math.log(factor):
             both = [pair for pair in pairs if (pair[0].sequence, pair[0].system) == (name, system)]
-            values = ([v for o in side if (v := o.value(_PRIMARY)) is not None] for side in zip(*both, strict=True))
+            values = (
+                [v for o in side if (v := o.value(_PRIMARY)) is not None]
+                for side in zip(*both, strict=True)
+            )
             before, after = (float(np.median(v)) for v in values)
-            verdict: Verdict = "cannot tell" if p > LEVEL else "worse" if effect.ratio > 1 else "better"
+            verdict: Verdict = (
+                "cannot tell" if p > LEVEL else "worse" if effect.ratio > 1 else "better"
+            )
             yield SequenceChange(name, system, before, after, effect, verdict)
 
 
 def comparison_lines(result: Comparison) -> Iterator[str]:
-    """Yield a comparison as text: figures over all sequences, then single sequences, then what was lost."""
+    """Yield a comparison as text: figures over all sequences, then single sequences, then what
+    was lost.
+    """
     titles = {metric.name: metric.title for metric in METRICS}
     width = max(16, *(len(c.system) for c in result.changes)) if result.changes else 16
     head = f"{'configuration':<{width}} {'figure':<14} {'B / A':>8}  {'95 % interval':<18} "
@@ -271,8 +334,13 @@ def comparison_lines(result: Comparison) -> Iterator[str]:
         values = f"ATE {number(s.before, 3)} to {number(s.after, 3)} m"
         by = f"B / A {number(s.effect.ratio, 3)}, {_interval(s.effect)} over n = {s.effect.n} different seeds"
         yield f"{s.sequence}, {s.system}: {values} ({by}): {s.verdict}"
-    yield from (f"{sequence}, {system}: worse, no result any more: {why}" for sequence, system, why in result.lost)
-    yield from (f"{sequence}, {system}: better, has a result now" for sequence, system in result.won)
+    yield from (
+        f"{sequence}, {system}: worse, no result any more: {why}"
+        for sequence, system, why in result.lost
+    )
+    yield from (
+        f"{sequence}, {system}: better, has a result now" for sequence, system in result.won
+    )
     if result.only_in_one:
         yield f"{result.only_in_one} runs are in one of the two only and were not compared"
     share = number(100 * (result.margin - 1), 3)
@@ -280,7 +348,8 @@ def comparison_lines(result: Comparison) -> Iterator[str]:
         "worse": "worse",
         "better": "better",
         "not worse": f"not worse by {share} % or more",
-        "cannot tell": f"cannot tell whether it is worse by {share} % or more: more sequences or seeds are needed",
+        "cannot tell": f"cannot tell whether it is worse by {share} % or more: more sequences or "
+        "seeds are needed",
     }[result.verdict]
 
 

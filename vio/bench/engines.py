@@ -1,4 +1,7 @@
-"""Where tasks are done: processes of this machine, or a Dask cluster. Both do the same with each task."""
+"""Where tasks are done: processes of this machine, or a Dask cluster.
+
+Both do the same with each task.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +25,13 @@ _POLL_S = 0.5
 def run_here(
     jobs: Mapping[str, Job], cache: str, *, workers: int, perform: Perform = perform_job
 ) -> Iterator[tuple[str, Record]]:
-    """Yield key and record of each job as it is done, by up to `workers` processes of this machine at a time."""
+    """Yield key and record of each job as it is done, by up to `workers` processes of this
+    machine at a time.
+    """
     with ThreadPoolExecutor(workers) as pool:
-        futures: dict[Future[Record], str] = {pool.submit(perform, job, cache): key for key, job in jobs.items()}
+        futures: dict[Future[Record], str] = {
+            pool.submit(perform, job, cache): key for key, job in jobs.items()
+        }
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
@@ -36,10 +43,11 @@ def run_here(
 def run_on_dask(
     jobs: Mapping[str, Job], cache: str, *, address: str, wait_s: float = 300.0
 ) -> Iterator[tuple[str, Record]]:
-    """Yield key and record of each job as it is done by the workers of the Dask scheduler at an address.
+    """Yield key and record of each job as it is done by the workers of the Dask scheduler at an
+    address.
 
-    A worker that is lost costs its tasks a repetition. A scheduler that is lost is waited for, `wait_s` at most, and
-    what has not come back is sent again. `cache` is a folder on the workers.
+    A worker that is lost costs its tasks a repetition. A scheduler that is lost is waited for,
+    `wait_s` at most, and what has not come back is sent again. `cache` is a folder on the workers.
 
     Raises:
         MissingDependencyError: Dask is not installed.
@@ -53,44 +61,59 @@ def run_on_dask(
         ) from error
     connect: Any = Client  # its annotations are incomplete
     pending = dict(jobs)
-    last_s, first = time.monotonic(), True
+    last_s = time.monotonic()
+    first = True
     while pending:
         try:
             with connect(address, timeout=min(wait_s, 10.0), set_as_default=False) as client:
                 if first:
                     _check_workers(client, pending)
-                first, last_s = False, time.monotonic()
+                first = False
+                last_s = time.monotonic()
                 for key, record in _session(client, pending, cache):
                     del pending[key]
                     yield key, record
         except ImportError as error:
             raise VioError(
-                f"a Dask worker cannot import stereo-vio ({error}); install it there, the same version"
+                f"a Dask worker cannot import stereo-vio ({error}); install it there, the same "
+                "version"
             ) from error
         except (OSError, TimeoutError, ValueError) as error:
             if first or time.monotonic() - last_s > wait_s:
                 raise VioError(
-                    f"no Dask scheduler at {address} ({' '.join(str(error).split()) or type(error).__name__}); start "
+                    f"no Dask scheduler at {address} "
+                    f"({' '.join(str(error).split()) or type(error).__name__}); start "
                     "one with dask scheduler, and workers with dask worker"
                 ) from error
         if pending:
-            log.warning("the scheduler %s was lost; waiting for it with %d tasks left", address, len(pending))
+            log.warning(
+                "the scheduler %s was lost; waiting for it with %d tasks left",
+                address,
+                len(pending),
+            )
             time.sleep(_POLL_S)
 
 
 def _check_workers(client: Any, jobs: Mapping[str, Job]) -> None:
-    """Refuse workers whose results would be others, before the first task; one that comes later refuses its tasks."""
+    """Refuse workers whose results would be others, before the first task; one that comes later
+    refuses its tasks.
+    """
     wanted = next(((job["code"], job["packages"]) for job in jobs.values() if "code" in job), None)
     if wanted is None:
         return
     found: dict[str, tuple[str, dict[str, str]]] = client.run(code_and_packages)
     for address, (code, packages) in found.items():
         differ = [
-            f"{name} {packages.get(name)}" for name, version in wanted[1].items() if packages.get(name) != version
+            f"{name} {packages.get(name)}"
+            for name, version in wanted[1].items()
+            if packages.get(name) != version
         ]
         if code != wanted[0] or differ:
             what = f"packages ({', '.join(differ)})" if differ else "code"
-            raise VioError(f"the Dask worker {address} has other {what} than this command; install the same versions")
+            raise VioError(
+                f"the Dask worker {address} has other {what} than this command; install the same "
+                "versions"
+            )
 
 
 def _session(client: Any, jobs: Mapping[str, Job], cache: str) -> Iterator[tuple[str, Record]]:
@@ -98,7 +121,8 @@ def _session(client: Any, jobs: Mapping[str, Job], cache: str) -> Iterator[tuple
     from distributed import KilledWorker
 
     futures = {
-        client.submit(perform_job, job, cache, key=f"vio-{key}", pure=False): key for key, job in list(jobs.items())
+        client.submit(perform_job, job, cache, key=f"vio-{key}", pure=False): key
+        for key, job in list(jobs.items())
     }
     while futures:
         done = [future for future in futures if future.done()]

@@ -1,4 +1,6 @@
-"""One task, wherever it is done: render what it needs, start a process, try again where that is lost."""
+"""One task, wherever it is done: render what it needs, start a process, try again where that is
+lost.
+"""
 
 from __future__ import annotations
 
@@ -33,10 +35,13 @@ _lock = threading.Lock()
 
 
 def perform_job(job: dict[str, Any], cache: str) -> dict[str, Any]:
-    """Do one task in a process of its own, again where that is killed; return its record, which may be a failure."""
+    """Do one task in a process of its own, again where that is killed; return its record, which
+    may be a failure.
+    """
     try:
         Path(cache).mkdir(parents=True, exist_ok=True)
-        job, lost = rendered_sources(job, Path(cache)), 0
+        job = rendered_sources(job, Path(cache))
+        lost = 0
         while True:
             record, number = _in_process(job, Path(cache))
             if record is not None:
@@ -44,17 +49,25 @@ def perform_job(job: dict[str, Any], cache: str) -> dict[str, Any]:
                 return record
             lost += 1
             if lost > RETRIES:
-                hint = "; out of memory? Use fewer --workers" if number == getattr(signal, "SIGKILL", 9) else ""
+                hint = (
+                    "; out of memory? Use fewer --workers"
+                    if number == getattr(signal, "SIGKILL", 9)
+                    else ""
+                )
                 name = signal.Signals(number).name
                 return failed(f"its process was ended by {name}, {lost} times{hint}", keep=False)
     except VioError as error:
         return failed(" ".join(str(error).split()), keep=False)
     except OSError as error:
-        return failed(f"cannot use {error.filename or cache}: {error.strerror or error}", keep=False)
+        return failed(
+            f"cannot use {error.filename or cache}: {error.strerror or error}", keep=False
+        )
 
 
 def rendered_sources(job: dict[str, Any], cache: Path) -> dict[str, Any]:
-    """Return a job with the folders of its renders as sources; they are made now unless they are there."""
+    """Return a job with the folders of its renders as sources; they are made now unless they are
+    there.
+    """
     job = {**job, "first": job.get("first") and dict(job["first"])}
     for part in (job, job["first"]):
         if part is not None and part["render"] is not None:
@@ -67,7 +80,14 @@ def failed(reason: str, *, keep: bool) -> dict[str, Any]:
 
     `keep`: the same would happen again, so that the task need not be repeated.
     """
-    return {"figures": {}, "measured": {}, "failure": reason, "keep": keep, "curve": None, "trajectory": None}
+    return {
+        "figures": {},
+        "measured": {},
+        "failure": reason,
+        "keep": keep,
+        "curve": None,
+        "trajectory": None,
+    }
 
 
 def end_processes() -> None:
@@ -83,9 +103,13 @@ def _in_process(job: dict[str, Any], cache: Path) -> tuple[dict[str, Any] | None
         job = {**job, "scratch": str(folder)}
         (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
         try:
-            status, words = _call([sys.executable, "-m", "vio.bench.worker", str(folder)], job.get("time_limit_s"))
+            status, words = _call(
+                [sys.executable, "-m", "vio.bench.worker", str(folder)], job.get("time_limit_s")
+            )
         except subprocess.TimeoutExpired as late:
-            return failed(f"it took longer than the time limit of {late.timeout:g} s", keep=False), 0
+            return failed(
+                f"it took longer than the time limit of {late.timeout:g} s", keep=False
+            ), 0
         result = folder / "result.json"
         if result.is_file():
             record: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
@@ -104,20 +128,40 @@ def _rendered(render: dict[str, Any], cache: Path) -> Path:
         if fcntl is not None:  # another process of this machine that has it is waited for
             fcntl.flock(stream, fcntl.LOCK_EX)
         if not folder.is_dir():
-            command = [sys.executable, "-m", "vio", "render", *render["words"], "--workers", "1", "--out", str(folder)]
+            command = [
+                sys.executable,
+                "-m",
+                "vio",
+                "render",
+                *render["words"],
+                "--workers",
+                "1",
+                "--out",
+                str(folder),
+            ]
             status, words = _call([*command, "--json"])
             if status:
                 last = (words.strip() or f"exit status {status}").splitlines()[-1]
-                raise DataError(f"vio render {' '.join(render['words'])}: {last.removeprefix('error: ')}")
+                raise DataError(
+                    f"vio render {' '.join(render['words'])}: {last.removeprefix('error: ')}"
+                )
     return folder
 
 
 def _call(command: list[str], limit_s: float | None = None) -> tuple[int, str]:
     """Run a command that ends with this process; return its status and the end of its stderr."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
+    }
     with tempfile.TemporaryFile(mode="w+", encoding="utf-8", errors="replace") as words:
         process = subprocess.Popen(
-            command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=words, text=True
+            command,
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=words,
+            text=True,
         )
         with _lock:
             _running.add(process)
@@ -137,7 +181,9 @@ def _call(command: list[str], limit_s: float | None = None) -> tuple[int, str]:
 
 @contextlib.contextmanager
 def _task_folder(cache: Path) -> Iterator[Path]:
-    """A folder for one task, locked meanwhile; those without a lock, which killed processes left, are removed."""
+    """A folder for one task, locked meanwhile; those without a lock, which killed processes
+    left, are removed.
+    """
     for left in cache.glob("task-*") if fcntl is not None else ():
         if (taken := lock_path(left)) is not None:
             shutil.rmtree(left, ignore_errors=True)

@@ -17,7 +17,14 @@ from vio.geometry.lie import FloatArray, se3_inverse, se3_log
 from vio.geometry.upright import yaw_and_position
 from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
-_OF_REFERENCE = ("ate_sim3_m", "scale_error_percent", "rpe_m", "drift_percent", "drift_deg_per_100m", "nees")
+_OF_REFERENCE = (
+    "ate_sim3_m",
+    "scale_error_percent",
+    "rpe_m",
+    "drift_percent",
+    "drift_deg_per_100m",
+    "nees",
+)
 _OF_LOOPS = ("loops", "loops_false", "loop_error_m", "loop_recall")
 _OF_PLACES = ("placed", "place_s", "map_causal_ate_m", "map_nees", "map_nees_50", "map_nees_95")
 _OF_COVERS = ("again_s", "placed_again")
@@ -25,7 +32,8 @@ _OF_MAPS = ("map_ate_m", "placed_wrong", *_OF_LOOPS, *_OF_PLACES, *_OF_COVERS)
 _CURVE = 240  # points of the error over time that are kept; a report shows no more
 _QUANTILES = (0, 5, 25, 50, 75, 95, 100)
 _FRAME_NS = 10_000_000  # a pose within 10 ms of a frame is that frame's, as in `vio eval`
-# Condition of a pose covariance below which it is inverted: the first frames of a run know their pose exactly.
+# Condition of a pose covariance below which it is inverted: the first frames of a run know their
+# pose exactly.
 _MOST_CONDITION = 1e14
 
 
@@ -34,7 +42,9 @@ def figures_of(evaluation: Evaluation, *, positions_only: bool) -> dict[str, Any
 
     With `positions_only` the reference has no orientations, and all that needs them is None.
     """
-    scores, truth_m, scale_free = evaluation.as_dict(), evaluation.reference_path_length_m, evaluation.scale_free
+    scores = evaluation.as_dict()
+    truth_m = evaluation.reference_path_length_m
+    scale_free = evaluation.scale_free
     rpe, kitti = (None, None) if positions_only else (evaluation.rpe, evaluation.kitti)
     return {
         "ate_m": scores["ate_m"],
@@ -69,26 +79,31 @@ def pose_nees(
     upright: BoolArray | bool,
     T_world_true: FloatArray | None = None,
 ) -> FloatArray | None:
-    """Return the NEES (M,) of the poses, 6 in the mean for a consistent filter; None: no covariance can be inverted.
+    """Return the NEES (M,) of the poses, 6 in the mean for a consistent filter; None: no covariance
+    can be inverted.
 
-    The world frames are identified at the first matched pose: all of it where the filter's world is that of its first
-    frame, position and yaw where both worlds are upright, as the first inclination is then estimated like any other.
+    The world frames are identified at the first matched pose: all of it where the filter's world is
+    that of its first frame, position and yaw where both worlds are upright, as the first
+    inclination is then estimated like any other.
 
     Args:
         evaluation: which poses match which of the reference.
         T_world_imu: (N, 4, 4) all estimated poses.
         covariances: (N, 6, 6) of xi in T_imu_world = exp(xi) T_imu_world_hat.
         T_cam0_imu: (4, 4) extrinsics.
-        upright: (N,) or one for all, whether both worlds have z up; where that ends, they are identified anew.
+        upright: (N,) or one for all, whether both worlds have z up; where that ends, they are
+            identified anew.
         T_world_true: (4, 4) of the reference's world in the filter's; None: as said above.
     """
     truth = evaluation.reference.in_imu(T_cam0_imu).T_world_body
-    T, P = T_world_imu[evaluation.rows], covariances[evaluation.rows]
+    T = T_world_imu[evaluation.rows]
+    P = covariances[evaluation.rows]
     upright = np.broadcast_to(upright, len(T_world_imu))[evaluation.rows]
     errors = np.empty((len(T), 6))
     for rows in (np.flatnonzero(upright), np.flatnonzero(~upright)):
         if len(rows):
-            a, b = T[rows[0]], truth[rows[0]]
+            a = T[rows[0]]
+            b = truth[rows[0]]
             first = yaw_and_position(a, b) if upright[rows[0]] else a @ se3_inverse(b)
             world = first if T_world_true is None else T_world_true
             errors[rows] = se3_log(se3_inverse(world @ truth[rows]) @ T[rows])
@@ -103,7 +118,10 @@ def pose_nees(
 
 def nees_figures(values: FloatArray, name: str) -> dict[str, float]:
     """Return mean, median and 95 % of NEES (M,), by names that begin with `name`."""
-    return {name: float(values.mean()), **{f"{name}_{q}": float(np.percentile(values, q)) for q in (50, 95)}}
+    return {
+        name: float(values.mean()),
+        **{f"{name}_{q}": float(np.percentile(values, q)) for q in (50, 95)},
+    }
 
 
 def absent_reasons(
@@ -113,12 +131,19 @@ def absent_reasons(
     why = dict.fromkeys(("ate_m", *_OF_REFERENCE), "the recording has no ground truth")
     if has_reference:
         why = {
-            **dict.fromkeys(("ate_sim3_m", "scale_error_percent"), "the positions do not determine a scale"),
-            **dict.fromkeys(("drift_percent", "drift_deg_per_100m"), "the path is shorter than the drift's lengths"),
+            **dict.fromkeys(
+                ("ate_sim3_m", "scale_error_percent"), "the positions do not determine a scale"
+            ),
+            **dict.fromkeys(
+                ("drift_percent", "drift_deg_per_100m"),
+                "the path is shorter than the drift's lengths",
+            ),
             "nees": "the ground truth is no more exact than the estimate",
         }
         if positions_only:
-            why |= dict.fromkeys(("rpe_m", *_OF_REFERENCE[-3:]), "the ground truth has no orientations")
+            why |= dict.fromkeys(
+                ("rpe_m", *_OF_REFERENCE[-3:]), "the ground truth has no orientations"
+            )
     why |= {
         "refused_share": "no observation was offered",
         "cpu_ms": "too few frames for a mean",
@@ -150,7 +175,9 @@ def error_curve(evaluation: Evaluation, times_ns: IntArray | None) -> dict[str, 
     `times_ns` (N,) are those of the trajectory's poses; None: frames stand for seconds.
     """
     rows = evaluation.rows
-    seconds = rows.astype(float) if times_ns is None else (times_ns[rows] - times_ns[rows[0]]) / NS_PER_S
+    seconds = (
+        rows.astype(float) if times_ns is None else (times_ns[rows] - times_ns[rows[0]]) / NS_PER_S
+    )
     picked = np.unique(np.linspace(0, len(rows) - 1, min(_CURVE, len(rows))).round().astype(int))
     return {
         "seconds": _rounded(seconds[picked], 3),
@@ -163,7 +190,9 @@ def between(trajectory: Trajectory, first_ns: int, last_ns: int) -> Trajectory:
     """Return the poses within a span of time, 10 ms at each end included."""
     if trajectory.times_ns is None:
         return trajectory
-    inside = (trajectory.times_ns >= first_ns - _FRAME_NS) & (trajectory.times_ns <= last_ns + _FRAME_NS)
+    inside = (trajectory.times_ns >= first_ns - _FRAME_NS) & (
+        trajectory.times_ns <= last_ns + _FRAME_NS
+    )
     indices = trajectory.frame_indices
     return replace(
         trajectory,

@@ -26,12 +26,16 @@ _BLOCK = 2**20
 
 def digest_of(value: Any) -> str:
     """Return the SHA-256 of plain data as canonical JSON."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()
 
 
 @cache
 def code_digest() -> str:
-    """Return the digest of all code that a run's figures depend on: what a task imports, at once or later."""
+    """Return the digest of all code that a run's figures depend on: what a task imports, at once
+    or later.
+    """
     return _digest_files(imported_code("vio.bench.worker", later=("vio.",)))
 
 
@@ -42,12 +46,14 @@ def render_code_digest() -> str:
 
 
 def imported_code(root: str, later: tuple[str, ...]) -> list[str]:
-    """Return our files that a module imports, and those that these import, relative to the installation.
+    """Return our files that a module imports, and those that these import, relative to the
+    installation.
 
-    Of the command line only the module itself counts. Imports inside functions count in modules whose names begin as
-    one of `later`.
+    Of the command line only the module itself counts. Imports inside functions count in modules
+    whose names begin as one of `later`.
     """
-    found, names = set[str](), [root]
+    found = set[str]()
+    names = [root]
     while names:
         name = names.pop()
         path = Path(ROOT, *name.split("."))
@@ -89,14 +95,21 @@ def code_and_packages() -> tuple[str, dict[str, str]]:
 
 
 def commit_of(root: Path) -> str | None:
-    """Return the commit of a checkout, with a + where its code was changed since; None: it is no checkout."""
+    """Return the commit of a checkout, with a + where its code was changed since.
+
+    None: it is no checkout.
+    """
 
     def git(*words: str) -> str:
         command = ["git", "-C", str(root), *words]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.strip()
+        return subprocess.run(
+            command, capture_output=True, text=True, check=True, timeout=30
+        ).stdout.strip()
 
     try:
-        return git("rev-parse", "--short=8", "HEAD") + ("+" if git("status", "--porcelain", "vio", "frontend") else "")
+        return git("rev-parse", "--short=8", "HEAD") + (
+            "+" if git("status", "--porcelain", "vio", "frontend") else ""
+        )
     except (OSError, subprocess.SubprocessError):
         return None
 
@@ -105,7 +118,11 @@ def machine() -> str:
     """Return processors and operating system, without the name of the machine."""
     model = platform.processor() or platform.machine()
     try:
-        names = re.findall(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
+        names = re.findall(
+            r"^model name\s*: (.+)$",
+            Path("/proc/cpuinfo").read_text(encoding="utf-8"),
+            re.MULTILINE,
+        )
         model = names[0] if names else model
     except OSError:
         pass
@@ -113,14 +130,18 @@ def machine() -> str:
 
 
 class InputDigests:
-    """Digests of recordings, remembered with sizes and times of change so that each content is read once."""
+    """Digests of recordings, remembered with sizes and times of change so that each content is
+    read once.
+    """
 
     def __init__(self, file: Path, identity: Identity = "content") -> None:
         """Read what is remembered in a JSON file.
 
-        A recording is known by the bytes of its files (content), or by their names, sizes and times of change (stat).
+        A recording is known by the bytes of its files (content), or by their names, sizes and times
+        of change (stat).
         """
-        self._file, self._identity = file, identity
+        self._file = file
+        self._identity = identity
         self._known: dict[str, list[str]] = {}
         self._bytes: dict[Path, int] = {}
         try:
@@ -144,10 +165,15 @@ class InputDigests:
                 return f"stat:{signature}"
             known = self._known.get(str(path.absolute()))
             if known is None or known[0] != signature:
-                known = [signature, digest_of([[*_stat(f, path)[:2], _digest_file(f)] for f in _files(path)])]
+                known = [
+                    signature,
+                    digest_of([[*_stat(f, path)[:2], _digest_file(f)] for f in _files(path)]),
+                ]
                 self._known[str(path.absolute())] = known
         except OSError as error:
-            raise DataError(f"cannot read {error.filename or path}: {error.strerror or error}") from error
+            raise DataError(
+                f"cannot read {error.filename or path}: {error.strerror or error}"
+            ) from error
         return known[1]
 
     def bytes_of(self, path: Path) -> int:
@@ -168,7 +194,9 @@ def _files(path: Path) -> list[Path]:
     """All files of a recording, in the order of their names."""
     if not path.is_dir():
         return [path]
-    inside = [Path(folder, name) for folder, _, names in os.walk(path, followlinks=True) for name in names]
+    inside = [
+        Path(folder, name) for folder, _, names in os.walk(path, followlinks=True) for name in names
+    ]
     # KITTI: ground truth two levels up, calibration of a raw drive in the folder of its day.
     beside = [path.parent.parent / "poses" / f"{path.name}.txt", *path.parent.glob("calib_*.txt")]
     return sorted(inside) + [file for file in beside if file.is_file()]

@@ -1,4 +1,6 @@
-"""The figures of a map: errors in it, its loops against ground truth, how soon a place is found, and found again."""
+"""The figures of a map: errors in it, its loops against ground truth, how soon a place is found,
+and found again.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +18,33 @@ from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
 from vio.mapping.map_store import MapStore
 from vio.protocols import Dataset
-from vio.records import NS_PER_S, BoolArray, Event, IntArray, Observations, Recording, StereoFrame, Trajectory
+from vio.records import (
+    NS_PER_S,
+    BoolArray,
+    Event,
+    IntArray,
+    Observations,
+    Recording,
+    StereoFrame,
+    Trajectory,
+)
 from vio.runs.pipeline import RunResult
 
-# A keyframe is at a place seen before where a keyframe of an earlier visit is so near and looks the same way.
-_REVISIT_M, _REVISIT_DEG, _REVISIT_NS = 3.0, 30.0, 10 * NS_PER_S
-_FALSE_M, _FALSE_DEG = 0.5, 5.0  # error of a loop's motion, or of a place, from which it is false
+# A keyframe is at a place seen before where a keyframe of an earlier visit is so near and looks the
+# same way.
+_REVISIT_M = 3.0
+_REVISIT_DEG = 30.0
+_REVISIT_NS = 10 * NS_PER_S
+_FALSE_M = 0.5  # error of a loop's motion, or of a place, from which it is false
+_FALSE_DEG = 5.0
 _PLACED_M = 1.0  # stated standard deviation of a position beyond which a frame is not localised
 
 
 @dataclass(frozen=True, slots=True)
 class Covered:
-    """A recording whose cameras are covered for a while: black images, and a motion sensor that goes on."""
+    """A recording whose cameras are covered for a while: black images, and a motion sensor that
+    goes on.
+    """
 
     source: Dataset
     spans: tuple[tuple[int, int], ...]  # first frame, and the one after the last
@@ -37,11 +54,18 @@ class Covered:
         """That of the source."""
         return self.source.recording
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
         """Yield the events of some frames."""
         for event in self.source.events(start, stop, images=images):
-            if isinstance(event, StereoFrame) and any(first <= event.index < end for first, end in self.spans):
-                left, right = (None if image is None else np.zeros_like(image) for image in (event.left, event.right))
+            if isinstance(event, StereoFrame) and any(
+                first <= event.index < end for first, end in self.spans
+            ):
+                left, right = (
+                    None if image is None else np.zeros_like(image)
+                    for image in (event.left, event.right)
+                )
                 event = replace(event, left=left, right=right)
             yield event
 
@@ -67,7 +91,8 @@ def map_figures(
         reference: ground truth.
         store: the map that the run built; None: it was localised in one of another session.
         T_ref_map: (4, 4) world of the reference from the map of another session; None: not known.
-        covered: first frame, and the one after the last, of each time that the cameras were covered.
+        covered: first frame, and the one after the last, of each time that the cameras were
+            covered.
 
     Raises:
         VioError: the poses in the map cannot be compared, or the map's file is damaged.
@@ -75,7 +100,9 @@ def map_figures(
     mapped = result.mapped
     assert mapped is not None
     final = replace(result.trajectory, T_world_body=mapped.T_map_body)
-    figures: dict[str, Any] = {"map_ate_m": evaluate(final, reference, T_cam0_imu=result.T_cam0_body).ate_m.rmse}
+    figures: dict[str, Any] = {
+        "map_ate_m": evaluate(final, reference, T_cam0_imu=result.T_cam0_body).ate_m.rmse
+    }
     known = np.trace(mapped.causal["covariance"][:, :3, :3], axis1=1, axis2=2) < _PLACED_M**2
     for first, end in covered:  # where the cameras show nothing, a pose is no place
         known &= (mapped.causal["index"] < first) | (mapped.causal["index"] >= end)
@@ -83,13 +110,18 @@ def map_figures(
     frames, times_ns = (np.array(result.estimates.column(name)) for name in ("index", "time_ns"))
     figures |= placement_figures(frames, times_ns, np.isin(frames, placed["index"]), covered)
     causal = Trajectory(np.array(placed["T_map_body"]), np.array(placed["time_ns"]), result.body)
-    figures |= _causal_figures(causal, np.array(placed["covariance"]), reference, result.T_cam0_body, T_ref_map)
+    figures |= _causal_figures(
+        causal, np.array(placed["covariance"]), reference, result.T_cam0_body, T_ref_map
+    )
     if store is not None:
         if mapped.loops:  # else its poses are the odometry's
-            held, upright = mapped.in_map, result.motion == "imu"
+            held = mapped.in_map
+            upright = result.motion == "imu"
             built = Trajectory(held.T_map_body, held.time_ns, result.body, held.frame)
             score = evaluate(built, reference, T_cam0_imu=result.T_cam0_body)
-            values = pose_nees(score, held.T_map_body, held.covariance, result.T_cam0_body, upright=upright)
+            values = pose_nees(
+                score, held.T_map_body, held.covariance, result.T_cam0_body, upright=upright
+            )
             figures |= {} if values is None else nees_figures(values, "map_nees")
         T_true = truth.reference.in_imu(result.T_cam0_body).T_world_body
         figures |= loop_figures(store, frames[truth.rows], T_true, result.T_cam0_body)
@@ -99,13 +131,15 @@ def map_figures(
 def placement_figures(
     frames: IntArray, times_ns: IntArray, placed: BoolArray, covered: Sequence[tuple[int, int]]
 ) -> dict[str, float | None]:
-    """Return how many frames are localised, how soon the first is, and the same after the cameras were covered.
+    """Return how many frames are localised, how soon the first is, and the same after the cameras
+    were covered.
 
     Args:
         frames: (N,) numbers of the frames with an estimate.
         times_ns: (N,) their times.
         placed: (N,) which of them are localised at the time.
-        covered: first frame, and the one after the last, of each time that the cameras were covered.
+        covered: first frame, and the one after the last, of each time that the cameras were
+            covered.
     """
     figures: dict[str, float | None] = {"placed": float(placed.mean())}
     if placed.any():
@@ -116,7 +150,10 @@ def placement_figures(
     if after:
         figures["placed_again"] = float(placed[np.any(after, axis=0)].mean())
         if all(placed[seen].any() for seen in after):  # of several, the longest
-            figures["again_s"] = max(float(times_ns[seen & placed][0] - times_ns[seen][0]) for seen in after) / NS_PER_S
+            figures["again_s"] = (
+                max(float(times_ns[seen & placed][0] - times_ns[seen][0]) for seen in after)
+                / NS_PER_S
+            )
     return figures
 
 
@@ -127,7 +164,9 @@ def _causal_figures(
     T_cam0_body: FloatArray,
     T_ref_map: FloatArray | None,
 ) -> dict[str, float]:
-    """Return the error of the localised poses as known at the time; in another session's map, NEES and false share."""
+    """Return the error of the localised poses as known at the time; in another session's map,
+    NEES and false share.
+    """
     try:
         score = evaluate(causal, reference, T_cam0_imu=T_cam0_body)
     except EvaluationError:  # known for too short a time
@@ -136,7 +175,8 @@ def _causal_figures(
     if T_ref_map is not None:
         T_true = score.reference.in_imu(T_cam0_body).T_world_body
         figures["placed_wrong"] = wrong_share(T_ref_map @ causal.T_world_body[score.rows], T_true)
-        T, world = causal.T_world_body, se3_inverse(T_ref_map)
+        T = causal.T_world_body
+        world = se3_inverse(T_ref_map)
         values = pose_nees(score, T, covariances, T_cam0_body, upright=False, T_world_true=world)
         figures |= {} if values is None else nees_figures(values, "map_nees")
     return figures
@@ -145,32 +185,45 @@ def _causal_figures(
 def wrong_share(T: FloatArray, T_true: FloatArray) -> float:
     """Return the share of poses (M, 4, 4) that are false, as a loop is."""
     E = se3_inverse(T_true) @ T
-    return float(np.mean((np.linalg.norm(E[:, :3, 3], axis=1) > _FALSE_M) | (rotation_angle_deg(E) > _FALSE_DEG)))
+    return float(
+        np.mean(
+            (np.linalg.norm(E[:, :3, 3], axis=1) > _FALSE_M) | (rotation_angle_deg(E) > _FALSE_DEG)
+        )
+    )
 
 
 def loop_figures(
     store: Path, frames: IntArray, T_world_body: FloatArray, T_cam0_body: FloatArray
 ) -> dict[str, float | None]:
-    """Return figures of the loops that a map of one session kept, against the true poses (M, 4, 4) of frames (M,).
+    """Return figures of the loops that a map of one session kept, against the true poses (M, 4, 4)
+    of frames (M,).
 
-    The error is the median over the loops; recall the share of the keyframes at a place seen before of which a loop was
-    kept, None where there is none. Extrinsics are (4, 4).
+    The error is the median over the loops; recall the share of the keyframes at a place seen before
+    of which a loop was kept, None where there is none. Extrinsics are (4, 4).
 
     Raises:
         DataError: the file is damaged.
     """
     held = MapStore(store, read_only=True)
     try:
-        keyframes, loops = held.keyframes(), [loop for loop in held.loops() if loop.kept]
+        keyframes = held.keyframes()
+        loops = [loop for loop in held.loops() if loop.kept]
     finally:
         held.close()
     T_world_cam = dict(zip(frames.tolist(), T_world_body @ se3_inverse(T_cam0_body), strict=True))
-    true = {k: T_world_cam[row.frame] for k, row in enumerate(keyframes) if row.frame in T_world_cam}
+    true = {
+        k: T_world_cam[row.frame] for k, row in enumerate(keyframes) if row.frame in T_world_cam
+    }
     errors = []
     for loop in loops:
         if loop.first in true and loop.second in true:
             E = se3_inverse(loop.pose.T_i_j) @ se3_inverse(true[loop.first]) @ true[loop.second]
-            errors.append((float(np.linalg.norm(E[:3, 3])), float(np.degrees(np.linalg.norm(so3_log(E[:3, :3]))))))
+            errors.append(
+                (
+                    float(np.linalg.norm(E[:3, 3])),
+                    float(np.degrees(np.linalg.norm(so3_log(E[:3, :3])))),
+                )
+            )
     false = sum(metres > _FALSE_M or degrees > _FALSE_DEG for metres, degrees in errors)
     times_ns = np.array([row.time_ns for row in keyframes], dtype=np.int64)
     revisits = _revisits(true, times_ns)

@@ -1,4 +1,6 @@
-"""The report of a bench: one HTML file with tables and SVG figures, which loads nothing from elsewhere."""
+"""The report of a bench: one HTML file with tables and SVG figures, which loads nothing from
+elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +23,22 @@ _COLOURS = ("#1f5fbf", "#d9822b", "#5aa469", "#c23b5a", "#8e63b8", "#6b7785", "#
 _MOST_SEQUENCES = 24  # with figures of their own: the worst ones of a larger suite
 _MOST_POINTS = 500  # of a box: evenly spaced among the sorted ones of a larger suite
 _STYLE = (
-    "body{font:15px/1.45 system-ui,sans-serif;max-width:1180px;margin:2em auto;padding:0 1em;color:#1b2733}"
+    "body{font:15px/1.45 system-ui,sans-serif;max-width:1180px;margin:2em auto;padding:0 "
+    "1em;color:#1b2733}"
     "table{border-collapse:collapse;font-size:13px;margin:1em 0;display:block;overflow-x:auto}"
-    "td,th{border:1px solid #d4dbe2;padding:3px 8px;text-align:right}td:first-child,th:first-child{text-align:left}"
+    "td,th{border:1px solid #d4dbe2;padding:3px "
+    "8px;text-align:right}td:first-child,th:first-child{text-align:left}"
     "th{background:#f1f4f7}tr:nth-child(even) td{background:#fafbfc}svg{max-width:100%;height:auto}"
     "h2{margin-top:2em}li{font-size:14px}"
 )
 
 
 def write_bench_report(
-    path: Path, suite: Suite, rows: Sequence[Row], outcomes: Sequence[Outcome], facts: Mapping[str, Any]
+    path: Path,
+    suite: Suite,
+    rows: Sequence[Row],
+    outcomes: Sequence[Outcome],
+    facts: Mapping[str, Any],
 ) -> None:
     """Write the report.
 
@@ -41,18 +49,24 @@ def write_bench_report(
     figures = [
         (
             "Errors of each sequence",
-            "Position errors: median, quartiles, 5 and 95 % over the frames. Of several seeds, the run of median ATE.",
+            "Position errors: median, quartiles, 5 and 95 % over the frames. Of several seeds, the "
+            "run of median ATE.",
             _boxes,
         ),
         ("Error over time", "Of several seeds, the run of the median ATE.", _curves),
     ]
     parts = [_as_html(markdown(suite, rows, outcomes, facts))]
     if any(o.curve for o in outcomes):
-        note = f" The {len(shown)} sequences with the largest errors." if len(shown) < len(suite.sequences) else ""
+        note = (
+            f" The {len(shown)} sequences with the largest errors."
+            if len(shown) < len(suite.sequences)
+            else ""
+        )
         for title, text, draw in figures:
             parts.append(f"<h2>{title}</h2><p>{text}{note}</p>{_svg(draw(shown, outcomes))}")
         parts.append(
-            f"<h2>Systems</h2><p>ATE of all sequences with median and quartiles.</p>{_svg(_system_boxes(rows))}"
+            "<h2>Systems</h2><p>ATE of all sequences with median and "
+            f"quartiles.</p>{_svg(_system_boxes(rows))}"
         )
     title = html.escape(f"stereo-vio bench {suite.name}")
     head = f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
@@ -71,7 +85,9 @@ def _worst_sequences(rows: Sequence[Row]) -> list[str]:
 
 
 def _boxes(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
-    """Draw box plots of the errors: sequences across, systems side by side, on a logarithmic axis."""
+    """Draw box plots of the errors: sequences across, systems side by side, on a logarithmic
+    axis.
+    """
     from matplotlib.figure import Figure
 
     systems = list(dict.fromkeys(o.system for o in outcomes if o.curve))
@@ -79,9 +95,12 @@ def _boxes(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
     figure = Figure(figsize=(width, 4.2), layout="constrained")
     axes = figure.add_subplot()
     for k, system in enumerate(systems):
-        stats, places = [], []
+        stats = []
+        places = []
         for j, sequence in enumerate(sequences):
-            known = [o for o in outcomes if (o.sequence, o.system) == (sequence, system) and o.curve]
+            known = [
+                o for o in outcomes if (o.sequence, o.system) == (sequence, system) and o.curve
+            ]
             if known:
                 stats.append(_box(_median_run(known)))
                 places.append(j * (len(systems) + 1) + k)
@@ -93,7 +112,9 @@ def _boxes(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
         )  # fmt: skip
         if drawn["boxes"]:
             drawn["boxes"][0].set_label(system)
-    axes.set_xticks([j * (len(systems) + 1) + (len(systems) - 1) / 2 for j in range(len(sequences))], sequences)
+    axes.set_xticks(
+        [j * (len(systems) + 1) + (len(systems) - 1) / 2 for j in range(len(sequences))], sequences
+    )
     axes.tick_params(axis="x", labelrotation=35 if len(sequences) > 5 else 0)
     axes.set_yscale("log")
     axes.set_ylabel("position error (m)")
@@ -122,11 +143,19 @@ def _curves(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
     for j, sequence in enumerate(sequences):
         axes = figure.add_subplot(lines, columns, j + 1)
         for k, system in enumerate(systems):
-            known = [o for o in outcomes if (o.sequence, o.system) == (sequence, system) and o.curve]
+            known = [
+                o for o in outcomes if (o.sequence, o.system) == (sequence, system) and o.curve
+            ]
             if known:
                 curve = _median_run(known).curve
                 assert curve is not None
-                axes.plot(curve["seconds"], curve["error_m"], color=_COLOURS[k % len(_COLOURS)], lw=1.1, label=system)
+                axes.plot(
+                    curve["seconds"],
+                    curve["error_m"],
+                    color=_COLOURS[k % len(_COLOURS)],
+                    lw=1.1,
+                    label=system,
+                )
         axes.set_title(sequence, fontsize=9, loc="left", parse_math=False)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.25)
@@ -178,11 +207,15 @@ def _box(outcome: Outcome) -> dict[str, Any]:
 
 
 def _svg(figure: Any) -> str:
-    """Return a figure as SVG text without a date or random names, so that equal results make equal reports."""
+    """Return a figure as SVG text without a date or random names, so that equal results make
+    equal reports.
+    """
     import matplotlib
 
     stream = io.StringIO()
-    with matplotlib.rc_context({"svg.hashsalt": "vio", "svg.fonttype": "none", "font.family": "sans-serif"}):
+    with matplotlib.rc_context(
+        {"svg.hashsalt": "vio", "svg.fonttype": "none", "font.family": "sans-serif"}
+    ):
         figure.savefig(stream, format="svg", metadata={"Date": None})
     text = stream.getvalue()
     return text[text.index("<svg") :]
@@ -199,7 +232,9 @@ def _as_html(text: str) -> str:
         elif lines[0].startswith("| "):
             out.append(_table(lines))
         elif lines[0].startswith("- "):
-            out.append("<ul>" + "".join(f"<li>{_inline(line[2:])}</li>" for line in lines) + "</ul>")
+            out.append(
+                "<ul>" + "".join(f"<li>{_inline(line[2:])}</li>" for line in lines) + "</ul>"
+            )
         else:
             out.append(f"<p>{_inline(' '.join(lines))}</p>")
     return "".join(out)
@@ -208,7 +243,9 @@ def _as_html(text: str) -> str:
 def _table(lines: Sequence[str]) -> str:
     rows = [cells_of(line) for line in lines]
     head = "".join(f"<th>{_inline(cell)}</th>" for cell in rows[0])
-    body = "".join("<tr>" + "".join(f"<td>{_inline(cell)}</td>" for cell in row) + "</tr>" for row in rows[2:])
+    body = "".join(
+        "<tr>" + "".join(f"<td>{_inline(cell)}</td>" for cell in row) + "</tr>" for row in rows[2:]
+    )
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
@@ -224,7 +261,8 @@ _SPECIAL = {
 
 
 def latex_of(markdown: str) -> str:
-    """Return each table of a text of `vio.bench.tables` as LaTeX, with its heading and its paragraphs as comments.
+    """Return each table of a text of `vio.bench.tables` as LaTeX, with its heading and its
+    paragraphs as comments.
 
     The preamble of the paper needs the packages booktabs and inputenc with utf8.
     """

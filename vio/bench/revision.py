@@ -1,4 +1,6 @@
-"""A suite with the code of another revision, in turns with ours: on a shared machine times compare only so."""
+"""A suite with the code of another revision, in turns with ours: on a shared machine times
+compare only so.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +27,13 @@ def revision_folder(place: Place, revision: str) -> Path:
     return place.out.with_name(f"{place.out.name}@{revision.replace('/', '_')}")
 
 
-def run_in_turns(suite: Suite, place: Place, revision: str, say: Callable[[str], None] = lambda text: None) -> None:
+def run_in_turns(
+    suite: Suite, place: Place, revision: str, say: Callable[[str], None] = lambda text: None
+) -> None:
     """Run each sequence with the revision's code, then with ours; at last write the tables of both.
 
-    The revision's results are beside `place.out`; published figures are left out. `say` is called with what is run.
+    The revision's results are beside `place.out`; published figures are left out. `say` is called
+    with what is run.
 
     Raises:
         ConfigError: this is no checkout, or it has no such revision.
@@ -43,7 +48,10 @@ def run_in_turns(suite: Suite, place: Place, revision: str, say: Callable[[str],
         check=False,
     )
     if found.returncode:
-        raise ConfigError(f"--revision {revision}: {ROOT} has no such revision ({found.stderr.strip() or 'no git'})")
+        raise ConfigError(
+            f"--revision {revision}: {ROOT} has no such revision "
+            f"({found.stderr.strip() or 'no git'})"
+        )
     tree = _checked_out(found.stdout.strip(), place.cache.absolute() / "revisions")
     place.out.mkdir(parents=True, exist_ok=True)
     file = place.out / "suite.yaml"
@@ -58,13 +66,21 @@ def run_in_turns(suite: Suite, place: Place, revision: str, say: Callable[[str],
 def _run(file: Path, place: Place, out: Path, code: Path, only: list[str]) -> None:
     folders = {"--data": place.data, "--out": out, "--cache": place.cache}
     command = [sys.executable, "-m", "vio", "bench", str(file.absolute()), "--quiet", "--json"]
-    command += [word for option, folder in folders.items() for word in (option, str(folder.absolute()))]
+    command += [
+        word for option, folder in folders.items() for word in (option, str(folder.absolute()))
+    ]
     command += ["--workers", str(place.workers), "--identity", place.identity]
     command += ["--only", ",".join(only)] if only else []
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(code), os.environ.get("PYTHONPATH", "")])}
-    environment.setdefault("NUMBA_OPT", "3")  # its default: with a setting of numba, numba loads the loops of both
-    done = subprocess.run(command, cwd=code, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode and not done.stdout:  # with results, a run has failed, which the comparison says
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(code), os.environ.get("PYTHONPATH", "")])
+    }
+    # its default: with a setting of numba, numba loads the loops of both
+    environment.setdefault("NUMBA_OPT", "3")
+    done = subprocess.run(
+        command, cwd=code, env=environment, capture_output=True, text=True, check=False
+    )
+    # with results, a run has failed, which the comparison says
+    if done.returncode and not done.stdout:
         last = (done.stderr.strip() or "no message").splitlines()[-1]
         raise DataError(f"vio bench with the code of {code}: {last}")
 
@@ -76,7 +92,9 @@ def _checked_out(commit: str, folder: Path) -> Path:
         partial = folder / f"{commit}.partial"
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
-        archive = subprocess.run(["git", "-C", str(ROOT), "archive", commit], capture_output=True, check=True)
+        archive = subprocess.run(
+            ["git", "-C", str(ROOT), "archive", commit], capture_output=True, check=True
+        )
         subprocess.run(["tar", "-x", "-C", str(partial)], input=archive.stdout, check=True)
         partial.rename(tree)
     return tree
@@ -87,15 +105,36 @@ def _as_yaml(suite: Suite) -> dict[str, Any]:
 
     Older revisions do not know all keys: what has its default is left out.
     """
-    sequences = {s.name: {key: value for key, value in _changed(s).items() if key != "name"} for s in suite.sequences}
+    sequences = {
+        s.name: {key: value for key, value in _changed(s).items() if key != "name"}
+        for s in suite.sequences
+    }
     configurations = {
-        name: {**values, **({"config": str(suite.folder / str(values["config"]))} if values.get("config") else {})}
+        name: {
+            **values,
+            **(
+                {"config": str(suite.folder / str(values["config"]))}
+                if values.get("config")
+                else {}
+            ),
+        }
         for name, values in suite.configurations.items()
     }
-    limits = {key: value for key, value in _changed(suite).items() if key in ("time_limit_s", "success_percent")}
-    known = {"name": suite.name, "sequences": sequences, "configurations": configurations, "seeds": list(suite.seeds)}
+    limits = {
+        key: value
+        for key, value in _changed(suite).items()
+        if key in ("time_limit_s", "success_percent")
+    }
+    known = {
+        "name": suite.name,
+        "sequences": sequences,
+        "configurations": configurations,
+        "seeds": list(suite.seeds),
+    }
     return known | limits
 
 
 def _changed(record: Suite | Sequence) -> dict[str, Any]:
-    return {f.name: value for f in fields(record) if (value := getattr(record, f.name)) != f.default}
+    return {
+        f.name: value for f in fields(record) if (value := getattr(record, f.name)) != f.default
+    }

@@ -49,5 +49,7 @@ class Store:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise DataError(f"cannot write {path}: {error.strerror or error}; choose another --cache") from error
+            raise DataError(
+                f"cannot write {path}: {error.strerror or error}; choose another --cache"
+            ) from error
         atomic_write_text(path, json_text(record) + "\n")

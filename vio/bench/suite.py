@@ -17,12 +17,14 @@ from vio.files.inputs import read_input
 from vio.files.yaml_text import MOST_BYTES, read_yaml
 
 SHIPPED = Path(__file__).resolve().parent / "suites"
-_NAME = re.compile(r"[\w.+-]+")  # of a sequence or configuration: it becomes part of a command line and of a CSV file
+# of a sequence or configuration: it becomes part of a command line and of a CSV file
+_NAME = re.compile(r"[\w.+-]+")
 _MOST_SEEDS = 1000
 SUCCESS_PERCENT = 1.0  # of the path, where a suite says nothing else
 PUBLISHED_MEAN = "all"  # in the place of a sequence: the source's own mean
 _PUBLISHED_FIGURES = ("ate_m", "drift_percent", "drift_deg_per_100m")
-_RENDER_OWN = ("--out", "--seed", "--workers", "--json")  # of `vio render`: given by the bench itself
+# of `vio render`: given by the bench itself
+_RENDER_OWN = ("--out", "--seed", "--workers", "--json")
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,16 +35,21 @@ class Sequence:
     source: str | None = None  # as `vio run` takes it, relative to the data folder
     render: tuple[str, ...] = ()  # arguments of `vio render`
     render_each_seed: bool = False  # render anew with every seed; else with seed 0
-    reference: str | None = None  # ground truth in place of the recording's own, relative to the data folder
+    # ground truth in place of the recording's own, relative to the data folder
+    reference: str | None = None
     start: str = "0"  # first frame, or a time such as 12s
     stop: str | None = None
     lengths_m: tuple[float, ...] | None = None  # path lengths of the drift; None: KITTI's
-    positions_only: bool = False  # the reference's orientations mean nothing: no relative errors, no NEES
-    exact_truth: bool | None = None  # so much better than the estimate that NEES says something; None: if rendered
+    # the reference's orientations mean nothing: no relative errors, no NEES
+    positions_only: bool = False
+    # so much better than the estimate that NEES says something; None: if rendered
+    exact_truth: bool | None = None
     settings: Mapping[str, Any] | None = None  # over those of the configuration
     map: bool = False  # build a map, and score it
-    map_of: str | None = None  # the sequence in whose map this one is localised, built beforehand in the same task
-    covered: tuple[tuple[str, str], ...] = ()  # from, to: the images are black meanwhile, and the rig is moved
+    # the sequence in whose map this one is localised, built beforehand in the same task
+    map_of: str | None = None
+    # from, to: the images are black meanwhile, and the rig is moved
+    covered: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +67,9 @@ class Published:
     @property
     def conditions(self) -> tuple[str, str, str, str]:
         """Sensors, causal, alignment and loops, for a table."""
-        causal, loops = ("?" if v is None else "yes" if v else "no" for v in (self.causal, self.loops))
+        causal, loops = (
+            "?" if v is None else "yes" if v else "no" for v in (self.causal, self.loops)
+        )
         return self.sensors, causal, self.alignment or "?", loops
 
 
@@ -74,9 +83,11 @@ class Suite:
     configurations: Mapping[str, Mapping[str, Any]]  # deviations from the defaults
     seeds: tuple[int, ...] = (0,)
     published: tuple[Published, ...] = ()
-    titles: Mapping[str, str] = field(default_factory=dict)  # of sequences and systems, for tables in documents
+    # of sequences and systems, for tables in documents
+    titles: Mapping[str, str] = field(default_factory=dict)
     publisher: str | None = None  # where the recordings can be had
-    success_percent: float = SUCCESS_PERCENT  # a run with an ATE below this share of the path succeeds
+    # a run with an ATE below this share of the path succeeds
+    success_percent: float = SUCCESS_PERCENT
     time_limit_s: float | None = None  # of a task; then it has no result
 
 
@@ -89,7 +100,8 @@ def read_suite(what: str) -> Suite:
     """Read a suite: the path of a YAML file, or the name of a shipped one.
 
     Raises:
-        ConfigError: the file cannot be read, or a key or value is wrong; the message names file and key.
+        ConfigError: the file cannot be read, or a key or value is wrong; the message names file and
+            key.
     """
     path = Path(what)
     if not path.is_file() and what in shipped_suites():
@@ -99,7 +111,9 @@ def read_suite(what: str) -> Suite:
     except OSError as error:
         names = ", ".join(shipped_suites())
         reason = error.strerror or error
-        raise ConfigError(f"{what}: no suite ({reason}); give a YAML file or one of {names}") from error
+        raise ConfigError(
+            f"{what}: no suite ({reason}); give a YAML file or one of {names}"
+        ) from error
     except ValueError as error:
         raise ConfigError(f"{path}: not valid YAML ({error})") from error
     return suite_from(values, path)
@@ -115,7 +129,9 @@ def suite_from(values: Any, path: Path) -> Suite:
     given = _mapping(values, where, "a suite")
     _only_keys(given, [f.name for f in fields(Suite) if f.name != "folder"], where)
     sequences = _mapping(given.get("sequences"), where, "'sequences'")
-    configurations = _mapping(given.get("configurations") or {"default": {}}, where, "'configurations'")
+    configurations = _mapping(
+        given.get("configurations") or {"default": {}}, where, "'configurations'"
+    )
     for name in (*sequences, *configurations):
         if not _NAME.fullmatch(str(name)):
             raise ConfigError(f"{where}: '{name}' is no name; use letters, digits and . _ + -")
@@ -126,12 +142,22 @@ def suite_from(values: Any, path: Path) -> Suite:
         name=str(given.get("name", path.stem)),
         folder=path.resolve().parent,
         sequences=tuple(_sequence(str(name), value, where) for name, value in sequences.items()),
-        configurations={str(name): _mapping(value or {}, where, f"'{name}'") for name, value in configurations.items()},
+        configurations={
+            str(name): _mapping(value or {}, where, f"'{name}'")
+            for name, value in configurations.items()
+        },
         seeds=_seeds(given.get("seeds", [0]), where),
-        published=tuple(_published(value, where, sequences) for value in given.get("published") or ()),
-        titles={str(k): str(v) for k, v in _mapping(given.get("titles") or {}, where, "'titles'").items()},
+        published=tuple(
+            _published(value, where, sequences) for value in given.get("published") or ()
+        ),
+        titles={
+            str(k): str(v)
+            for k, v in _mapping(given.get("titles") or {}, where, "'titles'").items()
+        },
         publisher=None if given.get("publisher") is None else str(given["publisher"]),
-        success_percent=_positive(given.get("success_percent", SUCCESS_PERCENT), "success_percent", where),
+        success_percent=_positive(
+            given.get("success_percent", SUCCESS_PERCENT), "success_percent", where
+        ),
         time_limit_s=None if limit is None else _positive(limit, "time_limit_s", where),
     )
     for sequence in suite.sequences:
@@ -157,28 +183,43 @@ def config_of(suite: Suite, sequence: Sequence, configuration: str, seed: int) -
     file = values.pop("config", None)
     config = load_config(None if file is None else suite.folder / str(file))
     config = merge(config, _nested(values, where), where=where)
-    config = merge(config, _nested(sequence.settings or {}, where), where=f"{suite.name}, sequence {sequence.name}")
+    config = merge(
+        config,
+        _nested(sequence.settings or {}, where),
+        where=f"{suite.name}, sequence {sequence.name}",
+    )
     return merge(config, {"frontend": {"consensus": {"seed": seed}}}, where="seeds")
 
 
 def chosen(suite: Suite, only: Iterable[str], configurations: Iterable[str]) -> Suite:
-    """Return the suite with the named sequences and configurations alone, and the maps that they need; none named: all.
+    """Return the suite with the named sequences and configurations alone, and the maps that they
+    need; none named: all.
 
     Raises:
         ConfigError: a name is unknown.
     """
-    sequences, configured = tuple(only), tuple(configurations)
-    for names, known in ((sequences, [s.name for s in suite.sequences]), (configured, list(suite.configurations))):
+    sequences = tuple(only)
+    configured = tuple(configurations)
+    for names, known in (
+        (sequences, [s.name for s in suite.sequences]),
+        (configured, list(suite.configurations)),
+    ):
         for name in names:
             if name not in known:
                 near = difflib.get_close_matches(name, known, 1)
-                hint = f"; did you mean '{near[0]}'?" if near else f"; it holds {', '.join(known[:8])}"
+                hint = (
+                    f"; did you mean '{near[0]}'?" if near else f"; it holds {', '.join(known[:8])}"
+                )
                 raise ConfigError(f"suite {suite.name} has no '{name}'{hint}")
     needed = {*sequences, *(s.map_of for s in suite.sequences if s.name in sequences)}
     return replace(
         suite,
         sequences=tuple(s for s in suite.sequences if not sequences or s.name in needed),
-        configurations={name: v for name, v in suite.configurations.items() if not configured or name in configured},
+        configurations={
+            name: v
+            for name, v in suite.configurations.items()
+            if not configured or name in configured
+        },
     )
 
 
@@ -200,7 +241,9 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
             if given.get(key) is not None:
                 given[key] = str(given[key])
                 parse_bound(given[key])
-        given["covered"] = tuple((str(begin), str(end)) for begin, end in given.get("covered") or ())
+        given["covered"] = tuple(
+            (str(begin), str(end)) for begin, end in given.get("covered") or ()
+        )
         for bound in (bound for span in given["covered"] for bound in span):
             parse_bound(bound)
         if given.get("lengths_m") is not None:
@@ -222,10 +265,13 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
 
 def _published(value: Any, where: str, sequences: Iterable[str]) -> Published:
     given = dict(_mapping(value, where, "an entry of 'published'"))
-    system, source = given.pop("system", None), given.pop("source", None)
+    system = given.pop("system", None)
+    source = given.pop("source", None)
     if not system or not source:
         raise ConfigError(f"{where}: published figures need a system and a source")
-    conditions = {name: given.pop(name, None) for name in ("sensors", "causal", "alignment", "loops")}
+    conditions = {
+        name: given.pop(name, None) for name in ("sensors", "causal", "alignment", "loops")
+    }
     if not conditions["sensors"] or conditions["alignment"] not in (None, "SE3", "Sim3"):
         raise ConfigError(f"{where}: {system} needs sensors, and as alignment SE3, Sim3 or none")
     if any(conditions[name] not in (None, True, False) for name in ("causal", "loops")):
@@ -234,32 +280,57 @@ def _published(value: Any, where: str, sequences: Iterable[str]) -> Published:
     figures = {}
     for name, of_sequences in given.items():
         if name not in _PUBLISHED_FIGURES:
-            raise ConfigError(f"{where}: {system} has unknown '{name}'; figures are {', '.join(_PUBLISHED_FIGURES)}")
-        figures[name] = {str(k): v for k, v in _mapping(of_sequences, where, f"'{name}' of {system}").items()}
+            raise ConfigError(
+                f"{where}: {system} has unknown '{name}'; figures are "
+                f"{', '.join(_PUBLISHED_FIGURES)}"
+            )
+        figures[name] = {
+            str(k): v for k, v in _mapping(of_sequences, where, f"'{name}' of {system}").items()
+        }
         for sequence, figure in figures[name].items():
             if sequence != PUBLISHED_MEAN and sequence not in map(str, sequences):
-                raise ConfigError(f"{where}: {name} of {system} names {sequence}, which is no sequence of the suite")
+                raise ConfigError(
+                    f"{where}: {name} of {system} names {sequence}, which is no sequence of the "
+                    "suite"
+                )
             if isinstance(figure, bool) or not isinstance(figure, (int, float)) or not figure >= 0:
-                raise ConfigError(f"{where}: {name} of {system} on {sequence} is a number, got {figure!r}")
+                raise ConfigError(
+                    f"{where}: {name} of {system} on {sequence} is a number, got {figure!r}"
+                )
     return Published(str(system), str(source), figures, **conditions)
 
 
 def _positive(value: Any, name: str, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < float("inf"):
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float))
+        or not 0 < value < float("inf")
+    ):
         raise ConfigError(f"{where}: {name} is a number above 0, got {value!r}")
     return float(value)
 
 
 def _seeds(value: Any, where: str) -> tuple[int, ...]:
     seeds = list(range(value)) if isinstance(value, int) and not isinstance(value, bool) else value
-    fine = isinstance(seeds, list) and 0 < len(seeds) <= _MOST_SEEDS and len(set(map(str, seeds))) == len(seeds)
-    if not fine or any(not isinstance(s, int) or isinstance(s, bool) or not 0 <= s < 2**32 for s in seeds):
-        raise ConfigError(f"{where}: seeds takes different whole numbers such as [0, 1, 2], or how many; got {value!r}")
+    fine = (
+        isinstance(seeds, list)
+        and 0 < len(seeds) <= _MOST_SEEDS
+        and len(set(map(str, seeds))) == len(seeds)
+    )
+    if not fine or any(
+        not isinstance(s, int) or isinstance(s, bool) or not 0 <= s < 2**32 for s in seeds
+    ):
+        raise ConfigError(
+            f"{where}: seeds takes different whole numbers such as [0, 1, 2], or how many; got "
+            f"{value!r}"
+        )
     return tuple(seeds)
 
 
 def _nested(values: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Turn `a.b: 1` into `a: {b: 1}`, as deep as the dots go, beside settings that are nested already."""
+    """Turn `a.b: 1` into `a: {b: 1}`, as deep as the dots go, beside settings that are nested
+    already.
+    """
     out: dict[str, Any] = {}
     for key, value in values.items():
         *sections, last = str(key).split(".")
@@ -267,7 +338,9 @@ def _nested(values: Mapping[str, Any], where: str) -> dict[str, Any]:
         for section in sections:
             inner = inner.setdefault(section, {})
             if not isinstance(inner, dict):
-                raise ConfigError(f"{where}: '{key}' and '{section}' exclude each other; give one of them")
+                raise ConfigError(
+                    f"{where}: '{key}' and '{section}' exclude each other; give one of them"
+                )
         inner[last] = {**inner.get(last, {}), **value} if isinstance(value, dict) else value
     return out
 

@@ -1,4 +1,7 @@
-"""Tables of a bench: each sequence and system over its seeds, each system over the sequences; Markdown and CSV."""
+"""Tables of a bench: each sequence and system over its seeds, each system over the sequences.
+
+Markdown and CSV.
+"""
 
 from __future__ import annotations
 
@@ -89,7 +92,8 @@ class Outcome:
     failure: str | None
     curve: Mapping[str, Any] | None
     warnings: Sequence[str] = ()
-    notes: Sequence[str] = ()  # signs of a reference of another recording or body, or in other conventions
+    # signs of a reference of another recording or body, or in other conventions
+    notes: Sequence[str] = ()
     absent: Mapping[str, str] = field(default_factory=dict)  # by name of an undefined figure: why
     succeeded: bool | None = None  # None: undefined, without a reference
 
@@ -102,7 +106,17 @@ class Outcome:
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything but the curve, for JSON."""
-        names = ("sequence", "system", "seed", "key", "figures", "measured", "failure", "absent", "succeeded")
+        names = (
+            "sequence",
+            "system",
+            "seed",
+            "key",
+            "figures",
+            "measured",
+            "failure",
+            "absent",
+            "succeeded",
+        )
         return {
             **{name: getattr(self, name) for name in names},
             "warnings": list(self.warnings),
@@ -146,13 +160,27 @@ def summary_rows(outcomes: Iterable[Outcome]) -> list[Row]:
 
 
 def _row(group: Sequence[Outcome]) -> Row:
-    cells = {m.name: cell for m in BY_NAME.values() if (cell := cell_of((o.value(m) for o in group), m))}
+    cells = {
+        m.name: cell for m in BY_NAME.values() if (cell := cell_of((o.value(m) for o in group), m))
+    }
     first = group[0]
     failed = sum(o.failure is not None for o in group)
     absent = {name: why for o in reversed(group) for name, why in o.absent.items()}
-    succeeded = None if all(o.succeeded is None for o in group) else sum(bool(o.succeeded) for o in group)
+    succeeded = (
+        None if all(o.succeeded is None for o in group) else sum(bool(o.succeeded) for o in group)
+    )
     failure = next((o.failure for o in group if o.failure is not None), None)
-    return Row(first.sequence, first.system, first.seed is None, len(group), failed, cells, absent, succeeded, failure)
+    return Row(
+        first.sequence,
+        first.system,
+        first.seed is None,
+        len(group),
+        failed,
+        cells,
+        absent,
+        succeeded,
+        failure,
+    )
 
 
 def cell_of(values: Iterable[float | None], metric: Metric) -> Cell | None:
@@ -162,23 +190,35 @@ def cell_of(values: Iterable[float | None], metric: Metric) -> Cell | None:
         return None
     worst = min(known) if metric.larger_is_better else max(known)
     sd = statistics.stdev(known) if len(known) > 1 else 0.0
-    return Cell(statistics.median(known), worst, max(known) - min(known), len(known), statistics.fmean(known), sd)
+    return Cell(
+        statistics.median(known),
+        worst,
+        max(known) - min(known),
+        len(known),
+        statistics.fmean(known),
+        sd,
+    )
 
 
 def summary_of(rows: Iterable[Row]) -> dict[str, tuple[int, int, dict[str, Cell]]]:
-    """Return by system: sequences with a result, all its sequences, and the medians of these over the sequences."""
+    """Return by system: sequences with a result, all its sequences, and the medians of these
+    over the sequences.
+    """
     by_system: dict[str, list[Row]] = {}
     for row in rows:
         by_system.setdefault(row.system, []).append(row)
     out = {}
     for system, own in by_system.items():
         medians = {name: [r.cells[name].median for r in own if name in r.cells] for name in BY_NAME}
-        cells = {name: cell for name, known in medians.items() if (cell := cell_of(known, BY_NAME[name]))}
+        cells = {
+            name: cell for name, known in medians.items() if (cell := cell_of(known, BY_NAME[name]))
+        }
         out[system] = (sum(row.failed == 0 for row in own), len(own), cells)
     return out
 
 
-# --- text -----------------------------------------------------------------------------------------------------------
+# --- text
+# -----------------------------------------------------------------------------------------------------------
 
 
 def number(value: float, digits: int) -> str:
@@ -187,7 +227,9 @@ def number(value: float, digits: int) -> str:
 
 
 def cell_text(cell: Cell, metric: Metric, runs: int | None = None) -> str:
-    """Return `median` or, where values differ, `median (mean ± standard deviation)`, with n where it is not `runs`."""
+    """Return `median` or, where values differ, `median (mean ± standard deviation)`, with n
+    where it is not `runs`.
+    """
     text = number(cell.median, metric.digits)
     if cell.count > 1 and cell.spread > 0:
         text += f" ({number(cell.mean, metric.digits)} ± {number(cell.sd, 2)})"
@@ -222,22 +264,30 @@ def row_text(row: Row, metric: Metric, notes: Notes) -> str:
     return notes.dash(row, metric) if cell is None else cell_text(cell, metric, row.runs)
 
 
-def markdown(suite: Suite, rows: Sequence[Row], outcomes: Sequence[Outcome], facts: Mapping[str, Any]) -> str:
+def markdown(
+    suite: Suite, rows: Sequence[Row], outcomes: Sequence[Outcome], facts: Mapping[str, Any]
+) -> str:
     """Return all tables of a bench."""
     seeds = f", seeds {', '.join(map(str, suite.seeds))}" if len(suite.seeds) > 1 else ""
     parts = [
         f"# {suite.name}\n\n{provenance(facts)}{seeds}.\n",
-        "## ATE in m\n\nMedian over the seeds (mean ± standard deviation).\n\n" + "\n".join(matrix(rows)),
-        "## All figures\n\nMedian over the seeds (mean ± standard deviation), n as in the column of runs where nothing "
-        f"else is said. Success: share of the runs whose ATE is below {suite.success_percent:g} % of the path and that "
+        "## ATE in m\n\nMedian over the seeds (mean ± standard deviation).\n\n"
+        + "\n".join(matrix(rows)),
+        "## All figures\n\nMedian over the seeds (mean ± standard deviation), n as in the column "
+        "of runs where nothing "
+        f"else is said. Success: share of the runs whose ATE is below {suite.success_percent:g} % "
+        "of the path and that "
         f"cover {100 * SUCCESS_COVERAGE:g} % of the frames.\n\n" + "\n".join(full_table(rows)),
-        "## Systems\n\nMedian and worst over the sequences of the medians over seeds; n in brackets.\n\n"
-        + "\n".join(system_table(rows)),
+        "## Systems\n\nMedian and worst over the sequences of the medians over seeds; n in "
+        "brackets.\n\n" + "\n".join(system_table(rows)),
     ]
     if mapped := [row for row in rows if any(metric.name in row.cells for metric in OF_MAPS)]:
         parts.append("## Maps\n\n" + "\n".join(full_table(mapped, OF_MAPS)))
     if failed := [o for o in outcomes if o.failure is not None]:
-        runs = [f"{o.sequence}, {o.system}" + ("" if o.seed is None else f", seed {o.seed}") for o in failed]
+        runs = [
+            f"{o.sequence}, {o.system}" + ("" if o.seed is None else f", seed {o.seed}")
+            for o in failed
+        ]
         lines = [f"- {run}: {printable(o.failure)}" for run, o in zip(runs, failed, strict=True)]
         parts.append("## Without a result\n\n" + "\n".join(lines))
     if noted := dict.fromkeys((o.sequence, o.system, note) for o in outcomes for note in o.notes):
@@ -245,7 +295,8 @@ def markdown(suite: Suite, rows: Sequence[Row], outcomes: Sequence[Outcome], fac
         parts.append("## Doubts about the ground truth\n\n" + "\n".join(lines))
     if suite.published:
         parts.append(
-            "## Published figures\n\nTheir sources', under their conditions; ours above are causal, over all frames, "
+            "## Published figures\n\nTheir sources', under their conditions; ours above are "
+            "causal, over all frames, "
             "without loops, after SE(3) alignment.\n\n" + "\n".join(published_table(suite))
         )
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
@@ -265,9 +316,11 @@ def matrix(
     systems: Sequence[str] = (),
     titles: Mapping[str, str] | None = None,
 ) -> Iterator[str]:
-    """Yield the table of one figure: sequences down, systems across; the smallest of a line in bold.
+    """Yield the table of one figure: sequences down, systems across; the smallest of a line in
+    bold.
 
-    `systems` are the columns; none: all, ours first. `titles` are those of sequences and systems, by name.
+    `systems` are the columns; none: all, ours first. `titles` are those of sequences and systems,
+    by name.
     """
     named = titles or {}
     known = list(dict.fromkeys(row.system for row in sorted(rows, key=lambda row: row.is_peer)))
@@ -280,15 +333,31 @@ def matrix(
         by_sequence.setdefault(row.sequence, {})[row.system] = row
     for sequence, cells in by_sequence.items():
         own = {s: cells[s] for s in columns if s in cells}
-        medians = {s: r.cells[metric.name].median for s, r in own.items() if metric.name in r.cells and not r.failed}
-        best = (max if metric.larger_is_better else min)(medians.values()) if len(medians) > 1 else None
+        medians = {
+            s: r.cells[metric.name].median
+            for s, r in own.items()
+            if metric.name in r.cells and not r.failed
+        }
+        best = (
+            (max if metric.larger_is_better else min)(medians.values())
+            if len(medians) > 1
+            else None
+        )
         texts = []
         for system in columns:
-            text = notes.because("there is no trajectory of this system") if system not in own else ""
+            text = (
+                notes.because("there is no trajectory of this system") if system not in own else ""
+            )
             if system in own:
-                text = f"failed {own[system].failed} of {own[system].runs}" if own[system].failed else ""
+                text = (
+                    f"failed {own[system].failed} of {own[system].runs}"
+                    if own[system].failed
+                    else ""
+                )
                 text = text or row_text(own[system], metric, notes) + _part(own[system], metric)
-            texts.append(f"**{text}**" if best is not None and medians.get(system) == best else text)
+            texts.append(
+                f"**{text}**" if best is not None and medians.get(system) == best else text
+            )
         yield _line([named.get(sequence, sequence), *texts])
     yield from notes.lines()
 
@@ -296,17 +365,37 @@ def matrix(
 def _part(row: Row, metric: Metric) -> str:
     """Say which share of the frames has a pose, where it is not all of them."""
     cell = row.cells.get("coverage")
-    if cell is None or metric.name == "coverage" or metric.name not in row.cells or cell.median > _ALL_FRAMES:
+    if (
+        cell is None
+        or metric.name == "coverage"
+        or metric.name not in row.cells
+        or cell.median > _ALL_FRAMES
+    ):
         return ""
     return f" [{100 * cell.median:.0f} % of the frames]"
 
 
 def published_table(suite: Suite) -> Iterator[str]:
-    """Yield published figures with their conditions: systems down, sequences across, then the mean and the source."""
+    """Yield published figures with their conditions: systems down, sequences across, then the
+    mean and the source.
+    """
     for name in dict.fromkeys(name for p in suite.published for name in p.figures):
         entries = [p for p in suite.published if name in p.figures]
-        sequences = [s.name for s in suite.sequences if any(s.name in p.figures[name] for p in entries)]
-        yield _line([BY_NAME[name].title, "sensors", "causal", "alignment", "loops", *sequences, "mean", "source"])
+        sequences = [
+            s.name for s in suite.sequences if any(s.name in p.figures[name] for p in entries)
+        ]
+        yield _line(
+            [
+                BY_NAME[name].title,
+                "sensors",
+                "causal",
+                "alignment",
+                "loops",
+                *sequences,
+                "mean",
+                "source",
+            ]
+        )
         yield "|---|---|---|---|---|" + "---:|" * (len(sequences) + 1) + "---|"
         for p in entries:
             values = [v for s in sequences if (v := p.figures[name].get(s)) is not None]
@@ -329,12 +418,16 @@ def full_table(
 ) -> Iterator[str]:
     """Yield the table of all figures: a line for each sequence and system.
 
-    `for_documents` leaves out runs and success (unless asked for), and sequence or system where there is one alone.
+    `for_documents` leaves out runs and success (unless asked for), and sequence or system where
+    there is one alone.
     """
-    named, notes = titles or {}, Notes()
+    named = titles or {}
+    notes = Notes()
     names = ["sequence", "system"]
     if for_documents:
-        names = [name for name in names if len({getattr(row, name) for row in rows}) > 1] or names[1:]
+        names = [name for name in names if len({getattr(row, name) for row in rows}) > 1] or names[
+            1:
+        ]
     last = ["runs", "success"] if success or not for_documents else []
     yield _line([*names, *(metric.title for metric in metrics), *last])
     yield "|" + "---|" * len(names) + "---:|" * (len(metrics) + len(last))
@@ -344,7 +437,11 @@ def full_table(
         texts = [row_text(row, metric, notes) for metric in metrics]
         share = "–" if row.succeeded is None else f"{100 * row.succeeded / row.runs:.0f} %"
         labels = [named.get(getattr(row, name), getattr(row, name)) for name in names]
-        shown = ["", *labels[1:]] if for_documents and len(labels) > 1 and labels[:1] == before else labels
+        shown = (
+            ["", *labels[1:]]
+            if for_documents and len(labels) > 1 and labels[:1] == before
+            else labels
+        )
         before = labels[:1]
         yield _line([*shown, *texts, *([runs, share] if last else [])])
     yield from notes.lines()
@@ -358,12 +455,26 @@ def system_table(rows: Sequence[Row]) -> Iterator[str]:
         texts = []
         for metric in METRICS:
             cell = cells.get(metric.name)
-            worst = "" if cell is None or cell.count == 1 else f", worst {number(cell.worst, metric.digits)}"
-            texts.append("–" if cell is None else f"{number(cell.median, metric.digits)}{worst} ({cell.count})")
+            worst = (
+                ""
+                if cell is None or cell.count == 1
+                else f", worst {number(cell.worst, metric.digits)}"
+            )
+            texts.append(
+                "–"
+                if cell is None
+                else f"{number(cell.median, metric.digits)}{worst} ({cell.count})"
+            )
         own = [row for row in rows if row.system == system and row.succeeded is not None]
-        runs, succeeded = sum(row.runs for row in own), sum(row.succeeded or 0 for row in own)
+        runs = sum(row.runs for row in own)
+        succeeded = sum(row.succeeded or 0 for row in own)
         yield _line(
-            [system, f"{done} of {count}", *texts, f"{100 * succeeded / runs:.0f} % of {runs}" if runs else "–"]
+            [
+                system,
+                f"{done} of {count}",
+                *texts,
+                f"{100 * succeeded / runs:.0f} % of {runs}" if runs else "–",
+            ]
         )
 
 
@@ -375,7 +486,9 @@ def csv_of_rows(rows: Iterable[Row]) -> str:
     lines = []
     for row in rows:
         cells = [row.cells.get(metric.name) for metric in METRICS]
-        values = ["" if cell is None else repr(getattr(cell, part)) for cell in cells for part in parts]
+        values = [
+            "" if cell is None else repr(getattr(cell, part)) for cell in cells for part in parts
+        ]
         succeeded = "" if row.succeeded is None else str(row.succeeded)
         lines.append([row.sequence, row.system, str(row.runs), str(row.failed), succeeded, *values])
     return _csv([head, *lines])

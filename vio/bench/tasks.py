@@ -1,4 +1,6 @@
-"""The tasks of a bench: runs of a sequence with a configuration and seed, and trajectories of other systems."""
+"""The tasks of a bench: runs of a sequence with a configuration and seed, and trajectories of
+other systems.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +12,21 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from vio.bench.identity import InputDigests, code_digest, digest_of, package_versions, render_code_digest
+from vio.bench.identity import (
+    InputDigests,
+    code_digest,
+    digest_of,
+    package_versions,
+    render_code_digest,
+)
 from vio.bench.suite import Sequence, Suite, config_of
 from vio.config import as_dict
 from vio.datasets import READERS
 from vio.errors import ConfigError, DataError
 from vio.files.trajectories import read_trajectory
 
-_NO_FILES = ("handheld", "car", "simulated", "none")  # values of `vio render` in the place of a file
+# values of `vio render` in the place of a file
+_NO_FILES = ("handheld", "car", "simulated", "none")
 _FORM = 2  # of jobs and records: another one makes other keys
 # Settings that name files, relative to the folder of the recordings.
 _FILE_SETTINGS = re.compile(
@@ -35,14 +44,19 @@ class Task:
     key: str  # digest of all that the figures depend on
     job: dict[str, Any]  # what a worker needs; empty where the task cannot be done
     failure: str | None = None  # why it cannot
-    size: float = 0.0  # of the inputs in bytes, infinite for what must be rendered: the largest tasks are done first
+    # of the inputs in bytes, infinite for what must be rendered: the largest tasks are done first
+    size: float = 0.0
 
 
-def tasks_of(suite: Suite, data: Path, digests: InputDigests, peers: Path | None = None) -> list[Task]:
-    """Return all tasks of a suite, in the order of its tables; an input that is missing makes a failed task.
+def tasks_of(
+    suite: Suite, data: Path, digests: InputDigests, peers: Path | None = None
+) -> list[Task]:
+    """Return all tasks of a suite, in the order of its tables; an input that is missing makes a
+    failed task.
 
     Raises:
-        ConfigError: the folder of other systems' trajectories does not exist or holds none of a sequence of the suite.
+        ConfigError: the folder of other systems' trajectories does not exist or holds none of a
+            sequence of the suite.
     """
     tasks = [  # of one configuration all sequences first, so that renders are made side by side
         _task(suite, sequence, name, seed, data, digests)
@@ -51,14 +65,21 @@ def tasks_of(suite: Suite, data: Path, digests: InputDigests, peers: Path | None
     if peers is not None:
         tasks += _peers(suite, data, digests, peers)
     for task in tasks:
-        task.job["time_limit_s"] = suite.time_limit_s  # no part of the key: a result does not depend on it
+        # no part of the key: a result does not depend on it
+        task.job["time_limit_s"] = suite.time_limit_s
     return tasks
 
 
 def inputs_of(sequence: Sequence, data: Path) -> list[Path]:
-    """Return what a sequence reads: its recording or the files of its render, and its ground truth."""
+    """Return what a sequence reads: its recording or the files of its render, and its ground
+    truth.
+    """
     paths = [] if sequence.source is None else [_source(sequence.source, data)[1]]
-    paths += [data / value for head, value in _render_words(sequence) if head is not None and value not in _NO_FILES]
+    paths += [
+        data / value
+        for head, value in _render_words(sequence)
+        if head is not None and value not in _NO_FILES
+    ]
     return paths + ([] if sequence.reference is None else [data / sequence.reference])
 
 
@@ -68,7 +89,8 @@ def render_of(sequence: Sequence, data: Path, digests: InputDigests, seed: int) 
     Raises:
         DataError: a file that it reads cannot be read.
     """
-    words, known = [], []
+    words = []
+    known = []
     for head, value in _render_words(sequence):
         if head is not None and value and not value.startswith("-") and (data / value).exists():
             words.append(f"{head}{(data / value).absolute()}")
@@ -82,23 +104,33 @@ def render_of(sequence: Sequence, data: Path, digests: InputDigests, seed: int) 
 
 
 def _render_words(sequence: Sequence) -> Iterator[tuple[str | None, str]]:
-    """Yield the words of a render in two parts: of a path what stands before it, maybe nothing; of others None."""
+    """Yield the words of a render in two parts: of a path what stands before it, maybe nothing;
+    of others None.
+    """
     before = ""
     for word in sequence.render:
         option, equals, value = word.rpartition("=") if word.startswith("--") else ("", "", word)
         takes_path = (option or before) in ("--trajectory", "--imu", "--frame-times")
-        yield (f"{option}{equals}", value) if takes_path and (equals or not word.startswith("-")) else (None, word)
+        yield (
+            (f"{option}{equals}", value)
+            if takes_path and (equals or not word.startswith("-"))
+            else (None, word)
+        )
         before = word
 
 
-def _task(suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, digests: InputDigests) -> Task:
+def _task(
+    suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, digests: InputDigests
+) -> Task:
     task = Task(sequence.name, name, seed, "", {})
     try:
         job, identity = _common(sequence, data, digests, seed)
         if sequence.map_of is not None:
             (first,) = (s for s in suite.sequences if s.name == sequence.map_of)
             job["first"], identity["first"] = _common(first, data, digests, seed)
-            job["first"]["config"], identity["first"]["config"] = _settings(suite, first, name, seed, data, digests)
+            job["first"]["config"], identity["first"]["config"] = _settings(
+                suite, first, name, seed, data, digests
+            )
         config, known = _settings(suite, sequence, name, seed, data, digests)
     except DataError as error:
         return replace(task, failure=" ".join(str(error).split()))
@@ -110,14 +142,25 @@ def _task(suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, di
 def _settings(
     suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, digests: InputDigests
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the settings of a run, and the part of them that the result depends on: files by their content."""
-    config, files = as_dict(config_of(suite, sequence, name, seed)), dict[str, str]()
+    """Return the settings of a run, and the part of them that the result depends on: files by
+    their content.
+    """
+    config = as_dict(config_of(suite, sequence, name, seed))
+    files = dict[str, str]()
     return config, {**_without_files(config, data, digests, files), "files": files}
 
 
-def _common(sequence: Sequence, data: Path, digests: InputDigests, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
+def _common(
+    sequence: Sequence, data: Path, digests: InputDigests, seed: int
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return what a worker needs for a sequence, and the part of it that the result depends on."""
-    job: dict[str, Any] = {"source": None, "render": None, "reference": None, "scratch": None, "first": None}
+    job: dict[str, Any] = {
+        "source": None,
+        "render": None,
+        "reference": None,
+        "scratch": None,
+        "first": None,
+    }
     exact = bool(sequence.render) if sequence.exact_truth is None else sequence.exact_truth
     shared: dict[str, Any] = {
         "start": sequence.start,
@@ -156,9 +199,14 @@ def _source(text: str, data: Path) -> tuple[str, Path]:
 
 
 def _without_files(
-    config: dict[str, Any], data: Path, digests: InputDigests, files: dict[str, str], prefix: str = ""
+    config: dict[str, Any],
+    data: Path,
+    digests: InputDigests,
+    files: dict[str, str],
+    prefix: str = "",
 ) -> dict[str, Any]:
-    """Return settings without those that name files: where a file lies does not matter, what is in it does.
+    """Return settings without those that name files: where a file lies does not matter, what is in
+    it does.
 
     In `config` these become absolute paths; `files` takes their digests by the settings' names.
     """
@@ -178,7 +226,9 @@ def _without_files(
 def _peers(suite: Suite, data: Path, digests: InputDigests, folder: Path) -> Iterator[Task]:
     """Yield one task for each file SEQUENCE.SYSTEM.tum whose sequence is in the suite."""
     if not folder.is_dir():
-        raise ConfigError(f"--peers {folder}: no such folder; give one with files SEQUENCE.SYSTEM.tum")
+        raise ConfigError(
+            f"--peers {folder}: no such folder; give one with files SEQUENCE.SYSTEM.tum"
+        )
     found = False
     for sequence in suite.sequences:
         for path in sorted(folder.glob("*.tum")):
@@ -190,11 +240,19 @@ def _peers(suite: Suite, data: Path, digests: InputDigests, folder: Path) -> Ite
             try:
                 job, identity = _common(sequence, data, digests, 0)
                 identity["trajectory"] = digests.of(path)
-                config = as_dict(config_of(suite, sequence, next(iter(suite.configurations)), 0))["dataset"]
-                job |= {"kind": "peer", "config": {"dataset": config}, "trajectory": str(path.absolute())}
+                config = as_dict(config_of(suite, sequence, next(iter(suite.configurations)), 0))[
+                    "dataset"
+                ]
+                job |= {
+                    "kind": "peer",
+                    "config": {"dataset": config},
+                    "trajectory": str(path.absolute()),
+                }
                 yield replace(task, job=job, key=digest_of([_FORM, "peer", identity, config]))
             except DataError as error:
                 yield replace(task, failure=" ".join(str(error).split()))
     if not found:
         names = ", ".join(s.name for s in suite.sequences[:5])
-        raise ConfigError(f"--peers {folder}: no file SEQUENCE.SYSTEM.tum of a sequence of the suite ({names}, …)")
+        raise ConfigError(
+            f"--peers {folder}: no file SEQUENCE.SYSTEM.tum of a sequence of the suite ({names}, …)"
+        )

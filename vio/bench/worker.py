@@ -1,7 +1,9 @@
-"""One task in a process of its own: `python -m vio.bench.worker FOLDER` reads job.json there and writes result.json.
+"""One task in a process of its own: `python -m vio.bench.worker FOLDER` reads job.json there and
+writes result.json.
 
-A process per task, wherever it was started: its memory and CPU time are its own, a crash costs one row, and the result
-is the same on any engine. The process ends when its standard input is closed, that is, with whoever started it.
+A process per task, wherever it was started: its memory and CPU time are its own, a crash costs one
+row, and the result is the same on any engine. The process ends when its standard input is closed,
+that is, with whoever started it.
 """
 
 from __future__ import annotations
@@ -22,7 +24,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, nees_figures, pose_nees
+from vio.bench.figures import (
+    absent_reasons,
+    between,
+    coverage,
+    error_curve,
+    figures_of,
+    nees_figures,
+    pose_nees,
+)
 from vio.bench.identity import code_digest, package_versions
 from vio.config import Config, merge
 from vio.datasets import open_dataset
@@ -40,11 +50,14 @@ if TYPE_CHECKING:
     from vio.records import FrameResult
     from vio.runs.pipeline import RunResult
 
-_WARM_FRAMES = 8  # in which compiled functions are loaded: left out of the CPU time a frame, as its wall times
+# in which compiled functions are loaded: left out of the CPU time a frame, as its wall times
+_WARM_FRAMES = 8
 _MOST_WARNINGS = 5
-JOB, RESULT = "job.json", "result.json"
+JOB = "job.json"
+RESULT = "result.json"
 _BODY = re.compile(r"^#\s*body:\s*(\S+)", re.MULTILINE)
-# Poses of a SLAM system in its map, as known at the end or at the time of their frame; else of its odometry.
+# Poses of a SLAM system in its map, as known at the end or at the time of their frame; else of its
+# odometry.
 _POSES = re.compile(r"^#\s*map:\s*(final|causal)\s*$", re.MULTILINE)
 
 
@@ -90,9 +103,17 @@ class _Truth:
 
 
 def perform(job: dict[str, Any]) -> dict[str, Any]:
-    """Do one task; return figures (the same wherever it is done), what was measured, and why it failed, if it did."""
+    """Do one task; return figures (the same wherever it is done), what was measured, and why it
+    failed, if it did.
+    """
     began = time.perf_counter()
-    record: dict[str, Any] = {"figures": {}, "failure": None, "keep": True, "curve": None, "trajectory": None}
+    record: dict[str, Any] = {
+        "figures": {},
+        "failure": None,
+        "keep": True,
+        "curve": None,
+        "trajectory": None,
+    }
     timer = _CpuTimer()
     try:
         _check_place(job)
@@ -100,8 +121,10 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
         truth = _truth(job, config)
         record |= _peer(job, truth) if job["kind"] == "peer" else _run(job, config, truth, timer)
     except VioError as error:
-        record["failure"], cause = " ".join(str(error).split()), error.__cause__
-        # What comes from the system, such as a full disk, may not come again; parsers set no number.
+        record["failure"] = " ".join(str(error).split())
+        cause = error.__cause__
+        # What comes from the system, such as a full disk, may not come again; parsers set no
+        # number.
         from_system = isinstance(cause, OSError) and cause.errno is not None
         record["keep"] = not (from_system or isinstance(error, _WrongPlaceError))
     except MemoryError:
@@ -116,7 +139,9 @@ def _truth(job: dict[str, Any], config: Config) -> _Truth:
     stop = None if job["stop"] is None else parse_bound(job["stop"])
     first, end = frames_between(dataset.recording, parse_bound(job["start"]), stop)
     total = len(dataset.recording.frame_times_ns)
-    covered = [frames_between(dataset.recording, *map(parse_bound, span)) for span in job["covered"]]
+    covered = [
+        frames_between(dataset.recording, *map(parse_bound, span)) for span in job["covered"]
+    ]
     spans = tuple(sorted((begin, total if last is None else last) for begin, last in covered))
     if any(begin >= last for begin, last in spans):
         raise DataError(f"{dataset.recording.path}: a part that is covered ends before it begins")
@@ -130,7 +155,8 @@ def _truth(job: dict[str, Any], config: Config) -> _Truth:
 
 
 def reference_fault(job: dict[str, Any]) -> str | None:
-    """Return why a run's ground truth cannot be that of its recording, by times and body; None: it may be.
+    """Return why a run's ground truth cannot be that of its recording, by times and body; None: it
+    may be.
 
     Nothing is run. A recording that cannot be opened is left to its task.
     """
@@ -140,7 +166,8 @@ def reference_fault(job: dict[str, Any]) -> str | None:
         return None
     if truth.reference is None:
         return None
-    recording, times_ns = truth.dataset.recording, truth.frame_times_ns
+    recording = truth.dataset.recording
+    times_ns = truth.frame_times_ns
     name = f"the ground truth {job['reference'] or f'in {recording.path}'} is not that of the recording"
     stated = job["reference"] and _stated(_BODY, Path(job["reference"]))
     if stated == "imu" and recording.T_cam0_imu is None:
@@ -151,7 +178,11 @@ def reference_fault(job: dict[str, Any]) -> str | None:
         matched = len(associate(frames, truth.reference.numbered())[1])
     except EvaluationError as error:
         return f"{name}: {str(error).replace('the estimate', 'the recording')}"
-    return f"{name}: it has poses of {matched} of {len(frames)} frames" if matched < LEAST_POSES else None
+    return (
+        f"{name}: it has poses of {matched} of {len(frames)} frames"
+        if matched < LEAST_POSES
+        else None
+    )
 
 
 def _stated(pattern: re.Pattern[str], path: Path) -> str | None:
@@ -177,10 +208,14 @@ class _WrongPlaceError(DataError):
 
 
 def _check_place(job: dict[str, Any]) -> None:
-    for what, wanted, here in (("code", job["code"], code_digest()), ("packages", job["packages"], package_versions())):
+    for what, wanted, here in (
+        ("code", job["code"], code_digest()),
+        ("packages", job["packages"], package_versions()),
+    ):
         if wanted != here:
             raise _WrongPlaceError(
-                f"the worker on {platform.node()} has other {what} than the command that sent the task: install the "
+                f"the worker on {platform.node()} has other {what} than the command that sent the "
+                "task: install the "
                 "same versions there; if the code was edited meanwhile, repeat the bench"
             )
 
@@ -193,32 +228,56 @@ def _used(truth: _Truth, config: Config) -> IntArray:
 
 
 def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -> dict[str, Any]:
-    """Run the odometry as `vio run` does, with one thread of OpenCV, in a folder that is removed."""
+    """Run the odometry as `vio run` does, with one thread of OpenCV, in a folder that is
+    removed.
+    """
     import cv2
 
     from vio.bench.maps import map_figures
     from vio.live.build import MapUse
     from vio.offline.map_adjustment import adjust_map
     from vio.runs.folder import growing_folder, landmark_error, refused_share
-    from vio.runs.pipeline import RunControl, run  # loads compiled functions: not for what cannot be opened
+
+    # loads compiled functions: not for what cannot be opened
+    from vio.runs.pipeline import RunControl, run
 
     cv2.setNumThreads(1)  # tasks run side by side; the figures do not depend on it
     with tempfile.TemporaryDirectory(prefix="vio-bench-", dir=job["scratch"]) as folder:
-        growing = growing_folder(Path(folder) / "run", truth.dataset, config, {"source": "", "start": truth.first})
+        growing = growing_folder(
+            Path(folder) / "run", truth.dataset, config, {"source": "", "start": truth.first}
+        )
         control = RunControl(growing)
         store = Path(folder) / "map.db"
-        use, T_ref_map = MapUse(store) if job["map"] else None, None
+        use = MapUse(store) if job["map"] else None
+        T_ref_map = None
         if job["first"] is not None:
             built = merge(Config(), job["first"]["config"], where="the suite")
-            before, use = _truth(job["first"], built), MapUse(store, localise=True)
-            begin, to = before.first, before.end
-            made = run(before.dataset, built, start=begin, stop=to, map=MapUse(store), keep_observations=True)
+            before = _truth(job["first"], built)
+            use = MapUse(store, localise=True)
+            begin = before.first
+            to = before.end
+            made = run(
+                before.dataset,
+                built,
+                start=begin,
+                stop=to,
+                map=MapUse(store),
+                keep_observations=True,
+            )
             made = adjust_map(made, store)
             T_ref_map = None if before.reference is None else _world_of_map(made, before.reference)
-        first, end = truth.first, truth.end
+        first = truth.first
+        end = truth.end
         kept = bool(job["map"])
         result = run(
-            truth.dataset, config, start=first, stop=end, viewer=timer, map=use, control=control, keep_observations=kept
+            truth.dataset,
+            config,
+            start=first,
+            stop=end,
+            viewer=timer,
+            map=use,
+            control=control,
+            keep_observations=kept,
         )
         if kept:  # in a copy: loops are scored as they were measured
             result = adjust_map(result, Path(shutil.copy(store, Path(folder) / "adjusted.db")))
@@ -227,14 +286,22 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             "frames": len(result.frames),
             "path_m": path_length_m(trajectory.positions),
             "coverage": coverage(_used(truth, config), trajectory),
-            "refused_share": refused_share(result.frames.column("used"), result.frames.column("gated")),
-            "used_per_frame": float(np.mean(np.asarray(result.frames.column("used"), dtype=np.float64))),
+            "refused_share": refused_share(
+                result.frames.column("used"), result.frames.column("gated")
+            ),
+            "used_per_frame": float(
+                np.mean(np.asarray(result.frames.column("used"), dtype=np.float64))
+            ),
             "landmarks": len(result.landmarks.ids),
             "innovation_px": _median(f.innovation_median_px for f in result.frames),
             "innovation_ratio": _median(f.innovation_ratio for f in result.frames),
         }
         timer.stages = _stages(result)
-        record = {"figures": figures, "failure": result.stopped, "warnings": list(result.warnings[:_MOST_WARNINGS])}
+        record = {
+            "figures": figures,
+            "failure": result.stopped,
+            "warnings": list(result.warnings[:_MOST_WARNINGS]),
+        }
         if truth.reference is not None:
             score = _evaluate(job, trajectory, truth.reference, result.T_cam0_body)
             figures |= figures_of(score, positions_only=job["positions_only"])
@@ -244,11 +311,19 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             if result.mapped is not None and result.stopped is None:
                 own = store if job["map"] else None
                 figures |= map_figures(
-                    result, score, truth.reference.numbered(), store=own, T_ref_map=T_ref_map, covered=truth.covered
+                    result,
+                    score,
+                    truth.reference.numbered(),
+                    store=own,
+                    T_ref_map=T_ref_map,
+                    covered=truth.covered,
                 )
         assert trajectory.times_ns is not None
         text = tum_text(
-            trajectory.times_ns, trajectory.T_world_body, body=trajectory.body, frames=trajectory.frame_indices
+            trajectory.times_ns,
+            trajectory.T_world_body,
+            body=trajectory.body,
+            frames=trajectory.frame_indices,
         )
         record["trajectory"] = text.splitlines()  # JSON of ours holds printable text only
     record["absent"] = _absent(job, figures, truth)
@@ -272,7 +347,9 @@ def _absent(job: dict[str, Any], figures: dict[str, Any], truth: _Truth) -> dict
 
 
 def _stages(result: RunResult) -> dict[str, float]:
-    """Return wall times of a frame in ms, start left out: medians of stages and of all, and what 95 % stay within."""
+    """Return wall times of a frame in ms, start left out: medians of stages and of all, and what
+    95 % stay within.
+    """
     frames = list(result.frames)[_WARM_FRAMES:]
     if not frames:
         return {}
@@ -292,10 +369,15 @@ def _median(values: Iterable[float | None]) -> float | None:
 
 def _nees(result: RunResult, score: Evaluation) -> dict[str, float | None]:
     rows = result.estimates
-    T_world_imu, covariances = (np.array(rows.column(name)) for name in ("T_world_imu", "covariance"))
-    # With an IMU, the world stays that of the first seconds while gravity is known better, and says where it points.
+    T_world_imu, covariances = (
+        np.array(rows.column(name)) for name in ("T_world_imu", "covariance")
+    )
+    # With an IMU, the world stays that of the first seconds while gravity is known better, and says
+    # where it points.
     stays = np.isfinite(np.array(rows.column("gravity_world"))).all(axis=1)
-    upright: BoolArray = np.asarray(~stays if result.motion == "imu" else np.zeros_like(stays), dtype=np.bool_)
+    upright: BoolArray = np.asarray(
+        ~stays if result.motion == "imu" else np.zeros_like(stays), dtype=np.bool_
+    )
     values = pose_nees(score, T_world_imu, covariances, result.T_cam0_body, upright=upright)
     return {"nees": None} if values is None else {**nees_figures(values, "nees")}
 
@@ -313,7 +395,11 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
     trajectory = between(trajectory, int(times_ns[0]), int(times_ns[-1]))
     score = _evaluate(job, trajectory, truth.reference, recording.T_cam0_body)
     covered = coverage(times_ns, trajectory)
-    figures: dict[str, Any] = {"frames": len(trajectory), "path_m": score.path_length_m, "coverage": covered}
+    figures: dict[str, Any] = {
+        "frames": len(trajectory),
+        "path_m": score.path_length_m,
+        "coverage": covered,
+    }
     kind = _stated(_POSES, path)
     if kind is None:
         figures |= figures_of(score, positions_only=job["positions_only"])
@@ -324,11 +410,20 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
         if trajectory.times_ns is not None:
             figures["place_s"] = float(trajectory.times_ns[0] - times_ns[0]) / NS_PER_S
     curve = error_curve(score, trajectory.times_ns)
-    return {"figures": figures, "curve": curve, "absent": _absent(job, figures, truth), "notes": list(score.notes)}
+    return {
+        "figures": figures,
+        "curve": curve,
+        "absent": _absent(job, figures, truth),
+        "notes": list(score.notes),
+    }
 
 
-def _evaluate(job: dict[str, Any], trajectory: Trajectory, reference: Trajectory, T_cam0_imu: Any) -> Evaluation:
-    return evaluate(trajectory, reference.numbered(), T_cam0_imu=T_cam0_imu, lengths_m=job["lengths_m"])
+def _evaluate(
+    job: dict[str, Any], trajectory: Trajectory, reference: Trajectory, T_cam0_imu: Any
+) -> Evaluation:
+    return evaluate(
+        trajectory, reference.numbered(), T_cam0_imu=T_cam0_imu, lengths_m=job["lengths_m"]
+    )
 
 
 def _peak_memory_mib() -> float | None:

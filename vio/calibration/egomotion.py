@@ -1,4 +1,6 @@
-"""The left camera's motion from its stereo tracks alone, frame to frame: the reference for every motion sensor."""
+"""The left camera's motion from its stereo tracks alone, frame to frame: the reference for every
+motion sensor.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,11 @@ from vio.records import BoolArray, FeatureTracks, IntArray
 
 _MIN_LINKS = 8  # tracks needed between two frames
 _MIN_DISPARITY_PX = 2.0
-_WIDTHS_PX = (30.0, 15.0, 8.0, 4.0, 2.0, 2.0)  # robust width per iteration, decreasing to exclude outliers
+# robust width per iteration, decreasing to exclude outliers
+_WIDTHS_PX = (30.0, 15.0, 8.0, 4.0, 2.0, 2.0)
 _MIN_DEPTH_M = 0.5
-_DEGENERATE = 1e-9  # relative size of a normal matrix's smallest eigenvalue below which a motion is not determined
+# relative size of a normal matrix's smallest eigenvalue below which a motion is not determined
+_DEGENERATE = 1e-9
 _LEAST_TWISTS = 40  # frame intervals for a calibration
 _LARGEST_GAP_S = 0.25
 _NS = 1e-9
@@ -25,15 +29,21 @@ _NS = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class CameraMotion:
-    """The left camera's motion over those intervals between successive frames whose tracks determine it."""
+    """The left camera's motion over those intervals between successive frames whose tracks
+    determine it.
+    """
 
     times_ns: IntArray  # (F,) of all frames
     frames: IntArray  # (K,) earlier frame of each interval, increasing
-    twists: FloatArray  # (K, 6) [v; omega] of cam0 in cam0, m/s and rad/s: p_next = exp(-dt twist^) p
+    # (K, 6) [v; omega] of cam0 in cam0, m/s and rad/s: p_next = exp(-dt twist^) p
+    twists: FloatArray
 
 
-def stereo_twists(camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray, guess: FloatArray) -> CameraMotion:
-    """Estimate the camera's twist from each frame to the next by robust Gauss-Newton on the stereo reprojection.
+def stereo_twists(
+    camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray, guess: FloatArray
+) -> CameraMotion:
+    """Estimate the camera's twist from each frame to the next by robust Gauss-Newton on the stereo
+    reprojection.
 
     Args:
         camera: rectified pair.
@@ -43,30 +53,45 @@ def stereo_twists(camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArra
     """
     earlier, later = _links(tracks)
     p, valid = triangulate(camera, tracks.z[earlier], min_disparity_px=_MIN_DISPARITY_PX)
-    p, earlier, later = p[valid], earlier[valid], later[valid]
+    p = p[valid]
+    earlier = earlier[valid]
+    later = later[valid]
     count = np.bincount(tracks.frames[earlier], minlength=len(times_ns))[tracks.frames[earlier]]
     enough = count >= _MIN_LINKS
-    p, later, of = p[enough], later[enough], tracks.frames[earlier][enough]
+    p = p[enough]
+    later = later[enough]
+    of = tracks.frames[earlier][enough]
     frames, begins = np.unique(of, return_index=True)
     if not len(frames):
         return CameraMotion(times_ns, frames.astype(np.int64), np.zeros((0, 6)))
     dt = (np.diff(times_ns) * _NS)[frames]
     T_next_prev = se3_exp(-dt[:, None] * guess[frames])
     determined = np.empty(len(frames), dtype=np.bool_)
-    _fit_motions(camera_args(camera), p, tracks.z[later], np.append(begins, len(p)), T_next_prev, determined)
+    _fit_motions(
+        camera_args(camera), p, tracks.z[later], np.append(begins, len(p)), T_next_prev, determined
+    )
     twists = -se3_log(T_next_prev) / dt[:, None]
     return CameraMotion(times_ns, frames[determined].astype(np.int64), twists[determined])
 
 
 @compiled
 def _fit_motions(
-    camera: CameraArgs, p: FloatArray, z: FloatArray, begins: IntArray, T: FloatArray, determined: BoolArray
+    camera: CameraArgs,
+    p: FloatArray,
+    z: FloatArray,
+    begins: IntArray,
+    T: FloatArray,
+    determined: BoolArray,
 ) -> None:
-    """Move motions (K, 4, 4) so that points (L, 3) come to pixels (L, 4), and write which are determined (K,).
+    """Move motions (K, 4, 4) so that points (L, 3) come to pixels (L, 4), and write which are
+    determined (K,).
 
     Motion k is that of the points from `begins[k]` (K + 1,) on.
     """
-    normal, shifted, xi, none = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
+    normal = np.empty((6, 6))
+    shifted = np.empty((6, 6))
+    xi = np.empty(6)
+    none = np.empty(6)
     for k in range(len(T)):
         determined[k] = True
         for width in _WIDTHS_PX:
@@ -101,27 +126,41 @@ def _add_point(
     normal: FloatArray,
     gradient: FloatArray,
 ) -> None:
-    """Add what a point's pixels (4,) say of a motion (4, 4) to normal equations (6, 6) and (6,), if it is ahead."""
+    """Add what a point's pixels (4,) say of a motion (4, 4) to normal equations (6, 6) and (6,),
+    if it is ahead.
+    """
     fu, fv, cu, cv, baseline, _ = camera
-    q, row, D = np.empty(3), np.empty(6), np.empty(3)
+    q = np.empty(3)
+    row = np.empty(6)
+    D = np.empty(3)
     for i in range(3):
         q[i] = T[i, 0] * p[0] + T[i, 1] * p[1] + T[i, 2] * p[2] + T[i, 3]
     azimuth, s, c, y, depth = turn_to(camera, q[1], q[2])
     if not depth > _MIN_DEPTH_M:
         return
-    u, v = fu * q[0] / depth, fv * y / depth
-    r0, r1, r3 = z[0] - u - cu, z[1] - v - fv * azimuth - cv, z[3] - v - fv * azimuth - cv
+    u = fu * q[0] / depth
+    v = fv * y / depth
+    r0 = z[0] - u - cu
+    r1 = z[1] - v - fv * azimuth - cv
+    r3 = z[3] - v - fv * azimuth - cv
     r2 = z[2] - (u - fu * baseline / depth) - cu
     weight = 1.0 / (1.0 + (r0 * r0 + r1 * r1 + r2 * r2 + r3 * r3) / width2) ** 2
     for a in range(4):
         r = r0 if a == 0 else r1 if a == 1 else r2 if a == 2 else r3
         if a == 0 or a == 2:
             across = u if a == 0 else u - fu * baseline / depth
-            D[0], D[1], D[2] = fu / depth, -across * s / depth, -across * c / depth
+            D[0] = fu / depth
+            D[1] = -across * s / depth
+            D[2] = -across * c / depth
         else:
-            D[0], D[1], D[2] = 0.0, (fv * c - v * s) / depth, (-fv * s - v * c) / depth
-        row[0], row[1], row[2] = D[0], D[1], D[2]
-        row[3], row[4] = q[1] * D[2] - q[2] * D[1], q[2] * D[0] - q[0] * D[2]
+            D[0] = 0.0
+            D[1] = (fv * c - v * s) / depth
+            D[2] = (-fv * s - v * c) / depth
+        row[0] = D[0]
+        row[1] = D[1]
+        row[2] = D[2]
+        row[3] = q[1] * D[2] - q[2] * D[1]
+        row[4] = q[2] * D[0] - q[0] * D[2]
         row[5] = q[0] * D[1] - q[1] * D[0]
         for i in range(6):
             gradient[i] += weight * row[i] * r
@@ -130,18 +169,26 @@ def _add_point(
 
 
 def _links(tracks: FeatureTracks) -> tuple[IntArray, IntArray]:
-    """Return rows (L,) and (L,) of the same id in successive frames, not stale and with a right match, by frame."""
-    frames, usable = tracks.frames, tracks.has_right & ~tracks.stale
+    """Return rows (L,) and (L,) of the same id in successive frames, not stale and with a right
+    match, by frame.
+    """
+    frames = tracks.frames
+    usable = tracks.has_right & ~tracks.stale
     order = np.lexsort((frames, tracks.ids))
-    a, b = order[:-1], order[1:]
+    a = order[:-1]
+    b = order[1:]
     linked = (tracks.ids[a] == tracks.ids[b]) & (frames[a] + 1 == frames[b]) & usable[a] & usable[b]
-    a, b = a[linked], b[linked]
+    a = a[linked]
+    b = b[linked]
     by_frame = np.argsort(a, kind="stable")
     return a[by_frame], b[by_frame]
 
 
-def camera_motion(camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray) -> CameraMotion | NotObservable:
-    """Estimate the camera's motion for a calibration; not observable if too few short intervals have one.
+def camera_motion(
+    camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray
+) -> CameraMotion | NotObservable:
+    """Estimate the camera's motion for a calibration; not observable if too few short intervals
+    have one.
 
     Args:
         camera: rectified pair.
@@ -156,7 +203,8 @@ def camera_motion(camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArra
         gap = float(np.median(np.diff(times_ns))) * _NS if len(times_ns) > 1 else float("inf")
         return NotObservable(
             "IMU-camera calibration",
-            f"only {len(found.frames)} frame intervals determine the camera's motion ({_LEAST_TWISTS} needed; frames "
+            f"only {len(found.frames)} frame intervals determine the camera's motion "
+            f"({_LEAST_TWISTS} needed; frames "
             f"are {gap:.3g} s apart); too few images, too far apart, or too little texture",
         )
     return found

@@ -1,4 +1,6 @@
-"""Results other than values: why a quantity is not observable, and faults of a given calibration."""
+"""Results other than values: why a quantity is not observable, and faults of a given
+calibration.
+"""
 
 from __future__ import annotations
 

@@ -22,10 +22,12 @@ _NS = 1e-9
 
 
 def align_gyro(motion: CameraMotion, rates: Rates) -> ImuAlignment | NotObservable:
-    """Estimate rotation, time offset and gyro bias that align the gyro's rotations with those of the camera.
+    """Estimate rotation, time offset and gyro bias that align the gyro's rotations with those of
+    the camera.
 
-    Model, for each frame interval: `omega_cam dt = R_cam0_imu (integral of gyro over the shifted interval - b dt)`.
-    Velocities of a `velocity` recording are used as directions, since a car rotates about one axis only.
+    Model, for each frame interval:
+    `omega_cam dt = R_cam0_imu (integral of gyro over the shifted interval - b dt)`. Velocities of a
+    `velocity` recording are used as directions, since a car rotates about one axis only.
     """
     if float(np.linalg.norm(motion.twists[:, 3:].std(axis=0))) < _MIN_RATE_RADPS:
         return NotObservable("IMU-camera rotation and time offset", "the camera does not rotate")
@@ -47,7 +49,9 @@ def align_gyro(motion: CameraMotion, rates: Rates) -> ImuAlignment | NotObservab
     if rotation_sigma.max() > _ROTATION_DEG:
         weak = "rotation about one axis (too little rotation about the others)"
     if errors[3] > TIME_OFFSET_S:
-        weak = f"{weak} and time offset" if weak else "time offset (the rotation rate hardly changes)"
+        weak = (
+            f"{weak} and time offset" if weak else "time offset (the rotation rate hardly changes)"
+        )
     return ImuAlignment(
         R_cam0_imu=so3_exp(solution[:3]),
         rotation_sigma_deg=rotation_sigma,
@@ -79,15 +83,22 @@ class _GyroProblem:
         self._velocities: tuple[FloatArray, FloatArray] | None = None
         if not rates.inertial:
             middle = (self._begin + self._end) / 2
-            v_imu = np.stack([np.interp(middle, self._t, rates.linear[:, k]) for k in range(3)], axis=1)
+            v_imu = np.stack(
+                [np.interp(middle, self._t, rates.linear[:, k]) for k in range(3)], axis=1
+            )
             self._velocities = motion.twists[:, :3], v_imu
 
     def gyro(self, offset: float) -> FloatArray:
         """Return the mean rotation rate (K, 3) of each interval, imu frame."""
         turned = [
-            np.interp(at + offset, self._t, self._turned[:, k]) for k in range(3) for at in (self._end, self._begin)
+            np.interp(at + offset, self._t, self._turned[:, k])
+            for k in range(3)
+            for at in (self._end, self._begin)
         ]
-        return np.stack([turned[2 * k] - turned[2 * k + 1] for k in range(3)], axis=1) / self._dt[:, None]
+        return (
+            np.stack([turned[2 * k] - turned[2 * k + 1] for k in range(3)], axis=1)
+            / self._dt[:, None]
+        )
 
     def coarse_offset(self) -> float:
         """Return the offset at which the magnitudes of the two rotation rates agree best."""
@@ -100,8 +111,12 @@ class _GyroProblem:
         return float(offsets[int(np.argmin(scores))])
 
     def start(self, offset: float) -> FloatArray:
-        """Return the closed-form solution at one offset. Reference: Wahba's problem by SVD (Markley 1988)."""
-        gyro, omega = self.gyro(offset)[self.covered], self._omega[self.covered]
+        """Return the closed-form solution at one offset.
+
+        Reference: Wahba's problem by SVD (Markley 1988).
+        """
+        gyro = self.gyro(offset)[self.covered]
+        omega = self._omega[self.covered]
         C = (omega - np.median(omega, axis=0)).T @ (gyro - np.median(gyro, axis=0))
         if self._velocities is not None:
             v_cam, v_imu = (v[self.covered] for v in self._velocities)
@@ -109,7 +124,9 @@ class _GyroProblem:
         return np.concatenate([so3_log(nearest_rotation(C)), [offset], np.zeros(3)])
 
     def residuals(self, x: FloatArray) -> FloatArray:
-        """Return differences (K, 3 or 6) of the rates, and of the velocities where they are known."""
+        """Return differences (K, 3 or 6) of the rates, and of the velocities where they are
+        known.
+        """
         R = so3_exp(x[:3])
         turning = self._omega - (self.gyro(float(x[3])) - x[4:]) @ R.T
         if self._velocities is None:
@@ -139,17 +156,21 @@ class _GyroProblem:
         return max(robust_sigma(self.residuals(x)[keep]), 1e-6)
 
     def formal_sigma(self, x: FloatArray, keep: BoolArray, sigma: float) -> FloatArray:
-        """Return standard deviations (7,) for independent residuals; large in unobservable directions."""
+        """Return standard deviations (7,) for independent residuals; large in unobservable
+        directions.
+        """
         J = np.empty((self.residuals(x)[keep].size, 7))
         for k, h in enumerate([1e-4] * 3 + [1e-3] + [1e-4] * 3):
             step = np.zeros(7)
             step[k] = h
             if k < 3:  # a rotation on the camera's side, as in the jackknife
                 plus, minus = (
-                    np.concatenate([so3_log(so3_exp(s * step[:3]) @ so3_exp(x[:3])), x[3:]]) for s in (1.0, -1.0)
+                    np.concatenate([so3_log(so3_exp(s * step[:3]) @ so3_exp(x[:3])), x[3:]])
+                    for s in (1.0, -1.0)
                 )
             else:
-                plus, minus = x + step, x - step
+                plus = x + step
+                minus = x - step
             J[:, k] = (self.residuals(plus) - self.residuals(minus))[keep].ravel() / (2 * h)
         scale = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
         information = (J / scale).T @ (J / scale) + 1e-12 * np.eye(7)

@@ -1,4 +1,6 @@
-"""Types shared by the inertial calibration: motion samples as arrays, and the sensor's alignment with the camera."""
+"""Types shared by the inertial calibration: motion samples as arrays, and the sensor's alignment
+with the camera.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ class Rates:
 def rates_of(samples: Sequence[MotionSample]) -> Rates:
     """Return motion samples of one kind, one at least, as arrays."""
     inertial = isinstance(samples[0], ImuSample)
-    pairs = [(s.gyro, s.accel) if isinstance(s, ImuSample) else (s.angular, s.linear) for s in samples]
+    pairs = [
+        (s.gyro, s.accel) if isinstance(s, ImuSample) else (s.angular, s.linear) for s in samples
+    ]
     return Rates(
         np.array([s.time_ns for s in samples], dtype=np.int64),
         np.array([p[0] for p in pairs]),
@@ -39,7 +43,8 @@ class ImuAlignment:
 
     R_cam0_imu: FloatArray  # (3, 3)
     rotation_sigma_deg: FloatArray  # (3,) about the axes of cam0
-    time_offset_s: float  # IMU clock minus camera clock: a frame stamped t was exposed at t + offset of the IMU's clock
+    # IMU clock minus camera clock: a frame stamped t was exposed at t + offset of the IMU's clock
+    time_offset_s: float
     time_offset_sigma_s: float
     gyro_bias: FloatArray  # (3,) rad/s
     residual_radps: float  # robust spread of the rotation rates' difference, each axis

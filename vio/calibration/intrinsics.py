@@ -1,4 +1,6 @@
-"""Focal length and principal point as the motion of the cameras shows them, beside the given ones."""
+"""Focal length and principal point as the motion of the cameras shows them, beside the given
+ones.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +11,14 @@ import numpy as np
 from vio.calibration.findings import Fault, Finding, NotObservable
 from vio.geometry.stereo import StereoCamera
 
-# Standard deviations of what is left of a lens beyond its model, beside those of the estimate: on four real drives with
-# calibrations of their own, focal lengths came out by -0.4 to +3.3 % and principal points by 1 to 4 % of a focal length
-# from the given ones, with 0.3 to 0.7 % of standard deviation.
+# Standard deviations of what is left of a lens beyond its model, beside those of the estimate: on
+# four real drives with calibrations of their own, focal lengths came out by -0.4 to +3.3 % and
+# principal points by 1 to 4 % of a focal length from the given ones, with 0.3 to 0.7 % of standard
+# deviation.
 _LENS_FOCAL = 0.012
 _LENS_CENTRE = 0.02  # focal lengths
-_LARGEST_FOCAL, _LARGEST_CENTRE = 0.03, 0.05  # standard deviations above which nothing can be said
+_LARGEST_FOCAL = 0.03  # standard deviations above which nothing can be said
+_LARGEST_CENTRE = 0.05
 _NAMED_SIGMAS = 3.0
 
 
@@ -36,9 +40,11 @@ def judged_observable(
     centre_off: tuple[float, float],
     centre_sigma: tuple[float, float],
 ) -> Intrinsics | NotObservable:
-    """Return the intrinsics with the uncertainty that lens models leave, where the motion determines enough.
+    """Return the intrinsics with the uncertainty that lens models leave, where the motion
+    determines enough.
 
-    A camera that does not turn sees the same with any focal length and principal point: the scene is only stretched.
+    A camera that does not turn sees the same with any focal length and principal point: the scene
+    is only stretched.
 
     Args:
         camera: the pair as calibrated.
@@ -56,7 +62,9 @@ def judged_observable(
             f"{camera.fu * max(across):.0f} px",
         )
     u, v = (camera.fu * c for c in centre_off)
-    return Intrinsics(camera.fu, focal_off, sigma, (u, v), (camera.fu * across[0], camera.fv * across[1]))
+    return Intrinsics(
+        camera.fu, focal_off, sigma, (u, v), (camera.fu * across[0], camera.fv * across[1])
+    )
 
 
 def judge_intrinsics(found: Intrinsics | NotObservable) -> tuple[Finding, ...]:
@@ -66,14 +74,21 @@ def judge_intrinsics(found: Intrinsics | NotObservable) -> tuple[Finding, ...]:
     out: dict[Fault, str] = {}
     if abs(found.focal_off) > _NAMED_SIGMAS * found.focal_sigma:
         out["focal length wrong"] = (
-            f"off by {100 * found.focal_off:+.1f} % (standard deviation {100 * found.focal_sigma:.1f} %): "
-            f"{found.focal_px * (1 + found.focal_off):.0f} px in place of {found.focal_px:.0f}; calibrate the lenses "
+            f"off by {100 * found.focal_off:+.1f} % (standard deviation "
+            f"{100 * found.focal_sigma:.1f} %): "
+            f"{found.focal_px * (1 + found.focal_off):.0f} px in place of {found.focal_px:.0f}; "
+            "calibrate the lenses "
             "again, and check that the images were not resized"
         )
-    if any(abs(o) > _NAMED_SIGMAS * s for o, s in zip(found.centre_off_px, found.centre_sigma_px, strict=True)):
-        (u, v), (su, sv) = found.centre_off_px, found.centre_sigma_px
+    if any(
+        abs(o) > _NAMED_SIGMAS * s
+        for o, s in zip(found.centre_off_px, found.centre_sigma_px, strict=True)
+    ):
+        (u, v) = found.centre_off_px
+        (su, sv) = found.centre_sigma_px
         out["principal point wrong"] = (
-            f"off by {u:+.0f} {v:+.0f} px along u v (standard deviations {su:.0f} {sv:.0f}); calibrate the lenses "
+            f"off by {u:+.0f} {v:+.0f} px along u v (standard deviations {su:.0f} {sv:.0f}); "
+            "calibrate the lenses "
             "again, and check that the images were not cropped"
         )
     return tuple(Finding(*each) for each in out.items())

@@ -1,4 +1,6 @@
-"""The IMU's lever arm: estimated from its accelerometer, or chosen between two candidates by velocities."""
+"""The IMU's lever arm: estimated from its accelerometer, or chosen between two candidates by
+velocities.
+"""
 
 from __future__ import annotations
 
@@ -39,11 +41,14 @@ class LeverArm:
     windows: int
 
 
-def estimate_lever_arm(motion: CameraMotion, rates: Rates, alignment: ImuAlignment) -> LeverArm | NotObservable:
+def estimate_lever_arm(
+    motion: CameraMotion, rates: Rates, alignment: ImuAlignment
+) -> LeverArm | NotObservable:
     """Estimate the IMU's position in the left camera's frame from accelerometer and camera motion.
 
-    Over windows of one second, the doubly integrated specific force must agree with the camera's motion and the lever
-    arm. Start velocity and gravity are free in every window, the accelerometer bias is common.
+    Over windows of one second, the doubly integrated specific force must agree with the camera's
+    motion and the lever arm. Start velocity and gravity are free in every window, the accelerometer
+    bias is common.
     """
     what = "lever arm"
     if not rates.inertial:
@@ -53,23 +58,32 @@ def estimate_lever_arm(motion: CameraMotion, rates: Rates, alignment: ImuAlignme
     blocks = _windows(motion, rates, alignment)
     if len(blocks) < _LEAST_WINDOWS:
         return NotObservable(
-            what, f"only {len(blocks)} windows of {_WINDOW_S:g} s are without tracking loss ({_LEAST_WINDOWS} needed)"
+            what,
+            f"only {len(blocks)} windows of {_WINDOW_S:g} s are without tracking loss "
+            f"({_LEAST_WINDOWS} needed)",
         )
     x = _solve_windows(blocks)
     refits = [
-        _solve_windows([b for k, b in enumerate(blocks) if k % _BLOCKS != left_out]) for left_out in range(_BLOCKS)
+        _solve_windows([b for k, b in enumerate(blocks) if k % _BLOCKS != left_out])
+        for left_out in range(_BLOCKS)
     ]
     sigma = jackknife(refits)[:3]
     if sigma.max() > _MAX_SIGMA_M:
         axis = "xyz"[int(np.argmax(sigma))]
         return NotObservable(
-            what, f"the camera rotates too little: the standard deviation is {sigma.max():.3f} m along {axis} of cam0"
+            what,
+            f"the camera rotates too little: the standard deviation is {sigma.max():.3f} m along "
+            f"{axis} of cam0",
         )
     return LeverArm(x[:3], sigma, len(blocks))
 
 
-def _windows(motion: CameraMotion, rates: Rates, alignment: ImuAlignment) -> list[tuple[FloatArray, FloatArray]]:
-    """Return each window's Jacobian and right side w.r.t. `[t_cam0_imu; bias]`, with the nuisances projected out."""
+def _windows(
+    motion: CameraMotion, rates: Rates, alignment: ImuAlignment
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return each window's Jacobian and right side w.r.t. `[t_cam0_imu; bias]`, with the
+    nuisances projected out.
+    """
     origin = int(motion.times_ns[0])
     t_imu = _seconds(rates.times_ns, origin) - alignment.time_offset_s
     t_frame = _seconds(motion.times_ns, origin)
@@ -86,7 +100,17 @@ def _windows(motion: CameraMotion, rates: Rates, alignment: ImuAlignment) -> lis
         if not (whole and inside):
             first = max(last, first + 1)
             continue
-        out.append(_window(steps, t_frame[first : last + 1], first, t_imu, gyro, rates.linear, alignment.R_cam0_imu))
+        out.append(
+            _window(
+                steps,
+                t_frame[first : last + 1],
+                first,
+                t_imu,
+                gyro,
+                rates.linear,
+                alignment.R_cam0_imu,
+            )
+        )
         first = last
     return out
 
@@ -125,10 +149,15 @@ def _window(
 def _integrals(
     t: FloatArray, t_imu: FloatArray, gyro: FloatArray, force: FloatArray, R_cam0_imu: FloatArray
 ) -> FloatArray:
-    """Return double integrals (n, 3, 4) at t[1:] of force (column 0) and rotation (columns 1 to 3), in cam0(t0)."""
+    """Return double integrals (n, 3, 4) at t[1:] of force (column 0) and rotation (columns 1 to
+    3), in cam0(t0).
+    """
     low, high = np.searchsorted(t_imu, [t[0], t[-1]])
     knots = np.unique(np.concatenate([t, t_imu[low:high]]))
-    omega, f = (np.stack([np.interp(knots, t_imu, values[:, k]) for k in range(3)], axis=1) for values in (gyro, force))
+    omega, f = (
+        np.stack([np.interp(knots, t_imu, values[:, k]) for k in range(3)], axis=1)
+        for values in (gyro, force)
+    )
     dt = np.diff(knots)
     turns = so3_exp(dt[:, None] * (omega[1:] + omega[:-1]) / 2)
     R = [R_cam0_imu]
@@ -138,7 +167,10 @@ def _integrals(
     value = np.concatenate([(rotation @ f[..., None]), rotation], axis=2)  # (m, 3, 4)
     mean = (value[1:] + value[:-1]) / 2
     velocity = np.concatenate([np.zeros((1, 3, 4)), np.cumsum(dt[:, None, None] * mean, axis=0)])
-    third = dt[:, None, None] * velocity[:-1] + dt[:, None, None] ** 2 * (2 * value[:-1] + value[1:]) / 6
+    third = (
+        dt[:, None, None] * velocity[:-1]
+        + dt[:, None, None] ** 2 * (2 * value[:-1] + value[1:]) / 6
+    )
     position = np.concatenate([np.zeros((1, 3, 4)), np.cumsum(third, axis=0)])
     return position[np.searchsorted(knots, t[1:])]
 
@@ -148,7 +180,9 @@ def _solve_windows(blocks: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArra
     weights: FloatArray = np.ones(len(blocks))
     x: FloatArray = np.zeros(6)
     for _ in range(6):
-        normal = sum((w * A.T @ A for w, (A, _) in zip(weights, blocks, strict=True)), 1e-9 * np.eye(6))
+        normal = sum(
+            (w * A.T @ A for w, (A, _) in zip(weights, blocks, strict=True)), 1e-9 * np.eye(6)
+        )
         right = sum((w * A.T @ b for w, (A, b) in zip(weights, blocks, strict=True)), np.zeros(6))
         x = np.linalg.solve(normal, right)
         rms = np.array([np.sqrt(np.mean((A @ x - b) ** 2)) for A, b in blocks])
@@ -161,7 +195,9 @@ class LeverArmVerdict:
     """Which of two camera positions in the IMU frame agrees with velocities and features."""
 
     better: int | None  # 0 or 1; None: the motion does not distinguish them
-    place: float  # estimated position of the camera on the line between the two: -1 at the first, +1 at the second
+    # estimated position of the camera on the line between the two: -1 at the first, +1 at the
+    # second
+    place: float
     place_sigma: float  # standard error of `place`; infinite where nothing could be measured
     intervals: int  # frame intervals used
 
@@ -174,13 +210,15 @@ def judge_lever_arms(
     R_cam0_imu: FloatArray,
     lever_arms: tuple[FloatArray, FloatArray],
 ) -> LeverArmVerdict:
-    """Decide between two positions l of cam0 in the IMU frame by `v_cam = v_imu + omega x l` of a rigid body.
+    """Decide between two positions l of cam0 in the IMU frame by `v_cam = v_imu + omega x l` of a
+    rigid body.
 
-    The camera's velocity and rotation rate come from the stereo tracks, v_imu from the file (its noise averages out).
-    Other causes of a velocity difference are fitted together with the lever arm, for each axis: a constant, and terms
-    proportional to speed (scale, misalignment), to acceleration (clock offset), and to yaw rate times squared speed
-    (side slip of the tyres, which otherwise looks like half a metre of lever arm). The standard error is a jackknife
-    over blocks of the recording, so that it includes correlated errors.
+    The camera's velocity and rotation rate come from the stereo tracks, v_imu from the file (its
+    noise averages out). Other causes of a velocity difference are fitted together with the lever
+    arm, for each axis: a constant, and terms proportional to speed (scale, misalignment), to
+    acceleration (clock offset), and to yaw rate times squared speed (side slip of the tyres, which
+    otherwise looks like half a metre of lever arm). The standard error is a jackknife over blocks
+    of the recording, so that it includes correlated errors.
 
     Args:
         camera: rectified pair.
@@ -196,8 +234,10 @@ def judge_lever_arms(
     count = len(seen.frames)
     if count < _MIN_INTERVALS:
         return LeverArmVerdict(None, 0.0, float("inf"), count)
-    v_cam, omega = seen.twists[:, :3] @ R_cam0_imu, seen.twists[:, 3:] @ R_cam0_imu
-    centre, half = (lever_arms[1] + lever_arms[0]) / 2, (lever_arms[1] - lever_arms[0]) / 2
+    v_cam = seen.twists[:, :3] @ R_cam0_imu
+    omega = seen.twists[:, 3:] @ R_cam0_imu
+    centre = (lever_arms[1] + lever_arms[0]) / 2
+    half = (lever_arms[1] - lever_arms[0]) / 2
     y = v_cam - middle[seen.frames, :3] - np.cross(omega, centre)
     speed = np.linalg.norm(v_cam, axis=1)
     yaw_rate = omega[:, np.argmax(omega.std(axis=0))]
@@ -213,12 +253,16 @@ def judge_lever_arms(
 
 
 def _fit_place(y: FloatArray, signal: FloatArray, nuisance: FloatArray) -> float:
-    """Fit `y = place * signal + nuisance c` (N, 3) robustly, with c per axis and a common `place`."""
+    """Fit `y = place * signal + nuisance c` (N, 3) robustly, with c per axis and a common
+    `place`.
+    """
     top = bottom = 0.0
     for axis in range(3):
         X = np.concatenate([signal[:, axis : axis + 1], nuisance], axis=1)
         scale = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
-        weight, sigma, x = np.ones(len(X)), 1.0, np.zeros(X.shape[1])
+        weight = np.ones(len(X))
+        sigma = 1.0
+        x = np.zeros(X.shape[1])
         normal = np.eye(X.shape[1])
         for _ in range(_REWEIGHTINGS):
             weighted = X / scale * weight[:, None]

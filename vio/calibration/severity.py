@@ -1,8 +1,9 @@
 """How much it matters that a stereo calibration is off: one grade and one wording for all commands.
 
-Rows of left and right show that a calibration is off, but cost little themselves, as a row is no depth. Disparities
-that are off cost lengths: a point at disparity d is taken to be nearer by the share off / d. Rows do not tell what
-disparities are off by (a camera that turned about the vertical axis shows in disparities alone); motion does.
+Rows of left and right show that a calibration is off, but cost little themselves, as a row is no
+depth. Disparities that are off cost lengths: a point at disparity d is taken to be nearer by the
+share off / d. Rows do not tell what disparities are off by (a camera that turned about the vertical
+axis shows in disparities alone); motion does.
 """
 
 from __future__ import annotations
@@ -12,10 +13,14 @@ from typing import Literal, TypeAlias, get_args
 
 Grade: TypeAlias = Literal["negligible", "worth calibrating", "unusable"]
 
-# Rows, root mean square. Good calibrations leave less than the first; with the second, matching along rows fails.
-_NEGLIGIBLE_ROWS_PX, _UNUSABLE_ROWS_PX = 0.15, 2.0
-# Lengths, m per 100 m. Less than the first is below the drift of images alone on a road; a tenth is no measurement.
-_NEGLIGIBLE_LENGTH, _UNUSABLE_LENGTH = 0.2, 10.0
+# Rows, root mean square. Good calibrations leave less than the first; with the second, matching
+# along rows fails.
+_NEGLIGIBLE_ROWS_PX = 0.15
+_UNUSABLE_ROWS_PX = 2.0
+# Lengths, m per 100 m. Less than the first is below the drift of images alone on a road; a tenth is
+# no measurement.
+_NEGLIGIBLE_LENGTH = 0.2
+_UNUSABLE_LENGTH = 10.0
 _SIGMAS = 3.0  # standard deviations of doubt
 
 
@@ -25,7 +30,8 @@ class StereoError:
 
     rows_px: float  # root mean square of the smooth part of vl - vr
     seen_px: float  # median disparity of the features; 0: not known
-    disparity_px: float | None = None  # by which disparities are too large in the middle; None: not known
+    # by which disparities are too large in the middle; None: not known
+    disparity_px: float | None = None
     disparity_sigma_px: float | None = None
 
     @property
@@ -51,7 +57,8 @@ class StereoError:
         if self.seen_px < 0:
             return f"{text}, most disparities are negative"
         if self.disparity_px is not None and self.per_100_m is not None:
-            sigma_px, sigma_m = "", ""
+            sigma_px = ""
+            sigma_m = ""
             if self.disparity_sigma_px is not None:
                 sigma_px = f" ± {self.disparity_sigma_px:.2f}"
                 sigma_m = f" ± {_short(100 * self.disparity_sigma_px / self.seen_px)}"
@@ -73,7 +80,13 @@ def length_grade(per_100_m: float) -> Grade:
 
 
 def _graded(size: float, negligible: float, unusable: float) -> Grade:
-    return "negligible" if size <= negligible else "unusable" if size > unusable else "worth calibrating"
+    return (
+        "negligible"
+        if size <= negligible
+        else "unusable"
+        if size > unusable
+        else "worth calibrating"
+    )
 
 
 def _short(value: float) -> str:

@@ -1,4 +1,6 @@
-"""Relative pose of the two cameras from rays of matched points, and row residuals of rectified images."""
+"""Relative pose of the two cameras from rays of matched points, and row residuals of rectified
+images.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +16,21 @@ from vio.numerics.robust import robust_sigma
 from vio.records import BoolArray, IntArray
 
 _BLOCKS = 10  # of a jackknife
-_WIDEST_DEG, _NARROWER_DEG = 1.0, 0.3  # gates on epipolar angles in successive fits
+_WIDEST_DEG = 1.0  # gates on epipolar angles in successive fits
+_NARROWER_DEG = 0.3
 _LEAST_MATCHES = 150
 _LEAST_PAIRS = 3
 _STEREO_ROTATION_DEG = 0.2  # with larger standard deviations the value is not observable
 _STEREO_DIRECTION_DEG = 2.0
-# What a lens model that is off by half a pixel in the corners does to the rotation from single pairs: rows cannot tell
-# a yaw from a tangential distortion of 1e-3, which calibrations leave.
+# What a lens model that is off by half a pixel in the corners does to the rotation from single
+# pairs: rows cannot tell a yaw from a tangential distortion of 1e-3, which calibrations leave.
 _LENS_DEG = 0.15
 _EDGE = 0.95  # quantile of the rays' angles off the axis at which a lens model is off by that
 _CELLS = 5  # across the image, a side of the grid on which residuals show a distortion
 _LEAST_IN_CELL = 15  # matches that make a cell's median
 
-_Pose: TypeAlias = tuple[FloatArray, FloatArray]  # R_cam1_cam0 (3, 3), unit direction (3,) from cam0 to cam1 in cam0
+# R_cam1_cam0 (3, 3), unit direction (3,) from cam0 to cam1 in cam0
+_Pose: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +67,16 @@ class StereoEstimate:
     matches: int  # inliers
     pairs: int
     residual_deg: float  # robust spread of the epipolar angle over single pairs
-    segments: int | None = None  # segments of video that the values come from; None: single pairs alone
+    # segments of video that the values come from; None: single pairs alone
+    segments: int | None = None
 
 
-def epipolar_angles(R_cam1_cam0: FloatArray, direction: FloatArray, matches: RayMatches) -> FloatArray:
-    """Return signed angles (N,) in radians between the rays of cam1 and the epipolar planes of those of cam0."""
+def epipolar_angles(
+    R_cam1_cam0: FloatArray, direction: FloatArray, matches: RayMatches
+) -> FloatArray:
+    """Return signed angles (N,) in radians between the rays of cam1 and the epipolar planes of
+    those of cam0.
+    """
     turned = matches.ray0 @ R_cam1_cam0.T
     normal = np.cross(R_cam1_cam0 @ direction, turned)
     length = np.linalg.norm(normal, axis=1)
@@ -89,7 +98,8 @@ def refine_stereo(
         R_cam1_cam0: (3, 3) where to start.
         direction: (3,) unit vector where to start, cam0 frame.
     """
-    R, d = R_cam1_cam0, direction
+    R = R_cam1_cam0
+    d = direction
     inliers = matches
     for gate in (np.radians(_WIDEST_DEG), np.radians(_NARROWER_DEG), None):
         angles = np.abs(epipolar_angles(R, d, matches))
@@ -101,20 +111,29 @@ def refine_stereo(
             return few
         R, d = _fit_stereo(inliers, R, d, max(spread, 1e-6))
     spread = robust_sigma(epipolar_angles(R, d, inliers))
-    refits = [_fit_stereo(inliers.take(~block), R, d, max(spread, 1e-6)) for block in _blocks(inliers.pair)]
-    turns, swings = np.array([so3_log(Rk @ R.T) for Rk, _ in refits]), np.array([np.cross(d, dk) for _, dk in refits])
+    refits = [
+        _fit_stereo(inliers.take(~block), R, d, max(spread, 1e-6))
+        for block in _blocks(inliers.pair)
+    ]
+    turns = np.array([so3_log(Rk @ R.T) for Rk, _ in refits])
+    swings = np.array([np.cross(d, dk) for _, dk in refits])
     rotation_sigma, direction_sigma = (_jackknife_norm(v) for v in (turns, swings))
-    if rotation_sigma > np.radians(_STEREO_ROTATION_DEG) or direction_sigma > np.radians(_STEREO_DIRECTION_DEG):
+    if rotation_sigma > np.radians(_STEREO_ROTATION_DEG) or direction_sigma > np.radians(
+        _STEREO_DIRECTION_DEG
+    ):
         return NotObservable(
             "left-right extrinsics",
             f"the standard deviations are {np.degrees(rotation_sigma):.2f} deg of rotation and "
-            f"{np.degrees(direction_sigma):.1f} deg of direction; all points may be far away or on one plane",
+            f"{np.degrees(direction_sigma):.1f} deg of direction; all points may be far away or on "
+            "one plane",
         )
     return StereoEstimate(
         R_cam1_cam0=R,
         direction=d,
         rotation_sigma_deg=float(np.hypot(np.degrees(rotation_sigma), _LENS_DEG)),
-        direction_sigma_deg=float(np.degrees(np.hypot(direction_sigma, _lens_swing(inliers, R, d, max(spread, 1e-6))))),
+        direction_sigma_deg=float(
+            np.degrees(np.hypot(direction_sigma, _lens_swing(inliers, R, d, max(spread, 1e-6))))
+        ),
         matches=len(inliers.pair),
         pairs=len(np.unique(inliers.pair)),
         residual_deg=float(np.degrees(spread)),
@@ -124,9 +143,9 @@ def refine_stereo(
 def _lens_swing(matches: RayMatches, R: FloatArray, d: FloatArray, spread: float) -> float:
     """Return how far, radians, a lens model that is off turns the baseline's direction.
 
-    Rows of single pairs fit part of a distortion by a direction of the baseline, however many matches there are. What
-    they do not fit is left in the residuals over the image, so a bend that leaves more there than is seen is taken as
-    that much smaller.
+    Rows of single pairs fit part of a distortion by a direction of the baseline, however many
+    matches there are. What they do not fit is left in the residuals over the image, so a bend that
+    leaves more there than is seen is taken as that much smaller.
     """
     angles = epipolar_angles(R, d, matches)
     cells = _cells(_angles(matches.ray0))
@@ -142,7 +161,9 @@ def _lens_swing(matches: RayMatches, R: FloatArray, d: FloatArray, spread: float
 
 
 def _cells(angles: FloatArray) -> IntArray:
-    """Return the cell (N,) of a grid over the image, equally filled along x and y, of angles (N, 2) off the axis."""
+    """Return the cell (N,) of a grid over the image, equally filled along x and y, of angles (N,
+    2) off the axis.
+    """
     limits = np.quantile(angles, np.linspace(0, 1, _CELLS + 1)[1:-1], axis=0)
     column, row = (np.searchsorted(limits[:, k], angles[:, k]) for k in range(2))
     return column * _CELLS + row
@@ -150,21 +171,29 @@ def _cells(angles: FloatArray) -> IntArray:
 
 def _structure(values: FloatArray, cells: IntArray) -> float:
     """Return the rms over the cells (N,) of the medians of values (N,)."""
-    medians = [np.median(values[cells == k]) for k, n in enumerate(np.bincount(cells)) if n >= _LEAST_IN_CELL]
+    medians = [
+        np.median(values[cells == k])
+        for k, n in enumerate(np.bincount(cells))
+        if n >= _LEAST_IN_CELL
+    ]
     return float(np.sqrt(np.mean(np.square(medians)))) if medians else float("inf")
 
 
 def _bends(rays: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return by what radial and both tangential distortions move rays (N, 3), each (N, 2), radians, in `_angles`.
+    """Return by what radial and both tangential distortions move rays (N, 3), each (N, 2), radians,
+    in `_angles`.
 
-    Reference: Brown, Close-range camera calibration (1971), in the angles off the axis, as lenses may be wide.
+    Reference: Brown, Close-range camera calibration (1971), in the angles off the axis, as lenses
+    may be wide.
     """
     angles = _angles(rays)
     edge = max(float(np.quantile(np.linalg.norm(angles, axis=1), _EDGE)), 1e-6)
     xy = angles / edge
     r2 = np.sum(xy**2, axis=1, keepdims=True)
     size = np.radians(_LENS_DEG)
-    return size * xy * r2, *(size / 3 * (r2 * axis + 2 * xy * xy[:, k : k + 1]) for k, axis in enumerate(np.eye(2)))
+    return size * xy * r2, *(
+        size / 3 * (r2 * axis + 2 * xy * xy[:, k : k + 1]) for k, axis in enumerate(np.eye(2))
+    )
 
 
 def _angles(rays: FloatArray) -> FloatArray:
@@ -181,13 +210,17 @@ def _bent(rays: FloatArray, bend: FloatArray) -> FloatArray:
 
 
 def too_few(matches: RayMatches) -> NotObservable | None:
-    """Return why left-right extrinsics are not observable with so few matches; None: there are enough."""
+    """Return why left-right extrinsics are not observable with so few matches.
+
+    None: there are enough.
+    """
     pairs = len(np.unique(matches.pair))
     if len(matches.pair) >= _LEAST_MATCHES and pairs >= _LEAST_PAIRS:
         return None
     return NotObservable(
         "left-right extrinsics",
-        f"only {len(matches.pair)} consistent matches in {pairs} pairs were found ({_LEAST_MATCHES} in {_LEAST_PAIRS} "
+        f"only {len(matches.pair)} consistent matches in {pairs} pairs were found "
+        f"({_LEAST_MATCHES} in {_LEAST_PAIRS} "
         "are needed); the images are too few, do not overlap, or have no texture",
     )
 
@@ -202,7 +235,10 @@ def _fit_stereo(matches: RayMatches, R: FloatArray, d: FloatArray, spread: float
         return so3_exp(x[:3]) @ R, out / np.linalg.norm(out)
 
     found = least_squares(
-        lambda x: epipolar_angles(*moved(x), matches) / spread, np.zeros(5), loss="soft_l1", x_scale=1e-2
+        lambda x: epipolar_angles(*moved(x), matches) / spread,
+        np.zeros(5),
+        loss="soft_l1",
+        x_scale=1e-2,
     )
     return moved(found.x)
 
@@ -220,8 +256,12 @@ def _blocks(labels: IntArray) -> list[BoolArray]:
 
 
 def _jackknife_norm(values: FloatArray) -> float:
-    """Return the standard error of a vector (its length) from its leave-one-block-out values (n, d)."""
-    return float(np.sqrt((len(values) - 1) * np.mean(np.sum((values - values.mean(axis=0)) ** 2, axis=1))))
+    """Return the standard error of a vector (its length) from its leave-one-block-out values (n,
+    d).
+    """
+    return float(
+        np.sqrt((len(values) - 1) * np.mean(np.sum((values - values.mean(axis=0)) ** 2, axis=1)))
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +270,8 @@ class RowResiduals:
 
     median_px: float  # of vl - vr
     spread_px: float  # robust standard deviation
-    grid_px: FloatArray  # (3, 3) medians over the image, rows from the top; NaN where there are too few matches
+    # (3, 3) medians over the image, rows from the top; NaN where there are too few matches
+    grid_px: FloatArray
     positive_disparity: float  # share of matches with ul > ur
     matches: int
     rms_px: float  # root mean square over the matches of the median where each of them is
@@ -238,12 +279,15 @@ class RowResiduals:
 
 
 def row_residuals(z: FloatArray, width: float, height: float) -> RowResiduals | NotObservable:
-    """Describe the row differences of matches (N, 4) `[ul vl ur vr]` in rectified pixels, over the image."""
+    """Describe the row differences of matches (N, 4) `[ul vl ur vr]` in rectified pixels, over
+    the image.
+    """
     if len(z) < _LEAST_MATCHES:
         return NotObservable("row alignment", f"only {len(z)} matches were found")
     off = z[:, 1] - z[:, 3]
     median = float(np.median(off))
-    grid, smooth = np.full((3, 3), np.nan), np.full(len(off), median)
+    grid = np.full((3, 3), np.nan)
+    smooth = np.full(len(off), median)
     column = np.clip((3 * z[:, 0] / width).astype(int), 0, 2)
     row = np.clip((3 * z[:, 1] / height).astype(int), 0, 2)
     for i in range(3):

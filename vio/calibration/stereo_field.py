@@ -1,11 +1,13 @@
 """The field of pixels that a stereo calibration is off by, and the calibration that has none.
 
-The sliding window estimates a low-order field over the rectified images, equations (R1) to (R3) of docs/math.md. Here
-it is taken out of pixels, and turned into a rig: a rotation of the right camera, its principal point, focal lengths
-and tangential distortion against the left one, the distortion of both, and how far the right camera sits below the row
-of the left one. The field's coefficients determine these parameters to first order, but three of them badly (a yaw, a
-principal point and a tangential distortion of the right camera move pixels almost alike); a prior of what real rigs do
-decides between them. The term of the fourth order of the right columns has no parameter and is left.
+The sliding window estimates a low-order field over the rectified images, equations (R1) to (R3) of
+docs/math.md. Here it is taken out of pixels, and turned into a rig: a rotation of the right camera,
+its principal point, focal lengths and tangential distortion against the left one, the distortion of
+both, and how far the right camera sits below the row of the left one. The field's coefficients
+determine these parameters to first order, but three of them badly (a yaw, a principal point and a
+tangential distortion of the right camera move pixels almost alike); a prior of what real rigs do
+decides between them. The term of the fourth order of the right columns has no parameter and is
+left.
 """
 
 from __future__ import annotations
@@ -32,22 +34,26 @@ from vio.records import (
     StereoScaleEstimate,
 )
 
-# Parameters of a rig's correction: rotation of the right camera (rad, in the rectified frame: its points p are seen as
-# `exp(w) p`), its principal point (focal lengths), focal ratios and tangential distortion against the left camera;
-# radial distortion of both, of the third and fifth order, and tangential; how far the right camera is below the left
-# one's row (baselines).
+# Parameters of a rig's correction: rotation of the right camera (rad, in the rectified frame: its
+# points p are seen as `exp(w) p`), its principal point (focal lengths), focal ratios and tangential
+# distortion against the left camera; radial distortion of both, of the third and fifth order, and
+# tangential; how far the right camera is below the left one's row (baselines).
 PARAMETERS = ("wx", "wy", "wz", "cu", "cv", "fu", "fv", "p1", "p2", "k", "k2", "q1", "q2", "ty")
 _BOTH = ("k", "k2", "q1", "q2")
 TERMS = FIELD_TERMS + ROW_TERMS  # coefficients of the field: of (R3), then of the rows (R2)
 _FOURTH = RIGHT_TERMS - 1  # the one of them that no rig has
 _BELOW = TERMS - 1  # the one of the baseline's direction
-# What a calibration of a real rig is usually off by: mounts turn by tenths of a degree; principal point and focal
-# lengths by 2e-3 focal lengths; lens models as the sliding window takes them (online_calibration). A Cauchy
-# distribution of this width: a rig that is off by much more is believed.
-_PRIOR = np.array([*[np.radians(0.5)] * 3, *[2e-3] * 4, *[2e-3] * 2, 1e-2, 1e-2, *[2e-3] * 2, np.radians(0.5)])
+# What a calibration of a real rig is usually off by: mounts turn by tenths of a degree; principal
+# point and focal lengths by 2e-3 focal lengths; lens models as the sliding window takes them
+# (online_calibration). A Cauchy distribution of this width: a rig that is off by much more is
+# believed.
+_PRIOR = np.array(
+    [*[np.radians(0.5)] * 3, *[2e-3] * 4, *[2e-3] * 2, 1e-2, 1e-2, *[2e-3] * 2, np.radians(0.5)]
+)
 _MODEL = 1e-4  # focal lengths, 0.05 px: what terms beyond those of the field leave in a coefficient
 _NO_PARAMETER = 1.0  # focal lengths: a coefficient that says nothing of the rig
-_BENDS = ("pinhole", "radtan", "unified")  # models that hold tangential distortion, or become one that does
+# models that hold tangential distortion, or become one that does
+_BENDS = ("pinhole", "radtan", "unified")
 _GRID = (11, 9)  # points along the image's width and height at which field and rig are compared
 _STEP = 1e-6  # of numeric derivatives by the parameters, which are all of the size of radians
 _STEPS = 15  # of Gauss-Newton; the weights of the prior need most of them
@@ -80,8 +86,10 @@ class DisplacementField:
     @classmethod
     def of(cls, camera: StereoCamera, estimate: StereoFieldEstimate) -> DisplacementField:
         """Return the field of an estimate, without rows where they are not known."""
-        coefficients, covariance = np.zeros(TERMS), np.zeros((TERMS, TERMS))
-        coefficients[:FIELD_TERMS], covariance[:FIELD_TERMS, :FIELD_TERMS] = estimate.coefficients, estimate.covariance
+        coefficients = np.zeros(TERMS)
+        covariance = np.zeros((TERMS, TERMS))
+        coefficients[:FIELD_TERMS] = estimate.coefficients
+        covariance[:FIELD_TERMS, :FIELD_TERMS] = estimate.covariance
         if estimate.rows is not None:
             coefficients[FIELD_TERMS:] = estimate.rows
         if estimate.rows_covariance is not None:
@@ -93,20 +101,25 @@ class DisplacementField:
         return error_basis(self.camera, z) @ self.coefficients
 
     def without(self, z: FloatArray, has_right: BoolArray) -> FloatArray:
-        """Return pixels (N, 4) without the field; right pixels stay as they are where `has_right` (N,) is False."""
+        """Return pixels (N, 4) without the field; right pixels stay as they are where
+        `has_right` (N,) is False.
+        """
         off = self.at(z)
         off[~has_right, 2:] = 0
         return z - off
 
     def deviations(self, z: FloatArray) -> FloatArray:
-        """Return by how much pixels (N, 4) move (N, 4, 15) for one standard deviation of independent combinations."""
+        """Return by how much pixels (N, 4) move (N, 4, 15) for one standard deviation of
+        independent combinations.
+        """
         if self.covariance is None:
             return np.zeros((*z.shape, TERMS))
         variances, V = np.linalg.eigh(self.covariance)
         return error_basis(self.camera, z) @ (V * np.sqrt(np.maximum(variances, 0.0)))
 
     def maps(self) -> tuple[tuple[MapArray, MapArray], tuple[MapArray, MapArray]]:
-        """Return where each pixel of the left and right images without the field lies in the images as they are.
+        """Return where each pixel of the left and right images without the field lies in the images
+        as they are.
 
         Source u and v (H, W) of both, for cv2.remap.
         """
@@ -128,10 +141,12 @@ class CalibratedRig:
     """A rig as a run corrected it."""
 
     rig: Rig
-    parameters: FloatArray  # (14,) what the given rig was off by, in the order and units of `PARAMETERS`
+    # (14,) what the given rig was off by, in the order and units of `PARAMETERS`
+    parameters: FloatArray
     covariance: FloatArray  # (14, 14)
     left_px: float  # root mean square over the images of the field that the rig cannot express
-    scale: StereoScaleEstimate | None = None  # what baseline and focal length were off by, where they were estimated
+    # what baseline and focal length were off by, where they were estimated
+    scale: StereoScaleEstimate | None = None
 
     @property
     def sigmas(self) -> FloatArray:
@@ -141,27 +156,34 @@ class CalibratedRig:
     def lines(self) -> tuple[str, ...]:
         """Return one line for each parameter that is off by more than three standard deviations.
 
-        A turn about the vertical or horizontal axis and a principal point move the image's centre alike, and only their
-        sum is well determined: it is the turn that is named.
+        A turn about the vertical or horizontal axis and a principal point move the image's centre
+        alike, and only their sum is well determined: it is the turn that is named.
         """
         combine = np.eye(len(PARAMETERS))
         for turn, centre, sign in (("wx", "cv", -1.0), ("wy", "cu", 1.0)):
             combine[PARAMETERS.index(turn), PARAMETERS.index(centre)] = sign
-        values, covariance = combine @ self.parameters, combine @ self.covariance @ combine.T
+        values = combine @ self.parameters
+        covariance = combine @ self.covariance @ combine.T
         out = []
-        for name, value, variance in zip(PARAMETERS, values.tolist(), np.diag(covariance).tolist(), strict=True):
+        for name, value, variance in zip(
+            PARAMETERS, values.tolist(), np.diag(covariance).tolist(), strict=True
+        ):
             if name in _TEXT and value * value > _NAMED_SIGMAS**2 * variance:
                 text, scale, form = _TEXT[name]
                 out.append(text.format(f"{scale * value:+{form}} ± {scale * variance**0.5:{form}}"))
         found = {} if self.scale is None else self.scale.percent()
-        out += [f"{name} off by {percent:+.2f} ± {sigma:.2f} %" for name, (percent, sigma) in found.items()]
+        out += [
+            f"{name} off by {percent:+.2f} ± {sigma:.2f} %"
+            for name, (percent, sigma) in found.items()
+        ]
         return tuple(out)
 
 
 def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
     """Return a given rig with all that a run estimated of it.
 
-    That is the rectification error, baseline and focal length, extrinsics and time offset of the IMU.
+    That is the rectification error, baseline and focal length, extrinsics and time offset of the
+    IMU.
 
     What the run did not estimate stays as given, with its prior standard deviations.
 
@@ -178,7 +200,9 @@ def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
     rig = out.rig
     if estimate.T_cam0_imu is not None:
         R_cam0_rect = _Frame.of(given).R_rect_cam0.T
-        rig = replace(rig, T_cam0_imu=se3_from_parts(R_cam0_rect, np.zeros(3)) @ estimate.T_cam0_imu)
+        rig = replace(
+            rig, T_cam0_imu=se3_from_parts(R_cam0_rect, np.zeros(3)) @ estimate.T_cam0_imu
+        )
     if estimate.time_offset_s is not None:
         rig = replace(rig, time_offset_s=given.time_offset_s + estimate.time_offset_s)
     if estimate.stereo_scale is not None:
@@ -187,17 +211,27 @@ def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
 
 
 def _scaled(rig: Rig, baseline: float, focal: float) -> Rig:
-    """Return a rig whose baseline and focal lengths are longer by factors exp(baseline) and exp(focal), (R4).
+    """Return a rig whose baseline and focal lengths are longer by factors exp(baseline) and
+    exp(focal), (R4).
 
-    A pixel's ray is nearer to the axis by exp(focal), which the coefficients of the radial-tangential model follow,
-    each by the power of the radius that it belongs to. Other models keep theirs: the same near the axis.
+    A pixel's ray is nearer to the axis by exp(focal), which the coefficients of the
+    radial-tangential model follow, each by the power of the radius that it belongs to. Other models
+    keep theirs: the same near the axis.
     """
 
     def lens(camera: CameraModel) -> CameraModel:
-        powers = (2, 4, 1, 1, 6, 2, 4, 6) if camera.model == "radtan" else (0,) * len(camera.coefficients)
-        coefficients = tuple(c * math.exp(n * focal) for c, n in zip(camera.coefficients, powers, strict=False))
+        powers = (
+            (2, 4, 1, 1, 6, 2, 4, 6)
+            if camera.model == "radtan"
+            else (0,) * len(camera.coefficients)
+        )
+        coefficients = tuple(
+            c * math.exp(n * focal) for c, n in zip(camera.coefficients, powers, strict=False)
+        )
         factor = math.exp(focal)
-        return replace(camera, fu=factor * camera.fu, fv=factor * camera.fv, coefficients=coefficients)
+        return replace(
+            camera, fu=factor * camera.fu, fv=factor * camera.fv, coefficients=coefficients
+        )
 
     cam1, T_cam1_cam0 = rig.right
     T = T_cam1_cam0.copy()
@@ -213,7 +247,8 @@ def field_of(camera: StereoCamera, parameters: FloatArray) -> DisplacementField:
 
 
 def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
-    """Fit the parameters to the field's coefficients with their covariance and the prior, by Gauss-Newton.
+    """Fit the parameters to the field's coefficients with their covariance and the prior, by
+    Gauss-Newton.
 
     The Cauchy prior is a Gaussian one whose weights follow the parameters.
     """
@@ -227,7 +262,8 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
     W = np.linalg.inv(P)
     free = _expressible(given)
     x = np.zeros(len(PARAMETERS))
-    J, information = np.zeros((TERMS, len(PARAMETERS))), np.diag(1 / _PRIOR**2)
+    J = np.zeros((TERMS, len(PARAMETERS)))
+    information = np.diag(1 / _PRIOR**2)
     for round_ in range(_STEPS):
         prior = np.diag(1 / (_PRIOR**2 + x**2))
         for k in np.flatnonzero(free & (round_ in _LINEARISED)):
@@ -264,25 +300,35 @@ class _Frame:
     @classmethod
     def of(cls, rig: Rig) -> _Frame:
         """Rectify a rig."""
-        camera, R_rect_cam0, R_rect_cam1 = rig.camera, np.eye(3), np.eye(3)
+        camera = rig.camera
+        R_rect_cam0 = np.eye(3)
+        R_rect_cam1 = np.eye(3)
         if rectified_pair(rig.stereo) is None:
             pair = rectified_cameras(rig.stereo)
-            camera, R_rect_cam0, R_rect_cam1 = pair.camera, pair.R_rect_cam0, pair.R_rect_cam1
+            camera = pair.camera
+            R_rect_cam0 = pair.R_rect_cam0
+            R_rect_cam1 = pair.R_rect_cam1
         assert camera.width is not None
         assert camera.height is not None
-        u, v = np.meshgrid(np.linspace(0, camera.width - 1, _GRID[0]), np.linspace(0, camera.height - 1, _GRID[1]))
-        return cls(rig, camera, R_rect_cam0, R_rect_cam1, np.stack([u, v, u, v], axis=-1).reshape(-1, 4))
+        u, v = np.meshgrid(
+            np.linspace(0, camera.width - 1, _GRID[0]), np.linspace(0, camera.height - 1, _GRID[1])
+        )
+        return cls(
+            rig, camera, R_rect_cam0, R_rect_cam1, np.stack([u, v, u, v], axis=-1).reshape(-1, 4)
+        )
 
     def moved(self, x: FloatArray) -> Rig:
         """Return the rig whose calibration differs from the given one by parameters (14,)."""
         if not np.any(x):
             return self.given
-        given, named = self.given, dict(zip(PARAMETERS, x.tolist(), strict=True))
+        given = self.given
+        named = dict(zip(PARAMETERS, x.tolist(), strict=True))
         k, k2, q1, q2 = (named[name] for name in _BOTH)
         b, T_cam1_cam0 = given.right
         b = replace(b, cu=b.cu + b.fu * named["cu"], cv=b.cv + b.fv * named["cv"])
         b = replace(b, fu=b.fu * (1 + named["fu"]), fv=b.fv * (1 + named["fv"]))
-        cam0, cam1 = _bent(given.cam0, (k, k2), q1, q2), _bent(b, (k, k2), q1 + named["p1"], q2 + named["p2"])
+        cam0 = _bent(given.cam0, (k, k2), q1, q2)
+        cam1 = _bent(b, (k, k2), q1 + named["p1"], q2 + named["p2"])
         R = self.R_rect_cam1.T @ so3_exp(x[:3]) @ self.R_rect_cam0
         centre = se3_inverse(T_cam1_cam0)[:3, 3]
         down = self.R_rect_cam0[1] * named["ty"] * np.linalg.norm(centre)
@@ -290,8 +336,11 @@ class _Frame:
         return replace(given, cam0=cam0, cam1=cam1, T_cam1_cam0=se3_from_parts(R, -R @ centre))
 
     def as_seen(self, x: FloatArray) -> FloatArray:
-        """Return where the given rectification shows the grid's pixels (N, 4) if it is off by parameters (14,)."""
-        true, out = self.moved(x), np.empty(self.grid.shape)
+        """Return where the given rectification shows the grid's pixels (N, 4) if it is off by
+        parameters (14,).
+        """
+        true = self.moved(x)
+        out = np.empty(self.grid.shape)
         cam1, T_cam1_cam0 = true.right
         turn1 = T_cam1_cam0[:3, :3] @ self.R_rect_cam0.T
         sides = (
@@ -299,16 +348,22 @@ class _Frame:
             (self.given.right[0], cam1, turn1, self.R_rect_cam1),
         )
         for column, (believed, real, turn, R_rect_cam) in zip((0, 2), sides, strict=True):
-            raw, _ = project_point(real, left_rays(self.camera, self.grid[:, column : column + 2]) @ turn.T)
+            raw, _ = project_point(
+                real, left_rays(self.camera, self.grid[:, column : column + 2]) @ turn.T
+            )
             out[:, column : column + 2], _ = rectify_pixels(believed, R_rect_cam, self.camera, raw)
         return out
 
     def where_read(self, seen: FloatArray) -> FloatArray:
-        """Return the pixels (N, 4) at which (R2) and (R3) are evaluated: those seen, in the rows of the left image."""
+        """Return the pixels (N, 4) at which (R2) and (R3) are evaluated: those seen, in the rows
+        of the left image.
+        """
         return np.stack([seen[:, 0], seen[:, 1], seen[:, 2], self.grid[:, 3]], axis=1)
 
     def coefficients(self, x: FloatArray) -> FloatArray:
-        """Return the field's coefficients (15,) that fit best what parameters (14,) do to the grid's pixels."""
+        """Return the field's coefficients (15,) that fit best what parameters (14,) do to the
+        grid's pixels.
+        """
         seen = self.as_seen(x)
         D = error_basis(self.camera, self.where_read(seen)).reshape(-1, TERMS)[:, :_BELOW]
         found = np.linalg.lstsq(D, (seen - self.grid).ravel(), rcond=None)[0]
@@ -322,12 +377,15 @@ def rig_off_by(given: Rig, parameters: FloatArray) -> Rig:
 
 def _bent(camera: CameraModel, radial: tuple[float, float], p1: float, p2: float) -> CameraModel:
     """Return a camera with more radial and tangential distortion, as far as its model holds it."""
-    c, (k1, k2) = camera.coefficients, radial
+    c = camera.coefficients
+    (k1, k2) = radial
     if camera.model == "pinhole":
         return replace(camera, model="radtan", coefficients=(k1, k2, p1, p2))
     if camera.model == "unified":
         bend = c[1:] or (0.0, 0.0, 0.0, 0.0)
-        return replace(camera, coefficients=(c[0], bend[0] + k1, bend[1] + k2, bend[2] + p1, bend[3] + p2))
+        return replace(
+            camera, coefficients=(c[0], bend[0] + k1, bend[1] + k2, bend[2] + p1, bend[3] + p2)
+        )
     if camera.model == "radtan":
         return replace(camera, coefficients=(c[0] + k1, c[1] + k2, c[2] + p1, c[3] + p2, *c[4:]))
     if camera.model == "equidistant":
@@ -335,10 +393,13 @@ def _bent(camera: CameraModel, radial: tuple[float, float], p1: float, p2: float
     return camera
 
 
-_MOST_LEFT_PX = 5.0  # a rig that leaves more of what the run saw is none of these cameras; true ones leave 0.3 px
+# a rig that leaves more of what the run saw is none of these cameras; true ones leave 0.3 px
+_MOST_LEFT_PX = 5.0
 
 
-def estimated_rig(given: Rig, estimate: Estimate, camera: StereoCamera, where: str) -> CalibratedRig:
+def estimated_rig(
+    given: Rig, estimate: Estimate, camera: StereoCamera, where: str
+) -> CalibratedRig:
     """Return a given rig with all that a run estimated of it.
 
     On a cylinder left and right stay as given: its rectification error is not expressed as a rig.
@@ -357,6 +418,8 @@ def estimated_rig(given: Rig, estimate: Estimate, camera: StereoCamera, where: s
     except CalibrationError as error:  # the fit's steps led out of the possible rigs
         cause = error
     raise CalibrationError(
-        f"{where}: no rig with the given lens models is off as the run found it (rows by {field.rows_rms_px:.2f} px "
-        "rms); the calibration may be that of other images, or without their distortion: calibrate the cameras anew"
+        f"{where}: no rig with the given lens models is off as the run found it (rows by "
+        f"{field.rows_rms_px:.2f} px "
+        "rms); the calibration may be that of other images, or without their distortion: calibrate "
+        "the cameras anew"
     ) from cause

@@ -16,12 +16,14 @@ from vio.geometry.lie import FloatArray, so3_log
 from vio.geometry.stereo import StereoCamera
 from vio.records import FeatureTracks, IntArray
 
-_CLEARLY_WORSE = 2.0  # spread of the given calibration's epipolar angles over that of the measured one
+# spread of the given calibration's epipolar angles over that of the measured one
+_CLEARLY_WORSE = 2.0
 _EXCHANGED_DEG = 0.2  # largest epipolar angle of a calibration that fits
 _OPPOSITE_DEG = 20.0  # a direction so close to the negative of another is taken as inverted
 _NAMED_SIGMAS = 5.0  # a difference must exceed so many standard deviations …
 _NAMED_ROTATION_DEG = 0.3  # … and these limits, to be called a fault
-_NAMED_IN_MOTION_DEG = 0.05  # where motion has separated a rotation from the lens model: half a pixel of disparity
+# where motion has separated a rotation from the lens model: half a pixel of disparity
+_NAMED_IN_MOTION_DEG = 0.05
 _NAMED_DIRECTION_DEG = 1.0
 _NAMED_IMU_ROTATION_DEG = 0.5
 _INVERSE_DEG = 5.0  # an inverse that fits so well is taken as the explanation
@@ -29,17 +31,21 @@ _NAMED_LEVER_ARM_M = 0.03
 _NAMED_OFFSET_S = 0.002
 
 
-# --- left and right -------------------------------------------------------------------------------------------------
+# --- left and right
+# -------------------------------------------------------------------------------------------------
 
 
-def judge_stereo(estimate: StereoEstimate, T_cam0_cam1: FloatArray, inliers: RayMatches) -> tuple[Finding, ...]:
+def judge_stereo(
+    estimate: StereoEstimate, T_cam0_cam1: FloatArray, inliers: RayMatches
+) -> tuple[Finding, ...]:
     """Compare measured left-right extrinsics with given ones (4, 4).
 
-    The order of the cameras is measured, too: cam1 must be on the positive x side of cam0. From single pairs, a
-    difference is a fault only if the given extrinsics explain the matches clearly worse: a slightly wrong lens model
-    looks like a few tenths of a degree of yaw.
+    The order of the cameras is measured, too: cam1 must be on the positive x side of cam0. From
+    single pairs, a difference is a fault only if the given extrinsics explain the matches clearly
+    worse: a slightly wrong lens model looks like a few tenths of a degree of yaw.
     """
-    R_given, given = T_cam0_cam1[:3, :3].T, _unit(T_cam0_cam1[:3, 3])
+    R_given = T_cam0_cam1[:3, :3].T
+    given = _unit(T_cam0_cam1[:3, 3])
     swapped = _judge_order(estimate, R_given, given)
     if swapped is not None:
         return (swapped,)
@@ -51,30 +57,40 @@ def judge_stereo(estimate: StereoEstimate, T_cam0_cam1: FloatArray, inliers: Ray
     swing_deg = _between_deg(estimate.direction, given)
     if _opposite(estimate, given):
         found["baseline translation inverted"] = (
-            f"the calibration puts cam1 at {_triple(given)}, the images at {_triple(estimate.direction)} (unit vectors "
+            f"the calibration puts cam1 at {_triple(given)}, the images at "
+            f"{_triple(estimate.direction)} (unit vectors "
             "in cam0); the translation has the wrong sign, or the transform is the inverse one"
         )
     elif swing_deg > _swing_limit_deg(estimate) and clear:
         sigma_deg = estimate.direction_sigma_deg
-        found["baseline direction wrong"] = f"off by {swing_deg:.2f} deg (standard deviation {sigma_deg:.2f})"
+        found["baseline direction wrong"] = (
+            f"off by {swing_deg:.2f} deg (standard deviation {sigma_deg:.2f})"
+        )
     turn = so3_log(estimate.R_cam1_cam0 @ R_given.T)
     turn_deg = float(np.degrees(np.linalg.norm(turn)))
     if turn_deg > _turn_limit_deg(estimate) and clear:
         x, y, z = np.degrees(turn)
         found["left-right rotation wrong"] = (
-            f"off by {turn_deg:.2f} deg ({x:+.2f} {y:+.2f} {z:+.2f} about x y z of cam1; standard deviation "
+            f"off by {turn_deg:.2f} deg ({x:+.2f} {y:+.2f} {z:+.2f} about x y z of cam1; standard "
+            "deviation "
             f"{estimate.rotation_sigma_deg:.3f})"
         )
     return tuple(Finding(*each) for each in found.items())
 
 
-def _judge_order(estimate: StereoEstimate, R_given: FloatArray, given: FloatArray) -> Finding | None:
-    """Check whether cam1 is the left camera, in the images or in the calibration (rotation (3, 3), direction (3,))."""
+def _judge_order(
+    estimate: StereoEstimate, R_given: FloatArray, given: FloatArray
+) -> Finding | None:
+    """Check whether cam1 is the left camera, in the images or in the calibration (rotation (3,
+    3), direction (3,)).
+    """
     if estimate.direction[0] < -0.5:
         return Finding(
             "cameras swapped",
-            "the images of cam1 are taken from the left of those of cam0 (measured baseline direction "
-            f"{_triple(estimate.direction)} in cam0); exchange the two folders, or the two calibrations with them",
+            "the images of cam1 are taken from the left of those of cam0 (measured baseline "
+            "direction "
+            f"{_triple(estimate.direction)} in cam0); exchange the two folders, or the two "
+            "calibrations with them",
         )
     limit_deg = _turn_limit_deg(estimate)
     differs = float(rotation_angle_deg(estimate.R_cam1_cam0 @ R_given.T)) > limit_deg
@@ -82,13 +98,16 @@ def _judge_order(estimate: StereoEstimate, R_given: FloatArray, given: FloatArra
     if _opposite(estimate, given) and differs and inverse_fits:
         return Finding(
             "cameras swapped",
-            "the calibration is that of the two cameras exchanged, or the inverse transform: its inverse fits",
+            "the calibration is that of the two cameras exchanged, or the inverse transform: its "
+            "inverse fits",
         )
     return None
 
 
 def _opposite(estimate: StereoEstimate, given: FloatArray) -> bool:
-    return _between_deg(estimate.direction, given) > 180 - max(_swing_limit_deg(estimate), _OPPOSITE_DEG)
+    return _between_deg(estimate.direction, given) > 180 - max(
+        _swing_limit_deg(estimate), _OPPOSITE_DEG
+    )
 
 
 def _turn_limit_deg(estimate: StereoEstimate) -> float:
@@ -100,8 +119,11 @@ def _swing_limit_deg(estimate: StereoEstimate) -> float:
     return max(_NAMED_DIRECTION_DEG, _NAMED_SIGMAS * estimate.direction_sigma_deg)
 
 
-def judge_exchange(matches: RayMatches, exchanged: RayMatches, T_cam0_cam1: FloatArray) -> tuple[Finding, ...]:
-    """Check whether the given calibration (4, 4) fits the images much better with the two cameras' images exchanged.
+def judge_exchange(
+    matches: RayMatches, exchanged: RayMatches, T_cam0_cam1: FloatArray
+) -> tuple[Finding, ...]:
+    """Check whether the given calibration (4, 4) fits the images much better with the two cameras'
+    images exchanged.
 
     Args:
         matches: rays by the cameras as the recording has them.
@@ -110,20 +132,25 @@ def judge_exchange(matches: RayMatches, exchanged: RayMatches, T_cam0_cam1: Floa
     """
     if too_few(matches) is not None or too_few(exchanged) is not None:
         return ()
-    R, direction = T_cam0_cam1[:3, :3].T, _unit(T_cam0_cam1[:3, 3])
-    as_given, other_way = (float(np.degrees(epipolar_spread(R, direction, m))) for m in (matches, exchanged))
+    R = T_cam0_cam1[:3, :3].T
+    direction = _unit(T_cam0_cam1[:3, 3])
+    as_given, other_way = (
+        float(np.degrees(epipolar_spread(R, direction, m))) for m in (matches, exchanged)
+    )
     if other_way * _CLEARLY_WORSE > as_given or other_way > _EXCHANGED_DEG:
         return ()
     return (
         Finding(
             "cameras swapped",
-            f"the calibration fits the images to {other_way:.3f} deg with cam0 and cam1 exchanged, and to "
+            f"the calibration fits the images to {other_way:.3f} deg with cam0 and cam1 exchanged, "
+            "and to "
             f"{as_given:.3f} deg as given; exchange the two image folders",
         ),
     )
 
 
-# --- inertial sensor ------------------------------------------------------------------------------------------------
+# --- inertial sensor
+# ------------------------------------------------------------------------------------------------
 
 
 def judge_imu(
@@ -135,8 +162,14 @@ def judge_imu(
         found += _judge_translation(lever_arm, T_cam0_imu)
     limit_s = max(_NAMED_OFFSET_S, _NAMED_SIGMAS * alignment.time_offset_sigma_s)
     if alignment.time_offset_sigma_s < TIME_OFFSET_S and abs(alignment.time_offset_s) > limit_s:
-        off_ms, sigma_ms = 1e3 * alignment.time_offset_s, 1e3 * alignment.time_offset_sigma_s
-        found.append(Finding("clocks apart", f"IMU minus camera {off_ms:+.2f} ms (standard deviation {sigma_ms:.2f})"))
+        off_ms = 1e3 * alignment.time_offset_s
+        sigma_ms = 1e3 * alignment.time_offset_sigma_s
+        found.append(
+            Finding(
+                "clocks apart",
+                f"IMU minus camera {off_ms:+.2f} ms (standard deviation {sigma_ms:.2f})",
+            )
+        )
     return tuple(found)
 
 
@@ -144,23 +177,30 @@ def _judge_rotation(alignment: ImuAlignment, R: FloatArray) -> Iterator[Finding]
     """Compare the measured rotation with a given one (3, 3) and with its inverse."""
     off = so3_log(alignment.R_cam0_imu @ R.T)
     sigma = np.maximum(alignment.rotation_sigma_deg, 1e-3)
-    if not (np.abs(np.degrees(off)) > np.maximum(_NAMED_IMU_ROTATION_DEG, _NAMED_SIGMAS * sigma)).any():
+    if not (
+        np.abs(np.degrees(off)) > np.maximum(_NAMED_IMU_ROTATION_DEG, _NAMED_SIGMAS * sigma)
+    ).any():
         return
     inverse_deg = float(rotation_angle_deg(alignment.R_cam0_imu @ R))
     if inverse_deg < max(_INVERSE_DEG, _NAMED_SIGMAS * float(sigma.max())):
-        yield Finding("IMU-camera rotation inverted", f"the inverse of the given one fits to {inverse_deg:.2f} deg")
+        yield Finding(
+            "IMU-camera rotation inverted",
+            f"the inverse of the given one fits to {inverse_deg:.2f} deg",
+        )
         return
     x, y, z = np.degrees(off)
     yield Finding(
         "IMU-camera rotation wrong",
-        f"off by {float(np.degrees(np.linalg.norm(off))):.2f} deg ({x:+.2f} {y:+.2f} {z:+.2f} about x y z of cam0; "
+        f"off by {float(np.degrees(np.linalg.norm(off))):.2f} deg ({x:+.2f} {y:+.2f} {z:+.2f} "
+        "about x y z of cam0; "
         f"standard deviations {sigma[0]:.2f} {sigma[1]:.2f} {sigma[2]:.2f})",
     )
 
 
 def _judge_translation(lever_arm: LeverArm, T_cam0_imu: FloatArray) -> Iterator[Finding]:
     """Compare the measured translation with a given one, and with its likely confusions."""
-    R, t = T_cam0_imu[:3, :3], T_cam0_imu[:3, 3]
+    R = T_cam0_imu[:3, :3]
+    t = T_cam0_imu[:3, 3]
     off_m = float(np.linalg.norm(lever_arm.t_cam0_imu - t))
     if off_m <= max(_NAMED_LEVER_ARM_M, _NAMED_SIGMAS * float(np.linalg.norm(lever_arm.sigma_m))):
         return
@@ -169,25 +209,34 @@ def _judge_translation(lever_arm: LeverArm, T_cam0_imu: FloatArray) -> Iterator[
         "as the camera's position in the IMU frame it": -R @ t,
         "the inverse transform": -R.T @ t,
     }
-    nearest = min(others, key=lambda name: float(np.linalg.norm(lever_arm.t_cam0_imu - others[name])))
+    nearest = min(
+        others, key=lambda name: float(np.linalg.norm(lever_arm.t_cam0_imu - others[name]))
+    )
     near_m = float(np.linalg.norm(lever_arm.t_cam0_imu - others[nearest]))
     if near_m < 0.5 * off_m:
         yield Finding(
             "IMU-camera translation inverted",
-            f"measured {_triple(lever_arm.t_cam0_imu)} m, given {_triple(t)} m; {nearest} fits to {near_m:.3f} m",
+            f"measured {_triple(lever_arm.t_cam0_imu)} m, given {_triple(t)} m; {nearest} fits to "
+            f"{near_m:.3f} m",
         )
         return
     yield Finding(
         "IMU-camera translation wrong",
-        f"measured {_triple(lever_arm.t_cam0_imu)} m (standard deviations {_triple(lever_arm.sigma_m)}), "
+        f"measured {_triple(lever_arm.t_cam0_imu)} m (standard deviations "
+        f"{_triple(lever_arm.sigma_m)}), "
         f"given {_triple(t)} m",
     )
 
 
 def judge_velocity_lever_arm(
-    camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray, rates: Rates, T_cam0_imu: FloatArray
+    camera: StereoCamera,
+    tracks: FeatureTracks,
+    times_ns: IntArray,
+    rates: Rates,
+    T_cam0_imu: FloatArray,
 ) -> tuple[Finding, ...]:
-    """Check whether the translation of a recording with velocities is the camera's position in the IMU frame.
+    """Check whether the translation of a recording with velocities is the camera's position in the
+    IMU frame.
 
     Args:
         camera: rectified pair.
@@ -196,9 +245,11 @@ def judge_velocity_lever_arm(
         rates: velocities.
         T_cam0_imu: (4, 4) as given.
     """
-    R, t = T_cam0_imu[:3, :3], T_cam0_imu[:3, 3]
+    R = T_cam0_imu[:3, :3]
+    t = T_cam0_imu[:3, 3]
     both = np.concatenate([rates.linear, rates.angular], axis=1)
-    at, clock = times_ns - times_ns[0], rates.times_ns - times_ns[0]
+    at = times_ns - times_ns[0]
+    clock = rates.times_ns - times_ns[0]
     velocities = np.stack([np.interp(at, clock, both[:, k]) for k in range(6)], axis=1)
     verdict = judge_lever_arms(camera, tracks, times_ns, velocities, R, (-R.T @ t, t))
     if verdict.better != 1:
@@ -207,8 +258,10 @@ def judge_velocity_lever_arm(
     return (
         Finding(
             "IMU-camera translation inverted",
-            f"velocities and features give the camera's position as {verdict.place:+.2f} +- {verdict.place_sigma:.2f} "
-            f"between that of the transform (-1) and its translation taken as a position in the IMU frame (+1); "
+            f"velocities and features give the camera's position as {verdict.place:+.2f} +- "
+            f"{verdict.place_sigma:.2f} "
+            "between that of the transform (-1) and its translation taken as a position in the "
+            "IMU frame (+1); "
             f"the translation must be -R t = ({x:.3f}, {y:.3f}, {z:.3f}) m",
         ),
     )

@@ -15,27 +15,35 @@ CameraArgs: TypeAlias = tuple[float, float, float, float, float, bool]
 
 
 _MOST_KNOWN = 8
-_known: dict[int, tuple[StereoCamera, CameraArgs]] = {}  # by identity: a camera's hash costs more than the answer
+# by identity: a camera's hash costs more than the answer
+_known: dict[int, tuple[StereoCamera, CameraArgs]] = {}
 
 
 def camera_args(camera: StereoCamera) -> CameraArgs:
     """Return the intrinsics of both rectified images, as compiled functions take them."""
     known = _known.get(id(camera))
     if known is None:
-        fu, fv, cu, cv = float(camera.fu), float(camera.fv), float(camera.cu), float(camera.cv)
+        fu = float(camera.fu)
+        fv = float(camera.fv)
+        cu = float(camera.cu)
+        cv = float(camera.cv)
         if len(_known) == _MOST_KNOWN:
             _known.clear()
-        known = _known[id(camera)] = camera, (fu, fv, cu, cv, float(camera.baseline_m), camera.is_cylinder)
+        known = _known[id(camera)] = (
+            camera,
+            (fu, fv, cu, cv, float(camera.baseline_m), camera.is_cylinder),
+        )
     return known[1]
 
 
 @compiled
 def turn_to(camera: CameraArgs, y: float, z: float) -> tuple[float, float, float, float, float]:
-    """Turn the camera about its baseline to a point, as `vio.geometry.stereo.facing` does; a pinhole stays.
+    """Turn the camera about its baseline to a point, as `vio.geometry.stereo.facing` does; a
+    pinhole stays.
 
     Returns:
-        The azimuth (radians), its sine and cosine, and y and z of the point in the turned camera: z is the depth of
-        `depth_of`, and the point is seen in row `fv y / z + fv azimuth + cv`.
+        The azimuth (radians), its sine and cosine, and y and z of the point in the turned camera: z
+        is the depth of `depth_of`, and the point is seen in row `fv y / z + fv azimuth + cv`.
     """
     if camera[5]:
         azimuth = np.arctan2(y, z)
@@ -44,7 +52,9 @@ def turn_to(camera: CameraArgs, y: float, z: float) -> tuple[float, float, float
 
 
 @compiled
-def moved_pixel(camera: CameraArgs, T: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
+def moved_pixel(
+    camera: CameraArgs, T: FloatArray, x: float, y: float, z: float
+) -> tuple[float, float, float]:
     """Left pixel u, v and depth of a point that a motion T (4, 4) takes into the camera's frame."""
     fu, fv, cu, cv, _, _ = camera
     ahead = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]

@@ -1,4 +1,6 @@
-"""The one or two cameras that recordings, calibration files and callers describe, and their rectification."""
+"""The one or two cameras that recordings, calibration files and callers describe, and their
+rectification.
+"""
 
 from __future__ import annotations
 
@@ -25,15 +27,19 @@ from vio.geometry.stereo import StereoCamera, one_camera
 from vio.records import Image, ImuDensities, StereoFrame
 
 _PARTS = 32  # of a pixel, in which OpenCV's remap counts
-# Standard deviation of a virtual disparity over that of the pixels of a track, which are those of two exposures.
+# Standard deviation of a virtual disparity over that of the pixels of a track, which are those of
+# two exposures.
 _DISPARITY_SIGMAS = 2**0.5
 _PIXEL_SIGMA_PX = 0.2  # of a tracked feature; what the filter learns on real images is 0.1 to 0.3
-LookUp: TypeAlias = tuple[npt.NDArray[Any], npt.NDArray[Any]]  # maps for cv2.remap: u and v, or those of `fixed_point`
+# maps for cv2.remap: u and v, or those of `fixed_point`
+LookUp: TypeAlias = tuple[npt.NDArray[Any], npt.NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Rectifier:
-    """The rectification of a rig's raw images; of one camera, its undistortion, which keeps its direction."""
+    """The rectification of a rig's raw images; of one camera, its undistortion, which keeps its
+    direction.
+    """
 
     lenses: StereoRig | CameraModel  # the raw cameras, or the only one
     camera: StereoCamera  # rectified; of kind "mono" or "rgbd" for one camera
@@ -56,7 +62,11 @@ class Rectifier:
     @property
     def cameras(self) -> tuple[CameraModel, ...]:
         """The raw cameras: left and right, or the only one."""
-        return (self.lenses,) if isinstance(self.lenses, CameraModel) else (self.lenses.cam0, self.lenses.cam1)
+        return (
+            (self.lenses,)
+            if isinstance(self.lenses, CameraModel)
+            else (self.lenses.cam0, self.lenses.cam1)
+        )
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -69,8 +79,10 @@ class Rectifier:
             return ()
         form = "a cylinder about the baseline" if self.camera.is_cylinder else "a pinhole's image"
         return (
-            f"the lens shows {seen[0]:.0f} x {seen[1]:.0f} deg; rectified to {form}, {kept[0]:.0f} x {kept[1]:.0f} deg "
-            f"are kept, at {self.camera.fu:.0f} px per radian in the middle (the lens: {lens.fu:.0f})",
+            f"the lens shows {seen[0]:.0f} x {seen[1]:.0f} deg; rectified to {form}, {kept[0]:.0f} "
+            f"x {kept[1]:.0f} deg "
+            f"are kept, at {self.camera.fu:.0f} px per radian in the middle (the lens: "
+            f"{lens.fu:.0f})",
         )
 
     def __call__(self, left: Image, right: Image) -> tuple[Image, Image]:
@@ -84,7 +96,9 @@ class Rectifier:
         return image if self.maps is None else remap(image, self.maps[0], self.interpolation)
 
     def depth(self, depth_m: FloatArray) -> FloatArray:
-        """Undistort a depth image (H, W) in metres: each pixel takes the nearest depth, as means cross outlines."""
+        """Undistort a depth image (H, W) in metres: each pixel takes the nearest depth, as means
+        cross outlines.
+        """
         if self.maps is None:
             return depth_m
         u, v = (np.rint(m).astype(np.int64) for m in self.maps[0])
@@ -92,17 +106,32 @@ class Rectifier:
         return np.where(inside, depth_m[np.where(inside, v, 0), np.where(inside, u, 0)], 0.0)
 
     def frame(
-        self, index: int, time_ns: int, left: Image, right: Image | None = None, *, depth_m: FloatArray | None = None
+        self,
+        index: int,
+        time_ns: int,
+        left: Image,
+        right: Image | None = None,
+        *,
+        depth_m: FloatArray | None = None,
     ) -> StereoFrame:
-        """Return the rectified frame of raw images (H, W) and, where there is one, a depth image (H, W) in metres."""
+        """Return the rectified frame of raw images (H, W) and, where there is one, a depth image
+        (H, W) in metres.
+        """
         left_image, right_image = (self.left(left), None) if right is None else self(left, right)
-        return StereoFrame(index, time_ns, left_image, right_image, None if depth_m is None else self.depth(depth_m))
+        return StereoFrame(
+            index,
+            time_ns,
+            left_image,
+            right_image,
+            None if depth_m is None else self.depth(depth_m),
+        )
 
 
 def rectifier_of(
     rig: StereoRig, interpolation: Interpolation = "linear", projection: ProjectionMode = "auto"
 ) -> Rectifier:
-    """Prepare the rectification of two cameras; a pair that is rectified already passes images through unchanged.
+    """Prepare the rectification of two cameras; a pair that is rectified already passes images
+    through unchanged.
 
     Raises:
         CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
@@ -116,9 +145,11 @@ def rectifier_of(
 
 
 def fixed_point(maps: tuple[MapArray, MapArray]) -> LookUp:
-    """Return source u and v (H, W) as cv2.remap makes them of floats for each image, in three quarters of the memory.
+    """Return source u and v (H, W) as cv2.remap makes them of floats for each image, in three
+    quarters of the memory.
 
-    That is whole pixels (H, W, 2) int16, and the rest (H, W) uint16 in parts of a pixel, `32 v + u`.
+    That is whole pixels (H, W, 2) int16, and the rest (H, W) uint16 in parts of a pixel,
+    `32 v + u`.
     """
     u, v = (np.rint(m * np.float32(_PARTS)).astype(np.int32) for m in maps)
     whole = np.stack([u // _PARTS, v // _PARTS], axis=-1).astype(np.int16)
@@ -130,7 +161,8 @@ def remap(image: Image, maps: LookUp, interpolation: Interpolation) -> Image:
     import cv2
 
     codes = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos4": cv2.INTER_LANCZOS4}
-    # The maps stay inside the image, so only the outermost taps of the interpolation reach the border.
+    # The maps stay inside the image, so only the outermost taps of the interpolation reach the
+    # border.
     out = cv2.remap(image, maps[0], maps[1], codes[interpolation], borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(out, dtype=np.uint8)
 
@@ -138,9 +170,11 @@ def remap(image: Image, maps: LookUp, interpolation: Interpolation) -> Image:
 def with_virtual_baseline(camera: StereoCamera, depth_noise: float) -> StereoCamera:
     """Return a camera with depth images as a pair whose disparities are as uncertain as the depths.
 
-    A depth's standard deviation `k z^2` makes one of `fu b k` of the disparity `fu b / z`, at every depth. The baseline
-    b is chosen so that it is that of a stereo match, of which each pixel has the noise of a tracked feature.
-    Reference: Khoshelham & Elberink, Accuracy and resolution of Kinect depth data, Sensors (2012), for `k z^2`.
+    A depth's standard deviation `k z^2` makes one of `fu b k` of the disparity `fu b / z`, at every
+    depth. The baseline b is chosen so that it is that of a stereo match, of which each pixel has
+    the noise of a tracked feature.
+    Reference: Khoshelham & Elberink, Accuracy and resolution of Kinect depth data, Sensors (2012),
+    for `k z^2`.
 
     Args:
         camera: undistorted.
@@ -154,20 +188,24 @@ def with_virtual_baseline(camera: StereoCamera, depth_noise: float) -> StereoCam
 class Rig:
     """One camera or two and, where there is one, an inertial sensor, as calibrated.
 
-    Build a pair with `Rig.rectified` or `Rig.raw`, one camera as `Rig(camera_model, T_cam0_imu=T)`, any with
-    `vio.load_rig`. Raw images are rectified by `rectifier`; the estimator works with `camera` and `T_rect0_imu`, those
-    of the rectified images.
+    Build a pair with `Rig.rectified` or `Rig.raw`, one camera as `Rig(camera_model, T_cam0_imu=T)`,
+    any with `vio.load_rig`. Raw images are rectified by `rectifier`; the estimator works with
+    `camera` and `T_rect0_imu`, those of the rectified images.
     """
 
     cam0: CameraModel  # left, or the only one
     cam1: CameraModel | None = None  # right; None: there is one camera
-    T_cam1_cam0: FloatArray | None = None  # (4, 4) maps points of the left camera to the right one, metres
-    T_cam0_imu: FloatArray | None = None  # (4, 4) of the left camera as calibrated; None: no sensor, the body is cam0
+    # (4, 4) maps points of the left camera to the right one, metres
+    T_cam1_cam0: FloatArray | None = None
+    # (4, 4) of the left camera as calibrated; None: no sensor, the body is cam0
+    T_cam0_imu: FloatArray | None = None
     imu_noise: ImuDensities | None = None
     time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock
     notes: tuple[str, ...] = ()  # what a reader of calibration files found and assumed
-    residual_px: float = 0.0  # by how much pixels are known to be off still (rms): what the lens models cannot hold
-    depth_factor: float | None = None  # levels of its depth images in a metre; None: not stated, or there are none
+    # by how much pixels are known to be off still (rms): what the lens models cannot hold
+    residual_px: float = 0.0
+    # levels of its depth images in a metre; None: not stated, or there are none
+    depth_factor: float | None = None
 
     def __post_init__(self) -> None:
         if (self.cam1 is None) != (self.T_cam1_cam0 is None):
@@ -176,9 +214,13 @@ class Rig:
             if T is not None and (fault := "not 4x4" if np.shape(T) != (4, 4) else rigid_fault(T)):
                 raise CalibrationError(f"{name}: {fault}")
         if self.depth_factor is not None and not self.depth_factor > 0:
-            raise CalibrationError(f"the depth factor is {self.depth_factor:g}; give levels per metre, such as 1000")
+            raise CalibrationError(
+                f"the depth factor is {self.depth_factor:g}; give levels per metre, such as 1000"
+            )
         if not np.isfinite(self.time_offset_s):
-            raise CalibrationError(f"the time offset of camera and IMU is {self.time_offset_s}; give finite seconds")
+            raise CalibrationError(
+                f"the time offset of camera and IMU is {self.time_offset_s}; give finite seconds"
+            )
 
     @classmethod
     def rectified(
@@ -205,7 +247,8 @@ class Rig:
             baseline_m: distance from the left to the right camera, metres.
             width: image width, pixels.
             height: image height, pixels.
-            T_cam0_imu: (4, 4) or (3, 4), maps IMU coordinates to the left camera; None: no inertial sensor.
+            T_cam0_imu: (4, 4) or (3, 4), maps IMU coordinates to the left camera; None: no inertial
+                sensor.
             imu_noise: densities of the IMU, where known.
             time_offset_s: a frame stamped t was exposed at t + offset of the IMU's clock.
 
@@ -239,25 +282,35 @@ class Rig:
         Args:
             K0: (3, 3) intrinsic matrix of the left camera, pixels.
             K1: (3, 3) of the right camera.
-            T_cam1_cam0: (4, 4) or (3, 4), maps left-camera coordinates to the right camera, metres (OpenCV's R, T).
+            T_cam1_cam0: (4, 4) or (3, 4), maps left-camera coordinates to the right camera, metres
+                (OpenCV's R, T).
             width: image width, pixels, of both.
             height: image height, pixels.
             model: lens model of both.
             distortion0: coefficients of the left lens, in the order of `CameraModel.coefficients`.
             distortion1: coefficients of the right lens.
-            T_cam0_imu: (4, 4) or (3, 4), maps IMU coordinates to the left camera; None: no inertial sensor.
+            T_cam0_imu: (4, 4) or (3, 4), maps IMU coordinates to the left camera; None: no inertial
+                sensor.
             imu_noise: densities of the IMU, where known.
             time_offset_s: a frame stamped t was exposed at t + offset of the IMU's clock.
 
         Raises:
-            CalibrationError: a matrix has a wrong form, or the model does not take these coefficients.
+            CalibrationError: a matrix has a wrong form, or the model does not take these
+                coefficients.
         """
         cam0, cam1 = (
             camera_from_matrix(K, width, height, model, distortion, name)
             for K, distortion, name in ((K0, distortion0, "K0"), (K1, distortion1, "K1"))
         )
         T_imu = None if T_cam0_imu is None else checked_transform(T_cam0_imu, "T_cam0_imu")
-        return cls(cam0, cam1, checked_transform(T_cam1_cam0, "T_cam1_cam0"), T_imu, imu_noise, time_offset_s)
+        return cls(
+            cam0,
+            cam1,
+            checked_transform(T_cam1_cam0, "T_cam1_cam0"),
+            T_imu,
+            imu_noise,
+            time_offset_s,
+        )
 
     @property
     def cameras(self) -> tuple[CameraModel, ...]:
@@ -288,12 +341,19 @@ class Rig:
 
     @property
     def is_rectified(self) -> bool:
-        """Whether images need no rectification: a pinhole, or equal pinholes with rows aligned to 0.01 px."""
-        return self.cam0.model == "pinhole" if self.cam1 is None else rectified_pair(self.stereo) is not None
+        """Whether images need no rectification: a pinhole, or equal pinholes with rows aligned
+        to 0.01 px.
+        """
+        return (
+            self.cam0.model == "pinhole"
+            if self.cam1 is None
+            else rectified_pair(self.stereo) is not None
+        )
 
     @property
     def camera(self) -> StereoCamera:
-        """The rectified pair, or one undistorted camera: of the images, or of what `rectifier` makes of them.
+        """The rectified pair, or one undistorted camera: of the images, or of what `rectifier`
+        makes of them.
 
         Raises:
             CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
@@ -301,12 +361,17 @@ class Rig:
         if self.cam1 is None:
             return _undistorted(self.cam0)[0]
         pair = rectified_pair(self.stereo)
-        camera = rectified_cameras(self.stereo, "auto").camera if pair is None else self._exact(pair)
+        camera = (
+            rectified_cameras(self.stereo, "auto").camera if pair is None else self._exact(pair)
+        )
         return replace(camera, residual_px=self.residual_px)
 
     @property
     def T_rect0_imu(self) -> FloatArray | None:
-        """Extrinsics (4, 4) of the rectified left camera, as the estimator takes them; None: no inertial sensor."""
+        """Extrinsics (4, 4) of the rectified left camera, as the estimator takes them.
+
+        None: no inertial sensor.
+        """
         if self.T_cam0_imu is None or self.cam1 is None or self.is_rectified:
             return self.T_cam0_imu
         return rectified_cameras(self.stereo).T_rect0_imu
@@ -318,12 +383,15 @@ class Rig:
         *,
         depth_noise: float | None = None,
     ) -> Rectifier:
-        """Return what rectifies raw images (H, W), or undistorts those of one camera; the identity where none is raw.
+        """Return what rectifies raw images (H, W), or undistorts those of one camera; the identity
+        where none is raw.
 
         Args:
             interpolation: how gray values between pixels are found.
-            projection: of rectified pairs: a cylinder about the baseline for wide lenses by default.
-            depth_noise: of one camera, `k` of a depth's standard deviation `k depth^2`, 1/m; None: no depth images.
+            projection: of rectified pairs: a cylinder about the baseline for wide lenses by
+                default.
+            depth_noise: of one camera, `k` of a depth's standard deviation `k depth^2`, 1/m; None:
+                no depth images.
 
         Raises:
             CalibrationError: as `camera`.
@@ -342,7 +410,9 @@ class Rig:
         return replace(made, camera=self._exact(camera), T_rect0_imu=T)
 
     def _exact(self, pair: StereoCamera) -> StereoCamera:
-        """Return a rectified pair with the baseline as stated, which the way through the body would round."""
+        """Return a rectified pair with the baseline as stated, which the way through the body
+        would round.
+        """
         _, T = self.right
         x, y, z = T[:3, 3].tolist()
         stated = not np.any(T[:3, :3] != np.eye(3)) and y == z == 0
@@ -383,13 +453,17 @@ def camera_from_matrix(
     M = np.asarray(K, dtype=np.float64)
     if M.shape != (3, 3) or not np.allclose(M[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], atol=1e-8):
         raise CalibrationError(
-            f"{name} is no intrinsic matrix [fu 0 cu; 0 fv cv; 0 0 1] but {M.tolist()}; check its order"
+            f"{name} is no intrinsic matrix [fu 0 cu; 0 fv cv; 0 0 1] but {M.tolist()}; check its "
+            "order"
         )
     if abs(M[0, 1]) > 1e-8 * abs(M[0, 0]):
-        raise CalibrationError(f"{name} has a skew of {M[0, 1]:g} px, which no lens model takes; calibrate without")
+        raise CalibrationError(
+            f"{name} has a skew of {M[0, 1]:g} px, which no lens model takes; calibrate without"
+        )
     values = tuple(float(c) for c in np.ravel(np.asarray(coefficients, dtype=np.float64)))
     if model == "radtan" and not any(values):
-        model, values = "pinhole", ()
+        model = "pinhole"
+        values = ()
     fu, fv, cu, cv = M[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     return CameraModel(fu, fv, cu, cv, int(width), int(height), model, values)
 
@@ -399,7 +473,14 @@ def rig_of_rectified(camera: StereoCamera, T_cam0_imu: FloatArray | None) -> Rig
 
     None: one camera, no known image size, or a cylinder, which no lens model holds.
     """
-    if camera.width is None or camera.height is None or camera.kind != "stereo" or camera.is_cylinder:
+    if (
+        camera.width is None
+        or camera.height is None
+        or camera.kind != "stereo"
+        or camera.is_cylinder
+    ):
         return None
     c = camera
-    return Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height, T_cam0_imu)
+    return Rig.rectified(
+        c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height, T_cam0_imu
+    )

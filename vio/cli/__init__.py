@@ -1,9 +1,10 @@
 """The command `vio`: subcommands, one file each; nothing heavy is imported before a command runs.
 
-Such a file has `add_parser`, which adds its options, and `execute`, which runs it and returns the exit status.
+Such a file has `add_parser`, which adds its options, and `execute`, which runs it and returns the
+exit status.
 
-Exit status: 0 success, 1 an expected error, reported in one line, 2 wrong usage, 130 interrupted by Ctrl-C, 143 ended
-by SIGTERM, 129 by SIGHUP; the last three leave no unfinished files behind.
+Exit status: 0 success, 1 an expected error, reported in one line, 2 wrong usage, 130 interrupted by
+Ctrl-C, 143 ended by SIGTERM, 129 by SIGHUP; the last three leave no unfinished files behind.
 """
 
 from __future__ import annotations
@@ -44,10 +45,11 @@ BY_PURPOSE = {
 }
 _COMMANDS = tuple(module for modules in BY_PURPOSE.values() for module in modules)
 
-# Objects made before Python looks for cycles among the young ones: a tenth of a command's start went into that search,
-# over modules and samples that stay.
+# Objects made before Python looks for cycles among the young ones: a tenth of a command's start
+# went into that search, over modules and samples that stay.
 _GC_OBJECTS = 100_000
-_LEAST_ADDRESS_SPACE = 1_000_000_000  # bytes; a short run of MH_01 takes 976 MB, and OpenCV fails to load in 820
+# bytes; a short run of MH_01 takes 976 MB, and OpenCV fails to load in 820
+_LEAST_ADDRESS_SPACE = 1_000_000_000
 _LIGHT = ("config", "completion")  # commands that load no library
 _MOST_SHOWN = 200  # characters of a path in a message
 _ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -91,10 +93,16 @@ def _orderly_end() -> Iterator[None]:
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     parser = argparse.ArgumentParser(
-        prog="vio", description="Stereo visual-inertial odometry: from rectified stereo images to a trajectory."
+        prog="vio",
+        description="Stereo visual-inertial odometry: from rectified stereo images to a "
+        "trajectory.",
     )
     parser.add_argument("--version", action="version", version=f"stereo-vio {__version__}")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an expected error, and debug logs")
+    parser.add_argument(
+        "--debug",
+        action="store_true",
+        help="show the traceback of an expected error, and debug logs",
+    )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in _COMMANDS:
         module.add_parser(commands)
@@ -104,18 +112,24 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Parse the command line; an unknown option shows the usage of its subcommand, not that of `vio`."""
+    """Parse the command line; an unknown option shows the usage of its subcommand, not that of
+    `vio`.
+    """
     parser = build_parser()
     args, unknown = parser.parse_known_args(argv)
     if unknown:
-        chosen = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices[args.command]
+        chosen = next(
+            a for a in parser._actions if isinstance(a, argparse._SubParsersAction)
+        ).choices[args.command]
         chosen.error(f"unrecognized arguments: {' '.join(unknown)}")
     args.command_line = shlex.join(["vio", *(sys.argv[1:] if argv is None else argv)])
     return args
 
 
 def _check_address_space(command: str) -> None:
-    """Refuse a limit under which the libraries of a command end the process when they are loaded."""
+    """Refuse a limit under which the libraries of a command end the process when they are
+    loaded.
+    """
     if sys.platform == "win32" or command in _LIGHT:
         return
     import resource
@@ -123,8 +137,10 @@ def _check_address_space(command: str) -> None:
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if 0 <= limit < _LEAST_ADDRESS_SPACE:  # RLIM_INFINITY is -1
         raise VioError(
-            f"the address space is limited to {limit / 1e6:.0f} MB (ulimit -v), and vio {command} loads "
-            f"{_LEAST_ADDRESS_SPACE / 1e6:.0f} MB of libraries; raise the limit, or limit the resident memory "
+            f"the address space is limited to {limit / 1e6:.0f} MB (ulimit -v), and vio {command} "
+            "loads "
+            f"{_LEAST_ADDRESS_SPACE / 1e6:.0f} MB of libraries; raise the limit, or limit the "
+            "resident memory "
             "instead (a container, systemd-run -p MemoryMax)"
         )
 
@@ -132,13 +148,16 @@ def _check_address_space(command: str) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a character must not end the program
+        # a terminal that cannot show a character must not end the program
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     args = _parse(argv)
     gc.set_threshold(_GC_OBJECTS)
     logging.addLevelName(NOTE, "NOTE")
     logging.basicConfig(
-        level=logging.DEBUG if args.debug else NOTE, format="%(levelname)s: %(message)s", stream=sys.stderr
+        level=logging.DEBUG if args.debug else NOTE,
+        format="%(levelname)s: %(message)s",
+        stream=sys.stderr,
     )
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     try:
@@ -175,7 +194,8 @@ def _message(error: VioError | OSError | MemoryError) -> str:
         return f"out of memory ({str(error)[:_MOST_SHOWN] or 'no details'}); process less at once"
     if isinstance(error, VioError):
         return str(error)
-    # A path that no check foresaw: too long a name, a folder that may not be entered, a disk that fails.
+    # A path that no check foresaw: too long a name, a folder that may not be entered, a disk that
+    # fails.
     file = error.filename
     where = "cannot write the output" if file is None else f"cannot use {str(file)[:_MOST_SHOWN]}"
     return f"{where}: {error.strerror or error}"

@@ -23,37 +23,63 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
         help="YAML file with settings that differ from the defaults; or fast, a preset",
     )
     parser.add_argument(
-        "--set", action="append", default=[], metavar="a.b=c", help="change one setting; may be repeated"
+        "--set",
+        action="append",
+        default=[],
+        metavar="a.b=c",
+        help="change one setting; may be repeated",
     )
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that change the configuration."""
     add_settings_arguments(parser)
-    parser.add_argument("--motion", metavar="NAME", help="imu, velocity, none or auto: same as --set motion=NAME")
+    parser.add_argument(
+        "--motion", metavar="NAME", help="imu, velocity, none or auto: same as --set motion=NAME"
+    )
     parser.add_argument("--backend", metavar="NAME", help="same as --set backend=NAME")
     parser.add_argument("--calibration", metavar="F", help="same as --set dataset.calibration=F")
-    parser.add_argument("--camera", metavar="NAME", help="left: one camera of two: same as --set dataset.camera=left")
-    parser.add_argument("--topics", metavar="A=/B,…", help="topics of a bag: same as --set dataset.topics=A=/B,…")
+    parser.add_argument(
+        "--camera",
+        metavar="NAME",
+        help="left: one camera of two: same as --set dataset.camera=left",
+    )
+    parser.add_argument(
+        "--topics", metavar="A=/B,…", help="topics of a bag: same as --set dataset.topics=A=/B,…"
+    )
     parser.add_argument("--frontend", metavar="NAME", help="same as --set frontend.name=NAME")
 
 
 def add_span_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the range of frames."""
     parser.add_argument(
-        "--start", type=bound, default=0, metavar="N", help="first frame, or time such as 12s (default 0)"
+        "--start",
+        type=bound,
+        default=0,
+        metavar="N",
+        help="first frame, or time such as 12s (default 0)",
     )
     parser.add_argument(
-        "--stop", "--end", type=bound, metavar="N", help="frame after the last one, or time such as 60s"
+        "--stop",
+        "--end",
+        type=bound,
+        metavar="N",
+        help="frame after the last one, or time such as 60s",
     )
 
 
 def add_map_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the map and the folder of results of a live odometry."""
     parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map")
-    parser.add_argument("--localise", action="store_true", help="find poses in --map, and leave it as it is")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write trajectory and calibration there at the end")
-    parser.add_argument("--drop", choices=("oldest", "none", "block"), default="oldest", help="of frames that wait")
+    parser.add_argument(
+        "--localise", action="store_true", help="find poses in --map, and leave it as it is"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="write trajectory and calibration there at the end"
+    )
+    parser.add_argument(
+        "--drop", choices=("oldest", "none", "block"), default="oldest", help="of frames that wait"
+    )
 
 
 def map_from(args: argparse.Namespace) -> MapUse | None:
@@ -78,7 +104,8 @@ def add_lengths_argument(parser: argparse.ArgumentParser) -> None:
         "--lengths",
         type=lengths,
         metavar="M,M",
-        help="path lengths of the drift (default 100,…,800; a tenth or a hundredth of these where the path is shorter)",
+        help="path lengths of the drift (default 100,…,800; a tenth or a hundredth of these where "
+        "the path is shorter)",
     )
 
 
@@ -89,7 +116,9 @@ def lengths(text: str) -> tuple[float, ...]:
     except ValueError:
         values = ()
     if not values or any(not 0 < v < float("inf") for v in values):
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of path lengths; give metres above 0, as in 25,50")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no list of path lengths; give metres above 0, as in 25,50"
+        )
     return values
 
 
@@ -107,7 +136,11 @@ def config_from(args: argparse.Namespace) -> Config:
         "dataset.topics": "topics",
     }
     # Commands that take any setting alone have none of these, or others by the same name.
-    values = {} if not hasattr(args, "backend") else {key: getattr(args, name) for key, name in named.items()}
+    values = (
+        {}
+        if not hasattr(args, "backend")
+        else {key: getattr(args, name) for key, name in named.items()}
+    )
     for key, value in values.items():
         if value is not None:
             # Quoted: to YAML a bare `none` is text but `null`, `on` or `no` would not be.

@@ -1,4 +1,6 @@
-"""`vio bench`: many recordings, configurations and seeds in one table; comparison of two of them."""
+"""`vio bench`: many recordings, configurations and seeds in one table; comparison of two of
+them.
+"""
 
 from __future__ import annotations
 
@@ -18,27 +20,60 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "bench",
         help="run a suite of recordings into one table, or compare two",
-        description="Run every sequence of a suite with every configuration and seed, side by side, and write tables "
-        "and a report. SUITE is a YAML file or the name of a shipped suite: small, rendered, realistic, kitti, euroc, "
-        "tumvi. 'vio bench compare A B' says what became better or worse from one output folder to another, and "
+        description="Run every sequence of a suite with every configuration and seed, side by "
+        "side, and write tables "
+        "and a report. SUITE is a YAML file or the name of a shipped suite: small, rendered, "
+        "realistic, kitti, euroc, "
+        "tumvi. 'vio bench compare A B' says what became better or worse from one output folder to "
+        "another, and "
         "'vio bench compare A --between X Y' from one configuration or system to another.",
     )
-    parser.add_argument("suite", metavar="SUITE", help="YAML file, name of a shipped suite, or 'compare'")
-    parser.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="compare: output folders")
-    parser.add_argument("--between", nargs=2, metavar=("X", "Y"), help="compare: these systems, X of A and Y of B")
-    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings (default: the suite's)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of tables and report (default bench/NAME)")
     parser.add_argument(
-        "--cache", type=Path, metavar="DIR", help="results of tasks and renders, kept (default bench/cache)"
+        "suite", metavar="SUITE", help="YAML file, name of a shipped suite, or 'compare'"
     )
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one a processor)")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler, tcp://…; needs the extra cluster")
-    parser.add_argument("--peers", type=Path, metavar="DIR", help="other systems' SEQUENCE.SYSTEM.tum, for the tables")
+    parser.add_argument(
+        "folders", metavar="FOLDER", nargs="*", type=Path, help="compare: output folders"
+    )
+    parser.add_argument(
+        "--between", nargs=2, metavar=("X", "Y"), help="compare: these systems, X of A and Y of B"
+    )
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="folder of the recordings (default: the suite's)"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder of tables and report (default bench/NAME)"
+    )
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        metavar="DIR",
+        help="results of tasks and renders, kept (default bench/cache)",
+    )
+    parser.add_argument(
+        "--workers", type=int, metavar="N", help="processes (default: one a processor)"
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="a Dask scheduler, tcp://…; needs the extra cluster"
+    )
+    parser.add_argument(
+        "--peers",
+        type=Path,
+        metavar="DIR",
+        help="other systems' SEQUENCE.SYSTEM.tum, for the tables",
+    )
     parser.add_argument("--only", default="", metavar="NAME,…", help="these sequences alone")
-    parser.add_argument("--configurations", default="", metavar="NAME,…", help="these configurations alone")
+    parser.add_argument(
+        "--configurations", default="", metavar="NAME,…", help="these configurations alone"
+    )
     parser.add_argument("--seeds", metavar="N,…", help="in the place of the suite's seeds")
-    parser.add_argument("--time-limit", type=float, metavar="S", help="seconds of a task; then it has no result")
-    parser.add_argument("--list", action="store_true", help="say which recordings are there and which not; run nothing")
+    parser.add_argument(
+        "--time-limit", type=float, metavar="S", help="seconds of a task; then it has no result"
+    )
+    parser.add_argument(
+        "--list",
+        action="store_true",
+        help="say which recordings are there and which not; run nothing",
+    )
     parser.add_argument(
         "--revision",
         metavar="REV",
@@ -48,7 +83,8 @@ def add_parser(commands: Any) -> None:
         "--identity",
         choices=("content", "stat"),
         default="content",
-        help="what an input is known by: its bytes, read once (default), or names, sizes and times of change",
+        help="what an input is known by: its bytes, read once (default), or names, sizes and times "
+        "of change",
     )
     parser.add_argument(
         "--factor",
@@ -58,7 +94,11 @@ def add_parser(commands: Any) -> None:
         help="compare: a single sequence that changes by more than this is shown (default 2)",
     )
     parser.add_argument(
-        "--margin", type=float, default=1.1, metavar="X", help="compare: a change below this is none (default 1.1)"
+        "--margin",
+        type=float,
+        default=1.1,
+        metavar="X",
+        help="compare: a change below this is none (default 1.1)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -68,11 +108,15 @@ def execute(args: argparse.Namespace) -> int:
     if args.suite == "compare":
         if len(args.folders) != 2 and not (args.between and len(args.folders) == 1):
             raise ConfigError(
-                f"vio bench compare takes two output folders, or one with --between X Y, got {len(args.folders)}"
+                "vio bench compare takes two output folders, or one with --between X Y, got "
+                f"{len(args.folders)}"
             )
         return _compare(args)
     if args.folders:
-        raise ConfigError(f"vio bench takes one suite; what is {args.folders[0]}? To compare: vio bench compare A B")
+        raise ConfigError(
+            f"vio bench takes one suite; what is {args.folders[0]}? To compare: vio bench compare "
+            "A B"
+        )
     return _bench(args)
 
 
@@ -104,7 +148,12 @@ def _bench(args: argparse.Namespace) -> int:
     if args.list:
         return _list(suite, place.data, args)
     if args.revision is not None:
-        run_in_turns(suite, place, args.revision, say=lambda text: None if args.quiet else print(text, file=sys.stderr))
+        run_in_turns(
+            suite,
+            place,
+            args.revision,
+            say=lambda text: None if args.quiet else print(text, file=sys.stderr),
+        )
         args.folders = [revision_folder(place, args.revision), place.out]
         return _compare(args)
     try:
@@ -120,14 +169,30 @@ def _list(suite: Any, data: Path, args: argparse.Namespace) -> int:
     """Print what is there and what is missing; the status is 1 where something is."""
     from vio.bench.tasks import inputs_of
 
-    missing = {s.name: [str(p) for p in inputs_of(s, data) if not p.exists()] for s in suite.sequences}
-    lines = [(name, "there" if not paths else f"missing: {', '.join(paths)}") for name, paths in missing.items()]
+    missing = {
+        s.name: [str(p) for p in inputs_of(s, data) if not p.exists()] for s in suite.sequences
+    }
+    lines = [
+        (name, "there" if not paths else f"missing: {', '.join(paths)}")
+        for name, paths in missing.items()
+    ]
     runs = len(suite.sequences) * len(suite.configurations) * len(suite.seeds)
-    lines.append(("runs", f"{runs}: {', '.join(suite.configurations)}; seeds {', '.join(map(str, suite.seeds))}"))
+    lines.append(
+        (
+            "runs",
+            f"{runs}: {', '.join(suite.configurations)}; seeds {', '.join(map(str, suite.seeds))}",
+        )
+    )
     if any(missing.values()) and suite.publisher is not None:
         lines.append(("from", suite.publisher))
-    facts = {"suite": suite.name, "missing": {k: v for k, v in missing.items() if v}, "publisher": suite.publisher}
-    print_result({**facts, "runs": runs}, lines, as_json=args.json, name_width=max(len(n) for n, _ in lines))
+    facts = {
+        "suite": suite.name,
+        "missing": {k: v for k, v in missing.items() if v},
+        "publisher": suite.publisher,
+    }
+    print_result(
+        {**facts, "runs": runs}, lines, as_json=args.json, name_width=max(len(n) for n, _ in lines)
+    )
     return 1 if any(missing.values()) else 0
 
 
@@ -138,23 +203,35 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
     summary = summary_of(summary_rows(result.outcomes))
     lines = []
     for system, (done, count, cells) in summary.items():
-        shown = [f"{m.title} {number(cells[m.name].median, m.digits)}" for m in METRICS if m.name in cells]
-        lines.append((system, f"{done} of {count} sequences; median {', '.join(shown) or 'nothing'}"))
+        shown = [
+            f"{m.title} {number(cells[m.name].median, m.digits)}"
+            for m in METRICS
+            if m.name in cells
+        ]
+        lines.append(
+            (system, f"{done} of {count} sequences; median {', '.join(shown) or 'nothing'}")
+        )
     lines.append(("tasks", f"{len(result.outcomes)}, of which {result.reused} were done before"))
     lines.append(("report", f"{out / 'report.html'}, tables.md, tables.tex, table.csv, runs.csv"))
     facts = {**result.facts, "out": str(out), "reused": result.reused}
     width = max(10, *(len(name) for name, _ in lines))
     print_result(facts, lines, as_json=args.json, name_width=width)
     for outcome in result.failures:
-        print(printable(f"failed: {outcome.sequence}, {outcome.system}: {outcome.failure}"), file=sys.stderr)
+        print(
+            printable(f"failed: {outcome.sequence}, {outcome.system}: {outcome.failure}"),
+            file=sys.stderr,
+        )
     return 1 if result.failures else 0
 
 
 def _compare(args: argparse.Namespace) -> int:
-    """Print what changed; the status is 1 where something became worse, 3 where that is undecided."""
+    """Print what changed; the status is 1 where something became worse, 3 where that is
+    undecided.
+    """
     from vio.bench.compare import EXIT_STATUS, compare, comparison_lines
 
-    a, b = args.folders[0], args.folders[-1]
+    a = args.folders[0]
+    b = args.folders[-1]
     between = None if args.between is None else tuple(args.between)
     result = compare(a, b, between=between, factor=args.factor, margin=args.margin)
     if args.json:
@@ -181,9 +258,12 @@ def _check_renders(suite: Any) -> None:
     render.add_parser(parser.add_subparsers())
     for sequence in suite.sequences:
         try:
-            parser.parse_args(["render", *sequence.render, "--out", "."])  # one without a render passes
+            # one without a render passes
+            parser.parse_args(["render", *sequence.render, "--out", "."])
         except ConfigError as error:
-            raise ConfigError(f"{suite.name}, sequence {sequence.name}: vio render: {error}") from error
+            raise ConfigError(
+                f"{suite.name}, sequence {sequence.name}: vio render: {error}"
+            ) from error
 
 
 def _with_seeds(suite: Any, text: str) -> Any:

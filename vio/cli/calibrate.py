@@ -35,21 +35,38 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "calibrate",
         help="measure and check a calibration",
-        description="Measure from a recording itself: left-right rotation and baseline direction (the length is taken "
-        "as given), IMU-camera rotation, time offset and lever arm where the motion makes them observable; compare "
-        "with the given calibration and report its faults; focal length and principal point, too, where the cameras "
-        "turn. Writes a Kalibr-style and EuRoC-style YAML, which --calibration of `vio run` takes. The length of the "
+        description="Measure from a recording itself: left-right rotation and baseline direction "
+        "(the length is taken "
+        "as given), IMU-camera rotation, time offset and lever arm where the motion makes them "
+        "observable; compare "
+        "with the given calibration and report its faults; focal length and principal point, too, "
+        "where the cameras "
+        "turn. Writes a Kalibr-style and EuRoC-style YAML, which --calibration of `vio run` takes. "
+        "The length of the "
         "baseline is taken as given.",
     )
-    parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for report and YAML (default calibrations/NAME)"
+        "source", metavar="SOURCE", help="a recording: folder or file, or kind:path"
     )
     parser.add_argument(
-        "--pairs", type=int, default=_PAIRS, metavar="N", help=f"stereo pairs matched (default {_PAIRS})"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder for report and YAML (default calibrations/NAME)",
     )
     parser.add_argument(
-        "--frames", type=int, default=_FRAMES, metavar="N", help=f"frames tracked for the IMU (default {_FRAMES})"
+        "--pairs",
+        type=int,
+        default=_PAIRS,
+        metavar="N",
+        help=f"stereo pairs matched (default {_PAIRS})",
+    )
+    parser.add_argument(
+        "--frames",
+        type=int,
+        default=_FRAMES,
+        metavar="N",
+        help=f"frames tracked for the IMU (default {_FRAMES})",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -71,7 +88,9 @@ def execute(args: argparse.Namespace) -> int:
     check_replaceable(out.absolute(), replace=True, marker=MARKER)
     check_writable(out)
     with one_blas_thread(), ProgressBar(f"calibrate {source.path.name}") as bar:
-        report = measure(source, _frontend, pairs=args.pairs, frames=args.frames, progress=bar.update)
+        report = measure(
+            source, _frontend, pairs=args.pairs, frames=args.frames, progress=bar.update
+        )
     facts = {"out": str(out), **_facts(report)}
     with atomic_folder(out, replace=True, marker=MARKER) as folder:
         write_calibration_report(folder, report)
@@ -79,7 +98,13 @@ def execute(args: argparse.Namespace) -> int:
         written = (folder / CAMCHAIN).is_file()
     rows = [*_rows(report), ("results", str(out))]
     if written:
-        rows.append(("next", f"vio run {shlex.quote(args.source)} --calibration {shlex.quote(str(out / CAMCHAIN))}"))
+        rows.append(
+            (
+                "next",
+                f"vio run {shlex.quote(args.source)} --calibration "
+                f"{shlex.quote(str(out / CAMCHAIN))}",
+            )
+        )
     return print_result(facts, rows, as_json=args.json, name_width=22)
 
 
@@ -115,7 +140,9 @@ def _plain(record: Any) -> dict[str, Any]:
         return {"verdict": str(record)}
     none = np.array(None)
     return {
-        key: np.where(np.isfinite(v), v.astype(object), none).tolist() if isinstance(v, np.ndarray) else v
+        key: np.where(np.isfinite(v), v.astype(object), none).tolist()
+        if isinstance(v, np.ndarray)
+        else v
         for key, v in asdict(record).items()
     }
 
@@ -144,7 +171,11 @@ def _rows(report: CalibrationReport) -> list[tuple[str, str]]:
     rows += [("FOUND", str(finding)) for finding in report.findings]
     off = report.stereo_error
     if off is None:
-        return rows if report.findings else [*rows, ("verdict", "no fault found in what could be observed")]
+        return (
+            rows
+            if report.findings
+            else [*rows, ("verdict", "no fault found in what could be observed")]
+        )
     return [*rows, ("verdict", str(off))]
 
 
@@ -156,8 +187,10 @@ def _observed(name: str, found: _Part | NotObservable, rows: Callable[[_Part], _
 
 
 def _intrinsics_rows(found: Intrinsics) -> _Rows:
-    (u, v), (su, sv) = found.centre_off_px, found.centre_sigma_px
-    off, sigma = 100 * found.focal_off, 100 * found.focal_sigma
+    (u, v) = found.centre_off_px
+    (su, sv) = found.centre_sigma_px
+    off = 100 * found.focal_off
+    sigma = 100 * found.focal_sigma
     return [
         ("focal length", f"off by {off:+.1f} %, sigma {sigma:.1f} (given {found.focal_px:.1f} px)"),
         ("principal point", f"off by {u:+.1f} {v:+.1f} px, sigma {su:.1f} {sv:.1f}"),
@@ -187,11 +220,22 @@ def _stereo_rows(stereo: StereoEstimate) -> _Rows:
     from vio.geometry.lie import so3_log
 
     x, y, z = np.degrees(so3_log(stereo.R_cam1_cam0))
-    (u, v, w), sigma_deg = stereo.direction, stereo.rotation_sigma_deg
+    (u, v, w) = stereo.direction
+    sigma_deg = stereo.rotation_sigma_deg
     return [
-        ("left-right rotation", f"{x:+.4f} {y:+.4f} {z:+.4f} deg (cam0 to cam1), sigma {sigma_deg:.4f}"),
-        ("baseline direction", f"{u:+.5f} {v:+.5f} {w:+.5f} in cam0, sigma {stereo.direction_sigma_deg:.3f} deg"),
-        ("matches", f"{stereo.matches} in {stereo.pairs} pairs, epipolar spread {60 * stereo.residual_deg:.2f} arcmin"),
+        (
+            "left-right rotation",
+            f"{x:+.4f} {y:+.4f} {z:+.4f} deg (cam0 to cam1), sigma {sigma_deg:.4f}",
+        ),
+        (
+            "baseline direction",
+            f"{u:+.5f} {v:+.5f} {w:+.5f} in cam0, sigma {stereo.direction_sigma_deg:.3f} deg",
+        ),
+        (
+            "matches",
+            f"{stereo.matches} in {stereo.pairs} pairs, epipolar spread "
+            f"{60 * stereo.residual_deg:.2f} arcmin",
+        ),
     ]
 
 
@@ -199,10 +243,13 @@ def _alignment_rows(r: RowResiduals) -> _Rows:
     import numpy as np
 
     summary = (
-        f"median {r.median_px:+.3f} px, spread {r.spread_px:.3f} px; {100 * r.positive_disparity:.1f} % of "
+        f"median {r.median_px:+.3f} px, spread {r.spread_px:.3f} px; "
+        f"{100 * r.positive_disparity:.1f} % of "
         f"{r.matches} matches have a positive disparity"
     )
-    grid = (" ".join("    –  " if np.isnan(c) else f"{c:+7.3f}" for c in line) for line in r.grid_px)
+    grid = (
+        " ".join("    –  " if np.isnan(c) else f"{c:+7.3f}" for c in line) for line in r.grid_px
+    )
     return [("rows vl - vr", summary), *(("  over the image", line) for line in grid)]
 
 
@@ -214,13 +261,24 @@ def _imu_rows(a: ImuAlignment) -> _Rows:
     x, y, z = np.degrees(so3_log(a.R_cam0_imu))
     p, q, r = a.rotation_sigma_deg
     rows = [
-        ("IMU-camera rotation", f"{x:+.3f} {y:+.3f} {z:+.3f} deg (IMU to cam0), sigma {p:.3f} {q:.3f} {r:.3f}"),
-        ("IMU minus camera clock", f"{1e3 * a.time_offset_s:+.2f} ms, sigma {1e3 * a.time_offset_sigma_s:.2f} ms"),
+        (
+            "IMU-camera rotation",
+            f"{x:+.3f} {y:+.3f} {z:+.3f} deg (IMU to cam0), sigma {p:.3f} {q:.3f} {r:.3f}",
+        ),
+        (
+            "IMU minus camera clock",
+            f"{1e3 * a.time_offset_s:+.2f} ms, sigma {1e3 * a.time_offset_sigma_s:.2f} ms",
+        ),
     ]
-    weak = [] if a.weak is None else [("  not observable", f"the motion leaves unobservable the {a.weak}")]
+    weak = (
+        []
+        if a.weak is None
+        else [("  not observable", f"the motion leaves unobservable the {a.weak}")]
+    )
     return rows + weak
 
 
 def _lever_arm_rows(found: LeverArm) -> _Rows:
-    (x, y, z), (p, q, r) = found.t_cam0_imu, found.sigma_m
+    (x, y, z) = found.t_cam0_imu
+    (p, q, r) = found.sigma_m
     return [("IMU in cam0", f"{x:+.4f} {y:+.4f} {z:+.4f} m, sigma {p:.4f} {q:.4f} {r:.4f}")]

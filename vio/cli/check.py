@@ -24,14 +24,22 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "check",
         help="check a run without ground truth",
-        description="Reconstruct keyframes of a run (of `vio run --save-observations`) from their images alone with "
-        "COLMAP's incremental and global mapper, with a known stereo rig, and compare: ATE after SE(3) alignment, "
-        "scale, and segments that disagree. Loops that the run closed in its map are matched as well. Writes RUN/check "
+        description="Reconstruct keyframes of a run (of `vio run --save-observations`) from their "
+        "images alone with "
+        "COLMAP's incremental and global mapper, with a known stereo rig, and compare: ATE after "
+        "SE(3) alignment, "
+        "scale, and segments that disagree. Loops that the run closed in its map are matched as "
+        "well. Writes RUN/check "
         "with a report, a plot and both models. Takes minutes.",
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder with observations.npz")
     parser.add_argument(
-        "--mapper", choices=("both", "incremental", "global"), default="both", help="COLMAP's mapper (default both)"
+        "run", type=Path, metavar="RUN", help="a run's folder with observations.npz"
+    )
+    parser.add_argument(
+        "--mapper",
+        choices=("both", "incremental", "global"),
+        default="both",
+        help="COLMAP's mapper (default both)",
     )
     parser.add_argument(
         "--keyframes",
@@ -41,7 +49,9 @@ def add_parser(commands: Any) -> None:
         help=f"largest number of keyframes (default {KEYFRAMES})",
     )
     parser.add_argument(
-        "--source", metavar="SOURCE", help="current path of the recording (default: as stored in the run)"
+        "--source",
+        metavar="SOURCE",
+        help="current path of the recording (default: as stored in the run)",
     )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="default 1: repeatable")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -58,9 +68,14 @@ def execute(args: argparse.Namespace) -> int:
         raise ConfigError("--threads must be at least 1 and --keyframes at least 2")
     quiet()
     run = read_saved_run(args.run)
-    mappers: tuple[Mapper, ...] = ("incremental", "global") if args.mapper == "both" else (args.mapper,)
+    mappers: tuple[Mapper, ...] = (
+        ("incremental", "global") if args.mapper == "both" else (args.mapper,)
+    )
     out = args.run / "check"
-    with ProgressBar(f"check {args.run.name}") as bar, atomic_folder(out, replace=True, marker=MARKER) as folder:
+    with (
+        ProgressBar(f"check {args.run.name}") as bar,
+        atomic_folder(out, replace=True, marker=MARKER) as folder,
+    ):
         results = check_run(
             run,
             folder,
@@ -80,8 +95,12 @@ def execute(args: argparse.Namespace) -> int:
         }
         (folder / MARKER).write_text(json_text(report, indent=2) + "\n", encoding="utf-8")
     rows = [("verdict", str(report["verdict"]))]
-    rows += [(result.mapper, f"{key:<10} {value}") for result in results for key, value in _rows(result)]
-    return print_result(report, [*rows, ("plot", str(out / "check.png"))], as_json=args.json, name_width=12)
+    rows += [
+        (result.mapper, f"{key:<10} {value}") for result in results for key, value in _rows(result)
+    ]
+    return print_result(
+        report, [*rows, ("plot", str(out / "check.png"))], as_json=args.json, name_width=12
+    )
 
 
 def _facts(result: MapperResult) -> dict[str, Any]:
@@ -116,24 +135,49 @@ def _rows(result: MapperResult) -> list[tuple[str, str]]:
     apart = f"{comparison.end_m:.4f} m and {comparison.end_deg:.3f} deg"
     expected = f"{comparison.expected_end_m:.3g} m and {comparison.expected_end_deg:.3g} deg"
     whole = int(comparison.piece.sum()) == len(comparison.piece)
-    in_one = "" if whole else f", {int(comparison.piece.sum())} of them in one piece, which is compared below"
+    in_one = (
+        ""
+        if whole
+        else f", {int(comparison.piece.sum())} of them in one piece, which is compared below"
+    )
     rows = [
-        ("keyframes", f"{len(model.keyframes)} of {result.total} connected{in_one}, {model.points} points"),
-        ("ATE", f"{comparison.ate_m:.4f} m to the run after SE(3) alignment, {comparison.ate_deg:.3f} deg"),
+        (
+            "keyframes",
+            f"{len(model.keyframes)} of {result.total} connected{in_one}, {model.points} points",
+        ),
+        (
+            "ATE",
+            f"{comparison.ate_m:.4f} m to the run after SE(3) alignment, {comparison.ate_deg:.3f} "
+            "deg",
+        ),
         ("end", f"{apart} apart at the end; up to {expected} expected"),
     ]
     if len(model.shared):
         joined = int((model.shared >= LEAST_SHARED).sum())
-        rows.insert(1, ("loops", f"{joined} of {len(model.shared)} in the model, with {LEAST_SHARED} points or more"))
+        rows.insert(
+            1,
+            (
+                "loops",
+                f"{joined} of {len(model.shared)} in the model, with {LEAST_SHARED} points or more",
+            ),
+        )
     if comparison.scale is not None and comparison.scale_sigma is not None:
-        percent, sigma = 100 * (comparison.scale - 1), 100 * comparison.scale_sigma
+        percent = 100 * (comparison.scale - 1)
+        sigma = 100 * comparison.scale_sigma
         text = f"{percent:+.3f} +- {sigma:.3f} % (COLMAP relative to the run, both by the known baseline)"
         rows.append(("scale", text))
     for segment in comparison.segments:
-        where, apart_mm = f"frames {segment.first_frame} to {segment.last_frame}", 1e3 * segment.difference_m
-        rows.append(("segment", f"{where}: motions differ by {apart_mm:.1f} mm, {segment.difference_deg:.3f} deg"))
+        where = f"frames {segment.first_frame} to {segment.last_frame}"
+        apart_mm = 1e3 * segment.difference_m
+        rows.append(
+            (
+                "segment",
+                f"{where}: motions differ by {apart_mm:.1f} mm, {segment.difference_deg:.3f} deg",
+            )
+        )
     if comparison.reference_ate_m is not None and comparison.run_reference_ate_m is not None:
-        own, percent = comparison.run_reference_ate_m, 100 * ((comparison.reference_scale or 1) - 1)
+        own = comparison.run_reference_ate_m
+        percent = 100 * ((comparison.reference_scale or 1) - 1)
         text = f"COLMAP {comparison.reference_ate_m:.4f} m, the run {own:.4f} m from it at these keyframes"
         rows.append(("reference", f"{text}; COLMAP's scale {percent:+.3f} %"))
     rows.append(("result", result.verdict))

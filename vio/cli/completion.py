@@ -12,8 +12,10 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "completion",
         help="print a script that completes commands and options in a shell",
-        description="Print a script that completes commands, options and their choices in a shell. bash: put "
-        '`eval "$(vio completion bash)"` into ~/.bashrc; zsh: `vio completion zsh > DIR/_vio` for a DIR of $fpath.',
+        description="Print a script that completes commands, options and their choices in a shell. "
+        "bash: put "
+        '`eval "$(vio completion bash)"` into ~/.bashrc; zsh: `vio completion zsh > DIR/_vio` for '
+        "a DIR of $fpath.",
     )
     parser.add_argument("shell", choices=_SHELLS)
 

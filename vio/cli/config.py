@@ -15,15 +15,21 @@ if TYPE_CHECKING:
 
 def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
-        "config", help="show or check settings", description="Show the settings, or check and print a configuration."
+        "config",
+        help="show or check settings",
+        description="Show the settings, or check and print a configuration.",
     )
-    parser.add_argument("--show", action="store_true", help="the basic settings: value, unit, meaning")
+    parser.add_argument(
+        "--show", action="store_true", help="the basic settings: value, unit, meaning"
+    )
     parser.add_argument("--all", action="store_true", help="every setting, in groups")
     add_config_arguments(parser)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand: a table with --show or --all, else the effective configuration as YAML."""
+    """Run the subcommand: a table with --show or --all, else the effective configuration as
+    YAML.
+    """
     from vio.config import BASIC, describe, to_yaml
 
     config = config_from(args)

@@ -1,4 +1,6 @@
-"""`vio convert`: write a recording as a folder or bag of another form, or a trajectory as another file."""
+"""`vio convert`: write a recording as a folder or bag of another form, or a trajectory as
+another file.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,28 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "convert",
         help="write a recording or a trajectory in another format",
-        description="Write any recording of images, such as a ROS bag or two videos, as an EuRoC, a KITTI or a plain "
-        "folder or as a ROS 2 bag: frame by frame, rectified as a run sees them, with IMU, velocities and ground "
-        "truth. Write a trajectory file (TUM, KITTI, EuRoC) in another of these forms; --to tum writes a recording's "
+        description="Write any recording of images, such as a ROS bag or two videos, as an EuRoC, "
+        "a KITTI or a plain "
+        "folder or as a ROS 2 bag: frame by frame, rectified as a run sees them, with IMU, "
+        "velocities and ground "
+        "truth. Write a trajectory file (TUM, KITTI, EuRoC) in another of these forms; --to tum "
+        "writes a recording's "
         "ground truth.",
     )
-    parser.add_argument("source", metavar="SOURCE", help="a recording (folder, file or kind:path), or a trajectory")
+    parser.add_argument(
+        "source", metavar="SOURCE", help="a recording (folder, file or kind:path), or a trajectory"
+    )
     parser.add_argument("--to", choices=(*_FORMS, "tum"), required=True, help="form of the output")
-    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder or file to write (atomically)")
-    parser.add_argument("--times", type=Path, metavar="FILE", help="times of a KITTI trajectory, one a line")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="OUT",
+        help="folder or file to write (atomically)",
+    )
+    parser.add_argument(
+        "--times", type=Path, metavar="FILE", help="times of a KITTI trajectory, one a line"
+    )
     add_span_arguments(parser)
     add_config_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -51,19 +66,30 @@ def _trajectory(args: argparse.Namespace) -> int:
     from vio.files.trajectories import is_trajectory_file
     from vio.offline.convert_trajectory import convert_trajectory, write_reference
 
-    source, config = Path(args.source), config_from(args)
+    source = Path(args.source)
+    config = config_from(args)
     if args.start or args.stop is not None:
-        raise ConfigError("--start and --end choose frames of a recording to convert, not poses; leave them out")
+        raise ConfigError(
+            "--start and --end choose frames of a recording to convert, not poses; leave them out"
+        )
     check_new_file(args.out)
     if not is_trajectory_file(source):
         written = write_reference(open_dataset(args.source, config.dataset), args.out)
     elif args.to in _TRAJECTORIES:
         calibration = config.dataset.calibration
-        written = convert_trajectory(source, args.out, args.to, times=args.times, calibration=calibration)
+        written = convert_trajectory(
+            source, args.out, args.to, times=args.times, calibration=calibration
+        )
     else:
-        raise ConfigError(f"{source} is a trajectory: choose --to {', '.join(_TRAJECTORIES)}, not {args.to}")
+        raise ConfigError(
+            f"{source} is a trajectory: choose --to {', '.join(_TRAJECTORIES)}, not {args.to}"
+        )
     facts = {"out": str(args.out), "form": args.to, "poses": len(written), "body": written.body}
-    rows = [("file", str(args.out)), ("form", args.to), ("poses", f"{len(written)} of {written.body}")]
+    rows = [
+        ("file", str(args.out)),
+        ("form", args.to),
+        ("poses", f"{len(written)} of {written.body}"),
+    ]
     return print_result(facts, rows, as_json=args.json)
 
 
@@ -105,7 +131,10 @@ def _recording(args: argparse.Namespace) -> int:
 
 
 def _written(out: Path) -> list[str] | None:
-    """Return the names that an earlier conversion wrote into a folder; None: there is none, or it is not known."""
+    """Return the names that an earlier conversion wrote into a folder.
+
+    None: there is none, or it is not known.
+    """
     try:
         files = json.loads((out / MARKER).read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError):

@@ -13,9 +13,12 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "demo",
         help="render a small recording and process it",
-        description="Render a stereo recording with ground truth, process it from the images, and print the errors.",
+        description="Render a stereo recording with ground truth, process it from the images, and "
+        "print the errors.",
     )
-    parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="folder (default demo)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("demo"), metavar="DIR", help="folder (default demo)"
+    )
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
 
 

@@ -34,12 +34,18 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "eval",
         help="compare trajectories with a reference",
-        description="Compare trajectories, or runs' folders, with a reference: ATE, RPE and KITTI drift. Files in "
-        "TUM, KITTI or EuRoC format, or a COLMAP model; a reference in KITTI format, or a model whose images are "
+        description="Compare trajectories, or runs' folders, with a reference: ATE, RPE and KITTI "
+        "drift. Files in "
+        "TUM, KITTI or EuRoC format, or a COLMAP model; a reference in KITTI format, or a model "
+        "whose images are "
         "numbered, is associated by frame number, others by time.",
     )
     parser.add_argument(
-        "estimates", type=Path, nargs="+", metavar="EST", help="trajectory files or runs' folders, side by side"
+        "estimates",
+        type=Path,
+        nargs="+",
+        metavar="EST",
+        help="trajectory files or runs' folders, side by side",
     )
     parser.add_argument(
         "reference",
@@ -51,7 +57,8 @@ def add_parser(commands: Any) -> None:
         "--align",
         choices=("se3", "sim3", "first", "none"),
         default="se3",
-        help="alignment: se3 (default), sim3 (scale as well), first (at the first matched pose), none (same body and "
+        help="alignment: se3 (default), sim3 (scale as well), first (at the first matched pose), "
+        "none (same body and "
         "world frame only)",
     )
     add_lengths_argument(parser)
@@ -62,11 +69,20 @@ def add_parser(commands: Any) -> None:
         metavar="S",
         help="association by time, seconds (default 0.01)",
     )
-    parser.add_argument("--extrinsics", type=Path, metavar="F", help="T_cam0_imu, 3 or 4 rows of 4 numbers")
     parser.add_argument(
-        "--plot", nargs="?", const=Path("eval.png"), type=Path, metavar="F", help="draw paths and errors (eval.png)"
+        "--extrinsics", type=Path, metavar="F", help="T_cam0_imu, 3 or 4 rows of 4 numbers"
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object; of several by their names")
+    parser.add_argument(
+        "--plot",
+        nargs="?",
+        const=Path("eval.png"),
+        type=Path,
+        metavar="F",
+        help="draw paths and errors (eval.png)",
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON object; of several by their names"
+    )
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -86,7 +102,9 @@ def execute(args: argparse.Namespace) -> int:
     if args.plot is not None:
         from vio.runs.picture import draw_comparison, write_picture
 
-        write_picture(args.plot, lambda: draw_comparison({printable(name): r for name, r in results.items()}))
+        write_picture(
+            args.plot, lambda: draw_comparison({printable(name): r for name, r in results.items()})
+        )
         if not args.json:
             print_result({}, [("plot", str(args.plot))], as_json=False)
     return 0
@@ -106,7 +124,10 @@ def _evaluated(
 
         T_cam0_imu = read_extrinsics(args.extrinsics)
         if T_cam0_imu is None:
-            raise DataError(f"{args.extrinsics} does not exist; give a file with T_cam0_imu, 3 or 4 rows of 4 numbers")
+            raise DataError(
+                f"{args.extrinsics} does not exist; give a file with T_cam0_imu, 3 or 4 rows of 4 "
+                "numbers"
+            )
     result = evaluate(
         estimate[0],
         reference[0],
@@ -116,7 +137,9 @@ def _evaluated(
         lengths_m=args.lengths,
     )
     if result.matched < LEAST_POSES:
-        raise EvaluationError(f"only {result.matched} poses match; a comparison needs at least {LEAST_POSES}")
+        raise EvaluationError(
+            f"only {result.matched} poses match; a comparison needs at least {LEAST_POSES}"
+        )
     for note in result.notes:
         log.warning("%s", note)
     return result
@@ -127,13 +150,19 @@ def _side_by_side(results: Mapping[str, Evaluation]) -> Iterator[tuple[str, str]
     from vio.evaluation.trajectories import metres_text
 
     names = {name: name if len(name) <= _NAME else "…" + name[1 - _NAME :] for name in results}
-    yield "", f"{'':<{_NAME}} {'poses':>7} {'ATE':>10} {'attitude':>10} {'scale':>9} {'RPE':>10} {'drift':>8}"
+    yield (
+        "",
+        f"{'':<{_NAME}} {'poses':>7} {'ATE':>10} {'attitude':>10} {'scale':>9} {'RPE':>10} "
+        f"{'drift':>8}",
+    )
     for name, r in results.items():
         scale = "–" if r.scale_free is None else f"{100 * (r.scale_free.scale - 1):+.3f} %"
         rpe = "–" if r.rpe is None else metres_text(r.rpe.trans_rmse_m)
         drift = "–" if r.kitti is None else f"{r.kitti.t_err_percent:.3f} %"
         ate = metres_text(r.ate_m.rmse)
-        figures = f"{r.matched:>7} {ate:>10} {r.ate_deg.rmse:>6.3f} deg {scale:>9} {rpe:>10} {drift:>8}"
+        figures = (
+            f"{r.matched:>7} {ate:>10} {r.ate_deg.rmse:>6.3f} deg {scale:>9} {rpe:>10} {drift:>8}"
+        )
         yield "", f"{printable(names[name]):<{_NAME}} {figures}"
 
 
@@ -145,19 +174,34 @@ def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
     if result.coverage.reference_span is not None:
         share += f" and {100 * result.coverage.reference_span:.1f} % of the reference's span"
     yield "compared", f"{result.matched} poses ({result.body}) by {result.association}: {share}"
-    yield "path", f"{result.matched_path_length_m:.3f} m, the reference's {result.reference_path_length_m:.3f} m"
-    yield "alignment", _ALIGNMENTS[result.align] + (f", scale {result.scale:.6f}" if result.align == "sim3" else "")
+    yield (
+        "path",
+        f"{result.matched_path_length_m:.3f} m, the reference's "
+        f"{result.reference_path_length_m:.3f} m",
+    )
+    yield (
+        "alignment",
+        _ALIGNMENTS[result.align]
+        + (f", scale {result.scale:.6f}" if result.align == "sim3" else ""),
+    )
     small = result.ate_m.rmse < 0.01
     position = ("ATE", result.ate_m, *((1e3, "mm") if small else (1.0, "m")))
     for name, errors, factor, unit in (position, ("attitude", result.ate_deg, 1.0, "deg")):
-        mean, middle, largest = (factor * value for value in (errors.mean, errors.median, errors.max))
+        mean, middle, largest = (
+            factor * value for value in (errors.mean, errors.median, errors.max)
+        )
         yield (
             name,
-            f"{factor * errors.rmse:.4g} {unit} (rms), mean {mean:.4g}, median {middle:.4g}, largest {largest:.4g}",
+            f"{factor * errors.rmse:.4g} {unit} (rms), mean {mean:.4g}, median {middle:.4g}, "
+            f"largest {largest:.4g}",
         )
         if name == "ATE" and result.scale_free is not None:
             off = 100 * (result.scale_free.scale - 1)
-            without = f"{1e3 * result.scale_free.ate_m:.4g} mm" if small else f"{result.scale_free.ate_m:.4g} m"
+            without = (
+                f"{1e3 * result.scale_free.ate_m:.4g} mm"
+                if small
+                else f"{result.scale_free.ate_m:.4g} m"
+            )
             yield "scale", f"off by {off:+.3f} %; ATE {without} (rms) without it, after Sim(3)"
     if result.rpe is not None:
         step = result.rpe.trans_rmse_m
@@ -167,15 +211,23 @@ def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
         yield "drift", "the path is shorter than the lengths over which it is measured"
         return
     turned = rotation_drift_text(result.kitti.r_err_deg_per_100m, result.kitti.lengths_m, 4)
-    yield "drift", f"{result.kitti.t_err_percent:.3f} %, {turned} over {lengths_text(result.kitti.lengths_m)}"
+    yield (
+        "drift",
+        f"{result.kitti.t_err_percent:.3f} %, {turned} over {lengths_text(result.kitti.lengths_m)}",
+    )
     for row in result.kitti.per_length:
         if row.t_err_percent is not None and row.r_err_deg_per_100m is not None:
             turned = rotation_drift_text(row.r_err_deg_per_100m, result.kitti.lengths_m, 4)
-            yield f"  {row.length_m:g} m", f"{row.t_err_percent:8.3f} % {turned:>19} {row.segments:6d} segments"
+            yield (
+                f"  {row.length_m:g} m",
+                f"{row.t_err_percent:8.3f} % {turned:>19} {row.segments:6d} segments",
+            )
 
 
 def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
-    """Read a trajectory file, a run's folder or a COLMAP model, with the extrinsics if it has them."""
+    """Read a trajectory file, a run's folder or a COLMAP model, with the extrinsics if it has
+    them.
+    """
     from vio.runs.files import RunFile
     from vio.runs.folder import read_run
 

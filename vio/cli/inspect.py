@@ -19,14 +19,22 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "inspect",
         help="examine a recording before a run",
-        description="Say what was found in a recording and how it was understood: clocks, calibration, images, stereo "
-        "rows or depths, IMU (units, standstill, gravity, noise against the data sheet, agreement with images), ground "
+        description="Say what was found in a recording and how it was understood: clocks, "
+        "calibration, images, stereo "
+        "rows or depths, IMU (units, standstill, gravity, noise against the data sheet, agreement "
+        "with images), ground "
         "truth, and what is missing. Exit status 1 where a run makes no sense, with the remedy.",
     )
-    parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
+    parser.add_argument(
+        "source", metavar="SOURCE", help="a recording: folder or file, or kind:path"
+    )
     add_config_arguments(parser)
-    parser.add_argument("--pairs", type=int, default=12, metavar="N", help="frames looked at (default 12)")
-    parser.add_argument("--frames", type=int, default=60, metavar="N", help="frames tracked (default 60; 0: none)")
+    parser.add_argument(
+        "--pairs", type=int, default=12, metavar="N", help="frames looked at (default 12)"
+    )
+    parser.add_argument(
+        "--frames", type=int, default=60, metavar="N", help="frames tracked (default 60; 0: none)"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -68,4 +76,8 @@ def _rows(report: Inspection, source: str) -> list[tuple[str, str]]:
     rows = [(part.name, part.text) for part in report.parts]
     rows += [("note", note) for note in report.notes]
     rows += [("FAULT", fault) for fault in report.faults]
-    return rows if report.faults else [*rows, ("verdict", "can be run"), ("next", f"vio run {shlex.quote(source)}")]
+    return (
+        rows
+        if report.faults
+        else [*rows, ("verdict", "can be run"), ("next", f"vio run {shlex.quote(source)}")]
+    )

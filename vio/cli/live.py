@@ -15,11 +15,14 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "live",
         help="odometry from a camera",
-        description="Run on a camera until Ctrl-C. SOURCE is v4l2:/dev/video0, a URL as rtsp://…, video:FILE, "
+        description="Run on a camera until Ctrl-C. SOURCE is v4l2:/dev/video0, a URL as rtsp://…, "
+        "video:FILE, "
         "realsense:[SERIAL] (extra realsense) or oak:[ID] (extra oak).",
     )
     parser.add_argument("source", metavar="SOURCE", help="the camera")
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="in place of the device's own")
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="in place of the device's own"
+    )
     parser.add_argument(
         "--layout",
         choices=("side-by-side", "top-bottom", "single"),
@@ -27,12 +30,19 @@ def add_parser(commands: Any) -> None:
         help="how the images lie in a video (default side-by-side)",
     )
     add_settings_arguments(parser)
-    parser.add_argument("--record", type=Path, metavar="DIR", help="keep images and samples, for vio run DIR")
     parser.add_argument(
-        "--record-as", choices=("plain", "rosbag2", "mcap"), default="plain", help="folder or ROS 2 bag (default plain)"
+        "--record", type=Path, metavar="DIR", help="keep images and samples, for vio run DIR"
+    )
+    parser.add_argument(
+        "--record-as",
+        choices=("plain", "rosbag2", "mcap"),
+        default="plain",
+        help="folder or ROS 2 bag (default plain)",
     )
     add_map_arguments(parser)
-    parser.add_argument("--view", nargs="?", const="spawn", metavar="WHERE", help="show it in rerun (extra view)")
+    parser.add_argument(
+        "--view", nargs="?", const="spawn", metavar="WHERE", help="show it in rerun (extra view)"
+    )
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -40,7 +50,8 @@ def execute(args: argparse.Namespace) -> int:
     from vio.sources.run import run_source
     from vio.sources.source import open_source
 
-    config, map_use = config_from(args), map_from(args)
+    config = config_from(args)
+    map_use = map_from(args)
     rig = None
     if args.calibration is not None:
         rig = load_rig(args.calibration, cameras=1 if args.layout == "single" else 2)
@@ -56,7 +67,9 @@ def execute(args: argparse.Namespace) -> int:
         if address is not None:
             print(f"shown at {address}", file=sys.stderr)
         T_cam0_body = odometry.T_cam0_body
-        viewers.append(RerunViewer(stream, ViewedRig(odometry.camera, T_cam0_body, odometry.motion, None)))
+        viewers.append(
+            RerunViewer(stream, ViewedRig(odometry.camera, T_cam0_body, odometry.motion, None))
+        )
         return viewers[0].frame
 
     with StopRequest() as asked:
@@ -76,7 +89,11 @@ def execute(args: argparse.Namespace) -> int:
     for viewer in viewers:
         viewer.close()
     found = run.figures
-    print(f"{found.results} frames with a pose, {found.dropped} left out, {run.samples} IMU samples")
+    print(
+        f"{found.results} frames with a pose, {found.dropped} left out, {run.samples} IMU samples"
+    )
     if found.latency_median_ms is not None:
-        print(f"latency {found.latency_median_ms:.0f} ms (median), {found.latency_95_ms:.0f} (95 %)")
+        print(
+            f"latency {found.latency_median_ms:.0f} ms (median), {found.latency_95_ms:.0f} (95 %)"
+        )
     return 0

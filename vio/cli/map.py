@@ -33,39 +33,67 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "map",
         help="show, check, merge, prune and serve maps",
-        description="Show what a map holds, check it, merge two maps that show places in common, or keep a part of "
+        description="Show what a map holds, check it, merge two maps that show places in common, "
+        "or keep a part of "
         "one. `vio run --map` makes maps.",
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     show = actions.add_parser("show", help="what a map holds")
     show.add_argument("map", type=Path, metavar="MAP", help="a map's file")
     merge = actions.add_parser(
-        "merge", help="make one map of two, in any order; the frame is that of the one recorded first"
+        "merge",
+        help="make one map of two, in any order; the frame is that of the one recorded first",
     )
     merge.add_argument("first", type=Path, metavar="A", help="a map's file")
     merge.add_argument("second", type=Path, metavar="B", help="a map's file")
-    merge.add_argument("--out", type=Path, required=True, metavar="MAP", help="the merged map, a new file")
-    merge.add_argument("--workers", type=int, default=1, metavar="N", help="processes that look for places (default 1)")
+    merge.add_argument(
+        "--out", type=Path, required=True, metavar="MAP", help="the merged map, a new file"
+    )
+    merge.add_argument(
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="processes that look for places (default 1)",
+    )
     check = actions.add_parser("check", help="read everything in a map against its checksums")
-    drop = actions.add_parser("drop", help="take a session out of a map, as `vio map show` numbers it")
-    prune = actions.add_parser("prune", help="keep the most informative keyframes of each cubic metre")
+    drop = actions.add_parser(
+        "drop", help="take a session out of a map, as `vio map show` numbers it"
+    )
+    prune = actions.add_parser(
+        "prune", help="keep the most informative keyframes of each cubic metre"
+    )
     extract = actions.add_parser("extract", help="a new map of the keyframes around a point")
     for action in (check, drop, prune, extract):
         action.add_argument("map", type=Path, metavar="MAP", help="a map's file")
     drop.add_argument("session", type=int, metavar="SESSION", help="its number")
     prune.add_argument(
-        "--density", type=int, default=DENSITY, metavar="N", help=f"in a cubic metre (default {DENSITY})"
+        "--density",
+        type=int,
+        default=DENSITY,
+        metavar="N",
+        help=f"in a cubic metre (default {DENSITY})",
     )
     extract.add_argument(
-        "--around", type=parse_point, required=True, metavar="X,Y,Z", help="m, in the map (--around=-1,2,0)"
+        "--around",
+        type=parse_point,
+        required=True,
+        metavar="X,Y,Z",
+        help="m, in the map (--around=-1,2,0)",
     )
     extract.add_argument("--radius", type=float, required=True, metavar="M", help="m")
     extract.add_argument("--out", type=Path, required=True, metavar="MAP", help="a new file")
-    serve = actions.add_parser("serve", help="find image pairs of clients in a map, over HTTP, until Ctrl-C")
+    serve = actions.add_parser(
+        "serve", help="find image pairs of clients in a map, over HTTP, until Ctrl-C"
+    )
     serve.add_argument("map", type=Path, metavar="MAP", help="a map's file; it stays as it is")
-    serve.add_argument("--host", default="127.0.0.1", help="address to listen at (default 127.0.0.1, this machine)")
+    serve.add_argument(
+        "--host", default="127.0.0.1", help="address to listen at (default 127.0.0.1, this machine)"
+    )
     serve.add_argument("--port", type=int, default=8734, help="port (default 8734)")
-    serve.add_argument("--session", type=int, metavar="N", help="whose rig the clients have (default the newest)")
+    serve.add_argument(
+        "--session", type=int, metavar="N", help="whose rig the clients have (default the newest)"
+    )
     for action in (show, merge, check, drop, prune, extract):
         action.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -115,7 +143,11 @@ def _serve(args: argparse.Namespace) -> int:
         server = MapServer(lookup, args.host, args.port)
         threading.Thread(target=server.serve_forever, daemon=True).start()
         host, port = server.server_address[:2]
-        print(f"serving {lookup.keyframes} keyframes at http://{host!s}:{port}", file=sys.stderr, flush=True)
+        print(
+            f"serving {lookup.keyframes} keyframes at http://{host!s}:{port}",
+            file=sys.stderr,
+            flush=True,
+        )
         while asked.reason() is None:
             time.sleep(_POLL_S)
         server.shutdown()

@@ -22,21 +22,39 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "mesh",
         help="reconstruct a coloured mesh and a floor plan",
-        description="Compute dense depth of a run's images by semi-global matching, with the stereo calibration as the "
-        "run found it, and fuse it along the run's poses: mesh.ply, mesh.glb and points.ply in colour where the "
-        "recording has any, preview.png, and occupancy.pgm with occupancy.yaml, a floor plan as ROS reads it. Ctrl-C "
+        description="Compute dense depth of a run's images by semi-global matching, with the "
+        "stereo calibration as the "
+        "run found it, and fuse it along the run's poses: mesh.ply, mesh.glb and points.ply in "
+        "colour where the "
+        "recording has any, preview.png, and occupancy.pgm with occupancy.yaml, a floor plan as "
+        "ROS reads it. Ctrl-C "
         "keeps what is fused so far.",
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder")
-    parser.add_argument("--map", type=Path, metavar="FILE", help="a map that holds the run, for its poses")
-    parser.add_argument("--voxel", type=float, metavar="M", help="size of the voxels (default: by the scene's depth)")
     parser.add_argument(
-        "--memory", type=int, default=256, metavar="MIB", help="of the voxels; farther ones go to a file (default 256)"
+        "--map", type=Path, metavar="FILE", help="a map that holds the run, for its poses"
     )
     parser.add_argument(
-        "--source", metavar="SOURCE", help="current path of the recording (default: as stored in the run)"
+        "--voxel",
+        type=float,
+        metavar="M",
+        help="size of the voxels (default: by the scene's depth)",
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default RUN/mesh)")
+    parser.add_argument(
+        "--memory",
+        type=int,
+        default=256,
+        metavar="MIB",
+        help="of the voxels; farther ones go to a file (default 256)",
+    )
+    parser.add_argument(
+        "--source",
+        metavar="SOURCE",
+        help="current path of the recording (default: as stored in the run)",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder to write (default RUN/mesh)"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -72,7 +90,9 @@ def execute(args: argparse.Namespace) -> int:
         }
         with atomic_folder(out, replace=True, marker=MeshFile.FACTS) as folder:
             _write(folder, done)
-            (folder / MeshFile.FACTS).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
+            (folder / MeshFile.FACTS).write_text(
+                json_text(facts, indent=2) + "\n", encoding="utf-8"
+            )
     return print_result(facts, _rows(facts), as_json=args.json)
 
 
@@ -82,7 +102,9 @@ def _write(folder: Path, done: DenseMap) -> None:
     from vio.runs.files import MeshFile
 
     mesh = done.mesh
-    (folder / MeshFile.MESH).write_bytes(ply_points(mesh.vertices, mesh.colours, mesh.normals, mesh.triangles))
+    (folder / MeshFile.MESH).write_bytes(
+        ply_points(mesh.vertices, mesh.colours, mesh.normals, mesh.triangles)
+    )
     (folder / MeshFile.POINTS).write_bytes(ply_points(mesh.vertices, mesh.colours, mesh.normals))
     glb = glb_mesh(mesh.vertices, mesh.normals, mesh.colours, mesh.triangles, done.R_upright_world)
     (folder / MeshFile.GLTF).write_bytes(glb)
@@ -96,15 +118,21 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     from vio.runs.files import MeshFile
 
     extent = " x ".join(f"{length:.1f}" for length in facts["extent_m"])
-    sigmas = ", ".join(f"{1e3 * sigma:.0f} mm at {z} m" for z, sigma in facts["depth_sigma_m"].items())
+    sigmas = ", ".join(
+        f"{1e3 * sigma:.0f} mm at {z} m" for z, sigma in facts["depth_sigma_m"].items()
+    )
     stopped = "" if facts["stopped"] is None else f" of {facts['chosen']}, {facts['stopped']}"
     return [
         ("folder", facts["out"]),
-        ("frames", f"{facts['frames']}{stopped}, poses of the {facts['poses']}, {facts['seconds']:.0f} s"),
+        (
+            "frames",
+            f"{facts['frames']}{stopped}, poses of the {facts['poses']}, {facts['seconds']:.0f} s",
+        ),
         ("depth", f"up to {facts['farthest_m']:.1f} m; standard deviation {sigmas}"),
         (
             "mesh",
-            f"{facts['vertices']} vertices, {facts['triangles']} triangles, {extent} m, voxels {facts['voxel_m']:g} m",
+            f"{facts['vertices']} vertices, {facts['triangles']} triangles, {extent} m, voxels "
+            f"{facts['voxel_m']:g} m",
         ),
         ("picture", str(Path(facts["out"]) / MeshFile.PICTURE)),
         ("next", f"vio view {facts['of']}"),

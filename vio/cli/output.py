@@ -9,13 +9,21 @@ from typing import Any
 
 from vio.files.printable import json_text, printable
 
-NOTE = 25  # level of a log line that says what was found or assumed, and asks for nothing: between info and warning
+# level of a log line that says what was found or assumed, and asks for nothing: between info and
+# warning
+NOTE = 25
 
 
 def print_result(
-    facts: Mapping[str, Any], rows: Iterable[tuple[str, str]], *, as_json: bool, name_width: int = 10
+    facts: Mapping[str, Any],
+    rows: Iterable[tuple[str, str]],
+    *,
+    as_json: bool,
+    name_width: int = 10,
 ) -> int:
-    """Print all results as JSON, or rows of names and values as a table, names of files escaped; return the status."""
+    """Print all results as JSON, or rows of names and values as a table, names of files escaped;
+    return the status.
+    """
     if as_json:
         print(json_text(facts))
     else:
@@ -25,13 +33,22 @@ def print_result(
 
 
 class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
-    """A tqdm bar on stderr for work whose total may become known only during it; silent where stderr is no terminal."""
+    """A tqdm bar on stderr for work whose total may become known only during it; silent where
+    stderr is no terminal.
+    """
 
     def __init__(self, label: str, total: int | None = None, *, unit: str = "steps") -> None:
         from tqdm import tqdm
 
         hidden = not sys.stderr.isatty()
-        self._bar = tqdm(desc=label, total=total, unit=f" {unit}", dynamic_ncols=True, file=sys.stderr, disable=hidden)
+        self._bar = tqdm(
+            desc=label,
+            total=total,
+            unit=f" {unit}",
+            dynamic_ncols=True,
+            file=sys.stderr,
+            disable=hidden,
+        )
 
     def update(self, done: int, total: int | None = None) -> None:
         """Set the number of steps done, and optionally the total."""

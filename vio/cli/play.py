@@ -15,17 +15,29 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "play",
         help="publish a recording to ROS 2 (extra ros2)",
-        description="Publish the rectified images of a recording with their CameraInfo, its IMU samples and the IMU's "
+        description="Publish the rectified images of a recording with their CameraInfo, its IMU "
+        "samples and the IMU's "
         "pose on /tf_static, once somebody subscribes.",
     )
-    parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
     parser.add_argument(
-        "--ros2", action="store_true", required=True, help="to a ROS 2 graph; there is no other way yet"
+        "source", metavar="SOURCE", help="a recording: folder or file, or kind:path"
     )
-    parser.add_argument("--left", default="/cam0/image_raw", metavar="TOPIC", help="(default /cam0/image_raw)")
-    parser.add_argument("--right", default="/cam1/image_raw", metavar="TOPIC", help="(default /cam1/image_raw)")
+    parser.add_argument(
+        "--ros2",
+        action="store_true",
+        required=True,
+        help="to a ROS 2 graph; there is no other way yet",
+    )
+    parser.add_argument(
+        "--left", default="/cam0/image_raw", metavar="TOPIC", help="(default /cam0/image_raw)"
+    )
+    parser.add_argument(
+        "--right", default="/cam1/image_raw", metavar="TOPIC", help="(default /cam1/image_raw)"
+    )
     parser.add_argument("--imu", default="/imu0", metavar="TOPIC", help="(default /imu0)")
-    parser.add_argument("--rate", default="1", metavar="X", help="times real time, or max (default 1)")
+    parser.add_argument(
+        "--rate", default="1", metavar="X", help="times real time, or max (default 1)"
+    )
     parser.add_argument("--stop", type=int, metavar="N", help="frame after the last one")
     parser.add_argument("--now", action="store_true", help="do not wait for a subscriber")
     add_transport_arguments(parser, "waits for slow subscribers")
@@ -39,7 +51,10 @@ def execute(args: argparse.Namespace) -> int:
 
     rate = _rate(args.rate)
     dataset = open_dataset(args.source)
-    with contextlib.closing(open_transport(args.transport, args.domain)) as transport, StopRequest() as asked:
+    with (
+        contextlib.closing(open_transport(args.transport, args.domain)) as transport,
+        StopRequest() as asked,
+    ):
         played = play(
             transport,
             dataset,

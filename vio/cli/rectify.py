@@ -18,12 +18,18 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "rectify",
         help="write a rectified folder",
-        description="Rectify the images of an EuRoC folder (written as an EuRoC folder with pinhole cameras, the same "
-        "IMU and ground truth) or of an unrectified KITTI raw drive (written as a KITTI odometry folder). `vio run` "
+        description="Rectify the images of an EuRoC folder (written as an EuRoC folder with "
+        "pinhole cameras, the same "
+        "IMU and ground truth) or of an unrectified KITTI raw drive (written as a KITTI odometry "
+        "folder). `vio run` "
         "does not need this, since it rectifies while reading; other programs may.",
     )
-    parser.add_argument("source", metavar="SOURCE", help="an EuRoC folder or a KITTI raw drive, or kind:path")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write (atomically)")
+    parser.add_argument(
+        "source", metavar="SOURCE", help="an EuRoC folder or a KITTI raw drive, or kind:path"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder to write (atomically)"
+    )
     parser.add_argument(
         "--interpolation",
         choices=("linear", "cubic", "lanczos4"),
@@ -41,15 +47,21 @@ def execute(args: argparse.Namespace) -> int:
     from vio.offline.convert import convert, write_rectified_euroc
     from vio.records import need_stereo
 
-    dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation, projection="pinhole"))
+    dataset = open_dataset(
+        args.source, DatasetSettings(interpolation=args.interpolation, projection="pinhole")
+    )
     recording = dataset.recording
     need_stereo(recording, "vio rectify")
     for note in recording.notes:
         logging.getLogger(__name__).log(NOTE, "%s", note)
     if recording.kind in ("plain", "bag", "video"):
-        raise DataError(f"{recording.path} is of kind {recording.kind}; rectify it with vio convert --to euroc")
+        raise DataError(
+            f"{recording.path} is of kind {recording.kind}; rectify it with vio convert --to euroc"
+        )
     if not isinstance(dataset, ImageDataset) or dataset.rectifier.maps is None:
-        raise DataError(f"{recording.path} is rectified already: there is nothing to do; use it as it is")
+        raise DataError(
+            f"{recording.path} is rectified already: there is nothing to do; use it as it is"
+        )
     camera = recording.camera
     facts = {
         "kind": recording.kind,

@@ -22,22 +22,36 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "refine",
         help="bundle-adjust a run",
-        description="Bundle-adjust the keyframes of a run (of `vio run --save-observations`) with the run's own "
-        "tracks, the matches of its loops and a fixed stereo rig, and write the refined trajectory and map to "
+        description="Bundle-adjust the keyframes of a run (of `vio run --save-observations`) with "
+        "the run's own "
+        "tracks, the matches of its loops and a fixed stereo rig, and write the refined trajectory "
+        "and map to "
         "RUN/refined, which `vio eval` and `vio export` read like a run.",
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder with observations.npz")
-    parser.add_argument("--keyframes", type=int, metavar="N", help="largest number of keyframes (default: as needed)")
+    parser.add_argument(
+        "run", type=Path, metavar="RUN", help="a run's folder with observations.npz"
+    )
+    parser.add_argument(
+        "--keyframes",
+        type=int,
+        metavar="N",
+        help="largest number of keyframes (default: as needed)",
+    )
     parser.add_argument(
         "--priors",
         choices=("none", "filter"),
         default="none",
-        help="use the filter's camera positions and covariances as priors (replays the filter; default none)",
+        help="use the filter's camera positions and covariances as priors (replays the filter; "
+        "default none)",
     )
     parser.add_argument(
-        "--imu", action="store_true", help="take in the IMU, and find what the rig is off by, scale included"
+        "--imu",
+        action="store_true",
+        help="take in the IMU, and find what the rig is off by, scale included",
     )
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="of the solver (default 1: repeatable)")
+    parser.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="of the solver (default 1: repeatable)"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -103,17 +117,28 @@ def _write(out: Path, run: SavedRun, done: Refinement, metrics: dict[str, Any]) 
     from vio.runs.folder import write_landmarks_ply
 
     with atomic_folder(out, replace=True, marker=RunFile.METRICS) as folder:
-        in_body = done.trajectory.in_imu(run.T_cam0_imu) if run.metrics["body"] == "imu" else done.trajectory
+        in_body = (
+            done.trajectory.in_imu(run.T_cam0_imu)
+            if run.metrics["body"] == "imu"
+            else done.trajectory
+        )
         write_tum(folder / RunFile.TRAJECTORY, in_body)
         write_landmarks_ply(folder / RunFile.LANDMARKS, done.landmarks)
         (folder / RunFile.METRICS).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
 
 
 def _rows(m: dict[str, Any]) -> list[tuple[str, str]]:
-    others = "with the IMU" if m["imu"] else f"{m['frames_aligned_to_points']} more aligned to the refined points"
+    others = (
+        "with the IMU"
+        if m["imu"]
+        else f"{m['frames_aligned_to_points']} more aligned to the refined points"
+    )
     rows = [
         ("keyframes", f"{m['keyframes']} of {m['frames']} frames; {others}"),
-        ("points", f"{m['points']} from {m['rows']} stereo rows, {m['rows_dropped']} dropped as outliers"),
+        (
+            "points",
+            f"{m['points']} from {m['rows']} stereo rows, {m['rows_dropped']} dropped as outliers",
+        ),
         ("residual", f"{m['rms_before_px']:.3f} px before, {m['rms_after_px']:.3f} px after"),
         ("moved", f"{1e3 * m['moved_rms_m']:.1f} mm rms after SE(3) alignment"),
     ]
@@ -122,5 +147,7 @@ def _rows(m: dict[str, Any]) -> list[tuple[str, str]]:
     if m["ate_m"] is not None:
         from vio.evaluation.trajectories import metres_text
 
-        rows.append(("ATE", f"{metres_text(m['ate_before_m'])} before, {metres_text(m['ate_m'])} after"))
+        rows.append(
+            ("ATE", f"{metres_text(m['ate_before_m'])} before, {metres_text(m['ate_m'])} after")
+        )
     return [*rows, ("time", f"{m['seconds']:.1f} s"), ("results", m["out"])]

@@ -13,17 +13,22 @@ from vio.errors import ConfigError
 if TYPE_CHECKING:
     from vio.sim.scenarios import Conditions, Scenario
 
-_EFFECTS = "clean exposure gain gain-high blur noise dark bare-wall moving dropped duplicated time-offset"
+_EFFECTS = (
+    "clean exposure gain gain-high blur noise dark bare-wall moving dropped duplicated time-offset"
+)
 
 
 def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "render",
         help="render a recording with ground truth",
-        description="Render a stereo-inertial recording with ground truth along a built-in or recorded trajectory, and "
+        description="Render a stereo-inertial recording with ground truth along a built-in or "
+        "recorded trajectory, and "
         "write it as an EuRoC or KITTI folder that any odometry system can read.",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write (atomically)")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder to write (atomically)"
+    )
     parser.add_argument(
         "--scene",
         choices=("room", "street", "corridor", "doors"),
@@ -34,52 +39,81 @@ def add_parser(commands: Any) -> None:
         "--trajectory",
         default="handheld",
         metavar="T",
-        help="handheld (default), car, a TUM file of the IMU's poses, or the folder of a recorded flight with "
+        help="handheld (default), car, a TUM file of the IMU's poses, or the folder of a recorded "
+        "flight with "
         "groundtruth_tum.txt and, used where they exist, image_timestamps_ns.txt and imu0.csv",
     )
     parser.add_argument(
-        "--frame-times", type=Path, metavar="F", help="frame times of a recorded trajectory: ns, one per line"
+        "--frame-times",
+        type=Path,
+        metavar="F",
+        help="frame times of a recorded trajectory: ns, one per line",
     )
     parser.add_argument(
-        "--imu", metavar="F", help="simulated, none, or EuRoC's csv of a recorded IMU (default: that of the flight)"
+        "--imu",
+        metavar="F",
+        help="simulated, none, or EuRoC's csv of a recorded IMU (default: that of the flight)",
     )
     parser.add_argument(
         "--velocity",
         choices=("none", "paper", "exact"),
-        help="body velocity in KITTI folders (default there: paper, which is 0.5 m/s and 0.05 rad/s of noise)",
+        help="body velocity in KITTI folders (default there: paper, which is 0.5 m/s and 0.05 "
+        "rad/s of noise)",
     )
     parser.add_argument(
         "--rig",
         choices=("euroc", "euroc-rectified", "kitti", "fisheye", "wide", "small"),
-        help="cameras and their extrinsics to the IMU (default: euroc-rectified for handheld, kitti for car, euroc, "
+        help="cameras and their extrinsics to the IMU (default: euroc-rectified for handheld, "
+        "kitti for car, euroc, "
         "which is unrectified, for a recorded trajectory)",
     )
-    parser.add_argument("--width", type=int, metavar="PX", help="image width, with the same field of view")
-    parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second (default 20; 10 for car)")
-    parser.add_argument("--duration", type=float, metavar="S", help="length (default 30 s, or the whole flight)")
+    parser.add_argument(
+        "--width", type=int, metavar="PX", help="image width, with the same field of view"
+    )
+    parser.add_argument(
+        "--rate", type=float, metavar="HZ", help="frames per second (default 20; 10 for car)"
+    )
+    parser.add_argument(
+        "--duration", type=float, metavar="S", help="length (default 30 s, or the whole flight)"
+    )
     parser.add_argument(
         "--realism",
         choices=("plain", "real", "drawn"),
         default="plain",
-        help="real: what real cameras do, all at once: exposure control with lag and jumps, motion blur of its shutter "
-        "time, noise of its gain, unequal cameras, vignetting, glare, uneven light, blank walls, walking people, and a "
+        help="real: what real cameras do, all at once: exposure control with lag and jumps, motion "
+        "blur of its shutter "
+        "time, noise of its gain, unequal cameras, vignetting, glare, uneven light, blank walls, "
+        "walking people, and a "
         "calibration that is slightly off; --set switches single ones off. drawn: the same, with "
         "a rig drawn from calibration_sigmas (default plain)",
     )
-    parser.add_argument("--effects", metavar="NAME,…", default="", help=f"in addition, of {_EFFECTS}")
+    parser.add_argument(
+        "--effects", metavar="NAME,…", default="", help=f"in addition, of {_EFFECTS}"
+    )
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="a.b=c",
-        help="one value of effects, faults, imu_noise, calibration or calibration_sigmas, or of the scene "
-        "(bare_wall, moving, people, lighting), such as effects.blur_exposure_ms=20 or people=0; may be repeated",
+        help="one value of effects, faults, imu_noise, calibration or calibration_sigmas, or of "
+        "the scene "
+        "(bare_wall, moving, people, lighting), such as effects.blur_exposure_ms=20 or people=0; "
+        "may be repeated",
     )
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all random numbers")
     parser.add_argument(
-        "--format", choices=("euroc", "kitti", "rgbd"), help="of the folder (default kitti for that rig)"
+        "--seed", type=int, default=0, metavar="N", help="seed of all random numbers"
     )
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default up to 2); the images are the same")
+    parser.add_argument(
+        "--format",
+        choices=("euroc", "kitti", "rgbd"),
+        help="of the folder (default kitti for that rig)",
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="processes (default up to 2); the images are the same",
+    )
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
 
 
@@ -140,10 +174,20 @@ def execute(args: argparse.Namespace) -> int:
 
 def _rows(summary: dict[str, Any]) -> tuple[tuple[str, str], ...]:
     return (
-        ("scene", f"{summary['scene']}, trajectory {summary['trajectory']}, seed {summary['seed']}"),
-        ("cameras", f"{summary['rig']} ({summary['camera']}), {summary['width']} x {summary['height']}"),
+        (
+            "scene",
+            f"{summary['scene']}, trajectory {summary['trajectory']}, seed {summary['seed']}",
+        ),
+        (
+            "cameras",
+            f"{summary['rig']} ({summary['camera']}), {summary['width']} x {summary['height']}",
+        ),
         ("frames", f"{summary['frames']} over {summary['duration_s']:.2f} s, IMU {summary['imu']}"),
-        ("time", f"{summary['seconds']:.1f} s, {summary['pairs_per_s']:.1f} pairs/s, processes: {summary['workers']}"),
+        (
+            "time",
+            f"{summary['seconds']:.1f} s, {summary['pairs_per_s']:.1f} pairs/s, processes: "
+            f"{summary['workers']}",
+        ),
         ("folder", f"{summary['out']} ({summary['format']}, {summary['bytes'] / 1e6:.1f} MB)"),
     )
 
@@ -158,7 +202,8 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
 
     car = args.trajectory == "car"
     trajectory: Any = args.trajectory
-    frame_times, imu = args.frame_times, args.imu
+    frame_times = args.frame_times
+    imu = args.imu
     if args.frame_times is not None and args.rate is not None:
         raise ConfigError("--frame-times and --rate exclude each other; give one of them")
     if trajectory not in READY_MOTIONS:
@@ -169,13 +214,19 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
             imu = own_imu if imu is None else imu
         elif not trajectory.exists():
             raise ConfigError(
-                f"--trajectory {trajectory}: there is no such file; give {', '.join(READY_MOTIONS)}, a TUM file or the "
+                f"--trajectory {trajectory}: there is no such file; give "
+                f"{', '.join(READY_MOTIONS)}, a TUM file or the "
                 "folder of a recorded flight"
             )
-    rig: Any = args.rig or ("euroc" if isinstance(trajectory, Path) else "kitti" if car else "euroc-rectified")
+    rig: Any = args.rig or (
+        "euroc" if isinstance(trajectory, Path) else "kitti" if car else "euroc-rectified"
+    )
     form = args.format or ("kitti" if rig == "kitti" else "euroc")
     if form == "euroc" and imu == "none":
-        raise ConfigError("an EuRoC folder needs an IMU; give --imu simulated or a recorded one, or --format kitti")
+        raise ConfigError(
+            "an EuRoC folder needs an IMU; give --imu simulated or a recorded one, or --format "
+            "kitti"
+        )
     if form == "euroc" and args.velocity not in (None, "none"):
         raise ConfigError("an EuRoC folder cannot contain body velocities; give --format kitti")
     if form == "kitti" and args.imu not in (None, "none"):
@@ -205,7 +256,9 @@ def _conditions(args: argparse.Namespace) -> Conditions:
 
     real = args.realism != "plain"
     level = real_conditions(args.scene, drawn_rig=args.realism == "drawn") if real else Conditions()
-    conditions = conditions_of([name.strip() for name in args.effects.split(",") if name.strip()], level)
+    conditions = conditions_of(
+        [name.strip() for name in args.effects.split(",") if name.strip()], level
+    )
     for override in args.set:
         conditions = merge_override(conditions, override, example="effects.gamma=2.2")
     return conditions

@@ -14,13 +14,21 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "report",
         help="write a page about one or several runs",
-        description="Write one self-contained HTML page about finished runs: summary, path, attitude, errors, "
-        "features, innovations, biases, time, warnings and settings. Several runs are shown side by side. The page "
+        description="Write one self-contained HTML page about finished runs: summary, path, "
+        "attitude, errors, "
+        "features, innovations, biases, time, warnings and settings. Several runs are shown side "
+        "by side. The page "
         "needs no network.",
     )
-    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folders that `vio run` wrote")
-    parser.add_argument("--reference", type=Path, metavar="F", help="ground truth in place of that of the runs")
-    parser.add_argument("--out", type=Path, metavar="F", help="the page (default report.html in the first RUN)")
+    parser.add_argument(
+        "runs", type=Path, nargs="+", metavar="RUN", help="folders that `vio run` wrote"
+    )
+    parser.add_argument(
+        "--reference", type=Path, metavar="F", help="ground truth in place of that of the runs"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="F", help="the page (default report.html in the first RUN)"
+    )
     parser.add_argument("--open", action="store_true", help="show it in the browser")
 
 
@@ -30,7 +38,11 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def write(
-    folders: Sequence[Path], reference: Path | None = None, out: Path | None = None, *, shown: bool = False
+    folders: Sequence[Path],
+    reference: Path | None = None,
+    out: Path | None = None,
+    *,
+    shown: bool = False,
 ) -> Path:
     """Write the page about runs and return its path; `shown`: also show it in the browser."""
     from vio.files.atomic import check_new_file
@@ -40,7 +52,9 @@ def write(
     try:
         from vio.report.page import write_report
     except ImportError as error:  # pragma: no cover - plotly is installed with this package
-        raise DataError(f"the report needs plotly ({error}); install it with: pip install plotly") from error
+        raise DataError(
+            f"the report needs plotly ({error}); install it with: pip install plotly"
+        ) from error
     runs = with_distinct_names([read_finished_run(folder, reference) for folder in folders])
     out = out or folders[0] / RunFile.REPORT
     check_new_file(out, b'<p class="remark">stereo-vio')

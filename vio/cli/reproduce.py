@@ -13,11 +13,24 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "reproduce",
         help="repeat the paper's experiment",
-        description="Repeat the paper's experiment on ECE276A .npz files: dead reckoning, mapping, SLAM with all "
-        "features and with the most seen 1/7, and the recommended setting. One table, one figure per drive.",
+        description="Repeat the paper's experiment on ECE276A .npz files: dead reckoning, mapping, "
+        "SLAM with all "
+        "features and with the most seen 1/7, and the recommended setting. One table, one figure "
+        "per drive.",
     )
-    parser.add_argument("files", nargs="+", metavar="FILE[=REF]", help="an .npz file, with its ground truth after '='")
-    parser.add_argument("--out", type=Path, default=Path("reproduce"), metavar="DIR", help="folder (default reproduce)")
+    parser.add_argument(
+        "files",
+        nargs="+",
+        metavar="FILE[=REF]",
+        help="an .npz file, with its ground truth after '='",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("reproduce"),
+        metavar="DIR",
+        help="folder (default reproduce)",
+    )
     parser.add_argument("--json", action="store_true", help="print the table as one JSON object")
 
 

@@ -17,17 +17,29 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "ros2",
         help="odometry as a ROS 2 node (extra ros2)",
-        description="Subscribe to images and IMU, and publish odometry, /tf, path, landmarks and /diagnostics, until "
+        description="Subscribe to images and IMU, and publish odometry, /tf, path, landmarks and "
+        "/diagnostics, until "
         "Ctrl-C. Uses rclpy where ROS 2 is installed, else DDS directly.",
     )
-    parser.add_argument("--left", required=True, metavar="TOPIC", help="left or only camera; Image or …/compressed")
-    parser.add_argument("--right", metavar="TOPIC", help="right camera; without it, one camera and its IMU")
+    parser.add_argument(
+        "--left", required=True, metavar="TOPIC", help="left or only camera; Image or …/compressed"
+    )
+    parser.add_argument(
+        "--right", metavar="TOPIC", help="right camera; without it, one camera and its IMU"
+    )
     parser.add_argument("--imu", metavar="TOPIC", help="IMU; without it, images alone")
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="default: CameraInfo and /tf_static")
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="default: CameraInfo and /tf_static"
+    )
     add_settings_arguments(parser)
     add_map_arguments(parser)
     parser.add_argument("--prefix", default="/vio", help="of the published topics (default /vio)")
-    parser.add_argument("--frames", default="map,odom,base_link", metavar="A,B,C", help="(default map,odom,base_link)")
+    parser.add_argument(
+        "--frames",
+        default="map,odom,base_link",
+        metavar="A,B,C",
+        help="(default map,odom,base_link)",
+    )
     parser.add_argument("--no-tf", action="store_true", help="do not publish /tf")
     add_transport_arguments(parser, "needs reliable publishers, and loses nothing")
 
@@ -35,8 +47,12 @@ def add_parser(commands: Any) -> None:
 def add_transport_arguments(parser: argparse.ArgumentParser, reliable: str) -> None:
     """Add the options of the way to the graph; `reliable` says what that quality does."""
     parser.add_argument("--reliable", action="store_true", help=f"reliable transport: {reliable}")
-    parser.add_argument("--transport", choices=("auto", "dds", "rclpy"), default="auto", help="way to the graph")
-    parser.add_argument("--domain", type=int, metavar="N", help="of DDS (default: ROS_DOMAIN_ID, or 0)")
+    parser.add_argument(
+        "--transport", choices=("auto", "dds", "rclpy"), default="auto", help="way to the graph"
+    )
+    parser.add_argument(
+        "--domain", type=int, metavar="N", help="of DDS (default: ROS_DOMAIN_ID, or 0)"
+    )
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -46,13 +62,18 @@ def execute(args: argparse.Namespace) -> int:
     from vio.ros2.sensors import SensorTopics
     from vio.ros2.transport import open_transport
 
-    config, map_use = config_from(args), map_from(args)
+    config = config_from(args)
+    map_use = map_from(args)
     names = args.frames.split(",")
     if len(names) != 3 or not all(names):
         raise ConfigError(f"--frames {args.frames}: give three names, map,odom,base")
     if args.right is None and args.imu is None:
         raise ConfigError("one camera needs an IMU; give --imu TOPIC, or --right TOPIC")
-    rig = None if args.calibration is None else load_rig(args.calibration, cameras=1 if args.right is None else 2)
+    rig = (
+        None
+        if args.calibration is None
+        else load_rig(args.calibration, cameras=1 if args.right is None else 2)
+    )
     settings = NodeSettings(
         SensorTopics(args.left, args.right, args.imu),
         FrameNames(*names),
@@ -67,6 +88,9 @@ def execute(args: argparse.Namespace) -> int:
     def say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
-    with contextlib.closing(open_transport(args.transport, args.domain)) as transport, StopRequest() as asked:
+    with (
+        contextlib.closing(open_transport(args.transport, args.domain)) as transport,
+        StopRequest() as asked,
+    ):
         run_node(transport, settings, config, rig, should_stop=asked.reason, say=say)
     return 0

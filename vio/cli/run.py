@@ -7,7 +7,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vio.cli.arguments import add_config_arguments, add_lengths_argument, add_span_arguments, config_from
+from vio.cli.arguments import (
+    add_config_arguments,
+    add_lengths_argument,
+    add_span_arguments,
+    config_from,
+)
 from vio.cli.output import print_result
 from vio.errors import ConfigError
 
@@ -16,21 +21,38 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "run",
         help="process a recording",
-        description="Process a recording and write a folder of results. The kind of SOURCE is detected from its "
-        "content; 'kind:path' sets it (kitti, kitti_raw, euroc, plain, bag, video, ece276a, utias, log).",
+        description="Process a recording and write a folder of results. The kind of SOURCE is "
+        "detected from its "
+        "content; 'kind:path' sets it (kitti, kitti_raw, euroc, plain, bag, video, ece276a, utias, "
+        "log).",
     )
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("source", metavar="SOURCE", nargs="?", help="a recording: folder or file, or kind:path")
-    what.add_argument("--resume", type=Path, metavar="RUN", help="go on with the unfinished run in this folder")
+    what.add_argument(
+        "source", metavar="SOURCE", nargs="?", help="a recording: folder or file, or kind:path"
+    )
+    what.add_argument(
+        "--resume", type=Path, metavar="RUN", help="go on with the unfinished run in this folder"
+    )
     add_config_arguments(parser)
-    parser.add_argument("--reference", type=Path, metavar="F", help="ground truth (TUM, KITTI or EuRoC format)")
+    parser.add_argument(
+        "--reference", type=Path, metavar="F", help="ground truth (TUM, KITTI or EuRoC format)"
+    )
     add_span_arguments(parser)
     add_lengths_argument(parser)
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
-    parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")
-    parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map: loops are closed in it")
     parser.add_argument(
-        "--map-density", type=int, metavar="N", help="keep features of N keyframes in a cubic metre of the map (all)"
+        "--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)"
+    )
+    parser.add_argument(
+        "--save-observations", action="store_true", help="also write the front end's observations"
+    )
+    parser.add_argument(
+        "--map", type=Path, metavar="FILE", help="begin or continue a map: loops are closed in it"
+    )
+    parser.add_argument(
+        "--map-density",
+        type=int,
+        metavar="N",
+        help="keep features of N keyframes in a cubic metre of the map (all)",
     )
     parser.add_argument(
         "--save-calibration",
@@ -38,7 +60,8 @@ def add_parser(commands: Any) -> None:
         nargs="?",
         const=Path(),
         metavar="FILE",
-        help="write the calibration with what the run found it to be off by, for --calibration of the next run "
+        help="write the calibration with what the run found it to be off by, for --calibration of "
+        "the next run "
         "(Kalibr's format; default camchain-imucam.yaml in the folder of results)",
     )
     parser.add_argument(
@@ -46,10 +69,13 @@ def add_parser(commands: Any) -> None:
         nargs="?",
         const="spawn",
         metavar="WHERE",
-        help="show the run in rerun: in a window, in a browser (web), or into a file *.rrd (extra view)",
+        help="show the run in rerun: in a window, in a browser (web), or into a file *.rrd (extra "
+        "view)",
     )
     parser.add_argument("--no-plot", action="store_true", help="do not draw trajectory.png")
-    parser.add_argument("--report", action="store_true", help="also write report.html, as `vio report` does")
+    parser.add_argument(
+        "--report", action="store_true", help="also write report.html, as `vio report` does"
+    )
     parser.add_argument("--open", action="store_true", help="with --report: show it in the browser")
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

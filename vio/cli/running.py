@@ -86,8 +86,9 @@ def process(
 ) -> dict[str, Any]:
     """Process a source into a run folder, which grows meanwhile, and return its metrics.
 
-    `save_calibration` names the file for the calibration that the run found; `Path()`, one in the run's folder.
-    `command` is kept in the metrics; `finished` gets them before the picture is drawn.
+    `save_calibration` names the file for the calibration that the run found; `Path()`, one in the
+    run's folder. `command` is kept in the metrics; `finished` gets them before the picture is
+    drawn.
     """
     dataset = _opened(source, config, mapped=map_file is not None)
     unused = dataset.recording.motion_notes if config.motion == "none" else ()
@@ -111,18 +112,31 @@ def process(
         "plot": plot,
         "command": command,
     }
-    return _process(dataset, config, folder, request, progress=progress, resume=False, view=view, finished=finished)
+    return _process(
+        dataset,
+        config,
+        folder,
+        request,
+        progress=progress,
+        resume=False,
+        view=view,
+        finished=finished,
+    )
 
 
 def _map_use(request: Mapping[str, Any]) -> MapUse | None:
     if request.get("map") is None:
         return None
-    return MapUse(Path(request["map"]), request.get("localise", False), density=request.get("map_density"))
+    return MapUse(
+        Path(request["map"]), request.get("localise", False), density=request.get("map_density")
+    )
 
 
 def _opened(source: str, config: Config, *, mapped: bool) -> Dataset:
     """Open a recording; maps know pinholes only."""
-    return open_dataset(source, replace(config.dataset, projection="pinhole") if mapped else config.dataset)
+    return open_dataset(
+        source, replace(config.dataset, projection="pinhole") if mapped else config.dataset
+    )
 
 
 def resume(
@@ -139,7 +153,9 @@ def resume(
     saved = (folder / RunFile.UNFINISHED / CHECKPOINT).is_file()
     if not saved:
         log.warning("%s: the run ended before its first checkpoint; it begins again", folder)
-    return _process(dataset, config, folder, request, progress=progress, resume=saved, finished=finished)
+    return _process(
+        dataset, config, folder, request, progress=progress, resume=saved, finished=finished
+    )
 
 
 def _process(
@@ -154,10 +170,15 @@ def _process(
     finished: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Run, write the results and return the metrics; an interrupted run reports how to go on."""
-    recording, reference = dataset.recording, request["reference"]
+    recording = dataset.recording
+    reference = request["reference"]
     truth = recording.reference if reference is None else read_trajectory(Path(reference))
-    start, stop, save_observations = request["start"], request["stop"], request["save_observations"]
-    frames = int((used_frames(recording.frame_times_ns[:stop], config.dataset.max_frame_rate) >= start).sum())
+    start = request["start"]
+    stop = request["stop"]
+    save_observations = request["save_observations"]
+    frames = int(
+        (used_frames(recording.frame_times_ns[:stop], config.dataset.max_frame_rate) >= start).sum()
+    )
     builds_map = bool(request.get("map")) and not request.get("localise", False)
     annotated = AnnotatedImage(frames)
     viewers: list[Viewer] = [ProgressViewer(frames, recording.path.name)] if progress else []
@@ -184,7 +205,9 @@ def _process(
                 keep_observations=save_observations or builds_map,  # which its adjustment takes
                 viewer=Viewers(viewers),
                 map=_map_use(request),
-                control=RunControl(growing_folder(folder, dataset, config, request), resume, asked.reason),
+                control=RunControl(
+                    growing_folder(folder, dataset, config, request), resume, asked.reason
+                ),
             )
             if builds_map:
                 from vio.offline.map_adjustment import adjust_map
@@ -198,7 +221,10 @@ def _process(
                 truth,
                 lengths_m=request["lengths_m"],
                 save_observations=save_observations,
-                more={"command": request.get("command"), "calibration": file if isinstance(calibration, str) else None},
+                more={
+                    "command": request.get("command"),
+                    "calibration": file if isinstance(calibration, str) else None,
+                },
                 plot=request.get("plot", True),
                 finished=complete,
             )
@@ -220,12 +246,16 @@ def _process(
         text = f"{result.stopped}; the results of {len(result.frames)} of {frames} frames are in {folder}"
         if asked.number is None:
             raise StoppedError(f"error: {text}", status=1)
-        raise StoppedError(f"{text}; go on with: vio run --resume {folder}", status=128 + asked.number)
+        raise StoppedError(
+            f"{text}; go on with: vio run --resume {folder}", status=128 + asked.number
+        )
     return metrics
 
 
 def _calibration_or_fault(result: RunResult) -> str | CalibrationError:
-    """Return what `--save-calibration` writes, or why there is none; read before the unfinished folder goes."""
+    """Return what `--save-calibration` writes, or why there is none; read before the unfinished
+    folder goes.
+    """
     try:
         return calibration_text(result)
     except CalibrationError as error:
@@ -233,36 +263,50 @@ def _calibration_or_fault(result: RunResult) -> str | CalibrationError:
 
 
 def _calibration_file(dataset: Dataset, folder: Path, asked: Path | None) -> Path | None:
-    """Return where a run's calibration goes, checked before the processing starts; None: it was not asked for."""
+    """Return where a run's calibration goes, checked before the processing starts.
+
+    None: it was not asked for.
+    """
     if asked is None:
         return None
     if given_rig(dataset) is None:
         if dataset.recording.camera.is_cylinder:
             raise DataError(
-                f"{dataset.recording.path}: holds features of images on a cylinder, which no lens model holds; run on "
+                f"{dataset.recording.path}: holds features of images on a cylinder, which no lens "
+                "model holds; run on "
                 "the images, or leave --save-calibration out"
             )
         raise DataError(
-            f"{dataset.recording.path}: states no image size, which a calibration needs; leave --save-calibration out"
+            f"{dataset.recording.path}: states no image size, which a calibration needs; leave "
+            "--save-calibration out"
         )
     if asked == Path():
         return folder / RunFile.CALIBRATION
     if asked.suffix.lower() not in (".yaml", ".yml"):
-        raise ConfigError(f"--save-calibration {asked}: writes Kalibr's format; give a file name that ends in .yaml")
+        raise ConfigError(
+            f"--save-calibration {asked}: writes Kalibr's format; give a file name that ends in "
+            ".yaml"
+        )
     if asked.is_dir() or not asked.absolute().parent.is_dir():
-        raise DataError(f"--save-calibration {asked}: its folder does not exist, or it is one; name a file")
+        raise DataError(
+            f"--save-calibration {asked}: its folder does not exist, or it is one; name a file"
+        )
     check_new_file(asked, b"# by vio run")
     check_writable(asked)
     return asked
 
 
-def _open_view(where: str, dataset: Dataset, config: Config, reference: Trajectory | None) -> RerunViewer:
+def _open_view(
+    where: str, dataset: Dataset, config: Config, reference: Trajectory | None
+) -> RerunViewer:
     """Open rerun's viewer, a file or a web server for a run."""
     from vio.view.live import RerunViewer, ViewedRig
     from vio.view.stream import open_stream
 
     recording = dataset.recording
-    rig = ViewedRig(recording.camera, recording.T_cam0_body, resolve_motion(recording, config), reference)
+    rig = ViewedRig(
+        recording.camera, recording.T_cam0_body, resolve_motion(recording, config), reference
+    )
     stream, address = open_stream(where, recording.path.name)
     if address is not None:
         log.warning("the run is shown at %s", address)
@@ -270,10 +314,12 @@ def _open_view(where: str, dataset: Dataset, config: Config, reference: Trajecto
 
 
 def check_out(folder: Path) -> Path:
-    """Reject a folder with other contents, or one that cannot be written, before the processing starts.
+    """Reject a folder with other contents, or one that cannot be written, before the processing
+    starts.
 
     Raises:
-        VioError: the folder is not an earlier run's, the path is a file, or nothing can be written there.
+        VioError: the folder is not an earlier run's, the path is a file, or nothing can be written
+            there.
     """
     if folder.exists() and not folder.is_dir():
         raise VioError(f"{folder}: is a file; --out takes a folder")
@@ -292,29 +338,55 @@ def free_folder(source: Path, root: Path = Path("runs")) -> Path:
 
 
 def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str, str]]:
-    """Return a run's metrics as a few table rows, ended by what to do next; `plot`: whether its picture is drawn."""
+    """Return a run's metrics as a few table rows, ended by what to do next; `plot`: whether its
+    picture is drawn.
+    """
     stages = ", ".join(f"{name} {ms:.1f}" for name, ms in metrics["stages_ms"].items())
-    frames, span = metrics["frames"], metrics["last_frame"] - metrics["first_frame"] + 1
-    median, most = metrics["ms_per_frame_median"], metrics["ms_per_frame_95"]
+    frames = metrics["frames"]
+    span = metrics["last_frame"] - metrics["first_frame"] + 1
+    median = metrics["ms_per_frame_median"]
+    most = metrics["ms_per_frame_95"]
     rows = [
-        ("frames", f"{frames}{f' of {span}' if span > frames else ''}, path {metrics['path_length_m']:.2f} m"),
+        (
+            "frames",
+            f"{frames}{f' of {span}' if span > frames else ''}, path "
+            f"{metrics['path_length_m']:.2f} m",
+        ),
         ("time", f"{median:.1f} ms a frame, 95 % within {most:.1f} ({stages})"),
     ]
     if metrics["start_s"] > _COMPILED_S:
-        rows.append(("", f"and {metrics['start_s']:.0f} s in slow frames: loops are compiled once on a machine"))
+        rows.append(
+            (
+                "",
+                f"and {metrics['start_s']:.0f} s in slow frames: loops are compiled once on a "
+                "machine",
+            )
+        )
     rows.append(("back end", f"{metrics['backend']}, motion {metrics['motion']}"))
     if metrics["refused_share"] is not None:
-        refused = f"{100 * metrics['refused_share']:.1f} % of the observations, by the chi-square gates"
+        refused = (
+            f"{100 * metrics['refused_share']:.1f} % of the observations, by the chi-square gates"
+        )
         ratio = metrics.get("innovation_ratio")
-        more = "" if ratio is None else f"; innovations are {ratio:.2g} of their standard deviation (median)"
+        more = (
+            ""
+            if ratio is None
+            else f"; innovations are {ratio:.2g} of their standard deviation (median)"
+        )
         rows.append(("refused", refused + more))
     if metrics.get("scale_sigma") is not None:
         sigma = f"{100 * metrics['scale_sigma']:.2g} %"
-        rows.append(("scale", f"one camera: from the IMU, standard deviation {sigma} (median of the frames)"))
+        rows.append(
+            (
+                "scale",
+                f"one camera: from the IMU, standard deviation {sigma} (median of the frames)",
+            )
+        )
     elif metrics["camera"].get("kind") == "rgbd":
         rows.append(("scale", "one camera: from the depth images"))
     elif metrics.get("rig_scale_sigma"):
-        share, path_m = metrics["rig_scale_sigma"], metrics["path_length_m"]
+        share = metrics["rig_scale_sigma"]
+        path_m = metrics["path_length_m"]
         of_path = f"{metres_text(share * path_m)} of {path_m:.2f} m"
         rows.append(("scale", f"known to {100 * share:.2g} % by the calibration: {of_path}"))
     if metrics["stereo_field"] is not None:
@@ -332,7 +404,11 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
         free = metrics["evaluation"]["scale_free"]
         if free is not None:
             rows.append(
-                ("", f"{metres_text(free['ate_m'])} after Sim(3), scale off by {100 * (free['scale'] - 1):+.2f} %")
+                (
+                    "",
+                    f"{metres_text(free['ate_m'])} after Sim(3), scale off by "
+                    f"{100 * (free['scale'] - 1):+.2f} %",
+                )
             )
     if metrics["t_err_percent"] is not None:
         over = lengths_text(metrics["drift_lengths_m"])
@@ -345,7 +421,11 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
     if metrics["landmark_error"] is not None:
         score = metrics["landmark_error"]
         rows.append(
-            ("landmarks", f"{metres_text(score['rmse_m'])} ({score['matched']} of {score['surveyed']} surveyed ones)")
+            (
+                "landmarks",
+                f"{metres_text(score['rmse_m'])} ({score['matched']} of {score['surveyed']} "
+                "surveyed ones)",
+            )
         )
     if metrics.get("calibration") is not None:
         rows.append(("calib.", f"{metrics['calibration']} (next: --calibration FILE)"))
@@ -357,7 +437,9 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
 
 
 def _calibration_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
-    """What was found of the camera's scale, and of camera and IMU; they are near zero where the calibration is good."""
+    """What was found of the camera's scale, and of camera and IMU; they are near zero where the
+    calibration is good.
+    """
     scale = scale_findings(metrics)
     rows = [("cameras", ", ".join(scale))] if scale else []
     rows += [("IMU", line) for line in camera_imu_findings(metrics)]
@@ -369,7 +451,10 @@ def _calibration_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         if words:
             rows.append(("IMU", f"{sensor} scale {', '.join(words)} %"))
         if "misalignment_deg" in own:
-            size, sigma = (math.hypot(*own[key].values()) for key in ("misalignment_deg", "misalignment_deg_sigma"))
+            size, sigma = (
+                math.hypot(*own[key].values())
+                for key in ("misalignment_deg", "misalignment_deg_sigma")
+            )
             rows.append(("", f"{sensor} misalignment {size:.2f} ± {sigma:.2f} deg"))
     return rows
 

@@ -1,4 +1,6 @@
-"""Ending a long run in order: the first signal asks it to stop after the present frame, the second one ends it."""
+"""Ending a long run in order: the first signal asks it to stop after the present frame, the
+second one ends it.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +9,15 @@ import threading
 from types import FrameType
 from typing import Any
 
-_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
 
 
 class StopRequest:
-    """Notes the first Ctrl-C, SIGTERM or SIGHUP inside the block; in other threads than the main one, none."""
+    """Notes the first Ctrl-C, SIGTERM or SIGHUP inside the block; in other threads than the main
+    one, none.
+    """
 
     def __init__(self) -> None:
         self.number: int | None = None  # of the signal
@@ -21,7 +27,11 @@ class StopRequest:
         """Why the run should stop; None: it should not."""
         if self.number is None:
             return None
-        return "interrupted" if self.number == signal.SIGINT else f"ended by {signal.Signals(self.number).name}"
+        return (
+            "interrupted"
+            if self.number == signal.SIGINT
+            else f"ended by {signal.Signals(self.number).name}"
+        )
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():

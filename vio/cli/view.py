@@ -11,12 +11,17 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "view",
         help="show a finished run in rerun",
-        description="Show a finished run again: path, covariance, curves, map; features where the run was made with "
+        description="Show a finished run again: path, covariance, curves, map; features where the "
+        "run was made with "
         "--save-observations, and its images where the recording still is. Needs the extra view.",
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="a folder that `vio run` wrote")
     parser.add_argument(
-        "where", nargs="?", default="spawn", metavar="WHERE", help="web, or a file *.rrd (default: a window)"
+        "where",
+        nargs="?",
+        default="spawn",
+        metavar="WHERE",
+        help="web, or a file *.rrd (default: a window)",
     )
 
 

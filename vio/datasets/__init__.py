@@ -1,4 +1,7 @@
-"""Readers of recordings. A source is a path whose kind is detected from its content, or `kind:path`."""
+"""Readers of recordings.
+
+A source is a path whose kind is detected from its content, or `kind:path`.
+"""
 
 from __future__ import annotations
 
@@ -34,10 +37,14 @@ READERS = {
     "log": "observation_log:read_observation_log",
 }
 _LOOKED_FOR = (
-    "a KITTI folder (image_0 image_1 calib.txt times.txt), a KITTI raw drive (image_00 image_01), an EuRoC folder "
-    "(mav0), a plain folder (left right and a calibration), one camera (left or cam0, a calibration and an IMU), one "
-    "with depth images (rgb.txt depth.txt, or left depth), a ROS bag (.bag, .db3, .mcap), two videos (left.mp4 "
-    "right.mp4), an ECE276A .npz, a UTIAS .mat, GTSAM's stereo factors (*stereo_factors*.txt) or an observation log "
+    "a KITTI folder (image_0 image_1 calib.txt times.txt), a KITTI raw drive (image_00 image_01), "
+    "an EuRoC folder "
+    "(mav0), a plain folder (left right and a calibration), one camera (left or cam0, a "
+    "calibration and an IMU), one "
+    "with depth images (rgb.txt depth.txt, or left depth), a ROS bag (.bag, .db3, .mcap), two "
+    "videos (left.mp4 "
+    "right.mp4), an ECE276A .npz, a UTIAS .mat, GTSAM's stereo factors (*stereo_factors*.txt) or "
+    "an observation log "
     ".npz"
 )
 
@@ -50,20 +57,28 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
         options: reader settings.
 
     Raises:
-        DataError: the path does not exist, or its content is of no known kind; the message lists the known kinds.
+        DataError: the path does not exist, or its content is of no known kind; the message lists
+            the known kinds.
         CalibrationError: the recording's calibration is invalid.
     """
     kind, path = _parse(os.fspath(source))
     if path.is_symlink() and not path.exists():
-        raise DataError(f"{path} is a link to {os.readlink(path)}, which leads nowhere; give {_LOOKED_FOR}")
+        raise DataError(
+            f"{path} is a link to {os.readlink(path)}, which leads nowhere; give {_LOOKED_FOR}"
+        )
     if not path.exists():
         raise DataError(_missing(path))
     settings = options or DatasetSettings()
     module, reader = READERS[_for_settings(kind or _detect(path), path, settings)].split(":")
-    read: Callable[[Path, DatasetSettings], Dataset] = getattr(import_module(f"vio.datasets.{module}"), reader)
+    read: Callable[[Path, DatasetSettings], Dataset] = getattr(
+        import_module(f"vio.datasets.{module}"), reader
+    )
     dataset = read(path, settings)
-    # The settings of a run that took the left camera also serve its observations, which are of that camera.
-    if settings.camera == "both" or (not dataset.recording.has_images and dataset.recording.camera.kind == "mono"):
+    # The settings of a run that took the left camera also serve its observations, which are of that
+    # camera.
+    if settings.camera == "both" or (
+        not dataset.recording.has_images and dataset.recording.camera.kind == "mono"
+    ):
         return dataset
     from vio.datasets.left_camera import left_camera
 
@@ -71,7 +86,8 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
 
 
 def in_colour(dataset: Dataset) -> Dataset:
-    """Return a recording whose frames keep the colours of its images, (H, W, 3) red, green, blue; gray ones stay gray.
+    """Return a recording whose frames keep the colours of its images, (H, W, 3) red, green, blue;
+    gray ones stay gray.
 
     No front end takes such frames: they are for those who show images or write them.
     """
@@ -83,12 +99,17 @@ def in_colour(dataset: Dataset) -> Dataset:
 def _for_settings(kind: str, path: Path, settings: DatasetSettings) -> str:
     """Return the kind that reads a recording with another calibration or named topics."""
     if settings.topics is not None and kind != "bag":
-        raise DataError(f"{path}: --topics names topics of a ROS bag, but this is of kind {kind}; leave it out")
+        raise DataError(
+            f"{path}: --topics names topics of a ROS bag, but this is of kind {kind}; leave it out"
+        )
     if settings.calibration is None or kind in ("plain", "mono", "rgbd", "bag", "video"):
         return kind
     if kind in ("kitti", "kitti_raw", "euroc"):
         return "plain"  # which reads these folders, too, with any calibration
-    raise DataError(f"{path}: --calibration takes the place of a camera's calibration, but kind {kind} has its own")
+    raise DataError(
+        f"{path}: --calibration takes the place of a camera's calibration, but kind {kind} has its "
+        "own"
+    )
 
 
 def _parse(source: str) -> tuple[str | None, Path]:
@@ -101,7 +122,10 @@ def _parse(source: str) -> tuple[str | None, Path]:
     if head not in READERS:
         near = difflib.get_close_matches(head, READERS, 1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
-        raise DataError(f"'{head}' in '{source}' is no kind of recording; choose one of {', '.join(READERS)}{hint}")
+        raise DataError(
+            f"'{head}' in '{source}' is no kind of recording; choose one of "
+            f"{', '.join(READERS)}{hint}"
+        )
     if not tail:
         raise DataError(f"'{source}' names no path; write {head}:PATH")
     return head, Path(tail)
@@ -120,7 +144,9 @@ def _missing(path: Path) -> str:
     folder = path.parent
     if not folder.is_dir():
         return f"{path} does not exist, nor does {folder}; check the path"
-    near = difflib.get_close_matches(path.name, os.listdir(folder) if os.access(folder, os.R_OK) else (), 1, 0.75)
+    near = difflib.get_close_matches(
+        path.name, os.listdir(folder) if os.access(folder, os.R_OK) else (), 1, 0.75
+    )
     hint = f"did you mean {folder / near[0]}?" if near else "check the path"
     return f"{path} does not exist; {hint}"
 
@@ -133,14 +159,17 @@ def _unknown(path: Path) -> str:
     if path.is_dir() and (found := images_of_one_camera(path)) is not None:
         if found == path:
             return (
-                f"{path}: holds images, but not in folders; put those of a stereo camera into left and right, with "
-                "its calibration beside them, or those of one camera into left, with calibration.yaml and imu.csv"
+                f"{path}: holds images, but not in folders; put those of a stereo camera into left "
+                "and right, with "
+                "its calibration beside them, or those of one camera into left, with "
+                "calibration.yaml and imu.csv"
             )
         name = found.relative_to(path)
         if not set(name.parts) & set(ALONE):
             return f"{path}: holds images in {name} but none of a left camera; add them"
         return (
-            f"{path}: holds images in {name} but no right camera's and no calibration; add the right images, "
+            f"{path}: holds images in {name} but no right camera's and no calibration; add the "
+            "right images, "
             "or for one camera a calibration.yaml (Kalibr's camchain with cam0) and imu.csv"
         )
     if path.suffix.lower() in images.SUFFIXES:
@@ -165,7 +194,8 @@ def _folder_kind(path: Path) -> str | None:
         raise DataError(f"{path} is empty; give {_LOOKED_FOR}")
     if "metrics.json" in names and "config.yaml" in names:
         raise DataError(
-            f"{path} holds the results of a run, not a recording; show it with vio report, compare it by vio eval, or "
+            f"{path} holds the results of a run, not a recording; show it with vio report, compare "
+            "it by vio eval, or "
             "give its observations.npz (of --save-observations)"
         )
     if is_bag(path):
@@ -189,7 +219,10 @@ def _folder_kind(path: Path) -> str | None:
     if plain.is_mono_folder(path):
         return "mono"
     if "sequences" in names:
-        raise DataError(f"{path} holds several KITTI sequences; name one of them, such as {path / 'sequences' / '00'}")
+        raise DataError(
+            f"{path} holds several KITTI sequences; name one of them, such as "
+            f"{path / 'sequences' / '00'}"
+        )
     return None
 
 

@@ -1,4 +1,6 @@
-"""Helpers shared by the readers: integer clocks, events in time order, checked calibrations and archives."""
+"""Helpers shared by the readers: integer clocks, events in time order, checked calibrations and
+archives.
+"""
 
 from __future__ import annotations
 
@@ -24,15 +26,27 @@ from vio.files.text import check_increasing
 from vio.geometry.lie import FloatArray
 from vio.records import NS_PER_S, BoolArray, Event, IntArray, MotionSample, Recording, StereoFrame
 
-_GRAVITY, _GRAVITY_OFF = 9.81, 1.5  # m/s^2; by what accelerations and biases move the median of a motion's readings
-_MOST_ARRAY_BYTES = 2**31  # the largest published course file takes 140 MB; a bomb of kilobytes claims terabytes
-# What a damaged or encrypted archive also raises: an unknown compression, a header that is no literal.
-_DAMAGE = (RuntimeError, MemoryError, TypeError, SyntaxError, TokenError, lzma.LZMAError, struct.error)
+_GRAVITY = 9.81  # m/s^2; by what accelerations and biases move the median of a motion's readings
+_GRAVITY_OFF = 1.5
+# the largest published course file takes 140 MB; a bomb of kilobytes claims terabytes
+_MOST_ARRAY_BYTES = 2**31
+# What a damaged or encrypted archive also raises: an unknown compression, a header that is no
+# literal.
+_DAMAGE = (
+    RuntimeError,
+    MemoryError,
+    TypeError,
+    SyntaxError,
+    TokenError,
+    lzma.LZMAError,
+    struct.error,
+)
 _EXACT_ENTRY = 1e-8  # tolerance of the zeros and the one of an intrinsic matrix
 
 
 def check_gravity_column(values: FloatArray, where: str, form: str, remedy: str) -> None:
-    """Raise DataError where gravity is among the gyro's columns of readings (N, 6) and not among the accelerometer's.
+    """Raise DataError where gravity is among the gyro's columns of readings (N, 6) and not among
+    the accelerometer's.
 
     Args:
         values: in the order of `form`, rad/s and m/s^2.
@@ -43,12 +57,15 @@ def check_gravity_column(values: FloatArray, where: str, form: str, remedy: str)
     first, second = (float(np.median(np.linalg.norm(values[:, k : k + 3], axis=1))) for k in (0, 3))
     if abs(first - _GRAVITY) < _GRAVITY_OFF < abs(second - _GRAVITY):
         raise DataError(
-            f"{where}: gravity is in the columns 2 to 4 (median {first:.2f}), where {form} has the gyro; {remedy}"
+            f"{where}: gravity is in the columns 2 to 4 (median {first:.2f}), where {form} has the "
+            f"gyro; {remedy}"
         )
 
 
 def seconds_to_ns(seconds: npt.ArrayLike) -> IntArray:
-    """Integer nanoseconds (N,) of float seconds (N,); whole seconds are split off first, so that no digit is lost."""
+    """Integer nanoseconds (N,) of float seconds (N,); whole seconds are split off first, so that
+    no digit is lost.
+    """
     s = np.asarray(seconds, dtype=np.float64)
     whole = np.floor(s)
     return whole.astype(np.int64) * NS_PER_S + np.rint((s - whole) * NS_PER_S).astype(np.int64)
@@ -68,7 +85,9 @@ def clock_ns(seconds: npt.ArrayLike, where: Callable[[int], str]) -> IntArray:
     bad = ~np.isfinite(s) | (np.abs(s) > 9e9)
     if bad.any():
         k = int(np.argmax(bad))
-        raise DataError(f"{where(k)}: the time {s[k]:g} is not a time in seconds; write a finite number there")
+        raise DataError(
+            f"{where(k)}: the time {s[k]:g} is not a time in seconds; write a finite number there"
+        )
     return check_increasing(seconds_to_ns(s), where)
 
 
@@ -81,9 +100,13 @@ def numbers_in(text: str, count: int, where: str) -> FloatArray:
     try:
         values = np.array([float(value) for value in text.split()])
     except ValueError as error:
-        raise CalibrationError(f"{where} holds no number ({error}); copy the calibration again") from error
+        raise CalibrationError(
+            f"{where} holds no number ({error}); copy the calibration again"
+        ) from error
     if values.shape != (count,):
-        raise CalibrationError(f"{where} holds {len(values)} values, expected {count}; copy it again")
+        raise CalibrationError(
+            f"{where} holds {len(values)} values, expected {count}; copy it again"
+        )
     if not np.isfinite(values).all():
         raise CalibrationError(f"{where} holds values that are not finite; copy it again")
     return values
@@ -94,7 +117,8 @@ def check_intrinsics(K: FloatArray, where: str) -> None:
     form = np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1], atol=_EXACT_ENTRY)
     if not (form and K[0, 0] > 0 and K[1, 1] > 0):
         raise CalibrationError(
-            f"{where} is no intrinsic matrix [fu 0 cu; 0 fv cv; 0 0 1], fu and fv positive, but {K.tolist()}; "
+            f"{where} is no intrinsic matrix [fu 0 cu; 0 fv cv; 0 0 1], fu and fv positive, but "
+            f"{K.tolist()}; "
             "check the order"
         )
 
@@ -108,7 +132,8 @@ def image_size(values: Sequence[float], where: str) -> tuple[int, int]:
     width, height = (int(value) for value in values)
     if [width, height] != list(values) or min(width, height) < 1:
         raise CalibrationError(
-            f"{where}: an image of {values[0]:g} x {values[1]:g} pixels; give whole, positive numbers"
+            f"{where}: an image of {values[0]:g} x {values[1]:g} pixels; give whole, positive "
+            "numbers"
         )
     return width, height
 
@@ -117,12 +142,14 @@ def finite_rows(values: FloatArray, what: str) -> FloatArray:
     """Return per-frame values (F, k) after checking that all are finite.
 
     Raises:
-        DataError: a value is not finite; the message begins with `what`, which names file and variable.
+        DataError: a value is not finite; the message begins with `what`, which names file and
+            variable.
     """
     bad: BoolArray = np.asarray(~np.isfinite(values).all(axis=1))
     if bad.any():
         raise DataError(
-            f"{what} is not finite in {int(bad.sum())} of {len(bad)} frames, first in frame {int(np.argmax(bad))}; "
+            f"{what} is not finite in {int(bad.sum())} of {len(bad)} frames, first in frame "
+            f"{int(np.argmax(bad))}; "
             "remove or repair them"
         )
     return values
@@ -152,14 +179,21 @@ def frame_range(recording: Recording, start: int, stop: int | None) -> range:
     end = count if stop is None else min(stop, count)
     if not 0 <= start < end:
         limit = "the end" if stop is None else str(stop)
-        raise DataError(f"{recording.path}: holds frames 0 to {count - 1}; none is between start {start} and {limit}")
+        raise DataError(
+            f"{recording.path}: holds frames 0 to {count - 1}; none is between start {start} and "
+            f"{limit}"
+        )
     return range(start, end)
 
 
-def chosen_frames(recording: Recording, start: int, stop: int | None, most_hz: float | None) -> Sequence[int]:
-    """Return the frames `start <= index < stop` that a limit on the frame rate lets through, increasing.
+def chosen_frames(
+    recording: Recording, start: int, stop: int | None, most_hz: float | None
+) -> Sequence[int]:
+    """Return the frames `start <= index < stop` that a limit on the frame rate lets through,
+    increasing.
 
-    Which ones does not depend on `start`, so that a run that goes on takes the frames that it would have taken.
+    Which ones does not depend on `start`, so that a run that goes on takes the frames that it would
+    have taken.
 
     Args:
         recording: the frame times.
@@ -168,7 +202,8 @@ def chosen_frames(recording: Recording, start: int, stop: int | None, most_hz: f
         most_hz: frames a second; None: no limit.
 
     Raises:
-        DataError: the range is empty or begins after the last frame, or the limit lets none of it through.
+        DataError: the range is empty or begins after the last frame, or the limit lets none of it
+            through.
     """
     chosen = frame_range(recording, start, stop)
     if most_hz is None:
@@ -176,7 +211,8 @@ def chosen_frames(recording: Recording, start: int, stop: int | None, most_hz: f
     taken = [k for k in used_frames(recording.frame_times_ns, most_hz).tolist() if k in chosen]
     if not taken:
         raise DataError(
-            f"{recording.path}: dataset.max_frame_rate {most_hz:g} leaves no frame of {start} to {chosen.stop}; take "
+            f"{recording.path}: dataset.max_frame_rate {most_hz:g} leaves no frame of {start} to "
+            f"{chosen.stop}; take "
             "more frames, or raise it"
         )
     return taken
@@ -189,18 +225,24 @@ def blank_frames(recording: Recording, chosen: Sequence[int]) -> Generator[Stere
 
 
 def merge_events(
-    recording: Recording, chosen: Sequence[int], motion: Sequence[MotionSample], frames: Generator[StereoFrame]
+    recording: Recording,
+    chosen: Sequence[int],
+    motion: Sequence[MotionSample],
+    frames: Generator[StereoFrame],
 ) -> Iterator[Event]:
-    """Yield the motion samples and chosen frames in time order, a sample before a frame of the same time.
+    """Yield the motion samples and chosen frames in time order, a sample before a frame of the same
+    time.
 
-    Raw IMU begins a second before the first frame, so that an estimator can determine gravity before the first image,
-    and ends with the first sample at or after the last frame, so that readings can be interpolated to its exposure.
+    Raw IMU begins a second before the first frame, so that an estimator can determine gravity
+    before the first image, and ends with the first sample at or after the last frame, so that
+    readings can be interpolated to its exposure.
 
     Args:
         recording: the frame times.
         chosen: frame numbers, increasing.
         motion: samples of the whole recording, in time order.
-        frames: the frames of the range, in time order; some may be missing. The generator is closed at the end.
+        frames: the frames of the range, in time order; some may be missing. The generator is closed
+            at the end.
     """
     first_ns, last_ns = (int(recording.frame_times_ns[k]) for k in (chosen[0], chosen[-1]))
     samples = _samples_between(motion_samples(motion), first_ns, last_ns)
@@ -216,9 +258,12 @@ def merge_events(
         yield from samples
 
 
-def _samples_between(motion: MotionSamples[MotionSample], first_ns: int, last_ns: int) -> Iterator[MotionSample]:
+def _samples_between(
+    motion: MotionSamples[MotionSample], first_ns: int, last_ns: int
+) -> Iterator[MotionSample]:
     """Yield the samples that go with the frames between two times, see `merge_events`."""
-    times_ns, is_imu = motion.times_ns, motion.is_imu
+    times_ns = motion.times_ns
+    is_imu = motion.is_imu
     after = times_ns[is_imu & (times_ns >= last_ns)]
     begin_ns = np.where(is_imu, first_ns - NS_PER_S, first_ns)
     end_ns = np.where(is_imu, after[0] if len(after) else last_ns, last_ns)
@@ -246,12 +291,14 @@ def read_npz(path: Path, keys: Iterable[str] | None = None) -> Mapping[str, np.n
         keys: names of the arrays; None: all.
 
     Raises:
-        DataError: the file is missing, corrupt, no archive, holds pickled objects, or its arrays would take more than
-            2 GiB.
+        DataError: the file is missing, corrupt, no archive, holds pickled objects, or its arrays
+            would take more than 2 GiB.
     """
     with _open_npz(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-        wanted = {key: members[key] for key in (members if keys is None else keys) if key in members}
+        wanted = {
+            key: members[key] for key in (members if keys is None else keys) if key in members
+        }
         check_array_bytes({key: info.file_size for key, info in wanted.items()}, path)
         return {key: _read_member(archive, info) for key, info in wanted.items()}
 
@@ -261,7 +308,8 @@ def check_array_bytes(sizes: Mapping[str, int], path: Path) -> None:
     if (total := sum(sizes.values())) > _MOST_ARRAY_BYTES:
         largest = max(sizes, key=lambda key: sizes[key])
         raise DataError(
-            f"{path}: its arrays take {total / 2**30:.1f} GiB ({largest} alone {sizes[largest] / 2**30:.1f}), more "
+            f"{path}: its arrays take {total / 2**30:.1f} GiB ({largest} alone "
+            f"{sizes[largest] / 2**30:.1f}), more "
             f"than {_MOST_ARRAY_BYTES / 2**30:g} GiB; split the recording"
         )
 
@@ -270,10 +318,16 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     """Read one array; its header must not state more than the archive says that it holds."""
     with archive.open(info) as stream:
         major = np.lib.format.read_magic(stream)[0]
-        read_header = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+        read_header = (
+            np.lib.format.read_array_header_1_0
+            if major == 1
+            else np.lib.format.read_array_header_2_0
+        )
         shape, _, dtype = read_header(stream)
         if math.prod(shape) * dtype.itemsize > info.file_size:
-            raise ValueError(f"{info.filename} states the shape {shape}, but has {info.file_size} bytes")
+            raise ValueError(
+                f"{info.filename} states the shape {shape}, but has {info.file_size} bytes"
+            )
     with archive.open(info) as stream:
         return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
 
@@ -285,13 +339,20 @@ def _open_npz(path: Path) -> Iterator[zipfile.ZipFile]:
         check_regular(path)
         if not zipfile.is_zipfile(path) and path.is_file():
             raise DataError(
-                f"{path}: is damaged or no .npz archive of named arrays; copy it again, or give another file"
+                f"{path}: is damaged or no .npz archive of named arrays; copy it again, or give "
+                "another file"
             )
         with zipfile.ZipFile(path) as archive:
             yield archive
     except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError, *_DAMAGE) as error:
         why = "holds pickled objects" if "pickle" in str(error) else "is damaged"
-        remedy = "save it again as plain numeric arrays with numpy.savez" if "pickle" in str(error) else "copy it again"
+        remedy = (
+            "save it again as plain numeric arrays with numpy.savez"
+            if "pickle" in str(error)
+            else "copy it again"
+        )
         raise DataError(f"{path}: {why} ({' '.join(str(error).split())}); {remedy}") from error
     except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}; give a readable file") from error
+        raise DataError(
+            f"cannot read {path}: {error.strerror or error}; give a readable file"
+        ) from error

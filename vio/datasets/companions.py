@@ -1,4 +1,6 @@
-"""What is beside the images of a plain recording: calibration, motion samples, ground truth, and the rest."""
+"""What is beside the images of a plain recording: calibration, motion samples, ground truth, and
+the rest.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,15 @@ from vio.errors import CalibrationError, DataError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.imu.clocks import judge_clocks
-from vio.records import NS_PER_S, ImuRecord, ImuSample, IntArray, MotionSample, Recording, Trajectory
+from vio.records import (
+    NS_PER_S,
+    ImuRecord,
+    ImuSample,
+    IntArray,
+    MotionSample,
+    Recording,
+    Trajectory,
+)
 
 IMU_FILES = ("imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv")
 _REFERENCES = (
@@ -51,7 +61,8 @@ def find_calibration_of(layout: Layout) -> Path:
     if (found := calibration_beside(layout)) is not None:
         return found
     raise CalibrationError(
-        f"{layout.root}: no calibration; add one as calibration.yaml (Kalibr's camchain, OpenCV's M1 D1 M2 D2 R T), "
+        f"{layout.root}: no calibration; add one as calibration.yaml (Kalibr's camchain, OpenCV's "
+        "M1 D1 M2 D2 R T), "
         "calib.txt (KITTI's) or another that vio.load_rig reads, or name it with --calibration FILE"
     )
 
@@ -142,12 +153,15 @@ def read_companions(
         DataError: samples or ground truth cannot be used.
         CalibrationError: the rig cannot be rectified, or samples need the pose of their sensor.
     """
-    (file, rig), (times_ns, times_file) = calibration, times
+    (file, rig) = calibration
+    (times_ns, times_file) = times
     rig, extrinsics = _with_extrinsics(rig, layout, file)
     motion, motion_files, motion_notes = _read_motion(layout, rig, times_ns, times_file is not None)
     with naming(file):
         depth_noise = settings.depth_noise if has_depths else None
-        rectifier = rig.rectifier(settings.interpolation, settings.projection, depth_noise=depth_noise)
+        rectifier = rig.rectifier(
+            settings.interpolation, settings.projection, depth_noise=depth_noise
+        )
     reference_file = None
     if reference is None:
         reference, reference_file = _read_reference(layout, rig, rectifier, times_ns)
@@ -156,7 +170,15 @@ def read_companions(
     has_body = rig.T_cam0_imu is not None and (rig.cam1 is not None or len(motion_files) > 0)
     stated_by = [file] * len(rig.cameras)
     return parts_of(
-        kind, layout, rectifier, settings, times_ns, beside, (*notes, *rig.notes), stated_by, has_body=has_body
+        kind,
+        layout,
+        rectifier,
+        settings,
+        times_ns,
+        beside,
+        (*notes, *rig.notes),
+        stated_by,
+        has_body=has_body,
     )
 
 
@@ -171,17 +193,26 @@ def _with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Pa
 def _read_motion(
     layout: Layout, rig: Rig, times_ns: IntArray, timed: bool
 ) -> tuple[MotionSamples[MotionSample], list[Path], list[str]]:
-    """Read the IMU and the velocities, on the clock of the images; return the samples, their files and notes."""
-    imu = next((f for base in (layout.root, layout.base) for n in IMU_FILES if (f := base / n).is_file()), None)
+    """Read the IMU and the velocities, on the clock of the images; return the samples, their
+    files and notes.
+    """
+    imu = next(
+        (f for base in (layout.root, layout.base) for n in IMU_FILES if (f := base / n).is_file()),
+        None,
+    )
     velocity = layout.root / "velocity.csv"
     files = [f for f in (imu, velocity) if f is not None and f.is_file()]
     if not files:
         return in_time_order(), [], []
     if not timed:
-        raise DataError(f"{files[0]}: needs the times of the images on the same clock; add times.txt, or remove it")
+        raise DataError(
+            f"{files[0]}: needs the times of the images on the same clock; add times.txt, or "
+            "remove it"
+        )
     if rig.T_cam0_imu is None:
         raise CalibrationError(
-            f"{files[0]}: needs the pose of its sensor; add T_cam0_imu.txt (IMU to left camera), or use a calibration "
+            f"{files[0]}: needs the pose of its sensor; add T_cam0_imu.txt (IMU to left camera), "
+            "or use a calibration "
             "with T_cam_imu (Kalibr's camchain-imucam), or remove the file to use the images alone"
         )
     parts: list[Sequence[MotionSample]] = []
@@ -201,7 +232,9 @@ def _read_motion(
 def _read_reference(
     layout: Layout, rig: Rig, rectifier: Rectifier, times_ns: IntArray
 ) -> tuple[Trajectory | None, Path | None]:
-    """Read the ground truth as that of the body: the IMU, or the rectified left camera where there is none."""
+    """Read the ground truth as that of the body: the IMU, or the rectified left camera where
+    there is none.
+    """
     bases = (layout.root, layout.base, layout.root / "dso")
     file = next((f for n in _REFERENCES for base in bases if (f := base / n).is_file()), None)
     if file is None:
@@ -209,7 +242,10 @@ def _read_reference(
     truth = read_trajectory(file)
     if truth.times_ns is None:
         if len(truth) > len(times_ns):
-            raise DataError(f"{file} holds {len(truth)} poses for {len(times_ns)} pairs; give one line for each pair")
+            raise DataError(
+                f"{file} holds {len(truth)} poses for {len(times_ns)} pairs; give one line for "
+                "each pair"
+            )
         truth = replace(truth, times_ns=times_ns[: len(truth)], frame_indices=np.arange(len(truth)))
     with naming(file):
         return reference_of_body(truth, rig, rectifier), file
@@ -218,7 +254,8 @@ def _read_reference(
 def imu_on_camera_clock(
     record: ImuRecord, rig: Rig, frame_times_ns: IntArray, where: Path | str
 ) -> tuple[MotionSamples[ImuSample], list[str]]:
-    """Return samples whose stamps are moved by the calibration's time offset, and a note where that is not zero.
+    """Return samples whose stamps are moved by the calibration's time offset, and a note where that
+    is not zero.
 
     Raises:
         DataError: no sample is within the time of the images.
@@ -234,7 +271,9 @@ def check_overlap(frame_times_ns: IntArray, times_ns: IntArray, where: Path | st
     """Raise DataError where no sample lies within the time of the images."""
     if times_ns[-1] < frame_times_ns[0] or times_ns[0] > frame_times_ns[-1]:
         (finding,) = judge_clocks(frame_times_ns, times_ns)
-        raise DataError(f"{where}: no sample is within the time of the images; {finding.message}; or remove it")
+        raise DataError(
+            f"{where}: no sample is within the time of the images; {finding.message}; or remove it"
+        )
 
 
 def reference_of_body(truth: Trajectory, rig: Rig, rectifier: Rectifier) -> Trajectory:
@@ -246,7 +285,11 @@ def reference_of_body(truth: Trajectory, rig: Rig, rectifier: Rectifier) -> Traj
     if rig.T_cam0_imu is not None:
         return truth.in_imu(rig.T_cam0_imu)
     if truth.body == "imu":
-        # Without extrinsics IMU and camera cannot be distinguished; a TUM file without a comment is the camera's.
+        # Without extrinsics IMU and camera cannot be distinguished; a TUM file without a comment is
+        # the camera's.
         truth = replace(truth, body="cam0")
     R_rect_cam0: FloatArray = rectifier.T_rect0_imu[:3, :3]
-    return replace(truth, T_world_body=truth.T_world_body @ se3_inverse(se3_from_parts(R_rect_cam0, np.zeros(3))))
+    return replace(
+        truth,
+        T_world_body=truth.T_world_body @ se3_inverse(se3_from_parts(R_rect_cam0, np.zeros(3))),
+    )

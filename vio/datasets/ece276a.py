@@ -1,12 +1,13 @@
 """ECE276A course files: velocities, stereo features and calibration in one `.npz`.
 
-Two generations of key names are read: `time_stamps features linear_velocity rotational_velocity K b cam_T_imu`, and
+Two generations of key names are read:
+`time_stamps features linear_velocity rotational_velocity K b cam_T_imu`, and
 `timestamps features v_t w_t K_l K_r extL_T_imu extR_T_imu`.
 
-In the published files of the first kind `cam_T_imu` mixes two conventions: its rotation maps the IMU frame to the
-camera, but its translation is the camera's position in the IMU frame. The consistent transform has `t = -R t_file`.
-The matrix alone does not reveal this, so the recording's motion decides:
-see `vio.calibration.lever_arm.judge_lever_arms`.
+In the published files of the first kind `cam_T_imu` mixes two conventions: its rotation maps the
+IMU frame to the camera, but its translation is the camera's position in the IMU frame. The
+consistent transform has `t = -R t_file`. The matrix alone does not reveal this, so the recording's
+motion decides: see `vio.calibration.lever_arm.judge_lever_arms`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,15 @@ from pathlib import Path
 import numpy as np
 
 from vio.calibration.lever_arm import LeverArmVerdict, judge_lever_arms
-from vio.datasets.common import check_intrinsics, clock_ns, finite_rows, naming, npz_names, read_npz, shape_text
+from vio.datasets.common import (
+    check_intrinsics,
+    clock_ns,
+    finite_rows,
+    naming,
+    npz_names,
+    read_npz,
+    shape_text,
+)
 from vio.datasets.features import FeatureDataset
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings, ExtrinsicsMode
@@ -28,9 +37,18 @@ from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, se3_
 from vio.geometry.stereo import StereoCamera
 from vio.records import FeatureTracks, IntArray, Recording
 
-OLD_KEYS = ("time_stamps", "features", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
+OLD_KEYS = (
+    "time_stamps",
+    "features",
+    "linear_velocity",
+    "rotational_velocity",
+    "K",
+    "b",
+    "cam_T_imu",
+)
 NEW_KEYS = ("timestamps", "features", "v_t", "w_t", "K_l", "K_r", "extL_T_imu", "extR_T_imu")
-_RECTIFIED = 0.02  # allowed offset of the right camera from the left one's x axis, as a share of the baseline
+# allowed offset of the right camera from the left one's x axis, as a share of the baseline
+_RECTIFIED = 0.02
 _SAME_M = 1e-3  # difference below which both interpretations of the translation are the same
 _ALIGNED = 2e-3  # largest deviation from identity of the rotation between rectified cameras
 
@@ -46,25 +64,39 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
     """Read a course file.
 
     Raises:
-        DataError: keys, shapes, clocks or values are wrong; the message names which and the expected form.
+        DataError: keys, shapes, clocks or values are wrong; the message names which and the
+            expected form.
         CalibrationError: the calibration is invalid.
     """
     arrays = read_npz(path, (*OLD_KEYS, *NEW_KEYS))
     if set(OLD_KEYS) <= set(arrays):
-        time_key, linear_key, angular_key = "time_stamps", "linear_velocity", "rotational_velocity"
+        time_key = "time_stamps"
+        linear_key = "linear_velocity"
+        angular_key = "rotational_velocity"
         calibration = _old_calibration(arrays, path)
     elif set(NEW_KEYS) <= set(arrays):
-        time_key, linear_key, angular_key = "timestamps", "v_t", "w_t"
+        time_key = "timestamps"
+        linear_key = "v_t"
+        angular_key = "w_t"
         calibration = _new_calibration(arrays, path)
     else:
         raise DataError(
-            f"{path}: an ECE276A file needs the keys {' '.join(OLD_KEYS)} (or {' '.join(NEW_KEYS)}); "
+            f"{path}: an ECE276A file needs the keys {' '.join(OLD_KEYS)} (or "
+            f"{' '.join(NEW_KEYS)}); "
             f"found {' '.join(sorted(npz_names(path))) or 'none'}"
         )
-    features = _array(arrays, "features", path, lambda s: len(s) == 3 and s[0] == 4 and s[2] > 1, "4 x M x T")
+    features = _array(
+        arrays, "features", path, lambda s: len(s) == 3 and s[0] == 4 and s[2] > 1, "4 x M x T"
+    )
     count = features.shape[2]
     times_ns = clock_ns(
-        _array(arrays, time_key, path, lambda s: s in ((count,), (1, count), (count, 1)), f"1 x {count}").reshape(-1),
+        _array(
+            arrays,
+            time_key,
+            path,
+            lambda s: s in ((count,), (1, count), (count, 1)),
+            f"1 x {count}",
+        ).reshape(-1),
         lambda k: f"{path}, {time_key}[{k}]",
     )
     linear = _velocities(arrays, linear_key, path, count)
@@ -73,7 +105,11 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
         tracks_from_dense(features, path), moving_frames(linear, angular), settings.repeated_tracks
     )
     T_cam0_imu, extrinsics_notes = _resolve_extrinsics(
-        calibration, tracks, times_ns, np.concatenate([linear, angular], axis=1), settings.extrinsics
+        calibration,
+        tracks,
+        times_ns,
+        np.concatenate([linear, angular], axis=1),
+        settings.extrinsics,
     )
     recording = Recording(
         kind="ece276a",
@@ -91,13 +127,18 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
 
 
 def _array(
-    arrays: Mapping[str, np.ndarray], key: str, path: Path, fits: Callable[[tuple[int, ...]], bool], wanted: str
+    arrays: Mapping[str, np.ndarray],
+    key: str,
+    path: Path,
+    fits: Callable[[tuple[int, ...]], bool],
+    wanted: str,
 ) -> FloatArray:
     """One array as float64, of a fitting shape."""
     value = arrays[key]
     if not fits(value.shape) or value.dtype.kind not in "fiu":
         raise DataError(
-            f"{path}: {key} has shape {shape_text(value)} and type {value.dtype}; expected {wanted} real numbers"
+            f"{path}: {key} has shape {shape_text(value)} and type {value.dtype}; expected "
+            f"{wanted} real numbers"
         )
     return value.astype(np.float64)
 
@@ -115,23 +156,34 @@ def _intrinsics(arrays: Mapping[str, np.ndarray], key: str, path: Path) -> Float
 
 def _camera(K: FloatArray, baseline_m: float, path: Path) -> StereoCamera:
     with naming(path):
-        return StereoCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), baseline_m)
+        return StereoCamera(
+            float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), baseline_m
+        )
 
 
 def _old_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibration:
     K = _intrinsics(arrays, "K", path)
     b = float(_array(arrays, "b", path, lambda s: int(np.prod(s)) == 1, "one value").reshape(()))
-    T = checked_transform(_array(arrays, "cam_T_imu", path, lambda s: s == (4, 4), "4 x 4"), f"{path}, cam_T_imu")
+    T = checked_transform(
+        _array(arrays, "cam_T_imu", path, lambda s: s == (4, 4), "4 x 4"), f"{path}, cam_T_imu"
+    )
     return _Calibration(_camera(K, b, path), T, ambiguous=True)
 
 
 def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibration:
-    """Read the newer calibration; the two extrinsics of a rectified pair determine which way they map."""
-    K, K_right = _intrinsics(arrays, "K_l", path), _intrinsics(arrays, "K_r", path)
+    """Read the newer calibration; the two extrinsics of a rectified pair determine which way
+    they map.
+    """
+    K = _intrinsics(arrays, "K_l", path)
+    K_right = _intrinsics(arrays, "K_r", path)
     if not np.allclose(K, K_right, rtol=1e-6):
-        raise CalibrationError(f"{path}: K_l and K_r differ, so the features are not rectified; rectify them first")
+        raise CalibrationError(
+            f"{path}: K_l and K_r differ, so the features are not rectified; rectify them first"
+        )
     given = [
-        checked_transform(_array(arrays, key, path, lambda s: s == (4, 4), "4 x 4"), f"{path}, {key}")
+        checked_transform(
+            _array(arrays, key, path, lambda s: s == (4, 4), "4 x 4"), f"{path}, {key}"
+        )
         for key in ("extL_T_imu", "extR_T_imu")
     ]
     for left, right in (given, [se3_inverse(T) for T in given]):
@@ -141,19 +193,26 @@ def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibrati
         if aligned and x < 0 and np.hypot(y, z) < _RECTIFIED * -x:
             return _Calibration(_camera(K, float(-x), path), left, ambiguous=False)
     raise CalibrationError(
-        f"{path}: extL_T_imu and extR_T_imu place the cameras {np.round(T_cam1_cam0[:3, 3], 4).tolist()} m apart; the "
-        "right camera of a rectified pair is on the left one's positive x axis, with the same orientation"
+        f"{path}: extL_T_imu and extR_T_imu place the cameras "
+        f"{np.round(T_cam1_cam0[:3, 3], 4).tolist()} m apart; the "
+        "right camera of a rectified pair is on the left one's positive x axis, with the same "
+        "orientation"
     )
 
 
 def _resolve_extrinsics(
-    calibration: _Calibration, tracks: FeatureTracks, times_ns: IntArray, velocities: FloatArray, mode: ExtrinsicsMode
+    calibration: _Calibration,
+    tracks: FeatureTracks,
+    times_ns: IntArray,
+    velocities: FloatArray,
+    mode: ExtrinsicsMode,
 ) -> tuple[FloatArray, tuple[str, ...]]:
     """Choose between the literal translation and the corrected one."""
     literal = calibration.T_cam0_imu
     if not calibration.ambiguous or mode == "literal":
         return literal, ()
-    R, t = literal[:3, :3], literal[:3, 3]
+    R = literal[:3, :3]
+    t = literal[:3, 3]
     corrected = se3_from_parts(R, -R @ t)
     if np.abs(corrected - literal).max() < _SAME_M:
         return literal, ()
@@ -164,8 +223,10 @@ def _resolve_extrinsics(
         return corrected, (_explain(verdict, t),)
     if verdict.better is None:
         return literal, (
-            "cam_T_imu is taken literally: this recording turns too little to decide whether its translation is the "
-            "camera's position in the IMU frame, as in the published files; set dataset.extrinsics if it is known",
+            "cam_T_imu is taken literally: this recording turns too little to decide whether its "
+            "translation is the "
+            "camera's position in the IMU frame, as in the published files; set dataset.extrinsics "
+            "if it is known",
         )
     return literal, ()
 
@@ -173,8 +234,10 @@ def _resolve_extrinsics(
 def _explain(verdict: LeverArmVerdict, t: FloatArray) -> str:
     x, y, z = t
     return (
-        f"the translation of cam_T_imu ({x:.2f}, {y:.2f}, {z:.2f}) is the camera's position in the IMU frame, not the "
+        f"the translation of cam_T_imu ({x:.2f}, {y:.2f}, {z:.2f}) is the camera's position in the "
+        "IMU frame, not the "
         "IMU's in the camera frame as its rotation demands: velocities and features estimate it at "
-        f"{verdict.place:+.2f} +- {verdict.place_sigma:.2f} between literal (-1) and corrected (+1); "
+        f"{verdict.place:+.2f} +- {verdict.place_sigma:.2f} between literal (-1) and corrected "
+        "(+1); "
         "corrected to t = -R t (dataset.extrinsics=literal keeps it)"
     )

@@ -20,7 +20,9 @@ class FeatureDataset:
     motion: Sequence[MotionSample]  # in time order
     present: IntArray  # (P,) numbers of the frames that events may yield, increasing
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order, without images.
 
         Raises:

@@ -1,4 +1,6 @@
-"""Which frames of a recording are used: a limited rate, a part (`--start 12s --stop 60s`), pairs of stamps."""
+"""Which frames of a recording are used: a limited rate, a part (`--start 12s --stop 60s`), pairs
+of stamps.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,13 @@ import numpy as np
 from vio.errors import DataError
 from vio.records import NS_PER_S, IntArray, Recording
 
-_EARLY = 0.1  # of an interval that a frame may come early: cameras jitter, and 30 frames/s are rarely exactly 30
+# of an interval that a frame may come early: cameras jitter, and 30 frames/s are rarely exactly 30
+_EARLY = 0.1
 
 
 class FrameRateLimit:
-    """Tells which frames of a sequence are used: those that come no sooner than an interval after the last one used.
+    """Tells which frames of a sequence are used: those that come no sooner than an interval after
+    the last one used.
 
     A sequence that has passed one limit passes the same limit again whole.
     """
@@ -39,7 +43,8 @@ class FrameRateLimit:
 
 
 def used_frames(times_ns: IntArray, most_hz: float | None) -> IntArray:
-    """Return the numbers (G,) of the frames of a recording that a limit lets through, counted from the first of all.
+    """Return the numbers (G,) of the frames of a recording that a limit lets through, counted from
+    the first of all.
 
     Args:
         times_ns: of all frames (F,), increasing.
@@ -67,8 +72,11 @@ def parse_bound(text: str) -> int | Seconds:
     return int(text)
 
 
-def frames_between(recording: Recording, start: int | Seconds, stop: int | Seconds | None) -> tuple[int, int | None]:
-    """Return the first frame and the frame after the last one (None: to the end) of bounds in frames or seconds.
+def frames_between(
+    recording: Recording, start: int | Seconds, stop: int | Seconds | None
+) -> tuple[int, int | None]:
+    """Return the first frame and the frame after the last one (None: to the end) of bounds in
+    frames or seconds.
 
     The start is the first frame at or after its time, the stop the first one at or after its own.
 
@@ -79,7 +87,10 @@ def frames_between(recording: Recording, start: int | Seconds, stop: int | Secon
     count = len(recording.frame_times_ns)
     if isinstance(start, Seconds) and first >= count:
         length_s = float(recording.frame_times_ns[-1] - recording.frame_times_ns[0]) / NS_PER_S
-        raise DataError(f"{recording.path}: --start {start.seconds:g}s is after its last frame at {length_s:.3f} s")
+        raise DataError(
+            f"{recording.path}: --start {start.seconds:g}s is after its last frame at "
+            f"{length_s:.3f} s"
+        )
     return first, None if stop is None else _frame(recording, stop)
 
 
@@ -95,7 +106,9 @@ _JITTER_NS = 1_000_000  # allowed deviation of the offset between paired stamps 
 
 
 def pair_stamps(left_ns: IntArray, right_ns: IntArray) -> tuple[IntArray, IntArray]:
-    """Indices (F,), (F,) of paired stamps: equal ones, or nearest ones at a small, constant offset."""
+    """Indices (F,), (F,) of paired stamps: equal ones, or nearest ones at a small, constant
+    offset.
+    """
     _, equal_a, equal_b = np.intersect1d(left_ns, right_ns, assume_unique=True, return_indices=True)
     b = nearest(left_ns, right_ns)
     a = np.arange(len(left_ns))
@@ -110,26 +123,35 @@ def pair_stamps(left_ns: IntArray, right_ns: IntArray) -> tuple[IntArray, IntArr
 def paired(
     left_ns: IntArray, right_ns: IntArray, names: Sequence[str], where: Path
 ) -> tuple[IntArray, IntArray, list[str]]:
-    """Return what `pair_stamps` does of the images of two cameras, and notes about images that differ or are alone.
+    """Return what `pair_stamps` does of the images of two cameras, and notes about images that
+    differ or are alone.
 
     Raises:
         DataError: no image of the left camera has one of the right camera.
     """
     a, b = pair_stamps(left_ns, right_ns)
     if not len(a):
-        left, right = (f"{name} ({t[0]} to {t[-1]} ns)" for name, t in zip(names, (left_ns, right_ns), strict=True))
+        left, right = (
+            f"{name} ({t[0]} to {t[-1]} ns)"
+            for name, t in zip(names, (left_ns, right_ns), strict=True)
+        )
         raise DataError(
-            f"{where}: no image of {left} has one of {right} within {PAIRED_NS / 1e6:g} ms; the cameras must "
+            f"{where}: no image of {left} has one of {right} within {PAIRED_NS / 1e6:g} ms; the "
+            "cameras must "
             "be synchronised, and their stamps of one clock"
         )
     notes = []
     alone = len(left_ns) - len(a), len(right_ns) - len(b)
     if any(alone):
-        notes.append(f"{alone[0]} images of {names[0]} and {alone[1]} of {names[1]} have no partner and are skipped")
+        notes.append(
+            f"{alone[0]} images of {names[0]} and {alone[1]} of {names[1]} have no partner and are "
+            "skipped"
+        )
     if np.any(right_ns[b] != left_ns[a]):
         offset_ms = float(np.median(right_ns[b] - left_ns[a])) / 1e6
         notes.append(
-            f"the stamps of {names[1]} differ from those of {names[0]} (median {offset_ms:+.3f} ms); each left image "
+            f"the stamps of {names[1]} differ from those of {names[0]} (median {offset_ms:+.3f} "
+            "ms); each left image "
             "is paired with the nearest right one"
         )
     return a, b, notes

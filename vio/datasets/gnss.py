@@ -19,7 +19,8 @@ _OXTS_COLUMNS = 30
 _OXTS_ACCURACY = 23  # column of pos_accuracy, m
 _OXTS_LEAST_M = 0.02
 _NAVSATFIX = "sensor_msgs/msg/NavSatFix"
-_NO_FIX, _UNKNOWN = -1, 0  # of status.status and of position_covariance_type
+_NO_FIX = -1  # of status.status and of position_covariance_type
+_UNKNOWN = 0
 
 
 def read_gnss(path: Path, topic: str | None = None) -> GnssFixes:
@@ -34,23 +35,32 @@ def read_gnss(path: Path, topic: str | None = None) -> GnssFixes:
     if path.exists() and is_bag(path):
         return _read_navsatfix(path, topic)
     if not path.is_file():
-        raise DataError(f"{path}: holds no GNSS positions; give a table {_FORM}, a drive with oxts/data, or a bag")
+        raise DataError(
+            f"{path}: holds no GNSS positions; give a table {_FORM}, a drive with oxts/data, or a "
+            "bag"
+        )
     return _read_csv(path)
 
 
 def _read_csv(path: Path) -> GnssFixes:
     """Read a table with or without the standard deviations; empty or NaN: not known."""
-    lines = [line for _, line in text_lines(path) if line.strip() and not line.lstrip().startswith("#")]
+    lines = [
+        line for _, line in text_lines(path) if line.strip() and not line.lstrip().startswith("#")
+    ]
     last = lines[-1].replace(";", ",") if lines else ""
     columns = 4 if len(last.split("," if "," in last else None)) == 4 else 7
     table = read_table(path, columns, _FORM)
-    if table.header and not all(word in name for word, name in zip(("time", "lat", "lon"), table.header, strict=False)):
+    if table.header and not all(
+        word in name for word, name in zip(("time", "lat", "lon"), table.header, strict=False)
+    ):
         raise DataError(f"{path}: has the columns {','.join(table.header)}; expected {_FORM}")
     values = table.values
     sigmas = values[:, 3:].copy() if columns == 7 else np.full((len(values), 3), np.nan)
     no_up = np.isnan(sigmas[:, 2])
     sigmas[no_up, 2] = UP_SHARE * sigmas[no_up, :2].max(axis=1)
-    return checked_fixes(stamps_ns(table), values[:, :3], np.eye(3) * sigmas[:, None, :] ** 2, str(path))
+    return checked_fixes(
+        stamps_ns(table), values[:, :3], np.eye(3) * sigmas[:, None, :] ** 2, str(path)
+    )
 
 
 def _read_oxts(folder: Path) -> GnssFixes:
@@ -62,25 +72,41 @@ def _read_oxts(folder: Path) -> GnssFixes:
     for file in files:
         words = " ".join(line for _, line in text_lines(file)).split()
         if len(words) != _OXTS_COLUMNS:
-            raise DataError(f"{file}: has {len(words)} values, not the {_OXTS_COLUMNS} of KITTI's oxts; copy it again")
+            raise DataError(
+                f"{file}: has {len(words)} values, not the {_OXTS_COLUMNS} of KITTI's oxts; copy "
+                "it again"
+            )
         try:
             rows.append([float(word) for word in words])
         except ValueError as error:
             raise DataError(f"{file}: {error}; copy it again") from error
     values = np.array(rows)
-    times_ns = drive_times(folder / "timestamps.txt", np.array([int(file.stem) for file in files], dtype=np.int64))
+    times_ns = drive_times(
+        folder / "timestamps.txt", np.array([int(file.stem) for file in files], dtype=np.int64)
+    )
     sigma = np.maximum(values[:, _OXTS_ACCURACY], _OXTS_LEAST_M)
-    return checked_fixes(times_ns, values[:, :3], sigma[:, None, None] ** 2 * np.eye(3), str(folder))
+    return checked_fixes(
+        times_ns, values[:, :3], sigma[:, None, None] ** 2 * np.eye(3), str(folder)
+    )
 
 
 def _read_navsatfix(path: Path, topic: str | None) -> GnssFixes:
     """Read the positions of a bag's only topic of NavSatFix, or of the one named."""
-    times, positions, covariances, lost = [], [], [], 0
+    times = []
+    positions = []
+    covariances = []
+    lost = 0
     with Bag(path) as bag:
-        found = [t.name for t in bag.topics if t.kind == _NAVSATFIX and t.count and topic in (None, t.name)]
+        found = [
+            t.name
+            for t in bag.topics
+            if t.kind == _NAVSATFIX and t.count and topic in (None, t.name)
+        ]
         if len(found) != 1:
             names = ", ".join(found) or "none"
-            raise DataError(f"{path}: topics of NavSatFix: {names}; name one with --topic, or give another bag")
+            raise DataError(
+                f"{path}: topics of NavSatFix: {names}; name one with --topic, or give another bag"
+            )
         for message in bag.messages(found):
             fix = bag.decoded(message)
             if int(fix.status.status) <= _NO_FIX:
@@ -90,11 +116,17 @@ def _read_navsatfix(path: Path, topic: str | None) -> GnssFixes:
             times.append(stamp_of(fix) or message.logged_ns)
             positions.append([float(fix.latitude), float(fix.longitude), float(fix.altitude)])
             covariances.append(
-                np.array(fix.position_covariance, dtype=np.float64).reshape(3, 3) if known else np.full((3, 3), np.nan)
+                np.array(fix.position_covariance, dtype=np.float64).reshape(3, 3)
+                if known
+                else np.full((3, 3), np.nan)
             )
     notes = (f"{lost} messages of {found[0]} say that there is no fix",) if lost else ()
     if not times:
         raise DataError(f"{path}: {found[0]} holds no position; give a record with a fix")
     return checked_fixes(
-        np.array(times, dtype=np.int64), np.array(positions), np.array(covariances), f"{path}, {found[0]}", notes
+        np.array(times, dtype=np.int64),
+        np.array(positions),
+        np.array(covariances),
+        f"{path}, {found[0]}",
+        notes,
     )

@@ -1,6 +1,7 @@
 """The image files of a recording as names; their paths are made when they are asked for.
 
-A path takes 350 bytes and its name 70: an hour of a stereo camera at 20 frames a second has 144,000.
+A path takes 350 bytes and its name 70: an hour of a stereo camera at 20 frames a second has
+144,000.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from typing import overload
 
 
 def stem_of(name: str) -> str:
-    """Return a file's name without its suffix, as `Path.stem`, which keeps a copy of each name for the process."""
+    """Return a file's name without its suffix, as `Path.stem`, which keeps a copy of each name
+    for the process.
+    """
     return os.path.splitext(name)[0]
 
 

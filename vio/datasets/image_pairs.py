@@ -1,4 +1,6 @@
-"""Recordings of one or two image folders: paired by name, prefetched, with unusable frames skipped."""
+"""Recordings of one or two image folders: paired by name, prefetched, with unusable frames
+skipped.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +28,21 @@ from vio.datasets.images import (
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
-from vio.records import Event, Image, ImuDensities, MotionSample, Observations, Recording, StereoFrame
+from vio.records import (
+    Event,
+    Image,
+    ImuDensities,
+    MotionSample,
+    Observations,
+    Recording,
+    StereoFrame,
+)
 
 logger = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
-ImagePairs = Sequence[tuple[Path, Path]]  # left and right image of each frame; of one camera, the same twice
+# left and right image of each frame; of one camera, the same twice
+ImagePairs = Sequence[tuple[Path, Path]]
 
 _NAMED = 5  # skipped frames that get a line each; the others are counted in one at the end
 
@@ -42,12 +53,19 @@ def pair_images(left: Path, right: Path) -> ImagePairs:
     Raises:
         DataError: a file lacks its partner; the message gives both counts and names the first one.
     """
-    lefts, rights = list_images(left), list_images(right)
+    lefts = list_images(left)
+    rights = list_images(right)
     rows = [{stem_of(name): k for k, name in enumerate(files.names)} for files in (lefts, rights)]
-    for here, there, files, folder in ((rows[0], rows[1], lefts, right), (rows[1], rows[0], rights, left)):
-        if (missing := next((k for stem, k in here.items() if stem not in there), None)) is not None:
+    for here, there, files, folder in (
+        (rows[0], rows[1], lefts, right),
+        (rows[1], rows[0], rights, left),
+    ):
+        if (
+            missing := next((k for stem, k in here.items() if stem not in there), None)
+        ) is not None:
             raise DataError(
-                f"{left} holds {len(lefts)} images and {right} {len(rights)}: {folder / files.names[missing]} is "
+                f"{left} holds {len(lefts)} images and {right} {len(rights)}: "
+                f"{folder / files.names[missing]} is "
                 "missing; remove its partner or copy it again"
             )
     return FilePairs(lefts, rights.take(rows[1][stem_of(name)] for name in lefts.names))
@@ -62,14 +80,19 @@ class BadFrame:
 
 
 def readable_frames(
-    load: Callable[[Item], StereoFrame | BadFrame], chosen: Iterable[Item], settings: DatasetSettings
+    load: Callable[[Item], StereoFrame | BadFrame],
+    chosen: Iterable[Item],
+    settings: DatasetSettings,
 ) -> Generator[StereoFrame]:
     """Prefetch frames in a thread, and skip unusable ones with a warning.
 
     Raises:
-        DataError: every frame is unusable, more are than the settings allow, or whatever `load` raises.
+        DataError: every frame is unusable, more are than the settings allow, or whatever `load`
+            raises.
     """
-    good, first_bad, bad = 0, "", 0
+    good = 0
+    first_bad = ""
+    bad = 0
     unsaid: list[BadFrame] = []  # until a frame can be used: if none can, the error alone says why
     with contextlib.closing(prefetch(load, chosen, settings.prefetch_frames)) as loaded:
         for frame in loaded:
@@ -78,10 +101,12 @@ def readable_frames(
                 _say_skipped(unsaid)
                 yield frame
                 continue
-            bad, first_bad = bad + 1, first_bad or frame.why
+            bad = bad + 1
+            first_bad = first_bad or frame.why
             if settings.max_bad_frames is not None and bad > settings.max_bad_frames:
                 raise DataError(
-                    f"{frame.why} ({bad} unusable frames, dataset.max_bad_frames allows {settings.max_bad_frames})"
+                    f"{frame.why} ({bad} unusable frames, dataset.max_bad_frames allows "
+                    f"{settings.max_bad_frames})"
                 )
             if bad <= _NAMED:
                 unsaid.append(frame)
@@ -90,7 +115,9 @@ def readable_frames(
     if bad and not good:
         raise DataError(f"none of {bad} frames can be used; the first: {first_bad}")
     if bad > _NAMED:
-        logger.warning("%d of %d frames were skipped; the first %d are named above", bad, bad + good, _NAMED)
+        logger.warning(
+            "%d of %d frames were skipped; the first %d are named above", bad, bad + good, _NAMED
+        )
 
 
 def _say_skipped(unsaid: list[BadFrame]) -> None:
@@ -100,18 +127,26 @@ def _say_skipped(unsaid: list[BadFrame]) -> None:
     unsaid.clear()
 
 
-_WHITE_FRAMES = 8  # that determine the level of white, spread over the recording: the first may be dark
+# that determine the level of white, spread over the recording: the first may be dark
+_WHITE_FRAMES = 8
 
 
 def full_scale(pairs: ImagePairs) -> tuple[int, tuple[str, ...]]:
-    """Return the level of white of a recording's 16-bit images, for `load_gray`, with a note where it is not 65535."""
-    chosen = {(len(pairs) - 1) * k // (_WHITE_FRAMES - 1) for k in range(_WHITE_FRAMES)} if pairs else set()
+    """Return the level of white of a recording's 16-bit images, for `load_gray`, with a note
+    where it is not 65535.
+    """
+    chosen = (
+        {(len(pairs) - 1) * k // (_WHITE_FRAMES - 1) for k in range(_WHITE_FRAMES)}
+        if pairs
+        else set()
+    )
     white = white_level([path for k in sorted(chosen) for path in pairs[k]])
     return white, white_note(white)
 
 
 def measured_images(pairs: ImagePairs) -> tuple[tuple[int, int], int, tuple[str, ...]]:
-    """Return width and height of the first left image that can be read, the level of white of all, and notes.
+    """Return width and height of the first left image that can be read, the level of white of all,
+    and notes.
 
     Raises:
         UnreadableImageError: all left images are unreadable.
@@ -141,14 +176,17 @@ class ImageSize:
         """Raise UnreadableImageError unless an image (H, W) or (H, W, 3) has this size."""
         if image.shape[:2] != (self.height, self.width):
             raise UnreadableImageError(
-                f"{path} is {image.shape[1]} x {image.shape[0]} pixels but {self.stated_by} is for {self.width} x "
+                f"{path} is {image.shape[1]} x {image.shape[0]} pixels but {self.stated_by} is for "
+                f"{self.width} x "
                 f"{self.height}; give images of one size, and the calibration of these images"
             )
 
 
 @dataclass(frozen=True, slots=True)
 class ImageRecording(ABC):
-    """Implements `vio.protocols.Dataset` over images, which a subclass reads; they are rectified as they are read."""
+    """Implements `vio.protocols.Dataset` over images, which a subclass reads; they are rectified
+    as they are read.
+    """
 
     recording: Recording
     motion: Sequence[MotionSample] = field(repr=False)  # in time order
@@ -158,13 +196,16 @@ class ImageRecording(ABC):
     imu_noise: ImuDensities | None = field(default=None, kw_only=True)
     colour: bool = field(default=False, kw_only=True)  # see `in_colour`
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order.
 
         A frame with an image that is unreadable or of another size is skipped with a warning.
 
         Raises:
-            DataError: the range holds no frame, or none that can be used, or more are unusable than the settings allow.
+            DataError: the range holds no frame, or none that can be used, or more are unusable than
+                the settings allow.
         """
         chosen = chosen_frames(self.recording, start, stop, self.settings.max_frame_rate)
         frames = self._frames(chosen) if images else blank_frames(self.recording, chosen)
@@ -184,8 +225,10 @@ class ImageDataset(ImageRecording):
     """Implements `vio.protocols.Dataset` over image files."""
 
     pairs: ImagePairs
-    white: int = field(default=WHITE_16, kw_only=True)  # level of white of 16-bit files, from `full_scale`
-    depths: Sequence[Path] | None = field(default=None, kw_only=True)  # depth image of each frame; None: there are none
+    # level of white of 16-bit files, from `full_scale`
+    white: int = field(default=WHITE_16, kw_only=True)
+    # depth image of each frame; None: there are none
+    depths: Sequence[Path] | None = field(default=None, kw_only=True)
     depth_factor: float = field(default=1.0, kw_only=True)  # levels of a depth image per metre
 
     def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
@@ -196,10 +239,16 @@ class ImageDataset(ImageRecording):
         time_ns = int(self.recording.frame_times_ns[index])
         try:
             images = []
-            for size, path in zip(self.sizes[: self.settings.cameras], self.pairs[index], strict=False):
+            for size, path in zip(
+                self.sizes[: self.settings.cameras], self.pairs[index], strict=False
+            ):
                 images.append(load_gray(path, self.white, colour=self.colour)[0])
                 size.check(images[-1], path)
-            depth_m = None if self.depths is None else _depth_m(self.depths[index], images[0], self.depth_factor)
+            depth_m = (
+                None
+                if self.depths is None
+                else _depth_m(self.depths[index], images[0], self.depth_factor)
+            )
             return self.rectifier.frame(index, time_ns, *images, depth_m=depth_m)
         except UnreadableImageError as error:
             return BadFrame(index, str(error))
@@ -210,7 +259,8 @@ def _depth_m(file: Path, image: Image, factor: float) -> FloatArray:
     levels = load_depth(file)
     if levels.shape != image.shape[:2]:
         raise UnreadableImageError(
-            f"{file} is {levels.shape[1]} x {levels.shape[0]} pixels, but its image is {image.shape[1]} x "
+            f"{file} is {levels.shape[1]} x {levels.shape[0]} pixels, but its image is "
+            f"{image.shape[1]} x "
             f"{image.shape[0]}; depth images must be registered to the images"
         )
     return levels / factor

@@ -1,7 +1,8 @@
-"""Read image files with strict checks and prefetching, as gray ones where nothing else is asked for, and write them.
+"""Read image files with strict checks and prefetching, as gray ones where nothing else is asked
+for, and write them.
 
-OpenCV fills the missing part of a truncated file with gray and reports no error, so a file's end is checked before it
-is decoded.
+OpenCV fills the missing part of a truncated file with gray and reports no error, so a file's end is
+checked before it is decoded.
 """
 
 from __future__ import annotations
@@ -31,12 +32,14 @@ OTHER_SUFFIXES = (".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp")
 SUFFIXES = (".png", ".jpg", ".jpeg", *OTHER_SUFFIXES)
 _TIFF_STARTS = (b"II*\0", b"MM\0*")
 _PNG_START = b"\x89PNG\r\n\x1a\n"
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG_START = b"\xff\xd8"
+_JPEG_END = b"\xff\xd9"
 WHITE_16 = 65535  # the level of white in an image that uses all of its 16 bits
 _MOST_BYTES = 2**29  # of a file: more than 64 Mpx of 16 bits in colour
 _SENSOR_BITS = (10, 12, 14)  # of cameras whose pixels are stored in the low bits of 16
 _WHITE_SHARE = 0.999  # of the pixels are no brighter than the level that shows the bits in use
-_JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})  # start-of-frame markers, with the image size
+# start-of-frame markers, with the image size
+_JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 _PNG_LEVEL = 1  # files a tenth larger than at the usual level 3, in a third of the time
 
 
@@ -45,28 +48,36 @@ Loaded = TypeVar("Loaded")
 
 
 class UnreadableImageError(DataError):
-    """An image file is missing, truncated, corrupt or of another size; a reader may skip its frame."""
+    """An image file is missing, truncated, corrupt or of another size; a reader may skip its
+    frame.
+    """
 
 
 def load_gray(path: Path, white: int = WHITE_16, *, colour: bool = False) -> tuple[Image, int]:
-    """Read a PNG or JPEG as 8-bit gray (H, W); return it with the file's own bits per channel (8 or 16).
+    """Read a PNG or JPEG as 8-bit gray (H, W); return it with the file's own bits per channel (8 or
+    16).
 
-    Colour is converted to gray with OpenCV's weights (.299 R + .587 G + .114 B), or kept as (H, W, 3) with `colour`.
+    Colour is converted to gray with OpenCV's weights (.299 R + .587 G + .114 B), or kept as (H, W,
+    3) with `colour`.
 
     Args:
         path: the file.
-        white: the level of a file of 16 bits that becomes 255; brighter pixels do, too. See `white_level`.
+        white: the level of a file of 16 bits that becomes 255; brighter pixels do, too. See
+            `white_level`.
         colour: keep red, green and blue, where the file has them.
 
     Raises:
-        UnreadableImageError: the file cannot be read, is truncated or too large, or does not decode.
+        UnreadableImageError: the file cannot be read, is truncated or too large, or does not
+            decode.
     """
     pixels = _load(path, colour=colour)
     return to_8_bits(pixels, white), pixels.dtype.itemsize * 8
 
 
 def decode_gray(data: bytes, path: Path | str, *, colour: bool = False) -> Image:
-    """Decode an image file in memory as `load_gray` does, 16 bits by full scale; `path` names it in messages."""
+    """Decode an image file in memory as `load_gray` does, 16 bits by full scale; `path` names it
+    in messages.
+    """
     return to_8_bits(_decoded(data, path, colour=colour), WHITE_16)
 
 
@@ -78,10 +89,12 @@ def to_8_bits(pixels: npt.NDArray[Any], white: int) -> Image:
 
 
 def white_level(paths: Sequence[Path]) -> int:
-    """Return the level of white of 16-bit images: that of 10, 12, 14 or 16 bits, the fewest that hold the images.
+    """Return the level of white of 16-bit images: that of 10, 12, 14 or 16 bits, the fewest that
+    hold the images.
 
-    Cameras of 12 bits store 0 to 4095 in 16 bits, which full scale would make almost black. One level serves all frames
-    of a recording, so that its brightness does not jump. Images of 8 bits, and unreadable ones, are passed over.
+    Cameras of 12 bits store 0 to 4095 in 16 bits, which full scale would make almost black. One
+    level serves all frames of a recording, so that its brightness does not jump. Images of 8 bits,
+    and unreadable ones, are passed over.
 
     Args:
         paths: some images of the recording, spread over it.
@@ -103,7 +116,9 @@ def brightest(pixels: npt.NDArray[Any]) -> float:
 
 
 def white_of(level: float) -> int:
-    """Return the level of white of 16-bit images whose brightest pixels have `level`; 0: it is not known."""
+    """Return the level of white of 16-bit images whose brightest pixels have `level`; 0: it is
+    not known.
+    """
     fitting = (2**bits - 1 for bits in _SENSOR_BITS if level <= 2**bits - 1)
     return next(fitting, WHITE_16) if level > 0 else WHITE_16
 
@@ -112,11 +127,16 @@ def white_note(white: int) -> tuple[str, ...]:
     """Return a note on the level of white of 16-bit images where it is not full scale."""
     if white == WHITE_16:
         return ()
-    return (f"the images have 16 bits but use {white.bit_length()}: the levels 0 to {white} are scaled to 8 bits",)
+    return (
+        f"the images have 16 bits but use {white.bit_length()}: the levels 0 to {white} are scaled "
+        "to 8 bits",
+    )
 
 
 def _load(path: Path, *, colour: bool = False) -> npt.NDArray[Any]:
-    """Read a file as gray (H, W) of its own depth, or in colour (H, W, 3) where it has any and it is asked for."""
+    """Read a file as gray (H, W) of its own depth, or in colour (H, W, 3) where it has any and
+    it is asked for.
+    """
     try:
         data = read_input(path, _MOST_BYTES)
     except OSError as error:
@@ -135,18 +155,27 @@ def _decoded(data: bytes, path: Path | str, *, colour: bool) -> npt.NDArray[Any]
     try:
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except (cv2.error, MemoryError) as error:
-        raise UnreadableImageError(f"{path}: does not decode ({' '.join(str(error).split())})") from error
+        raise UnreadableImageError(
+            f"{path}: does not decode ({' '.join(str(error).split())})"
+        ) from error
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
-        raise UnreadableImageError(f"{path}: does not decode as an image of 8 or 16 bits; copy the image again")
+        raise UnreadableImageError(
+            f"{path}: does not decode as an image of 8 or 16 bits; copy the image again"
+        )
     if pixels.ndim == 3:
-        codes = (cv2.COLOR_BGR2RGB, cv2.COLOR_BGRA2RGB) if colour else (cv2.COLOR_BGR2GRAY, cv2.COLOR_BGRA2GRAY)
+        codes = (
+            (cv2.COLOR_BGR2RGB, cv2.COLOR_BGRA2RGB)
+            if colour
+            else (cv2.COLOR_BGR2GRAY, cv2.COLOR_BGRA2GRAY)
+        )
         code = {1: None, 3: codes[0], 4: codes[1]}[pixels.shape[2]]
         pixels = pixels[..., 0] if code is None else cv2.cvtColor(pixels, code)
     return np.asarray(pixels)
 
 
 def load_depth(path: Path) -> FloatArray:
-    """Read a depth image (H, W) of 16 bits as the levels that it holds, 0 where the depth is not known.
+    """Read a depth image (H, W) of 16 bits as the levels that it holds, 0 where the depth is not
+    known.
 
     Raises:
         UnreadableImageError: the file cannot be read, or is no gray image of 16 bits.
@@ -154,7 +183,8 @@ def load_depth(path: Path) -> FloatArray:
     pixels = _load(path)
     if pixels.dtype != np.uint16:
         raise UnreadableImageError(
-            f"{path}: has 8 bits a pixel, too few for depths; give depth images of 16 bits (PNG or TIFF)"
+            f"{path}: has 8 bits a pixel, too few for depths; give depth images of 16 bits (PNG or "
+            "TIFF)"
         )
     return pixels.astype(np.float64)
 
@@ -186,7 +216,8 @@ def _too_large(width: int, height: int) -> str | None:
 
 
 def _jpeg_damage(data: bytes) -> str | None:
-    """Check the segments up to the end of the image; what follows it (a preview, a video) is not looked at.
+    """Check the segments up to the end of the image; what follows it (a preview, a video) is not
+    looked at.
 
     Reference: ITU-T T.81, annex B.
     """
@@ -219,13 +250,17 @@ def _end_of_scan(data: bytes, at: int) -> int:
         at = data.find(b"\xff", at)
         if at < 0 or at + 1 >= len(data):
             return -1
-        if data[at + 1] != 0 and not 0xD0 <= data[at + 1] <= 0xD7:  # neither a data byte of 255 nor a restart
+        # neither a data byte of 255 nor a restart
+        if data[at + 1] != 0 and not 0xD0 <= data[at + 1] <= 0xD7:
             return at
         at += 2
 
 
 def _png_damage(data: bytes) -> str | None:
-    """Check the chunks up to IEND and their checksums. Reference: PNG specification (W3C), section 5."""
+    """Check the chunks up to IEND and their checksums.
+
+    Reference: PNG specification (W3C), section 5.
+    """
     at = len(_PNG_START)
     while at + 12 <= len(data):
         size, kind = struct.unpack_from(">I4s", data, at)
@@ -234,7 +269,11 @@ def _png_damage(data: bytes) -> str | None:
             break
         if crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
             return f"the PNG is damaged (wrong checksum in its {kind.decode('latin-1')!r} chunk)"
-        if kind == b"IHDR" and size >= 8 and (problem := _too_large(*struct.unpack_from(">II", data, at + 8))):
+        if (
+            kind == b"IHDR"
+            and size >= 8
+            and (problem := _too_large(*struct.unpack_from(">II", data, at + 8)))
+        ):
             return problem
         if kind == b"IEND":
             return None
@@ -243,32 +282,44 @@ def _png_damage(data: bytes) -> str | None:
 
 
 def list_images(folder: Path) -> ImageFiles:
-    """The image files of a folder, sorted by name, numbers as numbers: `left2.png` before `left10.png`.
+    """The image files of a folder, sorted by name, numbers as numbers: `left2.png` before
+    `left10.png`.
 
     Raises:
         DataError: the folder is missing or holds no image.
     """
     try:
-        images = (n for n in os.listdir(folder) if os.path.splitext(n)[1].lower() in SUFFIXES and n[0] != ".")
+        images = (
+            n
+            for n in os.listdir(folder)
+            if os.path.splitext(n)[1].lower() in SUFFIXES and n[0] != "."
+        )
         found = sorted(images, key=natural_key)
     except OSError as error:
-        raise DataError(f"cannot list {folder}: {error.strerror or error}; give a folder of images") from error
+        raise DataError(
+            f"cannot list {folder}: {error.strerror or error}; give a folder of images"
+        ) from error
     if not found:
         raise DataError(f"{folder}: holds no image ({', '.join(SUFFIXES)})")
     return ImageFiles(folder, tuple(found))
 
 
 def natural_key(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
-    """Sort key of a name with its runs of digits as numbers; equal ones (`1.png`, `01.png`) by their text."""
+    """Sort key of a name with its runs of digits as numbers; equal ones (`1.png`, `01.png`) by
+    their text.
+    """
     parts = re.split(r"(\d+)", stem_of(name))
     return tuple((int(p), "") if k % 2 else (-1, p) for k, p in enumerate(parts)), name
 
 
-def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) -> Generator[Loaded]:
-    """Yield `load(item)` in order, taking and loading up to `depth` items ahead in one thread; 0: in the caller's.
+def prefetch(
+    load: Callable[[Item], Loaded], items: Iterable[Item], depth: int
+) -> Generator[Loaded]:
+    """Yield `load(item)` in order, taking and loading up to `depth` items ahead in one thread; 0:
+    in the caller's.
 
-    An exception of `load` or of the items is raised at its item. Closing the generator drops pending items, ends the
-    thread, and closes the items where they are a generator.
+    An exception of `load` or of the items is raised at its item. Closing the generator drops
+    pending items, ends the thread, and closes the items where they are a generator.
     """
     if depth <= 0:
         yield from map(load, items)
@@ -276,7 +327,9 @@ def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) 
     source = iter(items)
 
     def step() -> list[Loaded]:
-        """Take and load an item, if any is left; all in the thread, as the items may be read from a file, too."""
+        """Take and load an item, if any is left; all in the thread, as the items may be read
+        from a file, too.
+        """
         return [load(item) for item in itertools.islice(source, 1)]
 
     waiting: deque[Future[list[Loaded]]] = deque()
@@ -295,14 +348,21 @@ def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) 
 def other_damage(data: bytes) -> str | None:
     """Describe the damage of an encoded BMP, TIFF, PGM, PPM or WebP image; None: it is complete.
 
-    References: the formats' headers. TIFF states no length; the decoder refuses what it cannot read.
+    References: the formats' headers. TIFF states no length; the decoder refuses what it cannot
+    read.
     """
     if data.startswith(b"BM") and len(data) >= 6:
         return "the BMP is truncated" if struct.unpack_from("<I", data, 2)[0] > len(data) else None
     if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
-        return "the WebP is truncated" if struct.unpack_from("<I", data, 4)[0] + 8 > len(data) else None
+        return (
+            "the WebP is truncated"
+            if struct.unpack_from("<I", data, 4)[0] + 8 > len(data)
+            else None
+        )
     if data[:2] in (b"P5", b"P6"):
-        header = re.match(rb"P[56]\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s", data)
+        header = re.match(
+            rb"P[56]\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s", data
+        )
         if header is None:
             return "the PGM or PPM has no valid header"
         width, height, top = (int(x) for x in header.groups())

@@ -1,4 +1,5 @@
-"""The calibration files of KITTI raw drives: `calib_cam_to_cam.txt calib_velo_to_cam.txt calib_imu_to_velo.txt`.
+"""The calibration files of KITTI raw drives:
+`calib_cam_to_cam.txt calib_velo_to_cam.txt calib_imu_to_velo.txt`.
 
 They lie in the drive or a folder above it. `R_0k`, `T_0k` map coordinates of camera 0 to camera k.
 Reference: Geiger et al., Vision meets robotics: the KITTI dataset (2013).
@@ -52,7 +53,9 @@ def read_cam_to_cam(path: Path) -> KittiRawCalibration:
         CalibrationError: an entry is missing, malformed or impossible.
     """
     entries = _read_entries(path)
-    raw, rect, offsets = [], [], []
+    raw = []
+    rect = []
+    offsets = []
     for k in ("00", "01"):
         size = _size(entries, f"S_{k}", path)
         K = _entry(entries, f"K_{k}", 9, path)
@@ -65,7 +68,8 @@ def read_cam_to_cam(path: Path) -> KittiRawCalibration:
     return KittiRawCalibration(
         cam0=raw[0],
         cam1=raw[1],
-        T_cam1_cam0=_transform(entries, path, "R_01", "T_01") @ se3_inverse(_transform(entries, path, "R_00", "T_00")),
+        T_cam1_cam0=_transform(entries, path, "R_01", "T_01")
+        @ se3_inverse(_transform(entries, path, "R_00", "T_00")),
         rect0=rect[0],
         rect1=rect[1],
         T_rect1_rect0=se3_from_parts(np.eye(3), offsets[1] - offsets[0]),
@@ -74,7 +78,9 @@ def read_cam_to_cam(path: Path) -> KittiRawCalibration:
     )
 
 
-def _camera(K: FloatArray, size: tuple[int, int], coefficients: tuple[float, ...], where: str) -> CameraModel:
+def _camera(
+    K: FloatArray, size: tuple[int, int], coefficients: tuple[float, ...], where: str
+) -> CameraModel:
     check_intrinsics(K, where)
     kind: DistortionModel = "radtan" if coefficients else "pinhole"
     with naming(where):
@@ -86,7 +92,9 @@ def _size(entries: Mapping[str, str], name: str, path: Path) -> tuple[int, int]:
     return image_size(_entry(entries, name, 2, path).tolist(), f"{path}, {name}")
 
 
-def _transform(entries: Mapping[str, str], path: Path, rotation: str, translation: str | None = None) -> FloatArray:
+def _transform(
+    entries: Mapping[str, str], path: Path, rotation: str, translation: str | None = None
+) -> FloatArray:
     """Return the transform (4, 4) of two entries, or of a rotation alone."""
     R = _entry(entries, rotation, 9, path).reshape(3, 3)
     t = np.zeros(3) if translation is None else _entry(entries, translation, 3, path)
@@ -94,12 +102,21 @@ def _transform(entries: Mapping[str, str], path: Path, rotation: str, translatio
 
 
 def read_imu_pose(path: Path) -> tuple[FloatArray | None, tuple[str, ...]]:
-    """`T_cam0_imu` (4, 4) of the raw camera 0, through the laser scanner's frame; None where a file is missing."""
-    velo, imu = find_above(path, VELO), find_above(path, IMU)
+    """`T_cam0_imu` (4, 4) of the raw camera 0, through the laser scanner's frame.
+
+    None where a file is missing.
+    """
+    velo = find_above(path, VELO)
+    imu = find_above(path, IMU)
     if velo is None or imu is None:
         lacking = " and ".join(name for name, found in ((VELO, velo), (IMU, imu)) if found is None)
-        return None, (f"{path}: {lacking} not found; the pose of the IMU is unknown, and poses describe the camera",)
-    T_cam0_velo, T_velo_imu = (_transform(_read_entries(file), file, "R", "T") for file in (velo, imu))
+        return None, (
+            f"{path}: {lacking} not found; the pose of the IMU is unknown, and poses describe the "
+            "camera",
+        )
+    T_cam0_velo, T_velo_imu = (
+        _transform(_read_entries(file), file, "R", "T") for file in (velo, imu)
+    )
     return T_cam0_velo @ T_velo_imu, ()
 
 
@@ -112,7 +129,9 @@ def _read_entries(path: Path) -> dict[str, str]:
             continue
         if not colon or name in entries:
             what = "repeats an entry" if colon else "is not of the form 'name: values'"
-            raise CalibrationError(f"{path}, line {number}: {what} ({line[:40]!r}); copy the calibration again")
+            raise CalibrationError(
+                f"{path}, line {number}: {what} ({line[:40]!r}); copy the calibration again"
+            )
         entries[name] = values
     return entries
 

@@ -1,8 +1,10 @@
-"""The log of a run's observations and motion samples: a source that replays to the bit, and the form of other features.
+"""The log of a run's observations and motion samples: a source that replays to the bit, and the
+form of other features.
 
-One `.npz` without pickle. The rows of all frames are concatenated; `offsets` separates them. Data that the recording
-lacks (extrinsics, reference, …) are absent from the archive, never coded by a special number. The arrays are described
-in docs/tutorials/features.md; a file of another program needs the first six of them only.
+One `.npz` without pickle. The rows of all frames are concatenated; `offsets` separates them. Data
+that the recording lacks (extrinsics, reference, …) are absent from the archive, never coded by a
+special number. The arrays are described in docs/tutorials/features.md; a file of another program
+needs the first six of them only.
 """
 
 from __future__ import annotations
@@ -49,7 +51,8 @@ _REQUIRED: dict[str, tuple[str, int]] = {  # array kinds (numpy's letters) and d
     "z": ("f", 2),
     "has_right": ("b", 1),
 }
-_DEFAULTED: dict[str, tuple[str, int]] = {  # likewise; `_with_defaults` says what an absent one means
+# likewise; `_with_defaults` says what an absent one means
+_DEFAULTED: dict[str, tuple[str, int]] = {
     "version": ("i", 0),
     "source": ("U", 0),
     "notes": ("U", 1),
@@ -97,7 +100,8 @@ def write_observation_log(
         recording: the source of the run.
         observations: one record for each processed frame, in time order.
         motion_samples: every sample that the estimator received, in time order.
-        run_motion: what carried the pose in that run, for `motion: auto` in a replay; None: not known.
+        run_motion: what carried the pose in that run, for `motion: auto` in a replay; None: not
+            known.
 
     Raises:
         DataError: the file cannot be written.
@@ -105,24 +109,37 @@ def write_observation_log(
     """
     frames = np.array([o.frame_index for o in observations], dtype=np.int64)
     times_ns = np.array([o.time_ns for o in observations], dtype=np.int64)
-    if (np.diff(frames) <= 0).any() or not np.array_equal(times_ns, recording.frame_times_ns[frames]):
-        raise ValueError("the observations are not in the order of the recording's frames, or have other times")
-    camera, sigma, motion = recording.camera, joined_sigmas(observations), as_arrays(motion_samples)
-    reference, landmarks = recording.reference, recording.landmarks_reference
+    if (np.diff(frames) <= 0).any() or not np.array_equal(
+        times_ns, recording.frame_times_ns[frames]
+    ):
+        raise ValueError(
+            "the observations are not in the order of the recording's frames, or have other times"
+        )
+    camera = recording.camera
+    sigma = joined_sigmas(observations)
+    motion = as_arrays(motion_samples)
+    reference = recording.reference
+    landmarks = recording.landmarks_reference
     entries: dict[str, npt.ArrayLike | None] = {  # None: absent
         "format": FORMAT,
         "version": np.int64(VERSION),
         "source": f"{recording.kind}:{recording.path}",
         "notes": np.array(recording.notes, dtype=np.str_),
-        "intrinsics": np.array([camera.fu, camera.fv, camera.cu, camera.cv, camera.baseline_m], dtype=np.float64),
-        "image_size": np.array([k for k in (camera.width, camera.height) if k is not None], dtype=np.int64),
+        "intrinsics": np.array(
+            [camera.fu, camera.fv, camera.cu, camera.cv, camera.baseline_m], dtype=np.float64
+        ),
+        "image_size": np.array(
+            [k for k in (camera.width, camera.height) if k is not None], dtype=np.int64
+        ),
         "projection": None if camera.projection == "pinhole" else camera.projection,
         "frame_times_ns": recording.frame_times_ns,
         "frame_indices": frames,
         "offsets": np.cumsum([0, *(len(o) for o in observations)], dtype=np.int64),
         "ids": np.concatenate([np.zeros(0, dtype=np.int64), *(o.ids for o in observations)]),
         "z": np.concatenate([np.zeros((0, 4)), *(o.z for o in observations)]),
-        "has_right": np.concatenate([np.zeros(0, dtype=np.bool_), *(o.has_right for o in observations)]),
+        "has_right": np.concatenate(
+            [np.zeros(0, dtype=np.bool_), *(o.has_right for o in observations)]
+        ),
         "stale": np.concatenate([np.zeros(0, dtype=np.bool_), *(o.stale for o in observations)]),
         "motion_times_ns": motion.times_ns,
         "motion_is_imu": motion.is_imu,
@@ -162,8 +179,9 @@ def write_observations(
         path: the `.npz` to write; its folder must exist.
         camera: the rectified pair that the pixels belong to, or the rig whose `Rig.camera` that is.
         frame_times_ns: (F,) exposure times, integer nanoseconds, increasing.
-        frames: for each frame ids (N,), pixels (N, 4) `[ul vl ur vr]`, rectified, and which rows have a right match
-            (N,) (None: all). An id belongs to one point, and occurs once in a frame.
+        frames: for each frame ids (N,), pixels (N, 4) `[ul vl ur vr]`, rectified, and which rows
+            have a right match (N,) (None: all). An id belongs to one point, and occurs once in a
+            frame.
         motion: samples of an IMU or velocities on the clock of the frames, in time order.
         T_cam0_imu: (4, 4) extrinsics of the motion sensor; None: those of a `Rig`.
         reference: ground truth, for the errors of a run.
@@ -178,14 +196,17 @@ def write_observations(
     times_ns = np.asarray(frame_times_ns)
     if times_ns.ndim != 1 or times_ns.dtype.kind not in "iu" or len(times_ns) != len(frames):
         raise DataError(
-            f"frame times are {shape_text(times_ns)} of {times_ns.dtype} for {len(frames)} frames; give one integer, "
+            f"frame times are {shape_text(times_ns)} of {times_ns.dtype} for {len(frames)} frames; "
+            "give one integer, "
             "in nanoseconds, for each"
         )
     times_ns = check_increasing(times_ns.astype(np.int64), lambda k: f"frame times, entry {k}")
     seen = [frame_observations(k, int(times_ns[k]), *frame) for k, frame in enumerate(frames)]
     T = None if T_cam0_imu is None else checked_transform(T_cam0_imu, "T_cam0_imu")
     samples = as_arrays(motion)
-    recording = Recording("features", Path(path), camera, T, times_ns, False, samples.kinds, reference)
+    recording = Recording(
+        "features", Path(path), camera, T, times_ns, False, samples.kinds, reference
+    )
     write_observation_log(Path(path), recording, seen, samples)
 
 
@@ -202,11 +223,17 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
     """
     arrays = read_npz(path, tuple(_KINDS))
     arrays = _checked(arrays, path)
-    frames, offsets, times_ns = arrays["frame_indices"], arrays["offsets"], arrays["frame_times_ns"]
+    frames = arrays["frame_indices"]
+    offsets = arrays["offsets"]
+    times_ns = arrays["frame_times_ns"]
     dense_offsets = offsets[np.searchsorted(frames, np.arange(len(times_ns) + 1))]
     sigma = arrays["sigma"].astype(np.float32) if "sigma" in arrays else None
-    tracks = FeatureTracks(dense_offsets, arrays["ids"], arrays["z"], arrays["has_right"], arrays["stale"], sigma)
-    motion = MotionSamples[MotionSample](arrays["motion_times_ns"], arrays["motion_values"], arrays["motion_is_imu"])
+    tracks = FeatureTracks(
+        dense_offsets, arrays["ids"], arrays["z"], arrays["has_right"], arrays["stale"], sigma
+    )
+    motion = MotionSamples[MotionSample](
+        arrays["motion_times_ns"], arrays["motion_values"], arrays["motion_is_imu"]
+    )
     recording = Recording(
         kind="log",
         path=path,
@@ -226,18 +253,24 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
 def _checked(arrays: Mapping[str, np.ndarray], path: Path) -> Mapping[str, np.ndarray]:
     """Return all arrays but the optional ones, in 64 bits; absent ones have their defaults."""
     if "format" in arrays and str(arrays["format"]) != FORMAT:
-        raise DataError(f"{path}: no observation log; create one with `vio run SOURCE --save-observations`")
+        raise DataError(
+            f"{path}: no observation log; create one with `vio run SOURCE --save-observations`"
+        )
     version = arrays.get("version", np.zeros((), dtype=np.int64))
     if version.dtype.kind == "i" and version.ndim == 0 and version > VERSION:
         raise DataError(
-            f"{path}: an observation log of version {version}, this program reads up to {VERSION}; upgrade stereo-vio"
+            f"{path}: an observation log of version {version}, this program reads up to {VERSION}; "
+            "upgrade stereo-vio"
         )
     for key in _REQUIRED:
         if key not in arrays:
             raise DataError(f"{path}: the observation log lacks {key}; write it again")
     for key, (kind, dimensions) in _KINDS.items():
         if key in arrays and (arrays[key].dtype.kind != kind or arrays[key].ndim != dimensions):
-            raise DataError(f"{path}: {key} of the observation log has type {arrays[key].dtype}, {arrays[key].ndim}-D")
+            raise DataError(
+                f"{path}: {key} of the observation log has type {arrays[key].dtype}, "
+                f"{arrays[key].ndim}-D"
+            )
     whole = _with_defaults(arrays)
     if problem := _inconsistency(whole):
         raise DataError(f"{path}: the observation log is inconsistent: {problem}; write it again")
@@ -245,9 +278,14 @@ def _checked(arrays: Mapping[str, np.ndarray], path: Path) -> Mapping[str, np.nd
 
 
 def _with_defaults(arrays: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-    """Add what is absent: every frame was processed, no row repeats an earlier one, there are no motion samples."""
+    """Add what is absent: every frame was processed, no row repeats an earlier one, there are no
+    motion samples.
+    """
     wide = {"i": np.int64, "f": np.float64}
-    given = {key: array.astype(wide.get(array.dtype.kind, array.dtype), copy=False) for key, array in arrays.items()}
+    given = {
+        key: array.astype(wide.get(array.dtype.kind, array.dtype), copy=False)
+        for key, array in arrays.items()
+    }
     nothing = np.zeros(0, dtype=np.int64)
     return {
         "notes": np.zeros(0, dtype=np.str_),
@@ -263,11 +301,23 @@ def _with_defaults(arrays: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]
 
 def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
     """Describe an inconsistency; None: there is none."""
-    rows, offsets, frames = len(arrays["ids"]), arrays["offsets"], arrays["frame_indices"]
-    times_ns, samples = arrays["frame_times_ns"], len(arrays["motion_times_ns"])
-    if arrays["z"].shape != (rows, 4) or len(arrays["has_right"]) != rows or len(arrays["stale"]) != rows:
+    rows = len(arrays["ids"])
+    offsets = arrays["offsets"]
+    frames = arrays["frame_indices"]
+    times_ns = arrays["frame_times_ns"]
+    samples = len(arrays["motion_times_ns"])
+    if (
+        arrays["z"].shape != (rows, 4)
+        or len(arrays["has_right"]) != rows
+        or len(arrays["stale"]) != rows
+    ):
         return f"{rows} ids, but z is {arrays['z'].shape} with {len(arrays['stale'])} stale marks"
-    if len(offsets) != len(frames) + 1 or offsets[0] != 0 or offsets[-1] != rows or (np.diff(offsets) < 0).any():
+    if (
+        len(offsets) != len(frames) + 1
+        or offsets[0] != 0
+        or offsets[-1] != rows
+        or (np.diff(offsets) < 0).any()
+    ):
         return f"the offsets do not split {rows} rows into {len(frames)} frames"
     in_frame = np.stack([arrays["ids"], np.repeat(np.arange(len(frames)), np.diff(offsets))])
     in_order = in_frame[:, np.lexsort(in_frame)]
@@ -275,7 +325,9 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
         return "an id occurs twice in a frame"
     if (np.diff(times_ns) <= 0).any() or (np.diff(arrays["motion_times_ns"]) < 0).any():
         return "a clock does not increase"
-    if len(frames) and (frames[0] < 0 or frames[-1] >= len(times_ns) or (np.diff(frames) <= 0).any()):
+    if len(frames) and (
+        frames[0] < 0 or frames[-1] >= len(times_ns) or (np.diff(frames) <= 0).any()
+    ):
         return f"frame numbers do not increase within 0 to {len(times_ns) - 1}"
     if arrays["motion_values"].shape != (samples, 6) or len(arrays["motion_is_imu"]) != samples:
         return f"{samples} motion times, but values {arrays['motion_values'].shape}"
@@ -284,7 +336,11 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
     for first, group in _GROUPS.items():
         if first in arrays and any(key not in arrays for key in group):
             return f"{first} lacks {' '.join(key for key in group if key not in arrays)}"
-    for key, names in (("projection", Projection), ("run_motion", RunMotion), ("camera_kind", CameraKind)):
+    for key, names in (
+        ("projection", Projection),
+        ("run_motion", RunMotion),
+        ("camera_kind", CameraKind),
+    ):
         if key in arrays and str(arrays[key]) not in get_args(names):
             return f"{key} is {str(arrays[key])!r}, none of {', '.join(get_args(names))}"
     residual = arrays.get("residual_px", np.zeros(()))
@@ -293,7 +349,11 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
     if "sigma" in arrays and arrays["sigma"].shape != (rows, 3):
         return f"{rows} ids, but sigma is {shape_text(arrays['sigma'])}"
     poses = arrays.get("reference_T_world_body", np.zeros((0, 4, 4)))
-    stamps = [len(arrays[key]) for key in ("reference_times_ns", "reference_frame_indices") if key in arrays]
+    stamps = [
+        len(arrays[key])
+        for key in ("reference_times_ns", "reference_frame_indices")
+        if key in arrays
+    ]
     if poses.shape[1:] != (4, 4) or any(count != len(poses) for count in stamps):
         return f"reference poses {poses.shape} with {stamps} times or frame numbers"
     return None
@@ -329,4 +389,6 @@ def _reference(arrays: Mapping[str, np.ndarray]) -> Trajectory | None:
 def _landmarks(arrays: Mapping[str, np.ndarray]) -> Landmarks | None:
     if "landmark_ids" not in arrays:
         return None
-    return Landmarks(arrays["landmark_ids"], arrays["landmark_p_world"], arrays["landmark_covariance"])
+    return Landmarks(
+        arrays["landmark_ids"], arrays["landmark_p_world"], arrays["landmark_covariance"]
+    )

@@ -1,13 +1,14 @@
 """Folders of images: KITTI's, and plain ones of one camera, two, or one with depth images.
 
-A plain folder has images in `left right`, `image_0 image_1`, `cam0 cam1` and other usual names, in the folder or in its
-`data` or `images`. Calibration: any that `vio.load_rig` reads. Optional: `times.txt`, `imu.csv`, `velocity.csv`,
-`T_cam0_imu.txt`, and ground truth in `reference.tum`. TUM-VI in both of its forms is such a folder. What lies there
-and is not used is named in the recording's notes.
+A plain folder has images in `left right`, `image_0 image_1`, `cam0 cam1` and other usual names, in
+the folder or in its `data` or `images`. Calibration: any that `vio.load_rig` reads. Optional:
+`times.txt`, `imu.csv`, `velocity.csv`, `T_cam0_imu.txt`, and ground truth in `reference.tum`.
+TUM-VI in both of its forms is such a folder. What lies there and is not used is named in the
+recording's notes.
 
-Without the right images it is a recording of one camera (`mono`). With `depth/`, whose files are named as the images,
-or in the layout of TUM RGB-D, it is one with depth images (`rgbd`): they have 16 bits, 0 being unknown, and show what
-the images show, pixel by pixel.
+Without the right images it is a recording of one camera (`mono`). With `depth/`, whose files are
+named as the images, or in the layout of TUM RGB-D, it is one with depth images (`rgbd`): they have
+16 bits, 0 being unknown, and show what the images show, pixel by pixel.
 """
 
 from __future__ import annotations
@@ -20,7 +21,12 @@ from pathlib import Path
 import numpy as np
 
 from vio.cameras.rig import Rig
-from vio.datasets.companions import IMU_FILES, calibration_beside, find_calibration_of, read_companions
+from vio.datasets.companions import (
+    IMU_FILES,
+    calibration_beside,
+    find_calibration_of,
+    read_companions,
+)
 from vio.datasets.frame_times import pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
@@ -44,7 +50,8 @@ _PAIRS: tuple[tuple[str, ...], ...] = (
     ("image_lcam_front", "image_rcam_front"), ("infra1", "infra2"),
 )  # fmt: skip
 ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
-_GRAY, _COLOUR = (0, 1), (2, 3)  # of KITTI
+_GRAY = (0, 1)  # of KITTI
+_COLOUR = (2, 3)
 _INSIDE = ("data", "images", "")
 _DRIVE_NS = 100_000_000  # between frames of a KITTI drive
 _SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
@@ -67,7 +74,9 @@ def is_plain_folder(path: Path) -> bool:
 
 
 def holds_more_than_kitti(path: Path) -> bool:
-    """Return whether a folder with KITTI's names has an IMU, or another calibration that goes before `calib.txt`."""
+    """Return whether a folder with KITTI's names has an IMU, or another calibration that goes
+    before `calib.txt`.
+    """
     if not is_plain_folder(path):
         return False
     if any((path / name).is_file() for name in IMU_FILES):
@@ -76,15 +85,21 @@ def holds_more_than_kitti(path: Path) -> bool:
 
 
 def lacks_sensor_yaml(path: Path) -> bool:
-    """Return whether a folder with EuRoC's names has its calibration elsewhere, as TUM-VI's export."""
+    """Return whether a folder with EuRoC's names has its calibration elsewhere, as TUM-VI's
+    export.
+    """
     layout = _layout(path)
-    if layout is None or any((base / "cam0" / "sensor.yaml").is_file() for base in (layout.base, layout.root)):
+    if layout is None or any(
+        (base / "cam0" / "sensor.yaml").is_file() for base in (layout.base, layout.root)
+    ):
         return False
     return calibration_beside(layout) is not None
 
 
 def images_of_one_camera(path: Path) -> Path | None:
-    """Return the folder of images that a folder holds or is, whether or not anything else identifies them."""
+    """Return the folder of images that a folder holds or is, whether or not anything else
+    identifies them.
+    """
     layout = _layout_of_one(path) or _layout(path, [(names[-1],) for names in _PAIRS])
     return layout.left if layout is not None else path if _holds_images(path) else None
 
@@ -139,7 +154,10 @@ def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
     layout = _layout(path)
     if layout is None:
         names = ", ".join(" ".join(names) for names in _PAIRS[:4])
-        raise DataError(f"{path}: holds no pair of image folders ({names} or others); give one with left/ and right/")
+        raise DataError(
+            f"{path}: holds no pair of image folders ({names} or others); give one with left/ and "
+            "right/"
+        )
     pairs, notes = pair_files(list_images(layout.left), list_images(layout.right))
     return _read("plain", layout, _Images(pairs, notes), settings)
 
@@ -147,19 +165,22 @@ def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
 def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     """Read a KITTI odometry folder.
 
-    Official: `sequences/NN/` with `image_0 image_1 calib.txt times.txt` (and `image_2 image_3` in colour), poses in
-    `../../poses/NN.txt`. Self-contained: the same with, where there are any, `poses.txt`, `velocity.csv` (in the IMU's
-    frame) and `T_cam0_imu.txt`. Poses and extrinsics of KITTI's camera 0 are transformed to the left camera used.
+    Official: `sequences/NN/` with `image_0 image_1 calib.txt times.txt` (and `image_2 image_3` in
+    colour), poses in `../../poses/NN.txt`. Self-contained: the same with, where there are any,
+    `poses.txt`, `velocity.csv` (in the IMU's frame) and `T_cam0_imu.txt`. Poses and extrinsics of
+    KITTI's camera 0 are transformed to the left camera used.
 
     Raises:
-        DataError: files are missing, counts differ or a clock is wrong; the message names file and remedy.
+        DataError: files are missing, counts differ or a clock is wrong; the message names file and
+            remedy.
         CalibrationError: the calibration is missing or invalid.
     """
     cameras = _choose_cameras(path, settings.colour)
     layout = Layout(path, path, *(path / f"image_{k}" for k in cameras))
     pairs = pair_images(layout.left, layout.right)
     size, white, notes = measured_images(pairs)
-    file, times_file = path / "calib.txt", path / "times.txt"
+    file = path / "calib.txt"
+    times_file = path / "times.txt"
     rig, T_left_cam0 = kitti_rig(file, size, cameras)
     if not times_file.is_file():
         raise DataError(f"{times_file} is missing; it holds one time in seconds for each image")
@@ -168,41 +189,51 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     reference = None if poses is None else _read_reference(poses, times_ns, T_left_cam0)
     used = [] if poses is None else [poses]
     times = times_ns, times_file
-    parts = read_companions("kitti", layout, (file, rig), settings, times, notes, used, reference=reference)
+    parts = read_companions(
+        "kitti", layout, (file, rig), settings, times, notes, used, reference=reference
+    )
     return ImageDataset(*parts, pairs, white=white)
 
 
 def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
     """Read the gray pair of a KITTI raw drive: `image_00/data/0000000000.png`, `image_01/data/…`.
 
-    The drives named `_extract` are unrectified: they are rectified as they are read, with rotations computed here
-    (`R_rect_00` and `P_rect_00` belong to KITTI's). The drives named `_sync` are rectified already; the image size
-    distinguishes the two. The IMU's record (`oxts`) is not read.
+    The drives named `_extract` are unrectified: they are rectified as they are read, with rotations
+    computed here (`R_rect_00` and `P_rect_00` belong to KITTI's). The drives named `_sync` are
+    rectified already; the image size distinguishes the two. The IMU's record (`oxts`) is not read.
 
     Raises:
-        DataError: images are missing, counts differ or a clock is wrong; the message names file and remedy.
+        DataError: images are missing, counts differ or a clock is wrong; the message names file and
+            remedy.
         CalibrationError: the calibration is missing or invalid.
     """
     layout = Layout(path, path, *(path / name / "data" for name in ("image_00", "image_01")))
     for folder in (layout.left, layout.right):
         if not folder.is_dir():
-            raise DataError(f"{path}: holds no {folder.relative_to(path)}; give a KITTI raw drive with both cameras")
+            raise DataError(
+                f"{path}: holds no {folder.relative_to(path)}; give a KITTI raw drive with both "
+                "cameras"
+            )
     pairs = pair_images(layout.left, layout.right)
     file = find_above(path, CAMERAS)
     if file is None:
         raise CalibrationError(
-            f"{path}: {CAMERAS} is neither there nor in the folders above; copy KITTI's calibration of that day there"
+            f"{path}: {CAMERAS} is neither there nor in the folders above; copy KITTI's "
+            "calibration of that day there"
         )
     size, white, notes = measured_images(pairs)
     rig = load_rig(file, image_size=size, cameras=2)
-    used = [path / name / "timestamps.txt" for name in ("image_00", "image_01")]  # one trigger: the left ones serve
+    # one trigger: the left ones serve
+    used = [path / name / "timestamps.txt" for name in ("image_00", "image_01")]
     numbers = _frame_numbers(pairs)
     if used[0].is_file():
         times_ns = drive_times(used[0], numbers)
     else:
         times_ns = numbers * _DRIVE_NS
         notes = (f"{used[0]} is missing; times follow from the frame numbers at 10 Hz", *notes)
-    parts = read_companions("kitti_raw", layout, (file, rig), settings, (times_ns, used[0]), notes, used)
+    parts = read_companions(
+        "kitti_raw", layout, (file, rig), settings, (times_ns, used[0]), notes, used
+    )
     return ImageDataset(*parts, pairs, white=white)
 
 
@@ -215,7 +246,10 @@ def read_mono(path: Path, settings: DatasetSettings) -> ImageDataset:
     """
     layout = _layout_of_one(path)
     if layout is None:
-        raise DataError(f"{path}: holds no folder of images ({', '.join(ALONE[:4])} or others); give one with left/")
+        raise DataError(
+            f"{path}: holds no folder of images ({', '.join(ALONE[:4])} or others); give one with "
+            "left/"
+        )
     files = list_images(layout.left)
     return _read("mono", layout, _Images(FilePairs(files, files)), settings)
 
@@ -234,12 +268,18 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> ImageDataset:
         return _read("rgbd", Layout(path, path, folder, folder), images, settings)
     layout = _layout_of_one(path)
     if layout is None or not _holds_images(layout.base / "depth"):
-        raise DataError(f"{path}: holds no images beside depth/; give rgb.txt and depth.txt, or left/ and depth/")
-    lefts, depth_images = list_images(layout.left), list_images(layout.base / "depth")
+        raise DataError(
+            f"{path}: holds no images beside depth/; give rgb.txt and depth.txt, or left/ and "
+            "depth/"
+        )
+    lefts = list_images(layout.left)
+    depth_images = list_images(layout.base / "depth")
     depth_of = {file.stem: k for k, file in enumerate(depth_images)}
     files = lefts.take(k for k, file in enumerate(lefts) if file.stem in depth_of)
     if not files:
-        raise DataError(f"{layout.base / 'depth'}: no file is named as one of {layout.left}; name them alike")
+        raise DataError(
+            f"{layout.base / 'depth'}: no file is named as one of {layout.left}; name them alike"
+        )
     depths_of_files = depth_images.take(depth_of[file.stem] for file in files)
     return _read("rgbd", layout, _Images(FilePairs(files, files), depths=depths_of_files), settings)
 
@@ -247,10 +287,14 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> ImageDataset:
 def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings) -> ImageDataset:
     """Read what goes with the images: calibration, times, motion samples and ground truth."""
     size, white, notes = measured_images(images.pairs)
-    is_tum, used = images.listed_ns is not None, list[Path]()
-    file = settings.calibration or (calibration_beside(layout) if is_tum else find_calibration_of(layout))
+    is_tum = images.listed_ns is not None
+    used = list[Path]()
+    file = settings.calibration or (
+        calibration_beside(layout) if is_tum else find_calibration_of(layout)
+    )
     if file is None:
-        file, rig = layout.root / LISTS[0], published_camera(layout.root, size)
+        file = layout.root / LISTS[0]
+        rig = published_camera(layout.root, size)
     else:
         rig = load_rig(file, image_size=size, cameras=2 if kind == "plain" else 1)
     depth_factor = 1.0
@@ -262,13 +306,24 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
         times_ns, times_file, time_notes = frame_times(layout, images.pairs)
         notes = (*notes, *time_notes)
     else:
-        times_ns, times_file = images.listed_ns, layout.root / LISTS[0]
-    if kind != "plain" and times_file == layout.left:  # EuRoC's list repeats the times that the images are named by
+        times_ns = images.listed_ns
+        times_file = layout.root / LISTS[0]
+    # EuRoC's list repeats the times that the images are named by
+    if kind != "plain" and times_file == layout.left:
         used.append(layout.left.parent / "data.csv")
-    times, notes, has_depths = (times_ns, times_file), (*images.notes, *notes), images.depths is not None
-    parts = read_companions(kind, layout, (file, rig), settings, times, notes, used, has_depths=has_depths)
+    times = (times_ns, times_file)
+    notes = (*images.notes, *notes)
+    has_depths = images.depths is not None
+    parts = read_companions(
+        kind, layout, (file, rig), settings, times, notes, used, has_depths=has_depths
+    )
     return ImageDataset(
-        *parts, images.pairs, imu_noise=rig.imu_noise, white=white, depths=images.depths, depth_factor=depth_factor
+        *parts,
+        images.pairs,
+        imu_noise=rig.imu_noise,
+        white=white,
+        depths=images.depths,
+        depth_factor=depth_factor,
     )
 
 
@@ -279,7 +334,10 @@ def _choose_cameras(path: Path, colour: bool | None) -> tuple[int, int]:
             return cameras
     looked = " or ".join(f"image_{a} with image_{b}" for a, b in wanted)
     hint = "" if colour is None else f" (dataset.colour is {str(colour).lower()})"
-    raise DataError(f"{path}: holds no {looked}{hint}; give a KITTI odometry folder with both images of each pair")
+    raise DataError(
+        f"{path}: holds no {looked}{hint}; give a KITTI odometry folder with both images of each "
+        "pair"
+    )
 
 
 def _poses_file(path: Path) -> Path | None:
@@ -290,32 +348,51 @@ def _poses_file(path: Path) -> Path | None:
 
 
 def _read_reference(file: Path, times_ns: IntArray, T_left_cam0: FloatArray) -> Trajectory:
-    """Read the ground truth of camera 0 and move it, and the world, to the left camera; identity stays identity."""
+    """Read the ground truth of camera 0 and move it, and the world, to the left camera; identity
+    stays identity.
+    """
     poses = read_trajectory(file, fmt="kitti").T_world_body
     if len(poses) > len(times_ns):
-        raise DataError(f"{file} holds {len(poses)} poses for {len(times_ns)} images; give one line for each image")
-    moved = T_left_cam0 @ poses @ se3_inverse(T_left_cam0) if np.any(T_left_cam0 != np.eye(4)) else poses
+        raise DataError(
+            f"{file} holds {len(poses)} poses for {len(times_ns)} images; give one line for each "
+            "image"
+        )
+    moved = (
+        T_left_cam0 @ poses @ se3_inverse(T_left_cam0)
+        if np.any(T_left_cam0 != np.eye(4))
+        else poses
+    )
     return Trajectory(moved, times_ns[: len(poses)], "cam0", np.arange(len(poses)))
 
 
-def _depth_factor(rig: Rig, settings: DatasetSettings, where: Path) -> tuple[float, tuple[str, ...]]:
-    """Return the levels per metre of depth images, and a note where setting and calibration differ."""
+def _depth_factor(
+    rig: Rig, settings: DatasetSettings, where: Path
+) -> tuple[float, tuple[str, ...]]:
+    """Return the levels per metre of depth images, and a note where setting and calibration
+    differ.
+    """
     factor = settings.depth_factor or rig.depth_factor
     if factor is None:
         raise CalibrationError(
-            f"{where}: the unit of its depth images is not given; add depth_factor (levels per metre, 1000 for "
+            f"{where}: the unit of its depth images is not given; add depth_factor (levels per "
+            "metre, 1000 for "
             "millimetres) to cam0 of the calibration, or --set dataset.depth_factor=1000"
         )
     if settings.depth_factor is None or rig.depth_factor in (None, factor):
         return factor, ()
-    return factor, (f"dataset.depth_factor {factor:g} takes the place of the calibration's {rig.depth_factor:g}",)
+    return factor, (
+        f"dataset.depth_factor {factor:g} takes the place of the calibration's "
+        f"{rig.depth_factor:g}",
+    )
 
 
-# --- images and times -----------------------------------------------------------------------------------------------
+# --- images and times
+# -----------------------------------------------------------------------------------------------
 
 
 def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple[str, ...]]:
-    """Pair image files by equal names, by the last number in their names, or by stamps in their names.
+    """Pair image files by equal names, by the last number in their names, or by stamps in their
+    names.
 
     Raises:
         DataError: the names share nothing.
@@ -324,18 +401,23 @@ def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple
     if not set(keys[0]) & set(keys[1]):
         keys = [[_last_number(p) for p in files] for files in (lefts, rights)]
     if not set(keys[0]) & set(keys[1]) and all(_is_stamp(p.stem) for p in (*lefts, *rights)):
-        a, b = pair_stamps(*(np.array([int(p.stem) for p in files], dtype=np.int64) for files in (lefts, rights)))
+        a, b = pair_stamps(
+            *(np.array([int(p.stem) for p in files], dtype=np.int64) for files in (lefts, rights))
+        )
         keys = [list(range(len(lefts))), [-1] * len(rights)]
         for i, j in zip(a.tolist(), b.tolist(), strict=True):
             keys[1][j] = i
     right_of = {key: k for k, key in enumerate(keys[1])}
     if len(right_of) < len(rights) and -1 not in right_of:
-        raise DataError(f"{rights[0].parent}: several images have the same number; number them uniquely")
+        raise DataError(
+            f"{rights[0].parent}: several images have the same number; number them uniquely"
+        )
     rows = [(k, right_of[key]) for k, key in enumerate(keys[0]) if key in right_of]
     pairs = FilePairs(lefts.take(k for k, _ in rows), rights.take(k for _, k in rows))
     if not pairs:
         raise DataError(
-            f"{lefts[0].parent} and {rights[0].parent}: no name of the one fits one of the other ({lefts[0].name}, "
+            f"{lefts[0].parent} and {rights[0].parent}: no name of the one fits one of the other "
+            f"({lefts[0].name}, "
             f"{rights[0].name}); give both images of a pair the same name or number"
         )
     alone = len(lefts) - len(pairs), len(rights) - len(pairs)
@@ -373,7 +455,8 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
     if has_list:
         return _listed_times(file, pairs), file, missing
     note = (
-        f"{layout.root}: no times.txt; frames are taken to be {1 / _ASSUMED_HZ:g} s apart, so speeds are unknown; "
+        f"{layout.root}: no times.txt; frames are taken to be {1 / _ASSUMED_HZ:g} s apart, so "
+        "speeds are unknown; "
         "write one time an image (seconds or nanoseconds) into times.txt"
     )
     return np.arange(len(pairs), dtype=np.int64) * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
@@ -385,14 +468,19 @@ def _slow_note(file: Path, times_ns: IntArray) -> tuple[str, ...]:
     if apart_s <= _SLOWEST_S:
         return ()
     return (
-        f"{file}: frames are {apart_s:g} s apart, as its times are taken for seconds; if they are not, write seconds",
+        f"{file}: frames are {apart_s:g} s apart, as its times are taken for seconds; if they are "
+        "not, write seconds",
     )
 
 
 def _missing_note(file: Path, pairs: ImagePairs) -> tuple[str, ...]:
     """Say how many of the images in EuRoC's list of a camera are there, if not all are."""
     listed = sum(line.strip()[:1] not in ("#", "") for _, line in text_lines(file))
-    return (f"{file} lists {listed} images; the {len(pairs)} that are there are used",) if listed > len(pairs) else ()
+    return (
+        (f"{file} lists {listed} images; the {len(pairs)} that are there are used",)
+        if listed > len(pairs)
+        else ()
+    )
 
 
 def _listed_times(file: Path, pairs: ImagePairs) -> IntArray:
@@ -406,17 +494,25 @@ def _listed_times(file: Path, pairs: ImagePairs) -> IntArray:
 
 
 def times_of(file: Path, pairs: ImagePairs) -> IntArray:
-    """Read the times (F,) of image pairs: one a line, or `name time` where the first column names the images.
+    """Read the times (F,) of image pairs: one a line, or `name time` where the first column names
+    the images.
 
-    Dates are those of a KITTI raw drive, which is a plain folder where it is run with another calibration.
+    Dates are those of a KITTI raw drive, which is a plain folder where it is run with another
+    calibration.
 
     Raises:
         DataError: the file does not fit the images, or the times do not increase.
     """
     numbers = [_last_number(left) for left, _ in pairs]
-    if is_date(next((line for _, line in text_lines(file)), "")) and all(isinstance(n, int) for n in numbers):
+    if is_date(next((line for _, line in text_lines(file)), "")) and all(
+        isinstance(n, int) for n in numbers
+    ):
         return drive_times(file, np.array(numbers, dtype=np.int64))
-    rows = [(n, line.replace(",", " ").split()) for n, line in text_lines(file) if line.strip()[:1] not in ("#", "")]
+    rows = [
+        (n, line.replace(",", " ").split())
+        for n, line in text_lines(file)
+        if line.strip()[:1] not in ("#", "")
+    ]
     by_name = {Path(fields[0]).stem: (n, fields[1]) for n, fields in rows if len(fields) > 1}
     if by_name and all(left.stem in by_name for left, _ in pairs):
         chosen = [by_name[left.stem] for left, _ in pairs]
@@ -424,7 +520,8 @@ def times_of(file: Path, pairs: ImagePairs) -> IntArray:
         chosen = [(n, fields[0]) for n, fields in rows]
     else:
         raise DataError(
-            f"{file} holds {len(rows)} times for {len(pairs)} image pairs; there must be one time an image, or lines "
+            f"{file} holds {len(rows)} times for {len(pairs)} image pairs; there must be one time "
+            "an image, or lines "
             "'name time'"
         )
     return parse_stamps([text for _, text in chosen], lambda k: f"{file}, line {chosen[k][0]}")
@@ -434,12 +531,15 @@ def _frame_numbers(pairs: ImagePairs) -> IntArray:
     """Read the frame numbers (F,) from the image names."""
     bad = next((left for left, _ in pairs if not re.fullmatch(r"\d{1,18}", left.stem)), None)
     if bad is not None:
-        raise DataError(f"{bad}: an image of KITTI raw is named by its frame number (0000000000.png); rename it")
+        raise DataError(
+            f"{bad}: an image of KITTI raw is named by its frame number (0000000000.png); rename it"
+        )
     numbers = np.array([int(left.stem) for left, _ in pairs], dtype=np.int64)
     if (np.diff(numbers) <= 0).any():
         k = int(np.argmax(np.diff(numbers) <= 0))
         raise DataError(
-            f"{pairs[k + 1][0]}: its frame number does not increase after {pairs[k][0].name}; name all images with the "
+            f"{pairs[k + 1][0]}: its frame number does not increase after {pairs[k][0].name}; name "
+            "all images with the "
             "same number of digits"
         )
     return numbers

@@ -1,9 +1,10 @@
 """PNG files of 8-bit gray pixels, in about half the time that OpenCV takes for them.
 
-Such files hold the images of most recordings, and libpng takes more of a frame's time than Lucas-Kanade. Here zlib
-inflates all pixels at once, and a compiled loop undoes the filters. Nearly all rows of a photograph have Paeth's, which
-predicts a byte from its neighbours left, above, and above left, so that a row waits for itself at each pixel; rows are
-therefore decoded side by side, each one pixel behind the row above it.
+Such files hold the images of most recordings, and libpng takes more of a frame's time than
+Lucas-Kanade. Here zlib inflates all pixels at once, and a compiled loop undoes the filters. Nearly
+all rows of a photograph have Paeth's, which predicts a byte from its neighbours left, above, and
+above left, so that a row waits for itself at each pixel; rows are therefore decoded side by side,
+each one pixel behind the row above it.
 Reference: PNG specification (W3C), sections 7 to 10.
 """
 
@@ -24,21 +25,28 @@ except ImportError:  # a processor without its wheels
     from zlib import crc32, decompressobj  # type: ignore[assignment]
     from zlib import error as ZlibError  # type: ignore[assignment]  # noqa: N812
 
-MOST_PIXELS = 2**26  # 8192 x 8192; a header may state 2^62, and decoding would try to get the memory
+# 8192 x 8192; a header may state 2^62, and decoding would try to get the memory
+MOST_PIXELS = 2**26
 _START = b"\x89PNG\r\n\x1a\n"
 _GRAY_8 = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method, no interlacing
-# Chunks that change no pixel. With any other, such as transparency or an animation, the file is left to OpenCV.
-_PASSED_OVER = frozenset({b"tEXt", b"zTXt", b"iTXt", b"pHYs", b"tIME", b"gAMA", b"cHRM", b"sRGB", b"iCCP", b"sBIT"})
+# Chunks that change no pixel. With any other, such as transparency or an animation, the file is
+# left to OpenCV.
+_PASSED_OVER = frozenset(
+    {b"tEXt", b"zTXt", b"iTXt", b"pHYs", b"tIME", b"gAMA", b"cHRM", b"sRGB", b"iCCP", b"sBIT"}
+)
 _LAST_FILTER = 4  # Paeth's
 
 
 def decode_gray8(data: bytes) -> Image | None:
-    """Return the pixels (H, W) of a PNG file in memory, which are whole by the checksum of all of them.
+    """Return the pixels (H, W) of a PNG file in memory, which are whole by the checksum of all of
+    them.
 
-    None where the file is not of 8-bit gray without interlacing, or where it is damaged or too large: OpenCV reads the
-    other kinds, and `vio.datasets.images` says what is damaged, by the checksums of the chunks.
+    None where the file is not of 8-bit gray without interlacing, or where it is damaged or too
+    large: OpenCV reads the other kinds, and `vio.datasets.images` says what is damaged, by the
+    checksums of the chunks.
     """
-    parts, size = [], None
+    parts = []
+    size = None
     at = len(_START)
     while at + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
@@ -48,7 +56,11 @@ def decode_gray8(data: bytes) -> Image | None:
             parts.append(data[at + 8 : at + 8 + length])
         elif kind == b"IHDR" and length == 13:
             width, height, *form = struct.unpack_from(">IIBBBBB", data, at + 8)
-            size = (height, width) if tuple(form) == _GRAY_8 and height * width <= MOST_PIXELS else None
+            size = (
+                (height, width)
+                if tuple(form) == _GRAY_8 and height * width <= MOST_PIXELS
+                else None
+            )
         elif kind == b"IEND":
             return None if size is None else _pixels(b"".join(parts), *size)
         elif kind not in _PASSED_OVER:

@@ -13,7 +13,9 @@ _PAETH = 4  # number of the filter
 
 @compiled
 def unfilter(rows: Image, out: Image) -> None:
-    """Write the pixels (H, W) of filtered rows (H, 1 + W), each with the number of its filter in front."""
+    """Write the pixels (H, W) of filtered rows (H, 1 + W), each with the number of its filter in
+    front.
+    """
     y = int(np.int64(0))  # no literal: see `vio.numerics.compiled`
     while y < len(out):
         if y > 0 and _paeth_rows(rows, y) >= _SIDE_BY_SIDE:
@@ -36,7 +38,8 @@ def _paeth_rows(rows: Image, y: int) -> int:
 @compiled
 def _one_row(rows: Image, out: Image, y: int) -> None:
     kind = rows[y, 0]
-    left, corner = np.int16(0), np.int16(0)
+    left = np.int16(0)
+    corner = np.int16(0)
     for x in range(out.shape[1]):
         above = np.int16(out[y - 1, x]) if y > 0 else np.int16(0)
         guess = np.int16(0)
@@ -48,25 +51,34 @@ def _one_row(rows: Image, out: Image, y: int) -> None:
             guess = np.int16((left + above) // 2)
         elif kind == _PAETH:
             guess = _paeth(left, above, corner)
-        left, corner = np.int16((np.int16(rows[y, x + 1]) + guess) & 255), above
+        left = np.int16((np.int16(rows[y, x + 1]) + guess) & 255)
+        corner = above
         out[y, x] = left
 
 
 @compiled
 def _paeth(left: np.int16, above: np.int16, corner: np.int16) -> np.int16:
     """The neighbour that is nearest to `left + above - corner`; of equals the first."""
-    up, across = np.int16(above - corner), np.int16(left - corner)
-    by_left, by_above, by_corner = np.int16(abs(up)), np.int16(abs(across)), np.int16(abs(np.int16(up + across)))
+    up = np.int16(above - corner)
+    across = np.int16(left - corner)
+    by_left = np.int16(abs(up))
+    by_above = np.int16(abs(across))
+    by_corner = np.int16(abs(np.int16(up + across)))
     other = above if by_above <= by_corner else corner
     return left if by_left <= min(by_above, by_corner) else other
 
 
 @compiled
 def _side_by_side(rows: Image, out: Image, y: int) -> None:
-    """Write 16 rows from y > 0 on, each one pixel behind the row above it, so that all neighbours are there."""
-    width, last = out.shape[1], _SIDE_BY_SIDE - 1
-    left, above = np.empty(_SIDE_BY_SIDE, np.int16), np.empty(_SIDE_BY_SIDE, np.int16)
-    corner, change = np.empty(_SIDE_BY_SIDE, np.int16), np.empty(_SIDE_BY_SIDE, np.int16)
+    """Write 16 rows from y > 0 on, each one pixel behind the row above it, so that all
+    neighbours are there.
+    """
+    width = out.shape[1]
+    last = _SIDE_BY_SIDE - 1
+    left = np.empty(_SIDE_BY_SIDE, np.int16)
+    above = np.empty(_SIDE_BY_SIDE, np.int16)
+    corner = np.empty(_SIDE_BY_SIDE, np.int16)
+    change = np.empty(_SIDE_BY_SIDE, np.int16)
     for k in range(_SIDE_BY_SIDE):
         left[k] = corner[k] = 0
     for step in range(width + last):

@@ -12,7 +12,15 @@ from typing import TypeVar, cast, overload
 import numpy as np
 
 from vio.geometry.lie import FloatArray
-from vio.records import BoolArray, ImuRecord, ImuSample, IntArray, MotionSample, MotionSource, VelocitySample
+from vio.records import (
+    BoolArray,
+    ImuRecord,
+    ImuSample,
+    IntArray,
+    MotionSample,
+    MotionSource,
+    VelocitySample,
+)
 
 Sample_co = TypeVar("Sample_co", bound=ImuSample | VelocitySample, covariant=True)
 _CHUNK = 1000  # samples whose times are plain numbers at once
@@ -23,7 +31,8 @@ class MotionSamples(Sequence[Sample_co]):
     """Samples of an IMU, velocities, or both."""
 
     times_ns: IntArray  # (N,)
-    values: FloatArray  # (N, 6) gyro and accelerometer (rad/s, m/s^2), or linear and angular velocity (m/s, rad/s)
+    # (N, 6) gyro and accelerometer (rad/s, m/s^2), or linear and angular velocity (m/s, rad/s)
+    values: FloatArray
     is_imu: BoolArray  # (N,)
 
     def __post_init__(self) -> None:
@@ -50,7 +59,12 @@ class MotionSamples(Sequence[Sample_co]):
     def __iter__(self) -> Iterator[Sample_co]:
         for k in range(0, len(self), _CHUNK):
             part = slice(k, k + _CHUNK)
-            columns = self.times_ns[part].tolist(), self.values[part, :3], self.values[part, 3:], self.is_imu[part]
+            columns = (
+                self.times_ns[part].tolist(),
+                self.values[part, :3],
+                self.values[part, 3:],
+                self.is_imu[part],
+            )
             for time_ns, first, second, is_imu in zip(*columns, strict=True):
                 kind = ImuSample if is_imu else VelocitySample
                 yield cast(Sample_co, kind(time_ns, first, second))
@@ -71,7 +85,9 @@ def imu_samples(record: ImuRecord) -> MotionSamples[ImuSample]:
     return MotionSamples(record.times_ns, values, np.ones(len(values), dtype=np.bool_))
 
 
-def velocity_samples(times_ns: IntArray, linear: FloatArray, angular: FloatArray) -> MotionSamples[VelocitySample]:
+def velocity_samples(
+    times_ns: IntArray, linear: FloatArray, angular: FloatArray
+) -> MotionSamples[VelocitySample]:
     """Build samples from times (N,), m/s (N, 3) and rad/s (N, 3), all in the imu frame."""
     values = np.hstack([linear, angular])
     return MotionSamples(times_ns, values, np.zeros(len(values), dtype=np.bool_))
@@ -81,7 +97,9 @@ def motion_samples(samples: Sequence[MotionSample]) -> MotionSamples[MotionSampl
     """Return records (N,) as arrays; those that are arrays already as they are."""
     if isinstance(samples, MotionSamples):
         return samples
-    parts = [(x.gyro, x.accel) if isinstance(x, ImuSample) else (x.linear, x.angular) for x in samples]
+    parts = [
+        (x.gyro, x.accel) if isinstance(x, ImuSample) else (x.linear, x.angular) for x in samples
+    ]
     return MotionSamples(
         np.array([x.time_ns for x in samples], dtype=np.int64),
         np.array(parts, dtype=np.float64).reshape(-1, 6),
@@ -94,6 +112,8 @@ def in_time_order(*parts: Sequence[MotionSample]) -> MotionSamples[MotionSample]
     arrays = [motion_samples(part) for part in (*parts, ())]
     times_ns = np.concatenate([part.times_ns for part in arrays])
     whole = MotionSamples[MotionSample](
-        times_ns, np.concatenate([part.values for part in arrays]), np.concatenate([part.is_imu for part in arrays])
+        times_ns,
+        np.concatenate([part.values for part in arrays]),
+        np.concatenate([part.is_imu for part in arrays]),
     )
     return whole.take(np.argsort(times_ns, kind="stable"))

@@ -1,4 +1,6 @@
-"""Tables of stamped samples as people write them: any separator, a header or none, stamps in s, ms, us or ns."""
+"""Tables of stamped samples as people write them: any separator, a header or none, stamps in s,
+ms, us or ns.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +20,14 @@ from vio.files.text import check_increasing, lines_of, parse_stamps, text_lines,
 from vio.geometry.lie import FloatArray
 from vio.records import ImuRecord, IntArray, VelocitySample
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
+_NUMBER = re.compile(
+    r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE
+)
 _PLAIN = re.compile(r"[0-9.eE+-]*")  # numbers in these are written as `_NUMBER` says, or are none
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
-_LEAST_IMU_HZ = 50.0  # below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
+# below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
+_LEAST_IMU_HZ = 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +49,16 @@ def read_table(path: Path, columns: int, form: str, cut: list[str] | None = None
     """Read a table of stamps and numbers; see `table_rows`."""
     rows = table_rows(path, columns, form, cut)
     header = tuple(field.lower() for field in next(rows)[1])
-    stamps, values, lines = list[str](), array("d"), array("q")
+    stamps = list[str]()
+    values = array("d")
+    lines = array("q")
     for number, fields in rows:
         stamps.append(fields[0])
         lines.append(number)
         values.extend(_numbers(fields[1:]))
-    return NumberTable(path, header, tuple(stamps), np.array(values).reshape(-1, columns - 1), lines)
+    return NumberTable(
+        path, header, tuple(stamps), np.array(values).reshape(-1, columns - 1), lines
+    )
 
 
 def _numbers(texts: Sequence[str]) -> list[float]:
@@ -61,32 +70,42 @@ def _numbers(texts: Sequence[str]) -> list[float]:
 
 
 def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[str], list[int]]:
-    """Return the times (N,) of a table that are in whole nanoseconds, the last field of each line, and its number.
+    """Return the times (N,) of a table that are in whole nanoseconds, the last field of each line,
+    and its number.
 
     Raises:
         DataError: as `table_rows`, or a stamp is another number, or not later than the one before.
     """
     rows = list(table_rows(path, columns, form))[1:]
     lines = [number for number, _ in rows]
-    times_ns = whole_ns_stamps([fields[0] for _, fields in rows], lambda k: f"{path}, line {lines[k]}")
+    times_ns = whole_ns_stamps(
+        [fields[0] for _, fields in rows], lambda k: f"{path}, line {lines[k]}"
+    )
     return times_ns, [fields[-1] for _, fields in rows], lines
 
 
-def table_rows(path: Path, columns: int, form: str, cut: list[str] | None = None) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and the fields of each line of a table, and before the first one 0 and those of the header.
+def table_rows(
+    path: Path, columns: int, form: str, cut: list[str] | None = None
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the fields of each line of a table, and before the first one 0 and those
+    of the header.
 
-    Commas, semicolons or white space separate. The header is the last comment or text line above; it may have none.
+    Commas, semicolons or white space separate. The header is the last comment or text line above;
+    it may have none.
 
     Args:
         path: the file.
         columns: expected number of columns.
         form: their names, for messages.
-        cut: where to note a last line that ends too early, which is left out then; None: it is an error.
+        cut: where to note a last line that ends too early, which is left out then; None: it is an
+            error.
 
     Raises:
         DataError: the file cannot be read or is empty, or a line has another number of columns.
     """
-    header, unread, is_data = list[str](), "", False
+    header = list[str]()
+    unread = ""
+    is_data = False
     lines = lines_of(path)
     for number, line in lines:
         text = line.strip()
@@ -102,13 +121,17 @@ def table_rows(path: Path, columns: int, form: str, cut: list[str] | None = None
                 early = f"the last line ends too early ({len(fields)} of {columns} values)"
                 cut.append(f"{path}, line {number}: {early}; left out")
                 return
-            raise DataError(f"{path}, line {number}: {len(fields)} values instead of {columns} ({form})")
+            raise DataError(
+                f"{path}, line {number}: {len(fields)} values instead of {columns} ({form})"
+            )
         if not is_data:
             is_data = True
             yield 0, header
         yield number, fields
     if not is_data:
-        raise DataError(f"{path}: holds no line of data ({form}){unread}; copy it again, or remove it")
+        raise DataError(
+            f"{path}: holds no line of data ({form}){unread}; copy it again, or remove it"
+        )
 
 
 def _split(text: str) -> list[str]:
@@ -119,19 +142,25 @@ def _split(text: str) -> list[str]:
 
 
 def stamps_ns(table: NumberTable) -> IntArray:
-    """Return the first column as nanoseconds (N,), strictly increasing; the unit as stated, else by its size.
+    """Return the first column as nanoseconds (N,), strictly increasing; the unit as stated, else by
+    its size.
 
     Raises:
         DataError: a stamp is no number, or not later than the one before.
     """
-    stated = re.search(r"(?:\[|_|\()\s*(ns|us|ms|sec|s)\s*(?:\]|\)|$)", table.header[0]) if table.header else None
+    stated = (
+        re.search(r"(?:\[|_|\()\s*(ns|us|ms|sec|s)\s*(?:\]|\)|$)", table.header[0])
+        if table.header
+        else None
+    )
     return parse_stamps(table.stamps, table.where, None if stated is None else stated[1])
 
 
 def read_imu_table(
     path: Path, *, cut: list[str] | None = None, whole_ns: bool = False
 ) -> tuple[ImuRecord, tuple[str, ...]]:
-    """Read raw inertial readings; a header may name the order of its columns, and the units deg/s and g.
+    """Read raw inertial readings; a header may name the order of its columns, and the units deg/s
+    and g.
 
     Args:
         path: the file.
@@ -142,7 +171,8 @@ def read_imu_table(
         The record, and notes about what was converted or looks wrong.
 
     Raises:
-        DataError: a line lacks seven finite numbers, the stamps do not increase, or the order of columns is unclear.
+        DataError: a line lacks seven finite numbers, the stamps do not increase, or the order of
+            columns is unclear.
     """
     table = read_table(path, 7, _IMU_FORM, cut)
     times_ns = whole_ns_stamps(table.stamps, table.where) if whole_ns else stamps_ns(table)
@@ -152,7 +182,8 @@ def read_imu_table(
         remedy = "exchange these columns with 5 to 7, or add a header such as 'timestamp [ns],ax,ay,az,wx,wy,wz'"
         check_gravity_column(values, str(path), _IMU_FORM, remedy)
         return ImuRecord(times_ns, values[:, :3], values[:, 3:]), imu_notes(times_ns, str(path))
-    gyro, accel = values[:, order[:3]], values[:, order[3:]]
+    gyro = values[:, order[:3]]
+    accel = values[:, order[3:]]
     notes: list[str] = []
     if any("deg" in table.header[1 + k] for k in order[:3]):
         gyro = np.radians(gyro)
@@ -164,13 +195,22 @@ def read_imu_table(
 
 
 def _imu_order(table: NumberTable) -> list[int] | None:
-    """Return the columns of gyro x y z and accel x y z by the header's names; None: it names no axes."""
+    """Return the columns of gyro x y z and accel x y z by the header's names.
+
+    None: it names no axes.
+    """
     found: dict[tuple[str, str], int] = {}
     for k, cell in enumerate(table.header[1:]):
         name = re.sub(r"[\[(].*", "", cell)
         name = re.sub(r"(_?(radps|rad_s|mps2|m_s2|dps|degps|deg_s|ms2|rads|g))$", "", name.strip())
         letters = re.sub(r"[^a-z]", "", name)
-        kind = "w" if re.match(r"w|g|om|ang|rot|rs?sw", letters) else "a" if letters.startswith(("a", "lin")) else ""
+        kind = (
+            "w"
+            if re.match(r"w|g|om|ang|rot|rs?sw", letters)
+            else "a"
+            if letters.startswith(("a", "lin"))
+            else ""
+        )
         axis = next((c for c in reversed(letters) if c in "xyz"), "")
         found[(kind, axis)] = k
     wanted = [(kind, axis) for kind in "wa" for axis in "xyz"]
@@ -178,7 +218,8 @@ def _imu_order(table: NumberTable) -> list[int] | None:
         return None
     if set(found) != set(wanted):
         raise DataError(
-            f"{table.path}: the header {','.join(table.header)[:80]!r} does not name gyro and accel; write "
+            f"{table.path}: the header {','.join(table.header)[:80]!r} does not name gyro and "
+            "accel; write "
             "'timestamp [ns],wx,wy,wz,ax,ay,az', or no header for that order"
         )
     return [found[key] for key in wanted]
@@ -192,7 +233,8 @@ def imu_notes(times_ns: IntArray, where: str) -> tuple[str, ...]:
     if rate_hz >= _LEAST_IMU_HZ:
         return ()
     return (
-        f"{where}: the IMU has {rate_hz:.3g} Hz, too few to integrate the motion between images; record at least "
+        f"{where}: the IMU has {rate_hz:.3g} Hz, too few to integrate the motion between images; "
+        "record at least "
         f"{_LEAST_IMU_HZ:g} Hz, or use --motion none",
     )
 
@@ -206,7 +248,8 @@ def read_velocity_table(path: Path) -> MotionSamples[VelocitySample]:
     table = read_table(path, 7, VELOCITY_HEADER)
     if ",".join(table.header) != VELOCITY_HEADER:
         raise DataError(f"{path}, line 1: expected the header {VELOCITY_HEADER}")
-    times_ns, values = stamps_ns(table), _finite(table)
+    times_ns = stamps_ns(table)
+    values = _finite(table)
     return velocity_samples(times_ns, values[:, :3], values[:, 3:])
 
 
@@ -215,13 +258,15 @@ def _finite(table: NumberTable) -> FloatArray:
     bad = ~np.isfinite(table.values).all(axis=1)
     if bad.any():
         raise DataError(
-            f"{table.where(int(np.argmax(bad)))}: a reading is not a finite number ({int(bad.sum())} lines in all); "
+            f"{table.where(int(np.argmax(bad)))}: a reading is not a finite number "
+            f"({int(bad.sum())} lines in all); "
             "remove such lines"
         )
     return table.values
 
 
-_DATE = re.compile(r"(19|20|21)\d\d-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{0,9})?")  # whose nanoseconds fit 64 bits
+# whose nanoseconds fit 64 bits
+_DATE = re.compile(r"(19|20|21)\d\d-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{0,9})?")
 
 
 def is_date(text: str) -> bool:
@@ -232,7 +277,8 @@ def is_date(text: str) -> bool:
 def drive_times(path: Path, numbers: IntArray) -> IntArray:
     """Read times in nanoseconds since 1970 (F,) of images with frame numbers (F,).
 
-    The file holds one line an image, or one for each frame of the drive that the images are a part of.
+    The file holds one line an image, or one for each frame of the drive that the images are a part
+    of.
 
     Raises:
         DataError: the file fits neither, a line is no date, or the clock does not increase.
@@ -244,7 +290,8 @@ def drive_times(path: Path, numbers: IntArray) -> IntArray:
         rows = numbers.tolist()
     else:
         raise DataError(
-            f"{path} holds {len(lines)} times for {len(numbers)} images up to number {numbers[-1]}; there must be one "
+            f"{path} holds {len(lines)} times for {len(numbers)} images up to number "
+            f"{numbers[-1]}; there must be one "
             "line an image, or one for each frame of the drive"
         )
     times = [_parse_date(lines[row][1], path, lines[row][0]) for row in rows]
@@ -259,5 +306,6 @@ def _parse_date(text: str, path: Path, number: int) -> int:
         return int(np.datetime64(text.strip().rstrip("."), "ns").astype(np.int64))
     except ValueError as error:
         raise DataError(
-            f"{path}, line {number}: {text.strip()[:40]!r} is no time of the form '2011-09-26 14:02:25.951199337'"
+            f"{path}, line {number}: {text.strip()[:40]!r} is no time of the form '2011-09-26 "
+            "14:02:25.951199337'"
         ) from error

@@ -9,7 +9,15 @@ from pathlib import Path
 
 from vio.datasets.images import SUFFIXES
 
-_SILENT = ("readme*", "license*", "*.md", "simulation.json", "rectification.json", "conversion.json")  # no data
+# no data
+_SILENT = (
+    "readme*",
+    "license*",
+    "*.md",
+    "simulation.json",
+    "rectification.json",
+    "conversion.json",
+)
 _PHOTOMETRIC = ("pcalib*.txt", "vignette*.png")  # of DSO and TUM-VI
 _NAMED = 12  # of a list
 
@@ -25,7 +33,8 @@ class Layout:
 
 
 def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
-    """Return a note that names what lies in the folder and was not read, and one for photometric files.
+    """Return a note that names what lies in the folder and was not read, and one for photometric
+    files.
 
     Files in `used` need not exist.
     """
@@ -42,12 +51,20 @@ def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
         if folder != layout.root and layout.root not in folder.parents:
             continue
         with_images = folder in images
-        children = (child for child in folder.iterdir() if not (with_images and child.suffix.lower() in SUFFIXES))
+        children = (
+            child
+            for child in folder.iterdir()
+            if not (with_images and child.suffix.lower() in SUFFIXES)
+        )
         for child in sorted(children):
-            silent = child.name.startswith(".") or any(fnmatch.fnmatch(child.name.lower(), s) for s in _SILENT)
+            silent = child.name.startswith(".") or any(
+                fnmatch.fnmatch(child.name.lower(), s) for s in _SILENT
+            )
             if not silent and child.absolute() not in kept:
                 found.append(str(child.relative_to(layout.root)) + ("/" if child.is_dir() else ""))
-    photometric = [name for name in found if any(fnmatch.fnmatch(Path(name).name, p) for p in _PHOTOMETRIC)]
+    photometric = [
+        name for name in found if any(fnmatch.fnmatch(Path(name).name, p) for p in _PHOTOMETRIC)
+    ]
     others = [name for name in found if name not in photometric]
     notes = []
     if photometric:

@@ -1,7 +1,7 @@
 """UTIAS course files: KITTI drives tracked by KLT, and the Starry Night rig, as MATLAB `.mat`.
 
-Conventions, verified on the data by the tests: `p_c = C_c_v (p_v - rho_v_c_v)`, and `theta_vk_i` is the rotation vector
-of `R_i_v`, which maps the vehicle's axes to the inertial frame.
+Conventions, verified on the data by the tests: `p_c = C_c_v (p_v - rho_v_c_v)`, and `theta_vk_i` is
+the rotation vector of `R_i_v`, which maps the vehicle's axes to the inertial frame.
 """
 
 from __future__ import annotations
@@ -33,23 +33,32 @@ def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
     """Read a course file; velocities and poses after the last feature frame are ignored.
 
     Raises:
-        DataError: variables, shapes, clocks or values are wrong; the message names which and the expected form.
+        DataError: variables, shapes, clocks or values are wrong; the message names which and the
+            expected form.
         CalibrationError: the calibration is invalid.
     """
     arrays = _read_mat(path)
     features = arrays["y_k_j"]
     if features.ndim != 3 or features.shape[0] != 4 or features.shape[1] < 2:
-        raise DataError(f"{path}: y_k_j has shape {shape_text(features)}; expected 4 x T x M with at least two frames")
+        raise DataError(
+            f"{path}: y_k_j has shape {shape_text(features)}; expected 4 x T x M with at least two "
+            "frames"
+        )
     count = features.shape[1]
     times_ns = clock_ns(_rows(arrays, "t", path, 1, count)[:, 0], lambda k: f"{path}, t[{k}]")
     linear = _finite(arrays, "v_vk_vk_i", path, count)
     angular = _finite(arrays, "w_vk_vk_i", path, count)
     tracks, notes = resolve_repeats(
-        tracks_from_dense(np.swapaxes(features, 1, 2), path), moving_frames(linear, angular), settings.repeated_tracks
+        tracks_from_dense(np.swapaxes(features, 1, 2), path),
+        moving_frames(linear, angular),
+        settings.repeated_tracks,
     )
     longest = max(arrays[key].shape[1] for key in ("v_vk_vk_i", "w_vk_vk_i"))
     if longest > count:
-        notes = (f"velocities cover {longest} frames, features {count}; the first {count} are read", *notes)
+        notes = (
+            f"velocities cover {longest} frames, features {count}; the first {count} are read",
+            *notes,
+        )
     recording = Recording(
         kind="utias",
         path=path,
@@ -80,24 +89,40 @@ def _read_mat(path: Path) -> Mapping[str, FloatArray]:
         raw = loadmat(path, mat_dtype=True, variable_names=wanted)
     except NotImplementedError as error:
         raise DataError(f"{path}: a MATLAB 7.3 file; save it again with `save -v7`") from error
-    except (MatReadError, ValueError, TypeError, KeyError, IndexError, EOFError, MemoryError, zlib.error) as error:
+    except (
+        MatReadError,
+        ValueError,
+        TypeError,
+        KeyError,
+        IndexError,
+        EOFError,
+        MemoryError,
+        zlib.error,
+    ) as error:
         raise DataError(f"{path}: is damaged or no MATLAB file ({error}); copy it again") from error
     except OSError as error:
         raise DataError(f"cannot read {path}: {error.strerror or error}; copy it again") from error
     if missing := [key for key in KEYS if key not in wanted]:
         names = " ".join(sorted(name for name in shapes if not name.startswith("__")))
-        raise DataError(f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found {names}")
+        raise DataError(
+            f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found {names}"
+        )
     for key in wanted:
         if not isinstance(raw.get(key), np.ndarray) or raw[key].dtype.kind not in "fiu":
             raise DataError(f"{path}: {key} is not an array of real numbers; save it again as one")
     return {key: raw[key].astype(np.float64) for key in wanted}
 
 
-def _rows(arrays: Mapping[str, FloatArray], key: str, path: Path, rows: int, count: int) -> FloatArray:
+def _rows(
+    arrays: Mapping[str, FloatArray], key: str, path: Path, rows: int, count: int
+) -> FloatArray:
     """The first `count` columns of a (rows, >= count) array, as (count, rows)."""
     value = arrays[key]
     if value.ndim != 2 or value.shape[0] != rows or value.shape[1] < count:
-        raise DataError(f"{path}: {key} has shape {shape_text(value)}; expected {rows} x T with T at least {count}")
+        raise DataError(
+            f"{path}: {key} has shape {shape_text(value)}; expected {rows} x T with T at least "
+            f"{count}"
+        )
     return np.ascontiguousarray(value[:, :count].T)
 
 
@@ -109,24 +134,31 @@ def _finite(arrays: Mapping[str, FloatArray], key: str, path: Path, count: int) 
 def _vector(arrays: Mapping[str, FloatArray], key: str, path: Path, size: int) -> FloatArray:
     value = arrays[key].reshape(-1)
     if len(value) != size or not np.isfinite(value).all():
-        raise DataError(f"{path}: {key} has shape {shape_text(arrays[key])}; expected {size} finite value(s)")
+        raise DataError(
+            f"{path}: {key} has shape {shape_text(arrays[key])}; expected {size} finite value(s)"
+        )
     return value
 
 
 def _camera(arrays: Mapping[str, FloatArray], path: Path) -> StereoCamera:
-    fu, fv, cu, cv, b = (float(_vector(arrays, key, path, 1)[0]) for key in ("fu", "fv", "cu", "cv", "b"))
+    fu, fv, cu, cv, b = (
+        float(_vector(arrays, key, path, 1)[0]) for key in ("fu", "fv", "cu", "cv", "b")
+    )
     with naming(path):
         return StereoCamera(fu, fv, cu, cv, b)
 
 
 def _extrinsics(arrays: Mapping[str, FloatArray], path: Path) -> FloatArray:
-    C, rho = arrays["C_c_v"], _vector(arrays, "rho_v_c_v", path, 3)
+    C = arrays["C_c_v"]
+    rho = _vector(arrays, "rho_v_c_v", path, 3)
     if C.shape != (3, 3):
         raise DataError(f"{path}: C_c_v has shape {shape_text(C)}; expected 3 x 3")
     return checked_transform(np.concatenate([C, (-C @ rho)[:, None]], axis=1), f"{path}, C_c_v")
 
 
-def _reference(arrays: Mapping[str, FloatArray], path: Path, times_ns: IntArray) -> Trajectory | None:
+def _reference(
+    arrays: Mapping[str, FloatArray], path: Path, times_ns: IntArray
+) -> Trajectory | None:
     if not {"r_i_vk_i", "theta_vk_i"} <= set(arrays):
         return None
     count = len(times_ns)

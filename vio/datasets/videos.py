@@ -1,7 +1,9 @@
-"""Two video files, left and right, with a calibration and, as in a plain folder, what else is beside them.
+"""Two video files, left and right, with a calibration and, as in a plain folder, what else is
+beside them.
 
-Frame k of the one file belongs to frame k of the other. Frames are decoded in order, from the first on, because seeking
-in compressed video is not exact. Times come from `times.txt`, else from the frame rate that the files state.
+Frame k of the one file belongs to frame k of the other. Frames are decoded in order, from the first
+on, because seeking in compressed video is not exact. Times come from `times.txt`, else from the
+frame rate that the files state.
 """
 
 from __future__ import annotations
@@ -25,7 +27,13 @@ from vio.errors import DataError
 from vio.records import NS_PER_S, Image, IntArray, StereoFrame
 
 SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
-_NAMES = (("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("image_0", "image_1"), ("video_0", "video_1"))
+_NAMES = (
+    ("left", "right"),
+    ("Left", "Right"),
+    ("cam0", "cam1"),
+    ("image_0", "image_1"),
+    ("video_0", "video_1"),
+)
 _RATES = (1.0, 1000.0)  # frames per second that a file can plausibly state
 
 
@@ -41,7 +49,9 @@ class _Facts:
 
 def video_files(path: Path) -> tuple[Path, Path] | None:
     """Return the left and right video file of a folder; None: it has none."""
-    found = {child.stem: child for child in sorted(path.iterdir()) if child.suffix.lower() in SUFFIXES}
+    found = {
+        child.stem: child for child in sorted(path.iterdir()) if child.suffix.lower() in SUFFIXES
+    }
     return next(((found[a], found[b]) for a, b in _NAMES if a in found and b in found), None)
 
 
@@ -49,16 +59,21 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
     """Read a folder with two video files.
 
     Raises:
-        DataError: a file is no video, the two differ in rate or size, or times and samples do not fit.
+        DataError: a file is no video, the two differ in rate or size, or times and samples do not
+            fit.
         CalibrationError: there is no calibration, or it is invalid.
     """
     files = video_files(path) if path.is_dir() else None
     if files is None:
-        raise DataError(f"{path}: holds no pair of videos (left.mp4 and right.mp4, or others); give a folder with both")
+        raise DataError(
+            f"{path}: holds no pair of videos (left.mp4 and right.mp4, or others); give a folder "
+            "with both"
+        )
     left, right = (_facts(file) for file in files)
     if abs(left.rate_hz - right.rate_hz) > 1e-3 * left.rate_hz:
         raise DataError(
-            f"{files[0]} has {left.rate_hz:g} and {files[1].name} {right.rate_hz:g} frames per second; record both "
+            f"{files[0]} has {left.rate_hz:g} and {files[1].name} {right.rate_hz:g} frames per "
+            "second; record both "
             "with one trigger, or write image folders"
         )
     layout = Layout(path, path, *files)
@@ -66,8 +81,13 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
     rig = load_rig(file, image_size=(left.width, left.height), cameras=2)
     times_ns, times_file, notes = _times(path, files, min(left.count, right.count), left.rate_hz)
     if left.count != right.count:
-        notes.append(f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the shorter counts")
-    parts = read_companions("video", layout, (file, rig), settings, (times_ns, times_file), notes, files)
+        notes.append(
+            f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the "
+            "shorter counts"
+        )
+    parts = read_companions(
+        "video", layout, (file, rig), settings, (times_ns, times_file), notes, files
+    )
     return VideoDataset(*parts, files, imu_noise=rig.imu_noise)
 
 
@@ -76,31 +96,40 @@ def _facts(file: Path) -> _Facts:
 
     capture = cv2.VideoCapture(str(file))
     try:
-        count, rate_hz = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
+        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
         found, image = capture.read()
     finally:
         capture.release()
     if not found or count < 1:
-        raise DataError(f"{file}: no frame can be decoded; the file is damaged, or OpenCV has no decoder for it")
+        raise DataError(
+            f"{file}: no frame can be decoded; the file is damaged, or OpenCV has no decoder for it"
+        )
     if not _RATES[0] <= rate_hz <= _RATES[1]:
         rate_hz = 0.0
     return _Facts(count, rate_hz, image.shape[1], image.shape[0])
 
 
-def _times(path: Path, files: tuple[Path, Path], count: int, rate_hz: float) -> tuple[IntArray, Path | None, list[str]]:
+def _times(
+    path: Path, files: tuple[Path, Path], count: int, rate_hz: float
+) -> tuple[IntArray, Path | None, list[str]]:
     """Return the times (F,) of the frames, the file that states them, and notes."""
     if (file := path / "times.txt").is_file():
         names = [(Path(f"{k}"), Path(f"{k}")) for k in range(count)]
         return times_of(file, tuple(names)), file, []
     if rate_hz == 0.0:
-        raise DataError(f"{files[0]}: states no frame rate; write one time a frame into times.txt beside it")
+        raise DataError(
+            f"{files[0]}: states no frame rate; write one time a frame into times.txt beside it"
+        )
     note = f"no times.txt: frames are {1e3 / rate_hz:.4g} ms apart, as {files[0].name} states; real cameras jitter"
     return np.rint(np.arange(count) * (NS_PER_S / rate_hz)).astype(np.int64), None, [note]
 
 
 @dataclass(frozen=True, slots=True)
 class VideoDataset(ImageRecording):
-    """Implements `vio.protocols.Dataset` over two video files; a frame that cannot be decoded is an error."""
+    """Implements `vio.protocols.Dataset` over two video files; a frame that cannot be decoded is
+    an error.
+    """
 
     files: tuple[Path, Path]
 
@@ -110,7 +139,8 @@ class VideoDataset(ImageRecording):
 
         captures = [cv2.VideoCapture(str(file)) for file in self.files[: self.settings.cameras]]
 
-        after = dict(zip(chosen, [0, *(k + 1 for k in chosen)], strict=False))  # where the decoders are before a frame
+        # where the decoders are before a frame
+        after = dict(zip(chosen, [0, *(k + 1 for k in chosen)], strict=False))
 
         def load(index: int) -> StereoFrame:
             for capture in captures:
@@ -120,7 +150,9 @@ class VideoDataset(ImageRecording):
             return self.rectifier.frame(index, int(self.recording.frame_times_ns[index]), *images)
 
         try:
-            with contextlib.closing(prefetch(load, chosen, self.settings.prefetch_frames)) as loaded:
+            with contextlib.closing(
+                prefetch(load, chosen, self.settings.prefetch_frames)
+            ) as loaded:
                 yield from loaded
         finally:
             for capture in captures:
@@ -132,7 +164,8 @@ class VideoDataset(ImageRecording):
         found, pixels = capture.read()
         if not found:
             raise DataError(
-                f"{self.files[side]}: frame {index} of {len(self.recording.frame_times_ns)} cannot be decoded; "
+                f"{self.files[side]}: frame {index} of {len(self.recording.frame_times_ns)} cannot "
+                "be decoded; "
                 f"the file is truncated, or states too many frames: use --stop {index}"
             )
         code = cv2.COLOR_BGR2RGB if self.colour else cv2.COLOR_BGR2GRAY

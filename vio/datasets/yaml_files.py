@@ -1,4 +1,6 @@
-"""Read calibration files in YAML, OpenCV's dialect included, as plain entries, and their numbers with strict checks."""
+"""Read calibration files in YAML, OpenCV's dialect included, as plain entries, and their numbers
+with strict checks.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from vio.records import ImuDensities
 
 Entries: TypeAlias = Mapping[str, object]
 
-NOISE_UNITS = {  # entries of an IMU's noise, as EuRoC and Kalibr name them, in the order of `ImuDensities`
+# entries of an IMU's noise, as EuRoC and Kalibr name them, in the order of `ImuDensities`
+NOISE_UNITS = {
     "gyroscope_noise_density": "rad / s / sqrt(Hz)",
     "gyroscope_random_walk": "rad / s^2 / sqrt(Hz)",
     "accelerometer_noise_density": "m / s^2 / sqrt(Hz)",
@@ -40,17 +43,22 @@ def read_yaml_file(path: Path, what: str = "the sensor's calibration") -> dict[s
     if not path.is_file():
         raise CalibrationError(f"{path} is missing; it holds {what}")
     if (size := path.stat().st_size) > _MAX_BYTES:
-        raise CalibrationError(f"{path}: {size} bytes are too many for a calibration; give the right file")
+        raise CalibrationError(
+            f"{path}: {size} bytes are too many for a calibration; give the right file"
+        )
     # OpenCV's writer begins with '%YAML:1.0', which is no YAML directive, and tags its matrices.
     lines = [line for _, line in text_lines(path) if not line.startswith("%YAML")]
     try:
         entries = read_yaml_text("\n".join(lines).replace("!!opencv-matrix", ""))
     except ValueError as error:
         raise CalibrationError(
-            f"{path}: not a YAML file of plain values ({error}); write plain numbers, or copy it again"
+            f"{path}: not a YAML file of plain values ({error}); write plain numbers, or copy it "
+            "again"
         ) from error
     if not isinstance(entries, dict):
-        raise CalibrationError(f"{path}: holds no calibration (expected 'key: value' lines); copy it again")
+        raise CalibrationError(
+            f"{path}: holds no calibration (expected 'key: value' lines); copy it again"
+        )
     return {str(key): value for key, value in entries.items()}
 
 
@@ -73,7 +81,9 @@ def lens_model(name: object, where: Path | str) -> DistortionModel:
         CalibrationError: the name is not known.
     """
     if (model := _LENS_MODELS.get(str(name).lower())) is None:
-        raise CalibrationError(f"{where}: distortion_model {name!r} is not read; known: {', '.join(_LENS_MODELS)}")
+        raise CalibrationError(
+            f"{where}: distortion_model {name!r} is not read; known: {', '.join(_LENS_MODELS)}"
+        )
     return model
 
 
@@ -85,7 +95,9 @@ def as_number(value: object) -> float:
         return float("nan")
 
 
-def numbers(entries: Entries, key: str, where: Path | str, count: int | None = None) -> tuple[float, ...]:
+def numbers(
+    entries: Entries, key: str, where: Path | str, count: int | None = None
+) -> tuple[float, ...]:
     """Return a list of finite numbers, or a single one as a list.
 
     Raises:
@@ -120,11 +132,14 @@ def densities_text(noise: ImuDensities, *, units: bool) -> str:
     """Return the entries of an IMU's noise, with all digits, and `units` as comments."""
     values = (noise.gyro, noise.gyro_walk, noise.accel, noise.accel_walk)
     lines = zip(NOISE_UNITS.items(), values, strict=True)
-    return "".join(f"{key}: {value!r}{f'  # [ {unit} ]' if units else ''}\n" for (key, unit), value in lines)
+    return "".join(
+        f"{key}: {value!r}{f'  # [ {unit} ]' if units else ''}\n" for (key, unit), value in lines
+    )
 
 
 def matrix(value: object, shape: tuple[int, int] | None, where: str) -> FloatArray:
-    """Return a matrix given as rows, as a flat list, or as OpenCV's block of `rows`, `cols` and `data`.
+    """Return a matrix given as rows, as a flat list, or as OpenCV's block of `rows`, `cols` and
+    `data`.
 
     Args:
         value: the entry.
@@ -136,14 +151,19 @@ def matrix(value: object, shape: tuple[int, int] | None, where: str) -> FloatArr
     """
     stated: tuple[int, int] | None = None
     if isinstance(value, dict):
-        rows, cols = as_number(value.get("rows")), as_number(value.get("cols", value.get("columns")))
+        rows = as_number(value.get("rows"))
+        cols = as_number(value.get("cols", value.get("columns")))
         stated = (int(rows), int(cols)) if rows >= 1 and cols >= 1 else None
         value = value.get("data")
     if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
         stated = stated or (len(value), len(value[0]))
         value = [x for row in value for x in row]
-    found = np.array([as_number(x) for x in value] if isinstance(value, list) else [as_number(value)])
+    found = np.array(
+        [as_number(x) for x in value] if isinstance(value, list) else [as_number(value)]
+    )
     size = shape or stated or (1, len(found))
     if len(found) != size[0] * size[1] or not np.isfinite(found).all():
-        raise CalibrationError(f"{where} holds {len(found)} values, expected {size[0]} x {size[1]} finite numbers")
+        raise CalibrationError(
+            f"{where} holds {len(found)} values, expected {size[0]} x {size[1]} finite numbers"
+        )
     return found.reshape(size)

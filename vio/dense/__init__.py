@@ -1,1 +1,3 @@
-"""Dense reconstruction: depth of rectified pairs, its fusion into a signed distance function, and the surface of it."""
+"""Dense reconstruction: depth of rectified pairs, its fusion into a signed distance function,
+and the surface of it.
+"""

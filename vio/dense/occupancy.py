@@ -29,7 +29,8 @@ class OccupancyGrid:
 
 
 def occupancy_grid(mesh: Mesh, R_upright_world: FloatArray, voxel_m: float) -> OccupancyGrid | None:
-    """Return the floor plan of a mesh, in coordinates to the right and ahead; None: it is empty or too large.
+    """Return the floor plan of a mesh, in coordinates to the right and ahead; None: it is empty or
+    too large.
 
     Ground is the lowest surface within 1.5 m; an obstacle is what stands 0.2 to 2 m above it.
 
@@ -54,7 +55,9 @@ def occupancy_grid(mesh: Mesh, R_upright_world: FloatArray, voxel_m: float) -> O
         lowest.reshape(height, width), size=2 * int(np.ceil(_GROUND_M / cell_m)) + 1, mode="nearest"
     )
     above = p[:, 2] - ground.ravel()[cell]
-    standing = np.bincount(cell[(above > _STEP_M) & (above < _CLEARANCE_M)], minlength=width * height)
+    standing = np.bincount(
+        cell[(above > _STEP_M) & (above < _CLEARANCE_M)], minlength=width * height
+    )
     flat = np.bincount(cell[above <= _STEP_M], minlength=width * height).reshape(height, width)
     occupied = standing.reshape(height, width) >= _LEAST_VERTICES
     free = binary_closing(flat >= _LEAST_VERTICES, iterations=1) & ~occupied

@@ -8,9 +8,11 @@ from vio.dense.surface import Mesh
 from vio.geometry.lie import FloatArray
 from vio.records import Image
 
-_WIDTH, _HEIGHT = 1280, 720
+_WIDTH = 1280
+_HEIGHT = 720
 _FOCAL = 1.1  # widths
-_PITCH_DEG, _ASIDE_DEG = 40.0, 60.0  # that the view looks down, and to the left of the path
+_PITCH_DEG = 40.0  # that the view looks down, and to the left of the path
+_ASIDE_DEG = 60.0
 _BACKGROUND = 245
 _AWAY = 0.1  # surfaces that face away by more than this are culled
 _SHARE_SEEN = 0.98  # of the vertices that are to be in the picture
@@ -32,16 +34,21 @@ def preview(mesh: Mesh, path_m: FloatArray, R_upright_world: FloatArray, voxel_m
     line = _along(path, voxel_m)
     light = 0.65 + 0.35 * np.abs(n @ np.array([-0.3, -0.5, 0.81]))
     points = np.concatenate([p[facing], line])
-    colours = np.concatenate([(mesh.colours * light[:, None])[facing], np.tile([220.0, 30.0, 30.0], (len(line), 1))])
+    colours = np.concatenate(
+        [(mesh.colours * light[:, None])[facing], np.tile([220.0, 30.0, 30.0], (len(line), 1))]
+    )
     size_m = voxel_m * np.repeat([1.6, 2.0], [int(facing.sum()), len(line)])
     return _splat(points @ axes.T, colours, size_m, len(line))
 
 
 def _view(course: FloatArray) -> FloatArray:
     """Return right, down and ahead (3, 3) of a view down on a path that leads along (2,)."""
-    heading, pitch = np.arctan2(course[0], course[1]) - np.radians(_ASIDE_DEG), np.radians(_PITCH_DEG)
+    heading = np.arctan2(course[0], course[1]) - np.radians(_ASIDE_DEG)
+    pitch = np.radians(_PITCH_DEG)
     right = np.array([np.cos(heading), -np.sin(heading), 0.0])
-    ahead = np.array([np.cos(pitch) * np.sin(heading), np.cos(pitch) * np.cos(heading), -np.sin(pitch)])
+    ahead = np.array(
+        [np.cos(pitch) * np.sin(heading), np.cos(pitch) * np.cos(heading), -np.sin(pitch)]
+    )
     return np.stack([right, np.cross(ahead, right), ahead])
 
 
@@ -53,23 +60,34 @@ def _along(path: FloatArray, step_m: float) -> FloatArray:
 
 
 def _splat(q: FloatArray, colours: FloatArray, size_m: FloatArray, inside: int) -> Image:
-    """Draw squares (N) at (N, 3) right, down and ahead, far ones first; the last `inside` are in the picture."""
+    """Draw squares (N) at (N, 3) right, down and ahead, far ones first; the last `inside` are in
+    the picture.
+    """
     image = np.full((_HEIGHT, _WIDTH, 3), _BACKGROUND, dtype=np.uint8)
     low, high = np.quantile(q, (0.02, 0.98), axis=0)
     q = q - (low + high) / 2
     focal = _FOCAL * _WIDTH
     # As near as leaves most of the points in the picture.
-    near = np.maximum(np.abs(q[:, 0]) * 2 * focal / _WIDTH, np.abs(q[:, 1]) * 2 * focal / _HEIGHT) - q[:, 2]
+    near = (
+        np.maximum(np.abs(q[:, 0]) * 2 * focal / _WIDTH, np.abs(q[:, 1]) * 2 * focal / _HEIGHT)
+        - q[:, 2]
+    )
     q[:, 2] += max(float(np.quantile(near, _SHARE_SEEN)), float(near[len(near) - inside :].max()))
     order = np.argsort(-q[:, 2])
-    q, colours, size_m = q[order], colours[order], size_m[order]
+    q = q[order]
+    colours = colours[order]
+    size_m = size_m[order]
     ahead_of = q[:, 2] > 1e-3
-    q, colours, size_m = q[ahead_of], colours[ahead_of], size_m[ahead_of]
+    q = q[ahead_of]
+    colours = colours[ahead_of]
+    size_m = size_m[ahead_of]
     u = np.rint(focal * q[:, 0] / q[:, 2] + _WIDTH / 2).astype(int)
     v = np.rint(focal * q[:, 1] / q[:, 2] + _HEIGHT / 2).astype(int)
     reach = np.clip(np.ceil(0.5 * focal * size_m / q[:, 2]).astype(int), 0, 12)
     shown = (u >= 0) & (v >= 0) & (u < _WIDTH) & (v < _HEIGHT)
     for row in np.flatnonzero(shown).tolist():
         r = reach[row]
-        image[max(v[row] - r, 0) : v[row] + r + 1, max(u[row] - r, 0) : u[row] + r + 1] = colours[row]
+        image[max(v[row] - r, 0) : v[row] + r + 1, max(u[row] - r, 0) : u[row] + r + 1] = colours[
+            row
+        ]
     return image

@@ -1,4 +1,6 @@
-"""Depth of every pixel of a rectified pair by semi-global matching, and its errors against a known depth."""
+"""Depth of every pixel of a rectified pair by semi-global matching, and its errors against a
+known depth.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +16,18 @@ DISPARITY_SIGMA_PX = 0.25  # of a match, as rendered images show it
 _WIDTH_SHARE = 8  # the largest disparity is the image's width over this
 _BLOCK_PX = 5
 _UNIQUENESS_PERCENT = 10  # by which the best match must beat the others
-_SPECKLE_PX, _SPECKLE_RANGE = 200, 2  # smaller regions of one disparity are dropped
-_SLANT_BOX_PX, _SLANT_STEP_PX = 9, 12  # over which the surface's direction is measured
+_SPECKLE_PX = 200  # smaller regions of one disparity are dropped
+_SPECKLE_RANGE = 2
+_SLANT_BOX_PX = 9  # over which the surface's direction is measured
+_SLANT_STEP_PX = 12
 _LEAST_SLANT = 0.05  # a road 1.6 m below the camera, 30 m ahead
 _FIXED_POINT = 16.0  # parts of a pixel in OpenCV's disparities
 
 
 class StereoMatcher:
-    """Semi-global matching (Hirschmueller, 2008) by OpenCV, with one set of parameters for all cameras."""
+    """Semi-global matching (Hirschmueller, 2008) by OpenCV, with one set of parameters for all
+    cameras.
+    """
 
     def __init__(self, camera: StereoCamera, width: int) -> None:
         """Prepare for images of a width in pixels."""
@@ -47,7 +53,9 @@ class StereoMatcher:
         """Return the depth (H, W) of the left image's pixels (H, W), of gray images."""
         # Columns left of the first disparity would stay unknown: the pair is continued there.
         pad = [np.pad(image, ((0, 0), (self._count, 0)), mode="edge") for image in (left, right)]
-        disparity = self._sgm.compute(*pad)[:, self._count :].astype(np.float32) / np.float32(_FIXED_POINT)
+        disparity = self._sgm.compute(*pad)[:, self._count :].astype(np.float32) / np.float32(
+            _FIXED_POINT
+        )
         # A match that lies left of the right image is one with the padding.
         inside = (disparity > 0.5) & (disparity <= np.arange(left.shape[1], dtype=np.float32))
         scale = np.float32(self._camera.fu * self._camera.baseline_m)
@@ -55,18 +63,22 @@ class StereoMatcher:
 
 
 def slant(depth: DepthImage, camera: StereoCamera) -> DepthImage:
-    """Return by what (H, W) a difference of depths is multiplied to be a distance from the surface at that pixel.
+    """Return by what (H, W) a difference of depths is multiplied to be a distance from the surface
+    at that pixel.
 
-    The inverse depth of a plane `n p = 1` is `n ray`: its differences in the image are the first two of n, and
-    `(1 - n p) / |n|` is the distance of a point p. Of the differences to both sides, the smaller one is that of the
-    surface, and not across its outline; it is 1 where neither is known.
+    The inverse depth of a plane `n p = 1` is `n ray`: its differences in the image are the first
+    two of n, and `(1 - n p) / |n|` is the distance of a point p. Of the differences to both sides,
+    the smaller one is that of the surface, and not across its outline; it is 1 where neither is
+    known.
     """
     import cv2
 
     known = (depth > 0).astype(np.float32)
     size = (_SLANT_BOX_PX, _SLANT_BOX_PX)
     share = cv2.blur(known, size)
-    inverse = cv2.blur(known / np.maximum(depth, np.float32(1e-3)), size) / np.maximum(share, np.float32(1e-6))
+    inverse = cv2.blur(known / np.maximum(depth, np.float32(1e-3)), size) / np.maximum(
+        share, np.float32(1e-6)
+    )
     height, width = depth.shape
     rays = [
         (np.arange(n, dtype=np.float32) - c) / f
@@ -75,19 +87,29 @@ def slant(depth: DepthImage, camera: StereoCamera) -> DepthImage:
     slopes = []
     for axis, focal in ((1, camera.fu), (0, camera.fv)):
         step = np.full_like(inverse, np.inf)
-        inner, ahead = [slice(None)] * 2, [slice(None)] * 2
-        inner[axis], ahead[axis] = slice(0, -_SLANT_STEP_PX), slice(_SLANT_STEP_PX, None)
-        here, there = tuple(inner), tuple(ahead)
+        inner = [slice(None)] * 2
+        ahead = [slice(None)] * 2
+        inner[axis] = slice(0, -_SLANT_STEP_PX)
+        ahead[axis] = slice(_SLANT_STEP_PX, None)
+        here = tuple(inner)
+        there = tuple(ahead)
         both = (known[here] > 0) & (known[there] > 0)
         difference = np.where(both, inverse[there] - inverse[here], np.inf).astype(np.float32)
         step[here] = difference
         closer = np.abs(difference) < np.abs(step[there])
         step[there][closer] = difference[closer]
-        slopes.append(np.where(np.isfinite(step), step * np.float32(focal / _SLANT_STEP_PX), 0).astype(np.float32))
-    x, y = rays[0][None, :], rays[1][:, None]
+        slopes.append(
+            np.where(np.isfinite(step), step * np.float32(focal / _SLANT_STEP_PX), 0).astype(
+                np.float32
+            )
+        )
+    x = rays[0][None, :]
+    y = rays[1][:, None]
     third = inverse - slopes[0] * x - slopes[1] * y
     length = np.sqrt(slopes[0] ** 2 + slopes[1] ** 2 + third**2)
-    return np.clip(inverse / np.maximum(length, np.float32(1e-9)), np.float32(_LEAST_SLANT), np.float32(1.5))
+    return np.clip(
+        inverse / np.maximum(length, np.float32(1e-9)), np.float32(_LEAST_SLANT), np.float32(1.5)
+    )
 
 
 def depth_sigma_m(camera: StereoCamera, depth_m: float) -> float:

@@ -1,7 +1,8 @@
 """The surface of a signed distance function as triangles: naive surface nets.
 
-Gibson, Constrained elastic surface nets, MICCAI 1998: one vertex in each cell that the surface crosses, at the mean of
-its crossings of the cell's edges, and one quadrilateral for each crossed edge of the lattice.
+Gibson, Constrained elastic surface nets, MICCAI 1998: one vertex in each cell that the surface
+crosses, at the mean of its crossings of the cell's edges, and one quadrilateral for each crossed
+edge of the lattice.
 """
 
 from __future__ import annotations
@@ -33,8 +34,13 @@ class Mesh:
 
 
 def extract_surface(grid: VoxelGrid, *, least_seen: int = _LEAST_SEEN) -> Mesh:
-    """Return the surface between samples that at least so many images show, without small loose pieces."""
-    keys, points, colours, quads = [], [], [], []
+    """Return the surface between samples that at least so many images show, without small loose
+    pieces.
+    """
+    keys = []
+    points = []
+    colours = []
+    quads = []
     for first, block in grid.padded():
         if not (block["seen"] >= least_seen).any():
             continue
@@ -43,7 +49,15 @@ def extract_surface(grid: VoxelGrid, *, least_seen: int = _LEAST_SEEN) -> Mesh:
         colour = np.empty((SIDE**3, 3), dtype=np.uint8)
         quad = np.empty((3 * SIDE**3, 4, 3), dtype=np.int64)
         vertices, faces = _surface_nets(
-            block["distance"], block["seen"], block["colour"], least_seen, first, cell, point, colour, quad
+            block["distance"],
+            block["seen"],
+            block["colour"],
+            least_seen,
+            first,
+            cell,
+            point,
+            colour,
+            quad,
         )
         keys.append(pack(cell[:vertices]))
         points.append(grid.voxel_m * point[:vertices])
@@ -59,19 +73,25 @@ def extract_surface(grid: VoxelGrid, *, least_seen: int = _LEAST_SEEN) -> Mesh:
     return _tidied(np.concatenate(points).astype(np.float32), np.concatenate(colours), triangles)
 
 
-def _tidied(points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8], triangles: IntArray) -> Mesh:
+def _tidied(
+    points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8], triangles: IntArray
+) -> Mesh:
     """Return the mesh without loose pieces and vertices of no triangle, with normals."""
     count = len(points)
     edges = triangles[:, :2]
     edges = np.concatenate([edges, triangles[:, 1:]])
-    graph = coo_matrix((np.ones(len(edges), dtype=np.bool_), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    graph = coo_matrix(
+        (np.ones(len(edges), dtype=np.bool_), (edges[:, 0], edges[:, 1])), shape=(count, count)
+    )
     _, piece = connected_components(graph, directed=False)
     sizes = np.bincount(piece[triangles[:, 0]], minlength=int(piece.max()) + 1)
     triangles = triangles[sizes[piece[triangles[:, 0]]] >= _LEAST_TRIANGLES]
     used = np.unique(triangles)
     place = np.zeros(count, dtype=np.int64)
     place[used] = np.arange(len(used))
-    points, colours, triangles = points[used], colours[used], place[triangles]
+    points = points[used]
+    colours = colours[used]
+    triangles = place[triangles]
     normals = _normals(points.astype(np.float64), triangles)
     return Mesh(points, normals.astype(np.float32), colours, triangles.astype(np.uint32))
 
@@ -81,7 +101,11 @@ def _normals(points: FloatArray, triangles: IntArray) -> FloatArray:
     a, b, c = (points[triangles[:, k]] for k in range(3))
     area = np.cross(b - a, c - a)
     total = np.stack(
-        [np.bincount(triangles.ravel(), np.repeat(area[:, k], 3), minlength=len(points)) for k in range(3)], axis=1
+        [
+            np.bincount(triangles.ravel(), np.repeat(area[:, k], 3), minlength=len(points))
+            for k in range(3)
+        ],
+        axis=1,
     )
     out: FloatArray = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
     return out
@@ -99,12 +123,15 @@ def _surface_nets(
     shade: npt.NDArray[np.uint8],
     quad: IntArray,
 ) -> tuple[int, int]:
-    """Write vertices and quadrilaterals of one block with a margin of one sample; return how many of both.
+    """Write vertices and quadrilaterals of one block with a margin of one sample; return how many
+    of both.
 
-    A sample (i, j, k) of the block is at [i + 1, j + 1, k + 1]; a cell has the coordinates of its first sample.
+    A sample (i, j, k) of the block is at [i + 1, j + 1, k + 1]; a cell has the coordinates of its
+    first sample.
     """
     side = len(distance)
-    vertices, faces = 0, 0
+    vertices = 0
+    faces = 0
     whole = np.zeros((side, side, side), dtype=np.uint8)  # cells of samples that were all seen
     for i in range(side - 1):
         for j in range(side - 1):
@@ -119,16 +146,27 @@ def _surface_nets(
         for j in range(1, side - 1):
             for k in range(1, side - 1):
                 if whole[i, j, k]:
-                    crossings, x, y, z, r, g, b = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                    crossings = 0
+                    x = 0.0
+                    y = 0.0
+                    z = 0.0
+                    r = 0.0
+                    g = 0.0
+                    b = 0.0
                     for low in range(8):
                         for axis in range(3):
                             bit = 4 >> axis
                             if low & bit:
                                 continue
                             high = low | bit
-                            ai, aj, ak = i + (low >> 2), j + ((low >> 1) & 1), k + (low & 1)
-                            bi, bj, bk = i + (high >> 2), j + ((high >> 1) & 1), k + (high & 1)
-                            da, db = distance[ai, aj, ak], distance[bi, bj, bk]
+                            ai = i + (low >> 2)
+                            aj = j + ((low >> 1) & 1)
+                            ak = k + (low & 1)
+                            bi = i + (high >> 2)
+                            bj = j + ((high >> 1) & 1)
+                            bk = k + (high & 1)
+                            da = distance[ai, aj, ak]
+                            db = distance[bi, bj, bk]
                             if (da < 0.0) == (db < 0.0):
                                 continue
                             t = da / (da - db)
@@ -140,9 +178,9 @@ def _surface_nets(
                             b += colour[ai, aj, ak, 2] * (1 - t) + colour[bi, bj, bk, 2] * t
                             crossings += 1
                     if crossings:
-                        cell[vertices, 0], cell[vertices, 1], cell[vertices, 2] = (
-                            first[0] + i - 1, first[1] + j - 1, first[2] + k - 1,
-                        )  # fmt: skip
+                        cell[vertices, 0] = first[0] + i - 1  # fmt: skip
+                        cell[vertices, 1] = first[1] + j - 1
+                        cell[vertices, 2] = first[2] + k - 1
                         point[vertices, 0] = first[0] - 1 + x / crossings
                         point[vertices, 1] = first[1] - 1 + y / crossings
                         point[vertices, 2] = first[2] - 1 + z / crossings
@@ -151,18 +189,24 @@ def _surface_nets(
                         shade[vertices, 2] = np.uint8(b / crossings + 0.5)
                         vertices += 1
                 for axis in range(3):
-                    ni, nj, nk = i + (axis == 0), j + (axis == 1), k + (axis == 2)
+                    ni = i + (axis == 0)
+                    nj = j + (axis == 1)
+                    nk = k + (axis == 2)
                     inside = distance[i, j, k] < 0.0
                     if inside == (distance[ni, nj, nk] < 0.0):
                         continue
                     # The two directions across the edge, so that (axis, one, two) is right-handed.
-                    one, two = (axis + 1) % 3, (axis + 2) % 3
+                    one = (axis + 1) % 3
+                    two = (axis + 2) % 3
                     all_seen = True
                     for corner in range(4):
                         # Around the edge: (0, 0), (-1, 0), (-1, -1), (0, -1), seen along the axis.
                         back = corner if inside else 3 - corner
-                        a, b2 = -(back == 1 or back == 2), -(back >= 2)
-                        ci, cj, ck = i, j, k
+                        a = -(back == 1 or back == 2)
+                        b2 = -(back >= 2)
+                        ci = i
+                        cj = j
+                        ck = k
                         ci += a * (one == 0) + b2 * (two == 0)
                         cj += a * (one == 1) + b2 * (two == 1)
                         ck += a * (one == 2) + b2 * (two == 2)

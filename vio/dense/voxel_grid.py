@@ -1,7 +1,9 @@
-"""A truncated signed distance function in sparse blocks of voxels, of which a bounded number is in memory.
+"""A truncated signed distance function in sparse blocks of voxels, of which a bounded number is in
+memory.
 
-Curless & Levoy, A volumetric method for building complex models from range images, SIGGRAPH 1996; blocks as in Niessner
-et al., Real-time 3D reconstruction at scale using voxel hashing, 2013. Samples lie on the lattice of the voxel size.
+Curless & Levoy, A volumetric method for building complex models from range images, SIGGRAPH 1996;
+blocks as in Niessner et al., Real-time 3D reconstruction at scale using voxel hashing, 2013.
+Samples lie on the lattice of the voxel size.
 """
 
 from __future__ import annotations
@@ -58,7 +60,8 @@ class VoxelGrid:
             voxel_m: distance of the samples.
             most_blocks: that are in memory at once, but for those that one image shows.
         """
-        self.voxel_m, self.truncation_m = voxel_m, TRUNCATION * voxel_m
+        self.voxel_m = voxel_m
+        self.truncation_m = TRUNCATION * voxel_m
         self._most = most_blocks
         self._pool = np.zeros(min(1024, most_blocks), dtype=BLOCK)
         self._slot: dict[int, int] = {}  # in memory
@@ -73,12 +76,20 @@ class VoxelGrid:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._file.close()
 
     def fuse(
-        self, depth: DepthImage, image: Image, camera: StereoCamera, T_world_cam: FloatArray, far_m: float
+        self,
+        depth: DepthImage,
+        image: Image,
+        camera: StereoCamera,
+        T_world_cam: FloatArray,
+        far_m: float,
     ) -> None:
         """Take up the depths of one image.
 
@@ -104,7 +115,14 @@ class VoxelGrid:
             SIDE * unpack(keys),
             se3_inverse(T_world_cam),
             np.array([camera.fu, camera.fv, camera.cu, camera.cv]),
-            np.array([self.voxel_m, self.truncation_m, far_m, DISPARITY_SIGMA_PX / (camera.fu * camera.baseline_m)]),
+            np.array(
+                [
+                    self.voxel_m,
+                    self.truncation_m,
+                    far_m,
+                    DISPARITY_SIGMA_PX / (camera.fu * camera.baseline_m),
+                ]
+            ),
             np.ascontiguousarray(depth),
             slant(depth, camera),
             np.ascontiguousarray(colour),
@@ -122,24 +140,38 @@ class VoxelGrid:
         return self._read(key) if key in self._kept else None
 
     def padded(self) -> Iterator[tuple[IntArray, npt.NDArray[np.void]]]:
-        """Yield for each block the coordinates (3,) of its first sample, and a record with one sample more around it.
+        """Yield for each block the coordinates (3,) of its first sample, and a record with one
+        sample more around it.
 
-        Its fields are those of `BLOCK` with 10 samples along each edge, unseen where there is no block.
+        Its fields are those of `BLOCK` with 10 samples along each edge, unseen where there is no
+        block.
         """
-        wide = np.dtype([(name, BLOCK[name].base, (10, 10, 10, *BLOCK[name].shape[3:])) for name in BLOCK.names or ()])
-        parts = {-1: (slice(0, 1), slice(7, 8)), 0: (slice(1, 9), slice(0, 8)), 1: (slice(9, 10), slice(0, 1))}
+        wide = np.dtype(
+            [
+                (name, BLOCK[name].base, (10, 10, 10, *BLOCK[name].shape[3:]))
+                for name in BLOCK.names or ()
+            ]
+        )
+        parts = {
+            -1: (slice(0, 1), slice(7, 8)),
+            0: (slice(1, 9), slice(0, 8)),
+            1: (slice(9, 10), slice(0, 1)),
+        }
         offsets = [(i, j, k) for i in parts for j in parts for k in parts]
         steps = pack(np.array(offsets)) - pack(np.zeros((1, 3), dtype=np.int64))
         for key, first in zip(self.keys().tolist(), SIDE * unpack(self.keys()), strict=True):
             out = np.zeros((), dtype=wide)
             for (i, j, k), step in zip(offsets, steps.tolist(), strict=True):
                 if (found := self.block(key + step)) is not None:
-                    to, of = (parts[i][0], parts[j][0], parts[k][0]), (parts[i][1], parts[j][1], parts[k][1])
+                    to = (parts[i][0], parts[j][0], parts[k][0])
+                    of = (parts[i][1], parts[j][1], parts[k][1])
                     for name in BLOCK.names or ():
                         out[name][to] = found[name][of]
             yield first, out
 
-    def _blocks_at(self, depth: DepthImage, camera: StereoCamera, T_world_cam: FloatArray, far_m: float) -> IntArray:
+    def _blocks_at(
+        self, depth: DepthImage, camera: StereoCamera, T_world_cam: FloatArray, far_m: float
+    ) -> IntArray:
         """Return the keys (B,) of the blocks within the truncation of the depths."""
         edge_m = SIDE * self.voxel_m
         step = max(1, int(0.25 * edge_m * camera.fu / far_m))
@@ -147,17 +179,26 @@ class VoxelGrid:
         v, u = np.nonzero((z > 0) & (z < far_m))
         z = z[v, u]
         rays = np.stack(
-            [(u * step - camera.cu) / camera.fu, (v * step - camera.cv) / camera.fv, np.ones(len(u))], axis=1
+            [
+                (u * step - camera.cu) / camera.fu,
+                (v * step - camera.cv) / camera.fv,
+                np.ones(len(u)),
+            ],
+            axis=1,
         )
         found = []
-        for offset in np.linspace(-1, 1, 2 * max(1, int(np.ceil(2 * self.truncation_m / edge_m))) + 1):
+        for offset in np.linspace(
+            -1, 1, 2 * max(1, int(np.ceil(2 * self.truncation_m / edge_m))) + 1
+        ):
             along = z + offset * self.truncation_m / np.linalg.norm(rays, axis=1)
             points = transform_points(T_world_cam, rays * along[:, None])
             found.append(pack(np.floor(points / edge_m).astype(np.int64)))
         return np.unique(np.concatenate(found))
 
     def _slots(self, keys: IntArray, centre: FloatArray) -> IntArray:
-        """Return the slots (B,) in memory of blocks, which are made or read where they are not there."""
+        """Return the slots (B,) in memory of blocks, which are made or read where they are not
+        there.
+        """
         wanted = keys.tolist()
         missing = [key for key in wanted if key not in self._slot]
         if len(missing) > len(self._free):
@@ -169,7 +210,9 @@ class VoxelGrid:
         return np.array([self._slot[key] for key in wanted], dtype=np.int64)
 
     def _make_room(self, count: int, wanted: set[int], centre: FloatArray) -> None:
-        """Have `count` free slots: by more memory up to the bound, then by writing the farthest blocks to the file."""
+        """Have `count` free slots: by more memory up to the bound, then by writing the farthest
+        blocks to the file.
+        """
         size = len(self._pool)
         needed = count - len(self._free)
         grown = min(max(2 * size, size + needed), max(self._most, len(wanted)))
@@ -208,7 +251,9 @@ def _integrate(
     cosine: DepthImage,
     image: Image,
 ) -> None:
-    """Average the distances of samples from the depth image's surface, along its normals, by weights 1 / variance."""
+    """Average the distances of samples from the depth image's surface, along its normals, by
+    weights 1 / variance.
+    """
     fu, fv, cu, cv = pinhole
     voxel, truncation, far, sigma_per_z2 = lengths
     height, width = depth.shape
@@ -217,7 +262,9 @@ def _integrate(
         for i in range(SIDE):
             for j in range(SIDE):
                 for k in range(SIDE):
-                    px, py, pz = voxel * (first[m, 0] + i), voxel * (first[m, 1] + j), voxel * (first[m, 2] + k)
+                    px = voxel * (first[m, 0] + i)
+                    py = voxel * (first[m, 1] + j)
+                    pz = voxel * (first[m, 2] + k)
                     z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
                     if z <= 0.0:
                         continue
@@ -225,7 +272,8 @@ def _integrate(
                     v = fv * (T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) / z + cv
                     if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
                         continue
-                    column, row = int(u + 0.5), int(v + 0.5)
+                    column = int(u + 0.5)
+                    row = int(v + 0.5)
                     d = depth[row, column]
                     if d <= 0.0 or d >= far:
                         continue
@@ -235,13 +283,21 @@ def _integrate(
                     sigma = max(voxel, sigma_per_z2 * d * d)
                     w = (voxel / sigma) ** 2
                     old = weight[s, i, j, k]
-                    distance[s, i, j, k] += (min(off / truncation, 1.0) - distance[s, i, j, k]) * w / (old + w)
+                    distance[s, i, j, k] += (
+                        (min(off / truncation, 1.0) - distance[s, i, j, k]) * w / (old + w)
+                    )
                     weight[s, i, j, k] = min(old + w, _MOST_WEIGHT)
                     if off < truncation:
                         n = seen[s, i, j, k]
                         share = max(w / (old + w), 0.125)
                         for c in range(3):
-                            before = float(colour[s, i, j, k, c]) if n > 0 else float(image[row, column, c])
-                            colour[s, i, j, k, c] = np.uint8(before + (image[row, column, c] - before) * share + 0.5)
+                            before = (
+                                float(colour[s, i, j, k, c])
+                                if n > 0
+                                else float(image[row, column, c])
+                            )
+                            colour[s, i, j, k, c] = np.uint8(
+                                before + (image[row, column, c] - before) * share + 0.5
+                            )
                         if n < 255:
                             seen[s, i, j, k] = n + 1

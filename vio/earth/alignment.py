@@ -1,10 +1,11 @@
-"""A trajectory on the earth: GNSS positions as factors on the graph of its poses, with a robust loss.
+"""A trajectory on the earth: GNSS positions as factors on the graph of its poses, with a robust
+loss.
 
-The unknowns are the poses in east, north, up at an origin, and the logarithm of the scale. Motions between neighbours
-(and across loops) are those of the finished trajectory, which itself never changes. A position by GNSS measures the
-antenna between two poses; its horizontal and its vertical part are decided on apart, by truncated least squares with
-graduated non-convexity (Yang et al., 2020), so that jumps and wrong heights end with weight zero. Equations (E1) to
-(E4) of docs/math.md.
+The unknowns are the poses in east, north, up at an origin, and the logarithm of the scale. Motions
+between neighbours (and across loops) are those of the finished trajectory, which itself never
+changes. A position by GNSS measures the antenna between two poses; its horizontal and its vertical
+part are decided on apart, by truncated least squares with graduated non-convexity (Yang et al.,
+2020), so that jumps and wrong heights end with weight zero. Equations (E1) to (E4) of docs/math.md.
 """
 
 from __future__ import annotations
@@ -32,14 +33,20 @@ from vio.numerics.sparse import factors
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 
-# What odometry drifts by between neighbours beyond its scale: 0.2 m and 0.3 deg over 100 m, as random walks.
-_DRIFT_M, _DRIFT_RAD = 0.02, float(np.radians(0.03))  # per square root of a metre
-_LEAST_M, _LEAST_RAD = 1e-3, 1e-5  # of a motion at standstill
+# What odometry drifts by between neighbours beyond its scale: 0.2 m and 0.3 deg over 100 m, as
+# random walks.
+_DRIFT_M = 0.02  # per square root of a metre
+_DRIFT_RAD = float(np.radians(0.03))
+_LEAST_M = 1e-3  # of a motion at standstill
+_LEAST_RAD = 1e-5
 _SCALE_SIGMA = 0.01  # prior
 _CORRELATED_S = 5.0  # errors of GNSS last: positions within it count as one
-_TIMING_M = 0.1  # of the antenna beside the stated error: 10 ms of the clocks at 10 m/s, the lever arm
+# of the antenna beside the stated error: 10 ms of the clocks at 10 m/s, the lever arm
+_TIMING_M = 0.1
 _TRUNCATION = 0.999  # probability at which a residual is cut off
-_MU_GROWTH, _MOST_STEPS, _SETTLED = 1.6, 40, 1e-5
+_MU_GROWTH = 1.6
+_MOST_STEPS = 40
+_SETTLED = 1e-5
 _START_STEPS = 20  # of the robust alignment that it starts from
 _LEAST_FIXES = 3
 _HEIGHT_SIGMA_M = 1e3  # of the first pose, where no position states a height
@@ -56,7 +63,8 @@ class Path:
     second: IntArray  # (E,)
     up_map: FloatArray  # (3,) unit vector upwards in its frame
     up_sigma_rad: float
-    breaks: IntArray  # rows at which a new session begins; no GNSS position is between it and the row before
+    # rows at which a new session begins; no GNSS position is between it and the row before
+    breaks: IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,11 +92,14 @@ def heading_deg(T_enu_map: FloatArray, covariance: FloatArray) -> tuple[float, f
         covariance: (6, 6) of xi in T_enu_map exp(xi).
     """
     R = T_enu_map[:3, :3]
-    heading, sigma = np.arctan2(R[1, 0], R[0, 0]), np.sqrt((R @ covariance[3:, 3:] @ R.T)[2, 2])
+    heading = np.arctan2(R[1, 0], R[0, 0])
+    sigma = np.sqrt((R @ covariance[3:, 3:] @ R.T)[2, 2])
     return float(np.degrees(heading)), float(np.degrees(sigma))
 
 
-def georeference(path: Path, fixes: GnssFixes, lever_arm_m: FloatArray, time_offset_ns: int = 0) -> Georeference:
+def georeference(
+    path: Path, fixes: GnssFixes, lever_arm_m: FloatArray, time_offset_ns: int = 0
+) -> Georeference:
     """Return where a trajectory is on the earth.
 
     Args:
@@ -98,27 +109,39 @@ def georeference(path: Path, fixes: GnssFixes, lever_arm_m: FloatArray, time_off
         time_offset_ns: added to the stamps of the positions.
 
     Raises:
-        EstimationError: fewer than three positions are within the trajectory's time, or they determine nothing.
+        EstimationError: fewer than three positions are within the trajectory's time, or they
+            determine nothing.
     """
     before, share, inside = _between(path, fixes.times_ns + time_offset_ns)
     if int(inside.sum()) < _LEAST_FIXES:
         own_ns = fixes.times_ns + time_offset_ns
         spans = [f"{t[0] * 1e-9:.3f} to {t[-1] * 1e-9:.3f} s" for t in (own_ns, path.times_ns)]
         raise EstimationError(
-            f"only {int(inside.sum())} GNSS positions ({spans[0]}) are within the trajectory ({spans[1]}); give "
+            f"only {int(inside.sum())} GNSS positions ({spans[0]}) are within the trajectory "
+            f"({spans[1]}); give "
             "those of this drive, or the offset of the clocks with --time-offset"
         )
     frame = LocalFrame(fixes.geodetic[int(np.argmax(inside))].copy())
     measured = frame.enu(fixes.geodetic)[inside]
-    of_fixes = before[inside], share[inside], measured, fixes.covariance[inside], fixes.has_height[inside]
+    of_fixes = (
+        before[inside],
+        share[inside],
+        measured,
+        fixes.covariance[inside],
+        fixes.has_height[inside],
+    )
     problem = _Problem(path, *of_fixes, lever_arm_m)
     T, log_scale, weight = problem.solve()
     normal = problem.factorised(T, log_scale, weight)
     used, used_height = (np.zeros(len(fixes), dtype=np.bool_) for _ in range(2))
     residuals = np.full((len(fixes), 3), np.nan)
-    used[inside], used_height[inside] = weight[:, 0] > 0.5, weight[:, 1] > 0.5
+    used[inside] = weight[:, 0] > 0.5
+    used_height[inside] = weight[:, 1] > 0.5
     if int(used.sum()) < _LEAST_FIXES:
-        raise EstimationError(f"only {int(used.sum())} of {int(inside.sum())} GNSS positions agree with the trajectory")
+        raise EstimationError(
+            f"only {int(used.sum())} of {int(inside.sum())} GNSS positions agree with the "
+            "trajectory"
+        )
     residuals[inside] = measured - problem.antenna(T)
     T_enu_map, gain = _rigid_fit(path.T_map_body, T)
     spread = normal.solve(np.concatenate([gain.T, np.zeros((1, 6))]))
@@ -140,9 +163,12 @@ def georeference(path: Path, fixes: GnssFixes, lever_arm_m: FloatArray, time_off
 
 
 def _between(path: Path, times_ns: IntArray) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Return the pose before each time (N,), its share of the way to the next one, and whether it is between two."""
+    """Return the pose before each time (N,), its share of the way to the next one, and whether
+    it is between two.
+    """
     starts = np.concatenate([[0], path.breaks, [len(path.times_ns)]]).astype(np.int64)
-    before, share = np.zeros(len(times_ns), dtype=np.int64), np.zeros(len(times_ns))
+    before = np.zeros(len(times_ns), dtype=np.int64)
+    share = np.zeros(len(times_ns))
     inside = np.zeros(len(times_ns), dtype=np.bool_)
     for start, stop in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
         own = path.times_ns[start:stop]
@@ -169,15 +195,20 @@ class _Problem:
         has_height: BoolArray,
         lever_arm_m: FloatArray,
     ) -> None:
-        self._path, self._before, self._share = path, before, share
-        self._measured, self._has_height, self._lever = measured, has_height, lever_arm_m
+        self._path = path
+        self._before = before
+        self._share = share
+        self._measured = measured
+        self._has_height = has_height
+        self._lever = lever_arm_m
         k = np.arange(len(path.times_ns) - 1)
         self._i = np.concatenate([k, path.first])
         self._j = np.concatenate([k + 1, path.second])
         self._T_i_j = se3_inverse(path.T_map_body[self._i]) @ path.T_map_body[self._j]
         length = np.linalg.norm(self._T_i_j[:, :3, 3], axis=1)
         root = np.sqrt(length + np.linalg.norm(se3_log(self._T_i_j)[:, 3:], axis=1))
-        sigma_m, sigma_rad = np.maximum(_DRIFT_M * root, _LEAST_M), np.maximum(_DRIFT_RAD * root, _LEAST_RAD)
+        sigma_m = np.maximum(_DRIFT_M * root, _LEAST_M)
+        sigma_rad = np.maximum(_DRIFT_RAD * root, _LEAST_RAD)
         self._edge_weight = 1 / np.repeat(np.stack([sigma_m, sigma_rad], axis=1), 3, axis=1) ** 2
         self._up_body = path.up_map @ path.T_map_body[:, :3, :3]
         covariance = covariance + _TIMING_M**2 * np.eye(3)
@@ -189,15 +220,24 @@ class _Problem:
 
     def antenna(self, T: FloatArray) -> FloatArray:
         """Return where the antenna is (N, 3) at the times of the positions."""
-        k, a = self._before, T[:, :3, :3] @ self._lever + T[:, :3, 3]
+        k = self._before
+        a = T[:, :3, :3] @ self._lever + T[:, :3, 3]
         out: FloatArray = a[k] + self._share[:, None] * (a[k + 1] - a[k])
         return out
 
     def solve(self) -> tuple[FloatArray, float, FloatArray]:
-        """Return the poses (K, 4, 4), the logarithm of the scale, and the weights (N, 2) horizontal and vertical."""
-        T = _start(self.antenna(self._path.T_map_body), self._measured, self._path.up_map) @ self._path.T_map_body
-        known = np.stack([np.ones(len(self._measured)), self._has_height], axis=1).astype(np.float64)
-        log_scale, weight = 0.0, known
+        """Return the poses (K, 4, 4), the logarithm of the scale, and the weights (N, 2)
+        horizontal and vertical.
+        """
+        T = (
+            _start(self.antenna(self._path.T_map_body), self._measured, self._path.up_map)
+            @ self._path.T_map_body
+        )
+        known = np.stack([np.ones(len(self._measured)), self._has_height], axis=1).astype(
+            np.float64
+        )
+        log_scale = 0.0
+        weight = known
         limits = np.array([chi_square_quantile(_TRUNCATION, n) for n in (2, 1)], dtype=np.float64)
         mu = None
         for _ in range(_MOST_STEPS):
@@ -209,7 +249,9 @@ class _Problem:
             moved = 0.0
             for _ in range(2):
                 T, log_scale, moved = self._step(T, log_scale, weight)
-            if (mu > 1e3).all() or (((weight == 0) | (weight == 1)).all() and moved < _SETTLED and (mu > 1).all()):
+            if (mu > 1e3).all() or (
+                ((weight == 0) | (weight == 1)).all() and moved < _SETTLED and (mu > 1).all()
+            ):
                 break
             mu = mu * _MU_GROWTH
         weight = (self._squared(T) < limits) * known
@@ -227,21 +269,34 @@ class _Problem:
         """Return the squared normalised residuals (N, 2), horizontal and vertical."""
         r = self._measured - self.antenna(T)
         return np.stack(
-            [np.einsum("ni,nij,nj->n", r[:, :2], self._horizontal, r[:, :2]), self._vertical * r[:, 2] ** 2], 1
+            [
+                np.einsum("ni,nij,nj->n", r[:, :2], self._horizontal, r[:, :2]),
+                self._vertical * r[:, 2] ** 2,
+            ],
+            1,
         )
 
-    def _step(self, T: FloatArray, log_scale: float, weight: FloatArray) -> tuple[FloatArray, float, float]:
+    def _step(
+        self, T: FloatArray, log_scale: float, weight: FloatArray
+    ) -> tuple[FloatArray, float, float]:
         H, g = self._normal(T, log_scale, weight)
         x = _Factors(H).solve(g[:, None])[:, 0]
         return T @ se3_exp(x[:-1].reshape(-1, 6)), log_scale + float(x[-1]), float(np.abs(x).max())
 
-    def _normal(self, T: FloatArray, log_scale: float, weight: FloatArray) -> tuple[csc_matrix, FloatArray]:
+    def _normal(
+        self, T: FloatArray, log_scale: float, weight: FloatArray
+    ) -> tuple[csc_matrix, FloatArray]:
         """Return the normal matrix and the right-hand side of the step, for T <- T exp(xi)."""
         count = len(T)
-        g, rows, columns, values = np.zeros(6 * count + 1), [], [], []
+        g = np.zeros(6 * count + 1)
+        rows = []
+        columns = []
+        values = []
 
         def add(at: list[IntArray], J: list[FloatArray], r: FloatArray, W: FloatArray) -> None:
-            """Add factors: Jacobians (F, m, n) at first columns (F,), residuals (F, m), information (F, m, m)."""
+            """Add factors: Jacobians (F, m, n) at first columns (F,), residuals (F, m),
+            information (F, m, m).
+            """
             for a, Ja in zip(at, J, strict=True):
                 JW = np.swapaxes(Ja, 1, 2) @ W
                 ia = a[:, None] + np.arange(Ja.shape[2])
@@ -258,13 +313,20 @@ class _Problem:
         r = se3_log(se3_inverse(scaled) @ se3_inverse(T[self._i]) @ T[self._j])
         r_D_j = np.asarray(np.linalg.inv(se3_left_jacobian(-r)), dtype=np.float64)
         r_D_i: FloatArray = -r_D_j @ se3_adjoint(se3_inverse(T[self._j]) @ T[self._i])
-        # A longer motion is T_i_j exp([R^T t ds; 0]) before what follows it: minus the left Jacobian's inverse.
+        # A longer motion is T_i_j exp([R^T t ds; 0]) before what follows it: minus the left
+        # Jacobian's inverse.
         r_D_scale = np.zeros((len(r), 6, 1))
         r_D_scale[:, :3, 0] = -np.einsum("eji,ej->ei", scaled[:, :3, :3], scaled[:, :3, 3])
         r_D_scale = np.linalg.inv(se3_left_jacobian(r)) @ r_D_scale
         last = np.full(len(r), 6 * count)
-        add([6 * self._i, 6 * self._j, last], [r_D_i, r_D_j, r_D_scale], r, self._edge_weight[:, :, None] * np.eye(6))
-        k, share = self._before, self._share[:, None, None]
+        add(
+            [6 * self._i, 6 * self._j, last],
+            [r_D_i, r_D_j, r_D_scale],
+            r,
+            self._edge_weight[:, :, None] * np.eye(6),
+        )
+        k = self._before
+        share = self._share[:, None, None]
         p = self._measured - self.antenna(T)
         W = np.zeros((len(p), 3, 3))
         W[:, :2, :2] = self._horizontal * weight[:, 0, None, None]
@@ -281,12 +343,23 @@ class _Problem:
         if not weight[:, 1].any():
             rise = np.zeros((1, 1, 6))
             rise[0, 0, :3] = T[0, 2, :3]
-            add([np.zeros(1, dtype=np.int64)], [rise], T[:1, 2, 3:4], np.full((1, 1, 1), _HEIGHT_SIGMA_M**-2))
+            add(
+                [np.zeros(1, dtype=np.int64)],
+                [rise],
+                T[:1, 2, 3:4],
+                np.full((1, 1, 1), _HEIGHT_SIGMA_M**-2),
+            )
         add(
-            [np.array([6 * count])], [np.ones((1, 1, 1))], np.array([[log_scale]]), np.full((1, 1, 1), _SCALE_SIGMA**-2)
+            [np.array([6 * count])],
+            [np.ones((1, 1, 1))],
+            np.array([[log_scale]]),
+            np.full((1, 1, 1), _SCALE_SIGMA**-2),
         )
         size = 6 * count + 1
-        H = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(size, size))
+        H = coo_matrix(
+            (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
+            shape=(size, size),
+        )
         return H.tocsc(), g
 
 
@@ -313,16 +386,21 @@ class _Factors:
 
 
 def _start(p: FloatArray, measured: FloatArray, up: FloatArray) -> FloatArray:
-    """Return the transform (4, 4) of points (N, 3) to others that fits most, with `up` (3,) as z, reweighted."""
+    """Return the transform (4, 4) of points (N, 3) to others that fits most, with `up` (3,) as
+    z, reweighted.
+    """
     side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     side /= np.linalg.norm(side)
     level = np.stack([side, np.cross(up, side), up])
     p = p @ level.T
-    T, weight = np.eye(4), np.ones(len(p))
+    T = np.eye(4)
+    weight = np.ones(len(p))
     for _ in range(_START_STEPS):
         share = weight / weight.sum()
-        mean_p, mean_m = share @ p, share @ measured
-        q, m = (p - mean_p)[:, :2], share[:, None] * (measured - mean_m)[:, :2]
+        mean_p = share @ p
+        mean_m = share @ measured
+        q = (p - mean_p)[:, :2]
+        m = share[:, None] * (measured - mean_m)[:, :2]
         yaw = np.arctan2(np.sum(q[:, 0] * m[:, 1] - q[:, 1] * m[:, 0]), np.sum(q * m))
         R = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
         T = se3_from_parts(R @ level, mean_m - R @ mean_p)
@@ -332,7 +410,9 @@ def _start(p: FloatArray, measured: FloatArray, up: FloatArray) -> FloatArray:
 
 
 def _rigid_fit(T_map: FloatArray, T_enu: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the transform (4, 4) that takes poses (K, 4, 4) nearest to others, and its Jacobian (6, 6K) by those."""
+    """Return the transform (4, 4) that takes poses (K, 4, 4) nearest to others, and its Jacobian
+    (6, 6K) by those.
+    """
     W = np.repeat([1.0, _METRE_PER_RAD], 3) ** 2
     T = T_enu[len(T_enu) // 2] @ se3_inverse(T_map[len(T_map) // 2])
     A = se3_adjoint(se3_inverse(T_map))
@@ -346,7 +426,9 @@ def _rigid_fit(T_map: FloatArray, T_enu: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _position_covariances(normal: _Factors, T: FloatArray) -> FloatArray:
-    """Return the covariances (K, 3, 3) of the poses' positions, exact at some of them and interpolated between."""
+    """Return the covariances (K, 3, 3) of the poses' positions, exact at some of them and
+    interpolated between.
+    """
     count = len(T)
     rows = np.unique(np.linspace(0, count - 1, min(count, 200)).astype(np.int64))
     out = np.empty((len(rows), 3, 3))
@@ -356,4 +438,6 @@ def _position_covariances(normal: _Factors, T: FloatArray) -> FloatArray:
         R = T[k, :3, :3]
         out[n] = R @ normal.solve(unit)[6 * k : 6 * k + 3] @ R.T
     at = np.arange(count)
-    return np.stack([np.interp(at, rows, out[:, i, j]) for i in range(3) for j in range(3)], axis=1).reshape(-1, 3, 3)
+    return np.stack(
+        [np.interp(at, rows, out[:, i, j]) for i in range(3) for j in range(3)], axis=1
+    ).reshape(-1, 3, 3)

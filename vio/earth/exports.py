@@ -23,14 +23,20 @@ def _feature(kind: str, geodetic: FloatArray, **properties: str) -> dict[str, An
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def write_geojson(path: Path, name: str, track: FloatArray, fixes: FloatArray, used: BoolArray) -> None:
-    """Write a track (K, 3), and the GNSS positions (N, 3) with whether they were used (N,), as GeoJSON (RFC 7946)."""
+def write_geojson(
+    path: Path, name: str, track: FloatArray, fixes: FloatArray, used: BoolArray
+) -> None:
+    """Write a track (K, 3), and the GNSS positions (N, 3) with whether they were used (N,), as
+    GeoJSON (RFC 7946).
+    """
 
     features = [_feature("LineString", track, name=name, what="trajectory")]
     for what, rows in (("GNSS positions used", used), ("GNSS positions refused", ~used)):
         if rows.any():
             features.append(_feature("MultiPoint", fixes[rows], name=name, what=what))
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}) + "\n", encoding="utf-8")
+    path.write_text(
+        json.dumps({"type": "FeatureCollection", "features": features}) + "\n", encoding="utf-8"
+    )
 
 
 def write_points_geojson(path: Path, name: str, points: FloatArray) -> None:
@@ -42,7 +48,8 @@ def write_kml(path: Path, name: str, track: FloatArray) -> None:
     """Write a track (K, 3) as KML 2.2; drawn on the ground, as heights are above the ellipsoid."""
     line = " ".join(",".join(map(str, row)) for row in _positions(track))
     path.write_text(
-        '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark>'
+        '<?xml version="1.0" encoding="UTF-8"?>\n<kml '
+        'xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark>'
         f"<name>{escape(printable(name))}</name><LineString><altitudeMode>clampToGround</altitudeMode>"
         f"<coordinates>{line}</coordinates></LineString></Placemark></Document></kml>\n",
         encoding="utf-8",
@@ -50,12 +57,17 @@ def write_kml(path: Path, name: str, track: FloatArray) -> None:
 
 
 def write_utm(path: Path, geodetic: FloatArray, times_ns: IntArray | None = None) -> str:
-    """Write points (K, 3) in the UTM zone of the first, with times (K,) where given; return its EPSG code."""
-    zone, south = utm_zone(geodetic[0]), bool(geodetic[0, 0] < 0)
+    """Write points (K, 3) in the UTM zone of the first, with times (K,) where given; return its
+    EPSG code.
+    """
+    zone = utm_zone(geodetic[0])
+    south = bool(geodetic[0, 0] < 0)
     epsg = f"EPSG:{(32700 if south else 32600) + zone}"
     xy = utm(geodetic, zone)
     xy[:, 1] += 1e7 * (float(south) - (geodetic[:, 0] < 0))  # all in the hemisphere of the first
-    rows = [f"{e:.4f},{n:.4f},{h:.4f}" for (e, n), h in zip(xy.tolist(), geodetic[:, 2], strict=True)]
+    rows = [
+        f"{e:.4f},{n:.4f},{h:.4f}" for (e, n), h in zip(xy.tolist(), geodetic[:, 2], strict=True)
+    ]
     if times_ns is not None:
         rows = [f"{t},{row}" for t, row in zip(times_ns.tolist(), rows, strict=True)]
     head = f"# {epsg}, UTM zone {zone}{'S' if south else 'N'}, WGS84, height above the ellipsoid\n"

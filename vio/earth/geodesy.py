@@ -12,8 +12,11 @@ _A = 6378137.0  # semi-major axis, m
 _F = 1 / 298.257223563
 _E2 = _F * (2 - _F)
 _HEIGHT_STEPS = 6  # of the fixed point iteration: 1e-9 m within 100 km of the surface
-# UTM: scale on the central meridian, false easting and northing, and Krueger's series in n = f / (2 - f).
-_K0, _EAST_M, _NORTH_M = 0.9996, 500_000.0, 10_000_000.0
+# UTM: scale on the central meridian, false easting and northing, and Krueger's series in n = f / (2
+# - f).
+_K0 = 0.9996
+_EAST_M = 500_000.0
+_NORTH_M = 10_000_000.0
 _N = _F / (2 - _F)
 _RADIUS = _A / (1 + _N) * (1 + _N**2 / 4 + _N**4 / 64)
 _ALPHA = (
@@ -24,15 +27,23 @@ _ALPHA = (
 
 
 def ecef(geodetic: FloatArray) -> FloatArray:
-    """Return earth-centred coordinates (N, 3) of latitude, longitude (degrees) and height (N, 3)."""
-    lat, lon, h = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1]), geodetic[:, 2]
+    """Return earth-centred coordinates (N, 3) of latitude, longitude (degrees) and height (N,
+    3).
+    """
+    lat = np.radians(geodetic[:, 0])
+    lon = np.radians(geodetic[:, 1])
+    h = geodetic[:, 2]
     across = _A / np.sqrt(1 - _E2 * np.sin(lat) ** 2)
     ring = (across + h) * np.cos(lat)
-    return np.stack([ring * np.cos(lon), ring * np.sin(lon), (across * (1 - _E2) + h) * np.sin(lat)], axis=1)
+    return np.stack(
+        [ring * np.cos(lon), ring * np.sin(lon), (across * (1 - _E2) + h) * np.sin(lat)], axis=1
+    )
 
 
 def geodetic_of(p_ecef: FloatArray) -> FloatArray:
-    """Return latitude, longitude (degrees) and height (N, 3) of earth-centred coordinates (N, 3)."""
+    """Return latitude, longitude (degrees) and height (N, 3) of earth-centred coordinates (N,
+    3).
+    """
     x, y, z = p_ecef.T
     ring = np.hypot(x, y)
     lat = np.arctan2(z, ring * (1 - _E2))
@@ -70,21 +81,27 @@ class LocalFrame:
 
 
 def utm_zone(geodetic: FloatArray) -> int:
-    """Return the UTM zone (1 to 60) of a point (3,), without the exceptions of Norway and Svalbard."""
+    """Return the UTM zone (1 to 60) of a point (3,), without the exceptions of Norway and
+    Svalbard.
+    """
     return int((geodetic[1] + 180) // 6) % 60 + 1
 
 
 def utm(geodetic: FloatArray, zone: int) -> FloatArray:
-    """Return easting and northing (N, 2) of latitude and longitude (degrees) (N, 2 or more) in a zone.
+    """Return easting and northing (N, 2) of latitude and longitude (degrees) (N, 2 or more) in a
+    zone.
 
     Northings count from the equator, in the south plus 10,000 km.
     Reference: Krueger (1912); third order in n, exact to a millimetre within the zone.
     """
-    lat, lon = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1] - (6 * zone - 183))
+    lat = np.radians(geodetic[:, 0])
+    lon = np.radians(geodetic[:, 1] - (6 * zone - 183))
     e = np.sqrt(_E2)
     t = np.sinh(np.arctanh(np.sin(lat)) - e * np.arctanh(e * np.sin(lat)))
-    xi, eta = np.arctan2(t, np.cos(lon)), np.arctanh(np.sin(lon) / np.sqrt(1 + t**2))
-    east, north = eta.copy(), xi.copy()
+    xi = np.arctan2(t, np.cos(lon))
+    eta = np.arctanh(np.sin(lon) / np.sqrt(1 + t**2))
+    east = eta.copy()
+    north = xi.copy()
     for j, alpha in enumerate(_ALPHA, 1):
         east += alpha * np.cos(2 * j * xi) * np.sinh(2 * j * eta)
         north += alpha * np.sin(2 * j * xi) * np.cosh(2 * j * eta)

@@ -31,7 +31,11 @@ class GnssFixes:
 
 
 def checked_fixes(
-    times_ns: IntArray, geodetic: FloatArray, covariance: FloatArray | None, where: str, notes: tuple[str, ...] = ()
+    times_ns: IntArray,
+    geodetic: FloatArray,
+    covariance: FloatArray | None,
+    where: str,
+    notes: tuple[str, ...] = (),
 ) -> GnssFixes:
     """Return positions in the order of time, without those that are not finite or repeat a stamp.
 
@@ -46,23 +50,34 @@ def checked_fixes(
         DataError: there is no position, or one is none of WGS84.
     """
     order = np.argsort(times_ns, kind="stable")
-    times_ns, geodetic = times_ns[order], geodetic[order]
+    times_ns = times_ns[order]
+    geodetic = geodetic[order]
     C = np.full((len(order), 3, 3), np.nan) if covariance is None else covariance[order]
-    keep = np.isfinite(geodetic[:, :2]).all(axis=1) & np.concatenate([[True], np.diff(times_ns) > 0])
+    keep = np.isfinite(geodetic[:, :2]).all(axis=1) & np.concatenate(
+        [[True], np.diff(times_ns) > 0]
+    )
     if not keep.any():
         raise DataError(f"{where}: holds no position; give a record with a fix")
-    notes += (f"{int((~keep).sum())} of {len(keep)} rows without a position or of a repeated time are skipped",) * bool(
-        (~keep).any()
-    )
-    times_ns, geodetic, C = times_ns[keep], geodetic[keep].copy(), C[keep].copy()
+    notes += (
+        f"{int((~keep).sum())} of {len(keep)} rows without a position or of a repeated time are "
+        "skipped",
+    ) * bool((~keep).any())
+    times_ns = times_ns[keep]
+    geodetic = geodetic[keep].copy()
+    C = C[keep].copy()
     outside = (np.abs(geodetic[:, 0]) > 90) | (np.abs(geodetic[:, 1]) > 360)
     if outside.any() or (np.abs(geodetic[:, :2]) < 1e-9).all():
         lat, lon = geodetic[int(np.argmax(outside)), :2]
         raise DataError(
-            f"{where}: {lat:g}, {lon:g} is no latitude and longitude in degrees; give positions in WGS84 (convert "
+            f"{where}: {lat:g}, {lon:g} is no latitude and longitude in degrees; give positions in "
+            "WGS84 (convert "
             "those of another datum or projection first)"
         )
-    has_height = np.isfinite(geodetic[:, 2]) & (geodetic[:, 2] > _HEIGHTS_M[0]) & (geodetic[:, 2] < _HEIGHTS_M[1])
+    has_height = (
+        np.isfinite(geodetic[:, 2])
+        & (geodetic[:, 2] > _HEIGHTS_M[0])
+        & (geodetic[:, 2] < _HEIGHTS_M[1])
+    )
     geodetic[~has_height, 2] = 0.0
     if not has_height.all():
         notes += (f"{int((~has_height).sum())} positions have no height",)

@@ -1,4 +1,6 @@
-"""Alignment of a trajectory with a reference: the similarity that minimises the squared distances of the positions."""
+"""Alignment of a trajectory with a reference: the similarity that minimises the squared
+distances of the positions.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +10,30 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from vio.errors import EvaluationError
-from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts, se3_inverse, so3_exp, so3_hat, so3_log
+from vio.geometry.lie import (
+    FloatArray,
+    nearest_rotation,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+    so3_hat,
+    so3_log,
+)
 
 AlignMode: TypeAlias = Literal["se3", "sim3", "first", "none"]
-RotationSource: TypeAlias = Literal["positions", "direction and orientations", "orientations", "first pose", "none"]
+RotationSource: TypeAlias = Literal[
+    "positions", "direction and orientations", "orientations", "first pose", "none"
+]
 
 _COLLINEAR = 1e-13  # ratio of squared extents below which points are collinear, to rounding
-_LOOSE_RAD = 0.05  # positions determine the rotation about the path if its standard deviation is below 3 degrees
-_ORIENTATION_GAIN = 10.0  # ratio of standard deviations above which the orientations replace the positions in it
-_CONTRADICTION = 5.0  # standard deviations by which they may differ; more: they do not describe the same body
-_STATIONARY = 1e-12  # extent, relative to the size of the coordinates, below which points coincide, to rounding
+# positions determine the rotation about the path if its standard deviation is below 3 degrees
+_LOOSE_RAD = 0.05
+# ratio of standard deviations above which the orientations replace the positions in it
+_ORIENTATION_GAIN = 10.0
+# standard deviations by which they may differ; more: they do not describe the same body
+_CONTRADICTION = 5.0
+# extent, relative to the size of the coordinates, below which points coincide, to rounding
+_STATIONARY = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,29 +43,34 @@ class Alignment:
     R: FloatArray  # (3, 3)
     t: FloatArray  # (3,) metres
     scale: float
-    rotation_from: RotationSource = "positions"  # direction and orientations: of the path, and of the poses about it
+    # direction and orientations: of the path, and of the poses about it
+    rotation_from: RotationSource = "positions"
 
 
 def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignment:
-    """Find the alignment of M >= 1 paired poses (M, 4, 4) that minimises the squared distances of their positions.
+    """Find the alignment of M >= 1 paired poses (M, 4, 4) that minimises the squared distances of
+    their positions.
 
-    Where the positions do not determine the rotation (one point, or a straight line), the orientations do. `first`
-    makes the first pair of poses equal instead, `none` is the identity.
+    Where the positions do not determine the rotation (one point, or a straight line), the
+    orientations do. `first` makes the first pair of poses equal instead, `none` is the identity.
 
     Raises:
         EvaluationError: the scale of `sim3` is undefined, because one of the two does not move.
 
-    Reference: Umeyama, Least-squares estimation of transformation parameters between two point patterns,
-    IEEE TPAMI (1991), equations 34 to 43.
+    Reference: Umeyama, Least-squares estimation of transformation parameters between two point
+    patterns, IEEE TPAMI (1991), equations 34 to 43.
     """
     if mode == "none":
         return Alignment(np.eye(3), np.zeros(3), 1.0, "none")
     if mode == "first":
         T = T_ref[0] @ se3_inverse(T_est[0])
         return Alignment(T[:3, :3], T[:3, 3], 1.0, "first pose")
-    x, y = T_est[:, :3, 3], T_ref[:, :3, 3]
-    x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
-    x_extent, y_extent = _extent(x), _extent(y)
+    x = T_est[:, :3, 3]
+    y = T_ref[:, :3, 3]
+    x_mean = x.mean(axis=0)
+    y_mean = y.mean(axis=0)
+    x_extent = _extent(x)
+    y_extent = _extent(y)
     covariance = (y - y_mean).T @ (x - x_mean) / len(x)
     U, d, Vt = np.linalg.svd(covariance)
     sign = np.array([1.0, 1.0, 1.0 if np.linalg.det(U @ Vt) > 0 else -1.0])
@@ -58,8 +79,11 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
     moving = min(x_extent, y_extent) > 0 and d[0] > _COLLINEAR * x_extent * y_extent
     if not moving:
         if mode == "sim3":
-            raise EvaluationError("sim3 alignment needs two trajectories that move together; align with se3 or none")
-        R, rotation_from = nearest_rotation(_orientation_sum(T_est, T_ref)), "orientations"
+            raise EvaluationError(
+                "sim3 alignment needs two trajectories that move together; align with se3 or none"
+            )
+        R = nearest_rotation(_orientation_sum(T_est, T_ref))
+        rotation_from = "orientations"
     elif d[1] <= _COLLINEAR * d[0]:
         R = _rotate_about(U[:, 0], R, _orientation_sum(T_est, T_ref))
         rotation_from = "direction and orientations"
@@ -68,11 +92,13 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
 
 
 def settle_rotation(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) -> Alignment:
-    """Return the alignment of paired poses (M, 4, 4), turned about the path where positions leave that part open.
+    """Return the alignment of paired poses (M, 4, 4), turned about the path where positions leave
+    that part open.
 
-    On a nearly straight path the least squares of the positions determine the rotation about the path to
-    `sigma_p` only (math.md, E1), which may be tens of degrees. There the orientations replace them, if their own errors
-    about the path are far smaller and both agree within `sigma_p`. Anywhere else the alignment is returned unchanged.
+    On a nearly straight path the least squares of the positions determine the rotation about the
+    path to `sigma_p` only (math.md, E1), which may be tens of degrees. There the orientations
+    replace them, if their own errors about the path are far smaller and both agree within
+    `sigma_p`. Anywhere else the alignment is returned unchanged.
     """
     if alignment.rotation_from != "positions":
         return alignment
@@ -87,10 +113,16 @@ def settle_rotation(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) 
     return Alignment(R, t, alignment.scale, "direction and orientations")
 
 
-def deviation_about_path(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) -> tuple[FloatArray, float]:
-    """Return the direction (3,) of a path and the standard deviation, radians, of an alignment's rotation about it."""
-    x, y = alignment.scale * T_est[:, :3, 3] @ alignment.R.T, T_ref[:, :3, 3]
-    x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
+def deviation_about_path(
+    alignment: Alignment, T_est: FloatArray, T_ref: FloatArray
+) -> tuple[FloatArray, float]:
+    """Return the direction (3,) of a path and the standard deviation, radians, of an alignment's
+    rotation about it.
+    """
+    x = alignment.scale * T_est[:, :3, 3] @ alignment.R.T
+    y = T_ref[:, :3, 3]
+    x_mean = x.mean(axis=0)
+    y_mean = y.mean(axis=0)
     S = (y - y_mean).T @ (x - x_mean) / len(x)  # symmetric at the least squares
     axis = np.linalg.svd(S)[0][:, 0]
     across = np.eye(3) - np.outer(axis, axis)
@@ -106,7 +138,9 @@ def apply_alignment(alignment: Alignment, T_est: FloatArray) -> FloatArray:
 
 
 def _extent(p: FloatArray) -> float:
-    """Root mean square distance from the centroid; 0 where it is within rounding of the coordinates."""
+    """Root mean square distance from the centroid; 0 where it is within rounding of the
+    coordinates.
+    """
     extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
     return extent if extent > _STATIONARY * float(np.abs(p).max()) else 0.0
 

@@ -1,4 +1,6 @@
-"""Pair the poses of two trajectories, by nearest time or by frame number, one to one, without interpolation."""
+"""Pair the poses of two trajectories, by nearest time or by frame number, one to one, without
+interpolation.
+"""
 
 from __future__ import annotations
 
@@ -21,38 +23,55 @@ class Coverage:
     """The compared share of estimate and reference."""
 
     estimate: float  # fraction of the estimate's poses that had a reference
-    reference_span: float | None  # fraction of the reference's time (or frame) span between first and last match
+    # fraction of the reference's time (or frame) span between first and last match
+    reference_span: float | None
     longest_gap_s: float | None  # between matched poses; None: one pose, or association by frame
 
 
 def associate(
     estimate: Trajectory, reference: Trajectory, *, max_time_difference_s: float = 0.01
 ) -> tuple[AssociationMode, IntArray, IntArray]:
-    """Pair poses one to one: the mode, rows of the estimate (M,) and rows of the reference (M,), M >= 1.
+    """Pair poses one to one: the mode, rows of the estimate (M,) and rows of the reference (M,), M
+    >= 1.
 
-    By time where both have times, else by frame number: row k of a trajectory without frame numbers is frame k.
+    By time where both have times, else by frame number: row k of a trajectory without frame numbers
+    is frame k.
 
     Raises:
         EvaluationError: no poses match.
     """
     if len(estimate) == 0 or len(reference) == 0:
-        raise EvaluationError(f"cannot compare {len(estimate)} estimated poses with {len(reference)} reference poses")
+        raise EvaluationError(
+            f"cannot compare {len(estimate)} estimated poses with {len(reference)} reference poses"
+        )
     if estimate.times_ns is not None and reference.times_ns is not None:
         if not 0 <= max_time_difference_s <= _LONGEST_S:
             limit = f"the largest time difference is 0 to {_LONGEST_S:g} s"
             raise EvaluationError(f"{limit}, got {max_time_difference_s:g} s")
         most_ns = round(max_time_difference_s * NS_PER_S)
-        rows, reference_rows = associate_times(estimate.times_ns, reference.times_ns, max_difference_ns=most_ns)
+        rows, reference_rows = associate_times(
+            estimate.times_ns, reference.times_ns, max_difference_ns=most_ns
+        )
         if len(rows) == 0:
-            raise EvaluationError(_no_common_time(estimate.times_ns, reference.times_ns, max_time_difference_s))
+            raise EvaluationError(
+                _no_common_time(estimate.times_ns, reference.times_ns, max_time_difference_s)
+            )
         return "time", rows, reference_rows
-    if reference.times_ns is not None and reference.frame_indices is None and len(estimate) != len(reference):
+    if (
+        reference.times_ns is not None
+        and reference.frame_indices is None
+        and len(estimate) != len(reference)
+    ):
         raise EvaluationError(
-            f"the estimate has {len(estimate)} poses without times and the reference {len(reference)} poses with times "
+            f"the estimate has {len(estimate)} poses without times and the reference "
+            f"{len(reference)} poses with times "
             "but no frame numbers; give the estimate with times (TUM form)"
         )
-    frames, reference_frames = _frames(estimate), _frames(reference)
-    _, rows, reference_rows = np.intersect1d(frames, reference_frames, assume_unique=True, return_indices=True)
+    frames = _frames(estimate)
+    reference_frames = _frames(reference)
+    _, rows, reference_rows = np.intersect1d(
+        frames, reference_frames, assume_unique=True, return_indices=True
+    )
     if len(rows) == 0:
         raise EvaluationError(
             f"no common frame: the estimate has frames {frames[0]} to {frames[-1]}, the reference "
@@ -64,11 +83,13 @@ def associate(
 def associate_times(
     times_a_ns: npt.ArrayLike, times_b_ns: npt.ArrayLike, *, max_difference_ns: int
 ) -> tuple[IntArray, IntArray]:
-    """Pair two increasing clocks one to one and in order, closest pairs first; return row indices (M,) into each.
+    """Pair two increasing clocks one to one and in order, closest pairs first; return row indices
+    (M,) into each.
 
     A pair is at most `max_difference_ns` apart. Of equally close pairs the earlier one is chosen.
     """
-    a, b = np.asarray(times_a_ns, dtype=np.int64), np.asarray(times_b_ns, dtype=np.int64)
+    a = np.asarray(times_a_ns, dtype=np.int64)
+    b = np.asarray(times_b_ns, dtype=np.int64)
     low = np.searchsorted(b, a - max_difference_ns, side="left")
     count = np.searchsorted(b, a + max_difference_ns, side="right") - low
     i = np.repeat(np.arange(len(a)), count)
@@ -86,15 +107,25 @@ def associate_times(
 
 
 def coverage(
-    estimate: Trajectory, reference: Trajectory, mode: AssociationMode, rows: IntArray, reference_rows: IntArray
+    estimate: Trajectory,
+    reference: Trajectory,
+    mode: AssociationMode,
+    rows: IntArray,
+    reference_rows: IntArray,
 ) -> Coverage:
     """Return which part of both trajectories the matched rows (M,) of both are."""
-    clock = reference.times_ns if mode == "time" and reference.times_ns is not None else _frames(reference)
+    clock = (
+        reference.times_ns
+        if mode == "time" and reference.times_ns is not None
+        else _frames(reference)
+    )
     span = int(clock[-1] - clock[0])
     gaps = None if estimate.times_ns is None else np.diff(estimate.times_ns[rows])
     return Coverage(
         estimate=len(rows) / len(estimate),
-        reference_span=int(clock[reference_rows[-1]] - clock[reference_rows[0]]) / span if span else None,
+        reference_span=int(clock[reference_rows[-1]] - clock[reference_rows[0]]) / span
+        if span
+        else None,
         longest_gap_s=None if gaps is None or len(gaps) == 0 else int(gaps.max()) / NS_PER_S,
     )
 
@@ -102,12 +133,19 @@ def coverage(
 def _no_common_time(estimate_ns: IntArray, reference_ns: IntArray, limit_s: float) -> str:
     """Format how the two clocks relate to each other."""
     after = np.searchsorted(reference_ns, estimate_ns)
-    left, right = np.clip(after - 1, 0, None), np.clip(after, None, len(reference_ns) - 1)
-    nearest = np.minimum(np.abs(estimate_ns - reference_ns[left]), np.abs(estimate_ns - reference_ns[right]))
-    spans = [f"{t[0] / NS_PER_S:.3f} to {t[-1] / NS_PER_S:.3f} s" for t in (estimate_ns, reference_ns)]
+    left = np.clip(after - 1, 0, None)
+    right = np.clip(after, None, len(reference_ns) - 1)
+    nearest = np.minimum(
+        np.abs(estimate_ns - reference_ns[left]), np.abs(estimate_ns - reference_ns[right])
+    )
+    spans = [
+        f"{t[0] / NS_PER_S:.3f} to {t[-1] / NS_PER_S:.3f} s" for t in (estimate_ns, reference_ns)
+    ]
     return (
-        f"no poses within {limit_s:g} s of each other: the estimate covers {spans[0]}, the reference {spans[1]}, "
-        f"closest pair {nearest.min() / NS_PER_S:.6g} s; check the clocks or allow a larger difference"
+        f"no poses within {limit_s:g} s of each other: the estimate covers {spans[0]}, the "
+        f"reference {spans[1]}, "
+        f"closest pair {nearest.min() / NS_PER_S:.6g} s; check the clocks or allow a larger "
+        "difference"
     )
 
 

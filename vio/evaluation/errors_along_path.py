@@ -64,7 +64,8 @@ class KittiError:
 
 
 def relative_error_frames(T_est: FloatArray, T_ref: FloatArray, delta: int) -> RelativeError | None:
-    """Relative pose error over every pair `delta` poses apart (M, 4, 4); None where there is no such pair.
+    """Relative pose error over every pair `delta` poses apart (M, 4, 4); None where there is no
+    such pair.
 
     Raises:
         EvaluationError: `delta` is not positive.
@@ -77,8 +78,11 @@ def relative_error_frames(T_est: FloatArray, T_ref: FloatArray, delta: int) -> R
     return _relative_error(T_est, T_ref, first, first + delta, float(delta), "frames")
 
 
-def relative_error_distance(T_est: FloatArray, T_ref: FloatArray, delta_m: float) -> RelativeError | None:
-    """Relative pose error over pairs `delta_m` of the reference's path apart; None where there is no such pair.
+def relative_error_distance(
+    T_est: FloatArray, T_ref: FloatArray, delta_m: float
+) -> RelativeError | None:
+    """Relative pose error over pairs `delta_m` of the reference's path apart; None where there is
+    no such pair.
 
     Each pose is paired with the later one whose path length from it comes closest, within
     `RPE_DISTANCE_TOLERANCE` of `delta_m`.
@@ -93,7 +97,8 @@ def relative_error_distance(T_est: FloatArray, T_ref: FloatArray, delta_m: float
     first = np.arange(n)
     target = travelled + delta_m
     beyond = np.searchsorted(travelled, target, side="left")
-    before = np.searchsorted(travelled, travelled[beyond - 1], side="left")  # the first of poses at one position
+    # the first of poses at one position
+    before = np.searchsorted(travelled, travelled[beyond - 1], side="left")
     gap_before = target - travelled[before]
     gap_beyond = np.where(beyond < n, travelled[np.minimum(beyond, n - 1)] - target, np.inf)
     last = np.where(gap_before <= gap_beyond, before, beyond)
@@ -107,18 +112,22 @@ def kitti_error(
     lengths_m: Sequence[float] = KITTI_LENGTHS_M,
     step_frames: int = KITTI_STEP_FRAMES,
 ) -> KittiError | None:
-    """Compute the drift over segments of given path lengths, of paired poses (M, 4, 4); None where no segment fits.
+    """Compute the drift over segments of given path lengths, of paired poses (M, 4, 4); None where
+    no segment fits.
 
-    A segment starts at every `step_frames`-th pose and ends at the first one more than the length further along
-    the reference's path. Its errors are divided by the length.
+    A segment starts at every `step_frames`-th pose and ends at the first one more than the length
+    further along the reference's path. Its errors are divided by the length.
 
     Raises:
         EvaluationError: a length or the step is not positive.
 
-    Reference: Geiger, Lenz & Urtasun, Are we ready for autonomous driving?, CVPR (2012), and its development kit.
+    Reference: Geiger, Lenz & Urtasun, Are we ready for autonomous driving?, CVPR (2012), and its
+    development kit.
     """
     if not all(np.isfinite(length) and length > 0 for length in lengths_m) or step_frames < 1:
-        raise EvaluationError(f"segment lengths and step must be positive, got {list(lengths_m)} m, {step_frames}")
+        raise EvaluationError(
+            f"segment lengths and step must be positive, got {list(lengths_m)} m, {step_frames}"
+        )
     travelled = _cumulative_path_length(T_ref[:, :3, 3])
     per_length: list[LengthError] = []
     all_trans: list[FloatArray] = []
@@ -126,21 +135,27 @@ def kitti_error(
     for length in lengths_m:
         first = np.arange(0, len(travelled), step_frames)
         last = np.searchsorted(travelled, travelled[first] + length, side="right")
-        first, last = first[last < len(travelled)], last[last < len(travelled)]
+        first = first[last < len(travelled)]
+        last = last[last < len(travelled)]
         trans_m, rot_deg = _motion_errors(T_est, T_ref, first, last)
         all_trans.append(100 * trans_m / length)
         all_rot.append(100 * rot_deg / length)
-        means = [float(errors[-1].mean()) if len(first) else None for errors in (all_trans, all_rot)]
+        means = [
+            float(errors[-1].mean()) if len(first) else None for errors in (all_trans, all_rot)
+        ]
         per_length.append(LengthError(float(length), len(first), *means))
     segments = sum(row.segments for row in per_length)
     if segments == 0:
         return None
-    t_err, r_err = np.concatenate(all_trans).mean(), np.concatenate(all_rot).mean()
+    t_err = np.concatenate(all_trans).mean()
+    r_err = np.concatenate(all_rot).mean()
     return KittiError(float(t_err), float(r_err), segments, tuple(per_length))
 
 
 def drift(T_est: FloatArray, T_ref: FloatArray) -> KittiError | None:
-    """Compute the drift over KITTI's lengths, or where no segment fits over a tenth or a hundredth of them."""
+    """Compute the drift over KITTI's lengths, or where no segment fits over a tenth or a
+    hundredth of them.
+    """
     for divisor in (1, 10, 100):
         if error := kitti_error(T_est, T_ref, [length / divisor for length in KITTI_LENGTHS_M]):
             return error
@@ -156,12 +171,16 @@ def error_statistics(errors: npt.ArrayLike) -> ErrorStatistics:
 
 def rotation_angle_deg(R: npt.ArrayLike) -> FloatArray:
     """Angles (...,) in [0, 180] degrees of rotations (..., 3, 3) or transforms (..., 4, 4)."""
-    return np.degrees(np.linalg.norm(so3_log(np.asarray(R, dtype=np.float64)[..., :3, :3]), axis=-1))
+    return np.degrees(
+        np.linalg.norm(so3_log(np.asarray(R, dtype=np.float64)[..., :3, :3]), axis=-1)
+    )
 
 
 def path_length_m(positions: npt.ArrayLike) -> float:
     """Length of the polygon through positions (N, 3), metres; 0 for fewer than two."""
-    return float(np.linalg.norm(np.diff(np.asarray(positions, dtype=np.float64), axis=0), axis=1).sum())
+    return float(
+        np.linalg.norm(np.diff(np.asarray(positions, dtype=np.float64), axis=0), axis=1).sum()
+    )
 
 
 def _cumulative_path_length(positions: FloatArray) -> FloatArray:
@@ -173,7 +192,9 @@ def _cumulative_path_length(positions: FloatArray) -> FloatArray:
 def _motion_errors(
     T_est: FloatArray, T_ref: FloatArray, first: npt.NDArray[np.intp], last: npt.NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray]:
-    """Translation (metres) and rotation (degrees) errors (K,) of the motions from poses `first` to poses `last`."""
+    """Translation (metres) and rotation (degrees) errors (K,) of the motions from poses `first`
+    to poses `last`.
+    """
     motion_ref = se3_inverse(T_ref[first]) @ T_ref[last]
     motion_est = se3_inverse(T_est[first]) @ T_est[last]
     error = se3_inverse(motion_ref) @ motion_est
@@ -191,4 +212,6 @@ def _relative_error(
     if len(first) == 0:
         return None
     trans_m, rot_deg = _motion_errors(T_est, T_ref, first, last)
-    return RelativeError(delta, unit, len(first), error_statistics(trans_m).rmse, error_statistics(rot_deg).rmse)
+    return RelativeError(
+        delta, unit, len(first), error_statistics(trans_m).rmse, error_statistics(rot_deg).rmse
+    )

@@ -1,4 +1,6 @@
-"""Compare a trajectory with a reference: ATE, RPE and the KITTI drift metric. `N` poses, `M` matched pairs."""
+"""Compare a trajectory with a reference: ATE, RPE and the KITTI drift metric. `N` poses, `M`
+matched pairs.
+"""
 
 from __future__ import annotations
 
@@ -40,14 +42,25 @@ _MILLIMETRES_BELOW_M = 0.01  # lengths in words
 _SHORT_M = 10.0  # over shorter lengths a drift for 100 m says nothing that a reader can picture
 _PATH_RATIO = 1.5  # ratio of path lengths above which the reference may be another recording's
 _UNITS = {"millimetres": 1000.0, "centimetres": 100.0}
-_UNIT_SHARE = 0.1  # a ratio of path lengths so near one of these is no chance; odometry without a scale has any ratio
+# a ratio of path lengths so near one of these is no chance; odometry without a scale has any ratio
+_UNIT_SHARE = 0.1
 _PATH_LEAST_M = 1.0  # paths below this may consist of noise
 _MATCHED_SHARE = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
-_MATCHED_ESTIMATE = 0.2  # span of the matched poses, of the estimate; below, the figures are those of a part
-_FARTHEST_M = 1e12  # of a position from the origin: farther than the sun, and squares do not overflow
+# span of the matched poses, of the estimate; below, the figures are those of a part
+_MATCHED_ESTIMATE = 0.2
+# of a position from the origin: farther than the sun, and squares do not overflow
+_FARTHEST_M = 1e12
 # Of an evaluation, as it holds them.
 _FIGURES = (
-    *("align", "association", "body", "matched", "coverage", "path_length_m", "matched_path_length_m"),
+    *(
+        "align",
+        "association",
+        "body",
+        "matched",
+        "coverage",
+        "path_length_m",
+        "matched_path_length_m",
+    ),
     *("reference_path_length_m", "scale", "rotation_from"),
 )
 LEAST_POSES = 3  # that determine a scale, and make a figure
@@ -55,7 +68,9 @@ LEAST_POSES = 3  # that determine a scale, and make a figure
 
 @dataclass(frozen=True, slots=True)
 class ScaleFree:
-    """The scale of an estimate, and its error after a similarity alignment: a wrong baseline makes the scale alone."""
+    """The scale of an estimate, and its error after a similarity alignment: a wrong baseline
+    makes the scale alone.
+    """
 
     scale: float  # of the estimate, over the reference's
     ate_m: float  # root mean square after a similarity alignment
@@ -79,18 +94,26 @@ class Evaluation:
     ate_deg: ErrorStatistics
     rpe: RelativeError | None  # over frames
     rpe_distance: RelativeError | None  # over metres, if requested
-    kitti: KittiError | None  # None: the record is shorter than every length that was asked for, or than 1 m
-    T_ref_est: FloatArray  # (4, 4) alignment of `settle_rotation`; under sim3 the estimate is scaled first
+    # None: the record is shorter than every length that was asked for, or than 1 m
+    kitti: KittiError | None
+    # (4, 4) alignment of `settle_rotation`; under sim3 the estimate is scaled first
+    T_ref_est: FloatArray
     rows: IntArray  # (M,) matched rows of the estimate
-    errors_m: FloatArray  # (M,) distance to the reference after the alignment of `align_poses`, the least squares
+    # (M,) distance to the reference after the alignment of `align_poses`, the least squares
+    errors_m: FloatArray
     errors_deg: FloatArray  # (M,) rotation angle to the reference after alignment by T_ref_est
-    aligned: Trajectory  # the whole estimate (N) in the reference's world and body frame, by T_ref_est
-    reference: Trajectory  # the matched poses (M) of the reference; row k matches row rows[k] of the estimate
+    # the whole estimate (N) in the reference's world and body frame, by T_ref_est
+    aligned: Trajectory
+    # the matched poses (M) of the reference; row k matches row rows[k] of the estimate
+    reference: Trajectory
     scale_free: ScaleFree | None = None  # None: positions do not determine a scale
-    notes: tuple[str, ...] = ()  # signs of a reference of another recording, or in other conventions
+    # signs of a reference of another recording, or in other conventions
+    notes: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures for JSON: `ate_m` is the RMSE, undefined metrics are None, arrays are omitted."""
+        """Return the figures for JSON: `ate_m` is the RMSE, undefined metrics are None, arrays
+        are omitted.
+        """
         kitti = self.kitti
         return {
             **{name: _plain(getattr(self, name)) for name in _FIGURES},
@@ -121,38 +144,49 @@ def evaluate(
     rpe_delta_frames: int = 1,
     rpe_delta_m: float | None = None,
 ) -> Evaluation:
-    """Evaluate an estimate against a reference, in the frame (cam0 or IMU) that the reference describes.
+    """Evaluate an estimate against a reference, in the frame (cam0 or IMU) that the reference
+    describes.
 
     Args:
         estimate: N poses.
-        reference: associated by time where both have times, else by frame number; it may cover part of the estimate.
-        align: rigid, rigid with scale, the first matched poses made equal, or none (both must then describe the same
-            body in the same world). All metrics are those of the aligned estimate, so `sim3` removes the scale error
-            from the relative ones too.
-        lengths_m: path lengths of the KITTI metric; None: KITTI's 100 to 800 m, and where the reference's path is
-            too short for all of them, the first set with a segment of 10 to 80 m and 1 to 8 m. `KittiError.lengths_m`
-            names them: drift over short lengths contains more of the noise of single poses.
+        reference: associated by time where both have times, else by frame number; it may cover part
+            of the estimate.
+        align: rigid, rigid with scale, the first matched poses made equal, or none (both must then
+            describe the same body in the same world). All metrics are those of the aligned
+            estimate, so `sim3` removes the scale error from the relative ones too.
+        lengths_m: path lengths of the KITTI metric; None: KITTI's 100 to 800 m, and where the
+            reference's path is too short for all of them, the first set with a segment of 10 to 80
+            m and 1 to 8 m. `KittiError.lengths_m` names them: drift over short lengths contains
+            more of the noise of single poses.
         max_time_difference_s: poses further apart in time are not compared.
         T_cam0_imu: extrinsic (4, 4), needed where the two trajectories describe different frames.
         rpe_delta_frames: distance of the pairs of `Evaluation.rpe`, in matched poses.
-        rpe_delta_m: distance of the pairs of `Evaluation.rpe_distance`, in metres of the reference's path.
+        rpe_delta_m: distance of the pairs of `Evaluation.rpe_distance`, in metres of the
+            reference's path.
 
     Raises:
-        EvaluationError: nothing to compare, different frames without an extrinsic or without an alignment, non-finite
-            poses, or an alignment that the data do not determine (the scale of a motionless estimate).
+        EvaluationError: nothing to compare, different frames without an extrinsic or without an
+            alignment, non-finite poses, or an alignment that the data do not determine (the scale
+            of a motionless estimate).
     """
     if align not in get_args(AlignMode):
-        raise EvaluationError(f"unknown alignment {align!r}; choose one of {', '.join(get_args(AlignMode))}")
+        raise EvaluationError(
+            f"unknown alignment {align!r}; choose one of {', '.join(get_args(AlignMode))}"
+        )
     _require_finite("estimate", estimate)
     _require_finite("reference", reference)
     if align == "none" and estimate.body != reference.body:
         raise EvaluationError(
-            f"align none needs both in one world, but the estimate describes {estimate.body} and the reference "
+            f"align none needs both in one world, but the estimate describes {estimate.body} and "
+            "the reference "
             f"{reference.body}, whose world frames differ; take align first, or se3"
         )
     moved = _in_frame_of(estimate, reference, T_cam0_imu)
-    association, rows, reference_rows = associate(moved, reference, max_time_difference_s=max_time_difference_s)
-    T_est, T_ref = moved.T_world_body[rows], reference.T_world_body[reference_rows]
+    association, rows, reference_rows = associate(
+        moved, reference, max_time_difference_s=max_time_difference_s
+    )
+    T_est = moved.T_world_body[rows]
+    T_ref = reference.T_world_body[reference_rows]
     closest = align_poses(T_est, T_ref, align)
     errors_m = np.linalg.norm(apply_alignment(closest, T_est)[:, :3, 3] - T_ref[:, :3, 3], axis=1)
     alignment = settle_rotation(closest, T_est, T_ref)
@@ -173,8 +207,12 @@ def evaluate(
         ate_m=error_statistics(errors_m),
         ate_deg=error_statistics(errors_deg),
         rpe=relative_error_frames(T_aligned, T_ref, rpe_delta_frames),
-        rpe_distance=None if rpe_delta_m is None else relative_error_distance(T_aligned, T_ref, rpe_delta_m),
-        kitti=drift(T_aligned, T_ref) if lengths_m is None else kitti_error(T_aligned, T_ref, lengths_m),
+        rpe_distance=None
+        if rpe_delta_m is None
+        else relative_error_distance(T_aligned, T_ref, rpe_delta_m),
+        kitti=drift(T_aligned, T_ref)
+        if lengths_m is None
+        else kitti_error(T_aligned, T_ref, lengths_m),
         T_ref_est=se3_from_parts(alignment.R, alignment.t),
         rows=rows,
         errors_m=errors_m,
@@ -183,14 +221,23 @@ def evaluate(
         reference=take(reference, reference_rows),
         scale_free=_scale_free(T_est, T_ref),
         notes=(
-            *_notes(path_length_m(T_aligned[:, :3, 3]), path_length_m(T_ref[:, :3, 3]), rows, moved, reference),
+            *_notes(
+                path_length_m(T_aligned[:, :3, 3]),
+                path_length_m(T_ref[:, :3, 3]),
+                rows,
+                moved,
+                reference,
+            ),
             *_attitude_notes(alignment, T_est, T_ref, T_aligned),
         ),
     )
 
 
 def _scale_free(T_est: FloatArray, T_ref: FloatArray) -> ScaleFree | None:
-    """Return the scale of M poses (M, 4, 4) and their error without it; None with too few poses or without motion."""
+    """Return the scale of M poses (M, 4, 4) and their error without it.
+
+    None with too few poses or without motion.
+    """
     if len(T_est) < LEAST_POSES:
         return None
     try:
@@ -202,18 +249,23 @@ def _scale_free(T_est: FloatArray, T_ref: FloatArray) -> ScaleFree | None:
 
 
 def metres_text(value_m: float) -> str:
-    """Return a length with its unit: millimetres below a centimetre, else metres with three decimals."""
+    """Return a length with its unit: millimetres below a centimetre, else metres with three
+    decimals.
+    """
     return f"{1e3 * value_m:.3g} mm" if value_m < _MILLIMETRES_BELOW_M else f"{value_m:.3f} m"
 
 
 def lengths_text(lengths_m: Sequence[float]) -> str:
     """Return path lengths in words: `10 to 50 m`."""
-    first, last = min(lengths_m), max(lengths_m)
+    first = min(lengths_m)
+    last = max(lengths_m)
     return f"{first:g} m" if first == last else f"{first:g} to {last:g} m"
 
 
 def rotation_drift_text(deg_per_100m: float, lengths_m: Sequence[float], digits: int = 3) -> str:
-    """Return a drift of rotation with its unit: `0.039 deg/100 m`, or by the metre where no length has ten metres."""
+    """Return a drift of rotation with its unit: `0.039 deg/100 m`, or by the metre where no
+    length has ten metres.
+    """
     if max(lengths_m) < _SHORT_M:
         return f"{deg_per_100m / 100:.{digits}f} deg/m"
     return f"{deg_per_100m:.{digits}f} deg/100 m"
@@ -228,18 +280,22 @@ def _require_finite(name: str, trajectory: Trajectory) -> None:
     bad = ~(np.abs(trajectory.T_world_body.reshape(-1, 16)) < _FARTHEST_M).all(axis=1)
     if bad.any():
         raise EvaluationError(
-            f"pose {int(np.argmax(bad))} of the {name} is not finite ({int(bad.sum())} of {len(trajectory)} are not); "
+            f"pose {int(np.argmax(bad))} of the {name} is not finite ({int(bad.sum())} of "
+            f"{len(trajectory)} are not); "
             "remove such poses or check why the estimator diverged"
         )
 
 
-def _in_frame_of(estimate: Trajectory, reference: Trajectory, T_cam0_imu: npt.ArrayLike | None) -> Trajectory:
+def _in_frame_of(
+    estimate: Trajectory, reference: Trajectory, T_cam0_imu: npt.ArrayLike | None
+) -> Trajectory:
     """Return the estimate in the reference's body frame, so that no lever arm enters the errors."""
     if estimate.body == reference.body:
         return estimate
     if T_cam0_imu is None:
         raise EvaluationError(
-            f"the estimate describes {estimate.body} and the reference {reference.body}; give the extrinsic T_cam0_imu"
+            f"the estimate describes {estimate.body} and the reference {reference.body}; give the "
+            "extrinsic T_cam0_imu"
         )
     T = np.asarray(T_cam0_imu, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
@@ -248,25 +304,42 @@ def _in_frame_of(estimate: Trajectory, reference: Trajectory, T_cam0_imu: npt.Ar
 
 
 def _notes(
-    estimate_m: float, reference_m: float, rows: IntArray, estimate: Trajectory, reference: Trajectory
+    estimate_m: float,
+    reference_m: float,
+    rows: IntArray,
+    estimate: Trajectory,
+    reference: Trajectory,
 ) -> tuple[str, ...]:
     """Name signs that the reference belongs to another recording."""
     notes = []
     short, long = sorted((estimate_m, reference_m))
     if long > _PATH_LEAST_M and long > _PATH_RATIO * short:
-        units = {name: size for name, size in _UNITS.items() if abs(long / max(short, 1e-12) / size - 1) < _UNIT_SHARE}
+        units = {
+            name: size
+            for name, size in _UNITS.items()
+            if abs(long / max(short, 1e-12) / size - 1) < _UNIT_SHARE
+        }
         which = "the reference" if reference_m > estimate_m else "the estimate"
-        what = f"{which} seems to be in {next(iter(units))}" if units else "is it the reference of this recording?"
+        what = (
+            f"{which} seems to be in {next(iter(units))}"
+            if units
+            else "is it the reference of this recording?"
+        )
         notes.append(
-            f"over the same poses the estimate travels {estimate_m:.1f} m and the reference {reference_m:.1f} m; {what}"
+            f"over the same poses the estimate travels {estimate_m:.1f} m and the reference "
+            f"{reference_m:.1f} m; {what}"
         )
     span = float(rows[-1] - rows[0]) / max(len(estimate) - 1, 1)
     if len(estimate) > 1 and span < _MATCHED_ESTIMATE:
-        notes.append(f"the reference covers {100 * span:.0f} % of the estimate: the figures are those of this part")
+        notes.append(
+            f"the reference covers {100 * span:.0f} % of the estimate: the figures are those of "
+            "this part"
+        )
     shorter = min(len(estimate), len(reference))
     if len(rows) < _MATCHED_SHARE * shorter:
         notes.append(
-            f"only {len(rows)} poses match, of {len(estimate)} of the estimate and {len(reference)} of the reference; "
+            f"only {len(rows)} poses match, of {len(estimate)} of the estimate and "
+            f"{len(reference)} of the reference; "
             "is it the reference of this recording, on the same clock?"
         )
     return tuple(notes)
@@ -275,9 +348,15 @@ def _notes(
 def _attitude_notes(
     alignment: Alignment, T_est: FloatArray, T_ref: FloatArray, T_aligned: FloatArray
 ) -> tuple[str, ...]:
-    """Name what explains a large attitude error of M poses (M, 4, 4) whose positions were aligned."""
+    """Name what explains a large attitude error of M poses (M, 4, 4) whose positions were
+    aligned.
+    """
     if alignment.rotation_from not in ("positions", "direction and orientations"):
         return ()
-    sigma = deviation_about_path(alignment, T_est, T_ref)[1] if alignment.rotation_from == "positions" else 0.0
+    sigma = (
+        deviation_about_path(alignment, T_est, T_ref)[1]
+        if alignment.rotation_from == "positions"
+        else 0.0
+    )
     note = attitude_note(T_aligned[:, :3, :3], T_ref[:, :3, :3], sigma)
     return () if note is None else (note,)

@@ -1,7 +1,8 @@
 """Atomic writing of files and folders.
 
-What is being written lies beside its target, as `.NAME.<12 hex digits>.partial`, and is locked by its process. The lock
-ends with the process, whatever ends that; the next write of the same target removes what has none.
+What is being written lies beside its target, as `.NAME.<12 hex digits>.partial`, and is locked by
+its process. The lock ends with the process, whatever ends that; the next write of the same target
+removes what has none.
 """
 
 from __future__ import annotations
@@ -29,17 +30,23 @@ except ImportError:  # Windows: leftovers stay
 
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Of `os.open`: neither follows a link nor waits for the reader of a pipe; text is written as it is.
-_NO_LINK = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
+_NO_LINK = sum(
+    getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY")
+)
 _PROBE_BYTES = 2**22  # what a run of a thousand frames writes, about
 
 
 def _sibling(path: Path, kind: str) -> Path:
-    """Return a unique hidden name beside `path`, on the same file system, so that a rename is atomic."""
+    """Return a unique hidden name beside `path`, on the same file system, so that a rename is
+    atomic.
+    """
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.{kind}")
 
 
 def lock_path(path: Path) -> int | None:
-    """Lock a file or folder for this process; return the descriptor that holds the lock, None if another holds it."""
+    """Lock a file or folder for this process; return the descriptor that holds the lock, None if
+    another holds it.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except OSError:
@@ -65,8 +72,11 @@ def _remove_leftovers(target: Path) -> None:
     except OSError:
         return
     for path in found:
-        if path.suffix == ".old" and not target.exists():  # killed between two renames: the only copy there is
-            logger.warning("%s is the earlier content of %s, kept when a process was killed", path, target)
+        # killed between two renames: the only copy there is
+        if path.suffix == ".old" and not target.exists():
+            logger.warning(
+                "%s is the earlier content of %s, kept when a process was killed", path, target
+            )
             continue
         descriptor = None if path.is_symlink() else lock_path(path)
         if descriptor is None:
@@ -81,13 +91,16 @@ def _remove_leftovers(target: Path) -> None:
 
 @contextlib.contextmanager
 def _partial_folder(target: Path) -> Iterator[Path]:
-    """Make and lock a folder for `target` to be written in; what was made and not renamed is removed at the end."""
+    """Make and lock a folder for `target` to be written in; what was made and not renamed is
+    removed at the end.
+    """
     parents = [parent for parent in target.parents if not parent.exists()]
     partial: Path | None = None
     lock: int | None = None
     try:
         with _writing(target):
-            while partial is None or not partial.is_dir():  # one may be taken for a leftover before it is locked
+            # one may be taken for a leftover before it is locked
+            while partial is None or not partial.is_dir():
                 partial = _sibling(target, "partial")
                 partial.mkdir(parents=True)
                 lock = lock_path(partial)
@@ -116,11 +129,15 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def _unwritable(path: Path, error: OSError) -> DataError:
-    return DataError(f"cannot write {path}: {error.strerror or error}; choose a writable path with enough free space")
+    return DataError(
+        f"cannot write {path}: {error.strerror or error}; choose a writable path with enough free "
+        "space"
+    )
 
 
 def open_own(path: Path, mode: Literal["wb", "ab", "r+b"]) -> BinaryIO:
-    """Open a file of this program's for writing, whose content `wb` removes; a link is not followed.
+    """Open a file of this program's for writing, whose content `wb` removes; a link is not
+    followed.
 
     Raises:
         DataError: it is a link, which could lead to another's file, or no file.
@@ -138,17 +155,23 @@ def open_own(path: Path, mode: Literal["wb", "ab", "r+b"]) -> BinaryIO:
 
 
 def check_own(path: Path) -> None:
-    """Raise DataError where a file or folder of this program's is a link, which could lead to another's."""
+    """Raise DataError where a file or folder of this program's is a link, which could lead to
+    another's.
+    """
     try:
         found = path.lstat()
     except OSError:  # opening it says why
         return
     if path.is_symlink() or (stat.S_ISREG(found.st_mode) and found.st_nlink > 1):
-        raise DataError(f"{path}: is a link, and another file would be overwritten; remove it, and repeat the command")
+        raise DataError(
+            f"{path}: is a link, and another file would be overwritten; remove it, and repeat the "
+            "command"
+        )
 
 
 def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file atomically: it holds either its old content or all of the new. Its folder must exist.
+    """Write a file atomically: it holds either its old content or all of the new. Its folder must
+    exist.
 
     Raises:
         DataError: the folder is missing or not writable, or the disk is full.
@@ -184,7 +207,8 @@ def check_new_file(path: Path, sign: bytes | None = None) -> None:
 
     Args:
         path: to be written.
-        sign: what our own files of this kind hold, which may be replaced; None: none can be distinguished from others.
+        sign: what our own files of this kind hold, which may be replaced; None: none can be
+            distinguished from others.
 
     Raises:
         DataError: it exists and is another's.
@@ -194,18 +218,26 @@ def check_new_file(path: Path, sign: bytes | None = None) -> None:
     with _writing(path):
         ours = sign is not None and path.is_file() and sign in path.read_bytes()
     if not ours:
-        raise DataError(f"{path} exists and was not made by this command; remove it, or choose another name")
+        raise DataError(
+            f"{path} exists and was not made by this command; remove it, or choose another name"
+        )
 
 
 @contextlib.contextmanager
 def atomic_folder(
-    path: str | os.PathLike[str], *, replace: bool, marker: str | None = None, own: Collection[str] | None = None
+    path: str | os.PathLike[str],
+    *,
+    replace: bool,
+    marker: str | None = None,
+    own: Collection[str] | None = None,
 ) -> Iterator[Path]:
-    """Yield a temporary folder that becomes `path` when the block succeeds, and is removed when it fails.
+    """Yield a temporary folder that becomes `path` when the block succeeds, and is removed when it
+    fails.
 
-    Missing parent folders are created (and removed again on failure). With `replace`, an old folder is moved aside at
-    the end and removed only after the new one is in place; it must be empty or hold the file named by `marker`, and
-    only names in `own` where those are given, so that a mistyped path never deletes a user's own files.
+    Missing parent folders are created (and removed again on failure). With `replace`, an old folder
+    is moved aside at the end and removed only after the new one is in place; it must be empty or
+    hold the file named by `marker`, and only names in `own` where those are given, so that a
+    mistyped path never deletes a user's own files.
 
     Raises:
         VioError: `path` exists and may not be replaced.
@@ -221,40 +253,60 @@ def atomic_folder(
             if error.errno in _NO_SPACE:
                 raise _unwritable(target, error) from error
             raise
-        check_replaceable(target, replace, marker, own)  # another process may have created it meanwhile
+        # another process may have created it meanwhile
+        check_replaceable(target, replace, marker, own)
         with _writing(target):
             _swap_in(partial, target)
 
 
-def check_replaceable(target: Path, replace: bool, marker: str | None, own: Collection[str] | None = None) -> None:
-    """Raise VioError unless `target` is free or may be replaced under the rules of `atomic_folder`."""
+def check_replaceable(
+    target: Path, replace: bool, marker: str | None, own: Collection[str] | None = None
+) -> None:
+    """Raise VioError unless `target` is free or may be replaced under the rules of
+    `atomic_folder`.
+    """
     if not os.path.lexists(target):
         return
     if not replace:
-        raise VioError(f"{target} exists already; choose another path, remove it, or allow it to be replaced")
+        raise VioError(
+            f"{target} exists already; choose another path, remove it, or allow it to be replaced"
+        )
     if target.is_symlink() or not target.is_dir():
         raise VioError(f"{target} is not a folder and will not be replaced; choose another path")
     if any(target.iterdir()) and (marker is None or not (target / marker).is_file()):
         wanted = "" if marker is None else f" (it has no {marker})"
-        raise VioError(f"{target} was not made by this program{wanted} and will not be replaced; choose another path")
-    foreign = [] if own is None else sorted(path.name for path in target.iterdir() if path.name not in own)
+        raise VioError(
+            f"{target} was not made by this program{wanted} and will not be replaced; choose "
+            "another path"
+        )
+    foreign = (
+        []
+        if own is None
+        else sorted(path.name for path in target.iterdir() if path.name not in own)
+    )
     if foreign:
         names = ", ".join(foreign[:3]) + (" and more" if len(foreign) > 3 else "")
         raise VioError(
-            f"{target} holds {names} beside an earlier result and will not be replaced; move that away, or choose "
+            f"{target} holds {names} beside an earlier result and will not be replaced; move that "
+            "away, or choose "
             "another path"
         )
 
 
 def check_spares(source: Path, target: Path) -> None:
     """Raise VioError if replacing a folder would remove the recording that it is made from."""
-    own, there = source.resolve(), target.resolve()
+    own = source.resolve()
+    there = target.resolve()
     if there == own or there in own.parents:
-        raise VioError(f"{target}: holds the recording {source} itself and will not be replaced; choose another path")
+        raise VioError(
+            f"{target}: holds the recording {source} itself and will not be replaced; choose "
+            "another path"
+        )
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Check, before work of minutes begins, that a folder can be written: a few MiB beside it, which are removed again.
+    """Check, before work of minutes begins, that a folder can be written: a few MiB beside it,
+    which are removed again.
 
     Raises:
         DataError: no folder can be made there, or the disk is full.
@@ -266,7 +318,8 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 @contextlib.contextmanager
 def locked_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Create a folder if it is missing and lock it for this process; one that is empty at the end is removed again.
+    """Create a folder if it is missing and lock it for this process; one that is empty at the end
+    is removed again.
 
     Raises:
         VioError: another process holds the lock.
@@ -278,7 +331,10 @@ def locked_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         target.mkdir(parents=True, exist_ok=True)
     lock = lock_path(target)
     if lock is None:
-        raise VioError(f"{target}: another process is writing into this folder; choose another path, or wait for it")
+        raise VioError(
+            f"{target}: another process is writing into this folder; choose another path, or wait "
+            "for it"
+        )
     try:
         yield target
     finally:
@@ -301,4 +357,6 @@ def _swap_in(partial: Path, target: Path) -> None:
     try:
         shutil.rmtree(old)
     except OSError as error:
-        logger.warning("%s is written, but the folder it replaced is still at %s: %s", target, old, error)
+        logger.warning(
+            "%s is written, but the folder it replaced is still at %s: %s", target, old, error
+        )

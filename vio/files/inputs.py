@@ -1,6 +1,7 @@
 """Reading of files that others wrote: regular ones, up to a size.
 
-A pipe without a writer would block for ever, a device never end, and a file of many gigabytes fill the memory.
+A pipe without a writer would block for ever, a device never end, and a file of many gigabytes fill
+the memory.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ _READABLE = (os.devnull, "/dev/fd/", "/proc/self/fd/", "/dev/stdin")
 
 
 def check_regular(path: Path) -> None:
-    """Raise OSError, with a reason in its `strerror`, unless a path names a file that can be read to its end.
+    """Raise OSError, with a reason in its `strerror`, unless a path names a file that can be read
+    to its end.
 
     Folders pass: what opens one raises its own OSError.
     """
@@ -29,11 +31,13 @@ def read_input(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     """Read a whole file.
 
     Raises:
-        OSError: it cannot be read, is no regular file or larger than the limit; `strerror` says which.
+        OSError: it cannot be read, is no regular file or larger than the limit; `strerror` says
+            which.
     """
     check_regular(path)
     with path.open("rb") as stream:
-        # A buffer of the file's size: one of `most_bytes` costs five times as much as reading an image does.
+        # A buffer of the file's size: one of `most_bytes` costs five times as much as reading an
+        # image does.
         size = os.fstat(stream.fileno()).st_size
         data = stream.read(size + 1 if 0 < size < most_bytes else most_bytes + 1)
     if len(data) > most_bytes:

@@ -14,8 +14,11 @@ from vio.geometry.lie import FloatArray
 R_GLTF_UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # glTF's axes: right, up, back
 _PLY_NAMES = {"<f4": "float", "u1": "uchar"}
 _GLTF_KINDS = {"float32": 5126, "uint32": 5125, "uint8": 5121}  # componentType of the specification
-_ARRAY, _INDICES = 34962, 34963  # bufferView.target
-FREE, OCCUPIED, UNKNOWN = 254, 0, 205  # gray levels of ROS's map_server
+_ARRAY = 34962  # bufferView.target
+_INDICES = 34963
+FREE = 254  # gray levels of ROS's map_server
+OCCUPIED = 0
+UNKNOWN = 205
 
 
 def ply_points(
@@ -24,24 +27,31 @@ def ply_points(
     normals: npt.NDArray[Any] | None = None,
     triangles: npt.NDArray[np.uint32] | None = None,
 ) -> bytes:
-    """Return points (N, 3) as a binary PLY: x y z in metres, normals where given, red green blue, and triangles (T, 3).
+    """Return points (N, 3) as a binary PLY: x y z in metres, normals where given, red green blue,
+    and triangles (T, 3).
 
     Points without colours are black.
     """
     fields = [(name, "<f4") for name in (*"xyz", *(() if normals is None else ("nx", "ny", "nz")))]
-    rows = np.zeros(len(points), dtype=[*fields, *((name, "u1") for name in ("red", "green", "blue"))])
+    rows = np.zeros(
+        len(points), dtype=[*fields, *((name, "u1") for name in ("red", "green", "blue"))]
+    )
     columns = points if normals is None else np.concatenate([points, normals], axis=1)
     for (name, _), column in zip(fields, columns.T, strict=True):
         rows[name] = column
     if colours is not None:
         rows["red"], rows["green"], rows["blue"] = colours.T
-    header = [f"element vertex {len(rows)}", *(f"property {_PLY_NAMES[kind]} {name}" for name, kind in fields)]
+    header = [
+        f"element vertex {len(rows)}",
+        *(f"property {_PLY_NAMES[kind]} {name}" for name, kind in fields),
+    ]
     header += [f"property uchar {name}" for name in ("red", "green", "blue")]
     faces = b""
     if triangles is not None:
         header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
         listed = np.zeros(len(triangles), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-        listed["count"], listed["corners"] = 3, triangles
+        listed["count"] = 3
+        listed["corners"] = triangles
         faces = listed.tobytes()
     text = "\n".join(["ply", "format binary_little_endian 1.0", *header, "end_header"])
     return f"{text}\n".encode("ascii") + rows.tobytes() + faces
@@ -54,7 +64,8 @@ def glb_mesh(
     triangles: npt.NDArray[np.uint32],
     R_upright_world: FloatArray,
 ) -> bytes:
-    """Return a mesh as binary glTF 2.0, turned so that y is up, with its colours as they are (unlit).
+    """Return a mesh as binary glTF 2.0, turned so that y is up, with its colours as they are
+    (unlit).
 
     Args:
         points: (V, 3) metres.
@@ -72,13 +83,25 @@ def glb_mesh(
         (np.concatenate([colours, opaque], axis=1), "VEC4", {"normalized": True}),
         (triangles.ravel(), "SCALAR", {}),
     ]
-    views, accessors, data = [], [], b""
+    views = []
+    accessors = []
+    data = b""
     for number, (array, kind, more) in enumerate(arrays):
         part = np.ascontiguousarray(array).tobytes()
         target = _INDICES if kind == "SCALAR" else _ARRAY
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(part), "target": target})
+        views.append(
+            {"buffer": 0, "byteOffset": len(data), "byteLength": len(part), "target": target}
+        )
         component = _GLTF_KINDS[array.dtype.name]
-        accessors.append({"bufferView": number, "componentType": component, "count": len(array), "type": kind, **more})
+        accessors.append(
+            {
+                "bufferView": number,
+                "componentType": component,
+                "count": len(array),
+                "type": kind,
+                **more,
+            }
+        )
         data += part + b"\0" * (-len(part) % 4)
     attributes = {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}
     document = {
@@ -102,7 +125,9 @@ def glb_mesh(
     return b"glTF" + np.array([2, 12 + len(chunks)], dtype="<u4").tobytes() + chunks
 
 
-def write_ros_map(folder: Path, name: str, levels: npt.NDArray[np.uint8], cell_m: float, origin_m: FloatArray) -> None:
+def write_ros_map(
+    folder: Path, name: str, levels: npt.NDArray[np.uint8], cell_m: float, origin_m: FloatArray
+) -> None:
     """Write NAME.pgm and NAME.yaml of map_server and Nav2.
 
     Args:

@@ -1,6 +1,8 @@
-"""Text for terminals and files from names that the system allows but text does not: bytes that are not UTF-8, controls.
+"""Text for terminals and files from names that the system allows but text does not: bytes that are
+not UTF-8, controls.
 
-Python holds a byte of a file name that is not UTF-8 as a lone surrogate, which neither UTF-8 nor JSON can express.
+Python holds a byte of a file name that is not UTF-8 as a lone surrogate, which neither UTF-8 nor
+JSON can express.
 """
 
 from __future__ import annotations
@@ -11,7 +13,9 @@ from typing import Any
 
 
 def printable(text: object) -> str:
-    r"""Return the text in one line: a foreign byte as `\xff`, a control character as `\n`, `\x1b`, …"""
+    r"""Return the text in one line: a foreign byte as `\xff`, a control character as `\n`,
+    `\x1b`, …
+    """
     given = str(text)
     if given.isprintable():
         return given

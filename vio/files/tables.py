@@ -1,7 +1,7 @@
 """Tables that grow by rows: in memory, or in an `.npy` file that is valid after each flush.
 
-A file's header is rewritten in place when rows were flushed (NumPy leaves room for a growing first axis), so a program
-that dies leaves a file with all rows of its last flush.
+A file's header is rewritten in place when rows were flushed (NumPy leaves room for a growing first
+axis), so a program that dies leaves a file with all rows of its last flush.
 """
 
 from __future__ import annotations
@@ -28,7 +28,12 @@ class Table:
     """Structured rows, appended one or several at a time."""
 
     def __init__(
-        self, dtype: np.dtype, path: Path | None = None, *, keep: int = 0, summed: tuple[int, int] = (0, 0)
+        self,
+        dtype: np.dtype,
+        path: Path | None = None,
+        *,
+        keep: int = 0,
+        summed: tuple[int, int] = (0, 0),
     ) -> None:
         """Begin a table, or continue one.
 
@@ -36,14 +41,17 @@ class Table:
             dtype: structured type of a row.
             path: its file; None: in memory.
             keep: rows of an existing file to keep; what follows them is cut off.
-            summed: of how many of these rows a checksum is known, and the checksum, see `check_table`.
+            summed: of how many of these rows a checksum is known, and the checksum, see
+                `check_table`.
 
         Raises:
             DataError: the file cannot be written, is a link, or has fewer rows or another type.
         """
-        self.dtype, self._path = dtype, path
+        self.dtype = dtype
+        self._path = path
         self._memory: Rows = np.zeros(0, dtype=dtype)
-        self._count, self._summed = keep, summed
+        self._count = keep
+        self._summed = summed
         self._file: BinaryIO | None = None
         self._is_synced = False
         if path is not None:
@@ -61,7 +69,11 @@ class Table:
     def _write_header(self) -> None:
         assert self._file is not None
         self._file.seek(0)
-        header = {"descr": np.lib.format.dtype_to_descr(self.dtype), "fortran_order": False, "shape": (self._count,)}
+        header = {
+            "descr": np.lib.format.dtype_to_descr(self.dtype),
+            "fortran_order": False,
+            "shape": (self._count,),
+        }
         np.lib.format.write_array_header_1_0(self._file, header)
 
     def __len__(self) -> int:
@@ -78,7 +90,9 @@ class Table:
             self._file.write(rows.tobytes())
         else:
             if self._count + len(rows) > len(self._memory):
-                grown = np.zeros(max(2 * len(self._memory), self._count + len(rows), 64), dtype=self.dtype)
+                grown = np.zeros(
+                    max(2 * len(self._memory), self._count + len(rows), 64), dtype=self.dtype
+                )
                 grown[: self._count] = self._memory[: self._count]
                 self._memory = grown
             self._memory[self._count : self._count + len(rows)] = rows
@@ -125,7 +139,9 @@ class Table:
         if not self._file.closed:
             self._file.flush()
         assert self._path is not None
-        whole: Rows = np.memmap(self._path, dtype=self.dtype, mode="r", offset=self._start, shape=(self._count,))
+        whole: Rows = np.memmap(
+            self._path, dtype=self.dtype, mode="r", offset=self._start, shape=(self._count,)
+        )
         return whole[start:stop]
 
     def close(self) -> None:
@@ -145,7 +161,8 @@ def check_table(path: Path, dtype: np.dtype, keep: int, summed: tuple[int, int] 
         summed: a number of rows, and the checksum that they must have.
 
     Raises:
-        DataError: it is missing, has fewer rows or another type, or its rows are not those of the checksum.
+        DataError: it is missing, has fewer rows or another type, or its rows are not those of the
+            checksum.
     """
     try:
         held = np.load(path, mmap_mode="r" if keep else None, allow_pickle=False)
@@ -153,7 +170,12 @@ def check_table(path: Path, dtype: np.dtype, keep: int, summed: tuple[int, int] 
             raise ValueError(f"it has {len(held)} rows, of another kind or fewer than {keep}")
         if _checksum(held[: summed[0]], 0) != summed[1]:
             raise ValueError("its checksum does not agree with its content")
-    except (OSError, ValueError, EOFError, TokenError) as error:  # NumPy takes a damaged header for one of Python 2
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        TokenError,
+    ) as error:  # NumPy takes a damaged header for one of Python 2
         reason = " ".join(str(error).split())
         raise DataError(f"{path}: is damaged ({reason}); repeat the run from its start") from error
 
@@ -169,7 +191,8 @@ class Records(Sequence[_Record], Generic[_Record]):
     """A table's rows as records, made when they are asked for."""
 
     def __init__(self, table: Table, decode: Callable[[np.void], _Record]) -> None:
-        self._table, self._decode = table, decode
+        self._table = table
+        self._decode = decode
 
     def __len__(self) -> int:
         return len(self._table)

@@ -1,4 +1,6 @@
-"""Read and write text files: numbered lines, exact digits, and increasing clocks in integer nanoseconds."""
+"""Read and write text files: numbered lines, exact digits, and increasing clocks in integer
+nanoseconds.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,11 @@ from vio.records import NS_PER_S, IntArray
 INT64_MAX = 2**63 - 1
 _UNITS = {"s": 9, "sec": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanoseconds
 # Stamps of 1973 and later in ns, us and ms; smaller ones are seconds from any zero.
-_NS_SINCE, _US_SINCE, _MS_SINCE = Decimal("1e17"), Decimal("1e14"), Decimal("1e11")
-_WHOLE, _SIGNED = re.compile(r"\d{1,19}"), re.compile(r"[+-]?\d{1,19}")
+_NS_SINCE = Decimal("1e17")
+_US_SINCE = Decimal("1e14")
+_MS_SINCE = Decimal("1e11")
+_WHOLE = re.compile(r"\d{1,19}")
+_SIGNED = re.compile(r"[+-]?\d{1,19}")
 _PIECE = 2**16  # characters that are split into lines at a time
 
 
@@ -33,7 +38,8 @@ def text_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def lines_of(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield what `text_lines` returns: an hour of an IMU has 700,000 lines, which take 100 MB at a time.
+    """Yield what `text_lines` returns: an hour of an IMU has 700,000 lines, which take 100 MB at a
+    time.
 
     Raises:
         DataError: the file is missing or is no text.
@@ -41,9 +47,13 @@ def lines_of(path: Path) -> Iterator[tuple[int, str]]:
     try:
         text = read_input(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a text file ({error.reason}); give the original file") from error
+        raise DataError(
+            f"{path}: not a text file ({error.reason}); give the original file"
+        ) from error
     except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}; give a readable file") from error
+        raise DataError(
+            f"cannot read {path}: {error.strerror or error}; give a readable file"
+        ) from error
     blank: list[tuple[int, str]] = []  # lines that are left out at the end
     for number, line in enumerate(_split_lines(text), start=1):
         if not line.strip():
@@ -65,20 +75,27 @@ def _split_lines(text: str) -> Iterator[str]:
 
 
 def read_numbers(path: Path, columns: int) -> FloatArray:
-    """Read a text table of numbers (N, columns) between white space, without blank lines at the end.
+    """Read a text table of numbers (N, columns) between white space, without blank lines at the
+    end.
 
     Raises:
-        DataError: the file cannot be read, or a line holds something else; the message names the line.
+        DataError: the file cannot be read, or a line holds something else; the message names the
+            line.
     """
     rows: list[list[float]] = []
     for number, line in text_lines(path):
         fields = line.split()
         if len(fields) != columns:
-            raise DataError(f"{path}, line {number}: {len(fields)} values instead of {columns}; correct that line")
+            raise DataError(
+                f"{path}, line {number}: {len(fields)} values instead of {columns}; correct that "
+                "line"
+            )
         try:
             rows.append([float(value) for value in fields])
         except ValueError as error:
-            raise DataError(f"{path}, line {number}: not a number ({error}); write plain decimals") from error
+            raise DataError(
+                f"{path}, line {number}: not a number ({error}); write plain decimals"
+            ) from error
     return np.array(rows, dtype=np.float64).reshape(-1, columns)
 
 
@@ -88,7 +105,9 @@ def write_text(path: Path, text: str) -> None:
 
 
 def exact_text(values: npt.ArrayLike, separator: str = " ") -> str:
-    """Format numbers (any shape, row by row) as the shortest decimals that read back to the same bits."""
+    """Format numbers (any shape, row by row) as the shortest decimals that read back to the same
+    bits.
+    """
     return separator.join(repr(float(value)) for value in np.ravel(values))
 
 
@@ -113,19 +132,24 @@ def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> In
     if len(back):
         k = int(back[0]) + 1
         what = "repeats" if times[k] == times[k - 1] else "runs backwards"
-        now, before = seconds_text(int(times[k])), seconds_text(int(times[k - 1]))
-        raise DataError(f"{where(k)}: the clock {what} ({now} s after {before} s); remove or reorder that entry")
+        now = seconds_text(int(times[k]))
+        before = seconds_text(int(times[k - 1]))
+        raise DataError(
+            f"{where(k)}: the clock {what} ({now} s after {before} s); remove or reorder that entry"
+        )
     return times
 
 
-def parse_stamps(texts: Sequence[str], where: Callable[[int], str], unit: str | None = None) -> IntArray:
+def parse_stamps(
+    texts: Sequence[str], where: Callable[[int], str], unit: str | None = None
+) -> IntArray:
     """Parse stamps as exact decimals.
 
     Args:
         texts: one stamp each.
         where: returns the place of an entry, for messages.
-        unit: "s", "ms", "us" or "ns"; None: by the size of the first (seconds since 1970 or since the start, or
-            milliseconds, microseconds or nanoseconds since 1970).
+        unit: "s", "ms", "us" or "ns"; None: by the size of the first (seconds since 1970 or since
+            the start, or milliseconds, microseconds or nanoseconds since 1970).
 
     Raises:
         DataError: a stamp is no number, or not later than the one before.
@@ -144,13 +168,18 @@ def parse_stamps(texts: Sequence[str], where: Callable[[int], str], unit: str | 
     power = _UNITS[unit] if unit is not None else by_size
     limit = Decimal(INT64_MAX).scaleb(-power)
     for k, value in enumerate(values):
-        if value.copy_abs() > limit:  # abs() would round, which no context can do with an exponent of any size
+        # abs() would round, which no context can do with an exponent of any size
+        if value.copy_abs() > limit:
             remedy = "divide nanoseconds by 1e9, or state their unit in a header ([ns])"
             raise DataError(f"{where(k)}: {texts[k]!r} is out of range for a time; {remedy}")
-    return check_increasing([int(value.scaleb(power).to_integral_value()) for value in values], where)
+    return check_increasing(
+        [int(value.scaleb(power).to_integral_value()) for value in values], where
+    )
 
 
-def whole_ns_stamps(texts: Sequence[str], where: Callable[[int], str], *, signed: bool = False) -> IntArray:
+def whole_ns_stamps(
+    texts: Sequence[str], where: Callable[[int], str], *, signed: bool = False
+) -> IntArray:
     """Return stamps (N,) that are written as whole nanoseconds, strictly increasing.
 
     Args:

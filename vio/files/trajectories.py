@@ -33,7 +33,8 @@ logger = logging.getLogger(__name__)
 
 TrajectoryFormat: TypeAlias = Literal["tum", "kitti", "euroc"]
 
-ROTATION_TOLERANCE = 1e-3  # deviation of a quaternion's norm or of R^T R from one accepted as rounding
+# deviation of a quaternion's norm or of R^T R from one accepted as rounding
+ROTATION_TOLERANCE = 1e-3
 _LARGEST = 1e12  # of a coordinate, in metres: beyond, squares overflow
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _COLUMNS: dict[TrajectoryFormat, str] = {
@@ -41,7 +42,9 @@ _COLUMNS: dict[TrajectoryFormat, str] = {
     "kitti": "12 columns, the first three rows of a 4x4 pose",
     "euroc": "at least 8 comma-separated columns 'timestamp [ns], px, py, pz, qw, qx, qy, qz'",
 }
-_EUROC_HEADER = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w, q_RS_x, q_RS_y, q_RS_z\n"
+_EUROC_HEADER = (
+    "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w, q_RS_x, q_RS_y, q_RS_z\n"
+)
 _LONGEST_LINE = 2**20  # bytes: the frames of a day with gaps are numbered in a comment of less
 _LONGEST_LIST = 100  # characters of frame numbers in a warning
 _DEFAULT_BODY: dict[TrajectoryFormat, BodyFrame] = {"tum": "imu", "kitti": "cam0", "euroc": "imu"}
@@ -69,19 +72,26 @@ class _Table:
 
 
 def read_trajectory(
-    path: str | os.PathLike[str], *, fmt: TrajectoryFormat | None = None, body: BodyFrame | None = None
+    path: str | os.PathLike[str],
+    *,
+    fmt: TrajectoryFormat | None = None,
+    body: BodyFrame | None = None,
 ) -> Trajectory:
     """Read a trajectory; the format is detected from the content unless given.
 
-    A KITTI file describes cam0 and has no times; an EuRoC file describes the IMU; a TUM file describes the
-    frame of its comment `# body: imu` or `# body: cam0`, else the IMU. `body` overrides all of these. A comment
-    `# frames: 0-41 45-99` in a TUM file (written by `write_tum`) numbers the poses.
+    A KITTI file describes cam0 and has no times; an EuRoC file describes the IMU; a TUM file
+    describes the frame of its comment `# body: imu` or `# body: cam0`, else the IMU. `body`
+    overrides all of these. A comment `# frames: 0-41 45-99` in a TUM file (written by `write_tum`)
+    numbers the poses.
 
     Raises:
         DataError: the file cannot be used; the message names file, line and remedy.
     """
     if fmt is not None and fmt not in get_args(TrajectoryFormat):
-        raise DataError(f"unknown trajectory format {fmt!r}; choose one of {', '.join(get_args(TrajectoryFormat))}")
+        raise DataError(
+            f"unknown trajectory format {fmt!r}; choose one of "
+            f"{', '.join(get_args(TrajectoryFormat))}"
+        )
     table = _read_table(Path(path))
     if not table.rows:
         raise DataError(f"{table.path}: holds no poses; give a TUM, KITTI or EuRoC trajectory file")
@@ -91,7 +101,9 @@ def read_trajectory(
         return Trajectory(_kitti_poses(table), None, body or _DEFAULT_BODY[kind])
     stamps = [table.fields(row, 1)[0].strip() for row in range(len(table.rows))]
     times_ns = (
-        whole_ns_stamps(stamps, table.where, signed=True) if kind == "euroc" else parse_stamps(stamps, table.where, "s")
+        whole_ns_stamps(stamps, table.where, signed=True)
+        if kind == "euroc"
+        else parse_stamps(stamps, table.where, "s")
     )
     poses = _quaternion_poses(table, kind)
     header_body = _header(table, r"body:\s*(\S+)") if kind == "tum" else None
@@ -105,19 +117,32 @@ def read_trajectory(
 
 
 def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
-    """Write `timestamp tx ty tz qx qy qz qw`, seconds with nine decimals, metres; body and frames in the comments.
+    """Write `timestamp tx ty tz qx qy qz qw`, seconds with nine decimals, metres; body and frames
+    in the comments.
 
     Raises:
         DataError: the trajectory has no times, or the file cannot be written.
     """
     if trajectory.times_ns is None:
-        raise DataError(f"cannot write {path}: a TUM file needs times and this trajectory has none; write KITTI form")
-    text = tum_text(trajectory.times_ns, trajectory.T_world_body, body=trajectory.body, frames=trajectory.frame_indices)
+        raise DataError(
+            f"cannot write {path}: a TUM file needs times and this trajectory has none; write "
+            "KITTI form"
+        )
+    text = tum_text(
+        trajectory.times_ns,
+        trajectory.T_world_body,
+        body=trajectory.body,
+        frames=trajectory.frame_indices,
+    )
     atomic_write_text(path, text)
 
 
 def tum_text(
-    times_ns: IntArray, T_world_body: FloatArray, *, body: BodyFrame | None = None, frames: IntArray | None = None
+    times_ns: IntArray,
+    T_world_body: FloatArray,
+    *,
+    body: BodyFrame | None = None,
+    frames: IntArray | None = None,
 ) -> str:
     """Return the lines of `write_tum`.
 
@@ -133,51 +158,71 @@ def tum_text(
         if frames is not None and len(frames):
             lines.append(f"# frames: {_format_frames(frames)}")
         lines.append("# timestamp tx ty tz qx qy qz qw")
-    values = np.concatenate([T_world_body[:, :3, 3], quat_xyzw_from_rotation(T_world_body[:, :3, :3])], axis=1)
-    lines += [f"{seconds_text(t)} {exact_text(row)}" for t, row in zip(times_ns.tolist(), values, strict=True)]
+    values = np.concatenate(
+        [T_world_body[:, :3, 3], quat_xyzw_from_rotation(T_world_body[:, :3, :3])], axis=1
+    )
+    lines += [
+        f"{seconds_text(t)} {exact_text(row)}"
+        for t, row in zip(times_ns.tolist(), values, strict=True)
+    ]
     return "".join(f"{line}\n" for line in lines)
 
 
 def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
     """Write the first three rows of each cam0 pose as 12 numbers a line, without comments.
 
-    Every reader of this form assumes that row k is frame k; other frame numbers are logged as a warning.
+    Every reader of this form assumes that row k is frame k; other frame numbers are logged as a
+    warning.
 
     Raises:
         DataError: the poses describe the IMU, or the file cannot be written.
     """
     if trajectory.body != "cam0":
-        raise DataError(f"cannot write {path}: KITTI form describes cam0; convert with Trajectory.in_cam0 first")
+        raise DataError(
+            f"cannot write {path}: KITTI form describes cam0; convert with Trajectory.in_cam0 first"
+        )
     frames = trajectory.frame_indices
     if frames is not None and not np.array_equal(frames, np.arange(len(trajectory))):
         text = _format_frames(frames)
         if len(text) > _LONGEST_LIST:
             text = f"{frames[0]} to {frames[-1]} with gaps, {len(frames)} in all"
         logger.warning(
-            "%s: its rows are the frames %s; tools that number rows from 0 will misread them", Path(path).name, text
+            "%s: its rows are the frames %s; tools that number rows from 0 will misread them",
+            Path(path).name,
+            text,
         )
     rows = trajectory.T_world_body[:, :3, :].reshape(-1, 12)
     atomic_write_text(path, "".join(f"{exact_text(row)}\n" for row in rows))
 
 
 def write_euroc(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
-    """Write `timestamp [ns], p x y z, q w x y z` of the IMU, the columns of EuRoC's ground truth up to the velocity.
+    """Write `timestamp [ns], p x y z, q w x y z` of the IMU, the columns of EuRoC's ground truth up
+    to the velocity.
 
     Raises:
         DataError: the poses describe the camera or have no times, or the file cannot be written.
     """
     if trajectory.body != "imu" or trajectory.times_ns is None:
-        lacks = "describes the IMU; convert with Trajectory.in_imu" if trajectory.body != "imu" else "needs times"
+        lacks = (
+            "describes the IMU; convert with Trajectory.in_imu"
+            if trajectory.body != "imu"
+            else "needs times"
+        )
         raise DataError(f"cannot write {path}: EuRoC form {lacks} first")
     T = trajectory.T_world_body
     q_wxyz = np.roll(quat_xyzw_from_rotation(T[:, :3, :3]), 1, axis=1)
     values = np.concatenate([T[:, :3, 3], q_wxyz], axis=1)
-    rows = (f"{t},{exact_text(row, ',')}\n" for t, row in zip(trajectory.times_ns.tolist(), values, strict=True))
+    rows = (
+        f"{t},{exact_text(row, ',')}\n"
+        for t, row in zip(trajectory.times_ns.tolist(), values, strict=True)
+    )
     atomic_write_text(path, "".join([_EUROC_HEADER, *rows]))
 
 
 def is_trajectory_file(path: Path) -> bool:
-    """Return whether a text file begins like a trajectory: comments, then a row of 8 or 12 numbers, or a wider csv."""
+    """Return whether a text file begins like a trajectory: comments, then a row of 8 or 12
+    numbers, or a wider csv.
+    """
     if not path.is_file():
         return False
     with path.open("rb") as stream:
@@ -229,12 +274,15 @@ def _check_columns(table: _Table, kind: TrajectoryFormat) -> None:
     for row, line in enumerate(table.rows):
         count = line.count(",") + 1 if table.commas else len(line.split())
         if count != expected:
-            table.fail(row, f"{count} columns instead of {expected}; {kind} form has {_COLUMNS[kind]}")
+            table.fail(
+                row, f"{count} columns instead of {expected}; {kind} form has {_COLUMNS[kind]}"
+            )
 
 
 def _floats(table: _Table, first: int, last: int) -> FloatArray:
     """Columns `first <= column < last` as finite numbers (N, last - first)."""
-    values, row = array("d"), 0
+    values = array("d")
+    row = 0
     try:
         for row in range(len(table.rows)):
             values.extend(map(float, table.fields(row, last)[first:last]))
@@ -245,21 +293,27 @@ def _floats(table: _Table, first: int, last: int) -> FloatArray:
     if bad.any():
         table.fail(
             int(np.argmax(bad)),
-            f"a pose is not finite, or beyond {_LARGEST:g} (first of {int(bad.sum())}); remove such lines",
+            f"a pose is not finite, or beyond {_LARGEST:g} (first of {int(bad.sum())}); remove "
+            "such lines",
         )
     return out
 
 
 def _quaternion_poses(table: _Table, kind: TrajectoryFormat) -> FloatArray:
     values = _floats(table, 1, 8)
-    p, q = values[:, :3], values[:, 3:]
+    p = values[:, :3]
+    q = values[:, 3:]
     q_xyzw = q if kind == "tum" else np.roll(q, -1, axis=1)
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(q_xyzw, axis=1)
     bad = np.abs(norm - 1) > ROTATION_TOLERANCE
     if bad.any():
         row = int(np.argmax(bad))
-        table.fail(row, f"the quaternion has norm {norm[row]:.6g}, not 1; check the column order ({_COLUMNS[kind]})")
+        table.fail(
+            row,
+            f"the quaternion has norm {norm[row]:.6g}, not 1; check the column order "
+            f"({_COLUMNS[kind]})",
+        )
     return se3_from_parts(rotation_from_quat_xyzw(q_xyzw), p)
 
 
@@ -272,7 +326,11 @@ def _kitti_poses(table: _Table) -> FloatArray:
     bad = ~(deviation <= ROTATION_TOLERANCE) | mirrored
     if bad.any():
         row = int(np.argmax(bad))
-        why = "mirrors" if deviation[row] <= ROTATION_TOLERANCE else f"is off orthonormal by {deviation[row]:.3g}"
+        why = (
+            "mirrors"
+            if deviation[row] <= ROTATION_TOLERANCE
+            else f"is off orthonormal by {deviation[row]:.3g}"
+        )
         table.fail(row, f"the rotation {why}; KITTI form has {_COLUMNS['kitti']}, row by row")
     orthonormal = np.where((deviation <= _EXACT)[:, None, None], R, nearest_rotation(R))
     return se3_from_parts(orthonormal, values[:, :, 3])
@@ -287,20 +345,28 @@ def _header(table: _Table, pattern: str) -> str | None:
 def _body(table: _Table, header_body: str | None, requested: BodyFrame | None) -> BodyFrame | None:
     if header_body is not None and header_body not in get_args(BodyFrame):
         raise DataError(
-            f"{table.path}: its comment names the body {header_body!r}; use '# body: imu' or '# body: cam0'"
+            f"{table.path}: its comment names the body {header_body!r}; use '# body: imu' or '# "
+            "body: cam0'"
         )
     if requested is not None:
         if header_body is not None and header_body != requested:
             logger.warning(
-                "%s describes %s according to its comment; read as %s, as requested", table.path, header_body, requested
+                "%s describes %s according to its comment; read as %s, as requested",
+                table.path,
+                header_body,
+                requested,
             )
         return requested
     return "cam0" if header_body == "cam0" else "imu" if header_body == "imu" else None
 
 
 def _format_frames(frames: IntArray) -> str:
-    """Format frame numbers as ranges: [0 1 2 5] becomes '0-2 5-5', and [0 2 4], every second frame, '0-4/2'."""
-    numbers, runs, first = frames.tolist(), [], 0
+    """Format frame numbers as ranges: [0 1 2 5] becomes '0-2 5-5', and [0 2 4], every second
+    frame, '0-4/2'.
+    """
+    numbers = frames.tolist()
+    runs = []
+    first = 0
     while first < len(numbers):
         last = min(first + 1, len(numbers) - 1)
         step = max(numbers[last] - numbers[first], 1)
@@ -308,18 +374,27 @@ def _format_frames(frames: IntArray) -> str:
             last += 1
         if step > 1 and last == first + 1:  # two frames apart are no rhythm
             last = first
-        runs.append(f"{numbers[first]}-{numbers[last]}" + (f"/{step}" if step > 1 and last > first else ""))
+        runs.append(
+            f"{numbers[first]}-{numbers[last]}" + (f"/{step}" if step > 1 and last > first else "")
+        )
         first = last + 1
     return " ".join(runs)
 
 
 def _parse_frames(table: _Table, text: str) -> IntArray:
     runs = [re.fullmatch(r"(\d{1,9})-(\d{1,9})(?:/([1-9]\d{0,8}))?", run) for run in text.split()]
-    spans = [range(int(run.group(1)), int(run.group(2)) + 1, int(run.group(3) or 1)) for run in runs if run]
+    spans = [
+        range(int(run.group(1)), int(run.group(2)) + 1, int(run.group(3) or 1))
+        for run in runs
+        if run
+    ]
     ordered = all(len(a) and len(b) and a[-1] < b[0] for a, b in pairwise(spans))
     if not all(runs) or not ordered or sum(map(len, spans)) != len(table.rows):
         raise DataError(
-            f"{table.path}: its comment '# frames: {text[:60]}' does not number its {len(table.rows)} poses; "
+            f"{table.path}: its comment '# frames: {text[:60]}' does not number its "
+            f"{len(table.rows)} poses; "
             "remove the comment or correct it"
         )
-    return np.concatenate([np.arange(span.start, span.stop, span.step, dtype=np.int64) for span in spans])
+    return np.concatenate(
+        [np.arange(span.start, span.stop, span.step, dtype=np.int64) for span in spans]
+    )

@@ -7,12 +7,15 @@ from typing import Any
 import yaml
 
 MOST_BYTES = 2**22  # of a configuration or calibration
-_MOST_NODES = 20_000  # a long list of views of a calibration; aliases of aliases make a kilobyte a billion
+# a long list of views of a calibration; aliases of aliases make a kilobyte a billion
+_MOST_NODES = 20_000
 _MOST_DEPTH = 32  # the deepest known calibration has five levels
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Refuses what makes a small text large or deep, and duplicate keys, of which YAML itself would use the last."""
+    """Refuses what makes a small text large or deep, and duplicate keys, of which YAML itself
+    would use the last.
+    """
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
@@ -51,7 +54,9 @@ class _PlainLoader(yaml.SafeLoader):
             seen: set[str] = set()
             for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
                 if key.value in seen:
-                    raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' is given twice", key.start_mark)
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"'{key.value}' is given twice", key.start_mark
+                    )
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
 
@@ -60,12 +65,16 @@ def read_yaml(text: str) -> Any:
     """Return the data of a YAML text.
 
     Raises:
-        ValueError: it is no YAML, or more than plain data; the message is one line and names line and column.
+        ValueError: it is no YAML, or more than plain data; the message is one line and names line
+            and column.
     """
     try:
         return yaml.load(text, Loader=_PlainLoader)
     except yaml.YAMLError as error:
         raise ValueError(" ".join(str(error).split())) from error
     except (ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError) as error:
-        # PyYAML lets these through for tagged or malformed scalars: a 13th month, !!bool maybe, 5000 digits
-        raise ValueError(f"a value does not fit its type: {' '.join(str(error).split())}") from error
+        # PyYAML lets these through for tagged or malformed scalars: a 13th month, !!bool maybe,
+        # 5000 digits
+        raise ValueError(
+            f"a value does not fit its type: {' '.join(str(error).split())}"
+        ) from error

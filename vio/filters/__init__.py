@@ -1,4 +1,7 @@
-"""Back ends: estimators fed with motion samples and observations. None of them imports cv2 or torch."""
+"""Back ends: estimators fed with motion samples and observations.
+
+None of them imports cv2 or torch.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,8 @@ def _msckf() -> type[Backend]:
     return Msckf
 
 
-# The back ends by their names in the configuration; the settings of one are the section of the same name, if any.
+# The back ends by their names in the configuration; the settings of one are the section of the same
+# name, if any.
 BACKENDS: dict[str, Callable[[], type[Backend]]] = {"vislam": _vislam, "msckf": _msckf}
 
 

@@ -7,7 +7,8 @@
 | `clones` | camera poses (6 each), oldest first |
 | `landmarks` | points (3 each) |
 
-Covariances, Jacobians and information matrices find their rows and columns here, by the name of the block.
+Covariances, Jacobians and information matrices find their rows and columns here, by the name of the
+block.
 """
 
 from __future__ import annotations
@@ -23,13 +24,16 @@ from vio.geometry.lie import FloatArray
 
 
 class ErrorState:
-    """Where each block is in an error vector of length D; a window with other blocks has another one."""
+    """Where each block is in an error vector of length D; a window with other blocks has another
+    one.
+    """
 
     def __init__(self, calibration: Mapping[str, int], clones: int, landmarks: int) -> None:
         """Lay out the blocks.
 
         Args:
-            calibration: name and size of each block of the calibration that is estimated, in their order.
+            calibration: name and size of each block of the calibration that is estimated, in their
+                order.
             clones: how many.
             landmarks: how many.
         """
@@ -46,8 +50,10 @@ class ErrorState:
             for where in ("motion", "pixels")
         )
         self.motion = slice(0, DIM + of_motion)  # what the motion model predicts and corrects
-        self.stereo = slice(self.motion.stop, self.motion.stop + of_pixels)  # coefficients that pixels depend on
-        self.first_of_pixels = self.stereo.start if of_pixels else first  # pixels depend on no error before it
+        # coefficients that pixels depend on
+        self.stereo = slice(self.motion.stop, self.motion.stop + of_pixels)
+        # pixels depend on no error before it
+        self.first_of_pixels = self.stereo.start if of_pixels else first
         self.clones = slice(first, first + 6 * clones)
         self.landmarks = slice(self.clones.stop, self.clones.stop + 3 * landmarks)
         self.size = self.landmarks.stop
@@ -68,7 +74,9 @@ class ErrorState:
         bounds = self.clones.start if index >= 0 else self.clones.stop
         return slice(bounds + 6 * index, bounds + 6 * index + 6)
 
-    def jacobian(self, out_D_clones: FloatArray, out_D_stereo: FloatArray | None = None) -> FloatArray:
+    def jacobian(
+        self, out_D_clones: FloatArray, out_D_stereo: FloatArray | None = None
+    ) -> FloatArray:
         """Turn Jacobians into Jacobians (..., D) by the error vector.
 
         Args:
@@ -93,7 +101,8 @@ class ErrorState:
             considered: how many of the coefficients, the last ones, have no errors here.
 
         Returns:
-            Matrix (D, D), vector (D,), and the information of all errors with the coefficients considered (D, C).
+            Matrix (D, D), vector (D,), and the information of all errors with the coefficients
+            considered (D, C).
         """
         out: tuple[FloatArray, FloatArray, FloatArray] = (
             np.empty((self.size, self.size)),
@@ -101,5 +110,7 @@ class ErrorState:
             np.empty((self.size, considered)),
         )
         clones = self.clones
-        loops.place_information(A, b, variance, clones.stop - clones.start, clones.start, self.stereo.start, *out)
+        loops.place_information(
+            A, b, variance, clones.stop - clones.start, clones.start, self.stereo.start, *out
+        )
         return out

@@ -1,8 +1,8 @@
 """A frame's update: Gauss-Newton over the window, gates, and what is marginalised into the prior.
 
-Fit to everything that is observed; gate tracks and landmarks; marginalise what ends here (tracks that were lost, tracks
-that leave the window); estimate with what passed its gate; drop the oldest clone. Tracks that continue are linearised
-anew in every frame and absorbed into the prior once.
+Fit to everything that is observed; gate tracks and landmarks; marginalise what ends here (tracks
+that were lost, tracks that leave the window); estimate with what passed its gate; drop the oldest
+clone. Tracks that continue are linearised anew in every frame and absorbed into the prior once.
 """
 
 from __future__ import annotations
@@ -38,37 +38,66 @@ from vio.filters.tracks import precision, rows_of
 from vio.filters.window import Window
 from vio.filters.window_posterior import WindowPosterior, landmark_covariance, move_covariance
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat, transform_points
+from vio.geometry.lie import (
+    FloatArray,
+    se3_adjoint,
+    se3_inverse,
+    se3_log,
+    so3_hat,
+    transform_points,
+)
 from vio.geometry.stereo import depth_of, project
 from vio.numerics.robust import median
-from vio.records import FIELD_TERMS, BoolArray, IntArray, MotionPrior, Observations, TrackPrior, UpdateReport
+from vio.records import (
+    FIELD_TERMS,
+    BoolArray,
+    IntArray,
+    MotionPrior,
+    Observations,
+    TrackPrior,
+    UpdateReport,
+)
 
-_FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
-# Standard deviations of a point's inverse depth over itself, at most. A landmark is linearised and marginalised frame
-# by frame as a Cartesian point, which biases scale in second order of it where the depth comes from motion. With left
-# images and an IMU, position NEES after 2 s is 24 of 3 at 0.2, 15 at 0.05, 6 at 0.02, 2.8 at 0.01, 2.5 without any.
+_FIRST_STEPS = 0  # Gauss-Newton steps on each point, before and after the poses moved
+_LATER_STEPS = 1
+# Standard deviations of a point's inverse depth over itself, at most. A landmark is linearised and
+# marginalised frame by frame as a Cartesian point, which biases scale in second order of it where
+# the depth comes from motion. With left images and an IMU, position NEES after 2 s is 24 of 3 at
+# 0.2, 15 at 0.05, 6 at 0.02, 2.8 at 0.01, 2.5 without any.
 _LANDMARK_DEPTH_SIGMA = 0.01  # by all views
 _LANDMARK_STEREO_SIGMA = 0.1  # or by the right views alone, which know the scale
-# Standard deviation of the baseline over it, and that of a point's stereo depth by the rectification, over it, at most:
-# while the scale is open, the same bias falls on the baseline, and on the field.
-# With a prior of 5 % and a baseline that is off by 9.5 %, 15 s of a flight with an IMU end at 4.07 +- 0.03 % with
-# landmarks from the start, at 9.02 +- 0.29 % without any. Where no right image gives depths any more, the bias is the
-# lesser evil: on MH_01 36 such frames by images alone cost 86 mm without landmarks, 4 mm with them.
+# Standard deviation of the baseline over it, and that of a point's stereo depth by the
+# rectification, over it, at most: while the scale is open, the same bias falls on the baseline, and
+# on the field. With a prior of 5 % and a baseline that is off by 9.5 %, 15 s of a flight with an
+# IMU end at 4.07 +- 0.03 % with landmarks from the start, at 9.02 +- 0.29 % without any. Where no
+# right image gives depths any more, the bias is the lesser evil: on MH_01 36 such frames by images
+# alone cost 86 mm without landmarks, 4 mm with them.
 _SCALE_SIGMA = 0.001
-_MAP_DEPTH_SIGMA = 0.2  # by all views; a point of the map is reported with its covariance, and not used
-_FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
+# by all views; a point of the map is reported with its covariance, and not used
+_MAP_DEPTH_SIGMA = 0.2
+# pixels by which the predicted pose may be off before one step over the window is too few
+_FAR = 0.5
 _NEARER = 1.25  # by which factor a step must have come nearer for another one
-_MOST_STEPS = 4  # over the window in a frame: one is the rule, two bring in a start in motion, a third is an exception
+# over the window in a frame: one is the rule, two bring in a start in motion, a third is an
+# exception
+_MOST_STEPS = 4
 
 
 class FrameUpdate:
     """Updates a window with what a frame shows."""
 
     def __init__(
-        self, settings: MsckfSettings, rig: RigCalibration, propagation: Propagation, points: PointMap
+        self,
+        settings: MsckfSettings,
+        rig: RigCalibration,
+        propagation: Propagation,
+        points: PointMap,
     ) -> None:
         """Prepare; `points` gets the points of tracks and landmarks that end."""
-        self._settings, self._rig, self._propagation, self._points = settings, rig, propagation, points
+        self._settings = settings
+        self._rig = rig
+        self._propagation = propagation
+        self._points = points
         self.tracks = WindowTracks(rig.camera, settings)
         self.smoothed: WindowPosterior | None = None  # after the last frame
         self._landmark_gate = LandmarkGate(settings.gate_probability)
@@ -76,18 +105,28 @@ class FrameUpdate:
 
     @property
     def _variance(self) -> float:
-        """Variance of one pixel coordinate in this frame that counts as if all of them were independent, px^2."""
+        """Variance of one pixel coordinate in this frame that counts as if all of them were
+        independent, px^2.
+        """
         return self.tracks.variance * self.tracks.common_noise * self._overdispersion.factor
 
-    def expected_tracks(self, window: Window, T_cam0_world: FloatArray, motion: MotionPrior) -> TrackPrior:
-        """Predict the pixels of all tracks with a point from a camera pose (4, 4) at a coming frame."""
-        table, camera = self.tracks.table, self._rig.camera
+    def expected_tracks(
+        self, window: Window, T_cam0_world: FloatArray, motion: MotionPrior
+    ) -> TrackPrior:
+        """Predict the pixels of all tracks with a point from a camera pose (4, 4) at a coming
+        frame.
+        """
+        table = self.tracks.table
+        camera = self._rig.camera
         rows = table.rows()
         rows = rows[table.has_point[rows]]
         ids = np.concatenate([table.ids(rows), window.landmark_ids])
-        p_cam = transform_points(T_cam0_world, np.concatenate([table.points[rows], window.landmarks]))
+        p_cam = transform_points(
+            T_cam0_world, np.concatenate([table.points[rows], window.landmarks])
+        )
         ahead = depth_of(camera, p_cam) > MIN_DEPTH * camera.baseline_m
-        z, field = project(camera, p_cam[ahead]), self._rig.field(window)
+        z = project(camera, p_cam[ahead])
+        field = self._rig.field(window)
         if field is not None:
             z = field.seen(z)
         return TrackPrior(ids[ahead], z, motion.T_curr_prev[:3, :3], motion)
@@ -110,7 +149,8 @@ class FrameUpdate:
         Args:
             window: whose newest clone is the frame's.
             seen: its observations.
-            expected: covariance (6, 6) of the camera's motion since the last frame, as it was predicted.
+            expected: covariance (6, 6) of the camera's motion since the last frame, as it was
+                predicted.
 
         Raises:
             numpy.linalg.LinAlgError: the filter has diverged.
@@ -127,16 +167,24 @@ class FrameUpdate:
 
         predicted = window.camera_move_since(-2) if len(window.clones) > 1 else None
         tracks = self._linearise(window, self.tracks.choose(len(window.clones)), _FIRST_STEPS)
-        at_prediction, innovation = tracks, tracks.newest_innovation()
+        at_prediction = tracks
+        innovation = tracks.newest_innovation()
         innovation_ratio = self.tracks.innovation_ratio(tracks, expected)
         tracks, fitted = self._fit(window, tracks, pixels, innovation)
         step = self._step_errors(window, tracks, predicted, fitted, expected)
         if step is not None:
-            missing, doubted = step.missing_noise(), False
+            missing = step.missing_noise()
+            doubted = False
             if missing.any() and self.tracks.agree(tracks.at):
-                window.inflate_process_noise(np.einsum("k,kij->ij", missing, propagation.since_frame.Q_parts))
+                window.inflate_process_noise(
+                    np.einsum("k,kij->ij", missing, propagation.since_frame.Q_parts)
+                )
                 tracks, fitted = self._fit(window, tracks, pixels, innovation)
-            elif missing.any() and propagation.source == "imu" and not propagation.since_frame.bridged:
+            elif (
+                missing.any()
+                and propagation.source == "imu"
+                and not propagation.since_frame.bridged
+            ):
                 doubted = self.tracks.drop_unpredicted(at_prediction, expected)
                 pixels = Views(pixels.z, np.zeros_like(pixels.weight))
                 tracks, fitted = self._fit_again(window, pixels)
@@ -168,8 +216,11 @@ class FrameUpdate:
         """Drop the landmarks outside a mask (M,) from the state; their points go to the map."""
         if kept.all():
             return
-        gone, covariances = ~kept, self._rig.landmark_covariances(window)
-        self._points.store(window, window.landmark_ids[gone], window.landmarks[gone], covariances[gone])
+        gone = ~kept
+        covariances = self._rig.landmark_covariances(window)
+        self._points.store(
+            window, window.landmark_ids[gone], window.landmarks[gone], covariances[gone]
+        )
         window.keep_landmarks(kept)
 
     def _linearise(self, window: Window, rows: IntArray, steps: int) -> LinearTracks:
@@ -179,7 +230,9 @@ class FrameUpdate:
     def _fit(
         self, window: Window, tracks: LinearTracks, pixels: Views, innovation: float | None
     ) -> tuple[LinearTracks, Fit]:
-        """Gauss-Newton over the window; returns the tracks linearised at the estimate, and the last fit."""
+        """Gauss-Newton over the window; returns the tracks linearised at the estimate, and the
+        last fit.
+        """
         for _ in range(_MOST_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b, _ = self._information(window, tracks, everything, pixels)
@@ -193,7 +246,9 @@ class FrameUpdate:
         return tracks, fitted
 
     def _fit_again(self, window: Window, pixels: Views) -> tuple[LinearTracks, Fit]:
-        """Fit to what is left of views that contradict the IMU and one another: a person in the view, not a shock."""
+        """Fit to what is left of views that contradict the IMU and one another: a person in the
+        view, not a shock.
+        """
         tracks = self._linearise(window, self.tracks.choose(len(window.clones)), _LATER_STEPS)
         return self._fit(window, tracks, pixels, tracks.newest_innovation())
 
@@ -206,7 +261,8 @@ class FrameUpdate:
         b: FloatArray,
         size: int,
     ) -> Fit:
-        """Move the means, and the tracks' points with them, to the optimum of the prior and of given information.
+        """Move the means, and the tracks' points with them, to the optimum of the prior and of
+        given information.
 
         Args:
             window: moved; its prior stays.
@@ -220,7 +276,9 @@ class FrameUpdate:
             The fit, with their covariance (size, size) there.
         """
         fitted, error = window.optimum(A, b, size)
-        self.tracks.move_points(tracks, columns, error[window.state.clones], error[window.state.stereo])
+        self.tracks.move_points(
+            tracks, columns, error[window.state.clones], error[window.state.stereo]
+        )
         window.relinearise(error)
         return fitted
 
@@ -232,10 +290,11 @@ class FrameUpdate:
         fitted: Fit,
         expected: FloatArray,
     ) -> StepErrors | None:
-        """The predicted and the corrected motion since the last frame, and what its fit leaves of their errors.
+        """The predicted and the corrected motion since the last frame, and what its fit leaves of
+        their errors.
 
-        It is the camera's motion, seen from the body, so that a new estimate of the extrinsics is no motion. None with
-        too few tracks.
+        It is the camera's motion, seen from the body, so that a new estimate of the extrinsics is
+        no motion. None with too few tracks.
         """
         if predicted is None or len(tracks.rows) < MIN_TRACKS_FOR_NOISE:
             return None
@@ -262,30 +321,45 @@ class FrameUpdate:
             tracks: linearised there.
             chosen: mask (F,).
             pixels: of the landmarks; None: without them.
-            joint: the tracks' columns of the coefficients estimated and of those considered; None: without the latter.
+            joint: the tracks' columns of the coefficients estimated and of those considered; None:
+                without the latter.
 
         Returns:
-            Its matrix (D, D) and vector (D,), and that of all errors with what is considered (D, 4).
+            Its matrix (D, D) and vector (D,), and that of all errors with what is considered (D,
+            4).
         """
-        field, state = self._rig.field(window), window.state
+        field = self._rig.field(window)
+        state = window.state
         considered = 0 if joint is None else CONSIDERED
-        A, b = eliminate_points(tracks.information, chosen, tracks.stereo if joint is None else joint)
+        A, b = eliminate_points(
+            tracks.information, chosen, tracks.stereo if joint is None else joint
+        )
         A, b, by_considered = state.information(A, b, self._variance, considered)
         if pixels is not None and len(pixels.z):
-            at, H = self._landmark_residuals(window, pixels), np.empty((len(pixels.z), 4, 0))
+            at = self._landmark_residuals(window, pixels)
+            H = np.empty((len(pixels.z), 4, 0))
             if field is not None or considered:
-                H = self._error_columns(field, considered).jacobian(unweighted(pixels.z, at.r, at.precision))
+                H = self._error_columns(field, considered).jacobian(
+                    unweighted(pixels.z, at.r, at.precision)
+                )
             # In their anchor, the newest clone: dp = xi_f - xi_rho.
             rows = state.clone(-1).start, state.landmarks.start, state.stereo.start
             weight = at.weight / self._variance
-            track_loops.add_landmarks(at.r, at.J, H, at.precision, weight, *rows, A, b, by_considered)
+            track_loops.add_landmarks(
+                at.r, at.J, H, at.precision, weight, *rows, A, b, by_considered
+            )
         return A, b, None if joint is None else by_considered
 
     def _joint_columns(self, window: Window, tracks: LinearTracks) -> StereoColumns | None:
-        """The tracks' columns of the coefficients estimated and of those considered; None: none is considered."""
+        """The tracks' columns of the coefficients estimated and of those considered.
+
+        None: none is considered.
+        """
         if not self._rig.considered_sigmas(window).any():
             return None
-        return stereo_columns(self._error_columns(tracks.field, CONSIDERED), tracks.at, tracks.z, tracks.weight)
+        return stereo_columns(
+            self._error_columns(tracks.field, CONSIDERED), tracks.at, tracks.z, tracks.weight
+        )
 
     def _error_columns(self, field: StereoCorrection | None, considered: int) -> ErrorColumns:
         """Columns of the coefficients that are estimated, and of the C considered."""
@@ -299,24 +373,31 @@ class FrameUpdate:
         if field is not None:
             pixels = field.corrected(pixels)
         T = window.T_cam0_world(-1)[0]
-        return landmark_residuals(self._rig.camera, T, window.landmarks, pixels, self.tracks.variance)
+        return landmark_residuals(
+            self._rig.camera, T, window.landmarks, pixels, self.tracks.variance
+        )
 
     def _gate_landmarks(self, window: Window, pixels: Views, fitted: Fit) -> tuple[Views, IntArray]:
         """Test the landmarks' pixels after a fit; drop the landmarks that keep failing.
 
         Returns:
-            The pixels of the landmarks left, without weight where rejected, and the ids (R,) of those rejected.
+            The pixels of the landmarks left, without weight where rejected, and the ids (R,) of
+            those rejected.
         """
         if not len(pixels.z):
             return pixels, window.landmark_ids
         at = self._landmark_residuals(window, pixels)
-        J, field = at.J, self._rig.field(window)
+        J = at.J
+        field = self._rig.field(window)
         if field is not None:
             z = unweighted(pixels.z, at.r, at.precision)
             H = field.columns().jacobian(z) * (at.precision * np.any(at.J, axis=2))[..., None]
             J = np.concatenate([J, H], axis=2)
-        weight = at.weight * (self.tracks.variance / self._variance)  # that they entered the fit with
-        nis = leave_one_out_nis(at.r, J, landmark_covariance(window, fitted), weight, self.tracks.variance)
+        # that they entered the fit with
+        weight = at.weight * (self.tracks.variance / self._variance)
+        nis = leave_one_out_nis(
+            at.r, J, landmark_covariance(window, fitted), weight, self.tracks.variance
+        )
         dof = np.maximum(np.any(at.J, axis=2).sum(axis=1), 1)
         used, dropped = self._landmark_gate.check(window.landmark_ids, nis, dof)
         rejected = window.landmark_ids[~used]
@@ -327,28 +408,33 @@ class FrameUpdate:
     def _marginalise(
         self, window: Window, tracks: LinearTracks, good: BoolArray, pixels: Views, stereo: bool
     ) -> tuple[int, float]:
-        """Absorb what ends in this frame into the prior, estimate with all that is good, and make room.
+        """Absorb what ends in this frame into the prior, estimate with all that is good, and make
+        room.
 
-        Only tracks and landmarks that passed their gates steer the estimate: the means move to the optimum of the
-        prior, the landmarks' pixels and the good tracks, also those that go on.
+        Only tracks and landmarks that passed their gates steer the estimate: the means move to the
+        optimum of the prior, the landmarks' pixels and the good tracks, also those that go on.
 
         Returns:
-            How many landmarks are new, and how many degrees of freedom the tracks that go on have spent on the errors
-            that they share.
+            How many landmarks are new, and how many degrees of freedom the tracks that go on have
+            spent on the errors that they share.
         """
-        table, newest = self.tracks.table, len(window.clones) - 1
+        table = self.tracks.table
+        newest = len(window.clones) - 1
         full = len(window.clones) > self._settings.clones
         seen = table.seen(tracks.rows)
-        lost, leaving = ~seen[:, newest], seen[:, 0] & full
+        lost = ~seen[:, newest]
+        leaving = seen[:, 0] & full
         ending = lost | leaving
-        ended, joint = np.flatnonzero(ending & good), self._joint_columns(window, tracks)
+        ended = np.flatnonzero(ending & good)
+        joint = self._joint_columns(window, tracks)
         columns = tracks.stereo if joint is None else joint
         if len(ended):
             directions = np.empty((len(ended), 2))
             track_loops.write_directions(ended, tracks.T_cam0_world[-1], tracks.p_world, directions)
             scored = self.tracks.drift_scores(tracks, ended)
             self._overdispersion.add(table.ids(tracks.rows[ended]), directions, *scored)
-        # Errors that last stay in one place of the image, too, and the field takes them in with every frame.
+        # Errors that last stay in one place of the image, too, and the field takes them in with
+        # every frame.
         repeated = self._overdispersion.factor
         A, b, considered = self._information(window, tracks, ending & good, pixels, joint)
         window.absorb(A, b, repeated=repeated, considered=considered)
@@ -358,9 +444,11 @@ class FrameUpdate:
 
         A, b, considered = self._information(window, tracks, good & ~ending, None, joint)
         if columns is not None and not good.all():
-            eliminate_points(tracks.information, ~good, columns)  # the points of tracks that are left out move, too
+            # the points of tracks that are left out move, too
+            eliminate_points(tracks.information, ~good, columns)
         size = window.state.clones.stop
-        P = self._move_to_optimum(window, tracks, columns, A, b, size).covariance()  # without landmarks
+        # without landmarks
+        P = self._move_to_optimum(window, tracks, columns, A, b, size).covariance()
         fitted = float(np.sum(A[:size, :size] * P))
         V = window.prior.error_D_constants[:size, 1:]
         if considered is not None:
@@ -376,10 +464,14 @@ class FrameUpdate:
             of_points = tracks.information.point_D_clones(done) @ V[window.state.clones]
             of_points += joint.point_D_stereo(tracks.information, done)[..., -CONSIDERED:]
             covariance = covariance + self._rig.uncertainty(window, of_points)
-        self._points.store(window, table.ids(tracks.rows[done]), table.points[tracks.rows[done]], covariance)
+        self._points.store(
+            window, table.ids(tracks.rows[done]), table.points[tracks.rows[done]], covariance
+        )
         spent = leaving & ~lost
         spent[promoted] = False
-        self.tracks.end_frame(spent=tracks.rows[spent], promoted=tracks.rows[promoted], newest=newest)
+        self.tracks.end_frame(
+            spent=tracks.rows[spent], promoted=tracks.rows[promoted], newest=newest
+        )
         if full:
             window.drop_oldest_clone()
             table.shift()
@@ -394,23 +486,30 @@ class FrameUpdate:
         depth_sigma: FloatArray,
         stereo: bool,
     ) -> IntArray:
-        """Make landmarks of the best known points whose tracks leave the window; return which tracks (indices).
+        """Make landmarks of the best known points whose tracks leave the window; return which
+        tracks (indices).
 
         Args:
             window: receives the landmarks.
             tracks: linearised at its means.
-            columns: theirs of the coefficients estimated and of those considered; None: there are none.
+            columns: theirs of the coefficients estimated and of those considered; None: there are
+                none.
             candidates: mask (F,) of the tracks that may become landmarks.
             depth_sigma: (F,) standard deviation of each inverse depth, over itself.
-            stereo: whether this frame has right pixels, from which the next tracks will get their depths.
+            stereo: whether this frame has right pixels, from which the next tracks will get their
+                depths.
         """
         room = self._settings.max_landmarks - len(window.landmarks)
         unsure = _scale_sigma(window) > _SCALE_SIGMA
         if room <= 0 or unsure or not candidates.any():
             return np.zeros(0, dtype=np.int64)
         chosen = np.flatnonzero(candidates)
-        by_stereo = np.sqrt(self.tracks.variance) * relative_stereo_sigma(tracks.at, tracks.information.q, chosen)
-        chosen = chosen[(depth_sigma[chosen] < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)]
+        by_stereo = np.sqrt(self.tracks.variance) * relative_stereo_sigma(
+            tracks.at, tracks.information.q, chosen
+        )
+        chosen = chosen[
+            (depth_sigma[chosen] < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)
+        ]
         field = self._rig.field(window)
         if field is not None:
             p = transform_points(window.T_cam0_world(-1)[0], tracks.p_world[chosen])
@@ -424,10 +523,14 @@ class FrameUpdate:
         worst = np.linalg.eigvalsh(covariance)[:, 2]
         table = self.tracks.table
         best = np.lexsort((table.ids(tracks.rows[chosen]), worst))[:room]
-        chosen, covariance = chosen[best], covariance[best]
-        p, point_D_poses = tracks.p_world[chosen], tracks.information.point_D_clones(chosen)
+        chosen = chosen[best]
+        covariance = covariance[best]
+        p = tracks.p_world[chosen]
+        point_D_poses = tracks.information.point_D_clones(chosen)
         point_D_poses[:, :, -3:] += so3_hat(p)  # the anchor: rotation of the newest exposure
-        ids, point_D_stereo, by_considered = table.ids(tracks.rows[chosen]), None, None
+        ids = table.ids(tracks.rows[chosen])
+        point_D_stereo = None
+        by_considered = None
         if columns is not None:
             estimated = window.state.stereo.stop - window.state.stereo.start
             point_D_terms = columns.point_D_stereo(tracks.information, chosen)
@@ -440,7 +543,9 @@ class FrameUpdate:
 
 
 def _scale_sigma(window: Window) -> float:
-    """The larger one of the standard deviations of baseline and focal length, over them; 0 where they are known."""
+    """The larger one of the standard deviations of baseline and focal length, over them; 0 where
+    they are known.
+    """
     if "stereo_scale" not in window.state:
         return 0.0
     return float(np.sqrt(window.prior.P.diagonal()[window.state["stereo_scale"]].max(initial=0.0)))

@@ -1,4 +1,5 @@
-"""The compiled loops behind the tests of corrections and landmarks: small symmetric matrices, many at a time.
+"""The compiled loops behind the tests of corrections and landmarks: small symmetric matrices, many
+at a time.
 
 Each loop writes into the arrays that come last. `tests/numpy_twins.py` holds the same in NumPy.
 """
@@ -20,14 +21,17 @@ def whiten_correction(
     first: int,
     informed: float,
 ) -> tuple[float, int, float]:
-    """Return the fields of `WhitenedCorrection` for three rows of a step's errors, from the `first` one on.
+    """Return the fields of `WhitenedCorrection` for three rows of a step's errors, from the `first`
+    one on.
 
     Not a number where the predicted covariance is not positive.
     """
     scale = expected[first, first] + expected[first + 1, first + 1] + expected[first + 2, first + 2]
     if not scale > 0.0:
         return 0.0, 0, 0.0
-    L, M, V = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    L = np.empty((3, 3))
+    M = np.empty((3, 3))
+    V = np.empty((3, 3))
     for i in range(3):  # L L' = B, and the rows of V are the inverse of L
         for j in range(i + 1):
             total = expected[first + i, first + j] + (1e-12 * scale if i == j else 0.0)
@@ -48,9 +52,12 @@ def whiten_correction(
                 for m in range(3):
                     removed = expected[first + k, first + m] - remaining[first + k, first + m]
                     M[i, j] += V[i, k] * removed * V[j, m]
-    U, row = np.empty((3, 3)), np.empty(3)
+    U = np.empty((3, 3))
+    row = np.empty(3)
     eigenvectors(M, U)
-    squared, dof, share = 0.0, 0, 0.0
+    squared = 0.0
+    dof = 0
+    share = 0.0
     for e in range(3):
         if not M[e, e] > informed:
             continue
@@ -68,11 +75,18 @@ def whiten_correction(
 
 @compiled
 def leave_out(
-    r: FloatArray, J: FloatArray, covariance: FloatArray, weight: FloatArray, variance: float, nis: FloatArray
+    r: FloatArray,
+    J: FloatArray,
+    covariance: FloatArray,
+    weight: FloatArray,
+    variance: float,
+    nis: FloatArray,
 ) -> None:
     """Write the normalised innovations squared (K,) of `leave_one_out_nis`."""
     n = J.shape[2]
-    JC, inner, U = np.empty((4, n)), np.empty((4, 4)), np.empty((4, 4))
+    JC = np.empty((4, n))
+    inner = np.empty((4, 4))
+    U = np.empty((4, 4))
     for k in range(len(r)):
         R = variance / max(weight[k], 1e-6)
         for a in range(4):
@@ -89,7 +103,8 @@ def leave_out(
         nis[k] = 0.0
         for e in range(4):
             # Rounding, and noise that was re-estimated since, must not make a variance negative.
-            value, y = max(inner[e, e], 1e-3 * R), 0.0
+            value = max(inner[e, e], 1e-3 * R)
+            y = 0.0
             for a in range(4):
                 y += U[a, e] * r[k, a]
             nis[k] += (R / value * y) ** 2 / (R * R / value - R + variance)

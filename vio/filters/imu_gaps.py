@@ -1,9 +1,11 @@
-"""What an interval without IMU samples may hide: process noise for interpolation over a gap, and for a held sample.
+"""What an interval without IMU samples may hide: process noise for interpolation over a gap, and
+for a held sample.
 
-Between samples the signal is a straight line, after the last one it is held. What the true signal does beside that is
-a Brownian motion: pinned at both ends over a gap (a bridge), at one end where a sample is held. Its size is learned
-from the samples before: the mean squared change over a lag, the structure function D. Equations (N11) and (N12) of
-docs/math.md. Reference: Kolmogorov's structure function, as in Monin & Yaglom, Statistical fluid mechanics (1975).
+Between samples the signal is a straight line, after the last one it is held. What the true signal
+does beside that is a Brownian motion: pinned at both ends over a gap (a bridge), at one end where a
+sample is held. Its size is learned from the samples before: the mean squared change over a lag, the
+structure function D. Equations (N11) and (N12) of docs/math.md. Reference: Kolmogorov's structure
+function, as in Monin & Yaglom, Statistical fluid mechanics (1975).
 """
 
 from __future__ import annotations
@@ -22,12 +24,16 @@ from vio.records import ImuSample, IntArray
 _NS = 1e-9
 _MEMORY_S = 2.0  # samples that the structure function is learned from
 _MOST_SAMPLES = 8000  # of them, whatever their stamps say
-_LONGEST_LAG_S = 1.0  # half of it; beyond, the signal is taken to have changed as much as it ever does
+# half of it; beyond, the signal is taken to have changed as much as it ever does
+_LONGEST_LAG_S = 1.0
 _LEAST_SAMPLES = 10  # with fewer the signal is not characterised
-_UNKNOWN = np.array([3.0, 1.0]) ** 2  # D then: accelerometer (m/s^2)^2, gyro (rad/s)^2, of a vehicle that manoeuvres
+# D then: accelerometer (m/s^2)^2, gyro (rad/s)^2, of a vehicle that manoeuvres
+_UNKNOWN = np.array([3.0, 1.0]) ** 2
 _MEASURED_SHARE = 8  # of the samples in memory, 1 / 8: so many new ones change their median little
-_LONG_PERIODS = 1.5  # an interval longer than so many median periods lacks a sample; jitter of the clock stays below
-_SHORTEST_CUT_NS, _MOST_CUTS = 1e6, 1000  # of a gap, for the integration
+# an interval longer than so many median periods lacks a sample; jitter of the clock stays below
+_LONG_PERIODS = 1.5
+_SHORTEST_CUT_NS = 1e6  # of a gap, for the integration
+_MOST_CUTS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,19 +41,26 @@ class Hidden:
     """An interval that lacks samples, cut finely, and what it may hide."""
 
     cuts_ns: FloatArray  # (K,) increasing
-    variance: FloatArray  # (2, K - 1) of the integrals of accelerometer and gyro over each step, m^2/s^2 and rad^2
-    gap: bool  # whether samples are missing; False: the last one is held for less than the time to the next
+    # (2, K - 1) of the integrals of accelerometer and gyro over each step, m^2/s^2 and rad^2
+    variance: FloatArray
+    # whether samples are missing; False: the last one is held for less than the time to the next
+    gap: bool
 
 
 class ImuHistory:
-    """The samples of the last two seconds but for gaps, and how much their signals change in a given time."""
+    """The samples of the last two seconds but for gaps, and how much their signals change in a
+    given time.
+    """
 
     def __init__(self) -> None:
         self._samples: deque[ImuSample] = deque(maxlen=_MOST_SAMPLES)
-        self._period, self._unmeasured = 0.0, 0  # median distance, and samples since it was computed
+        self._period = 0.0  # median distance, and samples since it was computed
+        self._unmeasured = 0
 
     def take(self, samples: Sequence[ImuSample]) -> None:
-        """Take samples in order of time and drop what is too old: a gap, however long, makes none so."""
+        """Take samples in order of time and drop what is too old: a gap, however long, makes
+        none so.
+        """
         self._samples.extend(samples)
         self._unmeasured += len(samples)
         while len(self._samples) * self.period_ns() > _MEMORY_S / _NS:
@@ -62,7 +75,8 @@ class ImuHistory:
         return self._period
 
     def hidden(self, cuts_ns: FloatArray, times_ns: FloatArray) -> Hidden | None:
-        """Cut the parts of an interval that lack samples finely, and say what they hide; None: none are missing.
+        """Cut the parts of an interval that lack samples finely, and say what they hide; None: none
+        are missing.
 
         Args:
             cuts_ns: (K,) where an integration would step: its ends and the samples between.
@@ -78,16 +92,25 @@ class ImuHistory:
         silent = np.where(held, np.minimum(cuts_ns[1:] - left, right - cuts_ns[:-1]), right - left)
         gap = silent > _LONG_PERIODS * period_ns
         uncertain = gap | held
-        counts = np.where(uncertain, np.ceil(np.diff(cuts_ns) / max(period_ns, _SHORTEST_CUT_NS)), 1)
+        counts = np.where(
+            uncertain, np.ceil(np.diff(cuts_ns) / max(period_ns, _SHORTEST_CUT_NS)), 1
+        )
         parts = np.clip(counts, 1, _MOST_CUTS).astype(np.int64)
-        ends = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(cuts_ns[:-1], cuts_ns[1:], parts, strict=True)]
+        ends = [
+            np.linspace(a, b, n + 1)[:-1]
+            for a, b, n in zip(cuts_ns[:-1], cuts_ns[1:], parts, strict=True)
+        ]
         cuts = np.concatenate([*ends, cuts_ns[-1:]])
         left, right, uncertain = (np.repeat(x, parts) for x in (left, right, uncertain))
-        variance = np.where(uncertain, self._hidden_variance(cuts * _NS, left * _NS, right * _NS), 0.0)
+        variance = np.where(
+            uncertain, self._hidden_variance(cuts * _NS, left * _NS, right * _NS), 0.0
+        )
         return Hidden(cuts, variance, bool(gap.any()))
 
     def _hidden_variance(self, cuts: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-        """Variance (2, K - 1) that each step adds to the integrals, equations (N11) and (N12), by Simpson's rule."""
+        """Variance (2, K - 1) that each step adds to the integrals, equations (N11) and (N12),
+        by Simpson's rule.
+        """
         lags, change = self._structure()
 
         def rate(t: FloatArray) -> FloatArray:
@@ -97,24 +120,30 @@ class ImuHistory:
             bridge = np.maximum(t - left, 0) ** 2 * np.maximum(right - t, 0) / T**2
             out = [
                 np.where(
-                    held, np.interp(age, lags, D) * np.minimum(age, _LONGEST_LAG_S), np.interp(T, lags, D) * bridge
+                    held,
+                    np.interp(age, lags, D) * np.minimum(age, _LONGEST_LAG_S),
+                    np.interp(T, lags, D) * bridge,
                 )
                 for D in change
             ]
             return np.array(out)
 
         with np.errstate(invalid="ignore"):  # a bridge that has no end, which `held` leaves out
-            a, b = cuts[:-1], cuts[1:]
+            a = cuts[:-1]
+            b = cuts[1:]
             total: FloatArray = (rate(a) + 4 * rate(0.5 * (a + b)) + rate(b)) / 6 * (b - a)
         return total
 
     def _structure(self) -> tuple[FloatArray, FloatArray]:
-        """Lags (L,) in s and the mean squared change (2, L) of accelerometer and gyro over them, of the worst axis."""
+        """Lags (L,) in s and the mean squared change (2, L) of accelerometer and gyro over them,
+        of the worst axis.
+        """
         if len(self._samples) < _LEAST_SAMPLES:
             return np.array([0.0, 1.0]), np.stack([_UNKNOWN, _UNKNOWN], axis=1)
         times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
         period = self.period_ns()
-        lags, change = [0.0], [np.zeros(2)]
+        lags = [0.0]
+        change = [np.zeros(2)]
         lag = period
         while lag <= _LONGEST_LAG_S / _NS and times[-1] - times[0] >= lag:
             pairs = _pairs(times, lag, 0.5 * period)

@@ -1,8 +1,10 @@
-"""The start with an IMU: standstill or motion, by the samples of the last half second before the first frame.
+"""The start with an IMU: standstill or motion, by the samples of the last half second before the
+first frame.
 
-White noise averages out over a tenth of a second, a motion does not: at standstill the means of such blocks agree
-within the noise, and the mean specific force is as long as gravity. A steady turn and a steady acceleration look the
-same to an IMU, so both stay within the standard deviations that come with the result. Equation (N10) of docs/math.md.
+White noise averages out over a tenth of a second, a motion does not: at standstill the means of
+such blocks agree within the noise, and the mean specific force is as long as gravity. A steady turn
+and a steady acceleration look the same to an IMU, so both stay within the standard deviations that
+come with the result. Equation (N10) of docs/math.md.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from vio.imu.standstill import NOISE_FACTOR, STANDSTILL_S, blocks_agree
 from vio.records import ImuSample
 
 START_TILT_SIGMA_DEG = 8.0  # initial standard deviation of roll and pitch
-_MOST_TILT_RAD = np.pi / 4  # beyond, the direction of gravity is unknown; a larger prior says no more
+# beyond, the direction of gravity is unknown; a larger prior says no more
+_MOST_TILT_RAD = np.pi / 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,38 +51,55 @@ def imu_start(samples: Sequence[ImuSample], time_ns: int, settings: MsckfSetting
     before = [x for x in samples if x.time_ns <= time_ns] or list(samples[:1])
     recent = [x for x in before if x.time_ns >= before[-1].time_ns - STANDSTILL_S * 1e9]
     times_s = np.array([x.time_ns - before[-1].time_ns for x in recent]) * 1e-9
-    gyro, accel = np.array([x.gyro for x in recent]), np.array([x.accel for x in recent])
+    gyro = np.array([x.gyro for x in recent])
+    accel = np.array([x.accel for x in recent])
     force = np.mean(_turned_to_the_last(times_s, gyro, accel), axis=0)
     length = float(np.linalg.norm(force))
     if length < 1e-3:
         raise EstimationError("the accelerometer reads zero; is it in m/s^2, with gravity in it?")
     s = settings
     span_s = max(-float(times_s[0]), 1e-3) if len(recent) > 1 else 5e-3
-    force_noise, rate_noise = (d / np.sqrt(span_s) for d in (s.accel_noise_density, s.gyro_noise_density))
+    force_noise, rate_noise = (
+        d / np.sqrt(span_s) for d in (s.accel_noise_density, s.gyro_noise_density)
+    )
     tolerance = 3 * np.hypot(s.accel_bias_sigma_mps2, NOISE_FACTOR * force_noise)
     mean_rate = gyro.mean(axis=0)
     turn = float(np.linalg.norm(mean_rate))
-    still = blocks_agree(times_s, gyro, s.gyro_noise_density) and blocks_agree(times_s, accel, s.accel_noise_density)
-    still = still and abs(length - s.gravity_mps2) < tolerance and turn < 3 * s.gyro_bias_sigma_radps
-    # |f|^2 = g^2 + a^2 where the acceleration is level; what noise alone makes of |f|^2 - g^2 is no evidence.
+    still = blocks_agree(times_s, gyro, s.gyro_noise_density) and blocks_agree(
+        times_s, accel, s.accel_noise_density
+    )
+    still = (
+        still and abs(length - s.gravity_mps2) < tolerance and turn < 3 * s.gyro_bias_sigma_radps
+    )
+    # |f|^2 = g^2 + a^2 where the acceleration is level; what noise alone makes of |f|^2 - g^2 is no
+    # evidence.
     level = abs(length**2 - s.gravity_mps2**2) - 4 * s.gravity_mps2 * force_noise
     shown = np.sqrt(max(level, 0.0))
     if still:
         # The whole reading may be a turn, so the bias is known to its size.
         bias_sigma = float(np.hypot(turn, NOISE_FACTOR * rate_noise))
         return ImuStart(
-            True, force, gyro[-1], mean_rate, bias_sigma, float(np.hypot(shown, NOISE_FACTOR * force_noise))
+            True,
+            force,
+            gyro[-1],
+            mean_rate,
+            bias_sigma,
+            float(np.hypot(shown, NOISE_FACTOR * force_noise)),
         )
     scatter = float(np.sqrt(accel.var(axis=0).sum()))
     base = s.gravity_mps2 * np.radians(START_TILT_SIGMA_DEG)
-    sigma = min(float(np.linalg.norm([base, shown, scatter])), s.gravity_mps2 * float(np.tan(_MOST_TILT_RAD)))
+    sigma = min(
+        float(np.linalg.norm([base, shown, scatter])),
+        s.gravity_mps2 * float(np.tan(_MOST_TILT_RAD)),
+    )
     return ImuStart(False, force, gyro[-1], np.zeros(3), s.gyro_bias_sigma_radps, sigma)
 
 
 def _turned_to_the_last(times_s: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
     """Specific forces (N, 3) in the body frame of the last sample, by integrating the gyro."""
     steps = so3_exp(0.5 * (gyro[1:] + gyro[:-1]) * np.diff(times_s)[:, None])
-    out, R = np.empty_like(accel), np.eye(3)  # R takes the body frame of sample k to the last one's
+    out = np.empty_like(accel)  # R takes the body frame of sample k to the last one's
+    R = np.eye(3)
     for k in range(len(accel) - 1, -1, -1):
         out[k] = R @ accel[k]
         if k:

@@ -1,9 +1,12 @@
-"""Scale and misalignment of accelerometer and gyro as states: how readings and the motion depend on them.
+"""Scale and misalignment of accelerometer and gyro as states: how readings and the motion depend on
+them.
 
-Equations (A1) to (A5) of docs/math.md. The IMU's frame is the accelerometer's: its z axis, and the plane of its y and z
-axes. So the accelerometer has six terms, and the gyro, whose axes may be turned against it, nine.
-Reference: Rehder et al., Extending kalibr: calibrating the extrinsics of multiple IMUs and of individual axes (2016),
-for the model; the columns are those of the biases in (N1), times the readings.
+Equations (A1) to (A5) of docs/math.md. The IMU's frame is the accelerometer's: its z axis, and the
+plane of its y and z axes. So the accelerometer has six terms, and the gyro, whose axes may be
+turned against it, nine.
+Reference: Rehder et al., Extending kalibr: calibrating the extrinsics of multiple IMUs and of
+individual axes (2016), for the model; the columns are those of the biases in (N1), times the
+readings.
 """
 
 from __future__ import annotations
@@ -17,16 +20,18 @@ from vio.records import IMU_ENTRIES, IntArray, imu_matrices
 
 ImuTerms = Literal["off", "scale", "full"]
 IMU_TERMS = len(IMU_ENTRIES)
-# A lever that contains the noise of its own interval biases a scale by minus the noise's share of the lever's square:
-# at rest the readings are noise, which a scale of zero would explain. This share is kept below 0.2 %, a fifth of what
-# consumer IMUs' scales are off by; without it a gyro's scale moved by 0.5 % in 20 s of standstill.
+# A lever that contains the noise of its own interval biases a scale by minus the noise's share of
+# the lever's square: at rest the readings are noise, which a scale of zero would explain. This
+# share is kept below 0.2 %, a fifth of what consumer IMUs' scales are off by; without it a gyro's
+# scale moved by 0.5 % in 20 s of standstill.
 _CLEAR = 500.0
 _USUAL_S = 1.0  # over which readings are averaged: a tenth of a second of noise is a tenth of it
 _SCALE_SIGMA = 0.01  # initial standard deviation of a scale, over it
 _MISALIGNMENT_SIGMA_DEG = 0.5  # initial standard deviation of a misalignment
 _SENSOR, _ROW, _COLUMN = np.array(IMU_ENTRIES).T
-# Random walk of the terms per root second, over their initial standard deviation: by their data sheets, consumer
-# accelerometers and gyros change by 0.02 to 0.03 % a degree, so two degrees in a hundred seconds are 0.05 %.
+# Random walk of the terms per root second, over their initial standard deviation: by their data
+# sheets, consumer accelerometers and gyros change by 0.02 to 0.03 % a degree, so two degrees in a
+# hundred seconds are 0.05 %.
 IMU_WALK = 0.005
 # Which terms are estimated.
 CHOSEN: dict[ImuTerms, IntArray] = {
@@ -43,36 +48,49 @@ def term_sigmas() -> FloatArray:
 
 
 def calibrated(readings: FloatArray, terms: FloatArray) -> FloatArray:
-    """Return readings (..., 6) `[gyro, accel]` with scale and misalignment taken out, equation (A1)."""
+    """Return readings (..., 6) `[gyro, accel]` with scale and misalignment taken out, equation
+    (A1).
+    """
     M_accel, M_gyro = imu_matrices(terms)
     return np.concatenate([readings[..., :3] @ M_gyro.T, readings[..., 3:] @ M_accel.T], axis=-1)
 
 
 def raw_rate(rate: FloatArray, terms: FloatArray) -> FloatArray:
-    """Return what the gyro reads (3,) where that is `rate` (3,), bias included, by equation (A1)."""
+    """Return what the gyro reads (3,) where that is `rate` (3,), bias included, by equation
+    (A1).
+    """
     return np.asarray(np.linalg.solve(imu_matrices(terms)[1], rate), dtype=np.float64)
 
 
 def accel_D_terms(accel: FloatArray) -> FloatArray:
-    """Jacobian (..., 3, 15) of the calibrated accelerometer by the terms, at readings (..., 3): equation (A2)."""
+    """Jacobian (..., 3, 15) of the calibrated accelerometer by the terms, at readings (..., 3):
+    equation (A2).
+    """
     return _sensor_D_terms(accel, 0)
 
 
 def gyro_D_terms(gyro: FloatArray) -> FloatArray:
-    """Jacobian (..., 3, 15) of the calibrated gyro by the terms, at readings (..., 3): equation (A2)."""
+    """Jacobian (..., 3, 15) of the calibrated gyro by the terms, at readings (..., 3): equation
+    (A2).
+    """
     return _sensor_D_terms(gyro, 1)
 
 
 def usual_reading(before: FloatArray | None, readings: FloatArray, seconds: float) -> FloatArray:
-    """Return the mean reading (6,) over about the last second, from what it was and readings (K, 6) over some time."""
+    """Return the mean reading (6,) over about the last second, from what it was and readings (K,
+    6) over some time.
+    """
     mean: FloatArray = readings.mean(axis=0)
     if before is None:
         return mean
     return before + (1 - np.exp(-seconds / _USUAL_S)) * (mean - before)
 
 
-def significant(readings: FloatArray, usual: FloatArray, seconds: float, densities: FloatArray) -> FloatArray:
-    """Return readings (K, 6) `[gyro, accel]`, their deviation from the usual one shrunk by their noise: (A5).
+def significant(
+    readings: FloatArray, usual: FloatArray, seconds: float, densities: FloatArray
+) -> FloatArray:
+    """Return readings (K, 6) `[gyro, accel]`, their deviation from the usual one shrunk by their
+    noise: (A5).
 
     Args:
         readings: over an interval.
@@ -96,7 +114,8 @@ def term_columns(
     velocity: FloatArray,
     gravity: FloatArray,
 ) -> FloatArray:
-    """How errors of the terms move the navigation state's error (15, 15) over an interval, equation (A3).
+    """How errors of the terms move the navigation state's error (15, 15) over an interval, equation
+    (A3).
 
     Args:
         times_ns: (K,) of the readings, from the interval's start to its end.
@@ -114,7 +133,8 @@ def term_columns(
     v = velocity + np.cumsum(np.concatenate([np.zeros((1, 3)), a * dt]), axis=0)
     moved = (v[:-1] + 0.5 * a * dt) * dt
     p = T_world_imu[:3, 3] + np.cumsum(np.concatenate([np.zeros((1, 3)), moved]), axis=0)
-    pm, vm = 0.5 * (p[1:] + p[:-1])[:, :, None], 0.5 * (v[1:] + v[:-1])[:, :, None]
+    pm = 0.5 * (p[1:] + p[:-1])[:, :, None]
+    vm = 0.5 * (v[1:] + v[:-1])[:, :, None]
     g = gravity[:, None]
 
     # In the middle of each step: what an error of the terms does to the world's force and rate.
@@ -123,7 +143,8 @@ def term_columns(
     middle = 0.5 * (R[1:] + R[:-1])
     by_gyro = middle @ gyro_D_terms(0.5 * (raw[1:, :3] + raw[:-1, :3])) * dt[:, :, None]
     out = np.zeros((15, IMU_TERMS))
-    lever, swing = so3_hat((pm + left * (vm + 0.5 * left * g))[:, :, 0]), so3_hat((vm + left * g)[:, :, 0])
+    lever = so3_hat((pm + left * (vm + 0.5 * left * g))[:, :, 0])
+    swing = so3_hat((vm + left * g)[:, :, 0])
     out[0:3] = np.sum(lever @ by_gyro + left * by_accel, axis=0)
     out[3:6] = np.sum(by_gyro, axis=0)
     out[6:9] = np.sum(swing @ by_gyro + by_accel, axis=0)
@@ -131,14 +152,17 @@ def term_columns(
 
 
 def tilt_columns(T_world_imu: FloatArray, gravity: FloatArray) -> FloatArray:
-    """How errors of the terms move the first attitude's error phi (3, 15), which the accelerometer gave: (A4).
+    """How errors of the terms move the first attitude's error phi (3, 15), which the accelerometer
+    gave: (A4).
 
     Args:
         T_world_imu: (4, 4) the first pose.
         gravity: (3,) world, m/s^2.
     """
     R = T_world_imu[:3, :3]
-    out: FloatArray = so3_hat(gravity) @ R @ accel_D_terms(-R.T @ gravity) / float(gravity @ gravity)
+    out: FloatArray = (
+        so3_hat(gravity) @ R @ accel_D_terms(-R.T @ gravity) / float(gravity @ gravity)
+    )
     return out
 
 

@@ -1,6 +1,8 @@
-"""Checks of what comes into a filter, before it changes anything: order in time, finite values, ids, types.
+"""Checks of what comes into a filter, before it changes anything: order in time, finite values,
+ids, types.
 
-What is refused leaves the filter as it was, so that the caller may go on with the next frame or sample.
+What is refused leaves the filter as it was, so that the caller may go on with the next frame or
+sample.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import ImuSample, MotionSample, Observations
 from vio.setting import Section
 
-LARGEST = 1e6  # of a pixel, m/s, rad/s or m/s^2: beyond any sensor, and no square overflows below it
+# of a pixel, m/s, rad/s or m/s^2: beyond any sensor, and no square overflows below it
+LARGEST = 1e6
 _FARTHEST_M = 1e3  # between IMU and camera
 
 
@@ -25,7 +28,9 @@ def check_parts(name: str, camera: object, settings: object, section: type[Secti
     if not isinstance(camera, StereoCamera):
         raise ConfigError(f"{name} takes a StereoCamera, got {type(camera).__name__}")
     if not isinstance(settings, section):
-        raise ConfigError(f"{name} takes {section.__name__}, got {type(settings).__name__}; give its own section")
+        raise ConfigError(
+            f"{name} takes {section.__name__}, got {type(settings).__name__}; give its own section"
+        )
 
 
 def checked_extrinsics(T_cam0_imu: npt.ArrayLike) -> FloatArray:
@@ -37,12 +42,16 @@ def checked_extrinsics(T_cam0_imu: npt.ArrayLike) -> FloatArray:
     try:
         T = np.asarray(T_cam0_imu, dtype=np.float64)
     except (ValueError, TypeError) as error:
-        raise CalibrationError(f"T_cam0_imu is no matrix of numbers ({error}); give a (4, 4) array") from error
+        raise CalibrationError(
+            f"T_cam0_imu is no matrix of numbers ({error}); give a (4, 4) array"
+        ) from error
     fault = f"has the shape {T.shape} instead of (4, 4)" if T.shape != (4, 4) else rigid_fault(T)
     if fault is None and not np.abs(T[:3, 3]).max() <= _FARTHEST_M:
         fault = f"puts the camera {np.abs(T[:3, 3]).max() / 1e3:g} km from the IMU; translations are in metres"
     if fault is not None:
-        raise CalibrationError(f"T_cam0_imu {fault}; it maps the IMU's coordinates to the left camera's")
+        raise CalibrationError(
+            f"T_cam0_imu {fault}; it maps the IMU's coordinates to the left camera's"
+        )
     return T
 
 
@@ -58,28 +67,38 @@ class InputOrder:
         """Check a motion sample.
 
         Raises:
-            DataError: it is not after the last one, a velocity is before the last frame, or a value is not finite or
-                absurdly large.
+            DataError: it is not after the last one, a velocity is before the last frame, or a value
+                is not finite or absurdly large.
         """
         imu = isinstance(sample, ImuSample)
         first, second = (
-            (sample.gyro, sample.accel) if isinstance(sample, ImuSample) else (sample.linear, sample.angular)
+            (sample.gyro, sample.accel)
+            if isinstance(sample, ImuSample)
+            else (sample.linear, sample.angular)
         )
-        kind, now = "IMU" if imu else "velocity", sample.time_ns
-        (a, b, c), (d, e, f), most = first.tolist(), second.tolist(), LARGEST
+        kind = "IMU" if imu else "velocity"
+        now = sample.time_ns
+        (a, b, c) = first.tolist()
+        (d, e, f) = second.tolist()
+        most = LARGEST
         # Written out, as it is asked of every sample.
         if not (-most < a < most and -most < b < most and -most < c < most) or not (
             -most < d < most and -most < e < most and -most < f < most
         ):
-            raise DataError(f"{self.name}: the {kind} sample at {now} ns holds {_values(first, second)}; drop it")
+            raise DataError(
+                f"{self.name}: the {kind} sample at {now} ns holds {_values(first, second)}; drop "
+                "it"
+            )
         if self._sample_ns is not None and now <= self._sample_ns:
             raise DataError(
-                f"{self.name}: the {kind} sample at {now} ns is not after the last one ({self._sample_ns} ns); "
+                f"{self.name}: the {kind} sample at {now} ns is not after the last one "
+                f"({self._sample_ns} ns); "
                 "sort the samples, and drop doubled ones"
             )
         if not imu and self._frame_ns is not None and now < self._frame_ns:
             raise DataError(
-                f"{self.name}: the velocity at {now} ns is before the last frame ({self._frame_ns} ns); give "
+                f"{self.name}: the velocity at {now} ns is before the last frame ({self._frame_ns} "
+                "ns); give "
                 "samples and frames in order of time"
             )
         self._sample_ns = now
@@ -92,18 +111,21 @@ class InputOrder:
             reached_ns: time of the filter's state.
 
         Raises:
-            DataError: the frame is not after the last one or before the state, an id occurs twice, or a pixel is not
-                finite.
+            DataError: the frame is not after the last one or before the state, an id occurs twice,
+                or a pixel is not finite.
         """
-        where, now = f"{self.name}: frame {seen.frame_index}", seen.time_ns
+        where = f"{self.name}: frame {seen.frame_index}"
+        now = seen.time_ns
         before = self._frame_ns
         if before is not None and now <= before:
             raise DataError(
-                f"{where} at {now} ns is not after the last frame ({before} ns); give frames in order of time"
+                f"{where} at {now} ns is not after the last frame ({before} ns); give frames in "
+                "order of time"
             )
         if before is not None and now < reached_ns:
             raise DataError(
-                f"{where} at {now} ns is before the last velocity ({reached_ns} ns); give both in order of time"
+                f"{where} at {now} ns is before the last velocity ({reached_ns} ns); give both in "
+                "order of time"
             )
         ids = np.sort(seen.ids)
         if (ids[1:] == ids[:-1]).any():
@@ -113,7 +135,8 @@ class InputOrder:
         if not finite.all() and not (finite[:, :2].all() and finite[seen.has_right].all()):
             row = int(np.argmin(finite.all(axis=1)))
             raise DataError(
-                f"{where}: feature {int(seen.ids[row])} is at the pixels {seen.z[row].tolist()}; leave it out, or "
+                f"{where}: feature {int(seen.ids[row])} is at the pixels {seen.z[row].tolist()}; "
+                "leave it out, or "
                 "clear has_right where only the right one is missing"
             )
         self._frame_ns = now

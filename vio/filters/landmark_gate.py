@@ -1,8 +1,9 @@
-"""Which landmarks of the state may be used: a moving point, or a track that slipped, must not steer the pose.
+"""Which landmarks of the state may be used: a moving point, or a track that slipped, must not steer
+the pose.
 
-A landmark stays in the state for many frames and is known to millimetres, so a slow mover passes a test of single
-frames against the pixel noise. Two tests are made: its newest pixels against what all *other* measurements predict, and
-a running sum of these tests.
+A landmark stays in the state for many frames and is known to millimetres, so a slow mover passes a
+test of single frames against the pixel noise. Two tests are made: its newest pixels against what
+all *other* measurements predict, and a running sum of these tests.
 """
 
 from __future__ import annotations
@@ -15,21 +16,25 @@ from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, IntArray
 
 _MEMORY = 0.8  # weight of the past in the running sum
-_DROP = 4.5 / np.sqrt(1 - _MEMORY**2)  # running sum above which a landmark is dropped: 4.5 standard deviations of it
+# running sum above which a landmark is dropped: 4.5 standard deviations of it
+_DROP = 4.5 / np.sqrt(1 - _MEMORY**2)
 
 
 def leave_one_out_nis(
     r: FloatArray, J: FloatArray, covariance: FloatArray, weight: FloatArray, variance: float
 ) -> FloatArray:
-    """Normalised innovations squared (K,) of landmarks' pixels, predicted without these very pixels.
+    """Normalised innovations squared (K,) of landmarks' pixels, predicted without these very
+    pixels.
 
-    With `R` the variance that a pixel entered the fit with, and `C` the posterior covariance of what the pixels depend
-    on, the point relative to the camera and the stereo calibration, the residual of the prediction without it is
-    `R (R I - J C J')^-1 r`, and its covariance `R^2 (R I - J C J')^-1 - R I + variance I`, exactly in a linear problem.
+    With `R` the variance that a pixel entered the fit with, and `C` the posterior covariance of
+    what the pixels depend on, the point relative to the camera and the stereo calibration, the
+    residual of the prediction without it is `R (R I - J C J')^-1 r`, and its covariance
+    `R^2 (R I - J C J')^-1 - R I + variance I`, exactly in a linear problem.
 
     Args:
         r: residuals after the fit (K, 4), pixels, zero where not measured.
-        J: their Jacobians by the n quantities that they depend on (K, 4, n), zero where not measured.
+        J: their Jacobians by the n quantities that they depend on (K, 4, n), zero where not
+            measured.
         covariance: of these after the fit (K, n, n).
         weight: robust weights (K,) that the pixels entered the fit with.
         variance: of one pixel coordinate, px^2.

@@ -1,4 +1,6 @@
-"""The sliding-window filter with one camera: its scale comes from the IMU, and it waits until that is observable."""
+"""The sliding-window filter with one camera: its scale comes from the IMU, and it waits until
+that is observable.
+"""
 
 from __future__ import annotations
 
@@ -40,11 +42,14 @@ _WORLD = [0, 1, 2, 5]  # errors of position and yaw, which the start takes for t
 class MonoMsckf(Msckf):
     """A sliding-window filter with one camera and an IMU.
 
-    Until it has begun, `update` reports `started` False, and there is no estimate. After a divergence it begins anew
-    and goes on in the same world, with the uncertainty of what passed in between.
+    Until it has begun, `update` reports `started` False, and there is no estimate. After a
+    divergence it begins anew and goes on in the same world, with the uncertainty of what passed in
+    between.
     """
 
-    def __init__(self, camera: StereoCamera, T_cam0_imu: FloatArray, settings: MsckfSettings) -> None:
+    def __init__(
+        self, camera: StereoCamera, T_cam0_imu: FloatArray, settings: MsckfSettings
+    ) -> None:
         """Prepare; the arguments are those of `Msckf`."""
         super().__init__(camera, T_cam0_imu, _for_one_camera(settings), motion="imu")
         self._starter = MonoStarter(camera, self._calibration.T_cam0_imu, settings)
@@ -55,7 +60,11 @@ class MonoMsckf(Msckf):
 
     @classmethod
     def build(
-        cls, camera: StereoCamera, T_cam0_body: FloatArray, settings: MsckfSettings, motion: MotionSource | None
+        cls,
+        camera: StereoCamera,
+        T_cam0_body: FloatArray,
+        settings: MsckfSettings,
+        motion: MotionSource | None,
     ) -> MonoMsckf:
         """Build the filter of a run, see `Backend`.
 
@@ -64,19 +73,23 @@ class MonoMsckf(Msckf):
         """
         if motion != "imu":
             raise ConfigError(
-                "one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu; --motion none leaves it out), "
+                "one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu; --motion "
+                "none leaves it out), "
                 "depth images or a second camera"
             )
         if settings.calibrate_imu != "off":
             raise ConfigError(
-                f"msckf.calibrate_imu: {settings.calibrate_imu} needs a stereo pair, as the scale of one camera is the "
+                f"msckf.calibrate_imu: {settings.calibrate_imu} needs a stereo pair, as the scale "
+                "of one camera is the "
                 "accelerometer's; set it to off"
             )
         return cls(camera, T_cam0_body, settings)
 
     @property
     def initialisation(self) -> Initialisation:
-        """The standard deviation of the scale at the initialisation, or why that is not possible yet."""
+        """The standard deviation of the scale at the initialisation, or why that is not possible
+        yet.
+        """
         if self._begun is None:
             return Initialisation(waits_for=self._starter.why)
         return Initialisation(scale_sigma=self._begun.scale_sigma)
@@ -103,27 +116,43 @@ class MonoMsckf(Msckf):
         if begun is None:
             return None
         self._begun = begun
-        return (begun.nav, begun.P) if self._resumed is None else self._placed(begun, self._resumed, seen.time_ns)
+        return (
+            (begun.nav, begun.P)
+            if self._resumed is None
+            else self._placed(begun, self._resumed, seen.time_ns)
+        )
 
     def _first_noise(self, P: FloatArray) -> MotionNoise:
         return MotionNoise(START_FACTORS, *IMU_FACTORS[1:])
 
-    def _placed(self, begun: MonoStart, good: GoodState, time_ns: int) -> tuple[NavState, FloatArray]:
-        """A start after a divergence in the world of before, where position and yaw are those held since."""
+    def _placed(
+        self, begun: MonoStart, good: GoodState, time_ns: int
+    ) -> tuple[NavState, FloatArray]:
+        """A start after a divergence in the world of before, where position and yaw are those
+        held since.
+        """
         held, P_held = restarted(good, time_ns, self._propagation.motion, self._settings)
-        R, R_new = held.T_world_imu[:3, :3], begun.nav.T_world_imu[:3, :3]
+        R = held.T_world_imu[:3, :3]
+        R_new = begun.nav.T_world_imu[:3, :3]
         yaw = so3_exp([0.0, 0.0, nearest_yaw(R @ R_new.T)])
         T = se3_from_parts(yaw, held.T_world_imu[:3, 3])
         M = np.eye(DIM)
-        M[:6, :6], M[6:9, 6:9] = se3_adjoint(T), yaw
+        M[:6, :6] = se3_adjoint(T)
+        M[6:9, 6:9] = yaw
         P = M @ begun.P @ M.T
         P[np.ix_(_WORLD, _WORLD)] += P_held[np.ix_(_WORLD, _WORLD)]
-        return replace(begun.nav, T_world_imu=T @ begun.nav.T_world_imu, velocity=yaw @ begun.nav.velocity), P
+        return replace(
+            begun.nav, T_world_imu=T @ begun.nav.T_world_imu, velocity=yaw @ begun.nav.velocity
+        ), P
 
     def restart(self, observations: Observations) -> UpdateReport:
-        """Begin anew after a divergence, see `Msckf`; there is no estimate until the start is observable again."""
+        """Begin anew after a divergence, see `Msckf`; there is no estimate until the start is
+        observable again.
+        """
         self._resumed = good = required(self._good)
-        self._window, self._begun, self._good = None, None, None
+        self._window = None
+        self._begun = None
+        self._good = None
         self._propagation.forget()
         self._forget_tracks(good)
         self._starter = MonoStarter(self._rig.camera, self._calibration.T_cam0_imu, self._settings)
@@ -133,14 +162,20 @@ class MonoMsckf(Msckf):
         return replace(super()._wait(observations), started=False)
 
     def estimate(self) -> Estimate:
-        """Return the estimate at the time of the last event, with the standard deviation of its scale."""
+        """Return the estimate at the time of the last event, with the standard deviation of its
+        scale.
+        """
         smoothed = self._frame.smoothed
-        return replace(super().estimate(), scale_sigma=None if smoothed is None else scale_sigma(smoothed))
+        return replace(
+            super().estimate(), scale_sigma=None if smoothed is None else scale_sigma(smoothed)
+        )
 
     def _apply_zero_velocity(self, window: Window) -> None:
-        """Absorb a zero-velocity measurement where neither the tracks nor the IMU move; see `Msckf`.
+        """Absorb a zero-velocity measurement where neither the tracks nor the IMU move; see
+        `Msckf`.
 
-        At standstill, tracks of one camera fix no point, and the window's posterior knows the IMU's motion alone.
+        At standstill, tracks of one camera fix no point, and the window's posterior knows the IMU's
+        motion alone.
         """
         now = self._recent[-1].time_ns
         if not self._settings.zero_velocity or now - STANDSTILL_S * 1e9 < self._stationary_ns:
@@ -157,4 +192,6 @@ def _for_one_camera(settings: MsckfSettings) -> MsckfSettings:
     clones = max(settings.clones, _LEAST_CLONES)
     # The time offset trades against the scale, which rests on the IMU alone.
     calibrate = "none" if settings.calibrate_camera_imu == "auto" else settings.calibrate_camera_imu
-    return replace(settings, max_landmarks=_LANDMARKS, clones=clones, calibrate_camera_imu=calibrate)
+    return replace(
+        settings, max_landmarks=_LANDMARKS, clones=clones, calibrate_camera_imu=calibrate
+    )

@@ -1,10 +1,12 @@
-"""The start with one camera and an IMU: at standstill, or by visual-inertial alignment once the scale is observable.
+"""The start with one camera and an IMU: at standstill, or by visual-inertial alignment once the
+scale is observable.
 
-Nothing is estimated before. At standstill (the IMU shows noise alone, and the tracks do not move) the velocity is zero.
-In motion, a linear solution (`vio.filters.alignment`) starts Gauss-Newton over some views of the last seconds, with the
-same motion model, errors and elimination of points as the filter has; its covariance is that of the start. The frames
-that were used have no pose of their own: the filter begins with the newest one and never sees their pixels again.
-Equations (V1) to (V6) of docs/math.md.
+Nothing is estimated before. At standstill (the IMU shows noise alone, and the tracks do not move)
+the velocity is zero. In motion, a linear solution (`vio.filters.alignment`) starts Gauss-Newton
+over some views of the last seconds, with the same motion model, errors and elimination of points as
+the filter has; its covariance is that of the start. The frames that were used have no pose of their
+own: the filter begins with the newest one and never sees their pixels again. Equations (V1) to (V6)
+of docs/math.md.
 """
 
 from __future__ import annotations
@@ -16,7 +18,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from vio.filters.alignment import Bearings, FreeMotion, VisualInertialAlignment, align_visual_inertial, gyro_bias
+from vio.filters.alignment import (
+    Bearings,
+    FreeMotion,
+    VisualInertialAlignment,
+    align_visual_inertial,
+    gyro_bias,
+)
 from vio.filters.imu_start import imu_start
 from vio.filters.navigation import (
     DIM,
@@ -50,13 +58,16 @@ _STEPS = 30  # of Gauss-Newton at most: where the scale is hardly known it takes
 _CONVERGED = 1e-3  # m, m/s and rad
 _STILL_PX = 0.5  # median motion of the tracks over half a second at standstill
 _TILT_SIGMA_RAD = np.radians(15.0)  # of gravity by the linear solution
-MOST_SCALE_SIGMA = 0.1  # of a start; the filter is linear in the scale to half the square of it, 0.5 %
-_AGREEMENT = 0.999  # chi-square probability of the fit's distance from the prior, which is that of the IMU
-_PATIENCE_S = 5.0  # from the first contradiction, after which a start is taken with a covariance that allows for it
+# of a start; the filter is linear in the scale to half the square of it, 0.5 %
+MOST_SCALE_SIGMA = 0.1
+# chi-square probability of the fit's distance from the prior, which is that of the IMU
+_AGREEMENT = 0.999
+# from the first contradiction, after which a start is taken with a covariance that allows for it
+_PATIENCE_S = 5.0
 _BIASES = slice(9, DIM)  # of gyro and accelerometer, among the errors
 _LEAST_PX = 0.15  # pixel noise that fewer residuals than a filter's cannot prove
-# On the densities of accelerometer and gyro, until the filter has learned its own: too small ones cost the scale, too
-# large ones time (docs/notes/design_decisions.md, IMU noise at the start).
+# On the densities of accelerometer and gyro, until the filter has learned its own: too small ones
+# cost the scale, too large ones time (docs/notes/design_decisions.md, IMU noise at the start).
 START_FACTORS = np.array([2.0, 8.0])
 
 
@@ -70,10 +81,14 @@ class MonoStart:
     frames: int  # that have passed before
 
 
-def is_still(frames: Sequence[Observations], samples: Sequence[ImuSample], settings: MsckfSettings) -> bool:
-    """Whether IMU and tracks show a standstill over the last half second: noise alone, and no motion of the features.
+def is_still(
+    frames: Sequence[Observations], samples: Sequence[ImuSample], settings: MsckfSettings
+) -> bool:
+    """Whether IMU and tracks show a standstill over the last half second: noise alone, and no
+    motion of the features.
 
-    A steady flight looks the same to an IMU, and a distant scene does to a camera; few flights are both.
+    A steady flight looks the same to an IMU, and a distant scene does to a camera; few flights are
+    both.
 
     Args:
         frames: in order of time, the newest last.
@@ -94,12 +109,16 @@ def is_still(frames: Sequence[Observations], samples: Sequence[ImuSample], setti
 class MonoStarter:
     """Collects frames until one of them can begin."""
 
-    def __init__(self, camera: StereoCamera, T_cam0_imu: FloatArray, settings: MsckfSettings) -> None:
-        self._camera, self._T_cam0_imu = camera, T_cam0_imu
+    def __init__(
+        self, camera: StereoCamera, T_cam0_imu: FloatArray, settings: MsckfSettings
+    ) -> None:
+        self._camera = camera
+        self._T_cam0_imu = T_cam0_imu
         self._settings = replace(settings, clones=_VIEWS, max_features=_MOST_TRACKS)
         self._frames: deque[Observations] = deque()
         self._passed = 0
-        self._contradicted_ns: int | None = None  # stamp of the first view at which features and IMU did
+        # stamp of the first view at which features and IMU did
+        self._contradicted_ns: int | None = None
         self.why = "no frame has come"  # the start is not possible yet
 
     def try_frame(self, seen: Observations, motion: ImuMotion) -> MonoStart | None:
@@ -150,44 +169,64 @@ class MonoStarter:
         nav, P, sigma = found
         if sigma > MOST_SCALE_SIGMA:
             self.why = (
-                f"the scale is known to {100 * sigma:.0f} % only (more than {100 * MOST_SCALE_SIGMA:.0f} %); move "
+                f"the scale is known to {100 * sigma:.0f} % only (more than "
+                f"{100 * MOST_SCALE_SIGMA:.0f} %); move "
                 "the camera sideways with changing speed"
             )
             return None
         return MonoStart(nav, P, sigma, self._passed - 1)
 
     def _contradiction_persists(self, now_ns: int) -> bool:
-        """Note that features and IMU contradict each other; whether they did so long ago, too, as by a wrong clock."""
+        """Note that features and IMU contradict each other; whether they did so long ago, too,
+        as by a wrong clock.
+        """
         self._contradicted_ns = now_ns if self._contradicted_ns is None else self._contradicted_ns
         return now_ns - self._contradicted_ns > _PATIENCE_S * 1e9
 
     def _views(self) -> list[Observations]:
         """Some of the frames, evenly spaced, with the first and the newest."""
         count = min(_VIEWS, len(self._frames))
-        return [self._frames[k] for k in np.linspace(0, len(self._frames) - 1, count).round().astype(int)]
+        return [
+            self._frames[k]
+            for k in np.linspace(0, len(self._frames) - 1, count).round().astype(int)
+        ]
 
-    def _aligned(self, motion: ImuMotion, views: list[Observations], tracks: WindowTracks) -> NavState | None:
-        """The navigation state at the first view by the linear solution; None where there is none."""
+    def _aligned(
+        self, motion: ImuMotion, views: list[Observations], tracks: WindowTracks
+    ) -> NavState | None:
+        """The navigation state at the first view by the linear solution.
+
+        None where there is none.
+        """
         seen_of = tracks.table.views(tracks.choose(len(views)), len(views))
         T_imu_cam0 = se3_inverse(self._T_cam0_imu)
         rays = left_rays(self._camera, seen_of.z[..., :2]) @ T_imu_cam0[:3, :3].T
         rays = rays / np.linalg.norm(rays, axis=2, keepdims=True)
         bearings = Bearings(rays, seen_of.weight[..., 0] > 0, T_imu_cam0[:3, 3])
-        zero, sigma = np.zeros(3), self._settings.gyro_bias_sigma_radps
+        zero = np.zeros(3)
+        sigma = self._settings.gyro_bias_sigma_radps
         nav = NavState(np.eye(4), zero, zero, zero, zero)
         for _ in range(2):
             free = self._free_motion(motion, views, nav)
             nav = replace(nav, gyro_bias=nav.gyro_bias + gyro_bias(bearings, free, sigma))
-        found = align_visual_inertial(bearings, self._free_motion(motion, views, nav), self._settings.gravity_mps2)
+        found = align_visual_inertial(
+            bearings, self._free_motion(motion, views, nav), self._settings.gravity_mps2
+        )
         return None if found is None else _upright(nav, found)
 
-    def _free_motion(self, motion: ImuMotion, views: list[Observations], nav: NavState) -> FreeMotion:
+    def _free_motion(
+        self, motion: ImuMotion, views: list[Observations], nav: NavState
+    ) -> FreeMotion:
         """Integrate the IMU from a body at rest at the origin, and take its gravity out again."""
-        begin_ns, now, growth = views[0].time_ns, nav, NO_STEP
-        states, phi_D_bias = [nav], [np.zeros((3, 3))]
+        begin_ns = views[0].time_ns
+        now = nav
+        growth = NO_STEP
+        states = [nav]
+        phi_D_bias = [np.zeros((3, 3))]
         for before, view in pairwise(views):
             step = motion.advance(now, before.time_ns, view.time_ns)
-            now, growth = step.nav, growth.then(step)
+            now = step.nav
+            growth = growth.then(step)
             states.append(now)
             phi_D_bias.append(growth.Phi[3:6, 9:12])
         t = np.array([view.time_ns - begin_ns for view in views]) * 1e-9
@@ -201,8 +240,8 @@ class MonoStarter:
         """Gauss-Newton over the views.
 
         Returns:
-            The state at the newest view, its covariance (15, 15) and the standard deviation of the scale, both inflated
-            where features and IMU contradict each other.
+            The state at the newest view, its covariance (15, 15) and the standard deviation of the
+            scale, both inflated where features and IMU contradict each other.
         """
         for attempt in range(2):  # the second time linearised at the result of the first
             window = self._window(motion, views, begin)
@@ -220,7 +259,9 @@ class MonoStarter:
                     fitted, error = window.optimum(A, b, len(A))
                 except np.linalg.LinAlgError:
                     return None
-                tracks.move_points(lin, lin.stereo, error[window.state.clones], error[window.state.stereo])
+                tracks.move_points(
+                    lin, lin.stereo, error[window.state.clones], error[window.state.stereo]
+                )
                 window.relinearise(error)
                 if np.abs(error).max() < _CONVERGED:
                     break
@@ -232,16 +273,24 @@ class MonoStarter:
                 tracks.table.remove(lin.rows[~passed])  # they are on what moves
                 first = window.clones[0]
                 begin = replace(
-                    begin, T_world_imu=first.T_world_imu, velocity=first.velocity, gyro_bias=window.nav.gyro_bias
+                    begin,
+                    T_world_imu=first.T_world_imu,
+                    velocity=first.velocity,
+                    gyro_bias=window.nav.gyro_bias,
                 )
         assert fitted is not None
         if tracks.variance >= self._settings.pixel_sigma_max_px**2:
-            self.why = f"features and IMU disagree by more than {self._settings.pixel_sigma_max_px:g} px"
+            self.why = (
+                f"features and IMU disagree by more than {self._settings.pixel_sigma_max_px:g} px"
+            )
             return None
-        excess = max(1.0, _disagreement(window.prior, slice(None)), _disagreement(window.prior, _BIASES))
+        excess = max(
+            1.0, _disagreement(window.prior, slice(None)), _disagreement(window.prior, _BIASES)
+        )
         if excess > 1.0 and not self._contradiction_persists(views[-1].time_ns):
             self.why = (
-                "features and IMU contradict each other: their clocks may be apart, or most features belong to "
+                "features and IMU contradict each other: their clocks may be apart, or most "
+                "features belong to "
                 "something that moves"
             )
             return None
@@ -253,19 +302,27 @@ class MonoStarter:
         """The window of all views, predicted from a first state, under the prior alone."""
         s = self._settings
         sigmas = [0.0, START_VELOCITY_SIGMA_MPS, s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2]
-        P = np.diag(np.concatenate([[0.0] * 3, [_TILT_SIGMA_RAD] * 2, np.repeat(sigmas, [1, 3, 3, 3])]) ** 2)
+        P = np.diag(
+            np.concatenate([[0.0] * 3, [_TILT_SIGMA_RAD] * 2, np.repeat(sigmas, [1, 3, 3, 3])]) ** 2
+        )
         window = Window(motion, begin, P, Calibration(self._T_cam0_imu))
         for k, view in enumerate(views):
             if k:
-                window.propagate(motion.advance(window.nav, views[k - 1].time_ns, view.time_ns, START_FACTORS))
+                window.propagate(
+                    motion.advance(window.nav, views[k - 1].time_ns, view.time_ns, START_FACTORS)
+                )
             window.add_clone(view.frame_index, view.time_ns)
         return window
 
     def _follow_noise(self, tracks: WindowTracks, lin: LinearTracks) -> None:
-        """Set the pixel noise to that of the median track, and to no less than few tracks can show."""
+        """Set the pixel noise to that of the median track, and to no less than few tracks can
+        show.
+        """
         _, squares, dof = tracks.gate(lin.at)
         ratio = float(np.median(squares / chi_square_table(0.5)[dof]))
-        tracks.variance = float(np.clip(tracks.variance * ratio, _LEAST_PX**2, self._settings.pixel_sigma_max_px**2))
+        tracks.variance = float(
+            np.clip(tracks.variance * ratio, _LEAST_PX**2, self._settings.pixel_sigma_max_px**2)
+        )
 
 
 def _disagreement(prior: Prior, rows: slice) -> float:
@@ -283,6 +340,7 @@ def _upright(nav: NavState, found: VisualInertialAlignment) -> NavState:
 def _at_origin(nav: NavState, P: FloatArray) -> tuple[NavState, FloatArray]:
     """Begin the world at the body: its position and its yaw are zero by definition, and known."""
     P = 0.5 * (P + P.T)
-    P[[0, 1, 2, 5]], P[:, [0, 1, 2, 5]] = 0.0, 0.0
+    P[[0, 1, 2, 5]] = 0.0
+    P[:, [0, 1, 2, 5]] = 0.0
     T = se3_from_parts(nav.T_world_imu[:3, :3], np.zeros(3))
     return replace(nav, T_world_imu=T), P

@@ -1,10 +1,11 @@
 """The sliding-window filter: right-invariant, multi-state constrained, with long-lived landmarks.
 
-For each frame: propagate (`propagation`); clone the pose; update (`frame_update`). What of the stereo calibration is
-estimated, `rig_calibration` decides. The prior is kept in right-invariant errors, whose unobservable directions (global
-position and yaw) do not depend on the estimate, so relinearisation adds no information along them.
-References: Mourikis & Roumeliotis (2007); Sun et al. (2018); Wu et al., An invariant-EKF VINS algorithm for improving
-consistency (2017); Barrau & Bonnabel (2017).
+For each frame: propagate (`propagation`); clone the pose; update (`frame_update`). What of the
+stereo calibration is estimated, `rig_calibration` decides. The prior is kept in right-invariant
+errors, whose unobservable directions (global position and yaw) do not depend on the estimate, so
+relinearisation adds no information along them.
+References: Mourikis & Roumeliotis (2007); Sun et al. (2018); Wu et al., An invariant-EKF VINS
+algorithm for improving consistency (2017); Barrau & Bonnabel (2017).
 """
 
 from __future__ import annotations
@@ -20,7 +21,13 @@ from vio.errors import ConfigError, DivergedError, EstimationError
 from vio.filters.frame_update import FrameUpdate
 from vio.filters.imu_terms import IMU_TERMS
 from vio.filters.inputs import InputOrder, check_parts, checked_extrinsics
-from vio.filters.navigation import DIM, ZERO_RATE_SIGMA_RADPS, ZERO_VELOCITY_SIGMA_MPS, ImuMotion, NavState
+from vio.filters.navigation import (
+    DIM,
+    ZERO_RATE_SIGMA_RADPS,
+    ZERO_VELOCITY_SIGMA_MPS,
+    ImuMotion,
+    NavState,
+)
 from vio.filters.noise import MotionNoise
 from vio.filters.online_calibration import Calibration, all_imu_terms, first_calibration
 from vio.filters.point_map import PointMap
@@ -74,19 +81,24 @@ class Msckf(Backend):
             motion: which motion samples will come; None: images alone.
 
         Raises:
-            ConfigError: the calibration is to be estimated without an IMU, or an argument is of another kind.
+            ConfigError: the calibration is to be estimated without an IMU, or an argument is of
+                another kind.
             CalibrationError: the extrinsics are no rigid transform.
         """
         check_parts("msckf", camera, settings, MsckfSettings)
         if motion not in (None, *self.motion_sources):
-            raise ConfigError(f"msckf has no model for motion {motion!r}; give imu, velocity or None")
+            raise ConfigError(
+                f"msckf has no model for motion {motion!r}; give imu, velocity or None"
+            )
         if settings.calibrate_camera_imu not in ("auto", "none") and motion != "imu":
             raise ConfigError(
                 f"msckf.calibrate_camera_imu: {settings.calibrate_camera_imu} needs --motion imu; "
                 "set it to auto or none"
             )
         if settings.calibrate_imu != "off" and motion != "imu":
-            raise ConfigError(f"msckf.calibrate_imu: {settings.calibrate_imu} needs --motion imu; set it to off")
+            raise ConfigError(
+                f"msckf.calibrate_imu: {settings.calibrate_imu} needs --motion imu; set it to off"
+            )
         if camera.is_cylinder:  # equation (R4) is a pinhole's
             settings = replace(settings, calibrate_scale="off")
         self._settings = settings
@@ -100,14 +112,20 @@ class Msckf(Backend):
         self._frame = FrameUpdate(settings, self._rig, self._propagation, self._points)
         self._began_ns = 0
         self._stationary_ns = -(2**62)  # newest frame of the last zero-velocity measurement
-        self._tilted: FloatArray = np.eye(3)  # (3, 3) how the first attitude has been corrected, on the world's side
+        # (3, 3) how the first attitude has been corrected, on the world's side
+        self._tilted: FloatArray = np.eye(3)
         self._good: GoodState | None = None  # after the last plausible update
 
     @classmethod
     def build(
-        cls, camera: StereoCamera, T_cam0_body: FloatArray, settings: MsckfSettings, motion: MotionSource | None
+        cls,
+        camera: StereoCamera,
+        T_cam0_body: FloatArray,
+        settings: MsckfSettings,
+        motion: MotionSource | None,
     ) -> Msckf:
-        """Build the filter of a run, see `Backend`: that of one camera, or one whose IMU may begin late, included.
+        """Build the filter of a run, see `Backend`: that of one camera, or one whose IMU may begin
+        late, included.
 
         Raises:
             ConfigError: one camera without an IMU, or settings that need another motion or camera.
@@ -129,7 +147,10 @@ class Msckf(Backend):
             DataError: it is out of order or not finite; the filter is unchanged.
         """
         if self._source is None or not isinstance(sample, _SAMPLES[self._source]):
-            raise ConfigError(f"msckf was built for motion {self._source or 'none'}, got a {type(sample).__name__}")
+            raise ConfigError(
+                f"msckf was built for motion {self._source or 'none'}, got a "
+                f"{type(sample).__name__}"
+            )
         self._order.sample(sample)
         self._propagation.take(sample)
         if self._source == "velocity" and self._window is not None:
@@ -137,19 +158,27 @@ class Msckf(Backend):
             self._measure()
 
     def take_rotation_comparison(self, comparison: RotationComparison | None) -> None:
-        """Take how the camera's rotation compares with the gyro's; None: they were not compared yet.
+        """Take how the camera's rotation compares with the gyro's; None: they were not compared
+        yet.
 
-        Until they agree, nothing is concluded of the baseline, for which a wrong focal length passes.
+        Until they agree, nothing is concluded of the baseline, for which a wrong focal length
+        passes.
         """
         self._rig.rotation = comparison
 
     def predict(self, time_ns: int) -> Prediction | None:
-        """Predict a coming frame: the pixels of all tracks with a point, and the camera's motion."""
+        """Predict a coming frame: the pixels of all tracks with a point, and the camera's
+        motion.
+        """
         window = self._window
         if window is None or not window.clones or time_ns < self._propagation.time_ns:
             return None
         predicted = self._propagation.predict(window, time_ns)
-        return None if predicted is None else Prediction(self._frame.expected_tracks(window, *predicted), predicted[1])
+        return (
+            None
+            if predicted is None
+            else Prediction(self._frame.expected_tracks(window, *predicted), predicted[1])
+        )
 
     def update(self, observations: Observations) -> UpdateReport:
         """Propagate to the time of the frame and update with its observations.
@@ -157,13 +186,15 @@ class Msckf(Backend):
         Raises:
             EstimationError: the motion samples do not cover the step.
             DivergedError: the filter diverged; `restart` goes on from the last good state.
-            DataError: the frame is out of order, or its observations are impossible; the filter is unchanged.
+            DataError: the frame is out of order, or its observations are impossible; the filter is
+                unchanged.
         """
         self._order.frame(observations, self._propagation.time_ns)
         return self._update(observations)
 
     def _update(self, observations: Observations) -> UpdateReport:
-        seen, propagation = observations.take(~observations.stale), self._propagation
+        seen = observations.take(~observations.stale)
+        propagation = self._propagation
         if self._window is None:
             start = self._start_state(seen)
             if start is None:
@@ -177,12 +208,15 @@ class Msckf(Backend):
                 to_tilt = np.eye(state.size)
                 to_tilt[3:6, state["imu_terms"]] = propagation.motion.tilt_D_terms(nav)  # (A4)
                 self._window.prior.transform(to_tilt)
-            self._began_ns, self._tilted = observations.time_ns, np.eye(3)  # one camera begins anew after a divergence
+            self._began_ns = observations.time_ns  # one camera begins anew after a divergence
+            self._tilted = np.eye(3)
             propagation.begin(self._window, observations.time_ns, observations.time_ns)
             self._measure()
         elif len(seen) and propagation.is_lost and self._good is not None:
             unseen_s = (observations.time_ns - self._good.time_ns) * 1e-9
-            raise DivergedError(f"msckf has lost its way in {unseen_s:.1f} s without a feature or a motion sensor")
+            raise DivergedError(
+                f"msckf has lost its way in {unseen_s:.1f} s without a feature or a motion sensor"
+            )
         else:
             propagation.advance(self._window, observations.time_ns)
         window = self._window
@@ -193,9 +227,11 @@ class Msckf(Backend):
                 raise DivergedError(_lost(observations.frame_index))
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         propagation.blind = False
-        now, late_s = (window.nav, propagation.since_frame), propagation.late_s
+        now = (window.nav, propagation.since_frame)
+        late_s = propagation.late_s
         exposure, expected = propagation.exposure(window, *now, late_s)
-        # Half a window gives the velocity: before, its product with the offset's error would pass for knowledge of it.
+        # Half a window gives the velocity: before, its product with the offset's error would pass
+        # for knowledge of it.
         moving = len(window.clones) >= self._settings.clones // 2
         if "time_offset" in window.state and moving and not window.clocks_compared:
             twist = propagation.twist(window, *now)
@@ -203,7 +239,8 @@ class Msckf(Backend):
             exposure = window.camera_D_own(late_s, twist)
         window.add_clone(observations.frame_index, observations.time_ns, exposure)
         self._keep_first_attitude(window)
-        before = window.clones[int(len(window.clones) > self._settings.clones)]  # the oldest that stays
+        # the oldest that stays
+        before = window.clones[int(len(window.clones) > self._settings.clones)]
         try:
             report = self._frame.update(window, seen, expected)
             self._apply_zero_velocity(window)
@@ -214,12 +251,19 @@ class Msckf(Backend):
             raise DivergedError(_lost(observations.frame_index))
         if report.used >= report.gated:
             self._good = GoodState(
-                observations.frame_index, propagation.time_ns, window.nav, propagation.posterior.own, window.calibration
+                observations.frame_index,
+                propagation.time_ns,
+                window.nav,
+                propagation.posterior.own,
+                window.calibration,
             )
         return report
 
     def _start_state(self, seen: Observations) -> tuple[NavState, FloatArray] | None:
-        """The navigation state at the first frame and its covariance (15, 15); None: the frame passes."""
+        """The navigation state at the first frame and its covariance (15, 15).
+
+        None: the frame passes.
+        """
         motion = self._propagation.motion
         return motion.start(seen.time_ns) if motion.ready else None
 
@@ -230,8 +274,9 @@ class Msckf(Backend):
     def restart(self, observations: Observations) -> UpdateReport:
         """Start again at a frame after a divergence, from the state after the last good update.
 
-        The pose is carried on with an inflated covariance, velocity and biases are uncertain as at the start, and the
-        window is emptied; the map's points stay, and so does what is known of the calibration.
+        The pose is carried on with an inflated covariance, velocity and biases are uncertain as at
+        the start, and the window is emptied; the map's points stay, and so does what is known of
+        the calibration.
 
         Args:
             observations: of the frame at which `update` failed, or of a later one.
@@ -240,15 +285,20 @@ class Msckf(Backend):
             EstimationError: there was no good update.
             DivergedError: the filter diverges again at once.
         """
-        good, propagation = required(self._good), self._propagation
+        good = required(self._good)
+        propagation = self._propagation
         nav, P = restarted(good, observations.time_ns, propagation.motion, self._settings)
         window = self._window = self._first_window(nav, P, good.calibration)
-        propagation.begin(window, observations.time_ns, propagation.body_time(window, observations.time_ns))
+        propagation.begin(
+            window, observations.time_ns, propagation.body_time(window, observations.time_ns)
+        )
         self._forget_tracks(good)
         return self._update(observations)
 
     def _forget_tracks(self, good: GoodState) -> None:
-        """Forget all tracks and the motion's noise; go on with the calibration of the last good state."""
+        """Forget all tracks and the motion's noise; go on with the calibration of the last good
+        state.
+        """
         self._calibration = good.calibration
         self._frame.forget()
         self._propagation.noise = self._propagation.unknown_noise()
@@ -264,12 +314,15 @@ class Msckf(Backend):
 
     def estimate(self) -> Estimate:
         """Return the estimate at the time of the last event."""
-        window, propagation = self._window, self._propagation
+        window = self._window
+        propagation = self._propagation
         if window is None:
             return Estimate(propagation.time_ns, np.eye(4), np.eye(6))
-        own, motion = propagation.own_covariance(window), propagation.motion
+        own = propagation.own_covariance(window)
+        motion = propagation.motion
         T, covariance = propagation.exposed(window, own)
-        # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error is its negative.
+        # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error
+        # is its negative.
         A = se3_adjoint(se3_inverse(T))
         M = np.eye(DIM, len(own))
         M[:6] = window.since_first(M[:6])
@@ -290,7 +343,9 @@ class Msckf(Backend):
         )
 
     def imu_terms_covariance(self) -> FloatArray:
-        """Return the covariance (15, 15) of the errors of `Estimate.imu_terms`; zero where a term is not estimated."""
+        """Return the covariance (15, 15) of the errors of `Estimate.imu_terms`; zero where a
+        term is not estimated.
+        """
         if self._window is None or "imu_terms" not in self._window.state:
             return np.zeros((IMU_TERMS, IMU_TERMS))
         own = self._window.state["imu_terms"]
@@ -302,22 +357,30 @@ class Msckf(Backend):
         return self._settings.clones
 
     def smoothed(self, frame_index: int) -> Estimate | None:
-        """Return the estimate at a past frame with all frames since; None where it has left the window."""
-        window, smoothed = self._window, self._frame.smoothed
+        """Return the estimate at a past frame with all frames since.
+
+        None where it has left the window.
+        """
+        window = self._window
+        smoothed = self._frame.smoothed
         found = None if smoothed is None else smoothed.estimate(frame_index)
         return (
-            found if found is None or window is None else replace(found, gravity_world=_gravity(window, self._settings))
+            found
+            if found is None or window is None
+            else replace(found, gravity_world=_gravity(window, self._settings))
         )
 
     def relative(self, older: int, newer: int) -> RelativePose | None:
-        """Return the body's motion between two frames of the window, by numbers, with all frames since.
+        """Return the body's motion between two frames of the window, by numbers, with all frames
+        since.
 
         None where one of them is not in the window.
         """
         return None if self._frame.smoothed is None else self._frame.smoothed.motion(older, newer)
 
     def landmarks(self) -> Landmarks:
-        """Return the points of all tracks that were used and fix their depth, with their covariance given the poses.
+        """Return the points of all tracks that were used and fix their depth, with their covariance
+        given the poses.
 
         A point that came back under its id appears once, as it was seen last.
         """
@@ -325,7 +388,8 @@ class Msckf(Backend):
         return self._points.with_landmarks(window, self._rig.landmark_covariances(window))
 
     def take_landmarks(self) -> Landmarks:
-        """Return the points that have left the state since the last call, and forget them; `landmarks` has the others.
+        """Return the points that have left the state since the last call, and forget them;
+        `landmarks` has the others.
 
         None as long as the first tilt may still turn the map.
         """
@@ -335,7 +399,9 @@ class Msckf(Backend):
         return self._points.take()
 
     def _wait(self, observations: Observations) -> UpdateReport:
-        """Let a frame pass that comes before the first motion sample; the run monitor reports it."""
+        """Let a frame pass that comes before the first motion sample; the run monitor reports
+        it.
+        """
         self._propagation.time_ns = observations.time_ns
         return UpdateReport(0, 0, 0, 0, None, None)
 
@@ -348,16 +414,24 @@ class Msckf(Backend):
         self._propagation.measure(self._started())
 
     def _keep_first_attitude(self, window: Window) -> None:
-        """Let the world that is reported stay where the first frames have put it, once the first one leaves: (N14)."""
-        leaving = len(window.clones) > self._settings.clones and window.clones[0].time_ns == self._began_ns
+        """Let the world that is reported stay where the first frames have put it, once the first
+        one leaves: (N14).
+        """
+        leaving = (
+            len(window.clones) > self._settings.clones
+            and window.clones[0].time_ns == self._began_ns
+        )
         if self._source == "imu" and leaving and "first_attitude" not in window.state:
-            window.keep_first_attitude(window.calibration.estimating("first_attitude", self._settings))
+            window.keep_first_attitude(
+                window.calibration.estimating("first_attitude", self._settings)
+            )
 
     def _keep_first_yaw(self, window: Window, before: Clone) -> None:
         """Keep the world's yaw that of the start while the first tilt is corrected, equation (N13).
 
-        Corrections of roll and pitch by tens of degrees one after the other make a yaw, to second order, that no
-        linear filter sees. The start knew no yaw but that of the shortest turn from its first attitude to the true one.
+        Corrections of roll and pitch by tens of degrees one after the other make a yaw, to second
+        order, that no linear filter sees. The start knew no yaw but that of the shortest turn from
+        its first attitude to the true one.
 
         Args:
             window: after the frame's update.
@@ -369,7 +443,8 @@ class Msckf(Backend):
         if not len(after):
             return
         old = self._tilted
-        phi, t = so3_log(after[0, :3, :3] @ before.T_world_imu[:3, :3].T), _half_tangent(old)
+        phi = so3_log(after[0, :3, :3] @ before.T_world_imu[:3, :3].T)
+        t = _half_tangent(old)
         moved = so3_exp(phi) @ old
         yaw = -nearest_yaw(moved)
         self._tilted = so3_exp([0.0, 0.0, yaw]) @ moved
@@ -382,16 +457,20 @@ class Msckf(Backend):
         self._points.turn(R)
 
     def _apply_zero_velocity(self, window: Window) -> None:
-        """Absorb a zero-velocity measurement where the whole window is indistinguishable from standstill.
+        """Absorb a zero-velocity measurement where the whole window is indistinguishable from
+        standstill.
 
-        One measurement per window of frames: what two overlapping windows say of a slow motion is the same.
+        One measurement per window of frames: what two overlapping windows say of a slow motion is
+        the same.
         """
         if not self._settings.zero_velocity or len(window.clones) < self._settings.clones:
             return
         if window.clones[0].time_ns <= self._stationary_ns:
             return
         smoothed = self._frame.smoothed
-        if smoothed is None or not smoothed.is_stationary(ZERO_VELOCITY_SIGMA_MPS, ZERO_RATE_SIGMA_RADPS):
+        if smoothed is None or not smoothed.is_stationary(
+            ZERO_VELOCITY_SIGMA_MPS, ZERO_RATE_SIGMA_RADPS
+        ):
             return
         measurement = self._propagation.motion.zero_velocity(window.nav, self._propagation.gyro)
         if measurement is not None:
@@ -400,7 +479,9 @@ class Msckf(Backend):
 
 
 def _vertical(window: Window, own: FloatArray, settings: MsckfSettings) -> dict[str, Any]:
-    """The fields of `Estimate` that say where gravity points, by the upright covariance (15 + C, 15 + C)."""
+    """The fields of `Estimate` that say where gravity points, by the upright covariance (15 + C,
+    15 + C).
+    """
     (xx, xy), (_, yy) = own[3:5, 3:5].tolist()
     sigma = math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))  # of the larger eigenvalue
     return {"tilt_sigma_rad": sigma, "gravity_world": _gravity(window, settings)}

@@ -1,10 +1,11 @@
 """Motion models of the sliding-window filter: raw IMU, or a body twist that drifts.
 
-Both carry a navigation state with a 15-dimensional error whose first six entries are the pose's `[rho; phi]`,
-right-invariant: `T_world_imu = exp(xi) T_hat`. The rest is `[xi_v; gyro bias; accel bias]` for the IMU, with
-`v = exp(phi) v_hat + xi_v`, and `[twist; gyro bias]` for the twist. Equation numbers are those of docs/math.md.
-References: Barrau & Bonnabel, The invariant extended Kalman filter as a stable observer (2017); Hartley et al.,
-Contact-aided invariant extended Kalman filtering for robot state estimation (2020).
+Both carry a navigation state with a 15-dimensional error whose first six entries are the pose's
+`[rho; phi]`, right-invariant: `T_world_imu = exp(xi) T_hat`. The rest is
+`[xi_v; gyro bias; accel bias]` for the IMU, with `v = exp(phi) v_hat + xi_v`, and
+`[twist; gyro bias]` for the twist. Equation numbers are those of docs/math.md.
+References: Barrau & Bonnabel, The invariant extended Kalman filter as a stable observer (2017);
+Hartley et al., Contact-aided invariant extended Kalman filtering for robot state estimation (2020).
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ from vio.records import ImuSample, MotionSample, VelocitySample
 
 DIM = 15  # error dimensions of the navigation state
 UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
-_EXTRAPOLATE_NS = 30_000_000  # by which samples may end before an exposure and its pose is still taken from its twist
+# by which samples may end before an exposure and its pose is still taken from its twist
+_EXTRAPOLATE_NS = 30_000_000
 _SAMPLE_S = 0.005  # between two samples of a usual IMU, where only one has come
 _NO_TERMS: FloatArray = np.zeros(IMU_TERMS)
 START_VELOCITY_SIGMA_MPS = 10.0  # initial standard deviation of the velocity
@@ -63,10 +65,12 @@ class NavState:
 
     T_world_imu: FloatArray  # (4, 4)
     velocity: FloatArray  # (3,) IMU model: world frame; twist model: body frame; m/s
-    rate: FloatArray  # (3,) body frame, rad/s; IMU model: what the gyro reads now less its bias, no state of its own
+    # (3,) body frame, rad/s; IMU model: what the gyro reads now less its bias, no state of its own
+    rate: FloatArray
     gyro_bias: FloatArray  # (3,) rad/s
     accel_bias: FloatArray  # (3,) m/s^2; twist model: unused, zero
-    imu_terms: FloatArray = field(default_factory=lambda: _NO_TERMS)  # (15,) scale and misalignment, equation (A1)
+    # (15,) scale and misalignment, equation (A1)
+    imu_terms: FloatArray = field(default_factory=lambda: _NO_TERMS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +89,12 @@ class Transition:
     nav: NavState
     Phi: FloatArray  # (15, 15)
     Q: FloatArray  # (15, 15)
-    Q_parts: FloatArray  # (2, 15, 15) of Q, what the translation's and what the rotation's noise brought
-    gyro: FloatArray | None = None  # (3,) mean rate that the gyro measured over the step, rad/s; None: it did not
-    bridged: bool = False  # whether IMU samples were missing, so that Q says nothing of the sensors' noise
+    # (2, 15, 15) of Q, what the translation's and what the rotation's noise brought
+    Q_parts: FloatArray
+    # (3,) mean rate that the gyro measured over the step, rad/s; None: it did not
+    gyro: FloatArray | None = None
+    # whether IMU samples were missing, so that Q says nothing of the sensors' noise
+    bridged: bool = False
     Phi_imu: FloatArray | None = None  # (15, I) by the IMU's terms; None: they are known
 
 
@@ -106,7 +113,8 @@ class Growth:
         if self is NO_STEP:
             return Growth(step.Phi, step.Q, step.Q_parts, step.bridged, step.Phi_imu)
         Phi = step.Phi
-        Q, Q_parts = Phi @ self.Q @ Phi.T + step.Q, Phi @ self.Q_parts @ Phi.T + step.Q_parts
+        Q = Phi @ self.Q @ Phi.T + step.Q
+        Q_parts = Phi @ self.Q_parts @ Phi.T + step.Q_parts
         Phi_imu = step.Phi_imu
         if Phi_imu is not None and self.Phi_imu is not None:
             Phi_imu = Phi @ self.Phi_imu + Phi_imu
@@ -118,12 +126,15 @@ NO_STEP = Growth(np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM)))
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """A linear measurement of the errors of navigation state and IMU terms: residual = H error + noise."""
+    """A linear measurement of the errors of navigation state and IMU terms: residual = H error +
+    noise.
+    """
 
     H: FloatArray  # (k, 15 + I)
     residual: FloatArray  # (k,)
     R: FloatArray  # (k, k)
-    metric: bool = False  # whether it is a velocity in m/s; standstill is standstill whatever the scale
+    # whether it is a velocity in m/s; standstill is standstill whatever the scale
+    metric: bool = False
 
 
 class ImuMotion:
@@ -148,7 +159,9 @@ class ImuMotion:
 
     @property
     def samples(self) -> Sequence[ImuSample]:
-        """The samples that are kept, in order of time; new ones are checked here, all since the last use at once."""
+        """The samples that are kept, in order of time; new ones are checked here, all since the
+        last use at once.
+        """
         if self._new:
             usable = self._check.take_all(self._new)
             self._new = []
@@ -162,11 +175,13 @@ class ImuMotion:
         return bool(self.samples)
 
     def start(self, time_ns: int) -> tuple[NavState, FloatArray]:
-        """Return the state at the first frame and its covariance (15, 15), from the last half second of samples.
+        """Return the state at the first frame and its covariance (15, 15), from the last half
+        second of samples.
 
-        Roll and pitch from the mean specific force, whose acceleration has the standard deviation that the readings
-        suggest; a gyro bias where they show a standstill (`imu_start`). Tilt and accelerometer bias are correlated, as
-        either explains the same reading: equation (N10). Position and yaw are the world's; the velocity is unknown.
+        Roll and pitch from the mean specific force, whose acceleration has the standard deviation
+        that the readings suggest; a gyro bias where they show a standstill (`imu_start`). Tilt and
+        accelerometer bias are correlated, as either explains the same reading: equation (N10).
+        Position and yaw are the world's; the velocity is unknown.
 
         Raises:
             EstimationError: the accelerometer reads nothing.
@@ -180,71 +195,109 @@ class ImuMotion:
         sigmas = np.concatenate(
             [
                 np.zeros(5),
-                [_yaw_sigma(np.hypot(begin.accel_sigma_mps2, s.accel_bias_sigma_mps2) / s.gravity_mps2, known)],
+                [
+                    _yaw_sigma(
+                        np.hypot(begin.accel_sigma_mps2, s.accel_bias_sigma_mps2) / s.gravity_mps2,
+                        known,
+                    )
+                ],
                 np.full(3, START_VELOCITY_SIGMA_MPS),
                 np.full(3, begin.gyro_bias_sigma_radps),
                 np.full(3, s.accel_bias_sigma_mps2),
             ]
         )
         P = np.diag(sigmas**2)
-        tilt_D_accel = -so3_hat(self._gravity) / s.gravity_mps2**2  # g^ phi = R db_a + acceleration, solved for phi
+        # g^ phi = R db_a + acceleration, solved for phi
+        tilt_D_accel = -so3_hat(self._gravity) / s.gravity_mps2**2
         tilt_D_bias = tilt_D_accel @ R
         P[3:6, 12:15] = tilt_D_bias * s.accel_bias_sigma_mps2**2
         P[12:15, 3:6] = P[3:6, 12:15].T
-        P[3:6, 3:6] += tilt_D_accel @ tilt_D_accel.T * (begin.accel_sigma_mps2**2 + s.accel_bias_sigma_mps2**2)
+        P[3:6, 3:6] += (
+            tilt_D_accel @ tilt_D_accel.T * (begin.accel_sigma_mps2**2 + s.accel_bias_sigma_mps2**2)
+        )
         return nav, P
 
     def start_covariance(self, settings: MsckfSettings) -> FloatArray:
-        """Covariance (15, 15) of velocity and biases of which nothing is known; that of the pose is zero."""
+        """Covariance (15, 15) of velocity and biases of which nothing is known; that of the pose
+        is zero.
+        """
         s = settings
-        sigmas = [0.0, 0.0, START_VELOCITY_SIGMA_MPS, s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2]
+        sigmas = [
+            0.0,
+            0.0,
+            START_VELOCITY_SIGMA_MPS,
+            s.gyro_bias_sigma_radps,
+            s.accel_bias_sigma_mps2,
+        ]
         return np.diag(np.repeat(sigmas, 3) ** 2)
 
-    def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray = UNSCALED) -> Transition:
-        """Integrate from one time to another, equations (N1) to (N4); factors (2,) scale accelerometer and gyro noise.
+    def advance(
+        self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray = UNSCALED
+    ) -> Transition:
+        """Integrate from one time to another, equations (N1) to (N4); factors (2,) scale
+        accelerometer and gyro noise.
 
-        Where samples are missing, it interpolates, or holds the last one, and adds what that may hide to the noise:
-        equations (N11) and (N12).
+        Where samples are missing, it interpolates, or holds the last one, and adds what that may
+        hide to the noise: equations (N11) and (N12).
 
         Raises:
             EstimationError: there is no sample at all.
         """
         times, raw, hidden = self._interval(start_ns, end_ns)
         readings = calibrated(raw, nav.imu_terms) if len(self._chosen) else raw
-        s, steps = self._settings, len(times) - 1
+        s = self._settings
+        steps = len(times) - 1
         densities = factors * [s.accel_noise_density, s.gyro_noise_density]
         variance = np.zeros((2, steps)) if hidden is None else hidden.variance
-        T, v, turned = nav.T_world_imu.copy(), nav.velocity.copy(), np.zeros(3)
+        T = nav.T_world_imu.copy()
+        v = nav.velocity.copy()
+        turned = np.zeros(3)
         total = float(times[-1]) * 1e-9
-        Phi, Q_parts, Q = np.eye(DIM), np.zeros((2, DIM, DIM)), np.empty((DIM, DIM))
-        bias, noise = np.concatenate([nav.gyro_bias, nav.accel_bias]), (densities, self._walks, variance)
+        Phi = np.eye(DIM)
+        Q_parts = np.zeros((2, DIM, DIM))
+        Q = np.empty((DIM, DIM))
+        bias = np.concatenate([nav.gyro_bias, nav.accel_bias])
+        noise = (densities, self._walks, variance)
         loops.integrate(times, readings, bias, self._gravity, *noise, T, v, turned, Phi, Q_parts, Q)
-        moved = NavState(T, v, readings[-1, :3] - nav.gyro_bias, nav.gyro_bias, nav.accel_bias, nav.imu_terms)
+        moved = NavState(
+            T, v, readings[-1, :3] - nav.gyro_bias, nav.gyro_bias, nav.accel_bias, nav.imu_terms
+        )
         Phi_imu = None
         if len(self._chosen):
             own = readings - bias
             levers = raw if self._usual is None else significant(raw, self._usual, total, densities)
-            by_terms = term_columns(times, levers, own, nav.T_world_imu, nav.velocity, self._gravity)
+            by_terms = term_columns(
+                times, levers, own, nav.T_world_imu, nav.velocity, self._gravity
+            )
             Phi_imu = by_terms[:, self._chosen]
         if hidden is not None and hidden.gap:
             return Transition(moved, Phi, Q, Q_parts, bridged=True, Phi_imu=Phi_imu)
-        return Transition(moved, Phi, Q, Q_parts, turned / max(total, 1e-9) + nav.gyro_bias, Phi_imu=Phi_imu)
+        return Transition(
+            moved, Phi, Q, Q_parts, turned / max(total, 1e-9) + nav.gyro_bias, Phi_imu=Phi_imu
+        )
 
     def tilt_D_terms(self, nav: NavState) -> FloatArray:
-        """How errors of the IMU's terms move the attitude's error (3, I) of a state that `start` has returned: (A4)."""
+        """How errors of the IMU's terms move the attitude's error (3, I) of a state that `start`
+        has returned: (A4).
+        """
         return tilt_columns(nav.T_world_imu, self._gravity)[:, self._chosen]
 
     def rate_D_error(self, nav: NavState) -> FloatArray:
-        """Jacobian (3, 15 + I) of the present rate by the errors of navigation state and IMU terms."""
+        """Jacobian (3, 15 + I) of the present rate by the errors of navigation state and IMU
+        terms.
+        """
         out = np.zeros((3, DIM + len(self._chosen)))
         out[:, 9:12] = -np.eye(3)
         if len(self._chosen):
-            out[:, DIM:] = gyro_D_terms(raw_rate(nav.rate + nav.gyro_bias, nav.imu_terms))[:, self._chosen]
+            out[:, DIM:] = gyro_D_terms(raw_rate(nav.rate + nav.gyro_bias, nav.imu_terms))[
+                :, self._chosen
+            ]
         return out
 
     def forget_before(self, time_ns: int) -> None:
         """Drop the samples that no interval from this time on needs."""
-        samples, keep = self.samples, 0
+        samples = self.samples
+        keep = 0
         while keep + 1 < len(samples) and samples[keep + 1].time_ns <= time_ns:
             keep += 1
         if keep and len(self._chosen):
@@ -257,7 +310,8 @@ class ImuMotion:
         return None
 
     def zero_velocity(self, nav: NavState, gyro: FloatArray | None) -> Measurement | None:
-        """Rest as a measurement, equation (N7): no velocity, and the gyro, calibrated, reads its bias.
+        """Rest as a measurement, equation (N7): no velocity, and the gyro, calibrated, reads its
+        bias.
 
         None where the gyro contradicts.
         """
@@ -281,28 +335,39 @@ class ImuMotion:
         return nav.velocity
 
     def uncertainty(self, nav: NavState, P: FloatArray) -> MotionUncertainty:
-        """Return the uncertainty of velocity and biases, from the covariance (15, 15) of the error."""
-        velocity_D_error = np.concatenate([-so3_hat(nav.velocity), np.eye(3)], axis=1)  # v = exp(phi) v_hat + xi_v
+        """Return the uncertainty of velocity and biases, from the covariance (15, 15) of the
+        error.
+        """
+        # v = exp(phi) v_hat + xi_v
+        velocity_D_error = np.concatenate([-so3_hat(nav.velocity), np.eye(3)], axis=1)
         sigmas = np.sqrt(np.diag(P)[9:15])
-        return MotionUncertainty(velocity_D_error @ P[3:9, 3:9] @ velocity_D_error.T, sigmas[:3], sigmas[3:])
+        return MotionUncertainty(
+            velocity_D_error @ P[3:9, 3:9] @ velocity_D_error.T, sigmas[:3], sigmas[3:]
+        )
 
     def corrected(self, nav: NavState, error: FloatArray) -> NavState:
         """Return the state moved by an error (15 + I,)."""
-        T, v = nav.T_world_imu.copy(), nav.velocity.copy()
+        T = nav.T_world_imu.copy()
+        v = nav.velocity.copy()
         move_by_twist(error[:6], T)
         loops.move_points(error[3:6], error[None, 6:9], v[None])
-        rate, terms = nav.rate - error[9:12], nav.imu_terms
+        rate = nav.rate - error[9:12]
+        terms = nav.imu_terms
         if len(self._chosen):
             by_terms = error[DIM : DIM + len(self._chosen)]
-            rate = rate + self.rate_D_error(nav)[:, DIM:] @ by_terms  # exact, as the rate is linear in the terms
+            # exact, as the rate is linear in the terms
+            rate = rate + self.rate_D_error(nav)[:, DIM:] @ by_terms
             terms = terms.copy()
             terms[self._chosen] += by_terms
-        return NavState(T, v, rate, nav.gyro_bias + error[9:12], nav.accel_bias + error[12:15], terms)
+        return NavState(
+            T, v, rate, nav.gyro_bias + error[9:12], nav.accel_bias + error[12:15], terms
+        )
 
     def corrected_earlier(
         self, velocities: FloatArray, R_world_imu: FloatArray, ages_s: FloatArray, error: FloatArray
     ) -> FloatArray:
-        """Return velocities as a present error moves them: (N2) back, with the accelerometer's bias and terms.
+        """Return velocities as a present error moves them: (N2) back, with the accelerometer's bias
+        and terms.
 
         Args:
             velocities: (N, 3) of the past, world, the present one last.
@@ -311,7 +376,9 @@ class ImuMotion:
             error: (15 + I,) of the present state.
         """
         out: FloatArray = velocities.copy()
-        loops.move_earlier_velocities(self._gravity, ages_s, np.ascontiguousarray(R_world_imu), error, out)
+        loops.move_earlier_velocities(
+            self._gravity, ages_s, np.ascontiguousarray(R_world_imu), error, out
+        )
         if len(self._chosen):  # the mean force over the time since, times that time
             force = velocities[-1] - velocities - ages_s[:, None] * self._gravity
             by_terms = accel_D_terms(np.einsum("nji,nj->ni", R_world_imu, force))[..., self._chosen]
@@ -320,24 +387,33 @@ class ImuMotion:
         return out
 
     def rate_variance(self, factors: FloatArray) -> float:
-        """Variance (rad/s)^2 of the rate that the gyro reads in one sample; factors (2,) as in `advance`."""
-        period_ns = self._history.period_ns() if self.samples else 0.0  # new samples come into the history here
+        """Variance (rad/s)^2 of the rate that the gyro reads in one sample; factors (2,) as in
+        `advance`.
+        """
+        # new samples come into the history here
+        period_ns = self._history.period_ns() if self.samples else 0.0
         period_s = period_ns * 1e-9 if period_ns > 0 else _SAMPLE_S
         return float((factors[1] * self._settings.gyro_noise_density) ** 2 / period_s)
 
     def covered(self, time_ns: int) -> int:
-        """The latest time, up to a given one, that the samples reach; the given one where they end long before."""
+        """The latest time, up to a given one, that the samples reach; the given one where they
+        end long before.
+        """
         latest = self.samples[-1].time_ns
         return time_ns if time_ns - latest > _EXTRAPOLATE_NS else min(time_ns, latest)
 
     def _interval(self, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, Hidden | None]:
-        """Times relative to the start (K,) in ns, readings `[gyro, accel]` (K, 6), and what gaps hide.
+        """Times relative to the start (K,) in ns, readings `[gyro, accel]` (K, 6), and what gaps
+        hide.
 
-        Values are interpolated between samples and held beyond the first and the last; None: no sample is missing.
+        Values are interpolated between samples and held beyond the first and the last; None: no
+        sample is missing.
         """
         samples = self.samples
         if not samples:
-            raise EstimationError(f"no IMU sample before {end_ns} ns; check that IMU and camera share a clock")
+            raise EstimationError(
+                f"no IMU sample before {end_ns} ns; check that IMU and camera share a clock"
+            )
         t = np.array([float(x.time_ns - start_ns) for x in samples])
         end = float(end_ns - start_ns)
         cuts = np.concatenate([[0.0], t[(t > 0) & (t < end)], [end]])
@@ -350,9 +426,11 @@ class ImuMotion:
 
 
 class TwistMotion:
-    """The body twist is a state that drifts with white acceleration; velocity samples, if any, measure it.
+    """The body twist is a state that drifts with white acceleration; velocity samples, if any,
+    measure it.
 
-    This is `vio.filters.vislam_motion.DriftingTwist` with the error on the world side and a bias of the angular rate.
+    This is `vio.filters.vislam_motion.DriftingTwist` with the error on the world side and a bias of
+    the angular rate.
     """
 
     def __init__(self, settings: MsckfSettings) -> None:
@@ -371,17 +449,31 @@ class TwistMotion:
         self._pending = sample
 
     def start(self, time_ns: int) -> tuple[NavState, FloatArray]:
-        """Return the state at the first frame and its covariance (15, 15): the world is where the body is."""
+        """Return the state at the first frame and its covariance (15, 15): the world is where
+        the body is.
+        """
         zero = np.zeros(3)
         return NavState(np.eye(4), zero, zero, zero, zero), self.start_covariance(self._settings)
 
     def start_covariance(self, settings: MsckfSettings) -> FloatArray:
-        """Covariance (15, 15) of twist and rate bias of which nothing is known; that of the pose is zero."""
-        sigmas = [0.0, 0.0, START_VELOCITY_SIGMA_MPS, _START_RATE_SIGMA_RADPS, RATE_BIAS_SIGMA_RADPS]
+        """Covariance (15, 15) of twist and rate bias of which nothing is known; that of the pose
+        is zero.
+        """
+        sigmas = [
+            0.0,
+            0.0,
+            START_VELOCITY_SIGMA_MPS,
+            _START_RATE_SIGMA_RADPS,
+            RATE_BIAS_SIGMA_RADPS,
+        ]
         return np.diag(np.repeat(sigmas, 3) ** 2)
 
-    def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray = UNSCALED) -> Transition:
-        """Carry pose and twist over a time, equations (N5) and (N6); factors (2,) scale linear and angular noise."""
+    def advance(
+        self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray = UNSCALED
+    ) -> Transition:
+        """Carry pose and twist over a time, equations (N5) and (N6); factors (2,) scale linear
+        and angular noise.
+        """
         tau = (end_ns - start_ns) * 1e-9
         u = np.concatenate([nav.velocity, nav.rate])
         T = nav.T_world_imu
@@ -408,14 +500,17 @@ class TwistMotion:
 
     def measurement(self, nav: NavState) -> Measurement | None:
         """The velocity sample that has just been taken, if any."""
-        sample, self._pending = self._pending, None
+        sample = self._pending
+        self._pending = None
         if sample is None:
             return None
         s = self._settings
         H = np.zeros((6, DIM))
         H[:, 6:12] = np.eye(6)
         H[3:, 12:15] = np.eye(3)
-        residual = np.concatenate([sample.linear - nav.velocity, sample.angular - nav.rate - nav.gyro_bias])
+        residual = np.concatenate(
+            [sample.linear - nav.velocity, sample.angular - nav.rate - nav.gyro_bias]
+        )
         sigmas = np.repeat([s.linear_velocity_sigma_mps, s.angular_rate_sigma_radps], 3)
         return Measurement(H, residual, np.diag(sigmas**2), metric=True)
 
@@ -432,7 +527,9 @@ class TwistMotion:
         return out
 
     def uncertainty(self, nav: NavState, P: FloatArray) -> MotionUncertainty:
-        """Return the uncertainty of velocity and biases, from the covariance (15, 15) of the error."""
+        """Return the uncertainty of velocity and biases, from the covariance (15, 15) of the
+        error.
+        """
         R = nav.T_world_imu[:3, :3]  # v_world = exp(phi) R (v_hat + delta)
         velocity_D_error = np.concatenate([-so3_hat(R @ nav.velocity), R], axis=1)
         velocity_P: FloatArray = velocity_D_error @ P[3:9, 3:9] @ velocity_D_error.T
@@ -450,10 +547,12 @@ class TwistMotion:
 
 
 def _yaw_sigma(tilt_sigma: float, known_sigma: float) -> float:
-    """What corrections of the first tilt leave of yaw, rad: two turns about level axes make a turn about the vertical.
+    """What corrections of the first tilt leave of yaw, rad: two turns about level axes make a turn
+    about the vertical.
 
-    The filter takes out the second order, (N13), for as long as the first frame is in its window; the third vanishes
-    about the vertical, and of the fourth `x^4 / 24` remains (Baker, Campbell & Hausdorff). Later corrections are of the
-    size of the tilt that is known by then, and their second order `x^2 / 2` stays.
+    The filter takes out the second order, (N13), for as long as the first frame is in its window;
+    the third vanishes about the vertical, and of the fourth `x^4 / 24` remains (Baker, Campbell &
+    Hausdorff). Later corrections are of the size of the tilt that is known by then, and their
+    second order `x^2 / 2` stays.
     """
     return float(np.hypot(tilt_sigma**4 / 24, known_sigma**2 / 2))

@@ -1,4 +1,6 @@
-"""The motion model's process noise, learned from how much the images correct each predicted motion."""
+"""The motion model's process noise, learned from how much the images correct each predicted
+motion.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +13,25 @@ from vio.filters import gate_loops as loops
 from vio.geometry.lie import FloatArray
 from vio.numerics.statistics import chi_square_cdf, chi_square_quantile
 
-_STEPS = 10  # over which corrections are summed: errors that last, such as a gyro's scale, show only in the sum
-_INFORMED = 0.3  # share of its predicted variance that the images must have removed for a direction to count
+# over which corrections are summed: errors that last, such as a gyro's scale, show only in the sum
+_STEPS = 10
+# share of its predicted variance that the images must have removed for a direction to count
+_INFORMED = 0.3
 _LOG_VARIANCE_SIGMA = 1.5  # initial standard deviation of the logarithm of the squared factor
 _LOG_VARIANCE_WALK = 0.15  # its random walk per sum of steps
 _SURPRISE = 0.9999  # chi-square probability beyond which a single step is an exception
 _SURPRISING = chi_square_quantile(_SURPRISE, np.arange(1, 4)).tolist()
 _MOST = 1e6
 _PARTS = slice(0, 3), slice(3, 6)  # translation, rotation
-_SENSITIVITY = (0.0, 1 / np.pi, 0.5, 2 / np.pi)  # d E[2 F_k(e^t x) - 1] / dt at t = 0 for x ~ chi-square(k), k = 0..3
+# d E[2 F_k(e^t x) - 1] / dt at t = 0 for x ~ chi-square(k), k = 0..3
+_SENSITIVITY = (0.0, 1 / np.pi, 0.5, 2 / np.pi)
 
 
 @dataclass(frozen=True, slots=True)
 class StepErrors:
-    """One predicted step, or the sum of several, and its correction by the images; body frame, `[rho; phi]`, m, rad."""
+    """One predicted step, or the sum of several, and its correction by the images; body frame,
+    `[rho; phi]`, m, rad.
+    """
 
     correction: FloatArray  # (6,) what the images added to the predicted motion
     expected: FloatArray  # (6, 6) covariance of the predicted motion
@@ -32,7 +39,9 @@ class StepErrors:
     remaining: FloatArray  # (6, 6) covariance of the motion after the update
 
     def __add__(self, other: StepErrors) -> StepErrors:
-        """Sum the corrections of two steps; those of a filter with the right noise are uncorrelated."""
+        """Sum the corrections of two steps; those of a filter with the right noise are
+        uncorrelated.
+        """
         return StepErrors(
             self.correction + other.correction,
             self.expected + other.expected,
@@ -41,7 +50,8 @@ class StepErrors:
         )
 
     def missing_noise(self) -> FloatArray:
-        """By how many times (2,) its own the process noise was too small to explain the correction; 0 where it was not.
+        """By how many times (2,) its own the process noise was too small to explain the correction;
+        0 where it was not.
 
         A shock, a saturated sensor, or a step of the vehicle that its model cannot make.
         """
@@ -55,18 +65,22 @@ class StepErrors:
 
 @dataclass(frozen=True, slots=True)
 class WhitenedCorrection:
-    """A correction in units of its own standard deviation, in the directions that the images inform."""
+    """A correction in units of its own standard deviation, in the directions that the images
+    inform.
+    """
 
     squared: float  # chi-square distributed with `dof` degrees of freedom if the noise is right
     dof: int  # 0 to 3
-    share: float  # of the predicted variance in these directions, what the process noise of the steps brought
+    # of the predicted variance in these directions, what the process noise of the steps brought
+    share: float
 
 
 def whitened_correction(step: StepErrors, part: slice) -> WhitenedCorrection:
-    """Test one part (translation or rotation) of a correction against its covariance, `expected - remaining`.
+    """Test one part (translation or rotation) of a correction against its covariance,
+    `expected - remaining`.
 
-    Directions are the eigenvectors of the removed share of the predicted covariance; those in which the images removed
-    little say nothing about the motion model and are left out.
+    Directions are the eigenvectors of the removed share of the predicted covariance; those in which
+    the images removed little say nothing about the motion model and are left out.
     """
     errors = step.correction, step.expected, step.process, step.remaining
     found = WhitenedCorrection(*loops.whiten_correction(*errors, part.start, _INFORMED))
@@ -78,17 +92,21 @@ def whitened_correction(step: StepErrors, part: slice) -> WhitenedCorrection:
 class MotionNoise:
     """Factors on the motion model's noise densities, one for translation and one for rotation.
 
-    A data sheet describes the sensor on the bench; vibration, misalignment and sampling add to it, by a factor that
-    differs from rig to rig. The corrections that the images make to the predicted motion are compared with their
-    covariance: the squared whitened sum of ten of them is chi-square distributed if the factor is right. Its
-    probability `F_k`, mapped to `y = 2 F_k - 1`, has mean zero and variance 1/3 then, whatever the degrees of freedom
-    k, and is bounded, so that a few wild steps do no harm. A scalar Kalman filter on the logarithm of the squared
-    factor takes `y` as its innovation: equation (N8).
-    Reference: Mehra, Approaches to adaptive filtering, IEEE TAC (1972), for matching the innovations' covariance.
+    A data sheet describes the sensor on the bench; vibration, misalignment and sampling add to it,
+    by a factor that differs from rig to rig. The corrections that the images make to the predicted
+    motion are compared with their covariance: the squared whitened sum of ten of them is chi-square
+    distributed if the factor is right. Its probability `F_k`, mapped to `y = 2 F_k - 1`, has mean
+    zero and variance 1/3 then, whatever the degrees of freedom k, and is bounded, so that a few
+    wild steps do no harm. A scalar Kalman filter on the logarithm of the squared factor takes `y`
+    as its innovation: equation (N8).
+    Reference: Mehra, Approaches to adaptive filtering, IEEE TAC (1972), for matching the
+    innovations' covariance.
     """
 
     def __init__(self, start: float | FloatArray, smallest: float, largest: float) -> None:
-        """Start both factors at one value or at two (2,), and keep them between bounds; all on standard deviations."""
+        """Start both factors at one value or at two (2,), and keep them between bounds; all on
+        standard deviations.
+        """
         self.factors: FloatArray = np.ones(2) * start  # translation, rotation
         self._bounds = smallest, largest
         self._variance: FloatArray = np.full(2, _LOG_VARIANCE_SIGMA**2)
@@ -103,7 +121,8 @@ class MotionNoise:
             return
         for k, part in enumerate(_PARTS):
             self._update_factor(k, whitened_correction(self._sum, part))
-        self._sum, self._steps = None, 0
+        self._sum = None
+        self._steps = 0
 
     def _update_factor(self, k: int, test: WhitenedCorrection) -> None:
         self._variance[k] += _LOG_VARIANCE_WALK**2

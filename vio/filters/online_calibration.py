@@ -1,12 +1,15 @@
-"""Online calibration: the constants that the filter may estimate beside the motion, one class for each block of them.
+"""Online calibration: the constants that the filter may estimate beside the motion, one class for
+each block of them.
 
-`BLOCKS` is the table: a block says when it is estimated, its prior and random walk, how an error moves its mean, where
-its errors enter, and what of it is reported. A new one is a class here, its mean in `Calibration`, its fields in
-`Estimate`, and its setting; its columns are in `camera_D_error`, in `StereoCorrection`, or in the motion model's step.
+`BLOCKS` is the table: a block says when it is estimated, its prior and random walk, how an error
+moves its mean, where its errors enter, and what of it is reported. A new one is a class here, its
+mean in `Calibration`, its fields in `Estimate`, and its setting; its columns are in
+`camera_D_error`, in `StereoCorrection`, or in the motion model's step.
 
-A frame stamped t was exposed at `t + time_offset_s` of the IMU's clock. The extrinsics' error `delta`, with
-`T_cam0_imu = T_hat exp(delta)`, is kept on the world's side, `eta = Ad(T_world_imu) delta`, and moves with the body.
-Both errors enter where the camera's pose is cloned from the body's, equations (C1) to (C5) of docs/math.md.
+A frame stamped t was exposed at `t + time_offset_s` of the IMU's clock. The extrinsics' error
+`delta`, with `T_cam0_imu = T_hat exp(delta)`, is kept on the world's side,
+`eta = Ad(T_world_imu) delta`, and moves with the body. Both errors enter where the camera's pose is
+cloned from the body's, equations (C1) to (C5) of docs/math.md.
 Reference: Li & Mourikis, Online temporal calibration for camera-IMU systems (2014).
 """
 
@@ -25,27 +28,40 @@ from vio.filters.navigation import DIM, Growth, NavState, Transition
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, so3_exp
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import FIELD_TERMS, IntArray, MotionSource, StereoFieldEstimate, StereoScaleEstimate
+from vio.records import (
+    FIELD_TERMS,
+    IntArray,
+    MotionSource,
+    StereoFieldEstimate,
+    StereoScaleEstimate,
+)
 
 if TYPE_CHECKING:
     from vio.filters.error_state import ErrorState
 
-_NOISE_ONLY = float(chi_square_quantile(0.999, 3))  # squared half of a twist in its standard deviations at standstill
+# squared half of a twist in its standard deviations at standstill
+_NOISE_ONLY = float(chi_square_quantile(0.999, 3))
 # Random walks of a mount that gives and of clocks that drift, each per root second.
 _EXTRINSIC_ROTATION_WALK_DEG = 2.0e-3
 _EXTRINSIC_TRANSLATION_WALK_M = 1.0e-4
 _TIME_OFFSET_WALK_S = 2.0e-6
-STEREO_YAW_SIGMA_DEG = 0.05  # initial standard deviation of the right camera's rotation about its vertical axis
-LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA = 5.0e-4, 2.0e-3  # the same of the other rectification terms, in focal lengths
-_LEAST_COMMON_SIGMA = 1.0e-3  # at least that of what both lenses have in common, which moves no rows of far points
+# initial standard deviation of the right camera's rotation about its vertical axis
+STEREO_YAW_SIGMA_DEG = 0.05
+LEAST_FIELD_SIGMA = 5.0e-4  # the same of the other rectification terms, in focal lengths
+MOST_FIELD_SIGMA = 2.0e-3
+# at least that of what both lenses have in common, which moves no rows of far points
+_LEAST_COMMON_SIGMA = 1.0e-3
 _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
-_STEREO_WALK = 0.02  # random walk of the rectification error per root second, over its initial standard deviation
+# random walk of the rectification error per root second, over its initial standard deviation
+_STEREO_WALK = 0.02
 
 
 def stereo_field_sigmas(sigma: float, turn_rad: float = 0.0) -> FloatArray:
-    """Initial standard deviations (8,) of the rectification error, in focal lengths, by that of its lens terms.
+    """Initial standard deviations (8,) of the rectification error, in focal lengths, by that of its
+    lens terms.
 
-    Yaw, which moves no row, is known no better than by the turn `turn_rad` that pitch and roll would make of the rows.
+    Yaw, which moves no row, is known no better than by the turn `turn_rad` that pitch and roll
+    would make of the rows.
     """
     common = max(sigma, _LEAST_COMMON_SIGMA)
     yaw = max(np.radians(STEREO_YAW_SIGMA_DEG), turn_rad)
@@ -62,7 +78,8 @@ class Twist:
     def significant(self) -> FloatArray:
         """The twist (6,), each half shrunk by what its own noise may make of it, equation (C3).
 
-        An estimated twist that is noise alone would pass for a motion, from which the time offset is learned.
+        An estimated twist that is noise alone would pass for a motion, from which the time offset
+        is learned.
         """
         out: FloatArray = self.mean.copy()
         loops.shrink_by_noise(self.covariance, _NOISE_ONLY, out)
@@ -73,7 +90,9 @@ NO_TWIST = Twist(np.zeros(6), np.zeros((6, 6)))
 
 
 def body_twist(T_world_imu: FloatArray, velocity_world: FloatArray, rate: FloatArray) -> FloatArray:
-    """Twist (6,) `[v; omega]` in the body frame of a pose (4, 4), a world velocity and a body rate (3,)."""
+    """Twist (6,) `[v; omega]` in the body frame of a pose (4, 4), a world velocity and a body
+    rate (3,).
+    """
     return np.concatenate([T_world_imu[:3, :3].T @ velocity_world, rate])
 
 
@@ -83,10 +102,13 @@ class Calibration:
 
     T_cam0_imu: FloatArray  # (4, 4)
     time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock
-    stereo: FloatArray = field(default_factory=lambda: np.zeros(TERMS))  # (10,) coefficients of (R3) and (R4)
-    # (3, 3) from the world of the first seconds to that of the present estimate, which gravity keeps upright
+    # (10,) coefficients of (R3) and (R4)
+    stereo: FloatArray = field(default_factory=lambda: np.zeros(TERMS))
+    # (3, 3) from the world of the first seconds to that of the present estimate, which gravity
+    # keeps upright
     R_upright_world: FloatArray = field(default_factory=lambda: np.eye(3))
-    estimated: dict[str, int] = field(default_factory=dict)  # names and sizes of the blocks, in the order of the table
+    # names and sizes of the blocks, in the order of the table
+    estimated: dict[str, int] = field(default_factory=dict)
 
     @property
     def moves_camera(self) -> bool:
@@ -101,10 +123,15 @@ class Calibration:
     def estimating(self, name: str, settings: MsckfSettings) -> Calibration:
         """Return the calibration with one more of its blocks estimated."""
         chosen = {*self.estimated, name}
-        return replace(self, estimated={key: block.size(settings) for key, block in BLOCKS.items() if key in chosen})
+        return replace(
+            self,
+            estimated={key: block.size(settings) for key, block in BLOCKS.items() if key in chosen},
+        )
 
     def corrected(self, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
-        """Return the calibration moved by an error (C,), the body's pose (4, 4) being that of the error."""
+        """Return the calibration moved by an error (C,), the body's pose (4, 4) being that of
+        the error.
+        """
         changed: dict[str, Any] = {}
         first = 0
         for name, size in self.estimated.items():
@@ -117,8 +144,11 @@ class Calibration:
         return np.concatenate([np.zeros(0), *(of_block[name] for name in self.estimated)])
 
     def in_world(self, variances: FloatArray, T_world_imu: FloatArray) -> FloatArray:
-        """Turn variances (C,) of the constants into the covariance (C, C) of their errors, with eta."""
-        out, first = np.diag(variances), 0
+        """Turn variances (C,) of the constants into the covariance (C, C) of their errors, with
+        eta.
+        """
+        out = np.diag(variances)
+        first = 0
         for name, size in self.estimated.items():
             moved = BLOCKS[name].moved_by(T_world_imu)
             if moved is not None:
@@ -127,8 +157,11 @@ class Calibration:
             first += size
         return out
 
-    def transition(self, state: ErrorState, step: Transition | Growth, T_moved: FloatArray) -> FloatArray:
-        """Transition (15 + C, 15 + C) of the errors of navigation state and calibration, equation (C4).
+    def transition(
+        self, state: ErrorState, step: Transition | Growth, T_moved: FloatArray
+    ) -> FloatArray:
+        """Transition (15 + C, 15 + C) of the errors of navigation state and calibration, equation
+        (C4).
 
         Args:
             state: their rows.
@@ -146,7 +179,9 @@ class Calibration:
         return out
 
     def report(self, state: ErrorState, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
-        """Return the fields of `Estimate` that say what is estimated, by the errors' covariance (15 + C, 15 + C)."""
+        """Return the fields of `Estimate` that say what is estimated, by the errors' covariance
+        (15 + C, 15 + C).
+        """
         out: dict[str, Any] = {}
         for name in self.estimated:
             rows = state[name]
@@ -156,7 +191,9 @@ class Calibration:
 
 @lru_cache(maxsize=8)
 def _stereo_terms(names: tuple[str, ...]) -> IntArray:
-    """Which of the coefficients `Calibration.stereo` are estimated with the blocks of given names."""
+    """Which of the coefficients `Calibration.stereo` are estimated with the blocks of given
+    names.
+    """
     blocks = [BLOCKS[name] for name in names]
     terms = [np.arange(TERMS)[block.terms] for block in blocks if isinstance(block, StereoBlock)]
     return np.concatenate([np.arange(0), *terms])
@@ -166,7 +203,8 @@ class CalibrationBlock:
     """Constants that are estimated together: one line of the table."""
 
     name: ClassVar[str]
-    # Where its errors enter: in the motion model's step, in pixels, or in the camera's pose at an exposure.
+    # Where its errors enter: in the motion model's step, in pixels, or in the camera's pose at an
+    # exposure.
     enters: ClassVar[Literal["motion", "pixels", "camera"]]
     walk: ClassVar[float] = 0.0  # random walk per root second, over the initial standard deviation
 
@@ -187,20 +225,35 @@ class CalibrationBlock:
         return self.sigmas(settings) * self.walk
 
     def correct(
-        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+        self,
+        calibration: Calibration,
+        error: FloatArray,
+        T_world_imu: FloatArray,
+        changed: dict[str, Any],
     ) -> None:
-        """Put the fields of a calibration that an error (n,) at a pose of the body (4, 4) moves into `changed`."""
+        """Put the fields of a calibration that an error (n,) at a pose of the body (4, 4) moves
+        into `changed`.
+        """
         raise NotImplementedError
 
-    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
-        """Return the fields of `Estimate` with mean and uncertainty, by the covariance (n, n) of the errors."""
+    def report(
+        self, calibration: Calibration, nav: NavState, covariance: FloatArray
+    ) -> dict[str, Any]:
+        """Return the fields of `Estimate` with mean and uncertainty, by the covariance (n, n) of
+        the errors.
+        """
         raise NotImplementedError
 
     def moved_by(self, T: FloatArray) -> FloatArray | None:
-        """How its errors follow a motion (4, 4) of the body on the world's side (n, n); None: not."""
+        """How its errors follow a motion (4, 4) of the body on the world's side (n, n).
+
+        None: not.
+        """
         return None
 
-    def camera_D_error(self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None) -> FloatArray | None:
+    def camera_D_error(
+        self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None
+    ) -> FloatArray | None:
         """How its errors move the camera at an exposure (6, n), equation (C2); None: not.
 
         Args:
@@ -212,7 +265,9 @@ class CalibrationBlock:
 
 
 class _ImuTermsBlock(CalibrationBlock):
-    """Scale and misalignment of the IMU; the navigation state has their means, and its motion model their columns."""
+    """Scale and misalignment of the IMU; the navigation state has their means, and its motion
+    model their columns.
+    """
 
     name = "imu_terms"
     enters = "motion"
@@ -225,24 +280,36 @@ class _ImuTermsBlock(CalibrationBlock):
         return term_sigmas()[CHOSEN[settings.calibrate_imu]]
 
     def correct(
-        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+        self,
+        calibration: Calibration,
+        error: FloatArray,
+        T_world_imu: FloatArray,
+        changed: dict[str, Any],
     ) -> None:
         """Nothing of the calibration moves."""
 
-    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+    def report(
+        self, calibration: Calibration, nav: NavState, covariance: FloatArray
+    ) -> dict[str, Any]:
         sigmas = np.sqrt(np.diag(all_imu_terms(covariance)))
         return {"imu_terms": nav.imu_terms, "imu_terms_sigma": sigmas}
 
 
 class StereoBlock(CalibrationBlock):
-    """Some coefficients of the stereo calibration; `StereoCorrection` has their columns in the pixels."""
+    """Some coefficients of the stereo calibration; `StereoCorrection` has their columns in the
+    pixels.
+    """
 
     terms: ClassVar[slice]  # of `Calibration.stereo`
     enters = "pixels"
     walk = _STEREO_WALK
 
     def correct(
-        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+        self,
+        calibration: Calibration,
+        error: FloatArray,
+        T_world_imu: FloatArray,
+        changed: dict[str, Any],
     ) -> None:
         """Put the coefficients moved by an error (n,) of some of them into `changed`."""
         if "stereo" not in changed:
@@ -251,9 +318,12 @@ class StereoBlock(CalibrationBlock):
 
 
 class _StereoFieldBlock(StereoBlock):
-    """The field of right columns, equation (R3); its estimation begins with the first rows, which give its prior."""
+    """The field of right columns, equation (R3); its estimation begins with the first rows,
+    which give its prior.
+    """
 
-    name, terms = "stereo_field", slice(0, FIELD_TERMS)
+    name = "stereo_field"
+    terms = slice(0, FIELD_TERMS)
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
         return False
@@ -261,14 +331,17 @@ class _StereoFieldBlock(StereoBlock):
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
         return stereo_field_sigmas(MOST_FIELD_SIGMA)
 
-    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+    def report(
+        self, calibration: Calibration, nav: NavState, covariance: FloatArray
+    ) -> dict[str, Any]:
         return {"stereo_field": StereoFieldEstimate(calibration.stereo[self.terms], covariance)}
 
 
 class _StereoScaleBlock(StereoBlock):
     """Baseline and focal length, equation (R4); they are estimated with a metric sensor only."""
 
-    name, terms = "stereo_scale", slice(FIELD_TERMS, TERMS)
+    name = "stereo_scale"
+    terms = slice(FIELD_TERMS, TERMS)
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
         return motion is not None and settings.calibrate_scale == "on"
@@ -276,7 +349,9 @@ class _StereoScaleBlock(StereoBlock):
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
         return np.array([settings.stereo_baseline_sigma, settings.stereo_focal_sigma])
 
-    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+    def report(
+        self, calibration: Calibration, nav: NavState, covariance: FloatArray
+    ) -> dict[str, Any]:
         return {"stereo_scale": StereoScaleEstimate(calibration.stereo[self.terms], covariance)}
 
 
@@ -294,22 +369,35 @@ class _ExtrinsicsBlock(CalibrationBlock):
         return np.repeat([settings.extrinsic_translation_sigma_m, rotation], 3)
 
     def walks(self, settings: MsckfSettings) -> FloatArray:
-        return np.repeat([_EXTRINSIC_TRANSLATION_WALK_M, np.radians(_EXTRINSIC_ROTATION_WALK_DEG)], 3)
+        return np.repeat(
+            [_EXTRINSIC_TRANSLATION_WALK_M, np.radians(_EXTRINSIC_ROTATION_WALK_DEG)], 3
+        )
 
     def correct(
-        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+        self,
+        calibration: Calibration,
+        error: FloatArray,
+        T_world_imu: FloatArray,
+        changed: dict[str, Any],
     ) -> None:
         moved = calibration.T_cam0_imu @ se3_exp(se3_adjoint(se3_inverse(T_world_imu)) @ error)
         changed["T_cam0_imu"] = moved
 
-    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+    def report(
+        self, calibration: Calibration, nav: NavState, covariance: FloatArray
+    ) -> dict[str, Any]:
         back = se3_adjoint(se3_inverse(nav.T_world_imu))
-        return {"T_cam0_imu": calibration.T_cam0_imu, "T_cam0_imu_covariance": back @ covariance @ back.T}
+        return {
+            "T_cam0_imu": calibration.T_cam0_imu,
+            "T_cam0_imu_covariance": back @ covariance @ back.T,
+        }
 
     def moved_by(self, T: FloatArray) -> FloatArray | None:
         return se3_adjoint(T)
 
-    def camera_D_error(self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None) -> FloatArray | None:
+    def camera_D_error(
+        self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None
+    ) -> FloatArray | None:
         return -se3_adjoint(T_exposed @ se3_inverse(T_world_imu))
 
 
@@ -329,20 +417,30 @@ class _TimeOffsetBlock(CalibrationBlock):
         return np.array([_TIME_OFFSET_WALK_S])
 
     def correct(
-        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+        self,
+        calibration: Calibration,
+        error: FloatArray,
+        T_world_imu: FloatArray,
+        changed: dict[str, Any],
     ) -> None:
         changed["time_offset_s"] = calibration.time_offset_s + float(error[0])
 
-    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+    def report(
+        self, calibration: Calibration, nav: NavState, covariance: FloatArray
+    ) -> dict[str, Any]:
         sigma = float(np.sqrt(covariance[0, 0]))
         return {"time_offset_s": calibration.time_offset_s, "time_offset_sigma_s": sigma}
 
-    def camera_D_error(self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None) -> FloatArray | None:
+    def camera_D_error(
+        self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None
+    ) -> FloatArray | None:
         return None if twist is None else (se3_adjoint(T_exposed) @ twist.significant())[:, None]
 
 
 class _FirstAttitudeBlock(CalibrationBlock):
-    """The attitude of the first frame, which defines the world that is reported, after it has left the window."""
+    """The attitude of the first frame, which defines the world that is reported, after it has
+    left the window.
+    """
 
     name = "first_attitude"
     enters = "camera"  # behind all others; nothing depends on it
@@ -354,11 +452,17 @@ class _FirstAttitudeBlock(CalibrationBlock):
         return np.zeros(3)
 
     def correct(
-        self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray, changed: dict[str, Any]
+        self,
+        calibration: Calibration,
+        error: FloatArray,
+        T_world_imu: FloatArray,
+        changed: dict[str, Any],
     ) -> None:
         changed["R_upright_world"] = so3_exp(error) @ calibration.R_upright_world
 
-    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+    def report(
+        self, calibration: Calibration, nav: NavState, covariance: FloatArray
+    ) -> dict[str, Any]:
         return {}
 
 
@@ -374,12 +478,19 @@ _ALL = (
 BLOCKS: dict[str, CalibrationBlock] = {block.name: block for block in _ALL}
 
 
-def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings, motion: MotionSource | None) -> Calibration:
+def first_calibration(
+    T_cam0_imu: FloatArray, settings: MsckfSettings, motion: MotionSource | None
+) -> Calibration:
     """Return the calibration at the start.
 
-    Of camera and IMU nothing is estimated without an IMU, and nothing metric without a metric sensor.
+    Of camera and IMU nothing is estimated without an IMU, and nothing metric without a metric
+    sensor.
     """
-    sizes = {name: block.size(settings) for name, block in BLOCKS.items() if block.is_estimated(settings, motion)}
+    sizes = {
+        name: block.size(settings)
+        for name, block in BLOCKS.items()
+        if block.is_estimated(settings, motion)
+    }
     return Calibration(np.asarray(T_cam0_imu, dtype=np.float64), estimated=sizes)
 
 
@@ -394,7 +505,9 @@ def walk_variances(settings: MsckfSettings) -> dict[str, FloatArray]:
 
 
 def all_imu_terms(covariance: FloatArray) -> FloatArray:
-    """Fill a covariance (I, I) of the IMU's terms that are estimated up to all (15, 15), with zeros."""
+    """Fill a covariance (I, I) of the IMU's terms that are estimated up to all (15, 15), with
+    zeros.
+    """
     out = np.zeros((IMU_TERMS, IMU_TERMS))
     chosen = next(rows for rows in CHOSEN.values() if len(rows) == len(covariance))
     out[np.ix_(chosen, chosen)] = covariance

@@ -1,11 +1,14 @@
-"""How much larger the errors of tracks are together than the filter believes: learned while running.
+"""How much larger the errors of tracks are together than the filter believes: learned while
+running.
 
-The filter counts all pixels as independent. Those of a front end are not: an error lasts along a track, comes back when
-the track begins again under its id, and neighbours share it. So the score of a cluster of features, the sum of
-`H' R^-1 r` over their lives with their points eliminated, varies more than its information, the sum of `H' R^-1 H`,
-says. Over all clusters, the ratio of the two is the factor by which information is counted too often (quasi-likelihood:
-Wedderburn 1974; clusters: Liang & Zeger, Longitudinal data analysis using generalized linear models, 1986). Scores are
-taken by a drift of the poses, (R7) of docs/math.md: what lasts along a track moves the poses as a drift does.
+The filter counts all pixels as independent. Those of a front end are not: an error lasts along a
+track, comes back when the track begins again under its id, and neighbours share it. So the score of
+a cluster of features, the sum of `H' R^-1 r` over their lives with their points eliminated, varies
+more than its information, the sum of `H' R^-1 H`, says. Over all clusters, the ratio of the two is
+the factor by which information is counted too often (quasi-likelihood: Wedderburn 1974; clusters:
+Liang & Zeger, Longitudinal data analysis using generalized linear models, 1986). Scores are taken
+by a drift of the poses, (R7) of docs/math.md: what lasts along a track moves the poses as a drift
+does.
 """
 
 from __future__ import annotations
@@ -16,7 +19,8 @@ from vio.filters import track_loops as loops
 from vio.geometry.lie import FloatArray
 from vio.records import IntArray
 
-PRIOR_FACTOR = 2.5  # before any track has ended: white noise has 1, front ends on real images 2 to 7
+# before any track has ended: white noise has 1, front ends on real images 2 to 7
+PRIOR_FACTOR = 2.5
 _PRIOR_TRACKS = 30.0  # as many ended tracks count for it
 _MOST_FEATURES = 4096  # whose clusters are kept: far more than are seen at once
 CELL_RAD = 0.2  # side of the cells of directions in which features are neighbours
@@ -27,15 +31,22 @@ class Overdispersion:
     """The ratio of squared scores to information, clustered by feature, direction and time."""
 
     def __init__(self) -> None:
-        self._cluster: dict[int, tuple[int, int, int]] = {}  # of features, by id, in the order in which they ended last
-        self._row: dict[tuple[int, int, int], int] = {}  # of clusters in `_scores`, in the order of their last change
+        # of features, by id, in the order in which they ended last
+        self._cluster: dict[int, tuple[int, int, int]] = {}
+        # of clusters in `_scores`, in the order of their last change
+        self._row: dict[tuple[int, int, int], int] = {}
         self._free: list[int] = []  # rows without a cluster
         self._scores: FloatArray = np.zeros((0, 6))
-        self._squares, self._information = np.zeros(6), np.zeros(6)
-        self._tracks, self._calls = 0, 0
-        self.factor = PRIOR_FACTOR  # by how much too often the information of pixels is counted, at least one
+        self._squares = np.zeros(6)
+        self._information = np.zeros(6)
+        self._tracks = 0
+        self._calls = 0
+        # by how much too often the information of pixels is counted, at least one
+        self.factor = PRIOR_FACTOR
 
-    def add(self, ids: IntArray, directions: FloatArray, scores: FloatArray, information: FloatArray) -> None:
+    def add(
+        self, ids: IntArray, directions: FloatArray, scores: FloatArray, information: FloatArray
+    ) -> None:
         """Take in tracks that ended in a frame.
 
         Args:
@@ -66,5 +77,7 @@ class Overdispersion:
         known = self._information > 0
         if known.any():
             ratio = float(np.mean(self._squares[known] / self._information[known]))
-            learned = (_PRIOR_TRACKS * PRIOR_FACTOR + self._tracks * ratio) / (_PRIOR_TRACKS + self._tracks)
+            learned = (_PRIOR_TRACKS * PRIOR_FACTOR + self._tracks * ratio) / (
+                _PRIOR_TRACKS + self._tracks
+            )
             self.factor = max(learned, 1.0)

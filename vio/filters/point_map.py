@@ -20,24 +20,32 @@ class PointMap:
         self.parts: list[Landmarks] = []
         self._stored = 0  # points since they were merged
 
-    def store(self, window: Window, ids: IntArray, p_world: FloatArray, covariance: FloatArray) -> None:
+    def store(
+        self, window: Window, ids: IntArray, p_world: FloatArray, covariance: FloatArray
+    ) -> None:
         """Add points (K, 3) of a window with their covariances (K, 3, 3)."""
         if len(ids):
             self.parts.append(_reported(window, ids, p_world, covariance))
             self._stored += len(ids)
             # Features that stay in view are stored again and again.
             if self._stored > _LEAST_MERGE + len(self.parts[0].ids):
-                self.parts, self._stored = [newest_points(self.parts)], 0
+                self.parts = [newest_points(self.parts)]
+                self._stored = 0
 
     def take(self) -> Landmarks:
         """Return all points, and forget them."""
         taken = newest_points(self.parts) if self.parts else no_landmarks()
-        self.parts, self._stored = [], 0
+        self.parts = []
+        self._stored = 0
         return taken
 
     def with_landmarks(self, window: Window, covariances: FloatArray) -> Landmarks:
-        """Return all points, and the landmarks that are states, with their covariances (M, 3, 3)."""
-        return newest_points([*self.parts, _reported(window, window.landmark_ids, window.landmarks, covariances)])
+        """Return all points, and the landmarks that are states, with their covariances (M, 3,
+        3).
+        """
+        return newest_points(
+            [*self.parts, _reported(window, window.landmark_ids, window.landmarks, covariances)]
+        )
 
     def turn(self, R: FloatArray) -> None:
         """Turn the world by R (3, 3)."""
@@ -48,7 +56,9 @@ class PointMap:
         self.parts = [part for part in self.parts if np.isfinite(part.p_world).all()]
 
 
-def _reported(window: Window, ids: IntArray, p_upright: FloatArray, covariance: FloatArray) -> Landmarks:
+def _reported(
+    window: Window, ids: IntArray, p_upright: FloatArray, covariance: FloatArray
+) -> Landmarks:
     """Points of a window in the world that is reported, equation (N14)."""
     R = window.calibration.R_upright_world.T
     return Landmarks(ids, p_upright @ R.T, R @ covariance @ R.T)

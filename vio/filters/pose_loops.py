@@ -1,7 +1,8 @@
-"""The compiled loops over the poses of the window and over the IMU's samples, behind `window` and `navigation`.
+"""The compiled loops over the poses of the window and over the IMU's samples, behind `window` and
+`navigation`.
 
-Shapes: N clones, M points, K times of an integration. Each loop changes or fills the arrays that come last.
-`tests/numpy_twins.py` holds the same in NumPy.
+Shapes: N clones, M points, K times of an integration. Each loop changes or fills the arrays that
+come last. `tests/numpy_twins.py` holds the same in NumPy.
 """
 
 from __future__ import annotations
@@ -15,33 +16,55 @@ from vio.records import IntArray
 
 @compiled
 def _sinc_terms(squared: float) -> tuple[float, float, float]:
-    """Return `sin(a)/a`, `(1 - cos a)/a^2` and `(a - sin a)/a^3` of a squared angle, as `vio.geometry.lie` does."""
+    """Return `sin(a)/a`, `(1 - cos a)/a^2` and `(a - sin a)/a^3` of a squared angle, as
+    `vio.geometry.lie` does.
+    """
     if squared < 1e-4:  # cancellation in the closed forms
         a = 1.0 - squared / 6.0 * (1.0 - squared / 20.0 * (1.0 - squared / 42.0))
         b = 0.5 - squared / 24.0 * (1.0 - squared / 30.0 * (1.0 - squared / 56.0))
         return a, b, 1.0 / 6.0 - squared / 120.0 * (1.0 - squared / 42.0 * (1.0 - squared / 72.0))
     angle = np.sqrt(squared)
     half = np.sin(angle / 2.0)
-    return np.sin(angle) / angle, 2.0 * half * half / squared, (angle - np.sin(angle)) / (angle * squared)
+    return (
+        np.sin(angle) / angle,
+        2.0 * half * half / squared,
+        (angle - np.sin(angle)) / (angle * squared),
+    )
 
 
 @compiled
-def _turned(x: float, y: float, z: float, first: float, second: float, v: FloatArray) -> tuple[float, float, float]:
+def _turned(
+    x: float, y: float, z: float, first: float, second: float, v: FloatArray
+) -> tuple[float, float, float]:
     """Return `(I + first W + second W W) v`, with W the skew-symmetric matrix of (x, y, z)."""
-    cx, cy, cz = y * v[2] - z * v[1], z * v[0] - x * v[2], x * v[1] - y * v[0]
-    dx, dy, dz = y * cz - z * cy, z * cx - x * cz, x * cy - y * cx
-    return v[0] + first * cx + second * dx, v[1] + first * cy + second * dy, v[2] + first * cz + second * dz
+    cx = y * v[2] - z * v[1]
+    cy = z * v[0] - x * v[2]
+    cz = x * v[1] - y * v[0]
+    dx = y * cz - z * cy
+    dy = z * cx - x * cz
+    dz = x * cy - y * cx
+    return (
+        v[0] + first * cx + second * dx,
+        v[1] + first * cy + second * dy,
+        v[2] + first * cz + second * dz,
+    )
 
 
 @compiled
 def move_points(phi: FloatArray, xi: FloatArray, p: FloatArray) -> None:
-    """Replace points or velocities (M, 3) by `exp(phi) p + J_l(phi) xi`, with one phi (3,) and xi (M, 3)."""
-    x, y, z = phi[0], phi[1], phi[2]
+    """Replace points or velocities (M, 3) by `exp(phi) p + J_l(phi) xi`, with one phi (3,) and
+    xi (M, 3).
+    """
+    x = phi[0]
+    y = phi[1]
+    z = phi[2]
     a, b, c = _sinc_terms(x * x + y * y + z * z)
     for m in range(len(p)):
         px, py, pz = _turned(x, y, z, a, b, p[m])
         qx, qy, qz = _turned(x, y, z, b, c, xi[m])
-        p[m, 0], p[m, 1], p[m, 2] = px + qx, py + qy, pz + qz
+        p[m, 0] = px + qx
+        p[m, 1] = py + qy
+        p[m, 2] = pz + qz
 
 
 @compiled
@@ -62,15 +85,22 @@ def camera_poses(T_cam0_imu: FloatArray, T_world_imu: FloatArray, out: FloatArra
 
 
 @compiled
-def add_extrinsic_moves(T_world_imu: FloatArray, now: FloatArray, eta: FloatArray, moves: FloatArray) -> None:
-    """Add how the extrinsics' error eta (6,) moves the body's poses (N, 4, 4), `Ad(T T_now^-1) eta`: moves (N, 6)."""
+def add_extrinsic_moves(
+    T_world_imu: FloatArray, now: FloatArray, eta: FloatArray, moves: FloatArray
+) -> None:
+    """Add how the extrinsics' error eta (6,) moves the body's poses (N, 4, 4),
+    `Ad(T T_now^-1) eta`: moves (N, 6).
+    """
     for n in range(len(moves)):
-        T, t, turned = T_world_imu[n], moves[n], np.zeros(6)  # R' eta of the present pose, then by that of the clone
+        T = T_world_imu[n]  # R' eta of the present pose, then by that of the clone
+        t = moves[n]
+        turned = np.zeros(6)
         for i in range(3):
             for j in range(3):
                 turned[i] += now[j, i] * (eta[j] - _cross(now[:, 3], eta[3:], j))
                 turned[3 + i] += now[j, i] * eta[3 + j]
-        rho, phi = np.zeros(3), np.zeros(3)
+        rho = np.zeros(3)
+        phi = np.zeros(3)
         for i in range(3):
             for j in range(3):
                 rho[i] += T[i, j] * turned[j]
@@ -83,7 +113,8 @@ def add_extrinsic_moves(T_world_imu: FloatArray, now: FloatArray, eta: FloatArra
 @compiled
 def _cross(a: FloatArray, b: FloatArray, i: int) -> float:
     """One entry of the cross product."""
-    j, k = (i + 1) % 3, (i + 2) % 3
+    j = (i + 1) % 3
+    k = (i + 2) % 3
     return a[j] * b[k] - a[k] * b[j]
 
 
@@ -91,7 +122,9 @@ def _cross(a: FloatArray, b: FloatArray, i: int) -> float:
 def move_earlier_velocities(
     gravity: FloatArray, ages: FloatArray, R: FloatArray, error: FloatArray, velocities: FloatArray
 ) -> None:
-    """Move velocities (N, 3) of the past by a present error (15,), see `ImuMotion.corrected_earlier`."""
+    """Move velocities (N, 3) of the past by a present error (15,), see
+    `ImuMotion.corrected_earlier`.
+    """
     xi = np.empty(velocities.shape)
     for n in range(len(ages)):
         for i in range(3):
@@ -102,11 +135,13 @@ def move_earlier_velocities(
 
 @compiled
 def shrink_by_noise(covariance: FloatArray, noise_only: float, halves: FloatArray) -> None:
-    """Shrink each half (3,) of a vector (6,) by the part of its squared length that noise alone may make, (C3).
+    """Shrink each half (3,) of a vector (6,) by the part of its squared length that noise alone may
+    make, (C3).
 
     The length is in standard deviations of its covariance (6, 6); noise makes `noise_only` of it.
     """
-    C, y = np.empty((3, 3)), np.empty(3)
+    C = np.empty((3, 3))
+    y = np.empty(3)
     for first in (0, 3):
         for i in range(3):
             y[i] = halves[first + i]
@@ -129,7 +164,9 @@ def take_rows(P: FloatArray, rows: IntArray, out: FloatArray) -> None:
 
 @compiled
 def take_blocks(P: FloatArray, out: FloatArray) -> None:
-    """Write each point's block with the last S errors (M, 3 + S, 3 + S) of the covariance of all (3M + S, same)."""
+    """Write each point's block with the last S errors (M, 3 + S, 3 + S) of the covariance of all
+    (3M + S, same).
+    """
     points = 3 * len(out)
     for m in range(len(out)):
         for i in range(out.shape[1]):
@@ -140,7 +177,8 @@ def take_blocks(P: FloatArray, out: FloatArray) -> None:
 
 @compiled
 def take_since_first(P: FloatArray, first: int, attitude: int, out: FloatArray) -> None:
-    """Write the covariance (6N, 6N) of poses, from row `first` of P on, in the world that is reported: (N14).
+    """Write the covariance (6N, 6N) of poses, from row `first` of P on, in the world that is
+    reported: (N14).
 
     `attitude` is the row of the error of the first attitude.
     """
@@ -159,24 +197,28 @@ def take_since_first(P: FloatArray, first: int, attitude: int, out: FloatArray) 
 
 @compiled
 def insert_rows(P: FloatArray, at: int, J: FloatArray, noise: FloatArray, out: FloatArray) -> None:
-    """Write a covariance (D + k, D + k) with errors `J error + noise` at a row, from that of the others (D, D).
+    """Write a covariance (D + k, D + k) with errors `J error + noise` at a row, from that of the
+    others (D, D).
 
     J is (k, m) of the first m errors. Where it is the identity, the new rows are exact copies.
     """
-    D, k = len(P), len(J)
+    D = len(P)
+    k = len(J)
     for i in range(D):
         row = i if i < at else i + k
         for j in range(D):
             out[row, j if j < at else j + k] = P[i, j]
     for a in range(k):
         for j in range(D):
-            beside, below = 0.0, 0.0
+            beside = 0.0
+            below = 0.0
             for m in range(J.shape[1]):
                 if J[a, m] != 0.0:
                     beside += J[a, m] * P[m, j]
                     below += J[a, m] * P[j, m]
             column = j if j < at else j + k
-            out[at + a, column], out[column, at + a] = beside, below
+            out[at + a, column] = beside
+            out[column, at + a] = below
     for a in range(k):
         for b in range(k):
             total = 0.0
@@ -187,12 +229,16 @@ def insert_rows(P: FloatArray, at: int, J: FloatArray, noise: FloatArray, out: F
 
 
 @compiled
-def append_rows(P: FloatArray, AP: FloatArray, A: FloatArray, blocks: FloatArray, out: FloatArray) -> None:
-    """Write a covariance (D + n, D + n) with errors `A error + noise` of points, (n, D), behind the others (D, D).
+def append_rows(
+    P: FloatArray, AP: FloatArray, A: FloatArray, blocks: FloatArray, out: FloatArray
+) -> None:
+    """Write a covariance (D + n, D + n) with errors `A error + noise` of points, (n, D), behind the
+    others (D, D).
 
     AP is `A P`; blocks (n / 3, 3, 3) are the noise's covariances.
     """
-    D, n = len(P), len(A)
+    D = len(P)
+    n = len(A)
     for i in range(D):
         for j in range(i + 1):
             out[i, j] = out[j, i] = 0.5 * (P[i, j] + P[j, i])
@@ -221,28 +267,39 @@ def _add_noise(
     Phi: FloatArray,
     Q_parts: FloatArray,
 ) -> None:
-    """Add what one step of dt (s), `left` (s) before the end, brings to Phi and Q_parts (2, 15, 15): (N3), (N4).
+    """Add what one step of dt (s), `left` (s) before the end, brings to Phi and Q_parts (2, 15,
+    15): (N3), (N4).
 
     `gyro2` and `accel2` are the variances of the integrals of gyro and accelerometer over it.
     """
-    # How noise and bias errors of gyro and accelerometer enter [rho phi xi_v] (9, 6) there, carried to the end.
-    out, lever, swing = np.empty((9, 6)), np.empty(3), np.empty(3)
+    # How noise and bias errors of gyro and accelerometer enter [rho phi xi_v] (9, 6) there, carried
+    # to the end.
+    out = np.empty((9, 6))
+    lever = np.empty(3)
+    swing = np.empty(3)
     for i in range(3):
         swing[i] = v[i] + left * gravity[i]
         lever[i] = p[i] + left * (v[i] + 0.5 * left * gravity[i])
     for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
+        j = (i + 1) % 3
+        k = (i + 2) % 3
         for c in range(3):
             out[i, c] = lever[k] * R[j, c] - lever[j] * R[k, c]
             out[3 + i, c] = -R[i, c]
             out[6 + i, c] = swing[k] * R[j, c] - swing[j] * R[k, c]
-            out[i, 3 + c], out[3 + i, 3 + c], out[6 + i, 3 + c] = -left * R[i, c], 0.0, -R[i, c]
+            out[i, 3 + c] = -left * R[i, c]
+            out[3 + i, 3 + c] = 0.0
+            out[6 + i, 3 + c] = -R[i, c]
     for i in range(9):
         for j in range(6):
             Phi[i, 9 + j] += out[i, j] * dt
         for j in range(9):
-            Q_parts[0, i, j] += accel2 * (out[i, 3] * out[j, 3] + out[i, 4] * out[j, 4] + out[i, 5] * out[j, 5])
-            Q_parts[1, i, j] += gyro2 * (out[i, 0] * out[j, 0] + out[i, 1] * out[j, 1] + out[i, 2] * out[j, 2])
+            Q_parts[0, i, j] += accel2 * (
+                out[i, 3] * out[j, 3] + out[i, 4] * out[j, 4] + out[i, 5] * out[j, 5]
+            )
+            Q_parts[1, i, j] += gyro2 * (
+                out[i, 0] * out[j, 0] + out[i, 1] * out[j, 1] + out[i, 2] * out[j, 2]
+            )
 
 
 @compiled
@@ -263,13 +320,18 @@ def integrate(
 ) -> None:
     """Integrate readings (K, 6) `[gyro, accel]` at times (K,), equations (N1) to (N4).
 
-    Moves the pose T (4, 4) and the velocity v (3,); adds the rotation to `turned` (3,), the step to Phi (15, 15), an
-    identity, and to Q_parts (2, 15, 15) the noise of accelerometer and gyro, of densities (2,) and what gaps hide
-    (2, K - 1). Q (15, 15) is their sum, with the walks of the biases of gyro and accelerometer (2,).
+    Moves the pose T (4, 4) and the velocity v (3,); adds the rotation to `turned` (3,), the step to
+    Phi (15, 15), an identity, and to Q_parts (2, 15, 15) the noise of accelerometer and gyro, of
+    densities (2,) and what gaps hide (2, K - 1). Q (15, 15) is their sum, with the walks of the
+    biases of gyro and accelerometer (2,).
     """
-    R, p = T[:3, :3].copy(), T[:3, 3].copy()
-    new, phi, force = np.empty((3, 3)), np.empty(3), np.empty(3)
-    pm, vm = np.empty(3), np.empty(3)
+    R = T[:3, :3].copy()
+    p = T[:3, 3].copy()
+    new = np.empty((3, 3))
+    phi = np.empty(3)
+    force = np.empty(3)
+    pm = np.empty(3)
+    vm = np.empty(3)
     end = times_ns[-1]
     for k in range(len(times_ns) - 1):
         dt = (times_ns[k + 1] - times_ns[k]) * 1e-9
@@ -282,15 +344,19 @@ def integrate(
         for i in range(3):
             force[i] = gravity[i]
             for j in range(3):
-                before, after = readings[k, 3 + j] - bias[3 + j], readings[k + 1, 3 + j] - bias[3 + j]
+                before = readings[k, 3 + j] - bias[3 + j]
+                after = readings[k + 1, 3 + j] - bias[3 + j]
                 force[i] += 0.5 * (R[i, j] * before + new[i, j] * after)
         for i in range(3):
-            pm[i], vm[i] = p[i], v[i]
+            pm[i] = p[i]
+            vm[i] = v[i]
             p[i] += v[i] * dt + 0.5 * force[i] * dt * dt
             v[i] += force[i] * dt
-            pm[i], vm[i] = 0.5 * (pm[i] + p[i]), 0.5 * (vm[i] + v[i])
+            pm[i] = 0.5 * (pm[i] + p[i])
+            vm[i] = 0.5 * (vm[i] + v[i])
         left = (end - 0.5 * (times_ns[k] + times_ns[k + 1])) * 1e-9
-        accel2, gyro2 = densities[0] ** 2 * dt + hidden[0, k], densities[1] ** 2 * dt + hidden[1, k]
+        accel2 = densities[0] ** 2 * dt + hidden[0, k]
+        gyro2 = densities[1] ** 2 * dt + hidden[1, k]
         _add_noise(R, pm, vm, gravity, left, dt, gyro2, accel2, Phi, Q_parts)
         for i in range(3):
             for j in range(3):
@@ -303,16 +369,22 @@ def integrate(
         T[i, 3] = p[i]
         for j in range(3):
             T[i, j] = R[i, j]
-        j, k = (i + 1) % 3, (i + 2) % 3
+        j = (i + 1) % 3
+        k = (i + 2) % 3
         Phi[i, 6 + i] = total  # (N2), the same for every state, which is the filter's point
-        Phi[i, 3 + j], Phi[i, 3 + k] = -(0.5 * total**2) * gravity[k], (0.5 * total**2) * gravity[j]
-        Phi[6 + i, 3 + j], Phi[6 + i, 3 + k] = -total * gravity[k], total * gravity[j]
-        Q[9 + i, 9 + i], Q[12 + i, 12 + i] = walks[0] ** 2 * total, walks[1] ** 2 * total
+        Phi[i, 3 + j] = -(0.5 * total**2) * gravity[k]
+        Phi[i, 3 + k] = (0.5 * total**2) * gravity[j]
+        Phi[6 + i, 3 + j] = -total * gravity[k]
+        Phi[6 + i, 3 + k] = total * gravity[j]
+        Q[9 + i, 9 + i] = walks[0] ** 2 * total
+        Q[12 + i, 12 + i] = walks[1] ** 2 * total
 
 
 @compiled
 def interpolate(cuts: FloatArray, t: FloatArray, readings: FloatArray, out: FloatArray) -> None:
-    """Write readings (K, 6) at times (K,) from those (S, 6) at times (S,): on straight lines, the ends held."""
+    """Write readings (K, 6) at times (K,) from those (S, 6) at times (S,): on straight lines,
+    the ends held.
+    """
     s = 0
     for k in range(len(cuts)):
         while s < len(t) and t[s] <= cuts[k]:
@@ -326,10 +398,15 @@ def interpolate(cuts: FloatArray, t: FloatArray, readings: FloatArray, out: Floa
 
 
 @compiled
-def scale_nav(T_world_imu: FloatArray, T_cam0_imu: FloatArray, velocity: FloatArray, out: FloatArray) -> None:
-    """Write how a navigation state's error (15,) moves with the logarithm of the world's scale, equation (S1)."""
+def scale_nav(
+    T_world_imu: FloatArray, T_cam0_imu: FloatArray, velocity: FloatArray, out: FloatArray
+) -> None:
+    """Write how a navigation state's error (15,) moves with the logarithm of the world's scale,
+    equation (S1).
+    """
     for i in range(3):
-        out[i], out[6 + i] = T_world_imu[i, 3], velocity[i]
+        out[i] = T_world_imu[i, 3]
+        out[6 + i] = velocity[i]
         out[3 + i] = out[9 + i] = out[12 + i] = 0.0
         for k in range(3):
             for j in range(3):
@@ -338,7 +415,9 @@ def scale_nav(T_world_imu: FloatArray, T_cam0_imu: FloatArray, velocity: FloatAr
 
 @compiled
 def lacks_samples(cuts: FloatArray, t: FloatArray, longest: float) -> bool:
-    """Whether any step between cuts (K,) lies beyond the samples at times (S,), or between two that are far apart."""
+    """Whether any step between cuts (K,) lies beyond the samples at times (S,), or between two
+    that are far apart.
+    """
     s = 0
     for k in range(len(cuts) - 1):
         middle = 0.5 * (cuts[k] + cuts[k + 1])

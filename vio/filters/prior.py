@@ -1,7 +1,9 @@
-"""The prior of the window: one mean and covariance over all errors, and the algebra that changes them.
+"""The prior of the window: one mean and covariance over all errors, and the algebra that changes
+them.
 
-The means of the states are the newest estimates, at which everything is linearised; `P` and `delta` describe what all
-absorbed measurements say: the true error of the means has mean `-delta` and covariance `P`.
+The means of the states are the newest estimates, at which everything is linearised; `P` and `delta`
+describe what all absorbed measurements say: the true error of the means has mean `-delta` and
+covariance `P`.
 """
 
 from __future__ import annotations
@@ -21,14 +23,17 @@ _SINGULAR = 1e-12  # of the largest eigenvalue of a matrix of correlations
 
 
 class Prior:
-    """Mean and covariance of D errors, and how they depend on constants that are estimated beside them."""
+    """Mean and covariance of D errors, and how they depend on constants that are estimated
+    beside them.
+    """
 
     def __init__(self, P: FloatArray) -> None:
         self._factors: dict[tuple[int, int], Factor] = {}  # of parts of P, since it changed
         self.P = P
         self.delta: FloatArray = np.zeros(len(P))
         self.scale_test: ScaleTest | None = None
-        # How the errors depend on constants that are not estimated: the scale that is tested, then those considered.
+        # How the errors depend on constants that are not estimated: the scale that is tested, then
+        # those considered.
         self.error_D_constants: FloatArray = np.zeros((len(P), 1 + CONSIDERED))
 
     @property
@@ -38,7 +43,8 @@ class Prior:
 
     @P.setter
     def P(self, P: FloatArray) -> None:
-        self._P, self._factors = P, {}
+        self._P = P
+        self._factors = {}
 
     def to_change(self) -> FloatArray:
         """Return the covariance, for changes in place."""
@@ -58,15 +64,21 @@ class Prior:
 
     def insert(self, first: int, covariance: FloatArray) -> None:
         """Add errors with a covariance (S, S), from the row `first` on, that depend on no other."""
-        D, S = len(self.P), len(covariance)
+        D = len(self.P)
+        S = len(covariance)
         old = np.concatenate([np.arange(first), np.arange(first + S, D + S)])
-        P, delta = np.zeros((D + S, D + S)), np.zeros(D + S)
-        P[np.ix_(old, old)], delta[old] = self.P, self.delta
+        P = np.zeros((D + S, D + S))
+        delta = np.zeros(D + S)
+        P[np.ix_(old, old)] = self.P
+        delta[old] = self.delta
         P[first : first + S, first : first + S] = covariance
-        self.P, self.delta = P, delta
+        self.P = P
+        self.delta = delta
         self.error_D_constants = np.insert(self.error_D_constants, [first] * S, 0.0, axis=0)
 
-    def insert_dependent(self, at: int, J: FloatArray, noise: FloatArray, of_scale: FloatArray) -> None:
+    def insert_dependent(
+        self, at: int, J: FloatArray, noise: FloatArray, of_scale: FloatArray
+    ) -> None:
         """Add errors `J error + noise` at a row.
 
         Args:
@@ -75,17 +87,21 @@ class Prior:
             noise: covariance (k, k).
             of_scale: how they depend on the scale that is tested (k,).
         """
-        D, own = len(self.P) + len(J), slice(0, J.shape[1])
+        D = len(self.P) + len(J)
+        own = slice(0, J.shape[1])
         P: FloatArray = np.empty((D, D))
         loops.insert_rows(self.P, at, J, noise, P)
-        delta, V = self.delta, self.error_D_constants
+        delta = self.delta
+        V = self.error_D_constants
         self.delta = np.concatenate([delta[:at], J @ delta[own], delta[at:]])
         of_new = J @ V[own]
         of_new[:, 0] = of_scale
         self.error_D_constants = np.concatenate([V[:at], of_new, V[at:]])
         self.P = P
 
-    def append(self, A: FloatArray, blocks: FloatArray, by_considered: FloatArray | None = None) -> None:
+    def append(
+        self, A: FloatArray, blocks: FloatArray, by_considered: FloatArray | None = None
+    ) -> None:
         """Add errors `A error + B constants + noise` of points behind the others.
 
         Args:
@@ -108,9 +124,12 @@ class Prior:
         P = np.empty((len(rows), len(rows)))
         loops.take_rows(self.P, rows, P)
         self.P = P
-        self.delta, self.error_D_constants = self.delta[rows], self.error_D_constants[rows]
+        self.delta = self.delta[rows]
+        self.error_D_constants = self.error_D_constants[rows]
 
-    def optimum(self, information: FloatArray, vector: FloatArray, size: int, first: int = 0) -> tuple[Fit, FloatArray]:
+    def optimum(
+        self, information: FloatArray, vector: FloatArray, size: int, first: int = 0
+    ) -> tuple[Fit, FloatArray]:
         """Where the prior and given information agree best.
 
         Args:
@@ -120,15 +139,17 @@ class Prior:
             first: row before which there is usually no information.
 
         Returns:
-            The fit, with the covariance (k, k) of the first errors there, and the error vector (D,) that moves the
-            means there.
+            The fit, with the covariance (k, k) of the first errors there, and the error vector (D,)
+            that moves the means there.
         """
         prior = self._factor(information, size, first)
         own = slice(prior.first, size)
-        A, b = information[own, own], vector[own] + information[own, own] @ self.delta[own]
+        A = information[own, own]
+        b = vector[own] + information[own, own] @ self.delta[own]
         fitted = fit(prior, A)
         moved = fitted.move(b)
-        shift: FloatArray = self.P[:, own] @ (b - A @ moved)  # the others follow by their correlation
+        # the others follow by their correlation
+        shift: FloatArray = self.P[:, own] @ (b - A @ moved)
         shift[own] = moved
         return fitted, shift - self.delta
 
@@ -147,11 +168,14 @@ class Prior:
             information: `H' R^-1 H` (D, D) of the residuals at the present means.
             vector: `H' R^-1 r` (D,).
             first: row before which there is usually no information.
-            scaled: for measurements in metres, how the errors (D,) move with the logarithm of the world's scale.
-            repeated: rows of constants, and the factor by which the measurements repeat what was said of them: these
-                take in that part of it only, while all others take in the whole; the partial-update filter of Brink,
-                Partial-update Schmidt-Kalman filter, JGCD (2017), which keeps the covariance of all errors true.
-            considered: `H' R^-1 C` (D, 4), C being the derivatives of the residuals by the constants considered.
+            scaled: for measurements in metres, how the errors (D,) move with the logarithm of the
+                world's scale.
+            repeated: rows of constants, and the factor by which the measurements repeat what was
+                said of them: these take in that part of it only, while all others take in the
+                whole; the partial-update filter of Brink, Partial-update Schmidt-Kalman filter,
+                JGCD (2017), which keeps the covariance of all errors true.
+            considered: `H' R^-1 C` (D, 4), C being the derivatives of the residuals by the
+                constants considered.
         """
         prior = self._factor(information, len(self.P), first)
         own = slice(prior.first, None)
@@ -167,18 +191,24 @@ class Prior:
             self.scale_test.absorb(V[:, 0], W[:, 0], vector + information @ delta, P)
         V = self.error_D_constants - P @ W
         if repeated is not None:
-            rows, kept = repeated[0], 1 - 1 / repeated[1]
+            rows = repeated[0]
+            kept = 1 - 1 / repeated[1]
             delta[rows] += np.sqrt(kept) * (self.delta[rows] - delta[rows])
             P[rows, rows] += kept * (self.P[rows, rows] - P[rows, rows])
             V[rows] += np.sqrt(kept) * (self.error_D_constants[rows] - V[rows])
-        self.P, self.delta, self.error_D_constants = P, delta, V
+        self.P = P
+        self.delta = delta
+        self.error_D_constants = V
 
     def squared_distance(self, rows: slice) -> tuple[float, int]:
-        """Squared distance of the means of some errors from what the prior says, over its covariance; its dimensions.
+        """Squared distance of the means of some errors from what the prior says, over its
+        covariance; its dimensions.
 
-        Directions in which the covariance is singular to rounding have no part: states are copies, or known.
+        Directions in which the covariance is singular to rounding have no part: states are copies,
+        or known.
         """
-        P, delta = self.P[rows, rows], self.delta[rows]
+        P = self.P[rows, rows]
+        delta = self.delta[rows]
         scale = np.sqrt(np.where(P.diagonal() > 0, P.diagonal(), 1.0))
         values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
         free = values > _SINGULAR * values[-1]
@@ -186,10 +216,11 @@ class Prior:
         return float(np.sum(along**2 / values[free])), int(free.sum())
 
     def _factor(self, information: FloatArray, size: int, first: int) -> Factor:
-        """The factor of the present covariance, up to row `size`, of the errors that information (D, D) is about.
+        """The factor of the present covariance, up to row `size`, of the errors that information
+        (D, D) is about.
 
-        It begins at row `first` where there is no information before it, and the part after it is not singular beyond
-        rounding. It is computed once for all fits to one covariance.
+        It begins at row `first` where there is no information before it, and the part after it is
+        not singular beyond rounding. It is computed once for all fits to one covariance.
         """
         if information[:first].any():
             first = 0
@@ -204,7 +235,8 @@ class Factor:
 
     P: FloatArray  # (D, D)
     L: FloatArray  # (n, n)
-    triangular: bool  # by Cholesky; False: by the eigenvectors of a P that is singular beyond rounding
+    # by Cholesky; False: by the eigenvectors of a P that is singular beyond rounding
+    triangular: bool
 
     @property
     def first(self) -> int:
@@ -214,10 +246,13 @@ class Factor:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The covariance after a measurement of the last n errors in information form: `P_n_new = L (K K')^-1 L'`."""
+    """The covariance after a measurement of the last n errors in information form:
+    `P_n_new = L (K K')^-1 L'`.
+    """
 
     prior: Factor
-    K_transposed: FloatArray  # (n, n) upper triangle, of `K K' = I + L' A L`, in LAPACK's order of columns
+    # (n, n) upper triangle, of `K K' = I + L' A L`, in LAPACK's order of columns
+    K_transposed: FloatArray
 
     def move(self, vector: FloatArray) -> FloatArray:
         """Return `P_n_new v` (n,), for the information vector v (n,) the shift of their mean."""
@@ -226,7 +261,9 @@ class Fit:
         return out
 
     def rows(self, rows: slice) -> FloatArray:
-        """Return the rows (k, n) of L that belong to rows of P: `J L` for a choice J of the errors."""
+        """Return the rows (k, n) of L that belong to rows of P: `J L` for a choice J of the
+        errors.
+        """
         first = self.prior.first
         return self.prior.L[rows.start - first : rows.stop - first]
 
@@ -239,10 +276,13 @@ class Fit:
     def covariance(self) -> FloatArray:
         """Return the covariance (D, D) of all errors: symmetric and positive by construction.
 
-        That of the last n is `W' W`. With N the others' covariance with them before, times `L'^-1 K'^-1`, the others'
-        covariance with them is `N W`, and their own is `N N'` and what it is given the last n.
+        That of the last n is `W' W`. With N the others' covariance with them before, times
+        `L'^-1 K'^-1`, the others' covariance with them is `N W`, and their own is `N N'` and what
+        it is given the last n.
         """
-        P, L, first = self.prior.P, self.prior.L, self.prior.first
+        P = self.prior.P
+        L = self.prior.L
+        first = self.prior.first
         W = blas.dtrsm(1.0, self.K_transposed, L.T, lower=0, trans_a=1)
         out: FloatArray = np.empty(P.shape)
         out[first:, first:] = W.T @ W
@@ -257,7 +297,9 @@ class Fit:
 
 
 def _keep_positive(out: FloatArray, P: FloatArray, count: int) -> None:
-    """Add to the first variances of a covariance what keeps it positive to rounding, also where P knows one exactly."""
+    """Add to the first variances of a covariance what keeps it positive to rounding, also where
+    P knows one exactly.
+    """
     _diagonal(out)[:count] += 1e-14 * P.diagonal()[:count] + 1e-24
 
 
@@ -267,22 +309,27 @@ def _diagonal(A: FloatArray) -> FloatArray:
 
 
 def factor(P: FloatArray, first: int = 0) -> Factor:
-    """Factor a covariance (D, D) from the row `first` on; the whole where that part is singular beyond rounding."""
+    """Factor a covariance (D, D) from the row `first` on; the whole where that part is singular
+    beyond rounding.
+    """
     A = np.array(P[first:, first:], order="C")
     _keep_positive(A, A, len(A))
     upper, failed = lapack.dpotrf(A.T, lower=0, overwrite_a=1)
     if not failed:
         return Factor(P, upper.T, True)
     values, vectors = np.linalg.eigh(P)
-    root: FloatArray = np.array(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64, order="C")
+    root: FloatArray = np.array(
+        vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64, order="C"
+    )
     return Factor(P, root, False)
 
 
 def fit(prior: Factor, information: FloatArray) -> Fit:
     """Fit a prior to a measurement in information form (D, D).
 
-    `(P^-1 + A)^-1` without an inverse of P, which is singular where states are copies or known. Of `I + L' A L = K K'`,
-    only the triangle of K' is computed, in LAPACK's order of columns, in which the transpose of an array is free.
+    `(P^-1 + A)^-1` without an inverse of P, which is singular where states are copies or known. Of
+    `I + L' A L = K K'`, only the triangle of K' is computed, in LAPACK's order of columns, in which
+    the transpose of an array is free.
 
     Raises:
         numpy.linalg.LinAlgError: the information is not positive.
@@ -299,7 +346,11 @@ def fit(prior: Factor, information: FloatArray) -> Fit:
     return Fit(prior, K_transposed)
 
 
-def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance (D, D) and the shift of the mean (D,) after a measurement in information form."""
+def posterior(
+    P: FloatArray, information: FloatArray, vector: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the covariance (D, D) and the shift of the mean (D,) after a measurement in
+    information form.
+    """
     P_new = fit(factor(P), information).covariance()
     return P_new, P_new @ vector

@@ -1,4 +1,6 @@
-"""Between two frames: the motion model propagates the navigation state and predicts the camera's motion."""
+"""Between two frames: the motion model propagates the navigation state and predicts the camera's
+motion.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.errors import EstimationError
-from vio.filters.navigation import DIM, NO_STEP, Growth, ImuMotion, NavState, Transition, TwistMotion
+from vio.filters.navigation import (
+    DIM,
+    NO_STEP,
+    Growth,
+    ImuMotion,
+    NavState,
+    Transition,
+    TwistMotion,
+)
 from vio.filters.noise import MotionNoise
 from vio.filters.online_calibration import NO_TWIST, Twist, body_twist, walk_variances
 from vio.filters.settings import MsckfSettings
@@ -18,13 +28,17 @@ from vio.records import MotionPrior, MotionSample, MotionSource
 # Factors on the motion model's densities: at the start, at least, at most.
 IMU_FACTORS = (1.0, 1.0, 50.0)
 _TWIST_FACTORS = (1.0, 0.1, 10.0)
-# A start with a large uncertainty of the tilt is linearised far from the truth, which shows as process noise.
+# A start with a large uncertainty of the tilt is linearised far from the truth, which shows as
+# process noise.
 _FACTOR_PER_TILT_SIGMA = 1 / np.radians(8.0)
 _MOST_START_FACTOR = 5.0
 _LINEAR_RAD = (
-    1.0  # standard deviation of a rotation beyond which the errors of poses before and after it are not linear
+    # standard deviation of a rotation beyond which the errors of poses before and after it are not
+    # linear
+    1.0
 )
-_USELESS_RAD = 0.2  # standard deviation of a predicted rotation beyond which its pixels start no search
+# standard deviation of a predicted rotation beyond which its pixels start no search
+_USELESS_RAD = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,19 +60,25 @@ class FramePosterior:
     @classmethod
     def of(cls, window: Window, P: FloatArray) -> FramePosterior:
         """Take over the part of the covariance P (k, k) of a window's errors."""
-        own, newest = window.state.own, window.state.clone(-1)
+        own = window.state.own
+        newest = window.state.clone(-1)
         D = own.stop
         with_newest = np.empty((D + 6, D + 6))
-        with_newest[:D, :D], with_newest[:D, D:] = P[own, own], P[own, newest]
-        with_newest[D:, :D], with_newest[D:, D:] = P[newest, own], P[newest, newest]
+        with_newest[:D, :D] = P[own, own]
+        with_newest[:D, D:] = P[own, newest]
+        with_newest[D:, :D] = P[newest, own]
+        with_newest[D:, D:] = P[newest, newest]
         return cls(with_newest[:D, :D], with_newest, window.nav.T_world_imu)
 
     def transformed(self, window: Window, M: FloatArray) -> FramePosterior:
         """Return the covariances after `Window.turn_world`, which returned M."""
-        own, rows = window.state.own, np.r_[window.state.own, window.state.clone(-1)]
+        own = window.state.own
+        rows = np.r_[window.state.own, window.state.clone(-1)]
         turn = M[np.ix_(rows, rows)]
         return FramePosterior(
-            M[own, own] @ self.own @ M[own, own].T, turn @ self.with_newest @ turn.T, window.nav.T_world_imu
+            M[own, own] @ self.own @ M[own, own].T,
+            turn @ self.with_newest @ turn.T,
+            window.nav.T_world_imu,
         )
 
 
@@ -80,40 +100,57 @@ class Propagation:
     def __init__(self, source: MotionSource | None, settings: MsckfSettings) -> None:
         """Prepare; no window exists yet."""
         self.source = source
-        self.motion: ImuMotion | TwistMotion = ImuMotion(settings) if source == "imu" else TwistMotion(settings)
+        self.motion: ImuMotion | TwistMotion = (
+            ImuMotion(settings) if source == "imu" else TwistMotion(settings)
+        )
         self.walk = walk_variances(settings)  # a second
         self.noise = self.unknown_noise()
         self.time_ns = 0
         self.body_ns = 0  # time of the navigation state, on the IMU's clock
         self.blind = False  # the last frame showed nothing
         self.posterior = _NOTHING  # after the last frame that showed something
-        self.reported = _NOTHING  # the same with the uncertainty of the rig's scale, which corrects nothing
+        # the same with the uncertainty of the rig's scale, which corrects nothing
+        self.reported = _NOTHING
         self.since_frame = NO_STEP  # how the error has grown since then
         self.gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
         self._coming: _Coming | None = None  # the step that `predict` has integrated
         self._twist: tuple[NavState, Growth, Twist] | None = None  # the last one, and of what
-        self._camera: tuple[NavState, Growth, float, tuple[FloatArray, FloatArray, FloatArray]] | None = None  # too
+        # too
+        self._camera: (
+            tuple[NavState, Growth, float, tuple[FloatArray, FloatArray, FloatArray]] | None
+        ) = None
 
     def unknown_noise(self) -> MotionNoise:
         """The motion model's noise where nothing was learned of it."""
         return MotionNoise(*IMU_FACTORS) if self.source == "imu" else MotionNoise(*_TWIST_FACTORS)
 
     def begin(self, window: Window, time_ns: int, body_ns: int) -> None:
-        """Go on from a window without clones, at the times of a frame and of the navigation state."""
+        """Go on from a window without clones, at the times of a frame and of the navigation
+        state.
+        """
         self.forget()
-        self.time_ns, self.body_ns = time_ns, body_ns
+        self.time_ns = time_ns
+        self.body_ns = body_ns
         self.posterior = self.reported = FramePosterior.begun(window)
 
     def forget(self) -> None:
         """Forget the last frame and the steps since."""
-        self.gyro, self.blind = None, False
-        self.since_frame, self._coming = NO_STEP, None
+        self.gyro = None
+        self.blind = False
+        self.since_frame = NO_STEP
+        self._coming = None
 
     @property
     def is_lost(self) -> bool:
-        """Whether no feature and no sensor has related poses to each other for so long that the rotation is lost."""
+        """Whether no feature and no sensor has related poses to each other for so long that the
+        rotation is lost.
+        """
         of_rotation = self.since_frame.Q[3:6, 3:6]
-        return self.blind and self.source is None and bool(np.linalg.eigvalsh(of_rotation)[-1] > _LINEAR_RAD**2)
+        return (
+            self.blind
+            and self.source is None
+            and bool(np.linalg.eigvalsh(of_rotation)[-1] > _LINEAR_RAD**2)
+        )
 
     def take(self, sample: MotionSample) -> None:
         """Take a motion sample, which may change what the next step looks like."""
@@ -136,7 +173,9 @@ class Propagation:
         self.time_ns = time_ns
 
     def coming(self, window: Window, body_ns: int) -> _Coming:
-        """The motion model's step from the present state; what `predict` has integrated is not integrated again."""
+        """The motion model's step from the present state; what `predict` has integrated is not
+        integrated again.
+        """
         if self._coming is None or self._coming.body_ns != body_ns:
             step = self.motion.advance(window.nav, self.body_ns, body_ns, self.noise.factors)
             self._coming = _Coming(body_ns, step, self.since_frame.then(step))
@@ -159,16 +198,22 @@ class Propagation:
             window.absorb_measurement(measurement)
 
     def predict(self, window: Window, time_ns: int) -> tuple[FloatArray, MotionPrior] | None:
-        """Predict the camera's pose (4, 4) `T_cam0_world` at a coming frame and its motion; None: not well enough."""
-        nav, growth = window.nav, self.since_frame
+        """Predict the camera's pose (4, 4) `T_cam0_world` at a coming frame and its motion.
+
+        None: not well enough.
+        """
+        nav = window.nav
+        growth = self.since_frame
         body_ns = self.body_time(window, time_ns)
         if body_ns > self.body_ns:
             try:
                 coming = self.coming(window, body_ns)
             except EstimationError:  # the update will say it
                 return None
-            nav, growth = coming.step.nav, coming.growth
-        T_cam0_imu, late_s = window.calibration.T_cam0_imu, (body_ns - time_ns) * 1e-9
+            nav = coming.step.nav
+            growth = coming.growth
+        T_cam0_imu = window.calibration.T_cam0_imu
+        late_s = (body_ns - time_ns) * 1e-9
         (T_world_imu, *_), expected = self.exposure(window, nav, growth, late_s)
         T_cam0_world = T_cam0_imu @ se3_inverse(T_world_imu)
         T_curr_prev = T_cam0_world @ window.clones.T_world_imu[-1] @ se3_inverse(T_cam0_imu)
@@ -177,7 +222,10 @@ class Propagation:
         measured = self.source is not None and not growth.bridged
         motion = MotionPrior(T_curr_prev, A @ expected @ A.T, measured)
         of_rotation = motion.covariance[3:, 3:]  # no eigenvalue is larger than its trace
-        if of_rotation.trace() > _USELESS_RAD**2 and np.linalg.eigvalsh(of_rotation)[-1] > _USELESS_RAD**2:
+        if (
+            of_rotation.trace() > _USELESS_RAD**2
+            and np.linalg.eigvalsh(of_rotation)[-1] > _USELESS_RAD**2
+        ):
             return None
         return T_cam0_world, motion
 
@@ -193,10 +241,11 @@ class Propagation:
             late_s: the navigation state's time on the IMU's clock minus the frame's stamp.
 
         Returns:
-            What `Window.camera_D_own` returns, and the covariance (6, 6) of `xi_curr - xi_prev`, of the camera, where
-            the errors have grown since the last frame.
+            What `Window.camera_D_own` returns, and the covariance (6, 6) of `xi_curr - xi_prev`, of
+            the camera, where the errors have grown since the last frame.
         """
-        last, twist = self._camera, self.twist(window, nav, growth)
+        last = self._camera
+        twist = self.twist(window, nav, growth)
         if last is None or last[0] is not nav or last[1] is not growth or last[2] != late_s:
             T, J = window.camera_at(late_s, twist, nav)
             if not window.calibration.moves_camera and "imu_terms" not in window.state:
@@ -211,7 +260,9 @@ class Propagation:
         return (T, J, noise), moved + noise
 
     def grown(self, window: Window, nav: NavState, growth: Growth) -> FloatArray:
-        """Transition (15 + C, 15 + C) of the errors of navigation state and calibration since the last frame."""
+        """Transition (15 + C, 15 + C) of the errors of navigation state and calibration since
+        the last frame.
+        """
         T_moved = nav.T_world_imu @ se3_inverse(self.posterior.T_world_imu)
         return window.calibration.transition(window.state, growth, T_moved)
 
@@ -222,12 +273,14 @@ class Propagation:
         if self._twist is not None and self._twist[0] is nav and self._twist[1] is growth:
             return self._twist[2]
         R = nav.T_world_imu[:3, :3]
-        own, rate_D_error = window.state.motion, self.motion.rate_D_error(nav)
+        own = window.state.motion
+        rate_D_error = self.motion.rate_D_error(nav)
         Phi = growth.Phi if own.stop == DIM else self.grown(window, nav, growth)[own, own]
         P = Phi @ self.posterior.own[own, own] @ Phi.T
         P[:DIM, :DIM] += growth.Q
         covariance = np.zeros((6, 6))
-        covariance[:3, :3] = R.T @ P[6:9, 6:9] @ R  # v = exp(phi) v_hat + xi_v, seen from the body turned by phi
+        # v = exp(phi) v_hat + xi_v, seen from the body turned by phi
+        covariance[:3, :3] = R.T @ P[6:9, 6:9] @ R
         by_gyro = np.eye(3) * self.motion.rate_variance(self.noise.factors)
         covariance[3:, 3:] = rate_D_error @ P @ rate_D_error.T + by_gyro
         twist = Twist(body_twist(nav.T_world_imu, nav.velocity, nav.rate), covariance)
@@ -240,7 +293,8 @@ class Propagation:
         return (self.body_ns - self.time_ns) * 1e-9
 
     def own_covariance(self, window: Window) -> FloatArray:
-        """Covariance (15 + C, 15 + C) of navigation state and calibration at the time of the last event, reported.
+        """Covariance (15 + C, 15 + C) of navigation state and calibration at the time of the last
+        event, reported.
 
         It is upright: errors against the world that gravity shows at present.
         """
@@ -252,7 +306,8 @@ class Propagation:
         return out
 
     def exposed(self, window: Window, own: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Upright pose (4, 4) of the body at the newest exposure, and the covariance (6, 6) of the reported one.
+        """Upright pose (4, 4) of the body at the newest exposure, and the covariance (6, 6) of the
+        reported one.
 
         Args:
             window: the window.
@@ -266,7 +321,9 @@ class Propagation:
             J = np.eye(6, len(with_newest), len(own))  # of the camera, and back to the body
             J[:, : len(own)] += window.since_first(window.body_D_error()[-6:])[:, : len(own)]
             return window.clones.T_world_imu[-1], J @ with_newest @ J.T
-        T, J, noise = window.camera_D_own(self.late_s, self.twist(window, window.nav, self.since_frame))
+        T, J, noise = window.camera_D_own(
+            self.late_s, self.twist(window, window.nav, self.since_frame)
+        )
         if "extrinsics" in window.state:
             J[:, window.state["extrinsics"]] = 0.0  # of the body
         J = window.since_first(J)

@@ -13,10 +13,12 @@ from vio.filters.online_calibration import Calibration, body_twist
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp, so3_hat
 
-# A divergence begins before it shows, so the last good attitude is taken to be off by a few degrees already.
+# A divergence begins before it shows, so the last good attitude is taken to be off by a few degrees
+# already.
 _ROTATION_SIGMA_RAD = np.radians(2.0)
 _LEAST_SPEED_MPS = 1.0  # the last velocity may have been wrong by itself, and by this
-_EXTRAPOLATED_S = 0.5  # for which the last velocity and rate are believed; beyond it the pose is held
+# for which the last velocity and rate are believed; beyond it the pose is held
+_EXTRAPOLATED_S = 0.5
 _RATE_SIGMA_RADPS = 1.0  # of a body that nothing measures: a turn within a second is not seen
 _ANY_ROTATION_RAD = math.pi / math.sqrt(3.0)  # standard deviation of an angle that may be any
 
@@ -28,7 +30,8 @@ class GoodState:
     frame_index: int
     time_ns: int
     nav: NavState
-    covariance: FloatArray  # (15 + C, 15 + C) of navigation state and calibration, with all that was seen
+    # (15 + C, 15 + C) of navigation state and calibration, with all that was seen
+    covariance: FloatArray
     calibration: Calibration
 
 
@@ -39,18 +42,21 @@ def required(good: GoodState | None) -> GoodState:
         EstimationError: there is none.
     """
     if good is None:
-        raise EstimationError("msckf has no good state to start again from; check calibration and first frames")
+        raise EstimationError(
+            "msckf has no good state to start again from; check calibration and first frames"
+        )
     return good
 
 
 def restarted(
     good: GoodState, time_ns: int, motion: ImuMotion | TwistMotion, settings: MsckfSettings
 ) -> tuple[NavState, FloatArray]:
-    """Return the navigation state at a later time and its covariance (15, 15), both from the last good state.
+    """Return the navigation state at a later time and its covariance (15, 15), both from the last
+    good state.
 
-    The pose is carried on with the last velocity and rate for half a second at most. Its covariance grows by what a
-    body of that speed may have done in between; velocity and biases begin anew. Errors are right-invariant: an error
-    `n_r` of the body's attitude alone moves `rho` by `p^ n_r`.
+    The pose is carried on with the last velocity and rate for half a second at most. Its covariance
+    grows by what a body of that speed may have done in between; velocity and biases begin anew.
+    Errors are right-invariant: an error `n_r` of the body's attitude alone moves `rho` by `p^ n_r`.
 
     Args:
         good: the state to go on from.
@@ -59,12 +65,14 @@ def restarted(
         settings: initial standard deviations.
     """
     elapsed_s = (time_ns - good.time_ns) * 1e-9
-    nav, T = good.nav, good.nav.T_world_imu
+    nav = good.nav
+    T = good.nav.T_world_imu
     velocity = motion.velocity_world(nav)
     twist = body_twist(T, velocity, nav.rate)
     moved = replace(nav, T_world_imu=T @ se3_exp(min(elapsed_s, _EXTRAPOLATED_S) * twist))
     speed = float(np.linalg.norm(velocity)) + _LEAST_SPEED_MPS
-    position, rotation = speed * elapsed_s, float(np.hypot(_ROTATION_SIGMA_RAD, _RATE_SIGMA_RADPS * elapsed_s))
+    position = speed * elapsed_s
+    rotation = float(np.hypot(_ROTATION_SIGMA_RAD, _RATE_SIGMA_RADPS * elapsed_s))
     rotation = min(rotation, _ANY_ROTATION_RAD)
     J = np.eye(6)
     J[:3, 3:] = so3_hat(moved.T_world_imu[:3, 3])

@@ -1,4 +1,6 @@
-"""What of the stereo pair's calibration is estimated, and how pixels look without what it got wrong."""
+"""What of the stereo pair's calibration is estimated, and how pixels look without what it got
+wrong.
+"""
 
 from __future__ import annotations
 
@@ -29,23 +31,31 @@ from vio.records import (
     StereoScaleEstimate,
 )
 
-_PRINCIPAL_POINT = 1 / 3  # standard deviation of its coordinates, in focal lengths, over that of the focal length
-_COLUMNS_BY_ROWS = 3.0  # of the standard deviation of a lens term, over the root mean square of the rows' field
-_ROWS_MOVED = 2.0  # how much larger the rows' field must become for what was learned of the columns to be in doubt
+# standard deviation of its coordinates, in focal lengths, over that of the focal length
+_PRINCIPAL_POINT = 1 / 3
+# of the standard deviation of a lens term, over the root mean square of the rows' field
+_COLUMNS_BY_ROWS = 3.0
+# how much larger the rows' field must become for what was learned of the columns to be in doubt
+_ROWS_MOVED = 2.0
 
 
 def rows_off(camera: StereoCamera, offset_px: float) -> float:
-    """Size of the rows' field in focal lengths: its root mean square, and what a saved calibration left."""
+    """Size of the rows' field in focal lengths: its root mean square, and what a saved
+    calibration left.
+    """
     return float(np.hypot(offset_px, camera.residual_px)) / camera.fu
 
 
 def field_sigmas(camera: StereoCamera, offset_px: float) -> FloatArray:
-    """Standard deviations (8,) of the right columns' field, in focal lengths, by the rows' root mean square.
+    """Standard deviations (8,) of the right columns' field, in focal lengths, by the rows' root
+    mean square.
 
-    An error of turn or lens moves rows and columns alike, so the size of the rows' field is an estimate of the
-    standard deviation of the columns' (empirical Bayes).
+    An error of turn or lens moves rows and columns alike, so the size of the rows' field is an
+    estimate of the standard deviation of the columns' (empirical Bayes).
     """
-    sigma = float(np.clip(_COLUMNS_BY_ROWS * rows_off(camera, offset_px), LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA))
+    sigma = float(
+        np.clip(_COLUMNS_BY_ROWS * rows_off(camera, offset_px), LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA)
+    )
     return stereo_field_sigmas(sigma, offset_px / camera.fu)
 
 
@@ -62,30 +72,44 @@ class RigCalibration:
     """Begins to estimate a part of the stereo calibration where the run shows that it is off."""
 
     def __init__(self, camera: StereoCamera, settings: MsckfSettings) -> None:
-        """Prepare for a camera; nothing is estimated yet but what the settings want from the start."""
-        self.camera, self.settings = camera, settings
-        self.rotation: RotationComparison | None = ROTATION_NOT_COMPARABLE  # as others compared them; None: they will
+        """Prepare for a camera; nothing is estimated yet but what the settings want from the
+        start.
+        """
+        self.camera = camera
+        self.settings = settings
+        # as others compared them; None: they will
+        self.rotation: RotationComparison | None = ROTATION_NOT_COMPARABLE
         self._rows = VerticalDisparityModel(camera)
         self._sigmas = constant_sigmas(settings)
-        self._field_variances = prior_variances(settings)["stereo_field"]  # (8,) before anything was seen of it
-        self._rows_off = LEAST_FIELD_SIGMA / _COLUMNS_BY_ROWS  # size of the rows' field that gave them, focal lengths
-        self._field: tuple[Calibration, StereoCorrection | None] | None = None  # at a calibration, by the present rows
+        # (8,) before anything was seen of it
+        self._field_variances = prior_variances(settings)["stereo_field"]
+        # size of the rows' field that gave them, focal lengths
+        self._rows_off = LEAST_FIELD_SIGMA / _COLUMNS_BY_ROWS
+        # at a calibration, by the present rows
+        self._field: tuple[Calibration, StereoCorrection | None] | None = None
 
     def first_covariance(self, calibration: Calibration, T_world_imu: FloatArray) -> FloatArray:
-        """Covariance (C, C) of the errors of a calibration of which nothing was seen yet, at a pose (4, 4)."""
+        """Covariance (C, C) of the errors of a calibration of which nothing was seen yet, at a
+        pose (4, 4).
+        """
         variances = prior_variances(self.settings) | {"stereo_field": self._field_variances}
         return calibration.in_world(calibration.variances(variances), T_world_imu)
 
-    def test_scale(self, window: Window, source: MotionSource | None, before: ScaleTest | None) -> None:
-        """Begin to test the scale beside the states of a window without clones, with what a test before has found."""
+    def test_scale(
+        self, window: Window, source: MotionSource | None, before: ScaleTest | None
+    ) -> None:
+        """Begin to test the scale beside the states of a window without clones, with what a test
+        before has found.
+        """
         if source is not None and "stereo_scale" not in window.state:
             window.prior.scale_test = ScaleTest() if before is None else before
 
     def learn_rows(self, window: Window, seen: Observations) -> None:
-        """Learn the rows of a frame; the first ones say how far off the lenses may be, and begin to estimate the field.
+        """Learn the rows of a frame; the first ones say how far off the lenses may be, and begin to
+        estimate the field.
 
-        Where the rows' field grows much later, as a camera has been moved in its mount or the first matches were wrong
-        ones, the columns are in doubt again.
+        Where the rows' field grows much later, as a camera has been moved in its mount or the first
+        matches were wrong ones, the columns are in doubt again.
         """
         if self.settings.calibrate_stereo == "off" or self.camera.kind != "stereo":
             return
@@ -102,63 +126,93 @@ class RigCalibration:
             calibration = window.calibration.estimating("stereo_field", self.settings)
             window.estimate_block("stereo_field", calibration, np.diag(variances))
         else:
-            window.prior.inflate(window.state["stereo_field"], np.maximum(variances - self._field_variances, 0.0))
+            window.prior.inflate(
+                window.state["stereo_field"], np.maximum(variances - self._field_variances, 0.0)
+            )
         self._field_variances, self._rows_off = variances, max(off, self._rows_off)
 
     def end_frame(self, window: Window, seen: Observations) -> None:
-        """Count a frame of the scale's test; without right views the scale is not the baseline's."""
+        """Count a frame of the scale's test; without right views the scale is not the
+        baseline's.
+        """
         if not seen.has_right.any():
             window.prior.scale_test = None
         if window.prior.scale_test is not None:
             window.prior.scale_test.end_frame()
 
     def considered_sigmas(self, window: Window) -> FloatArray:
-        """Standard deviations (4,) as `constant_sigmas` returns them; zero where one is estimated."""
-        return self._sigmas * [0.0, 0.0, 1.0, 1.0] if "stereo_scale" in window.state else self._sigmas
+        """Standard deviations (4,) as `constant_sigmas` returns them; zero where one is
+        estimated.
+        """
+        return (
+            self._sigmas * [0.0, 0.0, 1.0, 1.0] if "stereo_scale" in window.state else self._sigmas
+        )
 
     def uncertainty(self, window: Window, V: FloatArray) -> FloatArray:
-        """What the constants considered add to a covariance (..., k, k), by how its errors follow them (..., k, 4)."""
+        """What the constants considered add to a covariance (..., k, k), by how its errors
+        follow them (..., k, 4).
+        """
         V = V * self.considered_sigmas(window)
         out: FloatArray = V @ np.swapaxes(V, -1, -2)
         return out
 
     def landmark_covariances(self, window: Window) -> FloatArray:
         """Covariances (M, 3, 3) of the landmarks in the state, with what is considered."""
-        first, prior = window.state.landmarks.start, window.prior
+        first = window.state.landmarks.start
+        prior = window.prior
         rows = first + np.arange(3 * len(window.landmarks)).reshape(-1, 3)
         out: FloatArray = prior.P[rows[:, :, None], rows[:, None, :]]
         return out + self.uncertainty(window, prior.error_D_constants[rows, 1:])
 
     def field(self, window: Window) -> StereoCorrection | None:
-        """The stereo calibration's faults at the window's present means; None where they are not estimated."""
+        """The stereo calibration's faults at the window's present means.
+
+        None where they are not estimated.
+        """
         if self._field is None or self._field[0] is not window.calibration:
             self._field = window.calibration, self._field_at(window)
         return self._field[1]
 
     def _field_at(self, window: Window) -> StereoCorrection | None:
-        estimated, stereo = window.calibration.stereo_terms, window.calibration.stereo
+        estimated = window.calibration.stereo_terms
+        stereo = window.calibration.stereo
         if not len(estimated):
             return None
-        rows, rows_D_common = np.zeros(ROW_TERMS), np.zeros((ROW_TERMS, 0))
+        rows = np.zeros(ROW_TERMS)
+        rows_D_common = np.zeros((ROW_TERMS, 0))
         if "stereo_field" in window.state:
             rows = self._rows.coefficients
-        # Lenses that bend both images alike pass for a focal length: 2 ± 0.4 % for k1 = -0.03. Where that counts as
-        # known, drives come out no better without their part of the rows: KITTI 03 by 20 %, 06 and 0039 not.
+        # Lenses that bend both images alike pass for a focal length: 2 ± 0.4 % for k1 = -0.03.
+        # Where that counts as known, drives come out no better without their part of the rows:
+        # KITTI 03 by 20 %, 06 and 0039 not.
         if "stereo_field" in window.state and "stereo_scale" in window.state:
-            rows, rows_D_common = self._rows.without_common(stereo), self._rows.rows_D_common
+            rows = self._rows.without_common(stereo)
+            rows_D_common = self._rows.rows_D_common
         return StereoCorrection(self.camera, rows, stereo, estimated, rows_D_common)
 
     def report(self, window: Window, own: FloatArray) -> dict[str, Any]:
-        """Return the fields of `Estimate` on the calibration, by the errors' covariance (15 + C, 15 + C).
+        """Return the fields of `Estimate` on the calibration, by the errors' covariance (15 + C, 15
+        + C).
 
         That is with the scale that was taken over, and with the rows that were learned.
         """
-        out, test = window.calibration.report(window.state, window.nav, own), window.prior.scale_test
-        if test is not None and test.is_confirmed and self.rotation is not None and self.rotation.agree:
+        out = window.calibration.report(window.state, window.nav, own)
+        test = window.prior.scale_test
+        if (
+            test is not None
+            and test.is_confirmed
+            and self.rotation is not None
+            and self.rotation.agree
+        ):
             log, sigma = test.estimate()  # a wrong focal length passes for it
-            out["stereo_scale"] = StereoScaleEstimate(np.array([log, 0.0]), np.diag([sigma**2, 0.0]))
+            out["stereo_scale"] = StereoScaleEstimate(
+                np.array([log, 0.0]), np.diag([sigma**2, 0.0])
+            )
         if "stereo_field" in out:
-            field, P = out["stereo_field"], self._rows.covariance
+            field = out["stereo_field"]
+            P = self._rows.covariance
             rows = self._rows.without_common(field.coefficients)
-            out["stereo_field"] = StereoFieldEstimate(field.coefficients, field.covariance, self._rows.rms_px, rows, P)
+            out["stereo_field"] = StereoFieldEstimate(
+                field.coefficients, field.covariance, self._rows.rms_px, rows, P
+            )
         return out

@@ -1,9 +1,11 @@
-"""Test while running whether IMU or velocities contradict the scale that the calibrated baseline gives.
+"""Test while running whether IMU or velocities contradict the scale that the calibrated baseline
+gives.
 
-The filter takes the scale for known. Beside it runs the estimate of its logarithm `s` that the filter would have with
-it as a state, from how the prior's mean depends on it: Friedland's separate-bias filter, equations (S1) to (S3) of
-docs/math.md. It costs one vector and changes nothing: what it finds is reported, and how the errors depend on the scale
-gives what an uncertain baseline adds to their covariance, equation (S4).
+The filter takes the scale for known. Beside it runs the estimate of its logarithm `s` that the
+filter would have with it as a state, from how the prior's mean depends on it: Friedland's
+separate-bias filter, equations (S1) to (S3) of docs/math.md. It costs one vector and changes
+nothing: what it finds is reported, and how the errors depend on the scale gives what an uncertain
+baseline adds to their covariance, equation (S4).
 Reference: Friedland, Treatment of bias in recursive filtering, IEEE TAC (1969).
 """
 
@@ -17,40 +19,51 @@ from vio.geometry.lie import FloatArray
 
 _SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
 # More than correct baselines show (docs/notes/design_decisions.md, contradiction of the scale).
-_LEAST, _SIGMAS = 0.04, 5.0
-# The accelerometer's noise is in the motion that is held against the images, and there passes for motion at twice the
-# scale. It has three degrees of freedom in a frame, of which images determine a part: 0.1 of information on a recording
-# of standstill, with more where the real noise is that of the settings. One is allowed for.
+_LEAST = 0.04
+_SIGMAS = 5.0
+# The accelerometer's noise is in the motion that is held against the images, and there passes for
+# motion at twice the scale. It has three degrees of freedom in a frame, of which images determine a
+# part: 0.1 of information on a recording of standstill, with more where the real noise is that of
+# the settings. One is allowed for.
 _BY_NOISE = 1.0
-# A velocity's squared standard deviations beyond which its own error makes less than 3 % of what it says of the scale.
+# A velocity's squared standard deviations beyond which its own error makes less than 3 % of what it
+# says of the scale.
 _CLEAR = 100.0
 
 
 def is_clear(velocity: FloatArray, covariance: FloatArray) -> bool:
-    """Whether a velocity (3,) of a covariance (3, 3) is far enough from its noise to tell the scale."""
+    """Whether a velocity (3,) of a covariance (3, 3) is far enough from its noise to tell the
+    scale.
+    """
     return float(velocity @ np.linalg.solve(covariance + 1e-18 * np.eye(3), velocity)) > _CLEAR
 
 
 def scaled_nav(nav: NavState, T_cam0_imu: FloatArray) -> FloatArray:
-    """How the navigation state's error (15,) moves with the logarithm of the world's scale, equation (S1)."""
+    """How the navigation state's error (15,) moves with the logarithm of the world's scale,
+    equation (S1).
+    """
     out: FloatArray = np.empty(15)
     loops.scale_nav(nav.T_world_imu, T_cam0_imu, nav.velocity, out)
     return out
 
 
 class ScaleTest:
-    """The estimate of the logarithm of the scale beside a filter of D errors that takes it for zero.
+    """The estimate of the logarithm of the scale beside a filter of D errors that takes it for
+    zero.
 
-    The errors are those of a world that is scaled with s, so no pixel depends on it, whatever the estimates:
-    relinearising cannot pass for knowledge of the scale.
+    The errors are those of a world that is scaled with s, so no pixel depends on it, whatever the
+    estimates: relinearising cannot pass for knowledge of the scale.
     """
 
     def __init__(self) -> None:
         """Start without knowledge."""
         self._frames = 0  # since the start
-        self._doubted = 0  # at which of them the scale was contradicted without a break since; 0: it is not
-        self._information, self._vector = _SIGMA**-2, 0.0
-        self.is_confirmed = False  # whether as many frames again have contradicted it as it took to find
+        # at which of them the scale was contradicted without a break since; 0: it is not
+        self._doubted = 0
+        self._information = _SIGMA**-2
+        self._vector = 0.0
+        # whether as many frames again have contradicted it as it took to find
+        self.is_confirmed = False
 
     def end_frame(self) -> None:
         """Count a frame, and ask whether the scale is contradicted."""
@@ -65,7 +78,8 @@ class ScaleTest:
         """Take in measurements that the filter has absorbed, equations (S2) and (S3).
 
         Args:
-            V: how the errors (D,) depend on the scale, for measurements in metres those of the scaled world.
+            V: how the errors (D,) depend on the scale, for measurements in metres those of the
+                scaled world.
             W: their information (D, D) times V, (D,).
             remaining: their information vector (D,) at the means after them.
             P: covariance of the errors (D, D) after them.
@@ -79,6 +93,8 @@ class ScaleTest:
 
     @property
     def _contradicted(self) -> bool:
-        """Whether the scale is off significantly, by more than is harmless and than the sensor's noise explains."""
+        """Whether the scale is off significantly, by more than is harmless and than the sensor's
+        noise explains.
+        """
         s, sigma = self.estimate()
         return abs(s) > max(_LEAST + _BY_NOISE * self._frames / self._information, _SIGMAS * sigma)

@@ -15,53 +15,75 @@ class VislamSettings(Section):
     section: ClassVar[str] = "vislam"
 
     mode: Literal["slam", "mapping", "dead_reckoning"] = setting(
-        "slam", "what runs: pose and landmark updates, landmark updates along the predicted pose, or prediction alone"
+        "slam",
+        "what runs: pose and landmark updates, landmark updates along the predicted pose, or "
+        "prediction alone",
     )
     motion_model: Literal["twist", "input"] = setting(
         "twist",
-        "what carries the pose: 'twist' keeps the body twist as a state that drifts and that velocities, if any, "
+        "what carries the pose: 'twist' keeps the body twist as a state that drifts and that "
+        "velocities, if any, "
         "measure; 'input' is the paper's, which takes each measured velocity as the truth plus W",
     )
     noise: Literal["consistent", "literal"] = setting(
         "consistent",
-        "model 'input', how W is read: 'consistent' adds (sigma * step)^2 per step; 'literal' adds the paper's numbers "
+        "model 'input', how W is read: 'consistent' adds (sigma * step)^2 per step; 'literal' adds "
+        "the paper's numbers "
         "as variances",
     )
     input_at: Literal["midpoint", "start", "end"] = setting(
         "midpoint",
-        "model 'input': which input carries the pose from one frame to the next; the paper holds the one at the start",
+        "model 'input': which input carries the pose from one frame to the next; the paper holds "
+        "the one at the start",
     )
-    linear_velocity_sigma_mps: float = setting(0.5, "noise of the measured body velocity", unit="m/s", above=0)
-    angular_rate_sigma_radps: float = setting(0.05, "noise of the measured angular rate", unit="rad/s", above=0)
+    linear_velocity_sigma_mps: float = setting(
+        0.5, "noise of the measured body velocity", unit="m/s", above=0
+    )
+    angular_rate_sigma_radps: float = setting(
+        0.05, "noise of the measured angular rate", unit="rad/s", above=0
+    )
     acceleration_density: float = setting(
-        1.0, "model 'twist': spectral density of the body acceleration", unit="m/s^2/sqrt(Hz)", at_least=0
+        1.0,
+        "model 'twist': spectral density of the body acceleration",
+        unit="m/s^2/sqrt(Hz)",
+        at_least=0,
     )
     angular_acceleration_density: float = setting(
-        0.1, "model 'twist': spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)", at_least=0
+        0.1,
+        "model 'twist': spectral density of the angular acceleration",
+        unit="rad/s^2/sqrt(Hz)",
+        at_least=0,
     )
     pixel_sigma_px: float = setting(
         0.75, "noise of one pixel coordinate; V is its square, 15 in the paper", unit="px", above=0
     )
     gate_probability: float | None = setting(
         0.95,
-        "observations outside this chi-square quantile are rejected; null keeps all, as the paper does",
+        "observations outside this chi-square quantile are rejected; null keeps all, as the paper "
+        "does",
         above=0,
         below=1,
     )
     landmark_uncertainty: bool = setting(
         True,
-        "add the landmarks' covariance to the innovation covariance of the pose update; the paper takes them as known",
+        "add the landmarks' covariance to the innovation covariance of the pose update; the paper "
+        "takes them as known",
     )
     landmark_prior: Literal["stereo", "isotropic"] = setting(
-        "stereo", "covariance of a new landmark: propagated from its first pixels and pose, or the same for all"
+        "stereo",
+        "covariance of a new landmark: propagated from its first pixels and pose, or the same for "
+        "all",
     )
     iterations: int = setting(
         3,
-        "Gauss-Newton iterations of the pose update; 1 is the paper's filter, more help a start in motion",
+        "Gauss-Newton iterations of the pose update; 1 is the paper's filter, more help a start in "
+        "motion",
         at_least=1,
         at_most=100,
     )
-    use_stale: bool = setting(False, "take in observations flagged as stale; the paper knows no such flag")
+    use_stale: bool = setting(
+        False, "take in observations flagged as stale; the paper knows no such flag"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +93,14 @@ class MsckfSettings(Section):
     section: ClassVar[str] = "msckf"
 
     clones: int = setting(11, "poses kept in the window", at_least=3, at_most=100)
-    max_landmarks: int = setting(30, "long-lived landmarks kept in the state", at_least=0, at_most=1000)
+    max_landmarks: int = setting(
+        30, "long-lived landmarks kept in the state", at_least=0, at_most=1000
+    )
     max_features: int = setting(
-        150, "tracks without a landmark of their own that enter one update", at_least=1, at_most=5000
+        150,
+        "tracks without a landmark of their own that enter one update",
+        at_least=1,
+        at_most=5000,
     )
     pixel_sigma_px: float = setting(
         0.5, "noise of one pixel coordinate at the start; then estimated", unit="px", above=0
@@ -81,61 +108,103 @@ class MsckfSettings(Section):
     pixel_sigma_max_px: float = setting(
         2.0, "upper bound of the estimated noise of a pixel coordinate", unit="px", above=0
     )
-    gate_probability: float = setting(0.99, "tracks outside this chi-square quantile are rejected", above=0, below=1)
+    gate_probability: float = setting(
+        0.99, "tracks outside this chi-square quantile are rejected", above=0, below=1
+    )
     gravity_mps2: float = setting(9.81, "magnitude of gravity", unit="m/s^2", above=0, at_most=100)
     gyro_noise_density: float = setting(
-        2.0e-4, "gyro white noise by its data sheet; what a rig adds to it is learned", unit="rad/s/sqrt(Hz)", above=0
+        2.0e-4,
+        "gyro white noise by its data sheet; what a rig adds to it is learned",
+        unit="rad/s/sqrt(Hz)",
+        above=0,
     )
-    accel_noise_density: float = setting(1.2e-2, "accelerometer white noise, likewise", unit="m/s^2/sqrt(Hz)", above=0)
-    gyro_bias_walk: float = setting(2.0e-5, "gyro bias random walk", unit="rad/s^2/sqrt(Hz)", at_least=0)
-    accel_bias_walk: float = setting(3.0e-3, "accelerometer bias random walk", unit="m/s^3/sqrt(Hz)", at_least=0)
-    gyro_bias_sigma_radps: float = setting(0.1, "initial standard deviation of the gyro bias", unit="rad/s", at_least=0)
+    accel_noise_density: float = setting(
+        1.2e-2, "accelerometer white noise, likewise", unit="m/s^2/sqrt(Hz)", above=0
+    )
+    gyro_bias_walk: float = setting(
+        2.0e-5, "gyro bias random walk", unit="rad/s^2/sqrt(Hz)", at_least=0
+    )
+    accel_bias_walk: float = setting(
+        3.0e-3, "accelerometer bias random walk", unit="m/s^3/sqrt(Hz)", at_least=0
+    )
+    gyro_bias_sigma_radps: float = setting(
+        0.1, "initial standard deviation of the gyro bias", unit="rad/s", at_least=0
+    )
     accel_bias_sigma_mps2: float = setting(
         0.3, "initial standard deviation of the accelerometer bias", unit="m/s^2", at_least=0
     )
     zero_velocity: bool = setting(
-        True, "measure zero velocity where the motion over the window is indistinguishable from none"
+        True,
+        "measure zero velocity where the motion over the window is indistinguishable from none",
     )
-    linear_velocity_sigma_mps: float = setting(0.5, "noise of a measured body velocity", unit="m/s", above=0)
-    angular_rate_sigma_radps: float = setting(0.05, "noise of a measured angular rate", unit="rad/s", above=0)
+    linear_velocity_sigma_mps: float = setting(
+        0.5, "noise of a measured body velocity", unit="m/s", above=0
+    )
+    angular_rate_sigma_radps: float = setting(
+        0.05, "noise of a measured angular rate", unit="rad/s", above=0
+    )
     acceleration_density: float = setting(
-        1.0, "without IMU: spectral density of the body acceleration", unit="m/s^2/sqrt(Hz)", at_least=0
+        1.0,
+        "without IMU: spectral density of the body acceleration",
+        unit="m/s^2/sqrt(Hz)",
+        at_least=0,
     )
     angular_acceleration_density: float = setting(
-        0.3, "without IMU: spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)", at_least=0
+        0.3,
+        "without IMU: spectral density of the angular acceleration",
+        unit="rad/s^2/sqrt(Hz)",
+        at_least=0,
     )
     calibrate_camera_imu: Literal["auto", "none", "extrinsics", "time_offset", "both"] = setting(
         "auto",
-        "what is estimated of camera and IMU besides the motion: T_cam0_imu, the time offset, or both; auto: the time "
+        "what is estimated of camera and IMU besides the motion: T_cam0_imu, the time offset, or "
+        "both; auto: the time "
         "offset, where a stereo pair has an IMU",
     )
     calibrate_imu: Literal["off", "scale", "full"] = setting(
         "off",
-        "what is estimated of the IMU's own calibration besides the biases: nothing; the scales of accelerometer and "
-        "gyro; or these, the misalignment of their axes, and the gyro's rotation against the accelerometer",
+        "what is estimated of the IMU's own calibration besides the biases: nothing; the scales of "
+        "accelerometer and "
+        "gyro; or these, the misalignment of their axes, and the gyro's rotation against the "
+        "accelerometer",
     )
     calibrate_stereo: Literal["on", "off"] = setting(
-        "on", "estimate what the calibration of a stereo pair is off by, a low-order field over the image"
+        "on",
+        "estimate what the calibration of a stereo pair is off by, a low-order field over the "
+        "image",
     )
     stereo_baseline_sigma: float = setting(
         0.005,
-        "standard deviation of the baseline's length, over it, as calibrations leave it; it is part of the covariances",
+        "standard deviation of the baseline's length, over it, as calibrations leave it; it is "
+        "part of the covariances",
         at_least=0,
     )
     stereo_focal_sigma: float = setting(
-        0.003, "the same of the focal length; the principal point is taken for three times as well known", at_least=0
+        0.003,
+        "the same of the focal length; the principal point is taken for three times as well known",
+        at_least=0,
     )
     calibrate_scale: Literal["off", "on"] = setting(
         "off",
-        "estimate baseline and focal length with these standard deviations at the start, with IMU or velocities only, "
+        "estimate baseline and focal length with these standard deviations at the start, with IMU "
+        "or velocities only, "
         "on whose scale the result depends; off: they are considered, and not corrected",
     )
     extrinsic_rotation_sigma_deg: float = setting(
-        0.5, "calibrate_camera_imu: initial standard deviation of T_cam0_imu's rotation", unit="deg", at_least=0
+        0.5,
+        "calibrate_camera_imu: initial standard deviation of T_cam0_imu's rotation",
+        unit="deg",
+        at_least=0,
     )
     extrinsic_translation_sigma_m: float = setting(
-        0.01, "calibrate_camera_imu: initial standard deviation of T_cam0_imu's translation", unit="m", at_least=0
+        0.01,
+        "calibrate_camera_imu: initial standard deviation of T_cam0_imu's translation",
+        unit="m",
+        at_least=0,
     )
     time_offset_sigma_s: float = setting(
-        5.0e-3, "calibrate_camera_imu: initial standard deviation of the time offset", unit="s", at_least=0
+        5.0e-3,
+        "calibrate_camera_imu: initial standard deviation of the time offset",
+        unit="s",
+        at_least=0,
     )

@@ -1,12 +1,15 @@
-"""What a stereo calibration got wrong, as states of the filter and as a field of rows learned beside it.
+"""What a stereo calibration got wrong, as states of the filter and as a field of rows learned
+beside it.
 
-A right camera that is turned, shifted or distorted against its calibration moves the right pixels by a smooth field.
-Its rows show in `vl - vr` at once. Its columns look like depth: only motion, which gives the same points a second
-depth, separates them. Equations (R1) to (R3) of docs/math.md: rows give three terms of the columns; four others are
-states, and so are four terms of distortion that both lenses have in common. With a metric sensor, so are the length of
-the baseline and the focal length, equation (R4).
-References: Dang, Hoffmann & Stiller, Continuous stereo self-calibration by camera parameter tracking, IEEE TIP (2009);
-Cvisic, Markovic & Petrovic, Recalibrating the KITTI dataset camera setup for improved odometry accuracy, ECMR (2021).
+A right camera that is turned, shifted or distorted against its calibration moves the right pixels
+by a smooth field. Its rows show in `vl - vr` at once. Its columns look like depth: only motion,
+which gives the same points a second depth, separates them. Equations (R1) to (R3) of docs/math.md:
+rows give three terms of the columns; four others are states, and so are four terms of distortion
+that both lenses have in common. With a metric sensor, so are the length of the baseline and the
+focal length, equation (R4).
+References: Dang, Hoffmann & Stiller, Continuous stereo self-calibration by camera parameter
+tracking, IEEE TIP (2009); Cvisic, Markovic & Petrovic, Recalibrating the KITTI dataset camera setup
+for improved odometry accuracy, ECMR (2021).
 """
 
 from __future__ import annotations
@@ -28,24 +31,29 @@ from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS, BoolArray, IntArray
 
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
-_ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the first frame, over the noise of a row
+# standard deviation of the rows' coefficients before the first frame, over the noise of a row
+_ROW_PRIOR_PX = 10.0
 _ROW_PRIOR: FloatArray = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
 
 
 class VerticalDisparityModel:
-    """Learns how far right rows are off over the image, equation (R2), from the matches of all frames."""
+    """Learns how far right rows are off over the image, equation (R2), from the matches of all
+    frames.
+    """
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
         self._A: FloatArray = _ROW_PRIOR.copy()
         self._b: FloatArray = np.zeros(ROW_TERMS)
-        self._inverse: FloatArray = np.asarray(np.linalg.inv(2 * _ROW_PRIOR), dtype=np.float64)  # of A with the prior
+        # of A with the prior
+        self._inverse: FloatArray = np.asarray(np.linalg.inv(2 * _ROW_PRIOR), dtype=np.float64)
         # Right sides if the rows were those of k1, k2, q1, q2 alone.
         self._common: FloatArray = np.zeros((ROW_TERMS, FIELD_TERMS - RIGHT_TERMS))
         self._squares = self._count = 0.0  # of the rows' residuals, in the same memory
         self._matches = 0  # of the last frame
         self.rms_px = 0.0  # of the field over the matches
-        self.coefficients: FloatArray = np.zeros(ROW_TERMS)  # of 1, x, y, x y, x^2, y^2, d, in focal lengths
+        # of 1, x, y, x y, x^2, y^2, d, in focal lengths
+        self.coefficients: FloatArray = np.zeros(ROW_TERMS)
 
     def update(self, seen: Observations) -> None:
         """Take in the rows of a frame's matches, with Cauchy weights against mismatches."""
@@ -63,35 +71,45 @@ class VerticalDisparityModel:
         solve_positive(self._A + (1 - _ROW_MEMORY) * _ROW_PRIOR, solution)
         self._inverse = np.empty(self._A.shape)
         invert_positive(self._A + _ROW_PRIOR, self._inverse)
-        self.coefficients, self._matches = solution / camera.fv, len(z)
+        self.coefficients = solution / camera.fv
+        self._matches = len(z)
         misfits, weights, squares = loops.fitted_rows(basis, rows, weight, solution)
         self._squares = _ROW_MEMORY * self._squares + misfits
         self._count = _ROW_MEMORY * self._count + weights
         self.rms_px = math.sqrt(squares / len(z))
 
     def without_common(self, stereo: FloatArray) -> FloatArray:
-        """Return the coefficients (7,) without what the distortion of both lenses, in (8,) of (R3), does to rows.
+        """Return the coefficients (7,) without what the distortion of both lenses, in (8,) of (R3),
+        does to rows.
 
         Both lenses bend a near point differently, as it lies at different places in the two images.
         """
-        return np.asarray(self.coefficients - self._inverse @ (self._common @ stereo[RIGHT_TERMS:FIELD_TERMS]))
+        return np.asarray(
+            self.coefficients - self._inverse @ (self._common @ stereo[RIGHT_TERMS:FIELD_TERMS])
+        )
 
     @property
     def rows_D_common(self) -> FloatArray:
-        """What k1, k2, q1 and q2 of (R3) add to the coefficients (7, 4) of the rows of the features seen."""
+        """What k1, k2, q1 and q2 of (R3) add to the coefficients (7, 4) of the rows of the
+        features seen.
+        """
         return np.asarray(self._inverse @ self._common, dtype=np.float64)
 
     @property
     def covariance(self) -> FloatArray:
         """Covariance (7, 7) of the coefficients, in squared focal lengths."""
-        # Rows of one feature share their error from frame to frame, so only the features of one frame count as many.
+        # Rows of one feature share their error from frame to frame, so only the features of one
+        # frame count as many.
         shared = max(self._count / max(self._matches, 1), 1.0)
         noise = self._squares / max(self._count, 1.0) if self._count else 1.0
         return np.asarray(noise * shared / self._camera.fv**2 * self._inverse, dtype=np.float64)
 
     @property
     def offset_px(self) -> float | None:
-        """Root mean square of the field over the last matches, less what noise alone makes; None before the first."""
+        """Root mean square of the field over the last matches, less what noise alone makes.
+
+        None before the first.
+        """
         if not self._matches:
             return None
         # The features of one frame count, as in the covariance.
@@ -104,10 +122,12 @@ class StereoCorrection:
     """The field at the present estimate: what is taken out of the pixels."""
 
     camera: StereoCamera
-    rows: FloatArray  # (7,) of (R2) that are the right camera's own, in focal lengths; zero where they show no fault
+    # (7,) of (R2) that are the right camera's own, in focal lengths; zero where they show no fault
+    rows: FloatArray
     coefficients: FloatArray  # (10,) of (R3) and (R4)
     terms: IntArray  # (S,) which of them are estimated
-    # (7, 4) what k1, k2, q1, q2 have taken off `rows`, which were learned with them; (7, 0): nothing
+    # (7, 4) what k1, k2, q1, q2 have taken off `rows`, which were learned with them; (7, 0):
+    # nothing
     rows_D_common: FloatArray = field(default_factory=lambda: np.zeros((ROW_TERMS, 0)))
 
     def columns(self, considered: int = 0) -> ErrorColumns:
@@ -115,10 +135,15 @@ class StereoCorrection:
 
         The four are baseline, focal length, principal point.
         """
-        return ErrorColumns(self.camera, _with_considered(tuple(self.terms.tolist()), considered), self.rows_D_common)
+        return ErrorColumns(
+            self.camera,
+            _with_considered(tuple(self.terms.tolist()), considered),
+            self.rows_D_common,
+        )
 
     def depth_sigma(self, p_cam: FloatArray, P: FloatArray) -> FloatArray:
-        """Standard deviations (M,) of stereo depths, over them, by errors of the coefficients of covariance P (S, S).
+        """Standard deviations (M,) of stereo depths, over them, by errors of the coefficients of
+        covariance P (S, S).
 
         Args:
             p_cam: points in the left camera (M, 3).
@@ -127,7 +152,9 @@ class StereoCorrection:
         z = project(self.camera, p_cam)
         J = self.columns().jacobian(z)
         by_terms = J[:, 0] - J[:, 2]
-        out: FloatArray = np.sqrt(np.einsum("ms,st,mt->m", by_terms, P, by_terms)) / (z[:, 0] - z[:, 2])
+        out: FloatArray = np.sqrt(np.einsum("ms,st,mt->m", by_terms, P, by_terms)) / (
+            z[:, 0] - z[:, 2]
+        )
         return out
 
     def corrected(self, views: Views) -> Views:
@@ -136,9 +163,12 @@ class StereoCorrection:
         return Views(out, views.weight)
 
     def seen(self, z: FloatArray) -> FloatArray:
-        """Pixels (M, 4) that the cameras show where the calibration expects z (M, 4): with (R4), without (R3)."""
+        """Pixels (M, 4) that the cameras show where the calibration expects z (M, 4): with (R4),
+        without (R3).
+        """
         baseline, focal = self.coefficients[FIELD_TERMS:]
-        centre, out = np.array([self.camera.cu, self.camera.cv]), z.copy()
+        centre = np.array([self.camera.cu, self.camera.cv])
+        out = z.copy()
         out[:, :2] = centre + (z[:, :2] - centre) * np.exp(focal)
         out[:, 2] = out[:, 0] - (z[:, 0] - z[:, 2]) * np.exp(focal + baseline)
         out[:, 3] = out[:, 1]
@@ -152,40 +182,56 @@ def _with_considered(terms: tuple[int, ...], considered: int) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class StereoColumns:
-    """The part of F tracks' normal equations that concerns the field's S coefficients: `r = J (B xi_i + dp) + H s`."""
+    """The part of F tracks' normal equations that concerns the field's S coefficients:
+    `r = J (B xi_i + dp) + H s`.
+    """
 
     wanted: ErrorColumns  # columns of H
     at: Residuals  # and Jacobians of the tracks in N clones
     z: FloatArray  # (F, N, 4) pixels at which H is taken
     weight: FloatArray  # (F, N) robust weights
-    G: FloatArray  # (F, S, 3) cross information of coefficients and point, of tracks whose points were eliminated
+    # (F, S, 3) cross information of coefficients and point, of tracks whose points were eliminated
+    G: FloatArray
 
     def point_D_stereo(self, info: TrackInformation, chosen: IntArray) -> FloatArray:
-        """How the estimated points of tracks (K,) follow errors of the coefficients (K, 3, S), world: `-C^-1 G`."""
+        """How the estimated points of tracks (K,) follow errors of the coefficients (K, 3, S),
+        world: `-C^-1 G`.
+        """
         out: FloatArray = np.empty((len(chosen), 3, self.G.shape[1]))
         loops.points_by_others(chosen, info.C, info.q.p_D_q, self.G, out)
         return out
 
 
-def stereo_columns(wanted: ErrorColumns, at: Residuals, z: FloatArray, weight: FloatArray) -> StereoColumns:
-    """Return the columns of tracks, see `StereoColumns`, before `eliminate_points` has collected them."""
+def stereo_columns(
+    wanted: ErrorColumns, at: Residuals, z: FloatArray, weight: FloatArray
+) -> StereoColumns:
+    """Return the columns of tracks, see `StereoColumns`, before `eliminate_points` has collected
+    them.
+    """
     return StereoColumns(wanted, at, z, weight, np.zeros((len(weight), len(wanted.chosen), 3)))
 
 
 def eliminate_points(
     info: TrackInformation, chosen: BoolArray, columns: StereoColumns | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Information matrix (6N + S, 6N + S) and vector about clones and coefficients of the chosen tracks, (M4).
+    """Information matrix (6N + S, 6N + S) and vector about clones and coefficients of the chosen
+    tracks, (M4).
 
-    `sum_f M_f - G_f C_f^-1 G_f'`: exact elimination of each point. Without columns, S is zero; those given learn the
-    cross information of the chosen tracks.
+    `sum_f M_f - G_f C_f^-1 G_f'`: exact elimination of each point. Without columns, S is zero;
+    those given learn the cross information of the chosen tracks.
     """
-    rows, size = np.flatnonzero(chosen), info.G.shape[1]
+    rows = np.flatnonzero(chosen)
+    size = info.G.shape[1]
     D = size if columns is None else size + len(columns.wanted.chosen)
-    V, A, b = np.empty((3 * len(rows), D)), np.zeros((D, D)), np.zeros(D)
-    loops.eliminate_tracks(rows, info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient, V, A, b)
+    V = np.empty((3 * len(rows), D))
+    A = np.zeros((D, D))
+    b = np.zeros(D)
+    loops.eliminate_tracks(
+        rows, info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient, V, A, b
+    )
     if columns is not None:
-        wanted, at = columns.wanted, columns.at
+        wanted = columns.wanted
+        at = columns.at
         of_views = columns.z, at.r, at.z_D_p, at.weight, columns.weight
         points = info.q.p_D_q, info.C, info.q_D_clone, info.point_gradient
         of_terms = camera_args(wanted.camera), wanted.chosen, wanted.rows_D_common

@@ -1,7 +1,8 @@
 """The compiled loops over tracks and their views behind `multiview` and `stereo_calibration`.
 
-Shapes: F tracks, N clones, S coefficients of the rectification error. `camera` is that of `camera_args`. Each loop
-writes into the arrays that come last. `tests/numpy_twins.py` holds the same in NumPy.
+Shapes: F tracks, N clones, S coefficients of the rectification error. `camera` is that of
+`camera_args`. Each loop writes into the arrays that come last. `tests/numpy_twins.py` holds the
+same in NumPy.
 """
 
 from __future__ import annotations
@@ -17,9 +18,12 @@ from vio.records import BoolArray, IntArray, SigmaArray
 
 @compiled
 def _turned_rows(T: FloatArray, s: float, c: float, row1: FloatArray, row2: FloatArray) -> None:
-    """Write the y and z axes (3,) of a camera (4, 4) turned about its baseline by an angle of this sine and cosine."""
+    """Write the y and z axes (3,) of a camera (4, 4) turned about its baseline by an angle of
+    this sine and cosine.
+    """
     for j in range(3):
-        row1[j], row2[j] = c * T[1, j] - s * T[2, j], s * T[1, j] + c * T[2, j]
+        row1[j] = c * T[1, j] - s * T[2, j]
+        row2[j] = s * T[1, j] + c * T[2, j]
 
 
 @compiled
@@ -34,9 +38,12 @@ def compare_views(
     J: FloatArray,
     ahead: BoolArray,
 ) -> None:
-    """Write residuals (F, N, 4), Jacobians (F, N, 4, 3) by the points (F, 3), and which points are ahead (F,): (M1)."""
+    """Write residuals (F, N, 4), Jacobians (F, N, 4, 3) by the points (F, 3), and which points
+    are ahead (F,): (M1).
+    """
     fu, fv, cu, cv, baseline, _ = camera
-    row1, row2 = np.empty(3), np.empty(3)
+    row1 = np.empty(3)
+    row2 = np.empty(3)
     for f in range(len(p)):
         ahead[f] = True
         for n in range(len(T)):
@@ -55,9 +62,13 @@ def compare_views(
                         J[f, n, a, j] = 0.0
                 continue
             _turned_rows(T[n], s, c, row1, row2)
-            u, v, d, row = fu * x / depth, fv * y / depth, fu * baseline / depth, fv * azimuth
+            u = fu * x / depth
+            v = fv * y / depth
+            d = fu * baseline / depth
+            row = fv * azimuth
             for a in range(4):
-                w, of_row = weight[f, n, a], a == 1 or a == 3
+                w = weight[f, n, a]
+                of_row = a == 1 or a == 3
                 pixel = v if of_row else u - d if a == 2 else u
                 seen_at = pixel + row if of_row else pixel
                 r[f, n, a] = (z[f, n, a] - seen_at - (cv if of_row else cu)) * w if w > 0.0 else 0.0
@@ -82,8 +93,11 @@ def _mark_views(J: FloatArray, out: BoolArray) -> None:
 
 @compiled
 def _square_view(r: FloatArray, J: FloatArray) -> tuple[float, int]:
-    """Squared residual of a view, of (4,) and (4, 3), and how many of its pixel coordinates were measured."""
-    squares, count = 0.0, 0
+    """Squared residual of a view, of (4,) and (4, 3), and how many of its pixel coordinates were
+    measured.
+    """
+    squares = 0.0
+    count = 0
     for a in range(4):
         squares += r[a] ** 2
         count += J[a, 0] != 0.0 or J[a, 1] != 0.0 or J[a, 2] != 0.0
@@ -92,7 +106,9 @@ def _square_view(r: FloatArray, J: FloatArray) -> tuple[float, int]:
 
 @compiled
 def square_views(r: FloatArray, J: FloatArray, squares: FloatArray, count: IntArray) -> None:
-    """Write squared residuals (F, N) of views, and how many of their pixel coordinates were measured."""
+    """Write squared residuals (F, N) of views, and how many of their pixel coordinates were
+    measured.
+    """
     for f in range(J.shape[0]):
         for n in range(J.shape[1]):
             squares[f, n], count[f, n] = _square_view(r[f, n], J[f, n])
@@ -100,9 +116,15 @@ def square_views(r: FloatArray, J: FloatArray, squares: FloatArray, count: IntAr
 
 @compiled
 def mark_wrong_views(
-    r: FloatArray, J: FloatArray, variance: float, limits: FloatArray, wrong: BoolArray, enough: BoolArray
+    r: FloatArray,
+    J: FloatArray,
+    variance: float,
+    limits: FloatArray,
+    wrong: BoolArray,
+    enough: BoolArray,
 ) -> bool:
-    """Write which views (F, N) exceed the limit of their number of pixels, and which tracks (F,) have two others.
+    """Write which views (F, N) exceed the limit of their number of pixels, and which tracks (F,)
+    have two others.
 
     Returns:
         Whether there is any such view.
@@ -120,13 +142,19 @@ def mark_wrong_views(
 
 
 @compiled
-def square_tracks(r: FloatArray, J: FloatArray, variance: float, most: int, squares: FloatArray, dof: IntArray) -> None:
-    """Write squared residuals (F,) of tracks over the variance, and their degrees of freedom (F,), 1 to `most`."""
+def square_tracks(
+    r: FloatArray, J: FloatArray, variance: float, most: int, squares: FloatArray, dof: IntArray
+) -> None:
+    """Write squared residuals (F,) of tracks over the variance, and their degrees of freedom
+    (F,), 1 to `most`.
+    """
     for f in range(J.shape[0]):
-        squares[f], count = 0.0, -3
+        squares[f] = 0.0
+        count = -3
         for n in range(J.shape[1]):
             of_view, measured = _square_view(r[f, n], J[f, n])
-            squares[f], count = squares[f] + of_view, count + measured
+            squares[f] = squares[f] + of_view
+            count = count + measured
         squares[f] /= variance
         dof[f] = min(max(count, 1), most)
 
@@ -145,8 +173,10 @@ def anchor_points(
     q_D_p: FloatArray,
 ) -> None:
     """Write the coordinates (M5) of points (F, 3): the columns of `InverseDepth`."""
-    fu, baseline = camera[0], camera[4]
-    row1, row2 = np.empty(3), np.empty(3)
+    fu = camera[0]
+    baseline = camera[4]
+    row1 = np.empty(3)
+    row2 = np.empty(3)
     for f in range(len(p)):
         k = 0
         for n in range(len(T) - 1, -1, -1):
@@ -154,7 +184,9 @@ def anchor_points(
                 k = n
         anchor[f] = k
         for i in range(3):
-            centre[f, i] = -(T[k, 0, i] * T[k, 0, 3] + T[k, 1, i] * T[k, 1, 3] + T[k, 2, i] * T[k, 2, 3])
+            centre[f, i] = -(
+                T[k, 0, i] * T[k, 0, 3] + T[k, 1, i] * T[k, 1, 3] + T[k, 2, i] * T[k, 2, 3]
+            )
         x = T[k, 0, 0] * p[f, 0] + T[k, 0, 1] * p[f, 1] + T[k, 0, 2] * p[f, 2] + T[k, 0, 3]
         y = T[k, 1, 0] * p[f, 0] + T[k, 1, 1] * p[f, 1] + T[k, 1, 2] * p[f, 2] + T[k, 1, 3]
         z = T[k, 2, 0] * p[f, 0] + T[k, 2, 1] * p[f, 1] + T[k, 2, 2] * p[f, 2] + T[k, 2, 3]
@@ -173,7 +205,9 @@ def anchor_points(
 
 @compiled
 def find_rows(ids: IntArray, increasing: IntArray, ordered: IntArray, rows: IntArray) -> int:
-    """Write the rows (K,) of ids (K,), -1 where unknown, and return how many are; ids (F,) are those of rows (F,)."""
+    """Write the rows (K,) of ids (K,), -1 where unknown, and return how many are; ids (F,) are
+    those of rows (F,).
+    """
     unknown = 0
     for k in range(len(ids)):
         at = index_of(ids[k], increasing)
@@ -184,12 +218,18 @@ def find_rows(ids: IntArray, increasing: IntArray, ordered: IntArray, rows: IntA
 
 @compiled
 def write_column(
-    rows: IntArray, column: int, z: FloatArray, weight: FloatArray, table_z: FloatArray, table_weight: FloatArray
+    rows: IntArray,
+    column: int,
+    z: FloatArray,
+    weight: FloatArray,
+    table_z: FloatArray,
+    table_weight: FloatArray,
 ) -> None:
     """Write pixels and weights (K, 4) into a column of the rows (K,) of tables (R, N, 4)."""
     for k in range(len(rows)):
         for a in range(4):
-            table_z[rows[k], column, a], table_weight[rows[k], column, a] = z[k, a], weight[k, a]
+            table_z[rows[k], column, a] = z[k, a]
+            table_weight[rows[k], column, a] = weight[k, a]
 
 
 @compiled
@@ -204,22 +244,32 @@ def count_views(rows: IntArray, weight: FloatArray, seen: BoolArray, length: Int
 
 @compiled
 def shift_columns(rows: IntArray, z: FloatArray, weight: FloatArray) -> None:
-    """Move rows of tables (R, N, 4) one column towards the first, which is lost; nothing was seen in the last one."""
+    """Move rows of tables (R, N, 4) one column towards the first, which is lost; nothing was
+    seen in the last one.
+    """
     last = z.shape[1] - 1
     for f in rows:
         for n in range(last):
             for a in range(4):
-                z[f, n, a], weight[f, n, a] = z[f, n + 1, a], weight[f, n + 1, a]
+                z[f, n, a] = z[f, n + 1, a]
+                weight[f, n, a] = weight[f, n + 1, a]
         for a in range(4):
             weight[f, last, a] = 0.0
 
 
 @compiled
 def middle(values: FloatArray) -> float:
-    """Median of one or more values (n,), which are reordered. Reference: Hoare, Algorithm 65: Find, CACM (1961)."""
-    k, low, high = len(values) // 2, 0, len(values) - 1
+    """Median of one or more values (n,), which are reordered.
+
+    Reference: Hoare, Algorithm 65: Find, CACM (1961).
+    """
+    k = len(values) // 2
+    low = 0
+    high = len(values) - 1
     while low < high:
-        pivot, i, j = values[k], low, high
+        pivot = values[k]
+        i = low
+        j = high
         while i <= j:
             while values[i] < pivot:
                 i += 1
@@ -227,7 +277,8 @@ def middle(values: FloatArray) -> float:
                 j -= 1
             if i <= j:
                 values[i], values[j] = values[j], values[i]
-                i, j = i + 1, j - 1
+                i = i + 1
+                j = j - 1
         if j < k:
             low = i
         if k < i:
@@ -242,8 +293,11 @@ def middle(values: FloatArray) -> float:
 
 @compiled
 def weigh_by_sigma(sigma: SigmaArray, least: float, most: float, weight: FloatArray) -> None:
-    """Multiply weights (N, 4), where above zero, by the median standard deviation over the pixel's own (N, 3)."""
-    values, count = np.empty(3 * len(sigma)), 0
+    """Multiply weights (N, 4), where above zero, by the median standard deviation over the
+    pixel's own (N, 3).
+    """
+    values = np.empty(3 * len(sigma))
+    count = 0
     for n in range(len(sigma)):
         for a in range(3):
             if weight[n, a] > 0.0 and sigma[n, a] > 0.0 and np.isfinite(sigma[n, a]):
@@ -255,14 +309,20 @@ def weigh_by_sigma(sigma: SigmaArray, least: float, most: float, weight: FloatAr
     for n in range(len(sigma)):
         for a in range(3):
             if weight[n, a] > 0.0 and sigma[n, a] > 0.0:
-                relative = np.float32(centre) / sigma[n, a]  # of float32, as the standard deviations are
+                # of float32, as the standard deviations are
+                relative = np.float32(centre) / sigma[n, a]
                 weight[n, a] *= min(max(relative, np.float32(least)), np.float32(most))
 
 
 @compiled
 def newest_residual(r: FloatArray, J: FloatArray) -> float | None:
-    """Return the median absolute residual of the newest clone's pixels, of (F, N, 4); None: there are none."""
-    values, count, n = np.empty(4 * len(r)), 0, r.shape[1] - 1
+    """Return the median absolute residual of the newest clone's pixels, of (F, N, 4).
+
+    None: there are none.
+    """
+    values = np.empty(4 * len(r))
+    count = 0
+    n = r.shape[1] - 1
     for f in range(len(r)):
         for a in range(4):
             if J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0:
@@ -275,7 +335,9 @@ def newest_residual(r: FloatArray, J: FloatArray) -> float | None:
 
 @compiled
 def weigh_rows(residual: FloatArray, cauchy: float, weight: FloatArray) -> None:
-    """Write Cauchy weights (M,) of residuals (M,) from their median, in standard deviations by its absolute values."""
+    """Write Cauchy weights (M,) of residuals (M,) from their median, in standard deviations by
+    its absolute values.
+    """
     values = residual.copy()
     centre = middle(values)
     for m in range(len(residual)):
@@ -296,7 +358,9 @@ def add_rows(
     b: FloatArray,
     C: FloatArray,
 ) -> None:
-    """Add normal equations of rows (M,) in terms (M, 7), and what others (M, 4) do to them, to those remembered."""
+    """Add normal equations of rows (M,) in terms (M, 7), and what others (M, 4) do to them, to
+    those remembered.
+    """
     for i in range(len(b)):
         b[i] *= memory
         for j in range(len(b)):
@@ -317,8 +381,12 @@ def add_rows(
 def fitted_rows(
     basis: FloatArray, rows: FloatArray, weight: FloatArray, solution: FloatArray
 ) -> tuple[float, float, float]:
-    """Return the weighted squares of what a solution (7,) leaves of rows (M,), the sum of weights, and its squares."""
-    misfits, weights, squares = 0.0, 0.0, 0.0
+    """Return the weighted squares of what a solution (7,) leaves of rows (M,), the sum of
+    weights, and its squares.
+    """
+    misfits = 0.0
+    weights = 0.0
+    squares = 0.0
     for m in range(len(rows)):
         fitted = 0.0
         for i in range(len(solution)):
@@ -339,10 +407,16 @@ def _first_view(weight: FloatArray, f: int) -> int:
 
 
 @compiled
-def _put_on_ray(camera: CameraArgs, T: FloatArray, u: float, v: float, disparity: float, p: FloatArray) -> None:
-    """Write the point (3,) in the world that a camera (4, 4) sees at a left pixel, at a disparity."""
+def _put_on_ray(
+    camera: CameraArgs, T: FloatArray, u: float, v: float, disparity: float, p: FloatArray
+) -> None:
+    """Write the point (3,) in the world that a camera (4, 4) sees at a left pixel, at a
+    disparity.
+    """
     x, y, z = point_at(camera, u, v, camera[0] * camera[4] / disparity)
-    x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
+    x = x - T[0, 3]
+    y = y - T[1, 3]
+    z = z - T[2, 3]
     for i in range(3):
         p[i] = T[0, i] * x + T[1, i] * y + T[2, i] * z
 
@@ -359,17 +433,21 @@ def start_by_stereo(
 ) -> None:
     """Write points (F, 3) at the stereo view of largest disparity, and which tracks (F,) have one.
 
-    The newest clone's view counts only where it is the only one. Disparities are kept between two values.
+    The newest clone's view counts only where it is the only one. Disparities are kept between two
+    values.
     """
     last = len(T) - 1
     for f in range(len(p)):
-        best, largest = -1, -np.inf
+        best = -1
+        largest = -np.inf
         for n in range(last):
             disparity = z[f, n, 0] - z[f, n, 2]
             if weight[f, n, 2] > 0.0 and disparity > largest:
-                best, largest = n, disparity
+                best = n
+                largest = disparity
         if best < 0 and weight[f, last, 2] > 0.0:
-            best, largest = last, z[f, last, 0] - z[f, last, 2]
+            best = last
+            largest = z[f, last, 0] - z[f, last, 2]
         known[f] = best >= 0
         if best >= 0:
             disparity = min(max(largest, disparities[0]), disparities[1])
@@ -386,20 +464,26 @@ def start_by_parallax(
     weight: FloatArray,
     p: FloatArray,
 ) -> None:
-    """Write points (F, 3) on the ray of each track's first left view, at the inverse depth that fits its others best.
+    """Write points (F, 3) on the ray of each track's first left view, at the inverse depth that
+    fits its others best.
 
-    With m that ray, and c its camera seen from camera i, view i shows `(m_i + rho c_i)`, up to scale; times its third
-    component this is linear in the inverse depth rho. A cylinder's rays may have no third component: there their cross
-    product with it is zero, which is linear as well. Disparities are kept between two values.
+    With m that ray, and c its camera seen from camera i, view i shows `(m_i + rho c_i)`, up to
+    scale; times its third component this is linear in the inverse depth rho. A cylinder's rays may
+    have no third component: there their cross product with it is zero, which is linear as well.
+    Disparities are kept between two values.
     """
-    m, c, m_i, c_i = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    m = np.empty(3)
+    c = np.empty(3)
+    m_i = np.empty(3)
+    c_i = np.empty(3)
     for f in range(len(p)):
         k = _first_view(weight, f)
         x, y, w = point_at(camera, z[f, k, 0], z[f, k, 1], 1.0)
         for i in range(3):
             m[i] = T[k, 0, i] * x + T[k, 1, i] * y + T[k, 2, i] * w
             c[i] = -(T[k, 0, i] * T[k, 0, 3] + T[k, 1, i] * T[k, 1, 3] + T[k, 2, i] * T[k, 2, 3])
-        along, squared = 0.0, tiny
+        along = 0.0
+        squared = tiny
         for n in range(len(T)):
             if not weight[f, n, 0] > 0.0:
                 continue
@@ -407,13 +491,19 @@ def start_by_parallax(
                 m_i[i] = T[n, i, 0] * m[0] + T[n, i, 1] * m[1] + T[n, i, 2] * m[2]
                 c_i[i] = T[n, i, 0] * c[0] + T[n, i, 1] * c[1] + T[n, i, 2] * c[2] + T[n, i, 3]
             x, y, w = point_at(camera, z[f, n, 0], z[f, n, 1], 1.0)
-            a0, a1, a2 = w * c_i[0] - x * c_i[2], w * c_i[1] - y * c_i[2], x * c_i[1] - y * c_i[0]
-            b0, b1, b2 = w * m_i[0] - x * m_i[2], w * m_i[1] - y * m_i[2], x * m_i[1] - y * m_i[0]
+            a0 = w * c_i[0] - x * c_i[2]
+            a1 = w * c_i[1] - y * c_i[2]
+            a2 = x * c_i[1] - y * c_i[0]
+            b0 = w * m_i[0] - x * m_i[2]
+            b1 = w * m_i[1] - y * m_i[2]
+            b2 = x * m_i[1] - y * m_i[0]
             if not camera[5]:
                 a2 = b2 = 0.0
             along -= a0 * b0 + a1 * b1 + a2 * b2
             squared += a0 * a0 + a1 * a1 + a2 * a2
-        disparity = min(max(along / squared * camera[0] * camera[4], disparities[0]), disparities[1])
+        disparity = min(
+            max(along / squared * camera[0] * camera[4], disparities[0]), disparities[1]
+        )
         _put_on_ray(camera, T[k], z[f, k, 0], z[f, k, 1], disparity, p[f])
 
 
@@ -427,7 +517,9 @@ def put_ahead(
     weight: FloatArray,
     p: FloatArray,
 ) -> None:
-    """Put points (F, 3) that are behind the first camera that saw them far away on its ray, in place."""
+    """Put points (F, 3) that are behind the first camera that saw them far away on its ray, in
+    place.
+    """
     for f in range(len(p)):
         k = _first_view(weight, f)
         y = T[k, 1, 0] * p[f, 0] + T[k, 1, 1] * p[f, 1] + T[k, 1, 2] * p[f, 2] + T[k, 1, 3]
@@ -439,16 +531,27 @@ def put_ahead(
 
 @compiled
 def step_points(
-    r: FloatArray, J: FloatArray, p_D_q: FloatArray, scale2: float, tiny: float, prior: float, dq: FloatArray
+    r: FloatArray,
+    J: FloatArray,
+    p_D_q: FloatArray,
+    scale2: float,
+    tiny: float,
+    prior: float,
+    dq: FloatArray,
 ) -> None:
-    """Write a Gauss-Newton step (F, 3) of each point in the coordinates (M5), with Cauchy weights of a scale."""
-    C, row = np.empty((3, 3)), np.empty(3)
+    """Write a Gauss-Newton step (F, 3) of each point in the coordinates (M5), with Cauchy
+    weights of a scale.
+    """
+    C = np.empty((3, 3))
+    row = np.empty(3)
     for f in range(len(r)):
         for i in range(3):
             dq[f, i] = 0.0
             for j in range(3):
                 C[i, j] = 0.0
-        C[0, 0], C[1, 1], C[2, 2] = tiny, tiny, prior
+        C[0, 0] = tiny
+        C[1, 1] = tiny
+        C[2, 2] = prior
         for n in range(r.shape[1]):
             if not _is_measured(J, f, n):
                 continue
@@ -459,7 +562,9 @@ def step_points(
                     continue
                 for i in range(3):
                     row[i] = (
-                        J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
+                        J[f, n, a, 0] * p_D_q[f, 0, i]
+                        + J[f, n, a, 1] * p_D_q[f, 1, i]
+                        + J[f, n, a, 2] * p_D_q[f, 2, i]
                     )
                 for i in range(3):
                     dq[f, i] += w * row[i] * r[f, n, a]
@@ -479,14 +584,22 @@ def _most_disparity(
     disparity: float,
     p: FloatArray,
 ) -> float:
-    """Disparity beyond which a point (3,) would come nearer to one of its cameras than the least depth."""
-    if camera[5]:  # of a cylinder, a point that comes too near to another camera than its anchor is dropped afterwards
+    """Disparity beyond which a point (3,) would come nearer to one of its cameras than the least
+    depth.
+    """
+    # of a cylinder, a point that comes too near to another camera than its anchor is dropped
+    # afterwards
+    if camera[5]:
         return camera[0] * camera[4] / least
     most = np.inf
     for n in range(len(T)):
         if weight[f, n, 0] > 0.0:
-            a, b, c = T[n, 2, 0], T[n, 2, 1], T[n, 2, 2]
-            ray = (a * (p[0] - centre[0]) + b * (p[1] - centre[1]) + c * (p[2] - centre[2])) * disparity
+            a = T[n, 2, 0]
+            b = T[n, 2, 1]
+            c = T[n, 2, 2]
+            ray = (
+                a * (p[0] - centre[0]) + b * (p[1] - centre[1]) + c * (p[2] - centre[2])
+            ) * disparity
             room = least - (a * centre[0] + b * centre[1] + c * centre[2] + T[n, 2, 3])
             if room > 0.0 and ray > 0.0:
                 most = min(most, ray / room)
@@ -495,9 +608,17 @@ def _most_disparity(
 
 @compiled
 def _move(
-    centre: FloatArray, p_D_q: FloatArray, disparity: float, dq: FloatArray, least: float, most: float, p: FloatArray
+    centre: FloatArray,
+    p_D_q: FloatArray,
+    disparity: float,
+    dq: FloatArray,
+    least: float,
+    most: float,
+    p: FloatArray,
 ) -> None:
-    """Write the point (3,) after a step (3,) in the coordinates (M5); its disparity stays between two values."""
+    """Write the point (3,) after a step (3,) in the coordinates (M5); its disparity stays
+    between two values.
+    """
     moved = max(min(disparity + dq[2], most), least)
     for i in range(3):
         ray = p_D_q[i, 0] * dq[0] + p_D_q[i, 1] * dq[1] - p_D_q[i, 2] * disparity
@@ -517,9 +638,13 @@ def step_inverse_depths(
     dq: FloatArray,
     p: FloatArray,
 ) -> None:
-    """Move points (F, 3) by steps (F, 3) in the coordinates (M5), to what is ahead of all cameras that saw them."""
+    """Move points (F, 3) by steps (F, 3) in the coordinates (M5), to what is ahead of all
+    cameras that saw them.
+    """
     for f in range(len(p)):
-        most = _most_disparity(camera, 1.01 * least_depth, T, weight, f, centre[f], disparity[f], p[f])
+        most = _most_disparity(
+            camera, 1.01 * least_depth, T, weight, f, centre[f], disparity[f], p[f]
+        )
         _move(centre[f], p_D_q[f], disparity[f], dq[f], least_disparity, most, p[f])
 
 
@@ -537,18 +662,29 @@ def refine(
     prior: float,
     p: FloatArray,
 ) -> None:
-    """Move points (F, 3) by Gauss-Newton steps in the coordinates (M5), each after what is behind was put ahead."""
+    """Move points (F, 3) by Gauss-Newton steps in the coordinates (M5), each after what is
+    behind was put ahead.
+    """
     F, N = weight.shape[:2]
-    r, J, ahead = np.empty((F, N, 4)), np.empty((F, N, 4, 3)), np.empty(F, np.bool_)
-    seen, anchor, centre, disparity = np.empty((F, N), np.bool_), np.empty(F, np.int64), np.empty((F, 3)), np.empty(F)
-    p_D_q, q_D_p, dq = np.empty((F, 3, 3)), np.empty((F, 3, 3)), np.empty((F, 3))
+    r = np.empty((F, N, 4))
+    J = np.empty((F, N, 4, 3))
+    ahead = np.empty(F, np.bool_)
+    seen = np.empty((F, N), np.bool_)
+    anchor = np.empty(F, np.int64)
+    centre = np.empty((F, 3))
+    disparity = np.empty(F)
+    p_D_q = np.empty((F, 3, 3))
+    q_D_p = np.empty((F, 3, 3))
+    dq = np.empty((F, 3))
     _mark_seen(weight, seen)
     for _ in range(steps):
         put_ahead(camera, least_depth, least_disparity, T, z, weight, p)
         compare_views(camera, least_depth, T, p, z, weight, r, J, ahead)
         anchor_points(camera, least_depth, T, p, seen, anchor, centre, disparity, p_D_q, q_D_p)
         step_points(r, J, p_D_q, scale2, tiny, prior, dq)
-        step_inverse_depths(camera, least_depth, least_disparity, T, weight, centre, p_D_q, disparity, dq, p)
+        step_inverse_depths(
+            camera, least_depth, least_disparity, T, weight, centre, p_D_q, disparity, dq, p
+        )
 
 
 @compiled
@@ -573,27 +709,41 @@ def mark_usable(
     limits: tuple[float, float],
     keep: BoolArray,
 ) -> None:
-    """Write which points (F, 3) are finite, ahead of their cameras and, without a right view, fixed by parallax.
+    """Write which points (F, 3) are finite, ahead of their cameras and, without a right view, fixed
+    by parallax.
 
-    The variance of their disparity, for one pixel of noise, is below the first limit, in px^2, plus the second one
-    times the squared disparity.
+    The variance of their disparity, for one pixel of noise, is below the first limit, in px^2, plus
+    the second one times the squared disparity.
     """
     F, N = weight.shape[:2]
-    seen, anchor, centre, disparity = np.empty((1, N), np.bool_), np.empty(1, np.int64), np.empty((1, 3)), np.empty(1)
-    p_D_q, q_D_p, C, L, row = np.empty((1, 3, 3)), np.empty((1, 3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    seen = np.empty((1, N), np.bool_)
+    anchor = np.empty(1, np.int64)
+    centre = np.empty((1, 3))
+    disparity = np.empty(1)
+    p_D_q = np.empty((1, 3, 3))
+    q_D_p = np.empty((1, 3, 3))
+    C = np.empty((3, 3))
+    L = np.empty((3, 3))
+    row = np.empty(3)
     for f in range(F):
-        keep[f] = ahead[f] and np.isfinite(p[f, 0]) and np.isfinite(p[f, 1]) and np.isfinite(p[f, 2])
+        keep[f] = (
+            ahead[f] and np.isfinite(p[f, 0]) and np.isfinite(p[f, 1]) and np.isfinite(p[f, 2])
+        )
         by_right = False
         for n in range(N):
             by_right = by_right or weight[f, n, 2] > 0.0
         if by_right or not keep[f]:
             continue
         _mark_seen(weight[f : f + 1], seen)
-        anchor_points(camera, least_depth, T, p[f : f + 1], seen, anchor, centre, disparity, p_D_q, q_D_p)
+        anchor_points(
+            camera, least_depth, T, p[f : f + 1], seen, anchor, centre, disparity, p_D_q, q_D_p
+        )
         for i in range(3):
             for j in range(3):
                 C[i, j] = 0.0
-        C[0, 0], C[1, 1], C[2, 2] = tiny, tiny, prior
+        C[0, 0] = tiny
+        C[1, 1] = tiny
+        C[2, 2] = prior
         for n in range(N):
             for a in range(4):
                 _by_point(J[f, n, a], p_D_q[0], row)
@@ -620,7 +770,9 @@ def expected_pixels(z: FloatArray, r: FloatArray, weight: FloatArray, out: Float
 
 
 @compiled
-def weigh_views(r: FloatArray, J: FloatArray, sigma2: float, median: float, cauchy: float, weights: FloatArray) -> None:
+def weigh_views(
+    r: FloatArray, J: FloatArray, sigma2: float, median: float, cauchy: float, weights: FloatArray
+) -> None:
     """Write Cauchy weights (F, N) of views, zero where not measured; the scale is each clone's own.
 
     It is the median of its squared residuals over `median`, and `sigma2` at least.
@@ -632,12 +784,18 @@ def weigh_views(r: FloatArray, J: FloatArray, sigma2: float, median: float, cauc
         for f in range(F):
             weights[f, n] = -1.0
             if _is_measured(J, f, n):
-                weights[f, n] = r[f, n, 0] ** 2 + r[f, n, 1] ** 2 + r[f, n, 2] ** 2 + r[f, n, 3] ** 2
+                weights[f, n] = (
+                    r[f, n, 0] ** 2 + r[f, n, 1] ** 2 + r[f, n, 2] ** 2 + r[f, n, 3] ** 2
+                )
                 squares[count] = weights[f, n]
                 count += 1
         scale2 = max(sigma2, middle(squares[:count]) / median) if count > 0 else sigma2
         for f in range(F):
-            weights[f, n] = 0.0 if weights[f, n] < 0.0 else 1.0 / (1.0 + weights[f, n] / (4.0 * scale2 * cauchy**2))
+            weights[f, n] = (
+                0.0
+                if weights[f, n] < 0.0
+                else 1.0 / (1.0 + weights[f, n] / (4.0 * scale2 * cauchy**2))
+            )
 
 
 @compiled
@@ -654,7 +812,8 @@ def add_landmarks(
     b: FloatArray,
     considered: FloatArray,
 ) -> None:
-    """Add what landmarks' pixels say of `dp = xi_f - xi_rho` and of S coefficients to A (D, D) and b (D,).
+    """Add what landmarks' pixels say of `dp = xi_f - xi_rho` and of S coefficients to A (D, D) and
+    b (D,).
 
     Args:
         r: residuals (K, 4).
@@ -763,15 +922,22 @@ def substitute_back(
     clone_errors: FloatArray,
     p: FloatArray,
 ) -> None:
-    """Write points (F, 3) that solve their own equations once the clones (6N,) have moved; see `TrackInformation`."""
-    dq, factor = np.empty(3), np.empty((3, 3))
+    """Write points (F, 3) that solve their own equations once the clones (6N,) have moved; see
+    `TrackInformation`.
+    """
+    dq = np.empty(3)
+    factor = np.empty((3, 3))
     for f in range(len(p)):
-        d0, d1, d2 = gradient[f, 0], gradient[f, 1], gradient[f, 2]
+        d0 = gradient[f, 0]
+        d1 = gradient[f, 1]
+        d2 = gradient[f, 2]
         for k in range(len(clone_errors)):
             d0 -= G[f, k, 0] * clone_errors[k]
             d1 -= G[f, k, 1] * clone_errors[k]
             d2 -= G[f, k, 2] * clone_errors[k]
-        dq[0], dq[1], dq[2] = d0, d1, d2
+        dq[0] = d0
+        dq[1] = d1
+        dq[2] = d2
         for i in range(3):
             for j in range(3):
                 factor[i, j] = C[f, i, j]
@@ -800,8 +966,12 @@ def collect_tracks(
     gradient: FloatArray,
     point_gradient: FloatArray,
 ) -> None:
-    """Write the normal equations of tracks, (M2), (M3), (M5), (M6): the columns of `TrackInformation`."""
-    C_i, g_i, row = np.empty((3, 3)), np.empty(3), np.empty(3)
+    """Write the normal equations of tracks, (M2), (M3), (M5), (M6): the columns of
+    `TrackInformation`.
+    """
+    C_i = np.empty((3, 3))
+    g_i = np.empty(3)
+    row = np.empty(3)
     seen = np.empty(weight.shape, np.bool_)
     _mark_views(J, seen)
     anchor_points(camera, least_depth, T, p, seen, anchor, centre, disparity, p_D_q, q_D_p)
@@ -825,7 +995,9 @@ def collect_tracks(
                     continue
                 for i in range(3):
                     row[i] = (
-                        J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
+                        J[f, n, a, 0] * p_D_q[f, 0, i]
+                        + J[f, n, a, 1] * p_D_q[f, 1, i]
+                        + J[f, n, a, 2] * p_D_q[f, 2, i]
                     )
                 for i in range(3):
                     g_i[i] += weight[f, n] * row[i] * r[f, n, a]
@@ -838,7 +1010,9 @@ def collect_tracks(
                 for j in range(3):
                     C[f, i, j] += C_i[i, j]
             for k in range(6):
-                b0, b1, b2 = B[f, 0, k], B[f, 1, k], B[f, 2, k]
+                b0 = B[f, 0, k]
+                b1 = B[f, 1, k]
+                b2 = B[f, 2, k]
                 gradient[f, 6 * n + k] = b0 * g_i[0] + b1 * g_i[1] + b2 * g_i[2]
                 for j in range(3):
                     G[f, 6 * n + k, j] = b0 * C_i[0, j] + b1 * C_i[1, j] + b2 * C_i[2, j]
@@ -848,9 +1022,15 @@ def collect_tracks(
 def _point_D_pose(q_D_p: FloatArray, p: FloatArray, B: FloatArray) -> None:
     """Write `S^-1 [-I, p^]` (3, 6) of one point, equation (M2)."""
     for i in range(3):
-        a, b, c = q_D_p[i, 0], q_D_p[i, 1], q_D_p[i, 2]
-        B[i, 0], B[i, 1], B[i, 2] = -a, -b, -c
-        B[i, 3], B[i, 4], B[i, 5] = b * p[2] - c * p[1], c * p[0] - a * p[2], a * p[1] - b * p[0]
+        a = q_D_p[i, 0]
+        b = q_D_p[i, 1]
+        c = q_D_p[i, 2]
+        B[i, 0] = -a
+        B[i, 1] = -b
+        B[i, 2] = -c
+        B[i, 3] = b * p[2] - c * p[1]
+        B[i, 4] = c * p[0] - a * p[2]
+        B[i, 5] = a * p[1] - b * p[0]
 
 
 @compiled
@@ -885,12 +1065,14 @@ def eliminate_tracks(
     A: FloatArray,
     b: FloatArray,
 ) -> None:
-    """Write the clones' columns of `V` (3K, 6N + S): `V' V` is what points of the chosen tracks take away, (M4).
+    """Write the clones' columns of `V` (3K, 6N + S): `V' V` is what points of the chosen tracks
+    take away, (M4).
 
-    What they say of the clones but for that is added to A (6N + S, 6N + S), and the vector with the points taken out to
-    b (6N + S,).
+    What they say of the clones but for that is added to A (6N + S, 6N + S), and the vector with the
+    points taken out to b (6N + S,).
     """
-    L, y = np.empty((3, 3)), np.empty(3)
+    L = np.empty((3, 3))
+    y = np.empty(3)
     for c, f in enumerate(chosen):
         _factor(C[f], L)
         _solve_lower(L, point_gradient[f], y)
@@ -901,7 +1083,9 @@ def eliminate_tracks(
                     V[3 * c, k] = V[3 * c + 1, k] = V[3 * c + 2, k] = 0.0
                     continue
                 b[k] += gradient[f, k] - _whiten(L, G[f, k], y, V, c, k)
-                g0, g1, g2 = G[f, k, 0], G[f, k, 1], G[f, k, 2]
+                g0 = G[f, k, 0]
+                g1 = G[f, k, 1]
+                g2 = G[f, k, 2]
                 for j in range(6):
                     A[k, 6 * n + j] += g0 * B[f, 0, j] + g1 * B[f, 1, j] + g2 * B[f, 2, j]
 
@@ -916,17 +1100,25 @@ def _solve_lower(L: FloatArray, g: FloatArray, y: FloatArray) -> None:
 
 @compiled
 def _whiten(L: FloatArray, g: FloatArray, y: FloatArray, V: FloatArray, c: int, k: int) -> float:
-    """Write column k of `L^-1 g` into the rows of point c of V, and return its product with y (3,)."""
+    """Write column k of `L^-1 g` into the rows of point c of V, and return its product with y
+    (3,).
+    """
     v0 = g[0] / L[0, 0]
     v1 = (g[1] - L[1, 0] * v0) / L[1, 1]
     v2 = (g[2] - L[2, 0] * v0 - L[2, 1] * v1) / L[2, 2]
-    V[3 * c, k], V[3 * c + 1, k], V[3 * c + 2, k] = v0, v1, v2
+    V[3 * c, k] = v0
+    V[3 * c + 1, k] = v1
+    V[3 * c + 2, k] = v2
     return v0 * y[0] + v1 * y[1] + v2 * y[2]
 
 
 @compiled
-def points_by_others(rows: IntArray, C: FloatArray, p_D_q: FloatArray, G: FloatArray, out: FloatArray) -> None:
-    """Write how the estimated points of tracks (K,) follow n other errors (K, 3, n), world: `-C^-1 G'`, G (F, n, 3)."""
+def points_by_others(
+    rows: IntArray, C: FloatArray, p_D_q: FloatArray, G: FloatArray, out: FloatArray
+) -> None:
+    """Write how the estimated points of tracks (K,) follow n other errors (K, 3, n), world:
+    `-C^-1 G'`, G (F, n, 3).
+    """
     L = np.empty((3, 3))
     for k, f in enumerate(rows):
         _factor(C[f], L)
@@ -948,19 +1140,25 @@ def _solved(L: FloatArray, y0: float, y1: float, y2: float) -> tuple[float, floa
 
 @compiled
 def point_covariances(rows: IntArray, C: FloatArray, p_D_q: FloatArray, out: FloatArray) -> None:
-    """Write the covariance (K, 3, 3) of the points of tracks (K,) given all else, world: `p_D_q C^-1 p_D_q'`."""
+    """Write the covariance (K, 3, 3) of the points of tracks (K,) given all else, world:
+    `p_D_q C^-1 p_D_q'`.
+    """
     L = np.empty((3, 3))
     for k, f in enumerate(rows):
         _factor(C[f], L)
         for i in range(3):
             y0, y1, y2 = _solved(L, p_D_q[f, i, 0], p_D_q[f, i, 1], p_D_q[f, i, 2])
             for j in range(i + 1):
-                out[k, i, j] = out[k, j, i] = p_D_q[f, j, 0] * y0 + p_D_q[f, j, 1] * y1 + p_D_q[f, j, 2] * y2
+                out[k, i, j] = out[k, j, i] = (
+                    p_D_q[f, j, 0] * y0 + p_D_q[f, j, 1] * y1 + p_D_q[f, j, 2] * y2
+                )
 
 
 @compiled
 def depth_sigmas(C: FloatArray, disparity: FloatArray, out: FloatArray) -> None:
-    """Write `relative_depth_sigma` (F,): what is left of the third diagonal entry without the other two coordinates."""
+    """Write `relative_depth_sigma` (F,): what is left of the third diagonal entry without the
+    other two coordinates.
+    """
     for f in range(len(C)):
         c = C[f]
         minor = c[0, 0] * c[1, 1] - c[0, 1] ** 2
@@ -970,8 +1168,12 @@ def depth_sigmas(C: FloatArray, disparity: FloatArray, out: FloatArray) -> None:
 
 
 @compiled
-def stereo_sigmas(rows: IntArray, J: FloatArray, disparity: FloatArray, variance: float, out: FloatArray) -> None:
-    """Write `relative_stereo_sigma` (K,) of tracks (K,), with the variance of one view's disparity."""
+def stereo_sigmas(
+    rows: IntArray, J: FloatArray, disparity: FloatArray, variance: float, out: FloatArray
+) -> None:
+    """Write `relative_stereo_sigma` (K,) of tracks (K,), with the variance of one view's
+    disparity.
+    """
     for k, f in enumerate(rows):
         views = 0
         for n in range(J.shape[1]):
@@ -989,18 +1191,25 @@ def innovations(
     squared: FloatArray,
     count: IntArray,
 ) -> None:
-    """Write `r' S^-1 r` (F,) of the newest clone's residuals, `S = B moved B' + variance`, and how many pixels (F,).
+    """Write `r' S^-1 r` (F,) of the newest clone's residuals, `S = B moved B' + variance`, and how
+    many pixels (F,).
 
-    `moved` is the covariance (6, 6) of its motion `[rho; phi]` on the world's side, and `B = J [I, -p^]`.
+    `moved` is the covariance (6, 6) of its motion `[rho; phi]` on the world's side, and
+    `B = J [I, -p^]`.
     """
     last = r.shape[1] - 1
-    B, BM, S, y = np.empty((4, 6)), np.empty((4, 6)), np.empty((4, 4)), np.empty(4)
+    B = np.empty((4, 6))
+    BM = np.empty((4, 6))
+    S = np.empty((4, 4))
+    y = np.empty(4)
     for f in range(len(r)):
         count[f] = 0
         for a in range(4):
             x = J[f, last, a]
             count[f] += x[0] != 0.0 or x[1] != 0.0 or x[2] != 0.0
-            B[a, 0], B[a, 1], B[a, 2] = x[0], x[1], x[2]
+            B[a, 0] = x[0]
+            B[a, 1] = x[1]
+            B[a, 2] = x[2]
             B[a, 3] = p[f, 1] * x[2] - p[f, 2] * x[1]
             B[a, 4] = p[f, 2] * x[0] - p[f, 0] * x[2]
             B[a, 5] = p[f, 0] * x[1] - p[f, 1] * x[0]
@@ -1018,7 +1227,8 @@ def innovations(
         total = 0.0
         for a in range(4):
             total += r[f, last, a] * y[a]
-        squared[f] = total if total > 0.0 else 0.0  # not a number where the covariances have lost all digits
+        # not a number where the covariances have lost all digits
+        squared[f] = total if total > 0.0 else 0.0
 
 
 @compiled
@@ -1041,22 +1251,25 @@ def eliminate_columns(
     A: FloatArray,
     b: FloatArray,
 ) -> None:
-    """Do what `eliminate_tracks` does for the S coefficients that `ErrorColumns` has chosen, behind the clones.
+    """Do what `eliminate_tracks` does for the S coefficients that `ErrorColumns` has chosen, behind
+    the clones.
 
-    Of A the rows of the clones and those of the coefficients. G (F, S, 3) is `H' W J`, the sum over the views of each
-    of these tracks. H are the derivatives of the pixels z (F, N, 4), of which those count that were measured. r and J
-    are times the precision (F, N, 4), H not.
+    Of A the rows of the clones and those of the coefficients. G (F, S, 3) is `H' W J`, the sum over
+    the views of each of these tracks. H are the derivatives of the pixels z (F, N, 4), of which
+    those count that were measured. r and J are times the precision (F, N, 4), H not.
     """
-    terms, size = len(chosen), 6 * J.shape[1]
-    H, by_q, L, y = np.empty((3, 12)), np.empty(3), np.empty((3, 3)), np.empty(3)
-    h, wh, own_b, own, of_view, sums = (
-        np.empty(terms),
-        np.empty(terms),
-        np.empty(terms),
-        np.empty((terms, terms)),
-        np.empty((3, terms)),
-        np.empty((3, terms)),
-    )
+    terms = len(chosen)
+    size = 6 * J.shape[1]
+    H = np.empty((3, 12))
+    by_q = np.empty(3)
+    L = np.empty((3, 3))
+    y = np.empty(3)
+    h = np.empty(terms)
+    wh = np.empty(terms)
+    own_b = np.empty(terms)
+    own = np.empty((terms, terms))
+    of_view = np.empty((3, terms))
+    sums = np.empty((3, terms))
     for c, f in enumerate(rows):
         for s in range(terms):
             own_b[s] = sums[0, s] = sums[1, s] = sums[2, s] = 0.0
@@ -1087,21 +1300,31 @@ def eliminate_columns(
                         of_view[i, s] += by_q[i] * wh[s]
                         sums[i, s] += by_q[i] * wh[s]
             for k in range(6):
-                b0, b1, b2 = B[f, 0, k], B[f, 1, k], B[f, 2, k]
+                b0 = B[f, 0, k]
+                b1 = B[f, 1, k]
+                b2 = B[f, 2, k]
                 for s in range(terms):
-                    A[6 * n + k, size + s] += b0 * of_view[0, s] + b1 * of_view[1, s] + b2 * of_view[2, s]
+                    A[6 * n + k, size + s] += (
+                        b0 * of_view[0, s] + b1 * of_view[1, s] + b2 * of_view[2, s]
+                    )
         _factor(C[f], L)
         _solve_lower(L, point_gradient[f], y)
         for s in range(terms):
-            G[f, s, 0], G[f, s, 1], G[f, s, 2] = sums[0, s], sums[1, s], sums[2, s]
+            G[f, s, 0] = sums[0, s]
+            G[f, s, 1] = sums[1, s]
+            G[f, s, 2] = sums[2, s]
             b[size + s] += own_b[s] - _whiten(L, G[f, s], y, V, c, size + s)
             for t in range(terms):
                 A[size + s, size + t] += own[s, t] if t <= s else own[t, s]
 
 
 @compiled
-def add_scores(clusters: IntArray, scores: FloatArray, together: FloatArray, squares: FloatArray) -> None:
-    """Add scores (K, 6) of tracks to those of their clusters (C, 6), and what the squares of these grow by (6,)."""
+def add_scores(
+    clusters: IntArray, scores: FloatArray, together: FloatArray, squares: FloatArray
+) -> None:
+    """Add scores (K, 6) of tracks to those of their clusters (C, 6), and what the squares of
+    these grow by (6,).
+    """
     for k, c in enumerate(clusters):
         for i in range(6):
             before = together[c, i]
@@ -1111,12 +1334,15 @@ def add_scores(clusters: IntArray, scores: FloatArray, together: FloatArray, squ
 
 @compiled
 def write_directions(rows: IntArray, T: FloatArray, p: FloatArray, out: FloatArray) -> None:
-    """Write azimuth and elevation (K, 2), rad, of points (F, 3) of the world as a camera (4, 4) sees them."""
+    """Write azimuth and elevation (K, 2), rad, of points (F, 3) of the world as a camera (4, 4)
+    sees them.
+    """
     for k, f in enumerate(rows):
         x = T[0, 0] * p[f, 0] + T[0, 1] * p[f, 1] + T[0, 2] * p[f, 2] + T[0, 3]
         y = T[1, 0] * p[f, 0] + T[1, 1] * p[f, 1] + T[1, 2] * p[f, 2] + T[1, 3]
         z = T[2, 0] * p[f, 0] + T[2, 1] * p[f, 1] + T[2, 2] * p[f, 2] + T[2, 3]
-        out[k, 0], out[k, 1] = np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))
+        out[k, 0] = np.arctan2(x, z)
+        out[k, 1] = np.arctan2(y, np.hypot(x, z))
 
 
 @compiled
@@ -1132,25 +1358,37 @@ def score_drifts(
     scores: FloatArray,
     information: FloatArray,
 ) -> None:
-    """Write scores and information (K, 6) of tracks by a drift of the poses, their points eliminated as in (M4).
+    """Write scores and information (K, 6) of tracks by a drift of the poses, their points
+    eliminated as in (M4).
 
-    The drift is a motion `[rho; phi]` of the clones along the world's axes, about `centre` (3,), that grows linearly
-    from -1/2 in a track's first view to 1/2 in its last one.
+    The drift is a motion `[rho; phi]` of the clones along the world's axes, about `centre` (3,),
+    that grows linearly from -1/2 in a track's first view to 1/2 in its last one.
     """
-    L, sums, own, g = np.empty((3, 3)), np.empty((6, 3)), np.empty((6, 6)), np.empty(6)
+    L = np.empty((3, 3))
+    sums = np.empty((6, 3))
+    own = np.empty((6, 6))
+    g = np.empty(6)
     B = np.zeros((6, 6))
     for i in range(6):
         B[i, i] = 1.0
-    B[0, 4], B[0, 5], B[1, 3] = -centre[2], centre[1], centre[2]
-    B[1, 5], B[2, 3], B[2, 4] = -centre[0], -centre[1], centre[0]
+    B[0, 4] = -centre[2]
+    B[0, 5] = centre[1]
+    B[1, 3] = centre[2]
+    B[1, 5] = -centre[0]
+    B[2, 3] = -centre[1]
+    B[2, 4] = centre[0]
     for k, f in enumerate(rows):
-        first, last, N = -1, -1, G.shape[1] // 6
+        first = -1
+        last = -1
+        N = G.shape[1] // 6
         for n in range(N):
             if G[f, 6 * n, 0] != 0.0 or G[f, 6 * n + 1, 1] != 0.0:
                 last = n
                 if first < 0:
                     first = n
-        sums[:], own[:], g[:] = 0.0, 0.0, 0.0
+        sums[:] = 0.0
+        own[:] = 0.0
+        g[:] = 0.0
         for n in range(first, last + 1):
             w = (n - first) / max(last - first, 1) - 0.5
             for i in range(6):
@@ -1163,7 +1401,11 @@ def score_drifts(
         _factor(C[f], L)
         y = point_gradient[f]
         for s in range(6):
-            g0, g1, g2, score, A = 0.0, 0.0, 0.0, 0.0, 0.0
+            g0 = 0.0
+            g1 = 0.0
+            g2 = 0.0
+            score = 0.0
+            A = 0.0
             for i in range(6):
                 b = B[i, s]
                 if b == 0.0:

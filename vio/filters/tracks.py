@@ -1,4 +1,6 @@
-"""The pixels of all living tracks over the window, in arrays: rows are tracks, columns are clones."""
+"""The pixels of all living tracks over the window, in arrays: rows are tracks, columns are
+clones.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +22,13 @@ class TrackTable:
     def __init__(self, columns: int) -> None:
         self._columns = columns
         self._rows: IntArray = np.zeros(0, dtype=np.int64)  # of all tracks, in order of their ids
-        self._free: IntArray = np.zeros(0, dtype=np.int64)  # rows without a track; the last one is used next
+        # rows without a track; the last one is used next
+        self._free: IntArray = np.zeros(0, dtype=np.int64)
         self._ids = np.zeros(0, dtype=np.int64)
         self._z = np.zeros((0, columns, 4))
         self._weight = np.zeros((0, columns, 4))  # as in `Views`
-        self.points = np.zeros((0, 3))  # world; the last triangulation of each row, a start for the next
+        # world; the last triangulation of each row, a start for the next
+        self.points = np.zeros((0, 3))
         self.has_point: BoolArray = np.zeros(0, dtype=np.bool_)
         self._grow(256)
 
@@ -44,7 +48,9 @@ class TrackTable:
         loops.write_column(rows, column, seen.z, precision(seen), self._z, self._weight)
 
     def rows(self) -> IntArray:
-        """Rows (F,) of all tracks, in order of their ids, so that no result depends on the table's history."""
+        """Rows (F,) of all tracks, in order of their ids, so that no result depends on the
+        table's history.
+        """
         return self._rows
 
     def ids(self, rows: IntArray) -> IntArray:
@@ -103,8 +109,9 @@ class TrackTable:
 def measured(has_right: BoolArray) -> FloatArray:
     """Weights (N, 4) of `[ul vl ur vr]`: 1 for what is a measurement of its own, 0 else.
 
-    The right row is none. It is fitted near the row that the left pixel and the learned rows of the pair predict, so
-    its error is that of `vl` and of the pair's calibration; as a fourth pixel it would make the filter overconfident.
+    The right row is none. It is fitted near the row that the left pixel and the learned rows of the
+    pair predict, so its error is that of `vl` and of the pair's calibration; as a fourth pixel it
+    would make the filter overconfident.
     """
     weight = np.zeros((len(has_right), 4))
     weight[:, :2] = 1.0
@@ -113,9 +120,11 @@ def measured(has_right: BoolArray) -> FloatArray:
 
 
 def precision(seen: Observations) -> FloatArray:
-    """One over the standard deviations (N, 4) of `[ul vl ur vr]`, in those of the frame's median; 0: not measured.
+    """One over the standard deviations (N, 4) of `[ul vl ur vr]`, in those of the frame's median;
+    0: not measured.
 
-    What patches state of a whole frame, such as its blur, is learned instead: errors that last along tracks exceed it.
+    What patches state of a whole frame, such as its blur, is learned instead: errors that last
+    along tracks exceed it.
     """
     weight = measured(seen.has_right)
     if seen.sigma is None:
@@ -125,7 +134,9 @@ def precision(seen: Observations) -> FloatArray:
 
 
 def rows_of(seen: Observations, ids: IntArray) -> tuple[IntArray, BoolArray]:
-    """Return the rows (K,) of given ids (M,) in one frame, in their order, and a mask (M,) of those that are there."""
+    """Return the rows (K,) of given ids (M,) in one frame, in their order, and a mask (M,) of
+    those that are there.
+    """
     if not len(seen) or not len(ids):
         return np.zeros(0, dtype=np.int64), np.zeros(len(ids), dtype=np.bool_)
     order = np.argsort(seen.ids)

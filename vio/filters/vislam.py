@@ -1,7 +1,8 @@
 """The paper's visual-inertial SLAM: EKF prediction on SE(3), landmark mapping, pose update.
 
-Equation numbers (P1) … (P9) are those of docs/math.md. In the paper's letters `U_t` is `T_imu_world`, `oT_i` is
-`T_cam0_imu`, `u = [v; omega]` the body velocity and angular rate, `tau` the time step, `m_j` a landmark.
+Equation numbers (P1) … (P9) are those of docs/math.md. In the paper's letters `U_t` is
+`T_imu_world`, `oT_i` is `T_cam0_imu`, `u = [v; omega]` the body velocity and angular rate, `tau`
+the time step, `m_j` a landmark.
 """
 
 from __future__ import annotations
@@ -37,13 +38,19 @@ _LANDMARK_PRIOR_SIGMA_M = 1.0  # standard deviation of the isotropic prior
 _MIN_FEATURES = 3  # fewer points leave a pose undetermined, and a single wrong one would steer it
 
 
-def z_D_landmark(camera: StereoCamera, T_cam0_imu: FloatArray, U: FloatArray, m: FloatArray) -> FloatArray:
-    """Jacobian (N, 4, 3) of the stereo pixels with respect to the landmarks (N, 3) in the world frame, (P4)."""
+def z_D_landmark(
+    camera: StereoCamera, T_cam0_imu: FloatArray, U: FloatArray, m: FloatArray
+) -> FloatArray:
+    """Jacobian (N, 4, 3) of the stereo pixels with respect to the landmarks (N, 3) in the world
+    frame, (P4).
+    """
     T_cam0_world = T_cam0_imu @ U
     return z_D_p_cam(camera, transform_points(T_cam0_world, m)) @ T_cam0_world[:3, :3]
 
 
-def z_D_xi(camera: StereoCamera, T_cam0_imu: FloatArray, U: FloatArray, m: FloatArray) -> FloatArray:
+def z_D_xi(
+    camera: StereoCamera, T_cam0_imu: FloatArray, U: FloatArray, m: FloatArray
+) -> FloatArray:
     """Jacobian (N, 4, 6) of the stereo pixels with respect to xi in `U <- exp(xi) U`, (P7)."""
     p_imu = transform_points(U, m)
     p_cam = transform_points(T_cam0_imu, p_imu)
@@ -55,8 +62,8 @@ def update_landmarks(
 ) -> tuple[FloatArray, FloatArray]:
     """Update landmarks (N, 3) with covariance blocks (N, 3, 3), equations (P5) and (P6).
 
-    With a known pose each landmark meets only its own pixels, so the 3M x 3M covariance of the paper stays block
-    diagonal and the blocks are all there is.
+    With a known pose each landmark meets only its own pixels, so the 3M x 3M covariance of the
+    paper stays block diagonal and the blocks are all there is.
     """
     Ht = np.swapaxes(H, -1, -2)
     S = H @ P @ Ht + pixel_variance * np.eye(4)
@@ -67,17 +74,21 @@ def update_landmarks(
     return m + (K @ residual[..., None])[..., 0], P_new
 
 
-def update_pose(Sigma: FloatArray, H: FloatArray, residual: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+def update_pose(
+    Sigma: FloatArray, H: FloatArray, residual: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return the correction K r (d,) and the updated covariance (d, d), equations (P8) and (P9).
 
     Args:
-        Sigma: prior covariance (d, d), d >= 6; its first six rows are the pose, the only ones that pixels depend on.
+        Sigma: prior covariance (d, d), d >= 6; its first six rows are the pose, the only ones that
+            pixels depend on.
         H: Jacobian blocks (N, 4, 6) with respect to the pose.
         residual: pixel residuals (N, 4).
         R: covariance of each residual block (N, 4, 4), independent of one another.
 
-    The gain is formed in the information form, `(Sigma^-1 + H' R^-1 H)^-1 H' R^-1`, which equals the paper's
-    `Sigma H' (H Sigma H' + R)^-1` by the matrix inversion lemma and costs O(N) instead of O(N^3).
+    The gain is formed in the information form, `(Sigma^-1 + H' R^-1 H)^-1 H' R^-1`, which equals
+    the paper's `Sigma H' (H Sigma H' + R)^-1` by the matrix inversion lemma and costs O(N) instead
+    of O(N^3).
     """
     RiH = np.linalg.solve(R, H)
     d = len(Sigma)
@@ -107,16 +118,20 @@ class _Map:
         return np.array([self.slot_of.get(i, unknown) for i in ids.tolist()], dtype=np.int64)
 
     def add(self, ids: IntArray, m: FloatArray, P: FloatArray) -> None:
-        first, last = len(self), len(self) + len(ids)
+        first = len(self)
+        last = len(self) + len(ids)
         while last > len(self.m):
             self.m = np.concatenate([self.m, np.zeros_like(self.m)])
             self.P = np.concatenate([self.P, np.zeros_like(self.P)])
-        self.m[first:last], self.P[first:last] = m, P
+        self.m[first:last] = m
+        self.P[first:last] = P
         self.slot_of.update(zip(ids.tolist(), range(first, last), strict=True))
 
 
 class Vislam(Backend):
-    """The paper's filter as a back end: `propagate` takes velocities, `update` takes stereo observations."""
+    """The paper's filter as a back end: `propagate` takes velocities, `update` takes stereo
+    observations.
+    """
 
     motion_sources: ClassVar[tuple[MotionSource, ...]] = ("velocity",)
     stereo_only = True
@@ -140,22 +155,32 @@ class Vislam(Backend):
             T_world_imu: start pose (4, 4); identity if None.
 
         Raises:
-            ConfigError: the settings need a motion sensor and there is none, or an argument is of another kind.
+            ConfigError: the settings need a motion sensor and there is none, or an argument is of
+                another kind.
             CalibrationError: the extrinsics are no rigid transform.
         """
         check_parts("vislam", camera, settings, VislamSettings)
-        if not motion_sensor and (settings.motion_model == "input" or settings.mode == "dead_reckoning"):
+        if not motion_sensor and (
+            settings.motion_model == "input" or settings.mode == "dead_reckoning"
+        ):
             raise ConfigError(
-                "the paper's motion model needs velocities, and there are none: use vislam.motion_model=twist, "
+                "the paper's motion model needs velocities, and there are none: use "
+                "vislam.motion_model=twist, "
                 "and a mode other than dead_reckoning"
             )
-        self._camera, self._T_cam0_imu, self._settings = camera, checked_extrinsics(T_cam0_imu), settings
+        self._camera = camera
+        self._T_cam0_imu = checked_extrinsics(T_cam0_imu)
+        self._settings = settings
         self._order = InputOrder("vislam")
         dead_reckoning = settings.mode == "dead_reckoning"
         self._motion: HeldInput | DriftingTwist = (
-            HeldInput(settings) if dead_reckoning or settings.motion_model == "input" else DriftingTwist(settings)
+            HeldInput(settings)
+            if dead_reckoning or settings.motion_model == "input"
+            else DriftingTwist(settings)
         )
-        self._state = self._motion.start(np.eye(4) if T_world_imu is None else se3_inverse(T_world_imu))
+        self._state = self._motion.start(
+            np.eye(4) if T_world_imu is None else se3_inverse(T_world_imu)
+        )
         self._time_ns: int | None = None  # of the state
         self._frame_time_ns: int | None = None  # of the last frame
         self._map = _Map()
@@ -164,15 +189,22 @@ class Vislam(Backend):
 
     @classmethod
     def build(
-        cls, camera: StereoCamera, T_cam0_body: FloatArray, settings: VislamSettings, motion: MotionSource | None
+        cls,
+        camera: StereoCamera,
+        T_cam0_body: FloatArray,
+        settings: VislamSettings,
+        motion: MotionSource | None,
     ) -> Vislam:
         """Build the filter of a run, see `Backend`.
 
         Raises:
-            ConfigError: one camera has no depths, or the settings need a motion sensor and there is none.
+            ConfigError: one camera has no depths, or the settings need a motion sensor and there is
+                none.
         """
         if camera.kind == "mono":
-            raise ConfigError("backend vislam needs a stereo pair, and this is one camera; take msckf")
+            raise ConfigError(
+                "backend vislam needs a stereo pair, and this is one camera; take msckf"
+            )
         return cls(camera, T_cam0_body, settings, motion_sensor=motion is not None)
 
     def propagate(self, sample: MotionSample) -> None:
@@ -183,7 +215,10 @@ class Vislam(Backend):
             DataError: it is out of order or not finite; the filter is unchanged.
         """
         if not isinstance(sample, VelocitySample):
-            raise ConfigError("backend vislam takes body velocities, not raw IMU; use --backend msckf or --motion none")
+            raise ConfigError(
+                "backend vislam takes body velocities, not raw IMU; use --backend msckf or "
+                "--motion none"
+            )
         self._order.sample(sample)
         if self._motion.measures_at_once:
             self.advance(sample.time_ns)
@@ -200,10 +235,15 @@ class Vislam(Backend):
 
         Raises:
             EstimationError: no velocity covers the step, or the pose is not finite any more.
-            DataError: the frame is out of order, or its observations are impossible; the filter is unchanged.
+            DataError: the frame is out of order, or its observations are impossible; the filter is
+                unchanged.
         """
         self._order.frame(observations, self._time_ns or 0)
-        step_s = 0.0 if self._frame_time_ns is None else (observations.time_ns - self._frame_time_ns) * 1e-9
+        step_s = (
+            0.0
+            if self._frame_time_ns is None
+            else (observations.time_ns - self._frame_time_ns) * 1e-9
+        )
         self._frame_time_ns = observations.time_ns
         self.advance(observations.time_ns)
         if self._settings.mode == "dead_reckoning":
@@ -216,7 +256,9 @@ class Vislam(Backend):
         slots = self._map.slots(observations.ids)
         known = slots < len(self._map)
         try:
-            used, gated, innovation, nis_per_dof = self._update_known(observations.z[known], slots[known], step_s)
+            used, gated, innovation, nis_per_dof = self._update_known(
+                observations.z[known], slots[known], step_s
+            )
         except np.linalg.LinAlgError as error:
             raise EstimationError(self._lost(observations.frame_index)) from error
         fresh = observations.take(~known)
@@ -234,12 +276,17 @@ class Vislam(Backend):
         )
 
     def _lost(self, frame_index: int) -> str:
-        remedy = "" if self._settings.motion_model == "input" else "; give it velocities, or stop before that frame"
+        remedy = (
+            ""
+            if self._settings.motion_model == "input"
+            else "; give it velocities, or stop before that frame"
+        )
         return f"vislam diverged at frame {frame_index}: too few features for too long, or too many wrong ones{remedy}"
 
     def estimate(self) -> Estimate:
         """Return the pose at the time of the last frame."""
-        U, twist = self._state.U, self._state.twist
+        U = self._state.U
+        twist = self._state.twist
         T_world_imu = se3_inverse(U)
         velocity = None if twist is None else T_world_imu[:3, :3] @ twist[:3]
         return Estimate(self._time_ns or 0, T_world_imu, self._state.Sigma[:6, :6].copy(), velocity)
@@ -253,14 +300,19 @@ class Vislam(Backend):
     def _update_known(
         self, z: FloatArray, slots: IntArray, step_s: float
     ) -> tuple[int, int, float | None, float | None]:
-        """Update pose and landmarks with known landmarks; return used, gated, median innovation, NIS per degree."""
-        camera, T_cam0_imu = self._camera, self._T_cam0_imu
+        """Update pose and landmarks with known landmarks; return used, gated, median innovation,
+        NIS per degree.
+        """
+        camera = self._camera
+        T_cam0_imu = self._T_cam0_imu
         visible = self._in_front(self._map.m[slots])
-        z, slots = z[visible], slots[visible]
+        z = z[visible]
+        slots = slots[visible]
         unseen = int((~visible).sum())
         if len(z) == 0:
             return 0, unseen, None, None
-        m, P = self._map.m[slots], self._map.P[slots]
+        m = self._map.m[slots]
+        P = self._map.P[slots]
         residual, nis = self._innovation(z, m, P)
         accepted: BoolArray = nis <= self._gate
         outvoted = len(z) >= _MIN_FEATURES and 2 * accepted.sum() < len(z)
@@ -274,7 +326,10 @@ class Vislam(Backend):
             return 0, gated, None, None
         innovation = float(np.median(np.abs(residual[accepted])))
         nis_per_dof = float(nis[accepted].mean() / 4)
-        m, P, z, slots = m[accepted], P[accepted], z[accepted], slots[accepted]
+        m = m[accepted]
+        P = P[accepted]
+        z = z[accepted]
+        slots = slots[accepted]
 
         if self._settings.mode == "slam" and len(z) >= _MIN_FEATURES:
             self._pose_update(z, m, P)
@@ -284,27 +339,37 @@ class Vislam(Backend):
         self._map.m[slots], self._map.P[slots] = update_landmarks(m, P, H_m, residual, V)
         return int(accepted.sum()), gated, innovation, nis_per_dof
 
-    def _innovation(self, z: FloatArray, m: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _innovation(
+        self, z: FloatArray, m: FloatArray, P: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Residuals (N, 4) of known landmarks and their squared Mahalanobis lengths (N,)."""
         U = self._state.U
         H = z_D_xi(self._camera, self._T_cam0_imu, U, m)
         residual = z - project(self._camera, transform_points(self._T_cam0_imu @ U, m))
         S = H @ self._state.Sigma[:6, :6] @ np.swapaxes(H, -1, -2) + self._residual_covariance(m, P)
-        return residual, np.einsum("ni,ni->n", residual, np.linalg.solve(S, residual[..., None])[..., 0])
+        return residual, np.einsum(
+            "ni,ni->n", residual, np.linalg.solve(S, residual[..., None])[..., 0]
+        )
 
     def _pose_update(self, z: FloatArray, m: FloatArray, P: FloatArray) -> None:
         """Update the pose, relinearising at each iteration (iterated EKF, Bell and Cathey 1993)."""
-        camera, T_cam0_imu, prior = self._camera, self._T_cam0_imu, self._state
+        camera = self._camera
+        T_cam0_imu = self._T_cam0_imu
+        prior = self._state
         for _ in range(self._settings.iterations):
             U = self._state.U
             H = z_D_xi(camera, T_cam0_imu, U, m)
             residual = z - project(camera, transform_points(T_cam0_imu @ U, m))
             moved = se3_log(U @ se3_inverse(prior.U))
-            correction, Sigma = update_pose(prior.Sigma, H, residual + H @ moved, self._residual_covariance(m, P))
+            correction, Sigma = update_pose(
+                prior.Sigma, H, residual + H @ moved, self._residual_covariance(m, P)
+            )
             self._state = prior.corrected(correction, Sigma)
 
     def _residual_covariance(self, m: FloatArray, P: FloatArray) -> FloatArray:
-        """Covariance (N, 4, 4) of the residuals but for the pose: pixels, and the landmarks where asked for."""
+        """Covariance (N, 4, 4) of the residuals but for the pose: pixels, and the landmarks
+        where asked for.
+        """
         V = self._settings.pixel_sigma_px**2 * np.eye(4)
         if not self._settings.landmark_uncertainty:
             return np.broadcast_to(V, (len(m), 4, 4))
@@ -321,7 +386,9 @@ class Vislam(Backend):
         p_cam, valid = triangulate(self._camera, z)
         depth = depth_of(self._camera, p_cam)
         valid &= (depth > _MIN_DEPTH_M) & (depth < _MAX_LANDMARK_DISTANCE_M)
-        ids, z, p_cam = ids[valid], z[valid], p_cam[valid]
+        ids = ids[valid]
+        z = z[valid]
+        p_cam = p_cam[valid]
         T_world_cam0 = se3_inverse(self._T_cam0_imu @ self._state.U)
         if s.landmark_prior == "stereo":
             J = T_world_cam0[:3, :3] @ p_cam_D_z(self._camera, z)

@@ -1,7 +1,7 @@
 """Motion models of the paper's filter: the input held from frame to frame, and a twist that drifts.
 
-The state is `U = T_imu_world` with error xi in `U = exp(xi) U_hat`, and, where the model keeps one, the body twist
-`u = [v; omega]` with an additive error. Equation numbers are those of docs/math.md.
+The state is `U = T_imu_world` with error xi in `U = exp(xi) U_hat`, and, where the model keeps one,
+the body twist `u = [v; omega]` with an additive error. Equation numbers are those of docs/math.md.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ class PoseState:
     """What the motion model carries."""
 
     U: FloatArray  # (4, 4) T_imu_world
-    twist: FloatArray | None  # (6,) body velocity and rate, m/s and rad/s; None: not part of the state
+    # (6,) body velocity and rate, m/s and rad/s; None: not part of the state
+    twist: FloatArray | None
     Sigma: FloatArray  # (6, 6) of xi, or (12, 12) of [xi; twist error]
 
     def corrected(self, correction: FloatArray, Sigma: FloatArray) -> PoseState:
@@ -72,7 +73,9 @@ def predict_twist(
 
 
 class HeldInput:
-    """The paper's model: each measured velocity is the input of the step, and W what it may be wrong by."""
+    """The paper's model: each measured velocity is the input of the step, and W what it may be
+    wrong by.
+    """
 
     measures_at_once = False
 
@@ -95,17 +98,22 @@ class HeldInput:
         Raises:
             EstimationError: there is no sample.
         """
-        U, Sigma = state.U, state.Sigma
+        U = state.U
+        Sigma = state.Sigma
         for u, part_s in self._inputs_between(start_ns, end_ns):
             W = self._noise(part_s, part_s / ((end_ns - start_ns) * 1e-9))
             U, Sigma = predict(U, Sigma, u, part_s, W)
         return replace(state, U=U, Sigma=Sigma)
 
     def _inputs_between(self, start_ns: int, end_ns: int) -> list[tuple[FloatArray, float]]:
-        """Split an interval at the samples within it: pairs of input (6,) and duration in seconds."""
+        """Split an interval at the samples within it: pairs of input (6,) and duration in
+        seconds.
+        """
         samples = self._samples
         if not samples:
-            raise EstimationError("no velocity sample before the second frame; use --motion none or check the clocks")
+            raise EstimationError(
+                "no velocity sample before the second frame; use --motion none or check the clocks"
+            )
         times = [s.time_ns for s in samples]
         inputs = np.array([np.concatenate([s.linear, s.angular]) for s in samples])
         cuts = [start_ns, *(t for t in times if start_ns < t < end_ns), end_ns]
@@ -113,26 +121,32 @@ class HeldInput:
         at_cuts = np.stack([np.interp(cuts, times, column) for column in inputs.T], axis=1)
         kept = [i for i, t in enumerate(times) if t <= end_ns][-1:]
         self._samples = samples[kept[0] if kept else 0 :]
-        first, second = {"midpoint": (0.5, 0.5), "start": (1.0, 0.0), "end": (0.0, 1.0)}[self._settings.input_at]
+        first, second = {"midpoint": (0.5, 0.5), "start": (1.0, 0.0), "end": (0.0, 1.0)}[
+            self._settings.input_at
+        ]
         return [
-            (first * at_cuts[k] + second * at_cuts[k + 1], (cuts[k + 1] - cuts[k]) * 1e-9) for k in range(len(cuts) - 1)
+            (first * at_cuts[k] + second * at_cuts[k + 1], (cuts[k + 1] - cuts[k]) * 1e-9)
+            for k in range(len(cuts) - 1)
         ]
 
     def _noise(self, part_s: float, share_of_step: float) -> FloatArray:
         """W (6, 6) of a part of the step from one frame to the next."""
         s = self._settings
         sigmas = np.repeat([s.linear_velocity_sigma_mps, s.angular_rate_sigma_radps], 3)
-        # The paper states standard deviations and adds them as variances once per frame, whatever the step.
+        # The paper states standard deviations and adds them as variances once per frame, whatever
+        # the step.
         return np.diag(sigmas * share_of_step if s.noise == "literal" else (sigmas * part_s) ** 2)
 
 
 class DriftingTwist:
-    """The body twist is a state that drifts with white acceleration; velocity samples, if any, measure it.
+    """The body twist is a state that drifts with white acceleration; velocity samples, if any,
+    measure it.
 
-    With velocities as noisy as the paper's, 5 cm and 0.3 deg a step, the step before says as much of the next one as
-    the sensor does; the two are weighed here instead of discarding one. Without velocities nothing else changes.
-    Reference: Barfoot, Tong & Särkkä, Batch continuous-time trajectory estimation (2014), the white-noise-on-
-    acceleration prior, here causal.
+    With velocities as noisy as the paper's, 5 cm and 0.3 deg a step, the step before says as much
+    of the next one as the sensor does; the two are weighed here instead of discarding one. Without
+    velocities nothing else changes.
+    Reference: Barfoot, Tong & Särkkä, Batch continuous-time trajectory estimation (2014), the
+    white-noise-on- acceleration prior, here causal.
     """
 
     measures_at_once = True
@@ -140,15 +154,21 @@ class DriftingTwist:
     def __init__(self, settings: VislamSettings) -> None:
         s = settings
         self._density = np.repeat([s.acceleration_density, s.angular_acceleration_density], 3) ** 2
-        self._sensor = np.diag(np.repeat([s.linear_velocity_sigma_mps, s.angular_rate_sigma_radps], 3) ** 2)
+        self._sensor = np.diag(
+            np.repeat([s.linear_velocity_sigma_mps, s.angular_rate_sigma_radps], 3) ** 2
+        )
         self._start = np.repeat([_START_VELOCITY_SIGMA_MPS, _START_RATE_SIGMA_RADPS], 3) ** 2
 
     def start(self, U: FloatArray) -> PoseState:
-        """Return the state at the first frame: the world is where the body is, its twist unknown."""
+        """Return the state at the first frame: the world is where the body is, its twist
+        unknown.
+        """
         return PoseState(U, np.zeros(6), np.diag(np.concatenate([np.zeros(6), self._start])))
 
     def take(self, state: PoseState, sample: VelocitySample) -> PoseState:
-        """Update the twist with a sample of the state's time; a plain Kalman update, as the sensor is linear."""
+        """Update the twist with a sample of the state's time; a plain Kalman update, as the
+        sensor is linear.
+        """
         assert state.twist is not None
         Sigma = state.Sigma
         K = np.linalg.solve(Sigma[6:, 6:] + self._sensor, Sigma[6:]).T

@@ -1,8 +1,9 @@
-"""The window: means of navigation state, calibration, clones and landmarks, and the prior over all their errors.
+"""The window: means of navigation state, calibration, clones and landmarks, and the prior over all
+their errors.
 
-The error of a clone is that of the camera's pose, equation (C2), so the calibration of camera and IMU enters where a
-clone is made and nowhere else. `vio.filters.error_state` says where each error is, `vio.filters.prior` holds the
-covariance.
+The error of a clone is that of the camera's pose, equation (C2), so the calibration of camera and
+IMU enters where a clone is made and nowhere else. `vio.filters.error_state` says where each error
+is, `vio.filters.prior` holds the covariance.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ class Clones:
         return len(self.times_ns)
 
     def __getitem__(self, index: int) -> Clone:
-        number, time_ns = int(self.frame_indices[index]), int(self.times_ns[index])
+        number = int(self.frame_indices[index])
+        time_ns = int(self.times_ns[index])
         return Clone(number, time_ns, self.T_world_imu[index], self.velocities[index])
 
     def with_newest(self, clone: Clone) -> Clones:
@@ -67,12 +69,18 @@ class Clones:
 
     def without_oldest(self) -> Clones:
         """Return all but the first."""
-        return Clones(self.frame_indices[1:], self.times_ns[1:], self.T_world_imu[1:], self.velocities[1:])
+        return Clones(
+            self.frame_indices[1:], self.times_ns[1:], self.T_world_imu[1:], self.velocities[1:]
+        )
 
     def turned(self, R: FloatArray) -> Clones:
         """Return the same in a world that is turned by R (3, 3)."""
         velocities = np.array([R @ v for v in self.velocities])
-        return replace(self, T_world_imu=se3_from_parts(R, np.zeros(3)) @ self.T_world_imu, velocities=velocities)
+        return replace(
+            self,
+            T_world_imu=se3_from_parts(R, np.zeros(3)) @ self.T_world_imu,
+            velocities=velocities,
+        )
 
 
 _NO_CALIBRATION = Calibration(np.eye(4))
@@ -118,7 +126,9 @@ class Window:
         return out
 
     def body_D_error(self) -> FloatArray:
-        """Jacobian (6N, k) of the errors of the body's poses at the exposures by the first k, to theirs: (C3)."""
+        """Jacobian (6N, k) of the errors of the body's poses at the exposures by the first k, to
+        theirs: (C3).
+        """
         state = self.state
         out = np.eye(6 * len(self.clones), state.clones.stop, state.clones.start)
         if "extrinsics" in state:
@@ -139,11 +149,17 @@ class Window:
 
         Args:
             step: the step.
-            walk: variances (C,) that the constants of the calibration gain by their random walk; None: nothing.
+            walk: variances (C,) that the constants of the calibration gain by their random walk;
+                None: nothing.
         """
-        state, prior, before = self.state, self.prior, self.nav
-        Phi = self.calibration.transition(state, step, step.nav.T_world_imu @ se3_inverse(before.T_world_imu))
-        own, T_cam0_imu = state.own, self.calibration.T_cam0_imu
+        state = self.state
+        prior = self.prior
+        before = self.nav
+        Phi = self.calibration.transition(
+            state, step, step.nav.T_world_imu @ se3_inverse(before.T_world_imu)
+        )
+        own = state.own
+        T_cam0_imu = self.calibration.T_cam0_imu
         V = prior.error_D_constants
         V[own] = Phi @ V[own]
         V[:DIM, 0] += step.Phi @ scaled_nav(before, T_cam0_imu) - scaled_nav(step.nav, T_cam0_imu)
@@ -153,7 +169,9 @@ class Window:
         P[:, own] = P[:, own] @ Phi.T
         P[:DIM, :DIM] += step.Q
         if walk is not None:
-            P[state.calibration, state.calibration] += self.calibration.in_world(walk, self.nav.T_world_imu)
+            P[state.calibration, state.calibration] += self.calibration.in_world(
+                walk, self.nav.T_world_imu
+            )
         prior.delta[own] = Phi @ prior.delta[own]
 
     def estimate_block(self, name: str, calibration: Calibration, covariance: FloatArray) -> None:
@@ -169,7 +187,8 @@ class Window:
         self.prior.insert(self.state[name].start, covariance)
 
     def keep_first_attitude(self, calibration: Calibration) -> None:
-        """Make a state of the oldest clone's attitude, which stays when the clone is dropped, equation (N14).
+        """Make a state of the oldest clone's attitude, which stays when the clone is dropped,
+        equation (N14).
 
         Args:
             calibration: that estimates the block `first_attitude`.
@@ -178,11 +197,15 @@ class Window:
         phi = slice(first.start + 3, first.stop)
         J = np.eye(3, first.stop, phi.start)
         self.calibration = calibration
-        self.prior.insert_dependent(first.start, J, np.zeros((3, 3)), self.prior.error_D_constants[phi, 0])
+        self.prior.insert_dependent(
+            first.start, J, np.zeros((3, 3)), self.prior.error_D_constants[phi, 0]
+        )
         self._lay_out()
 
     def since_first(self, out_D_error: FloatArray) -> FloatArray:
-        """Turn Jacobians (6k, D) of poses into those of the same in the world that is reported, equation (N14)."""
+        """Turn Jacobians (6k, D) of poses into those of the same in the world that is reported,
+        equation (N14).
+        """
         if "first_attitude" in self.state:
             out_D_error = out_D_error.copy()
             rows = out_D_error.reshape(-1, 6, out_D_error.shape[1])
@@ -190,7 +213,9 @@ class Window:
         return out_D_error
 
     def inflate_process_noise(self, extra: FloatArray) -> None:
-        """Add noise (15, 15) to the last step, as if its motion had been known less; the newest clone ends it."""
+        """Add noise (15, 15) to the last step, as if its motion had been known less; the newest
+        clone ends it.
+        """
         J = np.zeros((self.state.size, DIM))
         J[:DIM] = np.eye(DIM)
         J[self.state.clone(-1), :6] = np.eye(6)
@@ -200,8 +225,8 @@ class Window:
     def compare_clocks(self, time_ns: int, late_s: float, twist: Twist) -> None:
         """Let exposures follow the error of the time offset from now on, equation (C2).
 
-        Until here the navigation state was that of an exposure by the offset believed, so it is the state that an error
-        of the offset has moved, and not the next exposure.
+        Until here the navigation state was that of an exposure by the offset believed, so it is the
+        state that an error of the offset has moved, and not the next exposure.
 
         Args:
             time_ns: stamp of the coming frame.
@@ -211,7 +236,8 @@ class Window:
         self.clocks_compared = True
         _, camera_D_own, noise = self.camera_D_own(late_s, twist)
         offset = self.state["time_offset"].start
-        to_nav, moved = np.eye(self.state.size), camera_D_own[:, offset]
+        to_nav = np.eye(self.state.size)
+        moved = camera_D_own[:, offset]
         to_nav[:6, offset] = -moved
         before = self.clones[-1]
         acceleration = (self.nav.velocity - before.velocity) / (1e-9 * (time_ns - before.time_ns))
@@ -220,32 +246,46 @@ class Window:
         self.prior.P[:6, :6] += noise
 
     def add_clone(
-        self, frame_index: int, time_ns: int, exposure: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self,
+        frame_index: int,
+        time_ns: int,
+        exposure: tuple[FloatArray, FloatArray, FloatArray] | None = None,
     ) -> None:
-        """Add the pose at an exposure as the newest clone; landmarks are anchored to its rotation from now on.
+        """Add the pose at an exposure as the newest clone; landmarks are anchored to its rotation
+        from now on.
 
         Args:
             frame_index: the frame's number.
             time_ns: the frame's stamp.
-            exposure: what `camera_D_own` has returned for it; None: the navigation state is that of the exposure.
+            exposure: what `camera_D_own` has returned for it; None: the navigation state is that of
+                the exposure.
         """
         T, camera_D_own, noise = self.camera_D_own(0.0, NO_TWIST) if exposure is None else exposure
         of_scale = self.prior.error_D_constants[self.state.own, 0].copy()
         of_scale[:DIM] += scaled_nav(self.nav, self.calibration.T_cam0_imu)
         scaled_clone = scaled_nav(replace(self.nav, T_world_imu=T), self.calibration.T_cam0_imu)[:6]
-        self.prior.insert_dependent(self.state.clones.stop, camera_D_own, noise, camera_D_own @ of_scale - scaled_clone)
+        self.prior.insert_dependent(
+            self.state.clones.stop, camera_D_own, noise, camera_D_own @ of_scale - scaled_clone
+        )
         self.clones = self.clones.with_newest(Clone(frame_index, time_ns, T, self.nav.velocity))
         self._lay_out()
         if len(self.landmarks):
             self._anchor_to_newest(self.state.clone(-2).start + 3)
 
-    def camera_D_own(self, late_s: float, twist: Twist) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the body's pose and the Jacobian of `camera_at`, and the covariance of `exposure_noise`."""
+    def camera_D_own(
+        self, late_s: float, twist: Twist
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the body's pose and the Jacobian of `camera_at`, and the covariance of
+        `exposure_noise`.
+        """
         T, J = self.camera_at(late_s, twist, self.nav)
         return T, J, self.exposure_noise(T, late_s, twist)
 
-    def camera_at(self, late_s: float, twist: Twist, nav: NavState) -> tuple[FloatArray, FloatArray]:
-        """How errors of navigation state and calibration move the camera at an exposure, equation (C2).
+    def camera_at(
+        self, late_s: float, twist: Twist, nav: NavState
+    ) -> tuple[FloatArray, FloatArray]:
+        """How errors of navigation state and calibration move the camera at an exposure, equation
+        (C2).
 
         Args:
             late_s: the navigation state's time on the IMU's clock minus the frame's stamp.
@@ -255,8 +295,11 @@ class Window:
         Returns:
             The body's pose (4, 4) at the exposure, and the Jacobian (6, 15 + C).
         """
-        T, state, calibration = nav.T_world_imu, self.state, self.calibration
-        J, exposed = np.eye(6, state.own.stop), T
+        T = nav.T_world_imu
+        state = self.state
+        calibration = self.calibration
+        J = np.eye(6, state.own.stop)
+        exposed = T
         compared = self.clocks_compared and "time_offset" in state
         if "time_offset" in state:
             exposed = T @ se3_exp(twist.mean * (calibration.time_offset_s - late_s))
@@ -267,20 +310,28 @@ class Window:
         return exposed, J
 
     def exposure_noise(self, T_world_imu: FloatArray, late_s: float, twist: Twist) -> FloatArray:
-        """Covariance (6, 6) of the camera at an exposure of the body (4, 4), by an uncertain twist over its offset."""
+        """Covariance (6, 6) of the camera at an exposure of the body (4, 4), by an uncertain
+        twist over its offset.
+        """
         if not self.clocks_compared or "time_offset" not in self.state:
             return np.zeros((6, 6))
-        A, row = se3_adjoint(T_world_imu), self.state["time_offset"].start
+        A = se3_adjoint(T_world_imu)
+        row = self.state["time_offset"].start
         spread = float(self.prior.P[row, row]) + (self.calibration.time_offset_s - late_s) ** 2
         out: FloatArray = A @ twist.covariance @ A.T * spread
         return out
 
     def _anchor_to_newest(self, previous_rotation: int) -> None:
-        """Measure the landmarks' errors from the newest exposure's rotation: xi_f += p^ (phi_new - phi_old)."""
-        first, newest = self.state.landmarks.start, self.state.clone(-1).start + 3
-        turn, before = slice(newest, newest + 3), slice(previous_rotation, previous_rotation + 3)
+        """Measure the landmarks' errors from the newest exposure's rotation: xi_f += p^ (phi_new
+        - phi_old).
+        """
+        first = self.state.landmarks.start
+        newest = self.state.clone(-1).start + 3
+        turn = slice(newest, newest + 3)
+        before = slice(previous_rotation, previous_rotation + 3)
         p_cross = so3_hat(self.landmarks).reshape(-1, 3)
-        P, delta = self.prior.to_change(), self.prior.delta
+        P = self.prior.to_change()
+        delta = self.prior.delta
         P[first:] += p_cross @ (P[turn] - P[before])
         P[first:, first:] += (P[first:, turn] - P[first:, before]) @ p_cross.T
         P[:first, first:] = P[first:, :first].T
@@ -298,9 +349,12 @@ class Window:
         """Forget the landmarks outside a mask (M,)."""
         if chosen.all():
             return
-        rows = np.concatenate([np.ones(self.state.landmarks.start, dtype=np.bool_), np.repeat(chosen, 3)])
+        rows = np.concatenate(
+            [np.ones(self.state.landmarks.start, dtype=np.bool_), np.repeat(chosen, 3)]
+        )
         self.prior.keep(np.flatnonzero(rows))
-        self.landmark_ids, self.landmarks = self.landmark_ids[chosen], self.landmarks[chosen]
+        self.landmark_ids = self.landmark_ids[chosen]
+        self.landmarks = self.landmarks[chosen]
         self._lay_out()
 
     def add_landmarks(
@@ -313,15 +367,20 @@ class Window:
     ) -> None:
         """Add landmarks (K, 3) whose errors are `A xi + B c + noise`.
 
-        A is (3K, D), the noise's covariance (K, 3, 3), B (3K, 4) by the constants considered; None: zero.
+        A is (3K, D), the noise's covariance (K, 3, 3), B (3K, 4) by the constants considered; None:
+        zero.
         """
         self.prior.append(A, covariance, by_considered)
         self.landmark_ids = np.concatenate([self.landmark_ids, ids])
         self.landmarks = np.concatenate([self.landmarks, p_world])
         self._lay_out()
 
-    def optimum(self, information: FloatArray, vector: FloatArray, size: int) -> tuple[Fit, FloatArray]:
-        """Where the prior and information of pixels (D, D) and (D,) agree best, see `Prior.optimum`."""
+    def optimum(
+        self, information: FloatArray, vector: FloatArray, size: int
+    ) -> tuple[Fit, FloatArray]:
+        """Where the prior and information of pixels (D, D) and (D,) agree best, see
+        `Prior.optimum`.
+        """
         return self.prior.optimum(information, vector, size, self.state.first_of_pixels)
 
     def absorb(
@@ -338,21 +397,34 @@ class Window:
             information: (D, D).
             vector: (D,).
             scaled: for measurements in metres.
-            repeated: for pixels, the factor by which they repeat what was said of the rectification error.
+            repeated: for pixels, the factor by which they repeat what was said of the rectification
+                error.
             considered: for pixels, the part (D, 4) of the constants considered.
         """
-        partly = (self.state["stereo_field"], repeated) if repeated > 1 and "stereo_field" in self.state else None
-        self.prior.absorb(information, vector, self.state.first_of_pixels, scaled, partly, considered)
+        partly = (
+            (self.state["stereo_field"], repeated)
+            if repeated > 1 and "stereo_field" in self.state
+            else None
+        )
+        self.prior.absorb(
+            information, vector, self.state.first_of_pixels, scaled, partly, considered
+        )
 
     def absorb_measurement(self, measurement: Measurement) -> None:
         """Absorb a measurement of the navigation state; the means stay where they are."""
-        RiH, own = np.linalg.solve(measurement.R, measurement.H), slice(0, measurement.H.shape[1])
+        RiH = np.linalg.solve(measurement.R, measurement.H)
+        own = slice(0, measurement.H.shape[1])
         information = np.zeros_like(self.prior.P)
         information[own, own] = measurement.H.T @ RiH
         vector = np.zeros(self.state.size)
         vector[own] = RiH.T @ measurement.residual
-        scaled, test = None, self.prior.scale_test
-        if measurement.metric and test is not None and is_clear(self.nav.velocity, self.prior.P[6:9, 6:9]):
+        scaled = None
+        test = self.prior.scale_test
+        if (
+            measurement.metric
+            and test is not None
+            and is_clear(self.nav.velocity, self.prior.P[6:9, 6:9])
+        ):
             scaled = np.zeros(self.state.size)
             scaled[:DIM] = scaled_nav(self.nav, self.calibration.T_cam0_imu)
         self.absorb(information, vector, scaled)
@@ -366,8 +438,10 @@ class Window:
         """Move the means by an error vector (D,); the prior stays where it is."""
         state = self.state
         of_clones = error[state.clones]
-        clones, moves = self.clones, of_clones.reshape(-1, 6).copy()
-        T, velocities = clones.T_world_imu.copy(), clones.velocities
+        clones = self.clones
+        moves = of_clones.reshape(-1, 6).copy()
+        T = clones.T_world_imu.copy()
+        velocities = clones.velocities
         if "extrinsics" in state:
             loops.add_extrinsic_moves(T, self.nav.T_world_imu, error[state["extrinsics"]], moves)
         move_poses(moves, T)
@@ -380,21 +454,27 @@ class Window:
             velocities = self.motion.corrected_earlier(velocities, R, ages, error[state.motion])
         self.clones = Clones(clones.frame_indices, clones.times_ns, T, velocities)
         if self.calibration.estimated:
-            self.calibration = self.calibration.corrected(error[state.calibration], self.nav.T_world_imu)
+            self.calibration = self.calibration.corrected(
+                error[state.calibration], self.nav.T_world_imu
+            )
         self.nav = self.motion.corrected(self.nav, error[state.motion])
         self.prior.delta = self.prior.delta + error
 
     def turn_world(self, yaw: float, yaw_D_tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Turn the whole world about its z axis, and let the errors' yaw hang on the present tilt, equation (N13).
+        """Turn the whole world about its z axis, and let the errors' yaw hang on the present tilt,
+        equation (N13).
 
         Args:
             yaw: rad; no residual changes by it.
             yaw_D_tilt: (3,) by the navigation state's phi, for the yaw of all poses alike.
 
         Returns:
-            R (3, 3), which takes points of the old world to the new one, and M (D, D), which does so with errors.
+            R (3, 3), which takes points of the old world to the new one, and M (D, D), which does
+            so with errors.
         """
-        R, state, prior = so3_exp([0.0, 0.0, yaw]), self.state, self.prior
+        R = so3_exp([0.0, 0.0, yaw])
+        state = self.state
+        prior = self.prior
         M = np.eye(state.size)
         M[[5, *range(state.clones.start + 5, state.clones.stop, 6)], 3:6] += yaw_D_tilt
         in_world = [*range(0, 9, 3), *range(state.clones.start, state.size, 3)]
@@ -405,9 +485,13 @@ class Window:
             turn[k : k + 3, k : k + 3] = R
         M = turn @ M
         T = se3_from_parts(R, np.zeros(3))
-        self.nav = replace(self.nav, T_world_imu=T @ self.nav.T_world_imu, velocity=R @ self.nav.velocity)
+        self.nav = replace(
+            self.nav, T_world_imu=T @ self.nav.T_world_imu, velocity=R @ self.nav.velocity
+        )
         self.clones = self.clones.turned(R)
         self.landmarks = self.landmarks @ R.T
         P = M @ prior.P @ M.T
-        prior.P, prior.delta, prior.error_D_constants = 0.5 * (P + P.T), turn @ prior.delta, M @ prior.error_D_constants
+        prior.P = 0.5 * (P + P.T)
+        prior.delta = turn @ prior.delta
+        prior.error_D_constants = M @ prior.error_D_constants
         return R, M

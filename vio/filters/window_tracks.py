@@ -1,6 +1,8 @@
-"""The tracks of the window: which of them enter an update, their linearisation, their gates, and the pixel noise.
+"""The tracks of the window: which of them enter an update, their linearisation, their gates, and
+the pixel noise.
 
-Everything here is about pixels and points; poses come in as camera poses and go out as information about them.
+Everything here is about pixels and points; poses come in as camera poses and go out as information
+about them.
 """
 
 from __future__ import annotations
@@ -26,7 +28,12 @@ from vio.filters.multiview import (
     usable_points,
 )
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import StereoColumns, StereoCorrection, eliminate_points, stereo_columns
+from vio.filters.stereo_calibration import (
+    StereoColumns,
+    StereoCorrection,
+    eliminate_points,
+    stereo_columns,
+)
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -36,25 +43,32 @@ from vio.records import BoolArray, IntArray
 
 MIN_TRACKS_FOR_NOISE = 15  # with fewer, neither the pixel noise nor the process noise is adapted
 LEAST_PIXEL_SIGMA_PX = 0.03  # lower bound of the estimated noise of one pixel coordinate
-# Pixels of a track share errors that its residuals do not show, and no right image bounds what they make of the scale
-# (docs/notes/design_decisions.md, pixel noise of one camera).
+# Pixels of a track share errors that its residuals do not show, and no right image bounds what they
+# make of the scale (docs/notes/design_decisions.md, pixel noise of one camera).
 _LEAST_MONO_PX = 0.1
 _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals in the end
-_PRIOR_FRAMES = 0.1  # the noise at the start may be off by a factor of four, that of frames differs by one and a half
+# the noise at the start may be off by a factor of four, that of frames differs by one and a half
+_PRIOR_FRAMES = 0.1
 _MOST_CHANGE = 4.0  # of the variance from frame to frame that is believed in the end
-# Degrees of freedom: 2 for the mean of an inverse chi-square, over the efficiency of a median, 0.64.
+# Degrees of freedom: 2 for the mean of an inverse chi-square, over the efficiency of a median,
+# 0.64.
 _SPENT_ON_NOISE = 3.0
 _VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
-_GOING_ON = 0.1  # of the tracks used, at least, that the newest frame shows and that stay in the window
+# of the tracks used, at least, that the newest frame shows and that stay in the window
+_GOING_ON = 0.1
 _MOST_DOF = 199
-_NO_INFORMATION = 1e-8  # left of a pose's own, at most: directions that pixels alone do not tell, as where the world is
-_MOST_COMMON_NOISE = 4.0  # of a frame over the learned variance: beyond twice the noise it is no blur
+# left of a pose's own, at most: directions that pixels alone do not tell, as where the world is
+_NO_INFORMATION = 1e-8
+# of a frame over the learned variance: beyond twice the noise it is no blur
+_MOST_COMMON_NOISE = 4.0
 
 
 @dataclass(frozen=True)
 class LinearTracks:
-    """Tracks linearised at one estimate of the window; their normal equations are collected where they are used."""
+    """Tracks linearised at one estimate of the window; their normal equations are collected
+    where they are used.
+    """
 
     camera: StereoCamera
     variance: float  # of one pixel coordinate, px^2
@@ -62,9 +76,11 @@ class LinearTracks:
     rows: IntArray  # (F,) in the table
     p_world: FloatArray  # (F, 3)
     at: Residuals
-    # (F, N, 4) pixels as they are predicted: those seen share their noise with the residuals, which biases coefficients
+    # (F, N, 4) pixels as they are predicted: those seen share their noise with the residuals, which
+    # biases coefficients
     z: FloatArray
-    field: StereoCorrection | None  # what was taken out of the pixels; None: the rectification error is not estimated
+    # what was taken out of the pixels; None: the rectification error is not estimated
+    field: StereoCorrection | None
 
     @cached_property
     def weight(self) -> FloatArray:
@@ -84,7 +100,10 @@ class LinearTracks:
         return stereo_columns(self.field.columns(), self.at, self.z, self.weight)
 
     def newest_innovation(self) -> float | None:
-        """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
+        """Median absolute residual in the newest clone, pixels.
+
+        None where nothing is seen in it.
+        """
         return loops.newest_residual(self.at.r, self.at.z_D_p)
 
 
@@ -92,25 +111,32 @@ class WindowTracks:
     """The tracks in the window, and the pixel noise estimated from their residuals."""
 
     def __init__(self, camera: StereoCamera, settings: MsckfSettings) -> None:
-        self._camera, self._settings = camera, settings
+        self._camera = camera
+        self._settings = settings
         self.table = TrackTable(settings.clones + 1)
         self._least_px = _LEAST_MONO_PX if camera.kind == "mono" else LEAST_PIXEL_SIGMA_PX
         self._frames = 0  # from which the noise was learned
-        self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
-        self.common_noise = 1.0  # variance of all tracks' pixels over it in the last frame, at least 1
+        # of one pixel coordinate, px^2; follows the residuals
+        self.variance = settings.pixel_sigma_px**2
+        # variance of all tracks' pixels over it in the last frame, at least 1
+        self.common_noise = 1.0
 
     def choose(self, clones: int) -> IntArray:
-        """Rows of the tracks that constrain the poses: two views or more, the most informative first if too many."""
+        """Rows of the tracks that constrain the poses: two views or more, the most informative
+        first if too many.
+        """
         rows = self.table.rows()
         seen, length = self.table.lengths(rows)
         enough = length >= 2
         rows = rows[enough]
         if len(rows) > self._settings.max_features:
-            # What ends now has its last chance; then the longest. Where nearly all ends at once, as behind a cover, the
-            # newest pose needs some that go on: of few views a wrong one decides.
+            # What ends now has its last chance; then the longest. Where nearly all ends at once, as
+            # behind a cover, the newest pose needs some that go on: of few views a wrong one
+            # decides.
             seen = seen[enough]
             ends = ~seen[:, clones - 1] | seen[:, 0]
-            order, count = np.lexsort((self.table.ids(rows), -length[enough], ~ends)), int(ends.sum())
+            order = np.lexsort((self.table.ids(rows), -length[enough], ~ends))
+            count = int(ends.sum())
             most = self._settings.max_features
             going_on = order[count:][: round(_GOING_ON * most)]
             best = np.concatenate([going_on, order[:count], order[count + len(going_on) :]])[:most]
@@ -118,7 +144,11 @@ class WindowTracks:
         return rows
 
     def linearise(
-        self, T_cam0_world: FloatArray, rows: IntArray, steps: int, field: StereoCorrection | None = None
+        self,
+        T_cam0_world: FloatArray,
+        rows: IntArray,
+        steps: int,
+        field: StereoCorrection | None = None,
     ) -> LinearTracks:
         """Triangulate tracks, from where their points were last, and linearise them.
 
@@ -128,49 +158,76 @@ class WindowTracks:
             steps: Gauss-Newton steps on each point.
             field: what is taken out of the pixels where the rectification error is estimated.
         """
-        camera, table, T, clones = self._camera, self.table, T_cam0_world, len(T_cam0_world)
+        camera = self._camera
+        table = self.table
+        T = T_cam0_world
+        clones = len(T_cam0_world)
         views = self._views(rows, clones, field)
         fresh = ~table.has_point[rows]
         if fresh.any():
             start, known = first_points(camera, T, views.take(fresh))
-            table.points[rows[fresh]], table.has_point[rows[fresh]] = start, known
+            table.points[rows[fresh]] = start
+            table.has_point[rows[fresh]] = known
             started = table.has_point[rows]
-            rows, views = rows[started], views.take(started)
-        p = refine_points(camera, T, table.points[rows], views, steps, CAUCHY * float(np.sqrt(self.variance)))
+            rows = rows[started]
+            views = views.take(started)
+        p = refine_points(
+            camera, T, table.points[rows], views, steps, CAUCHY * float(np.sqrt(self.variance))
+        )
         at = residuals(camera, T, p, views)
         keep = usable_points(camera, T, p, views, at)
-        table.points[rows], table.has_point[rows] = p, keep
+        table.points[rows] = p
+        table.has_point[rows] = keep
         if not keep.all():
-            rows, p, at, views = rows[keep], p[keep], at.take(keep), views.take(keep)
+            rows = rows[keep]
+            p = p[keep]
+            at = at.take(keep)
+            views = views.take(keep)
         return self._linear(T, rows, p, at, field, at.predicted(views.z))
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
-        """Drop single views that contradict the rest of their track permanently, and linearise what is left."""
-        at, limits = tracks.at, chi_square_table(_VIEW_PROBABILITY)
+        """Drop single views that contradict the rest of their track permanently, and linearise
+        what is left.
+        """
+        at = tracks.at
+        limits = chi_square_table(_VIEW_PROBABILITY)
         wrong: BoolArray = np.empty(at.r.shape[:2], dtype=np.bool_)
         enough: BoolArray = np.empty(len(wrong), dtype=np.bool_)
         if not loops.mark_wrong_views(at.r, at.z_D_p, self.variance, limits, wrong, enough):
             return tracks
         self.table.drop_views(tracks.rows, wrong)
-        r, z_D_p = at.r.copy(), at.z_D_p.copy()
-        r[wrong], z_D_p[wrong] = 0.0, 0.0
+        r = at.r.copy()
+        z_D_p = at.z_D_p.copy()
+        r[wrong] = 0.0
+        z_D_p[wrong] = 0.0
         at = Residuals(r, z_D_p, np.ones(len(wrong), dtype=np.bool_), at.weight)
-        rows, p, z = tracks.rows[enough], tracks.p_world[enough], tracks.z[enough]
+        rows = tracks.rows[enough]
+        p = tracks.p_world[enough]
+        z = tracks.z[enough]
         return self._linear(tracks.T_cam0_world, rows, p, at.take(enough), tracks.field, z)
 
-    def innovations(self, predicted: LinearTracks, moved: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Squared innovations (F,) in the newest clone over their covariance, and how many pixels (F,) each has.
+    def innovations(
+        self, predicted: LinearTracks, moved: FloatArray
+    ) -> tuple[FloatArray, IntArray]:
+        """Squared innovations (F,) in the newest clone over their covariance, and how many pixels
+        (F,) each has.
 
         Args:
             predicted: tracks linearised where the motion model has the newest clone.
-            moved: covariance (6, 6) of its motion since the clone before, `[rho; phi]` on the world's side.
+            moved: covariance (6, 6) of its motion since the clone before, `[rho; phi]` on the
+                world's side.
         """
-        at, squared, pixels = predicted.at, np.empty(len(predicted.rows)), np.empty(len(predicted.rows), np.int64)
+        at = predicted.at
+        squared = np.empty(len(predicted.rows))
+        pixels = np.empty(len(predicted.rows), np.int64)
         loops.innovations(at.r, at.z_D_p, predicted.p_world, moved, self.variance, squared, pixels)
         return squared, pixels
 
     def innovation_ratio(self, predicted: LinearTracks, moved: FloatArray) -> float | None:
-        """Median innovation in the newest clone over its standard deviation; None where nothing is seen in it."""
+        """Median innovation in the newest clone over its standard deviation.
+
+        None where nothing is seen in it.
+        """
         squared, pixels = self.innovations(predicted, moved)
         used = pixels > 0
         if not used.any():
@@ -182,7 +239,8 @@ class WindowTracks:
 
         Args:
             predicted: tracks linearised where the motion model has the newest clone.
-            moved: covariance (6, 6) of its motion since the clone before, `[rho; phi]` on the world's side.
+            moved: covariance (6, 6) of its motion since the clone before, `[rho; phi]` on the
+                world's side.
 
         Returns:
             Whether there were any.
@@ -206,14 +264,18 @@ class WindowTracks:
         return LinearTracks(self._camera, self.variance, T_cam0_world, rows, p_world, at, z, field)
 
     def drift_scores(self, tracks: LinearTracks, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Scores and information (K, 6) of tracks (K,) by a drift of the poses about the newest one, points eliminated.
+        """Scores and information (K, 6) of tracks (K,) by a drift of the poses about the newest
+        one, points eliminated.
 
         In the believed noise, where the expected square of a score is its information.
         """
-        info, T = tracks.information, tracks.T_cam0_world[-1]
+        info = tracks.information
+        T = tracks.T_cam0_world[-1]
         scores, information = np.empty((2, len(chosen), 6))
         of_tracks = info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient
-        loops.score_drifts(chosen, *of_tracks, -T[:3, :3].T @ T[:3, 3], self.variance, scores, information)
+        loops.score_drifts(
+            chosen, *of_tracks, -T[:3, :3].T @ T[:3, 3], self.variance, scores, information
+        )
         return scores, information
 
     def _views(self, rows: IntArray, clones: int, field: StereoCorrection | None) -> Views:
@@ -228,27 +290,38 @@ class WindowTracks:
         exposure_errors: FloatArray,
         stereo_errors: FloatArray,
     ) -> None:
-        """Move each point as its own normal equations say once the clones (6N,) and the field (S,) have moved."""
+        """Move each point as its own normal equations say once the clones (6N,) and the field
+        (S,) have moved.
+        """
         other = 0.0 if columns is None else stereo_errors @ columns.G[:, : len(stereo_errors)]
         self.table.points[tracks.rows] = tracks.information.moved_points(exposure_errors, other)
 
     def agree(self, at: Residuals) -> bool:
-        """Whether nearly all views of the newest clone fit: only then may they contradict the motion model."""
+        """Whether nearly all views of the newest clone fit: only then may they contradict the
+        motion model.
+        """
         of_views, counts = squared_residuals(at)
-        squares, pixels = of_views[:, -1], counts[:, -1]
-        used, limits = pixels > 0, chi_square_table(_VIEW_PROBABILITY)[pixels]
-        return bool(used.any() and np.mean(squares[used] < self.variance * limits[used]) > _AGREEMENT)
+        squares = of_views[:, -1]
+        pixels = counts[:, -1]
+        used = pixels > 0
+        limits = chi_square_table(_VIEW_PROBABILITY)[pixels]
+        return bool(
+            used.any() and np.mean(squares[used] < self.variance * limits[used]) > _AGREEMENT
+        )
 
     def gate(self, at: Residuals) -> tuple[BoolArray, FloatArray, IntArray]:
-        """Test the tracks against the chi-square quantile of the settings, relative to how well all of them fit.
+        """Test the tracks against the chi-square quantile of the settings, relative to how well all
+        of them fit.
 
-        How well they fit, `common_noise`, is kept: it divides the information of this frame's pixels, too, less what
-        `leave_motion_out` takes out of it.
+        How well they fit, `common_noise`, is kept: it divides the information of this frame's
+        pixels, too, less what `leave_motion_out` takes out of it.
 
         Returns:
-            Mask (F,) of those that pass, their normalised squared residuals (F,), and the degrees of freedom (F,).
+            Mask (F,) of those that pass, their normalised squared residuals (F,), and the degrees
+            of freedom (F,).
         """
-        squares, dof = np.empty(len(at.r)), np.empty(len(at.r), dtype=np.int64)
+        squares = np.empty(len(at.r))
+        dof = np.empty(len(at.r), dtype=np.int64)
         loops.square_tracks(at.r, at.z_D_p, self.variance, _MOST_DOF, squares, dof)
         self.common_noise = min(_misfit(squares, dof), _MOST_COMMON_NOISE)
         limits = chi_square_table(self._settings.gate_probability)[dof] * self.common_noise
@@ -256,7 +329,8 @@ class WindowTracks:
         return passed, squares, dof
 
     def leave_motion_out(self, tracks: LinearTracks, nis: FloatArray, dof: IntArray) -> None:
-        """Leave out of the common noise what other poses would explain: it is an error of the prior, not of the pixels.
+        """Leave out of the common noise what other poses would explain: it is an error of the
+        prior, not of the pixels.
 
         With nothing but pixels to hold the poses, the weighted squares fall by `b' A^+ b`.
 
@@ -269,35 +343,45 @@ class WindowTracks:
             return
         A, b = eliminate_points(tracks.information, np.ones(len(dof), dtype=np.bool_))
         scale = np.sqrt(np.where(A.diagonal() > 0, A.diagonal(), 1.0))
-        # `b' A^+ b` by Cholesky with pivots, in the directions that A determines: b has no part in the others.
+        # `b' A^+ b` by Cholesky with pivots, in the directions that A determines: b has no part in
+        # the others.
         U, order, spent, _ = lapack.dpstrf(A / np.outer(scale, scale), tol=_NO_INFORMATION, lower=0)
         determined = order[:spent] - 1
         y, _ = lapack.dtrtrs(U[:spent, :spent], (b / scale)[determined], trans=1)
-        squares, total = float(np.sum(tracks.weight * squared_residuals(tracks.at)[0])), int(dof.sum())
+        squares = float(np.sum(tracks.weight * squared_residuals(tracks.at)[0]))
+        total = int(dof.sum())
         if total > spent:
             left = (1 - float(y @ y) / squares) / (1 - spent / total)
-            self.common_noise = min(max(_misfit(nis, dof) * min(left, 1.0), 1.0), _MOST_COMMON_NOISE)
+            self.common_noise = min(
+                max(_misfit(nis, dof) * min(left, 1.0), 1.0), _MOST_COMMON_NOISE
+            )
 
     def update_pixel_noise(self, squares: FloatArray, dof: IntArray, fitted: float) -> None:
-        """Let the pixel noise follow the median of squared residuals over that of chi-square, robustly.
+        """Let the pixel noise follow the median of squared residuals over that of chi-square,
+        robustly.
 
-        Its logarithm is the mean over the frames so far, then follows slowly. At the start it is hardly known: if half
-        a pixel is believed in place of a tenth, what moves by a pixel passes for noise.
+        Its logarithm is the mean over the frames so far, then follows slowly. At the start it is
+        hardly known: if half a pixel is believed in place of a tenth, what moves by a pixel passes
+        for noise.
 
         Args:
             squares: (F,) of tracks, over the variance believed.
             dof: (F,) their degrees of freedom, the poses known.
-            fitted: degrees of freedom that were spent on the poses and all else that tracks have in common.
+            fitted: degrees of freedom that were spent on the poses and all else that tracks have in
+                common.
         """
         if len(squares) < MIN_TRACKS_FOR_NOISE:
             return
         self._frames += 1
         gain = max(1 / (self._frames + _PRIOR_FRAMES), _NOISE_GAIN)
         most = _MOST_CHANGE ** (gain / _NOISE_GAIN)
-        # The mean of 1 / variance is that of the noise itself, where its estimate has about two degrees less.
+        # The mean of 1 / variance is that of the noise itself, where its estimate has about two
+        # degrees less.
         total = float(dof.sum())
         left = max(total - fitted - _SPENT_ON_NOISE, 0.25 * total)
-        ratio = min(max(total / left * median(squares / chi_square_table(0.5)[dof]), 1 / most), most)
+        ratio = min(
+            max(total / left * median(squares / chi_square_table(0.5)[dof]), 1 / most), most
+        )
         variance = max(self.variance * ratio**gain, self._least_px**2)
         self.variance = min(variance, self._settings.pixel_sigma_max_px**2)
 
@@ -317,10 +401,11 @@ class WindowTracks:
 
 
 def _misfit(squares: FloatArray, dof: IntArray) -> float:
-    """Variance of all tracks' pixels over what is assumed, where their squared residuals (F,) show more; else 1.
+    """Variance of all tracks' pixels over what is assumed, where their squared residuals (F,) show
+    more; else 1.
 
-    Blur comes and goes faster than the noise is learned, and then what fails the gate is the whole frame. The best
-    quarter decides: tracks on what moves are in the others.
+    Blur comes and goes faster than the noise is learned, and then what fails the gate is the whole
+    frame. The best quarter decides: tracks on what moves are in the others.
     """
     if len(squares) < MIN_TRACKS_FOR_NOISE:
         return 1.0

@@ -1,10 +1,12 @@
-"""Camera models: pinhole, radial-tangential, equidistant, unified, double sphere, and the stereo rig of two cameras.
+"""Camera models: pinhole, radial-tangential, equidistant, unified, double sphere, and the stereo
+rig of two cameras.
 
-Pixels: u right, v down, the centre of the top-left pixel is (0, 0). Rays and points are in the camera frame
-(x right, y down, z forward).
-References: Brown, Close-range camera calibration (1971), as written by OpenCV, EuRoC and KITTI with `k1 k2 p1 p2 [k3]`,
-or with OpenCV's rational `k4 k5 k6` as well; Kannala & Brandt, A generic camera model (2006), with `k1 k2 k3 k4` on the
-angle, as OpenCV's fisheye model. Unified and double sphere: `vio.geometry.sphere_models`.
+Pixels: u right, v down, the centre of the top-left pixel is (0, 0). Rays and points are in the
+camera frame (x right, y down, z forward).
+References: Brown, Close-range camera calibration (1971), as written by OpenCV, EuRoC and KITTI with
+`k1 k2 p1 p2 [k3]`, or with OpenCV's rational `k4 k5 k6` as well; Kannala & Brandt, A generic camera
+model (2006), with `k1 k2 k3 k4` on the angle, as OpenCV's fisheye model. Unified and double sphere:
+`vio.geometry.sphere_models`.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ _COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
 }
 _NEWTON_STEPS = 30
 _NEWTON_TOLERANCE = 1e-11  # on the normalised image plane: about 1e-8 px
-# Tolerances of a pair that is rectified up to the rounding of its calibration file: rows within 0.01 px.
+# Tolerances of a pair that is rectified up to the rounding of its calibration file: rows within
+# 0.01 px.
 _ALIGNED_RAD = 2e-5
 _ALIGNED_SHARE = 1e-4  # of the baseline
 _SAME_INTRINSICS = 1e-6
@@ -49,22 +52,28 @@ class CameraModel:
     width: int  # pixels
     height: int  # pixels
     model: DistortionModel = "pinhole"
-    # radtan: k1 k2 p1 p2 [k3 [k4 k5 k6]]; equidistant: k1 k2 k3 k4; unified: xi [k1 k2 p1 p2]; double_sphere: xi alpha;
-    # pinhole: none
+    # radtan: k1 k2 p1 p2 [k3 [k4 k5 k6]]; equidistant: k1 k2 k3 k4; unified: xi [k1 k2 p1 p2];
+    # double_sphere: xi alpha; pinhole: none
     coefficients: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if self.model not in _COEFFICIENTS:
-            raise CalibrationError(f"unknown distortion model {self.model!r}; use one of {', '.join(_COEFFICIENTS)}")
+            raise CalibrationError(
+                f"unknown distortion model {self.model!r}; use one of {', '.join(_COEFFICIENTS)}"
+            )
         values = (self.fu, self.fv, self.cu, self.cv, *self.coefficients)
         if not np.all(np.isfinite(values)):
-            raise CalibrationError(f"camera intrinsics are not finite: {values}; check the calibration file")
+            raise CalibrationError(
+                f"camera intrinsics are not finite: {values}; check the calibration file"
+            )
         if self.fu <= 0 or self.fv <= 0 or self.width <= 0 or self.height <= 0:
             raise CalibrationError(
-                f"focal lengths and image size must be positive, got fu={self.fu:g}, fv={self.fv:g}, "
+                f"focal lengths and image size must be positive, got fu={self.fu:g}, "
+                f"fv={self.fv:g}, "
                 f"{self.width}x{self.height}"
             )
-        object.__setattr__(self, "coefficients", tuple(self.coefficients))  # a list is no key of a cache
+        # a list is no key of a cache
+        object.__setattr__(self, "coefficients", tuple(self.coefficients))
         expected = _COEFFICIENTS[self.model]
         if len(self.coefficients) not in expected:
             raise CalibrationError(
@@ -72,12 +81,15 @@ class CameraModel:
                 f"{''.join(f' or {n}' for n in expected[1:])}, got {len(self.coefficients)}"
             )
         if self.model == "unified" and self.coefficients[0] < 0:
-            raise CalibrationError(f"the unified model's xi must not be negative, got {self.coefficients[0]:g}")
+            raise CalibrationError(
+                f"the unified model's xi must not be negative, got {self.coefficients[0]:g}"
+            )
         if self.model == "double_sphere":
             xi, alpha = self.coefficients
             if not (-1 < xi <= 1 and 0 <= alpha < 1):
                 raise CalibrationError(
-                    f"the double sphere model needs -1 < xi <= 1 and 0 <= alpha < 1, got xi={xi:g}, alpha={alpha:g}; "
+                    "the double sphere model needs -1 < xi <= 1 and 0 <= alpha < 1, got "
+                    f"xi={xi:g}, alpha={alpha:g}; "
                     "check their order"
                 )
 
@@ -104,11 +116,18 @@ class StereoRig:
 
 def rectified_pair(rig: StereoRig) -> StereoCamera | None:
     """Return the rectified pair equal to a rig up to rounding; None: the rig needs rectifying."""
-    a, b, T_cam0_cam1 = rig.cam0, rig.cam1, rig.T_cam0_cam1
+    a = rig.cam0
+    b = rig.cam1
+    T_cam0_cam1 = rig.T_cam0_cam1
     x, y, z = T_cam0_cam1[:3, 3]
     same_size = (a.width, a.height) == (b.width, b.height)
-    same = np.allclose((a.fu, a.fv, a.cu, a.cv), (b.fu, b.fv, b.cu, b.cv), rtol=_SAME_INTRINSICS, atol=0)
-    aligned = np.abs(T_cam0_cam1[:3, :3] - np.eye(3)).max() <= _ALIGNED_RAD and np.hypot(y, z) <= _ALIGNED_SHARE * x
+    same = np.allclose(
+        (a.fu, a.fv, a.cu, a.cv), (b.fu, b.fv, b.cu, b.cv), rtol=_SAME_INTRINSICS, atol=0
+    )
+    aligned = (
+        np.abs(T_cam0_cam1[:3, :3] - np.eye(3)).max() <= _ALIGNED_RAD
+        and np.hypot(y, z) <= _ALIGNED_SHARE * x
+    )
     if not (a.model == b.model == "pinhole" and same_size and same and aligned and x > 0):
         return None
     return StereoCamera(a.fu, a.fv, a.cu, a.cv, float(x), a.width, a.height)
@@ -118,7 +137,8 @@ def rectified_camera(rig: StereoRig) -> StereoCamera:
     """Return the rectified pair equal to the rig.
 
     Raises:
-        CalibrationError: the rig is not rectified (distortion, different intrinsics, or rows not aligned).
+        CalibrationError: the rig is not rectified (distortion, different intrinsics, or rows not
+            aligned).
     """
     if (pair := rectified_pair(rig)) is None:
         raise CalibrationError("the stereo rig is not rectified; rectify its images first")
@@ -140,11 +160,15 @@ def rig_from_rectified(camera: StereoCamera, T_cam0_imu: npt.ArrayLike) -> Stere
     return StereoRig(one, one, T_imu_cam0, T_imu_cam0 @ T_cam0_cam1)
 
 
-def project_point(camera: CameraModel, p_cam: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Pixels (..., 2) of points (..., 3) in the camera frame, and a mask (...) of those that the model can project.
+def project_point(
+    camera: CameraModel, p_cam: npt.ArrayLike
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Pixels (..., 2) of points (..., 3) in the camera frame, and a mask (...) of those that the
+    model can project.
 
-    False in the mask: behind the camera, or beyond the angle where the distortion polynomial folds back. The pixel
-    is then finite but arbitrary. Whether a pixel is inside the image is not checked.
+    False in the mask: behind the camera, or beyond the angle where the distortion polynomial folds
+    back. The pixel is then finite but arbitrary. Whether a pixel is inside the image is not
+    checked.
     """
     p = np.asarray(p_cam, dtype=np.float64)
     if camera.model == "equidistant":
@@ -166,8 +190,11 @@ def project_point(camera: CameraModel, p_cam: npt.ArrayLike) -> tuple[FloatArray
     return xy * (camera.fu, camera.fv) + (camera.cu, camera.cv), valid
 
 
-def unproject_pixel(camera: CameraModel, uv: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Unit rays (..., 3) in the camera frame of pixels (..., 2), and a mask (...) where Newton's method converged.
+def unproject_pixel(
+    camera: CameraModel, uv: npt.ArrayLike
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Unit rays (..., 3) in the camera frame of pixels (..., 2), and a mask (...) where Newton's
+    method converged.
 
     A pixel outside the model's range has False in the mask and an arbitrary finite ray.
     """
@@ -195,8 +222,13 @@ def _five(coefficients: tuple[float, ...]) -> tuple[float, float, float, float, 
     return k1, k2, p1, p2, coefficients[4] if len(coefficients) > 4 else 0.0
 
 
-def _divisor(coefficients: tuple[float, ...], r2: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Divisor of the rational model's radial factor and its derivative with respect to `r2`; None: not rational."""
+def _divisor(
+    coefficients: tuple[float, ...], r2: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Divisor of the rational model's radial factor and its derivative with respect to `r2`.
+
+    None: not rational.
+    """
     if len(coefficients) < 8:
         return None
     k4, k5, k6 = coefficients[5:]
@@ -205,22 +237,28 @@ def _divisor(coefficients: tuple[float, ...], r2: FloatArray) -> tuple[FloatArra
 
 def _radtan(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
     k1, k2, p1, p2, k3 = _five(coefficients)
-    x, y = xy[..., 0], xy[..., 1]
+    x = xy[..., 0]
+    y = xy[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     if (divisor := _divisor(coefficients, r2)) is not None:
         radial = radial / divisor[0]
     return np.stack(
-        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
         axis=-1,
     )
 
 
 def _radtan_D_xy(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
     k1, k2, p1, p2, k3 = _five(coefficients)
-    x, y = xy[..., 0], xy[..., 1]
+    x = xy[..., 0]
+    y = xy[..., 1]
     r2 = x * x + y * y
-    radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * k1 + r2 * (4 * k2 + r2 * 6 * k3)
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * k1 + r2 * (4 * k2 + r2 * 6 * k3)
     if (divisor := _divisor(coefficients, r2)) is not None:
         below, below_D_r2 = divisor
         radial, slope = radial / below, (slope - 2 * radial * below_D_r2 / below) / below
@@ -233,7 +271,9 @@ def _radtan_D_xy(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=256)
 def _radtan_max_radius(coefficients: tuple[float, ...]) -> float:
-    """Radius on the undistorted plane where the radial polynomial stops growing: the model folds back beyond it."""
+    """Radius on the undistorted plane where the radial polynomial stops growing: the model folds
+    back beyond it.
+    """
     k1, k2, _, _, k3 = _five(coefficients)
     if len(coefficients) == 8:
         return _rational_max_radius((1.0, k1, k2, k3), (1.0, *coefficients[5:]))
@@ -244,15 +284,20 @@ def _radtan_max_radius(coefficients: tuple[float, ...]) -> float:
 
 
 def _rational_max_radius(above: tuple[float, ...], below: tuple[float, ...]) -> float:
-    """Radius where `r above(r^2) / below(r^2)` stops growing, or the divisor vanishes; ascending powers of r^2."""
-    n, d = np.polynomial.Polynomial(above), np.polynomial.Polynomial(below)
+    """Radius where `r above(r^2) / below(r^2)` stops growing, or the divisor vanishes; ascending
+    powers of r^2.
+    """
+    n = np.polynomial.Polynomial(above)
+    d = np.polynomial.Polynomial(below)
     s = np.polynomial.Polynomial([0.0, 1.0])
     roots = [*(n * d + 2 * s * (n.deriv() * d - n * d.deriv())).roots(), *d.roots()]
     positive = [float(root.real) for root in roots if abs(root.imag) < 1e-9 and root.real > 1e-12]
     return float(np.sqrt(min(positive))) if positive else np.inf
 
 
-def _undistort_radtan(coefficients: tuple[float, ...], target: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+def _undistort_radtan(
+    coefficients: tuple[float, ...], target: FloatArray
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     xy = np.where(np.isfinite(target), target, 0.0)
     goal = xy
     for _ in range(_NEWTON_STEPS):
@@ -275,7 +320,9 @@ def _undistort_radtan(coefficients: tuple[float, ...], target: FloatArray) -> tu
     return xy, np.logical_and(found, radius < _radtan_max_radius(coefficients))
 
 
-def _theta_polynomial(coefficients: tuple[float, ...], theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _theta_polynomial(
+    coefficients: tuple[float, ...], theta: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return the distorted angle and its derivative."""
     k1, k2, k3, k4 = coefficients
     t2 = theta * theta
@@ -293,7 +340,9 @@ def _max_theta(coefficients: tuple[float, ...]) -> float:
     return float(min([np.pi, *np.sqrt(positive)]))
 
 
-def _equidistant(coefficients: tuple[float, ...], p: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+def _equidistant(
+    coefficients: tuple[float, ...], p: FloatArray
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     radius = np.linalg.norm(p[..., :2], axis=-1)
     theta = np.arctan2(radius, p[..., 2])
     valid = (theta < _max_theta(coefficients)) & (np.linalg.norm(p, axis=-1) > 1e-12)
@@ -303,7 +352,9 @@ def _equidistant(coefficients: tuple[float, ...], p: FloatArray) -> tuple[FloatA
     return p[..., :2] * scale[..., None], valid
 
 
-def _unproject_equidistant(coefficients: tuple[float, ...], xy: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+def _unproject_equidistant(
+    coefficients: tuple[float, ...], xy: FloatArray
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(axis=-1))
     xy = np.where(finite[..., None], xy, 0.0)
     theta_d = np.linalg.norm(xy, axis=-1)
@@ -313,7 +364,9 @@ def _unproject_equidistant(coefficients: tuple[float, ...], xy: FloatArray) -> t
         value, slope = _theta_polynomial(coefficients, theta)
         if np.abs(value - theta_d).max(initial=0.0) < _NEWTON_TOLERANCE:
             break
-        theta = np.clip(theta - (value - theta_d) / np.where(np.abs(slope) < 1e-3, 1e-3, slope), 0.0, limit)
+        theta = np.clip(
+            theta - (value - theta_d) / np.where(np.abs(slope) < 1e-3, 1e-3, slope), 0.0, limit
+        )
     value, _ = _theta_polynomial(coefficients, theta)
     valid = finite & (np.abs(value - theta_d) < 1e-8)
     near_axis = theta_d < 1e-12

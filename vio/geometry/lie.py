@@ -1,7 +1,8 @@
 """SO(3) and SE(3): exponential, logarithm, adjoint and the operators of the paper's filter.
 
-Convention: a twist is `xi = [rho; phi]`, translation first; every function takes leading batch dimensions.
-Single rotations and transforms, of which a filter takes many, go through plain numbers: NumPy's calls cost far more.
+Convention: a twist is `xi = [rho; phi]`, translation first; every function takes leading batch
+dimensions. Single rotations and transforms, of which a filter takes many, go through plain numbers:
+NumPy's calls cost far more.
 Reference: Barfoot, State Estimation for Robotics (2017), chapter 7.
 """
 
@@ -17,17 +18,23 @@ from vio.errors import CalibrationError
 FloatArray = npt.NDArray[np.float64]
 
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
-# Below this angle the closed forms suffer from cancellation and the Taylor series is exact to rounding.
+# Below this angle the closed forms suffer from cancellation and the Taylor series is exact to
+# rounding.
 _SMALL_ANGLE_RAD = 1e-2
 
 
 def so3_hat(phi: npt.ArrayLike) -> FloatArray:
-    """Map vectors (..., 3) to skew-symmetric matrices (..., 3, 3), so that `so3_hat(a) @ b = a x b`."""
+    """Map vectors (..., 3) to skew-symmetric matrices (..., 3, 3), so that
+    `so3_hat(a) @ b = a x b`.
+    """
     phi = np.asarray(phi, dtype=np.float64)
     out = np.zeros((*phi.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2] = -phi[..., 2], phi[..., 1]
-    out[..., 1, 0], out[..., 1, 2] = phi[..., 2], -phi[..., 0]
-    out[..., 2, 0], out[..., 2, 1] = -phi[..., 1], phi[..., 0]
+    out[..., 0, 1] = -phi[..., 2]
+    out[..., 0, 2] = phi[..., 1]
+    out[..., 1, 0] = phi[..., 2]
+    out[..., 1, 2] = -phi[..., 0]
+    out[..., 2, 0] = -phi[..., 1]
+    out[..., 2, 1] = phi[..., 0]
     return out
 
 
@@ -39,7 +46,9 @@ def _sinc_terms(angle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     first = np.where(small, 1 - a2 / 6 * (1 - a2 / 20 * (1 - a2 / 42)), np.sin(safe) / safe)
     half = np.sin(safe / 2) / (safe / 2)
     second = np.where(small, 0.5 - a2 / 24 * (1 - a2 / 30 * (1 - a2 / 56)), 0.5 * half * half)
-    third = np.where(small, 1 / 6 - a2 / 120 * (1 - a2 / 42 * (1 - a2 / 72)), (safe - np.sin(safe)) / safe**3)
+    third = np.where(
+        small, 1 / 6 - a2 / 120 * (1 - a2 / 42 * (1 - a2 / 72)), (safe - np.sin(safe)) / safe**3
+    )
     return first, second, third
 
 
@@ -50,7 +59,8 @@ def _sinc_terms_of_one(angle: float) -> tuple[float, float, float]:
         first = 1 - a2 / 6 * (1 - a2 / 20 * (1 - a2 / 42))
         second = 0.5 - a2 / 24 * (1 - a2 / 30 * (1 - a2 / 56))
         return first, second, 1 / 6 - a2 / 120 * (1 - a2 / 42 * (1 - a2 / 72))
-    half, sine = math.sin(angle / 2) / (angle / 2), math.sin(angle)
+    half = math.sin(angle / 2) / (angle / 2)
+    sine = math.sin(angle)
     return sine / angle, 0.5 * half * half, (angle - sine) / (angle * a2)
 
 
@@ -65,7 +75,12 @@ def _one(phi: FloatArray) -> tuple[float, float, float, float] | None:
 
 def _series(x: float, y: float, z: float, b: float, c: float) -> FloatArray:
     """`I + b W + c W W` (3, 3) with W the skew-symmetric matrix of a vector."""
-    xx, yy, zz, xy, xz, yz = c * x * x, c * y * y, c * z * z, c * x * y, c * x * z, c * y * z
+    xx = c * x * x
+    yy = c * y * y
+    zz = c * z * z
+    xy = c * x * y
+    xz = c * x * z
+    yz = c * y * z
     return np.array(
         [
             [1.0 - (yy + zz), xy - b * z, xz + b * y],
@@ -76,7 +91,9 @@ def _series(x: float, y: float, z: float, b: float, c: float) -> FloatArray:
 
 
 def so3_exp(phi: npt.ArrayLike) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians (Rodrigues' formula)."""
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians (Rodrigues'
+    formula).
+    """
     phi = np.asarray(phi, dtype=np.float64)
     if (one := _one(phi)) is not None:
         return _series(*one[:3], *_sinc_terms_of_one(one[3])[:2])
@@ -94,9 +111,15 @@ def quat_xyzw_from_rotation(R: npt.ArrayLike) -> FloatArray:
     R = np.asarray(R, dtype=np.float64)
     trace: FloatArray = np.trace(R, axis1=-2, axis2=-1)
     # Rows of 4 q q^T, one for each candidate of the largest component.
-    d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    s01, s02, s12 = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
-    a0, a1, a2 = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    d0 = R[..., 0, 0]
+    d1 = R[..., 1, 1]
+    d2 = R[..., 2, 2]
+    s01 = R[..., 0, 1] + R[..., 1, 0]
+    s02 = R[..., 0, 2] + R[..., 2, 0]
+    s12 = R[..., 1, 2] + R[..., 2, 1]
+    a0 = R[..., 2, 1] - R[..., 1, 2]
+    a1 = R[..., 0, 2] - R[..., 2, 0]
+    a2 = R[..., 1, 0] - R[..., 0, 1]
     rows = np.stack(
         [
             np.stack([1 + d0 - d1 - d2, s01, s02, a0], axis=-1),
@@ -113,10 +136,13 @@ def quat_xyzw_from_rotation(R: npt.ArrayLike) -> FloatArray:
 
 
 def rotation_from_quat_xyzw(q: npt.ArrayLike) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in x y z w order; they are normalised first."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in x y z w order; they are
+    normalised first.
+    """
     raw = np.asarray(q, dtype=np.float64)
     unit = raw / np.linalg.norm(raw, axis=-1, keepdims=True)
-    vector, w = unit[..., :3], unit[..., 3, None, None]
+    vector = unit[..., :3]
+    w = unit[..., 3, None, None]
     V = so3_hat(vector)
     return np.eye(3) + 2 * w * V + 2 * (V @ V)
 
@@ -127,13 +153,25 @@ def _quat_xyzw_of_one(R: FloatArray) -> tuple[float, float, float, float]:
     trace = d0 + d1 + d2
     largest = max(d0, d1, d2, trace)
     if largest == d0:
-        x, y, z, w = 1 + d0 - d1 - d2, m01 + m10, m02 + m20, m21 - m12
+        x = 1 + d0 - d1 - d2
+        y = m01 + m10
+        z = m02 + m20
+        w = m21 - m12
     elif largest == d1:
-        x, y, z, w = m01 + m10, 1 - d0 + d1 - d2, m12 + m21, m02 - m20
+        x = m01 + m10
+        y = 1 - d0 + d1 - d2
+        z = m12 + m21
+        w = m02 - m20
     elif largest == d2:
-        x, y, z, w = m02 + m20, m12 + m21, 1 - d0 - d1 + d2, m10 - m01
+        x = m02 + m20
+        y = m12 + m21
+        z = 1 - d0 - d1 + d2
+        w = m10 - m01
     else:
-        x, y, z, w = m21 - m12, m02 - m20, m10 - m01, 1 + trace
+        x = m21 - m12
+        y = m02 - m20
+        z = m10 - m01
+        w = 1 + trace
     size = math.copysign(math.sqrt(x * x + y * y + z * z + w * w), -1.0 if w < 0 else 1.0)
     return x / size, y / size, z / size, w / size
 
@@ -147,7 +185,8 @@ def so3_log(R: npt.ArrayLike) -> FloatArray:
         ratio = 2.0 if length < 1e-7 else 2 * math.atan2(length, w1) / length
         return np.array([ratio * x, ratio * y, ratio * z])
     q = quat_xyzw_from_rotation(R)
-    vector, w = q[..., :3], q[..., 3]
+    vector = q[..., :3]
+    w = q[..., 3]
     s = np.linalg.norm(vector, axis=-1)
     small = s < 1e-7
     angle_over_s = np.where(small, 2.0, 2 * np.arctan2(s, w) / np.where(small, 1.0, s))
@@ -171,7 +210,11 @@ def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
         x, y, z, angle1 = one
         a1, b1, _ = _sinc_terms_of_one(angle1)
         squared = angle1 * angle1
-        c = 1 / 12 + squared / 720 * (1 + squared / 42) if angle1 < _SMALL_ANGLE_RAD else (1 - a1 / (2 * b1)) / squared
+        c = (
+            1 / 12 + squared / 720 * (1 + squared / 42)
+            if angle1 < _SMALL_ANGLE_RAD
+            else (1 - a1 / (2 * b1)) / squared
+        )
         return _series(x, y, z, -0.5, c)
     angle = np.linalg.norm(phi, axis=-1)
     a, b, _ = _sinc_terms(angle)
@@ -185,20 +228,26 @@ def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
 
 def se3_from_parts(R: npt.ArrayLike, t: npt.ArrayLike) -> FloatArray:
     """Homogeneous transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
-    R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    R = np.asarray(R, dtype=np.float64)
+    t = np.asarray(t, dtype=np.float64)
     if R.ndim == 2 and t.ndim == 1:
         one = np.zeros((4, 4))
-        one[:3, :3], one[:3, 3], one[3, 3] = R, t, 1.0
+        one[:3, :3] = R
+        one[:3, 3] = t
+        one[3, 3] = 1.0
         return one
     out = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
-    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = R, t, 1.0
+    out[..., :3, :3] = R
+    out[..., :3, 3] = t
+    out[..., 3, 3] = 1.0
     return out
 
 
 def se3_exp(xi: npt.ArrayLike) -> FloatArray:
     """Transforms (..., 4, 4) of twists (..., 6) `[rho; phi]` in metres and radians."""
     xi = np.asarray(xi, dtype=np.float64)
-    rho, phi = xi[..., :3], xi[..., 3:]
+    rho = xi[..., :3]
+    phi = xi[..., 3:]
     return se3_from_parts(so3_exp(phi), (so3_left_jacobian(phi) @ rho[..., None])[..., 0])
 
 
@@ -215,14 +264,18 @@ def se3_inverse(T: npt.ArrayLike) -> FloatArray:
     T = np.asarray(T, dtype=np.float64)
     if T.ndim == 2:
         (a, b, c, x), (d, e, f, y), (g, h, i, z) = T[:3].tolist()
-        p, q, r = -(a * x + d * y + g * z), -(b * x + e * y + h * z), -(c * x + f * y + i * z)
+        p = -(a * x + d * y + g * z)
+        q = -(b * x + e * y + h * z)
+        r = -(c * x + f * y + i * z)
         return np.array([[a, d, g, p], [b, e, h, q], [c, f, i, r], [0.0, 0.0, 0.0, 1.0]])
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     return se3_from_parts(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
 
 def se3_curly_hat(xi: npt.ArrayLike) -> FloatArray:
-    """The adjoint of the algebra: twists (..., 6) to (..., 6, 6), `exp(curly_hat(xi)) = Ad(exp(xi))`."""
+    """The adjoint of the algebra: twists (..., 6) to (..., 6, 6),
+    `exp(curly_hat(xi)) = Ad(exp(xi))`.
+    """
     xi = np.asarray(xi, dtype=np.float64)
     W = so3_hat(xi[..., 3:])
     out = np.zeros((*xi.shape[:-1], 6, 6))
@@ -250,8 +303,8 @@ def se3_adjoint(T: npt.ArrayLike) -> FloatArray:
 def se3_left_jacobian(xi: npt.ArrayLike) -> FloatArray:
     """Left Jacobian of SE(3), (..., 6, 6): exp(xi + d) = exp(J d) exp(xi) to first order in d.
 
-    Summed as a power series in the curly hat, which converges for every twist; for one step of motion a few
-    terms suffice. Reference: Barfoot (2017), equation 7.83.
+    Summed as a power series in the curly hat, which converges for every twist; for one step of
+    motion a few terms suffice. Reference: Barfoot (2017), equation 7.83.
     """
     curly = se3_curly_hat(xi)
     term = np.broadcast_to(np.eye(6), curly.shape)
@@ -265,7 +318,9 @@ def se3_left_jacobian(xi: npt.ArrayLike) -> FloatArray:
 
 
 def circledot(p: npt.ArrayLike) -> FloatArray:
-    """The paper's operator on points (..., 3): (..., 4, 6) with `hat(xi) [p; 1] = circledot(p) xi`."""
+    """The paper's operator on points (..., 3): (..., 4, 6) with
+    `hat(xi) [p; 1] = circledot(p) xi`.
+    """
     p = np.asarray(p, dtype=np.float64)
     out = np.zeros((*p.shape[:-1], 4, 6))
     out[..., :3, :3] = np.eye(3)
@@ -275,7 +330,8 @@ def circledot(p: npt.ArrayLike) -> FloatArray:
 
 def transform_points(T_a_b: npt.ArrayLike, p_b: npt.ArrayLike) -> FloatArray:
     """Map points (N, 3) or (3,) from frame b to frame a with one transform (4, 4)."""
-    T_a_b, p_b = np.asarray(T_a_b, dtype=np.float64), np.asarray(p_b, dtype=np.float64)
+    T_a_b = np.asarray(T_a_b, dtype=np.float64)
+    p_b = np.asarray(p_b, dtype=np.float64)
     return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
@@ -290,7 +346,10 @@ _ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I accepted as rounding
 
 
 def rigid_fault(T: FloatArray) -> str | None:
-    """Describe why a matrix (4, 4), or its first three rows, is no rigid transform; None: it is one, to rounding."""
+    """Describe why a matrix (4, 4), or its first three rows, is no rigid transform.
+
+    None: it is one, to rounding.
+    """
     if not np.isfinite(T).all():
         return "not finite; check the calibration"
     if T.shape == (4, 4) and not np.allclose(T[3], [0, 0, 0, 1], atol=1e-9):
@@ -316,7 +375,9 @@ def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
     """
     T_ = np.asarray(T, dtype=np.float64)
     if T_.shape not in ((3, 4), (4, 4)) or not np.isfinite(T_).all():
-        raise CalibrationError(f"{where}: not a finite 3x4 or 4x4 transform (shape {T_.shape}); check the calibration")
+        raise CalibrationError(
+            f"{where}: not a finite 3x4 or 4x4 transform (shape {T_.shape}); check the calibration"
+        )
     if fault := rigid_fault(T_):
         raise CalibrationError(f"{where}: {fault}")
     R = T_[:3, :3]

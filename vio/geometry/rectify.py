@@ -1,8 +1,9 @@
 """Stereo rectification: a rotation and a lookup map for each of two cameras.
 
-The rectified cameras share the direction of the baseline as x axis, and the mean of the two optical axes, made
-perpendicular to it, as z axis. References: Fusiello, Trucco & Verri, A compact algorithm for rectification of stereo
-pairs (2000); Loop & Zhang, Computing rectifying homographies for stereo vision (1999) on splitting the rotation.
+The rectified cameras share the direction of the baseline as x axis, and the mean of the two optical
+axes, made perpendicular to it, as z axis. References: Fusiello, Trucco & Verri, A compact algorithm
+for rectification of stereo pairs (2000); Loop & Zhang, Computing rectifying homographies for stereo
+vision (1999) on splitting the rotation.
 """
 
 from __future__ import annotations
@@ -16,7 +17,14 @@ import numpy.typing as npt
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
-from vio.geometry.stereo import PROJECTIONS, Projection, StereoCamera, left_rays, one_camera, project
+from vio.geometry.stereo import (
+    PROJECTIONS,
+    Projection,
+    StereoCamera,
+    left_rays,
+    one_camera,
+    project,
+)
 
 MapArray = npt.NDArray[np.float32]
 Interpolation: TypeAlias = Literal["linear", "cubic", "lanczos4"]
@@ -43,10 +51,12 @@ class RectifiedPair:
 
 
 def projection_of(rig: StereoRig) -> Projection:
-    """Return the projection that keeps most of what a rig sees: a cylinder where a pinhole would crop rows.
+    """Return the projection that keeps most of what a rig sees: a cylinder where a pinhole would
+    crop rows.
 
-    A pinhole ends 54 degrees above and below the axis, a cylinder does not; along the baseline both end there. So only
-    lenses that see further than that above and below, in both images, have anything to gain.
+    A pinhole ends 54 degrees above and below the axis, a cylinder does not; along the baseline both
+    end there. So only lenses that see further than that above and below, in both images, have
+    anything to gain.
 
     Raises:
         CalibrationError: as `rectified_cameras`.
@@ -57,7 +67,8 @@ def projection_of(rig: StereoRig) -> Projection:
 
 
 def rectified_cameras(rig: StereoRig, projection: ProjectionMode = "pinhole") -> RectifiedPair:
-    """Find the rectified pair of a rig; its images have the size of the left one and no invalid border.
+    """Find the rectified pair of a rig; its images have the size of the left one and no invalid
+    border.
 
     Raises:
         CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
@@ -67,12 +78,17 @@ def rectified_cameras(rig: StereoRig, projection: ProjectionMode = "pinhole") ->
     low, high = _common_rectangle(rig, R_rect_cam0, R_rect_cam1, chosen)
     extent = high - low
     if extent.min() < _MIN_TANGENT_WIDTH:
-        raise CalibrationError("the two cameras share no field of view; check the extrinsics T_BS of both cameras")
-    width, height = rig.cam0.width, rig.cam0.height
-    # One focal length for both axes, large enough that the shared field of view fills the image along both.
+        raise CalibrationError(
+            "the two cameras share no field of view; check the extrinsics T_BS of both cameras"
+        )
+    width = rig.cam0.width
+    height = rig.cam0.height
+    # One focal length for both axes, large enough that the shared field of view fills the image
+    # along both.
     f = float(max((width - 1) / extent[0], (height - 1) / extent[1]))
     centre = (low + high) / 2
-    cu, cv = (width - 1) / 2 - f * centre[0], (height - 1) / 2 - f * centre[1]
+    cu = (width - 1) / 2 - f * centre[0]
+    cv = (height - 1) / 2 - f * centre[1]
     camera = StereoCamera(f, f, float(cu), float(cv), baseline_m, width, height, chosen)
     T_cam0_imu = se3_inverse(rig.T_imu_cam0)
     return RectifiedPair(
@@ -90,15 +106,20 @@ def rectifying_rotations(rig: StereoRig) -> tuple[FloatArray, FloatArray, float]
         CalibrationError: the cameras coincide, or a rectifying rotation is too large.
     """
     T_cam0_cam1 = rig.T_cam0_cam1
-    t, R_cam0_cam1 = T_cam0_cam1[:3, 3], T_cam0_cam1[:3, :3]
+    t = T_cam0_cam1[:3, 3]
+    R_cam0_cam1 = T_cam0_cam1[:3, :3]
     baseline_m = float(np.linalg.norm(t))
     if baseline_m < 1e-6:
-        raise CalibrationError("both cameras have the same position: the baseline is zero; check both T_BS")
+        raise CalibrationError(
+            "both cameras have the same position: the baseline is zero; check both T_BS"
+        )
     x = t / baseline_m
     forward = np.array([0.0, 0, 1]) + R_cam0_cam1[:, 2]
     z = forward - (forward @ x) * x
     if np.linalg.norm(z) < 1e-6:
-        raise CalibrationError("the cameras look along their baseline, or in opposite directions; check both T_BS")
+        raise CalibrationError(
+            "the cameras look along their baseline, or in opposite directions; check both T_BS"
+        )
     z /= np.linalg.norm(z)
     R_rect_cam0 = np.stack([x, np.cross(z, x), z])
     R_rect_cam1 = R_rect_cam0 @ R_cam0_cam1
@@ -106,7 +127,8 @@ def rectifying_rotations(rig: StereoRig) -> tuple[FloatArray, FloatArray, float]
         angle_deg = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
         if angle_deg > _MAX_ROTATION_DEG:
             raise CalibrationError(
-                f"rectifying would rotate the {name} camera by {angle_deg:.0f} deg; cam1 must be to the right of cam0, "
+                f"rectifying would rotate the {name} camera by {angle_deg:.0f} deg; cam1 must be "
+                "to the right of cam0, "
                 "so the cameras may be swapped, or an extrinsic T_BS inverted"
             )
     return R_rect_cam0, R_rect_cam1, baseline_m
@@ -126,25 +148,35 @@ def rectify_pixels(
 
 
 def field_of_view(camera: CameraModel | StereoCamera) -> tuple[float, float]:
-    """Angles in radians that an image spans along its middle row and its middle column, as far as the lens model goes.
+    """Angles in radians that an image spans along its middle row and its middle column, as far as
+    the lens model goes.
 
     Raises:
         CalibrationError: the image size is unknown.
     """
     if camera.width is None or camera.height is None:
         raise CalibrationError("a field of view needs the image size; this camera has none")
-    w, h, s = camera.width - 1.0, camera.height - 1.0, np.linspace(0, 1, 2 * _BORDER_SAMPLES + 1)
+    w = camera.width - 1.0
+    h = camera.height - 1.0
+    s = np.linspace(0, 1, 2 * _BORDER_SAMPLES + 1)
     spans = []
     for uv in (np.stack([w * s, 0 * s + h / 2], axis=1), np.stack([0 * s + w / 2, h * s], axis=1)):
-        ray, valid = (left_rays(camera, uv), None) if isinstance(camera, StereoCamera) else unproject_pixel(camera, uv)
+        ray, valid = (
+            (left_rays(camera, uv), None)
+            if isinstance(camera, StereoCamera)
+            else unproject_pixel(camera, uv)
+        )
         off_axis = np.arctan2(np.hypot(ray[:, 0], ray[:, 1]), ray[:, 2])
         off_axis = off_axis if valid is None else np.where(valid, off_axis, 0.0)
-        spans.append(float(off_axis[: _BORDER_SAMPLES + 1].max() + off_axis[_BORDER_SAMPLES:].max()))
+        spans.append(
+            float(off_axis[: _BORDER_SAMPLES + 1].max() + off_axis[_BORDER_SAMPLES:].max())
+        )
     return spans[0], spans[1]
 
 
 def pinhole_within(camera: StereoCamera) -> StereoCamera:
-    """Return a pinhole of a cylinder's size and pose whose image lies inside the cylinder's; a pinhole as it is.
+    """Return a pinhole of a cylinder's size and pose whose image lies inside the cylinder's; a
+    pinhole as it is.
 
     Raises:
         CalibrationError: the image size is unknown.
@@ -154,10 +186,14 @@ def pinhole_within(camera: StereoCamera) -> StereoCamera:
     if camera.width is None or camera.height is None:
         raise CalibrationError("a cylinder needs its image size; this camera has none")
     size = np.array([camera.width - 1.0, camera.height - 1.0])
-    centre, focal = np.array([camera.cu, camera.cv]), np.array([camera.fu, camera.fv])
-    low, high = np.clip(-centre / focal, -1.2, 1.2), np.clip((size - centre) / focal, -1.2, 1.2)
-    low[1], high[1] = np.tan(low[1]), np.tan(high[1])
-    low, high = np.maximum(low, -_MAX_TANGENT), np.minimum(high, _MAX_TANGENT)
+    centre = np.array([camera.cu, camera.cv])
+    focal = np.array([camera.fu, camera.fv])
+    low = np.clip(-centre / focal, -1.2, 1.2)
+    high = np.clip((size - centre) / focal, -1.2, 1.2)
+    low[1] = np.tan(low[1])
+    high[1] = np.tan(high[1])
+    low = np.maximum(low, -_MAX_TANGENT)
+    high = np.minimum(high, _MAX_TANGENT)
     f = float(np.max(size / (high - low)))
     cu, cv = (size / 2 - f * (low + high) / 2).tolist()
     return StereoCamera(f, f, cu, cv, camera.baseline_m, camera.width, camera.height)
@@ -166,7 +202,8 @@ def pinhole_within(camera: StereoCamera) -> StereoCamera:
 def pinhole_pixels(
     cylinder: StereoCamera, pinhole: StereoCamera, pixels: npt.ArrayLike
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Pixels (N, 2) of a pinhole where a cylinder of the same pose has (N, 2), and a mask (N,) of those in its image.
+    """Pixels (N, 2) of a pinhole where a cylinder of the same pose has (N, 2), and a mask (N,) of
+    those in its image.
 
     Both cameras of a pair share their intrinsics, so this applies to left and right alike.
     """
@@ -174,12 +211,16 @@ def pinhole_pixels(
     assert pinhole.height is not None
     plane, ahead = _on_plane(left_rays(cylinder, pixels), "pinhole", 1e-3)
     uv = plane * (pinhole.fu, pinhole.fv) + (pinhole.cu, pinhole.cv)
-    inside = (uv >= -0.5).all(axis=-1) & (uv <= (pinhole.width - 0.5, pinhole.height - 0.5)).all(axis=-1)
+    inside = (uv >= -0.5).all(axis=-1) & (uv <= (pinhole.width - 0.5, pinhole.height - 0.5)).all(
+        axis=-1
+    )
     return uv, ahead & inside
 
 
 def pinhole_maps(cylinder: StereoCamera, pinhole: StereoCamera) -> tuple[MapArray, MapArray]:
-    """Pixels u and v (H, W) of a cylinder's image for every pixel of a pinhole's of the same pose, for cv2.remap."""
+    """Pixels u and v (H, W) of a cylinder's image for every pixel of a pinhole's of the same
+    pose, for cv2.remap.
+    """
     assert pinhole.width is not None
     assert pinhole.height is not None
     pixels = np.stack(np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height)), axis=-1)
@@ -187,12 +228,17 @@ def pinhole_maps(cylinder: StereoCamera, pinhole: StereoCamera) -> tuple[MapArra
     return uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)
 
 
-def _on_plane(ray: FloatArray, projection: Projection, least_depth: float) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Coordinates (..., 2) of unit rays (..., 3) in a rectified image of focal length 1, and a mask (...).
+def _on_plane(
+    ray: FloatArray, projection: Projection, least_depth: float
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Coordinates (..., 2) of unit rays (..., 3) in a rectified image of focal length 1, and a mask
+    (...).
 
     Tangents for a pinhole; tangent and azimuth (radians) for a cylinder.
     """
-    rows, y, z = PROJECTIONS[projection], ray[..., 1], ray[..., 2]
+    rows = PROJECTIONS[projection]
+    y = ray[..., 1]
+    z = ray[..., 2]
     depth = rows.depth(y, z)
     ahead = np.asarray(depth > least_depth)
     depth = np.where(ahead, depth, 1.0)
@@ -203,7 +249,9 @@ def _on_plane(ray: FloatArray, projection: Projection, least_depth: float) -> tu
 def _common_rectangle(
     rig: StereoRig, R_rect_cam0: FloatArray, R_rect_cam1: FloatArray, projection: Projection
 ) -> tuple[FloatArray, FloatArray]:
-    """Corners (2,), (2,) of the largest box, in coordinates of `_on_plane`, inside the outlines of both images."""
+    """Corners (2,), (2,) of the largest box, in coordinates of `_on_plane`, inside the outlines
+    of both images.
+    """
     low0, high0 = _inner_rectangle(rig.cam0, R_rect_cam0, projection)
     low1, high1 = _inner_rectangle(rig.cam1, R_rect_cam1, projection)
     return np.maximum(low0, low1), np.minimum(high0, high1)
@@ -212,8 +260,11 @@ def _common_rectangle(
 def _inner_rectangle(
     camera: CameraModel, R_rect_cam: FloatArray, projection: Projection
 ) -> tuple[FloatArray, FloatArray]:
-    """Corners (2,), (2,) of the largest box, in coordinates of `_on_plane`, inside the image's outline."""
-    w, h = camera.width - 1.0, camera.height - 1.0
+    """Corners (2,), (2,) of the largest box, in coordinates of `_on_plane`, inside the image's
+    outline.
+    """
+    w = camera.width - 1.0
+    h = camera.height - 1.0
     s = np.linspace(0, 1, _BORDER_SAMPLES)
     sides = {
         "left": np.stack([0 * s, h * s], axis=1),
@@ -231,8 +282,10 @@ def _inner_rectangle(
         far = np.array(direction, dtype=np.float64) * 1e9
         plane[name] = np.where(ahead[:, None], on_plane, far)
     most = np.array([_MAX_TANGENT, _MAX_ROW[projection]])
-    top, bottom = max(plane["top"][:, 1].max(), -most[1]), min(plane["bottom"][:, 1].min(), most[1])
-    if projection == "cylinder":  # the corners of a wide lens look backwards, beyond the rows that are kept
+    top = max(plane["top"][:, 1].max(), -most[1])
+    bottom = min(plane["bottom"][:, 1].min(), most[1])
+    # the corners of a wide lens look backwards, beyond the rows that are kept
+    if projection == "cylinder":
         for name, bound in (("left", -np.inf), ("right", np.inf)):
             kept = (plane[name][:, 1] >= top) & (plane[name][:, 1] <= bottom)
             plane[name][~kept, 0] = bound
@@ -241,8 +294,12 @@ def _inner_rectangle(
     return np.maximum(low, -most), np.minimum(high, most)
 
 
-def lookup(rectified: StereoCamera, camera: CameraModel, R_rect_cam: FloatArray) -> tuple[MapArray, MapArray]:
-    """Return source u and v (H, W) of each pixel of a rectified image in that of its raw camera, for cv2.remap."""
+def lookup(
+    rectified: StereoCamera, camera: CameraModel, R_rect_cam: FloatArray
+) -> tuple[MapArray, MapArray]:
+    """Return source u and v (H, W) of each pixel of a rectified image in that of its raw camera,
+    for cv2.remap.
+    """
     assert rectified.width is not None
     assert rectified.height is not None
     u, v = np.empty((2, rectified.height, rectified.width), dtype=np.float32)
@@ -251,7 +308,8 @@ def lookup(rectified: StereoCamera, camera: CameraModel, R_rect_cam: FloatArray)
         pixels = np.stack(np.meshgrid(np.arange(rectified.width), rows), axis=-1)
         uv, valid = project_point(camera, left_rays(rectified, pixels) @ R_rect_cam)
         uv = np.where(valid[..., None], uv, -1e4)
-        u[rows], v[rows] = uv[..., 0], uv[..., 1]
+        u[rows] = uv[..., 0]
+        v[rows] = uv[..., 1]
     return u, v
 
 

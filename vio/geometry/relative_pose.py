@@ -15,7 +15,9 @@ class RelativePose:
     covariance: FloatArray  # (6, 6) of xi in T_i_j = T_hat exp(xi), [rho; phi], m and rad
 
     def then(self, other: RelativePose) -> RelativePose:
-        """Return the motion from i to k, of those from i to j and, independent of it, from j to k."""
+        """Return the motion from i to k, of those from i to j and, independent of it, from j to
+        k.
+        """
         A = se3_adjoint(se3_inverse(other.T_i_j))
         return RelativePose(self.T_i_j @ other.T_i_j, A @ self.covariance @ A.T + other.covariance)
 

@@ -1,9 +1,11 @@
-"""The unified and the double sphere camera model on the normalised image plane: lenses up to and beyond 180 degrees.
+"""The unified and the double sphere camera model on the normalised image plane: lenses up to and
+beyond 180 degrees.
 
-A point is projected to one unit sphere (unified: at distance `xi` from the projection centre) or to two (double sphere:
-`xi` apart, `alpha` between the second and the image plane). Both inverses are closed.
-References: Mei & Rives, Single view point omnidirectional camera calibration from planar grids (2007);
-Usenko, Demmel & Cremers, The double sphere camera model (2018).
+A point is projected to one unit sphere (unified: at distance `xi` from the projection centre) or to
+two (double sphere: `xi` apart, `alpha` between the second and the image plane). Both inverses are
+closed.
+References: Mei & Rives, Single view point omnidirectional camera calibration from planar grids
+(2007); Usenko, Demmel & Cremers, The double sphere camera model (2018).
 """
 
 from __future__ import annotations
@@ -20,7 +22,9 @@ _TINY = 1e-12
 
 
 def unified(xi: float, p: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Normalised plane (..., 2) of points (..., 3), and a mask (...) of those that the model can project."""
+    """Normalised plane (..., 2) of points (..., 3), and a mask (...) of those that the model can
+    project.
+    """
     distance = np.linalg.norm(p, axis=-1)
     # Beyond the cone where the image of the sphere folds back, two points would share a pixel.
     limit = xi if xi <= 1 else 1 / xi
@@ -30,7 +34,9 @@ def unified(xi: float, p: FloatArray) -> tuple[FloatArray, BoolArray]:
 
 
 def unproject_unified(xi: float, xy: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Unit rays (..., 3) of points (..., 2) of the normalised plane, and a mask (...) of those inside the model."""
+    """Unit rays (..., 3) of points (..., 2) of the normalised plane, and a mask (...) of those
+    inside the model.
+    """
     r2 = np.einsum("...i,...i->...", xy, xy)
     root = 1 + (1 - xi * xi) * r2
     valid: BoolArray = np.isfinite(r2) & (root >= 0)
@@ -39,7 +45,9 @@ def unproject_unified(xi: float, xy: FloatArray) -> tuple[FloatArray, BoolArray]
 
 
 def double_sphere(xi_alpha: tuple[float, ...], p: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Normalised plane (..., 2) of points (..., 3), and a mask (...) of those that the model can project."""
+    """Normalised plane (..., 2) of points (..., 3), and a mask (...) of those that the model can
+    project.
+    """
     xi, alpha = xi_alpha
     d1 = np.linalg.norm(p, axis=-1)
     limit = alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
@@ -51,8 +59,12 @@ def double_sphere(xi_alpha: tuple[float, ...], p: FloatArray) -> tuple[FloatArra
     return p[..., :2] / depth[..., None], valid
 
 
-def unproject_double_sphere(xi_alpha: tuple[float, ...], xy: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Unit rays (..., 3) of points (..., 2) of the normalised plane, and a mask (...) of those inside the model."""
+def unproject_double_sphere(
+    xi_alpha: tuple[float, ...], xy: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Unit rays (..., 3) of points (..., 2) of the normalised plane, and a mask (...) of those
+    inside the model.
+    """
     xi, alpha = xi_alpha
     r2 = np.einsum("...i,...i->...", xy, xy)
     root = 1 - (2 * alpha - 1) * r2

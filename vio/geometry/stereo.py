@@ -2,13 +2,15 @@
 
 Pixels: u right, v down, the centre of the top-left pixel is (0, 0). `z = [ul vl ur vr]`.
 
-Two projections have epipolar planes as rows. With `rho = hypot(y, z)`, the distance from the line of the baseline:
+Two projections have epipolar planes as rows. With `rho = hypot(y, z)`, the distance from the line
+of the baseline:
 
     pinhole    u = cu + fu x / z,    v = cv + fv y / z
     cylinder   u = cu + fu x / rho,  v = cv + fv atan2(y, z)
 
-The cylinder about the baseline is the pinhole turned about the baseline to each row: it agrees with the pinhole to
-first order in the middle row, disparity is `fu baseline / rho`, and rows reach beyond 90 degrees off the axis.
+The cylinder about the baseline is the pinhole turned about the baseline to each row: it agrees with
+the pinhole to first order in the middle row, disparity is `fu baseline / rho`, and rows reach
+beyond 90 degrees off the axis.
 """
 
 from __future__ import annotations
@@ -26,17 +28,21 @@ from vio.geometry.lie import FloatArray
 
 Projection: TypeAlias = Literal["pinhole", "cylinder"]
 CameraKind: TypeAlias = Literal["stereo", "rgbd", "mono"]
-# Of one camera, metres: no distance in the world, but the unit of length of inverse depths. Half of it is the nearest
-# depth, and a track enters the estimate once its inverse depth is known as well as by a stereo pair of this baseline.
+# Of one camera, metres: no distance in the world, but the unit of length of inverse depths. Half of
+# it is the nearest depth, and a track enters the estimate once its inverse depth is known as well
+# as by a stereo pair of this baseline.
 MONO_UNIT_M = 0.1
-_SHORT_M, _LONG_M = 0.005, 5.0  # baselines outside are those of another unit
+_SHORT_M = 0.005  # baselines outside are those of another unit
+_LONG_M = 5.0
 _YZ: TypeAlias = tuple[FloatArray | float, FloatArray | float]
 
 
 class PinholeRows:
-    """Where a pinhole differs from a cylinder: depths and rows of points with coordinates y and z (...), metres.
+    """Where a pinhole differs from a cylinder: depths and rows of points with coordinates y and z
+    (...), metres.
 
-    Columns follow from the depth. Rows are counted from the principal point, in the unit of the focal length.
+    Columns follow from the depth. Rows are counted from the principal point, in the unit of the
+    focal length.
     """
 
     def depth(self, y: FloatArray, z: FloatArray) -> FloatArray:
@@ -86,15 +92,20 @@ class _CylinderRows(PinholeRows):
         return np.cos(row), -np.sin(row)
 
 
-PROJECTIONS: Mapping[Projection, PinholeRows] = {"pinhole": PinholeRows(), "cylinder": _CylinderRows()}
+PROJECTIONS: Mapping[Projection, PinholeRows] = {
+    "pinhole": PinholeRows(),
+    "cylinder": _CylinderRows(),
+}
 
 
 @dataclass(frozen=True, slots=True)
 class StereoCamera:
-    """A rectified stereo pair: one intrinsic matrix, image rows aligned, cam1 at +baseline on cam0's x axis.
+    """A rectified stereo pair: one intrinsic matrix, image rows aligned, cam1 at +baseline on
+    cam0's x axis.
 
-    One camera with depth images ("rgbd") is a pair with a virtual right camera: `ur = ul - fu baseline / depth`. One
-    camera alone ("mono") has no right pixels; its `baseline_m` is a unit of length, `MONO_UNIT_M`.
+    One camera with depth images ("rgbd") is a pair with a virtual right camera:
+    `ur = ul - fu baseline / depth`. One camera alone ("mono") has no right pixels; its `baseline_m`
+    is a unit of length, `MONO_UNIT_M`.
     """
 
     fu: float  # focal length, pixels, along u
@@ -105,8 +116,10 @@ class StereoCamera:
     width: int | None = None  # image size in pixels; None where only features are given
     height: int | None = None
     projection: Projection = "pinhole"  # of both images; see above
-    kind: CameraKind = "stereo"  # where right pixels come from: a right camera, depth images, or nowhere
-    residual_px: float = 0.0  # by how much pixels are known to be off still (rms): what no lens model of the rig holds
+    # where right pixels come from: a right camera, depth images, or nowhere
+    kind: CameraKind = "stereo"
+    # by how much pixels are known to be off still (rms): what no lens model of the rig holds
+    residual_px: float = 0.0
 
     def __post_init__(self) -> None:
         values = (self.fu, self.fv, self.cu, self.cv, self.baseline_m)
@@ -114,27 +127,36 @@ class StereoCamera:
             raise CalibrationError(f"camera intrinsics are single numbers, got {values!r}"[:300])
         for name, size in (("width", self.width), ("height", self.height)):
             if size is not None and not (isinstance(size, Integral) and size > 0):
-                raise CalibrationError(f"the image {name} is a positive whole number of pixels, got {size!r}")
+                raise CalibrationError(
+                    f"the image {name} is a positive whole number of pixels, got {size!r}"
+                )
         if not np.all(np.isfinite(values)):
-            raise CalibrationError(f"camera intrinsics are not finite: {values}; check the calibration file")
+            raise CalibrationError(
+                f"camera intrinsics are not finite: {values}; check the calibration file"
+            )
         if self.fu <= 0 or self.fv <= 0:
-            raise CalibrationError(f"focal lengths must be positive, got fu={self.fu:g}, fv={self.fv:g}")
+            raise CalibrationError(
+                f"focal lengths must be positive, got fu={self.fu:g}, fv={self.fv:g}"
+            )
         if self.baseline_m <= 0:
             raise CalibrationError(
-                f"stereo baseline must be positive, got {self.baseline_m:g} m; a zero or negative baseline "
+                f"stereo baseline must be positive, got {self.baseline_m:g} m; a zero or negative "
+                "baseline "
                 "means that both projection matrices are the same or that the cameras are swapped"
             )
 
     @property
     def baseline_fault(self) -> str | None:
-        """The warning on a baseline that no rig has, as that of a calibration in millimetres; None: it is plausible.
+        """The warning on a baseline that no rig has, as that of a calibration in millimetres; None:
+        it is plausible.
 
         Of stereo pairs; those of one camera and of depth images are made up.
         """
         if self.kind != "stereo" or _SHORT_M <= self.baseline_m <= _LONG_M:
             return None
         return (
-            f"a baseline of {self.baseline_m:g} m is implausible; translations are metres: check the unit of the "
+            f"a baseline of {self.baseline_m:g} m is implausible; translations are metres: check "
+            "the unit of the "
             "calibration"
         )
 
@@ -146,21 +168,29 @@ class StereoCamera:
     @property
     def M(self) -> FloatArray:
         """The paper's stereo calibration matrix (4, 4) of a pinhole: `z = M pi(q)`."""
-        fu, fv, cu, cv = self.fu, self.fv, self.cu, self.cv
+        fu = self.fu
+        fv = self.fv
+        cu = self.cu
+        cv = self.cv
         return np.array(
-            [[fu, 0, cu, 0], [0, fv, cv, 0], [fu, 0, cu, -fu * self.baseline_m], [0, fv, cv, 0]], dtype=np.float64
+            [[fu, 0, cu, 0], [0, fv, cv, 0], [fu, 0, cu, -fu * self.baseline_m], [0, fv, cv, 0]],
+            dtype=np.float64,
         )
 
     @property
     def K(self) -> FloatArray:
-        """Intrinsic matrix (3, 3) of both cameras, pixels; of a cylinder, that of the pinhole at its middle row."""
+        """Intrinsic matrix (3, 3) of both cameras, pixels; of a cylinder, that of the pinhole at
+        its middle row.
+        """
         return np.array([[self.fu, 0, self.cu], [0, self.fv, self.cv], [0, 0, 1]], dtype=np.float64)
 
 
 def one_camera(
     fu: float, fv: float, cu: float, cv: float, width: int | None = None, height: int | None = None
 ) -> StereoCamera:
-    """Return an undistorted camera without a right one; the arguments are those of `StereoCamera`, in pixels."""
+    """Return an undistorted camera without a right one; the arguments are those of
+    `StereoCamera`, in pixels.
+    """
     return StereoCamera(fu, fv, cu, cv, MONO_UNIT_M, width, height, kind="mono")
 
 
@@ -170,19 +200,25 @@ def left_alone(camera: StereoCamera) -> StereoCamera:
 
 
 def depth_of(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
-    """Depth (...) of points (..., 3) in the cam0 frame, metres, as disparity measures it: `fu baseline / disparity`.
+    """Depth (...) of points (..., 3) in the cam0 frame, metres, as disparity measures it:
+    `fu baseline / disparity`.
 
-    Along the optical axis of a pinhole; from the line of the baseline, and never negative, for a cylinder.
+    Along the optical axis of a pinhole; from the line of the baseline, and never negative, for a
+    cylinder.
     """
     p = np.asarray(p_cam, dtype=np.float64)
     return PROJECTIONS[camera.projection].depth(p[..., 1], p[..., 2])
 
 
-def facing(camera: StereoCamera, pixels: npt.ArrayLike, p_cam: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Turn the camera about its baseline until left pixels lie in its middle row; a pinhole stays as it is.
+def facing(
+    camera: StereoCamera, pixels: npt.ArrayLike, p_cam: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Turn the camera about its baseline until left pixels lie in its middle row; a pinhole stays
+    as it is.
 
-    About there a cylinder is a pinhole of the same `fu`, `fv`, `cu`, `cv`, to first order along v and exactly along u,
-    so that the geometry of pinholes applies to each feature in its own turned camera.
+    About there a cylinder is a pinhole of the same `fu`, `fv`, `cu`, `cv`, to first order along v
+    and exactly along u, so that the geometry of pinholes applies to each feature in its own turned
+    camera.
 
     Args:
         camera: rectified pair.
@@ -190,20 +226,27 @@ def facing(camera: StereoCamera, pixels: npt.ArrayLike, p_cam: npt.ArrayLike) ->
         p_cam: points or directions (..., N, 3) or (..., 1, 3), cam0 frame.
 
     Returns:
-        The pixels (N, 2), and the points (..., N, 3) in the turned frame of each pixel; a pinhole's as given.
+        The pixels (N, 2), and the points (..., N, 3) in the turned frame of each pixel; a pinhole's
+        as given.
     """
-    uv, p = np.asarray(pixels, dtype=np.float64), np.asarray(p_cam, dtype=np.float64)
+    uv = np.asarray(pixels, dtype=np.float64)
+    p = np.asarray(p_cam, dtype=np.float64)
     if not camera.is_cylinder:
         return uv, p
     azimuth = (uv[..., 1] - camera.cv) / camera.fv
-    s, c = np.sin(azimuth), np.cos(azimuth)
-    x, y, z = np.broadcast_arrays(p[..., 0], c * p[..., 1] - s * p[..., 2], s * p[..., 1] + c * p[..., 2])
+    s = np.sin(azimuth)
+    c = np.cos(azimuth)
+    x, y, z = np.broadcast_arrays(
+        p[..., 0], c * p[..., 1] - s * p[..., 2], s * p[..., 1] + c * p[..., 2]
+    )
     turned = np.stack([x, y, z], axis=-1)
     return np.stack([uv[..., 0], np.full_like(uv[..., 0], camera.cv)], axis=-1), turned
 
 
 def project(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
-    """Stereo pixels (..., 4) of points (..., 3) in the cam0 frame, metres; their depth must not be zero."""
+    """Stereo pixels (..., 4) of points (..., 3) in the cam0 frame, metres; their depth must not
+    be zero.
+    """
     p = np.asarray(p_cam, dtype=np.float64)
     depth = depth_of(camera, p)
     out = np.empty((*p.shape[:-1], 4))
@@ -218,22 +261,28 @@ def left_rays(camera: StereoCamera, pixels: npt.ArrayLike) -> FloatArray:
     """Rays (..., 3) of unit depth (`depth_of`) in the cam0 frame through left pixels (..., 2)."""
     uv = np.asarray(pixels, dtype=np.float64)
     out = np.empty((*uv.shape[:-1], 3))
-    out[..., 0], row = (uv[..., 0] - camera.cu) / camera.fu, (uv[..., 1] - camera.cv) / camera.fv
+    out[..., 0] = (uv[..., 0] - camera.cu) / camera.fu
+    row = (uv[..., 1] - camera.cv) / camera.fv
     out[..., 1], out[..., 2] = PROJECTIONS[camera.projection].ray(row)
     return out
 
 
 def z_D_p_cam(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
-    """Jacobian (..., 4, 3) of `project` with respect to the point in the cam0 frame (pixels per metre)."""
+    """Jacobian (..., 4, 3) of `project` with respect to the point in the cam0 frame (pixels per
+    metre).
+    """
     p = np.asarray(p_cam, dtype=np.float64)
-    x, depth, projection = p[..., 0], depth_of(camera, p), PROJECTIONS[camera.projection]
+    x = p[..., 0]
+    depth = depth_of(camera, p)
+    projection = PROJECTIONS[camera.projection]
     yz = p[..., 1], p[..., 2], depth
     out = np.zeros((*p.shape[:-1], 4, 3))
     out[..., 0, 0] = out[..., 2, 0] = camera.fu / depth
     depth_D_y, depth_D_z = projection.depth_D_yz(*yz)
     for column, across in ((0, x), (2, x - camera.baseline_m)):
         u_D_depth = -camera.fu * across / depth**2
-        out[..., column, 1], out[..., column, 2] = u_D_depth * depth_D_y, u_D_depth * depth_D_z
+        out[..., column, 1] = u_D_depth * depth_D_y
+        out[..., column, 2] = u_D_depth * depth_D_z
     out[..., 1, 1], out[..., 1, 2] = projection.row_D_yz(*yz, camera.fv)
     out[..., 3, :] = out[..., 1, :]
     return out
@@ -244,8 +293,9 @@ def triangulate(
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Points (N, 3) in the cam0 frame from stereo pixels (N, 4), and a mask (N,) of valid ones.
 
-    The vertical coordinate is the mean of both images. A disparity `ul - ur` below `min_disparity_px` (a point
-    behind the cameras, or too far away) has False in the mask and an arbitrary finite point.
+    The vertical coordinate is the mean of both images. A disparity `ul - ur` below
+    `min_disparity_px` (a point behind the cameras, or too far away) has False in the mask and an
+    arbitrary finite point.
     """
     z = np.asarray(z, dtype=np.float64)
     disparity = z[..., 0] - z[..., 2]
@@ -257,17 +307,23 @@ def triangulate(
 
 
 def p_cam_D_z(camera: StereoCamera, z: npt.ArrayLike) -> FloatArray:
-    """Jacobian (..., 3, 4) of `triangulate` with respect to the stereo pixels (metres per pixel)."""
+    """Jacobian (..., 3, 4) of `triangulate` with respect to the stereo pixels (metres per
+    pixel).
+    """
     z = np.asarray(z, dtype=np.float64)
     disparity = z[..., 0] - z[..., 2]
     depth = camera.fu * camera.baseline_m / disparity
     depth_D_ul = -depth / disparity
     ray_x = (z[..., 0] - camera.cu) / camera.fu
-    row, projection = ((z[..., 1] + z[..., 3]) / 2 - camera.cv) / camera.fv, PROJECTIONS[camera.projection]
+    row = ((z[..., 1] + z[..., 3]) / 2 - camera.cv) / camera.fv
+    projection = PROJECTIONS[camera.projection]
     out = np.zeros((*z.shape[:-1], 3, 4))
     out[..., 0, 0] = depth / camera.fu + ray_x * depth_D_ul
     out[..., 0, 2] = -ray_x * depth_D_ul
-    for axis, ray, ray_D_row in zip((1, 2), projection.ray(row), projection.ray_D_row(row), strict=True):
-        out[..., axis, 0], out[..., axis, 2] = ray * depth_D_ul, -ray * depth_D_ul
+    for axis, ray, ray_D_row in zip(
+        (1, 2), projection.ray(row), projection.ray_D_row(row), strict=True
+    ):
+        out[..., axis, 0] = ray * depth_D_ul
+        out[..., axis, 2] = -ray * depth_D_ul
         out[..., axis, 1] = out[..., axis, 3] = ray_D_row * depth / (2 * camera.fv)
     return out

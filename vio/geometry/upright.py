@@ -6,16 +6,19 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 
-_LEVEL = 0.1  # horizontal part of the first optical axis below which the camera looks up or down: the path then leads
+# horizontal part of the first optical axis below which the camera looks up or down: the path then
+# leads
+_LEVEL = 0.1
 
 
 def upright_axes(T_world_cam0: FloatArray, up_world: FloatArray | None = None) -> FloatArray:
-    """Return the rotation (3, 3) whose rows are right, ahead and up in the world frame, at the first camera pose.
+    """Return the rotation (3, 3) whose rows are right, ahead and up in the world frame, at the
+    first camera pose.
 
     Args:
         T_world_cam0: poses (N, 4, 4) of the left camera.
-        up_world: (3,) opposite to gravity where it is known; None: cameras are mounted upright, so the upper edge of
-            the first image shows.
+        up_world: (3,) opposite to gravity where it is known; None: cameras are mounted upright, so
+            the upper edge of the first image shows.
     """
     first = T_world_cam0[0]
     up = -first[:3, 1] if up_world is None else np.asarray(up_world, dtype=np.float64)
@@ -29,7 +32,10 @@ def upright_axes(T_world_cam0: FloatArray, up_world: FloatArray | None = None) -
 
 
 def upright_view(
-    T_world_body: FloatArray, T_cam0_body: FloatArray, motion: str | None, gravity_world: FloatArray | None = None
+    T_world_body: FloatArray,
+    T_cam0_body: FloatArray,
+    motion: str | None,
+    gravity_world: FloatArray | None = None,
 ) -> FloatArray:
     """Return the transform (4, 4) from the world of a run to right, ahead and up at its first pose.
 
@@ -46,13 +52,15 @@ def upright_view(
 def rotated(R: FloatArray, P: FloatArray) -> FloatArray:
     """Return covariances (..., 3, 3) in a frame that R (..., 3, 3) takes the vectors to.
 
-    With `T_world_body = T_hat exp(-xi)`, an error of the body's pose moves its position by R rho in the world.
+    With `T_world_body = T_hat exp(-xi)`, an error of the body's pose moves its position by R rho in
+    the world.
     """
     return R @ P @ np.swapaxes(R, -1, -2)
 
 
 def up_of(motion: str | None, gravity_world: FloatArray | None) -> FloatArray | None:
-    """Return the up direction (3,) of a run's world frame; None where only an IMU could tell and there was none.
+    """Return the up direction (3,) of a run's world frame; None where only an IMU could tell and
+    there was none.
 
     Args:
         motion: the run's motion input; with an IMU the world began upright, z up.
@@ -64,11 +72,15 @@ def up_of(motion: str | None, gravity_world: FloatArray | None) -> FloatArray | 
 
 
 def attitude_deg(R_view_cam0: FloatArray) -> FloatArray:
-    """Return heading, pitch and roll (N, 3) of cameras (N, 3, 3) in the upright frame, degrees; heading is unwrapped.
+    """Return heading, pitch and roll (N, 3) of cameras (N, 3, 3) in the upright frame, degrees;
+    heading is unwrapped.
 
-    Heading is that of the optical axis, to the right of ahead; pitch its elevation; roll turns the right side down.
+    Heading is that of the optical axis, to the right of ahead; pitch its elevation; roll turns the
+    right side down.
     """
-    ahead, right, up = R_view_cam0[:, :, 2], R_view_cam0[:, :, 0], -R_view_cam0[:, :, 1]
+    ahead = R_view_cam0[:, :, 2]
+    right = R_view_cam0[:, :, 0]
+    up = -R_view_cam0[:, :, 1]
     heading = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 1]))
     pitch = np.arcsin(np.clip(ahead[:, 2], -1, 1))
     roll = np.arctan2(-right[:, 2], up[:, 2])
@@ -76,39 +88,50 @@ def attitude_deg(R_view_cam0: FloatArray) -> FloatArray:
 
 
 def rotation_to_up(up: FloatArray) -> FloatArray:
-    """Return the rotation (3, 3) that takes a unit vector (3,) to the z axis, by the shortest turn."""
+    """Return the rotation (3, 3) that takes a unit vector (3,) to the z axis, by the shortest
+    turn.
+    """
     axis = np.cross(up, [0.0, 0.0, 1.0])
-    s, c = float(np.linalg.norm(axis)), float(up[2])
+    s = float(np.linalg.norm(axis))
+    c = float(up[2])
     if s < 1e-9:
         return np.eye(3) if c > 0 else so3_exp([np.pi, 0.0, 0.0])
     return so3_exp(axis / s * np.arctan2(s, c))
 
 
 def mean_up(up: FloatArray, sigma_rad: FloatArray) -> FloatArray:
-    """Return the direction (3,) that verticals (N, 3) with standard deviations (N,) say in the mean."""
+    """Return the direction (3,) that verticals (N, 3) with standard deviations (N,) say in the
+    mean.
+    """
     total: FloatArray = (up / np.maximum(sigma_rad, 1e-6)[:, None] ** 2).sum(axis=0)
     return total / np.linalg.norm(total)
 
 
 def up_in(T_map: FloatArray, T_world: FloatArray, up_world: FloatArray) -> FloatArray:
-    """Return the mean direction (3,) that is up in a map, by poses (N, 4, 4) there and the same in the world of a run.
+    """Return the mean direction (3,) that is up in a map, by poses (N, 4, 4) there and the same in
+    the world of a run.
 
     Args:
         T_map: in the map.
         T_world: the same in the world of the run.
         up_world: (3,).
     """
-    up: FloatArray = (T_map[:, :3, :3] @ np.swapaxes(T_world[:, :3, :3], 1, 2) @ up_world).sum(axis=0)
+    up: FloatArray = (T_map[:, :3, :3] @ np.swapaxes(T_world[:, :3, :3], 1, 2) @ up_world).sum(
+        axis=0
+    )
     return up / np.linalg.norm(up)
 
 
 def nearest_yaw(M: FloatArray) -> float:
-    """Return the angle of the turn about z that is nearest to a matrix (3, 3), a rotation or a sum of some."""
+    """Return the angle of the turn about z that is nearest to a matrix (3, 3), a rotation or a
+    sum of some.
+    """
     return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
 
 
 def yaw_and_position(T: FloatArray, T_other: FloatArray) -> FloatArray:
-    """Return the motion (4, 4) of an upright world that brings a pose (4, 4) in it nearest to one in another, T.
+    """Return the motion (4, 4) of an upright world that brings a pose (4, 4) in it nearest to one
+    in another, T.
 
     It is a turn about the vertical and a shift: what two upright worlds may differ by.
     """

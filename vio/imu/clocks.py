@@ -10,12 +10,15 @@ from vio.records import IntArray
 _COVERED = 0.97  # share of the frames that must have samples …
 _UNCOVERED_S = 1.0  # … unless the uncovered time is shorter
 _LATE_S = 0.1  # a frame has a sample if the last one is no older
-_NO_IMU_FRAMES, _NO_IMU_S = 10, 0.4  # missing samples are reported after so many frames and so much time
+_NO_IMU_FRAMES = 10  # missing samples are reported after so many frames and so much time
+_NO_IMU_S = 0.4
 _NS = 1e-9
 
 
 def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[InertialFinding, ...]:
-    """Check whether the IMU's stamps (S,) cover those of the frames (F,), both increasing, and explain it if not."""
+    """Check whether the IMU's stamps (S,) cover those of the frames (F,), both increasing, and
+    explain it if not.
+    """
     if not len(frame_times_ns):
         return ()
     frames = int(frame_times_ns[0]), int(frame_times_ns[-1])
@@ -32,7 +35,9 @@ def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[Iner
 
 
 class SampleCoverage:
-    """Count the frames that have IMU samples during a run; a gap between samples is no matter of clocks."""
+    """Count the frames that have IMU samples during a run; a gap between samples is no matter of
+    clocks.
+    """
 
     def __init__(self) -> None:
         self._first_ns: int | None = None
@@ -82,13 +87,16 @@ class SampleCoverage:
         return (last_ns - first_ns) * _NS
 
 
-def _no_overlap(frames: tuple[int, int], imu: tuple[int, int] | None, step_ns: float) -> InertialFinding:
+def _no_overlap(
+    frames: tuple[int, int], imu: tuple[int, int] | None, step_ns: float
+) -> InertialFinding:
     seen = f"frames from {frames[0]} to {frames[1]} ns"
     if imu is None:
         return InertialFinding(
             "clocks without overlap",
             f"{seen}, no IMU sample among them",
-            "the IMU may begin later, or its stamps count from another epoch or in another unit (ns, us, ms, s); give "
+            "the IMU may begin later, or its stamps count from another epoch or in another unit "
+            "(ns, us, ms, s); give "
             "both one clock, or use --motion none",
         )
     seen = f"{seen}, IMU samples from {imu[0]} to {imu[1]} ns, without overlap"
@@ -102,27 +110,36 @@ def _no_overlap(frames: tuple[int, int], imu: tuple[int, int] | None, step_ns: f
     return InertialFinding(
         "clocks without overlap",
         seen,
-        f"{same}the clocks may have different epochs (the IMU starts {offset_s:+.3f} s from the frames), or the "
+        f"{same}the clocks may have different epochs (the IMU starts {offset_s:+.3f} s from the "
+        "frames), or the "
         "files belong to other recordings; convert the IMU's stamps to the camera's clock",
     )
 
 
-def _part_overlap(frames: tuple[int, int], imu: tuple[int, int], step_ns: float, covered: float) -> InertialFinding:
+def _part_overlap(
+    frames: tuple[int, int], imu: tuple[int, int], step_ns: float, covered: float
+) -> InertialFinding:
     unit = _unit_of_clock(frames, imu, step_ns)
     return InertialFinding(
         "clocks overlap in part",
         f"frames from {frames[0]} to {frames[1]} ns, IMU samples from {imu[0]} to {imu[1]} ns: "
         f"{100 * covered:.1f} % of the frames have IMU samples",
-        unit or "a file may be cut short, or the clocks may be shifted; use the frames that both cover, or other files",
+        unit
+        or "a file may be cut short, or the clocks may be shifted; use the frames that both cover, "
+        "or other files",
     )
 
 
 def _unit_of_clock(frames: tuple[int, int], imu: tuple[int, int], step_ns: float) -> str | None:
-    """Return the explanation by a power of 1000 that maps the IMU's stamps to the frames'; None: there is none."""
+    """Return the explanation by a power of 1000 that maps the IMU's stamps to the frames'.
+
+    None: there is none.
+    """
     names = {3: "microseconds", 6: "milliseconds", 9: "seconds"}
     for power in (3, 6, 9, -3, -6, -9):
         factor = 10.0**power
-        low, high = imu[0] * factor, imu[1] * factor
+        low = imu[0] * factor
+        high = imu[1] * factor
         shared = min(high, frames[1]) - max(low, frames[0])
         plausible = step_ns == 0 or 1e5 < step_ns * factor < 1e8  # 10 Hz to 10 kHz
         if plausible and shared > 0.5 * max(frames[1] - frames[0], 1):

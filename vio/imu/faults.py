@@ -1,12 +1,14 @@
-"""Faulty IMU samples: spikes, and readings that repeat to the last bit; both are left out as if they were missing.
+"""Faulty IMU samples: spikes, and readings that repeat to the last bit; both are left out as if
+they were missing.
 
-A spike is one sample that lies far from both of its neighbours, while these agree. A rig cannot turn or accelerate so
-within one period and back within the next: a sensor's bandwidth is a fraction of its rate, and vibration at that
-bandwidth fills the whole record, so the spike is judged by the changes of the two seconds before it. Healthy flights
-come to 23 robust standard deviations of these changes (docs/notes/design_decisions.md, spikes of an IMU).
+A spike is one sample that lies far from both of its neighbours, while these agree. A rig cannot
+turn or accelerate so within one period and back within the next: a sensor's bandwidth is a fraction
+of its rate, and vibration at that bandwidth fills the whole record, so the spike is judged by the
+changes of the two seconds before it. Healthy flights come to 23 robust standard deviations of these
+changes (docs/notes/design_decisions.md, spikes of an IMU).
 
-Noise changes the last bits of every reading, so six equal numbers after six equal numbers are one reading given twice.
-How often that is due to coarse quantisation is learned from the record.
+Noise changes the last bits of every reading, so six equal numbers after six equal numbers are one
+reading given twice. How often that is due to coarse quantisation is learned from the record.
 """
 
 from __future__ import annotations
@@ -23,14 +25,21 @@ from vio.numerics.compiled import compiled
 from vio.numerics.robust import median, robust_sigmas
 from vio.records import ImuSample, IntArray
 
-ImuFaultKind: TypeAlias = Literal["gyro spike", "accelerometer spike", "stuck IMU", "stuck gyro", "stuck accelerometer"]
+ImuFaultKind: TypeAlias = Literal[
+    "gyro spike", "accelerometer spike", "stuck IMU", "stuck gyro", "stuck accelerometer"
+]
 
 _HISTORY_NS = 2_000_000_000  # changes between samples that a spike is compared with
-_LEAST_HISTORY = 20  # changes; with fewer nothing is called a spike, nor stuck: a simulated IMU may have no noise
-_REFRESH, _REFRESH_SHARE = 20, 4  # samples between two evaluations of their scale, and the least share of all, 1 / 4
+# changes; with fewer nothing is called a spike, nor stuck: a simulated IMU may have no noise
+_LEAST_HISTORY = 20
+_REFRESH = 20  # samples between two evaluations of their scale, and the least share of all, 1 / 4
+_REFRESH_SHARE = 4
 _SPIKE_SIGMAS = 30.0  # robust standard deviations of the changes; real motion reached 23
-_SPIKE_IMPULSE = (5e-3, 5e-3, 5e-3, 0.15, 0.15, 0.15)  # rad and m/s over the sample's period; below, no spike does harm
-_RETURN = 0.25  # of the first change, by which the sample after a spike may lie from the one before it; a shock rings
+# rad and m/s over the sample's period; below, no spike does harm
+_SPIKE_IMPULSE = (5e-3, 5e-3, 5e-3, 0.15, 0.15, 0.15)
+# of the first change, by which the sample after a spike may lie from the one before it; a shock
+# rings
+_RETURN = 0.25
 _LONG_PERIODS = 3.0  # after a longer interval a change is no spike
 _PARTS: tuple[tuple[ImuFaultKind, slice], ...] = (
     ("stuck IMU", slice(0, 6)),
@@ -43,7 +52,8 @@ _RARE = 0.02  # share of repetitions below which one is held back
 _LEAST_CHANCE = 1e-8  # probability of so many repetitions in a row where they are independent
 _COUNTED = 400  # samples over which the share of repetitions is counted
 _NS = 1e-9
-_Reading: TypeAlias = list[float]  # (6,) gyro and accelerometer; plain numbers, as arrays of six cost ten times as much
+# (6,) gyro and accelerometer; plain numbers, as arrays of six cost ten times as much
+_Reading: TypeAlias = list[float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +63,15 @@ class ImuFault:
     kind: ImuFaultKind
     start_ns: int  # of the spike, or of the reading that was repeated
     end_ns: int  # of the last sample concerned
-    size: float  # spike: change from its neighbours, rad/s or m/s^2; stuck: the largest of the numbers repeated
+    # spike: change from its neighbours, rad/s or m/s^2; stuck: the largest of the numbers repeated
+    size: float
 
 
 class ImuSampleCheck:
     """Passes the samples of one IMU on, without the faulty ones.
 
-    A sample that looks like a spike or like a repetition is held until the next ones decide; all others pass at once.
+    A sample that looks like a spike or like a repetition is held until the next ones decide; all
+    others pass at once.
     """
 
     def __init__(self) -> None:
@@ -76,7 +88,8 @@ class ImuSampleCheck:
             return []
         times = np.array([x.time_ns for x in samples], dtype=np.int64)
         usable: list[ImuSample] = []
-        readings, k = readings_of(samples), 0
+        readings = readings_of(samples)
+        k = 0
         while k < len(samples):
             passed = self._pass_on(times[k:], readings[k:])
             usable += samples[k : k + passed]
@@ -84,11 +97,14 @@ class ImuSampleCheck:
             if passed == 0:
                 usable += self._take_unusual(samples[k], readings[k].tolist())
                 k += 1
-            self._previous, self._last_reading = samples[k - 1], readings[k - 1].tolist()
+            self._previous = samples[k - 1]
+            self._last_reading = readings[k - 1].tolist()
         return usable
 
     def _pass_on(self, times: IntArray, readings: FloatArray) -> int:
-        """Count the first of some samples, of times (K,) and readings (K, 6), that nothing is to be said of."""
+        """Count the first of some samples, of times (K,) and readings (K, 6), that nothing is to
+        be said of.
+        """
         if self._previous is None or self._held or any(r.repeats for r in self._repeats):
             return 0
         passed = self._spikes.pass_on(times, readings)
@@ -101,42 +117,57 @@ class ImuSampleCheck:
             equal = [a == b for a, b in zip(self._last_reading, reading, strict=True)]
             ended = [f for r in self._repeats for f in r.take(self._previous, sample, equal)]
             self._faults += ended[:1]  # that of the whole IMU is that of both sensors
-        if any(r.stuck for r in self._repeats) or not any(reading[3:]):  # gravity is never zero in all axes
+        # gravity is never zero in all axes
+        if any(r.stuck for r in self._repeats) or not any(reading[3:]):
             self._held = []
             return []
         if any(r.unusual for r in self._repeats):
             self._held.append(sample)
             return []
-        held, self._held = self._held, []
-        usable = [x for candidate in held for x in self._spikes.take(candidate, _reading(candidate))]
+        held = self._held
+        self._held = []
+        usable = [
+            x for candidate in held for x in self._spikes.take(candidate, _reading(candidate))
+        ]
         usable += self._spikes.take(sample, reading)
         self._faults += self._spikes.new_faults()
         return usable
 
     def new_faults(self) -> tuple[ImuFault, ...]:
         """Return the faults that ended since the last call."""
-        faults, self._faults = tuple(self._faults), []
+        faults = tuple(self._faults)
+        self._faults = []
         return faults
 
     def finish(self) -> tuple[ImuFault, ...]:
         """Return the faults that last until the end of the record."""
-        last = [r.fault(self._previous.time_ns) for r in self._repeats if r.stuck and self._previous is not None]
+        last = [
+            r.fault(self._previous.time_ns)
+            for r in self._repeats
+            if r.stuck and self._previous is not None
+        ]
         return (*self.new_faults(), *last[:1])
 
 
 class _Repetition:
-    """Counts how often some of a reading's numbers are those of the reading before, in a row and in all."""
+    """Counts how often some of a reading's numbers are those of the reading before, in a row and
+    in all.
+    """
 
     def __init__(self, kind: ImuFaultKind, part: slice) -> None:
-        self._kind, self._part = kind, part
-        self._counted: deque[bool] = deque(maxlen=_COUNTED)  # repetitions before the present row of them
+        self._kind = kind
+        self._part = part
+        # repetitions before the present row of them
+        self._counted: deque[bool] = deque(maxlen=_COUNTED)
         self._equal = 0  # of these, that were repetitions
         self._start: ImuSample | None = None  # the reading that is repeated
         self.repeats = 0  # in the present row
         self.stuck = False
 
     def take(self, previous: ImuSample, sample: ImuSample, equal: list[bool]) -> list[ImuFault]:
-        """Count a sample and which (6,) of its numbers are those of the one before; return the fault that it ends."""
+        """Count a sample and which (6,) of its numbers are those of the one before; return the
+        fault that it ends.
+        """
         if all(equal[self._part]):
             self._start = self._start if self.repeats else previous
             self.repeats += 1
@@ -145,7 +176,8 @@ class _Repetition:
         ended = [self.fault(previous.time_ns)] if self.stuck else []
         for repeated in (*([True] * (0 if self.stuck else self.repeats)), False):
             self._count(repeated)
-        self.repeats, self.stuck = 0, False
+        self.repeats = 0
+        self.stuck = False
         return ended
 
     def count_others(self, count: int) -> None:
@@ -192,9 +224,11 @@ class _SpikeCheck:
     """Leaves out single samples that lie far from both neighbours."""
 
     def __init__(self) -> None:
-        self._last: tuple[int, _Reading] | None = None  # time and reading of the last sample that passed
+        # time and reading of the last sample that passed
+        self._last: tuple[int, _Reading] | None = None
         self._suspect: ImuSample | None = None
-        # Of the samples of the last seconds that passed, in parts: their times (S,), and the changes (S, 6) to them.
+        # Of the samples of the last seconds that passed, in parts: their times (S,), and the
+        # changes (S, 6) to them.
         self._times: list[IntArray] = []
         self._changes: list[FloatArray] = []
         self._limit: _Reading | None = None  # (6,) a larger change is suspect; None: unknown
@@ -203,12 +237,16 @@ class _SpikeCheck:
         self._faults: list[ImuFault] = []
 
     def pass_on(self, times: IntArray, readings: FloatArray) -> int:
-        """Take the first of some samples, up to one that is suspect or repeats a reading; return how many."""
+        """Take the first of some samples, up to one that is suspect or repeats a reading; return
+        how many.
+        """
         if self._last is None or self._suspect is not None:
             return 0
         most = max(self._until_refresh, 1)  # then the limits change
-        times, readings = times[:most], readings[:most]
-        changes, limit = np.empty(readings.shape), np.array([np.inf] * 6 if self._limit is None else self._limit)
+        times = times[:most]
+        readings = readings[:most]
+        changes = np.empty(readings.shape)
+        limit = np.array([np.inf] * 6 if self._limit is None else self._limit)
         longest = _LONG_PERIODS * self._period_ns
         last_ns, last = self._last
         passed = _count_plain(times, readings, last_ns, np.array(last), limit, longest, changes)
@@ -220,7 +258,8 @@ class _SpikeCheck:
         if self._last is None:
             self._last = sample.time_ns, reading
             return (sample,)
-        suspect, self._suspect = self._suspect, None
+        suspect = self._suspect
+        self._suspect = None
         if suspect is not None:
             if self._has_returned(suspect, reading):
                 self._accept_one(sample, reading)
@@ -233,7 +272,8 @@ class _SpikeCheck:
         return (sample,) if suspect is None else (suspect, sample)
 
     def new_faults(self) -> list[ImuFault]:
-        faults, self._faults = self._faults, []
+        faults = self._faults
+        self._faults = []
         return faults
 
     def _is_suspect(self, time_ns: int, reading: _Reading) -> bool:
@@ -272,9 +312,11 @@ class _SpikeCheck:
         self._until_refresh -= len(times)
         if self._until_refresh > 0:
             return
-        together, changed = np.concatenate(self._times), np.concatenate(self._changes)
+        together = np.concatenate(self._times)
+        changed = np.concatenate(self._changes)
         old = int(np.searchsorted(together, self._last[0] - _HISTORY_NS))
-        self._times, self._changes = [together[old:]], [changed[old:]]
+        self._times = [together[old:]]
+        self._changes = [changed[old:]]
         if len(together) - old >= _LEAST_HISTORY:
             self._until_refresh = max(_REFRESH, (len(together) - old) // _REFRESH_SHARE)
             self._period_ns = median(np.diff(together[old:]))
@@ -301,14 +343,18 @@ def _count_plain(
     longest_ns: float,
     changes: FloatArray,
 ) -> int:
-    """Count the first of some samples, of times (K,) and readings (K, 6), that neither stand out nor repeat one.
+    """Count the first of some samples, of times (K,) and readings (K, 6), that neither stand out
+    nor repeat one.
 
-    Their changes (K, 6) are written: none above its limit (6,), unless the sample comes late, is suspect.
+    Their changes (K, 6) are written: none above its limit (6,), unless the sample comes late, is
+    suspect.
     """
     for k in range(len(times)):
         before = last if k == 0 else readings[k - 1]
         near = times[k] - (last_ns if k == 0 else times[k - 1]) <= longest_ns
-        gyro_changed, accel_changed, accel_reads = False, False, False
+        gyro_changed = False
+        accel_changed = False
+        accel_reads = False
         for i in range(6):
             changes[k, i] = readings[k, i] - before[i]
             if near and abs(changes[k, i]) > limit[i]:

@@ -31,11 +31,24 @@ InertialFault: TypeAlias = Literal[
 _GROUPS: dict[str, tuple[InertialFault, ...]] = {
     "overlap": ("clocks without overlap", "clocks overlap in part", "clocks apart"),
     "size": ("accelerometer units", "gravity removed"),
-    "rotation": ("gyro sign", "gyro axes", "gyro disagrees", "extrinsics inverted", "extrinsics rotation"),
+    "rotation": (
+        "gyro sign",
+        "gyro axes",
+        "gyro disagrees",
+        "extrinsics inverted",
+        "extrinsics rotation",
+    ),
     "force": ("accelerometer sign", "accelerometer axes", "upside down"),
 }
-# With any of these the readings are of no use to a filter, unless a factor on them is all that is wrong.
-_UNUSABLE = {*_GROUPS["size"], *_GROUPS["rotation"], "gyro units", "accelerometer sign", "accelerometer axes"}
+# With any of these the readings are of no use to a filter, unless a factor on them is all that is
+# wrong.
+_UNUSABLE = {
+    *_GROUPS["size"],
+    *_GROUPS["rotation"],
+    "gyro units",
+    "accelerometer sign",
+    "accelerometer axes",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +78,8 @@ class InertialFinding:
     seen: str  # the observation, with figures
     explanation: str  # the likely cause, and what to do
     certain: bool = True  # False: a hint; correct data can look like this
-    factor: float | None = None  # that takes the unit of these readings to rad/s or m/s^2; None: none does
+    # that takes the unit of these readings to rad/s or m/s^2; None: none does
+    factor: float | None = None
 
     @property
     def message(self) -> str:

@@ -11,8 +11,10 @@ from vio.monitor.samples import judge_size
 from vio.records import NS_PER_S, BoolArray, ImuDensities, ImuRecord
 
 _WINDOW_S = 0.5  # over which standstill is judged
-_STILL_GYRO, _STILL_ACCEL = 0.02, 0.15  # rad/s, m/s^2: spread within a window; ten times the noise of usual sensors
-_NOISE_TAUS_S = (0.1, 0.2, 0.5)  # Allan deviations where white noise outweighs quantisation and bias drift
+_STILL_GYRO = 0.02  # rad/s, m/s^2: spread within a window; ten times the noise of usual sensors
+_STILL_ACCEL = 0.15
+# Allan deviations where white noise outweighs quantisation and bias drift
+_NOISE_TAUS_S = (0.1, 0.2, 0.5)
 _LEAST_STILL_S = 3.0  # of one piece, for the noise
 _OFF_SHEET = 3.0  # measured over stated noise that is worth saying
 _FAR_M = 10.0  # an IMU further from its camera is no length in metres
@@ -42,13 +44,17 @@ def rest_part(record: ImuRecord, T_cam0_imu: FloatArray | None) -> Part:
         faults.append(unit.finding.message)
     mask = np.repeat(still, size) if still.any() else np.ones(len(record.accel), dtype=np.bool_)
     force = record.accel[: len(mask)][mask].mean(axis=0)
-    facts = {"still_share": share, "starts_still": bool(still[:2].all()) if len(still) > 1 else None}
+    facts = {
+        "still_share": share,
+        "starts_still": bool(still[:2].all()) if len(still) > 1 else None,
+    }
     facts |= {"force_mps2": force.tolist(), "force_norm_mps2": float(np.linalg.norm(force))}
     where = "at rest" if still.any() else "on average (never at rest)"
     text = f"{100 * share:.0f} % of the time; the accelerometer shows {np.linalg.norm(force):.2f} m/s^2 {where}"
     if T_cam0_imu is not None:
         up = T_cam0_imu[:3, :3] @ (force / max(float(np.linalg.norm(force)), 1e-9))
-        tilt = float(np.degrees(np.arccos(np.clip(-up[1], -1, 1))))  # the camera's y axis points down
+        # the camera's y axis points down
+        tilt = float(np.degrees(np.arccos(np.clip(-up[1], -1, 1))))
         facts["camera_tilt_deg"] = tilt
         text += f"; the camera is tilted by {tilt:.0f} deg from upright"
         if still.any():
@@ -57,7 +63,8 @@ def rest_part(record: ImuRecord, T_cam0_imu: FloatArray | None) -> Part:
 
 
 def allan_deviation(values: FloatArray, step_s: float, tau_s: float) -> float:
-    """Overlapping Allan deviation of readings (N, 3) at an averaging time; the root mean square over the axes.
+    """Overlapping Allan deviation of readings (N, 3) at an averaging time; the root mean square
+    over the axes.
 
     Reference: IEEE Std 952, annex C.
     """
@@ -68,7 +75,10 @@ def allan_deviation(values: FloatArray, step_s: float, tau_s: float) -> float:
 
 
 def noise_part(record: ImuRecord, stated: ImuDensities | None) -> Part | None:
-    """Compare the white noise in the longest standstill with the data sheet; None: no standstill is long enough."""
+    """Compare the white noise in the longest standstill with the data sheet.
+
+    None: no standstill is long enough.
+    """
     still, size = still_windows(record)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
     step_s = float(np.median(np.diff(record.times_ns))) / NS_PER_S
@@ -83,11 +93,14 @@ def noise_part(record: ImuRecord, stated: ImuDensities | None) -> Part | None:
         ("gyro", record.gyro[piece], None if stated is None else stated.gyro),
         ("accel", record.accel[piece], None if stated is None else stated.accel),
     ):
-        # Of white noise the deviation falls with the root of the averaging time; drift would only add.
+        # Of white noise the deviation falls with the root of the averaging time; drift would only
+        # add.
         density = min(allan_deviation(values, step_s, tau) * np.sqrt(tau) for tau in _NOISE_TAUS_S)
         facts |= {f"{name}_density": float(density), f"{name}_stated": sheet}
         of = "" if sheet is None else f" ({density / sheet:.1f} times the stated)"
-        hint = "; state the measured one" if sheet is not None and density > _OFF_SHEET * sheet else ""
+        hint = (
+            "; state the measured one" if sheet is not None and density > _OFF_SHEET * sheet else ""
+        )
         texts.append(f"{name} {density:.2g}{of}{hint}")
     rest_s = (piece.stop - piece.start) * step_s
     return Part("noise", f"{', '.join(texts)} per root Hz, at rest for {rest_s:.1f} s", facts)
@@ -95,14 +108,20 @@ def noise_part(record: ImuRecord, stated: ImuDensities | None) -> Part | None:
 
 def extrinsics_part(T_cam0_imu: FloatArray) -> Part:
     """Describe the IMU's place in the rectified left camera."""
-    R, t = T_cam0_imu[:3, :3], T_cam0_imu[:3, 3]
+    R = T_cam0_imu[:3, :3]
+    t = T_cam0_imu[:3, 3]
     turn = np.degrees(so3_log(R))
     distance = float(np.linalg.norm(t))
     faults = []
     if distance > _FAR_M:
-        faults.append(f"the IMU is {distance:.4g} m from the camera; translations are metres: check the unit")
+        faults.append(
+            f"the IMU is {distance:.4g} m from the camera; translations are metres: check the unit"
+        )
     text = (
-        f"the IMU is at {t[0]:+.3f} {t[1]:+.3f} {t[2]:+.3f} m in cam0, turned by {turn[0]:+.1f} {turn[1]:+.1f} "
+        f"the IMU is at {t[0]:+.3f} {t[1]:+.3f} {t[2]:+.3f} m in cam0, turned by {turn[0]:+.1f} "
+        f"{turn[1]:+.1f} "
         f"{turn[2]:+.1f} deg"
     )
-    return Part("extrinsics", text, {"t_cam0_imu_m": t.tolist(), "rotation_deg": turn.tolist()}, faults)
+    return Part(
+        "extrinsics", text, {"t_cam0_imu_m": t.tolist(), "rotation_deg": turn.tolist()}, faults
+    )

@@ -16,7 +16,15 @@ from vio.inspection.pictures import depths_part, images_part, rows_parts
 from vio.monitor.inertial import InertialCheck
 from vio.numerics.robust import robust_sigma
 from vio.protocols import Dataset, Frontend
-from vio.records import NS_PER_S, ImuRecord, ImuSample, IntArray, Recording, StereoFrame, VelocitySample
+from vio.records import (
+    NS_PER_S,
+    ImuRecord,
+    ImuSample,
+    IntArray,
+    Recording,
+    StereoFrame,
+    VelocitySample,
+)
 
 PAIRS = 12  # or single images looked at, spread over the recording
 TRACKED = 60  # frames tracked to compare the IMU with the images' motion
@@ -42,10 +50,14 @@ def inspect_recording(
         frames = _spread(dataset, pairs, progress)
         parts.append(images_part(frames))
         if recording.camera.kind != "mono":
-            parts += rows_parts(frames) if recording.camera.kind == "stereo" else [depths_part(frames)]
+            parts += (
+                rows_parts(frames) if recording.camera.kind == "stereo" else [depths_part(frames)]
+            )
     parts += _motion_parts(dataset)
     if recording.has_images and tracked > 1:
-        parts += _tracking_parts(dataset, build_frontend, min(tracked, len(recording.frame_times_ns)), progress)
+        parts += _tracking_parts(
+            dataset, build_frontend, min(tracked, len(recording.frame_times_ns)), progress
+        )
     parts += [_reference_part(recording), _missing_part(recording)]
     return Inspection(tuple(parts), recording.notes)
 
@@ -63,8 +75,14 @@ def camera_part(recording: Recording) -> Part:
     faults = []
     if c.baseline_fault is not None:
         faults.append(c.baseline_fault)
-    if c.width is not None and c.height is not None and not (0 < c.cu < c.width and 0 < c.cv < c.height):
-        faults.append(f"the principal point {c.cu:.0f}, {c.cv:.0f} is outside the image; check its size")
+    if (
+        c.width is not None
+        and c.height is not None
+        and not (0 < c.cu < c.width and 0 < c.cv < c.height)
+    ):
+        faults.append(
+            f"the principal point {c.cu:.0f}, {c.cv:.0f} is outside the image; check its size"
+        )
     if stereo:
         form = " to a cylinder" if c.is_cylinder else ""
         far = f"disparity 1 px at a depth of {c.fu * c.baseline_m:.0f} m"
@@ -75,7 +93,9 @@ def camera_part(recording: Recording) -> Part:
     return Part("camera", text, facts, faults)
 
 
-def _spread(dataset: Dataset, pairs: int, progress: Callable[[int, int], None]) -> list[StereoFrame]:
+def _spread(
+    dataset: Dataset, pairs: int, progress: Callable[[int, int], None]
+) -> list[StereoFrame]:
     """Read some frames, spread over the recording."""
     count = len(dataset.recording.frame_times_ns)
     if dataset.recording.kind == "video":
@@ -93,7 +113,11 @@ def _motion_parts(dataset: Dataset) -> list[Part]:
     recording = dataset.recording
     events = list(dataset.events(images=False))
     velocities = [event.time_ns for event in events if isinstance(event, VelocitySample)]
-    parts = [clock_part("velocity", recording, np.array(velocities, dtype=np.int64))] if velocities else []
+    parts = (
+        [clock_part("velocity", recording, np.array(velocities, dtype=np.int64))]
+        if velocities
+        else []
+    )
     samples = [event for event in events if isinstance(event, ImuSample)]
     if not samples:
         return parts
@@ -109,13 +133,20 @@ def _motion_parts(dataset: Dataset) -> list[Part]:
 
 
 def _tracking_parts(
-    dataset: Dataset, build_frontend: Callable[[Dataset], Frontend], frames: int, progress: Callable[[int, int], None]
+    dataset: Dataset,
+    build_frontend: Callable[[Dataset], Frontend],
+    frames: int,
+    progress: Callable[[int, int], None],
 ) -> list[Part]:
     """Track the first frames, and compare the IMU with the images' motion as a run does."""
     recording = dataset.recording
     frontend = build_frontend(dataset)
     imu = "imu" in recording.motion and recording.T_cam0_imu is not None
-    check = InertialCheck(recording.camera, recording.T_cam0_imu) if recording.T_cam0_imu is not None else None
+    check = (
+        InertialCheck(recording.camera, recording.T_cam0_imu)
+        if recording.T_cam0_imu is not None
+        else None
+    )
     tracked: list[int] = []
     matched: list[int] = []
     findings: list[str] = []
@@ -133,12 +164,19 @@ def _tracking_parts(
     if imu and check is not None:
         findings += _messages(check.finish(), mono=mono)
     kept = float(np.median(tracked[1:])) if len(tracked) > 1 else 0.0
-    facts = {"frames": len(tracked), "tracked_median": kept, "matched_median": float(np.median(matched or [0]))}
+    facts = {
+        "frames": len(tracked),
+        "tracked_median": kept,
+        "matched_median": float(np.median(matched or [0])),
+    }
     depth = "" if mono else f", {np.median(matched or [0]):.0f} with depth"
     text = f"{kept:.0f} features from frame to frame{depth} (of {len(tracked)} frames)"
     faults = []
     if len(tracked) > 1 and kept < 8:
-        faults.append("hardly any feature is tracked; the frames may not be consecutive, in disorder, dark or blurred")
+        faults.append(
+            "hardly any feature is tracked; the frames may not be consecutive, in disorder, dark "
+            "or blurred"
+        )
     parts = [Part("tracking", text, facts, faults)]
     if imu:
         verdict = "agrees with the motion of the images, as far as they move"
@@ -150,7 +188,9 @@ def _tracking_parts(
 
 
 def _messages(found: tuple[InertialFinding, ...], *, mono: bool) -> list[str]:
-    """Return findings of the IMU as lines; of one camera without its units, which the images then say nothing about."""
+    """Return findings of the IMU as lines; of one camera without its units, which the images
+    then say nothing about.
+    """
     return [f.message for f in found if not (mono and f.group == "size")]
 
 
@@ -163,19 +203,28 @@ def _reference_part(recording: Recording) -> Part:
         return Part("ground truth", text, {"poses": len(truth)})
     times = recording.frame_times_ns
     covered = float(np.mean((times >= truth.times_ns[0]) & (times <= truth.times_ns[-1])))
-    return Part("ground truth", f"{text}, over {100 * covered:.0f} % of the frames", {"poses": len(truth)})
+    return Part(
+        "ground truth", f"{text}, over {100 * covered:.0f} % of the frames", {"poses": len(truth)}
+    )
 
 
 def _missing_part(recording: Recording) -> Part:
     """Say what the recording lacks, and what is lost with it."""
-    missing, faults = [], []
-    if recording.camera.kind == "mono" and ("imu" not in recording.motion or recording.T_cam0_imu is None):
+    missing = []
+    faults = []
+    if recording.camera.kind == "mono" and (
+        "imu" not in recording.motion or recording.T_cam0_imu is None
+    ):
         missing.append("no IMU with T_cam0_imu")
         faults.append(
-            "one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu), depth images or a second camera"
+            "one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu), depth images or "
+            "a second camera"
         )
     elif not recording.motion:
-        missing.append("no IMU, no velocity (images alone: no gravity, nothing carries the pose over blind frames)")
+        missing.append(
+            "no IMU, no velocity (images alone: no gravity, nothing carries the pose over blind "
+            "frames)"
+        )
     elif recording.T_cam0_imu is None:
         missing.append("no T_cam0_imu")
     if recording.reference is None:
@@ -203,7 +252,8 @@ def clock_part(name: str, recording: Recording, times_ns: IntArray) -> Part:
     if name == "IMU":
         if facts["rate_hz"] is not None and facts["rate_hz"] < _LEAST_IMU_HZ:
             faults.append(
-                f"{facts['rate_hz']:.3g} Hz are too few to integrate the motion between images; record at least "
+                f"{facts['rate_hz']:.3g} Hz are too few to integrate the motion between images; "
+                "record at least "
                 f"{_LEAST_IMU_HZ:g} Hz, or use --motion none"
             )
         faults += [finding.message for finding in judge_clocks(recording.frame_times_ns, times_ns)]
@@ -213,7 +263,9 @@ def clock_part(name: str, recording: Recording, times_ns: IntArray) -> Part:
 
 
 def clock_facts(times_ns: IntArray) -> dict[str, float | int | None]:
-    """Return duration, median rate, jitter (robust standard deviation of the intervals), and gaps of stamps (N,)."""
+    """Return duration, median rate, jitter (robust standard deviation of the intervals), and
+    gaps of stamps (N,).
+    """
     if len(times_ns) < 2:
         return {"count": len(times_ns), "duration_s": 0.0, "rate_hz": None}
     steps = np.diff(times_ns).astype(np.float64) / NS_PER_S
@@ -232,5 +284,9 @@ def clock_facts(times_ns: IntArray) -> dict[str, float | int | None]:
 def _text(facts: dict[str, float | int | None]) -> str:
     if facts["rate_hz"] is None:
         return ""
-    gaps = f", {facts['gaps']} gaps, the longest {facts['longest_gap_s']:.3g} s" if facts["gaps"] else ", no gap"
+    gaps = (
+        f", {facts['gaps']} gaps, the longest {facts['longest_gap_s']:.3g} s"
+        if facts["gaps"]
+        else ", no gap"
+    )
     return f" in {facts['duration_s']:.2f} s, {facts['rate_hz']:.4g} Hz, jitter {facts['jitter_ms']:.3g} ms{gaps}"

@@ -14,13 +14,18 @@ from vio.geometry.lie import FloatArray
 from vio.inspection.finding import Part
 from vio.records import Image, StereoFrame
 
-_RATIO = 0.8  # of the best to the second best descriptor distance. Reference: Lowe, Distinctive image features (2004)
+# of the best to the second best descriptor distance. Reference: Lowe, Distinctive image features
+# (2004)
+_RATIO = 0.8
 _FEATURES = 1500  # per image
 _RANSAC_PX = 1.5
 _LEAST_MATCHES = 20  # a pair with fewer says nothing about the calibration
-_DARK, _BRIGHT, _FLAT = 12.0, 243.0, 3.0  # mean and standard deviation of gray levels of an image without content
+_DARK = 12.0  # mean and standard deviation of gray levels of an image without content
+_BRIGHT = 243.0
+_FLAT = 3.0
 _ROWS_FAULT_PX = 2.0  # where matching along rows fails
-_NEAREST_M, _FARTHEST_M = 0.1, 30.0  # medians outside are another unit: structured light ends at 5 m, lidars at 20
+_NEAREST_M = 0.1  # medians outside are another unit: structured light ends at 5 m, lidars at 20
+_FARTHEST_M = 30.0
 _LEAST_POSITIVE = 0.5  # share of matches with ul > ur; true pairs have nearly all
 
 
@@ -31,7 +36,8 @@ class GrayLevels:
     mean: float
     spread: float
     clipped: float  # share of pixels at 0 or 255
-    sharpness: float  # gradient of the image over that of the image blurred by 2 px; about 1 for a blurred one
+    # gradient of the image over that of the image blurred by 2 px; about 1 for a blurred one
+    sharpness: float
 
 
 def gray_levels_of(image: Image) -> GrayLevels:
@@ -47,25 +53,41 @@ def gray_levels_of(image: Image) -> GrayLevels:
 
 def images_part(frames: Sequence[StereoFrame]) -> Part:
     """Describe the images of some frames."""
-    shown = [tuple(image for image in (f.left, f.right) if image is not None) for f in frames if f.left is not None]
+    shown = [
+        tuple(image for image in (f.left, f.right) if image is not None)
+        for f in frames
+        if f.left is not None
+    ]
     cameras = max((len(images) for images in shown), default=0)
     shown = [images for images in shown if len(images) == cameras]
     if not shown:
-        return Part("images", "none could be read", {}, ["no image could be read; see the warnings above"])
+        return Part(
+            "images", "none could be read", {}, ["no image could be read; see the warnings above"]
+        )
     found = [[gray_levels_of(image) for image in side] for side in zip(*shown, strict=True)]
     means = [float(np.mean([e.mean for e in side])) for side in found]
     clipped = max(e.clipped for side in found for e in side)
     sharpness = float(np.median([e.sharpness for side in found for e in side]))
     height, width = shown[0][0].shape
-    facts = {"width": width, "height": height, "mean": means, "clipped": clipped, "sharpness": sharpness}
+    facts = {
+        "width": width,
+        "height": height,
+        "mean": means,
+        "clipped": clipped,
+        "sharpness": sharpness,
+    }
     faults = []
     flat = [e for side in found for e in side if e.spread < _FLAT or not _DARK < e.mean < _BRIGHT]
     if 2 * len(flat) > cameras * len(shown):
         faults.append(
-            f"{len(flat)} of {cameras * len(shown)} images are black, white or without content; correct the exposure"
+            f"{len(flat)} of {cameras * len(shown)} images are black, white or without content; "
+            "correct the exposure"
         )
     if cameras == 2 and all(np.array_equal(images[0], images[1]) for images in shown):
-        faults.append("left and right are the same images, so there is no depth; give the other camera's images")
+        faults.append(
+            "left and right are the same images, so there is no depth; give the other camera's "
+            "images"
+        )
     gray = f"{means[0]:.0f} left and {means[1]:.0f} right" if cameras == 2 else f"{means[0]:.0f}"
     text = f"{width} x {height}, mean gray {gray}, at most {100 * clipped:.1f} % at 0 or 255, sharpness {sharpness:.1f}"
     return Part("images", text, facts, faults)
@@ -75,25 +97,38 @@ def depths_part(frames: Sequence[StereoFrame]) -> Part:
     """Describe the depth images of some frames."""
     depths = [f.depth for f in frames if f.depth is not None]
     known = [depth[np.isfinite(depth) & (depth > 0)] for depth in depths]
-    share = float(np.mean([len(z) / depth.size for z, depth in zip(known, depths, strict=True)])) if depths else 0.0
+    share = (
+        float(np.mean([len(z) / depth.size for z, depth in zip(known, depths, strict=True)]))
+        if depths
+        else 0.0
+    )
     z = np.concatenate([np.zeros(0), *known])
     if not len(z):
-        fault = "no depth image holds a depth; check that they have 16 bits, and what their levels mean"
+        fault = (
+            "no depth image holds a depth; check that they have 16 bits, and what their levels mean"
+        )
         return Part("depth", "no depth is known", {"known": 0.0}, [fault])
     near, middle, far = (float(q) for q in np.quantile(z, [0.05, 0.5, 0.95]))
     faults = []
     if not _NEAREST_M < middle < _FARTHEST_M:
         faults.append(
-            f"the median depth is {middle:.3g} m, which is not that of a depth camera; check depth_factor (levels per "
+            f"the median depth is {middle:.3g} m, which is not that of a depth camera; check "
+            "depth_factor (levels per "
             "metre: 1000 for millimetres, 5000 for TUM RGB-D)"
         )
     text = f"{100 * share:.0f} % of the pixels have one, {near:.2f} to {far:.2f} m (90 %), median {middle:.2f} m"
-    return Part("depth", text, {"known": share, "near_m": near, "median_m": middle, "far_m": far}, faults)
+    return Part(
+        "depth", text, {"known": share, "near_m": near, "median_m": middle, "far_m": far}, faults
+    )
 
 
 def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
-    """Describe how the rows of left and right images agree, by SIFT matches that assume nothing of the calibration."""
-    matches = [sift_pairs(f.left, f.right) for f in frames if f.left is not None and f.right is not None]
+    """Describe how the rows of left and right images agree, by SIFT matches that assume nothing
+    of the calibration.
+    """
+    matches = [
+        sift_pairs(f.left, f.right) for f in frames if f.left is not None and f.right is not None
+    ]
     counts = [len(z) for z in matches]
     z = np.concatenate([np.zeros((0, 4)), *(m for m in matches if len(m) >= _LEAST_MATCHES)])
     image = next((f.left for f in frames if f.left is not None), None)
@@ -101,11 +136,14 @@ def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
     found = row_residuals(z, *size)
     if isinstance(found, NotObservable):
         fault = (
-            f"only {max(counts, default=0)} points match between left and right; check that the folders are of one "
+            f"only {max(counts, default=0)} points match between left and right; check that the "
+            "folders are of one "
             "stereo camera, its lenses clean and in focus"
         )
         hopeless = max(counts, default=0) < _LEAST_MATCHES
-        return [Part("stereo", str(found), {"matches": int(sum(counts))}, [fault] if hopeless else [])]
+        return [
+            Part("stereo", str(found), {"matches": int(sum(counts))}, [fault] if hopeless else [])
+        ]
     off = StereoError(found.rms_px, found.disparity_px)
     return [
         Part("stereo", _rows_text(found, counts), _rows_facts(found), _rows_faults(found)),
@@ -117,7 +155,8 @@ def _rows_text(found: RowResiduals, counts: Sequence[int]) -> str:
     field = found.grid_px[np.isfinite(found.grid_px)]
     over = f", {field.min():+.2f} to {field.max():+.2f} over the image" if len(field) else ""
     return (
-        f"{np.median(counts):.0f} matches a pair, rows {found.median_px:+.2f} px (median of vl - vr), spread "
+        f"{np.median(counts):.0f} matches a pair, rows {found.median_px:+.2f} px (median of vl - "
+        "vr), spread "
         f"{found.spread_px:.2f}{over}; {100 * found.positive_disparity:.0f} % in front"
     )
 
@@ -135,14 +174,18 @@ def _rows_facts(found: RowResiduals) -> dict[str, object]:
 def _rows_faults(found: RowResiduals) -> list[str]:
     if found.positive_disparity < _LEAST_POSITIVE:
         return [
-            f"{100 * (1 - found.positive_disparity):.0f} % of the matches are behind the cameras: left and right "
+            f"{100 * (1 - found.positive_disparity):.0f} % of the matches are behind the cameras: "
+            "left and right "
             "images are exchanged; exchange the folders or topics"
         ]
     if abs(found.median_px) + found.spread_px > _ROWS_FAULT_PX:
         return [
-            f"rows differ by {found.median_px:+.1f} px with spread {found.spread_px:.1f} px: a camera has been turned "
-            "since the calibration, left and right images are exchanged, the calibration is not that of these images, "
-            "or they are not rectified; run `vio calibrate`, which finds which, and give its file with --calibration"
+            f"rows differ by {found.median_px:+.1f} px with spread {found.spread_px:.1f} px: a "
+            "camera has been turned "
+            "since the calibration, left and right images are exchanged, the calibration is not "
+            "that of these images, "
+            "or they are not rectified; run `vio calibrate`, which finds which, and give its file "
+            "with --calibration"
         ]
     return []
 
@@ -152,14 +195,22 @@ def sift_pairs(left: Image, right: Image) -> FloatArray:
     import cv2
 
     sift = cv2.SIFT_create(_FEATURES)  # type: ignore[attr-defined] # missing in OpenCV's stubs
-    (points0, first), (points1, second) = (sift.detectAndCompute(image, None) for image in (left, right))
+    (points0, first), (points1, second) = (
+        sift.detectAndCompute(image, None) for image in (left, right)
+    )
     if first is None or second is None or min(len(points0), len(points1)) < _LEAST_MATCHES:
         return np.zeros((0, 4))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    near = [m for m in matcher.knnMatch(first, second, k=2) if len(m) == 2 and m[0].distance < _RATIO * m[1].distance]
+    near = [
+        m
+        for m in matcher.knnMatch(first, second, k=2)
+        if len(m) == 2 and m[0].distance < _RATIO * m[1].distance
+    ]
     if len(near) < _LEAST_MATCHES:
         return np.zeros((0, 4))
-    z = np.array([[*points0[m[0].queryIdx].pt, *points1[m[0].trainIdx].pt] for m in near], dtype=np.float64)
+    z = np.array(
+        [[*points0[m[0].queryIdx].pt, *points1[m[0].trainIdx].pt] for m in near], dtype=np.float64
+    )
     cv2.setRNGSeed(0)
     _, mask = cv2.findFundamentalMat(z[:, :2], z[:, 2:], cv2.FM_RANSAC, _RANSAC_PX, 0.999)
     return z if mask is None else z[mask.ravel() > 0]

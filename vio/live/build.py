@@ -1,4 +1,6 @@
-"""What a run consists of: motion source, front end, selector, back end and map, for recordings and for live use."""
+"""What a run consists of: motion source, front end, selector, back end and map, for recordings
+and for live use.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,8 @@ class MapUse:
 
     path: Path
     localise: bool = False  # find poses in the map, and leave it as it is
-    # Wait for the map's thread, so that results repeat to the bit; False: keyframes and results come when it is ready.
+    # Wait for the map's thread, so that results repeat to the bit; False: keyframes and results
+    # come when it is ready.
     wait: bool = True
     density: int | None = None  # keyframes a cubic metre that can be found again; None: all
 
@@ -60,7 +63,8 @@ class Source:
     T_cam0_body: FloatArray  # (4, 4)
     motion: MotionSource | None  # what propagates the pose between frames; None: images alone
     recording: Recording | None = None  # None: live
-    features: Dataset | None = None  # the recording, or the features used in place of its images; None: live
+    # the recording, or the features used in place of its images; None: live
+    features: Dataset | None = None
 
 
 def recorded_source(dataset: Dataset, config: Config) -> Source:
@@ -71,7 +75,9 @@ def recorded_source(dataset: Dataset, config: Config) -> Source:
     """
     recording = dataset.recording
     motion = resolve_motion(recording, config)
-    return Source(recording.camera, recording.T_cam0_body, motion, recording, _features(dataset, config))
+    return Source(
+        recording.camera, recording.T_cam0_body, motion, recording, _features(dataset, config)
+    )
 
 
 def live_source(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config) -> Source:
@@ -83,7 +89,9 @@ def live_source(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Con
     sensors: set[MotionSource] = set() if T_cam0_imu is None else {"imu"}
     if config.motion == "velocity":  # any rig may have the sensor
         sensors.add("velocity")
-    motion = _motion(config, sensors, missing="motion imu needs the extrinsics T_cam0_imu; give the rig them")
+    motion = _motion(
+        config, sensors, missing="motion imu needs the extrinsics T_cam0_imu; give the rig them"
+    )
     return Source(camera, np.eye(4) if T_cam0_imu is None else T_cam0_imu, motion)
 
 
@@ -93,17 +101,21 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
     Raises:
         ConfigError: the recording lacks what was asked for, or the back end has no model for it.
     """
-    path, logged = recording.path, recording.run_motion
+    path = recording.path
+    logged = recording.run_motion
     held = ", ".join(sorted(recording.motion)) or "no motion sensor"
     missing = f"{path}: --motion {config.motion} asked for, but the recording holds {held}"
     motion = _motion(config, recording.motion, logged=logged, missing=missing)
     if config.motion != "auto" or logged == "none":
         return motion
     if motion is None and recording.motion:
-        log.warning("%s: backend %s has no model for its %s; images alone", path, config.backend, held)
+        log.warning(
+            "%s: backend %s has no model for its %s; images alone", path, config.backend, held
+        )
     elif motion is not None and recording.kind == "log" and logged is None:
         log.warning(
-            "%s: the log does not say which motion its run used; motion auto takes its %s, --motion none images alone",
+            "%s: the log does not say which motion its run used; motion auto takes its %s, "
+            "--motion none images alone",
             path,
             motion,
         )
@@ -111,9 +123,15 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
 
 
 def _motion(
-    config: Config, sensors: Collection[MotionSource], *, missing: str, logged: RunMotion | None = None
+    config: Config,
+    sensors: Collection[MotionSource],
+    *,
+    missing: str,
+    logged: RunMotion | None = None,
 ) -> MotionSource | None:
-    """Return the configured motion; auto: that of a logged run, else the best that sensors and back end share."""
+    """Return the configured motion; auto: that of a logged run, else the best that sensors and
+    back end share.
+    """
     known = backend_class(config.backend).motion_sources
     if config.motion == "none":
         return None
@@ -125,7 +143,9 @@ def _motion(
         return next((sensor for sensor in known if sensor in sensors), None)
     if config.motion not in known:
         able = ", ".join((*known, "none"))
-        raise ConfigError(f"backend {config.backend} has no model for --motion {config.motion}; it takes {able}")
+        raise ConfigError(
+            f"backend {config.backend} has no model for --motion {config.motion}; it takes {able}"
+        )
     if config.motion not in sensors:
         raise ConfigError(missing)
     return config.motion
@@ -136,30 +156,40 @@ def _features(dataset: Dataset, config: Config) -> Dataset:
     if config.frontend.features is None:
         return dataset
     if config.frontend.name not in ("auto", "precomputed"):
-        raise ConfigError(f"frontend.features is given, but frontend.name is {config.frontend.name}; use precomputed")
+        raise ConfigError(
+            f"frontend.features is given, but frontend.name is {config.frontend.name}; use "
+            "precomputed"
+        )
     from vio.datasets import open_dataset
 
     features = open_dataset(config.frontend.features, config.dataset)
-    ours, theirs = dataset.recording, features.recording
+    ours = dataset.recording
+    theirs = features.recording
     if not np.isin(theirs.frame_times_ns, ours.frame_times_ns).all():
         raise ConfigError(
-            f"{config.frontend.features}: its frames are not those of {ours.path} (other times); give the features of "
+            f"{config.frontend.features}: its frames are not those of {ours.path} (other times); "
+            "give the features of "
             "this very recording"
         )
     return features
 
 
-def build_processor(source: Source, config: Config, parts: Parts, map: MapUse | None = None) -> EventProcessor:
+def build_processor(
+    source: Source, config: Config, parts: Parts, map: MapUse | None = None
+) -> EventProcessor:
     """Connect the parts of a run, those of the caller's own and the configured ones.
 
     Raises:
         ConfigError: the settings contradict one another, the camera or the back end.
         DataError: the map cannot be used.
     """
-    camera, features = source.camera, source.features
+    camera = source.camera
+    features = source.features
     backend = parts.backend or build_backend(camera, source.T_cam0_body, config, source.motion)
     if config.lag_frames and config.lag_frames >= backend.window_frames:
-        raise ConfigError(f"lag_frames={config.lag_frames}: needs backend msckf, and must be below msckf.clones")
+        raise ConfigError(
+            f"lag_frames={config.lag_frames}: needs backend msckf, and must be below msckf.clones"
+        )
     seen = camera if features is None else features.recording.camera
     name = config.frontend.name if config.frontend.features is None else "precomputed"
     pipeline = FramePipeline(
@@ -167,12 +197,17 @@ def build_processor(source: Source, config: Config, parts: Parts, map: MapUse | 
         source.T_cam0_body,
         source.motion,
         frontend=parts.frontend or build_frontend(name, seen, config.frontend, features),
-        selector=parts.selector or build_selector(config.selector, whole_record=_record(features), camera=seen),
+        selector=parts.selector
+        or build_selector(config.selector, whole_record=_record(features), camera=seen),
         backend=backend,
         use_prior=config.frontend.prior,
-        # One camera has no scale without its IMU; a map holds keyframes of the poses that were replaced.
+        # One camera has no scale without its IMU; a map holds keyframes of the poses that were
+        # replaced.
         trial=ImuTrial(backend)
-        if source.motion == "imu" and camera.kind != "mono" and parts.backend is None and map is None
+        if source.motion == "imu"
+        and camera.kind != "mono"
+        and parts.backend is None
+        and map is None
         else None,
     )
     session = None if map is None else _open_map(map, source, config, backend)
@@ -188,7 +223,10 @@ def build_backend(
 
 
 def _record(features: Dataset | None) -> Callable[[], list[Observations]] | None:
-    """Return a function that reads all observations of a recording; None: it has images, or it is live."""
+    """Return a function that reads all observations of a recording.
+
+    None: it has images, or it is live.
+    """
     if features is None or features.observations(0) is None:
         return None
     indices = range(len(features.recording.frame_times_ns))
@@ -204,9 +242,13 @@ def _open_map(use: MapUse, source: Source, config: Config, backend: Backend) -> 
     if recording is not None:
         need_stereo(recording, "a map")
         if not recording.has_images:
-            raise ConfigError(f"{recording.path}: a map is made of images, and this recording has features only")
+            raise ConfigError(
+                f"{recording.path}: a map is made of images, and this recording has features only"
+            )
     if not backend.window_frames:
-        raise ConfigError(f"a map needs the back end msckf, not {config.backend}; leave --backend out")
+        raise ConfigError(
+            f"a map needs the back end msckf, not {config.backend}; leave --backend out"
+        )
     sigmas = constant_sigmas(config.msckf)
     return MapSession(
         use.path,

@@ -1,4 +1,6 @@
-"""The calls by which a program gives samples and images; `Odometry` and `LiveOdometry` share them."""
+"""The calls by which a program gives samples and images; `Odometry` and `LiveOdometry` share
+them.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ class EventInputs(ABC, Generic[Result]):
     """Checks what is given, numbers frames, and hands both on."""
 
     _copies = True  # whether images are copied
-    _checking: AbstractContextManager[object] = nullcontext()  # held from the check of an event until it is taken
+    # held from the check of an event until it is taken
+    _checking: AbstractContextManager[object] = nullcontext()
 
     @property
     @abstractmethod
@@ -39,13 +42,16 @@ class EventInputs(ABC, Generic[Result]):
             accel: (3,) or (N, 3) m/s^2, specific force: about +9.81 upwards at rest.
 
         Raises:
-            DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
+            DataError: a wrong shape, a value that is not finite, or a time not after the last
+                sample's.
             ConfigError: this odometry does not use an IMU.
         """
         with self._checking:
             self.take(self.inputs.samples("imu", t_ns, gyro, accel))
 
-    def add_velocity(self, t_ns: int | npt.ArrayLike, linear: npt.ArrayLike, angular: npt.ArrayLike) -> None:
+    def add_velocity(
+        self, t_ns: int | npt.ArrayLike, linear: npt.ArrayLike, angular: npt.ArrayLike
+    ) -> None:
         """Take one sample of body velocity, or several in order of time.
 
         Args:
@@ -54,7 +60,8 @@ class EventInputs(ABC, Generic[Result]):
             angular: (3,) or (N, 3) rad/s, body frame.
 
         Raises:
-            DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
+            DataError: a wrong shape, a value that is not finite, or a time not after the last
+                sample's.
             ConfigError: this odometry does not use velocities; set `motion` to velocity.
         """
         with self._checking:
@@ -63,9 +70,9 @@ class EventInputs(ABC, Generic[Result]):
     def add_stereo(self, t_ns: int, left: npt.ArrayLike, right: npt.ArrayLike) -> Result:
         """Take a pair of images.
 
-        `Odometry` returns the newest estimate that it brought; None: it waits for IMU samples, the front end refused it
-        with a warning (of swapped cameras, for instance), or it came sooner than `dataset.max_frame_rate` allows.
-        `LiveOdometry` returns None at once.
+        `Odometry` returns the newest estimate that it brought; None: it waits for IMU samples, the
+        front end refused it with a warning (of swapped cameras, for instance), or it came sooner
+        than `dataset.max_frame_rate` allows. `LiveOdometry` returns None at once.
 
         Args:
             t_ns: time of the exposure in nanoseconds.
@@ -85,26 +92,35 @@ class EventInputs(ABC, Generic[Result]):
         *,
         depth_m: npt.ArrayLike | None = None,
     ) -> Result:
-        """Take the image of one camera, with depths where it has them; with a right image, as `add_stereo`.
+        """Take the image of one camera, with depths where it has them; with a right image, as
+        `add_stereo`.
 
-        One camera with an IMU has no estimate until the scale is observable: the return value is None until then.
+        One camera with an IMU has no estimate until the scale is observable: the return value is
+        None until then.
 
         Args:
             t_ns: time of the exposure in nanoseconds.
             left: (H, W) uint8 gray or (H, W, 3) uint8 BGR, distorted or not as the rig says.
             right: likewise, where the rig has two cameras.
-            depth_m: (H, W) metres along the optical axis of each pixel of the image, 0 where it is not known.
+            depth_m: (H, W) metres along the optical axis of each pixel of the image, 0 where it is
+                not known.
 
         Raises:
-            DataError: a wrong type, shape or size, a time not after the last frame's, or images of another rig's kind.
+            DataError: a wrong type, shape or size, a time not after the last frame's, or images of
+                another rig's kind.
         """
         with self._checking:
             return self.take(self.inputs.images(t_ns, left, right, depth_m, copy=self._copies))
 
     def add_observations(
-        self, t_ns: int, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None = None
+        self,
+        t_ns: int,
+        ids: npt.ArrayLike,
+        z: npt.ArrayLike,
+        has_right: npt.ArrayLike | None = None,
     ) -> Result:
-        """Take what a front end of the caller's own detected in a frame; the return value is that of `add_stereo`.
+        """Take what a front end of the caller's own detected in a frame; the return value is that
+        of `add_stereo`.
 
         Args:
             t_ns: time of the exposure in nanoseconds.
@@ -113,7 +129,8 @@ class EventInputs(ABC, Generic[Result]):
             has_right: (N,) whether the feature is seen in the right image; None: all are.
 
         Raises:
-            DataError: shapes disagree, an id occurs twice, a pixel is not finite, or a time not after the last one.
+            DataError: shapes disagree, an id occurs twice, a pixel is not finite, or a time not
+                after the last one.
         """
         with self._checking:
             return self.take(self.inputs.observations(t_ns, ids, z, has_right))

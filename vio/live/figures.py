@@ -1,4 +1,6 @@
-"""Figures of live use: how old results are when they come, how many frames are left out, and whether that is normal."""
+"""Figures of live use: how old results are when they come, how many frames are left out, and
+whether that is normal.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,10 @@ _MOST_LEFT_OUT = 10  # of the newest hundred frames
 
 @dataclass(frozen=True, slots=True)
 class LiveFigures:
-    """How a live odometry keeps up. Latency is the time from the call that brings a frame to its result."""
+    """How a live odometry keeps up.
+
+    Latency is the time from the call that brings a frame to its result.
+    """
 
     results: int  # frames with a result
     dropped: int  # frames left out because too many waited
@@ -28,12 +33,18 @@ class LiveFigures:
 
 
 class LiveMonitor:
-    """Measures latency and counts frames that are left out. Frames are noted by one thread, results by another."""
+    """Measures latency and counts frames that are left out.
+
+    Frames are noted by one thread, results by another.
+    """
 
     def __init__(self, *, judges_latency: bool) -> None:
-        """Begin; latency is judged where frames come at a camera's rate, so that late results mean a slow computer."""
+        """Begin; latency is judged where frames come at a camera's rate, so that late results
+        mean a slow computer.
+        """
         self._judges = judges_latency
-        self._arrived: deque[tuple[int, float]] = deque()  # time of the frame, ns, and of its arrival, s
+        # time of the frame, ns, and of its arrival, s
+        self._arrived: deque[tuple[int, float]] = deque()
         self._latencies_s: deque[float] = deque(maxlen=_KEPT)
         self._left_out: deque[bool] = deque(maxlen=100)
         self._late = 0  # results in a row
@@ -46,13 +57,18 @@ class LiveMonitor:
         self._arrived.append((time_ns, time.perf_counter()))
 
     def queued(self, *, fits: bool) -> None:
-        """Note whether there was room for a frame; else, one that had waited longer was left out."""
+        """Note whether there was room for a frame; else, one that had waited longer was left
+        out.
+        """
         self.dropped += not fits
         self._left_out.append(not fits)
 
     def result(self, time_ns: int) -> str | None:
-        """Note the result of a frame; return what is to be said once of a computer that falls behind."""
-        now, arrived = time.perf_counter(), None
+        """Note the result of a frame; return what is to be said once of a computer that falls
+        behind.
+        """
+        now = time.perf_counter()
+        arrived = None
         while self._arrived and self._arrived[0][0] <= time_ns:
             arrived = self._arrived.popleft()[1]
         if arrived is None:
@@ -63,7 +79,11 @@ class LiveMonitor:
         self._worst_s = max(self._worst_s, latency)
         self._late = self._late + 1 if latency > _LATE_S else 0
         left_out = sum(self._left_out)
-        if self._warned or not self._judges or (self._late < _LATE_RESULTS and left_out < _MOST_LEFT_OUT):
+        if (
+            self._warned
+            or not self._judges
+            or (self._late < _LATE_RESULTS and left_out < _MOST_LEFT_OUT)
+        ):
             return None
         self._warned = True
         lost = f", {left_out} of the last {len(self._left_out)} frames left out" if left_out else ""

@@ -1,4 +1,6 @@
-"""One frame through the pipeline: predict, front end, selector, filter, and the checks beside them."""
+"""One frame through the pipeline: predict, front end, selector, filter, and the checks beside
+them.
+"""
 
 from __future__ import annotations
 
@@ -41,12 +43,15 @@ class FramePipeline:
         use_prior: bool,
         trial: ImuTrial | None = None,
     ) -> None:
-        self.frontend, self.selector, self.backend = frontend, selector, backend
+        self.frontend = frontend
+        self.selector = selector
+        self.backend = backend
         self.monitor = RunMonitor(camera, T_cam0_body, imu=motion == "imu")
         self._motion = motion
         self._use_prior = use_prior
         self._propagate_ms = 0.0  # since the last frame
-        self._trial, self._imu = trial, AS_GIVEN
+        self._trial = trial
+        self._imu = AS_GIVEN
         self._revised: dict[int, Estimate] = {}
 
     def sample(self, sample: MotionSample) -> None:
@@ -74,7 +79,9 @@ class FramePipeline:
                 output = no_features(frame)
             else:
                 checked = self.monitor.without_repeated_depth(frame)
-                output = self.frontend.process(checked, expected.tracks if expected and self._use_prior else None)
+                output = self.frontend.process(
+                    checked, expected.tracks if expected and self._use_prior else None
+                )
         except DataError as error:
             self.monitor.refused(frame.index, str(error))
             return None
@@ -95,7 +102,9 @@ class FramePipeline:
         report = self._update(chosen)
         initialisation = self.backend.initialisation
         if not report.started:
-            self.monitor.waiting(frame, initialisation.waits_for or "the state is not observable yet")
+            self.monitor.waiting(
+                frame, initialisation.waits_for or "the state is not observable yet"
+            )
             return None
         self.monitor.begun(frame, initialisation.scale_sigma)
         estimate = self.backend.estimate()
@@ -104,16 +113,27 @@ class FramePipeline:
         timer.ms["filter"] = timer.ms["predict"] + timer.ms["update"] + self._propagate_ms
         self._propagate_ms = 0.0
         return FrameResult(
-            frame, output, selection, report, estimate, _frame_log(frame, timer.ms, output, selection, report)
+            frame,
+            output,
+            selection,
+            report,
+            estimate,
+            _frame_log(frame, timer.ms, output, selection, report),
         )
 
     def usable(self, sample: MotionSample) -> MotionSample | None:
-        """Return a sample as the back end takes it; None: it does not, as the sensor was found to be wrong."""
+        """Return a sample as the back end takes it.
+
+        None: it does not, as the sensor was found to be wrong.
+        """
         return corrected(sample, self._imu)
 
     def begin_again(self, index: int) -> None:
-        """Where the monitor has become certain that the IMU is wrong, estimate all frames again; else nothing."""
-        trial, verdict = self._trial, self.monitor.imu_verdict
+        """Where the monitor has become certain that the IMU is wrong, estimate all frames again;
+        else nothing.
+        """
+        trial = self._trial
+        verdict = self.monitor.imu_verdict
         if trial is None or not trial.open:
             return
         if verdict == self._imu:
@@ -136,7 +156,8 @@ class FramePipeline:
 
         There are some where the IMU was found to be wrong, once, in the first minute.
         """
-        revised, self._revised = self._revised, {}
+        revised = self._revised
+        self._revised = {}
         return revised
 
     def _update(self, seen: Observations) -> UpdateReport:
@@ -168,7 +189,11 @@ class _StageTimer:
 
 
 def _frame_log(
-    frame: StereoFrame, ms: dict[str, float], output: FrontendOutput, selection: Selection, report: UpdateReport
+    frame: StereoFrame,
+    ms: dict[str, float],
+    output: FrontendOutput,
+    selection: Selection,
+    report: UpdateReport,
 ) -> FrameLog:
     z = output.observations.z[output.observations.has_right]
     return FrameLog(

@@ -1,9 +1,10 @@
-"""What to do with an IMU that turns out to be wrong: begin again, with its readings in the right unit or without them.
+"""What to do with an IMU that turns out to be wrong: begin again, with its readings in the right
+unit or without them.
 
-A wrong unit, axis or sign is certain only after seconds of motion, and by then the estimate is lost. So the first
-minute of what the back end was given is kept beside a back end that has not begun. Once the monitor is certain, that
-one takes all of it again, and its estimates replace those before. Features are tracked well without the filter's
-prediction, so they are not extracted again.
+A wrong unit, axis or sign is certain only after seconds of motion, and by then the estimate is
+lost. So the first minute of what the back end was given is kept beside a back end that has not
+begun. Once the monitor is certain, that one takes all of it again, and its estimates replace those
+before. Features are tracked well without the filter's prediction, so they are not extracted again.
 """
 
 from __future__ import annotations
@@ -36,10 +37,13 @@ class ImuTrial:
 
     def close(self) -> None:
         """Forget all."""
-        self._fresh, self._taken = None, []
+        self._fresh = None
+        self._taken = []
 
     def take(self, event: MotionSample | Observations) -> None:
-        """Take a sample as it was recorded, or the observations of a frame, as they are given to the back end."""
+        """Take a sample as it was recorded, or the observations of a frame, as they are given to
+        the back end.
+        """
         if self._fresh is None:
             return
         self._taken.append(event)
@@ -48,11 +52,13 @@ class ImuTrial:
             self.close()
 
     def again(self, verdict: ImuVerdict) -> tuple[Backend, dict[int, Estimate]] | None:
-        """Give everything to a new back end, with the IMU that a verdict leaves; nothing can be taken again then.
+        """Give everything to a new back end, with the IMU that a verdict leaves; nothing can be
+        taken again then.
 
         Return that back end and its estimates by frame number; None: it is lost, too.
         """
-        backend, taken = self._fresh, self._taken
+        backend = self._fresh
+        taken = self._taken
         assert backend is not None
         self.close()
         try:
@@ -61,7 +67,9 @@ class ImuTrial:
             return None
 
 
-def _estimates(backend: Backend, taken: list[MotionSample | Observations], verdict: ImuVerdict) -> dict[int, Estimate]:
+def _estimates(
+    backend: Backend, taken: list[MotionSample | Observations], verdict: ImuVerdict
+) -> dict[int, Estimate]:
     """Give everything to a back end; return its estimates by frame number."""
     estimates = {}
     for event in taken:
@@ -83,4 +91,6 @@ def corrected(sample: MotionSample, verdict: ImuVerdict) -> MotionSample | None:
         return sample
     if not verdict.usable:
         return None
-    return replace(sample, gyro=verdict.gyro_factor * sample.gyro, accel=verdict.accel_factor * sample.accel)
+    return replace(
+        sample, gyro=verdict.gyro_factor * sample.gyro, accel=verdict.accel_factor * sample.accel
+    )

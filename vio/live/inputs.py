@@ -1,4 +1,6 @@
-"""Checks of what a live program gives: times, samples and images as arrays of the types that the filter takes."""
+"""Checks of what a live program gives: times, samples and images as arrays of the types that the
+filter takes.
+"""
 
 from __future__ import annotations
 
@@ -26,11 +28,14 @@ from vio.records import (
 )
 
 _MOST_NS = 2**62  # differences of times stay within 64 bits
-_JUMP_NS, _JUMP_STEPS = 2_000_000_000, 5  # a stamp so far ahead, and so many times the last step, is to be confirmed
+# a stamp so far ahead, and so many times the last step, is to be confirmed
+_JUMP_NS = 2_000_000_000
+_JUMP_STEPS = 5
 
 
 Kind: TypeAlias = Literal["stereo", "mono", "rgbd"]
-Shapes: TypeAlias = "tuple[tuple[int, int] | None, ...]"  # height and width of each camera's images; None: any
+# height and width of each camera's images; None: any
+Shapes: TypeAlias = "tuple[tuple[int, int] | None, ...]"
 
 _CAME = {"stereo": "two images", "mono": "one image", "rgbd": "an image with depths"}
 _TAKES = {
@@ -76,8 +81,12 @@ class Inputs:
             most_hz: frames a second that are used; None: all.
             say: takes a line about a stamp that is left out.
         """
-        self._camera, self._shapes, self._motion, self._offset_ns = camera, shapes, motion, offset_ns
-        self._limit, self._say = FrameRateLimit(most_hz), say
+        self._camera = camera
+        self._shapes = shapes
+        self._motion = motion
+        self._offset_ns = offset_ns
+        self._limit = FrameRateLimit(most_hz)
+        self._say = say
         self._frames = _Stamps("frame")
         self._samples = _Stamps("sample")
         self._count = 0  # of frames
@@ -92,12 +101,14 @@ class Inputs:
         *,
         copy: bool = True,
     ) -> GivenFrame | None:
-        """Return a frame of images; None: its stamp jumps ahead, or it comes sooner than the frame rate allows.
+        """Return a frame of images; None: its stamp jumps ahead, or it comes sooner than the frame
+        rate allows.
 
         Without `copy`, contiguous arrays with memory of their own are taken as they are.
 
         Raises:
-            DataError: a wrong type, shape or size, a time not after the last frame's, or images of another rig's kind.
+            DataError: a wrong type, shape or size, a time not after the last frame's, or images of
+                another rig's kind.
         """
         given = "stereo" if right is not None else "mono" if depth_m is None else "rgbd"
         if given != self._camera:
@@ -115,7 +126,9 @@ class Inputs:
         for k, image in enumerate(images):
             if copy or not (image.flags.carray and image.flags.owndata):
                 # Without letting another thread run, which would give way after 5 ms only.
-                images[k] = np.frombuffer(bytearray(image.data), dtype=np.uint8).reshape(image.shape)
+                images[k] = np.frombuffer(bytearray(image.data), dtype=np.uint8).reshape(
+                    image.shape
+                )
         return GivenFrame(*numbered, tuple(images), depth)
 
     def observations(
@@ -124,11 +137,16 @@ class Inputs:
         """Return a frame of observations; None: as of `images`.
 
         Raises:
-            DataError: shapes disagree, an id occurs twice, a pixel is not finite, or a time not after the last one.
+            DataError: shapes disagree, an id occurs twice, a pixel is not finite, or a time not
+                after the last one.
         """
         seen = checked_observations(self._count, t_ns, ids, z, has_right)
         numbered = self._numbered(t_ns, "observations")
-        return None if numbered is None else GivenFrame(*numbered, seen=replace(seen, time_ns=numbered[1]))
+        return (
+            None
+            if numbered is None
+            else GivenFrame(*numbered, seen=replace(seen, time_ns=numbered[1]))
+        )
 
     def samples(
         self, source: MotionSource, t_ns: Any, first: npt.ArrayLike, second: npt.ArrayLike
@@ -142,12 +160,14 @@ class Inputs:
             second: accelerometer or angular velocity, likewise.
 
         Raises:
-            DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
+            DataError: a wrong shape, a value that is not finite, or a time not after the last
+                sample's.
             ConfigError: samples of this sensor are not used.
         """
         if self._motion != source:
             raise ConfigError(
-                f"{source} samples came, but this odometry runs on motion {self._motion or 'none'}; set the "
+                f"{source} samples came, but this odometry runs on motion "
+                f"{self._motion or 'none'}; set the "
                 "configuration's motion, and for an IMU give the rig its T_cam0_imu"
             )
         names = ("gyro", "accel") if source == "imu" else ("linear", "angular")
@@ -175,7 +195,9 @@ class Inputs:
 
 
 class _Stamps:
-    """Leaves out a stamp that jumps ahead until the next one confirms it, lest all later ones be refused for it."""
+    """Leaves out a stamp that jumps ahead until the next one confirms it, lest all later ones be
+    refused for it.
+    """
 
     def __init__(self, of: str) -> None:
         self._of = of
@@ -187,7 +209,8 @@ class _Stamps:
         """Raise DataError unless a stamp is after the last one that was taken."""
         if self._last_ns is not None and time_ns <= self._last_ns:
             raise OrderError(
-                f"{self._of} at {time_ns} ns is not after the last one at {self._last_ns} ns; give them in order of "
+                f"{self._of} at {time_ns} ns is not after the last one at {self._last_ns} ns; give "
+                "them in order of "
                 "time, each once"
             )
 
@@ -200,12 +223,14 @@ class _Stamps:
             if not confirmed:
                 self._held_ns = time_ns
                 say(
-                    f"{self._of} at {time_ns} ns: its stamp is {step_ns * 1e-9:.1f} s ahead of the last one; left out, "
+                    f"{self._of} at {time_ns} ns: its stamp is {step_ns * 1e-9:.1f} s ahead of the "
+                    "last one; left out, "
                     "as are others so far ahead until two in a row agree"
                 )
                 return False
             step_ns = self._step_ns
-        self._last_ns, self._held_ns = time_ns, None
+        self._last_ns = time_ns
+        self._held_ns = None
         self._step_ns = step_ns or self._step_ns
         return True
 
@@ -225,20 +250,29 @@ def checked_time(t_ns: Any) -> int:
     return time_ns
 
 
-def checked_samples(t_ns: Any, values: dict[str, npt.ArrayLike]) -> tuple[list[int], list[FloatArray]]:
+def checked_samples(
+    t_ns: Any, values: dict[str, npt.ArrayLike]
+) -> tuple[list[int], list[FloatArray]]:
     """Return times (N,) and arrays (N, 3) of one sample or several.
 
     Raises:
         DataError: a wrong shape or type, a value that is not finite, or times that do not increase.
     """
-    if hasattr(t_ns, "__index__") and not getattr(t_ns, "ndim", 0):  # one sample, as drivers give it
+    # one sample, as drivers give it
+    if hasattr(t_ns, "__index__") and not getattr(t_ns, "ndim", 0):
         time_ns = checked_time(t_ns)
-        return [time_ns], [_checked_values(name, value, (3,), time_ns)[None] for name, value in values.items()]
+        return [time_ns], [
+            _checked_values(name, value, (3,), time_ns)[None] for name, value in values.items()
+        ]
     times: IntArray = np.asarray(t_ns)
     if not np.issubdtype(times.dtype, np.integer) or times.ndim != 1:
-        raise DataError(f"times must be integer nanoseconds, () or (N,), got {times.dtype} {times.shape}")
+        raise DataError(
+            f"times must be integer nanoseconds, () or (N,), got {times.dtype} {times.shape}"
+        )
     first_ns = times[0] if len(times) else 0
-    rows = [_checked_values(name, value, (len(times), 3), first_ns) for name, value in values.items()]
+    rows = [
+        _checked_values(name, value, (len(times), 3), first_ns) for name, value in values.items()
+    ]
     if np.any((times > _MOST_NS) | (times < -_MOST_NS)):
         raise DataError(f"{times[0]} to {times[-1]} ns are no times of a clock; give nanoseconds")
     if (times[1:] <= times[:-1]).any():  # differences of unsigned ones are never negative
@@ -246,7 +280,9 @@ def checked_samples(t_ns: Any, values: dict[str, npt.ArrayLike]) -> tuple[list[i
     return times.tolist(), rows
 
 
-def _checked_values(name: str, value: npt.ArrayLike, shape: tuple[int, ...], time_ns: int) -> FloatArray:
+def _checked_values(
+    name: str, value: npt.ArrayLike, shape: tuple[int, ...], time_ns: int
+) -> FloatArray:
     """Return a copy of the values of samples, the first of which is at a time."""
     try:
         array = np.array(value, dtype=np.float64)
@@ -254,10 +290,17 @@ def _checked_values(name: str, value: npt.ArrayLike, shape: tuple[int, ...], tim
         raise DataError(f"{name} is not numeric: {error}") from error
     if array.shape != shape:
         raise DataError(f"{name} has shape {array.shape}, expected {shape}")
-    # Of a single sample, without NumPy's functions: they take a driver's thread several times as long.
-    fits = all(abs(x) < LARGEST for x in array.tolist()) if len(shape) == 1 else (np.abs(array) < LARGEST).all()
+    # Of a single sample, without NumPy's functions: they take a driver's thread several times as
+    # long.
+    fits = (
+        all(abs(x) < LARGEST for x in array.tolist())
+        if len(shape) == 1
+        else (np.abs(array) < LARGEST).all()
+    )
     if not fits:  # nor is NaN
-        raise DataError(f"{name} at {time_ns} ns is not finite, or beyond any sensor ({LARGEST:g}): {array}")
+        raise DataError(
+            f"{name} at {time_ns} ns is not finite, or beyond any sensor ({LARGEST:g}): {array}"
+        )
     return array
 
 
@@ -267,7 +310,8 @@ def checked_observations(
     """Return what a front end saw in a frame.
 
     Raises:
-        DataError: shapes disagree, an id occurs twice, or a pixel that is seen is not finite or in no image.
+        DataError: shapes disagree, an id occurs twice, or a pixel that is seen is not finite or in
+            no image.
     """
     try:
         seen = observations(index, 0, ids, z, has_right)
@@ -276,16 +320,27 @@ def checked_observations(
     used = np.concatenate([seen.z[:, :2].ravel(), seen.z[seen.has_right, 2:].ravel()])
     wrong = int((~(np.abs(used) < LARGEST)).sum())
     if wrong:
-        raise DataError(f"observations at {time_ns} ns: {wrong} pixels are not finite, or in no image")
+        raise DataError(
+            f"observations at {time_ns} ns: {wrong} pixels are not finite, or in no image"
+        )
     return seen
 
 
-def _checked_image(image: npt.ArrayLike, name: str, shape: tuple[int, int] | None) -> npt.NDArray[np.uint8]:
-    """Return an image as it is, (H, W) gray or (H, W, 3) BGR, of the calibration's height and width."""
+def _checked_image(
+    image: npt.ArrayLike, name: str, shape: tuple[int, int] | None
+) -> npt.NDArray[np.uint8]:
+    """Return an image as it is, (H, W) gray or (H, W, 3) BGR, of the calibration's height and
+    width.
+    """
     array = np.asarray(image)
-    if array.dtype != np.uint8 or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)) or not array.size:
+    if (
+        array.dtype != np.uint8
+        or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3))
+        or not array.size
+    ):
         raise DataError(
-            f"the {name} image has shape {array.shape} and type {array.dtype}; give uint8, (H, W) gray or (H, W, 3) BGR"
+            f"the {name} image has shape {array.shape} and type {array.dtype}; give uint8, (H, W) "
+            "gray or (H, W, 3) BGR"
         )
     if shape is not None and array.shape[:2] != shape:
         raise DataError(
@@ -312,5 +367,8 @@ def checked_depths(depth_m: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray
     """
     array = np.array(depth_m, dtype=np.float64)
     if array.shape != shape:
-        raise DataError(f"the depths have shape {array.shape}, but the image {shape}; register them to the image")
+        raise DataError(
+            f"the depths have shape {array.shape}, but the image {shape}; register them to the "
+            "image"
+        )
     return array

@@ -1,4 +1,6 @@
-"""Odometry with a thread of its own: what adds samples and images never waits for the processing."""
+"""Odometry with a thread of its own: what adds samples and images never waits for the
+processing.
+"""
 
 from __future__ import annotations
 
@@ -29,15 +31,21 @@ from vio.records import Estimate, FrameResult, Landmarks, MotionSample
 
 log = logging.getLogger(__name__)
 
-_LANDMARK_FRAMES = 100  # results after which the points that will not change any more are taken from the filter
-_MOST_WAITING = 1000  # estimates that wait for the reader; of a slower one, the oldest are forgotten
+# results after which the points that will not change any more are taken from the filter
+_LANDMARK_FRAMES = 100
+# estimates that wait for the reader; of a slower one, the oldest are forgotten
+_MOST_WAITING = 1000
 
 
 class EstimateStream(Iterator[Estimate]):
-    """Estimates as they come; it ends when the odometry is closed. `trajectory` counts the resets before the last."""
+    """Estimates as they come; it ends when the odometry is closed. `trajectory` counts the
+    resets before the last.
+    """
 
     def __init__(self, raise_failure: Callable[[], None]) -> None:
-        """Create an empty stream; `raise_failure` raises what the odometry ended with, if it failed."""
+        """Create an empty stream; `raise_failure` raises what the odometry ended with, if it
+        failed.
+        """
         self.trajectory = self._resets = 0
         self._estimates: deque[tuple[int, Estimate]] = deque(maxlen=_MOST_WAITING)
         self._changed = threading.Condition()
@@ -73,11 +81,13 @@ class EstimateStream(Iterator[Estimate]):
 
 
 class LiveOdometry(EventInputs[None]):
-    """`Odometry` with a queue and a worker: calls that add return at once, results come from the worker.
+    """`Odometry` with a queue and a worker: calls that add return at once, results come from the
+    worker.
 
-    Units, frames and clocks are those of `Odometry`; where no frame is left out, poses are the same to the bit. Samples
-    and images may come from different threads, each in order of its own time. An error of the processing ends the
-    worker, and is raised by the next call that adds, by the iterator and by `close`.
+    Units, frames and clocks are those of `Odometry`; where no frame is left out, poses are the same
+    to the bit. Samples and images may come from different threads, each in order of its own time.
+    An error of the processing ends the worker, and is raised by the next call that adds, by the
+    iterator and by `close`.
     """
 
     def __init__(
@@ -100,11 +110,14 @@ class LiveOdometry(EventInputs[None]):
         Arguments that are not named here are those of `Odometry`; a map never makes a frame wait.
 
         Args:
-            on_frame: called with the result of each frame, by the worker: what takes long in it delays the next frame.
-            drop: what happens where `queue_frames` wait already: "oldest" leaves out the frame that has waited longest,
-                so that latency is bounded; "none" leaves out none; "block" makes the call wait, for recordings.
+            on_frame: called with the result of each frame, by the worker: what takes long in it
+                delays the next frame.
+            drop: what happens where `queue_frames` wait already: "oldest" leaves out the frame that
+                has waited longest, so that latency is bounded; "none" leaves out none; "block"
+                makes the call wait, for recordings.
             queue_frames: that may wait.
-            keep_landmarks: of the points that do not change any more, how many are kept for `landmarks`, at least.
+            keep_landmarks: of the points that do not change any more, how many are kept for
+                `landmarks`, at least.
             copy_images: False: the caller does not write into an array again that it has added.
 
         Raises:
@@ -112,7 +125,8 @@ class LiveOdometry(EventInputs[None]):
         """
         if drop not in DROPS or queue_frames < 1:
             raise ConfigError(
-                f"drop={drop!r}, queue_frames={queue_frames}: give one of {', '.join(DROPS)}, and 1 or more"
+                f"drop={drop!r}, queue_frames={queue_frames}: give one of {', '.join(DROPS)}, and "
+                "1 or more"
             )
         self._config = Config() if config is None else config
         use = MapUse(Path(map), localise) if isinstance(map, (str, Path)) else map
@@ -124,23 +138,28 @@ class LiveOdometry(EventInputs[None]):
             on_frame=self._take_result,
             map=None if use is None else replace(use, wait=False),
         )
-        self.camera, self.T_cam0_body, self.motion = odometry.camera, odometry.T_cam0_body, odometry.motion
+        self.camera = odometry.camera
+        self.T_cam0_body = odometry.T_cam0_body
+        self.motion = odometry.motion
         self._T_cam0_imu = rig.T_rect0_imu if isinstance(rig, Rig) else T_cam0_imu
-        self._on_frame, self._with_map = on_frame, use is not None
+        self._on_frame = on_frame
+        self._with_map = use is not None
         self._predictor = SharedPredictor(self._config.msckf.gravity_mps2)
         self._monitor = LiveMonitor(judges_latency=drop != "block")
         self._collector = QuietCollector()
         self._streams: list[EstimateStream] = []
         self._points: deque[Landmarks] = deque()  # that do not change any more
-        self._keep_landmarks, self._copies = keep_landmarks, copy_images
+        self._keep_landmarks = keep_landmarks
+        self._copies = copy_images
         self._lines: list[str] = []
         self._worker = Worker(queue_frames, drop, finish=self._odometry.finish, close=self._let_go)
 
     def warm_up(self) -> None:
-        """Process made-up images of the camera's size, so that the first frame takes no longer than others.
+        """Process made-up images of the camera's size, so that the first frame takes no longer than
+        others.
 
-        Loops are compiled or loaded, the front end is built, memory is touched; this takes some seconds, on a new
-        machine twenty. Of the caller's own parts, none is used.
+        Loops are compiled or loaded, the front end is built, memory is touched; this takes some
+        seconds, on a new machine twenty. Of the caller's own parts, none is used.
 
         Raises:
             DataError: the camera's image size is not known.
@@ -216,7 +235,9 @@ class LiveOdometry(EventInputs[None]):
         return self._odometry.estimate
 
     def __iter__(self) -> EstimateStream:
-        """Return the estimates from now on, for a thread of the caller's own; they end when the odometry is closed."""
+        """Return the estimates from now on, for a thread of the caller's own; they end when the
+        odometry is closed.
+        """
         stream = EstimateStream(self._worker.raise_failure)
         self._streams.append(stream)
         if not self._worker.is_alive:
@@ -224,7 +245,8 @@ class LiveOdometry(EventInputs[None]):
         return stream
 
     def predict(self, t_ns: int) -> PredictedPose:
-        """Return the pose at a time at or after the newest estimate, from all samples added; it waits for no frame.
+        """Return the pose at a time at or after the newest estimate, from all samples added; it
+        waits for no frame.
 
         Raises:
             DataError: there is no estimate yet, or the time is before it.
@@ -238,11 +260,14 @@ class LiveOdometry(EventInputs[None]):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the checks have found so far, and whether the computer falls behind, one line each."""
+        """What the checks have found so far, and whether the computer falls behind, one line
+        each.
+        """
         return (*self._odometry.warnings, *self._lines)
 
     def landmarks(self) -> Landmarks:
-        """Return the points of the map so far, of those that do not change any more the newest; waits for a frame.
+        """Return the points of the map so far, of those that do not change any more the newest;
+        waits for a frame.
 
         Raises:
             DataError: no frame has a pose yet.
@@ -250,14 +275,19 @@ class LiveOdometry(EventInputs[None]):
         return self._worker.ask(lambda: newest_points([*self._points, self._odometry.landmarks()]))
 
     def calibrated_rig(self) -> CalibratedRig:
-        """Return the rig with what the estimate says that its calibration is off by, see `Odometry.calibrated_rig`."""
+        """Return the rig with what the estimate says that its calibration is off by, see
+        `Odometry.calibrated_rig`.
+        """
         return self._odometry.calibrated_rig()
 
     def __enter__(self) -> LiveOdometry:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         """Close; where an error ended the block, without processing what waits."""
         if kind is None:
@@ -295,9 +325,14 @@ class LiveOdometry(EventInputs[None]):
             self._keep_points()
 
     def _keep_points(self) -> None:
-        """Take the points that will not change any more from the filter, which would keep all of them."""
+        """Take the points that will not change any more from the filter, which would keep all of
+        them.
+        """
         self._points.append(self._odometry.take_landmarks())
-        while sum(len(part.ids) for part in self._points) - len(self._points[0].ids) >= self._keep_landmarks:
+        while (
+            sum(len(part.ids) for part in self._points) - len(self._points[0].ids)
+            >= self._keep_landmarks
+        ):
             self._points.popleft()
 
     def _let_go(self) -> None:

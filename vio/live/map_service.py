@@ -1,9 +1,10 @@
 """Poses in a map over HTTP: one process reads the map, many clients ask.
 
-`GET /` says what the map is; `POST /localise` takes a rectified pair as JSON, `{"left": …, "right": …}`, each a PNG or
-JPEG file in base64, and gives `{"found": true, "T_map_cam0": …, "covariance": …, "matches": …, "keyframe": …}` or
-`{"found": false}`. With `"camera": {"fu": …, …}`, another camera than the map's is refused. A request that cannot be
-used gets a status 4xx and `{"error": …}` in one line.
+`GET /` says what the map is; `POST /localise` takes a rectified pair as JSON,
+`{"left": …, "right": …}`, each a PNG or JPEG file in base64, and gives
+`{"found": true, "T_map_cam0": …, "covariance": …, "matches": …, "keyframe": …}` or
+`{"found": false}`. With `"camera": {"fu": …, …}`, another camera than the map's is refused. A
+request that cannot be used gets a status 4xx and `{"error": …}` in one line.
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ class _RefusedError(Exception):
 
 
 class MapServer(ThreadingHTTPServer):
-    """Answers clients, each connection in a thread; as many are worked on at a time as there are processors."""
+    """Answers clients, each connection in a thread; as many are worked on at a time as there are
+    processors.
+    """
 
     daemon_threads = True
     request_queue_size = 64
@@ -55,11 +58,14 @@ class MapServer(ThreadingHTTPServer):
         Raises:
             VioError: the address cannot be used.
         """
-        self.lookup, self.free = lookup, threading.BoundedSemaphore(os.cpu_count() or 1)
+        self.lookup = lookup
+        self.free = threading.BoundedSemaphore(os.cpu_count() or 1)
         try:
             super().__init__((host, port), _Handler)
         except (OSError, OverflowError) as error:
-            raise VioError(f"cannot listen at {host}:{port} ({error}); give another --host or --port") from error
+            raise VioError(
+                f"cannot listen at {host}:{port} ({error}); give another --host or --port"
+            ) from error
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Report what went wrong with a connection, unless the client has closed it."""
@@ -78,14 +84,17 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.NOT_FOUND, {"error": "GET / and POST /localise are served"})
             return
         lookup = self.server.lookup
-        self._answer(HTTPStatus.OK, {"keyframes": lookup.keyframes, "camera": _camera_values(lookup.camera)})
+        self._answer(
+            HTTPStatus.OK, {"keyframes": lookup.keyframes, "camera": _camera_values(lookup.camera)}
+        )
 
     def do_POST(self) -> None:
         """Find an image pair."""
         try:
             if self.path != "/localise":
                 raise _RefusedError(HTTPStatus.NOT_FOUND, "GET / and POST /localise are served")
-            body, lookup = self._body(), self.server.lookup
+            body = self._body()
+            lookup = self.server.lookup
             with self.server.free:  # images take more memory than their files
                 found = lookup.find(*_pair(body, lookup.camera))
         except _RefusedError as error:
@@ -102,7 +111,9 @@ class _Handler(BaseHTTPRequestHandler):
         except (TypeError, ValueError):
             raise _RefusedError(HTTPStatus.LENGTH_REQUIRED, "Content-Length is missing") from None
         if not 0 <= length <= _MOST_BYTES:
-            raise _RefusedError(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a request has at most {_MOST_BYTES >> 20} MB")
+            raise _RefusedError(
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a request has at most {_MOST_BYTES >> 20} MB"
+            )
         body = self.rfile.read(length)
         if len(body) < length:
             raise _RefusedError(HTTPStatus.BAD_REQUEST, "the request ended early")
@@ -128,24 +139,42 @@ def _pair(body: bytes, camera: StereoCamera) -> tuple[Image, Image]:
         request = json.loads(body)
         texts = [request["left"], request["right"]]
         data = [base64.b64decode(text, validate=True) for text in texts]
-        given = {name: float(value) for name, value in (request.get("camera") or {}).items() if name in _CAMERA}
-    except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:
+        given = {
+            name: float(value)
+            for name, value in (request.get("camera") or {}).items()
+            if name in _CAMERA
+        }
+    except (
+        LookupError,
+        TypeError,
+        ValueError,
+        ArithmeticError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         reason = 'give JSON with "left" and "right", image files in base64'
         raise _RefusedError(HTTPStatus.BAD_REQUEST, f"{reason} ({type(error).__name__})") from None
     own = _camera_values(camera)
     for name, value in given.items():
         if not abs(value - own[name]) <= _SAME * abs(own[name]):
-            raise _RefusedError(HTTPStatus.CONFLICT, f"camera: {name} is {value:g}, that of the map {own[name]:g}")
+            raise _RefusedError(
+                HTTPStatus.CONFLICT, f"camera: {name} is {value:g}, that of the map {own[name]:g}"
+            )
     images: list[Image] = []
-    shape: tuple[int | None, ...] | None = None if camera.width is None else (camera.height, camera.width)
+    shape: tuple[int | None, ...] | None = (
+        None if camera.width is None else (camera.height, camera.width)
+    )
     for name, content in zip(("left", "right"), data, strict=True):
         try:
             image = decode_gray(content, name)
         except UnreadableImageError as error:
             raise _RefusedError(HTTPStatus.BAD_REQUEST, str(error)) from None
         if shape is not None and image.shape != shape:
-            size, wanted = f"{image.shape[1]}x{image.shape[0]}", f"{shape[1]}x{shape[0]}"
-            raise _RefusedError(HTTPStatus.CONFLICT, f"{name}: is of {size} pixels, the map's camera of {wanted}")
+            size = f"{image.shape[1]}x{image.shape[0]}"
+            wanted = f"{shape[1]}x{shape[0]}"
+            raise _RefusedError(
+                HTTPStatus.CONFLICT, f"{name}: is of {size} pixels, the map's camera of {wanted}"
+            )
         shape = image.shape  # a map of bare features does not say it
         images.append(image)
     return images[0], images[1]
@@ -158,8 +187,15 @@ def _camera_values(camera: StereoCamera) -> dict[str, Any]:
 def _facts(found: FoundPose | None) -> dict[str, Any]:
     if found is None:
         return {"found": False}
-    T, P = found.T_map_cam0.tolist(), found.covariance.tolist()
-    return {"found": True, "T_map_cam0": T, "covariance": P, "matches": found.matches, "keyframe": found.keyframe}
+    T = found.T_map_cam0.tolist()
+    P = found.covariance.tolist()
+    return {
+        "found": True,
+        "T_map_cam0": T,
+        "covariance": P,
+        "matches": found.matches,
+        "keyframe": found.keyframe,
+    }
 
 
 def ask(url: str, left: Image, right: Image, *, timeout_s: float = 30.0) -> FoundPose | None:
@@ -179,18 +215,23 @@ def ask(url: str, left: Image, right: Image, *, timeout_s: float = 30.0) -> Foun
         for name, image in (("left", left), ("right", right))
     }
     try:
-        request = urllib.request.Request(f"{url.rstrip('/')}/localise", json.dumps(files).encode(), method="POST")
+        request = urllib.request.Request(
+            f"{url.rstrip('/')}/localise", json.dumps(files).encode(), method="POST"
+        )
         with urllib.request.urlopen(request, timeout=timeout_s) as answer:
             facts = json.load(answer)
         if not facts["found"]:
             return None
-        T, P = np.array(facts["T_map_cam0"]), np.array(facts["covariance"])
+        T = np.array(facts["T_map_cam0"])
+        P = np.array(facts["covariance"])
         return FoundPose(T, P, facts["matches"], facts["keyframe"])
     except urllib.error.HTTPError as error:
         with error:
             raise VioError(f"{url}: {_reason(error)}") from None
     except (OSError, ValueError, LookupError, TypeError, http.client.HTTPException) as error:
-        raise VioError(f"{url}: does not answer ({error}); vio map serve MAP starts a server") from error
+        raise VioError(
+            f"{url}: does not answer ({error}); vio map serve MAP starts a server"
+        ) from error
 
 
 def _reason(error: urllib.error.HTTPError) -> str:

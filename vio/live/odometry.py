@@ -47,12 +47,14 @@ if TYPE_CHECKING:
 class Odometry(EventInputs["Estimate | None"]):
     """Stereo visual-inertial odometry, one event at a time.
 
-    Times are nanoseconds on the clock of the camera's stamps; units are metres, seconds and radians; frames are those
-    of docs/conventions.md. A frame is processed as soon as the first IMU sample at or after it has come, by the call
-    that brings the later of the two. Where no sample comes, it waits until a frame 0.1 s newer has come.
+    Times are nanoseconds on the clock of the camera's stamps; units are metres, seconds and
+    radians; frames are those of docs/conventions.md. A frame is processed as soon as the first IMU
+    sample at or after it has come, by the call that brings the later of the two. Where no sample
+    comes, it waits until a frame 0.1 s newer has come.
 
-    Calls may come from several threads; a lock lets one at a time process. `estimate` and `predict` never wait.
-    A call that raises has changed nothing: the next one goes on as if it had not been made.
+    Calls may come from several threads; a lock lets one at a time process. `estimate` and `predict`
+    never wait. A call that raises has changed nothing: the next one goes on as if it had not been
+    made.
     """
 
     def __init__(
@@ -69,19 +71,21 @@ class Odometry(EventInputs["Estimate | None"]):
         """Prepare; the first frame begins the trajectory.
 
         Args:
-            rig: the calibration, as `vio.load_rig` returns it; or a rectified pair. One camera needs an IMU or, where
-                it has a `depth_factor`, depth images.
-            config: every setting; None: the defaults. `motion` auto means the IMU where the rig has one.
+            rig: the calibration, as `vio.load_rig` returns it; or a rectified pair. One camera
+                needs an IMU or, where it has a `depth_factor`, depth images.
+            config: every setting; None: the defaults. `motion` auto means the IMU where the rig has
+                one.
             T_cam0_imu: (4, 4) extrinsics, only beside a rectified pair; a `Rig` has its own.
             parts: front end, selector or back end in place of the configured ones.
             on_frame: called with the result of each frame, by the call that processed it.
-            map: file of a map to begin or to continue (docs/maps.md): estimates have `T_map_body`, and `close` ends it;
-                or its use in full.
+            map: file of a map to begin or to continue (docs/maps.md): estimates have `T_map_body`,
+                and `close` ends it; or its use in full.
             localise: find poses in the map, and leave it as it is; with the file of a map.
 
         Raises:
             CalibrationError: the rig cannot be rectified.
-            ConfigError: the settings ask for what the rig does not have, or a map for a back end without a window.
+            ConfigError: the settings ask for what the rig does not have, or a map for a back end
+                without a window.
             DataError: the map cannot be used.
         """
         self._config = Config() if config is None else config
@@ -102,9 +106,10 @@ class Odometry(EventInputs["Estimate | None"]):
             T_cam0_imu = rig.T_rect0_imu
             self._offset_ns = round(1e9 * rig.time_offset_s)
         self._source = live_source(self.camera, T_cam0_imu, self._config)
-        # Extrinsics (4, 4) of the estimated body in the rectified left camera, and what propagates its pose between
-        # frames; None: images alone.
-        self.T_cam0_body, self.motion = self._source.T_cam0_body, self._source.motion
+        # Extrinsics (4, 4) of the estimated body in the rectified left camera, and what propagates
+        # its pose between frames; None: images alone.
+        self.T_cam0_body = self._source.T_cam0_body
+        self.motion = self._source.motion
         self._parts = parts
         self._map = MapUse(Path(map), localise) if isinstance(map, (str, Path)) else map
         self._on_frame = on_frame
@@ -119,9 +124,14 @@ class Odometry(EventInputs["Estimate | None"]):
             ConfigError: parts of the caller's own were given, which only the caller can make new.
         """
         if self._parts != CONFIGURED:
-            raise ConfigError("reset: front end, selector or back end were given; build a new Odometry with new ones")
+            raise ConfigError(
+                "reset: front end, selector or back end were given; build a new Odometry with new "
+                "ones"
+            )
         if self._map is not None:
-            raise ConfigError("reset: a map takes one trajectory of an Odometry; close it, and build a new one")
+            raise ConfigError(
+                "reset: a map takes one trajectory of an Odometry; close it, and build a new one"
+            )
         self._begin()
 
     def _begin(self) -> None:
@@ -147,7 +157,9 @@ class Odometry(EventInputs["Estimate | None"]):
         return self._inputs
 
     def take(self, given: GivenFrame | Sequence[MotionSample] | None) -> Estimate | None:
-        """Process what `inputs` has checked, maybe in another thread; the return value is that of `add_stereo`."""
+        """Process what `inputs` has checked, maybe in another thread; the return value is that
+        of `add_stereo`.
+        """
         with self._lock:
             if given is None:
                 return None
@@ -174,7 +186,8 @@ class Odometry(EventInputs["Estimate | None"]):
             self._processor.close()
 
     def prepare(self) -> None:
-        """Build what the first images would build: the front end, and the maps of the rectification.
+        """Build what the first images would build: the front end, and the maps of the
+        rectification.
 
         Raises:
             VioError: the settings contradict the camera, or name a file that cannot be read.
@@ -196,21 +209,28 @@ class Odometry(EventInputs["Estimate | None"]):
         return self._processor.estimate
 
     def calibrated_rig(self) -> CalibratedRig:
-        """Return the rig with what the estimate says that its calibration is off by; `rig` of it begins the next run.
+        """Return the rig with what the estimate says that its calibration is off by; `rig` of it
+        begins the next run.
 
         Raises:
-            DataError: there is no estimate yet, the size of the rectified images is not known, or they are a cylinder's
-                and the rig of the raw cameras was not given.
+            DataError: there is no estimate yet, the size of the rectified images is not known, or
+                they are a cylinder's and the rig of the raw cameras was not given.
             CalibrationError: no rig of the given lens models is off as the estimate says.
         """
         estimate = self.estimate
         if estimate is None:
             raise DataError("there is no calibration before the first frame")
-        rig = self._rig or rig_of_rectified(self.camera, None if self.motion is None else self.T_cam0_body)
+        rig = self._rig or rig_of_rectified(
+            self.camera, None if self.motion is None else self.T_cam0_body
+        )
         if rig is None:
             if self.camera.is_cylinder:
-                raise DataError("no lens model holds a cylinder; give Odometry the rig of the raw cameras")
-            raise DataError("the rectified camera has no image size; give StereoCamera its width and height")
+                raise DataError(
+                    "no lens model holds a cylinder; give Odometry the rig of the raw cameras"
+                )
+            raise DataError(
+                "the rectified camera has no image size; give StereoCamera its width and height"
+            )
         return estimated_rig(rig, estimate, self.camera, "live images")
 
     @property
@@ -237,8 +257,8 @@ class Odometry(EventInputs["Estimate | None"]):
     def predict(self, t_ns: int) -> PredictedPose:
         """Return the pose at a time at or after the newest estimate, from the samples added since.
 
-        It takes well under a millisecond and waits for no other call. Beyond the last sample the motion is held, for
-        half a second at most.
+        It takes well under a millisecond and waits for no other call. Beyond the last sample the
+        motion is held, for half a second at most.
 
         Raises:
             DataError: there is no estimate yet, or the time is before it.
@@ -257,7 +277,8 @@ class Odometry(EventInputs["Estimate | None"]):
             return self._processor.pipeline.backend.landmarks()
 
     def take_landmarks(self) -> Landmarks:
-        """Return the points of the map that will not change any more, and forget them, so that memory stays flat.
+        """Return the points of the map that will not change any more, and forget them, so that
+        memory stays flat.
 
         `landmarks` then returns the others.
         """
@@ -265,7 +286,10 @@ class Odometry(EventInputs["Estimate | None"]):
             return self._processor.pipeline.backend.take_landmarks()
 
     def smoothed(self, frame_index: int) -> Estimate | None:
-        """Return the estimate at a past frame with all frames since; None where the window no longer holds it."""
+        """Return the estimate at a past frame with all frames since.
+
+        None where the window no longer holds it.
+        """
         with self._lock:
             return self._processor.pipeline.backend.smoothed(frame_index)
 
@@ -273,7 +297,10 @@ class Odometry(EventInputs["Estimate | None"]):
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         """Finish, unless an error ended the block."""
         try:
@@ -286,14 +313,16 @@ class Odometry(EventInputs["Estimate | None"]):
 
     def _frame(self, given: GivenFrame) -> StereoFrame:
         """Return a frame for the front end, rectified where the rig is raw."""
-        index, time_ns = given.index, given.time_ns
+        index = given.index
+        time_ns = given.time_ns
         if given.seen is not None:
             self._frontend.given[index] = given.seen
             return StereoFrame(index, time_ns, None, None)
         if self._parts.frontend is None:
             self._frontend.open()
         images = map(gray, given.images)
-        left, right = next(images), next(images, None)
+        left = next(images)
+        right = next(images, None)
         if self._rectifier is None:
             return StereoFrame(index, time_ns, left, right, given.depth_m)
         return self._rectifier.frame(index, time_ns, left, right, depth_m=given.depth_m)
@@ -321,10 +350,13 @@ def _image_shapes(camera: StereoCamera, rectifier: Rectifier | None) -> Shapes:
 
 
 class _LiveFrontend:
-    """The configured front end for images; frames without images have the observations that the caller gave."""
+    """The configured front end for images; frames without images have the observations that the
+    caller gave.
+    """
 
     def __init__(self, camera: StereoCamera, settings: FrontendSettings) -> None:
-        self._camera, self._settings = camera, settings
+        self._camera = camera
+        self._settings = settings
         self.given: dict[int, Observations] = {}  # by frame, until it is processed
         self._replay = PrecomputedFrontend(lambda index: self.given.pop(index, None))
         self._images: Frontend | None = None

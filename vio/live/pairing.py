@@ -19,8 +19,11 @@ class Pairing(Generic[T]):
         self.alone = 0  # images that found no partner
 
     def add(self, side: int, time_ns: int, image: T) -> tuple[int, T, T] | None:
-        """Take an image of the left (0) or right (1) camera; return its pair with the left one's time, if complete."""
-        own, others = self._waiting[side], self._waiting[1 - side]
+        """Take an image of the left (0) or right (1) camera; return its pair with the left one's
+        time, if complete.
+        """
+        own = self._waiting[side]
+        others = self._waiting[1 - side]
         near = min(others, key=lambda t: abs(t - time_ns), default=None)
         if near is None or abs(near - time_ns) > PAIRED_NS:
             own[time_ns] = image

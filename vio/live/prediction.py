@@ -43,15 +43,17 @@ class _State:
 class PosePredictor:
     """Carries the newest estimate over the motion samples after it.
 
-    IMU: strapdown integration with the estimated biases. Velocities and images alone: the rate and velocity are held.
-    One thread may predict while another adds: states are only appended, and replaced as a whole.
+    IMU: strapdown integration with the estimated biases. Velocities and images alone: the rate and
+    velocity are held. One thread may predict while another adds: states are only appended, and
+    replaced as a whole.
     """
 
     def __init__(self, gravity_mps2: float) -> None:
         self._gravity = np.array([0.0, 0.0, -gravity_mps2])
         self._samples: deque[MotionSample] = deque()
         self._bias: tuple[FloatArray, FloatArray] = (_ZERO, _ZERO)
-        self._matrices: tuple[FloatArray, FloatArray] | None = None  # accelerometer and gyro, equation (A1)
+        # accelerometer and gyro, equation (A1)
+        self._matrices: tuple[FloatArray, FloatArray] | None = None
         self._last: Estimate | None = None
         self._states: list[_State] = []  # at the newest estimate and at the samples after it
 
@@ -74,13 +76,21 @@ class PosePredictor:
         self._matrices = None if estimate.imu_terms is None else imu_matrices(estimate.imu_terms)
         self._gravity = self._gravity if estimate.gravity_world is None else estimate.gravity_world
         omega, v = self._motion_of(estimate)
-        state = _State(estimate.time_ns, estimate.T_world_imu[:3, :3], estimate.T_world_imu[:3, 3], v, omega, _ZERO)
+        state = _State(
+            estimate.time_ns,
+            estimate.T_world_imu[:3, :3],
+            estimate.T_world_imu[:3, 3],
+            v,
+            omega,
+            _ZERO,
+        )
         before = [sample for sample in self._samples if sample.time_ns <= estimate.time_ns]
         states = [self._held(state, before[-1]) if before else state]
         for sample in self._samples:
             if sample.time_ns > estimate.time_ns:
                 states.append(self._carried(states[-1], sample))
-        self._last, self._states = estimate, states
+        self._last = estimate
+        self._states = states
 
     def predict(self, time_ns: int) -> PredictedPose:
         """Return the pose at a time at or after the newest estimate.
@@ -92,15 +102,21 @@ class PosePredictor:
         if not states:
             raise DataError("no pose can be predicted before the first estimate")
         if time_ns < states[0].time_ns:
-            raise DataError(f"{time_ns} ns is before the newest estimate at {states[0].time_ns} ns; take that one")
+            raise DataError(
+                f"{time_ns} ns is before the newest estimate at {states[0].time_ns} ns; take that "
+                "one"
+            )
         state = next(state for state in reversed(states) if state.time_ns <= time_ns)
         R, p, v = _moved(state, min((time_ns - state.time_ns) * _NS, _LONGEST_STEP_S))
         return PredictedPose(time_ns, se3_from_parts(R, p), v)
 
     def _motion_of(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-        """Body rate (3,) rad/s and world velocity (3,) m/s at an estimate, from the last two where it has none."""
+        """Body rate (3,) rad/s and world velocity (3,) m/s at an estimate, from the last two
+        where it has none.
+        """
         last = self._last
-        omega, v = _ZERO, _ZERO
+        omega = _ZERO
+        v = _ZERO
         if last is not None and estimate.time_ns > last.time_ns:
             dt = (estimate.time_ns - last.time_ns) * _NS
             omega = se3_log(se3_inverse(last.T_world_imu) @ estimate.T_world_imu)[3:] / dt
@@ -110,16 +126,24 @@ class PosePredictor:
     def _held(self, state: _State, sample: MotionSample) -> _State:
         """The state with the motion of a sample, which holds from there on."""
         if isinstance(sample, VelocitySample):
-            return _State(state.time_ns, state.R, state.p, state.R @ sample.linear, sample.angular, _ZERO)
+            return _State(
+                state.time_ns, state.R, state.p, state.R @ sample.linear, sample.angular, _ZERO
+            )
         gyro, accel = self._unbiased(sample)
-        return _State(state.time_ns, state.R, state.p, state.v, gyro, state.R @ accel + self._gravity)
+        return _State(
+            state.time_ns, state.R, state.p, state.v, gyro, state.R @ accel + self._gravity
+        )
 
     def _unbiased(self, sample: ImuSample) -> tuple[FloatArray, FloatArray]:
-        """Rate and specific force (3,) of a sample without biases, and without scale and misalignment if estimated."""
-        gyro, accel = sample.gyro, sample.accel
+        """Rate and specific force (3,) of a sample without biases, and without scale and
+        misalignment if estimated.
+        """
+        gyro = sample.gyro
+        accel = sample.accel
         if self._matrices is not None:
             M_accel, M_gyro = self._matrices
-            gyro, accel = M_gyro @ gyro, M_accel @ accel
+            gyro = M_gyro @ gyro
+            accel = M_accel @ accel
         return gyro - self._bias[0], accel - self._bias[1]
 
     def _carried(self, state: _State, sample: MotionSample) -> _State:
@@ -132,7 +156,14 @@ class PosePredictor:
         R = state.R @ so3_exp(0.5 * (state.gyro + gyro) * dt)
         force = R @ accel + self._gravity
         a = 0.5 * (state.accel + force)
-        return _State(sample.time_ns, R, state.p + state.v * dt + 0.5 * a * dt**2, state.v + a * dt, gyro, force)
+        return _State(
+            sample.time_ns,
+            R,
+            state.p + state.v * dt + 0.5 * a * dt**2,
+            state.v + a * dt,
+            gyro,
+            force,
+        )
 
 
 def _moved(state: _State, dt: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -141,7 +172,9 @@ def _moved(state: _State, dt: float) -> tuple[FloatArray, FloatArray, FloatArray
 
 
 class SharedPredictor:
-    """A `PosePredictor` to which adding takes microseconds: what is added is integrated by who asks, or later."""
+    """A `PosePredictor` to which adding takes microseconds: what is added is integrated by who
+    asks, or later.
+    """
 
     def __init__(self, gravity_mps2: float) -> None:
         self._predictor = PosePredictor(gravity_mps2)
@@ -149,7 +182,9 @@ class SharedPredictor:
         self._lock = threading.Lock()
 
     def add(self, event: MotionSample | Estimate) -> None:
-        """Take a motion sample or an estimate; samples come in order of time, and so do estimates."""
+        """Take a motion sample or an estimate; samples come in order of time, and so do
+        estimates.
+        """
         self._added.append(event)
 
     def catch_up(self) -> None:

@@ -1,4 +1,6 @@
-"""Events in any order of arrival in, results of frames out: the loop that live use and recordings share."""
+"""Events in any order of arrival in, results of frames out: the loop that live use and
+recordings share.
+"""
 
 from __future__ import annotations
 
@@ -14,32 +16,39 @@ if TYPE_CHECKING:
     from vio.mapping.session import MapSession
 
 
-LONGEST_WAIT_NS = 100_000_000  # a frame waits until one that is so much newer has come: then the IMU is silent
+# a frame waits until one that is so much newer has come: then the IMU is silent
+LONGEST_WAIT_NS = 100_000_000
 _MOST_SAMPLES = 100_000  # that wait: minutes in which no frame came
 
 
 class EventOrder:
-    """The order in which a run takes its events: each frame after the first IMU sample at or after its exposure.
+    """The order in which a run takes its events: each frame after the first IMU sample at or after
+    its exposure.
 
-    Where the filter estimates that frames are exposed after their stamps on the IMU's clock, the sample is that later
-    one. A live camera and a live IMU deliver on their own schedules. This order depends on the time stamps alone, so a
-    live run gives the same poses as the same recording replayed, however the events arrived.
+    Where the filter estimates that frames are exposed after their stamps on the IMU's clock, the
+    sample is that later one. A live camera and a live IMU deliver on their own schedules. This
+    order depends on the time stamps alone, so a live run gives the same poses as the same recording
+    replayed, however the events arrived.
     """
 
     def __init__(self, *, wait_for_imu: bool) -> None:
-        """Create an empty queue; with `wait_for_imu`, a frame waits for the first sample at or after it."""
+        """Create an empty queue; with `wait_for_imu`, a frame waits for the first sample at or
+        after it.
+        """
         self._wait = wait_for_imu
         self._frames: deque[StereoFrame] = deque()
         self._samples: deque[MotionSample] = deque(maxlen=_MOST_SAMPLES)
         self._newest_ns: int | None = None  # sample that has come
         self._released_ns: int | None = None  # newest sample that was released
-        self.exposed_after_ns = 0  # from a frame's stamp to its exposure on the IMU's clock, 0 or more, as estimated
+        # from a frame's stamp to its exposure on the IMU's clock, 0 or more, as estimated
+        self.exposed_after_ns = 0
 
     def add(self, event: Event) -> Iterator[Event]:
         """Take an event, and yield what can be processed now, in order.
 
-        Frames come in order of time, and samples do; a frame may come before or after its samples. Whether a second
-        frame is due may depend on the time offset that was estimated with the first, so take one after the other.
+        Frames come in order of time, and samples do; a frame may come before or after its samples.
+        Whether a second frame is due may depend on the time offset that was estimated with the
+        first, so take one after the other.
         """
         if isinstance(event, StereoFrame):
             self._frames.append(event)
@@ -66,10 +75,14 @@ class EventOrder:
         return self._frames[-1].time_ns - frame.time_ns >= LONGEST_WAIT_NS
 
     def _release(self) -> list[Event]:
-        """The oldest frame after the samples up to its time and, where it waits, one at or after it to interpolate."""
+        """The oldest frame after the samples up to its time and, where it waits, one at or after
+        it to interpolate.
+        """
         frame = self._frames.popleft()
         ready: list[Event] = []
-        while self._samples and (self._samples[0].time_ns <= self._exposed_ns(frame) or self._lacks_sample(frame)):
+        while self._samples and (
+            self._samples[0].time_ns <= self._exposed_ns(frame) or self._lacks_sample(frame)
+        ):
             sample = self._samples.popleft()
             self._released_ns = sample.time_ns
             ready.append(sample)
@@ -77,7 +90,9 @@ class EventOrder:
 
     def _lacks_sample(self, frame: StereoFrame) -> bool:
         """Whether no sample at or after the frame has been released that it waits for."""
-        return self._wait and (self._released_ns is None or self._released_ns < self._exposed_ns(frame))
+        return self._wait and (
+            self._released_ns is None or self._released_ns < self._exposed_ns(frame)
+        )
 
     def _exposed_ns(self, frame: StereoFrame) -> int:
         """Time on the IMU's clock that a frame's samples must reach."""
@@ -89,8 +104,11 @@ _CLEAR = 3.0  # standard deviations of a time offset that is waited for
 
 
 def _wait_ns(estimate: Estimate) -> int:
-    """How long after its stamp a frame is processed, ns, so that the IMU's samples reach its exposure."""
-    offset_s, sigma_s = estimate.time_offset_s, estimate.time_offset_sigma_s
+    """How long after its stamp a frame is processed, ns, so that the IMU's samples reach its
+    exposure.
+    """
+    offset_s = estimate.time_offset_s
+    sigma_s = estimate.time_offset_sigma_s
     if offset_s is None or sigma_s is None or offset_s < max(_LEAST_WAIT_S, _CLEAR * sigma_s):
         return 0
     return round(1e9 * offset_s)
@@ -99,18 +117,28 @@ def _wait_ns(estimate: Estimate) -> int:
 class EventProcessor:
     """Takes events through the pipeline and, where there is one, into the map."""
 
-    def __init__(self, pipeline: FramePipeline, *, wait_for_imu: bool, map: MapSession | None) -> None:
-        """Begin a trajectory, and its part of a map where there is one; `wait_for_imu` as of `EventOrder`."""
-        self.pipeline, self._order, self.map = pipeline, EventOrder(wait_for_imu=wait_for_imu), map
+    def __init__(
+        self, pipeline: FramePipeline, *, wait_for_imu: bool, map: MapSession | None
+    ) -> None:
+        """Begin a trajectory, and its part of a map where there is one; `wait_for_imu` as of
+        `EventOrder`.
+        """
+        self.pipeline = pipeline
+        self._order = EventOrder(wait_for_imu=wait_for_imu)
+        self.map = map
         self.estimate: Estimate | None = None  # newest; None before the first
         self._last_index = 0  # of the frame that it is of
 
     def add(self, event: Event) -> list[FrameResult]:
-        """Take an event, whose image is rectified, and return the results of the frames that it completed."""
+        """Take an event, whose image is rectified, and return the results of the frames that it
+        completed.
+        """
         return self._process(self._order.add(event))
 
     def finish(self) -> list[FrameResult]:
-        """Process the frames that still wait, and let the checks report what they have not yet reported."""
+        """Process the frames that still wait, and let the checks report what they have not yet
+        reported.
+        """
         results = self._process(self._order.flush())
         self.pipeline.monitor.close()
         if self.estimate is not None:
@@ -135,7 +163,8 @@ class EventProcessor:
             result = self.pipeline.frame(event)
             if result is not None:
                 results.append(self._in_map(event, result))
-                self.estimate, self._last_index = results[-1].estimate, event.index
+                self.estimate = results[-1].estimate
+                self._last_index = event.index
                 self._order.exposed_after_ns = _wait_ns(self.estimate)
         return results
 
@@ -143,10 +172,15 @@ class EventProcessor:
         """Add what the map says of a frame."""
         if self.map is None:
             return result
-        loops = self.map.frame(frame, result.output.observations, result.estimate, self.pipeline.backend.relative)
+        loops = self.map.frame(
+            frame, result.output.observations, result.estimate, self.pipeline.backend.relative
+        )
         T = self.map.T_map_odom
         if T is not None:
-            T_map_body, covariance = T @ result.estimate.T_world_imu, self.map.covariance
-            estimate = replace(result.estimate, T_map_body=T_map_body, T_map_body_covariance=covariance)
+            T_map_body = T @ result.estimate.T_world_imu
+            covariance = self.map.covariance
+            estimate = replace(
+                result.estimate, T_map_body=T_map_body, T_map_body_covariance=covariance
+            )
             result = replace(result, estimate=estimate)
         return replace(result, loops=loops, is_keyframe=self.map.newest_keyframe == frame.index)

@@ -1,4 +1,6 @@
-"""Two seconds of images made up, so that everything is compiled, loaded and allocated before the first real frame."""
+"""Two seconds of images made up, so that everything is compiled, loaded and allocated before the
+first real frame.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +19,19 @@ from vio.geometry.stereo import StereoCamera
 from vio.live.odometry import Odometry
 from vio.records import Image
 
-_FRAMES, _STEP_NS, _SAMPLES = 40, 50_000_000, 10  # samples a frame
-_FAR_PX, _NEAR_PX = 12.0, 24.0  # disparities of the upper and the lower half of the images
-_SWAY_PX, _SWAY_S = 60.0, 2.0  # of the near half, and its period
+_FRAMES = 40  # samples a frame
+_STEP_NS = 50_000_000
+_SAMPLES = 10
+_FAR_PX = 12.0  # disparities of the upper and the lower half of the images
+_NEAR_PX = 24.0
+_SWAY_PX = 60.0  # of the near half, and its period
+_SWAY_S = 2.0
 _SMOOTH_PX = 1.5
 
 
-def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config, *, with_map: bool) -> None:
+def warm_up(
+    camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config, *, with_map: bool
+) -> None:
     """Run an odometry of its own over a camera that sways sideways in front of two walls.
 
     `T_cam0_imu` is (4, 4), None without an IMU; `with_map` extracts features of keyframes, too.
@@ -32,7 +40,9 @@ def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config,
         DataError: the camera has no image size.
     """
     if camera.width is None or camera.height is None:
-        raise DataError("warm_up needs the size of the images; give StereoCamera its width and height")
+        raise DataError(
+            "warm_up needs the size of the images; give StereoCamera its width and height"
+        )
     with _without_warnings():
         for made in _configs(config):
             odometry = Odometry(camera, made, T_cam0_imu=T_cam0_imu)
@@ -42,13 +52,17 @@ def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config,
     if with_map:
         from vio.mapping.features import extract
 
-        left, right, _ = SwayingCamera(camera, odometry.T_cam0_body, config.msckf.gravity_mps2).images(0)
+        left, right, _ = SwayingCamera(
+            camera, odometry.T_cam0_body, config.msckf.gravity_mps2
+        ).images(0)
         assert right is not None  # of other cameras there is no map
         extract(left, right)
 
 
 def _configs(config: Config) -> list[Config]:
-    """Return the configuration, and one with which landmarks begin at once, not when the rectification is known."""
+    """Return the configuration, and one with which landmarks begin at once, not when the
+    rectification is known.
+    """
     at_once = replace(config, msckf=replace(config.msckf, calibrate_stereo="off"))
     return [config] if at_once == config else [config, at_once]
 
@@ -70,18 +84,23 @@ def sway(odometry: Odometry, config: Config) -> None:
 
 
 class SwayingCamera:
-    """A camera that sways sideways, without an end, in front of two walls of random texture across its optical axis.
+    """A camera that sways sideways, without an end, in front of two walls of random texture across
+    its optical axis.
 
     The lower wall is at half of the upper one's distance. Images, IMU and velocities agree.
     """
 
     def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, gravity_mps2: float) -> None:
-        """Make the walls of a rectified camera, which has an image size and looks at the horizon; extrinsics (4, 4)."""
+        """Make the walls of a rectified camera, which has an image size and looks at the
+        horizon; extrinsics (4, 4).
+        """
         import cv2
 
         assert camera.width is not None
         assert camera.height is not None
-        self._camera, self._R_body_cam, self._gravity_mps2 = camera, T_cam0_body[:3, :3].T, gravity_mps2
+        self._camera = camera
+        self._R_body_cam = T_cam0_body[:3, :3].T
+        self._gravity_mps2 = gravity_mps2
         self._size = camera.width, camera.height
         rows = camera.height // 2
         # A single camera's baseline is 1 m or made up: its walls are at some metres.
@@ -90,7 +109,9 @@ class SwayingCamera:
         self._sway_m = _SWAY_PX / self._px_per_m[1]
         self._depth_m: FloatArray = np.full((camera.height, camera.width), far_m)
         self._depth_m[rows:] /= 2.0
-        noise = np.random.default_rng(0).normal(size=(camera.height, camera.width + 4 * int(_SWAY_PX + _NEAR_PX)))
+        noise = np.random.default_rng(0).normal(
+            size=(camera.height, camera.width + 4 * int(_SWAY_PX + _NEAR_PX))
+        )
         smooth = cv2.GaussianBlur(noise, (0, 0), _SMOOTH_PX)
         self._texture = np.clip(128.0 + 40.0 * smooth / smooth.std(), 0, 255).astype(np.uint8)
         self._rows = slice(0, rows), slice(rows, camera.height)
@@ -106,17 +127,22 @@ class SwayingCamera:
         return self._R_body_cam @ np.array([speed, 0.0, 0.0]), np.zeros(3)
 
     def images(self, time_ns: int) -> tuple[Image, Image | None, FloatArray | None]:
-        """Return the left image (H, W), the right one of a pair, and the depths (H, W) where the camera has them."""
+        """Return the left image (H, W), the right one of a pair, and the depths (H, W) where the
+        camera has them.
+        """
         x, *_ = self.motion(time_ns * 1e-9)
         right = self._image(x + self._camera.baseline_m) if self._camera.kind == "stereo" else None
         return self._image(x), right, self._depth_m if self._camera.kind == "rgbd" else None
 
     def motion(self, time_s: float) -> tuple[float, float, float]:
-        """Return position, speed and acceleration along the camera's x axis, m and s; at rest before time 0."""
+        """Return position, speed and acceleration along the camera's x axis, m and s; at rest
+        before time 0.
+        """
         if time_s < 0:
             return 0.0, 0.0, 0.0
         rate = 2.0 * np.pi / _SWAY_S
-        phase, a = rate * time_s, 0.5 * self._sway_m
+        phase = rate * time_s
+        a = 0.5 * self._sway_m
         return a * (1 - np.cos(phase)), a * rate * np.sin(phase), a * rate**2 * np.cos(phase)
 
     def _image(self, x_m: float) -> Image:

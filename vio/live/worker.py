@@ -1,4 +1,6 @@
-"""The thread that does the processing of live use: calls in the order of arrival, of which few may be frames."""
+"""The thread that does the processing of live use: calls in the order of arrival, of which few
+may be frames.
+"""
 
 from __future__ import annotations
 
@@ -45,10 +47,11 @@ class EventQueue:
 
         Args:
             most_frames: that wait.
-            drop: what a frame too many does: "oldest" takes the place of the one that has waited longest, "none" waits
-                behind all others, "block" makes `put` wait for room.
+            drop: what a frame too many does: "oldest" takes the place of the one that has waited
+                longest, "none" waits behind all others, "block" makes `put` wait for room.
         """
-        self._most, self._drop = most_frames, drop
+        self._most = most_frames
+        self._drop = drop
         self._calls: queue.SimpleQueue[QueuedCall | None] = queue.SimpleQueue()  # None: the end
         self._frames: deque[QueuedCall] = deque()  # those of the calls that bring frames
         self._changed = threading.Condition()
@@ -65,11 +68,17 @@ class EventQueue:
             return True
         with self._changed:
             fits = True
-            while call.frame and self._drop == "block" and len(self._frames) >= self._most and not self._closed:
+            while (
+                call.frame
+                and self._drop == "block"
+                and len(self._frames) >= self._most
+                and not self._closed
+            ):
                 self._changed.wait()
             if call.frame and not self._closed:
                 if self._drop == "oldest" and len(self._frames) >= self._most:
-                    self._frames.popleft().make, fits = None, False
+                    self._frames.popleft().make = None
+                    fits = False
                 self._frames.append(call)
             self._add(call)
             return fits
@@ -97,7 +106,8 @@ class EventQueue:
     def close(self, *, discard: bool) -> None:
         """Let `take` end once nothing waits; with `discard`, what waits is forgotten."""
         with self._changed:
-            self._closed, self._discards = True, self._discards or discard
+            self._closed = True
+            self._discards = self._discards or discard
             while discard:
                 try:
                     call = self._calls.get_nowait()
@@ -117,18 +127,27 @@ class EventQueue:
 
 
 class Worker:
-    """Makes calls in a thread of its own. An error that a call raises ends it, and is raised by all later calls."""
+    """Makes calls in a thread of its own.
+
+    An error that a call raises ends it, and is raised by all later calls.
+    """
 
     def __init__(
-        self, most_frames: int, drop: Drop, *, finish: Callable[[], object], close: Callable[[], object]
+        self,
+        most_frames: int,
+        drop: Drop,
+        *,
+        finish: Callable[[], object],
+        close: Callable[[], object],
     ) -> None:
         """Start the thread; `most_frames` and `drop` are those of `EventQueue`.
 
-        `finish` is called after the last call, unless the worker failed or was asked to forget what waits; `close`
-        last, in any case.
+        `finish` is called after the last call, unless the worker failed or was asked to forget what
+        waits; `close` last, in any case.
         """
         self._queue = EventQueue(most_frames, drop)
-        self._finish, self._close = finish, close
+        self._finish = finish
+        self._close = close
         self._failure: Exception | None = None
         self._forgets = False
         self._thread = threading.Thread(target=self._run, name="vio", daemon=True)
@@ -155,7 +174,9 @@ class Worker:
         return self._queue.put(QueuedCall(make, frame))
 
     def ask(self, function: Callable[[], Answer]) -> Answer:
-        """Call a function in the thread, after all calls so far, and return or raise what it does."""
+        """Call a function in the thread, after all calls so far, and return or raise what it
+        does.
+        """
         if threading.current_thread() is self._thread:
             return function()
         self.raise_failure()
@@ -206,13 +227,15 @@ class Worker:
             self.fail(error)
 
 
-# Objects more than before until the young ones are searched. Frames make no cycles, so that few are ever found, and
-# what lives in a run is some ten thousand objects, through which a search takes a few milliseconds.
+# Objects more than before until the young ones are searched. Frames make no cycles, so that few are
+# ever found, and what lives in a run is some ten thousand objects, through which a search takes a
+# few milliseconds.
 _YOUNG = 20_000
 
 
 class QuietCollector:
-    """Keeps what is loaded out of Python's searches for reference cycles: one through all modules takes 50 to 100 ms.
+    """Keeps what is loaded out of Python's searches for reference cycles: one through all modules
+    takes 50 to 100 ms.
 
     The collector belongs to the process: the first user sets it up, and the last one restores it.
     """
@@ -225,7 +248,9 @@ class QuietCollector:
         self._holds = False
 
     def hold(self) -> None:
-        """Search a last time, and then through newer objects only; calling it again adds what has come since."""
+        """Search a last time, and then through newer objects only; calling it again adds what
+        has come since.
+        """
         gc.collect()
         gc.freeze()
         if not self._holds:

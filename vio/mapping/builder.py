@@ -1,7 +1,7 @@
 """Keyframes in, a map out: places recognised, loops confirmed, poses optimised.
 
-A loop is accepted where `place_finder` finds a place, and another keyframe close by finds the same. All follows from
-the keyframes alone, so that equal keyframes give equal maps.
+A loop is accepted where `place_finder` finds a place, and another keyframe close by finds the same.
+All follows from the keyframes alone, so that equal keyframes give equal maps.
 """
 
 from __future__ import annotations
@@ -28,13 +28,16 @@ from vio.records import BoolArray, LoopEvent
 log = logging.getLogger(__name__)
 
 CONFIRM_WITHIN = 6  # keyframes
-_NEIGHBOURS_M = 50.0  # path between two places up to which the map's own drift between them is counted
-_SETTLED = 6.0  # squared error of a new loop, its expected value, up to which the optimisation can wait …
+# path between two places up to which the map's own drift between them is counted
+_NEIGHBOURS_M = 50.0
+# squared error of a new loop, its expected value, up to which the optimisation can wait …
+_SETTLED = 6.0
 _PATIENCE = 8  # … for so many loops
 _COMMIT_EVERY = 20  # keyframes
 _ONLY = ("pinhole", "stereo")  # projection and kind of the cameras that maps know
 _SAME_RIG = 0.03  # by which two calibrations of one rig may differ in focal length and baseline
-_FIELD_MOVED_PX = 0.02  # by which a rectification error moves the pixels of a keyframe before all are corrected anew
+# by which a rectification error moves the pixels of a keyframe before all are corrected anew
+_FIELD_MOVED_PX = 0.02
 _OF_THE_FILE = ("_store", "_stored_poses", "_stored_kept")
 
 
@@ -42,20 +45,26 @@ def check_camera(path: Path, camera: StereoCamera) -> None:
     """Raise ConfigError unless a map can be made of a camera's images."""
     if (camera.projection, camera.kind) != _ONLY:
         raise ConfigError(
-            f"{path}: a map is made of the rectified images of a pinhole stereo pair, not of {_text(camera)}; "
+            f"{path}: a map is made of the rectified images of a pinhole stereo pair, not of "
+            f"{_text(camera)}; "
             "set dataset.projection to pinhole, and give a recording of two cameras"
         )
 
 
 def check_sessions(store: MapStore, camera: StereoCamera) -> None:
-    """Warn where a map was made with another rig; raise DataError where with another kind of camera."""
+    """Warn where a map was made with another rig; raise DataError where with another kind of
+    camera.
+    """
     others = [s.camera for s in store.sessions()]
     for other in others:
         if (other.projection, other.kind) != _ONLY:
-            raise DataError(f"{store.path}: is a map of {_text(other)}; use another map for {_text(camera)}")
+            raise DataError(
+                f"{store.path}: is a map of {_text(other)}; use another map for {_text(camera)}"
+            )
     if others and not any(_is_alike(other, camera) for other in others):
         log.warning(
-            "%s: was made with another rig, %s; this recording is of %s: places are looked for all the same, and if "
+            "%s: was made with another rig, %s; this recording is of %s: places are looked for all "
+            "the same, and if "
             "this is the same rig, one of the calibrations is wrong",
             store.path,
             _text(others[-1]),
@@ -66,7 +75,9 @@ def check_sessions(store: MapStore, camera: StereoCamera) -> None:
 def _is_alike(a: StereoCamera, b: StereoCamera) -> bool:
     """Whether two cameras may be one rig with two calibrations."""
     lengths, others = ((c.fu, c.fv, c.baseline_m) for c in (a, b))
-    return (a.width, a.height) == (b.width, b.height) and np.allclose(lengths, others, rtol=_SAME_RIG, atol=0)
+    return (a.width, a.height) == (b.width, b.height) and np.allclose(
+        lengths, others, rtol=_SAME_RIG, atol=0
+    )
 
 
 def _text(camera: StereoCamera) -> str:
@@ -86,7 +97,8 @@ class Keyframe:
     up_cam: FloatArray | None  # (3,) unit vector against gravity; None: not known
     up_sigma_rad: float  # standard deviation of its direction
     field: DisplacementField | None = None  # what the stereo calibration is off by, as known now
-    # Standard deviations of what the calibration leaves open: scale, over it, and direction of the optical axis, rad.
+    # Standard deviations of what the calibration leaves open: scale, over it, and direction of the
+    # optical axis, rad.
     rig_sigmas: tuple[float, float] = (0.0, 0.0)
 
 
@@ -95,10 +107,13 @@ class MapUpdate:
     """What a keyframe made of the map."""
 
     T_map_odom: FloatArray | None  # (4, 4); None: the session has not found its place in the map
-    T_map_cam: FloatArray | None  # (4, 4) of the keyframe, once a loop holds it; None: it moves with the odometry
-    covariance: FloatArray | None  # (6, 6) of xi in T_map_cam = T_hat exp(xi), in the map's frame; None: no place
+    # (4, 4) of the keyframe, once a loop holds it; None: it moves with the odometry
+    T_map_cam: FloatArray | None
+    # (6, 6) of xi in T_map_cam = T_hat exp(xi), in the map's frame; None: no place
+    covariance: FloatArray | None
     loops: tuple[LoopEvent, ...]
-    unconfirmed: bool = False  # whether the session, which has no place yet, may have found it, as another may confirm
+    # whether the session, which has no place yet, may have found it, as another may confirm
+    unconfirmed: bool = False
 
 
 class MapBuilder:
@@ -122,7 +137,8 @@ class MapBuilder:
             camera: rectified pair.
             upright: whether z of the odometry's world is up.
             localise: find poses in the map, and leave it as it is.
-            density: keyframes a cubic metre that can be found again, others keep poses and motions alone; None: all.
+            density: keyframes a cubic metre that can be found again, others keep poses and motions
+                alone; None: all.
 
         Raises:
             ConfigError: the images are not those of a pinhole stereo pair.
@@ -130,23 +146,30 @@ class MapBuilder:
         """
         check_camera(store.path, camera)
         check_sessions(store, camera)
-        self._store, self._camera, self._localise, self._density = store, camera, localise, density
+        self._store = store
+        self._camera = camera
+        self._localise = localise
+        self._density = density
         self.graph = MapGraph(store)
         self.first = len(self.graph)  # keyframe of this session
         sessions = self.graph.sessions
         self._own = len(sessions)
-        self._home = sessions[0].part if sessions else self._own  # the part whose frame is the map's
+        # the part whose frame is the map's
+        self._home = sessions[0].part if sessions else self._own
         sessions.append(SessionRow(source, camera, upright, self._own))
         if not localise:
             store.add_session(sessions[-1])
         self.places = PlaceFinder(store, self.graph, camera, self._own, writes=not localise)
         self._pending: list[FoundPlace] = []
         self._waiting = 0  # loops since the last optimisation
-        self._optimised = False  # whether loops hold this session: until then it is reported as the odometry has it
-        self._placed: Placed | None = None  # how well the newest keyframe was known when loops were last optimised
+        # whether loops hold this session: until then it is reported as the odometry has it
+        self._optimised = False
+        # how well the newest keyframe was known when loops were last optimised
+        self._placed: Placed | None = None
         self._moved = False  # poses since the last commit
         # As the file has them:
-        self._stored_poses, self._stored_kept = self.graph.T_map_cam.rows.copy(), [o.kept for o in self.graph.loops]
+        self._stored_poses = self.graph.T_map_cam.rows.copy()
+        self._stored_kept = [o.kept for o in self.graph.loops]
 
     @property
     def path(self) -> Path:
@@ -164,13 +187,27 @@ class MapBuilder:
         Raises:
             DataError: the file cannot be written or read.
         """
-        graph, number, motion = self.graph, len(self.graph), keyframe.motion
+        graph = self.graph
+        number = len(self.graph)
+        motion = keyframe.motion
         drift, path = graph.gathered(keyframe.T_odom_cam, motion)
         T = keyframe.T_odom_cam
-        if motion is not None:  # the filter's poses jump where it learns what it was off by; this motion does not
+        # the filter's poses jump where it learns what it was off by; this motion does not
+        if motion is not None:
             T = graph.T_map_cam[-1] @ motion.T_i_j
-        up, sigma = keyframe.up_cam, keyframe.up_sigma_rad
-        row = KeyframeRow(self._own, keyframe.frame, keyframe.time_ns, T, keyframe.T_odom_cam, drift, path, up, sigma)
+        up = keyframe.up_cam
+        sigma = keyframe.up_sigma_rad
+        row = KeyframeRow(
+            self._own,
+            keyframe.frame,
+            keyframe.time_ns,
+            T,
+            keyframe.T_odom_cam,
+            drift,
+            path,
+            up,
+            sigma,
+        )
         graph.append(row)
         if motion is not None:
             graph.add_motions([(number - 1, number, motion)])
@@ -193,8 +230,8 @@ class MapBuilder:
         """Optimise once more, write everything, and return the last correction.
 
         Args:
-            field: what the session found its stereo calibration to be off by at its end: loops are measured again in
-                pixels without it.
+            field: what the session found its stereo calibration to be off by at its end: loops are
+                measured again in pixels without it.
         """
         if field is not None and not self._localise and len(self.graph) > self.first:
             self._correct(field, None)
@@ -218,13 +255,16 @@ class MapBuilder:
         if self._localise:
             return
         if self._moved:
-            T, kept, before = self.graph.T_map_cam.rows, [o.kept for o in self.graph.loops], len(self._stored_poses)
+            T = self.graph.T_map_cam.rows
+            kept = [o.kept for o in self.graph.loops]
+            before = len(self._stored_poses)
             moved = np.ones(len(T), dtype=np.bool_)
             moved[:before] = (T[:before] != self._stored_poses).any(axis=(1, 2))
             self._store.set_poses({k: T[k] for k in np.flatnonzero(moved).tolist()})
             known = dict(enumerate(self._stored_kept))
             self._store.set_kept({n: now for n, now in enumerate(kept) if now != known.get(n)})
-            self._stored_poses, self._stored_kept = T.copy(), kept
+            self._stored_poses = T.copy()
+            self._stored_kept = kept
             self._store.set_parts([s.part for s in self.graph.sessions])
         self._store.set_field(self._own, self.graph.sessions[self._own].field)
         if self._moved:
@@ -240,8 +280,12 @@ class MapBuilder:
         return {key: value for key, value in self.__dict__.items() if key not in _OF_THE_FILE}
 
     def reopen(self, store: MapStore) -> None:
-        """Go on from a checkpoint with the file as it was then: what was added since is forgotten."""
-        self._store, self._stored_poses, self._stored_kept = store, np.zeros((0, 4, 4)), []
+        """Go on from a checkpoint with the file as it was then: what was added since is
+        forgotten.
+        """
+        self._store = store
+        self._stored_poses = np.zeros((0, 4, 4))
+        self._stored_kept = []
         graph = self.graph
         if not self._localise:
             store.truncate(len(graph.sessions), len(graph), len(graph.loops))
@@ -249,11 +293,13 @@ class MapBuilder:
         self.places.reopen(store, self.first if self._localise else len(graph))
 
     def _correct(self, field: DisplacementField, features: KeyframeFeatures | None) -> None:
-        """Take a newer estimate of the rectification error of this session, where it differs in a keyframe's features.
+        """Take a newer estimate of the rectification error of this session, where it differs in a
+        keyframe's features.
 
         All that was made of pixels before is forgotten.
         """
-        sessions, own = self.graph.sessions, self._own
+        sessions = self.graph.sessions
+        own = self._own
         before = sessions[own].field
         if before is not None and features is not None:
             moved = (field.at(features.z) - before.at(features.z))[features.has_right]
@@ -263,7 +309,9 @@ class MapBuilder:
         self.places.forget_pixels()
 
     def _forget(self, rows: BoolArray, cell: FloatArray | None = None) -> None:
-        """Find no more what exceeds the density among keyframes (K,), of one cubic metre (3,) or of all."""
+        """Find no more what exceeds the density among keyframes (K,), of one cubic metre (3,) or
+        of all.
+        """
         if self._density is None:
             return
         graph = self.graph
@@ -274,42 +322,63 @@ class MapBuilder:
         if len(near) > self._density:
             ends = [k for o in graph.loops if o.kept for k in (o.first, o.second)]
             loops = np.bincount(ends, minlength=len(graph))
-            self.places.forget(near[~spread(graph.T_map_cam[near], graph.part[near], loops[near], self._density)])
+            self.places.forget(
+                near[~spread(graph.T_map_cam[near], graph.part[near], loops[near], self._density)]
+            )
 
     def _measure_again(self) -> None:
         """Measure the loops of this session once more, from where the map has its keyframes now."""
         again = dict[int, LoopRow]()
         for n, loop in enumerate(self.graph.loops):
-            if loop.second >= self.first and (measured := self.places.measured_again(loop)) is not None:
+            if (
+                loop.second >= self.first
+                and (measured := self.places.measured_again(loop)) is not None
+            ):
                 again[n] = measured
                 self.graph.set_loop(n, measured)
         self._waiting += len(again)
         self._store.set_loops(again)
 
     def _update(self, events: tuple[LoopEvent, ...], rig_sigmas: tuple[float, float]) -> MapUpdate:
-        graph, k = self.graph, len(self.graph) - 1
+        graph = self.graph
+        k = len(self.graph) - 1
         if not self.is_joined:
-            return MapUpdate(None, None, None, events, unconfirmed=any(o.second == k for o in self._pending))
-        T_map_odom = graph.T_map_cam[k] @ se3_inverse(graph.T_odom_cam[k]) if self._optimised else np.eye(4)
+            return MapUpdate(
+                None, None, None, events, unconfirmed=any(o.second == k for o in self._pending)
+            )
+        T_map_odom = (
+            graph.T_map_cam[k] @ se3_inverse(graph.T_odom_cam[k]) if self._optimised else np.eye(4)
+        )
         T_map_cam = None if self.places.newest is None else graph.T_map_cam[k].copy()
         return MapUpdate(T_map_odom, T_map_cam, self._covariance(k, rig_sigmas), events)
 
     def _covariance(self, k: int, rig_sigmas: tuple[float, float]) -> FloatArray:
-        """Covariance (6, 6) of keyframe k: as last optimised, with the odometry since and the rig's errors, (G9).
+        """Covariance (6, 6) of keyframe k: as last optimised, with the odometry since and the rig's
+        errors, (G9).
 
-        That by the newest loop alone, with the map as exact, where it says more than the odometry since (which may have
-        begun anew).
+        That by the newest loop alone, with the map as exact, where it says more than the odometry
+        since (which may have begun anew).
         """
-        graph, newest = self.graph, self.places.newest
-        by_loop = self.places.drift_since(np.array([self.first if newest is None else newest.first]), k)[0]
+        graph = self.graph
+        newest = self.places.newest
+        by_loop = self.places.drift_since(
+            np.array([self.first if newest is None else newest.first]), k
+        )[0]
         if self._placed is None:
             return by_loop
-        placed, T = self._placed, graph.T_odom_cam
-        since = graph.odometry_scale * graph.drift(np.array([placed.keyframe]), np.array([k]), systematic=0.0)[0]
+        placed = self._placed
+        T = graph.T_odom_cam
+        since = (
+            graph.odometry_scale
+            * graph.drift(np.array([placed.keyframe]), np.array([k]), systematic=0.0)[0]
+        )
         if since[:3, :3].trace() > by_loop[:3, :3].trace():
             return by_loop
-        A, T_map_cam = se3_adjoint(se3_inverse(T[k]) @ T[placed.keyframe]), graph.T_map_cam[k]
-        d = np.append(rig_sigmas[0] * (T_map_cam[:3, 3] - placed.centre) @ T_map_cam[:3, :3], np.zeros(3))
+        A = se3_adjoint(se3_inverse(T[k]) @ T[placed.keyframe])
+        T_map_cam = graph.T_map_cam[k]
+        d = np.append(
+            rig_sigmas[0] * (T_map_cam[:3, 3] - placed.centre) @ T_map_cam[:3, :3], np.zeros(3)
+        )
         axis = rig_sigmas[1] ** 2 * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 0.0])
         return np.asarray(A @ placed.covariance @ A.T + since + np.outer(d, d) + axis)
 
@@ -330,7 +399,10 @@ class MapBuilder:
 
     def _accept(self, loop: FoundPlace) -> LoopEvent:
         """Add a confirmed loop to the graph, and optimise where it moves the map."""
-        graph, i, k, pose = self.graph, loop.first, loop.second, loop.seen.pose
+        graph = self.graph
+        i = loop.first
+        k = loop.second
+        pose = loop.seen.pose
         joined = bool(graph.part[i] != graph.part[k])
         if joined:
             join_parts(graph, self._home, i, k, graph.T_map_cam[i] @ pose.T_i_j)
@@ -344,7 +416,8 @@ class MapBuilder:
         graph.add_loops([row])
         if not self._localise:
             self._store.add_loop(row)
-        self.places.newest, self._moved = row, True
+        self.places.newest = row
+        self._moved = True
         self._waiting += 1
         settled = self._optimised and squared(r, pose.covariance) <= _SETTLED
         if joined or not settled or self._waiting >= _PATIENCE:
@@ -362,10 +435,13 @@ class MapBuilder:
         )
 
     def _optimise(self, *, whole: bool = False) -> None:
-        graph, part = self.graph, self.graph.sessions[self._own].part
+        graph = self.graph
+        part = self.graph.sessions[self._own].part
         own = graph.session == self._own
-        stated, stays = graph.T_map_cam.rows.copy(), graph.part == part
-        if self._localise:  # the frame is that of the map, whose keyframes are no more exact than it knows them
+        stated = graph.T_map_cam.rows.copy()
+        stays = graph.part == part
+        # the frame is that of the map, whose keyframes are no more exact than it knows them
+        if self._localise:
             stays &= ~own
         elif not self._optimised:  # until then the odometry's poses stood for those in the map
             alone = not (stays & ~own).any()
@@ -378,16 +454,22 @@ class MapBuilder:
         self._placed = graph.placed(part, stays, self._placed)
         if self.places.newest is not None and not self.graph.loops[-1].kept:
             self.places.newest = None
-        self._waiting, self._moved, self._optimised = 0, True, True
+        self._waiting = 0
+        self._moved = True
+        self._optimised = True
 
 
 def agree(graph: MapGraph, a: FoundPlace, b: FoundPlace) -> bool:
-    """Whether two loops, of which b is the later one, say the same of where their session is in the map."""
+    """Whether two loops, of which b is the later one, say the same of where their session is in
+    the map.
+    """
     if graph.part[a.first] != graph.part[b.first]:
         return False
     T = graph.T_map_cam
     T_second = se3_inverse(T[a.second]) @ T[b.second]
-    r = se3_log(se3_inverse(T[a.first] @ a.seen.pose.T_i_j @ T_second) @ T[b.first] @ b.seen.pose.T_i_j)
+    r = se3_log(
+        se3_inverse(T[a.first] @ a.seen.pose.T_i_j @ T_second) @ T[b.first] @ b.seen.pose.T_i_j
+    )
     A = se3_adjoint(se3_inverse(T_second))
     C = A @ a.seen.pose.covariance @ A.T + b.seen.pose.covariance
     C = C + graph.drift(np.array([a.second]), np.array([b.second]))[0]
@@ -397,7 +479,8 @@ def agree(graph: MapGraph, a: FoundPlace, b: FoundPlace) -> bool:
 
 
 def join_parts(graph: MapGraph, home: int, i: int, k: int, T_map_k: FloatArray) -> None:
-    """Bring the parts of keyframes i and k into one frame: that of part `home`, if one of them is in it, or that of i.
+    """Bring the parts of keyframes i and k into one frame: that of part `home`, if one of them is
+    in it, or that of i.
 
     Args:
         graph: their map.

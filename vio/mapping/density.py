@@ -13,7 +13,8 @@ _M_PER_RAD = 2.0  # a turn of a radian shows as much that is new as a step of so
 def spread(T_map_cam: FloatArray, part: IntArray, loops: IntArray, density: int) -> BoolArray:
     """Mask (K,) of at most `density` keyframes a cubic metre.
 
-    Of the two keyframes of a cell that show the most alike, that with fewer loops is left out, or the older one.
+    Of the two keyframes of a cell that show the most alike, that with fewer loops is left out, or
+    the older one.
 
     Args:
         T_map_cam: (K, 4, 4) poses.
@@ -25,7 +26,8 @@ def spread(T_map_cam: FloatArray, part: IntArray, loops: IntArray, density: int)
     cells = np.concatenate([np.floor(T_map_cam[:, :3, 3]), part[:, None]], axis=1)
     for cell in np.unique(cells, axis=0):
         rows = np.flatnonzero((cells == cell).all(axis=1))
-        position, axis = T_map_cam[rows, :3, 3], T_map_cam[rows, :3, 2]
+        position = T_map_cam[rows, :3, 3]
+        axis = T_map_cam[rows, :3, 2]
         apart = np.linalg.norm(position[:, None] - position, axis=2) + _M_PER_RAD * np.arccos(
             np.clip(axis @ axis.T, -1.0, 1.0)
         )
@@ -34,5 +36,6 @@ def spread(T_map_cam: FloatArray, part: IntArray, loops: IntArray, density: int)
             a, b = sorted(np.unravel_index(int(np.argmin(apart)), apart.shape))
             gone = b if loops[rows[b]] < loops[rows[a]] else a
             kept[rows[gone]] = False
-            apart[gone], apart[:, gone] = np.inf, np.inf
+            apart[gone] = np.inf
+            apart[:, gone] = np.inf
     return kept

@@ -1,7 +1,7 @@
 """What a keyframe keeps of its images: ORB key points with their pixels in both images.
 
-ORB (Rublee et al. 2011) from OpenCV: its bits are compared in a microsecond and its words need no training
-(`place_index`).
+ORB (Rublee et al. 2011) from OpenCV: its bits are compared in a microsecond and its words need no
+training (`place_index`).
 """
 
 from __future__ import annotations
@@ -21,31 +21,41 @@ from vio.records import BoolArray, Image, IntArray
 Bits: TypeAlias = npt.NDArray[np.uint8]
 
 DESCRIPTOR_BYTES = 32
-MOST_FEATURES = 600  # of a keyframe; 30 kB, so that 10 minutes of driving (2000 keyframes) need 60 MB
+# of a keyframe; 30 kB, so that 10 minutes of driving (2000 keyframes) need 60 MB
+MOST_FEATURES = 600
 _DETECTED = 3  # key points found for each that is kept, so that they can be spread over the image
 _CELLS = 10  # along the larger side of the image
-_LEVELS, _SCALE = 8, 1.2  # pyramid of the detector: up to 3.6 times nearer
+_LEVELS = 8  # pyramid of the detector: up to 3.6 times nearer
+_SCALE = 1.2
 _CORNER_CONTRAST = 7  # gray levels; low, since the best ones of each cell are kept
 _ROWS_PX = 2.0  # of a left and a right key point, at the scale of the detector's first level
 _MOST_DISPARITY = 0.4  # of the width
 _LEAST_DISPARITY_PX = 0.5
 _MOST_BITS = 64  # in which the descriptors of one point differ: a quarter
-_ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint16)  # bits of a byte
+# bits of a byte
+_ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint16)
 _LK_WINDOW = 11  # pixels
-_LK_CONTRAST = 15  # pixels; the images are brought to one brightness and contrast over squares of this size
-_LK_GRAY, _LK_DEVIATION, _LK_LEAST = 128.0, 40.0, 6.0  # mean and standard deviation then; below 6 gray levels less
-_LK_ROWS_PX = 2.0  # by which the rows of a refined match may differ: rectifications are off by up to a pixel
+# pixels; the images are brought to one brightness and contrast over squares of this size
+_LK_CONTRAST = 15
+_LK_GRAY = 128.0  # mean and standard deviation then; below 6 gray levels less
+_LK_DEVIATION = 40.0
+_LK_LEAST = 6.0
+# by which the rows of a refined match may differ: rectifications are off by up to a pixel
+_LK_ROWS_PX = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeFeatures:
     """The key points of one keyframe."""
 
-    z: FloatArray  # (N, 4) rectified pixels [ul vl ur vr]; ur, vr are arbitrary where has_right is False
+    # (N, 4) rectified pixels [ul vl ur vr]; ur, vr are arbitrary where has_right is False
+    z: FloatArray
     has_right: BoolArray  # (N,)
-    sigma_px: FloatArray  # (N,) standard deviation of a pixel coordinate: larger on the coarse levels
+    # (N,) standard deviation of a pixel coordinate: larger on the coarse levels
+    sigma_px: FloatArray
     descriptors: Bits  # (N, 32)
-    field: DisplacementField | None = None  # that was taken out of z; one object for all keyframes that share it
+    # that was taken out of z; one object for all keyframes that share it
+    field: DisplacementField | None = None
     z_seen: FloatArray | None = None  # (N, 4) pixels with it, as they were measured; None: z
 
     def __len__(self) -> int:
@@ -66,12 +76,17 @@ class KeyframeFeatures:
 def no_keyframe_features() -> KeyframeFeatures:
     """Return the features of a keyframe that shows none."""
     return KeyframeFeatures(
-        np.zeros((0, 4)), np.zeros(0, dtype=np.bool_), np.zeros(0), np.zeros((0, DESCRIPTOR_BYTES), dtype=np.uint8)
+        np.zeros((0, 4)),
+        np.zeros(0, dtype=np.bool_),
+        np.zeros(0),
+        np.zeros((0, DESCRIPTOR_BYTES), dtype=np.uint8),
     )
 
 
 def extract(left: Image, right: Image, *, most: int = MOST_FEATURES) -> KeyframeFeatures:
-    """Find and describe key points (N <= `most`) of the left image (H, W), and match them in the right one."""
+    """Find and describe key points (N <= `most`) of the left image (H, W), and match them in the
+    right one.
+    """
     orb = cv2.ORB.create(_DETECTED * most, _SCALE, _LEVELS, fastThreshold=_CORNER_CONTRAST)
     found = orb.detect(left, None)
     if not found:
@@ -84,14 +99,22 @@ def extract(left: Image, right: Image, *, most: int = MOST_FEATURES) -> Keyframe
     uv = np.array([p.pt for p in points], dtype=np.float64)
     scale = np.array([_SCALE**p.octave for p in points])
     order = np.lexsort((uv[:, 1], uv[:, 0]))  # OpenCV's own order is that of the levels
-    uv, scale, bits = uv[order], scale[order], bits[order]
+    uv = uv[order]
+    scale = scale[order]
+    bits = bits[order]
     ur, has_right = _right_pixels(orb, left, right, uv, scale, bits)
     z = np.concatenate([uv, ur], axis=1).astype(np.float32)  # as a map file keeps it
-    return KeyframeFeatures(z.astype(np.float64), has_right, scale.astype(np.float32).astype(np.float64), bits)
+    return KeyframeFeatures(
+        z.astype(np.float64), has_right, scale.astype(np.float32).astype(np.float64), bits
+    )
 
 
-def _spread(found: Sequence[cv2.KeyPoint], shape: tuple[int, ...], most: int) -> npt.NDArray[np.int64]:
-    """Choose up to `most` key points: the strongest of each cell first, then the second ones, and so on."""
+def _spread(
+    found: Sequence[cv2.KeyPoint], shape: tuple[int, ...], most: int
+) -> npt.NDArray[np.int64]:
+    """Choose up to `most` key points: the strongest of each cell first, then the second ones,
+    and so on.
+    """
     uv = np.array([p.pt for p in found])
     strength = np.array([p.response for p in found])
     cell = (uv // (max(shape) / _CELLS)).astype(np.int64)
@@ -106,11 +129,14 @@ def _spread(found: Sequence[cv2.KeyPoint], shape: tuple[int, ...], most: int) ->
 def _right_pixels(
     orb: cv2.ORB, left: Image, right: Image, uv: FloatArray, scale: FloatArray, bits: Bits
 ) -> tuple[FloatArray, BoolArray]:
-    """Match key points (N, 2) in the right image by descriptor near their row, and refine by Lucas-Kanade.
+    """Match key points (N, 2) in the right image by descriptor near their row, and refine by
+    Lucas-Kanade.
 
-    Lucas-Kanade takes both images to be equally bright, which two cameras with their own exposure are not.
+    Lucas-Kanade takes both images to be equally bright, which two cameras with their own exposure
+    are not.
     """
-    out, valid = np.zeros_like(uv), np.zeros(len(uv), dtype=np.bool_)
+    out = np.zeros_like(uv)
+    valid = np.zeros(len(uv), dtype=np.bool_)
     there, there_bits = orb.detectAndCompute(right, None)
     if there_bits is None:
         return out, valid
@@ -137,12 +163,15 @@ def _right_pixels(
     good = (status[:, 0] > 0) & (np.abs(found[:, 1] - uv[rows, 1]) <= _LK_ROWS_PX)
     good &= np.abs(found[:, 0] - start[:, 0, 0]) <= _ROWS_PX * scale[rows]
     good &= uv[rows, 0] - found[:, 0] >= _LEAST_DISPARITY_PX
-    out[rows[good]], valid[rows[good]] = found[good], True
+    out[rows[good]] = found[good]
+    valid[rows[good]] = True
     return out, valid
 
 
 def _near_rows(v: FloatArray, there: FloatArray, reach: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return all pairs (P,) of rows v (N,) and rows `there` (M,) that differ by at most `reach` (N,)."""
+    """Return all pairs (P,) of rows v (N,) and rows `there` (M,) that differ by at most `reach`
+    (N,).
+    """
     order = np.argsort(there, kind="stable")
     begin = np.searchsorted(there[order], v - reach, side="left")
     counts = np.searchsorted(there[order], v + reach, side="right") - begin
@@ -151,7 +180,9 @@ def _near_rows(v: FloatArray, there: FloatArray, reach: FloatArray) -> tuple[Int
 
 
 def _most_alike(i: IntArray, j: IntArray, a: Bits, b: Bits) -> tuple[IntArray, IntArray]:
-    """Of pairs (P,) of descriptors a (N, 32) and b (M, 32), return the best of each i, if it is good enough."""
+    """Of pairs (P,) of descriptors a (N, 32) and b (M, 32), return the best of each i, if it is
+    good enough.
+    """
     differing = _ONES[a[i] ^ b[j]].sum(axis=1)
     order = np.lexsort((j, differing, i))
     rows, first = np.unique(i[order], return_index=True)

@@ -33,10 +33,15 @@ def describe_map(path: Path) -> dict[str, Any]:
     """
     store = MapStore(path, read_only=True)
     with contextlib.closing(store):
-        sessions, keyframes, loops, earth = store.sessions(), store.keyframes(), store.loops(), store.earth()
+        sessions = store.sessions()
+        keyframes = store.keyframes()
+        loops = store.loops()
+        earth = store.earth()
         home = sessions[0].part if sessions else 0
         own = [[k for k in keyframes if k.session == n] for n in range(len(sessions))]
-        positions = np.array([k.T_map_cam[:3, 3] for k in keyframes if sessions[k.session].part == home])
+        positions = np.array(
+            [k.T_map_cam[:3, 3] for k in keyframes if sessions[k.session].part == home]
+        )
         return {
             "map": str(path),
             "version": store.version,
@@ -45,7 +50,9 @@ def describe_map(path: Path) -> dict[str, Any]:
             "loops": sum(o.kept for o in loops),
             "loops_rejected": sum(not o.kept for o in loops),
             "extent_m": np.ptp(positions, axis=0).tolist() if len(positions) else [0.0, 0.0, 0.0],
-            "earth": None if earth is None else {"origin": earth.origin, "T_enu_map": earth.T_enu_map.tolist()},
+            "earth": None
+            if earth is None
+            else {"origin": earth.origin, "T_enu_map": earth.T_enu_map.tolist()},
             "sessions": [
                 {
                     "source": session.source,
@@ -87,7 +94,8 @@ def drop_session(path: Path, session: int) -> dict[str, Any]:
 
 
 def prune_map(path: Path, density: int) -> dict[str, Any]:
-    """Leave at most so many keyframes in a cubic metre, see `spread`, in place; return what the map holds then.
+    """Leave at most so many keyframes in a cubic metre, see `spread`, in place; return what the map
+    holds then.
 
     Raises:
         DataError: the file cannot be used.
@@ -95,15 +103,20 @@ def prune_map(path: Path, density: int) -> dict[str, Any]:
     _, _, T = _outline(path)
     store = MapStore(path, read_only=True)
     with contextlib.closing(store):
-        loops = np.bincount([k for o in store.loops() if o.kept for k in (o.first, o.second)], minlength=len(T))
+        loops = np.bincount(
+            [k for o in store.loops() if o.kept for k in (o.first, o.second)], minlength=len(T)
+        )
         parts = np.array([s.part for s in store.sessions()])[[k.session for k in store.keyframes()]]
         kept = store.show_something()
     kept[kept] = spread(T[kept], parts[kept], loops[kept], density)
     return _keep(path, path, kept)
 
 
-def extract_map(path: Path, out: Path, centre: tuple[float, float, float], radius_m: float) -> dict[str, Any]:
-    """Write the keyframes of a map's first part within a radius of a point (m, in the map) to a new map.
+def extract_map(
+    path: Path, out: Path, centre: tuple[float, float, float], radius_m: float
+) -> dict[str, Any]:
+    """Write the keyframes of a map's first part within a radius of a point (m, in the map) to a new
+    map.
 
     Raises:
         DataError: there are none, or a file cannot be used.
@@ -111,7 +124,11 @@ def extract_map(path: Path, out: Path, centre: tuple[float, float, float], radiu
     if out.exists():
         raise DataError(f"{out}: exists; give another name for the new map")
     sessions, owner, T = _outline(path)
-    home = np.array([s.part == sessions[0].part for s in sessions])[owner] if len(owner) else np.zeros(0, np.bool_)
+    home = (
+        np.array([s.part == sessions[0].part for s in sessions])[owner]
+        if len(owner)
+        else np.zeros(0, np.bool_)
+    )
     return _keep(path, out, home & (np.linalg.norm(T[:, :3, 3] - centre, axis=1) <= radius_m))
 
 
@@ -125,7 +142,9 @@ def _outline(path: Path) -> tuple[list[SessionRow], IntArray, FloatArray]:
 
 
 def _keep(path: Path, out: Path, kept: BoolArray) -> dict[str, Any]:
-    """Write a map with those keyframes (K,) alone; motions over others are put together, their loops go."""
+    """Write a map with those keyframes (K,) alone; motions over others are put together, their
+    loops go.
+    """
     if not kept.any():
         raise DataError(f"{path}: no keyframe would be left")
     check_path(out)
@@ -135,7 +154,8 @@ def _keep(path: Path, out: Path, kept: BoolArray) -> dict[str, Any]:
         with contextlib.closing(source), contextlib.closing(store):
             _copy_rows(source, store, kept)
         target = out.resolve()
-        if target.with_name(f"{target.name}-wal").exists():  # its changes would be taken for those of the new file
+        # its changes would be taken for those of the new file
+        if target.with_name(f"{target.name}-wal").exists():
             raise DataError(f"{out}: another process reads it; try again when that has ended")
         if out == path:
             shutil.copymode(target, partial)
@@ -144,7 +164,8 @@ def _keep(path: Path, out: Path, kept: BoolArray) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def new_map(out: Path) -> Iterator[Path]:
-    """Give the path of a file to write, which takes the place of `out` at the end of the block; else it goes.
+    """Give the path of a file to write, which takes the place of `out` at the end of the block;
+    else it goes.
 
     Raises:
         DataError: it cannot be written.
@@ -155,13 +176,16 @@ def new_map(out: Path) -> Iterator[Path]:
         yield partial
         os.replace(partial, target)
     except OSError as error:
-        raise DataError(f"{out}: cannot be written ({error.strerror or error}); check the folder") from error
+        raise DataError(
+            f"{out}: cannot be written ({error.strerror or error}); check the folder"
+        ) from error
     finally:
         partial.unlink(missing_ok=True)
 
 
 def _copy_rows(source: MapStore, store: MapStore, kept: BoolArray) -> None:
-    rows, sessions = source.keyframes(), source.sessions()
+    rows = source.keyframes()
+    sessions = source.sessions()
     owners = np.unique([rows[k].session for k in np.flatnonzero(kept).tolist()]).tolist()
     parts = [sessions[n].part for n in owners]
     for n in owners:

@@ -1,11 +1,12 @@
 """Where a keyframe stands, by looking for the points of a place where they should be seen.
 
-Where the motion to a place is roughly known, each of its points competes only with the few features around its
-predicted pixel, in place of all features of the image (search by projection, as in Mur-Artal et al. 2015). Points
-come from several keyframes, so that one of them shows each from a similar view.
+Where the motion to a place is roughly known, each of its points competes only with the few features
+around its predicted pixel, in place of all features of the image (search by projection, as in
+Mur-Artal et al. 2015). Points come from several keyframes, so that one of them shows each from a
+similar view.
 
-A window always holds some feature that looks alike. What agrees by chance is counted with the same search where
-all points are moved aside, and a place needs several times as many.
+A window always holds some feature that looks alike. What agrees by chance is counted with the same
+search where all points are moved aside, and a place needs several times as many.
 """
 
 from __future__ import annotations
@@ -38,22 +39,27 @@ from vio.numerics.compiled import compiled
 from vio.records import IntArray
 
 _MOST_BITS = 64  # in which the descriptors of one point differ: a quarter
-_LEVELS = 1.6  # by which the size of a feature differs from the predicted one: two and a half levels
+# by which the size of a feature differs from the predicted one: two and a half levels
+_LEVELS = 1.6
 _SIGMAS = 3.0
 _WINDOW_PX = 3.0  # half of a window's side at the scale of its feature, where the pose is known
-_MOST_WINDOW_PX = 40.0  # half of a window's side: in larger ones, the best of all descriptors is seldom the point's
+# half of a window's side: in larger ones, the best of all descriptors is seldom the point's
+_MOST_WINDOW_PX = 40.0
 _SEARCHES = 2  # with the pose found
 _LEAST_SAMPLE = 8  # pairs that agree before the next search
-_CELL_PX = 8.0  # features closer together are of one corner, on several levels of the pyramid, and count once
+# features closer together are of one corner, on several levels of the pyramid, and count once
+_CELL_PX = 8.0
 _ROWS = 1 << 20  # more than an image has
-_ASIDE_PX = 25.0  # by which all points are moved to find the pairs of chance: more than a window of the last search
+# by which all points are moved to find the pairs of chance: more than a window of the last search
+_ASIDE_PX = 25.0
 _ASIDE = 8  # directions
 LEAST_CORNERS = 12
-# Times the mean number of corners of chance; or half as many times beside LEAST_CORNERS, which is less where chance is
-# above 4: large means scatter less. Of searches at wrong poses none had more than 1.9 times beside LEAST_CORNERS there.
+# Times the mean number of corners of chance; or half as many times beside LEAST_CORNERS, which is
+# less where chance is above 4: large means scatter less. Of searches at wrong poses none had more
+# than 1.9 times beside LEAST_CORNERS there.
 _OVER_CHANCE = 6.0
-# Share of the odometry's information in the measurement, since the map has it already: enough to hold what the pixels
-# leave open to where the covariance is linear.
+# Share of the odometry's information in the measurement, since the map has it already: enough to
+# hold what the pixels leave open to where the covariance is linear.
 _PRIOR_SHARE = 0.1
 
 
@@ -74,7 +80,8 @@ class PlaceView(NamedTuple):
     keyframe: int
     shown: Shown
     place: RelativePose  # in the frame of the place's first keyframe
-    middle: int = 0  # keyframe in the middle of its segment of the path, along which the odometry knows the motions
+    # keyframe in the middle of its segment of the path, along which the odometry knows the motions
+    middle: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +108,18 @@ class PlacePoints:
         return np.flatnonzero(middle == values[np.argmax(counts)])
 
     def with_covariance(self) -> StereoPoints:
-        """Return the points with their covariance; errors of the keyframes' poses count as those of their points."""
+        """Return the points with their covariance; errors of the keyframes' poses count as those
+        of their points.
+        """
         P = np.zeros((len(self.p), 3, 3))
         for n in np.unique(self.view).tolist():
-            source, place = self.views[n].shown, self.views[n].place
+            source = self.views[n].shown
+            place = self.views[n].place
             own = self.view == n
             seen = points_of(source.camera, source.features, self.row[own])
-            D = np.concatenate([np.broadcast_to(np.eye(3), (len(seen.p), 3, 3)), -so3_hat(seen.p)], axis=2)
+            D = np.concatenate(
+                [np.broadcast_to(np.eye(3), (len(seen.p), 3, 3)), -so3_hat(seen.p)], axis=2
+            )
             R = place.T_i_j[:3, :3]
             P[own] = R @ (seen.covariance + D @ place.covariance @ np.swapaxes(D, 1, 2)) @ R.T
         return StereoPoints(self.p, P, np.ones(len(P), dtype=np.bool_))
@@ -117,13 +129,18 @@ class PlacePoints:
         return [self.views[n].shown.features.field for n in self.view.tolist()]
 
     def shifts(self, field: DisplacementField) -> FloatArray:
-        """Return by how much one standard deviation of a field's combinations moves the points (K, 3, S)."""
+        """Return by how much one standard deviation of a field's combinations moves the points
+        (K, 3, S).
+        """
         out = np.zeros((len(self.p), 3, field.coefficients.size))
         for n in np.unique(self.view).tolist():
-            (camera, f, *_), own = self.views[n].shown, self.view == n
+            camera, f, *_ = self.views[n].shown
+            own = self.view == n
             if f.field is field:
                 z = f.z[self.row[own]]
-                out[own] = self.views[n].place.T_i_j[:3, :3] @ p_cam_D_z(camera, z) @ field.deviations(z)
+                out[own] = (
+                    self.views[n].place.T_i_j[:3, :3] @ p_cam_D_z(camera, z) @ field.deviations(z)
+                )
         return out
 
 
@@ -143,7 +160,9 @@ def shown(camera: StereoCamera, features: KeyframeFeatures) -> Shown:
     """Return the stereo points of a keyframe."""
     p, valid = triangulate(camera, features.z, min_disparity_px=LEAST_DISPARITY_PX)
     row = np.flatnonzero(valid & features.has_right)
-    return Shown(camera, features, row, p[row], features.sigma_px[row], _as_words(features.descriptors[row]))
+    return Shown(
+        camera, features, row, p[row], features.sigma_px[row], _as_words(features.descriptors[row])
+    )
 
 
 def place_points(views: Sequence[PlaceView]) -> PlacePoints:
@@ -153,7 +172,8 @@ def place_points(views: Sequence[PlaceView]) -> PlacePoints:
     view = np.repeat(np.arange(len(views)), [len(s.row) for s in each])
     eye = np.array([v.place.T_i_j[:3, 3] for v in views])[view]
     size_px, descriptors, row = (
-        np.concatenate(x) for x in zip(*((s.size_px, s.descriptors, s.row) for s in each), strict=True)
+        np.concatenate(x)
+        for x in zip(*((s.size_px, s.descriptors, s.row) for s in each), strict=True)
     )
     return PlacePoints(views, p, eye, size_px, descriptors, view, row)
 
@@ -169,15 +189,16 @@ def search(
     start: RelativePose,
     prior: RelativePose | None,
 ) -> Guided | None:
-    """Return where a keyframe stands in the frame of a place; None: not enough of the place is seen.
+    """Return where a keyframe stands in the frame of a place; None: not enough of the place is
+    seen.
 
     Args:
         place: the place's points.
         camera: of the keyframe.
         here: its features.
         start: about where it stands; the covariance gives the windows of the first search.
-        prior: where it stands by the odometry: it decides which pairs agree, and what the pixels leave open; pose and
-            covariance of the result are those of the pixels; None: not known.
+        prior: where it stands by the odometry: it decides which pairs agree, and what the pixels
+            leave open; pose and covariance of the result are those of the pixels; None: not known.
     """
     if len(here) < LEAST_CORNERS:
         return None
@@ -191,9 +212,12 @@ def search(
         if T is None:
             return None
         pairs = _pairs(place, target, T, None)
-        points, rows = place.take(pairs.point), pairs.feature
+        points = place.take(pairs.point)
+        rows = pairs.feature
         stereo = points.with_covariance()
-        fitted = fit_terms([Terms(stereo, camera, here, rows, inverse=True)], T, prior=prior, least=LEAST_CORNERS)
+        fitted = fit_terms(
+            [Terms(stereo, camera, here, rows, inverse=True)], T, prior=prior, least=LEAST_CORNERS
+        )
         T = None if fitted is None else fitted.T_i_j
     if fitted is None:
         return None
@@ -210,7 +234,9 @@ def search(
     measured = fit_terms([terms], fitted.T_i_j, prior=weak, least=_LEAST_SAMPLE)
     if measured is None:
         return None
-    by_fields = _covariance_by_fields(points.take(own), here, rows[own], terms, measured.T_i_j, weak)
+    by_fields = _covariance_by_fields(
+        points.take(own), here, rows[own], terms, measured.T_i_j, weak
+    )
     return _guided(measured, points.take(own), rows[own], inliers, chance, by_fields)
 
 
@@ -222,30 +248,46 @@ def _covariance_by_fields(
     T_i_k: FloatArray,
     prior: RelativePose | None,
 ) -> FloatArray:
-    """Covariance (6, 6) of a fitted pose by what is not known of the rectification errors, which sessions share."""
+    """Covariance (6, 6) of a fitted pose by what is not known of the rectification errors, which
+    sessions share.
+    """
     fields = {id(f): f for f in (*points.fields(), here.field) if f is not None}
     total = np.zeros((6, 6))
     for field in fields.values():
         z = here.z[rows]
-        dz = field.deviations(z) if here.field is field else np.zeros((*z.shape, field.coefficients.size))
+        dz = (
+            field.deviations(z)
+            if here.field is field
+            else np.zeros((*z.shape, field.coefficients.size))
+        )
         total += covariance_by_shifts(terms, T_i_k, prior, points.shifts(field), dz)
     return total
 
 
-def _of_one_segment(points: PlacePoints, here: KeyframeFeatures, rows: IntArray, agree: IntArray) -> IntArray:
-    """Return those of the pairs that `agree` which are of the segment that shows most of them, or all if too few are.
+def _of_one_segment(
+    points: PlacePoints, here: KeyframeFeatures, rows: IntArray, agree: IntArray
+) -> IntArray:
+    """Return those of the pairs that `agree` which are of the segment that shows most of them, or
+    all if too few are.
 
-    How segments stand to each other is what the map says so far, which is not to come back as a measurement.
+    How segments stand to each other is what the map says so far, which is not to come back as a
+    measurement.
     """
     own = agree[points.take(agree).main_segment()]
     return own if _corners(here.z[rows[own]]) >= LEAST_CORNERS else agree
 
 
 def _guided(
-    measured: Fitted, points: PlacePoints, rows: IntArray, inliers: int, chance: float, by_fields: FloatArray
+    measured: Fitted,
+    points: PlacePoints,
+    rows: IntArray,
+    inliers: int,
+    chance: float,
+    by_fields: FloatArray,
 ) -> Guided:
     """Return a place by the fit to pairs of its points and features `rows` (P,)."""
-    found, rows = points.take(np.flatnonzero(measured.fits)), rows[measured.fits]
+    found = points.take(np.flatnonzero(measured.fits))
+    rows = rows[measured.fits]
     depth = float(np.median(transform_points(se3_inverse(measured.T_i_j), found.p)[:, 2]))
     motion = measured.motion(depth)
     pose = RelativePose(motion.T_i_j, motion.covariance + by_fields)
@@ -258,7 +300,8 @@ def _in_reach(place: PlacePoints, camera: StereoCamera, T_i_k: FloatArray) -> In
     ahead = np.flatnonzero(q[:, 2] > 0)
     uv = project(camera, q[ahead])[:, :2]
     margin = _MOST_WINDOW_PX + _ASIDE_PX
-    w, h = camera.width or np.inf, camera.height or np.inf
+    w = camera.width or np.inf
+    h = camera.height or np.inf
     return ahead[(uv > -margin).all(axis=1) & (uv < [w + margin, h + margin]).all(axis=1)]
 
 
@@ -289,8 +332,11 @@ class _Pairs(NamedTuple):
     descriptors: npt.NDArray[np.uint64]  # (N, 4)
 
 
-def _pairs(place: PlacePoints, target: _Target, T_i_k: FloatArray, covariance: FloatArray | None) -> _Pairs:
-    """Pair points with features: for each feature the point that looks most alike and should be there.
+def _pairs(
+    place: PlacePoints, target: _Target, T_i_k: FloatArray, covariance: FloatArray | None
+) -> _Pairs:
+    """Pair points with features: for each feature the point that looks most alike and should be
+    there.
 
     Args:
         place: points.
@@ -298,12 +344,17 @@ def _pairs(place: PlacePoints, target: _Target, T_i_k: FloatArray, covariance: F
         T_i_k: (4, 4) pose of the keyframe that shows them.
         covariance: (6, 6) of xi in T_i_k = T_hat exp(xi); None: the pose is known.
     """
-    c, (uv, radius, size) = target.camera, (np.zeros((len(place.p), 2)), np.zeros(len(place.p)), place.size_px.copy())
+    c = target.camera
+    uv = np.zeros((len(place.p), 2))
+    radius = np.zeros(len(place.p))
+    size = place.size_px.copy()
     C = np.zeros((6, 6)) if covariance is None else _SIGMAS**2 * covariance
     camera = np.array([c.fu, c.fv, c.cu, c.cv, c.width or np.inf, c.height or np.inf])
     _predict(place.p, place.eye, se3_inverse(T_i_k), T_i_k[:3, 3], C, camera, uv, radius, size)
     seen = np.flatnonzero(radius > 0)
-    uv, radius, size = uv[seen], radius[seen], size[seen]
+    uv = uv[seen]
+    radius = radius[seen]
+    size = size[seen]
     descriptors = place.descriptors[seen]
     best, bits = _looked_for(uv, radius, size, descriptors, target)
     found = np.flatnonzero(best >= 0)
@@ -313,11 +364,20 @@ def _pairs(place: PlacePoints, target: _Target, T_i_k: FloatArray, covariance: F
 
 
 def _looked_for(
-    uv: FloatArray, radius: FloatArray, size: FloatArray, descriptors: npt.NDArray[np.uint64], target: _Target
+    uv: FloatArray,
+    radius: FloatArray,
+    size: FloatArray,
+    descriptors: npt.NDArray[np.uint64],
+    target: _Target,
 ) -> tuple[IntArray, IntArray]:
-    """Return for each point (N,) the place of its feature in the target's order, or -1, and their differing bits."""
-    best, bits = np.full(len(uv), -1, dtype=np.int64), np.zeros(len(uv), dtype=np.int64)
-    _best_in_windows(uv, radius, size, descriptors, target.z, target.size_px, target.descriptors, best, bits)
+    """Return for each point (N,) the place of its feature in the target's order, or -1, and
+    their differing bits.
+    """
+    best = np.full(len(uv), -1, dtype=np.int64)
+    bits = np.zeros(len(uv), dtype=np.int64)
+    _best_in_windows(
+        uv, radius, size, descriptors, target.z, target.size_px, target.descriptors, best, bits
+    )
     return best, bits
 
 
@@ -333,37 +393,61 @@ def _predict(
     radius: FloatArray,
     size: FloatArray,
 ) -> None:
-    """Predict pixels (N, 2), half windows (N,), 0 where a point should not be seen, and sizes of features (N,).
+    """Predict pixels (N, 2), half windows (N,), 0 where a point should not be seen, and sizes of
+    features (N,).
 
     Args:
         p: (N, 3) points.
         eye: (N, 3) positions of the cameras that saw them.
         T: (4, 4) maps points to the camera.
         here: (3,) position of the camera.
-        C: (6, 6) covariance of the pose, times the square of the standard deviations that a window has.
+        C: (6, 6) covariance of the pose, times the square of the standard deviations that a window
+            has.
         camera: [fu fv cu cv width height].
         uv: pixels, written.
         radius: windows, written.
         size: of the features in their keyframes; replaced.
     """
     fu, fv, cu, cv, width, height = camera
-    D, q = np.zeros((2, 6)), np.zeros(3)
+    D = np.zeros((2, 6))
+    q = np.zeros(3)
     for n in range(len(p)):
         for i in range(3):
             q[i] = T[i, 0] * p[n, 0] + T[i, 1] * p[n, 1] + T[i, 2] * p[n, 2] + T[i, 3]
-        dot, away, near = 0.0, 0.0, 0.0
+        dot = 0.0
+        away = 0.0
+        near = 0.0
         for i in range(3):
-            there, now = p[n, i] - eye[n, i], p[n, i] - here[i]
-            dot, away, near = dot + there * now, away + there * there, near + now * now
-        away, near = np.sqrt(away), np.sqrt(near)
-        if q[2] <= LEAST_DEPTH_M or dot <= VIEW_COS * away * near or not 1 / SCALES < away / near < SCALES:
+            there = p[n, i] - eye[n, i]
+            now = p[n, i] - here[i]
+            dot = dot + there * now
+            away = away + there * there
+            near = near + now * now
+        away = np.sqrt(away)
+        near = np.sqrt(near)
+        if (
+            q[2] <= LEAST_DEPTH_M
+            or dot <= VIEW_COS * away * near
+            or not 1 / SCALES < away / near < SCALES
+        ):
             continue
-        u, v = cu + fu * q[0] / q[2], cv + fv * q[1] / q[2]
+        u = cu + fu * q[0] / q[2]
+        v = cv + fv * q[1] / q[2]
         # uv_D_xi of q = exp(-xi) T p: [-J, J q^], with J = uv_D_q.
-        a, b, x, y = fu / q[2], fv / q[2], q[0] / q[2], q[1] / q[2]
-        D[0, 0], D[0, 2], D[1, 1], D[1, 2] = -a, a * x, -b, b * y
-        D[0, 3], D[0, 4], D[0, 5] = a * x * q[1], -a * (q[2] + x * q[0]), a * q[1]
-        D[1, 3], D[1, 4], D[1, 5] = b * (q[2] + y * q[1]), -b * y * q[0], -b * q[0]
+        a = fu / q[2]
+        b = fv / q[2]
+        x = q[0] / q[2]
+        y = q[1] / q[2]
+        D[0, 0] = -a
+        D[0, 2] = a * x
+        D[1, 1] = -b
+        D[1, 2] = b * y
+        D[0, 3] = a * x * q[1]
+        D[0, 4] = -a * (q[2] + x * q[0])
+        D[0, 5] = a * q[1]
+        D[1, 3] = b * (q[2] + y * q[1])
+        D[1, 4] = -b * y * q[0]
+        D[1, 5] = -b * q[0]
         largest = 0.0
         for r in range(2):
             total = 0.0
@@ -374,7 +458,9 @@ def _predict(
         size[n] = size[n] * away / near
         half = _WINDOW_PX * max(size[n], 1.0) + np.sqrt(largest)
         if half <= _MOST_WINDOW_PX and -half < u < width + half and -half < v < height + half:
-            uv[n, 0], uv[n, 1], radius[n] = u, v, half
+            uv[n, 0] = u
+            uv[n, 1] = v
+            radius[n] = half
 
 
 @compiled
@@ -389,7 +475,8 @@ def _best_in_windows(
     best: IntArray,
     bits: IntArray,
 ) -> None:
-    """Find for each point the feature around its pixel (N, 2) whose descriptor differs least; -1: none does well.
+    """Find for each point the feature around its pixel (N, 2) whose descriptor differs least; -1:
+    none does well.
 
     Features z (M, 2) are in the order of their columns.
     """
@@ -401,7 +488,8 @@ def _best_in_windows(
             if abs(z[j, 1] - uv[i, 1]) <= radius[i] and ratio < _LEVELS and ratio * _LEVELS > 1.0:
                 total = differing_bits(a[i], b[j])
                 if total < least:
-                    least, best[i] = total, j
+                    least = total
+                    best[i] = j
             j += 1
         bits[i] = least
 

@@ -1,8 +1,8 @@
 """Where one image pair stands in a map that is only read: relocalisation without a session.
 
-The search is that of a session that does not know its place (`builder`): words in common, PnP in both directions, and
-a search for the points around. A session waits for another keyframe that says the same; a single pair has none, and
-must show as many corners as a place that is believed at once.
+The search is that of a session that does not know its place (`builder`): words in common, PnP in
+both directions, and a search for the points around. A session waits for another keyframe that says
+the same; a single pair has none, and must show as many corners as a place that is believed at once.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ class FoundPose:
 
 
 class MapLookup:
-    """A map that is read, and finds image pairs of one rig in it; may be used from several threads."""
+    """A map that is read, and finds image pairs of one rig in it; may be used from several
+    threads.
+    """
 
     def __init__(self, path: Path, session: int | None = None) -> None:
         """Open a map.
@@ -59,7 +61,9 @@ class MapLookup:
             undo.pop_all()
         self.camera: StereoCamera = rig.camera
         self.keyframes = self._builder.first
-        self._field, self._home, self._lock = rig.field, sessions[0].part, threading.Lock()
+        self._field = rig.field
+        self._home = sessions[0].part
+        self._lock = threading.Lock()
         # A keyframe of which nothing is known stands for each query.
         self._builder.add(Keyframe(0, 0, np.eye(4), None, None, 0.0), no_keyframe_features())
 

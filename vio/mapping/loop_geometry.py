@@ -1,7 +1,8 @@
 """Whether two keyframes show one place, and where they stand to each other.
 
-Descriptors give pairs; PnP with RANSAC, in both directions, gives the motion; a least-squares fit of all stereo pixels
-refines it. A pair that agrees with the motion from i to j but not with that from j to i counts as wrong.
+Descriptors give pairs; PnP with RANSAC, in both directions, gives the motion; a least-squares fit
+of all stereo pixels refines it. A pair that agrees with the motion from i to j but not with that
+from j to i counts as wrong.
 """
 
 from __future__ import annotations
@@ -28,18 +29,25 @@ _MOST_BITS = 64
 _WORSE = 1000  # more than the 256 bits in which two descriptors can differ
 _RATIO = 0.85  # to the second-best descriptor
 _MOST_PAIRS = 200  # that enter the fit, which takes 4 ms then
-_RANSAC_PX, _RANSAC_STEPS, _RANSAC_SURE = 4.0, 300, 0.999
-_SAME_M, _SAME_DEG = 0.1, 3.0  # by which both directions may differ; metres, beside a share of the depth
+_RANSAC_PX = 4.0
+_RANSAC_STEPS = 300
+_RANSAC_SURE = 0.999
+_SAME_M = 0.1  # by which both directions may differ; metres, beside a share of the depth
+_SAME_DEG = 3.0
 _SAME_DEPTH = 0.05
-_STEPS, _CONVERGED = 10, 1e-5  # largest change, m and rad
+_STEPS = 10  # largest change, m and rad
+_CONVERGED = 1e-5
 _GATE = 3.0  # standard deviations, of a pixel coordinate
 LEAST_DISPARITY_PX = 1.0
-# Floor of a loop's standard deviations: errors that its points share, such as those of the calibration.
-_FLOOR_DEPTH, _FLOOR_DEG = 0.002, 0.05
-# Variance of a pixel over the one assumed, which is one pixel at the scale of its level: key points lie on whole pixels
-# of their level, so that the errors are at least those of rounding.
+# Floor of a loop's standard deviations: errors that its points share, such as those of the
+# calibration.
+_FLOOR_DEPTH = 0.002
+_FLOOR_DEG = 0.05
+# Variance of a pixel over the one assumed, which is one pixel at the scale of its level: key points
+# lie on whole pixels of their level, so that the errors are at least those of rounding.
 _LEAST_VARIANCE = 1 / 12
-_INFLATION = 2.0  # of its standard deviations: key points of neighbouring levels and edges are not independent
+# of its standard deviations: key points of neighbouring levels and edges are not independent
+_INFLATION = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +61,14 @@ class Verified:
 
 
 def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
-    """Pair features by descriptor: rows (K, 2) of i and j, each the other's best and clearly better than the next."""
+    """Pair features by descriptor: rows (K, 2) of i and j, each the other's best and clearly
+    better than the next.
+    """
     if len(i) < 2 or len(j) < 2:
         return np.zeros((0, 2), dtype=np.int64)
     bits = _differing_bits(i, j)
-    rows, best = np.arange(len(i)), bits.argmin(axis=1)
+    rows = np.arange(len(i))
+    best = bits.argmin(axis=1)
     mutual = bits.argmin(axis=0)[best] == rows
     least = bits[rows, best]
     bits[rows, best] = _WORSE
@@ -74,7 +85,9 @@ def _differing_bits(i: KeyframeFeatures, j: KeyframeFeatures) -> npt.NDArray[np.
 
 
 @compiled
-def _count_bits(a: npt.NDArray[np.uint64], b: npt.NDArray[np.uint64], out: npt.NDArray[np.int32]) -> None:
+def _count_bits(
+    a: npt.NDArray[np.uint64], b: npt.NDArray[np.uint64], out: npt.NDArray[np.int32]
+) -> None:
     """Count in which bits the rows of two arrays (N, W) and (M, W) differ."""
     for i in range(len(a)):
         for j in range(len(b)):
@@ -84,8 +97,10 @@ def _count_bits(a: npt.NDArray[np.uint64], b: npt.NDArray[np.uint64], out: npt.N
 @compiled
 def differing_bits(a: npt.NDArray[np.uint64], b: npt.NDArray[np.uint64]) -> np.uint64:
     """Count in which bits two descriptors (W,) differ, by sums over pairs, fours and bytes."""
-    pairs, fours = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
-    bytes_, ones = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
+    pairs = np.uint64(0x5555555555555555)
+    fours = np.uint64(0x3333333333333333)
+    bytes_ = np.uint64(0x0F0F0F0F0F0F0F0F)
+    ones = np.uint64(0x0101010101010101)
     total = np.uint64(0)
     for w in range(len(a)):
         x = a[w] ^ b[w]
@@ -96,12 +111,15 @@ def differing_bits(a: npt.NDArray[np.uint64], b: npt.NDArray[np.uint64]) -> np.u
     return total
 
 
-def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, j: KeyframeFeatures) -> Verified | None:
+def verify(
+    camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, j: KeyframeFeatures
+) -> Verified | None:
     """Return where camera j stands in the frame of camera i; None: they do not show one place."""
     pairs = match(i, j)
     if len(pairs) < LEAST_INLIERS:
         return None
-    if len(pairs) > _MOST_PAIRS:  # features are in the order of their columns, so these are spread over the image
+    # features are in the order of their columns, so these are spread over the image
+    if len(pairs) > _MOST_PAIRS:
         pairs = pairs[np.linspace(0, len(pairs) - 1, _MOST_PAIRS).astype(np.int64)]
     a, b = pairs.T
     T_j_i = _pnp(camera_i, i, a, camera_j, j, b)
@@ -110,7 +128,9 @@ def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, 
         return None
     depth = _median_depth(camera_j, j, b)
     gap = se3_log(T_i_j @ T_j_i)
-    if np.linalg.norm(gap[:3]) > _SAME_M + _SAME_DEPTH * depth or np.linalg.norm(gap[3:]) > np.radians(_SAME_DEG):
+    if np.linalg.norm(gap[:3]) > _SAME_M + _SAME_DEPTH * depth or np.linalg.norm(
+        gap[3:]
+    ) > np.radians(_SAME_DEG):
         return None
     fitted = _fit(camera_i, i, a, camera_j, j, b, T_i_j)
     if fitted is None:
@@ -118,7 +138,8 @@ def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, 
     pose, good = fitted
     if good.sum() < max(LEAST_INLIERS, _LEAST_SHARE * len(pairs)):
         return None
-    a, b = a[good], b[good]
+    a = a[good]
+    b = b[good]
     return Verified(pose, len(a), len(pairs), matches_of(i, a, j, b))
 
 
@@ -127,7 +148,9 @@ def matches_of(i: KeyframeFeatures, a: IntArray, j: KeyframeFeatures, b: IntArra
     return LoopMatches(i.measured[a], j.measured[b], i.has_right[a], j.has_right[b])
 
 
-def _points(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> tuple[FloatArray, BoolArray]:
+def _points(
+    camera: StereoCamera, f: KeyframeFeatures, rows: IntArray
+) -> tuple[FloatArray, BoolArray]:
     p, valid = triangulate(camera, f.z[rows], min_disparity_px=LEAST_DISPARITY_PX)
     return p, valid & f.has_right[rows]
 
@@ -145,13 +168,19 @@ def _pnp(
     b: KeyframeFeatures,
     rows_b: IntArray,
 ) -> FloatArray | None:
-    """Return T_b_a (4, 4) from the stereo points of a and the left pixels of b; None: too few agree."""
+    """Return T_b_a (4, 4) from the stereo points of a and the left pixels of b.
+
+    None: too few agree.
+    """
     p, valid = _points(camera_a, a, rows_a)
     return pose_of_most(camera_b, p[valid], b.z[rows_b[valid], :2], LEAST_INLIERS)
 
 
-def pose_of_most(camera: StereoCamera, p: FloatArray, uv: FloatArray, least: int) -> FloatArray | None:
-    """Return the transform (4, 4) into a camera with which most points agree, by RANSAC over samples of three.
+def pose_of_most(
+    camera: StereoCamera, p: FloatArray, uv: FloatArray, least: int
+) -> FloatArray | None:
+    """Return the transform (4, 4) into a camera with which most points agree, by RANSAC over
+    samples of three.
 
     Args:
         camera: the camera.
@@ -175,7 +204,8 @@ def pose_of_most(camera: StereoCamera, p: FloatArray, uv: FloatArray, least: int
     if not done or inliers is None or len(inliers) < least:
         return None
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = so3_exp(rotation[:, 0]), translation[:, 0]
+    T[:3, :3] = so3_exp(rotation[:, 0])
+    T[:3, 3] = translation[:, 0]
     return T
 
 
@@ -188,10 +218,11 @@ def _fit(
     b: IntArray,
     T_i_j: FloatArray,
 ) -> tuple[RelativePose, BoolArray] | None:
-    """Fit the motion to the stereo pixels of both keyframes; return it and a mask (K,) of the pairs that agree.
+    """Fit the motion to the stereo pixels of both keyframes; return it and a mask (K,) of the pairs
+    that agree.
 
-    The pixels of j are predicted from the points of i, whose covariance is added to theirs; where i has no right pixel,
-    the other way round.
+    The pixels of j are predicted from the points of i, whose covariance is added to theirs; where i
+    has no right pixel, the other way round.
     """
     forward = _points(camera_i, i, a)[1]
     order = np.concatenate([np.flatnonzero(forward), np.flatnonzero(~forward)])
@@ -212,16 +243,21 @@ class Fitted:
     """The motion that fits pixels best."""
 
     T_i_j: FloatArray  # (4, 4)
-    normal: FloatArray  # (6, 6) information of xi in T_i_j = T_hat exp(xi), of pixels as good as they were assumed
+    # (6, 6) information of xi in T_i_j = T_hat exp(xi), of pixels as good as they were assumed
+    normal: FloatArray
     squared: FloatArray  # (K,) squared normalised residuals
     fits: BoolArray  # (K,) pairs that agree
     stereo: BoolArray  # (K,) pairs whose target has a right pixel
 
     def motion(self, depth_m: float) -> RelativePose:
-        """Return it with a covariance; errors that all points share are in proportion to their median depth."""
+        """Return it with a covariance; errors that all points share are in proportion to their
+        median depth.
+        """
         floor = np.repeat([(_FLOOR_DEPTH * depth_m) ** 2, np.radians(_FLOOR_DEG) ** 2], 3)
         noise = _variance_factor(self.squared[self.fits], self.stereo[self.fits])
-        covariance = noise * _INFLATION**2 * np.asarray(np.linalg.inv(self.normal), dtype=np.float64) + np.diag(floor)
+        covariance = noise * _INFLATION**2 * np.asarray(
+            np.linalg.inv(self.normal), dtype=np.float64
+        ) + np.diag(floor)
         return RelativePose(self.T_i_j, covariance)
 
 
@@ -239,7 +275,8 @@ def covariance_by_shifts(
     """
 
     def step(terms: Terms) -> tuple[FloatArray, FloatArray]:
-        normal, pull = np.zeros((6, 6)), np.zeros(6)
+        normal = np.zeros((6, 6))
+        pull = np.zeros(6)
         terms.add(T_i_j, _GATE, normal, pull)
         return normal, pull
 
@@ -251,7 +288,11 @@ def covariance_by_shifts(
 
 
 def fit_terms(
-    parts: Sequence[Terms], T_i_j: FloatArray, *, prior: RelativePose | None = None, least: int = LEAST_INLIERS
+    parts: Sequence[Terms],
+    T_i_j: FloatArray,
+    *,
+    prior: RelativePose | None = None,
+    least: int = LEAST_INLIERS,
 ) -> Fitted | None:
     """Fit a motion by iterated reweighted least squares; None: too few pixels agree.
 
@@ -260,15 +301,19 @@ def fit_terms(
     Args:
         parts: pixels.
         T_i_j: (4, 4) where to start.
-        prior: what else is known of the motion: it decides what the pixels leave open, and is not part of `normal`.
+        prior: what else is known of the motion: it decides what the pixels leave open, and is not
+            part of `normal`.
         least: number of pairs that must agree.
     """
-    T, normal = T_i_j, np.eye(6)
+    T = T_i_j
+    normal = np.eye(6)
     P = 1e-9 * np.eye(6) if prior is None else np.asarray(np.linalg.inv(prior.covariance))
     squared = np.zeros(sum(len(part.stereo) for part in parts))
     for step in range(_STEPS):
         width = _GATE * 2.0 ** max(2 - step, 0)
-        normal, pull, begin = np.zeros((6, 6)), np.zeros(6), 0
+        normal = np.zeros((6, 6))
+        pull = np.zeros(6)
+        begin = 0
         for part in parts:
             squared[begin : begin + len(part.stereo)] = part.add(T, width, normal, pull)
             begin += len(part.stereo)
@@ -285,7 +330,8 @@ def fit_terms(
 
 
 def _variance_factor(squared: FloatArray, stereo: BoolArray) -> float:
-    """Return the variance of the pixels over the one assumed, by the median of the squared residuals (K,) of a fit.
+    """Return the variance of the pixels over the one assumed, by the median of the squared
+    residuals (K,) of a fit.
 
     Of a left and a right pixel they have three degrees of freedom, of a left one alone two.
     """
@@ -307,7 +353,9 @@ class StereoPoints:
 
 
 def points_of(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> StereoPoints:
-    """Return the points that features (rows, (K,)) of a keyframe show, in the frame of its left camera."""
+    """Return the points that features (rows, (K,)) of a keyframe show, in the frame of its left
+    camera.
+    """
     p, valid = _points(camera, f, rows)
     z = np.where(valid[:, None], f.z[rows], project(camera, [0.0, 0.0, 1.0]))
     J = p_cam_D_z(camera, z)
@@ -319,7 +367,13 @@ class Terms:
     """Residuals of the pixels of one keyframe, predicted from points in the frame of the other."""
 
     def __init__(
-        self, source: StereoPoints, camera_t: StereoCamera, t: KeyframeFeatures, rows_t: IntArray, *, inverse: bool
+        self,
+        source: StereoPoints,
+        camera_t: StereoCamera,
+        t: KeyframeFeatures,
+        rows_t: IntArray,
+        *,
+        inverse: bool,
     ) -> None:
         """Prepare pairs (K,); those without a valid point count nothing.
 
@@ -328,22 +382,32 @@ class Terms:
             camera_t: of the other keyframe, whose pixels are predicted.
             t: its features.
             rows_t: (K,) features that show the points.
-            inverse: whether the pixels are those of keyframe j, so that the inverse of T_i_j predicts them.
+            inverse: whether the pixels are those of keyframe j, so that the inverse of T_i_j
+                predicts them.
         """
         self._inverse = inverse
-        self._camera = np.array([camera_t.fu, camera_t.fv, camera_t.cu, camera_t.cv, camera_t.baseline_m])
-        self._p, self._P, self._used = source.p, source.covariance, source.valid
-        self._z, self.stereo = t.z[rows_t], t.has_right[rows_t]
+        self._camera = np.array(
+            [camera_t.fu, camera_t.fv, camera_t.cu, camera_t.cv, camera_t.baseline_m]
+        )
+        self._p = source.p
+        self._P = source.covariance
+        self._used = source.valid
+        self._z = t.z[rows_t]
+        self.stereo = t.has_right[rows_t]
         self._variance = t.sigma_px[rows_t] ** 2
 
     def shifted(self, dp: FloatArray, dz: FloatArray) -> Terms:
         """Return them with points moved by dp (K, 3), m, and pixels by dz (K, 4)."""
         out = copy(self)
-        out._p, out._z = self._p + dp, self._z + dz
+        out._p = self._p + dp
+        out._z = self._z + dz
         return out
 
-    def add(self, T_i_j: FloatArray, width: float, normal: FloatArray, pull: FloatArray) -> FloatArray:
-        """Add the normal equations of xi in T_i_j <- T_i_j exp(xi); return squared residuals (K,), infinite where none.
+    def add(
+        self, T_i_j: FloatArray, width: float, normal: FloatArray, pull: FloatArray
+    ) -> FloatArray:
+        """Add the normal equations of xi in T_i_j <- T_i_j exp(xi); return squared residuals (K,),
+        infinite where none.
 
         Args:
             T_i_j: (4, 4).
@@ -374,8 +438,13 @@ def _add_pairs(
     pull: FloatArray,
     squared: FloatArray,
 ) -> None:
-    """Whiten the residuals of pairs (K,) by Cholesky, and add their normal equations; arguments as `Terms` has them."""
-    A, M, C, q = np.zeros((3, 7)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)  # A: rows [J | r]; M: z_D_p
+    """Whiten the residuals of pairs (K,) by Cholesky, and add their normal equations; arguments
+    as `Terms` has them.
+    """
+    A = np.zeros((3, 7))  # A: rows [J | r]; M: z_D_p
+    M = np.zeros((3, 3))
+    C = np.zeros((3, 3))
+    q = np.zeros(3)
     for k in range(len(p)):
         for i in range(3):
             q[i] = T[i, 0] * p[k, 0] + T[i, 1] * p[k, 1] + T[i, 2] * p[k, 2] + T[i, 3]
@@ -423,9 +492,11 @@ def _linearise(
     A: FloatArray,
     M: FloatArray,
 ) -> None:
-    """Write Jacobian and residual [ul vl ur] of a point p (3,), at q in the target (3,), into A (3, 7), z_D_p into M.
+    """Write Jacobian and residual [ul vl ur] of a point p (3,), at q in the target (3,), into A (3,
+    7), z_D_p into M.
 
-    `q = exp(-xi) T_hat^-1 p` if `inverse`, else `q = T_hat exp(xi) p`: its derivative is [-I, q^] or R [I, -p^].
+    `q = exp(-xi) T_hat^-1 p` if `inverse`, else `q = T_hat exp(xi) p`: its derivative is [-I, q^]
+    or R [I, -p^].
     """
     fu, fv, cu, cv, baseline = camera
     z_D_q = np.zeros((3, 3))
@@ -439,7 +510,8 @@ def _linearise(
         for c in range(3):
             M[i, c] = z_D_q[i, 0] * T[0, c] + z_D_q[i, 1] * T[1, c] + z_D_q[i, 2] * T[2, c]
         for c in range(3):
-            a, b = (c + 1) % 3, (c + 2) % 3
+            a = (c + 1) % 3
+            b = (c + 2) % 3
             if inverse:
                 A[i, c] = -z_D_q[i, c]
                 A[i, 3 + c] = z_D_q[i, a] * q[b] - z_D_q[i, b] * q[a]

@@ -1,8 +1,9 @@
-"""A map's file: SQLite, version 5, described in docs/maps.md; older ones are read, and become 5 when written to.
+"""A map's file: SQLite, version 5, described in docs/maps.md; older ones are read, and become 5
+when written to.
 
-What belongs together is written in one transaction, so that a process that dies leaves the state before it. A file is
-checked when it is opened: it has our tables and nothing else, SQLite finds its pages whole, each row agrees with its
-checksum (from version 3 on), and its values fit together.
+What belongs together is written in one transaction, so that a process that dies leaves the state
+before it. A file is checked when it is opened: it has our tables and nothing else, SQLite finds its
+pages whole, each row agrees with its checksum (from version 3 on), and its values fit together.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ SINCE = {
     "places": 5,
     "earth": 5,
 }  # version that brought a column or a table; before 2 all were pinhole stereo pairs
-_BEFORE = {"projection": "'pinhole'", "kind": "'stereo'", "crc32": "0"}  # what rows of older versions get; else NULL
+# what rows of older versions get; else NULL
+_BEFORE = {"projection": "'pinhole'", "kind": "'stereo'", "crc32": "0"}
 KEYS = {
     "sessions": "id",
     "keyframes": "id",
@@ -92,9 +94,14 @@ def _errors_of(path: Path) -> Iterator[None]:
     try:
         yield
     except sqlite3.OperationalError as error:
-        if "interrupted" in str(error):  # by a signal's handler, whose exception SQLite takes for a wish to stop
+        # by a signal's handler, whose exception SQLite takes for a wish to stop
+        if "interrupted" in str(error):
             raise KeyboardInterrupt from error
-        remedy = "wait for the run that uses it" if "locked" in str(error) else "check the path and the free space"
+        remedy = (
+            "wait for the run that uses it"
+            if "locked" in str(error)
+            else "check the path and the free space"
+        )
         raise DataError(f"{path}: the map cannot be used ({error}); {remedy}") from error
     except sqlite3.DatabaseError as error:
         raise damaged(path, error) from error
@@ -110,7 +117,12 @@ class MapDatabase(ABC):
     """Tables of signed rows in a file, open."""
 
     def __init__(
-        self, path: Path, *, create: bool = False, read_only: bool = False, known_as: Path | None = None
+        self,
+        path: Path,
+        *,
+        create: bool = False,
+        read_only: bool = False,
+        known_as: Path | None = None,
     ) -> None:
         """Open a map.
 
@@ -121,7 +133,8 @@ class MapDatabase(ABC):
             known_as: what messages call it; None: its path.
 
         Raises:
-            DataError: there is no such map, it is damaged, of another version, or in use by another process.
+            DataError: there is no such map, it is damaged, of another version, or in use by another
+                process.
         """
         self.path = path if known_as is None else known_as
         self._end_s = math.inf
@@ -141,23 +154,29 @@ class MapDatabase(ABC):
             empty = not self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
             if empty and create:
                 self._db.executescript(
-                    f"BEGIN; PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = {VERSION}; "
+                    f"BEGIN; PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = "
+                    f"{VERSION}; "
                     f"{_SCHEMA} COMMIT;"
                 )
             elif self._pragma("application_id") != APPLICATION_ID:
-                raise DataError(f"{path}: is no map of this program; give a file that vio run --map wrote")
+                raise DataError(
+                    f"{path}: is no map of this program; give a file that vio run --map wrote"
+                )
             elif not _OLDEST <= self._pragma("user_version") <= VERSION:
                 raise DataError(
-                    f"{path}: is a map of version {self._pragma('user_version')}, this program reads {VERSION}; use "
+                    f"{path}: is a map of version {self._pragma('user_version')}, this program "
+                    f"reads {VERSION}; use "
                     "the program that wrote it, or build the map again"
                 )
             self._db.execute("BEGIN")  # one state of the file, whatever another process commits
-            self._checked: dict[str, list[Any]] = {}  # rows that were read to check them, until they are asked for
+            # rows that were read to check them, until they are asked for
+            self._checked: dict[str, list[Any]] = {}
             before = self._pragma("data_version")
             self._check()
             if not read_only:
                 self._db.execute("COMMIT")
-                # Readers see the last commit while this process writes; its transaction never ends, so no other writes.
+                # Readers see the last commit while this process writes; its transaction never ends,
+                # so no other writes.
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute("BEGIN IMMEDIATE")
                 if self._pragma("data_version") != before:  # another process wrote meanwhile
@@ -166,7 +185,9 @@ class MapDatabase(ABC):
             undo.pop_all()
 
     def _check(self) -> None:
-        """Raise DataError unless the file holds our tables, whole, with values that fit together."""
+        """Raise DataError unless the file holds our tables, whole, with values that fit
+        together.
+        """
         if (found := _schema_of(self._db)) != _expected(self.version):
             other = sorted({name for _, name, *_ in found ^ _expected(self.version)})
             raise damaged(self.path, f"{', '.join(other)} is not as this program makes it")
@@ -189,7 +210,9 @@ class MapDatabase(ABC):
                 continue
             self._db.execute(f"ALTER TABLE {table} RENAME TO older")
             self._db.execute(statement)
-            values = ", ".join(c if c in before else _BEFORE.get(c, "NULL") for c in self._columns(table))
+            values = ", ".join(
+                c if c in before else _BEFORE.get(c, "NULL") for c in self._columns(table)
+            )
             self._db.execute(f"INSERT INTO {table} SELECT {values} FROM older")
             self._db.execute("DROP TABLE older")
             self._sign(table)
@@ -218,7 +241,9 @@ class MapDatabase(ABC):
             except sqlite3.OperationalError as error:
                 if not self._is_late():
                     raise
-                raise DataError(f"{self.path}: a step took more than {_MOST_S:.0f} s; build the map again") from error
+                raise DataError(
+                    f"{self.path}: a step took more than {_MOST_S:.0f} s; build the map again"
+                ) from error
 
     def _is_late(self) -> bool:
         return time.monotonic() > self._end_s
@@ -234,7 +259,8 @@ class MapDatabase(ABC):
         with self._errors():
             if self._db.in_transaction:
                 self._db.execute("COMMIT")
-                with contextlib.suppress(sqlite3.OperationalError):  # it stays so while another process reads
+                # it stays so while another process reads
+                with contextlib.suppress(sqlite3.OperationalError):
                     self._db.execute("PRAGMA journal_mode = DELETE")
             self._db.close()
 
@@ -256,7 +282,9 @@ class MapDatabase(ABC):
             self._db.execute(f"INSERT INTO {table} VALUES ({'?,' * len(values)}0)", values)
             self._sign(table, f"WHERE {KEYS[table]} = {int(values[0])}")
 
-    def _set(self, table: str, columns: tuple[str, ...], values: Mapping[int, tuple[Any, ...]]) -> None:
+    def _set(
+        self, table: str, columns: tuple[str, ...], values: Mapping[int, tuple[Any, ...]]
+    ) -> None:
         """Replace values of the rows of some numbers."""
         with self._changes():
             assigned = ", ".join(f"{column} = ?" for column in columns)
@@ -268,15 +296,26 @@ class MapDatabase(ABC):
 
     def _sign(self, table: str, which: str = "") -> None:
         """Write the checksums of rows, of their values as they are stored."""
-        self._db.execute(f"UPDATE {table} SET crc32 = row_crc32({', '.join(self._columns(table)[:-1])}) {which}")
+        self._db.execute(
+            f"UPDATE {table} SET crc32 = row_crc32({', '.join(self._columns(table)[:-1])}) {which}"
+        )
 
     def _columns(self, table: str) -> list[str]:
-        return [name for (name,) in self._db.execute("SELECT name FROM pragma_table_info(?)", (table,))]
+        return [
+            name for (name,) in self._db.execute("SELECT name FROM pragma_table_info(?)", (table,))
+        ]
 
     def _count(self, table: str) -> int:
         """Number of rows of a table that are numbered from 0 on, without reading them."""
         with self._errors():
-            return int(self._db.execute(f"SELECT coalesce(max({KEYS[table]}), -1) FROM {table}").fetchone()[0]) + 1
+            return (
+                int(
+                    self._db.execute(
+                        f"SELECT coalesce(max({KEYS[table]}), -1) FROM {table}"
+                    ).fetchone()[0]
+                )
+                + 1
+            )
 
     def _read(self, table: str, made: Callable[..., _Row], which: str = "") -> list[_Row]:
         """Return what is made of the rows of a table, in the order of their numbers.
@@ -289,13 +328,19 @@ class MapDatabase(ABC):
             return checked
         with self._errors():
             rows = self._db.execute(f"SELECT * FROM {table} {which} ORDER BY {key}").fetchall()
-        signed, columns = self.version >= SINCE["crc32"], self._columns(table)
+        signed = self.version >= SINCE["crc32"]
+        columns = self._columns(table)
         if signed:
             columns = columns[:-1]
             for row in rows:
                 if row[-1] != _row_crc32(*row[:-1]):
-                    raise self._bad_row(table, row[0], "its checksum does not agree with its content")
-        if key == "id" and (lost := next((n for n, row in enumerate(rows) if row[0] != n), None)) is not None:
+                    raise self._bad_row(
+                        table, row[0], "its checksum does not agree with its content"
+                    )
+        if (
+            key == "id"
+            and (lost := next((n for n, row in enumerate(rows) if row[0] != n), None)) is not None
+        ):
             raise self._bad_row(table, rows[lost][0], f"row {lost} is missing")
         values: list[Any] = list(zip(*rows, strict=True)) if rows else [[] for _ in columns]
         for n, name in enumerate(columns):
@@ -324,13 +369,19 @@ class MapDatabase(ABC):
 
 
 def _schema_of(database: sqlite3.Connection) -> set[tuple[Any, ...]]:
-    """Return tables and columns, and what else a file has; a view or a trigger would run when rows are read."""
-    found = database.execute("SELECT type, name, sql LIKE 'CREATE TABLE %' FROM sqlite_master").fetchall()
+    """Return tables and columns, and what else a file has; a view or a trigger would run when
+    rows are read.
+    """
+    found = database.execute(
+        "SELECT type, name, sql LIKE 'CREATE TABLE %' FROM sqlite_master"
+    ).fetchall()
     columns = 'SELECT name, type, "notnull", pk, hidden FROM pragma_table_xinfo(?)'
     return {
         (kind, name, plain, *column)
         for kind, name, plain in found
-        for column in (database.execute(columns, (name,)).fetchall() if (kind, plain) == ("table", 1) else [()])
+        for column in (
+            database.execute(columns, (name,)).fetchall() if (kind, plain) == ("table", 1) else [()]
+        )
     }
 
 
@@ -355,10 +406,17 @@ def _row_crc32(*values: Any) -> int:
     return crc
 
 
-def _arrays(blobs: Sequence[Any], shape: tuple[int, int]) -> tuple[FloatArray, tuple[int, str] | None]:
-    """Return blobs as finite matrices (N, n, n), poses where n is 4, and the first that is none with the reason."""
+def _arrays(
+    blobs: Sequence[Any], shape: tuple[int, int]
+) -> tuple[FloatArray, tuple[int, str] | None]:
+    """Return blobs as finite matrices (N, n, n), poses where n is 4, and the first that is none
+    with the reason.
+    """
     length = 8 * shape[0] * shape[1]
-    wrong = next((n for n, blob in enumerate(blobs) if not isinstance(blob, bytes) or len(blob) != length), None)
+    wrong = next(
+        (n for n, blob in enumerate(blobs) if not isinstance(blob, bytes) or len(blob) != length),
+        None,
+    )
     if wrong is not None:
         return np.zeros((0, *shape)), (wrong, "a matrix is of another size")
     out: FloatArray = np.frombuffer(b"".join(blobs), dtype="<f8").reshape(-1, *shape).copy()

@@ -11,21 +11,31 @@ import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from vio.geometry.lie import FloatArray, nearest_rotation, se3_adjoint, se3_from_parts, se3_inverse, so3_exp
+from vio.geometry.lie import (
+    FloatArray,
+    nearest_rotation,
+    se3_adjoint,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+)
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.upright import mean_up, nearest_yaw, rotation_to_up
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.pose_graph import Edges, UpDirections, marginals, optimise
 from vio.records import BoolArray, IntArray
 
-# What the odometry may be off by beyond its own covariance, since errors of the calibration add up along the path:
-# 1 % and 0.5 deg/100 m; peers reach 1.2 % and 0.3 deg/100 m with stereo on KITTI.
-_DRIFT_SHARE, _DRIFT_RAD_PER_M = 0.01, float(np.radians(0.005))
-_FIRST_REACH, _FURTHER = 30.0, 2.0  # of the search for them, in mean variances of a motion; and from try to try
+# What the odometry may be off by beyond its own covariance, since errors of the calibration add up
+# along the path: 1 % and 0.5 deg/100 m; peers reach 1.2 % and 0.3 deg/100 m with stereo on KITTI.
+_DRIFT_SHARE = 0.01
+_DRIFT_RAD_PER_M = float(np.radians(0.005))
+_FIRST_REACH = 30.0  # of the search for them, in mean variances of a motion; and from try to try
+_FURTHER = 2.0
 _WINDOW = 1000  # keyframes that are optimised for a new loop, beside those of its cycle
 _MOST_EXACT = 200  # keyframes whose covariance is computed, beside the first of each session
 _LEAST_VARIANCE_M2 = 1e-8  # of a keyframe's position since its session began
-UNKNOWN = 1e6  # variance of the motion from one session to the next, m^2 and rad^2: nothing is known of it
+# variance of the motion from one session to the next, m^2 and rad^2: nothing is known of it
+UNKNOWN = 1e6
 
 
 class Rows:
@@ -59,7 +69,9 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """How well a keyframe is known after an optimisation, in the frame in which the map stands on average."""
+    """How well a keyframe is known after an optimisation, in the frame in which the map stands
+    on average.
+    """
 
     keyframe: int
     covariance: FloatArray  # (6, 6) of xi in T_map_cam = T_hat exp(xi)
@@ -68,16 +80,24 @@ class Placed:
 
 
 class MapGraph:
-    """Sessions, keyframes, odometry and loops; keyframes are numbered in the order in which they came."""
+    """Sessions, keyframes, odometry and loops; keyframes are numbered in the order in which they
+    came.
+    """
 
     def __init__(self, store: MapStore) -> None:
         self.sessions: list[SessionRow] = store.sessions()
-        self.T_map_cam, self.T_odom_cam, self._drift = Rows(4, 4), Rows(4, 4), Rows(6, 6)
-        self.path_m, self._session, self._frame = Rows(), Rows(), Rows()
+        self.T_map_cam = Rows(4, 4)
+        self.T_odom_cam = Rows(4, 4)
+        self._drift = Rows(6, 6)
+        self.path_m = Rows()
+        self._session = Rows()
+        self._frame = Rows()
         self._times: list[int] = []  # ns; too large for float64
         self._ups: list[tuple[int, FloatArray, float]] = []
-        self._T_motion, self._C_motion = Rows(4, 4), Rows(6, 6)  # of the odometry, with its covariance
-        self._links = Rows(3)  # of each of them: its keyframes, and the variance of its position, m^2
+        self._T_motion = Rows(4, 4)  # of the odometry, with its covariance
+        self._C_motion = Rows(6, 6)
+        # of each of them: its keyframes, and the variance of its position, m^2
+        self._links = Rows(3)
         self.add_motions(store.odometry())
         self.loops: list[LoopRow] = []
         self._loop_links = Rows(3)  # of each loop, likewise
@@ -113,7 +133,9 @@ class MapGraph:
     def extend(self, rows: Sequence[KeyframeRow]) -> None:
         """Add keyframes."""
         self._ups += [
-            (k, row.up_cam, row.up_sigma_rad) for k, row in enumerate(rows, len(self)) if row.up_cam is not None
+            (k, row.up_cam, row.up_sigma_rad)
+            for k, row in enumerate(rows, len(self))
+            if row.up_cam is not None
         ]
         self.T_map_cam.extend([row.T_map_cam for row in rows])
         self.T_odom_cam.extend([row.T_odom_cam for row in rows])
@@ -139,13 +161,20 @@ class MapGraph:
         self.loops[number] = row
         self._loop_links.rows[[number]] = _links([(row.first, row.second, row.pose)])
 
-    def gathered(self, T_odom_cam: FloatArray, motion: RelativePose | None) -> tuple[FloatArray, float]:
-        """Return the covariance (6, 6) and the path that the odometry has gathered at a new keyframe.
+    def gathered(
+        self, T_odom_cam: FloatArray, motion: RelativePose | None
+    ) -> tuple[FloatArray, float]:
+        """Return the covariance (6, 6) and the path that the odometry has gathered at a new
+        keyframe.
 
-        The covariance is that of right-invariant errors, which add up: `xi_k = xi_i + Ad(T_k) xi_i_k`. From session to
-        session it grows by `UNKNOWN`.
+        The covariance is that of right-invariant errors, which add up:
+        `xi_k = xi_i + Ad(T_k) xi_i_k`. From session to session it grows by `UNKNOWN`.
         """
-        before = (self._drift.rows[-1], float(self.path_m.rows[-1])) if len(self) else (np.zeros((6, 6)), 0.0)
+        before = (
+            (self._drift.rows[-1], float(self.path_m.rows[-1]))
+            if len(self)
+            else (np.zeros((6, 6)), 0.0)
+        )
         if motion is None:
             return before[0] + (UNKNOWN if len(self) else 0.0) * np.eye(6), before[1]
         A = se3_adjoint(T_odom_cam)
@@ -153,14 +182,16 @@ class MapGraph:
         return before[0] + A @ motion.covariance @ A.T, before[1] + moved
 
     def drift(self, i: IntArray, k: IntArray, *, systematic: float = 1.0) -> FloatArray:
-        """Covariance (N, 6, 6) of the motion between keyframes i and k (N,) along the path, in the frame of the later.
+        """Covariance (N, 6, 6) of the motion between keyframes i and k (N,) along the path, in the
+        frame of the later.
 
         Args:
             i: keyframes.
             k: keyframes.
             systematic: share that is added of what errors of the calibration may do.
         """
-        late, early = np.maximum(i, k), np.minimum(i, k)
+        late = np.maximum(i, k)
+        early = np.minimum(i, k)
         A = se3_adjoint(se3_inverse(self.T_odom_cam[late]))
         C: FloatArray = A @ (self._drift[late] - self._drift[early]) @ np.swapaxes(A, 1, 2)
         if systematic:
@@ -176,9 +207,11 @@ class MapGraph:
         self.sessions = [replace(s, part=into) if s.part == moved else s for s in self.sessions]
 
     def optimise_part(self, part: int) -> None:
-        """Optimise all keyframes of a part; of the first one of a connected component, roll and pitch alone at most.
+        """Optimise all keyframes of a part; of the first one of a connected component, roll and
+        pitch alone at most.
 
-        What the filter took for the vertical at its first frame is less exact than what it knows of it later.
+        What the filter took for the vertical at its first frame is less exact than what it knows of
+        it later.
         """
         rows = self.part == part
         self._optimise(rows, np.zeros(len(self), dtype=np.bool_), level=True)
@@ -186,8 +219,9 @@ class MapGraph:
     def optimise_near(self, part: int, newest: int) -> bool:
         """Optimise what the newest loops move most; keyframes around it stay, as anchors.
 
-        A loop closes a cycle with what was known before. The keyframes of the shortest one, by the variance of its
-        motions, carry most of what it corrects, and others the less the longer the way by them.
+        A loop closes a cycle with what was known before. The keyframes of the shortest one, by the
+        variance of its motions, carry most of what it corrects, and others the less the longer the
+        way by them.
 
         Args:
             part: of the loops.
@@ -200,10 +234,8 @@ class MapGraph:
         if int(rows.sum()) <= _WINDOW:
             self.optimise_part(part)
             return True
-        free, kept = (
-            np.zeros(len(self), dtype=np.bool_),
-            np.array([o.kept for o in self.loops[:-newest]], dtype=np.bool_),
-        )
+        free = np.zeros(len(self), dtype=np.bool_)
+        kept = np.array([o.kept for o in self.loops[:-newest]], dtype=np.bool_)
         known = self._linked(self._loop_links[:-newest][kept])
         free[_nearest(known, self.loops[-newest:], rows)] = True
         free[int(np.argmax(rows))] = False
@@ -213,7 +245,8 @@ class MapGraph:
         return False
 
     def keep_place(self, part: int, stays: BoolArray, T_before: FloatArray, *, level: bool) -> None:
-        """Move and turn the frame of a part as a whole, so that keyframes stand on average where they stood: (G7).
+        """Move and turn the frame of a part as a whole, so that keyframes stand on average where
+        they stood: (G7).
 
         Args:
             part: of the map.
@@ -221,11 +254,15 @@ class MapGraph:
             T_before: (K, 4, 4) poses of all keyframes, those of `stays` where they should stand.
             level: turn about the vertical alone, where z is up.
         """
-        rows, w = self.part == part, self.frame_weights(stays)[stays]
-        T, B = self.T_map_cam.rows[stays], T_before[stays]
-        p, q = w @ T[:, :3, 3], w @ B[:, :3, 3]
+        rows = self.part == part
+        w = self.frame_weights(stays)[stays]
+        T = self.T_map_cam.rows[stays]
+        B = T_before[stays]
+        p = w @ T[:, :3, 3]
+        q = w @ B[:, :3, 3]
         M = np.einsum("k,ki,kj->ij", w, B[:, :3, 3] - q, T[:, :3, 3] - p)
-        M += np.einsum("k,kia,kja->ij", w, B[:, :3, :3], T[:, :3, :3])  # directions, which a straight path leaves open
+        # directions, which a straight path leaves open
+        M += np.einsum("k,kia,kja->ij", w, B[:, :3, :3], T[:, :3, :3])
         if level and self._is_upright(rows):
             R = so3_exp(np.array([0.0, 0.0, nearest_yaw(M)]))
         else:
@@ -233,27 +270,35 @@ class MapGraph:
         self.T_map_cam.rows[rows] = se3_from_parts(R, q - R @ p) @ self.T_map_cam.rows[rows]
 
     def frame_weights(self, stays: BoolArray) -> FloatArray:
-        """Weights (K,) by which the frame is that of keyframes `stays` (K,), w in (G7); their sum is 1."""
-        numbers, session = np.flatnonzero(stays), self.session
+        """Weights (K,) by which the frame is that of keyframes `stays` (K,), w in (G7); their
+        sum is 1.
+        """
+        numbers = np.flatnonzero(stays)
+        session = self.session
         begins = np.unique(session, return_index=True)[1][session[numbers]]
-        variance = np.trace(self.drift(begins, numbers, systematic=0.0)[:, :3, :3], axis1=1, axis2=2)
+        variance = np.trace(
+            self.drift(begins, numbers, systematic=0.0)[:, :3, :3], axis1=1, axis2=2
+        )
         w = np.zeros(len(self))
         w[numbers] = 1.0 / (variance + np.median(variance) + _LEAST_VARIANCE_M2)
         return w / w.sum()
 
     def placed(self, part: int, stays: BoolArray, before: Placed | None) -> Placed:
-        """Return how well the newest keyframe, of a part, is known in the frame of keyframes `stays` (K,).
+        """Return how well the newest keyframe, of a part, is known in the frame of keyframes
+        `stays` (K,).
 
-        What that costs grows with the map. So, after what is around the newest loops was optimised alone, the keyframe
-        is taken to be known as well as the one before at which loops were, for as many keyframes as the part has
-        thousands, unless the odometry between the two says less than the newest loop, (G10).
+        What that costs grows with the map. So, after what is around the newest loops was optimised
+        alone, the keyframe is taken to be known as well as the one before at which loops were, for
+        as many keyframes as the part has thousands, unless the odometry between the two says less
+        than the newest loop, (G10).
 
         Args:
             part: of the keyframe.
             stays: keyframes that define the frame.
             before: how well the one before is known; None: how well the newest one is, is computed.
         """
-        rows, newest = self.part == part, len(self) - 1
+        rows = self.part == part
+        newest = len(self) - 1
         count = int(rows.sum())
         if before is not None and (newest - before.computed_for) * _WINDOW < count:
             loop = self.loops[-1]
@@ -269,9 +314,11 @@ class MapGraph:
         return Placed(newest, P, w @ self.T_map_cam.rows[:, :3, 3], newest)
 
     def covariances(self, part: int) -> FloatArray:
-        """Covariances (K, 6, 6) of xi in `T_map_cam exp(xi)` of the keyframes of a part, relative to its first one.
+        """Covariances (K, 6, 6) of xi in `T_map_cam exp(xi)` of the keyframes of a part, relative
+        to its first one.
 
-        Of many, those of some: the others have that of one before them, grown by the odometry since.
+        Of many, those of some: the others have that of one before them, grown by the odometry
+        since.
         """
         rows = self.part == part
         numbers = np.flatnonzero(rows)
@@ -280,22 +327,35 @@ class MapGraph:
         begins = np.unique(self.session[numbers], return_index=True)[1]
         few = np.linspace(0, len(numbers) - 1, min(_MOST_EXACT, len(numbers))).astype(np.int64)
         exact = np.union1d(begins, few)
-        P, T = self._marginals(rows, exact), self.T_map_cam.rows[rows]
+        P = self._marginals(rows, exact)
+        T = self.T_map_cam.rows[rows]
         before = np.searchsorted(exact, np.arange(len(T)), side="right") - 1
         i = exact[before]
         A = se3_adjoint(se3_inverse(T) @ T[i])
         grown = self.odometry_scale * self.drift(numbers[i], numbers, systematic=0.0)
         return np.asarray(A @ P[before] @ np.swapaxes(A, 1, 2) + grown)
 
-    def _marginals(self, rows: BoolArray, poses: IntArray, frame: FloatArray | None = None) -> FloatArray:
-        """Return `marginals` of some of the keyframes of a mask (K,), by their places among them."""
-        inside = [n for n, o in enumerate(self.loops) if o.kept and rows[o.first] and rows[o.second]]
-        ups, T = self._up_directions(rows), self.T_map_cam.rows[rows]
-        fixed, levelled = np.zeros(len(T), dtype=np.bool_), 0 if len(ups.pose) else None
-        return marginals(T, *self._edges(rows, inside), ups, fixed, poses, levelled=levelled, frame=frame)
+    def _marginals(
+        self, rows: BoolArray, poses: IntArray, frame: FloatArray | None = None
+    ) -> FloatArray:
+        """Return `marginals` of some of the keyframes of a mask (K,), by their places among
+        them.
+        """
+        inside = [
+            n for n, o in enumerate(self.loops) if o.kept and rows[o.first] and rows[o.second]
+        ]
+        ups = self._up_directions(rows)
+        T = self.T_map_cam.rows[rows]
+        fixed = np.zeros(len(T), dtype=np.bool_)
+        levelled = 0 if len(ups.pose) else None
+        return marginals(
+            T, *self._edges(rows, inside), ups, fixed, poses, levelled=levelled, frame=frame
+        )
 
     def _linked(self, loops: FloatArray) -> coo_matrix:
-        """Return the variances of the motions (K, K) between keyframes, by the odometry and by loops (L, 3)."""
+        """Return the variances of the motions (K, K) between keyframes, by the odometry and by
+        loops (L, 3).
+        """
         first, second, variance = np.concatenate([self._links.rows, loops]).T
         ends = first.astype(np.int64), second.astype(np.int64)
         return coo_matrix((variance, ends), shape=(len(self), len(self))).tocsr()
@@ -323,13 +383,22 @@ class MapGraph:
             self.loops[n] = replace(self.loops[n], kept=kept)
 
     def _edges(self, rows: BoolArray, inside: Sequence[int]) -> tuple[Edges, Edges]:
-        """Return the odometry between the keyframes of a mask (K,), and some loops, by their places among them."""
+        """Return the odometry between the keyframes of a mask (K,), and some loops, by their
+        places among them.
+        """
         place = np.cumsum(rows) - 1
         ends = self._links.rows[:, :2].astype(np.int64)
         near = np.flatnonzero(rows[ends].all(axis=1))
-        information = np.asarray(np.linalg.inv(self.odometry_scale * self._C_motion[near]), dtype=np.float64)
-        odometry = Edges(place[ends[near, 0]], place[ends[near, 1]], self._T_motion[near], information)
-        loops = [(int(place[o.first]), int(place[o.second]), o.pose) for o in (self.loops[n] for n in inside)]
+        information = np.asarray(
+            np.linalg.inv(self.odometry_scale * self._C_motion[near]), dtype=np.float64
+        )
+        odometry = Edges(
+            place[ends[near, 0]], place[ends[near, 1]], self._T_motion[near], information
+        )
+        loops = [
+            (int(place[o.first]), int(place[o.second]), o.pose)
+            for o in (self.loops[n] for n in inside)
+        ]
         return odometry, Edges.of(loops)
 
     def _up_directions(self, rows: BoolArray) -> UpDirections:
@@ -342,10 +411,11 @@ class MapGraph:
         )
 
     def _level_of(self, fixed: BoolArray) -> FloatArray:
-        """Rotation (3, 3) that turns up the mean vertical of keyframes that stay; the identity where they say nothing.
+        """Rotation (3, 3) that turns up the mean vertical of keyframes that stay; the identity
+        where they say nothing.
 
-        Until a part is optimised as a whole, its frame is that of its odometry, whose first seconds may have been wrong
-        about the vertical.
+        Until a part is optimised as a whole, its frame is that of its odometry, whose first seconds
+        may have been wrong about the vertical.
         """
         ups = [(self.T_map_cam[k][:3, :3] @ up, sigma) for k, up, sigma in self._ups if fixed[k]]
         if not ups or not self._is_upright(fixed):
@@ -354,21 +424,27 @@ class MapGraph:
         return rotation_to_up(mean_up(up, sigma))
 
     def _is_upright(self, rows: BoolArray) -> bool:
-        """Whether z is up in the frame of these keyframes: it is that of the first one's session."""
+        """Whether z is up in the frame of these keyframes: it is that of the first one's
+        session.
+        """
         return self.sessions[int(self._session.rows[int(np.argmax(rows))])].upright
 
 
 def _links(motions: Sequence[tuple[int, int, RelativePose]]) -> FloatArray:
     """Return the keyframes of motions and the variances of their positions (M, 3)."""
     variance = [m.covariance[0, 0] + m.covariance[1, 1] + m.covariance[2, 2] for _, _, m in motions]
-    return np.array([(i, j, v) for (i, j, _), v in zip(motions, variance, strict=True)]).reshape(-1, 3)
+    return np.array([(i, j, v) for (i, j, _), v in zip(motions, variance, strict=True)]).reshape(
+        -1, 3
+    )
 
 
 def _nearest(links: coo_matrix, new: Sequence[LoopRow], rows: BoolArray) -> IntArray:
-    """Return the keyframes of the shortest cycles that new loops close, and those with the smallest detour from them.
+    """Return the keyframes of the shortest cycles that new loops close, and those with the smallest
+    detour from them.
 
-    The search goes no further than it must, since it holds the interpreter: what lies beyond `reach` of an end has a
-    detour of more than `2 (reach - least)`, where `least` is the length of the cycle.
+    The search goes no further than it must, since it holds the interpreter: what lies beyond
+    `reach` of an end has a detour of more than `2 (reach - least)`, where `least` is the length of
+    the cycle.
 
     Args:
         links: (K, K) variances of the motions known before.
@@ -376,17 +452,22 @@ def _nearest(links: coo_matrix, new: Sequence[LoopRow], rows: BoolArray) -> IntA
         rows: (K,) keyframes that may be taken.
     """
     ends = [k for o in new for k in (o.first, o.second)]
-    reach, both = _FIRST_REACH * float(links.data.mean()), (links + links.T).tocsr()
+    reach = _FIRST_REACH * float(links.data.mean())
+    both = (links + links.T).tocsr()
     while True:
         away = np.stack([dijkstra(both, indices=k, limit=reach) for k in ends])
-        cycle = away[::2] + away[1::2]  # (L, K) length of the shortest cycle of each loop by each keyframe
+        # (L, K) length of the shortest cycle of each loop by each keyframe
+        cycle = away[::2] + away[1::2]
         least = cycle.min(axis=1, keepdims=True)
-        joined = np.isfinite(least[:, 0])  # others are of two pieces, which the loops are the first to join
+        # others are of two pieces, which the loops are the first to join
+        joined = np.isfinite(least[:, 0])
         detour = np.where(joined[:, None], cycle, np.minimum(away[::2], away[1::2]))
         detour[joined] -= least[joined]
         nearest = np.where(rows, detour.min(axis=0), np.inf)
         on_cycle = int((detour[joined] <= 1e-9 * least[joined]).any(axis=0).sum())
         chosen = np.argsort(nearest, kind="stable")[: _WINDOW + on_cycle]
-        if reach == np.inf or (joined.all() and nearest[chosen[-1]] <= 2 * (reach - float(least.max()))):
+        if reach == np.inf or (
+            joined.all() and nearest[chosen[-1]] <= 2 * (reach - float(least.max()))
+        ):
             return chosen[np.isfinite(nearest[chosen])]
         reach = _FURTHER * reach if reach < links.data.sum() else np.inf

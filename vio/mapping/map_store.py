@@ -1,4 +1,6 @@
-"""What a map holds: sessions, keyframes with their features, motions and loops between them, and its place on earth."""
+"""What a map holds: sessions, keyframes with their features, motions and loops between them, and
+its place on earth.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ class SessionRow:
     camera: StereoCamera
     upright: bool  # whether z of its odometry frame is up
     part: int  # sessions that loops have joined share the number
-    field: DisplacementField | None = None  # what its stereo calibration is off by; None: not estimated
+    # what its stereo calibration is off by; None: not estimated
+    field: DisplacementField | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +46,8 @@ class KeyframeRow:
     time_ns: int
     T_map_cam: FloatArray  # (4, 4) in the frame of its part of the map
     T_odom_cam: FloatArray  # (4, 4) by the filter
-    drift: FloatArray  # (6, 6) covariance that the odometry has gathered since the session began, see `MapBuilder`
+    # (6, 6) covariance that the odometry has gathered since the session began, see `MapBuilder`
+    drift: FloatArray
     path_m: float  # since the session began
     up_cam: FloatArray | None  # (3,) direction of the vertical; None without an IMU
     up_sigma_rad: float
@@ -84,23 +88,28 @@ def is_map(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         header = file.read(72)
-    return header.startswith(b"SQLite format 3\0") and header[68:] == APPLICATION_ID.to_bytes(4, "big")
+    return header.startswith(b"SQLite format 3\0") and header[68:] == APPLICATION_ID.to_bytes(
+        4, "big"
+    )
 
 
 class MapStore(MapDatabase):
     """What a map holds, in its file."""
 
     def _contents(self) -> dict[str, list[Any]]:
-        sessions, rows, odometry, loops = self.sessions(), self.keyframes(), self.odometry(), self.loops()
+        sessions = self.sessions()
+        rows = self.keyframes()
+        odometry = self.odometry()
+        loops = self.loops()
         keyframes = len(rows)
         if any(not 0 <= k.session < len(sessions) for k in rows):
             raise damaged(self.path, "a keyframe belongs to no session")
         pairs = [(i, j) for i, j, _ in odometry] + [(o.first, o.second) for o in loops]
         if any(not 0 <= i < j < keyframes for i, j in pairs):
             raise damaged(self.path, "a motion is between keyframes that are not there")
-        if [k for (k,) in self._db.execute("SELECT keyframe FROM features ORDER BY keyframe")] != list(
-            range(keyframes)
-        ):
+        if [
+            k for (k,) in self._db.execute("SELECT keyframe FROM features ORDER BY keyframe")
+        ] != list(range(keyframes)):
             raise damaged(self.path, "a keyframe has no features")
         return {"sessions": sessions, "keyframes": rows, "odometry": odometry, "loops": loops}
 
@@ -110,13 +119,26 @@ class MapStore(MapDatabase):
         """Return a hash of the descriptors of each keyframe that is distinctive enough."""
         with self._errors():
             least = _TELLING_FEATURES * DESCRIPTOR_BYTES
-            rows = self._db.execute("SELECT descriptors FROM features WHERE length(descriptors) >= ?", (least,))
+            rows = self._db.execute(
+                "SELECT descriptors FROM features WHERE length(descriptors) >= ?", (least,)
+            )
             return {hashlib.blake2b(bits, digest_size=16).digest() for (bits,) in rows}
 
     def add_session(self, row: SessionRow) -> int:
         """Add a session and return its number."""
         c = row.camera
-        values = (row.source, row.part, row.upright, c.fu, c.fv, c.cu, c.cv, c.baseline_m, c.width, c.height)
+        values = (
+            row.source,
+            row.part,
+            row.upright,
+            c.fu,
+            c.fv,
+            c.cu,
+            c.cv,
+            c.baseline_m,
+            c.width,
+            c.height,
+        )
         number = self._count("sessions")
         self._insert("sessions", (number, *values, c.projection, c.kind, *_field_blobs(row.field)))
         return number
@@ -127,7 +149,8 @@ class MapStore(MapDatabase):
         up = None if row.up_cam is None else _blob(row.up_cam)
         poses = _blob(row.T_map_cam), _blob(row.T_odom_cam), _blob(row.drift)
         self._insert(
-            "keyframes", (number, row.session, row.frame, row.time_ns, *poses, row.path_m, up, row.up_sigma_rad)
+            "keyframes",
+            (number, row.session, row.frame, row.time_ns, *poses, row.path_m, up, row.up_sigma_rad),
         )
         bits = np.packbits(features.has_right).tobytes()
         sizes = features.z.astype("<f4").tobytes(), bits, features.sigma_px.astype("<f4").tobytes()
@@ -141,12 +164,17 @@ class MapStore(MapDatabase):
     def add_loop(self, row: LoopRow) -> None:
         """Add a loop."""
         motion = _blob(row.pose.T_i_j), _blob(row.pose.covariance)
-        self._insert("loops", (self._count("loops"), row.first, row.second, *motion, row.inliers, row.kept))
+        self._insert(
+            "loops", (self._count("loops"), row.first, row.second, *motion, row.inliers, row.kept)
+        )
 
     def add_places(self, row: PlacesRow) -> None:
         """Add what finds the keyframes of the next segment again."""
         words = row.words.begins.astype("<u4").tobytes(), row.words.owners.tobytes()
-        self._insert("places", (self._count("places"), *words, _blob(row.points), row.stereo.astype("<i8").tobytes()))
+        self._insert(
+            "places",
+            (self._count("places"), *words, _blob(row.points), row.stereo.astype("<i8").tobytes()),
+        )
 
     def set_earth(self, row: EarthRow) -> None:
         """Say where the map is on the earth."""
@@ -159,9 +187,11 @@ class MapStore(MapDatabase):
         self._set("keyframes", ("T_map_cam",), {k: (_blob(T),) for k, T in T_map_cam.items()})
 
     def set_adjusted(self, T_map_cam: Mapping[int, FloatArray]) -> None:
-        """Replace the poses (4, 4) of keyframes, and what motions, loops kept and verticals measured by what these say.
+        """Replace the poses (4, 4) of keyframes, and what motions, loops kept and verticals
+        measured by what these say.
 
-        So the poses are the optimum of the graph, too. Covariances stay, which measured more than the poses need.
+        So the poses are the optimum of the graph, too. Covariances stay, which measured more than
+        the poses need.
         """
 
         def between(first: int, second: int, pose: RelativePose) -> RelativePose:
@@ -170,11 +200,19 @@ class MapStore(MapDatabase):
         upright = {k: row.up_cam is not None for k, row in enumerate(self.keyframes())}
         ups = {k: (_blob(T[2, :3]),) for k, T in T_map_cam.items() if upright[k]}
         motions = [row for row in self.odometry() if row[0] in T_map_cam and row[1] in T_map_cam]
-        loops = {n: o for n, o in enumerate(self.loops()) if o.kept and o.first in T_map_cam and o.second in T_map_cam}
+        loops = {
+            n: o
+            for n, o in enumerate(self.loops())
+            if o.kept and o.first in T_map_cam and o.second in T_map_cam
+        }
         self.set_poses(T_map_cam)
         self._set("keyframes", ("up_cam",), ups)
-        self._set("odometry", ("T_i_j",), {row[1]: (_blob(between(*row).T_i_j),) for row in motions})
-        self.set_loops({n: replace(o, pose=between(o.first, o.second, o.pose)) for n, o in loops.items()})
+        self._set(
+            "odometry", ("T_i_j",), {row[1]: (_blob(between(*row).T_i_j),) for row in motions}
+        )
+        self.set_loops(
+            {n: replace(o, pose=between(o.first, o.second, o.pose)) for n, o in loops.items()}
+        )
 
     def set_kept(self, kept: Mapping[int, bool]) -> None:
         """Say of loops whether they agree with the others."""
@@ -191,7 +229,9 @@ class MapStore(MapDatabase):
 
     def set_loops(self, rows: Mapping[int, LoopRow]) -> None:
         """Replace what is measured of loops, by their numbers."""
-        values = {n: (_blob(o.pose.T_i_j), _blob(o.pose.covariance), o.inliers) for n, o in rows.items()}
+        values = {
+            n: (_blob(o.pose.T_i_j), _blob(o.pose.covariance), o.inliers) for n, o in rows.items()
+        }
         self._set("loops", ("T_i_j", "covariance", "inliers"), values)
 
     def set_field(self, session: int, field: DisplacementField | None) -> None:
@@ -205,9 +245,12 @@ class MapStore(MapDatabase):
         """Forget what was added after there were so many."""
         with self._changes():
             for table, key in KEYS.items():
-                count = {"sessions": sessions, "loops": loops, "places": keyframes // SEGMENT, "earth": 1}.get(
-                    table, keyframes
-                )
+                count = {
+                    "sessions": sessions,
+                    "loops": loops,
+                    "places": keyframes // SEGMENT,
+                    "earth": 1,
+                }.get(table, keyframes)
                 self._db.execute(f"DELETE FROM {table} WHERE {key} >= ?", (count,))
 
     # Reading
@@ -217,8 +260,13 @@ class MapStore(MapDatabase):
 
         def made(_: int, source: str, part: int, upright: int, *camera: Any) -> SessionRow:
             lengths: list[Any] = [_number(value) for value in camera[:5]]
-            size, names, field = camera[5:7], [source, *camera[7:9]], camera[9:]
-            if not all(isinstance(value, (int, type(None))) for value in size) or min(lengths[:2]) <= 0:
+            size = camera[5:7]
+            names = [source, *camera[7:9]]
+            field = camera[9:]
+            if (
+                not all(isinstance(value, (int, type(None))) for value in size)
+                or min(lengths[:2]) <= 0
+            ):
                 raise ValueError("its camera is none")
             if not all(isinstance(value, str) for value in names):
                 raise ValueError("a name is no text")
@@ -235,7 +283,10 @@ class MapStore(MapDatabase):
             path_m: float, up: bytes | None, sigma: float | None,
         ) -> KeyframeRow:  # fmt: skip
             numbers = _integer(session), _integer(frame), _integer(time_ns)
-            vertical = None if up is None else _array(up, 3), 0.0 if sigma is None else _number(sigma)
+            vertical = (
+                None if up is None else _array(up, 3),
+                0.0 if sigma is None else _number(sigma),
+            )
             return KeyframeRow(*numbers, T_map, T_odom, drift, _number(path_m), *vertical)
 
         return self._read("keyframes", made)
@@ -243,7 +294,9 @@ class MapStore(MapDatabase):
     def odometry(self) -> list[tuple[int, int, RelativePose]]:
         """Return all motions between keyframes, (first, second, motion)."""
 
-        def made(second: int, first: int, T: FloatArray, covariance: FloatArray) -> tuple[int, int, RelativePose]:
+        def made(
+            second: int, first: int, T: FloatArray, covariance: FloatArray
+        ) -> tuple[int, int, RelativePose]:
             return _integer(first), second, RelativePose(T, covariance)
 
         return self._read("odometry", made)
@@ -252,10 +305,20 @@ class MapStore(MapDatabase):
         """Return all loops."""
 
         def made(
-            _: int, first: int, second: int, T: FloatArray, covariance: FloatArray, inliers: int, kept: int
+            _: int,
+            first: int,
+            second: int,
+            T: FloatArray,
+            covariance: FloatArray,
+            inliers: int,
+            kept: int,
         ) -> LoopRow:
             return LoopRow(
-                _integer(first), _integer(second), RelativePose(T, covariance), _integer(inliers), bool(kept)
+                _integer(first),
+                _integer(second),
+                RelativePose(T, covariance),
+                _integer(inliers),
+                bool(kept),
             )
 
         return self._read("loops", made)
@@ -263,17 +326,23 @@ class MapStore(MapDatabase):
     def earth(self) -> EarthRow | None:
         """Return where the map is on the earth; None: nothing said so."""
 
-        def made(_: int, latitude: float, longitude: float, height: float, T: FloatArray, C: FloatArray) -> EarthRow:
+        def made(
+            _: int, latitude: float, longitude: float, height: float, T: FloatArray, C: FloatArray
+        ) -> EarthRow:
             return EarthRow((_number(latitude), _number(longitude), _number(height)), T, C)
 
         rows = self._read("earth", made) if self.version >= SINCE["earth"] else []
         return rows[0] if rows else None
 
     def places(self) -> list[PlacesRow]:
-        """Return what finds keyframes again, of the first full segments; files before version 5 have none."""
+        """Return what finds keyframes again, of the first full segments; files before version 5
+        have none.
+        """
 
         def made(_: int, begins: bytes, owners: bytes, points: bytes, stereo: bytes) -> PlacesRow:
-            words = Segment.of(np.frombuffer(begins, dtype="<u4"), np.frombuffer(owners, dtype=np.uint8))
+            words = Segment.of(
+                np.frombuffer(begins, dtype="<u4"), np.frombuffer(owners, dtype=np.uint8)
+            )
             p = np.frombuffer(points, dtype="<f8").reshape(SEGMENT, -1, 3)
             return PlacesRow(words, p, np.frombuffer(stereo, dtype="<i8").reshape(SEGMENT))
 
@@ -282,13 +351,17 @@ class MapStore(MapDatabase):
     def show_something(self) -> BoolArray:
         """Mask (K,) of the keyframes that have features."""
         with self._errors():
-            rows = self._db.execute("SELECT length(z) > 0 FROM features ORDER BY keyframe").fetchall()
+            rows = self._db.execute(
+                "SELECT length(z) > 0 FROM features ORDER BY keyframe"
+            ).fetchall()
         return np.array(rows, dtype=np.bool_).reshape(-1)
 
     def features(self, keyframe: int) -> KeyframeFeatures:
         """Return the features of one keyframe."""
 
-        def made(_: int, z: bytes, has_right: bytes, sigma: bytes, descriptors: bytes) -> KeyframeFeatures:
+        def made(
+            _: int, z: bytes, has_right: bytes, sigma: bytes, descriptors: bytes
+        ) -> KeyframeFeatures:
             bits = np.frombuffer(descriptors, dtype=np.uint8).reshape(-1, DESCRIPTOR_BYTES)
             pixels = np.frombuffer(z, dtype="<f4").astype(np.float64).reshape(len(bits), 4)
             right = np.unpackbits(np.frombuffer(has_right, dtype=np.uint8)).astype(np.bool_)

@@ -1,8 +1,9 @@
-"""Two maps made into one: the later one is added as it is, and the first one's places are looked for in its keyframes.
+"""Two maps made into one: the later one is added as it is, and the first one's places are looked
+for in its keyframes.
 
-Each keyframe is looked for in the first map alone, so that the search divides over processes and its result is the same
-however many there are: first where nothing is known of where the maps lie, then, where places were found, once more
-with what they say.
+Each keyframe is looked for in the first map alone, so that the search divides over processes and
+its result is the same however many there are: first where nothing is known of where the maps lie,
+then, where places were found, once more with what they say.
 """
 
 from __future__ import annotations
@@ -34,16 +35,20 @@ from vio.records import IntArray
 log = logging.getLogger(__name__)
 
 _ROUNDS = 2  # of the search; the second knows where the maps lie
-_Map: TypeAlias = Callable[[Callable[[IntArray], list[FoundPlace]], Iterable[IntArray]], Iterable[list[FoundPlace]]]
+_Map: TypeAlias = Callable[
+    [Callable[[IntArray], list[FoundPlace]], Iterable[IntArray]], Iterable[list[FoundPlace]]
+]
 
 
 def merge_maps(first: Path, second: Path, out: Path, *, workers: int = 1) -> dict[str, Any]:
-    """Write a map that holds the sessions of two, joined where they show one place; return what it holds.
+    """Write a map that holds the sessions of two, joined where they show one place; return what it
+    holds.
 
-    Nothing is written where they hold the same recording, or show no place in common. Motions and loops of both stay as
-    they are; places of the map recorded first are looked for in the keyframes of the other one, and all poses optimised
-    with them. The order of the two does not matter: the frame is that of the map recorded first. Where only the other
-    one is on the earth, its place is brought into that frame; of two places, that of the frame's map is kept.
+    Nothing is written where they hold the same recording, or show no place in common. Motions and
+    loops of both stay as they are; places of the map recorded first are looked for in the keyframes
+    of the other one, and all poses optimised with them. The order of the two does not matter: the
+    frame is that of the map recorded first. Where only the other one is on the earth, its place is
+    brought into that frame; of two places, that of the frame's map is kept.
 
     Args:
         first: a map.
@@ -52,8 +57,8 @@ def merge_maps(first: Path, second: Path, out: Path, *, workers: int = 1) -> dic
         workers: processes that search; the result is the same with any number.
 
     Raises:
-        DataError: a file is no map, both hold the same recording or no common place, or `out` exists or cannot be
-            written.
+        DataError: a file is no map, both hold the same recording or no common place, or `out`
+            exists or cannot be written.
         VioError: a process ended unexpectedly.
     """
     if out.exists():
@@ -66,41 +71,60 @@ def merge_maps(first: Path, second: Path, out: Path, *, workers: int = 1) -> dic
         source = MapStore(first, read_only=True)
         source.copy_to(written, known_as=out)
         source.close()
-        other, store = MapStore(second, read_only=True), MapStore(written, known_as=out)
+        other = MapStore(second, read_only=True)
+        store = MapStore(written, known_as=out)
         with contextlib.closing(other), contextlib.closing(store):
             if shared := len(store.images() & other.images()):
                 raise DataError(
-                    f"{second}: {shared} of its keyframes are in {first} already: both hold one recording; "
+                    f"{second}: {shared} of its keyframes are in {first} already: both hold one "
+                    "recording; "
                     "vio map drop takes a session out of one"
                 )
             before = len(store.keyframes())
             _append(other, store)
             if not _Merge(store, before).join(written, workers):
-                raise DataError(f"{second}: shows no place of {first}; keep two maps, or record a way between them")
+                raise DataError(
+                    f"{second}: shows no place of {first}; keep two maps, or record a way between "
+                    "them"
+                )
             _merge_earth(store, other)
     return describe_map(out)
 
 
 def _begin(path: Path) -> tuple[Any, ...]:
-    """What orders two maps: one whose z is up first, then by the time of the first keyframe, then by its features."""
+    """What orders two maps: one whose z is up first, then by the time of the first keyframe,
+    then by its features.
+    """
     store = MapStore(path, read_only=True)
     with contextlib.closing(store):
-        sessions, keyframes = store.sessions(), store.keyframes()
+        sessions = store.sessions()
+        keyframes = store.keyframes()
         if not keyframes:
             return True, 0, 0, b""
         seen = store.features(0)
-        return not sessions[0].upright, keyframes[0].time_ns, len(keyframes), seen.descriptors.tobytes()
+        return (
+            not sessions[0].upright,
+            keyframes[0].time_ns,
+            len(keyframes),
+            seen.descriptors.tobytes(),
+        )
 
 
 def _append(other: MapStore, store: MapStore) -> None:
     """Add all that a map holds to another one, in parts of its own."""
-    sessions, rows, loops = len(store.sessions()), store.keyframes(), other.loops()
-    drift, path_m = (rows[-1].drift + UNKNOWN * np.eye(6), rows[-1].path_m) if rows else (np.zeros((6, 6)), 0.0)
+    sessions = len(store.sessions())
+    rows = store.keyframes()
+    loops = other.loops()
+    drift, path_m = (
+        (rows[-1].drift + UNKNOWN * np.eye(6), rows[-1].path_m) if rows else (np.zeros((6, 6)), 0.0)
+    )
     for session in other.sessions():
         check_sessions(store, session.camera)
         store.add_session(replace(session, part=session.part + sessions))
     for k, row in enumerate(other.keyframes()):
-        moved = replace(row, session=row.session + sessions, drift=row.drift + drift, path_m=row.path_m + path_m)
+        moved = replace(
+            row, session=row.session + sessions, drift=row.drift + drift, path_m=row.path_m + path_m
+        )
         store.add_keyframe(moved, other.features(k))
     for i, j, motion in other.odometry():
         store.add_odometry(len(rows) + i, len(rows) + j, motion)
@@ -113,9 +137,12 @@ class _Merge:
     """Joins the keyframes of a map from `before` on to those before, in its file."""
 
     def __init__(self, store: MapStore, before: int) -> None:
-        self._store, self._before, self._graph = store, before, MapGraph(store)
+        self._store = store
+        self._before = before
+        self._graph = MapGraph(store)
         shows = store.show_something()
-        self._order = np.cumsum(shows)  # of the keyframes that show something, by which neighbours are counted
+        # of the keyframes that show something, by which neighbours are counted
+        self._order = np.cumsum(shows)
         self._rows = before + np.flatnonzero(shows[before:])
         self._session = self._graph.session
         self._found: list[FoundPlace] = []  # accepted
@@ -130,15 +157,20 @@ class _Merge:
         with contextlib.ExitStack() as stack:
             each: _Map = map
             if workers > 1:  # not threads, which would share one interpreter
-                pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start_worker)
+                pool = ProcessPoolExecutor(
+                    workers, multiprocessing.get_context("spawn"), start_worker
+                )
                 each = stack.enter_context(pool).map
             try:
-                self._look(partial(places_found, path, self._store.path, self._before), each, workers)
+                self._look(
+                    partial(places_found, path, self._store.path, self._before), each, workers
+                )
             except BrokenProcessPool as error:
                 fault = f"{self._store.path}: a process that searches ended unexpectedly; try fewer workers"
                 raise VioError(fault) from error
         if self._found:  # writes what finds the keyframes again
-            graph, own = self._graph, len(self._graph.sessions) - 1
+            graph = self._graph
+            own = len(self._graph.sessions) - 1
             PlaceFinder(self._store, graph, graph.sessions[own].camera, own, writes=True)
         return bool(self._found)
 
@@ -146,7 +178,10 @@ class _Merge:
         """Search in rounds, and optimise after each, until nothing new is found."""
         left = self._rows
         for _ in range(_ROUNDS):
-            found = [*self._found, *(place for part in each(search, np.array_split(left, parts)) for place in part)]
+            found = [
+                *self._found,
+                *(place for part in each(search, np.array_split(left, parts)) for place in part),
+            ]
             known = {o.second for o in self._found}
             new = self._accepted([o for o in self._confirmed(found) if o.second not in known])
             if not new:
@@ -159,28 +194,46 @@ class _Merge:
 
     def _confirmed(self, found: Sequence[FoundPlace]) -> list[FoundPlace]:
         """Return the places that other keyframes confirm, before or after them."""
-        found, out = sorted(found, key=lambda o: o.second), list[FoundPlace]()
+        found = sorted(found, key=lambda o: o.second)
+        out = list[FoundPlace]()
         for n, place in enumerate(found):  # one a keyframe
             near = found[max(n - CONFIRM_WITHIN, 0) : n + CONFIRM_WITHIN + 1]
-            others = [o for o in near if o is not place and self._confirms(*sorted((o, place), key=lambda p: p.second))]
+            others = [
+                o
+                for o in near
+                if o is not place and self._confirms(*sorted((o, place), key=lambda p: p.second))
+            ]
             if len(others) >= min(o.needed for o in (place, *others)):
                 out.append(place)
         return out
 
     def _confirms(self, a: FoundPlace, b: FoundPlace) -> bool:
         near = self._order[b.second] - self._order[a.second] <= CONFIRM_WITHIN
-        return bool(near and self._session[a.second] == self._session[b.second] and agree(self._graph, a, b))
+        return bool(
+            near and self._session[a.second] == self._session[b.second] and agree(self._graph, a, b)
+        )
 
     def _accepted(self, found: Sequence[FoundPlace]) -> list[FoundPlace]:
-        """Join the parts of the map by the surest places; return those that agree with them, in their order."""
-        graph, out, own = self._graph, list[FoundPlace](), len(self._graph.sessions) - 1
-        finder = PlaceFinder(self._store, graph, graph.sessions[own].camera, own, writes=False, most=0)
+        """Join the parts of the map by the surest places; return those that agree with them, in
+        their order.
+        """
+        graph = self._graph
+        out = list[FoundPlace]()
+        own = len(self._graph.sessions) - 1
+        finder = PlaceFinder(
+            self._store, graph, graph.sessions[own].camera, own, writes=False, most=0
+        )
         for place in sorted(found, key=lambda o: -o.seen.inliers):
-            i, k = place.first, place.second
+            i = place.first
+            k = place.second
             if graph.part[i] != graph.part[k]:
-                join_parts(graph, graph.sessions[0].part, i, k, graph.T_map_cam[i] @ place.seen.pose.T_i_j)
+                join_parts(
+                    graph, graph.sessions[0].part, i, k, graph.T_map_cam[i] @ place.seen.pose.T_i_j
+                )
             else:
-                finder.newest = _nearest(graph, self._session, [_loop(o) for o in [*self._found, *out]], k)
+                finder.newest = _nearest(
+                    graph, self._session, [_loop(o) for o in [*self._found, *out]], k
+                )
                 if not finder.fits(i, k, place.seen, finder.drift_since(np.array([i]), k)[0]):
                     continue
             out.append(place)
@@ -188,7 +241,8 @@ class _Merge:
 
     def _optimise(self, new: Sequence[FoundPlace]) -> None:
         """Add loops, optimise the parts that have them, and write poses, loops and parts."""
-        graph, store = self._graph, self._store
+        graph = self._graph
+        store = self._store
         rows = [_loop(o) for o in new]
         graph.add_loops(rows)
         for row in rows:
@@ -208,14 +262,19 @@ def _loop(place: FoundPlace) -> LoopRow:
     return LoopRow(place.first, place.second, place.seen.pose, place.seen.inliers, kept=True)
 
 
-def _nearest(graph: MapGraph, session: IntArray, loops: Sequence[LoopRow], k: int) -> LoopRow | None:
-    """Return the loop whose later keyframe is closest to keyframe k along the path of its session, of (K,)."""
+def _nearest(
+    graph: MapGraph, session: IntArray, loops: Sequence[LoopRow], k: int
+) -> LoopRow | None:
+    """Return the loop whose later keyframe is closest to keyframe k along the path of its
+    session, of (K,).
+    """
     own = [o for o in loops if session[o.second] == session[k]]
     return min(own, key=lambda o: abs(graph.path_m[o.second] - graph.path_m[k]), default=None)
 
 
 def places_found(path: Path, known_as: Path, before: int, rows: IntArray) -> list[FoundPlace]:
-    """Return the places among the first `before` keyframes of a map that others (N,) show, one a keyframe at most.
+    """Return the places among the first `before` keyframes of a map that others (N,) show, one a
+    keyframe at most.
 
     Args:
         path: the map's file.
@@ -226,10 +285,12 @@ def places_found(path: Path, known_as: Path, before: int, rows: IntArray) -> lis
     Raises:
         DataError: the file cannot be used.
     """
-    out, finders = list[FoundPlace](), dict[int, PlaceFinder]()
+    out = list[FoundPlace]()
+    finders = dict[int, PlaceFinder]()
     with contextlib.closing(MapStore(path, read_only=True, known_as=known_as)) as store:
         graph = MapGraph(store)
-        session, loops = graph.session, [o for o in graph.loops if o.kept and o.first < before <= o.second]
+        session = graph.session
+        loops = [o for o in graph.loops if o.kept and o.first < before <= o.second]
         for k in rows.tolist():
             own = int(session[k])
             if own not in finders:
@@ -244,10 +305,12 @@ def places_found(path: Path, known_as: Path, before: int, rows: IntArray) -> lis
 
 
 def _merge_earth(store: MapStore, other: MapStore) -> None:
-    """Give a merged map the place on the earth of the map that was taken up, where it has none of its own.
+    """Give a merged map the place on the earth of the map that was taken up, where it has none of
+    its own.
 
-    Each keyframe k of both says how the frames lie, `T_store_k T_other_k^-1`. That of the one in the middle is taken,
-    and the mean square of the others' difference from it is added to the covariance.
+    Each keyframe k of both says how the frames lie, `T_store_k T_other_k^-1`. That of the one in
+    the middle is taken, and the mean square of the others' difference from it is added to the
+    covariance.
 
     Args:
         store: the merged map.
@@ -257,10 +320,15 @@ def _merge_earth(store: MapStore, other: MapStore) -> None:
     if earth is None:
         return
     if store.earth() is not None:
-        log.warning("%s: both maps are on the earth; the place of that recorded first is kept", store.path)
+        log.warning(
+            "%s: both maps are on the earth; the place of that recorded first is kept", store.path
+        )
         return
-    rows, before, sessions = store.keyframes(), other.keyframes(), store.sessions()
-    home, home_before = sessions[0].part, other.sessions()[0].part
+    rows = store.keyframes()
+    before = other.keyframes()
+    sessions = store.sessions()
+    home = sessions[0].part
+    home_before = other.sessions()[0].part
     parts = [s.part for s in other.sessions()]
     pairs = [
         (now.T_map_cam, row.T_map_cam)
@@ -268,13 +336,26 @@ def _merge_earth(store: MapStore, other: MapStore) -> None:
         if sessions[now.session].part == home and parts[row.session] == home_before
     ]
     if not pairs:
-        log.warning("%s: what was on the earth is not joined to the first session; its place is left out", store.path)
+        log.warning(
+            "%s: what was on the earth is not joined to the first session; its place is left out",
+            store.path,
+        )
         return
     T_now, T_before = (np.array(T) for T in zip(*pairs, strict=True))
-    middle = int(np.argmin(np.linalg.norm(T_now[:, :3, 3] - np.median(T_now[:, :3, 3], axis=0), axis=1)))
+    middle = int(
+        np.argmin(np.linalg.norm(T_now[:, :3, 3] - np.median(T_now[:, :3, 3], axis=0), axis=1))
+    )
     T_other_store = T_before @ se3_inverse(T_now)
     # In the frame of the keyframe in the middle, in which a rotation moves least.
-    xi = se3_log(se3_inverse(T_now[middle]) @ se3_inverse(T_other_store[middle]) @ T_other_store @ T_now[middle])
-    A, B = se3_adjoint(se3_inverse(T_other_store[middle])), se3_adjoint(T_now[middle])
+    xi = se3_log(
+        se3_inverse(T_now[middle])
+        @ se3_inverse(T_other_store[middle])
+        @ T_other_store
+        @ T_now[middle]
+    )
+    A = se3_adjoint(se3_inverse(T_other_store[middle]))
+    B = se3_adjoint(T_now[middle])
     covariance = A @ earth.covariance @ A.T + B @ (xi.T @ xi / len(xi)) @ B.T
-    store.set_earth(replace(earth, T_enu_map=earth.T_enu_map @ T_other_store[middle], covariance=covariance))
+    store.set_earth(
+        replace(earth, T_enu_map=earth.T_enu_map @ T_other_store[middle], covariance=covariance)
+    )

@@ -1,4 +1,6 @@
-"""How much of what keyframes showed should be seen from a pose: a few points of each keyframe, projected."""
+"""How much of what keyframes showed should be seen from a pose: a few points of each keyframe,
+projected.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from vio.records import BoolArray, IntArray
 
 _POINTS = 32  # of a keyframe; 0.8 kB
 LEAST_DEPTH_M = 0.1
-VIEW_COS = float(np.cos(np.radians(45.0)))  # between two views of a point: beyond, descriptors have little in common
+# between two views of a point: beyond, descriptors have little in common
+VIEW_COS = float(np.cos(np.radians(45.0)))
 SCALES = 2.5  # between the distances of two views of a point, likewise
 
 
@@ -29,18 +32,23 @@ class Overlaps:
         self._count.append(len(p))
 
     def restore(self, points: FloatArray, count: IntArray) -> None:
-        """Take the points (K, P, 3) and counts (K,) that `newest` gave of keyframes, in their order."""
+        """Take the points (K, P, 3) and counts (K,) that `newest` gave of keyframes, in their
+        order.
+        """
         self._points.extend(points)
         self._count.extend(count)
 
     def newest(self, count: int) -> tuple[FloatArray, IntArray]:
-        """Return the points (K, P, 3) of the newest keyframes, and how many stereo points each has (K,)."""
+        """Return the points (K, P, 3) of the newest keyframes, and how many stereo points each
+        has (K,).
+        """
         return self._points[-count:], self._count[-count:].astype(np.int64)
 
     def expected(
         self, rows: IntArray, T_map_cam: FloatArray, camera: StereoCamera, T_map_here: FloatArray
     ) -> FloatArray:
-        """Return how many points of keyframes `rows` (R,), which stand at T_map_cam (R, 4, 4), a camera should see.
+        """Return how many points of keyframes `rows` (R,), which stand at T_map_cam (R, 4, 4), a
+        camera should see.
 
         Args:
             rows: keyframes.
@@ -67,9 +75,13 @@ def is_visible(p: FloatArray, there: FloatArray, q: FloatArray, here: FloatArray
         q: (..., 3) the points in the camera.
         here: (3,) position of the camera, in the frame of p.
     """
-    then, now = p - there, p - here
-    away, near = np.linalg.norm(then, axis=-1), np.linalg.norm(now, axis=-1)
+    then = p - there
+    now = p - here
+    away = np.linalg.norm(then, axis=-1)
+    near = np.linalg.norm(now, axis=-1)
     cosine = np.einsum("...i,...i->...", then, now) / np.maximum(away * near, 1e-9)
     scale = away / np.maximum(near, 1e-9)
-    out: BoolArray = (q[..., 2] > LEAST_DEPTH_M) & (cosine > VIEW_COS) & (scale > 1 / SCALES) & (scale < SCALES)
+    out: BoolArray = (
+        (q[..., 2] > LEAST_DEPTH_M) & (cosine > VIEW_COS) & (scale > 1 / SCALES) & (scale < SCALES)
+    )
     return out

@@ -1,7 +1,9 @@
-"""Which places of a map a new keyframe shows again: those that the odometry expects, else those with words in common.
+"""Which places of a map a new keyframe shows again: those that the odometry expects, else those
+with words in common.
 
-A place is accepted in four steps: words in common (`place_index`); PnP in both directions (`loop_geometry`); agreement
-with the odometry within its covariance; and no second place that fits as well.
+A place is accepted in four steps: words in common (`place_index`); PnP in both directions
+(`loop_geometry`); agreement with the odometry within its covariance; and no second place that fits
+as well.
 """
 
 from __future__ import annotations
@@ -16,7 +18,15 @@ from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.guided_search import LEAST_CORNERS, Guided, PlaceView, Shown, place_points, search, shown
+from vio.mapping.guided_search import (
+    LEAST_CORNERS,
+    Guided,
+    PlaceView,
+    Shown,
+    place_points,
+    search,
+    shown,
+)
 from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, Verified, matches_of, verify
 from vio.mapping.map_graph import UNKNOWN, MapGraph
 from vio.mapping.map_store import LoopRow, MapStore, PlacesRow
@@ -28,21 +38,28 @@ from vio.records import BoolArray, IntArray
 _CANDIDATES = 3  # keyframes that are compared by geometry
 _RECENT = 10  # newest keyframes, which the filter's own tracks join
 _REVISIT_DEPTHS = 1.5  # path since a keyframe, in median depths, before it counts as seen again
-_VIEW_DEPTHS, _VIEW_RAD = 1.5, float(np.radians(70.0))  # how far apart two views of a place are, in median depths
+_VIEW_DEPTHS = 1.5  # how far apart two views of a place are, in median depths
+_VIEW_RAD = float(np.radians(70.0))
 _SIGMAS = 3.0
 GATE = float(chi_square_quantile(0.999, 6))
 _LOST_M = 3.0  # standard deviation of the position beyond which one confirmation is not enough …
-_CONFIRMATIONS, _CONFIRMATIONS_LOST = 1, 2  # other keyframes that must agree; … and how many then
+_CONFIRMATIONS = 1  # other keyframes that must agree; … and how many then
+_CONFIRMATIONS_LOST = 2
 _SURE_INLIERS = 60  # three times what is asked of any loop: one confirmation is enough
-_OTHER_PLACE = 0.5  # share of the best candidate's inliers at which one elsewhere makes the place ambiguous
-_SAME_DEPTHS, _SAME_M = 0.1, 0.1  # by which what two candidates say of the position may differ
+# share of the best candidate's inliers at which one elsewhere makes the place ambiguous
+_OTHER_PLACE = 0.5
+_SAME_DEPTHS = 0.1  # by which what two candidates say of the position may differ
+_SAME_M = 0.1
 _GUIDED_PLACES = 3  # that are searched together
-_GUIDED_NEIGHBOURS, _GUIDED_OTHERS = 3, 2  # keyframes to each side that belong to the first place, and to the others
-# Of what errors of the calibration may do (`MapGraph.drift`), what a search and its gate count on: it looks where the
-# odometry is right to 0.25 % and 0.12 deg/100 m, which is a quarter of what a place found without it is held against.
+_GUIDED_NEIGHBOURS = 3  # keyframes to each side that belong to the first place, and to the others
+_GUIDED_OTHERS = 2
+# Of what errors of the calibration may do (`MapGraph.drift`), what a search and its gate count on:
+# it looks where the odometry is right to 0.25 % and 0.12 deg/100 m, which is a quarter of what a
+# place found without it is held against.
 _GUIDED_SHARE = 0.25
 _GUIDED_M = 0.5  # standard deviation of the position up to which places are searched
-_SHOWN = 64  # keyframes whose points are held, 6 MB: from query to query, most of those searched are the same
+# keyframes whose points are held, 6 MB: from query to query, most of those searched are the same
+_SHOWN = 64
 _OF_THE_FILE = ("_store", "_index", "_overlaps", "_shown")
 
 
@@ -57,7 +74,9 @@ class FoundPlace:
 
     @property
     def is_sure(self) -> bool:
-        """Whether it shows enough to need one confirmation alone where nothing else is known of the place."""
+        """Whether it shows enough to need one confirmation alone where nothing else is known of
+        the place.
+        """
         return self.seen.inliers >= _SURE_INLIERS
 
 
@@ -85,7 +104,10 @@ class PlaceFinder:
             most: the first ones alone; None: all.
         """
         count = len(graph) if most is None else most
-        self._graph, self._camera, self._own, self._writes = graph, camera, own, writes
+        self._graph = graph
+        self._camera = camera
+        self._own = own
+        self._writes = writes
         self.newest: LoopRow | None = None  # accepted loop
         # Keyframes that are found no more.
         self._forgotten = set(np.flatnonzero(~store.show_something()[:count]).tolist())
@@ -93,7 +115,9 @@ class PlaceFinder:
 
     def reopen(self, store: MapStore, keyframes: int) -> None:
         """Begin again with so many keyframes of the file."""
-        self._store, self._index, self._overlaps = store, PlaceIndex(), Overlaps()
+        self._store = store
+        self._index = PlaceIndex()
+        self._overlaps = Overlaps()
         self._shown = lru_cache(_SHOWN)(self._read_shown)
         self._restore(keyframes)
 
@@ -113,21 +137,27 @@ class PlaceFinder:
         self._forgotten.update(keyframes.tolist())
 
     def forget_pixels(self) -> None:
-        """Forget what was made of the pixels of keyframes, as the estimate of the rectification error has changed."""
+        """Forget what was made of the pixels of keyframes, as the estimate of the rectification
+        error has changed.
+        """
         self._shown.cache_clear()
 
     def measured_again(self, loop: LoopRow) -> LoopRow | None:
-        """Return a loop as measured from where the map has its keyframes now; None: not enough is seen.
+        """Return a loop as measured from where the map has its keyframes now; None: not enough is
+        seen.
 
-        The prior is the odometry, as for a new loop. A loop's first measurement is none: of the pairs around it those
-        that agree with it would be chosen, right or wrong.
+        The prior is the odometry, as for a new loop. A loop's first measurement is none: of the
+        pairs around it those that agree with it would be chosen, right or wrong.
         """
-        i, k = loop.first, loop.second
+        i = loop.first
+        k = loop.second
         if self._forgotten & {i, k}:
             return None
         prior = self._priors(np.array([i]), k).get(i)
         views = place_points(self._views(i, i))
-        seen = search(views, self._camera, self.features(k), loop.pose if prior is None else prior, prior)
+        seen = search(
+            views, self._camera, self.features(k), loop.pose if prior is None else prior, prior
+        )
         return None if seen is None else replace(loop, pose=seen.pose, inliers=seen.inliers)
 
     def remember(self, camera: StereoCamera, features: KeyframeFeatures) -> None:
@@ -140,27 +170,37 @@ class PlaceFinder:
             self._store.add_places(PlacesRow(words, *self._overlaps.newest(SEGMENT)))
 
     def _restore(self, count: int) -> None:
-        """Let the first keyframes of the file be found again: by what it says of places, the rest by their features."""
+        """Let the first keyframes of the file be found again: by what it says of places, the
+        rest by their features.
+        """
         places = self._store.places()[: count // SEGMENT]
         self._index.restore([row.words for row in places])
         for row in places:
             self._overlaps.restore(row.points, row.stereo)
-        for k, session in enumerate(self._graph.session[len(self._index) : count].tolist(), start=len(self._index)):
+        for k, session in enumerate(
+            self._graph.session[len(self._index) : count].tolist(), start=len(self._index)
+        ):
             self.remember(self._graph.sessions[session].camera, self.features(k))
 
     def features(self, keyframe: int) -> KeyframeFeatures:
-        """Return a keyframe's features without what its session found the stereo calibration to be off by."""
+        """Return a keyframe's features without what its session found the stereo calibration to
+        be off by.
+        """
         graph = self._graph
-        return self._store.features(keyframe).without(graph.sessions[int(graph.session[keyframe])].field)
+        return self._store.features(keyframe).without(
+            graph.sessions[int(graph.session[keyframe])].field
+        )
 
     def find(self, number: int, features: KeyframeFeatures) -> FoundPlace | None:
-        """Return the best place that fits by geometry and odometry, unless another one fits nearly as well.
+        """Return the best place that fits by geometry and odometry, unless another one fits nearly
+        as well.
 
         Args:
             number: of the keyframe, which is in the graph.
             features: what it shows.
         """
-        depth, known = self._median_depth(features), len(self._index)
+        depth = self._median_depth(features)
+        known = len(self._index)
         if not known or depth is None:
             return None
         drift = self.drift_since(np.arange(known), number)
@@ -174,7 +214,9 @@ class PlaceFinder:
             seen = verify(camera, self.features(i), self._camera, features)
             if seen is not None and self.fits(i, number, seen, drift[i]):
                 lost = drift[i, :3, :3].trace() > _LOST_M**2 and seen.inliers < _SURE_INLIERS
-                found.append(FoundPlace(i, number, seen, _CONFIRMATIONS_LOST if lost else _CONFIRMATIONS))
+                found.append(
+                    FoundPlace(i, number, seen, _CONFIRMATIONS_LOST if lost else _CONFIRMATIONS)
+                )
         if not found:
             return None
         best = max(found, key=lambda loop: loop.seen.inliers)
@@ -182,9 +224,12 @@ class PlaceFinder:
             return None
         return self._refined(best, features, drift[best.first])
 
-    def _refined(self, loop: FoundPlace, features: KeyframeFeatures, drift: FloatArray) -> FoundPlace | None:
+    def _refined(
+        self, loop: FoundPlace, features: KeyframeFeatures, drift: FloatArray
+    ) -> FoundPlace | None:
         """Return a place with the pose by all that it shows; None: not enough of that is seen."""
-        i, k = loop.first, loop.second
+        i = loop.first
+        k = loop.second
         views = self._views(i, i)
         prior = self._priors(np.array([i]), k).get(i)
         seen = search(place_points(views), self._camera, features, loop.seen.pose, prior)
@@ -193,8 +238,11 @@ class PlaceFinder:
         refined = _as_place(views, k, seen, features, loop.needed)
         return refined if self.fits(refined.first, k, refined.seen, drift) else None
 
-    def _search(self, number: int, features: KeyframeFeatures, allowed: BoolArray) -> FoundPlace | None:
-        """Look for the points of the places that should be visible by the odometry, at the pixels that it predicts.
+    def _search(
+        self, number: int, features: KeyframeFeatures, allowed: BoolArray
+    ) -> FoundPlace | None:
+        """Look for the points of the places that should be visible by the odometry, at the pixels
+        that it predicts.
 
         Args:
             number: of the keyframe.
@@ -219,7 +267,9 @@ class PlaceFinder:
         return _as_place(views, number, seen, features, _CONFIRMATIONS)
 
     def _priors(self, rows: IntArray, k: int) -> dict[int, RelativePose]:
-        """Return where keyframe k stands in those of keyframes `rows` from which the odometry knows it well enough."""
+        """Return where keyframe k stands in those of keyframes `rows` from which the odometry
+        knows it well enough.
+        """
         graph = self._graph
         rows = rows[graph.part[rows] == graph.part[k]]
         drift = self.drift_since(rows, k, systematic=_GUIDED_SHARE)
@@ -229,7 +279,8 @@ class PlaceFinder:
 
     def _expected_places(self, number: int, rows: IntArray) -> list[int]:
         """Return the keyframes among `rows` of which most should be seen, each of another place."""
-        T, out = self._graph.T_map_cam, list[int]()
+        T = self._graph.T_map_cam
+        out = list[int]()
         score = np.zeros(len(self._index))
         score[rows] = self._overlaps.expected(rows, T[rows], self._camera, T[number])
         kernel = np.ones(2 * _GUIDED_NEIGHBOURS + 1)
@@ -238,19 +289,28 @@ class PlaceFinder:
         while len(out) < _GUIDED_PLACES and around.max(initial=0.0) >= LEAST_CORNERS:
             middle = int(np.argmax(around))
             out.append(middle)
-            around[max(middle - 2 * _GUIDED_NEIGHBOURS, 0) : middle + 2 * _GUIDED_NEIGHBOURS + 1] = 0.0
+            around[
+                max(middle - 2 * _GUIDED_NEIGHBOURS, 0) : middle + 2 * _GUIDED_NEIGHBOURS + 1
+            ] = 0.0
         return out
 
     def _views(self, i: int, origin: int, *, reach: int = _GUIDED_NEIGHBOURS) -> list[PlaceView]:
-        """Return keyframe i and its neighbours in its session, with their motion from another keyframe."""
-        graph, session = self._graph, self._graph.session
+        """Return keyframe i and its neighbours in its session, with their motion from another
+        keyframe.
+        """
+        graph = self._graph
+        session = self._graph.session
         around = range(max(i - reach, 0), min(i + reach + 1, len(self._index)))
         rows = [m for m in around if m not in self._forgotten]
-        near = np.array(sorted((m for m in rows if session[m] == session[i]), key=lambda m: abs(m - i)), dtype=np.int64)
+        near = np.array(
+            sorted((m for m in rows if session[m] == session[i]), key=lambda m: abs(m - i)),
+            dtype=np.int64,
+        )
         covariance = graph.drift(np.full(len(near), origin), near, systematic=0.0)
         motion = se3_inverse(graph.T_map_cam[origin]) @ graph.T_map_cam[near]
         return [
-            PlaceView(m, self._shown(m), RelativePose(motion[n], covariance[n]), i) for n, m in enumerate(near.tolist())
+            PlaceView(m, self._shown(m), RelativePose(motion[n], covariance[n]), i)
+            for n, m in enumerate(near.tolist())
         ]
 
     def _read_shown(self, keyframe: int) -> Shown:
@@ -260,7 +320,10 @@ class PlaceFinder:
     def _is_rival(self, other: FoundPlace, best: FoundPlace, depth: float) -> bool:
         """Whether another place of the same part of the map fits nearly as well as the best one."""
         part = self._graph.part
-        if part[other.first] != part[best.first] or other.seen.inliers < _OTHER_PLACE * best.seen.inliers:
+        if (
+            part[other.first] != part[best.first]
+            or other.seen.inliers < _OTHER_PLACE * best.seen.inliers
+        ):
             return False
         gap = self._position(other) - self._position(best)
         return float(np.linalg.norm(gap)) > _SAME_M + _SAME_DEPTHS * depth
@@ -275,7 +338,8 @@ class PlaceFinder:
         return float(np.median(p[valid, 2])) if valid.any() else None
 
     def drift_since(self, i: IntArray, k: int, *, systematic: float = 1.0) -> FloatArray:
-        """Covariance (N, 6, 6) of the motion from keyframes i (N,) to k, in the frame of k, before k's own loops.
+        """Covariance (N, 6, 6) of the motion from keyframes i (N,) to k, in the frame of k, before
+        k's own loops.
 
         The shorter of two ways: along the path, or by the newest loop.
         """
@@ -283,21 +347,31 @@ class PlaceFinder:
         direct = graph.drift(i, np.full(len(i), k), systematic=systematic)
         if self.newest is None:
             return direct
-        m, n = self.newest.first, self.newest.second
+        m = self.newest.first
+        n = self.newest.second
         A = se3_adjoint(se3_inverse(graph.T_odom_cam[k]) @ graph.T_odom_cam[n])
-        here = A @ self.newest.pose.covariance @ A.T + graph.drift(np.array([n]), np.array([k]), systematic=systematic)
+        here = A @ self.newest.pose.covariance @ A.T + graph.drift(
+            np.array([n]), np.array([k]), systematic=systematic
+        )
         there = graph.drift(i, np.full(len(i), m), systematic=systematic)
-        # The drift between i and m is known in the frame of the later one of them; its size is what matters here.
+        # The drift between i and m is known in the frame of the later one of them; its size is what
+        # matters here.
         by_loop = there + here
-        shorter = np.trace(by_loop[:, :3, :3], axis1=1, axis2=2) < np.trace(direct[:, :3, :3], axis1=1, axis2=2)
+        shorter = np.trace(by_loop[:, :3, :3], axis1=1, axis2=2) < np.trace(
+            direct[:, :3, :3], axis1=1, axis2=2
+        )
         return np.where(shorter[:, None, None], by_loop, direct)
 
     def _may_be_seen(self, number: int, depth: float, covariance: FloatArray) -> BoolArray:
-        """Mask (N,) of keyframes that are not recent, and close enough to show what this one shows."""
-        graph, count = self._graph, len(covariance)
+        """Mask (N,) of keyframes that are not recent, and close enough to show what this one
+        shows.
+        """
+        graph = self._graph
+        count = len(covariance)
         own = graph.session[:count] == self._own
         passed = graph.path_m[number] - graph.path_m[:count]
-        sigma = np.sqrt(np.maximum(np.trace(covariance, axis1=1, axis2=2), 0.0))  # large numbers cancel
+        # large numbers cancel
+        sigma = np.sqrt(np.maximum(np.trace(covariance, axis1=1, axis2=2), 0.0))
         near_path = (passed < _REVISIT_DEPTHS * depth) & (sigma < _LOST_M)
         recent = own & ((np.arange(count) > number - _RECENT) | near_path)
         T = se3_inverse(graph.T_map_cam[number]) @ graph.T_map_cam[:count]
@@ -316,17 +390,25 @@ class PlaceFinder:
         return squared(r, drift + seen.pose.covariance) < GATE
 
 
-def _as_place(views: list[PlaceView], number: int, seen: Guided, features: KeyframeFeatures, needed: int) -> FoundPlace:
-    """Return a place found by search as a motion from the keyframe that shows most of what was found.
+def _as_place(
+    views: list[PlaceView], number: int, seen: Guided, features: KeyframeFeatures, needed: int
+) -> FoundPlace:
+    """Return a place found by search as a motion from the keyframe that shows most of what was
+    found.
 
     Where that keyframe stands among the others enters the covariance by their points alone.
     """
     most = int(np.argmax(np.bincount(seen.view)))
-    best, own = views[most], seen.view == most
-    a, b, f = seen.row[own], seen.row_here[own], views[most].shown.features
+    best = views[most]
+    own = seen.view == most
+    a = seen.row[own]
+    b = seen.row_here[own]
+    f = views[most].shown.features
     matches = matches_of(f, a, features, b)
     pose = RelativePose(se3_inverse(best.place.T_i_j) @ seen.pose.T_i_j, seen.pose.covariance)
-    return FoundPlace(best.keyframe, number, Verified(pose, seen.inliers, len(seen.row), matches), needed)
+    return FoundPlace(
+        best.keyframe, number, Verified(pose, seen.inliers, len(seen.row), matches), needed
+    )
 
 
 def squared(r: FloatArray, covariance: FloatArray) -> float:

@@ -1,10 +1,11 @@
 """Which keyframes look like a new one: a bag of words whose words are some bits of the descriptors.
 
-A word is `_BITS` chosen bits of a descriptor, in each of `_TABLES` independent choices (locality-sensitive hashing,
-Indyk & Motwani 1998). Two descriptors of one point that differ in d of 256 bits share the word of one table with
-probability (1 - d / 256)^_BITS: 0.2 for d = 28, 0.6 with four tables. Nothing is trained, so that the words of two maps
-are the same, and a map's first keyframe can be found as well as its last one. Rare words weigh more (tf-idf, Sivic &
-Zisserman 2003).
+A word is `_BITS` chosen bits of a descriptor, in each of `_TABLES` independent choices
+(locality-sensitive hashing, Indyk & Motwani 1998). Two descriptors of one point that differ in d of
+256 bits share the word of one table with probability (1 - d / 256)^_BITS: 0.2 for d = 28, 0.6 with
+four tables. Nothing is trained, so that the words of two maps are the same, and a map's first
+keyframe can be found as well as its last one. Rare words weigh more (tf-idf, Sivic & Zisserman
+2003).
 """
 
 from __future__ import annotations
@@ -25,11 +26,14 @@ from vio.records import BoolArray, IntArray
 Words = npt.NDArray[np.uint16]
 Owners = npt.NDArray[np.unsignedinteger[Any]]
 
-_TABLES, _BITS = 4, 14  # 4 x 16384 words; a keyframe of 600 features has 2400 of them in 5 kB
+_TABLES = 4  # 4 x 16384 words; a keyframe of 600 features has 2400 of them in 5 kB
+_BITS = 14
 _WORDS = 1 << _BITS
 _SEED = 20120617  # of the choice of bits: any, but the same in all maps
-_NEIGHBOURS = 2  # keyframes before and after a candidate whose scores are added to its own: they show the same place
-_LEAST_TAIL, _TAIL_SHARE = 32, 1 / 16  # keyframes; a merge takes as long as the comparison with ten times as many
+# keyframes before and after a candidate whose scores are added to its own: they show the same place
+_NEIGHBOURS = 2
+_LEAST_TAIL = 32  # keyframes; a merge takes as long as the comparison with ten times as many
+_TAIL_SHARE = 1 / 16
 _UNIT = 1 << 16  # of the weights
 SEGMENT = 256  # keyframes whose words a file keeps in the order of the index
 
@@ -62,7 +66,8 @@ class Segment:
         Raises:
             ValueError: they are not those of an index.
         """
-        begins, owners = begins.reshape(_TABLES, _WORDS + 1), owners.reshape(_TABLES, -1)
+        begins = begins.reshape(_TABLES, _WORDS + 1)
+        owners = owners.reshape(_TABLES, -1)
         ends = begins[:, [0, -1]] == (0, owners.shape[1])
         if not ends.all() or (begins[:, 1:] < begins[:, :-1]).any():
             raise ValueError("its words are not in order")
@@ -72,19 +77,22 @@ class Segment:
 class PlaceIndex:
     """The words of all keyframes, in the order in which they were added.
 
-    An inverted index: for each word the keyframes that show it. The newest keyframes are a tail whose words are
-    compared one by one, until it is long enough to be merged into the index. Weights are integers, so that a score does
-    not depend on where a keyframe is.
+    An inverted index: for each word the keyframes that show it. The newest keyframes are a tail
+    whose words are compared one by one, until it is long enough to be merged into the index.
+    Weights are integers, so that a score does not depend on where a keyframe is.
     """
 
     def __init__(self) -> None:
-        self._begins: IntArray = np.zeros((_TABLES, _WORDS + 1), dtype=np.int64)  # of each word among the owners
+        # of each word among the owners
+        self._begins: IntArray = np.zeros((_TABLES, _WORDS + 1), dtype=np.int64)
         self._owners: Owners = np.zeros((_TABLES, 0), dtype=np.uint16)  # keyframes, ordered by word
         self._merged = 0  # keyframes in the index; the others are the tail
         self._tail: list[Words] = []
         self._sizes: list[int] = []  # features of each keyframe
-        self._newest: IntArray = np.zeros((_TABLES, _WORDS), dtype=np.int64)  # keyframe that showed a word last, from 1
-        self._frequency: IntArray = np.zeros((_TABLES, _WORDS), dtype=np.int64)  # keyframes with a word
+        # keyframe that showed a word last, from 1
+        self._newest: IntArray = np.zeros((_TABLES, _WORDS), dtype=np.int64)
+        # keyframes with a word
+        self._frequency: IntArray = np.zeros((_TABLES, _WORDS), dtype=np.int64)
         self._unsaved: list[Words] = []  # of the keyframes since the last full segment
 
     def __len__(self) -> int:
@@ -114,18 +122,25 @@ class PlaceIndex:
         owners, offsets = _joined([s.owners for s in segments])
         self._merged = len(segments) * SEGMENT
         self._owners = self._room(owners.shape[1])
-        _join_segments(begins, owners, offsets, self._begins, self._owners, self._newest, self._frequency)
+        _join_segments(
+            begins, owners, offsets, self._begins, self._owners, self._newest, self._frequency
+        )
         for segment in segments:
             self._sizes += np.bincount(segment.owners[0], minlength=SEGMENT).tolist()
 
     def full_segment(self) -> Segment | None:
-        """Return the words of the newest keyframes once there are `SEGMENT` of them; they are then forgotten here."""
+        """Return the words of the newest keyframes once there are `SEGMENT` of them; they are
+        then forgotten here.
+        """
         if len(self._unsaved) < SEGMENT:
             return None
         words, offsets = _joined(self._unsaved)
-        begins, owners = np.zeros_like(self._begins), np.empty(words.shape, dtype=np.uint16)
+        begins = np.zeros_like(self._begins)
+        owners = np.empty(words.shape, dtype=np.uint16)
         nothing = np.zeros((_TABLES, 0), dtype=np.uint16)
-        _merge_words(np.zeros_like(begins), nothing, words, offsets, int(np.int64(0)), begins, owners)
+        _merge_words(
+            np.zeros_like(begins), nothing, words, offsets, int(np.int64(0)), begins, owners
+        )
         self._unsaved = []
         return Segment(begins.astype(np.uint32), owners.astype(np.uint8))
 
@@ -139,10 +154,15 @@ class PlaceIndex:
         owners = self._room(self._owners.shape[1] + words.shape[1])
         begins = np.zeros_like(self._begins)
         _merge_words(self._begins, self._owners, words, offsets, self._merged, begins, owners)
-        self._begins, self._owners, self._merged, self._tail = begins, owners, len(self), []
+        self._begins = begins
+        self._owners = owners
+        self._merged = len(self)
+        self._tail = []
 
     def scores(self, descriptors: Bits) -> FloatArray:
-        """Return for each keyframe (K,) the weight of the words that it shares with descriptors (N, 32)."""
+        """Return for each keyframe (K,) the weight of the words that it shares with descriptors
+        (N, 32).
+        """
         count = len(self)
         weight = np.zeros((_TABLES, _WORDS), dtype=np.int64)
         known = [np.unique(row).astype(np.int64) for row in words_of(descriptors)]
@@ -156,7 +176,9 @@ class PlaceIndex:
         return out / (_UNIT * np.sqrt(np.maximum(self._sizes, 1.0)))
 
     def candidates(self, descriptors: Bits, allowed: BoolArray, most: int) -> IntArray:
-        """Return up to `most` keyframes among those `allowed` (K,), the most similar first, each of another place."""
+        """Return up to `most` keyframes among those `allowed` (K,), the most similar first, each
+        of another place.
+        """
         if not len(self) or not len(descriptors):
             return np.zeros(0, dtype=np.int64)
         score = np.where(allowed, self.scores(descriptors), 0.0)
@@ -168,14 +190,17 @@ class PlaceIndex:
             middle = int(np.argmax(left))
             near = slice(max(middle - _NEIGHBOURS, 0), middle + _NEIGHBOURS + 1)
             out.append(near.start + int(np.argmax(score[near])))
-            left[max(middle - 2 * _NEIGHBOURS, 0) : middle + 2 * _NEIGHBOURS + 1] = 0.0  # those that share its sum
+            # those that share its sum
+            left[max(middle - 2 * _NEIGHBOURS, 0) : middle + 2 * _NEIGHBOURS + 1] = 0.0
         return np.array(out, dtype=np.int64)
 
 
 def _joined(parts: Sequence[npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], IntArray]:
     """Return the words or owners (T, N) of all parts, and where those of each begin (K + 1,)."""
     nothing = np.zeros((_TABLES, 0), dtype=np.uint16)
-    return np.concatenate(parts or [nothing], axis=1), np.cumsum([0, *(part.shape[1] for part in parts)])
+    return np.concatenate(parts or [nothing], axis=1), np.cumsum(
+        [0, *(part.shape[1] for part in parts)]
+    )
 
 
 @compiled
@@ -188,9 +213,11 @@ def _join_segments(
     newest: IntArray,
     frequency: IntArray,
 ) -> None:
-    """Write the index of segments that follow one another, word by word, and count the keyframes with each.
+    """Write the index of segments that follow one another, word by word, and count the keyframes
+    with each.
 
-    Those of segment s begin at `offsets[s]` of the owners (T, N), and there at `begins[s]` (T, W + 1).
+    Those of segment s begin at `offsets[s]` of the owners (T, N), and there at `begins[s]` (T, W +
+    1).
     """
     for t in range(len(owners)):
         n = 0
@@ -208,7 +235,9 @@ def _join_segments(
 
 @compiled
 def _write_words(descriptors: Bits, chosen: IntArray, out: Words) -> None:
-    """Write the words (T, N) of descriptors (N, 32): bits (T, B), the highest of a byte being its first."""
+    """Write the words (T, N) of descriptors (N, 32): bits (T, B), the highest of a byte being
+    its first.
+    """
     for t in range(len(chosen)):
         for n in range(len(descriptors)):
             word = 0
@@ -239,7 +268,9 @@ def _merge_words(
     out_begins: IntArray,
     out_owners: Owners,
 ) -> None:
-    """Merge the words (T, N) of keyframes from `first` on into an index; those of keyframe k begin at `offsets[k]`."""
+    """Merge the words (T, N) of keyframes from `first` on into an index; those of keyframe k
+    begin at `offsets[k]`.
+    """
     cursor = np.empty(begins.shape[1], dtype=np.int64)
     for t in range(len(words)):
         for w in range(begins.shape[1] - 1):
@@ -260,8 +291,12 @@ def _merge_words(
 
 
 @compiled
-def _add_owners(begins: IntArray, owners: Owners, known: IntArray, weight: IntArray, out: IntArray) -> None:
-    """Add the weight of each word in `known` to its owners in `out` (K,), once for each feature with it."""
+def _add_owners(
+    begins: IntArray, owners: Owners, known: IntArray, weight: IntArray, out: IntArray
+) -> None:
+    """Add the weight of each word in `known` to its owners in `out` (K,), once for each feature
+    with it.
+    """
     for w in known:
         for e in range(begins[w], begins[w + 1]):
             out[owners[e]] += weight[w]
@@ -269,7 +304,9 @@ def _add_owners(begins: IntArray, owners: Owners, known: IntArray, weight: IntAr
 
 @compiled
 def _add_weights(words: Words, offsets: IntArray, weight: IntArray, out: IntArray) -> None:
-    """Add the weights of the words (T, N) of each keyframe to `out` (K,); those of keyframe k begin at `offsets[k]`."""
+    """Add the weights of the words (T, N) of each keyframe to `out` (K,); those of keyframe k
+    begin at `offsets[k]`.
+    """
     for k in range(len(out)):
         total = 0
         for n in range(offsets[k], offsets[k + 1]):

@@ -1,7 +1,9 @@
-"""The optimum of a graph of camera poses: odometry between keyframes, gravity, and loops that may be wrong.
+"""The optimum of a graph of camera poses: odometry between keyframes, gravity, and loops that may
+be wrong.
 
-Equations (G1) to (G5) of docs/math.md. Gauss-Newton on SE(3) over a sparse normal matrix. Loops are truncated least
-squares by graduated non-convexity (Yang et al., 2020): one that contradicts the others ends with weight zero.
+Equations (G1) to (G5) of docs/math.md. Gauss-Newton on SE(3) over a sparse normal matrix. Loops are
+truncated least squares by graduated non-convexity (Yang et al., 2020): one that contradicts the
+others ends with weight zero.
 """
 
 from __future__ import annotations
@@ -13,7 +15,15 @@ import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, se3_left_jacobian, se3_log, so3_hat
+from vio.geometry.lie import (
+    FloatArray,
+    se3_adjoint,
+    se3_exp,
+    se3_inverse,
+    se3_left_jacobian,
+    se3_log,
+    so3_hat,
+)
 from vio.geometry.relative_pose import RelativePose
 from vio.numerics import sparse
 from vio.numerics.robust import truncated_weights
@@ -22,9 +32,11 @@ from vio.records import BoolArray, IntArray
 
 _TRUNCATION = 0.999  # probability at which a loop's residual is cut off
 _MU_GROWTH = 1.6  # of the control parameter, from one step to the next
-_MOST_STEPS, _MOST_GNC_STEPS = 15, 30
+_MOST_STEPS = 15
+_MOST_GNC_STEPS = 30
 _CONVERGED = 1e-6  # largest change, m and rad
-_FRAME_METRIC = np.repeat([1.0, 2.0], 3)  # by which (G7) weighs an error xi: |R - R'|_F^2 = 2 |phi|^2
+# by which (G7) weighs an error xi: |R - R'|_F^2 = 2 |phi|^2
+_FRAME_METRIC = np.repeat([1.0, 2.0], 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +89,8 @@ def optimise(
     *,
     levelled: int | None = None,
 ) -> Optimum:
-    """Return the poses (K, 4, 4) that minimise the squared errors of odometry, gravity and truncated loops.
+    """Return the poses (K, 4, 4) that minimise the squared errors of odometry, gravity and
+    truncated loops.
 
     Args:
         T_map_cam: (K, 4, 4) where to start; the map's z axis is up if there are up_directions.
@@ -85,14 +98,19 @@ def optimise(
         loops: edges that may be wrong.
         up_directions: directions of the vertical.
         fixed: (K,) poses that stay; of a connected component without one of them, the first does.
-        levelled: one of the fixed poses whose position and heading alone stay, so that its roll and pitch follow the
-            up_directions; None: all of them stay.
+        levelled: one of the fixed poses whose position and heading alone stay, so that its roll and
+            pitch follow the up_directions; None: all of them stay.
     """
     free = _Free(fixed, levelled)
     limit = float(chi_square_quantile(_TRUNCATION, 6))
-    T, weight = T_map_cam.copy(), np.ones(len(loops))
+    T = T_map_cam.copy()
+    weight = np.ones(len(loops))
     if not len(loops):
-        return Optimum(_descend(T, odometry, loops, weight, up_directions, free, _MOST_STEPS), weight > 0.5, weight)
+        return Optimum(
+            _descend(T, odometry, loops, weight, up_directions, free, _MOST_STEPS),
+            weight > 0.5,
+            weight,
+        )
     T = _descend(T, odometry, loops, weight, up_directions, free, _MOST_STEPS)
     squared = _squared(T, loops)
     worst = float(squared.max())
@@ -118,18 +136,25 @@ def _squared(T: FloatArray, edges: Edges) -> FloatArray:
 
 def residual(T: FloatArray, edges: Edges) -> FloatArray:
     """Residuals (E, 6) of edges at poses (K, 4, 4): `log(T_i_j^-1 T_i^-1 T_j)`, equation (G1)."""
-    out: FloatArray = se3_log(se3_inverse(edges.T_i_j) @ se3_inverse(T[edges.first]) @ T[edges.second])
+    out: FloatArray = se3_log(
+        se3_inverse(edges.T_i_j) @ se3_inverse(T[edges.first]) @ T[edges.second]
+    )
     return out
 
 
 def r_D_poses(T: FloatArray, edges: Edges, r: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Jacobians (E, 6, 6) of `residual` with respect to xi_i and xi_j in T <- T exp(xi), equation (G2)."""
-    r_D_j = np.asarray(np.linalg.inv(se3_left_jacobian(-r)), dtype=np.float64)  # the right Jacobian's inverse
+    """Jacobians (E, 6, 6) of `residual` with respect to xi_i and xi_j in T <- T exp(xi),
+    equation (G2).
+    """
+    # the right Jacobian's inverse
+    r_D_j = np.asarray(np.linalg.inv(se3_left_jacobian(-r)), dtype=np.float64)
     return -r_D_j @ se3_adjoint(se3_inverse(T[edges.second]) @ T[edges.first]), r_D_j
 
 
 def up_residual(T: FloatArray, up_directions: UpDirections) -> tuple[FloatArray, FloatArray]:
-    """Residuals (U, 3) `R^T e_z - up_cam` at poses (K, 4, 4), and their Jacobians (U, 3, 6), equation (G3)."""
+    """Residuals (U, 3) `R^T e_z - up_cam` at poses (K, 4, 4), and their Jacobians (U, 3, 6),
+    equation (G3).
+    """
     up = T[up_directions.pose, 2, :3]  # R^T e_z
     D = np.zeros((len(up), 3, 6))
     D[:, :, 3:] = so3_hat(up)
@@ -146,13 +171,17 @@ class _Free:
     def directions(self, T: FloatArray) -> csc_matrix:
         """Columns (6K, F) of the changes xi of the poses (K, 4, 4) that are free."""
         rows = np.flatnonzero(np.repeat(~self.fixed, 6))
-        columns, values = np.arange(len(rows)), np.ones(len(rows))
+        columns = np.arange(len(rows))
+        values = np.ones(len(rows))
         if self.levelled is not None:
-            # T exp([0; R^T a]) rotates a pose about its position and the axis a of the map: the first two rows of R.
+            # T exp([0; R^T a]) rotates a pose about its position and the axis a of the map: the
+            # first two rows of R.
             rows = np.concatenate([rows, np.tile(6 * self.levelled + np.arange(3, 6), 2)])
             columns = np.concatenate([columns, np.repeat(len(columns) + np.arange(2), 3)])
             values = np.concatenate([values, T[self.levelled, :2, :3].ravel()])
-        return coo_matrix((values, (rows, columns)), shape=(6 * len(T), int(columns.max(initial=-1)) + 1)).tocsc()
+        return coo_matrix(
+            (values, (rows, columns)), shape=(6 * len(T), int(columns.max(initial=-1)) + 1)
+        ).tocsc()
 
 
 def _descend(
@@ -175,9 +204,14 @@ def _descend(
 
 
 def _anchored(fixed: BoolArray, odometry: Edges, loops: Edges, weight: FloatArray) -> BoolArray:
-    """Return the poses (K,) that stay: those given, and the first of each piece that no weight joins to one of them."""
+    """Return the poses (K,) that stay: those given, and the first of each piece that no weight
+    joins to one of them.
+    """
     held = weight > 0
-    ends = np.concatenate([odometry.first, loops.first[held]]), np.concatenate([odometry.second, loops.second[held]])
+    ends = (
+        np.concatenate([odometry.first, loops.first[held]]),
+        np.concatenate([odometry.second, loops.second[held]]),
+    )
     links = coo_matrix((np.ones(len(ends[0])), ends), shape=(len(fixed), len(fixed)))
     pieces, piece = connected_components(links, directed=False)
     loose = ~np.isin(np.arange(pieces), piece[fixed])
@@ -187,7 +221,12 @@ def _anchored(fixed: BoolArray, odometry: Edges, loops: Edges, weight: FloatArra
 
 
 def _step(
-    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, up_directions: UpDirections, free: _Free
+    T: FloatArray,
+    odometry: Edges,
+    loops: Edges,
+    weight: FloatArray,
+    up_directions: UpDirections,
+    free: _Free,
 ) -> FloatArray:
     """Solve the normal equations (G4) for xi (K, 6)."""
     H, gradient, P = _normal(T, odometry, loops, weight, up_directions, free)
@@ -205,13 +244,14 @@ def marginals(
     levelled: int | None = None,
     frame: FloatArray | None = None,
 ) -> FloatArray:
-    """Return the covariances (C, 6, 6) of xi in `T exp(xi)` of some poses (C,) of an optimum (K, 4, 4), by (G4).
+    """Return the covariances (C, 6, 6) of xi in `T exp(xi)` of some poses (C,) of an optimum (K, 4,
+    4), by (G4).
 
     The other arguments are those of `optimise`; all loops count, and what stays is exact.
 
     Args:
-        frame: (K,) weights of the poses that define the frame by where they stand on average, (G9); None: it is that in
-            which the fixed poses stay.
+        frame: (K,) weights of the poses that define the frame by where they stand on average, (G9);
+            None: it is that in which the fixed poses stay.
     """
     weight = np.ones(len(loops))
     free = _Free(_anchored(fixed, odometry, loops, weight), levelled)
@@ -227,9 +267,16 @@ def marginals(
 
 
 def _normal(
-    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, up_directions: UpDirections, free: _Free
+    T: FloatArray,
+    odometry: Edges,
+    loops: Edges,
+    weight: FloatArray,
+    up_directions: UpDirections,
+    free: _Free,
 ) -> tuple[csc_matrix, FloatArray, csc_matrix]:
-    """Return the normal matrix (F, F) of (G4) for what is free, the right-hand side (6K,) of all, and the columns."""
+    """Return the normal matrix (F, F) of (G4) for what is free, the right-hand side (6K,) of
+    all, and the columns.
+    """
     count = len(T)
     blocks: list[tuple[IntArray, IntArray, FloatArray]] = []
     gradient = np.zeros((count, 6))
@@ -239,15 +286,18 @@ def _normal(
         r = residual(T, edges)
         A, B = r_D_poses(T, edges, r)
         W = edges.information * scale[:, None, None]
-        AW, BW = np.swapaxes(A, 1, 2) @ W, np.swapaxes(B, 1, 2) @ W
-        i, j = edges.first, edges.second
+        AW = np.swapaxes(A, 1, 2) @ W
+        BW = np.swapaxes(B, 1, 2) @ W
+        i = edges.first
+        j = edges.second
         AB = AW @ B
         blocks += [(i, i, AW @ A), (j, j, BW @ B), (i, j, AB), (j, i, np.swapaxes(AB, 1, 2))]
         np.add.at(gradient, i, -np.einsum("eij,ej->ei", AW, r))
         np.add.at(gradient, j, -np.einsum("eij,ej->ei", BW, r))
     if len(up_directions.pose):
         r, D = up_residual(T, up_directions)
-        D, r = D / up_directions.sigma_rad[:, None, None], r / up_directions.sigma_rad[:, None]
+        D = D / up_directions.sigma_rad[:, None, None]
+        r = r / up_directions.sigma_rad[:, None]
         blocks.append((up_directions.pose, up_directions.pose, np.swapaxes(D, 1, 2) @ D))
         np.add.at(gradient, up_directions.pose, -np.einsum("eji,ej->ei", D, r))
     P = free.directions(T)

@@ -1,4 +1,6 @@
-"""Faults of an accelerometer or of the lever arm, by its readings and the camera's motion; exchanged axes."""
+"""Faults of an accelerometer or of the lever arm, by its readings and the camera's motion;
+exchanged axes.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ log = logging.getLogger(__name__)
 
 _SIGN_SIGMAS = 6.0
 AXES_WORSE = 3.0  # ratio of the given axes' squared misfit to that of others
-_AXES_WORSE_EARLY = 9.0  # likewise in fewer windows; right axes came to at most 1.2 in 178 pieces of flights and drives
+# likewise in fewer windows; right axes came to at most 1.2 in 178 pieces of flights and drives
+_AXES_WORSE_EARLY = 9.0
 _UPSIDE_DOWN = 0.5  # cosine between image-down and up: within 60 degrees
 _UPSIDE_SHARE = 0.95
 _NS = 1e-9
@@ -42,11 +45,19 @@ def signed_permutations() -> Iterator[FloatArray]:
 
 def axes_text(P: FloatArray) -> str:
     """Return how true readings of x y z appear in the recording, e.g. `[+y -x +z]`."""
-    return "[" + " ".join(f"{'+' if row.sum() > 0 else '-'}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in P) + "]"
+    return (
+        "["
+        + " ".join(
+            f"{'+' if row.sum() > 0 else '-'}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in P
+        )
+        + "]"
+    )
 
 
 def resolve_size(size: Size, evidence: Evidence) -> Size:
-    """Resolve an ambiguous magnitude: use the images' accelerations to test whether the readings are in m/s^2."""
+    """Resolve an ambiguous magnitude: use the images' accelerations to test whether the readings
+    are in m/s^2.
+    """
     if size.clear or size.finding is None or size.unit is None:
         return size
     if evidence.force is not None:
@@ -58,8 +69,12 @@ def resolve_size(size: Size, evidence: Evidence) -> Size:
 
 
 def judge_force(evidence: Evidence, unit: float) -> tuple[list[InertialFinding], bool]:
-    """Judge axes and sign of the accelerometer, whose readings times `unit` are m/s^2; and if the sign is known."""
-    gyro_fit, force, R = evidence.gyro_fit, evidence.force, evidence.R_cam0_imu
+    """Judge axes and sign of the accelerometer, whose readings times `unit` are m/s^2; and if
+    the sign is known.
+    """
+    gyro_fit = evidence.gyro_fit
+    force = evidence.force
+    R = evidence.R_cam0_imu
     readings = gyro_fit.force[gyro_fit.covered]
     if evidence.early_force is not None:
         wrong = _wrong_axes(evidence.early_force, R * unit)
@@ -68,33 +83,42 @@ def judge_force(evidence: Evidence, unit: float) -> tuple[list[InertialFinding],
     if force is not None:
         scale, sigma = force.sign(R * unit)
         if abs(scale) > _SIGN_SIGMAS * sigma and 0.5 < abs(scale) < 2.0:
-            return ([_wrong_sign(scale, sigma)] if scale < 0 else judge_up(readings, R, measured=True)), True
+            return (
+                [_wrong_sign(scale, sigma)] if scale < 0 else judge_up(readings, R, measured=True)
+            ), True
     return (judge_up(readings, R, measured=False) if evidence.last else []), False
 
 
 def _wrong_sign(scale: float, sigma: float) -> InertialFinding:
     return InertialFinding(
         "accelerometer sign",
-        f"the images' accelerations are {scale:+.2f} times (standard deviation {sigma:.2f}) those of the accelerometer",
-        "all readings have the wrong sign (specific force is +9.8 m/s^2 upwards at standstill); change it",
+        f"the images' accelerations are {scale:+.2f} times (standard deviation {sigma:.2f}) those "
+        "of the accelerometer",
+        "all readings have the wrong sign (specific force is +9.8 m/s^2 upwards at standstill); "
+        "change it",
     )
 
 
 def _wrong_axes(force: ForceFit, C: FloatArray) -> InertialFinding | None:
-    """Return exchanged axes of the accelerometer that fit clearly better than the given map (3, 3) to the camera."""
+    """Return exchanged axes of the accelerometer that fit clearly better than the given map (3,
+    3) to the camera.
+    """
     given = force.cost(C)
     others = [P for P in signed_permutations() if abs(np.trace(P)) < 2.5]
     costs = [force.cost(C @ P) for P in others]
     k = int(np.argmin(costs))
     worse = AXES_WORSE if force.windows >= LEAST_WINDOWS else _AXES_WORSE_EARLY
-    # Neither the given axes nor their negative may explain the readings: the sign is judged separately.
+    # Neither the given axes nor their negative may explain the readings: the sign is judged
+    # separately.
     if costs[k] * worse > min(given, force.cost(-C)):
         return None
     return InertialFinding(
         "accelerometer axes",
-        f"with the given axes the accelerometer deviates from the camera's path by {100 * np.sqrt(given):.1f} cm over "
+        "with the given axes the accelerometer deviates from the camera's path by "
+        f"{100 * np.sqrt(given):.1f} cm over "
         f"{WINDOW_S:g} s, with others by {100 * np.sqrt(costs[k]):.1f} cm, while the gyro agrees",
-        f"its axes contain {axes_text(others[k].T)} in place of [+x +y +z]; correct their order and signs",
+        f"its axes contain {axes_text(others[k].T)} in place of [+x +y +z]; correct their order "
+        "and signs",
     )
 
 
@@ -112,36 +136,47 @@ def judge_up(force: FloatArray, R_cam0_imu: FloatArray, *, measured: bool) -> li
     if share < _UPSIDE_SHARE:
         return []
     explanation = (
-        "the camera is mounted upside down, or gravity was added with the wrong sign (a + g in place of a - g), which "
+        "the camera is mounted upside down, or gravity was added with the wrong sign (a + g in "
+        "place of a - g), which "
         "motion alone cannot distinguish"
         if measured
-        else "the camera is mounted upside down, or the accelerometer's sign, that of its gravity, or T_cam0_imu is "
+        else "the camera is mounted upside down, or the accelerometer's sign, that of its gravity, "
+        "or T_cam0_imu is "
         "wrong; the motion is too small to decide"
     )
     return [
         InertialFinding(
             "upside down",
-            f"the accelerometer's 'up' points down in the image in {100 * share:.0f} % of the frames",
+            f"the accelerometer's 'up' points down in the image in {100 * share:.0f} % of the "
+            "frames",
             f"{explanation}; unless the camera is upside down, the estimated world will be",
             certain=False,
         )
     ]
 
 
-def judge_lever_arm(record: Record, gyro_fit: GyroFit, T_cam0_imu: FloatArray, rates: Rates) -> list[InertialFinding]:
-    """Report an inverted lever arm by the fit of `vio calibrate`; nothing if the motion does not determine it.
+def judge_lever_arm(
+    record: Record, gyro_fit: GyroFit, T_cam0_imu: FloatArray, rates: Rates
+) -> list[InertialFinding]:
+    """Report an inverted lever arm by the fit of `vio calibrate`; nothing if the motion does not
+    determine it.
 
     `T_cam0_imu` (4, 4) is as given; the gyro must agree with its rotation.
     """
-    times_ns = record.origin_ns + np.round(np.concatenate([record.begin, record.end[-1:]]) / _NS).astype(np.int64)
-    frames = np.flatnonzero(np.append(record.joined[1:], True))  # whose interval ends where the next frame is
+    times_ns = record.origin_ns + np.round(
+        np.concatenate([record.begin, record.end[-1:]]) / _NS
+    ).astype(np.int64)
+    # whose interval ends where the next frame is
+    frames = np.flatnonzero(np.append(record.joined[1:], True))
     motion = CameraMotion(times_ns, frames.astype(np.int64), record.twists[frames])
     alignment = ImuAlignment(
         R_cam0_imu=T_cam0_imu[:3, :3],
         rotation_sigma_deg=np.zeros(3),
         time_offset_s=gyro_fit.offset_s,
         time_offset_sigma_s=0.0,
-        gyro_bias=np.asarray(-np.linalg.lstsq(gyro_fit.A, gyro_fit.b, rcond=None)[0], dtype=np.float64),
+        gyro_bias=np.asarray(
+            -np.linalg.lstsq(gyro_fit.A, gyro_fit.b, rcond=None)[0], dtype=np.float64
+        ),
         residual_radps=gyro_fit.noise_radps,
         intervals=gyro_fit.count,
         weak=None,
@@ -155,7 +190,8 @@ def judge_lever_arm(record: Record, gyro_fit: GyroFit, T_cam0_imu: FloatArray, r
         InertialFinding(
             "extrinsics translation",
             fault.detail,
-            "the translation of T_cam0_imu has the wrong sign or belongs to the inverse transform; it must be the "
+            "the translation of T_cam0_imu has the wrong sign or belongs to the inverse transform; "
+            "it must be the "
             "IMU's position in the left camera's frame",
         )
         for fault in faults

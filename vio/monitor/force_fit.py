@@ -1,4 +1,6 @@
-"""The accelerometer against the images: the best linear map from its readings to the camera's accelerations, (I3)."""
+"""The accelerometer against the images: the best linear map from its readings to the camera's
+accelerations, (I3).
+"""
 
 from __future__ import annotations
 
@@ -13,21 +15,26 @@ from vio.monitor.motion import Record
 from vio.numerics.robust import jackknife
 from vio.records import BoolArray
 
-FIRST_EVALUATION = 60  # intervals before the first evaluation; there are fewer only at the end of a short run
+# intervals before the first evaluation; there are fewer only at the end of a short run
+FIRST_EVALUATION = 60
 WINDOW_S = 2.0
 LEAST_WINDOWS = 3  # for all but axes that are clearly wrong
 _FEWEST_WINDOWS = 2
 _BIAS_PRIOR_MPS2 = 0.3
 _LEVER_ARM_PRIOR_M = 1.0
 _MISFIT_M = 0.02  # standard deviation of a window's positions, to weight the priors
-_PRIOR = _MISFIT_M**2 / np.repeat([_BIAS_PRIOR_MPS2, _LEVER_ARM_PRIOR_M], 3) ** 2  # information, (6,)
-_MAP_PRIOR = np.full(9, _MISFIT_M**2 / 400)  # information on the map's entries, (9,): keeps the fit solvable
+# information, (6,)
+_PRIOR = _MISFIT_M**2 / np.repeat([_BIAS_PRIOR_MPS2, _LEVER_ARM_PRIOR_M], 3) ** 2
+# information on the map's entries, (9,): keeps the fit solvable
+_MAP_PRIOR = np.full(9, _MISFIT_M**2 / 400)
 _REWEIGHTINGS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class ForceFit:
-    """Normal equations of `camera acceleration - gravity = A force + b` over windows, (I3): A by rows, b, lever arm."""
+    """Normal equations of `camera acceleration - gravity = A force + b` over windows, (I3): A by
+    rows, b, lever arm.
+    """
 
     N: FloatArray  # (W, 15, 15)
     h: FloatArray  # (W, 15)
@@ -40,11 +47,19 @@ class ForceFit:
         return len(self.c)
 
     def reduced(self, keep: BoolArray | None = None) -> tuple[FloatArray, FloatArray, float]:
-        """Return N, h, c of the cost `c - 2 h a + a N a` of a linear map a (9,), bias and lever arm marginalised."""
+        """Return N, h, c of the cost `c - 2 h a + a N a` of a linear map a (9,), bias and lever
+        arm marginalised.
+        """
         w = self.weight if keep is None else self.weight * keep
-        N, h, c = np.tensordot(w, self.N, 1), w @ self.h, float(w @ self.c)
+        N = np.tensordot(w, self.N, 1)
+        h = w @ self.h
+        c = float(w @ self.c)
         K = np.linalg.solve(N[9:, 9:] + np.diag(_PRIOR), np.column_stack([N[9:, :9], h[9:]]))
-        return N[:9, :9] - N[:9, 9:] @ K[:, :9], h[:9] - N[:9, 9:] @ K[:, 9], c - float(h[9:] @ K[:, 9])
+        return (
+            N[:9, :9] - N[:9, 9:] @ K[:, :9],
+            h[:9] - N[:9, 9:] @ K[:, 9],
+            c - float(h[9:] @ K[:, 9]),
+        )
 
     def cost(self, C: FloatArray) -> float:
         """Return the squared misfit (m^2) of a map (3, 3) from force to the camera frame."""
@@ -53,8 +68,11 @@ class ForceFit:
         return max(float(c - 2 * h @ a + a @ N @ a), 0.0)
 
     def sign(self, C: FloatArray) -> tuple[float, float]:
-        """Return the best factor on a map (3, 3), and its standard error by a jackknife over windows."""
-        a, values = C.reshape(9), []
+        """Return the best factor on a map (3, 3), and its standard error by a jackknife over
+        windows.
+        """
+        a = C.reshape(9)
+        values = []
         every = np.arange(len(self.c))
         for left_out in (-1, *every):
             N, h, _ = self.reduced(every != left_out)
@@ -68,10 +86,13 @@ class Evidence:
 
     R_cam0_imu: FloatArray  # (3, 3) as given
     gyro_fit: GyroFit
-    force: ForceFit | None  # None: too few windows without tracking loss, or the readings have no unit
-    early_force: ForceFit | None  # likewise, from fewer windows: enough for axes that are clearly wrong
+    # None: too few windows without tracking loss, or the readings have no unit
+    force: ForceFit | None
+    # likewise, from fewer windows: enough for axes that are clearly wrong
+    early_force: ForceFit | None
     force_final: bool  # `force` will not improve: what it leaves undecided is judged without it
-    clipped: bool  # readings at the end of the range were found, which make rotations appear smaller
+    # readings at the end of the range were found, which make rotations appear smaller
+    clipped: bool
     last: bool  # no later evaluation will follow
 
     @property
@@ -93,8 +114,8 @@ class _Window:
 def fit_force(record: Record, gyro_fit: GyroFit, lever_arm: FloatArray) -> ForceFit | None:
     """Fit over whole windows; None: too few of them are without tracking loss.
 
-    The gyro's fit gives the camera's rotation where it explains the images. A correction to the given position of the
-    IMU in cam0, `lever_arm` (3,) in metres, is fitted, too.
+    The gyro's fit gives the camera's rotation where it explains the images. A correction to the
+    given position of the IMU in cam0, `lever_arm` (3,) in metres, is fitted, too.
     """
     blocks = [_normal_equations(window, lever_arm) for window in _windows(record, gyro_fit)]
     if len(blocks) < _FEWEST_WINDOWS:
@@ -111,8 +132,13 @@ def fit_force(record: Record, gyro_fit: GyroFit, lever_arm: FloatArray) -> Force
 
 def _windows(record: Record, gyro_fit: GyroFit) -> Iterator[_Window]:
     """Yield consecutive windows; after a tracking loss the next one starts anew."""
-    dt, joined = record.end - record.begin, record.joined
-    omega = gyro_fit.gyro @ gyro_fit.A.T + gyro_fit.b if gyro_fit.unexplained < AGREES else record.twists[:, 3:]
+    dt = record.end - record.begin
+    joined = record.joined
+    omega = (
+        gyro_fit.gyro @ gyro_fit.A.T + gyro_fit.b
+        if gyro_fit.unexplained < AGREES
+        else record.twists[:, 3:]
+    )
     first = 0
     while first < len(dt):
         last = first
@@ -125,11 +151,18 @@ def _windows(record: Record, gyro_fit: GyroFit) -> Iterator[_Window]:
         first = max(last, first + 1)
 
 
-def _normal_equations(window: _Window, lever_arm: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return normal equations N (15, 15), h (15,), c of one window; start velocity and gravity are projected out."""
-    n, dt = len(window.dt), window.dt
+def _normal_equations(
+    window: _Window, lever_arm: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return normal equations N (15, 15), h (15,), c of one window; start velocity and gravity
+    are projected out.
+    """
+    n = len(window.dt)
+    dt = window.dt
     R = _rotations(window)
-    position = np.cumsum(np.einsum("nij,nj->ni", R[:-1], se3_exp(dt[:, None] * window.twists)[:, :3, 3]), axis=0)
+    position = np.cumsum(
+        np.einsum("nij,nj->ni", R[:-1], se3_exp(dt[:, None] * window.twists)[:, :3, 3]), axis=0
+    )
     swing = R[1:] - np.eye(3)
     X = np.concatenate([_double_integrals(window, R[:-1]), -swing], axis=2)
     y = position + swing @ lever_arm  # the correction to the given lever arm is fitted
@@ -137,7 +170,8 @@ def _normal_equations(window: _Window, lever_arm: FloatArray) -> tuple[FloatArra
     Q = np.linalg.qr(np.stack([elapsed, elapsed**2], axis=1))[0]
     X = X - np.tensordot(Q, np.tensordot(Q, X, (0, 0)), (1, 0))
     y = y - Q @ (Q.T @ y)
-    X, flat = X.reshape(3 * n, 15), y.reshape(3 * n)
+    X = X.reshape(3 * n, 15)
+    flat = y.reshape(3 * n)
     return X.T @ X / n, X.T @ flat / n, float(flat @ flat) / n
 
 
@@ -152,8 +186,12 @@ def _rotations(window: _Window) -> FloatArray:
 
 
 def _double_integrals(window: _Window, R: FloatArray) -> FloatArray:
-    """Return the Jacobian (n, 3, 12) of the IMU's positions at the intervals' ends by A and b; R at their starts."""
-    n, dt = len(window.dt), window.dt[:, None, None]
+    """Return the Jacobian (n, 3, 12) of the IMU's positions at the intervals' ends by A and b.
+
+    R at their starts.
+    """
+    n = len(window.dt)
+    dt = window.dt[:, None, None]
     middle = R @ so3_exp(window.dt[:, None] / 2 * window.omega)
     of_map = np.einsum("nij,nl->nijl", middle, window.force).reshape(n, 3, 9)
     gain = dt * np.concatenate([of_map, middle], axis=2)

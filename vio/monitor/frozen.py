@@ -1,9 +1,11 @@
-"""Find images and depth images that show no motion although the rig moves: a camera or driver gives them again.
+"""Find images and depth images that show no motion although the rig moves: a camera or driver gives
+them again.
 
-Equal to the last bit is the same exposure, as noise differs from one to the next. Nearly equal pairs (encoded again, or
-with noise on top) are the same where the tracked corners have not moved, while the motion predicted since the last
-frame moves them by more than its uncertainty allows and the IMU is not at standstill. A rig at standstill gives nearly
-equal images, too; there the prediction agrees, and they are used.
+Equal to the last bit is the same exposure, as noise differs from one to the next. Nearly equal
+pairs (encoded again, or with noise on top) are the same where the tracked corners have not moved,
+while the motion predicted since the last frame moves them by more than its uncertainty allows and
+the IMU is not at standstill. A rig at standstill gives nearly equal images, too; there the
+prediction agrees, and they are used.
 """
 
 from __future__ import annotations
@@ -18,20 +20,31 @@ from vio.imu.standstill import STANDSTILL_S, blocks_agree
 from vio.numerics.compiled import compiled
 from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import Image, ImuSample, IntArray, MotionPrior, Observations, Prediction, StereoFrame
+from vio.records import (
+    Image,
+    ImuSample,
+    IntArray,
+    MotionPrior,
+    Observations,
+    Prediction,
+    StereoFrame,
+)
 
 _RADIUS = 4  # of the patches whose flow is measured, pixels
 _CORNERS = 60  # measured per image
 _LEAST_CORNERS = 15
 _PREDICTED_PX = 1.0  # a corner that is predicted to move less is no evidence …
 _ERRORS = 3.0  # … nor one that moves by less than so many times what predictions were off by …
-_RECENT, _LEAST_RECENT = 20, 5  # … at most in so many frames
+_RECENT = 20  # … at most in so many frames
+_LEAST_RECENT = 5
 _UNMOVED_PX = 0.15  # the flow of an unmoved corner under noise of a few gray levels
 _SHARE = 0.8  # of the corners that must be unmoved
 _FIRST_ROWS = 8  # compared before all others
-_LIMIT = float(chi_square_quantile(0.9999, 6))  # of the predicted motion for no motion to be possible
+# of the predicted motion for no motion to be possible
+_LIMIT = float(chi_square_quantile(0.9999, 6))
 _MOST_LINES = 3  # rows of repetitions that are reported one by one
-_GYRO_NOISE, _ACCEL_NOISE = 2e-4, 1.2e-2  # rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), of a rig's IMU by its data sheet
+_GYRO_NOISE = 2e-4  # rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), of a rig's IMU by its data sheet
+_ACCEL_NOISE = 1.2e-2
 _NS = 1e-9
 
 
@@ -51,10 +64,12 @@ class FrozenImages:
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
         self._seen: Observations | None = None  # its features
         self._repeating: Repeated | None = None  # of the frame before
-        self._deep: StereoFrame | None = None  # the last frame with a depth image that is no repetition
+        # the last frame with a depth image that is no repetition
+        self._deep: StereoFrame | None = None
         self._same_depth = False  # that of the frame before was one
         self._expected: Prediction | None = None  # of the present frame
-        self._errors_px: deque[float] = deque(maxlen=_RECENT)  # median error of each frame's predicted pixels
+        # median error of each frame's predicted pixels
+        self._errors_px: deque[float] = deque(maxlen=_RECENT)
 
     def sample(self, sample: ImuSample) -> None:
         """Take a sample of the IMU."""
@@ -65,7 +80,9 @@ class FrozenImages:
     def observations(self, seen: Observations) -> None:
         """Take the features of a frame that `check` let pass."""
         if self._expected is not None:
-            _, a, b = np.intersect1d(seen.ids, self._expected.tracks.ids, assume_unique=True, return_indices=True)
+            _, a, b = np.intersect1d(
+                seen.ids, self._expected.tracks.ids, assume_unique=True, return_indices=True
+            )
             if len(a):
                 off = seen.z[a, :2] - self._expected.tracks.z[b, :2]
                 self._errors_px.append(median(np.linalg.norm(off, axis=1)))
@@ -74,24 +91,28 @@ class FrozenImages:
     def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
         """Return which frame a pair repeats; None: it shows something new, or a rig at standstill.
 
-        Frames come in time order, with or without images, each with the back end's prediction, whose motion is that
-        since the last frame with features.
+        Frames come in time order, with or without images, each with the back end's prediction,
+        whose motion is that since the last frame with features.
         """
-        self._expected, self._repeating = expected, self._compare(frame, expected)
+        self._repeating = self._compare(frame, expected)
+        self._expected = expected
         if self._repeating is None:
             self._shown = frame
         return self._repeating
 
     def check_depth(self, frame: StereoFrame) -> Repeated | None:
-        """Return which frame's depth image a frame repeats; None: it is new, or the rig is at standstill.
+        """Return which frame's depth image a frame repeats; None: it is new, or the rig is at
+        standstill.
 
         Call it after `check`, with frames whose images are new.
         """
-        before, depth = self._deep, frame.depth
+        before = self._deep
+        depth = frame.depth
         if depth is None:
             return None
         if before is None or before.depth is None or not _same_depths(depth, before.depth):
-            self._deep, self._same_depth = frame, False
+            self._deep = frame
+            self._same_depth = False
             return None
         self._same_depth = self._same_depth or self._moves(self._expected)
         return Repeated(before.index, True) if self._same_depth else None
@@ -100,7 +121,8 @@ class FrozenImages:
         shown = self._shown
         if shown is None or frame.left is None:
             return None
-        images, before = _images(frame), _images(shown)
+        images = _images(frame)
+        before = _images(shown)
         if [image.shape for image in images] != [image.shape for image in before]:
             return None  # the front end refuses it
         again = self._repeating is not None  # what was given again once is, until it changes
@@ -112,7 +134,9 @@ class FrozenImages:
             return Repeated(shown.index, False) if _unmoved(shown, frame, self._seen) else None
         if len(self._errors_px) < _LEAST_RECENT or not self._contradicts(expected.motion):
             return None
-        moving = _predicted_to_move(self._seen, expected, max(_PREDICTED_PX, _ERRORS * max(self._errors_px)))
+        moving = _predicted_to_move(
+            self._seen, expected, max(_PREDICTED_PX, _ERRORS * max(self._errors_px))
+        )
         # The IMU comes last, as nearly every new frame has moved.
         frozen = _unmoved(shown, frame, moving) and not self._at_standstill()
         return Repeated(shown.index, False) if frozen else None
@@ -124,12 +148,17 @@ class FrozenImages:
         return expected is not None and self._contradicts(expected.motion)
 
     def _at_standstill(self) -> bool:
-        """Whether the IMU's last half second shows noise alone; steady motion looks the same, but no rig is steady."""
+        """Whether the IMU's last half second shows noise alone; steady motion looks the same,
+        but no rig is steady.
+        """
         if not self._imu:
             return False
         times_s = np.array([x.time_ns - self._imu[-1].time_ns for x in self._imu]) * _NS
-        gyro, accel = np.array([x.gyro for x in self._imu]), np.array([x.accel for x in self._imu])
-        return blocks_agree(times_s, gyro, _GYRO_NOISE) and blocks_agree(times_s, accel, _ACCEL_NOISE)
+        gyro = np.array([x.gyro for x in self._imu])
+        accel = np.array([x.accel for x in self._imu])
+        return blocks_agree(times_s, gyro, _GYRO_NOISE) and blocks_agree(
+            times_s, accel, _ACCEL_NOISE
+        )
 
     def _contradicts(self, motion: MotionPrior | None) -> bool:
         """Whether no motion at all contradicts the predicted one, by chi-square."""
@@ -142,12 +171,16 @@ class FrozenImages:
 
 
 def _equal(a: Image, b: Image) -> bool:
-    """Whether two images (H, W) are the same to the bit; most differ in their first rows, and need no more."""
+    """Whether two images (H, W) are the same to the bit; most differ in their first rows, and
+    need no more.
+    """
     return np.array_equal(a[:_FIRST_ROWS], b[:_FIRST_ROWS]) and np.array_equal(a, b)
 
 
 def _same_depths(a: FloatArray, b: FloatArray) -> bool:
-    """Whether two depth images (H, W) are the same to the bit; without any depth they are of a scene out of range."""
+    """Whether two depth images (H, W) are the same to the bit; without any depth they are of a
+    scene out of range.
+    """
     return a.shape == b.shape and np.array_equal(a, b, equal_nan=True) and bool(np.any(a > 0))
 
 
@@ -168,7 +201,10 @@ def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
     of_images = seen.z[:_CORNERS, :2], seen.z[seen.has_right][:_CORNERS, 2:]
     for old, new, pixels in zip(_images(before), _images(now), of_images, strict=False):
         flow = corner_flow(old, new, pixels)
-        if len(flow) < _LEAST_CORNERS or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE:
+        if (
+            len(flow) < _LEAST_CORNERS
+            or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE
+        ):
             return False
     return True
 
@@ -212,10 +248,15 @@ class RepeatReport:
     def frame(self, frame: StereoFrame, repeated: Repeated | None) -> list[str]:
         """Take a frame and what it repeats; return the lines that follow from it."""
         if repeated is None:
-            row, self._row = self._row, []
+            row = self._row
+            self._row = []
             seconds = (frame.time_ns - row[0].time_ns) * _NS if row else 0.0
             after = f"after {len(row)} repetitions ({seconds:.2f} s)"
-            return [f"frame {frame.index}: the {self._words.what} change again, {after}"] if len(row) > 1 else []
+            return (
+                [f"frame {frame.index}: the {self._words.what} change again, {after}"]
+                if len(row) > 1
+                else []
+            )
         self._row.append(frame)
         self._total += 1
         if len(self._row) > 1 or self._reported >= _MOST_LINES:
@@ -223,32 +264,46 @@ class RepeatReport:
         self._reported += 1
         if all(image.min() == image.max() for image in _images(frame)):  # black, or blown out
             return [
-                f"frame {frame.index}: the {self._words.what} have one gray value everywhere, as those of frame "
-                f"{repeated.of_index}: the lens is covered, the exposure failed, or the images were not delivered; "
+                f"frame {frame.index}: the {self._words.what} have one gray value everywhere, as "
+                "those of frame "
+                f"{repeated.of_index}: the lens is covered, the exposure failed, or the images "
+                "were not delivered; "
                 f"left out, {self._words.effect}"
             ]
         seen = self._words.exact if repeated.exact else "both images show nothing that has moved"
-        cause = self._words.cause if repeated.exact else f"{self._words.cause}, or it sees only what moves with it"
+        cause = (
+            self._words.cause
+            if repeated.exact
+            else f"{self._words.cause}, or it sees only what moves with it"
+        )
         return [
-            f"frame {frame.index}: {seen} since frame {repeated.of_index} although the rig moves: {cause}; "
+            f"frame {frame.index}: {seen} since frame {repeated.of_index} although the rig moves: "
+            f"{cause}; "
             f"left out, {self._words.effect}"
         ]
 
     def finish(self) -> list[str]:
         """Return the line at the end of the run."""
-        what, effect = self._words.what, self._words.summary
-        still = [f"the {what} stayed the same from frame {self._row[0].index} to the end"] if self._row else []
+        what = self._words.what
+        effect = self._words.summary
+        still = (
+            [f"the {what} stayed the same from frame {self._row[0].index} to the end"]
+            if self._row
+            else []
+        )
         return [*still, f"{self._total} frames {effect}"] if self._total > 1 else still
 
 
 def corner_flow(before: Image, after: Image, pixels: FloatArray) -> FloatArray:
-    """Flow (M, 2) of patches at pixels (N, 2) between two images by one Lucas-Kanade step, offsets of gray removed.
+    """Flow (M, 2) of patches at pixels (N, 2) between two images by one Lucas-Kanade step, offsets
+    of gray removed.
 
-    Exact for no motion; for motions of many pixels it only says that there is one. Patches that leave the image are
-    left out, so M <= N.
+    Exact for no motion; for motions of many pixels it only says that there is one. Patches that
+    leave the image are left out, so M <= N.
     """
     height, width = before.shape
-    margin, at = _RADIUS + 1, np.rint(pixels).astype(np.int64)
+    margin = _RADIUS + 1
+    at = np.rint(pixels).astype(np.int64)
     inside = np.all((at >= margin) & (at < np.array([width, height]) - margin), axis=1)
     flow = np.empty((int(inside.sum()), 2))
     _write_flow(before, after, at[inside], flow)
@@ -260,15 +315,29 @@ def _write_flow(before: Image, after: Image, at: IntArray, flow: FloatArray) -> 
     """Write the flow (M, 2) of patches around whole pixels (M, 2)."""
     size = (2 * _RADIUS + 1) ** 2
     for m in range(len(at)):
-        uu, uv, vv = 1.0, 0.0, 1.0  # one gray level squared, against patches without texture
-        ut, vt, u_sum, v_sum, change = 0.0, 0.0, 0.0, 0.0, 0.0
+        uu = 1.0  # one gray level squared, against patches without texture
+        uv = 0.0
+        vv = 1.0
+        ut = 0.0
+        vt = 0.0
+        u_sum = 0.0
+        v_sum = 0.0
+        change = 0.0
         for y in range(at[m, 1] - _RADIUS, at[m, 1] + _RADIUS + 1):
             for x in range(at[m, 0] - _RADIUS, at[m, 0] + _RADIUS + 1):
                 gu = 0.5 * (float(before[y, x + 1]) - float(before[y, x - 1]))
                 gv = 0.5 * (float(before[y + 1, x]) - float(before[y - 1, x]))
                 t = float(after[y, x]) - float(before[y, x])
-                uu, uv, vv = uu + gu * gu, uv + gu * gv, vv + gv * gv
-                ut, vt, u_sum, v_sum, change = ut + gu * t, vt + gv * t, u_sum + gu, v_sum + gv, change + t
-        ut, vt = ut - u_sum * change / size, vt - v_sum * change / size  # less the mean change
+                uu = uu + gu * gu
+                uv = uv + gu * gv
+                vv = vv + gv * gv
+                ut = ut + gu * t
+                vt = vt + gv * t
+                u_sum = u_sum + gu
+                v_sum = v_sum + gv
+                change = change + t
+        ut = ut - u_sum * change / size  # less the mean change
+        vt = vt - v_sum * change / size
         det = uu * vv - uv * uv
-        flow[m, 0], flow[m, 1] = -(vv * ut - uv * vt) / det, -(uu * vt - uv * ut) / det
+        flow[m, 0] = -(vv * ut - uv * vt) / det
+        flow[m, 1] = -(uu * vt - uv * ut) / det

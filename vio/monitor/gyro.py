@@ -17,7 +17,8 @@ from vio.monitor.force_fit import Evidence
 from vio.monitor.gyro_fit import AGREES, FAR_OFFSETS_S, GyroFit
 
 _DISAGREES = 0.5  # share of the rotation that the best linear map leaves unexplained
-_EXCESS_CLIPPED = 0.5  # excess allowed where readings are clipped, which rotates and shortens the gyro's rates
+# excess allowed where readings are clipped, which rotates and shortens the gyro's rates
+_EXCESS_CLIPPED = 0.5
 _EXCESS_BRIEF = 0.7  # likewise with fewer intervals than in the first evaluation
 
 
@@ -32,8 +33,12 @@ class _Explanation:
 
 
 def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
-    """Compare the gyro's rates, mapped by the given rotation, with the camera's; forces times `unit` are m/s^2."""
-    gyro_fit, R, brief = evidence.gyro_fit, evidence.R_cam0_imu, evidence.brief
+    """Compare the gyro's rates, mapped by the given rotation, with the camera's; forces times
+    `unit` are m/s^2.
+    """
+    gyro_fit = evidence.gyro_fit
+    R = evidence.R_cam0_imu
+    brief = evidence.brief
     if gyro_fit.unexplained > _DISAGREES:
         return [] if brief else [_disagreement(gyro_fit)]
     limit = max(gyro_fit.tolerance, _EXCESS_CLIPPED * evidence.clipped, _EXCESS_BRIEF * brief)
@@ -59,29 +64,37 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     return [
         InertialFinding(
             "gyro units",
-            f"{seen}, and no rotation fits: the best linear map stretches by {_triple_text(stretch)}",
+            f"{seen}, and no rotation fits: the best linear map stretches by "
+            f"{_triple_text(stretch)}",
             "the gyro's axes have different scales, or one of them is dead",
         )
     ]
 
 
 def _gyro_alone(evidence: Evidence, unit: float) -> bool:
-    """Return whether the accelerometer agrees with the given rotation, so that only the gyro is at fault."""
+    """Return whether the accelerometer agrees with the given rotation, so that only the gyro is
+    at fault.
+    """
     if evidence.force is None:
         return False
     best = nearest_rotation(evidence.gyro_fit.S_cg)
-    return evidence.force.cost(evidence.R_cam0_imu * unit) * AXES_WORSE < evidence.force.cost(best * unit)
+    return evidence.force.cost(evidence.R_cam0_imu * unit) * AXES_WORSE < evidence.force.cost(
+        best * unit
+    )
 
 
 def _contradiction(gyro_fit: GyroFit, R: FloatArray) -> str:
-    """Describe how far the given rotation (3, 3) contradicts the gyro, and which rotation fits best."""
+    """Describe how far the given rotation (3, 3) contradicts the gyro, and which rotation fits
+    best.
+    """
     best = nearest_rotation(gyro_fit.S_cg)
     near = f"; the best rotation is {rotation_angle_deg(best @ R.T):.0f} deg from the given one"
     few = {1: "one axis", 2: "two axes"}.get(gyro_fit.axes)
     about = "" if few is None else f" (it rotates about {few} only, so other explanations fit, too)"
     share = gyro_fit.excess(R, max(gyro_fit.scale(R), 0.0))
     return (
-        f"with the given T_cam0_imu {100 * share:.0f} % of the camera's rotation contradicts the gyro"
+        f"with the given T_cam0_imu {100 * share:.0f} % of the camera's rotation contradicts the "
+        "gyro"
         f"{near if gyro_fit.fits(best) else ''}{about}"
     )
 
@@ -91,15 +104,20 @@ def _disagreement(gyro_fit: GyroFit) -> InertialFinding:
     gyro_rms = float(np.sqrt(np.trace(gyro_fit.S_gg)))
     return InertialFinding(
         "gyro disagrees",
-        f"the camera rotates at {rate:.1f} deg/s (RMS) and the gyro explains {100 * (1 - gyro_fit.unexplained):.0f} % "
-        f"of it at the best clock offset within {FAR_OFFSETS_S[-1]:g} s (the gyro's own RMS is {gyro_rms:.3g})",
-        "the IMU's file may belong to another recording, the clocks may be further apart, the gyro may be dead, or the "
+        f"the camera rotates at {rate:.1f} deg/s (RMS) and the gyro explains "
+        f"{100 * (1 - gyro_fit.unexplained):.0f} % "
+        f"of it at the best clock offset within {FAR_OFFSETS_S[-1]:g} s (the gyro's own RMS is "
+        f"{gyro_rms:.3g})",
+        "the IMU's file may belong to another recording, the clocks may be further apart, the gyro "
+        "may be dead, or the "
         "images may show something that moves with the camera",
     )
 
 
 def _judge_scale(evidence: Evidence, C: FloatArray) -> list[InertialFinding]:
-    """Judge the gyro's unit by the factor on a map (3, 3) to the camera, unless its effect is negligible."""
+    """Judge the gyro's unit by the factor on a map (3, 3) to the camera, unless its effect is
+    negligible.
+    """
     gyro_fit = evidence.gyro_fit
     scale = gyro_fit.scale(C)
     if gyro_fit.excess(C, 1.0) < gyro_fit.tolerance or (evidence.clipped and 0.5 < scale < 2.0):
@@ -116,7 +134,9 @@ def _judge_scale(evidence: Evidence, C: FloatArray) -> list[InertialFinding]:
     }
     odd = "the gyro's scale is wrong, or the camera's focal length is; rad/s are expected"
     factor = next((factor for factor in named if abs(np.log(scale / factor)) < 0.15), None)
-    return [InertialFinding("gyro units", seen, odd if factor is None else named[factor], factor=factor)]
+    return [
+        InertialFinding("gyro units", seen, odd if factor is None else named[factor], factor=factor)
+    ]
 
 
 def _explanations(R: FloatArray, *, gyro_alone: bool) -> Iterator[_Explanation]:
@@ -132,31 +152,44 @@ def _explanations(R: FloatArray, *, gyro_alone: bool) -> Iterator[_Explanation]:
         "gyro sign",
         -R,
         "the inverted gyro fits",
-        "the gyro's rates are left-handed (all three have the wrong sign); change the sign of its readings",
+        "the gyro's rates are left-handed (all three have the wrong sign); change the sign of its "
+        "readings",
     )
     if not gyro_alone:
         yield _Explanation(
             "extrinsics rotation",
             np.eye(3),
             "the identity fits",
-            "IMU and camera have the same axes in these files; the rotation of T_cam0_imu should be the identity",
+            "IMU and camera have the same axes in these files; the rotation of T_cam0_imu should "
+            "be the identity",
         )
     for P in signed_permutations():
         # The recording contains P^T times the true rates, so that R P maps it to the camera.
         explanation = f"the gyro's axes contain {axes_text(P.T)} in place of [+x +y +z]"
         mirrored = np.linalg.det(P) < 0
         if mirrored or gyro_alone:
-            explanation += f"{', a left-handed frame' if mirrored else ''}; correct their order and signs"
+            explanation += (
+                f"{', a left-handed frame' if mirrored else ''}; correct their order and signs"
+            )
             yield _Explanation("gyro axes", R @ P, "exchanged axes fit", explanation)
         else:
             explanation = (
-                f"T_cam0_imu belongs to other IMU axes, or {explanation}; its rotation should be {_matrix_text(R @ P)}"
+                f"T_cam0_imu belongs to other IMU axes, or {explanation}; "
+                f"its rotation should be {_matrix_text(R @ P)}"
             )
-            yield _Explanation("extrinsics rotation", R @ P, "a rotation by multiples of 90 degrees fits", explanation)
+            yield _Explanation(
+                "extrinsics rotation",
+                R @ P,
+                "a rotation by multiples of 90 degrees fits",
+                explanation,
+            )
 
 
 def _free_explanations(S_cg: FloatArray) -> Iterator[_Explanation]:
-    """Yield the best rotation and reflection by moments (3, 3). Reference: Markley 1988, Wahba's problem by SVD."""
+    """Yield the best rotation and reflection by moments (3, 3).
+
+    Reference: Markley 1988, Wahba's problem by SVD.
+    """
     best = nearest_rotation(S_cg)
     yield _Explanation(
         "extrinsics rotation",

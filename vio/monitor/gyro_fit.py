@@ -1,4 +1,6 @@
-"""The gyro's rates against those of the camera: the best linear map, at the best clock offset; jitter of stamps."""
+"""The gyro's rates against those of the camera: the best linear map, at the best clock offset;
+jitter of stamps.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,12 @@ from vio.records import BoolArray
 
 _MIN_RATE_RADPS = 0.02  # a gyro is not judged where the camera rotates less
 _CLEAR_OF_NOISE = 5.0  # the camera's rates must exceed their noise by this factor
-AGREES = 0.2  # share of the rotation that the best linear map leaves unexplained: below, explanations are judged
-_EXCESS = 0.2  # misfit over the best linear map, as a share of the rotation: 11 degrees, or 20 % of scale
-_CHANCE = 30.0  # over the intervals, times the unexplained share: squared excess due to the map's free parameters
+# share of the rotation that the best linear map leaves unexplained: below, explanations are judged
+AGREES = 0.2
+# misfit over the best linear map, as a share of the rotation: 11 degrees, or 20 % of scale
+_EXCESS = 0.2
+# over the intervals, times the unexplained share: squared excess due to the map's free parameters
+_CHANCE = 30.0
 _CLEARLY_WORSE = 2.0
 _NAMED_OFFSET_S = 0.02
 _NEAR_OFFSETS_S = np.arange(-0.1, 0.1001, 0.01)
@@ -26,13 +31,16 @@ FAR_OFFSETS_S = np.arange(-5.0, 5.001, 0.025)
 _LEAST_INTERVALS = 40
 _LEAST_RATE_RADPS = 0.1  # where a millisecond is 0.1 mrad, about what the images resolve
 _LEAST_JITTER_S = 5e-4  # standard deviation of the intervals; smaller does little harm
-_SLOPE = 0.7, 1.3  # of the time missed by the gyro over the stamps' deviation: 1 for jitter, 0 for true intervals
+# of the time missed by the gyro over the stamps' deviation: 1 for jitter, 0 for true intervals
+_SLOPE = 0.7, 1.3
 _LEAST_CORRELATION = 0.7
 
 
 @dataclass(frozen=True, slots=True)
 class GyroFit:
-    """Second moments of the camera's and the gyro's rates at one clock offset, and the best linear map, (I1)."""
+    """Second moments of the camera's and the gyro's rates at one clock offset, and the best
+    linear map, (I1).
+    """
 
     offset_s: float
     S_cc: FloatArray  # (3, 3) camera, weighted mean of products, (rad/s)^2
@@ -65,9 +73,13 @@ class GyroFit:
         return float(np.sum(C * self.S_cg) / max(float(np.trace(self.S_gg)), 1e-300))
 
     def excess(self, C: FloatArray, scale: float) -> float:
-        """Return the misfit of `scale C` beyond that of the best linear map, as a share of the rotation, (I2)."""
+        """Return the misfit of `scale C` beyond that of the best linear map, as a share of the
+        rotation, (I2).
+        """
         total = float(np.trace(self.S_cc))
-        misfit = total - 2 * scale * float(np.sum(C * self.S_cg)) + scale**2 * float(np.trace(self.S_gg))
+        misfit = (
+            total - 2 * scale * float(np.sum(C * self.S_cg)) + scale**2 * float(np.trace(self.S_gg))
+        )
         return float(np.sqrt(max(misfit / max(total, 1e-300) - self.unexplained, 0.0)))
 
     @property
@@ -76,7 +88,9 @@ class GyroFit:
         return max(_EXCESS, float(np.sqrt(_CHANCE / max(self.count, 1) * self.unexplained)))
 
     def fits(self, C: FloatArray) -> bool:
-        """Return whether an orthogonal map (3, 3) from gyro to camera is accepted at its best scale."""
+        """Return whether an orthogonal map (3, 3) from gyro to camera is accepted at its best
+        scale.
+        """
         scale = self.scale(C)
         return scale > 0 and self.excess(C, scale) < self.tolerance
 
@@ -97,10 +111,13 @@ def fit_gyro(record: Record, least: int) -> GyroFit | None:
     return best if best.axes else None
 
 
-def _at_offset(record: Record, offsets: npt.NDArray[np.floating], least: int, noise: float) -> GyroFit | None:
+def _at_offset(
+    record: Record, offsets: npt.NDArray[np.floating], least: int, noise: float
+) -> GyroFit | None:
     """Fit the linear map at the best of some clock offsets, then robustly."""
     means, covered = record.means(offsets)
-    omega, gyro = record.twists[:, 3:], means[..., :3]
+    omega = record.twists[:, 3:]
+    gyro = means[..., :3]
     enough = covered.sum(axis=1) >= least
     if not enough.any():
         return None
@@ -108,7 +125,9 @@ def _at_offset(record: Record, offsets: npt.NDArray[np.floating], least: int, no
     k = int(np.argmin(shares))
     weight = covered[k].astype(np.float64)
     for _ in range(4):
-        S_cc, S_cg, S_gg, share, A, b = (x[0] for x in _moments(omega, gyro[k : k + 1], weight[None]))
+        S_cc, S_cg, S_gg, share, A, b = (
+            x[0] for x in _moments(omega, gyro[k : k + 1], weight[None])
+        )
         r = np.linalg.norm(omega - gyro[k] @ A.T - b, axis=1)
         width = max(2 * robust_sigma(r[covered[k]]), 1e-6)
         weight = covered[k] / (1 + (r / width) ** 2) ** 2
@@ -130,18 +149,31 @@ def _at_offset(record: Record, offsets: npt.NDArray[np.floating], least: int, no
 
 
 def _moments(omega: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[FloatArray, ...]:
-    """Return centred moments cc, cg, gg (M, 3, 3), unexplained share (M,), A (M, 3, 3), b (M, 3) for weights (M, K)."""
+    """Return centred moments cc, cg, gg (M, 3, 3), unexplained share (M,), A (M, 3, 3), b (M, 3)
+    for weights (M, K).
+    """
     w = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
-    mean_c, mean_g = w @ omega, np.einsum("mk,mki->mi", w, gyro)
-    c, g = omega[None] - mean_c[:, None], gyro - mean_g[:, None]
+    mean_c = w @ omega
+    mean_g = np.einsum("mk,mki->mi", w, gyro)
+    c = omega[None] - mean_c[:, None]
+    g = gyro - mean_g[:, None]
     cw = np.swapaxes(c * w[..., None], 1, 2)
-    S_cc, S_cg, S_gg = cw @ c, cw @ g, np.swapaxes(g * w[..., None], 1, 2) @ g
+    S_cc = cw @ c
+    S_cg = cw @ g
+    S_gg = np.swapaxes(g * w[..., None], 1, 2) @ g
     size = np.trace(S_gg, axis1=1, axis2=2)[:, None, None]
     A = np.linalg.solve(S_gg + (1e-9 * size + 1e-300) * np.eye(3), np.swapaxes(S_cg, 1, 2))
     A = np.swapaxes(A, 1, 2)
     total = np.trace(S_cc, axis1=1, axis2=2)
     share = 1 - np.sum(A * S_cg, axis=(1, 2)) / np.maximum(total, 1e-300)
-    return S_cc, S_cg, S_gg, np.clip(share, 0.0, 1.0), A, mean_c - np.einsum("mij,mj->mi", A, mean_g)
+    return (
+        S_cc,
+        S_cg,
+        S_gg,
+        np.clip(share, 0.0, 1.0),
+        A,
+        mean_c - np.einsum("mij,mj->mi", A, mean_g),
+    )
 
 
 def judge_offset(gyro_fit: GyroFit, record: Record, least: int) -> InertialFinding | None:
@@ -149,22 +181,34 @@ def judge_offset(gyro_fit: GyroFit, record: Record, least: int) -> InertialFindi
     if abs(gyro_fit.offset_s) < _NAMED_OFFSET_S or gyro_fit.unexplained > AGREES:
         return None
     as_stamped = _at_offset(record, np.zeros(1), least, gyro_fit.noise_radps)
-    if as_stamped is not None and as_stamped.unexplained < _CLEARLY_WORSE * gyro_fit.unexplained + 0.003:
+    if (
+        as_stamped is not None
+        and as_stamped.unexplained < _CLEARLY_WORSE * gyro_fit.unexplained + 0.003
+    ):
         return None
-    left = "cannot be compared" if as_stamped is None else f"leaves {100 * as_stamped.unexplained:.1f} % unexplained"
+    left = (
+        "cannot be compared"
+        if as_stamped is None
+        else f"leaves {100 * as_stamped.unexplained:.1f} % unexplained"
+    )
     return InertialFinding(
         "clocks apart",
-        f"the rates of gyro and images agree best if a frame stamped t is at t {gyro_fit.offset_s:+.3f} s of the "
-        f"IMU's clock ({100 * gyro_fit.unexplained:.1f} % of the rotation unexplained; without the shift it {left})",
-        f"the IMU's clock is ahead of the camera's by {gyro_fit.offset_s:+.3f} s; subtract that from the IMU's stamps",
+        "the rates of gyro and images agree best if a frame stamped t is at t "
+        f"{gyro_fit.offset_s:+.3f} s of the "
+        f"IMU's clock ({100 * gyro_fit.unexplained:.1f} % of the rotation unexplained; without the "
+        f"shift it {left})",
+        f"the IMU's clock is ahead of the camera's by {gyro_fit.offset_s:+.3f} s; subtract that "
+        "from the IMU's stamps",
     )
 
 
 def judge_stamps(record: Record) -> InertialFinding | None:
-    """Compare each interval's deviation from the usual one with the time that the camera's rotation took by the gyro.
+    """Compare each interval's deviation from the usual one with the time that the camera's rotation
+    took by the gyro.
 
-    Over an interval of stamps `dt` the gyro turns at a mean rate `w`; the images show an angle `a`, so the exposures
-    lay `a / w` apart. Where `a / w - dt` is the negative of `dt - median(dt)`, the stamps are wrong, not the exposures.
+    Over an interval of stamps `dt` the gyro turns at a mean rate `w`; the images show an angle `a`,
+    so the exposures lay `a / w` apart. Where `a / w - dt` is the negative of `dt - median(dt)`, the
+    stamps are wrong, not the exposures.
     """
     means, covered = record.means(np.zeros(1))
     gyro = np.linalg.norm(means[0, :, :3], axis=1)
@@ -174,7 +218,8 @@ def judge_stamps(record: Record) -> InertialFinding | None:
     used = covered[0] & (gyro > _LEAST_RATE_RADPS) & (np.abs(dt - usual) < 0.5 * usual)
     if used.sum() < _LEAST_INTERVALS or robust_sigma(dt[used] - usual) < _LEAST_JITTER_S:
         return None
-    weight = gyro[used]  # the angle's error is the same everywhere, the time's error falls with the rate
+    # the angle's error is the same everywhere, the time's error falls with the rate
+    weight = gyro[used]
     deviation = weight * (dt[used] - usual)
     missed = weight * (dt[used] - dt[used] * camera[used] / gyro[used])
     slope = float(deviation @ missed / (deviation @ deviation))
@@ -184,7 +229,9 @@ def judge_stamps(record: Record) -> InertialFinding | None:
     jitter_ms = 1e3 * robust_sigma(dt[used] - usual) / np.sqrt(2)
     return InertialFinding(
         "camera stamps",
-        f"the frames' intervals scatter as if each stamp were off by {jitter_ms:.1f} ms (standard deviation), but the "
+        f"the frames' intervals scatter as if each stamp were off by {jitter_ms:.1f} ms (standard "
+        "deviation), but the "
         f"gyro shows exposures at a steady {1e3 * usual:.1f} ms",
-        "the stamps jitter, perhaps taken when the image arrived; stamp frames at the exposure, by the camera's clock",
+        "the stamps jitter, perhaps taken when the image arrived; stamp frames at the exposure, by "
+        "the camera's clock",
     )

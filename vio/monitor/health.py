@@ -1,4 +1,6 @@
-"""Monitor a run for divergence by the estimator's outputs, and for features that it refuses; each event is one line."""
+"""Monitor a run for divergence by the estimator's outputs, and for features that it refuses;
+each event is one line.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +15,15 @@ from vio.numerics.robust import median
 from vio.records import BoolArray, Estimate, IntArray, Observations, UpdateReport
 
 _NO_FEATURES_S = 1.0  # without a usable feature for longer, the pose is a prediction only
-_GAP_S, _GAP_STEPS = 0.5, 5.0  # between frames: a gap if longer, and so many times the usual time
-_LEAST_STEPS, _RECENT_STEPS = 5, 50  # between frames, for the usual time to be known; and that it is taken from
-# No rig comes to this by a camera that turns in its mount (docs/notes/design_decisions.md, exchanged cameras).
+_GAP_S = 0.5  # between frames: a gap if longer, and so many times the usual time
+_GAP_STEPS = 5.0
+_LEAST_STEPS = 5  # between frames, for the usual time to be known; and that it is taken from
+_RECENT_STEPS = 50
+# No rig comes to this by a camera that turns in its mount (docs/notes/design_decisions.md,
+# exchanged cameras).
 _OTHER_PAIR_PX = 10.0
-_SCALE_OFF_PERCENT, _SCALE_SIGMAS = 1.0, 3.0  # of baseline or focal length, both to be exceeded
+_SCALE_OFF_PERCENT = 1.0  # of baseline or focal length, both to be exceeded
+_SCALE_SIGMAS = 3.0
 _RESTART_EVENT_S = 1.0  # restarts that follow each other within this time are one event
 _MAX_SPEED_MPS = 100.0
 _MAX_GYRO_BIAS_RADPS = 0.5
@@ -29,7 +35,8 @@ class RunHealth:
 
     def __init__(self) -> None:
         self._last: tuple[int, FloatArray] | None = None  # time and position of the frame before
-        self._last_used: tuple[int, int] | None = None  # index and time of the last frame with used features
+        # index and time of the last frame with used features
+        self._last_used: tuple[int, int] | None = None
         self._without_features = False
         self._steps_s: deque[float] = deque(maxlen=_RECENT_STEPS)
         self._last_index = 0
@@ -37,14 +44,18 @@ class RunHealth:
         self._restarted_ns: int | None = None  # time of the last restart
 
     def restarted(self, index: int, why: str, estimate: Estimate) -> tuple[str, ...]:
-        """Return the line on a restart from an estimate, with the reason; none within a second of the last one."""
-        last_ns, self._restarted_ns = self._restarted_ns, estimate.time_ns
+        """Return the line on a restart from an estimate, with the reason; none within a second
+        of the last one.
+        """
+        last_ns = self._restarted_ns
+        self._restarted_ns = estimate.time_ns
         self._last = estimate.time_ns, estimate.T_world_imu[:3, 3].copy()
         if last_ns is not None and (estimate.time_ns - last_ns) * 1e-9 < _RESTART_EVENT_S:
             return ()
         sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
         return (
-            f"frame {index}: {why}; started again from the last good pose, the standard deviation of its position is "
+            f"frame {index}: {why}; started again from the last good pose, the standard deviation "
+            "of its position is "
             f"{sigma:.2f} m",
         )
 
@@ -57,56 +68,79 @@ class RunHealth:
 
     def _gap(self, index: int, estimate: Estimate) -> list[str]:
         """Report a time without frames, with what is known of the pose after it."""
-        last, last_index = self._last, self._last_index
+        last = self._last
+        last_index = self._last_index
         self._last_index = index
         if last is None:
             return []
         step_s = (estimate.time_ns - last[0]) * 1e-9
         usual_s = np.inf
-        if step_s > _GAP_S and len(self._steps_s) >= _LEAST_STEPS:  # a shorter one is no gap, whatever is usual
+        # a shorter one is no gap, whatever is usual
+        if step_s > _GAP_S and len(self._steps_s) >= _LEAST_STEPS:
             usual_s = median(self._steps_s)
         self._steps_s.append(step_s)
         if step_s <= max(_GAP_S, _GAP_STEPS * usual_s):
             return []
         sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
         return [
-            f"frame {index}: no frame for {step_s:.2f} s since frame {last_index}; the motion in between is a "
+            f"frame {index}: no frame for {step_s:.2f} s since frame {last_index}; the motion in "
+            "between is a "
             f"prediction, the standard deviation of the position is {sigma:.2g} m after it"
         ]
 
     def _stereo(self, index: int, estimate: Estimate) -> list[str]:
-        """Report once that the filter estimates the stereo calibration, as the rows show that it is off."""
+        """Report once that the filter estimates the stereo calibration, as the rows show that it
+        is off.
+        """
         field = estimate.stereo_field
-        if field is None or "stereo" in self._reported or rows_grade(field.rows_rms_px) == "negligible":
+        if (
+            field is None
+            or "stereo" in self._reported
+            or rows_grade(field.rows_rms_px) == "negligible"
+        ):
             return []
         self._reported.add("stereo")
         seen = f"frame {index}: the rows of left and right images differ by {field.rows_rms_px:.2f} px (rms)"
         if field.rows_rms_px > _OTHER_PAIR_PX:
             return [
-                f"{seen}: left and right are exchanged, the calibration is not that of these images, or a camera was "
-                "moved; `vio calibrate` finds which; what the calibration is off by is estimated while running, which "
+                f"{seen}: left and right are exchanged, the calibration is not that of these "
+                "images, or a camera was "
+                "moved; `vio calibrate` finds which; what the calibration is off by is estimated "
+                "while running, which "
                 "may not suffice (msckf.calibrate_stereo)"
             ]
         return [
-            f"{seen} in a smooth pattern: the stereo calibration is off, {rows_grade(field.rows_rms_px)}; what it is "
+            f"{seen} in a smooth pattern: the stereo calibration is off, "
+            f"{rows_grade(field.rows_rms_px)}; what it is "
             "off by is estimated while running (msckf.calibrate_stereo)"
         ]
 
     def scale(self, index: int, estimate: Estimate) -> list[str]:
-        """Return once that baseline or focal length differ from the calibration significantly and harmfully."""
+        """Return once that baseline or focal length differ from the calibration significantly
+        and harmfully.
+        """
         lines: list[str] = []
         found = {} if estimate.stereo_scale is None else estimate.stereo_scale.percent()
         for name, (percent, sigma) in found.items():
-            if abs(percent) <= max(_SCALE_OFF_PERCENT, _SCALE_SIGMAS * sigma) or name in self._reported:
+            if (
+                abs(percent) <= max(_SCALE_OFF_PERCENT, _SCALE_SIGMAS * sigma)
+                or name in self._reported
+            ):
                 continue
             self._reported.add(name)
             # One scale does not tell them apart.
-            named = f"{name}, or the focal length," if len(found) == 1 and name == "baseline" else name
+            named = (
+                f"{name}, or the focal length," if len(found) == 1 and name == "baseline" else name
+            )
             lines.append(
-                f"frame {index}: the {named} is {abs(percent):.1f} % {'longer' if percent > 0 else 'shorter'} than "
-                f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor measures; check "
-                "the sensor (unit, axes, clock) and that images and calibration have one size (of depth images, "
-                "dataset.depth_factor); then calibrate the cameras anew, or run with what --save-calibration keeps"
+                f"frame {index}: the {named} is {abs(percent):.1f} % "
+                f"{'longer' if percent > 0 else 'shorter'} than "
+                f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor "
+                "measures; check "
+                "the sensor (unit, axes, clock) and that images and calibration have one size (of "
+                "depth images, "
+                "dataset.depth_factor); then calibrate the cameras anew, or run with what "
+                "--save-calibration keeps"
             )
         return lines
 
@@ -117,7 +151,8 @@ class RunHealth:
         if report.used > 0 or starts or self._last_used is None:
             ended = self._without_features
             away_s = 0.0 if self._last_used is None else (time_ns - self._last_used[1]) * 1e-9
-            self._last_used, self._without_features = (index, time_ns), False
+            self._last_used = (index, time_ns)
+            self._without_features = False
             return [f"frame {index}: features again, after {away_s:.1f} s without"] if ended else []
         seconds = (time_ns - self._last_used[1]) * 1e-9
         if self._without_features or seconds < _NO_FEATURES_S:
@@ -125,7 +160,8 @@ class RunHealth:
         self._without_features = True
         sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
         return [
-            f"frame {index}: no usable feature since frame {self._last_used[0]} ({seconds:.1f} s); the pose is a "
+            f"frame {index}: no usable feature since frame {self._last_used[0]} ({seconds:.1f} s); "
+            "the pose is a "
             f"prediction, the standard deviation of its position is {sigma:.2f} m"
         ]
 
@@ -134,7 +170,9 @@ class RunHealth:
         lines = []
         position = estimate.T_world_imu[:3, 3].copy()
         if self._last is not None and estimate.time_ns > self._last[0]:
-            speed = float(np.linalg.norm(position - self._last[1])) / ((estimate.time_ns - self._last[0]) * 1e-9)
+            speed = float(np.linalg.norm(position - self._last[1])) / (
+                (estimate.time_ns - self._last[0]) * 1e-9
+            )
             line = f"frame {index}: the estimate moves at {speed:.0f} m/s: the filter has diverged"
             lines += self._once("speed", speed, _MAX_SPEED_MPS, line)
         self._last = estimate.time_ns, position
@@ -155,11 +193,13 @@ class RunHealth:
         return [f"{line}; check the order of the images, calibration, units and clocks"]
 
 
-_SPAN_S, _LEAST_FRAMES = 1.0, 3
+_SPAN_S = 1.0
+_LEAST_FRAMES = 3
 _MOST_REFUSED = 0.4  # of the features over the span; healthy recordings come to a third at most
 _CELLS = 6, 4  # columns and rows that the image is divided into
 _TOGETHER = 0.2  # of the features, at most, where half of those refused are: then they lie together
-_CONTRADICTED = 2.0  # innovations over their standard deviation: more, and the motion sensor contradicts the images
+# innovations over their standard deviation: more, and the motion sensor contradicts the images
+_CONTRADICTED = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,25 +221,33 @@ class RefusalReport:
 
     def __init__(self, *, imu: bool) -> None:
         """Begin; `imu`: whether an IMU predicts the motion."""
-        self.imu, self._reported = imu, False
+        self.imu = imu
+        self._reported = False
         self._frames: deque[_Frame] = deque()
 
     def frame(self, seen: Observations, report: UpdateReport, estimate: Estimate) -> list[str]:
-        """Add the features of a frame and what the filter did with them; return the line to report, if any."""
+        """Add the features of a frame and what the filter did with them; return the line to
+        report, if any.
+        """
         if self._reported:
             return []
-        used, gated = report.used, report.gated
-        self._frames.append(_Frame(seen.time_ns, used, gated, seen, report.gated_ids, report.innovation_ratio))
+        used = report.used
+        gated = report.gated
+        self._frames.append(
+            _Frame(seen.time_ns, used, gated, seen, report.gated_ids, report.innovation_ratio)
+        )
         full = False
         while seen.time_ns - self._frames[0].time_ns >= _SPAN_S * 1e9:
             self._frames.popleft()
             full = True
-        kept, gone = sum(f.used for f in self._frames), sum(f.gated for f in self._frames)
+        kept = sum(f.used for f in self._frames)
+        gone = sum(f.gated for f in self._frames)
         if not full or len(self._frames) < _LEAST_FRAMES or gone <= _MOST_REFUSED * (kept + gone):
             return []
         self._reported = True
         return [
-            f"frame {seen.frame_index}: {100 * gone / (kept + gone):.0f} % of the features of the last second were "
+            f"frame {seen.frame_index}: {100 * gone / (kept + gone):.0f} % of the features of the "
+            "last second were "
             f"refused, as they contradict the others: {self._cause(estimate)}"
         ]
 
@@ -209,13 +257,18 @@ class RefusalReport:
         ratio = median(ratios) if ratios else 0.0
         if self.imu and ratio > _CONTRADICTED:
             return (
-                f"the images show features {ratio:.1f} standard deviations beside where the IMU predicts them; "
+                f"the images show features {ratio:.1f} standard deviations beside where the IMU "
+                "predicts them; "
                 "check the IMU, its clock and its place on the camera (vio check)"
             )
         place = self._place()
         if place is not None:
             return f"most lie together {place}; something moves there, or a lens is dirty"
-        where = "they are spread over the image; " if any(f.refused().any() for f in self._frames) else ""
+        where = (
+            "they are spread over the image; "
+            if any(f.refused().any() for f in self._frames)
+            else ""
+        )
         field = estimate.stereo_field
         if field is not None and rows_grade(field.rows_rms_px) != "negligible":
             return (
@@ -225,13 +278,19 @@ class RefusalReport:
         return f"{where}blurred images, repeated texture, or many things that move"
 
     def _place(self) -> str | None:
-        """Where in the image half of the refused features lie with few others; None: they are spread."""
+        """Where in the image half of the refused features lie with few others.
+
+        None: they are spread.
+        """
         pixels = np.concatenate([f.seen.z[:, :2] for f in self._frames])
         refused = np.concatenate([f.refused() for f in self._frames])
         if not refused.any():
             return None
-        low, size = pixels.min(axis=0), np.maximum(np.ptp(pixels, axis=0), 1.0)
-        cells = np.minimum(((pixels - low) / size * _CELLS).astype(np.int64), np.array(_CELLS) - 1) @ [_CELLS[1], 1]
+        low = pixels.min(axis=0)
+        size = np.maximum(np.ptp(pixels, axis=0), 1.0)
+        cells = np.minimum(
+            ((pixels - low) / size * _CELLS).astype(np.int64), np.array(_CELLS) - 1
+        ) @ [_CELLS[1], 1]
         total = np.bincount(cells, minlength=_CELLS[0] * _CELLS[1])
         count = np.bincount(cells[refused], minlength=len(total))
         order = np.argsort(-count / np.maximum(total, 1), kind="stable")

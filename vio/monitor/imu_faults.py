@@ -1,4 +1,6 @@
-"""Report gaps of the IMU's stamps, and the samples that are left out: spikes, readings that repeat to the last bit."""
+"""Report gaps of the IMU's stamps, and the samples that are left out: spikes, readings that
+repeat to the last bit.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ _SENSORS: dict[ImuFaultKind, str] = {
 
 
 class ImuFaultReport:
-    """Finds the faulty samples as the filter does; reports each stuck period, and spikes with the first and in all."""
+    """Finds the faulty samples as the filter does; reports each stuck period, and spikes with
+    the first and in all.
+    """
 
     def __init__(self) -> None:
         self._check = ImuSampleCheck()
@@ -35,7 +39,9 @@ class ImuFaultReport:
         self._frame = index
 
     def samples(self, samples: list[ImuSample]) -> tuple[list[ImuSample], list[str]]:
-        """Take samples; return those that may be used now, and the lines on faults that have ended."""
+        """Take samples; return those that may be used now, and the lines on faults that have
+        ended.
+        """
         self._samples += len(samples)
         usable = self._check.take_all(samples)
         return usable, [line for fault in self._check.new_faults() for line in self._line(fault)]
@@ -49,7 +55,8 @@ class ImuFaultReport:
             if len(spikes) > 1:
                 largest = max(fault.size for fault in spikes)
                 lines.append(
-                    f"{len(spikes)} of {self._samples} IMU samples were {kind}s, the largest {largest:.3g} "
+                    f"{len(spikes)} of {self._samples} IMU samples were {kind}s, the largest "
+                    f"{largest:.3g} "
                     f"{_UNITS[kind]}; they were left out"
                 )
         return lines
@@ -57,22 +64,31 @@ class ImuFaultReport:
     def _line(self, fault: ImuFault) -> list[str]:
         if fault.kind in _SENSORS:
             seconds = (fault.end_ns - fault.start_ns) * _NS
-            what = "repeated one reading to the last bit" if fault.size > 0 else "read zero in all axes"
+            what = (
+                "repeated one reading to the last bit"
+                if fault.size > 0
+                else "read zero in all axes"
+            )
             return [
-                f"frame {self._frame}: the {_SENSORS[fault.kind]} {what} for {seconds:.2f} s from {fault.start_ns} ns: "
+                f"frame {self._frame}: the {_SENSORS[fault.kind]} {what} for {seconds:.2f} s from "
+                f"{fault.start_ns} ns: "
                 "the sensor or its driver was stuck; its samples are left out, carried by images"
             ]
         self._spikes.setdefault(fault.kind, []).append(fault)
         if len(self._spikes[fault.kind]) > 1:
             return []
         return [
-            f"frame {self._frame}: {fault.kind}: one sample at {fault.start_ns} ns is {fault.size:.3g} "
-            f"{_UNITS[fault.kind]} from both its neighbours, a fault of the sensor or its transfer; it is left out"
+            f"frame {self._frame}: {fault.kind}: one sample at {fault.start_ns} ns is "
+            f"{fault.size:.3g} "
+            f"{_UNITS[fault.kind]} from both its neighbours, a fault of the sensor or its "
+            "transfer; it is left out"
         ]
 
 
 class ImuSilence:
-    """Takes the stamps of samples and frames; reports each gap once, in one line, when its length is known."""
+    """Takes the stamps of samples and frames; reports each gap once, in one line, when its
+    length is known.
+    """
 
     def __init__(self) -> None:
         self._times: deque[int] = deque(maxlen=_RECENT)
@@ -102,8 +118,10 @@ class ImuSilence:
             late_s = (first_ns - self._first_frame[1]) * _NS
             if late_s > GAP_S:
                 return (
-                    f"frame {index}: the first IMU sample came {late_s:.2f} s after frame {self._first_frame[0]}; "
-                    f"until then {self._waiting} frames were carried by images alone, in a world that is not upright",
+                    f"frame {index}: the first IMU sample came {late_s:.2f} s after frame "
+                    f"{self._first_frame[0]}; "
+                    f"until then {self._waiting} frames were carried by images alone, in a world "
+                    "that is not upright",
                 )
         return ()
 
@@ -112,7 +130,9 @@ class ImuSilence:
         if self._last_frame is None:
             return ()
         if self._first_imu_ns is None:
-            return (f"no IMU sample in any of {self._waiting} frames: all were carried by images alone",)
+            return (
+                f"no IMU sample in any of {self._waiting} frames: all were carried by images alone",
+            )
         return self._gap(self._last_frame[1], " to the end of the run")
 
     def _gap(self, until_ns: int, where: str) -> tuple[str, ...]:
@@ -128,5 +148,6 @@ class ImuSilence:
         assert self._last_frame is not None
         index = self._last_frame[0]
         return (
-            f"frame {index}: no IMU sample for {length_s:.2f} s from {self._times[-1]} ns{where}; carried by images",
+            f"frame {index}: no IMU sample for {length_s:.2f} s from {self._times[-1]} ns{where}; "
+            "carried by images",
         )

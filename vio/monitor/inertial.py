@@ -1,9 +1,10 @@
 """Check a run's IMU for wrong units, signs, axes, extrinsics and clocks, for clipping and for gaps.
 
-The camera's motion comes from the stereo tracks of consecutive frames, the gyro and the accelerometer are fitted to it
-by *general* linear maps, and every named explanation (the given extrinsics, their inverse, a permutation of axes,
-degrees, g, …) is then judged by how much worse it fits than the general map. A fault is named only where the given
-calibration fails clearly and the explanation does not; for equations (I1) to (I4) see docs/inertial.md.
+The camera's motion comes from the stereo tracks of consecutive frames, the gyro and the
+accelerometer are fitted to it by *general* linear maps, and every named explanation (the given
+extrinsics, their inverse, a permutation of axes, degrees, g, …) is then judged by how much worse it
+fits than the general map. A fault is named only where the given calibration fails clearly and the
+explanation does not; for equations (I1) to (I4) see docs/inertial.md.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from vio.monitor.samples import Samples, Size, judge_size
 from vio.records import ROTATION_NOT_COMPARABLE, ImuSample, Observations, RotationComparison
 
 _LEAST_AT_END = 20  # intervals needed to judge at the end of a run
-_LATER_EVALUATIONS = 150  # intervals between evaluations after `_ENOUGH`; until then `FIRST_EVALUATION`
+# intervals between evaluations after `_ENOUGH`; until then `FIRST_EVALUATION`
+_LATER_EVALUATIONS = 150
 _ENOUGH = 400  # intervals with rotation about all axes after which the comparison ends
 _NS = 1e-9
 
@@ -35,13 +37,17 @@ _NS = 1e-9
 class InertialCheck:
     """Monitor a run with raw IMU data without influencing it, and report each fault once.
 
-    Pass every sample and every frame's observations in time order; log what `frame` and `finish` return. The comparison
-    of motions ends after enough rotation about all axes; gaps and clipping are checked until the end of the run.
+    Pass every sample and every frame's observations in time order; log what `frame` and `finish`
+    return. The comparison of motions ends after enough rotation about all axes; gaps and clipping
+    are checked until the end of the run.
     """
 
     def __init__(self, camera: StereoCamera, T_cam0_imu: FloatArray) -> None:
-        """Create the check, for observations of a rectified pair and `T_cam0_imu` (4, 4) as the run uses it."""
-        self._stereo, self._T = camera, np.array(T_cam0_imu, dtype=np.float64)
+        """Create the check, for observations of a rectified pair and `T_cam0_imu` (4, 4) as the
+        run uses it.
+        """
+        self._stereo = camera
+        self._T = np.array(T_cam0_imu, dtype=np.float64)
         self._reported: set[str] = set()
         self._samples = Samples()
         self._coverage = SampleCoverage()
@@ -50,13 +56,17 @@ class InertialCheck:
 
     def reset(self) -> None:
         """Restart the comparison of motions; reported findings are not repeated."""
-        self._camera, self._motion = CameraTwists(self._stereo), RecentMotion()
+        self._camera = CameraTwists(self._stereo)
+        self._motion = RecentMotion()
         self._since_evaluation = self._seen = 0
         self._suspected: set[InertialFault] = set()
         self.done = False  # whether the comparison of motions has ended
-        self.rotation_comparison: RotationComparison | None = None  # the newest comparison; None: too few frames yet
-        self.axes_compared = False  # the accelerometer's with the images' path, or there will be no rotation for it
-        self.imu_at_fault = False  # by the newest judgement of units, axes, signs and clocks, reported yet or not
+        # the newest comparison; None: too few frames yet
+        self.rotation_comparison: RotationComparison | None = None
+        # the accelerometer's with the images' path, or there will be no rotation for it
+        self.axes_compared = False
+        # by the newest judgement of units, axes, signs and clocks, reported yet or not
+        self.imu_at_fault = False
 
     def imu(self, sample: ImuSample) -> None:
         """Add one sample."""
@@ -96,7 +106,9 @@ class InertialCheck:
         self._motion.add(motion)
         self._since_evaluation += len(motion)
         self._seen += len(motion)
-        if self._since_evaluation < (FIRST_EVALUATION if self._seen < _ENOUGH else _LATER_EVALUATIONS):
+        if self._since_evaluation < (
+            FIRST_EVALUATION if self._seen < _ENOUGH else _LATER_EVALUATIONS
+        ):
             if self.rotation_comparison is None:
                 self._compare_first_rotations()
             return found
@@ -140,38 +152,52 @@ class InertialCheck:
         return self._judge_rotating(evidence, size, record, rates)
 
     def _judge_stationary(self, size: Size, record: Record, *, last: bool) -> list[InertialFinding]:
-        """Judge without rotation: the magnitude of the readings and, at the end, the direction of gravity."""
+        """Judge without rotation: the magnitude of the readings and, at the end, the direction
+        of gravity.
+        """
         found = [] if size.finding is None else [size.finding]
         means, covered = record.means(np.zeros(1))
         if last and size.unit is not None and int(covered.sum()) >= _LEAST_AT_END:
             found += judge_up(means[0, covered[0], 3:], self._T[:3, :3], measured=False)
         return found
 
-    def _judge_rotating(self, evidence: Evidence, size: Size, record: Record, rates: Rates) -> list[InertialFinding]:
+    def _judge_rotating(
+        self, evidence: Evidence, size: Size, record: Record, rates: Rates
+    ) -> list[InertialFinding]:
         """Judge with rotation, and decide whether the comparison may end."""
-        gyro_fit, last = evidence.gyro_fit, evidence.last
+        gyro_fit = evidence.gyro_fit
+        last = evidence.last
         size = resolve_size(size, evidence)
         offset = judge_offset(gyro_fit, record, _LEAST_AT_END)
         found = [f for f in (size.finding, offset, judge_stamps(record)) if f is not None]
         rotation = judge_gyro(evidence, size.unit or 1.0)
         found += rotation
         found += self._compare_rotations(record, gyro_fit) if not rotation else []
-        agrees, measured = gyro_fit.unexplained < AGREES, False
+        agrees = gyro_fit.unexplained < AGREES
+        measured = False
         if size.unit is not None and agrees and all(f.fault == "gyro units" for f in rotation):
             forces, measured = judge_force(evidence, size.unit)
             found += forces
         self.imu_at_fault |= any(f.certain and f.fault != "camera stamps" for f in found)
-        self.imu_at_fault |= agrees and not gyro_fit.fits(evidence.R_cam0_imu)  # whatever turns out to be the cause
-        enough = gyro_fit.count >= _ENOUGH and gyro_fit.axes == 3 and (measured or size.unit is None or bool(rotation))
+        # whatever turns out to be the cause
+        self.imu_at_fault |= agrees and not gyro_fit.fits(evidence.R_cam0_imu)
+        enough = (
+            gyro_fit.count >= _ENOUGH
+            and gyro_fit.axes == 3
+            and (measured or size.unit is None or bool(rotation))
+        )
         if not found and (last or enough) and agrees and measured:
             found = judge_lever_arm(record, gyro_fit, self._T, rates)
             if not last:
-                self._suspected |= {f.fault for f in found}  # at this stage, one evaluation suffices
+                # at this stage, one evaluation suffices
+                self._suspected |= {f.fault for f in found}
         self.done = enough and all(f.fault in self._suspected for f in found)
         return found
 
     def _compare_first_rotations(self) -> None:
-        """Find before the first evaluation that rotations agree, for which the filter waits; to differ takes more."""
+        """Find before the first evaluation that rotations agree, for which the filter waits; to
+        differ takes more.
+        """
         times_ns, values = self._samples.table()
         motion = self._motion.joined()
         if len(times_ns) < 2 or motion is None:

@@ -1,4 +1,6 @@
-"""The left camera's twists from frame to frame, in batches, and the IMU's readings on the same clock."""
+"""The left camera's twists from frame to frame, in batches, and the IMU's readings on the same
+clock.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ class Intervals:
 
 
 class CameraTwists:
-    """Compute the left camera's twists from frame to frame, from a subset of the tracks, in batches."""
+    """Compute the left camera's twists from frame to frame, from a subset of the tracks, in
+    batches.
+    """
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
@@ -59,26 +63,35 @@ class CameraTwists:
         self._kept.append(kept)
         return self.flush() if len(self._kept) > BATCH else None
 
-    def _initial_rotation(self, last: Observations, kept: Observations, flow: FloatArray) -> FloatArray:
+    def _initial_rotation(
+        self, last: Observations, kept: Observations, flow: FloatArray
+    ) -> FloatArray:
         """Return the initial twist of a pure rotation: flow du = -fu wy dt, dv = fv wx dt."""
         out = np.zeros(6)
         dt = (kept.time_ns - last.time_ns) * _NS
         if len(flow) and dt > 0:
-            du, dv = median(flow[:, 0]), median(flow[:, 1])
-            out[3], out[4] = dv / self._camera.fv / dt, -du / self._camera.fu / dt
+            du = median(flow[:, 0])
+            dv = median(flow[:, 1])
+            out[3] = dv / self._camera.fv / dt
+            out[4] = -du / self._camera.fu / dt
         return out
 
     def flush(self) -> Intervals | None:
         """Return the motions since the last batch; None: there are none."""
         if len(self._kept) < 2:
             return None
-        kept, links = self._kept, np.array(self._links)
+        kept = self._kept
+        links = np.array(self._links)
         tracks = feature_tracks(dict(enumerate(kept)), len(kept))
         times_ns = np.array([o.time_ns for o in kept], dtype=np.int64)
         found = stereo_twists(self._camera, tracks, times_ns, np.array(self._guess))
-        good = (links[found.frames] >= _LEAST_LINKS) & (np.diff(times_ns)[found.frames] * _NS < _LONGEST_INTERVAL_S)
+        good = (links[found.frames] >= _LEAST_LINKS) & (
+            np.diff(times_ns)[found.frames] * _NS < _LONGEST_INTERVAL_S
+        )
         frames = found.frames[good]
-        self._kept, self._guess, self._links = kept[-1:], [], []
+        self._kept = kept[-1:]
+        self._guess = []
+        self._links = []
         return Intervals(times_ns[frames], times_ns[frames + 1], found.twists[good])
 
 
@@ -124,10 +137,18 @@ class Record:
         return np.concatenate([[False], np.abs(self.begin[1:] - self.end[:-1]) < _SAME_S])
 
     def means(self, offsets: npt.NDArray[np.floating]) -> tuple[FloatArray, BoolArray]:
-        """Return mean readings (M, K, 6) over the intervals shifted by offsets (M,), and a mask (M, K) of coverage."""
+        """Return mean readings (M, K, 6) over the intervals shifted by offsets (M,), and a mask
+        (M, K) of coverage.
+        """
         edges = [edge[None, :] + offsets[:, None] for edge in (self.begin, self.end)]
         low, high = (
-            np.stack([np.interp(at.ravel(), self.t, self.integral[:, k]).reshape(at.shape) for k in range(6)], axis=-1)
+            np.stack(
+                [
+                    np.interp(at.ravel(), self.t, self.integral[:, k]).reshape(at.shape)
+                    for k in range(6)
+                ],
+                axis=-1,
+            )
             for at in edges
         )
         covered = (edges[0] >= self.t[0]) & (edges[1] <= self.t[-1])
@@ -140,7 +161,8 @@ def record_of(intervals: Intervals, times_ns: IntArray, values: FloatArray) -> R
     """Convert intervals and readings (S, 6) [gyro; accel] at times (S,) to one clock."""
     origin = int(intervals.begin_ns[0])
     t, begin, end = (
-        np.asarray((x - origin) * _NS, dtype=np.float64) for x in (times_ns, intervals.begin_ns, intervals.end_ns)
+        np.asarray((x - origin) * _NS, dtype=np.float64)
+        for x in (times_ns, intervals.begin_ns, intervals.end_ns)
     )
     steps = np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2
     integral = np.concatenate([np.zeros((1, 6)), np.cumsum(steps, axis=0)])

@@ -1,4 +1,6 @@
-"""The camera's rotation about the axes of its image against the gyro's: they differ where the focal length is off."""
+"""The camera's rotation about the axes of its image against the gyro's: they differ where the
+focal length is off.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +14,21 @@ from vio.monitor.motion import Record
 from vio.records import ROTATION_NOT_COMPARABLE, RotationComparison
 
 _BLOCKS = 10  # of the record, for the jackknife
-_IMAGE, _OPTICAL = [0, 1], [2]  # the camera's axes
+_IMAGE = [0, 1]  # the camera's axes
+_OPTICAL = [2]
 
 
 def compare_rotations(record: Record, fit: GyroFit, R_cam0_imu: FloatArray) -> RotationComparison:
-    """Compare the rates of camera and gyro about the axes of the image, and about the optical axis; equation (I5).
+    """Compare the rates of camera and gyro about the axes of the image, and about the optical axis;
+    equation (I5).
 
     The gyro's rates are those at the best clock offset, and `R_cam0_imu` (3, 3) is as given.
     """
     used = fit.covered
     if fit.unexplained > AGREES or not fit.fits(R_cam0_imu) or not used.any():
         return ROTATION_NOT_COMPARABLE
-    camera, gyro = record.twists[used, 3:], fit.gyro[used] @ R_cam0_imu.T
+    camera = record.twists[used, 3:]
+    gyro = fit.gyro[used] @ R_cam0_imu.T
     (image, sigma), (optical, optical_sigma) = (
         _factor(camera[:, axes], gyro[:, axes], fit.weight[used]) for axes in (_IMAGE, _OPTICAL)
     )
@@ -33,9 +38,12 @@ def compare_rotations(record: Record, fit: GyroFit, R_cam0_imu: FloatArray) -> R
 
 
 def _factor(camera: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[float, float]:
-    """Return the factor from the gyro's rates (K, n) to the camera's, and its standard deviation by a jackknife."""
+    """Return the factor from the gyro's rates (K, n) to the camera's, and its standard deviation
+    by a jackknife.
+    """
     blocks = np.arange(len(weight)) * _BLOCKS // len(weight)
-    weights = np.concatenate([weight[None], weight * (blocks != np.arange(_BLOCKS)[:, None])])  # all, and all but one
+    # all, and all but one
+    weights = np.concatenate([weight[None], weight * (blocks != np.arange(_BLOCKS)[:, None])])
     total = np.maximum(weights.sum(axis=1), 1e-12)
     mean_c, mean_g = (weights @ x / total[:, None] for x in (camera, gyro))
     products = weights @ np.sum(camera * gyro, axis=1) - total * np.sum(mean_c * mean_g, axis=1)
@@ -57,13 +65,15 @@ def judge_rotations(compared: RotationComparison, camera: StereoCamera) -> list[
     estimate = (
         ""
         if camera.is_cylinder
-        else ", or have the focal length estimated (msckf.calibrate_scale: on, msckf.stereo_focal_sigma: 0.05)"
+        else ", or have the focal length estimated (msckf.calibrate_scale: on, "
+        "msckf.stereo_focal_sigma: 0.05)"
     )
     return [
         InertialFinding(
             "camera turns",
             f"about the axes of the image the camera turns {100 * abs(compared.excess):.1f} ± "
-            f"{100 * compared.sigma:.1f} % {'more' if compared.excess > 0 else 'less'} than the gyro says",
+            f"{100 * compared.sigma:.1f} % {'more' if compared.excess > 0 else 'less'} than the "
+            "gyro says",
             f"{cause}; calibrate the cameras anew{estimate}",
             certain=False,
         )

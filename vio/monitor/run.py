@@ -1,4 +1,6 @@
-"""All monitors of a run in one: plausibility of the estimate and, with raw IMU data, of the readings."""
+"""All monitors of a run in one: plausibility of the estimate and, with raw IMU data, of the
+readings.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_PREVENTS_START = ("size", "overlap")  # groups of faults without whose cure one camera finds no scale
+# groups of faults without whose cure one camera finds no scale
+_PREVENTS_START = ("size", "overlap")
 
 
 class RunMonitor:
@@ -42,14 +45,19 @@ class RunMonitor:
     """
 
     def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, *, imu: bool) -> None:
-        """Create the monitors of a rectified pair; extrinsics (4, 4); `imu`: raw samples propagate the pose."""
-        self._health, self._refusals = RunHealth(), RefusalReport(imu=imu)
+        """Create the monitors of a rectified pair; extrinsics (4, 4); `imu`: raw samples
+        propagate the pose.
+        """
+        self._health = RunHealth()
+        self._refusals = RefusalReport(imu=imu)
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
         self._inertial: InertialCheck | None = None
         self._silence = ImuSilence() if imu else None
         self._faults = ImuFaultReport() if imu else None
-        self._frozen, self._repeats, self._depths = FrozenImages(), RepeatReport(IMAGES), RepeatReport(DEPTHS)
+        self._frozen = FrozenImages()
+        self._repeats = RepeatReport(IMAGES)
+        self._depths = RepeatReport(DEPTHS)
         self._repeated = False  # the present frame shows an earlier exposure
         if imu:
             from vio.monitor.inertial import InertialCheck  # it loads scipy.optimize
@@ -57,7 +65,8 @@ class RunMonitor:
             self._inertial = InertialCheck(camera, T_cam0_body)
         self._new: list[ImuSample] = []  # since the last frame
         self._frames = self._features = 0
-        self._index, self._index_before = -1, -1  # of the present frame, and of the one before it
+        self._index = -1  # of the present frame, and of the one before it
+        self._index_before = -1
         self._refused_last = -2
         self.frames_refused = 0
         self.refusal = ""  # of the last of them
@@ -76,7 +85,8 @@ class RunMonitor:
 
     def _take_new(self) -> None:
         """Judge the samples since the last frame."""
-        new, self._new = self._new, []
+        new = self._new
+        self._new = []
         if self._silence is None or not new:
             return
         taken = 0
@@ -99,7 +109,8 @@ class RunMonitor:
             self._frozen.sample(x)
 
     def repeats(self, frame: StereoFrame, expected: Prediction | None) -> bool:
-        """Return whether a frame shows an earlier exposure again and must not be used; called before `observations`.
+        """Return whether a frame shows an earlier exposure again and must not be used; called
+        before `observations`.
 
         Frames come in time order, each with the back end's prediction of it.
         """
@@ -111,7 +122,9 @@ class RunMonitor:
         return self._repeated
 
     def without_repeated_depth(self, frame: StereoFrame) -> StereoFrame:
-        """Return a frame that `repeats` let pass, without its depths where they are those of an earlier frame."""
+        """Return a frame that `repeats` let pass, without its depths where they are those of an
+        earlier frame.
+        """
         if frame.depth is None:
             return frame
         repeated = self._frozen.check_depth(frame)
@@ -119,7 +132,9 @@ class RunMonitor:
         return frame if repeated is None else replace(frame, depth=np.zeros_like(frame.depth))
 
     def observations(self, seen: Observations, warnings: tuple[str, ...] = ()) -> None:
-        """Add the front end's observations, before feature selection, and its warnings on the images."""
+        """Add the front end's observations, before feature selection, and its warnings on the
+        images.
+        """
         self._take_new()
         if self._baseline_fault is not None and not self._frames:
             self._report([f"{self._baseline_fault}, or the path has another unit"])
@@ -139,26 +154,35 @@ class RunMonitor:
 
     @property
     def rotation_comparison(self) -> RotationComparison | None:
-        """How the camera's rotation compares with the gyro's so far; None: not compared yet, or no IMU.
+        """How the camera's rotation compares with the gyro's so far; None: not compared yet, or no
+        IMU.
 
-        While the IMU looks faulty, rotations that agree count as not compared: the filter, which waits for them to
-        judge the baseline by the IMU, then takes no wrong unit or axis for a wrong baseline.
+        While the IMU looks faulty, rotations that agree count as not compared: the filter, which
+        waits for them to judge the baseline by the IMU, then takes no wrong unit or axis for a
+        wrong baseline.
         """
         check = self._inertial
         if check is None or check.rotation_comparison is None:
             return None
-        return None if check.imu_at_fault and check.rotation_comparison.agree else check.rotation_comparison
+        return (
+            None
+            if check.imu_at_fault and check.rotation_comparison.agree
+            else check.rotation_comparison
+        )
 
     def say(self, line: str) -> None:
         """Report what was found elsewhere, in one line."""
         self._report([line])
 
     def refused(self, index: int, reason: str) -> None:
-        """Add a frame that the front end refused, with its reason; a row of such frames is reported once."""
+        """Add a frame that the front end refused, with its reason; a row of such frames is
+        reported once.
+        """
         if self._refused_last != self._index_before:
             self._report([f"frame skipped: {reason}"])
         self._refused_last = index
-        self.frames_refused, self.refusal = self.frames_refused + 1, reason
+        self.frames_refused = self.frames_refused + 1
+        self.refusal = reason
 
     @property
     def imu_is_judged(self) -> bool:
@@ -171,20 +195,29 @@ class RunMonitor:
         what = "the IMU is not used, and images alone go on"
         if verdict.usable:
             parts = (("gyro", verdict.gyro_factor), ("accelerometer", verdict.accel_factor))
-            factors = [f"the {name}'s readings are multiplied by {factor:.6g}" for name, factor in parts if factor != 1]
+            factors = [
+                f"the {name}'s readings are multiplied by {factor:.6g}"
+                for name, factor in parts
+                if factor != 1
+            ]
             what = " and ".join(factors)
         self._report([f"frame {index}: {what}; the {frames} frames so far were estimated again"])
 
     def waiting(self, frame: StereoFrame, why: str) -> None:
-        """Add a frame without a pose, as the back end's start is not observable yet; `why` is reported at the end."""
+        """Add a frame without a pose, as the back end's start is not observable yet; `why` is
+        reported at the end.
+        """
         self._waits_for = why
         if self._waiting_since is None:
             self._waiting_since = frame.time_ns
         self.frames_waiting += 1
 
     def begun(self, frame: StereoFrame, scale_sigma: float | None) -> None:
-        """Add a frame with a pose of a back end that may have waited: for the first one, report the start."""
-        since, self._waiting_since = self._waiting_since, None
+        """Add a frame with a pose of a back end that may have waited: for the first one, report
+        the start.
+        """
+        since = self._waiting_since
+        self._waiting_since = None
         if since is None:
             return
         how = (
@@ -194,13 +227,16 @@ class RunMonitor:
         )
         self._report(
             [
-                f"frame {frame.index}: one camera: the trajectory begins here, {how}; the frames of "
+                f"frame {frame.index}: one camera: the trajectory begins here, {how}; the frames "
+                "of "
                 f"{(frame.time_ns - since) * 1e-9:.1f} s before have no pose"
             ]
         )
 
     def restarted(self, index: int, why: str, estimate: Estimate) -> None:
-        """Report that the back end diverged in a frame and was started again; repeats within a second are one event."""
+        """Report that the back end diverged in a frame and was started again; repeats within a
+        second are one event.
+        """
         self._report(self._health.restarted(index, why, estimate))
 
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
@@ -212,7 +248,9 @@ class RunMonitor:
         self._report_scale(last=False)
 
     def _report_scale(self, *, last: bool) -> None:
-        """Report what the sensor says of the cameras' scale once its axes were compared, and are right."""
+        """Report what the sensor says of the cameras' scale once its axes were compared, and are
+        right.
+        """
         check = self._inertial
         if check is None or (not check.imu_at_fault and (check.axes_compared or last)):
             self._report(self._scale_lines)
@@ -223,7 +261,10 @@ class RunMonitor:
         self._take_new()
         if self._frames and not self._features:
             self._report(
-                [f"no feature in any of {self._frames} frames: the trajectory contains no information on the motion"]
+                [
+                    f"no feature in any of {self._frames} frames: the trajectory contains no "
+                    "information on the motion"
+                ]
             )
         self._report([*self._repeats.finish(), *self._depths.finish()])
         if self._silence is not None:
@@ -232,12 +273,17 @@ class RunMonitor:
             self._report(self._faults.finish())
         if self._inertial is not None:
             findings = self._inertial.finish()
-            if self._faults is not None and self._faults.stuck_at_end:  # which is no matter of clocks
+            # which is no matter of clocks
+            if self._faults is not None and self._faults.stuck_at_end:
                 findings = tuple(f for f in findings if f.group != "overlap")
             self._report_findings(findings)
         self._report_scale(last=True)
         if self._waiting_since is not None:
-            why = "correct the fault of the IMU that is named above first" if self._imu_at_fault else self._waits_for
+            why = (
+                "correct the fault of the IMU that is named above first"
+                if self._imu_at_fault
+                else self._waits_for
+            )
             self._report([f"one camera: {self.frames_waiting} frames have no pose; {why}"])
 
     def _report_findings(self, findings: Iterable[InertialFinding]) -> None:

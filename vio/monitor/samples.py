@@ -1,4 +1,6 @@
-"""The IMU's readings of the last minute, and the faults that they show by themselves: gaps, clipping, magnitude."""
+"""The IMU's readings of the last minute, and the faults that they show by themselves: gaps,
+clipping, magnitude.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ _LEAST_LEVELS = 20  # different readings on the axis
 
 _SMOOTH_S = 0.2  # readings are averaged over this time before their magnitude is judged
 _LEAST_SIZE_S = 1.0
-_GRAVITY, _MILLI_G = 9.80665, 1000.0  # m/s^2, and what readings in mg have
+_GRAVITY = 9.80665  # m/s^2, and what readings in mg have
+_MILLI_G = 1000.0
 _NS = 1e-9
 
 
@@ -40,7 +43,11 @@ class Samples:
     @property
     def span_ns(self) -> tuple[int, int] | None:
         """Stamps of the first and the last reading ever added; None: there are none."""
-        return None if self._first_ns is None or self.last_ns is None else (self._first_ns, self.last_ns)
+        return (
+            None
+            if self._first_ns is None or self.last_ns is None
+            else (self._first_ns, self.last_ns)
+        )
 
     @property
     def step_s(self) -> float:
@@ -72,7 +79,8 @@ class Samples:
             while self._times[-1][-1] - self._times[0][-1] > MEMORY_S / _NS:
                 del self._times[0], self._values[0]
         else:
-            self._times, self._values = [times[-1:]], [values[-1:]]
+            self._times = [times[-1:]]
+            self._values = [values[-1:]]
         self._new = []
         return found
 
@@ -84,19 +92,24 @@ class Samples:
 
 
 def _gap(times_ns: IntArray, steps: FloatArray, usual_s: float) -> Iterator[InertialFinding]:
-    """Yield the longest gap before readings at times (S,), if any; steps (S or S - 1,) in seconds end there."""
+    """Yield the longest gap before readings at times (S,), if any; steps (S or S - 1,) in
+    seconds end there.
+    """
     if not len(steps) or steps.max() <= max(GAP_S, GAP_STEPS * usual_s):
         return
     k = len(times_ns) - len(steps) + int(np.argmax(steps))
     yield InertialFinding(
         "IMU gap",
-        f"no sample for {steps.max():.3f} s before {times_ns[k]} ns (samples are {1e3 * usual_s:.1f} ms apart)",
+        f"no sample for {steps.max():.3f} s before {times_ns[k]} ns (samples are "
+        f"{1e3 * usual_s:.1f} ms apart)",
         "samples were lost; the motion in between is interpolated from the samples on both sides",
     )
 
 
 def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFinding]:
-    """Yield runs of equal readings at the extreme of an axis that quantisation or held samples do not explain."""
+    """Yield runs of equal readings at the extreme of an axis that quantisation or held samples
+    do not explain.
+    """
     if len(values) < 4 * _LEAST_RUN:
         return
     equal = values[1:] == values[:-1]
@@ -105,7 +118,8 @@ def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFind
             at = values[:, axis] == extreme
             if at.sum() < _LEAST_RUN or at.all():
                 continue
-            # Equal neighbours elsewhere are due to chance: a run of n has the probability held^(n-1).
+            # Equal neighbours elsewhere are due to chance: a run of n has the probability
+            # held^(n-1).
             held = float(np.mean(equal[~(at[1:] & at[:-1]), axis]))
             chance = np.log(_LEAST_CHANCE) / np.log(held) if held > 0 else 0.0
             run = _longest_run(at)
@@ -114,9 +128,11 @@ def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFind
             name, unit = ("gyro", "rad/s") if axis < 3 else ("accelerometer", "m/s^2")
             yield InertialFinding(
                 "saturation",
-                f"{int(at.sum())} samples of the {name}'s {'xyz'[axis % 3]} axis are at {extreme:.4g} {unit}, {run} "
+                f"{int(at.sum())} samples of the {name}'s {'xyz'[axis % 3]} axis are at "
+                f"{extreme:.4g} {unit}, {run} "
                 f"in a row, near {times_ns[int(np.argmax(at))]} ns",
-                "the motion exceeds the sensor's range; choose a larger range, and expect drift there",
+                "the motion exceeds the sensor's range; choose a larger range, and expect drift "
+                "there",
             )
             return
 
@@ -131,7 +147,8 @@ class Size:
     """Magnitude of the accelerometer's mean readings, and the implied unit."""
 
     finding: InertialFinding | None
-    unit: float | None  # factor that makes the readings m/s^2; None: unknown, since gravity was removed
+    # factor that makes the readings m/s^2; None: unknown, since gravity was removed
+    unit: float | None
     clear: bool = True  # False: biased readings without gravity can have this magnitude, too
 
 
@@ -140,9 +157,14 @@ def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
     t = np.asarray((times_ns - times_ns[0]) * _NS, dtype=np.float64)
     if t[-1] < _LEAST_SIZE_S:
         return Size(None, 1.0)
-    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(np.diff(t)[:, None] * (accel[1:] + accel[:-1]) / 2, axis=0)])
+    integral = np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(np.diff(t)[:, None] * (accel[1:] + accel[:-1]) / 2, axis=0)]
+    )
     edges = np.arange(0.0, t[-1], _SMOOTH_S)
-    mean = np.diff(np.stack([np.interp(edges, t, integral[:, k]) for k in range(3)], axis=1), axis=0) / _SMOOTH_S
+    mean = (
+        np.diff(np.stack([np.interp(edges, t, integral[:, k]) for k in range(3)], axis=1), axis=0)
+        / _SMOOTH_S
+    )
     size = np.linalg.norm(mean, axis=1)
     median = float(np.median(size))
     return _judge_median(median, robust_sigma(size - median) / max(median, 1e-300))
@@ -152,7 +174,9 @@ def _judge_median(median: float, spread: float) -> Size:
     """Judge a median magnitude and its relative spread."""
     if 0.5 < median / _GRAVITY < 2.5:
         return Size(None, 1.0)
-    seen = f"the accelerometer's median magnitude is {median:.4g} where gravity alone gives 9.8 m/s^2"
+    seen = (
+        f"the accelerometer's median magnitude is {median:.4g} where gravity alone gives 9.8 m/s^2"
+    )
     units = {
         1.0: "in g: multiply by 9.81",
         _MILLI_G: "in mg (multiply by 0.00981) or in cm/s^2 (divide by 100)",
@@ -161,7 +185,9 @@ def _judge_median(median: float, spread: float) -> Size:
     for gravity, explanation in units.items():
         if 0.6 < median / gravity < 1.6 and spread < 0.3:
             factor = None if gravity == _MILLI_G else _GRAVITY / gravity  # of which there are two
-            finding = InertialFinding("accelerometer units", seen, f"the readings are {explanation}", factor=factor)
+            finding = InertialFinding(
+                "accelerometer units", seen, f"the readings are {explanation}", factor=factor
+            )
             clear = gravity > 1.0 or (abs(median - 1.0) < 0.1 and spread < 0.06)
             return Size(finding, _GRAVITY / gravity, clear)
     if median < 0.5 * _GRAVITY and (spread >= 0.3 or median < 0.5):
@@ -179,6 +205,7 @@ def gravity_removed(seen: str) -> InertialFinding:
     return InertialFinding(
         "gravity removed",
         seen,
-        "gravity has been taken out ('linear acceleration'), or the sensor is dead; a filter needs the raw specific "
+        "gravity has been taken out ('linear acceleration'), or the sensor is dead; a filter needs "
+        "the raw specific "
         "force (+9.8 m/s^2 upwards at standstill)",
     )

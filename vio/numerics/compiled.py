@@ -1,10 +1,10 @@
 """Loops as machine code: compiled by numba, ahead of time or at the first call.
 
-For loops over small matrices and patches, where NumPy spends its time on calls and temporary arrays. Inside a compiled
-function, write out assignments of whole rows and sums of arrays as loops: numba's own forms of these take seconds to
-compile, and `reshape`, or `np.zeros` in place of `np.empty`, a tenth of a second. A whole number that is written out as
-an argument of a compiled function makes numba compile that function anew, for this number alone: pass
-`int(np.int64(1))`.
+For loops over small matrices and patches, where NumPy spends its time on calls and temporary
+arrays. Inside a compiled function, write out assignments of whole rows and sums of arrays as loops:
+numba's own forms of these take seconds to compile, and `reshape`, or `np.zeros` in place of
+`np.empty`, a tenth of a second. A whole number that is written out as an argument of a compiled
+function makes numba compile that function anew, for this number alone: pass `int(np.int64(1))`.
 """
 
 from __future__ import annotations
@@ -24,28 +24,35 @@ log = logging.getLogger(__name__)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Without the entry for callers in C, which nothing here uses, a function compiles in a tenth less time.
+# Without the entry for callers in C, which nothing here uses, a function compiles in a tenth less
+# time.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
-# numba counts references to each array that a function is given, or cuts out of one, by atomic additions. A function
-# needs that only if it allocates an array, by one of these names; one that does by another name does not compile.
+# numba counts references to each array that a function is given, or cuts out of one, by atomic
+# additions. A function needs that only if it allocates an array, by one of these names; one that
+# does by another name does not compile.
 _ALLOCATE = {"empty", "zeros", "copy", "reshape", "searchsorted"}
 LOOPS: list[Loop] = []
 
 
 class Loop:
-    """A function as machine code: from the extension module, or as numba compiles it for the types of a call."""
+    """A function as machine code: from the extension module, or as numba compiles it for the
+    types of a call.
+    """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         """Prepare; the first call looks for the code."""
         functools.update_wrapper(self, function)
-        self.function, self.options = function, options
+        self.function = function
+        self.options = options
         self._call: Callable[..., Any] = self._first_call
 
     def __call__(self, *arguments: Any) -> Any:
         """Call it."""
         try:
             return self._call(*arguments)
-        except TypeError:  # nothing is computed yet: the arguments are of types that the extension has no code for
+        except (
+            TypeError
+        ):  # nothing is computed yet: the arguments are of types that the extension has no code for
             return self.by_numba(*arguments)
 
     def _first_call(self, *arguments: Any) -> Any:
@@ -70,13 +77,18 @@ class Loop:
 
     @functools.cached_property
     def by_numba(self) -> Any:
-        """The function as numba has it; its code is compiled at the first call, or loaded from the cache."""
+        """The function as numba has it; its code is compiled at the first call, or loaded from
+        the cache.
+        """
         import numba
 
         try:
             return numba.njit(self.function, cache=True, **self.options)
         except RuntimeError:  # numba found no folder that it may write to
-            log.debug("no folder for numba's cache is writable: %s is compiled in each process", self.function.__name__)
+            log.debug(
+                "no folder for numba's cache is writable: %s is compiled in each process",
+                self.function.__name__,
+            )
             return numba.njit(self.function, **self.options)
 
     @property
@@ -102,19 +114,22 @@ def _first_that_takes(codes: list[Callable[..., Any]], *arguments: Any) -> Any:
 
 
 def compiled(function: Function) -> Function:
-    """Use a function as machine code, which is looked for, or compiled for the types of the call, at its first call.
+    """Use a function as machine code, which is looked for, or compiled for the types of the call,
+    at its first call.
 
-    Divisions follow IEEE 754 as NumPy's do, and sums keep their order. numba's cache is beside the source file, else in
-    the user's cache folder (NUMBA_CACHE_DIR overrides both); where neither is writable, every process compiles anew.
+    Divisions follow IEEE 754 as NumPy's do, and sums keep their order. numba's cache is beside the
+    source file, else in the user's cache folder (NUMBA_CACHE_DIR overrides both); where neither is
+    writable, every process compiles anew.
     """
     return _loop(function, {"fastmath": False})
 
 
 def compiled_sums(function: Function) -> Function:
-    """Compile a function like `compiled`, with its sums taken in an order that suits the processor's vectors.
+    """Compile a function like `compiled`, with its sums taken in an order that suits the
+    processor's vectors.
 
-    The order is part of the machine code, so results still repeat to the bit on one kind of processor. Unlike numba's
-    `fastmath=True`, infinities and NaN keep their meaning.
+    The order is part of the machine code, so results still repeat to the bit on one kind of
+    processor. Unlike numba's `fastmath=True`, infinities and NaN keep their meaning.
     """
     return _loop(function, {"fastmath": {"reassoc", "contract", "nsz"}})
 
@@ -132,7 +147,9 @@ def has_compiled() -> bool:
 
 @compiled
 def invert_positive(A: FloatArray, out: npt.NDArray[np.floating[Any]]) -> None:
-    """Write the inverse (n, n) of a symmetric positive definite matrix, whose lower triangle is read, by Cholesky."""
+    """Write the inverse (n, n) of a symmetric positive definite matrix, whose lower triangle is
+    read, by Cholesky.
+    """
     n = len(A)
     L = np.empty((n, n))  # first the factor, then its inverse
     for i in range(n):
@@ -158,7 +175,9 @@ def invert_positive(A: FloatArray, out: npt.NDArray[np.floating[Any]]) -> None:
 
 @compiled
 def solve_positive(A: FloatArray, b: FloatArray) -> None:
-    """Solve `A x = b` in place for a symmetric positive definite A (n, n): x replaces b[:n], and the factor A."""
+    """Solve `A x = b` in place for a symmetric positive definite A (n, n): x replaces b[:n], and
+    the factor A.
+    """
     n = len(A)
     for i in range(n):
         for j in range(i + 1):
@@ -180,7 +199,8 @@ def solve_positive(A: FloatArray, b: FloatArray) -> None:
 @compiled
 def index_of(value: int, increasing: npt.NDArray[np.int64]) -> int:
     """Index of a number among increasing ones (M,), by bisection; -1: it is not one of them."""
-    low, high = 0, len(increasing)
+    low = 0
+    high = len(increasing)
     while low < high:
         middle = (low + high) // 2
         if increasing[middle] < value:
@@ -192,16 +212,19 @@ def index_of(value: int, increasing: npt.NDArray[np.int64]) -> int:
 
 @compiled
 def eigenvectors(A: FloatArray, V: FloatArray) -> None:
-    """Make a small symmetric A (n, n) diagonal in place, and write its eigenvectors into the columns of V (n, n).
+    """Make a small symmetric A (n, n) diagonal in place, and write its eigenvectors into the
+    columns of V (n, n).
 
-    By Jacobi's rotations, each of which clears one entry. Reference: Golub & Van Loan, Matrix Computations, 8.5.
+    By Jacobi's rotations, each of which clears one entry. Reference: Golub & Van Loan, Matrix
+    Computations, 8.5.
     """
     n = len(A)
     for i in range(n):
         for j in range(n):
             V[i, j] = 1.0 if i == j else 0.0
     for _ in range(12):  # sweeps; convergence is quadratic
-        off, own = 0.0, 0.0
+        off = 0.0
+        own = 0.0
         for i in range(n):
             own += A[i, i] * A[i, i]
             for j in range(i):
@@ -225,8 +248,12 @@ def eigenvectors(A: FloatArray, V: FloatArray) -> None:
 
 @compiled
 def move_by_twist(xi: FloatArray, T: FloatArray) -> None:
-    """Replace a transform T (4, 4) by `exp(xi) T`, with a twist (6,) `[rho; phi]`: `se3_exp` of `vio.geometry.lie`."""
-    x, y, z = xi[3], xi[4], xi[5]
+    """Replace a transform T (4, 4) by `exp(xi) T`, with a twist (6,) `[rho; phi]`: `se3_exp` of
+    `vio.geometry.lie`.
+    """
+    x = xi[3]
+    y = xi[4]
+    z = xi[5]
     squared = x * x + y * y + z * z
     if squared < 1e-4:  # cancellation in the closed forms
         a = 1.0 - squared / 6.0 * (1.0 - squared / 20.0 * (1.0 - squared / 42.0))
@@ -234,16 +261,32 @@ def move_by_twist(xi: FloatArray, T: FloatArray) -> None:
         c = 1.0 / 6.0 - squared / 120.0 * (1.0 - squared / 42.0 * (1.0 - squared / 72.0))
     else:
         angle = np.sqrt(squared)
-        a, b, c = np.sin(angle) / angle, 2.0 * np.sin(angle / 2.0) ** 2 / squared, (angle - np.sin(angle)) / angle**3
+        a = np.sin(angle) / angle
+        b = 2.0 * np.sin(angle / 2.0) ** 2 / squared
+        c = (angle - np.sin(angle)) / angle**3
     # phi^ v and phi^ phi^ v are the cross products of phi with v, and with that.
     for j in range(4):
-        px, py, pz = T[0, j], T[1, j], T[2, j]
-        cx, cy, cz = y * pz - z * py, z * px - x * pz, x * py - y * px
-        dx, dy, dz = y * cz - z * cy, z * cx - x * cz, x * cy - y * cx
-        T[0, j], T[1, j], T[2, j] = px + a * cx + b * dx, py + a * cy + b * dy, pz + a * cz + b * dz
-    px, py, pz = xi[0], xi[1], xi[2]
-    cx, cy, cz = y * pz - z * py, z * px - x * pz, x * py - y * px
-    dx, dy, dz = y * cz - z * cy, z * cx - x * cz, x * cy - y * cx
+        px = T[0, j]
+        py = T[1, j]
+        pz = T[2, j]
+        cx = y * pz - z * py
+        cy = z * px - x * pz
+        cz = x * py - y * px
+        dx = y * cz - z * cy
+        dy = z * cx - x * cz
+        dz = x * cy - y * cx
+        T[0, j] = px + a * cx + b * dx
+        T[1, j] = py + a * cy + b * dy
+        T[2, j] = pz + a * cz + b * dz
+    px = xi[0]
+    py = xi[1]
+    pz = xi[2]
+    cx = y * pz - z * py
+    cy = z * px - x * pz
+    cz = x * py - y * px
+    dx = y * cz - z * cy
+    dy = z * cx - x * cz
+    dz = x * cy - y * cx
     T[0, 3] += px + b * cx + c * dx
     T[1, 3] += py + b * cy + c * dy
     T[2, 3] += pz + b * cz + c * dz

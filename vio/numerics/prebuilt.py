@@ -1,8 +1,10 @@
-"""Machine code of the compiled loops in an extension module, so that a run needs neither numba nor its compiler.
+"""Machine code of the compiled loops in an extension module, so that a run needs neither numba nor
+its compiler.
 
-`tools/prebuild.py` writes it beside this file, into a wheel or a checkout. A loop's code is used only where bytecode
-and constants of the loop, and of the loops that it calls, are those that it was made from; where Python and NumPy are
-those that it was made for; and on processors that have all of its instructions. Everywhere else numba compiles.
+`tools/prebuild.py` writes it beside this file, into a wheel or a checkout. A loop's code is used
+only where bytecode and constants of the loop, and of the loops that it calls, are those that it was
+made from; where Python and NumPy are those that it was made for; and on processors that have all of
+its instructions. Everywhere else numba compiles.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from typing import Any
 import numpy as np
 
 FOLDER = Path(__file__).with_name("machine_code")
-MANIFEST, MODULE = "manifest.json", "vio_loops"
+MANIFEST = "manifest.json"
+MODULE = "vio_loops"
 _CPU_INFO = Path("/proc/cpuinfo")
 # Settings of numba that change no code: with others, numba compiles as they say.
 _HARMLESS = {"NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS"}
@@ -38,7 +41,9 @@ def environment() -> dict[str, str]:
 
 
 def processor_flags(path: Path = _CPU_INFO) -> frozenset[str]:
-    """Return the names of the processor's instruction sets as Linux lists them; elsewhere, the machine's name."""
+    """Return the names of the processor's instruction sets as Linux lists them; elsewhere, the
+    machine's name.
+    """
     try:
         with path.open(encoding="utf-8") as file:
             listed = next((line for line in file if line.startswith(("flags", "Features"))), ":")
@@ -48,12 +53,15 @@ def processor_flags(path: Path = _CPU_INFO) -> frozenset[str]:
 
 
 def fingerprint(function: Callable[..., Any], options: Mapping[str, Any]) -> str:
-    """Return a hash of a function's bytecode and options, and of the constants and compiled functions that it uses.
+    """Return a hash of a function's bytecode and options, and of the constants and compiled
+    functions that it uses.
 
     Raises:
         AttributeError: it uses a global of another kind.
     """
-    digest = hashlib.sha256(repr(sorted((name, _text(value)) for name, value in options.items())).encode())
+    digest = hashlib.sha256(
+        repr(sorted((name, _text(value)) for name, value in options.items())).encode()
+    )
     digest.update(repr(function.__defaults__).encode())
     names = _add_code(function.__code__, digest)
     for name in sorted(names & function.__globals__.keys()):
@@ -62,7 +70,9 @@ def fingerprint(function: Callable[..., Any], options: Mapping[str, Any]) -> str
 
 
 def _add_code(code: CodeType, digest: Any) -> set[str]:
-    """Add the bytecode of a function and of those inside it to a hash; return the names that they refer to."""
+    """Add the bytecode of a function and of those inside it to a hash; return the names that
+    they refer to.
+    """
     names = set(code.co_names)
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -86,14 +96,18 @@ def _text(value: Any) -> str:
 
 @functools.cache
 def _extension() -> tuple[ModuleType | None, Mapping[str, Mapping[str, Any]]]:
-    """Return the extension module and what its manifest says of each loop; none where it must not be used."""
+    """Return the extension module and what its manifest says of each loop; none where it must
+    not be used.
+    """
     if any(name.startswith("NUMBA_") and name not in _HARMLESS for name in os.environ):
         return None, {}
     try:
         manifest = json.loads((FOLDER / MANIFEST).read_bytes())
         loops: Mapping[str, Mapping[str, Any]] = manifest["loops"]
         file = FOLDER / manifest["file"]
-        here = manifest["environment"] == environment() and set(manifest["flags"]) <= processor_flags()
+        here = (
+            manifest["environment"] == environment() and set(manifest["flags"]) <= processor_flags()
+        )
         if not here or hashlib.sha256(file.read_bytes()).hexdigest() != manifest["sha256"]:
             return None, {}
         spec = importlib.util.spec_from_file_location(MODULE, file)
@@ -101,13 +115,20 @@ def _extension() -> tuple[ModuleType | None, Mapping[str, Mapping[str, Any]]]:
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
-    except (OSError, ValueError, KeyError, TypeError, ImportError):  # there is none, or it is damaged
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        ImportError,
+    ):  # there is none, or it is damaged
         return None, {}
     return module, loops
 
 
 def code_of(function: Callable[..., Any], made_from: Callable[[], str]) -> list[Callable[..., Any]]:
-    """Return a function's machine code, one for each set of types; none where there is none for it as it is now.
+    """Return a function's machine code, one for each set of types; none where there is none for it
+    as it is now.
 
     Each raises TypeError, before it computes anything, where its arguments are of other types.
 

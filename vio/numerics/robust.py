@@ -11,22 +11,30 @@ _MEDIAN_TO_SIGMA = 1.4826  # standard deviation over median absolute value of a 
 
 
 def median(values: npt.ArrayLike) -> float:
-    """Return the median as NumPy does, to the bit (of nothing: NaN), but for few numbers in a sixth of the time."""
+    """Return the median as NumPy does, to the bit (of nothing: NaN), but for few numbers in a
+    sixth of the time.
+    """
     ordered = np.array(values, dtype=np.float64).ravel()
     ordered.sort()  # NaN come last
     middle = len(ordered) // 2
     if not len(ordered) or ordered[-1] != ordered[-1]:
         return float("nan")
-    return float(ordered[middle] if len(ordered) % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))
+    return float(
+        ordered[middle] if len(ordered) % 2 else 0.5 * (ordered[middle - 1] + ordered[middle])
+    )
 
 
 def robust_sigma(values: npt.ArrayLike) -> float:
-    """Estimate the standard deviation of zero-mean values from the median of their absolute values."""
+    """Estimate the standard deviation of zero-mean values from the median of their absolute
+    values.
+    """
     return _MEDIAN_TO_SIGMA * median(np.abs(values))
 
 
 def robust_sigmas(values: FloatArray) -> FloatArray:
-    """Estimate the standard deviations (K,) of the columns of zero-mean values (N, K) as `robust_sigma` does."""
+    """Estimate the standard deviations (K,) of the columns of zero-mean values (N, K) as
+    `robust_sigma` does.
+    """
     out: FloatArray = _MEDIAN_TO_SIGMA * np.median(np.abs(values), axis=0)
     return out
 
@@ -34,21 +42,30 @@ def robust_sigmas(values: FloatArray) -> FloatArray:
 def jackknife(values: npt.ArrayLike) -> FloatArray:
     """Compute standard errors (...) of an estimate from its leave-one-block-out values (n, ...).
 
-    With blocks longer than the correlation time of the errors, the result accounts for correlated errors.
+    With blocks longer than the correlation time of the errors, the result accounts for correlated
+    errors.
     Reference: Tukey (1958), after Quenouille.
     """
     estimates = np.asarray(values, dtype=np.float64)
-    out: FloatArray = np.sqrt((len(estimates) - 1) * np.mean((estimates - estimates.mean(axis=0)) ** 2, axis=0))
+    out: FloatArray = np.sqrt(
+        (len(estimates) - 1) * np.mean((estimates - estimates.mean(axis=0)) ** 2, axis=0)
+    )
     return out
 
 
-def truncated_weights(squared: FloatArray, mu: FloatArray | float, limit: FloatArray | float) -> FloatArray:
-    """Compute weights (...) of truncated least squares of squared errors (...) by graduated non-convexity.
+def truncated_weights(
+    squared: FloatArray, mu: FloatArray | float, limit: FloatArray | float
+) -> FloatArray:
+    """Compute weights (...) of truncated least squares of squared errors (...) by graduated
+    non-convexity.
 
-    Reference: Yang et al. (2020), equation (14); `mu` grows from 0 (convex) on, `limit` is the largest squared error.
+    Reference: Yang et al. (2020), equation (14); `mu` grows from 0 (convex) on, `limit` is the
+    largest squared error.
     """
     middle = np.sqrt(limit * mu * (mu + 1) / np.maximum(squared, 1e-12)) - mu
     out: FloatArray = np.where(
-        squared >= limit * (mu + 1) / mu, 0.0, np.where(squared <= limit * mu / (mu + 1), 1.0, middle)
+        squared >= limit * (mu + 1) / mu,
+        0.0,
+        np.where(squared <= limit * mu / (mu + 1), 1.0, middle),
     )
     return out

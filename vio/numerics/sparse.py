@@ -1,4 +1,6 @@
-"""Normal equations that are sparse, symmetric and positive definite: their factors, and blocks of their inverse."""
+"""Normal equations that are sparse, symmetric and positive definite: their factors, and blocks
+of their inverse.
+"""
 
 from __future__ import annotations
 
@@ -16,17 +18,21 @@ _AT_ONCE = 32  # blocks: right-hand sides are dense
 
 
 def factors(H: csc_matrix, block: int = 1) -> Callable[[FloatArray], FloatArray]:
-    """Return what solves `H x = b` for b (n,) or (n, m), H (n, n) being symmetric and positive definite.
+    """Return what solves `H x = b` for b (n,) or (n, m), H (n, n) being symmetric and positive
+    definite.
 
     Args:
         H: the matrix.
-        block: unknowns from the first on, of which all or none depend on another unknown. A large matrix is ordered by
-            its blocks, as scipy holds the interpreter while it orders; a smaller one as it is.
+        block: unknowns from the first on, of which all or none depend on another unknown. A large
+            matrix is ordered by its blocks, as scipy holds the interpreter while it orders; a
+            smaller one as it is.
     """
     # Ordered and pivoted as a symmetric matrix, its factors have a tenth of the entries.
     options: dict[str, Any] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     if block == 1 or H.shape[0] < _LARGE:
-        solve: Callable[[FloatArray], FloatArray] = splu(H, permc_spec="MMD_AT_PLUS_A", **options).solve
+        solve: Callable[[FloatArray], FloatArray] = splu(
+            H, permc_spec="MMD_AT_PLUS_A", **options
+        ).solve
         return solve
     links = H[::block, ::block].tocsc()
     links.data[:] = -1.0
@@ -44,22 +50,28 @@ def factors(H: csc_matrix, block: int = 1) -> Callable[[FloatArray], FloatArray]
     return solve_ordered
 
 
-def marginals(H: csc_matrix, D: csr_matrix, size: int, scores: csr_matrix | None = None, block: int = 1) -> FloatArray:
+def marginals(
+    H: csc_matrix, D: csr_matrix, size: int, scores: csr_matrix | None = None, block: int = 1
+) -> FloatArray:
     """Covariances (C, d, d) of `D_c x`, each alone, where x has the information matrix H (n, n).
 
     Args:
         H: sum of `J' W J`, symmetric and positive definite.
         D: (C d, n) rows of D_c, one after the other.
         size: d.
-        scores: (S, n) rows whose squares are together the covariance of the gradient; None: that is H.
+        scores: (S, n) rows whose squares are together the covariance of the gradient; None: that is
+            H.
         block: that of `factors`.
     """
-    solve, out = factors(H, block), np.zeros((D.shape[0] // size, size, size))
+    solve = factors(H, block)
+    out = np.zeros((D.shape[0] // size, size, size))
     for first in range(0, len(out), _AT_ONCE):
         rows = D[size * first : size * (first + _AT_ONCE)]
         x = solve(rows.T.toarray())
         y = None if scores is None else scores @ x
         P = np.asarray(rows @ x if y is None else y.T @ y)
         here = np.arange(len(P) // size)
-        out[first : first + len(here)] = P.reshape(len(here), size, len(here), size)[here, :, here, :]
+        out[first : first + len(here)] = P.reshape(len(here), size, len(here), size)[
+            here, :, here, :
+        ]
     return 0.5 * (out + np.swapaxes(out, 1, 2))

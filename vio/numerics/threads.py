@@ -1,4 +1,6 @@
-"""Single-threaded linear algebra: the filter's matrices are too small for a second thread to help."""
+"""Single-threaded linear algebra: the filter's matrices are too small for a second thread to
+help.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +8,15 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
-_pinned = 0  # how many blocks of `one_blas_thread` are open in this process: the limit is one for all threads
+# how many blocks of `one_blas_thread` are open in this process: the limit is one for all threads
+_pinned = 0
 
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Pin BLAS to one thread inside the block (a QR of 1640 x 96 was measured a hundred times slower with two)."""
+    """Pin BLAS to one thread inside the block (a QR of 1640 x 96 was measured a hundred times
+    slower with two).
+    """
     from threadpoolctl import threadpool_limits
 
     global _pinned
@@ -24,7 +29,9 @@ def one_blas_thread() -> Iterator[None]:
 
 
 class BlasLimit:
-    """As `one_blas_thread`, for blocks that are entered often: it looks for the BLAS libraries once."""
+    """As `one_blas_thread`, for blocks that are entered often: it looks for the BLAS libraries
+    once.
+    """
 
     def __init__(self) -> None:
         from threadpoolctl import ThreadpoolController
@@ -32,7 +39,9 @@ class BlasLimit:
         self._controller = ThreadpoolController()
 
     def __call__(self) -> AbstractContextManager[Any]:
-        """Return the context; inside `one_blas_thread` it does nothing: asking every library takes 0.3 ms."""
+        """Return the context; inside `one_blas_thread` it does nothing: asking every library
+        takes 0.3 ms.
+        """
         if _pinned:
             return nullcontext()
         limit: AbstractContextManager[Any] = self._controller.limit(limits=1, user_api="blas")

@@ -1,4 +1,6 @@
-"""Measurement of a recording's calibration from the recording itself, and comparison with the given one."""
+"""Measurement of a recording's calibration from the recording itself, and comparison with the
+given one.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,12 @@ from vio.calibration.stereo import (
     too_few,
 )
 from vio.calibration.stereo_field import PARAMETERS, field_of
-from vio.calibration.verdicts import judge_exchange, judge_imu, judge_stereo, judge_velocity_lever_arm
+from vio.calibration.verdicts import (
+    judge_exchange,
+    judge_imu,
+    judge_stereo,
+    judge_velocity_lever_arm,
+)
 from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import load_gray
 from vio.errors import EstimationError
@@ -44,16 +51,21 @@ from vio.records import BoolArray, FeatureTracks, IntArray, MotionSample, Record
 
 log = logging.getLogger(__name__)
 
-_SEGMENT, _SEGMENTS, _SEGMENT_KEYFRAMES = 36, 6, 20  # frames, pieces, keyframes of each, for the rig in motion
+_SEGMENT = 36  # frames, pieces, keyframes of each, for the rig in motion
+_SEGMENTS = 6
+_SEGMENT_KEYFRAMES = 20
 _SEGMENT_GATE_PX = 8.0  # wide: wrong extrinsics displace every point
-# What the gate leaves of a camera that is far off is biased: it is measured again with what was found taken out, until
-# less than this is left.
-_ROUNDS, _SETTLED_DEG = 5, 0.05
+# What the gate leaves of a camera that is far off is biased: it is measured again with what was
+# found taken out, until less than this is left.
+_ROUNDS = 5
+_SETTLED_DEG = 0.05
 _FRAMES_PER_PAIR = 5  # a frame of a feature file contains fewer matches than a pair of images
 _MAX_ROW_OFFSET_PX = 2.0  # with larger row differences, features are matched wrongly or not at all
 _UNUSABLE = ("cameras swapped", "baseline translation inverted")  # features are unusable then
 
-_ROWS, _IMU, _LEVER_ARM = "row alignment", "IMU-camera rotation and time offset", "lever arm"
+_ROWS = "row alignment"
+_IMU = "IMU-camera rotation and time offset"
+_LEVER_ARM = "lever arm"
 _INTRINSICS = "focal length and principal point"
 _NOT_TRACKED = NotObservable(_INTRINSICS, "no features were tracked")
 
@@ -126,16 +138,23 @@ def measure(
     Raises:
         VioError: the recording cannot be read.
     """
-    notes = () if source.rejection is None else (f"the reader rejects this calibration: {source.rejection}",)
+    notes = (
+        ()
+        if source.rejection is None
+        else (f"the reader rejects this calibration: {source.rejection}",)
+    )
     if source.raw_pairs:
-        matches, tracked = _match_images(source, pairs, progress), None
+        matches = _match_images(source, pairs, progress)
+        tracked = None
     else:
         assert source.dataset is not None
         tracked = track(source.dataset, build_frontend, frames)
         matches = _match_tracks(source.dataset.recording, tracked[0], pairs)
     given = source.T_cam0_cam1
     stereo, agreeing = _measure_stereo(matches.rays)
-    findings = () if matches.exchanged is None else judge_exchange(matches.rays, matches.exchanged, given)
+    findings = (
+        () if matches.exchanged is None else judge_exchange(matches.rays, matches.exchanged, given)
+    )
     if not findings and isinstance(stereo, StereoEstimate):
         findings = judge_stereo(stereo, given, agreeing)
     if source.dataset is None:
@@ -146,13 +165,16 @@ def measure(
     misaligned = isinstance(described, RowResiduals) and (
         abs(described.median_px) + described.spread_px > _MAX_ROW_OFFSET_PX
     )
-    if misaligned or any(f.fault in _UNUSABLE for f in findings):  # features may not be of the same point
+    # features may not be of the same point
+    if misaligned or any(f.fault in _UNUSABLE for f in findings):
         why = f"{findings[0].fault if findings else 'image rows do not match'}: correct that first, then measure again"
         return CalibrationReport(source, stereo, described, _no_imu(why), findings, notes)
     recording = source.dataset.recording
     tracks, samples = tracked or track(source.dataset, build_frontend, frames, progress)
     in_motion: SelfCalibration | None = None
-    intrinsics: Intrinsics | NotObservable = NotObservable(_INTRINSICS, "left and right could not be measured")
+    intrinsics: Intrinsics | NotObservable = NotObservable(
+        _INTRINSICS, "left and right could not be measured"
+    )
     if isinstance(stereo, StereoEstimate):
         stereo, intrinsics, in_motion = _measure_in_motion(source, stereo, tracks)
         findings = (*judge_stereo(stereo, given, agreeing), *judge_intrinsics(intrinsics))
@@ -161,18 +183,24 @@ def measure(
     return CalibrationReport(source, stereo, described, imu, findings, notes, intrinsics, in_motion)
 
 
-# --- left and right -------------------------------------------------------------------------------------------------
+# --- left and right
+# -------------------------------------------------------------------------------------------------
 
 
-def _match_images(source: CalibrationSource, pairs: int, progress: Callable[[int, int], None]) -> _Matches:
+def _match_images(
+    source: CalibrationSource, pairs: int, progress: Callable[[int, int], None]
+) -> _Matches:
     """Return SIFT matches of spread pairs of images."""
     assert source.rig is not None
-    rig, rotations = source.rig, source.rectifying()
+    rig = source.rig
+    rotations = source.rectifying()
     rays: list[RayMatches] = []
     exchanged: list[RayMatches] = []
     z: list[FloatArray] = [np.zeros((0, 4))]
     white, _ = full_scale(source.raw_pairs)
-    chosen = np.unique(np.linspace(0, len(source.raw_pairs) - 1, min(pairs, len(source.raw_pairs))).astype(int))
+    chosen = np.unique(
+        np.linspace(0, len(source.raw_pairs) - 1, min(pairs, len(source.raw_pairs))).astype(int)
+    )
     for done, k in enumerate(chosen.tolist()):
         left, right = (load_gray(path, white)[0] for path in source.raw_pairs[k])
         uv0, uv1 = sift_matches(left, right)
@@ -193,8 +221,12 @@ def _match_images(source: CalibrationSource, pairs: int, progress: Callable[[int
     )
 
 
-def _rays(rig: StereoRig, uv0: FloatArray, uv1: FloatArray, pair: int) -> tuple[RayMatches, BoolArray]:
-    """Return rays of matched pixels (N, 2) of both cameras, and a mask (N,) of the matches that have them."""
+def _rays(
+    rig: StereoRig, uv0: FloatArray, uv1: FloatArray, pair: int
+) -> tuple[RayMatches, BoolArray]:
+    """Return rays of matched pixels (N, 2) of both cameras, and a mask (N,) of the matches that
+    have them.
+    """
     ray0, valid0 = unproject_pixel(rig.cam0, uv0)
     ray1, valid1 = unproject_pixel(rig.cam1, uv1)
     valid = valid0 & valid1 & (ray0[:, 2] > 0.1) & (ray1[:, 2] > 0.1)
@@ -203,23 +235,29 @@ def _rays(rig: StereoRig, uv0: FloatArray, uv1: FloatArray, pair: int) -> tuple[
 
 def _match_tracks(recording: Recording, tracks: FeatureTracks, pairs: int) -> _Matches:
     """Return the stereo rows of spread frames of a feature file."""
-    frames, fresh = tracks.frames, tracks.has_right & ~tracks.stale
+    frames = tracks.frames
+    fresh = tracks.has_right & ~tracks.stale
     filled = np.unique(frames[fresh])
     spread = np.unique(np.linspace(0, len(filled) - 1, _FRAMES_PER_PAIR * pairs).astype(int))
     rows = fresh & np.isin(frames, filled[spread] if len(filled) else filled)
     z = tracks.z[rows]
-    rays = (left_rays(recording.camera, uv) for uv in (z[:, :2], z[:, 2:]))  # both cameras have the same intrinsics
+    # both cameras have the same intrinsics
+    rays = (left_rays(recording.camera, uv) for uv in (z[:, :2], z[:, 2:]))
     ray0, ray1 = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
     return _Matches(RayMatches(frames[rows], ray0, ray1), None, z)
 
 
 def _measure_stereo(matches: RayMatches) -> tuple[StereoEstimate | NotObservable, RayMatches]:
-    """Estimate by RANSAC, refinement on epipolar angles and bundle adjustment of the rig; also return the inliers."""
+    """Estimate by RANSAC, refinement on epipolar angles and bundle adjustment of the rig; also
+    return the inliers.
+    """
     if few := too_few(matches):
         return few, matches
     start = relative_pose(matches)
     if start is None:
-        return NotObservable("left-right extrinsics", "no rigid pose of cam1 explains the matches"), matches
+        return NotObservable(
+            "left-right extrinsics", "no rigid pose of cam1 explains the matches"
+        ), matches
     refined = refine_stereo(matches, *start)
     if isinstance(refined, NotObservable):
         return refined, matches
@@ -232,7 +270,9 @@ def _measure_stereo(matches: RayMatches) -> tuple[StereoEstimate | NotObservable
 def _measure_in_motion(
     source: CalibrationSource, stereo: StereoEstimate, tracks: FeatureTracks
 ) -> tuple[StereoEstimate, Intrinsics | NotObservable, SelfCalibration | None]:
-    """Estimate the calibration by bundle adjustment over segments of video; unchanged where there are none."""
+    """Estimate the calibration by bundle adjustment over segments of video; unchanged where
+    there are none.
+    """
     assert source.dataset is not None
     width, height = source.image_size(tracks.z)
     recording = source.dataset.recording
@@ -240,10 +280,20 @@ def _measure_in_motion(
     off: FloatArray = np.zeros(len(PARAMETERS))
     try:
         for _ in range(_ROUNDS):
-            z = field_of(camera, off).without(tracks.z, tracks.has_right) if np.any(off) else tracks.z
+            z = (
+                field_of(camera, off).without(tracks.z, tracks.has_right)
+                if np.any(off)
+                else tracks.z
+            )
             pieces = _segments(source, camera, replace(tracks, z=z), recording.frame_times_ns)
             if not pieces:
-                return stereo, NotObservable(_INTRINSICS, "there are no 20 frames in a row whose motion is known"), None
+                return (
+                    stereo,
+                    NotObservable(
+                        _INTRINSICS, "there are no 20 frames in a row whose motion is known"
+                    ),
+                    None,
+                )
             step = self_calibrate(camera, pieces, intrinsics=False)
             held = step.after(off)
             if np.degrees(np.linalg.norm(so3_log(step.right_camera()[0]))) < _SETTLED_DEG:
@@ -256,7 +306,8 @@ def _measure_in_motion(
     R, direction, rotation_deg, direction_deg = held.right_camera()
     if (rotations := source.rectifying()) is not None:
         R_rect_cam0, R_rect_cam1 = rotations
-        R, direction = R_rect_cam1.T @ R @ R_rect_cam0, R_rect_cam0.T @ direction
+        R = R_rect_cam1.T @ R @ R_rect_cam0
+        direction = R_rect_cam0.T @ direction
     found = replace(
         stereo,
         R_cam1_cam0=R,
@@ -274,17 +325,25 @@ def _segments(
     """Return keyframes, points and rows of pieces of the recording with tracked features."""
     motion = stereo_twists(camera, tracks, times_ns, np.zeros((len(times_ns) - 1, 6)))
     out = []
-    for piece in tracked_segments(source.path, camera, tracks, motion, longest=_SEGMENT, most=_SEGMENTS):
+    for piece in tracked_segments(
+        source.path, camera, tracks, motion, longest=_SEGMENT, most=_SEGMENTS
+    ):
         try:
             keyframes = choose_keyframes(piece, most=_SEGMENT_KEYFRAMES)
             T_world_cam0 = piece.trajectory.T_world_body[keyframes]
-            out.append(Segment(T_world_cam0, build_tracks(piece, keyframes, T_world_cam0, gate_px=_SEGMENT_GATE_PX)))
+            out.append(
+                Segment(
+                    T_world_cam0,
+                    build_tracks(piece, keyframes, T_world_cam0, gate_px=_SEGMENT_GATE_PX),
+                )
+            )
         except EstimationError as error:
             log.warning("a segment of video was left out: %s", error)
     return out
 
 
-# --- motion sensor --------------------------------------------------------------------------------------------------
+# --- motion sensor
+# --------------------------------------------------------------------------------------------------
 
 
 def _no_imu(why: str) -> ImuReport:
@@ -292,7 +351,10 @@ def _no_imu(why: str) -> ImuReport:
 
 
 def _measure_imu(
-    recording: Recording, tracks: FeatureTracks, samples: Sequence[MotionSample], motion: CameraMotion | NotObservable
+    recording: Recording,
+    tracks: FeatureTracks,
+    samples: Sequence[MotionSample],
+    motion: CameraMotion | NotObservable,
 ) -> ImuReport:
     if not samples:
         return _no_imu("the recording contains no motion sensor")
@@ -309,5 +371,8 @@ def _measure_imu(
     findings = judge_imu(alignment, lever_arm, given)
     if not rates.inertial:
         times_ns = recording.frame_times_ns
-        findings = (*findings, *judge_velocity_lever_arm(recording.camera, tracks, times_ns, rates, given))
+        findings = (
+            *findings,
+            *judge_velocity_lever_arm(recording.camera, tracks, times_ns, rates, given),
+        )
     return ImuReport(alignment, lever_arm, findings)

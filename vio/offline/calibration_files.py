@@ -26,7 +26,8 @@ CAMCHAIN = "camchain-imucam.yaml"
 
 
 def write_calibration_report(folder: Path, report: CalibrationReport) -> None:
-    """Write the measured calibration in both formats, with the given values where it is not observable.
+    """Write the measured calibration in both formats, with the given values where it is not
+    observable.
 
     Nothing is written for features without an image size. The folder must exist.
     """
@@ -46,29 +47,38 @@ def write_calibration_report(folder: Path, report: CalibrationReport) -> None:
             continue  # Kalibr's file has names for the other models
         (folder / name).mkdir()
         (folder / name / "sensor.yaml").write_text(
-            camera_yaml(camera, poses[name], comment=f"{name}, by vio calibrate", rate_hz=rate_hz), encoding="utf-8"
+            camera_yaml(camera, poses[name], comment=f"{name}, by vio calibrate", rate_hz=rate_hz),
+            encoding="utf-8",
         )
     measured = replace(stereo, T_cam0_imu=T_cam0_imu, time_offset_s=offset_s)
     (folder / CAMCHAIN).write_text(kalibr_text(measured), encoding="utf-8")
 
 
 def _measured_stereo(report: CalibrationReport, given: StereoRig) -> Rig:
-    """Return the cameras as measured, with the given length of the baseline, focal length and principal point."""
+    """Return the cameras as measured, with the given length of the baseline, focal length and
+    principal point.
+    """
     rig = Rig(given.cam0, given.cam1, se3_inverse(given.T_cam0_cam1))
     if not isinstance(report.stereo, StereoEstimate):
         return rig
     length = float(np.linalg.norm(given.T_cam0_cam1[:3, 3]))
     R = report.stereo.R_cam1_cam0
-    if report.in_motion is not None:  # what lenses and principal point share with the rotation, is apart there
+    # what lenses and principal point share with the rotation, is apart there
+    if report.in_motion is not None:
         rig = rig_off_by(rig, report.in_motion.rig_parameters())
         R = rig.right[1][:3, :3]
     return replace(rig, T_cam1_cam0=se3_from_parts(R, -length * R @ report.stereo.direction))
 
 
 def _measured_imu(report: CalibrationReport, rig: StereoRig) -> tuple[FloatArray, float]:
-    """Return `T_cam0_imu` (4, 4) of the raw left camera, and the IMU's clock minus the camera's in seconds."""
-    T_cam0_imu, offset_s = se3_inverse(rig.T_imu_cam0), 0.0
-    alignment, lever_arm, dataset = report.imu.alignment, report.imu.lever_arm, report.source.dataset
+    """Return `T_cam0_imu` (4, 4) of the raw left camera, and the IMU's clock minus the camera's
+    in seconds.
+    """
+    T_cam0_imu = se3_inverse(rig.T_imu_cam0)
+    offset_s = 0.0
+    alignment = report.imu.alignment
+    lever_arm = report.imu.lever_arm
+    dataset = report.source.dataset
     R_rect_cam0 = np.eye(3)  # the motion was measured with the rectified camera
     if isinstance(dataset, ImageDataset) and dataset.rectifier.maps is not None:
         R_rect_cam0 = (dataset.rectifier.T_rect0_imu @ rig.T_imu_cam0)[:3, :3]

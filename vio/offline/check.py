@@ -21,18 +21,22 @@ from vio.offline.verdict import MapperResult, overall_verdict
 from vio.records import Trajectory
 from vio.runs.picture import write_picture
 
-_MATCH_S, _MAP_S = 2.0, 1.0  # for a keyframe, see `expected_minutes`
+_MATCH_S = 2.0  # for a keyframe, see `expected_minutes`
+_MAP_S = 1.0
 _MARGIN = 0.15  # of the path's extent, left free about it
-_LOGARITHMIC = 30.0  # ratio of largest to median distance beyond which a linear axis shows the largest only
+# ratio of largest to median distance beyond which a linear axis shows the largest only
+_LOGARITHMIC = 30.0
 log = logging.getLogger(__name__)
 
 _COLOURS: dict[Mapper, str] = {"incremental": "#d9822b", "global": "#3a9d5d"}
 
 
 def expected_minutes(keyframes: int, mappers: Sequence[Mapper]) -> float:
-    """Return about how long a check of as many keyframes takes on one slow core; images below 0.1 megapixel take less.
+    """Return about how long a check of as many keyframes takes on one slow core; images below 0.1
+    megapixel take less.
 
-    Measured with 30 keyframes of 1226 x 370 pixels: 1.8 s each for features and matches, 1.0 and 0.7 s for the mappers.
+    Measured with 30 keyframes of 1226 x 370 pixels: 1.8 s each for features and matches, 1.0 and
+    0.7 s for the mappers.
     """
     return keyframes * (_MATCH_S + _MAP_S * len(mappers)) / 60
 
@@ -50,7 +54,8 @@ def check_run(
 ) -> tuple[MapperResult, ...]:
     """Reconstruct keyframes of a run from their images with a known stereo rig, and compare.
 
-    Of a run that closed loops, keyframes at both ends of loops are matched as well, and its poses are those in the map.
+    Of a run that closed loops, keyframes at both ends of loops are matched as well, and its poses
+    are those in the map.
 
     Writes a folder of each mapper's name with its model, and the plot `check.png`.
 
@@ -67,10 +72,12 @@ def check_run(
     Raises:
         VioError: the run has too few views, or its images are not available.
     """
-    path, steps = run.tracked, 2 + len(mappers)
+    path = run.tracked
+    steps = 2 + len(mappers)
     keyframes = keyframes_by_overlap(path, most=most)
     names = keyframe_images(path.frames[keyframes])
-    images, database = folder / "images", folder / "database.db"
+    images = folder / "images"
+    database = folder / "database.db"
     minutes = expected_minutes(len(keyframes), mappers)
     announce(f"{len(keyframes)} keyframes: about {minutes:.2g} minutes on one slow core")
     write_images(run, source, keyframes, names, images)
@@ -80,11 +87,16 @@ def check_run(
     progress(2, steps)
     results: list[MapperResult] = []
     for mapper in mappers:
-        model = reconstruct(database, images, names, mapper, folder / mapper, loops, threads=threads)
+        model = reconstruct(
+            database, images, names, mapper, folder / mapper, loops, threads=threads
+        )
         found = None
         if model is not None:
             rows = keyframes[model.keyframes]
-            found = model, compare_keyframes(path, rows, model.T_world_cam0, run.truth, linked=model.linked)
+            found = (
+                model,
+                compare_keyframes(path, rows, model.T_world_cam0, run.truth, linked=model.linked),
+            )
         results.append(MapperResult(mapper, len(keyframes), found))
         progress(2 + len(results), steps)
     write_picture(folder / "check.png", lambda: draw_check(path.trajectory, results))
@@ -94,7 +106,9 @@ def check_run(
 
 
 def draw_check(trajectory: Trajectory, results: Sequence[MapperResult]) -> Any:
-    """Plot the trajectories from above, and their distance along the path; a broken model must not shrink the rest."""
+    """Plot the trajectories from above, and their distance along the path; a broken model must
+    not shrink the rest.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 5.4), dpi=110, layout="constrained")
@@ -104,18 +118,26 @@ def draw_check(trajectory: Trajectory, results: Sequence[MapperResult]) -> Any:
     path = (p - p[0]) @ axes.T
     above.plot(*path.T, color="#1f5fbf", label="run")
     margin = _MARGIN * float(np.ptp(path, axis=0).max())
-    low, high = path.min(axis=0) - margin, path.max(axis=0) + margin
+    low = path.min(axis=0) - margin
+    high = path.max(axis=0) + margin
     differences = [np.zeros(0)]
     for result in results:
         if result.found is None:
             continue
-        comparison, colour = result.found[1], _COLOURS[result.mapper]
+        comparison = result.found[1]
+        colour = _COLOURS[result.mapper]
         q = (comparison.aligned[:, :3, 3] - p[0]) @ axes.T
         outside = int(((q < low) | (q > high)).any(axis=1).sum())
         q[((q < low) | (q > high)).any(axis=1)] = np.nan
         beyond = f" ({outside} of {len(q)} outside the picture)" if outside else ""
         above.plot(*q.T, ".", color=colour, label=f"COLMAP, {result.mapper}{beyond}")
-        along.plot(comparison.frames, 1e3 * comparison.difference_m, ".-", color=colour, label=result.mapper)
+        along.plot(
+            comparison.frames,
+            1e3 * comparison.difference_m,
+            ".-",
+            color=colour,
+            label=result.mapper,
+        )
         differences.append(comparison.difference_m)
         for segment in comparison.segments:
             along.axvspan(segment.first_frame, segment.last_frame, color=colour, alpha=0.2)

@@ -1,4 +1,6 @@
-"""Comparison of two trajectories over the same keyframes: distance, scale, and segments that disagree."""
+"""Comparison of two trajectories over the same keyframes: distance, scale, and segments that
+disagree.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +22,12 @@ _SCALE_SIGMA = 0.02  # a scale with a larger standard deviation is not reported
 _LEAST_MOTIONS = 8  # keyframes needed to detect outlying motions
 _OUTLYING = 6.0  # robust standard deviations
 # What COLMAP's own path may be off by at its end, beside the run's standard deviations.
-_END_SHARE, _END_DEG, _END_DEG_PER_M = 0.01, 0.5, 0.01
+_END_SHARE = 0.01
+_END_DEG = 0.5
+_END_DEG_PER_M = 0.01
 _END_SIGMAS = 3.0
-_BROKEN = 1.0  # of the motion between two keyframes: beyond it, one of both trajectories has jumped there
+# of the motion between two keyframes: beyond it, one of both trajectories has jumped there
+_BROKEN = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +38,10 @@ class GroundTruth:
     T_cam0_imu: FloatArray  # (4, 4)
 
     def ate_m(self, found: Trajectory) -> float:
-        """Return the ATE (rms) of a trajectory after rigid alignment; EvaluationError where they do not meet."""
+        """Return the ATE (rms) of a trajectory after rigid alignment.
+
+        EvaluationError where they do not meet.
+        """
         return evaluate(found, self.trajectory, T_cam0_imu=self.T_cam0_imu).ate_m.rmse
 
 
@@ -53,14 +61,17 @@ class KeyframeComparison:
 
     total: int  # keyframes compared
     frames: IntArray  # (R,) frame numbers
-    piece: BoolArray  # (R,) keyframes of the longest segment without a gap, and without a jump of either trajectory
+    # (R,) keyframes of the longest segment without a gap, and without a jump of either trajectory
+    piece: BoolArray
     pieces: int  # between gaps
-    aligned: FloatArray  # (R, 4, 4) the other poses in the run's world, after SE(3) alignment of this piece
+    # (R, 4, 4) the other poses in the run's world, after SE(3) alignment of this piece
+    aligned: FloatArray
     difference_m: FloatArray  # (R,)
     difference_deg: FloatArray  # (R,)
     ate_m: float  # of the piece
     ate_deg: float
-    end_m: float  # by which the motion from the first to the last keyframe of the piece differs, at one scale
+    # by which the motion from the first to the last keyframe of the piece differs, at one scale
+    end_m: float
     end_deg: float
     expected_end_m: float  # that it may differ by, by the run's covariance and COLMAP's own errors
     expected_end_deg: float
@@ -88,8 +99,8 @@ def compare_keyframes(
         rows: (R,) rows of its trajectory.
         T_other_cam0: (R, 4, 4) poses from the other source at these rows, in any world frame.
         truth: ground truth to compare both with.
-        linked: (R - 1,) whether the other source joins each keyframe to the next; motions where it does not are not
-            compared. None: all of them.
+        linked: (R - 1,) whether the other source joins each keyframe to the next; motions where it
+            does not are not compared. None: all of them.
 
     Reference: Umeyama (1991) for the alignment, as in `vio.evaluation.trajectories`.
     """
@@ -98,10 +109,17 @@ def compare_keyframes(
     piece, pieces = _longest_piece(own, T_other_cam0, linked)
     aligned = apply_alignment(align_poses(T_other_cam0[piece], own[piece], "se3"), T_other_cam0)
     difference_m = np.linalg.norm(aligned[:, :3, 3] - own[:, :3, 3], axis=1)
-    # Rotations are aligned separately: on a straight path an alignment by positions leaves the roll unobservable.
-    turn = nearest_rotation(np.einsum("nij,nkj->ik", own[piece, :3, :3], T_other_cam0[piece, :3, :3]))
-    difference_deg = rotation_angle_deg(np.swapaxes(own[:, :3, :3], 1, 2) @ turn @ T_other_cam0[:, :3, :3])
-    ate_m, ate_deg = (float(np.sqrt(np.mean(d[piece] ** 2))) for d in (difference_m, difference_deg))
+    # Rotations are aligned separately: on a straight path an alignment by positions leaves the roll
+    # unobservable.
+    turn = nearest_rotation(
+        np.einsum("nij,nkj->ik", own[piece, :3, :3], T_other_cam0[piece, :3, :3])
+    )
+    difference_deg = rotation_angle_deg(
+        np.swapaxes(own[:, :3, :3], 1, 2) @ turn @ T_other_cam0[:, :3, :3]
+    )
+    ate_m, ate_deg = (
+        float(np.sqrt(np.mean(d[piece] ** 2))) for d in (difference_m, difference_deg)
+    )
     scale, sigma, why = _scale_ratio(T_other_cam0[piece], own[piece], ate_m)
     segments = _disagreements(run.frames[rows], own, T_other_cam0, linked)
     path_m = path_length_m(own[piece, :3, 3])
@@ -140,20 +158,28 @@ def compare_keyframes(
 
 
 def _expected_end(run: TrackedPath, ends: IntArray, path_m: float) -> tuple[float, float]:
-    """Return by how much the motion between two rows (2,) of a right run may differ from COLMAP's, m and degrees."""
+    """Return by how much the motion between two rows (2,) of a right run may differ from
+    COLMAP's, m and degrees.
+    """
     sigma_m, sigma_deg = (0.0, 0.0) if run.sigmas is None else run.sigmas[ends[1]].tolist()
     by_colmap = _END_SHARE * path_m, _END_DEG + _END_DEG_PER_M * path_m
     return _END_SIGMAS * sigma_m + by_colmap[0], _END_SIGMAS * sigma_deg + by_colmap[1]
 
 
 def aligned_distance_m(T_other: FloatArray, T_own: FloatArray) -> float:
-    """Return the root mean square distance of the positions of paired poses (R, 4, 4) after SE(3) alignment."""
+    """Return the root mean square distance of the positions of paired poses (R, 4, 4) after
+    SE(3) alignment.
+    """
     aligned = apply_alignment(align_poses(T_other, T_own, "se3"), T_other)
     return float(np.sqrt(np.mean(np.sum((aligned[:, :3, 3] - T_own[:, :3, 3]) ** 2, axis=1))))
 
 
-def _scale_ratio(T_other: FloatArray, T_own: FloatArray, ate_m: float) -> tuple[float | None, float | None, str | None]:
-    """Return the other trajectory's scale relative to the run with its standard error, or why there is none."""
+def _scale_ratio(
+    T_other: FloatArray, T_own: FloatArray, ate_m: float
+) -> tuple[float | None, float | None, str | None]:
+    """Return the other trajectory's scale relative to the run with its standard error, or why
+    there is none.
+    """
     p = T_own[:, :3, 3]
     extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
     if len(p) < 3:
@@ -165,12 +191,20 @@ def _scale_ratio(T_other: FloatArray, T_own: FloatArray, ate_m: float) -> tuple[
     residual = apply_alignment(alignment, T_other)[:, :3, 3] - p
     sigma = float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))) / (extent * np.sqrt(len(p)))
     if sigma > _SCALE_SIGMA:
-        return None, None, f"the camera moves over {extent:.3g} m only, against differences of {ate_m:.2g} m"
+        return (
+            None,
+            None,
+            f"the camera moves over {extent:.3g} m only, against differences of {ate_m:.2g} m",
+        )
     return 1 / alignment.scale, sigma, None
 
 
-def _disagreements(frames: IntArray, T_own: FloatArray, T_other: FloatArray, linked: BoolArray) -> tuple[Segment, ...]:
-    """Return segments where motions between neighbouring keyframes, where there is no gap, differ by outliers."""
+def _disagreements(
+    frames: IntArray, T_own: FloatArray, T_other: FloatArray, linked: BoolArray
+) -> tuple[Segment, ...]:
+    """Return segments where motions between neighbouring keyframes, where there is no gap,
+    differ by outliers.
+    """
     if linked.sum() < _LEAST_MOTIONS - 1:
         return ()
     off_m, off_deg = motion_differences(T_own, T_other)
@@ -182,8 +216,11 @@ def _disagreements(frames: IntArray, T_own: FloatArray, T_other: FloatArray, lin
     )
 
 
-def _longest_piece(T_own: FloatArray, T_other: FloatArray, linked: BoolArray) -> tuple[BoolArray, int]:
-    """Return the rows (R,) of the longest segment without a gap in which no motion differs by more than its own length.
+def _longest_piece(
+    T_own: FloatArray, T_other: FloatArray, linked: BoolArray
+) -> tuple[BoolArray, int]:
+    """Return the rows (R,) of the longest segment without a gap in which no motion differs by more
+    than its own length.
 
     And how many there are between gaps.
     """
@@ -191,18 +228,24 @@ def _longest_piece(T_own: FloatArray, T_other: FloatArray, linked: BoolArray) ->
         return np.ones(len(T_own), dtype=bool), 1
     moved_m = np.linalg.norm(np.diff(T_own[:, :3, 3], axis=0), axis=1)
     off_m, _ = motion_differences(T_own, T_other)
-    broken = ~linked | _stands_out(off_m, linked) & (off_m > _BROKEN * np.maximum(moved_m, np.median(moved_m)))
+    broken = ~linked | _stands_out(off_m, linked) & (
+        off_m > _BROKEN * np.maximum(moved_m, np.median(moved_m))
+    )
     number = np.concatenate([[0], np.cumsum(broken)])
     piece: BoolArray = number == np.bincount(number).argmax()
     return piece, int((~linked).sum()) + 1
 
 
 def motion_differences(T_own: FloatArray, T_other: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return by how much the motions between neighbouring poses (R, 4, 4) differ: (R - 1,) metres and degrees."""
+    """Return by how much the motions between neighbouring poses (R, 4, 4) differ: (R - 1,)
+    metres and degrees.
+    """
     motion_own = se3_inverse(T_own[:-1]) @ T_own[1:]
     motion_other = se3_inverse(T_other[:-1]) @ T_other[1:]
     off_m: FloatArray = np.linalg.norm(motion_own[:, :3, 3] - motion_other[:, :3, 3], axis=1)
-    return off_m, rotation_angle_deg(np.swapaxes(motion_own[:, :3, :3], 1, 2) @ motion_other[:, :3, :3])
+    return off_m, rotation_angle_deg(
+        np.swapaxes(motion_own[:, :3, :3], 1, 2) @ motion_other[:, :3, :3]
+    )
 
 
 def _stands_out(values: FloatArray, linked: BoolArray) -> BoolArray:
@@ -211,17 +254,23 @@ def _stands_out(values: FloatArray, linked: BoolArray) -> BoolArray:
     if not len(usual):
         return np.zeros_like(linked)
     middle = float(np.median(usual))
-    return linked & (values > middle + _OUTLYING * max(robust_sigma(usual - middle), 0.1 * middle, 1e-9))
+    return linked & (
+        values > middle + _OUTLYING * max(robust_sigma(usual - middle), 0.1 * middle, 1e-9)
+    )
 
 
 def _against(
     truth: GroundTruth, run: TrackedPath, rows: IntArray, T_other_cam0: FloatArray
 ) -> tuple[float | None, float | None, float | None]:
-    """Return ATE and scale of the other poses, and ATE of the run; None where they cannot be compared."""
+    """Return ATE and scale of the other poses, and ATE of the run.
+
+    None where they cannot be compared.
+    """
     own = take(run.trajectory, rows)
     other = replace(own, T_world_body=T_other_cam0)
     try:
-        ate, of_run = truth.ate_m(other), truth.ate_m(own)
+        ate = truth.ate_m(other)
+        of_run = truth.ate_m(own)
         scaled = evaluate(other, truth.trajectory, align="sim3", T_cam0_imu=truth.T_cam0_imu)
         scale = float(scaled.as_dict()["scale"])
     except EvaluationError:

@@ -1,4 +1,6 @@
-"""Write any recording of images as a folder of another form or as a ROS 2 bag: streamed, rectified as a run sees it."""
+"""Write any recording of images as a folder of another form or as a ROS 2 bag: streamed,
+rectified as a run sees it.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,15 @@ from vio.files.text import exact_text, seconds_text, write_text
 from vio.files.trajectories import in_first_cam0, write_tum
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.protocols import Dataset, Progress
-from vio.records import Event, ImuDensities, ImuRecord, ImuSample, Recording, StereoFrame, VelocitySample
+from vio.records import (
+    Event,
+    ImuDensities,
+    ImuRecord,
+    ImuSample,
+    Recording,
+    StereoFrame,
+    VelocitySample,
+)
 
 Folder: TypeAlias = Literal["euroc", "kitti", "plain"]
 Form: TypeAlias = Literal["euroc", "kitti", "plain", "rosbag2", "mcap"]
@@ -76,8 +86,9 @@ def convert(
     Args:
         dataset: a recording with images.
         out: the folder.
-        form: "euroc" (mav0), "kitti" (image_0 image_1 calib.txt times.txt), "plain" (left right, Kalibr's file), or a
-            ROS 2 bag of SQLite ("rosbag2") or MCAP ("mcap") with Kalibr's file beside it.
+        form: "euroc" (mav0), "kitti" (image_0 image_1 calib.txt times.txt), "plain" (left right,
+            Kalibr's file), or a ROS 2 bag of SQLite ("rosbag2") or MCAP ("mcap") with Kalibr's file
+            beside it.
         start: first frame.
         stop: frame after the last one; None: to the end.
         progress: called after each frame.
@@ -103,11 +114,14 @@ def convert(
         "plain": _finish_plain,
     }
     lacking = writers[form](out, recording, written, noise)
-    return Converted(len(written.times_ns), len(written.imu), len(written.velocities), tuple(lacking))
+    return Converted(
+        len(written.times_ns), len(written.imu), len(written.velocities), tuple(lacking)
+    )
 
 
 def write_rectified_euroc(dataset: ImageDataset, out: Path, progress: Progress) -> int:
-    """Write an EuRoC recording as a folder of rectified images; the IMU and the ground truth are copied as they are.
+    """Write an EuRoC recording as a folder of rectified images; the IMU and the ground truth are
+    copied as they are.
 
     Returns:
         The number of frames written.
@@ -115,7 +129,8 @@ def write_rectified_euroc(dataset: ImageDataset, out: Path, progress: Progress) 
     Raises:
         DataError: too many images are unreadable, or a file cannot be copied.
     """
-    source, mav = euroc_base(dataset.recording.path), out / "mav0"
+    source = euroc_base(dataset.recording.path)
+    mav = out / "mav0"
     rig = rig_read_as(dataset.recording.camera, dataset.rectifier.T_rect0_imu)
     sensor = source / "imu0" / "sensor.yaml"
     T_body_imu = read_imu_yaml(sensor)[0] if sensor.is_file() else np.eye(4)
@@ -124,7 +139,8 @@ def write_rectified_euroc(dataset: ImageDataset, out: Path, progress: Progress) 
     times = np.array(written.times_ns, dtype=np.int64)
     write_cameras(mav, rig, times, written.last_ns, kind="rectified", T_body_imu=T_body_imu)
     copied = [
-        (source / part, mav / part) for part in (Path("imu0", "sensor.yaml"), Path("imu0", "data.csv"), STATE_CSV)
+        (source / part, mav / part)
+        for part in (Path("imu0", "sensor.yaml"), Path("imu0", "data.csv"), STATE_CSV)
     ]
     for file, target in (*copied, (source.absolute().parent / EUROC_TUM, out / EUROC_TUM)):
         if file.is_file():
@@ -132,7 +148,9 @@ def write_rectified_euroc(dataset: ImageDataset, out: Path, progress: Progress) 
             try:
                 shutil.copyfile(file, target)
             except shutil.SameFileError as error:
-                raise DataError(f"{file}: cannot be copied onto itself; choose another folder") from error
+                raise DataError(
+                    f"{file}: cannot be copied onto itself; choose another folder"
+                ) from error
     return len(times)
 
 
@@ -151,7 +169,11 @@ def _write_images(
 ) -> _Written:
     """Write the images of a range, and collect its samples."""
     written = _Written()
-    names = {"euroc": ("mav0/cam0/data", "mav0/cam1/data"), "kitti": ("image_0", "image_1"), "plain": ("left", "right")}
+    names = {
+        "euroc": ("mav0/cam0/data", "mav0/cam1/data"),
+        "kitti": ("image_0", "image_1"),
+        "plain": ("left", "right"),
+    }
     folders = [out / name for name in names[form]]
     for folder in folders:
         folder.mkdir(parents=True)
@@ -165,7 +187,11 @@ def _write_images(
         else:
             assert event.left is not None
             assert event.right is not None
-            name = f"{len(written.times_ns):06d}.png" if form == "kitti" else image_name(event.time_ns, written.last_ns)
+            name = (
+                f"{len(written.times_ns):06d}.png"
+                if form == "kitti"
+                else image_name(event.time_ns, written.last_ns)
+            )
             for folder, image in zip(folders, (event.left, event.right), strict=True):
                 write_png(folder / name, image)
             written.times_ns.append(event.time_ns)
@@ -173,9 +199,12 @@ def _write_images(
     return written
 
 
-def _finish_euroc(out: Path, recording: Recording, written: _Written, noise: ImuDensities | None) -> list[str]:
+def _finish_euroc(
+    out: Path, recording: Recording, written: _Written, noise: ImuDensities | None
+) -> list[str]:
     times = np.array(written.times_ns, dtype=np.int64)
-    rig, mav = rig_read_as(recording.camera, recording.T_cam0_body), out / "mav0"
+    rig = rig_read_as(recording.camera, recording.T_cam0_body)
+    mav = out / "mav0"
     write_cameras(mav, rig, times, written.last_ns, kind="rectified")
     notes = []
     if written.imu:
@@ -184,16 +213,22 @@ def _finish_euroc(out: Path, recording: Recording, written: _Written, noise: Imu
         (mav / "imu0").mkdir()
         write_text(mav / "imu0" / "data.csv", imu_csv(record))
         if noise is not None:
-            text = imu_yaml(np.eye(4), noise, comment="imu0", rate_hz=median_rate_hz(record.times_ns))
+            text = imu_yaml(
+                np.eye(4), noise, comment="imu0", rate_hz=median_rate_hz(record.times_ns)
+            )
             write_text(mav / "imu0" / "sensor.yaml", text)
     if written.velocities:
-        notes.append("velocities have no place in EuRoC's form and are left out; --to plain keeps them")
+        notes.append(
+            "velocities have no place in EuRoC's form and are left out; --to plain keeps them"
+        )
     if recording.reference is not None and recording.reference.times_ns is not None:
         write_tum(out / EUROC_TUM, recording.reference)
     return notes
 
 
-def _finish_kitti(out: Path, recording: Recording, written: _Written, noise: ImuDensities | None) -> list[str]:
+def _finish_kitti(
+    out: Path, recording: Recording, written: _Written, noise: ImuDensities | None
+) -> list[str]:
     times = np.array(written.times_ns, dtype=np.int64)
     first_ns = int(times[0])
     write_calibration(out, recording.camera, recording.T_cam0_imu)
@@ -203,7 +238,9 @@ def _finish_kitti(out: Path, recording: Recording, written: _Written, noise: Imu
     notes = []
     if written.imu:
         write_text(out / "imu.csv", _imu_text(written.imu, first_ns))
-        notes.append("KITTI's form has no IMU: imu.csv is beside it, and makes the folder one of kind plain")
+        notes.append(
+            "KITTI's form has no IMU: imu.csv is beside it, and makes the folder one of kind plain"
+        )
     truth = recording.reference
     if truth is None or truth.times_ns is None:
         return notes
@@ -215,11 +252,15 @@ def _finish_kitti(out: Path, recording: Recording, written: _Written, noise: Imu
         write_text(out / "poses.txt", "".join(f"{exact_text(row)}\n" for row in rows))
     else:
         write_tum(out / "reference.tum", replace(truth, times_ns=truth.times_ns - first_ns))
-        notes.append("the ground truth is not at the frames' times: it is in reference.tum, not in poses.txt")
+        notes.append(
+            "the ground truth is not at the frames' times: it is in reference.tum, not in poses.txt"
+        )
     return notes
 
 
-def _finish_plain(out: Path, recording: Recording, written: _Written, noise: ImuDensities | None) -> list[str]:
+def _finish_plain(
+    out: Path, recording: Recording, written: _Written, noise: ImuDensities | None
+) -> list[str]:
     _write_kalibr(out, recording, noise if written.imu else None)
     write_text(out / "times.txt", "".join(f"{seconds_text(t)}\n" for t in written.times_ns))
     if written.imu:
@@ -233,7 +274,8 @@ def _finish_plain(out: Path, recording: Recording, written: _Written, noise: Imu
 
 def _write_kalibr(out: Path, recording: Recording, noise: ImuDensities | None) -> None:
     """Write the rectified rig as Kalibr's camchain, and the IMU's noise beside it."""
-    rig, imu = rig_of_rectified(recording.camera, recording.T_cam0_imu), recording.T_cam0_imu is not None
+    rig = rig_of_rectified(recording.camera, recording.T_cam0_imu)
+    imu = recording.T_cam0_imu is not None
     assert rig is not None
     write_text(out / ("camchain-imucam.yaml" if imu else "camchain.yaml"), kalibr_text(rig))
     if noise is not None:
@@ -246,7 +288,10 @@ def _imu_text(samples: list[ImuSample], first_ns: int) -> str:
     return "\n".join(["timestamp [ns],wx,wy,wz,ax,ay,az", *rows]) + "\n"
 
 
-_WORLD, _LEFT, _RIGHT, _IMU = "world", "cam0", "cam1", "imu"
+_WORLD = "world"
+_LEFT = "cam0"
+_RIGHT = "cam1"
+_IMU = "imu"
 
 
 def _bag_notes(done: Converted, recording: Recording) -> tuple[str, ...]:
@@ -254,9 +299,14 @@ def _bag_notes(done: Converted, recording: Recording) -> tuple[str, ...]:
     if not done.velocities:
         return ()
     if recording.T_cam0_imu is None:
-        return ("velocities need the pose of their sensor in the camera, which this recording does not have",)
+        return (
+            "velocities need the pose of their sensor in the camera, which this recording does not "
+            "have",
+        )
     if done.imu_samples:
-        return ("a run reads the IMU alone; for the velocities as well: --topics velocity=/velocity",)
+        return (
+            "a run reads the IMU alone; for the velocities as well: --topics velocity=/velocity",
+        )
     return ()
 
 
@@ -273,9 +323,11 @@ def _write_bag(
 ) -> Converted:
     """Write a range of a recording as a bag; the arguments are those of `convert`.
 
-    Topics: /left/image_rect, /right/image_rect and their camera_info, /imu, /velocity, /ground_truth, /tf_static.
+    Topics: /left/image_rect, /right/image_rect and their camera_info, /imu, /velocity,
+    /ground_truth, /tf_static.
     """
-    recording, total = dataset.recording, _frames_in(dataset, start, stop)
+    recording = dataset.recording
+    total = _frames_in(dataset, start, stop)
     frames = samples = velocities = 0
     in_order: Iterator[Event | _Pose]
     in_order = heapq.merge(dataset.events(start, stop), _poses(recording), key=lambda x: x.time_ns)
@@ -300,15 +352,21 @@ def _write_bag(
 
 def _poses(recording: Recording) -> list[_Pose]:
     """Return the ground truth: that of the IMU, or of the left camera where there is none."""
-    truth, T = recording.reference, recording.T_cam0_imu
+    truth = recording.reference
+    T = recording.T_cam0_imu
     if truth is None or truth.times_ns is None:
         return []
     poses = truth.T_world_body if T is None else truth.in_imu(T).T_world_body
-    return [_Pose(time_ns, T_world_body) for time_ns, T_world_body in zip(truth.times_ns.tolist(), poses, strict=True)]
+    return [
+        _Pose(time_ns, T_world_body)
+        for time_ns, T_world_body in zip(truth.times_ns.tolist(), poses, strict=True)
+    ]
 
 
 def _frames(recording: Recording) -> list[tuple[str, str, FloatArray]]:
-    """Return the static transforms: the IMU carries the left camera, which carries the right one."""
+    """Return the static transforms: the IMU carries the left camera, which carries the right
+    one.
+    """
     T_cam0_cam1 = se3_from_parts(np.eye(3), [recording.camera.baseline_m, 0.0, 0.0])
     right = [(_LEFT, _RIGHT, T_cam0_cam1)]
     if recording.T_cam0_imu is None:

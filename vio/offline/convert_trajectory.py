@@ -11,27 +11,44 @@ from vio.datasets.kitti import read_extrinsics
 from vio.datasets.rigs import load_rig
 from vio.errors import CalibrationError, DataError
 from vio.files.text import parse_stamps, text_lines
-from vio.files.trajectories import TrajectoryFormat, read_trajectory, write_euroc, write_kitti, write_tum
+from vio.files.trajectories import (
+    TrajectoryFormat,
+    read_trajectory,
+    write_euroc,
+    write_kitti,
+    write_tum,
+)
 from vio.geometry.lie import FloatArray
 from vio.protocols import Dataset
 from vio.records import BodyFrame, IntArray, Trajectory
 
 _Writer: TypeAlias = Callable[[Path, Trajectory], None]
-_WRITERS: dict[TrajectoryFormat, _Writer] = {"tum": write_tum, "kitti": write_kitti, "euroc": write_euroc}
+_WRITERS: dict[TrajectoryFormat, _Writer] = {
+    "tum": write_tum,
+    "kitti": write_kitti,
+    "euroc": write_euroc,
+}
 _BODIES: dict[TrajectoryFormat, BodyFrame] = {"kitti": "cam0", "euroc": "imu"}
 
 
 def convert_trajectory(
-    source: Path, out: Path, form: TrajectoryFormat, *, times: Path | None = None, calibration: Path | None = None
+    source: Path,
+    out: Path,
+    form: TrajectoryFormat,
+    *,
+    times: Path | None = None,
+    calibration: Path | None = None,
 ) -> Trajectory:
-    """Write a trajectory file in another form; the world frame stays, the body becomes that of the form.
+    """Write a trajectory file in another form; the world frame stays, the body becomes that of the
+    form.
 
     Args:
         source: a TUM, KITTI or EuRoC trajectory.
         out: the file to write.
         form: "tum" (the body stays as it is), "kitti" (cam0) or "euroc" (IMU).
         times: of the poses of a KITTI file, one a line.
-        calibration: a rig with the IMU's pose, or `T_cam0_imu.txt`, for a change between IMU and cam0.
+        calibration: a rig with the IMU's pose, or `T_cam0_imu.txt`, for a change between IMU and
+            cam0.
 
     Returns:
         The trajectory as written.
@@ -44,7 +61,10 @@ def convert_trajectory(
     if times is not None:
         trajectory = replace(trajectory, times_ns=_read_times(times, len(trajectory)))
     if trajectory.times_ns is None and form != "kitti":
-        raise DataError(f"{source}: states no times, which {form} form needs; name them with --times FILE, one a line")
+        raise DataError(
+            f"{source}: states no times, which {form} form needs; name them with --times FILE, one "
+            "a line"
+        )
     body = _BODIES.get(form, trajectory.body)
     if trajectory.body != body:
         trajectory = _described_by(trajectory, body, source, calibration)
@@ -60,16 +80,23 @@ def write_reference(dataset: Dataset, out: Path) -> Trajectory:
     """
     truth = dataset.recording.reference
     if truth is None:
-        raise DataError(f"{dataset.recording.path}: has no ground truth to write as a TUM file; choose another --to")
+        raise DataError(
+            f"{dataset.recording.path}: has no ground truth to write as a TUM file; choose another "
+            "--to"
+        )
     write_tum(out, truth)
     return truth
 
 
-def _described_by(trajectory: Trajectory, body: BodyFrame, source: Path, calibration: Path | None) -> Trajectory:
+def _described_by(
+    trajectory: Trajectory, body: BodyFrame, source: Path, calibration: Path | None
+) -> Trajectory:
     if calibration is None:
         raise CalibrationError(
-            f"{source}: describes {trajectory.body}, not {body} as the form must; give --calibration FILE with the "
-            f"IMU's pose, or say '# body: {body}' in a comment of its first lines (TUM) if that is what it describes"
+            f"{source}: describes {trajectory.body}, not {body} as the form must; give "
+            "--calibration FILE with the "
+            f"IMU's pose, or say '# body: {body}' in a comment of its first lines (TUM) if that is "
+            "what it describes"
         )
     T_cam0_imu = _extrinsics(calibration)
     return trajectory.in_cam0(T_cam0_imu) if body == "cam0" else trajectory.in_imu(T_cam0_imu)
@@ -79,12 +106,20 @@ def _extrinsics(path: Path) -> FloatArray:
     """Read `T_cam0_imu` (4, 4) of a rig, or from a file of the matrix alone."""
     T = read_extrinsics(path) if path.name == "T_cam0_imu.txt" else load_rig(path).T_cam0_imu
     if T is None:
-        raise CalibrationError(f"{path}: states no pose of the IMU; give a calibration with T_cam_imu")
+        raise CalibrationError(
+            f"{path}: states no pose of the IMU; give a calibration with T_cam_imu"
+        )
     return T
 
 
 def _read_times(path: Path, count: int) -> IntArray:
-    rows = [(n, line.split()) for n, line in text_lines(path) if line.strip() and not line.startswith("#")]
+    rows = [
+        (n, line.split())
+        for n, line in text_lines(path)
+        if line.strip() and not line.startswith("#")
+    ]
     if len(rows) != count:
-        raise DataError(f"{path} holds {len(rows)} times for {count} poses; there must be one a line")
+        raise DataError(
+            f"{path} holds {len(rows)} times for {count} poses; there must be one a line"
+        )
     return parse_stamps([fields[0] for _, fields in rows], lambda k: f"{path}, line {rows[k][0]}")

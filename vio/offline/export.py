@@ -48,7 +48,8 @@ def export_colmap(
     source: str | None,
     progress: Callable[[int, int], None],
 ) -> Exported:
-    """Write `sparse/0`, `images`, `transforms.json` and `points.ply` into an existing, empty folder.
+    """Write `sparse/0`, `images`, `transforms.json` and `points.ply` into an existing, empty
+    folder.
 
     Args:
         run: the run.
@@ -94,8 +95,11 @@ def _write_images(
     folder: Path,
     progress: Callable[[int, int], None],
 ) -> ColourArray:
-    """Write the images of the keyframes; return the colours (M, 3) of the points, as the left camera sees them."""
-    total, count = np.zeros((len(tracks.ids), 3)), np.zeros((len(tracks.ids), 1))
+    """Write the images of the keyframes; return the colours (M, 3) of the points, as the left
+    camera sees them.
+    """
+    total = np.zeros((len(tracks.ids), 3))
+    count = np.zeros((len(tracks.ids), 1))
 
     def sample_colours(keyframe: int, left: Image) -> None:
         rows = tracks.keyframe == keyframe
@@ -108,16 +112,22 @@ def _write_images(
 
 
 def _colours_at(image: Image, uv: FloatArray) -> FloatArray:
-    """Return red, green and blue (N, 3) of the pixels of an image (H, W) or (H, W, 3) nearest to (N, 2)."""
+    """Return red, green and blue (N, 3) of the pixels of an image (H, W) or (H, W, 3) nearest to
+    (N, 2).
+    """
     u = np.clip(np.rint(uv[:, 0]).astype(int), 0, image.shape[1] - 1)
     v = np.clip(np.rint(uv[:, 1]).astype(int), 0, image.shape[0] - 1)
     return np.broadcast_to(image[v, u].astype(np.float64).reshape(len(uv), -1), (len(uv), 3))
 
 
-def nerfstudio_transforms(camera: StereoCamera, T_world_cam0: FloatArray, names: ModelImages) -> str:
-    """Return the text of nerfstudio's `transforms.json`; the point cloud is `points.ply` in the same folder.
+def nerfstudio_transforms(
+    camera: StereoCamera, T_world_cam0: FloatArray, names: ModelImages
+) -> str:
+    """Return the text of nerfstudio's `transforms.json`; the point cloud is `points.ply` in the
+    same folder.
 
-    Poses are camera to world with x right, y up, z back (OpenGL); the world frame is that of the run, metric.
+    Poses are camera to world with x right, y up, z back (OpenGL); the world frame is that of the
+    run, metric.
     """
     T_cam0_cam1 = np.eye(4)
     T_cam0_cam1[0, 3] = camera.baseline_m

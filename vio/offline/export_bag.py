@@ -13,7 +13,10 @@ from vio.geometry.lie import FloatArray, se3_inverse
 from vio.records import Trajectory
 from vio.runs.finished import FinishedRun, read_finished_run
 
-POSE, PATH, REFERENCE, POINTS = "/vio/pose", "/vio/path", "/reference/path", "/vio/landmarks"
+POSE = "/vio/pose"
+PATH = "/vio/path"
+REFERENCE = "/reference/path"
+POINTS = "/vio/landmarks"
 _WORLD = "world"
 
 
@@ -27,10 +30,12 @@ class ExportedBag:
 
 
 def export_bag(run: Path, out: Path, storage: Storage) -> ExportedBag:
-    """Write a run as a bag: /tf and /vio/pose with covariance at every frame; path, landmarks and ground truth at once.
+    """Write a run as a bag: /tf and /vio/pose with covariance at every frame; path, landmarks and
+    ground truth at once.
 
-    The frames are world, imu and cam0 (without an IMU world and cam0). The ground truth is aligned to the run's world.
-    What is written at once is stamped with the first frame, and kept for subscribers that come late.
+    The frames are world, imu and cam0 (without an IMU world and cam0). The ground truth is aligned
+    to the run's world. What is written at once is stamped with the first frame, and kept for
+    subscribers that come late.
 
     Args:
         run: folder of `vio run`; an unfinished one's may be given too.
@@ -44,7 +49,8 @@ def export_bag(run: Path, out: Path, storage: Storage) -> ExportedBag:
     finished = read_finished_run(run)
     trajectory = finished.trajectory
     assert trajectory.times_ns is not None
-    times, body = trajectory.times_ns.tolist(), trajectory.body
+    times = trajectory.times_ns.tolist()
+    body = trajectory.body
     reference = _reference(finished)
     with bag_writer(out, storage, latched=(PATH, REFERENCE, POINTS)) as bag:
         if body == "imu":
@@ -61,25 +67,31 @@ def export_bag(run: Path, out: Path, storage: Storage) -> ExportedBag:
 
 
 def ros_covariance(T_world_body: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the covariance (6, 6) of x y z and of rotations about the world's axes, as PoseWithCovariance has it.
+    """Return the covariance (6, 6) of x y z and of rotations about the world's axes, as
+    PoseWithCovariance has it.
 
     Args:
         T_world_body: (4, 4).
         covariance: (6, 6) of xi in T_body_world = exp(xi) T_body_world_hat, [rho; phi].
 
-    To first order xi moves the position by -R rho and the orientation by -R phi about the world's axes; R is the
-    rotation of T_world_body.
+    To first order xi moves the position by -R rho and the orientation by -R phi about the world's
+    axes; R is the rotation of T_world_body.
     """
     turn = np.kron(np.eye(2), T_world_body[:3, :3])
     return turn @ covariance @ turn.T
 
 
 def _reference(run: FinishedRun) -> Trajectory | None:
-    """Return the ground truth in the run's world; None: there is none with times, or it was not compared."""
+    """Return the ground truth in the run's world.
+
+    None: there is none with times, or it was not compared.
+    """
     path = run.folder / "reference.tum"
     if run.evaluation is None or not path.is_file():
         return None
     truth = read_trajectory(path)
     T_cam0_body = run.T_cam0_body
-    truth = truth.in_imu(T_cam0_body) if run.trajectory.body == "imu" else truth.in_cam0(T_cam0_body)
+    truth = (
+        truth.in_imu(T_cam0_body) if run.trajectory.body == "imu" else truth.in_cam0(T_cam0_body)
+    )
     return replace(truth, T_world_body=se3_inverse(run.evaluation.T_ref_est) @ truth.T_world_body)

@@ -26,9 +26,11 @@ from vio.runs.folder import read_metrics
 from vio.runs.mapped import read_keyframes, read_loops, read_trajectories
 
 FACTS = "earth.json"
-_UP_RAD, _MOUNT_RAD = float(np.radians(0.3)), float(np.radians(5.0))  # of an IMU's vertical; of an upright camera's
+_UP_RAD = float(np.radians(0.3))  # of an IMU's vertical; of an upright camera's
+_MOUNT_RAD = float(np.radians(5.0))
 _LEAST_COMMON = 3  # keyframes that run and map share
-_SAME, _SAME_SHARE = 0.05, 0.1  # by which a motion between two of them may differ, m and rad, and share of it
+_SAME = 0.05  # by which a motion between two of them may differ, m and rad, and share of it
+_SAME_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +56,14 @@ def _of_run(folder: FilePath) -> Placed:
     metrics, T_cam0_imu = read_metrics(folder)
     trajectory, odometry = read_trajectories(folder)
     if trajectory.times_ns is None or len(trajectory) < 2:
-        raise DataError(f"{folder}: its trajectory has no times, which GNSS positions are compared by")
-    place = {} if trajectory.frame_indices is None else {int(f): k for k, f in enumerate(trajectory.frame_indices)}
+        raise DataError(
+            f"{folder}: its trajectory has no times, which GNSS positions are compared by"
+        )
+    place = (
+        {}
+        if trajectory.frame_indices is None
+        else {int(f): k for k, f in enumerate(trajectory.frame_indices)}
+    )
     kept = [o for o in read_loops(folder) if o.kept and o.keyframe_frame is not None]
     loops = [(place.get(o.keyframe_frame), place.get(o.frame)) for o in kept]  # type: ignore[arg-type]
     known = [(i, j) for i, j in loops if i is not None and j is not None and i < j - 1]
@@ -64,7 +72,12 @@ def _of_run(folder: FilePath) -> Placed:
     if up is not None:
         up = up_in(trajectory.T_world_body, odometry.T_world_body, up)
     camera = trajectory.in_cam0(T_cam0_imu).T_world_body
-    path = _path(trajectory, known, -camera[0, :3, 1] if up is None else up, _MOUNT_RAD if up is None else _UP_RAD)
+    path = _path(
+        trajectory,
+        known,
+        -camera[0, :3, 1] if up is None else up,
+        _MOUNT_RAD if up is None else _UP_RAD,
+    )
     p = point_positions(folder)
     _, nearest = cKDTree(odometry.T_world_body[:, :3, 3]).query(p)
     T = (trajectory.T_world_body @ se3_inverse(odometry.T_world_body))[nearest]
@@ -74,13 +87,19 @@ def _of_run(folder: FilePath) -> Placed:
 
 def _of_map(file: FilePath) -> Placed:
     with contextlib.closing(MapStore(file, read_only=True)) as store:
-        sessions, rows, loops = store.sessions(), store.keyframes(), store.loops()
+        sessions = store.sessions()
+        rows = store.keyframes()
+        loops = store.loops()
     home = sessions[0].part if sessions else 0
     kept = [k for k, row in enumerate(rows) if sessions[row.session].part == home]
     if len(kept) < 2:
         raise DataError(f"{file}: has fewer than two keyframes; there is nothing to place")
     place = {k: n for n, k in enumerate(kept)}
-    known = [(place[o.first], place[o.second]) for o in loops if o.kept and o.first in place and o.second in place]
+    known = [
+        (place[o.first], place[o.second])
+        for o in loops
+        if o.kept and o.first in place and o.second in place
+    ]
     T = np.array([rows[k].T_map_cam for k in kept])
     trajectory = Trajectory(T, np.array([rows[k].time_ns for k in kept], dtype=np.int64), "cam0")
     upright = sessions[0].upright
@@ -91,9 +110,11 @@ def _of_map(file: FilePath) -> Placed:
 
 
 def _up_of_map(T_map_cam: FloatArray, rows: Sequence[KeyframeRow]) -> FloatArray:
-    """Return the direction (3,) that is up in a map of upright sessions: the mean by its keyframes; z where none says.
+    """Return the direction (3,) that is up in a map of upright sessions: the mean by its keyframes;
+    z where none says.
 
-    A map without loops has the world of its odometry, whose first seconds may have been wrong about the vertical.
+    A map without loops has the world of its odometry, whose first seconds may have been wrong about
+    the vertical.
     """
     seen = [
         (T[:3, :3] @ row.up_cam, row.up_sigma_rad)
@@ -106,17 +127,22 @@ def _up_of_map(T_map_cam: FloatArray, rows: Sequence[KeyframeRow]) -> FloatArray
     return mean_up(up, sigma)
 
 
-def _path(trajectory: Trajectory, loops: list[tuple[int, int]], up: FloatArray, sigma_rad: float) -> Path:
+def _path(
+    trajectory: Trajectory, loops: list[tuple[int, int]], up: FloatArray, sigma_rad: float
+) -> Path:
     assert trajectory.times_ns is not None
     ends = np.array(loops, dtype=np.int64).reshape(-1, 2)
     none = np.zeros(0, dtype=np.int64)
-    return Path(trajectory.times_ns, trajectory.T_world_body, ends[:, 0], ends[:, 1], up, sigma_rad, none)
+    return Path(
+        trajectory.times_ns, trajectory.T_world_body, ends[:, 0], ends[:, 1], up, sigma_rad, none
+    )
 
 
 def place_on_earth(
     of: Placed, fixes: GnssFixes, lever_arm_m: FloatArray, time_offset_s: float, folder: FilePath
 ) -> dict[str, Any]:
-    """Fuse a trajectory with GNSS positions, write all files into a folder, and return what is said of it.
+    """Fuse a trajectory with GNSS positions, write all files into a folder, and return what is said
+    of it.
 
     Args:
         of: the trajectory.
@@ -129,45 +155,65 @@ def place_on_earth(
         EstimationError: the positions do not determine its place.
     """
     found = georeference(of.path, fixes, lever_arm_m, round(1e9 * time_offset_s))
-    epsg = _write(folder, of, found.frame, found.T_enu_body, found.scale, fixes.geodetic, found.used)
+    epsg = _write(
+        folder, of, found.frame, found.T_enu_body, found.scale, fixes.geodetic, found.used
+    )
     return _facts(of, fixes, found, epsg)
 
 
 def place_by_map(of: Placed, run: FilePath, file: FilePath, folder: FilePath) -> dict[str, Any]:
     """Place a run on the earth where the map is that it was localised in; as `place_on_earth`.
 
-    The map may have changed since, or be a part of that map, or a merge of it: each pose moves with the nearest of the
-    keyframes that the run found.
+    The map may have changed since, or be a part of that map, or a merge of it: each pose moves with
+    the nearest of the keyframes that the run found.
 
     Raises:
         DataError: the map is nowhere on the earth, or the run was not localised in it.
     """
     with contextlib.closing(MapStore(file, read_only=True)) as store:
-        earth, rows, sessions = store.earth(), store.keyframes(), store.sessions()
+        earth = store.earth()
+        rows = store.keyframes()
+        sessions = store.sessions()
     if earth is None:
-        raise DataError(f"{file}: nothing says where it is on the earth; vio georeference {file} GNSS does")
+        raise DataError(
+            f"{file}: nothing says where it is on the earth; vio georeference {file} GNSS does"
+        )
     of_map = read_metrics(run)[0].get("map") if run.is_dir() else None
     if not isinstance(of_map, dict) or not of_map.get("joined"):
         raise DataError(
-            f"{run}: is no run that found its place in a map; vio localise RECORDING --map {file} makes one"
+            f"{run}: is no run that found its place in a map; vio localise RECORDING --map {file} "
+            "makes one"
         )
-    home = {(row.frame, row.time_ns): row.T_map_cam for row in rows if sessions[row.session].part == sessions[0].part}
+    home = {
+        (row.frame, row.time_ns): row.T_map_cam
+        for row in rows
+        if sessions[row.session].part == sessions[0].part
+    }
     before, now = _common(run, home)
     if len(before) < _LEAST_COMMON or not _is_one_path(before, now):
         raise DataError(
-            f"{run}: was localised in another map than {file}; give the map that the run found its place in"
+            f"{run}: was localised in another map than {file}; give the map that the run found its "
+            "place in"
         )
     _, nearest = cKDTree(before[:, :3, 3]).query(of.path.T_map_body[:, :3, 3])
-    of = replace(of, path=replace(of.path, T_map_body=(now @ se3_inverse(before))[nearest] @ of.path.T_map_body))
+    of = replace(
+        of,
+        path=replace(of.path, T_map_body=(now @ se3_inverse(before))[nearest] @ of.path.T_map_body),
+    )
     frame = LocalFrame(np.array(earth.origin))
     none = np.zeros((0, 3)), np.zeros(0, dtype=np.bool_)
     epsg = _write(folder, of, frame, earth.T_enu_map @ of.path.T_map_body, 1.0, *none)
     return _where(frame, earth.T_enu_map, earth.covariance) | {"crs": epsg}
 
 
-def _common(run: FilePath, home: dict[tuple[int, int], FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return the poses (K, 4, 4) of a run's keyframes that a map, by frame and time, holds: of the run, of the map."""
-    keyframes, (_, T_cam0_body) = read_keyframes(run), read_metrics(run)
+def _common(
+    run: FilePath, home: dict[tuple[int, int], FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the poses (K, 4, 4) of a run's keyframes that a map, by frame and time, holds: of
+    the run, of the map.
+    """
+    keyframes = read_keyframes(run)
+    (_, T_cam0_body) = read_metrics(run)
     keys = list(zip(keyframes.frame.tolist(), keyframes.time_ns.tolist(), strict=True))
     shared = [n for n, key in enumerate(keys) if key in home]
     T = keyframes.T_map_body[shared] @ se3_inverse(T_cam0_body)
@@ -175,7 +221,9 @@ def _common(run: FilePath, home: dict[tuple[int, int], FloatArray]) -> tuple[Flo
 
 
 def _is_one_path(before: FloatArray, now: FloatArray) -> bool:
-    """Whether most motions between neighbours of two series of poses (K, 4, 4) agree, as those of two maps do not."""
+    """Whether most motions between neighbours of two series of poses (K, 4, 4) agree, as those
+    of two maps do not.
+    """
     a, b = (se3_log(se3_inverse(T[:-1]) @ T[1:]) for T in (before, now))
     apart = np.linalg.norm(a - b, axis=1)
     return float(np.median(apart - _SAME_SHARE * np.linalg.norm(a, axis=1))) < _SAME
@@ -190,13 +238,23 @@ def keep_in_map(file: FilePath, facts: dict[str, Any]) -> None:
     origin = facts["origin"]
     where = origin["latitude_deg"], origin["longitude_deg"], origin["height_m"]
     with contextlib.closing(MapStore(file)) as store:
-        store.set_earth(EarthRow(where, np.array(facts["T_enu_map"]), np.array(facts["covariance"])))
+        store.set_earth(
+            EarthRow(where, np.array(facts["T_enu_map"]), np.array(facts["covariance"]))
+        )
 
 
 def _write(
-    folder: FilePath, of: Placed, frame: LocalFrame, T: FloatArray, scale: float, fixes: FloatArray, used: BoolArray
+    folder: FilePath,
+    of: Placed,
+    frame: LocalFrame,
+    T: FloatArray,
+    scale: float,
+    fixes: FloatArray,
+    used: BoolArray,
 ) -> str:
-    """Write poses (K, 4, 4) in east, north, up and landmarks as files; return the EPSG code of UTM."""
+    """Write poses (K, 4, 4) in east, north, up and landmarks as files; return the EPSG code of
+    UTM.
+    """
     write_tum(folder / "trajectory_enu.tum", replace(of.trajectory, T_world_body=T))
     track = frame.geodetic(T[:, :3, 3])
     write_geojson(folder / "trajectory.geojson", of.name, track, fixes, used)
@@ -206,7 +264,8 @@ def _write(
         # Each landmark moves with the pose nearest to it.
         T_map = of.path.T_map_body
         _, nearest = cKDTree(T_map[:, :3, 3]).query(of.points)
-        before, after = se3_inverse(T_map[nearest]), T[nearest]
+        before = se3_inverse(T_map[nearest])
+        after = T[nearest]
         p = scale * (np.einsum("nij,nj->ni", before[:, :3, :3], of.points) + before[:, :3, 3])
         landmarks = frame.geodetic(np.einsum("nij,nj->ni", after[:, :3, :3], p) + after[:, :3, 3])
         write_points_geojson(folder / "landmarks.geojson", of.name, landmarks)
@@ -218,7 +277,12 @@ def _where(frame: LocalFrame, T_enu_map: FloatArray, covariance: FloatArray) -> 
     heading, sigma = heading_deg(T_enu_map, covariance)
     latitude, longitude, height = frame.origin.tolist()
     return {
-        "origin": {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height, "datum": "WGS84"},
+        "origin": {
+            "latitude_deg": latitude,
+            "longitude_deg": longitude,
+            "height_m": height,
+            "datum": "WGS84",
+        },
         "T_enu_map": T_enu_map.tolist(),
         "covariance": covariance.tolist(),
         "heading_deg": heading,
@@ -227,7 +291,8 @@ def _where(frame: LocalFrame, T_enu_map: FloatArray, covariance: FloatArray) -> 
 
 
 def _facts(of: Placed, fixes: GnssFixes, found: Georeference, epsg: str) -> dict[str, Any]:
-    r, used = found.residuals, found.used
+    r = found.residuals
+    used = found.used
     sigma = np.sqrt(np.diagonal(found.position_covariance, axis1=1, axis2=2))
     rigid = found.T_enu_map @ of.path.T_map_body
     bent = np.linalg.norm(rigid[:, :3, 3] - found.T_enu_body[:, :3, 3], axis=1)

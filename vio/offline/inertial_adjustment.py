@@ -1,12 +1,14 @@
-"""Bundle adjustment of keyframes with an IMU: poses, velocities, biases, points, and what the rig is off by.
+"""Bundle adjustment of keyframes with an IMU: poses, velocities, biases, points, and what the rig
+is off by.
 
-Factors: stereo pixels of tracks and of points that loops join, the IMU's motions from keyframe to keyframe
-(`vio.imu.preintegration`), the walks of its biases, and priors of the rig. Where images show little, the IMU holds the
-poses, which is what a bundle adjustment of images alone lacks. Gauss-Newton with Levenberg's damping; points are
-eliminated (Schur complement), the rest is one sparse system. Pixels have Geman-McClure's weights, which begin wide.
-Ceres, as pycolmap has it, takes no factors in Python but pixels and priors of poses.
-References: Triggs et al., Bundle adjustment: a modern synthesis (2000); the covariance: White, Maximum likelihood
-estimation of misspecified models (1982), clustered as by Liang & Zeger (1986).
+Factors: stereo pixels of tracks and of points that loops join, the IMU's motions from keyframe to
+keyframe (`vio.imu.preintegration`), the walks of its biases, and priors of the rig. Where images
+show little, the IMU holds the poses, which is what a bundle adjustment of images alone lacks.
+Gauss-Newton with Levenberg's damping; points are eliminated (Schur complement), the rest is one
+sparse system. Pixels have Geman-McClure's weights, which begin wide. Ceres, as pycolmap has it,
+takes no factors in Python but pixels and priors of poses.
+References: Triggs et al., Bundle adjustment: a modern synthesis (2000); the covariance: White,
+Maximum likelihood estimation of misspecified models (1982), clustered as by Liang & Zeger (1986).
 """
 
 from __future__ import annotations
@@ -15,7 +17,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import block_array, bsr_matrix, coo_matrix, csc_matrix, csr_matrix, diags_array, hstack, vstack
+from scipy.sparse import (
+    block_array,
+    bsr_matrix,
+    coo_matrix,
+    csc_matrix,
+    csr_matrix,
+    diags_array,
+    hstack,
+    vstack,
+)
 
 from vio.cameras.rectification_error import METRIC_TERMS, ErrorColumns, error_basis
 from vio.filters.overdispersion import CELL_RAD
@@ -35,19 +46,24 @@ _STEPS = 25
 _WIDTH = 3.0  # standard deviations at which a row's weight is a quarter …
 _WIDER = 2  # … doubled in so many first steps, once each
 _SETTLED = 7  # steps after which neither width nor preintegration change
-_CONVERGED = 1e-4  # of the cost, from step to step: what goes on is rows that turn into outliers, and moves no pose
+# of the cost, from step to step: what goes on is rows that turn into outliers, and moves no pose
+_CONVERGED = 1e-4
 _MOST_DAMPING = 1e3
 _CELL_S = 1.0  # tracks that end within it in one cell of directions share their errors, as in (R7)
-_GAUGE = 1e4  # inverse standard deviation, 1/m and 1/rad, of position and heading of the first keyframe
+# inverse standard deviation, 1/m and 1/rad, of position and heading of the first keyframe
+_GAUGE = 1e4
 
 
 @dataclass(frozen=True, slots=True)
 class RigPrior:
-    """What the rig may be off by: 27 states of unit variance, of which none is known at the start."""
+    """What the rig may be off by: 27 states of unit variance, of which none is known at the
+    start.
+    """
 
     field: FloatArray  # (15, 15) coefficients of (R3) and (R2) by the states, focal lengths
     field_at_start: FloatArray  # (15,) the states that were taken out of the pixels
-    metric: FloatArray  # (4,) standard deviations of log baseline, log focal length, principal point / focal length
+    # (4,) standard deviations of log baseline, log focal length, principal point / focal length
+    metric: FloatArray
     extrinsics: FloatArray  # (6,) of xi in T_cam0_imu = T_hat exp(xi), m and rad
     time_s: float
     accel_scale: float
@@ -75,7 +91,8 @@ class Optimum:
     converged: bool
     pixels: float  # mean squared error of the pixels that agree, 1 expected
     inertial: float  # likewise of the IMU's motions
-    covariance: FloatArray  # (C, 6, 6) of xi in `T_world_cam0 exp(xi)` of the keyframes asked for, since the first one
+    # (C, 6, 6) of xi in `T_world_cam0 exp(xi)` of the keyframes asked for, since the first one
+    covariance: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +110,10 @@ class InertialAdjustment:
     gravity_mps2: float
 
     def solve(
-        self, body: BodyStates, covariance_of: IntArray | None = None, progress: Callable[[], None] = lambda: None
+        self,
+        body: BodyStates,
+        covariance_of: IntArray | None = None,
+        progress: Callable[[], None] = lambda: None,
     ) -> Optimum:
         """Return the optimum from some states on.
 
@@ -109,13 +129,18 @@ class InertialAdjustment:
         if covariance_of is not None:
             progress()
             system = self._system(at, steps, _WIDTH)
-            covariance = system.covariance(self._cameras_by_states(at, covariance_of), self._clusters())
+            covariance = system.covariance(
+                self._cameras_by_states(at, covariance_of), self._clusters()
+            )
         pixels = float(np.mean(squared[squared < _WIDTH**2])) / 3
         return Optimum(at, converged, pixels, float(np.mean(r**2)), covariance)
 
-    def _descend(self, body: BodyStates, progress: Callable[[], None]) -> tuple[Fit, Preintegrated, bool]:
+    def _descend(
+        self, body: BodyStates, progress: Callable[[], None]
+    ) -> tuple[Fit, Preintegrated, bool]:
         at = Fit(body, self.tracks.p_world, np.zeros(_SHARED))
-        damping, steps = 1e-6, self._preintegrated(body)
+        damping = 1e-6
+        steps = self._preintegrated(body)
         for n in range(_STEPS):
             progress()
             width = _WIDTH * 2.0 ** max(_WIDER - n, 0)
@@ -131,18 +156,24 @@ class InertialAdjustment:
                     break
                 damping *= 10
                 if damping > _MOST_DAMPING:
-                    return at, steps, n > _SETTLED  # no step is shorter: rounding is all that is left
-            at, damping = new, max(damping / 10, 1e-9)
+                    # no step is shorter: rounding is all that is left
+                    return at, steps, n > _SETTLED
+            at = new
+            damping = max(damping / 10, 1e-9)
             if n > _SETTLED and before - after < _CONVERGED * before:
                 return at, steps, True
         return at, steps, False
 
     def corrected_pixels(self, at: Fit) -> FloatArray:
-        """Return the rows' pixels (R, 4) without what the rig is off by; right rows stay as they are."""
+        """Return the rows' pixels (R, 4) without what the rig is off by; right rows stay as they
+        are.
+        """
         r, q, _ = self._pixels(at)
         z = self.tracks.z.copy()
         z[:, :3] = np.where(
-            self.tracks.has_right[:, None] | (np.arange(3) < 2), project(self.camera, q)[:, :3] + r, z[:, :3]
+            self.tracks.has_right[:, None] | (np.arange(3) < 2),
+            project(self.camera, q)[:, :3] + r,
+            z[:, :3],
         )
         return z
 
@@ -157,7 +188,9 @@ class InertialAdjustment:
     def _twists(self, at: Fit) -> FloatArray:
         """Twists (K, 6) of the body, in its axes."""
         t = self.readings.seconds
-        gyro = np.stack([np.interp(self.seconds, t, self.readings.gyro[:, k]) for k in range(3)], axis=1)
+        gyro = np.stack(
+            [np.interp(self.seconds, t, self.readings.gyro[:, k]) for k in range(3)], axis=1
+        )
         v = np.einsum("kji,kj->ki", at.body.T_world_imu[:, :3, :3], at.body.velocity)
         return np.concatenate([v, gyro - at.body.bias[:, :3]], axis=1)
 
@@ -168,12 +201,19 @@ class InertialAdjustment:
         return np.asarray(T_world_imu @ se3_exp(-e) @ se3_inverse(self.T_cam0_imu))
 
     def _cameras_by_states(self, at: Fit, keyframes: IntArray) -> csr_matrix:
-        """Derivatives (6C, 15K + 27) of xi in `T_world_cam0 exp(xi)` of keyframes (C,), extrinsics to first order."""
-        K, first = len(self.seconds), _FIELD + METRIC_TERMS + 2
-        cam_D_imu = se3_adjoint(se3_inverse(self.cameras(at)[keyframes]) @ at.body.T_world_imu[keyframes])
+        """Derivatives (6C, 15K + 27) of xi in `T_world_cam0 exp(xi)` of keyframes (C,),
+        extrinsics to first order.
+        """
+        K = len(self.seconds)
+        first = _FIELD + METRIC_TERMS + 2
+        cam_D_imu = se3_adjoint(
+            se3_inverse(self.cameras(at)[keyframes]) @ at.body.T_world_imu[keyframes]
+        )
         out = np.zeros((len(keyframes), 6, _OWN + _SHARED))
         out[:, :, :6] = cam_D_imu
-        out[:, :, _OWN + first : _OWN + first + 6] = -se3_adjoint(self.T_cam0_imu) * self.prior.extrinsics
+        out[:, :, _OWN + first : _OWN + first + 6] = (
+            -se3_adjoint(self.T_cam0_imu) * self.prior.extrinsics
+        )
         twists = self.prior.time_s * self._twists(at)[keyframes]
         out[:, :, _OWN + first + 6] = np.einsum("cij,cj->ci", cam_D_imu, twists)
         own = _blocks(np.arange(len(keyframes)), keyframes, out[:, :, :_OWN], len(keyframes), K)
@@ -181,11 +221,15 @@ class InertialAdjustment:
 
     def _clusters(self) -> IntArray:
         """Return numbers (M,) of the clusters of points: where and when their tracks end."""
-        tracks, c, last = self.tracks, self.camera, np.zeros(len(self.tracks.ids), dtype=np.int64)
+        tracks = self.tracks
+        c = self.camera
+        last = np.zeros(len(self.tracks.ids), dtype=np.int64)
         last[tracks.point] = np.arange(len(tracks.point))  # rows are ordered by keyframe
         across, down = (tracks.z[last, :2] - [c.cu, c.cv]).T / [[c.fu], [c.fv]]
         seconds = self.seconds[tracks.keyframe[last]]
-        cells = np.stack([np.arctan(across) / CELL_RAD, np.arctan(down) / CELL_RAD, seconds / _CELL_S])
+        cells = np.stack(
+            [np.arctan(across) / CELL_RAD, np.arctan(down) / CELL_RAD, seconds / _CELL_S]
+        )
         return np.asarray(np.unique(np.floor(cells), axis=1, return_inverse=True)[1]).ravel()
 
     def _extrinsics(self, rig: FloatArray) -> tuple[FloatArray, float]:
@@ -193,8 +237,11 @@ class InertialAdjustment:
         return rig[n : n + 6] * self.prior.extrinsics, float(rig[n + 6] * self.prior.time_s)
 
     def _pixels(self, at: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Residuals (R, 3) of [ul vl ur], points in the camera (R, 3), and residuals by the rig's terms (R, 3, 19)."""
-        tracks, prior = self.tracks, self.prior
+        """Residuals (R, 3) of [ul vl ur], points in the camera (R, 3), and residuals by the
+        rig's terms (R, 3, 19).
+        """
+        tracks = self.tracks
+        prior = self.prior
         T = se3_inverse(self.cameras(at))[tracks.keyframe]
         q = np.einsum("rij,rj->ri", T[:, :3, :3], at.p_world[tracks.point]) + T[:, :3, 3]
         q = np.where((q[:, 2] > MIN_DEPTH_M)[:, None], q, [0.0, 0.0, MIN_DEPTH_M])
@@ -216,7 +263,8 @@ class InertialAdjustment:
 
     def _inertial_residual(self, at: Fit, steps: Preintegrated) -> FloatArray:
         """Whitened residuals (F, 9)."""
-        i, j = at.body.take(slice(None, -1)), at.body.take(slice(1, None))
+        i = at.body.take(slice(None, -1))
+        j = at.body.take(slice(1, None))
         r = self._scaled(at, steps).residual(i, j, self.gravity_mps2)
         return np.asarray(np.einsum("fij,fj->fi", _whitening(steps), r))
 
@@ -240,7 +288,9 @@ class InertialAdjustment:
     # Normal equations
 
     def _system(self, at: Fit, steps: Preintegrated, width: float) -> _System:
-        tracks, K, count = self.tracks, len(self.seconds), len(self.tracks.point)
+        tracks = self.tracks
+        K = len(self.seconds)
+        count = len(self.tracks.point)
         columns = _OWN * K + _SHARED
         r, q, r_D_rig = self._pixels(at)
         squared = np.sum(r**2, axis=1) / self.sigma_px**2
@@ -255,21 +305,32 @@ class InertialAdjustment:
         r_D_point = r_D_q @ T_cam_world[:, :3, :3] * weight[:, None, None]
         twist = self._twists(at)[tracks.keyframe]
         late = (r_D_xi @ twist[:, :, None]) * self.prior.time_s
-        shared = np.concatenate([r_D_rig, -r_D_xi * self.prior.extrinsics, late, np.zeros((count, 3, 1))], axis=2)
+        shared = np.concatenate(
+            [r_D_rig, -r_D_xi * self.prior.extrinsics, late, np.zeros((count, 3, 1))], axis=2
+        )
         # Velocity and gyro bias act on a pixel by the twist alone, to second order: left out.
-        e, own = r * weight[:, None], r_D_xi * weight[:, None, None]
+        e = r * weight[:, None]
+        own = r_D_xi * weight[:, None, None]
         others, other_e = self._other_rows(at, steps, columns)
-        return _System(tracks, own, r_D_point, shared * weight[:, None, None], e, others, other_e, K)
+        return _System(
+            tracks, own, r_D_point, shared * weight[:, None, None], e, others, other_e, K
+        )
 
-    def _other_rows(self, at: Fit, steps: Preintegrated, columns: int) -> tuple[csr_matrix, FloatArray]:
+    def _other_rows(
+        self, at: Fit, steps: Preintegrated, columns: int
+    ) -> tuple[csr_matrix, FloatArray]:
         """Jacobian and residuals of IMU, walks, priors and what fixes the world, whitened."""
-        K, F = len(self.seconds), len(self.seconds) - 1
-        i, j = at.body.take(slice(None, -1)), at.body.take(slice(1, None))
+        K = len(self.seconds)
+        F = len(self.seconds) - 1
+        i = at.body.take(slice(None, -1))
+        j = at.body.take(slice(1, None))
         r, A, B = self._scaled(at, steps).linearised(i, j, self.gravity_mps2)
         W = _whitening(steps)
-        n, own = np.arange(F), _OWN * K
+        n = np.arange(F)
+        own = _OWN * K
         S = np.zeros((F, 9, _SHARED))
-        S[:, 3:6, -1], S[:, 6:, -1] = -self.prior.accel_scale * steps.v, -self.prior.accel_scale * steps.p
+        S[:, 3:6, -1] = -self.prior.accel_scale * steps.v
+        S[:, 6:, -1] = -self.prior.accel_scale * steps.p
         imu = _blocks(n, n, W @ A, F, K) + _blocks(n, n + 1, W @ B, F, K)
         parts = [hstack([imu, csr_matrix((W @ S).reshape(9 * F, _SHARED))])]
         errors = [np.einsum("fij,fj->fi", W, r).ravel()]
@@ -286,7 +347,8 @@ class InertialAdjustment:
         errors.append(self.prior.at_start + at.rig)
         gauge = np.zeros((4, columns))
         R = at.body.T_world_imu[0, :3, :3]
-        gauge[:3, :3], gauge[3, 3:6] = _GAUGE * R, _GAUGE * R[2]
+        gauge[:3, :3] = _GAUGE * R
+        gauge[3, 3:6] = _GAUGE * R[2]
         parts.append(csr_matrix(gauge))
         errors.append(np.zeros(4))
         return vstack(parts).tocsr(), np.concatenate(errors)
@@ -304,7 +366,9 @@ class _Points:
 
 @dataclass(frozen=True, slots=True)
 class _System:
-    """A linearised problem: rows of pixels `own xi + points p + rig s + e`, and `others x + other_e` beside them."""
+    """A linearised problem: rows of pixels `own xi + points p + rig s + e`, and
+    `others x + other_e` beside them.
+    """
 
     tracks: PointTracks
     own: FloatArray  # (R, 3, 6) by the pose of the row's keyframe
@@ -319,19 +383,22 @@ class _System:
         """Return the changes of the keyframes (K, 15), points (M, 3) and rig (27,)."""
         N, g, points = self._reduced(damping)
         x = -sparse.factors(N)(g)
-        own, s = x[: _OWN * self.keyframes].reshape(-1, _OWN), x[_OWN * self.keyframes :]
+        own = x[: _OWN * self.keyframes].reshape(-1, _OWN)
+        s = x[_OWN * self.keyframes :]
         by_poses = (points.by_pose.T @ own[:, :6].ravel()).reshape(-1, 3)
         p = -np.einsum("mij,mj->mi", points.V_inverse, points.e + by_poses + points.by_rig @ s)
         return own, p, s
 
     def covariance(self, D: csr_matrix, clusters: IntArray) -> FloatArray:
-        """Covariances (C, 6, 6) of `D x` (6C, 15K + 27) by the squared scores of clusters of points (M,).
+        """Covariances (C, 6, 6) of `D x` (6C, 15K + 27) by the squared scores of clusters of points
+        (M,).
 
-        Pixels of a cluster share errors, so that their score, `J' r` without the points, varies more than the normal
-        matrix says: `N^-1 (sum s s' + M) N^-1`, with M that of all else.
+        Pixels of a cluster share errors, so that their score, `J' r` without the points, varies
+        more than the normal matrix says: `N^-1 (sum s s' + M) N^-1`, with M that of all else.
         """
         N, _, points = self._reduced(0.0)
-        e, rows = self._without_points(points), np.arange(len(self.e))
+        e = self._without_points(points)
+        rows = np.arange(len(self.e))
         own = np.pad(np.einsum("rai,ra->ri", self.own, e), ((0, 0), (0, _OWN - 6)))[:, None]
         of_poses = _blocks(rows, self.tracks.keyframe, own, len(rows), self.keyframes)
         scores = hstack([of_poses, csr_matrix(np.einsum("rai,ra->ri", self.rig, e))])
@@ -344,9 +411,15 @@ class _System:
         return np.asarray(self.e - np.einsum("rij,rj->ri", self.points, p[self.tracks.point]))
 
     def _reduced(self, damping: float) -> tuple[csc_matrix, FloatArray, _Points]:
-        """Return normal matrix and gradient of keyframes and rig without the points, and what gives those."""
-        point, keyframe, K, M = self.tracks.point, self.tracks.keyframe, self.keyframes, len(self.tracks.ids)
-        own_T, points_T = np.swapaxes(self.own, 1, 2), np.swapaxes(self.points, 1, 2)
+        """Return normal matrix and gradient of keyframes and rig without the points, and what
+        gives those.
+        """
+        point = self.tracks.point
+        keyframe = self.tracks.keyframe
+        K = self.keyframes
+        M = len(self.tracks.ids)
+        own_T = np.swapaxes(self.own, 1, 2)
+        points_T = np.swapaxes(self.points, 1, 2)
         V = _sums(point, points_T @ self.points, M)
         trace = np.maximum(np.trace(V, axis1=1, axis2=2), 1e-9)
         V_inverse = np.linalg.inv(V + (1e-9 + damping) * trace[:, None, None] * np.eye(3))
@@ -366,12 +439,18 @@ class _System:
         eliminated = _Points(V_inverse, V_e, by_point, W_rig)
         e = self._without_points(eliminated)
         g = np.zeros(_OWN * K + _SHARED)
-        g[: _OWN * K].reshape(K, _OWN)[:, :6] = _sums(keyframe, np.einsum("rai,ra->ri", self.own, e), K)
+        g[: _OWN * K].reshape(K, _OWN)[:, :6] = _sums(
+            keyframe, np.einsum("rai,ra->ri", self.own, e), K
+        )
         g[_OWN * K :] = np.einsum("rai,ra->i", self.rig, e)
         g += self.others.T @ self.other_e
-        places = np.concatenate([(_OWN * np.arange(K)[:, None] + np.arange(6)).ravel(), _OWN * K + np.arange(_SHARED)])
+        places = np.concatenate(
+            [(_OWN * np.arange(K)[:, None] + np.arange(6)).ravel(), _OWN * K + np.arange(_SHARED)]
+        )
         seen = block_array([[poses, mixed], [mixed.T, rig]], format="coo")
-        N = coo_matrix((seen.data, (places[seen.row], places[seen.col])), shape=(len(g), len(g))).tocsc()
+        N = coo_matrix(
+            (seen.data, (places[seen.row], places[seen.col])), shape=(len(g), len(g))
+        ).tocsc()
         N = N + (self.others.T @ self.others).tocsc()
         N = N + damping * diags_array(N.diagonal(), format="csc")
         return N, g, eliminated
@@ -385,7 +464,12 @@ def _whitening(steps: Preintegrated) -> FloatArray:
 def _sums(groups: IntArray, values: FloatArray, count: int) -> FloatArray:
     """Sum values (N, ...) by group (N,), (count, ...)."""
     flat = values.reshape(len(values), -1)
-    sums = csr_matrix((np.ones(len(groups)), (groups, np.arange(len(groups)))), shape=(count, len(groups))) @ flat
+    sums = (
+        csr_matrix(
+            (np.ones(len(groups)), (groups, np.arange(len(groups)))), shape=(count, len(groups))
+        )
+        @ flat
+    )
     return np.asarray(sums).reshape(count, *values.shape[1:])
 
 
@@ -399,11 +483,21 @@ def _diagonal(blocks: FloatArray) -> bsr_matrix:
     return bsr_matrix((blocks, n, np.append(n, len(n))), shape=(6 * len(n), 6 * len(n)))
 
 
-def _blocks(rows: IntArray, columns: IntArray, values: FloatArray, count: int, width: int) -> csr_matrix:
-    """A sparse matrix with blocks (N, a, b) at block rows and columns (N,), of `count` by `width` blocks."""
+def _blocks(
+    rows: IntArray, columns: IntArray, values: FloatArray, count: int, width: int
+) -> csr_matrix:
+    """A sparse matrix with blocks (N, a, b) at block rows and columns (N,), of `count` by
+    `width` blocks.
+    """
     _, a, b = values.shape
-    r = (a * rows[:, None, None] + np.arange(a)[None, :, None] + np.zeros((1, 1, b), dtype=np.int64)).ravel()
-    c = (b * columns[:, None, None] + np.arange(b)[None, None, :] + np.zeros((1, a, 1), dtype=np.int64)).ravel()
+    r = (
+        a * rows[:, None, None] + np.arange(a)[None, :, None] + np.zeros((1, 1, b), dtype=np.int64)
+    ).ravel()
+    c = (
+        b * columns[:, None, None]
+        + np.arange(b)[None, None, :]
+        + np.zeros((1, a, 1), dtype=np.int64)
+    ).ravel()
     out = coo_matrix((values.ravel(), (r, c)), shape=(a * count, b * width)).tocsr()
     out.eliminate_zeros()
     return out

@@ -1,4 +1,6 @@
-"""What the adjustment of a run with an IMU begins with: keyframes, states, noise, and the priors of its rig."""
+"""What the adjustment of a run with an IMU begins with: keyframes, states, noise, and the priors
+of its rig.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ from vio.offline.points import PointTracks, build_tracks, reprojection
 from vio.records import FIELD_TERMS, ROW_TERMS, ImuDensities, ImuSample, IntArray, MotionSample
 
 _EVERY_S = 0.25  # from keyframe to keyframe
-# On the standard deviations of pixels: errors of a track last longer than from keyframe to keyframe. The same as on the
-# motions of a map's odometry, where it was measured.
+# On the standard deviations of pixels: errors of a track last longer than from keyframe to
+# keyframe. The same as on the motions of a map's odometry, where it was measured.
 _LASTING = 2.0
 _LEAST_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
 _TINY = 1e-7  # focal lengths: of coefficients that are known
@@ -51,7 +53,9 @@ class InertialRefinement:
 
 
 def inertial_keyframes(path: TrackedPath, most: int | None) -> IntArray:
-    """Return rows (K,) of the trajectory, a quarter of a second apart or as `most` allows, and both ends of loops."""
+    """Return rows (K,) of the trajectory, a quarter of a second apart or as `most` allows, and
+    both ends of loops.
+    """
     seconds = _seconds(path)
     seconds = seconds - seconds[0]
     ends = loop_ends(path, most)
@@ -76,10 +80,12 @@ def adjust_with_imu(
     Raises:
         VioError: the run has too few views or no consistent track.
     """
-    path, s = run.path, run.settings
+    path = run.path
+    s = run.settings
     T = path.trajectory.T_world_body[keyframes]
     tracks = build_tracks(path, keyframes, T)
-    here, last = run.known[keyframes], run.known[-1]
+    here = run.known[keyframes]
+    last = run.known[-1]
     T_cam0_imu = last["T_cam0_imu"] if np.isfinite(last["T_cam0_imu"]).all() else run.T_cam0_imu
     late_s = float(np.nan_to_num(last["time_offset_s"]))
     T_world_imu = T @ T_cam0_imu
@@ -89,12 +95,16 @@ def adjust_with_imu(
     bias = np.nan_to_num(np.concatenate([here["gyro_bias"], here["accel_bias"]], axis=1))
     motion = [x for x in run.samples if isinstance(x, ImuSample)]
     values = np.array([[*x.gyro, *x.accel] for x in motion])
-    densities = ImuDensities(s.gyro_noise_density, s.gyro_bias_walk, s.accel_noise_density, s.accel_bias_walk)
+    densities = ImuDensities(
+        s.gyro_noise_density, s.gyro_bias_walk, s.accel_noise_density, s.accel_bias_walk
+    )
     problem = InertialAdjustment(
         path.camera,
         tracks,
         _seconds(path)[keyframes] + late_s,
-        Readings(1e-9 * np.array([x.time_ns for x in motion]), values[:, :3], values[:, 3:], densities),
+        Readings(
+            1e-9 * np.array([x.time_ns for x in motion]), values[:, :3], values[:, 3:], densities
+        ),
         T_cam0_imu,
         _rig_prior(run, last),
         _row_sigmas(path, T, tracks),
@@ -114,7 +124,9 @@ def _seconds(path: TrackedPath) -> FloatArray:
 
 
 def _row_sigmas(path: TrackedPath, T_world_cam0: FloatArray, tracks: PointTracks) -> FloatArray:
-    """Standard deviations (R,) of a row's pixel coordinates, robust: one of tracks, one of points that loops join."""
+    """Standard deviations (R,) of a row's pixel coordinates, robust: one of tracks, one of
+    points that loops join.
+    """
     r = reprojection(path.camera, T_world_cam0, tracks)[0][:, :3]
     out = np.ones(len(r))
     for group in (tracks.by_loop, ~tracks.by_loop):
@@ -125,9 +137,12 @@ def _row_sigmas(path: TrackedPath, T_world_cam0: FloatArray, tracks: PointTracks
 
 
 def _rig_prior(run: InertialRun, last: np.void) -> RigPrior:
-    """What the rig may be off by before the run's tracks were seen; its rows, which are no pixels here, as it ended."""
+    """What the rig may be off by before the run's tracks were seen; its rows, which are no
+    pixels here, as it ended.
+    """
     s = run.settings
-    field, at_start = _TINY * np.eye(FIELD_TERMS + ROW_TERMS), np.zeros(FIELD_TERMS + ROW_TERMS)
+    field = _TINY * np.eye(FIELD_TERMS + ROW_TERMS)
+    at_start = np.zeros(FIELD_TERMS + ROW_TERMS)
     if run.field is not None:
         sigmas = field_sigmas(run.path.camera, float(last["stereo_rows_rms_px"]))
         field[:FIELD_TERMS, :FIELD_TERMS] = np.diag(sigmas)

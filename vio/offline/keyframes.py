@@ -35,8 +35,10 @@ class TrackedPath:
     camera: StereoCamera  # rectified pair
     trajectory: Trajectory  # of cam0, one pose a frame, with frame numbers
     tracks: FeatureTracks  # of all frames of the recording, by frame number
-    loops: tuple[LoopEvent, ...] = ()  # between two frames of the trajectory, whose poses agree with them
-    sigmas: FloatArray | None = None  # (N, 2) standard deviations of position (m) and attitude (deg) since the start
+    # between two frames of the trajectory, whose poses agree with them
+    loops: tuple[LoopEvent, ...] = ()
+    # (N, 2) standard deviations of position (m) and attitude (deg) since the start
+    sigmas: FloatArray | None = None
 
     @property
     def frames(self) -> IntArray:
@@ -51,18 +53,22 @@ class TrackedPath:
 
 
 def choose_keyframes(run: TrackedPath, *, most: int | None = None) -> IntArray:
-    """Return the rows (K,) of the trajectory that become keyframes: first, last, and after enough motion.
+    """Return the rows (K,) of the trajectory that become keyframes: first, last, and after enough
+    motion.
 
-    Enough is a share of the scene's median depth or a few degrees. Both limits are increased until there are at most
-    `most`. Without `most`, all frames of a short run are keyframes. Both frames of a loop are keyframes; where that
-    takes more than a third of `most`, only of some loops, spread over the run.
+    Enough is a share of the scene's median depth or a few degrees. Both limits are increased until
+    there are at most `most`. Without `most`, all frames of a short run are keyframes. Both frames
+    of a loop are keyframes; where that takes more than a third of `most`, only of some loops,
+    spread over the run.
 
     Raises:
         DataError: the run is shorter than two frames.
     """
     T = run.trajectory.T_world_body
     if len(T) < 2:
-        raise DataError(f"{run.where}: a run of {len(T)} frames has fewer than two views; process more frames")
+        raise DataError(
+            f"{run.where}: a run of {len(T)} frames has fewer than two views; process more frames"
+        )
     step_m = _SCENE_SHARE * _median_depth_m(run)
     if len(T) <= (_ALL_FRAMES if most is None else most):
         return np.arange(len(T))
@@ -78,7 +84,9 @@ def choose_keyframes(run: TrackedPath, *, most: int | None = None) -> IntArray:
 
 
 def after_motion(T: FloatArray, step_m: float, turn_deg: float) -> list[int]:
-    """Return the rows of poses (N, 4, 4) after enough motion, or turn, since the row before; the first one too."""
+    """Return the rows of poses (N, 4, 4) after enough motion, or turn, since the row before; the
+    first one too.
+    """
     chosen = [0]
     for k in range(1, len(T)):
         last = T[chosen[-1]]
@@ -89,23 +97,31 @@ def after_motion(T: FloatArray, step_m: float, turn_deg: float) -> list[int]:
 
 
 def keyframes_by_overlap(run: TrackedPath, *, most: int) -> IntArray:
-    """Return the rows (K,) of the trajectory that become keyframes, close where the view changes fast.
+    """Return the rows (K,) of the trajectory that become keyframes, close where the view changes
+    fast.
 
-    From one to the next an equal share of the features is lost, counted from frame to frame: a fifth, or more
-    where that takes more than `most`. Both frames of loops are keyframes, as in `choose_keyframes`.
+    From one to the next an equal share of the features is lost, counted from frame to frame: a
+    fifth, or more where that takes more than `most`. Both frames of loops are keyframes, as in
+    `choose_keyframes`.
 
     Raises:
         DataError: the run is shorter than two frames.
     """
     if len(run.frames) < 2:
-        raise DataError(f"{run.where}: a run of {len(run.frames)} frames has fewer than two views; process more frames")
+        raise DataError(
+            f"{run.where}: a run of {len(run.frames)} frames has fewer than two views; process "
+            "more frames"
+        )
     _median_depth_m(run)
     if len(run.frames) <= most:
         return np.arange(len(run.frames))
     ends = loop_ends(run, most)
     ids = [run.fresh(k).ids for k in range(len(run.frames))]
     shown = [k for k in range(len(ids)) if k in (0, len(ids) - 1) or len(ids[k]) >= _LEAST_SEEN]
-    lost = [1 - np.isin(ids[a], ids[b]).mean() if len(ids[a]) else 0.0 for a, b in itertools.pairwise(shown)]
+    lost = [
+        1 - np.isin(ids[a], ids[b]).mean() if len(ids[a]) else 0.0
+        for a, b in itertools.pairwise(shown)
+    ]
     total = np.concatenate([[0.0], np.cumsum(lost)])
     count = int(np.clip(np.ceil(total[-1] / _LOST_SHARE) + 1, 2, max(most - len(ends), 2)))
     chosen = np.searchsorted(total, np.linspace(0, total[-1], count)).clip(0, len(shown) - 1)
@@ -113,11 +129,15 @@ def keyframes_by_overlap(run: TrackedPath, *, most: int) -> IntArray:
 
 
 def loop_ends(run: TrackedPath, most: int | None) -> IntArray:
-    """Return the rows (E,) of the trajectory at which loops begin and end, at most a third of `most`."""
+    """Return the rows (E,) of the trajectory at which loops begin and end, at most a third of
+    `most`.
+    """
     pairs = loop_pairs(run.loops, run.frames)
     if most is not None:
         count = min(len(pairs), most // (2 * _LOOP_SHARE))
-        pairs = pairs[np.linspace(0, len(pairs) - 1, count).astype(np.int64)] if count else pairs[:0]
+        pairs = (
+            pairs[np.linspace(0, len(pairs) - 1, count).astype(np.int64)] if count else pairs[:0]
+        )
     return np.unique(pairs)
 
 
@@ -127,14 +147,21 @@ def _median_depth_m(run: TrackedPath) -> float:
     disparity = disparity[disparity > _MIN_DISPARITY_PX]
     if not len(disparity):
         raise EstimationError(
-            f"{run.where}: not observable because no feature has a right match with a positive disparity; check that "
+            f"{run.where}: not observable because no feature has a right match with a positive "
+            "disparity; check that "
             "left and right are not swapped and that the scene has texture"
         )
     return float(run.camera.fu * run.camera.baseline_m / np.median(disparity))
 
 
 def tracked_segments(
-    where: Path, camera: StereoCamera, tracks: FeatureTracks, motion: CameraMotion, *, longest: int, most: int
+    where: Path,
+    camera: StereoCamera,
+    tracks: FeatureTracks,
+    motion: CameraMotion,
+    *,
+    longest: int,
+    most: int,
 ) -> list[TrackedPath]:
     """Return pieces of a recording, with poses concatenated from frame to frame.
 
@@ -148,7 +175,11 @@ def tracked_segments(
     """
     breaks = np.flatnonzero(np.diff(motion.frames) != 1) + 1
     rows = np.arange(len(motion.frames))
-    parts = [part[k : k + longest] for part in np.split(rows, breaks) for k in range(0, len(part), longest)]
+    parts = [
+        part[k : k + longest]
+        for part in np.split(rows, breaks)
+        for k in range(0, len(part), longest)
+    ]
     parts = [part for part in parts if len(part) >= min(longest, _LEAST_STRETCH)]
     if not parts:
         return []
@@ -159,5 +190,9 @@ def tracked_segments(
         poses = [np.eye(4)]
         for step, dt_ns in zip(motion.twists[part], np.diff(times_ns), strict=True):
             poses.append(poses[-1] @ se3_exp(1e-9 * float(dt_ns) * step))
-        out.append(TrackedPath(where, camera, Trajectory(np.array(poses), times_ns, "cam0", indices), tracks))
+        out.append(
+            TrackedPath(
+                where, camera, Trajectory(np.array(poses), times_ns, "cam0", indices), tracks
+            )
+        )
     return out

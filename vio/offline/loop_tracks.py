@@ -1,4 +1,6 @@
-"""Points that loops add to a run's tracks: features of two keyframes, far apart in time, that show the same point."""
+"""Points that loops add to a run's tracks: features of two keyframes, far apart in time, that
+show the same point.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,12 @@ class LoopRows:
 
 
 def loop_pairs(loops: Sequence[LoopEvent], frames: IntArray) -> IntArray:
-    """Return the places (L, 2) in `frames` (K,), increasing, of the two frames of each loop that has both there."""
-    ends = np.array([(o.keyframe_frame, o.frame) for o in loops if o.keyframe_frame is not None], dtype=np.int64)
+    """Return the places (L, 2) in `frames` (K,), increasing, of the two frames of each loop that
+    has both there.
+    """
+    ends = np.array(
+        [(o.keyframe_frame, o.frame) for o in loops if o.keyframe_frame is not None], dtype=np.int64
+    )
     ends = ends.reshape(-1, 2)
     place = np.clip(np.searchsorted(frames, ends), 0, len(frames) - 1)
     return np.asarray(place[(frames[place] == ends).all(axis=1)], dtype=np.int64)
@@ -34,7 +40,8 @@ def loop_pairs(loops: Sequence[LoopEvent], frames: IntArray) -> IntArray:
 def loop_rows(loops: Sequence[LoopEvent], frames: IntArray) -> LoopRows:
     """Return the points that loops join and what keyframes show of them.
 
-    A feature that several loops match is one point. One that they match to two features of a keyframe is none.
+    A feature that several loops match is one point. One that they match to two features of a
+    keyframe is none.
 
     Args:
         loops: with their matches; those of other runs' keyframes, or without matches, add nothing.
@@ -48,7 +55,10 @@ def loop_rows(loops: Sequence[LoopEvent], frames: IntArray) -> LoopRows:
             ends.append((int(pair[0, 1]), o.matches.z_frame, o.matches.has_right_frame))
     if not ends:
         return LoopRows(
-            np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 4)), np.zeros(0, dtype=np.bool_)
+            np.zeros(0, dtype=np.int64),
+            np.zeros(0, dtype=np.int64),
+            np.zeros((0, 4)),
+            np.zeros(0, dtype=np.bool_),
         )
     keyframe = np.concatenate([np.full(len(z), k) for k, z, _ in ends])
     z = np.concatenate([z for _, z, _ in ends])
@@ -57,12 +67,21 @@ def loop_rows(loops: Sequence[LoopEvent], frames: IntArray) -> LoopRows:
     key = np.concatenate([keyframe[:, None], z[:, :2]], axis=1)
     _, first, feature = np.unique(key, axis=0, return_index=True, return_inverse=True)
     at = np.cumsum([0, *(len(z) for _, z, _ in ends)])
-    rows = [(np.arange(at[n], at[n + 1]), np.arange(at[n + 1], at[n + 2])) for n in range(0, len(ends), 2)]
+    rows = [
+        (np.arange(at[n], at[n + 1]), np.arange(at[n + 1], at[n + 2]))
+        for n in range(0, len(ends), 2)
+    ]
     a, b = (feature.ravel()[np.concatenate([pair[side] for pair in rows])] for side in (0, 1))
     graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(len(first), len(first)))
     point = connected_components(graph, directed=False)[1].astype(np.int64)
-    keyframe, z, has_right = keyframe[first], z[first], has_right[first]
-    _, of_keyframe, count = np.unique(np.stack([point, keyframe]), axis=1, return_inverse=True, return_counts=True)
+    keyframe = keyframe[first]
+    z = z[first]
+    has_right = has_right[first]
+    _, of_keyframe, count = np.unique(
+        np.stack([point, keyframe]), axis=1, return_inverse=True, return_counts=True
+    )
     wrong = np.unique(point[count[of_keyframe.ravel()] > 1])
     good = ~np.isin(point, wrong)
-    return LoopRows(np.unique(point[good], return_inverse=True)[1], keyframe[good], z[good], has_right[good])
+    return LoopRows(
+        np.unique(point[good], return_inverse=True)[1], keyframe[good], z[good], has_right[good]
+    )

@@ -29,7 +29,9 @@ from vio.runs.folder import read_metrics
 from vio.runs.mapped import corrected, read_trajectories
 
 _VOXEL_SHARE = 1 / 250  # of the landmarks' depth, at least
-_STEP_SHARE, _STEP_DEG = 0.02, 4.0  # of the landmarks' depth: motion from one image that is used to the next; or turn
+# of the landmarks' depth: motion from one image that is used to the next; or turn
+_STEP_SHARE = 0.02
+_STEP_DEG = 4.0
 _NEAR_QUANTILE = 0.25  # of the depths of landmarks
 _LEVEL = 0.9998  # z of the upward direction, 1.1 degrees, above which a map's z is taken for up
 _SIGMA_VOXELS = float(TRUNCATION)  # of a depth, beyond which it is not used
@@ -74,12 +76,16 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
         voxel_m: distance of the samples; None: by the depth of the landmarks.
 
     Raises:
-        DataError: it is no run's folder, or of one camera without depths, or the map does not hold the run.
+        DataError: it is no run's folder, or of one camera without depths, or the map does not hold
+            the run.
     """
     metrics, T_cam0_imu = read_metrics(folder)
     images = run_images(folder, metrics)
     if images.seen.kind == "mono":
-        raise DataError(f"{folder}: is a run of one camera without depth images; a mesh needs a stereo pair or depths")
+        raise DataError(
+            f"{folder}: is a run of one camera without depth images; a mesh needs a stereo pair or "
+            "depths"
+        )
     trajectory, odometry = read_trajectories(folder)
     mapped = trajectory is not odometry
     if trajectory.frame_indices is None or trajectory.times_ns is None or len(trajectory) < 1:
@@ -87,7 +93,11 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
     # The landmarks and the vertical are those of the odometry's world.
     by_odometry = odometry.in_cam0(T_cam0_imu)
     T_odom = by_odometry.T_world_body
-    T = trajectory.in_cam0(T_cam0_imu).T_world_body if map_file is None else _poses_in_map(map_file, by_odometry)
+    T = (
+        trajectory.in_cam0(T_cam0_imu).T_world_body
+        if map_file is None
+        else _poses_in_map(map_file, by_odometry)
+    )
     depth_m = _landmark_depth_m(folder, T_odom, None if voxel_m is None else voxel_m / _VOXEL_SHARE)
     voxel_m = _voxel_m(images.camera, depth_m) if voxel_m is None else voxel_m
     chosen = np.array(after_motion(T, _STEP_SHARE * depth_m, _STEP_DEG), dtype=np.int64)
@@ -118,7 +128,9 @@ def build_mesh(
     Raises:
         DataError: the images are not available, or show no surface.
     """
-    images, voxel_m, done = made_from.images, made_from.voxel_m, 0
+    images = made_from.images
+    voxel_m = made_from.voxel_m
+    done = 0
     matcher: StereoMatcher | None = None
     with VoxelGrid(voxel_m, most_blocks=most_blocks) as grid:
         found = images.frames(made_from.frames, source, colour=True)
@@ -126,7 +138,9 @@ def build_mesh(
             assert frame.left is not None
             if frame.depth is None and matcher is None:
                 matcher = StereoMatcher(images.camera, frame.left.shape[1])
-            grid.fuse(_depth_of(frame, matcher), frame.left, images.camera, T_world_cam0, made_from.far_m)
+            grid.fuse(
+                _depth_of(frame, matcher), frame.left, images.camera, T_world_cam0, made_from.far_m
+            )
             done += 1
             progress(done, len(made_from.frames))
             if stop():
@@ -135,7 +149,8 @@ def build_mesh(
         blocks = len(grid)
     if not len(mesh.triangles):
         raise DataError(
-            f"{images.where}: no surface was found within {made_from.far_m:.1f} m in {done} images; give larger "
+            f"{images.where}: no surface was found within {made_from.far_m:.1f} m in {done} "
+            "images; give larger "
             "voxels with --voxel, and see whether the run's poses are right"
         )
     R = upright_axes(made_from.T_world_cam0, made_from.up_world)
@@ -158,13 +173,18 @@ def _depth_of(frame: StereoFrame, matcher: StereoMatcher | None) -> DepthImage:
 def _gray(image: Image) -> Image:
     import cv2
 
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    return (
+        image
+        if image.ndim == 2
+        else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    )
 
 
 def _poses_in_map(file: Path, run: Trajectory) -> FloatArray:
     """Return the poses (N, 4, 4) of a run's frames in a map that holds it."""
     with contextlib.closing(MapStore(file, read_only=True)) as store:
-        graph, rows = MapGraph(store), store.keyframes()
+        graph = MapGraph(store)
+        rows = store.keyframes()
     assert run.times_ns is not None
     assert run.frame_indices is not None
     place = {int(t): k for k, t in enumerate(run.times_ns.tolist())}
@@ -172,25 +192,40 @@ def _poses_in_map(file: Path, run: Trajectory) -> FloatArray:
         own = [k for k in rows if k.session == session]
         if own and all(k.time_ns in place for k in own):
             at = np.array([place[k.time_ns] for k in own])
-            frames, T_map = run.frame_indices[at], np.array([k.T_map_cam for k in own])
-            return corrected(run.T_world_body, run.frame_indices, frames, T_map, run.T_world_body[at])
-    raise DataError(f"{file}: holds no session of this run; give the map that vio run --map FILE wrote in it")
+            frames = run.frame_indices[at]
+            T_map = np.array([k.T_map_cam for k in own])
+            return corrected(
+                run.T_world_body, run.frame_indices, frames, T_map, run.T_world_body[at]
+            )
+    raise DataError(
+        f"{file}: holds no session of this run; give the map that vio run --map FILE wrote in it"
+    )
 
 
 def _landmark_depth_m(folder: Path, T_world_cam0: FloatArray, otherwise_m: float | None) -> float:
-    """Return the depth within which a quarter of the landmarks ahead are; far ones say little of the scene."""
+    """Return the depth within which a quarter of the landmarks ahead are; far ones say little of
+    the scene.
+    """
     p = point_positions(folder)
-    depths = [transform_points(se3_inverse(T), p)[:, 2] for T in T_world_cam0[:: max(1, len(T_world_cam0) // 50)]]
+    depths = [
+        transform_points(se3_inverse(T), p)[:, 2]
+        for T in T_world_cam0[:: max(1, len(T_world_cam0) // 50)]
+    ]
     ahead = [float(np.quantile(z[z > 0], _NEAR_QUANTILE)) for z in depths if (z > 0).any()]
     if not ahead and otherwise_m is not None:
         return otherwise_m
     if not ahead:
-        raise DataError(f"{folder}: the run has no landmarks, so that nothing states the scene's size; give --voxel")
+        raise DataError(
+            f"{folder}: the run has no landmarks, so that nothing states the scene's size; give "
+            "--voxel"
+        )
     return float(np.median(ahead))
 
 
 def _voxel_m(camera: StereoCamera, depth_m: float) -> float:
-    """Return voxels with which surfaces are used at twice the landmarks' depth: 1, 2 or 5 times a power of ten."""
+    """Return voxels with which surfaces are used at twice the landmarks' depth: 1, 2 or 5 times
+    a power of ten.
+    """
     length_m = max(_VOXEL_SHARE * depth_m, depth_sigma_m(camera, 2 * depth_m) / _SIGMA_VOXELS)
     power = 10.0 ** np.floor(np.log10(length_m))
     return float(power * max(m for m in (1, 2, 5) if m * power <= length_m * (1 + 1e-9)))

@@ -29,11 +29,14 @@ class PointTracks:
     keyframe: IntArray  # (R,) index of the keyframe of a row; rows are ordered by keyframe
     z: FloatArray  # (R, 4) rectified pixels
     has_right: BoolArray  # (R,)
-    loops_from: int | None = None  # ids from here on are of points that loops join; None: there are none
+    # ids from here on are of points that loops join; None: there are none
+    loops_from: int | None = None
 
     @property
     def by_loop(self) -> BoolArray:
-        """Mask (R,) of the rows of points that loops join: their pixels are less exact than those of tracks."""
+        """Mask (R,) of the rows of points that loops join: their pixels are less exact than
+        those of tracks.
+        """
         if self.loops_from is None:
             return np.zeros(len(self.point), dtype=np.bool_)
         return np.asarray(self.ids[self.point] >= self.loops_from)
@@ -44,7 +47,8 @@ def build_tracks(
 ) -> PointTracks:
     """Turn a run's observations in keyframes into points, each seen in at least two of them.
 
-    The features that agree with the run's loops are points of their own, with ids after those of the tracks.
+    The features that agree with the run's loops are points of their own, with ids after those of
+    the tracks.
 
     Args:
         run: the run.
@@ -60,13 +64,18 @@ def build_tracks(
     ids = np.concatenate([o.ids for o in fresh])
     loops_from = int(ids.max(initial=-1)) + 1
     ids = np.concatenate([ids, loops.point + loops_from])
-    keyframe = np.concatenate([np.repeat(np.arange(len(keyframes)), [len(o) for o in fresh]), loops.keyframe])
+    keyframe = np.concatenate(
+        [np.repeat(np.arange(len(keyframes)), [len(o) for o in fresh]), loops.keyframe]
+    )
     order = np.argsort(keyframe, kind="stable")
-    ids, keyframe = ids[order], keyframe[order]
+    ids = ids[order]
+    keyframe = keyframe[order]
     z = np.concatenate([*(o.z for o in fresh), loops.z])[order]
     has_right = np.concatenate([*(o.has_right for o in fresh), loops.has_right])[order]
     names, point = np.unique(ids, return_inverse=True)
-    tracks = PointTracks(names, np.zeros((len(names), 3)), point.astype(np.int64), keyframe, z, has_right, loops_from)
+    tracks = PointTracks(
+        names, np.zeros((len(names), 3)), point.astype(np.int64), keyframe, z, has_right, loops_from
+    )
     tracks = keep_rows(tracks, np.ones(len(point), dtype=np.bool_))
     for _ in range(3):
         if not len(tracks.ids):
@@ -80,14 +89,17 @@ def build_tracks(
             break
     if not len(tracks.ids):
         raise EstimationError(
-            f"{run.where}: not observable because no feature is seen consistently in {_LEAST_VIEWS} keyframes; the "
+            f"{run.where}: not observable because no feature is seen consistently in "
+            f"{_LEAST_VIEWS} keyframes; the "
             "views do not overlap, the scene has no texture, or the run's poses are wrong"
         )
     return tracks
 
 
 def keep_rows(tracks: PointTracks, rows: BoolArray) -> PointTracks:
-    """Return the rows selected by a mask (R,), without points that then have too few views or no stereo row."""
+    """Return the rows selected by a mask (R,), without points that then have too few views or no
+    stereo row.
+    """
     count = len(tracks.ids)
     views = np.bincount(tracks.point[rows], minlength=count)
     stereo = np.bincount(tracks.point[rows & tracks.has_right], minlength=count)
@@ -105,8 +117,12 @@ def keep_rows(tracks: PointTracks, rows: BoolArray) -> PointTracks:
     )
 
 
-def reprojection(camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks) -> tuple[FloatArray, BoolArray]:
-    """Return residuals (R, 4) in pixels, zero for missing right pixels, and a mask (R,) of points ahead."""
+def reprojection(
+    camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks
+) -> tuple[FloatArray, BoolArray]:
+    """Return residuals (R, 4) in pixels, zero for missing right pixels, and a mask (R,) of
+    points ahead.
+    """
     T_cam0_world = se3_inverse(T_world_cam0)
     q, ahead = _in_camera(T_cam0_world, tracks)
     residual = tracks.z - project(camera, q)
@@ -124,9 +140,11 @@ def _in_camera(T_cam0_world: FloatArray, tracks: PointTracks) -> tuple[FloatArra
 def triangulate_tracks(
     camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks
 ) -> tuple[FloatArray, BoolArray]:
-    """Triangulate points (M, 3) from all views by robust Gauss-Newton; also return a mask (M,) of those determined.
+    """Triangulate points (M, 3) from all views by robust Gauss-Newton; also return a mask (M,) of
+    those determined.
 
-    Starts from the stereo pair with the largest disparity; a Geman-McClure weight of one pixel limits outliers.
+    Starts from the stereo pair with the largest disparity; a Geman-McClure weight of one pixel
+    limits outliers.
     """
     count = len(tracks.ids)
     disparity = np.where(tracks.has_right, tracks.z[:, 0] - tracks.z[:, 2], -np.inf)
@@ -162,13 +180,19 @@ def triangulate_tracks(
     return p_world, valid & np.isfinite(p_world).all(axis=1)
 
 
-def landmarks_of(camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks, sigma_px: float) -> Landmarks:
-    """Return the points as landmarks, with covariances for fixed poses and `sigma_px` per pixel coordinate."""
+def landmarks_of(
+    camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks, sigma_px: float
+) -> Landmarks:
+    """Return the points as landmarks, with covariances for fixed poses and `sigma_px` per pixel
+    coordinate.
+    """
     T_cam0_world = se3_inverse(T_world_cam0)
     q, _ = _in_camera(T_cam0_world, tracks)
     H = z_D_p_cam(camera, q) @ T_cam0_world[tracks.keyframe, :3, :3]
     H[~tracks.has_right, 2:] = 0
     information = np.zeros((len(tracks.ids), 3, 3))
     np.add.at(information, tracks.point, np.swapaxes(H, 1, 2) @ H)
-    covariance: FloatArray = sigma_px**2 * np.asarray(np.linalg.pinv(information, hermitian=True), dtype=np.float64)
+    covariance: FloatArray = sigma_px**2 * np.asarray(
+        np.linalg.pinv(information, hermitian=True), dtype=np.float64
+    )
     return Landmarks(tracks.ids, tracks.p_world, covariance)

@@ -1,4 +1,6 @@
-"""Bundle adjustment over a saved run's keyframes, and alignment of its other frames to the result."""
+"""Bundle adjustment over a saved run's keyframes, and alignment of its other frames to the
+result.
+"""
 
 from __future__ import annotations
 
@@ -47,39 +49,54 @@ class Refinement:
     aligned: int  # frames between keyframes that were aligned to the refined points
     with_priors: bool
     with_imu: bool
-    moved_rms_m: float  # RMS displacement from the run, or from its poses in the map, after SE(3) alignment
+    # RMS displacement from the run, or from its poses in the map, after SE(3) alignment
+    moved_rms_m: float
     ate_before_m: float | None  # against the reference in the recording; None without one
     ate_m: float | None  # likewise, after refinement
 
 
 def refine_run(
-    run: SavedRun, *, most: int | None, priors: bool, threads: int, progress: Callable[[int], None], imu: bool = False
+    run: SavedRun,
+    *,
+    most: int | None,
+    priors: bool,
+    threads: int,
+    progress: Callable[[int], None],
+    imu: bool = False,
 ) -> Refinement:
     """Bundle-adjust the keyframes of a run under its stereo rig, and take the other frames along.
 
-    Without IMU they are aligned to the refined points; with one, they keep the odometry's motion between keyframes.
+    Without IMU they are aligned to the refined points; with one, they keep the odometry's motion
+    between keyframes.
 
-    The features that agree with the loops of a run with a map are points across the loop, and the poses to begin with
-    are those in the map.
+    The features that agree with the loops of a run with a map are points across the loop, and the
+    poses to begin with are those in the map.
 
     Args:
         run: the run.
         most: largest number of keyframes; None: as many as needed.
-        priors: use the filter's camera positions and covariances as priors, if the filter reproduces the run.
+        priors: use the filter's camera positions and covariances as priors, if the filter
+            reproduces the run.
         threads: of the solver; one makes the result repeatable.
         progress: called with the number of steps done.
         imu: take in the IMU, and find what the rig is off by.
 
     Raises:
-        ConfigError: priors were asked for of a run that closed loops, or the IMU of one that used none.
+        ConfigError: priors were asked for of a run that closed loops, or the IMU of one that used
+            none.
         VioError: the run has too few views or no consistent track, or the solver failed.
     """
     path = run.tracked
     if priors and path.loops:
-        raise ConfigError(f"{path.where}: its loops moved the poses away from the filter's; leave --priors out")
+        raise ConfigError(
+            f"{path.where}: its loops moved the poses away from the filter's; leave --priors out"
+        )
     has_imu = run.metrics.get("motion") == "imu" and (path.where / RunFile.ESTIMATES).is_file()
     if imu and (priors or not has_imu or run.dataset.recording.camera.is_cylinder):
-        raise ConfigError(f"{path.where}: --imu takes a run with an IMU and a pinhole pair, and no --priors filter")
+        raise ConfigError(
+            f"{path.where}: --imu takes a run with an IMU and a pinhole pair, and no --priors "
+            "filter"
+        )
     rounds = iter((2, 3))
     held = None
     if imu:
@@ -87,8 +104,10 @@ def refine_run(
         progress(1)
         done = _adjusted_with_imu(run, keyframes)
         progress(3)
-        T, number = path.trajectory.T_world_body, np.arange(len(path.frames))
-        poses, aligned = corrected(T, number, keyframes, done.T_world_cam0, T[keyframes]), 0
+        T = path.trajectory.T_world_body
+        number = np.arange(len(path.frames))
+        poses = corrected(T, number, keyframes, done.T_world_cam0, T[keyframes])
+        aligned = 0
     else:
         keyframes = choose_keyframes(path, most=most)
         T_world_cam0 = path.trajectory.T_world_body[keyframes]
@@ -96,7 +115,12 @@ def refine_run(
         held = _priors(run, keyframes) if priors else None
         progress(1)
         done = adjust(
-            path.camera, T_world_cam0, tracks, priors=held, threads=threads, progress=lambda: progress(next(rounds))
+            path.camera,
+            T_world_cam0,
+            tracks,
+            priors=held,
+            threads=threads,
+            progress=lambda: progress(next(rounds)),
         )
         poses, aligned = fill_between(path, keyframes, done.T_world_cam0, done.tracks)
     progress(STEPS)
@@ -107,8 +131,10 @@ def refine_run(
         sigma_m = float(np.sqrt(np.mean(path.sigmas[:, 0] ** 2)))
         if moved_rms_m > _MOST_SIGMAS * sigma_m:
             log.warning(
-                "the refined poses are %.2g m (rms) from the run's, %.1f times its standard deviation of %.2g m: "
-                "images that show little do not hold poses alone, as an IMU does; compare both before you use them",
+                "the refined poses are %.2g m (rms) from the run's, %.1f times its standard "
+                "deviation of %.2g m: "
+                "images that show little do not hold poses alone, as an IMU does; compare both "
+                "before you use them",
                 moved_rms_m,
                 moved_rms_m / sigma_m,
                 sigma_m,
@@ -130,11 +156,14 @@ def refine_run(
 
 def _adjusted_with_imu(run: SavedRun, keyframes: IntArray) -> Adjustment:
     path = run.tracked
-    known, settings = read_estimates(path.where / RunFile.ESTIMATES), _estimator_settings(path.where / "config.yaml")
+    known = read_estimates(path.where / RunFile.ESTIMATES)
+    settings = _estimator_settings(path.where / "config.yaml")
     taken = InertialRun(path, known, run.dataset.motion, run.T_cam0_imu, run.field, settings.msckf)
     done = adjust_with_imu(taken, keyframes)
     T = path.trajectory.T_world_body[keyframes], done.T_world_cam0
-    before, after = (reprojection(path.camera, *at)[0] for at in zip(T, (done.before, done.after), strict=True))
+    before, after = (
+        reprojection(path.camera, *at)[0] for at in zip(T, (done.before, done.after), strict=True)
+    )
     return Adjustment(
         T_world_cam0=done.T_world_cam0,
         tracks=done.after,
@@ -157,21 +186,36 @@ def _scores(run: SavedRun, refined: Trajectory) -> tuple[float | None, float | N
 
 
 def _priors(run: SavedRun, keyframes: IntArray) -> PositionPriors | None:
-    """Replay the filter on its saved observations for the poses' covariances; None if it does not reproduce the run."""
-    where, frames = run.tracked.where, run.tracked.frames
+    """Replay the filter on its saved observations for the poses' covariances.
+
+    None if it does not reproduce the run.
+    """
+    where = run.tracked.where
+    frames = run.tracked.frames
     replayed = process(
-        run.dataset, _estimator_settings(where / "config.yaml"), start=int(frames[0]), stop=int(frames[-1]) + 1
+        run.dataset,
+        _estimator_settings(where / "config.yaml"),
+        start=int(frames[0]),
+        stop=int(frames[-1]) + 1,
     )
     poses = replayed.trajectory.in_cam0(replayed.T_cam0_body).T_world_body
-    if len(poses) != len(frames) or np.abs(poses - run.tracked.trajectory.T_world_body).max() > 1e-6:
-        log.warning("the filter does not reproduce %s (other version or settings); refining without priors", where)
+    if (
+        len(poses) != len(frames)
+        or np.abs(poses - run.tracked.trajectory.T_world_body).max() > 1e-6
+    ):
+        log.warning(
+            "the filter does not reproduce %s (other version or settings); refining without priors",
+            where,
+        )
         return None
     chosen = [replayed.estimates[int(k)] for k in keyframes]
     return PositionPriors(poses[keyframes, :3, 3], position_covariances(chosen, run.T_cam0_imu))
 
 
 def _estimator_settings(path: Path) -> Config:
-    """Return the settings of a run without those of front end and reader, which the replay does not need."""
+    """Return the settings of a run without those of front end and reader, which the replay does
+    not need.
+    """
     try:
         values = read_yaml(read_input(path, MOST_BYTES).decode("utf-8"))
     except (OSError, ValueError) as error:
@@ -188,9 +232,14 @@ _LEAST_SIGMA_M = 1e-4  # of a prior: the first pose of a filter has no uncertain
 
 
 def align_to_points(
-    camera: StereoCamera, T_world_cam0: FloatArray, p_world: FloatArray, z: FloatArray, has_right: BoolArray
+    camera: StereoCamera,
+    T_world_cam0: FloatArray,
+    p_world: FloatArray,
+    z: FloatArray,
+    has_right: BoolArray,
 ) -> FloatArray | None:
-    """Estimate one frame's pose (4, 4) from known points (P, 3) and pixels (P, 4); None: too few of them fit.
+    """Estimate one frame's pose (4, 4) from known points (P, 3) and pixels (P, 4); None: too few of
+    them fit.
 
     Robust Gauss-Newton from `T_world_cam0`.
     """
@@ -223,10 +272,11 @@ def align_to_points(
 def fill_between(
     run: TrackedPath, keyframes: IntArray, T_world_keyframes: FloatArray, tracks: PointTracks
 ) -> tuple[FloatArray, int]:
-    """Return poses (N, 4, 4) of all frames after the keyframes were adjusted, and how many come from points.
+    """Return poses (N, 4, 4) of all frames after the keyframes were adjusted, and how many come
+    from points.
 
-    A frame between keyframes is aligned to the refined points that it observes; with too few of them it keeps its
-    motion relative to the previous keyframe.
+    A frame between keyframes is aligned to the refined points that it observes; with too few of
+    them it keeps its motion relative to the previous keyframe.
     """
     old = run.trajectory.T_world_body
     before = np.clip(np.searchsorted(keyframes, np.arange(len(old)), side="right") - 1, 0, None)
@@ -236,7 +286,9 @@ def fill_between(
         seen = run.fresh(int(k))
         place = np.clip(np.searchsorted(tracks.ids, seen.ids), 0, len(tracks.ids) - 1)
         known = tracks.ids[place] == seen.ids
-        pose = align_to_points(run.camera, out[k], tracks.p_world[place[known]], seen.z[known], seen.has_right[known])
+        pose = align_to_points(
+            run.camera, out[k], tracks.p_world[place[known]], seen.z[known], seen.has_right[known]
+        )
         if pose is not None:
             out[k] = pose
             aligned += 1
@@ -244,9 +296,11 @@ def fill_between(
 
 
 def position_covariances(estimates: Sequence[Estimate], T_cam0_imu: FloatArray) -> FloatArray:
-    """Return covariances (K, 3, 3) of the left camera's position in the world, from `xi` (docs/conventions.md).
+    """Return covariances (K, 3, 3) of the left camera's position in the world, from `xi`
+    (docs/conventions.md).
 
-    `T_imu_world = exp(xi) T_hat` moves a point c fixed in the body by `R_world_imu (-rho + c x phi)`.
+    `T_imu_world = exp(xi) T_hat` moves a point c fixed in the body by
+    `R_world_imu (-rho + c x phi)`.
     """
     c = se3_inverse(T_cam0_imu)[:3, 3]
     p_D_xi = np.concatenate([-np.eye(3), so3_hat(c)], axis=1)

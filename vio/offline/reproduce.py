@@ -23,8 +23,9 @@ from vio.runs.picture import write_picture
 from vio.runs.pipeline import RunResult, run
 from vio.selection.selectors import SelectorSettings
 
-# The paper's values: W = diag(.5, .5, .5, .05, .05, .05) and V = 15 I, both taken as variances, no gate, landmarks
-# assumed known in the pose update, zero-order hold of the input between frames, repeated pixels used unchanged.
+# The paper's values: W = diag(.5, .5, .5, .05, .05, .05) and V = 15 I, both taken as variances, no
+# gate, landmarks assumed known in the pose update, zero-order hold of the input between frames,
+# repeated pixels used unchanged.
 PAPER = VislamSettings(
     motion_model="input",
     noise="literal",
@@ -53,7 +54,11 @@ class Variant:
     def config(self) -> Config:
         """The configuration of the row."""
         return Config(
-            backend=self.backend, motion=self.motion, dataset=self.dataset, selector=self.selector, vislam=self.vislam
+            backend=self.backend,
+            motion=self.motion,
+            dataset=self.dataset,
+            selector=self.selector,
+            vislam=self.vislam,
         )
 
 
@@ -61,7 +66,11 @@ class Variant:
 AS_FILED = DatasetSettings(repeated_tracks="literal")
 # The paper's filter with W as standard deviations times the step, a gate, and landmark uncertainty.
 CONSISTENT = replace(
-    PAPER, noise="consistent", gate_probability=0.95, landmark_uncertainty=True, landmark_prior="stereo"
+    PAPER,
+    noise="consistent",
+    gate_probability=0.95,
+    landmark_uncertainty=True,
+    landmark_prior="stereo",
 )
 MOST_SEEN = SelectorSettings(name="visibility_whole")
 MOST_SEEN_SO_FAR = SelectorSettings(name="visibility")
@@ -81,7 +90,9 @@ VARIANTS = (
     Variant("recommended", VislamSettings()),
     Variant("recommended, images alone", VislamSettings(), motion="none"),
     Variant("sliding window", VislamSettings(), backend="msckf"),
-    Variant("sliding window, most seen 1/7 so far", VislamSettings(), MOST_SEEN_SO_FAR, backend="msckf"),
+    Variant(
+        "sliding window, most seen 1/7 so far", VislamSettings(), MOST_SEEN_SO_FAR, backend="msckf"
+    ),
     Variant("sliding window, images alone", VislamSettings(), motion="none", backend="msckf"),
 )
 
@@ -103,8 +114,16 @@ class ReproducedTable:
         head = "| setting | ATE m | t % | deg/100 m | used a frame | landmarks | innovation px | ms a frame |"
         lines = [f"### {self.drive}", "", head, "|---" + "|---:" * 7 + "|"]
         for d in self.rows:
-            cells = [_number(d["ate_m"], 2), _number(d["t_err_percent"], 2), _number(d["r_err_deg_per_100m"], 2)]
-            cells += [_number(d["used_per_frame"], 1), str(d["landmarks"]), _number(d["innovation_median_px"], 2)]
+            cells = [
+                _number(d["ate_m"], 2),
+                _number(d["t_err_percent"], 2),
+                _number(d["r_err_deg_per_100m"], 2),
+            ]
+            cells += [
+                _number(d["used_per_frame"], 1),
+                str(d["landmarks"]),
+                _number(d["innovation_median_px"], 2),
+            ]
             lines.append(f"| {d['name']} | {' | '.join(cells)} | {_number(d['ms_per_frame'], 1)} |")
         return "\n".join(lines) + "\n"
 
@@ -118,19 +137,28 @@ def reproduce(file: Path, reference: Path | None, out: Path) -> ReproducedTable:
     dataset = open_dataset(str(file))
     recording = dataset.recording
     if "velocity" not in recording.motion or dataset.observations(0) is None:
-        raise DataError(f"{file}: the experiment needs features and velocities; this is a {recording.kind} recording")
+        raise DataError(
+            f"{file}: the experiment needs features and velocities; this is a {recording.kind} "
+            "recording"
+        )
     truth = recording.reference if reference is None else read_trajectory(reference)
     check_writable(out / file.stem)
     results: list[tuple[Variant, RunResult, Evaluation | None]] = []
     with one_blas_thread():
         for variant in VARIANTS:
             result = run(open_dataset(file, variant.dataset), variant.config)
-            score = None if truth is None else evaluate(result.trajectory, truth, T_cam0_imu=result.T_cam0_body)
+            score = (
+                None
+                if truth is None
+                else evaluate(result.trajectory, truth, T_cam0_imu=result.T_cam0_body)
+            )
             results.append((variant, result, score))
     table = ReproducedTable(file.stem, out / file.stem, tuple(_row(*each) for each in results))
     with atomic_folder(table.out, replace=True, marker="table.json") as inside:
         (inside / "table.md").write_text(table.as_text(), encoding="utf-8")
-        (inside / "table.json").write_text(json_text(table.as_dict(), indent=2) + "\n", encoding="utf-8")
+        (inside / "table.json").write_text(
+            json_text(table.as_dict(), indent=2) + "\n", encoding="utf-8"
+        )
         write_picture(inside / "trajectories.png", lambda: _figure(file.stem, results))
     return table
 
@@ -178,7 +206,9 @@ def _figure(drive: str, results: list[tuple[Variant, RunResult, Evaluation | Non
     for label, positions, colour in curves:
         axes.plot(*positions.T, color=colour, lw=1.5, label=label)
     axes.set_aspect("equal", adjustable="datalim")
-    title = f"{printable(drive)}: the paper's filter, and the effect of a gate and of consistent noise"
+    title = (
+        f"{printable(drive)}: the paper's filter, and the effect of a gate and of consistent noise"
+    )
     axes.set_title(title, fontsize=11, parse_math=False)
     axes.set_xlabel("m")
     axes.set_ylabel("m")

@@ -33,10 +33,14 @@ class RunImages:
     source: str  # the recording, as `kind:path`
     seen: StereoCamera  # of the images that the front end saw
     camera: StereoCamera  # of the corrected images: a pinhole's, without the field
-    field: DisplacementField | None  # what the run found its stereo calibration to be off by; None: nothing
+    # what the run found its stereo calibration to be off by; None: nothing
+    field: DisplacementField | None
 
-    def frames(self, indices: IntArray, source: str | None = None, *, colour: bool = False) -> Iterator[StereoFrame]:
-        """Yield the corrected images of frames (K,), in order, with the depths of a camera that has them.
+    def frames(
+        self, indices: IntArray, source: str | None = None, *, colour: bool = False
+    ) -> Iterator[StereoFrame]:
+        """Yield the corrected images of frames (K,), in order, with the depths of a camera that has
+        them.
 
         Args:
             indices: frame numbers, increasing.
@@ -44,7 +48,8 @@ class RunImages:
             colour: keep the images' colours, (H, W, 3).
 
         Raises:
-            DataError: the recording is missing, has no images or another camera, or a frame cannot be read.
+            DataError: the recording is missing, has no images or another camera, or a frame cannot
+                be read.
         """
         dataset = self._opened(source)
         correct = self._correction(dataset.recording.camera)
@@ -62,28 +67,41 @@ class RunImages:
     def _opened(self, source: str | None) -> Dataset:
         file = self.where / RunFile.CONFIG
         settings = load_config(file).dataset if file.is_file() else DatasetSettings()
-        settings = replace(settings, projection=self.seen.projection, max_frame_rate=None, camera="both")
+        settings = replace(
+            settings, projection=self.seen.projection, max_frame_rate=None, camera="both"
+        )
         try:
             dataset = open_dataset(source or self.source, settings)
         except DataError as error:
             raise DataError(
-                f"the images of {self.where} are not available: {error}; name the recording with --source"
+                f"the images of {self.where} are not available: {error}; name the recording with "
+                "--source"
             ) from error
         recording = dataset.recording
         if not recording.has_images:
-            raise DataError(f"{source or self.source} contains no images; name the recording with --source")
-        ours, theirs = self.seen if self.seen.is_cylinder else self.camera, recording.camera
+            raise DataError(
+                f"{source or self.source} contains no images; name the recording with --source"
+            )
+        ours = self.seen if self.seen.is_cylinder else self.camera
+        theirs = recording.camera
         if not np.allclose(
             [ours.fu, ours.fv, ours.cu, ours.cv, ours.baseline_m],
             [theirs.fu, theirs.fv, theirs.cu, theirs.cv, theirs.baseline_m],
             rtol=1e-9,
         ):
-            raise DataError(f"{recording.path} has another calibration than the run {self.where}; repeat the run")
+            raise DataError(
+                f"{recording.path} has another calibration than the run {self.where}; repeat the "
+                "run"
+            )
         return dataset
 
     def _correction(self, shown: StereoCamera) -> Rectifier | None:
-        """Return the map of images, of the camera that is `shown`, to the corrected ones; None: they are the same."""
-        camera = replace(self.camera, width=shown.width, height=shown.height)  # features may state no size
+        """Return the map of images, of the camera that is `shown`, to the corrected ones.
+
+        None: they are the same.
+        """
+        # features may state no size
+        camera = replace(self.camera, width=shown.width, height=shown.height)
         if self.seen.is_cylinder:
             maps = (pinhole_maps(self.seen, camera),) * 2
         elif self.field is not None:
@@ -96,7 +114,13 @@ class RunImages:
 def _chosen(dataset: Dataset, indices: list[int]) -> Iterator[StereoFrame]:
     """Yield some frames: image files one by one, others, which are read in order, in one pass."""
     files = isinstance(dataset, ImageDataset)
-    spans = [(k, k + 1) for k in indices] if files else [(indices[0], indices[-1] + 1)] if indices else []
+    spans = (
+        [(k, k + 1) for k in indices]
+        if files
+        else [(indices[0], indices[-1] + 1)]
+        if indices
+        else []
+    )
     waiting = iter(indices)
     due = next(waiting, None)
     for start, stop in spans:
@@ -107,7 +131,9 @@ def _chosen(dataset: Dataset, indices: list[int]) -> Iterator[StereoFrame]:
         if due is not None and due < stop:
             break
     if due is not None:
-        raise DataError(f"{dataset.recording.path}: frame {due} cannot be read; see the warnings above")
+        raise DataError(
+            f"{dataset.recording.path}: frame {due} cannot be read; see the warnings above"
+        )
 
 
 def run_images(folder: Path, metrics: dict[str, Any]) -> RunImages:
@@ -120,16 +146,25 @@ def run_images(folder: Path, metrics: dict[str, Any]) -> RunImages:
         seen = StereoCamera(**metrics["camera"])
         source = f"{metrics['kind']}:{metrics['source']}"
     except (KeyError, TypeError) as error:
-        raise DataError(f"{folder}: its metrics.json does not hold camera and source; repeat the run") from error
+        raise DataError(
+            f"{folder}: its metrics.json does not hold camera and source; repeat the run"
+        ) from error
     if metrics["kind"] == "log":
         source = original_source(Path(metrics["source"]))
     coefficients = None if seen.kind == "rgbd" else field_coefficients(folder, seen, metrics)
-    field = None if coefficients is None or seen.is_cylinder else DisplacementField(seen, coefficients)
-    return RunImages(folder, source, seen, pinhole_within(seen) if seen.is_cylinder else seen, field)
+    field = (
+        None if coefficients is None or seen.is_cylinder else DisplacementField(seen, coefficients)
+    )
+    return RunImages(
+        folder, source, seen, pinhole_within(seen) if seen.is_cylinder else seen, field
+    )
 
 
-def field_coefficients(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) -> FloatArray | None:
-    """Return the coefficients (15,) of (R3) and (R2) in a run's metrics; None: the run estimated none.
+def field_coefficients(
+    folder: Path, camera: StereoCamera, metrics: dict[str, Any]
+) -> FloatArray | None:
+    """Return the coefficients (15,) of (R3) and (R2) in a run's metrics; None: the run estimated
+    none.
 
     Raises:
         DataError: the metrics are damaged.
@@ -138,12 +173,17 @@ def field_coefficients(folder: Path, camera: StereoCamera, metrics: dict[str, An
     if stated is None or stated.get("rows_px") is None:
         return None
     try:
-        coefficients = np.array([*stated["coefficients_px"], *stated["rows_px"]], dtype=np.float64) / camera.fu
+        coefficients = (
+            np.array([*stated["coefficients_px"], *stated["rows_px"]], dtype=np.float64) / camera.fu
+        )
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{folder}: stereo_field of its metrics is damaged ({error}); repeat the run") from error
+        raise DataError(
+            f"{folder}: stereo_field of its metrics is damaged ({error}); repeat the run"
+        ) from error
     if coefficients.shape != (FIELD_TERMS + ROW_TERMS,) or not np.isfinite(coefficients).all():
         raise DataError(
-            f"{folder}: stereo_field of its metrics holds no {FIELD_TERMS + ROW_TERMS} finite numbers; repeat the run"
+            f"{folder}: stereo_field of its metrics holds no {FIELD_TERMS + ROW_TERMS} finite "
+            "numbers; repeat the run"
         )
     return coefficients
 

@@ -39,18 +39,24 @@ if TYPE_CHECKING:
 class SavedRun:
     """Contents of a run's folder, with its observations."""
 
-    tracked: TrackedPath  # the left camera's trajectory with its observations; `tracked.where` is the folder
+    # the left camera's trajectory with its observations; `tracked.where` is the folder
+    tracked: TrackedPath
     source: str  # the recording of the images, as `kind:path`
     dataset: FeatureDataset  # observations of every frame, as a recording
     T_cam0_imu: FloatArray  # (4, 4)
     metrics: dict[str, Any]
-    field: DisplacementField | None = None  # what the run found its stereo calibration to be off by; None: nothing
+    # what the run found its stereo calibration to be off by; None: nothing
+    field: DisplacementField | None = None
 
     @property
     def images(self) -> RunImages:
         """The recording's images as the tracks see them."""
         return RunImages(
-            self.tracked.where, self.source, self.dataset.recording.camera, self.tracked.camera, self.field
+            self.tracked.where,
+            self.source,
+            self.dataset.recording.camera,
+            self.tracked.camera,
+            self.field,
         )
 
     @property
@@ -63,10 +69,11 @@ class SavedRun:
 def read_saved_run(folder: Path) -> SavedRun:
     """Read the folder of `vio run --save-observations`.
 
-    Where the run estimated what its stereo calibration is off by, the tracks are those of a rectified pair without it;
-    where its images were rectified to a cylinder, those of a pinhole inside it, as other programs know no cylinder.
-    `dataset` holds the pixels as the front end saw them. Where the run had a map and closed loops between its own
-    frames, the poses are those in the map, and the tracks have the loops.
+    Where the run estimated what its stereo calibration is off by, the tracks are those of a
+    rectified pair without it; where its images were rectified to a cylinder, those of a pinhole
+    inside it, as other programs know no cylinder. `dataset` holds the pixels as the front end saw
+    them. Where the run had a map and closed loops between its own frames, the poses are those in
+    the map, and the tracks have the loops.
 
     Raises:
         DataError: no such folder, or the observations were not saved.
@@ -74,19 +81,28 @@ def read_saved_run(folder: Path) -> SavedRun:
     metrics, T_cam0_imu = read_metrics(folder)
     log = folder / RunFile.OBSERVATIONS
     if not log.is_file():
-        raise DataError(f"{folder} has no {RunFile.OBSERVATIONS}; repeat its run with --save-observations")
+        raise DataError(
+            f"{folder} has no {RunFile.OBSERVATIONS}; repeat its run with --save-observations"
+        )
     dataset = read_observation_log(log)
     need_stereo(replace(dataset.recording, path=folder), "checking, refining or exporting a run")
     loops = closing_loops(read_loops(folder))
     poses = RunFile.MAP_TRAJECTORY if loops else RunFile.TRAJECTORY
     trajectory = read_trajectory(folder / poses)
     frames = trajectory.frame_indices
-    if frames is None or not np.array_equal(frames, dataset.present) or not np.isfinite(trajectory.T_world_body).all():
+    if (
+        frames is None
+        or not np.array_equal(frames, dataset.present)
+        or not np.isfinite(trajectory.T_world_body).all()
+    ):
         raise DataError(
-            f"{folder}: {poses} and {RunFile.OBSERVATIONS} are not of the same complete run; repeat the run"
+            f"{folder}: {poses} and {RunFile.OBSERVATIONS} are not of the same complete run; "
+            "repeat the run"
         )
-    camera, tracks = dataset.recording.camera, dataset.tracks
-    coefficients, field = field_coefficients(folder, camera, metrics), None
+    camera = dataset.recording.camera
+    tracks = dataset.tracks
+    coefficients = field_coefficients(folder, camera, metrics)
+    field = None
     if camera.is_cylinder:
         camera, tracks = _in_pinhole(camera, tracks, coefficients)
     elif coefficients is not None:
@@ -99,25 +115,39 @@ def read_saved_run(folder: Path) -> SavedRun:
 
 
 def closing_loops(loops: Sequence[LoopEvent]) -> tuple[LoopEvent, ...]:
-    """Return the loops between frames of the run itself that agree with the others, with features."""
-    return tuple(o for o in loops if o.kept and o.keyframe_frame is not None and o.matches is not None)
+    """Return the loops between frames of the run itself that agree with the others, with
+    features.
+    """
+    return tuple(
+        o for o in loops if o.kept and o.keyframe_frame is not None and o.matches is not None
+    )
 
 
 def without_field(path: TrackedPath, field: DisplacementField) -> TrackedPath:
-    """Return a path with the pixels of a rectified pair without the field, in its tracks and its loops."""
+    """Return a path with the pixels of a rectified pair without the field, in its tracks and its
+    loops.
+    """
     tracks = replace(path.tracks, z=field.without(path.tracks.z, path.tracks.has_right))
     return replace(path, tracks=tracks, loops=tuple(_without(field, o) for o in path.loops))
 
 
 def _sigmas(path: Path, T_cam0_imu: FloatArray) -> FloatArray | None:
-    """Return standard deviations (N, 2) of the left camera's position and attitude; None: the run has no such file."""
+    """Return standard deviations (N, 2) of the left camera's position and attitude.
+
+    None: the run has no such file.
+    """
     if not path.is_file():
         return None
     rows = read_estimates(path)
-    P, c = np.array(rows["covariance"]), se3_inverse(T_cam0_imu)[:3, 3]
+    P = np.array(rows["covariance"])
+    c = se3_inverse(T_cam0_imu)[:3, 3]
     p_D_xi = np.concatenate([-np.eye(3), so3_hat(c)], axis=1)
     position = np.trace(p_D_xi @ P @ p_D_xi.T, axis1=1, axis2=2)
-    return np.sqrt(np.stack([position, np.degrees(np.degrees(np.trace(P[:, 3:, 3:], axis1=1, axis2=2)))], axis=1))
+    return np.sqrt(
+        np.stack(
+            [position, np.degrees(np.degrees(np.trace(P[:, 3:, 3:], axis1=1, axis2=2)))], axis=1
+        )
+    )
 
 
 def _without(field: DisplacementField, loop: LoopEvent) -> LoopEvent:
@@ -125,7 +155,10 @@ def _without(field: DisplacementField, loop: LoopEvent) -> LoopEvent:
     m = loop.matches
     if m is None:
         return loop
-    z = field.without(m.z_keyframe, m.has_right_keyframe), field.without(m.z_frame, m.has_right_frame)
+    z = (
+        field.without(m.z_keyframe, m.has_right_keyframe),
+        field.without(m.z_frame, m.has_right_frame),
+    )
     return replace(loop, matches=replace(m, z_keyframe=z[0], z_frame=z[1]))
 
 
@@ -134,7 +167,8 @@ def _in_pinhole(
 ) -> tuple[StereoCamera, FeatureTracks]:
     """Return the pinhole inside a cylinder, and those of the tracks' pixels that it shows.
 
-    They are without the rectification error of the coefficients (15,) of (R3) and (R2), where there is one.
+    They are without the rectification error of the coefficients (15,) of (R3) and (R2), where there
+    is one.
     """
     z = tracks.z
     if coefficients is not None:
@@ -158,9 +192,13 @@ def with_poses(run: SavedRun, folder: Path) -> SavedRun:
         DataError: that folder does not exist or contains other frames.
     """
     if not (folder / RunFile.TRAJECTORY).is_file():
-        raise DataError(f"{folder} contains no trajectory; create it with `vio refine {run.tracked.where}`")
+        raise DataError(
+            f"{folder} contains no trajectory; create it with `vio refine {run.tracked.where}`"
+        )
     trajectory = read_trajectory(folder / RunFile.TRAJECTORY).in_cam0(run.T_cam0_imu)
-    if trajectory.frame_indices is None or not np.array_equal(trajectory.frame_indices, run.tracked.frames):
+    if trajectory.frame_indices is None or not np.array_equal(
+        trajectory.frame_indices, run.tracked.frames
+    ):
         raise DataError(f"{folder} contains other frames than {run.tracked.where}; refine again")
     return replace(run, tracked=replace(run.tracked, trajectory=trajectory))
 
@@ -188,7 +226,9 @@ def write_images(
     """
     for name in (names.left[0], names.right[0]):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    for k, frame in enumerate(run.images.frames(run.tracked.frames[keyframes], source, colour=True)):
+    for k, frame in enumerate(
+        run.images.frames(run.tracked.frames[keyframes], source, colour=True)
+    ):
         assert frame.left is not None
         assert frame.right is not None
         for name, image in ((names.left[k], frame.left), (names.right[k], frame.right)):

@@ -1,11 +1,13 @@
-"""Bundle adjustment of segments of video with the calibration of the stereo pair free: what motion determines of it.
+"""Bundle adjustment of segments of video with the calibration of the stereo pair free: what motion
+determines of it.
 
-All segments share the calibration; each has its own poses and points, which are eliminated. A prior decides where
-neither matches nor motion do. Standard deviations come from the scatter of what regions of the image say (a sandwich
-estimate clustered by region and segment), as errors of a lens model, of features that wander along edges and of moving
-objects are shared by all rows of a region.
-References: Triggs et al., Bundle adjustment: a modern synthesis (2000) for the elimination; Liang & Zeger, Longitudinal
-data analysis using generalized linear models, Biometrika (1986) for the covariance.
+All segments share the calibration; each has its own poses and points, which are eliminated. A prior
+decides where neither matches nor motion do. Standard deviations come from the scatter of what
+regions of the image say (a sandwich estimate clustered by region and segment), as errors of a lens
+model, of features that wander along edges and of moving objects are shared by all rows of a region.
+References: Triggs et al., Bundle adjustment: a modern synthesis (2000) for the elimination; Liang &
+Zeger, Longitudinal data analysis using generalized linear models, Biometrika (1986) for the
+covariance.
 """
 
 from __future__ import annotations
@@ -25,32 +27,47 @@ from vio.numerics.robust import robust_sigma
 from vio.offline.points import MIN_DEPTH_M, PointTracks, keep_rows
 from vio.records import BoolArray, IntArray
 
-# Of both cameras: focal length and its ratio along v to along u (relative), principal point (focal lengths), radial and
-# tangential distortion. Of the right camera against the left one: rotation (rad, its points p are seen as `exp(w) p`),
-# direction of the baseline (over its length), principal point, focal lengths, tangential distortion.
+# Of both cameras: focal length and its ratio along v to along u (relative), principal point (focal
+# lengths), radial and tangential distortion. Of the right camera against the left one: rotation
+# (rad, its points p are seen as `exp(w) p`), direction of the baseline (over its length), principal
+# point, focal lengths, tangential distortion.
 NAMES = (
     *("focal", "aspect", "cu", "cv", "k", "q1", "q2"),
     *("wx", "wy", "wz", "ty", "tz", "right_cu", "right_cv", "right_fu", "right_fv", "p1", "p2"),
 )
-# Widths of a Cauchy prior: intrinsics of a good calibration are right to a few per cent, and the right camera agrees
-# with the left one as in vio.calibration.stereo_field.
+# Widths of a Cauchy prior: intrinsics of a good calibration are right to a few per cent, and the
+# right camera agrees with the left one as in vio.calibration.stereo_field.
 _PRIOR = np.array(
-    [*[0.05, 0.005, 0.02, 0.02, 1e-2, 2e-3, 2e-3], *[np.radians(0.5)] * 3, *[5e-3] * 2, *[2e-3] * 4, *[2e-3] * 2]
+    [
+        *[0.05, 0.005, 0.02, 0.02, 1e-2, 2e-3, 2e-3],
+        *[np.radians(0.5)] * 3,
+        *[5e-3] * 2,
+        *[2e-3] * 4,
+        *[2e-3] * 2,
+    ]
 )
-_OF_RIGHT = {"cu": "right_cu", "cv": "right_cv", "fu": "right_fu", "fv": "right_fv"}  # in `stereo_field.PARAMETERS`
-_FREE = tuple(name for name in PARAMETERS if _OF_RIGHT.get(name, name) in NAMES)  # those estimated here
-_LIKE_BOTH = (("right_cu", "cu"), ("right_cv", "cv"), ("p1", "q1"), ("p2", "q2"))  # of the right camera, as of both
+# in `stereo_field.PARAMETERS`
+_OF_RIGHT = {"cu": "right_cu", "cv": "right_cv", "fu": "right_fu", "fv": "right_fv"}
+# those estimated here
+_FREE = tuple(name for name in PARAMETERS if _OF_RIGHT.get(name, name) in NAMES)
+# of the right camera, as of both
+_LIKE_BOTH = (("right_cu", "cu"), ("right_cv", "cv"), ("p1", "q1"), ("p2", "q2"))
 INTRINSICS = ("focal", "aspect", "cu", "cv")
-# What lens models leave, beside the scatter: this and the sliding window differ by so much on the same drives.
-_LENS_DEG, _LENS_DIRECTION_DEG = 0.01, 0.3
+# What lens models leave, beside the scatter: this and the sliding window differ by so much on the
+# same drives.
+_LENS_DEG = 0.01
+_LENS_DIRECTION_DEG = 0.3
 _HELD = 1e-9  # standard deviation of what is not free
 _STEPS = 30  # of Levenberg-Marquardt, at most
-_FIRST_DAMPING, _LEAST_DAMPING = 1e-4, 1e-10  # over the diagonal of the information
+_FIRST_DAMPING = 1e-4  # over the diagonal of the information
+_LEAST_DAMPING = 1e-10
 _SETTLED = 1e-6  # relative decrease of the cost at which the steps end
-_LARGEST_RESIDUAL_PX = 1.5  # robust standard deviation above which the tracks are not of one rigid scene and rig
+# robust standard deviation above which the tracks are not of one rigid scene and rig
+_LARGEST_RESIDUAL_PX = 1.5
 _CAUCHY = 2.0  # residuals of so many standard deviations count half
 _GATE = 5.0  # rows with larger residuals, in standard deviations, are left out
-_ROUNDING = 1e-12  # of a point's information, against rounding; more of it passes for knowledge of depths
+# of a point's information, against rounding; more of it passes for knowledge of depths
+_ROUNDING = 1e-12
 _CELLS = (8, 4)  # regions of the image, along u and v
 _LEAST_RESIDUAL_PX = 0.02  # of exact tracks, so that weights stay finite
 
@@ -68,21 +85,24 @@ class SelfCalibration:
     """What the calibration is off by."""
 
     values: FloatArray  # (18,) in the order and units of `NAMES`
-    sigmas: FloatArray  # (18,) standard deviations; those of the prior where the motion determines nothing
+    # (18,) standard deviations; those of the prior where the motion determines nothing
+    sigmas: FloatArray
     covariance: FloatArray  # (18, 18)
     segments: int
     points: int
     residual_px: float  # robust standard deviation of a pixel coordinate
 
     def right_camera(self) -> tuple[FloatArray, FloatArray, float, float]:
-        """Return how the right camera lies as far as the image's centre determines it, with standard deviations.
+        """Return how the right camera lies as far as the image's centre determines it, with
+        standard deviations.
 
-        A turn about the vertical or horizontal axis, a principal point and a tangential distortion move pixels almost
-        alike; the turn that moves the image's centre as all of them do together is well determined, and is returned.
+        A turn about the vertical or horizontal axis, a principal point and a tangential distortion
+        move pixels almost alike; the turn that moves the image's centre as all of them do together
+        is well determined, and is returned.
 
         Returns:
-            `R_cam1_cam0` (3, 3) and the unit direction (3,) from cam0 to cam1 in cam0, rectified; standard deviations
-            of both in degrees.
+            `R_cam1_cam0` (3, 3) and the unit direction (3,) from cam0 to cam1 in cam0, rectified;
+            standard deviations of both in degrees.
         """
         combine = np.zeros((5, len(NAMES)))
         for row, name, sign in (
@@ -93,7 +113,9 @@ class SelfCalibration:
         off = combine @ self.values
         variances = np.diag(combine @ self.covariance @ combine.T)
         direction = np.array([1.0, off[3], off[4]])
-        rotation, swing = (float(np.degrees(np.sqrt(v.sum()))) for v in (variances[:3], variances[3:]))
+        rotation, swing = (
+            float(np.degrees(np.sqrt(v.sum()))) for v in (variances[:3], variances[3:])
+        )
         return (
             so3_exp(off[:3]),
             direction / np.linalg.norm(direction),
@@ -102,7 +124,9 @@ class SelfCalibration:
         )
 
     def after(self, parameters: FloatArray) -> SelfCalibration:
-        """Return the calibration of pixels as they were before a field of parameters (14,) was taken out of them."""
+        """Return the calibration of pixels as they were before a field of parameters (14,) was
+        taken out of them.
+        """
         values = self.values.copy()
         for name, value in zip(PARAMETERS, parameters, strict=True):
             if name in _FREE:
@@ -110,7 +134,8 @@ class SelfCalibration:
         return replace(self, values=values)
 
     def disparity_off(self, camera: StereoCamera, disparity_px: float) -> tuple[float, float]:
-        """Return by which disparities of that size are too large in the middle of the image, with standard deviation.
+        """Return by which disparities of that size are too large in the middle of the image, with
+        standard deviation.
 
         The focal length, which scales disparities and everything else, is not counted.
         """
@@ -119,12 +144,19 @@ class SelfCalibration:
         _, J = _derivatives(camera, x, np.array([[0.0, 0.0, depth_m]]))
         gradient = np.where(np.isin(NAMES, INTRINSICS), 0.0, J[0, 0] - J[0, 2])
         z = project_off(camera, x, np.array([[0.0, 0.0, depth_m]]))[0]
-        sigma = np.hypot(np.sqrt(gradient @ self.covariance @ gradient), camera.fu * np.radians(_LENS_DEG))
+        sigma = np.hypot(
+            np.sqrt(gradient @ self.covariance @ gradient), camera.fu * np.radians(_LENS_DEG)
+        )
         return float(z[0] - z[2] - disparity_px), float(sigma)
 
     def rig_parameters(self) -> FloatArray:
-        """Return what the right camera and both lenses are off by (14,), as `stereo_field.PARAMETERS` names it."""
-        values = [self.values[NAMES.index(_OF_RIGHT.get(name, name))] if name in _FREE else 0.0 for name in PARAMETERS]
+        """Return what the right camera and both lenses are off by (14,), as
+        `stereo_field.PARAMETERS` names it.
+        """
+        values = [
+            self.values[NAMES.index(_OF_RIGHT.get(name, name))] if name in _FREE else 0.0
+            for name in PARAMETERS
+        ]
         return np.array(values)
 
 
@@ -141,17 +173,28 @@ def intrinsics_of(camera: StereoCamera, found: SelfCalibration) -> Intrinsics | 
 
 
 def project_off(camera: StereoCamera, x: FloatArray, p: FloatArray) -> FloatArray:
-    """Pixels (N, 4) `[ul vl ur vr]` of points (N, 3) in the left camera by a pair that is off by parameters (18,)."""
+    """Pixels (N, 4) `[ul vl ur vr]` of points (N, 3) in the left camera by a pair that is off by
+    parameters (18,).
+    """
     focal, aspect, cu, cv, k, q1, q2 = x[:7]
     ty, tz, right_cu, right_cv, right_fu, right_fv, p1, p2 = x[10:]
     moved = (p - camera.baseline_m * np.array([1.0, ty, tz])) @ so3_exp(x[7:10]).T
     out = np.empty((len(p), 4))
     lenses = (
         (p, q1, q2, focal, focal + aspect, cu, cv),
-        (moved, q1 + p1, q2 + p2, focal + right_fu, focal + aspect + right_fv, cu + right_cu, cv + right_cv),
+        (
+            moved,
+            q1 + p1,
+            q2 + p2,
+            focal + right_fu,
+            focal + aspect + right_fv,
+            cu + right_cu,
+            cv + right_cv,
+        ),
     )
     for side, (points, t1, t2, fu, fv, u0, v0) in enumerate(lenses):
-        a, b = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+        a = points[:, 0] / points[:, 2]
+        b = points[:, 1] / points[:, 2]
         r2 = a * a + b * b
         bent_a = a * (1 + k * r2) + 2 * t1 * a * b + t2 * (r2 + 2 * a * a)
         bent_b = b * (1 + k * r2) + t1 * (r2 + 2 * b * b) + 2 * t2 * a * b
@@ -160,7 +203,9 @@ def project_off(camera: StereoCamera, x: FloatArray, p: FloatArray) -> FloatArra
     return out
 
 
-def self_calibrate(camera: StereoCamera, segments: Sequence[Segment], *, intrinsics: bool) -> SelfCalibration:
+def self_calibrate(
+    camera: StereoCamera, segments: Sequence[Segment], *, intrinsics: bool
+) -> SelfCalibration:
     """Estimate what a rectified pair's calibration is off by, from segments of video.
 
     The length of the baseline is held: it is the scale.
@@ -168,7 +213,8 @@ def self_calibrate(camera: StereoCamera, segments: Sequence[Segment], *, intrins
     Args:
         camera: the pair as calibrated, with image size.
         segments: at least one; rows with gross outliers are weighted down and left out.
-        intrinsics: whether focal length, its ratio and the principal point are free, too; else they are as given.
+        intrinsics: whether focal length, its ratio and the principal point are free, too; else they
+            are as given.
 
     Raises:
         EstimationError: no segment has a consistent track.
@@ -181,8 +227,12 @@ def self_calibrate(camera: StereoCamera, segments: Sequence[Segment], *, intrins
     x, pieces = _optimum(camera, x, pieces, width)
     sigma = _spread(camera, x, pieces)
     if sigma > _LARGEST_RESIDUAL_PX:
-        raise EstimationError(f"not observable because tracks and motion disagree by {sigma:.1f} px")
-    x, pieces = _optimum(camera, x, [_without_outliers(camera, x, piece, sigma) for piece in pieces], width)
+        raise EstimationError(
+            f"not observable because tracks and motion disagree by {sigma:.1f} px"
+        )
+    x, pieces = _optimum(
+        camera, x, [_without_outliers(camera, x, piece, sigma) for piece in pieces], width
+    )
     return _with_covariance(camera, x, pieces, width)
 
 
@@ -196,11 +246,16 @@ def _optimum(
         prior = np.diag(1 / (width**2 + x**2))
         solved = [_normal_equations(camera, x, piece, sigma, damping) for piece in pieces]
         A = np.sum([n.A for n in solved], axis=0) + prior
-        dx = np.linalg.solve(A + damping * np.diag(np.diag(A)), np.sum([n.b for n in solved], axis=0) - prior @ x)
+        dx = np.linalg.solve(
+            A + damping * np.diag(np.diag(A)), np.sum([n.b for n in solved], axis=0) - prior @ x
+        )
         moved = [n.moved(piece, dx) for n, piece in zip(solved, pieces, strict=True)]
-        before, after = _cost(camera, x, pieces, sigma, width), _cost(camera, x + dx, moved, sigma, width)
+        before = _cost(camera, x, pieces, sigma, width)
+        after = _cost(camera, x + dx, moved, sigma, width)
         if after < before:
-            x, pieces, damping = x + dx, moved, max(damping / 30, _LEAST_DAMPING)
+            x = x + dx
+            pieces = moved
+            damping = max(damping / 30, _LEAST_DAMPING)
         else:
             damping = 10 * max(damping, 1e-8)
         if abs(before - after) < _SETTLED * before:
@@ -211,8 +266,11 @@ def _optimum(
 def _with_covariance(
     camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment], width: FloatArray
 ) -> SelfCalibration:
-    """Return parameters (18,) at the optimum with their sandwich covariance; the prior has a `width` (18,)."""
-    sigma, prior = _spread(camera, x, pieces), np.diag(1 / (width**2 + x**2))
+    """Return parameters (18,) at the optimum with their sandwich covariance; the prior has a
+    `width` (18,).
+    """
+    sigma = _spread(camera, x, pieces)
+    prior = np.diag(1 / (width**2 + x**2))
     solved = [_normal_equations(camera, x, piece, sigma, 0.0) for piece in pieces]
     A = np.sum([n.A for n in solved], axis=0) + prior
     scores = np.concatenate([n.scores for n in solved])
@@ -227,10 +285,15 @@ def _with_covariance(
 
 def _spread(camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment]) -> float:
     """Return the robust standard deviation of a pixel coordinate."""
-    return max(robust_sigma(np.concatenate([_residuals(camera, x, s)[1] for s in pieces])), _LEAST_RESIDUAL_PX)
+    return max(
+        robust_sigma(np.concatenate([_residuals(camera, x, s)[1] for s in pieces])),
+        _LEAST_RESIDUAL_PX,
+    )
 
 
-def _cost(camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment], sigma: float, width: FloatArray) -> float:
+def _cost(
+    camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment], sigma: float, width: FloatArray
+) -> float:
     """Return what the steps decrease: Cauchy losses of rows and parameters (18,)."""
     squares = [np.sum(_residuals(camera, x, piece)[0] ** 2, axis=1) / sigma**2 for piece in pieces]
     rows = sum(float(np.sum(2 * _CAUCHY**2 * np.log1p(q / (4 * _CAUCHY**2)))) for q in squares)
@@ -238,16 +301,23 @@ def _cost(camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment], sigma:
 
 
 def _larger(A: FloatArray, B: FloatArray) -> FloatArray:
-    """Return a matrix that is not smaller than A and B (n, n) in any direction, by their joint diagonalisation."""
+    """Return a matrix that is not smaller than A and B (n, n) in any direction, by their joint
+    diagonalisation.
+    """
     L = np.linalg.cholesky(B)
     values, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, A).T))
     W = L @ vectors
     return (W * np.maximum(values, 1.0)) @ W.T
 
 
-def _residuals(camera: StereoCamera, x: FloatArray, piece: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return residuals (R, 4), zero where not measured; those measured (n,); and points in the camera (R, 3)."""
-    tracks, T = piece.tracks, se3_inverse(piece.T_world_cam0)[piece.tracks.keyframe]
+def _residuals(
+    camera: StereoCamera, x: FloatArray, piece: Segment
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return residuals (R, 4), zero where not measured; those measured (n,); and points in the
+    camera (R, 3).
+    """
+    tracks = piece.tracks
+    T = se3_inverse(piece.T_world_cam0)[piece.tracks.keyframe]
     q = np.einsum("nij,nj->ni", T[:, :3, :3], tracks.p_world[tracks.point]) + T[:, :3, 3]
     q = np.where((q[:, 2] > MIN_DEPTH_M)[:, None], q, [0.0, 0.0, 1e3])
     r = tracks.z - project_off(camera, x, q)
@@ -271,7 +341,8 @@ class _Normal:
     b: FloatArray  # (18,)
     scores: FloatArray  # (G, 18) contributions of regions of the image to b
     dp: tuple[FloatArray, FloatArray]  # steps of the points (3M,), by poses and parameters (3M, C)
-    dpose: tuple[FloatArray, FloatArray]  # steps of the poses (6(K-1),), by the parameters (6(K-1), 18)
+    # steps of the poses (6(K-1),), by the parameters (6(K-1), 18)
+    dpose: tuple[FloatArray, FloatArray]
 
     def moved(self, piece: Segment, dx: FloatArray) -> Segment:
         """Return the segment at the optimum after a step (18,) of the parameters."""
@@ -285,21 +356,34 @@ class _Normal:
         return Segment(se3_inverse(T_cam0_world), replace(piece.tracks, p_world=p))
 
 
-def _normal_equations(camera: StereoCamera, x: FloatArray, piece: Segment, sigma: float, damping: float) -> _Normal:
-    tracks, K, M, X = piece.tracks, len(piece.T_world_cam0), len(piece.tracks.ids), len(NAMES)
+def _normal_equations(
+    camera: StereoCamera, x: FloatArray, piece: Segment, sigma: float, damping: float
+) -> _Normal:
+    tracks = piece.tracks
+    K = len(piece.T_world_cam0)
+    M = len(piece.tracks.ids)
+    X = len(NAMES)
     r, _, q = _residuals(camera, x, piece)
     J_q, J_x = _derivatives(camera, x, q)
     J_q[~tracks.has_right, 2:] = 0
     J_x[~tracks.has_right, 2:] = 0
-    root = 1 / (sigma * np.sqrt(1 + np.sum(r**2, axis=1) / (4 * _CAUCHY**2 * sigma**2)))[:, None, None]
-    r, J_q, J_x = r * root[:, 0], J_q * root, J_x * root
+    root = (
+        1 / (sigma * np.sqrt(1 + np.sum(r**2, axis=1) / (4 * _CAUCHY**2 * sigma**2)))[:, None, None]
+    )
+    r = r * root[:, 0]
+    J_q = J_q * root
+    J_x = J_x * root
     R = se3_inverse(piece.T_world_cam0)[tracks.keyframe, :3, :3]
-    J_p, J_pose = J_q @ R, np.concatenate([J_q, -J_q @ so3_hat(q)], axis=2)
-    # Dense rows of each point: by its own coordinates (3), and by poses and parameters (C). A keyframe has it once.
+    J_p = J_q @ R
+    J_pose = np.concatenate([J_q, -J_q @ so3_hat(q)], axis=2)
+    # Dense rows of each point: by its own coordinates (3), and by poses and parameters (C). A
+    # keyframe has it once.
     C = 6 * K + X
-    H_pc, g_c = np.zeros((M, 3, C)), np.zeros((M, C))
+    H_pc = np.zeros((M, 3, C))
+    g_c = np.zeros((M, C))
     Jt = np.swapaxes(J_p, 1, 2)
-    H_pp, g_p = _sums(Jt @ J_p, tracks.point, M), _sums((Jt @ r[..., None])[..., 0], tracks.point, M)
+    H_pp = _sums(Jt @ J_p, tracks.point, M)
+    g_p = _sums((Jt @ r[..., None])[..., 0], tracks.point, M)
     blocks = np.zeros((M, K, 3, 6))
     blocks[tracks.point, tracks.keyframe] = Jt @ J_pose
     H_pc[:, :, : 6 * K] = blocks.transpose(0, 2, 1, 3).reshape(M, 3, 6 * K)
@@ -325,16 +409,22 @@ def _sums(values: FloatArray, group: IntArray, groups: int) -> FloatArray:
     return out
 
 
-def _derivatives(camera: StereoCamera, x: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives of `project_off` by points (R, 4, 3), in metres, and by parameters (R, 4, 18)."""
+def _derivatives(
+    camera: StereoCamera, x: FloatArray, q: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return derivatives of `project_off` by points (R, 4, 3), in metres, and by parameters (R,
+    4, 18).
+    """
     named = dict(zip(NAMES, x.tolist(), strict=True))
     R = so3_exp(x[7:10])
     moved = (q - camera.baseline_m * np.array([1.0, named["ty"], named["tz"]])) @ R.T
     moved_D_x = np.zeros((len(q), 3, len(x)))
     moved_D_x[:, :, 7:10] = -so3_hat(moved) @ so3_left_jacobian(x[7:10])
     moved_D_x[:, :, 10:12] = -camera.baseline_m * R[:, 1:]
-    J_q, J_x = np.empty((len(q), 4, 3)), np.zeros((len(q), 4, len(x)))
-    tangential, focal = (named["q1"], named["q2"]), (named["focal"], named["focal"] + named["aspect"])
+    J_q = np.empty((len(q), 4, 3))
+    J_x = np.zeros((len(q), 4, len(x)))
+    tangential = (named["q1"], named["q2"])
+    focal = (named["focal"], named["focal"] + named["aspect"])
     J_q[:, :2], J_x[:, :2] = _lens_derivatives(camera, named["k"], tangential, focal, q)
     tangential = tangential[0] + named["p1"], tangential[1] + named["p2"]
     focal = focal[0] + named["right_fu"], focal[1] + named["right_fv"]
@@ -348,13 +438,22 @@ def _derivatives(camera: StereoCamera, x: FloatArray, q: FloatArray) -> tuple[Fl
 
 
 def _lens_derivatives(
-    camera: StereoCamera, k: float, tangential: tuple[float, float], focal: tuple[float, float], p: FloatArray
+    camera: StereoCamera,
+    k: float,
+    tangential: tuple[float, float],
+    focal: tuple[float, float],
+    p: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives of one camera's pixels by points in it (R, 2, 3), and by parameters of both (R, 2, 18)."""
+    """Return derivatives of one camera's pixels by points in it (R, 2, 3), and by parameters of
+    both (R, 2, 18).
+    """
     t1, t2 = tangential
-    a, b = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2]
-    ab, r2 = a * b, a * a + b * b
-    of_t1, of_t2 = np.stack([2 * ab, r2 + 2 * b * b]), np.stack([r2 + 2 * a * a, 2 * ab])
+    a = p[:, 0] / p[:, 2]
+    b = p[:, 1] / p[:, 2]
+    ab = a * b
+    r2 = a * a + b * b
+    of_t1 = np.stack([2 * ab, r2 + 2 * b * b])
+    of_t2 = np.stack([r2 + 2 * a * a, 2 * ab])
     bent = np.stack([a, b]) * (1 + k * r2) + t1 * of_t1 + t2 * of_t2
     mixed = 2 * (k * ab + t1 * a + t2 * b)
     by_a = np.stack([1 + k * (r2 + 2 * a * a) + 2 * t1 * b + 6 * t2 * a, mixed])
@@ -390,14 +489,20 @@ def _regions(camera: StereoCamera, tracks: PointTracks) -> IntArray:
     """Return the region of the image (M,) in which each point lies on average."""
     count = np.bincount(tracks.point, minlength=len(tracks.ids))
     u, v = (np.bincount(tracks.point, tracks.z[:, k], len(tracks.ids)) / count for k in (0, 1))
-    width, height = camera.width or float(u.max()) + 1, camera.height or float(v.max()) + 1
+    width = camera.width or float(u.max()) + 1
+    height = camera.height or float(v.max()) + 1
     column = np.clip(_CELLS[0] * u / width, 0, _CELLS[0] - 1).astype(np.int64)
     row = np.clip(_CELLS[1] * v / height, 0, _CELLS[1] - 1).astype(np.int64)
     return np.asarray(_CELLS[0] * row + column, dtype=np.int64)
 
 
 def _eliminated(
-    H_pp: FloatArray, H_pc: FloatArray, g_p: FloatArray, g_c: FloatArray, H_cc: FloatArray, region: IntArray
+    H_pp: FloatArray,
+    H_pc: FloatArray,
+    g_p: FloatArray,
+    g_c: FloatArray,
+    H_cc: FloatArray,
+    region: IntArray,
 ) -> _Normal:
     """Eliminate points, then poses; the first pose is held."""
     M, _, C = H_pc.shape
@@ -407,8 +512,11 @@ def _eliminated(
     S = H_cc - H_pc.reshape(-1, C).T @ by_c.reshape(-1, C)
     scores = g_c - np.einsum("mic,mi->mc", H_pc, own)
     regions = _sums(scores, region, int(region.max()) + 1)
-    poses, params = np.arange(6, C - X), np.arange(C - X, C)
-    S_pp = S[np.ix_(poses, poses)] + 1e-9 * np.eye(len(poses)) * np.trace(S[np.ix_(poses, poses)]) / max(len(poses), 1)
+    poses = np.arange(6, C - X)
+    params = np.arange(C - X, C)
+    S_pp = S[np.ix_(poses, poses)] + 1e-9 * np.eye(len(poses)) * np.trace(
+        S[np.ix_(poses, poses)]
+    ) / max(len(poses), 1)
     gain = np.linalg.solve(S_pp, S[np.ix_(poses, params)])
     g = scores.sum(axis=0)
     kept: BoolArray = np.bincount(region, minlength=len(regions)) > 0
@@ -416,6 +524,9 @@ def _eliminated(
         A=S[np.ix_(params, params)] - S[np.ix_(params, poses)] @ gain,
         b=g[params] - gain.T @ g[poses],
         scores=(regions[:, params] - regions[:, poses] @ gain)[kept],
-        dp=(np.asarray(own.ravel(), dtype=np.float64), np.asarray(by_c.reshape(3 * M, C)[:, 6:], dtype=np.float64)),
+        dp=(
+            np.asarray(own.ravel(), dtype=np.float64),
+            np.asarray(by_c.reshape(3 * M, C)[:, 6:], dtype=np.float64),
+        ),
         dpose=(np.linalg.solve(S_pp, g[poses]), np.asarray(gain, dtype=np.float64)),
     )

@@ -17,7 +17,14 @@ from vio.geometry.distortion import StereoRig, rig_from_rectified
 from vio.geometry.lie import FloatArray
 from vio.geometry.rectify import rectifying_rotations
 from vio.protocols import Dataset, Frontend
-from vio.records import FeatureTracks, MotionSample, Observations, StereoFrame, feature_tracks, need_stereo
+from vio.records import (
+    FeatureTracks,
+    MotionSample,
+    Observations,
+    StereoFrame,
+    feature_tracks,
+    need_stereo,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +33,8 @@ class CalibrationSource:
 
     path: Path
     rig: StereoRig | None  # as calibrated; None: features without an image size
-    raw_pairs: Sequence[tuple[Path, Path]]  # image files, unrectified where the cameras are; empty: features only
+    # image files, unrectified where the cameras are; empty: features only
+    raw_pairs: Sequence[tuple[Path, Path]]
     dataset: Dataset | None  # None: images cannot be rectified with this calibration
     rejection: str | None  # the reader's error, if the images cannot be rectified
 
@@ -41,13 +49,18 @@ class CalibrationSource:
         return out
 
     def rectifying(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return the rotations (3, 3) from raw to rectified cameras; None: already rectified, or not possible."""
+        """Return the rotations (3, 3) from raw to rectified cameras.
+
+        None: already rectified, or not possible.
+        """
         if not isinstance(self.dataset, ImageDataset) or self.dataset.rectifier.maps is None:
             return None
         return rectifying_rotations(self.dataset.rectifier.rig)[:2]
 
     def image_size(self, z: FloatArray) -> tuple[float, float]:
-        """Return width and height in pixels; where unknown, the extent of rectified pixels (N, 4)."""
+        """Return width and height in pixels; where unknown, the extent of rectified pixels (N,
+        4).
+        """
         camera = None if self.dataset is None else self.dataset.recording.camera
         if camera is not None and camera.width is not None and camera.height is not None:
             return float(camera.width), float(camera.height)
@@ -71,18 +84,28 @@ def open_source(text: str) -> CalibrationSource:
     recording = dataset.recording
     need_stereo(recording, "a calibration of cameras")
     if isinstance(dataset, ImageDataset):
-        return CalibrationSource(recording.path, dataset.rectifier.rig, dataset.pairs, dataset, None)
+        return CalibrationSource(
+            recording.path, dataset.rectifier.rig, dataset.pairs, dataset, None
+        )
     known = recording.camera.width is not None
     rig = rig_from_rectified(recording.camera, recording.T_cam0_body) if known else None
     return CalibrationSource(recording.path, rig, (), dataset, None)
 
 
 def _raw_euroc(path: Path, rejection: str) -> CalibrationSource | None:
-    """Return rig and raw images of an EuRoC folder whose cameras cannot be rectified; None: another format."""
+    """Return rig and raw images of an EuRoC folder whose cameras cannot be rectified.
+
+    None: another format.
+    """
     mav = path / "mav0" if (path / "mav0").is_dir() else path
-    if not all((mav / name / "sensor.yaml").is_file() and (mav / name / "data").is_dir() for name in ("cam0", "cam1")):
+    if not all(
+        (mav / name / "sensor.yaml").is_file() and (mav / name / "data").is_dir()
+        for name in ("cam0", "cam1")
+    ):
         return None
-    (cam0, T0), (cam1, T1) = (read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1"))
+    (cam0, T0), (cam1, T1) = (
+        read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1")
+    )
     pairs = pair_images(mav / "cam0" / "data", mav / "cam1" / "data")
     return CalibrationSource(path, StereoRig(cam0, cam1, T0, T1), pairs, None, rejection)
 
@@ -93,7 +116,8 @@ def track(
     frames: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[FeatureTracks, Sequence[MotionSample]]:
-    """Return stereo tracks of the first frames, from the file or by a front end, and the motion samples.
+    """Return stereo tracks of the first frames, from the file or by a front end, and the motion
+    samples.
 
     Args:
         dataset: the recording.

@@ -15,12 +15,16 @@ from vio.records import IntArray
 
 _NAMED_DEG = 1.0  # turns from which they are named
 _TURN_DEG = 0.2  # a motion that differs by more turns the rest of the path
-_SCALE = 0.01  # by which lengths may differ without a word: matches that are off by 0.1 px make as much at far points
+# by which lengths may differ without a word: matches that are off by 0.1 px make as much at far
+# points
+_SCALE = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class MapperResult:
-    """The reconstruction of a run's keyframes by one of COLMAP's mappers, and its comparison with the run."""
+    """The reconstruction of a run's keyframes by one of COLMAP's mappers, and its comparison
+    with the run.
+    """
 
     mapper: Mapper
     total: int  # keyframes given
@@ -31,20 +35,30 @@ class MapperResult:
         """A short summary of this mapper alone."""
         if self.found is None:
             return (
-                "not observable because COLMAP could not connect the keyframes; too few images, no overlap between "
+                "not observable because COLMAP could not connect the keyframes; too few images, no "
+                "overlap between "
                 "them, or too little texture"
             )
         comparison = self.found[1]
         left_out = unconnected(self.total, comparison)
         if comparison.scale is None:
-            return f"{left_out}poses compared, scale not observable because {comparison.why_no_scale}"
-        where = f"disagrees in {len(comparison.segments)} segments" if comparison.segments else "agrees throughout"
+            return (
+                f"{left_out}poses compared, scale not observable because {comparison.why_no_scale}"
+            )
+        where = (
+            f"disagrees in {len(comparison.segments)} segments"
+            if comparison.segments
+            else "agrees throughout"
+        )
         return f"{left_out}{where}"
 
 
 def unconnected(total: int, comparison: KeyframeComparison) -> str:
-    """Return which of the keyframes are not compared, as the beginning of a sentence; nothing if all are."""
-    missing, compared = total - len(comparison.frames), comparison.frames[comparison.piece]
+    """Return which of the keyframes are not compared, as the beginning of a sentence; nothing if
+    all are.
+    """
+    missing = total - len(comparison.frames)
+    compared = comparison.frames[comparison.piece]
     text = f"{missing} of {total} keyframes not connected" if missing else ""
     if comparison.pieces > 1:
         text += f"{', the others' if missing else 'keyframes connected'} in {comparison.pieces} pieces, of which "
@@ -53,32 +67,50 @@ def unconnected(total: int, comparison: KeyframeComparison) -> str:
 
 
 def overall_verdict(results: Sequence[MapperResult]) -> str:
-    """Say whether the run and COLMAP agree, and where they do not, which of them is the likelier one to be wrong.
+    """Say whether the run and COLMAP agree, and where they do not, which of them is the likelier
+    one to be wrong.
 
-    COLMAP's two mappers share their matches but no poses. Where both differ from the run by the same motion, the run is
-    suspected; where one of them agrees with the run, the other one; where all three differ, nobody.
+    COLMAP's two mappers share their matches but no poses. Where both differ from the run by the
+    same motion, the run is suspected; where one of them agrees with the run, the other one; where
+    all three differ, nobody.
     """
     found = {result.mapper: result.found[1] for result in results if result.found is not None}
     if not found:
         return f"none: {results[0].verdict}"
-    agreeing = [name for name, comparison in found.items() if _grade(comparison, comparison.segments) == "negligible"]
+    agreeing = [
+        name
+        for name, comparison in found.items()
+        if _grade(comparison, comparison.segments) == "negligible"
+    ]
     agreeing.sort(key=lambda name: -int(found[name].piece.sum()))
-    compared = found[agreeing[0]] if agreeing else max(found.values(), key=lambda c: int(c.piece.sum()))
+    compared = (
+        found[agreeing[0]] if agreeing else max(found.values(), key=lambda c: int(c.piece.sum()))
+    )
     return unconnected(results[0].total, compared) + _judged(found, agreeing) + _revisits(results)
 
 
 def _revisits(results: Sequence[MapperResult]) -> str:
     """Say where COLMAP sees a place again that the run did not close."""
     for result in results:
-        if result.found is not None and len(result.found[0].revisits) and not len(result.found[0].shared):
-            frames = dict(zip(result.found[0].keyframes.tolist(), result.found[1].frames.tolist(), strict=True))
+        if (
+            result.found is not None
+            and len(result.found[0].revisits)
+            and not len(result.found[0].shared)
+        ):
+            frames = dict(
+                zip(
+                    result.found[0].keyframes.tolist(), result.found[1].frames.tolist(), strict=True
+                )
+            )
             a, b = (frames[k] for k in result.found[0].revisits[0].tolist())
             return f"; frames {a} and {b} show one place, which the run did not close as a loop"
     return ""
 
 
 def _judged(found: dict[Mapper, KeyframeComparison], agreeing: Sequence[Mapper]) -> str:
-    """Say whether a run and COLMAP agree where they are compared; models that do, that of most keyframes first."""
+    """Say whether a run and COLMAP agree where they are compared; models that do, that of most
+    keyframes first.
+    """
     if not agreeing:
         return _disagreement(found)
     comparison = found[agreeing[0]]
@@ -119,7 +151,9 @@ def _length(comparison: KeyframeComparison) -> float:
 
 def _per_100_m(comparison: KeyframeComparison, segments: Sequence[Segment]) -> float:
     """Return the largest difference of a motion over the length of the path, m per 100 m."""
-    return 100 * max((s.difference_m for s in segments), default=0.0) / max(_length(comparison), 1e-9)
+    return (
+        100 * max((s.difference_m for s in segments), default=0.0) / max(_length(comparison), 1e-9)
+    )
 
 
 def _grade(comparison: KeyframeComparison, segments: Sequence[Segment]) -> Grade:
@@ -136,7 +170,9 @@ def _size(comparison: KeyframeComparison, segments: Sequence[Segment]) -> str:
 
 
 def _shared(first: KeyframeComparison, second: KeyframeComparison) -> list[Segment]:
-    """Return the first one's segments in which the second one differs from the run by the same motion."""
+    """Return the first one's segments in which the second one differs from the run by the same
+    motion.
+    """
     _, rows, others = np.intersect1d(first.frames, second.frames, return_indices=True)
     frames: IntArray = first.frames[rows]
     if len(frames) < 2:
@@ -145,7 +181,10 @@ def _shared(first: KeyframeComparison, second: KeyframeComparison) -> list[Segme
     shared = []
     for segment in first.segments:
         inside = (frames[:-1] < segment.last_frame) & (frames[1:] > segment.first_frame)
-        met = any(s.first_frame < segment.last_frame and s.last_frame > segment.first_frame for s in second.segments)
+        met = any(
+            s.first_frame < segment.last_frame and s.last_frame > segment.first_frame
+            for s in second.segments
+        )
         close = (apart_m[inside] <= 0.5 * segment.difference_m) | (segment.difference_m == 0)
         turned = apart_deg[inside] <= max(0.5 * segment.difference_deg, 0.05)
         if met and inside.any() and bool((close & turned).all()):

@@ -9,14 +9,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vio.geometry.lie import FloatArray
-from vio.runs.curves import COLOURS, SIGMAS, STAGE_COLOURS, Curves, Truth, binned, stereo_curves, thinned
+from vio.runs.curves import (
+    COLOURS,
+    SIGMAS,
+    STAGE_COLOURS,
+    Curves,
+    Truth,
+    binned,
+    stereo_curves,
+    thinned,
+)
 from vio.runs.finished import FinishedRun
 from vio.runs.pipeline import STAGES
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
-_TRUTH, _POINTS, _LOOPS = "#111111", "#9aa5b1", "#c82828"
+_TRUTH = "#111111"
+_POINTS = "#9aa5b1"
+_LOOPS = "#c82828"
 _BULK = (10, 90)  # percentiles of the bands' edges that an axis shows at least
 _LONGEST_SIDE = 1.8  # of the box in three dimensions; seen whole from where plotly puts the eye
 _AXES = ("right", "ahead", "up")
@@ -55,13 +66,39 @@ def _paths(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSecti
         low, high = _extent([c.position for c in curves], (first, second))
         points = curves[0].points[:, (first, second)]
         points = points[np.all((points >= low) & (points <= high), axis=1)]
-        _line(figure, points, "landmarks", _POINTS, 1, column, mode="markers", marker={"size": 2, "opacity": 0.6})
+        _line(
+            figure,
+            points,
+            "landmarks",
+            _POINTS,
+            1,
+            column,
+            mode="markers",
+            marker={"size": 2, "opacity": 0.6},
+        )
         for truth in _truths(curves):
-            _line(figure, truth.position[:, (first, second)], "ground truth", _TRUTH, 1, column, width=3)
+            _line(
+                figure,
+                truth.position[:, (first, second)],
+                "ground truth",
+                _TRUTH,
+                1,
+                column,
+                width=3,
+            )
         for run, curve, colour in zip(runs, curves, COLOURS, strict=False):
             if curve.dead_reckoning is not None:
                 label = "dead reckoning" if len(runs) == 1 else f"{run.name}, dead reckoning"
-                _line(figure, curve.dead_reckoning[:, (first, second)], label, colour, 1, column, dash="dash", width=1)
+                _line(
+                    figure,
+                    curve.dead_reckoning[:, (first, second)],
+                    label,
+                    colour,
+                    1,
+                    column,
+                    dash="dash",
+                    width=1,
+                )
             _line(figure, curve.position[:, (first, second)], run.name, colour, 1, column)
         figure.update_xaxes(title_text=f"{_AXES[first]} (m)", row=1, col=column)
         figure.update_yaxes(title_text=f"{_AXES[second]} (m)", row=1, col=column)
@@ -76,18 +113,31 @@ def _path_3d(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSec
 
     figure = _subplots(1, 1, shared=False, kind="scene")
     paths = [("ground truth", truth.position, _TRUTH, 5) for truth in _truths(curves)]
-    paths += [(run.name, c.position, colour, 3) for run, c, colour in zip(runs, curves, COLOURS, strict=False)]
+    paths += [
+        (run.name, c.position, colour, 3)
+        for run, c, colour in zip(runs, curves, COLOURS, strict=False)
+    ]
     for label, p, colour, width in paths:
         x, y, z = (_short(p[:, axis]) for axis in range(3))
         line = {"color": colour, "width": width}
-        figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="lines", line=line, **_named(figure, label)))
+        figure.add_trace(
+            go.Scatter3d(x=x, y=y, z=z, mode="lines", line=line, **_named(figure, label))
+        )
     low, high = _extent([c.position for c in curves], (0, 1, 2), 0.05, 0.02)
-    points = curves[0].points[np.all((curves[0].points >= low) & (curves[0].points <= high), axis=1)]
+    points = curves[0].points[
+        np.all((curves[0].points >= low) & (curves[0].points <= high), axis=1)
+    ]
     x, y, z = (_short(points[:, axis]) for axis in range(3))
     marker = {"size": 1, "color": _POINTS, "opacity": 0.6}
-    figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, **_named(figure, "landmarks")))
-    axes = {f"{name}axis": {"title": f"{axis} (m)"} for name, axis in zip("xyz", _AXES, strict=True)}
-    ratio = dict(zip("xyz", (_LONGEST_SIDE * (high - low) / (high - low).max()).tolist(), strict=True))
+    figure.add_trace(
+        go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, **_named(figure, "landmarks"))
+    )
+    axes = {
+        f"{name}axis": {"title": f"{axis} (m)"} for name, axis in zip("xyz", _AXES, strict=True)
+    }
+    ratio = dict(
+        zip("xyz", (_LONGEST_SIDE * (high - low) / (high - low).max()).tolist(), strict=True)
+    )
     figure.update_layout(height=560, scene={**axes, "aspectmode": "manual", "aspectratio": ratio})
     return ReportSection("Path in three dimensions", figure, "Turn it with the mouse.")
 
@@ -95,7 +145,9 @@ def _path_3d(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSec
 def _mapped(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[ReportSection]:
     """Draw the runs that had a map in it, from above, with keyframes and loops."""
     chosen = [
-        (r, c.mapped, colour) for r, c, colour in zip(runs, curves, COLOURS, strict=False) if c.mapped is not None
+        (r, c.mapped, colour)
+        for r, c, colour in zip(runs, curves, COLOURS, strict=False)
+        if c.mapped is not None
     ]
     if not chosen:
         return []
@@ -105,11 +157,30 @@ def _mapped(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Repor
     for run, mapped, colour in chosen:
         name = "" if len(chosen) == 1 else f"{run.name}, "
         marks = {"size": 5, "symbol": "circle-open"}
-        _line(figure, mapped.keyframes[:, :2], f"{name}keyframes", _POINTS, 1, 1, mode="markers", marker=marks)
+        _line(
+            figure,
+            mapped.keyframes[:, :2],
+            f"{name}keyframes",
+            _POINTS,
+            1,
+            1,
+            mode="markers",
+            marker=marks,
+        )
         # One trace of separate strokes: rows of NaN part them.
-        strokes = np.concatenate([mapped.loops[:, :, :2], np.full((len(mapped.loops), 1, 2), np.nan)], axis=1)
+        strokes = np.concatenate(
+            [mapped.loops[:, :, :2], np.full((len(mapped.loops), 1, 2), np.nan)], axis=1
+        )
         if len(strokes):
-            _line(figure, strokes.reshape(-1, 2), f"{name}loops ({len(strokes)})", _LOOPS, 1, 1, width=1.2)
+            _line(
+                figure,
+                strokes.reshape(-1, 2),
+                f"{name}loops ({len(strokes)})",
+                _LOOPS,
+                1,
+                1,
+                width=1.2,
+            )
         _line(figure, mapped.position[:, :2], f"{name}in the map", colour, 1, 1)
     figure.update_xaxes(title_text=f"{_AXES[0]} (m)", row=1, col=1)
     figure.update_yaxes(title_text=f"{_AXES[1]} (m)", scaleanchor="x", row=1, col=1)
@@ -122,7 +193,9 @@ def _position(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSe
     found = [(c.seconds, c.position, c.position_sigma) for c in curves]
     truths = [(truth.seconds, truth.position) for truth in _truths(curves)]
     figure = _three(runs, found, truths, [f"{a} (m)" for a in _AXES])
-    return _over_time("Position and height", figure, "Bands are three standard deviations of the filter.")
+    return _over_time(
+        "Position and height", figure, "Bands are three standard deviations of the filter."
+    )
 
 
 def _attitude(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
@@ -136,7 +209,9 @@ def _attitude(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSe
 def _velocity(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
     found = [(c.seconds, c.velocity, c.velocity_sigma) for c in curves]
     known = [truth for truth in _truths(curves) if len(truth.seconds) > 2]
-    truths = [(truth.seconds, np.gradient(truth.position, truth.seconds, axis=0)) for truth in known]
+    truths = [
+        (truth.seconds, np.gradient(truth.position, truth.seconds, axis=0)) for truth in known
+    ]
     figure = _three(runs, found, truths, [f"{a} (m/s)" for a in _AXES])
     return _over_time("Velocity", figure, "Ground truth: differences of its positions.")
 
@@ -147,7 +222,9 @@ def _three(
     truths: Sequence[tuple[FloatArray, FloatArray]],
     names: Sequence[str],
 ) -> go.Figure:
-    """Draw three components of runs over time: seconds (N,), values (N, 3), sigmas (N, 3) of each, and the truth's."""
+    """Draw three components of runs over time: seconds (N,), values (N, 3), sigmas (N, 3) of
+    each, and the truth's.
+    """
     figure = _subplots(3, 1)
     for row, name in enumerate(names, start=1):
         for run, (seconds, values, sigmas), colour in zip(runs, found, COLOURS, strict=False):
@@ -172,7 +249,9 @@ def _errors(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSect
             _xy(figure, curve.truth.seconds, curve.truth.error_deg, run.name, colour, 2)
     figure.update_yaxes(title_text="position (m)", rangemode="tozero", row=1, col=1)
     figure.update_yaxes(title_text="attitude (deg)", rangemode="tozero", row=2, col=1)
-    return _over_time("Errors", figure, "Against the reference, after one rigid alignment of the whole path.")
+    return _over_time(
+        "Errors", figure, "Against the reference, after one rigid alignment of the whole path."
+    )
 
 
 def _features(runs: Sequence[FinishedRun]) -> ReportSection:
@@ -180,11 +259,19 @@ def _features(runs: Sequence[FinishedRun]) -> ReportSection:
     for run, colour in zip(runs, COLOURS, strict=False):
         for name, dash in (("matched", "dot"), ("selected", "dash"), ("used", "solid")):
             label = name if len(runs) == 1 else f"{run.name}, {name}"
-            shade = colour if len(runs) > 1 else {"matched": _POINTS, "selected": COLOURS[1], "used": COLOURS[0]}[name]
-            _frame_curve(figure, run, name, label, shade, 1, dash=dash if len(runs) > 1 else "solid")
+            shade = (
+                colour
+                if len(runs) > 1
+                else {"matched": _POINTS, "selected": COLOURS[1], "used": COLOURS[0]}[name]
+            )
+            _frame_curve(
+                figure, run, name, label, shade, 1, dash=dash if len(runs) > 1 else "solid"
+            )
     figure.update_yaxes(title_text="features", rangemode="tozero", row=1, col=1)
     return _over_time(
-        "Features", figure, "With a match in the right image; chosen by the selector; used by the filter."
+        "Features",
+        figure,
+        "With a match in the right image; chosen by the selector; used by the filter.",
     )
 
 
@@ -194,36 +281,56 @@ def _innovations(runs: Sequence[FinishedRun]) -> ReportSection:
         "innovation_ratio": "over their sigma",
         "nis_per_dof": "NIS per dof",
     }
-    shown = {name: title for name, title in shown.items() if any(name in run.frames for run in runs)}
+    shown = {
+        name: title for name, title in shown.items() if any(name in run.frames for run in runs)
+    }
     figure = _subplots(len(shown), 1)
     for row, (name, title) in enumerate(shown.items(), start=1):
         for run, colour in zip(runs, COLOURS, strict=False):
             if name in run.frames:
                 _frame_curve(figure, run, name, run.name, colour, row)
         figure.update_yaxes(title_text=title, rangemode="tozero", row=row, col=1)
-    text = "How far features lie from where the filter expects them, and that over its standard deviation (median): 1 "
-    text += (
-        "is consistent, less is cautious, more is overconfident; and the squared residuals of tracks over the noise."
+    text = (
+        "How far features lie from where the filter expects them, and that over its standard "
+        "deviation (median): 1 is consistent, less is cautious, more is overconfident; and the "
+        "squared residuals of tracks over the noise."
     )
     return _over_time("Innovations", figure, text)
 
 
 def _biases(runs: Sequence[FinishedRun]) -> list[ReportSection]:
     """Draw the biases of runs with an IMU."""
-    chosen = [(run, c) for run, c in zip(runs, COLOURS, strict=False) if run.metrics.get("motion") == "imu"]
+    chosen = [
+        (run, c)
+        for run, c in zip(runs, COLOURS, strict=False)
+        if run.metrics.get("motion") == "imu"
+    ]
     if not chosen:
         return []
     figure = _subplots(3, 2, titles=("gyroscope", "accelerometer"))
     for run, colour in chosen:
         rows = thinned(len(run.estimates))
-        for column, (name, factor) in enumerate((("gyro_bias", np.degrees(1.0)), ("accel_bias", 1.0)), start=1):
+        for column, (name, factor) in enumerate(
+            (("gyro_bias", np.degrees(1.0)), ("accel_bias", 1.0)), start=1
+        ):
             values, sigmas = (factor * run.estimates[key][rows] for key in (name, f"{name}_sigma"))
             for axis in range(3):
-                _band(figure, run.seconds[rows], values[:, axis], sigmas[:, axis], run.name, colour, axis + 1, column)
+                _band(
+                    figure,
+                    run.seconds[rows],
+                    values[:, axis],
+                    sigmas[:, axis],
+                    run.name,
+                    colour,
+                    axis + 1,
+                    column,
+                )
     for axis, name in enumerate("xyz"):
         figure.update_yaxes(title_text=f"{name} (deg/s)", row=axis + 1, col=1)
         figure.update_yaxes(title_text=f"{name} (m/s²)", row=axis + 1, col=2)
-    return [_over_time("IMU biases", figure, "Axes of the IMU; bands are three standard deviations.")]
+    return [
+        _over_time("IMU biases", figure, "Axes of the IMU; bands are three standard deviations.")
+    ]
 
 
 def _timing(runs: Sequence[FinishedRun]) -> ReportSection:
@@ -231,16 +338,26 @@ def _timing(runs: Sequence[FinishedRun]) -> ReportSection:
     for row, run in enumerate(runs, start=1):
         for stage, shade in zip(STAGES, STAGE_COLOURS, strict=True):
             seconds, median = binned(run.seconds, np.nan_to_num(run.frames[f"{stage}_ms"]), 600)
-            more: dict[str, Any] = {"stackgroup": "stages", "line": {"width": 0}, "fillcolor": shade}
+            more: dict[str, Any] = {
+                "stackgroup": "stages",
+                "line": {"width": 0},
+                "fillcolor": shade,
+            }
             _xy(figure, seconds, median, stage, shade, row, **more)
         figure.update_yaxes(title_text="ms a frame", row=row, col=1)
-    return _over_time("Time", figure, "Wall time by stage; long runs are shown by the medians of groups of frames.")
+    return _over_time(
+        "Time",
+        figure,
+        "Wall time by stage; long runs are shown by the medians of groups of frames.",
+    )
 
 
 def _stereo(runs: Sequence[FinishedRun]) -> list[ReportSection]:
     """Draw what the stereo calibration is off by, of runs that estimated it."""
     chosen = [
-        (run, c) for run, c in zip(runs, COLOURS, strict=False) if np.isfinite(run.estimates["stereo_field"]).any()
+        (run, c)
+        for run, c in zip(runs, COLOURS, strict=False)
+        if np.isfinite(run.estimates["stereo_field"]).any()
     ]
     if not chosen:
         return []
@@ -254,7 +371,8 @@ def _stereo(runs: Sequence[FinishedRun]) -> list[ReportSection]:
     return [_over_time("Stereo calibration", figure, text)]
 
 
-# --- drawing --------------------------------------------------------------------------------------------------------
+# --- drawing
+# --------------------------------------------------------------------------------------------------------
 
 
 def _subplots(
@@ -274,7 +392,13 @@ def _subplots(
     figure.update_layout(
         template="plotly_white",
         margin={"l": 60, "r": 30, "t": 64 if titles else 30, "b": 44},
-        legend={"orientation": "h", "y": 1.08 if titles else 1.02, "yanchor": "bottom", "x": 0, "xanchor": "left"},
+        legend={
+            "orientation": "h",
+            "y": 1.08 if titles else 1.02,
+            "yanchor": "bottom",
+            "x": 0,
+            "xanchor": "left",
+        },
         modebar={"orientation": "v"},
         font={"family": "system-ui, sans-serif", "size": 12},
         height=max(170 * rows, 300) + 60,
@@ -291,22 +415,32 @@ def _over_time(title: str, figure: go.Figure, remark: str) -> ReportSection:
 
 
 def _fit_bands(figure: go.Figure, row: int, column: int) -> None:
-    """Set an axis by its curves and the bulk of their bands: a filter that does not yet know has bands without end."""
+    """Set an axis by its curves and the bulk of their bands: a filter that does not yet know has
+    bands without end.
+    """
     traces = list(figure.select_traces(row=row, col=column))
-    bands, curves = [t for t in traces if t.fill == "toself"], [t for t in traces if t.fill != "toself"]
+    bands = [t for t in traces if t.fill == "toself"]
+    curves = [t for t in traces if t.fill != "toself"]
     values = [np.array(t.y, dtype=np.float64) for t in curves]
     if not bands or not values:
         return
     edges = np.concatenate([np.array(t.y, dtype=np.float64) for t in bands])
     shown = np.concatenate([*values, np.nanpercentile(edges, _BULK)])
-    low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
+    low = float(np.nanmin(shown))
+    high = float(np.nanmax(shown))
     margin = 0.05 * max(high - low, 1e-9)
     figure.update_yaxes(range=[low - margin, high + margin], row=row, col=column)
 
 
 def _named(figure: go.Figure, label: str) -> dict[str, Any]:
-    """Return what ties traces of one label together: one entry in the legend shows and hides them all."""
-    return {"name": label, "legendgroup": label, "showlegend": all(trace.name != label for trace in figure.data)}
+    """Return what ties traces of one label together: one entry in the legend shows and hides
+    them all.
+    """
+    return {
+        "name": label,
+        "legendgroup": label,
+        "showlegend": all(trace.name != label for trace in figure.data),
+    }
 
 
 def _line(
@@ -328,17 +462,31 @@ def _line(
     more = {"mode": "lines", **more}
     if "marker" in more:
         more["marker"] = {"color": colour, **more["marker"]}
-    trace = go.Scatter(x=_short(points[:, 0]), y=_short(points[:, 1]), line=line, **_named(figure, label), **more)
+    trace = go.Scatter(
+        x=_short(points[:, 0]), y=_short(points[:, 1]), line=line, **_named(figure, label), **more
+    )
     figure.add_trace(trace, row=row, col=column)
 
 
 def _xy(
-    figure: go.Figure, x: FloatArray, y: FloatArray, label: str, colour: str, row: int, column: int = 1, **more: Any
+    figure: go.Figure,
+    x: FloatArray,
+    y: FloatArray,
+    label: str,
+    colour: str,
+    row: int,
+    column: int = 1,
+    **more: Any,
 ) -> None:
     """Draw a curve (N,) over time."""
     import plotly.graph_objects as go
 
-    more["line"] = {"color": colour, "width": 1.5, "dash": more.pop("dash", "solid"), **more.get("line", {})}
+    more["line"] = {
+        "color": colour,
+        "width": 1.5,
+        "dash": more.pop("dash", "solid"),
+        **more.get("line", {}),
+    }
     trace = go.Scatter(x=_short(x), y=_short(y), mode="lines", **_named(figure, label), **more)
     figure.add_trace(trace, row=row, col=column)
 
@@ -374,7 +522,14 @@ def _band(
 
 
 def _frame_curve(
-    figure: go.Figure, run: FinishedRun, name: str, label: str, colour: str, row: int, *, dash: str = "solid"
+    figure: go.Figure,
+    run: FinishedRun,
+    name: str,
+    label: str,
+    colour: str,
+    row: int,
+    *,
+    dash: str = "solid",
 ) -> None:
     rows = thinned(len(run.estimates))
     _xy(figure, run.seconds[rows], run.frames[name][rows], label, colour, row, dash=dash)
@@ -383,13 +538,18 @@ def _frame_curve(
 def _extent(
     paths: Sequence[FloatArray], axes: tuple[int, ...], share: float = 0.25, least_m: float = 0.05
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of the box around paths with a margin (a share of the longest side), metres."""
+    """Return the corners of the box around paths with a margin (a share of the longest side),
+    metres.
+    """
     every = np.concatenate(paths)[:, axes]
-    low, high = every.min(axis=0), every.max(axis=0)
+    low = every.min(axis=0)
+    high = every.max(axis=0)
     margin = max(share * float((high - low).max()), least_m)
     return low - margin, high + margin
 
 
 def _short(values: FloatArray) -> list[float | None]:
-    """Return values with six digits, which a screen does not distinguish from all of them, None for NaN."""
+    """Return values with six digits, which a screen does not distinguish from all of them, None
+    for NaN.
+    """
     return [None if v != v else float(f"{v:.6g}") for v in values.tolist()]

@@ -50,16 +50,25 @@ def page(runs: Sequence[FinishedRun]) -> str:
     from plotly.offline import get_plotlyjs
 
     title = _text(", ".join(run.name for run in runs))
-    path, *figures = (_figure(section, number) for number, section in enumerate(sections(runs, curves_of(runs))))
-    warnings = _lists("Warnings", runs, [[str(line) for line in run.metrics.get("warnings") or []] for run in runs])
+    path, *figures = (
+        _figure(section, number) for number, section in enumerate(sections(runs, curves_of(runs)))
+    )
+    warnings = _lists(
+        "Warnings",
+        runs,
+        [[str(line) for line in run.metrics.get("warnings") or []] for run in runs],
+    )
     calibration = _lists("Calibration", runs, [calibration_findings(run.metrics) for run in runs])
     parts = [_words(runs), warnings, path, _key_figures(runs), calibration, _images(runs), *figures]
     parts.append(_settings(runs))
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style>'
+        '<meta name="viewport" content="width=device-width, '
+        f'initial-scale=1"><style>{_STYLE}</style>'
         f"<script>{get_plotlyjs()}</script></head>\n<body><main><h1>{title}</h1>"
-        f'<p class="remark">stereo-vio {_text(__version__)}</p>\n' + "\n".join(parts) + "\n</main></body></html>\n"
+        f'<p class="remark">stereo-vio {_text(__version__)}</p>\n'
+        + "\n".join(parts)
+        + "\n</main></body></html>\n"
     )
 
 
@@ -79,9 +88,14 @@ def _images(runs: Sequence[FinishedRun]) -> str:
     features = _pictures(runs, Path(RunFile.FEATURES), "jpeg")
     meshes = _pictures(runs, Path(MeshFile.FOLDER, MeshFile.PICTURE), "png")
     remark = (
-        '<p class="remark">The left image half-way through the run. Gray circles have no match in the right image.</p>'
+        '<p class="remark">The left image half-way through the run. Gray circles have no match '
+        "in the right image.</p>"
     )
-    out = f"<section><h2>Features and disparities</h2>{remark}{features}</section>" if features else ""
+    out = (
+        f"<section><h2>Features and disparities</h2>{remark}{features}</section>"
+        if features
+        else ""
+    )
     return out + (f"<section><h2>Mesh</h2>{meshes}</section>" if meshes else "")
 
 
@@ -92,7 +106,9 @@ def _pictures(runs: Sequence[FinishedRun], name: Path, kind: str) -> str:
         if (file := run.folder / name).is_file():
             data = b64encode(read_input(file)).decode("ascii")
             head = f"<p>{_text(run.name)}</p>" if len(runs) > 1 else ""
-            shown.append(f'{head}<img alt="{_text(name.stem)}" src="data:image/{kind};base64,{data}">')
+            shown.append(
+                f'{head}<img alt="{_text(name.stem)}" src="data:image/{kind};base64,{data}">'
+            )
     return "".join(shown)
 
 
@@ -117,10 +133,14 @@ def _settings(runs: Sequence[FinishedRun]) -> str:
     rows = {}
     for key in sorted({key for run in runs for key in run.changed}):
         default = next(run.changed[key][1] for run in runs if key in run.changed)
-        rows[key] = [str(v) for v in (default, *(run.changed.get(key, (default,))[0] for run in runs))]
+        rows[key] = [
+            str(v) for v in (default, *(run.changed.get(key, (default,))[0] for run in runs))
+        ]
     if not rows:
         return "<section><h2>Settings</h2><p>All settings have their defaults.</p></section>"
-    return _table("Settings that differ from the default", ["default", *(run.name for run in runs)], rows)
+    return _table(
+        "Settings that differ from the default", ["default", *(run.name for run in runs)], rows
+    )
 
 
 def _table(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
@@ -136,7 +156,10 @@ def _table(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]
 
 def _figure(section: ReportSection, number: int) -> str:
     drawing = section.figure.to_html(
-        full_html=False, include_plotlyjs=False, div_id=f"figure-{number}", config={"displaylogo": False}
+        full_html=False,
+        include_plotlyjs=False,
+        div_id=f"figure-{number}",
+        config={"displaylogo": False},
     )
     remark = f'<p class="remark">{_text(section.remark)}</p>' if section.remark else ""
     return f"<section><h2>{_text(section.title)}</h2>{remark}{drawing}</section>"

@@ -19,12 +19,15 @@ _MOTION = {"imu": "an IMU", "velocity": "velocities", "none": "images alone"}
 
 def summary(run: FinishedRun) -> list[str]:
     """Return what happened in a run, one sentence a line."""
-    m, span_s = run.metrics, float(run.seconds[-1])
-    frames, span = len(run.estimates), m.get("last_frame", 0) - m.get("first_frame", 0) + 1
+    m = run.metrics
+    span_s = float(run.seconds[-1])
+    frames = len(run.estimates)
+    span = m.get("last_frame", 0) - m.get("first_frame", 0) + 1
     counted = f"{frames} of {span}" if span > frames else str(frames)
     source = str(m.get("source", "")).replace("\\", "/").rstrip("/").rpartition("/")[2]
     lines = [
-        f"{counted} frames of {source or 'a recording'} ({m.get('kind', 'unknown kind')}), {span_s:.1f} s and "
+        f"{counted} frames of {source or 'a recording'} ({m.get('kind', 'unknown kind')}), "
+        f"{span_s:.1f} s and "
         f"{path_length_m(run.trajectory.positions):.1f} m, processed from "
         f"{_MOTION.get(str(m.get('motion')), 'images alone')} by {m.get('backend', 'the filter')}."
     ]
@@ -35,21 +38,29 @@ def summary(run: FinishedRun) -> list[str]:
     if evaluation is None:
         sigma = np.sqrt(np.trace(run.estimates["covariance"][-1][:3, :3]))
         lines.append(
-            f"There is no reference. The filter's own standard deviation of the last position is {sigma:.3g} m."
+            "There is no reference. The filter's own standard deviation of the last position is "
+            f"{sigma:.3g} m."
         )
     else:
         share = 100 * evaluation.ate_m.rmse / max(evaluation.reference_path_length_m, 1e-9)
         lines.append(
-            f"The position error is {metres_text(evaluation.ate_m.rmse)} (rms after alignment, {share:.2g} % of the "
-            f"path), at most {metres_text(evaluation.ate_m.max)}; the attitude error {evaluation.ate_deg.rmse:.2g} deg."
+            f"The position error is {metres_text(evaluation.ate_m.rmse)} (rms after alignment, "
+            f"{share:.2g} % of the "
+            f"path), at most {metres_text(evaluation.ate_m.max)}; the attitude error "
+            f"{evaluation.ate_deg.rmse:.2g} deg."
         )
         if evaluation.kitti is not None:
             lines.append(
-                f"Drift over {lengths_text(evaluation.kitti.lengths_m)} is {evaluation.kitti.t_err_percent:.2g} % and "
+                f"Drift over {lengths_text(evaluation.kitti.lengths_m)} is "
+                f"{evaluation.kitti.t_err_percent:.2g} % and "
                 f"{rotation_drift_text(evaluation.kitti.r_err_deg_per_100m, evaluation.kitti.lengths_m, 2)}."
             )
     lines.append(_speed(run))
-    nis = np.nanmedian(run.frames["nis_per_dof"]) if np.isfinite(run.frames["nis_per_dof"]).any() else None
+    nis = (
+        np.nanmedian(run.frames["nis_per_dof"])
+        if np.isfinite(run.frames["nis_per_dof"]).any()
+        else None
+    )
     if nis is not None:
         lines.append(f"The median innovation (NIS) is {nis:.2g} of its covariance.")
     warnings = m.get("warnings") or []
@@ -59,7 +70,8 @@ def summary(run: FinishedRun) -> list[str]:
 
 def _speed(run: FinishedRun) -> str:
     ms = float(np.nanmedian(_work_ms(run)))
-    frames, span_s = len(run.estimates), float(run.seconds[-1])
+    frames = len(run.estimates)
+    span_s = float(run.seconds[-1])
     if frames < 2 or span_s <= 0:
         return f"A frame took {ms:.1f} ms in the median."
     given_ms = 1e3 * span_s / (frames - 1)
@@ -69,7 +81,9 @@ def _speed(run: FinishedRun) -> str:
 
 
 def _work_ms(run: FinishedRun) -> Any:
-    return np.sum([run.frames[f"{stage}_ms"] for stage in STAGES if f"{stage}_ms" in run.frames], axis=0)
+    return np.sum(
+        [run.frames[f"{stage}_ms"] for stage in STAGES if f"{stage}_ms" in run.frames], axis=0
+    )
 
 
 def calibration_findings(metrics: Mapping[str, Any]) -> list[str]:
@@ -83,7 +97,9 @@ def calibration_findings(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def scale_findings(metrics: Mapping[str, Any]) -> list[str]:
-    """Return what a run found of the cameras' scale, one line each; they are near zero where it is right."""
+    """Return what a run found of the cameras' scale, one line each; they are near zero where it
+    is right.
+    """
     return [
         f"{name.replace('_', ' ')} off by {x['percent']:+.2f} ± {x['sigma_percent']:.2f} %"
         for name, x in (metrics.get("stereo_scale") or {}).items()
@@ -91,11 +107,15 @@ def scale_findings(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def camera_imu_findings(metrics: Mapping[str, Any]) -> list[str]:
-    """Return what a run found of the place and the clock of the IMU; they are near zero where these are right."""
-    found, words = metrics.get("camera_imu") or {}, []
+    """Return what a run found of the place and the clock of the IMU; they are near zero where
+    these are right.
+    """
+    found = metrics.get("camera_imu") or {}
+    words = []
     if "rotation_deg" in found:
         for key, unit, digits in (("rotation", "deg", 2), ("translation", "mm", 1)):
-            size, sigma = math.hypot(*found[f"{key}_{unit}"]), math.hypot(*found[f"{key}_sigma_{unit}"])
+            size = math.hypot(*found[f"{key}_{unit}"])
+            sigma = math.hypot(*found[f"{key}_sigma_{unit}"])
             words.append(f"{key} off by {size:.{digits}f} ± {sigma:.{digits}f} {unit}")
     if "time_offset_ms" in found:
         offset = f"{found['time_offset_ms']:+.2f} ± {found['time_offset_sigma_ms']:.2f} ms"
@@ -105,10 +125,12 @@ def camera_imu_findings(metrics: Mapping[str, Any]) -> list[str]:
 
 def run_figures(run: FinishedRun) -> dict[str, str]:
     """Return a run's figures for a table, in a fixed order; a dash where there is none."""
-    m, evaluation = run.metrics, run.evaluation
+    m = run.metrics
+    evaluation = run.evaluation
     work = _work_ms(run)
     kitti = None if evaluation is None else evaluation.kitti
-    refused, innovations = refused_share(run.frames["used"], run.frames["gated"]), m.get("innovation_ratio")
+    refused = refused_share(run.frames["used"], run.frames["gated"])
+    innovations = m.get("innovation_ratio")
     return {
         "frames": str(len(run.estimates)),
         "path (m)": f"{path_length_m(run.trajectory.positions):.2f}",
@@ -117,7 +139,9 @@ def run_figures(run: FinishedRun) -> dict[str, str]:
         "largest error": "–" if evaluation is None else metres_text(evaluation.ate_m.max),
         "attitude error (deg)": "–" if evaluation is None else f"{evaluation.ate_deg.rmse:.3f}",
         "drift (%)": "–" if kitti is None else f"{kitti.t_err_percent:.3f}",
-        "drift of rotation": "–" if kitti is None else rotation_drift_text(kitti.r_err_deg_per_100m, kitti.lengths_m),
+        "drift of rotation": "–"
+        if kitti is None
+        else rotation_drift_text(kitti.r_err_deg_per_100m, kitti.lengths_m),
         "features used, median": f"{np.nanmedian(run.frames['used']):.0f}",
         "observations refused (%)": "–" if refused is None else f"{100 * refused:.1f}",
         "innovations (sigmas), median": "–" if innovations is None else f"{innovations:.2g}",

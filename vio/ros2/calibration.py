@@ -27,12 +27,16 @@ class CameraInfos:
     """Collects the messages that make a rig."""
 
     def __init__(self, transport: Transport, topics: SensorTopics) -> None:
-        self._topics, self._index, self._frames = topics, BagIndex(), dict[str, str]()
+        self._topics = topics
+        self._index = BagIndex()
+        self._frames = dict[str, str]()
         self.kinds = {info_topic(camera): CAMERA_INFO for camera in topics.cameras}
         self.received = dict.fromkeys(self.kinds, 0)
         for name in self.kinds:
             transport.subscribe(name, CAMERA_INFO, self._info_taker(name), "sensor")
-        transport.subscribe(STATIC, TF, lambda data: self._index.add_frames(decoded(data, TF, STATIC)), "latched")
+        transport.subscribe(
+            STATIC, TF, lambda data: self._index.add_frames(decoded(data, TF, STATIC)), "latched"
+        )
         if topics.imu is not None:
             transport.subscribe(topics.imu, IMU, self._imu, "sensor")
 
@@ -47,7 +51,9 @@ class CameraInfos:
 
     def _imu(self, data: bytes) -> None:
         assert self._topics.imu is not None
-        self._frames[self._topics.imu] = str(decoded(data, IMU, self._topics.imu).header.frame_id).lstrip("/")
+        self._frames[self._topics.imu] = str(
+            decoded(data, IMU, self._topics.imu).header.frame_id
+        ).lstrip("/")
 
     def rig(self) -> Rig | None:
         """Return the rig once all messages have come that it is made of; None before.
@@ -61,7 +67,8 @@ class CameraInfos:
         if not all(name in self._index.infos for name in names):
             return None
         rig = rig_from_camera_infos(
-            [self._index.infos[name] for name in names], rectified="rect" in self._topics.left.rpartition("/")[2]
+            [self._index.infos[name] for name in names],
+            rectified="rect" in self._topics.left.rpartition("/")[2],
         )
         imu = self._topics.imu
         if imu is None:
@@ -73,7 +80,9 @@ class CameraInfos:
         return None if T_cam0_imu is None else replace(rig, T_cam0_imu=T_cam0_imu)
 
     def _imu_frame(self) -> str | None:
-        """Return the frame of the IMU's messages; before the first one, the only frame named after an IMU."""
+        """Return the frame of the IMU's messages; before the first one, the only frame named
+        after an IMU.
+        """
         if self._topics.imu in self._frames:
             return self._frames[self._topics.imu]
         named = {name for pair in self._index.frames for name in pair if "imu" in name.lower()}
@@ -84,7 +93,8 @@ class CameraInfos:
         missing = [name for name in self.kinds if name not in self._index.infos]
         if missing:
             return f"no CameraInfo on {' and '.join(missing)} yet; give --calibration FILE"
-        frame, camera = self._imu_frame(), self._frames[next(iter(self.kinds))]
+        frame = self._imu_frame()
+        camera = self._frames[next(iter(self.kinds))]
         if frame is None:
             return f"no message on {self._topics.imu} yet, whose frame is needed; give --calibration FILE"
         return f"{STATIC} does not connect {frame} with {camera}; give --calibration FILE with T_cam_imu"

@@ -1,7 +1,8 @@
 """The graph over DDS, with the package cyclonedds and without ROS.
 
-ROS 2 maps a topic `/name` to DDS's `rt/name`, and a type `pkg/msg/Name` to `pkg::msg::dds_::Name_`. Messages pass as
-the bytes that they are: cyclonedds's own coder makes a list of an image's bytes, 30 ms at 752x480.
+ROS 2 maps a topic `/name` to DDS's `rt/name`, and a type `pkg/msg/Name` to `pkg::msg::dds_::Name_`.
+Messages pass as the bytes that they are: cyclonedds's own coder makes a list of an image's bytes,
+30 ms at 752x480.
 Reference: the article "Topic and Service name mapping to DDS" of ROS 2's design.
 """
 
@@ -13,7 +14,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
-from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
+from cyclonedds.core import (
+    DDSException,
+    InstanceState,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl import types as idl
@@ -38,7 +46,11 @@ _BASE: dict[str, Any] = {
     "char": idl.uint8,
     "float32": idl.float32,
     "float64": idl.float64,
-    **{f"{sign}int{bits}": getattr(idl, f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)},
+    **{
+        f"{sign}int{bits}": getattr(idl, f"{sign}int{bits}")
+        for sign in ("", "u")
+        for bits in (8, 16, 32, 64)
+    },
 }
 
 _ARRAY: Any = idl.array
@@ -55,7 +67,9 @@ class _Raw:
 
 @functools.cache
 def _struct(kind: str) -> Any:
-    """Return the type of DDS for a message type, with its fields, by which others check that it is theirs."""
+    """Return the type of DDS for a message type, with its fields, by which others check that it
+    is theirs.
+    """
     package, _, name = kind.split("/")
     fields = {field.name: _field(field) for field in fields_of(kind)}
     return make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", fields)
@@ -85,13 +99,17 @@ def _raw_struct(kind: str) -> Any:
 
 def _qos(quality: Quality, *, of_images: bool = False) -> Qos:
     reliable = Policy.Reliability.Reliable(duration(hours=1))  # which a sender waits for room
-    format_of_ros = Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False)
+    format_of_ros = Policy.DataRepresentation(
+        use_cdrv0_representation=True, use_xcdrv2_representation=False
+    )
     if quality == "sensor":
         return Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(_DEPTH), format_of_ros)
     if quality == "reliable":
         limits = [Policy.ResourceLimits(max_samples=_MOST_IMAGES)] if of_images else []
         return Qos(reliable, Policy.History.KeepAll, format_of_ros, *limits)
-    return Qos(reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(1), format_of_ros)
+    return Qos(
+        reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(1), format_of_ros
+    )
 
 
 class DdsTransport:
@@ -102,7 +120,9 @@ class DdsTransport:
         try:
             self._participant = DomainParticipant(number)
         except DDSException as error:
-            raise DataError(f"DDS domain {number} cannot be joined: {error}; check CYCLONEDDS_URI") from error
+            raise DataError(
+                f"DDS domain {number} cannot be joined: {error}; check CYCLONEDDS_URI"
+            ) from error
         self._waitset = WaitSet(self._participant)
         self._readers: list[tuple[DataReader[Any], Any, Callable[[bytes], None]]] = []
         self._writers: dict[str, DataWriter[Any]] = {}
@@ -116,7 +136,9 @@ class DdsTransport:
             self._topics[key] = Topic(self._participant, f"rt{name}", _raw_struct(kind))
         return self._topics[key]
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[bytes], None], quality: Quality) -> None:
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[bytes], None], quality: Quality
+    ) -> None:
         """Hand the messages of a topic to a function."""
         qos = _qos(quality, of_images="Image" in kind)
         reader: DataReader[Any] = DataReader(self._participant, self._topic(topic, kind), qos=qos)
@@ -127,7 +149,9 @@ class DdsTransport:
     def advertise(self, topic: str, kind: str, quality: Quality) -> Callable[[bytes], None]:
         """Return the function that publishes on a topic."""
         made = _raw_struct(kind)
-        writer: DataWriter[Any] = DataWriter(self._participant, self._topic(topic, kind), qos=_qos(quality))
+        writer: DataWriter[Any] = DataWriter(
+            self._participant, self._topic(topic, kind), qos=_qos(quality)
+        )
         self._writers[topic] = writer
         self._own.add(str(writer.guid))
 
@@ -146,11 +170,14 @@ class DdsTransport:
         """Return the topics of other participants with their types."""
         found: dict[str, set[str]] = {}
         for sample in self._publications.read(10_000):
-            name, kind = getattr(sample, "topic_name", None), getattr(sample, "type_name", "")
+            name = getattr(sample, "topic_name", None)
+            kind = getattr(sample, "type_name", "")
             if name is None or not name.startswith("rt/") or str(sample.key) in self._own:
                 continue
             package, _, rest = kind.partition("::msg::dds_::")
-            found.setdefault(name[2:], set()).add(f"{package}/msg/{rest.removesuffix('_')}" if rest else kind)
+            found.setdefault(name[2:], set()).add(
+                f"{package}/msg/{rest.removesuffix('_')}" if rest else kind
+            )
         return {name: frozenset(kinds) for name, kinds in found.items()}
 
     def spin(self, timeout_s: float) -> None:
@@ -162,12 +189,15 @@ class DdsTransport:
             for sample in reader.take(_TAKEN, condition=condition)
             if isinstance(sample, _Raw)
         ]
-        # Topics are read one after the other: their messages are handed over in the order in which they were sent.
+        # Topics are read one after the other: their messages are handed over in the order in which
+        # they were sent.
         for _, take, data in sorted(taken, key=lambda each: each[0]):
             take(data)
 
     def close(self) -> None:
-        """Leave the domain, once what was published reliably has been received, or nobody takes it."""
+        """Leave the domain, once what was published reliably has been received, or nobody takes
+        it.
+        """
         for writer in self._writers.values():
             writer.wait_for_acks(duration(seconds=_LAST_S))
         for _, condition, _ in self._readers:

@@ -1,4 +1,6 @@
-"""The node: waits for the calibration, then feeds an odometry from the graph and publishes what it finds."""
+"""The node: waits for the calibration, then feeds an odometry from the graph and publishes what
+it finds.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +34,12 @@ class NodeSettings:
     topics: SensorTopics
     frames: FrameNames = field(default_factory=FrameNames)
     prefix: str = "/vio"  # of the names of what it publishes, and of reset and save
-    quality: Quality = "sensor"  # of the subscriptions: "reliable" loses nothing, and needs reliable publishers
+    # of the subscriptions: "reliable" loses nothing, and needs reliable publishers
+    quality: Quality = "sensor"
     drop: Drop = "oldest"  # see `LiveOdometry`
     with_tf: bool = True
-    out: Path | None = None  # folder for the trajectory and the calibration, at the end and on request
+    # folder for the trajectory and the calibration, at the end and on request
+    out: Path | None = None
     map: MapUse | None = None
 
 
@@ -51,7 +55,8 @@ def run_node(
     """Run until it is asked to stop; then write the map and what was asked for.
 
     Raises:
-        VioError: a topic has another type, images do not fit the calibration, or the estimation has failed.
+        VioError: a topic has another type, images do not fit the calibration, or the estimation has
+            failed.
     """
     topics = settings.topics
     check_types(topics.kinds, transport)
@@ -62,17 +67,29 @@ def run_node(
         config = replace(config, motion="none")
     elif found.T_cam0_imu is None:
         raise CalibrationError(
-            f"the calibration has no T_cam_imu, so that {topics.imu} cannot be used; leave --imu out"
+            f"the calibration has no T_cam_imu, so that {topics.imu} cannot be used; leave --imu "
+            "out"
         )
-    with LiveOdometry(found, config, drop=settings.drop, map=settings.map, copy_images=False) as odometry:
+    with LiveOdometry(
+        found, config, drop=settings.drop, map=settings.map, copy_images=False
+    ) as odometry:
         say("warming up")
         odometry.warm_up()
         sensors = Sensors(transport, topics, odometry, settings.quality)
         outputs = Outputs(
-            transport, odometry, sensors, frames=settings.frames, prefix=settings.prefix, with_tf=settings.with_tf
+            transport,
+            odometry,
+            sensors,
+            frames=settings.frames,
+            prefix=settings.prefix,
+            with_tf=settings.with_tf,
         )
-        transport.subscribe(f"{settings.prefix}/{RESET}", _EMPTY, lambda _: odometry.reset(), "reliable")
-        transport.subscribe(f"{settings.prefix}/{SAVE}", _EMPTY, lambda _: _save(outputs, settings), "reliable")
+        transport.subscribe(
+            f"{settings.prefix}/{RESET}", _EMPTY, lambda _: odometry.reset(), "reliable"
+        )
+        transport.subscribe(
+            f"{settings.prefix}/{SAVE}", _EMPTY, lambda _: _save(outputs, settings), "reliable"
+        )
         say(f"ready: {', '.join(topics.kinds)} to {settings.prefix}")
         silence = Silence(topics.kinds)
         while not should_stop():
@@ -93,10 +110,15 @@ def _save(outputs: Outputs, settings: NodeSettings) -> None:
 
 
 def _awaited(
-    transport: Transport, topics: SensorTopics, should_stop: Callable[[], object], say: Callable[[str], None]
+    transport: Transport,
+    topics: SensorTopics,
+    should_stop: Callable[[], object],
+    say: Callable[[str], None],
 ) -> Rig | None:
     """Wait for the calibration from the graph; None: it was asked to stop."""
-    infos, silence, since = CameraInfos(transport, topics), None, time.monotonic()
+    infos = CameraInfos(transport, topics)
+    silence = None
+    since = time.monotonic()
     while not should_stop():
         rig = infos.rig()
         if rig is not None:

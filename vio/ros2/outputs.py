@@ -1,4 +1,6 @@
-"""What the node publishes: odometry, frames, path, landmarks, diagnostics; and the files that it writes."""
+"""What the node publishes: odometry, frames, path, landmarks, diagnostics; and the files that it
+writes.
+"""
 
 from __future__ import annotations
 
@@ -22,18 +24,29 @@ from vio.ros2.transport import Transport, publisher
 
 log = logging.getLogger(__name__)
 
-ODOMETRY, PATH, POINTS, RESET, SAVE = "odometry", "path", "landmarks", "reset", "save"
-KINDS = {ODOMETRY: "nav_msgs/msg/Odometry", PATH: "nav_msgs/msg/Path", POINTS: "sensor_msgs/msg/PointCloud2"}
+ODOMETRY = "odometry"
+PATH = "path"
+POINTS = "landmarks"
+RESET = "reset"
+SAVE = "save"
+KINDS = {
+    ODOMETRY: "nav_msgs/msg/Odometry",
+    PATH: "nav_msgs/msg/Path",
+    POINTS: "sensor_msgs/msg/PointCloud2",
+}
 _SLOW_NS = NS_PER_S  # between paths, landmarks and diagnostics
 _PATH_POSES = 2000  # the newest ones
 _POINTS = 20_000  # likewise
 _UNKNOWN = 1e6  # variance of what is not measured
-_GYRO_VARIANCE = 1e-4  # (rad/s)^2 of a single sample: 0.01 rad/s, of cheap gyros at some hundred hertz
+# (rad/s)^2 of a single sample: 0.01 rad/s, of cheap gyros at some hundred hertz
+_GYRO_VARIANCE = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class FrameNames:
-    """Names of the frames of /tf: the map, the odometry's world, and the body (IMU, or left camera without one)."""
+    """Names of the frames of /tf: the map, the odometry's world, and the body (IMU, or left
+    camera without one).
+    """
 
     map: str = "map"
     odom: str = "odom"
@@ -54,7 +67,10 @@ class Outputs:
         with_tf: bool,
     ) -> None:
         """Advertise, and begin to publish."""
-        self._odometry, self._sensors, self._frames, self._with_tf = odometry, sensors, frames, with_tf
+        self._odometry = odometry
+        self._sensors = sensors
+        self._frames = frames
+        self._with_tf = with_tf
         self._names = {name: f"{prefix}/{name}" for name in KINDS}
         topics = {self._names[name]: kind for name, kind in KINDS.items()}
         if with_tf:
@@ -63,7 +79,9 @@ class Outputs:
         self._out = publisher(transport, topics, latched=late)
         self._poses: list[tuple[int, FloatArray]] = []
         self._slow_ns: int | None = None  # newest time of path, landmarks and diagnostics
-        self._thread = threading.Thread(target=self._run, args=(iter(odometry),), name="ros2", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, args=(iter(odometry),), name="ros2", daemon=True
+        )
         self._thread.start()
 
     def join(self) -> None:
@@ -82,33 +100,47 @@ class Outputs:
         trajectory = 0
         for estimate in estimates:
             if estimates.trajectory != trajectory:
-                trajectory, self._poses, self._slow_ns = estimates.trajectory, [], None
+                trajectory = estimates.trajectory
+                self._poses = []
+                self._slow_ns = None
             self._publish(estimate)
 
     def _publish(self, estimate: Estimate) -> None:
-        time_ns, T = estimate.time_ns, estimate.T_world_imu
+        time_ns = estimate.time_ns
+        T = estimate.T_world_imu
         self._poses.append((time_ns, T))
         names = self._frames
         covariance = ros_covariance(T, estimate.covariance)
         self._out.odometry(
-            self._names[ODOMETRY], (names.odom, names.base), time_ns, T, covariance, self._twist(estimate)
+            self._names[ODOMETRY],
+            (names.odom, names.base),
+            time_ns,
+            T,
+            covariance,
+            self._twist(estimate),
         )
         if self._with_tf:
             self._out.transform(names.odom, names.base, time_ns, T)
             if estimate.T_map_body is not None:
-                self._out.transform(names.map, names.odom, time_ns, estimate.T_map_body @ se3_inverse(T))
+                self._out.transform(
+                    names.map, names.odom, time_ns, estimate.T_map_body @ se3_inverse(T)
+                )
         if self._slow_ns is None or time_ns - self._slow_ns >= _SLOW_NS:
             self._slow_ns = time_ns
             self._publish_slowly(time_ns)
 
     def _publish_slowly(self, time_ns: int) -> None:
         recent = self._poses[-_PATH_POSES:]
-        self._out.path(self._names[PATH], self._frames.odom, live_trajectory(self._odometry, recent), time_ns)
+        self._out.path(
+            self._names[PATH], self._frames.odom, live_trajectory(self._odometry, recent), time_ns
+        )
         figures = self._odometry.figures
         with contextlib.suppress(VioError, CancelledError):  # the odometry is being closed
             points = self._odometry.landmarks()
             sigmas = np.sqrt(np.trace(points.covariance[-_POINTS:], axis1=1, axis2=2) / 3.0)
-            self._out.points(self._names[POINTS], self._frames.odom, time_ns, points.p_world[-_POINTS:], sigmas)
+            self._out.points(
+                self._names[POINTS], self._frames.odom, time_ns, points.p_world[-_POINTS:], sigmas
+            )
         warnings = self._odometry.warnings
         values = {
             "results": str(figures.results),
@@ -123,8 +155,12 @@ class Outputs:
         self._out.diagnostics("vio", time_ns, 1 if warnings else 0, text, values)
 
     def _twist(self, estimate: Estimate) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return linear and angular velocity (3,) of the body in its own axes, and their covariance (6, 6)."""
-        linear, angular, spread = np.zeros(3), np.zeros(3), np.eye(6) * _UNKNOWN
+        """Return linear and angular velocity (3,) of the body in its own axes, and their
+        covariance (6, 6).
+        """
+        linear = np.zeros(3)
+        angular = np.zeros(3)
+        spread = np.eye(6) * _UNKNOWN
         R_body_world = estimate.T_world_imu[:3, :3].T
         if estimate.velocity_world is not None:
             linear = R_body_world @ estimate.velocity_world

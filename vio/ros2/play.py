@@ -15,7 +15,8 @@ from vio.ros2.calibration import info_topic
 from vio.ros2.sensors import SensorTopics
 from vio.ros2.transport import Quality, Transport, publisher
 
-CAMERA_FRAMES, IMU_FRAME = ("cam0", "cam1"), "imu"
+CAMERA_FRAMES = ("cam0", "cam1")
+IMU_FRAME = "imu"
 _WAIT_S = 0.05
 _OTHERS_S = 1.0  # after the first subscriber, for those to other topics
 
@@ -39,7 +40,8 @@ def play(
     wait: bool = True,
     stop: int | None = None,
 ) -> Played:
-    """Publish the rectified images of a recording with their CameraInfo, its IMU samples, and the IMU's pose.
+    """Publish the rectified images of a recording with their CameraInfo, its IMU samples, and the
+    IMU's pose.
 
     Args:
         transport: of the graph.
@@ -58,10 +60,14 @@ def play(
     out = publisher(transport, kinds if imu is None else {**kinds, imu: IMU}, default=quality)
     if imu is not None and recording.T_cam0_imu is not None:
         first_ns = int(recording.frame_times_ns[0])
-        out.static_transforms(first_ns, [(IMU_FRAME, CAMERA_FRAMES[0], se3_inverse(recording.T_cam0_imu))])
+        out.static_transforms(
+            first_ns, [(IMU_FRAME, CAMERA_FRAMES[0], se3_inverse(recording.T_cam0_imu))]
+        )
     if wait:
         sensors = [*cameras] if imu is None else [*cameras, imu]
-        _wait_for_subscribers(transport, sensors, lambda: _publish_infos(out, cameras, recording), should_stop)
+        _wait_for_subscribers(
+            transport, sensors, lambda: _publish_infos(out, cameras, recording), should_stop
+        )
     frames = samples = 0
     for event in _in_time(dataset.events(0, stop), rate):
         if should_stop():
@@ -76,7 +82,10 @@ def play(
 
 
 def _wait_for_subscribers(
-    transport: Transport, topics: list[str], announce: Callable[[], None], should_stop: Callable[[], object]
+    transport: Transport,
+    topics: list[str],
+    announce: Callable[[], None],
+    should_stop: Callable[[], object],
 ) -> None:
     """Wait for a subscriber to the left images, and a little longer for those to the others.
 
@@ -95,10 +104,14 @@ def _wait_for_subscribers(
 def _publish_infos(out: BagWriter, cameras: tuple[str, ...], recording: Recording) -> None:
     for name, body in zip(cameras, CAMERA_FRAMES, strict=False):
         time_ns = int(recording.frame_times_ns[0])
-        out.camera_info(info_topic(name), body, time_ns, recording.camera, right=body == CAMERA_FRAMES[1])
+        out.camera_info(
+            info_topic(name), body, time_ns, recording.camera, right=body == CAMERA_FRAMES[1]
+        )
 
 
-def _publish_frame(out: BagWriter, cameras: tuple[str, ...], recording: Recording, frame: StereoFrame) -> None:
+def _publish_frame(
+    out: BagWriter, cameras: tuple[str, ...], recording: Recording, frame: StereoFrame
+) -> None:
     for name, body, image in zip(cameras, CAMERA_FRAMES, (frame.left, frame.right), strict=False):
         if image is not None:
             right = body == CAMERA_FRAMES[1]

@@ -1,7 +1,9 @@
-"""The graph by rclpy, where ROS 2 is installed and its setup.bash was sourced: with its middleware and its settings.
+"""The graph by rclpy, where ROS 2 is installed and its setup.bash was sourced: with its middleware
+and its settings.
 
-The only file that imports ROS. Messages pass as bytes here too (`raw=True`), so that both ways share all other code.
-Written against the reference of rclpy (Humble to Rolling); it could not be run where this was developed.
+The only file that imports ROS. Messages pass as bytes here too (`raw=True`), so that both ways
+share all other code. Written against the reference of rclpy (Humble to Rolling); it could not be
+run where this was developed.
 """
 
 from __future__ import annotations
@@ -28,13 +30,17 @@ class RclpyTransport:
     def __init__(self, domain: int | None) -> None:
         self._context = Context()
         # The command line handles signals itself.
-        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(
+            context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
+        )
         self._node = rclpy.create_node("vio", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._publishers: dict[str, Any] = {}
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[bytes], None], quality: Quality) -> None:
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[bytes], None], quality: Quality
+    ) -> None:
         """Hand the messages of a topic to a function."""
         self._node.create_subscription(_type(kind), topic, take, _qos(quality), raw=True)
 
@@ -73,14 +79,20 @@ def _type(kind: str) -> Any:
     try:
         return get_message(kind)
     except (ModuleNotFoundError, AttributeError, ValueError) as error:
-        raise DataError(f"{kind} is not known to this ROS 2: {error}; install its package") from error
+        raise DataError(
+            f"{kind} is not known to this ROS 2: {error}; install its package"
+        ) from error
 
 
 def _qos(quality: Quality) -> QoSProfile:
     if quality == "sensor":
-        return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        return QoSProfile(
+            history=HistoryPolicy.KEEP_LAST, depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT
+        )
     if quality == "reliable":
-        return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
+        return QoSProfile(
+            history=HistoryPolicy.KEEP_LAST, depth=_DEPTH, reliability=ReliabilityPolicy.RELIABLE
+        )
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=1,

@@ -1,4 +1,6 @@
-"""Image and IMU messages into the odometry: decoding, pairing, stamps that go back, and what is silent."""
+"""Image and IMU messages into the odometry: decoding, pairing, stamps that go back, and what is
+silent.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ from vio.ros2.transport import Quality, Transport
 log = logging.getLogger(__name__)
 
 SILENT_S = 5.0  # without a message, before it is said
-_BACK_NS = 500_000_000  # a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
+# a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
+_BACK_NS = 500_000_000
 _WHITE_IMAGES = 8  # of 16 bits, looked at for the level of white
 
 
@@ -46,15 +49,23 @@ class SensorTopics:
     @property
     def kinds(self) -> dict[str, str]:
         """All topics with their types: those of image_transport end in /compressed."""
-        kinds = {name: COMPRESSED if name.endswith("/compressed") else IMAGE for name in self.cameras}
+        kinds = {
+            name: COMPRESSED if name.endswith("/compressed") else IMAGE for name in self.cameras
+        }
         return kinds if self.imu is None else {**kinds, self.imu: IMU}
 
 
 class Sensors:
-    """Subscribes, and adds what comes to an odometry. All of it happens in the thread that spins the transport."""
+    """Subscribes, and adds what comes to an odometry.
 
-    def __init__(self, transport: Transport, topics: SensorTopics, odometry: LiveOdometry, quality: Quality) -> None:
-        self._topics, self._odometry = topics, odometry
+    All of it happens in the thread that spins the transport.
+    """
+
+    def __init__(
+        self, transport: Transport, topics: SensorTopics, odometry: LiveOdometry, quality: Quality
+    ) -> None:
+        self._topics = topics
+        self._odometry = odometry
         self._pairing: Pairing[Image] = Pairing()
         self._newest: dict[str, tuple[int | None, int]] = {}  # the last two stamps, ns
         self._back: set[str] = set()  # topics whose last stamp lay far before these
@@ -63,7 +74,9 @@ class Sensors:
         self.received = dict.fromkeys(topics.kinds, 0)  # messages
         self.refused = 0
         for side, name in enumerate(topics.cameras):
-            transport.subscribe(name, topics.kinds[name], functools.partial(self._image, name, side), quality)
+            transport.subscribe(
+                name, topics.kinds[name], functools.partial(self._image, name, side), quality
+            )
         if topics.imu is not None:
             transport.subscribe(topics.imu, IMU, self._imu, quality)
 
@@ -75,7 +88,9 @@ class Sensors:
             return
         where = f"{topic} at {time_ns} ns"
         try:
-            image = gray_of(fields, where, compressed=kind == COMPRESSED, white=self._white(fields, kind, where))
+            image = gray_of(
+                fields, where, compressed=kind == COMPRESSED, white=self._white(fields, kind, where)
+            )
         except UnreadableImageError as error:
             self._refuse(str(error))
             return
@@ -93,7 +108,8 @@ class Sensors:
         time_ns = self._stamped(self._topics.imu, fields)
         if time_ns is None:
             return
-        w, a = fields.angular_velocity, fields.linear_acceleration
+        w = fields.angular_velocity
+        a = fields.linear_acceleration
         try:
             self._odometry.add_imu(time_ns, [w.x, w.y, w.z], [a.x, a.y, a.z])
         except DataError as error:  # as of a sample that is not finite
@@ -114,14 +130,16 @@ class Sensors:
             last = before  # that one was far ahead, alone; the odometry has left it out
         elif back and topic in self._back:
             log.warning(
-                "%s: the stamps went back by %.1f s, as of a publisher that was restarted: a new trajectory begins",
+                "%s: the stamps went back by %.1f s, as of a publisher that was restarted: a new "
+                "trajectory begins",
                 topic,
                 ((last or 0) - time_ns) * 1e-9,
             )
             self._odometry.reset()
             self._newest.clear()
             self._back.clear()
-            self._pairing, last = Pairing(), None
+            self._pairing = Pairing()
+            last = None
         elif last is not None and time_ns <= last:
             if back:
                 self._back.add(topic)
@@ -148,7 +166,8 @@ class Silence:
 
     def __init__(self, kinds: Mapping[str, str]) -> None:
         self._kinds = kinds
-        self._heard = {topic: (0, time.monotonic()) for topic in kinds}  # messages so far, and when that changed
+        # messages so far, and when that changed
+        self._heard = {topic: (0, time.monotonic()) for topic in kinds}
         self._said: set[str] = set()
 
     def check(self, received: Mapping[str, int], transport: Transport) -> list[str]:
@@ -157,7 +176,8 @@ class Silence:
         Raises:
             DataError: a topic has messages of another type.
         """
-        now, lines = time.monotonic(), []
+        now = time.monotonic()
+        lines = []
         for topic, kind in self._kinds.items():
             count, since = self._heard[topic]
             if received.get(topic, 0) != count:
@@ -179,16 +199,24 @@ def check_types(kinds: Mapping[str, str], transport: Transport) -> None:
     for topic, kind in kinds.items():
         others = there.get(topic, frozenset())
         if others and kind not in others:
-            raise DataError(f"{topic} has {', '.join(sorted(others))}, not {kind}; name another topic")
+            raise DataError(
+                f"{topic} has {', '.join(sorted(others))}, not {kind}; name another topic"
+            )
 
 
 def _why_silent(topic: str, kind: str, there: Mapping[str, frozenset[str]], *, began: bool) -> str:
     """Return why nothing may come from a topic, and what to do."""
     if topic in there:
-        reason = "its publisher is silent" if began else "its publisher sends nothing, or cannot be reached"
+        reason = (
+            "its publisher is silent"
+            if began
+            else "its publisher sends nothing, or cannot be reached"
+        )
         return f"no message on {topic} for {SILENT_S:g} s: {reason}; check the driver"
     fitting = sorted(name for name, kinds in there.items() if kind in kinds)
     have = (
-        f"topics of its type are {', '.join(fitting[:8])}" if fitting else "and none of its type; check ROS_DOMAIN_ID"
+        f"topics of its type are {', '.join(fitting[:8])}"
+        if fitting
+        else "and none of its type; check ROS_DOMAIN_ID"
     )
     return f"no message on {topic} for {SILENT_S:g} s: nobody publishes it; {have}"

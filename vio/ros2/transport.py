@@ -9,16 +9,21 @@ from typing import Any, Literal, Protocol, TypeAlias
 from vio.datasets.bags.writer import BagWriter
 from vio.errors import MissingDependencyError
 
-# "sensor": unreliable, as drivers publish; "reliable": none is lost, and the sender waits for a slow receiver;
-# "latched": whoever comes late gets the last message.
+# "sensor": unreliable, as drivers publish; "reliable": none is lost, and the sender waits for a
+# slow receiver; "latched": whoever comes late gets the last message.
 Quality: TypeAlias = Literal["sensor", "reliable", "latched"]
 TransportName: TypeAlias = Literal["auto", "dds", "rclpy"]
 
 
 class Transport(Protocol):
-    """A participant of the graph. Messages are CDR with its header of four bytes; types as in sensor_msgs/msg/Image."""
+    """A participant of the graph.
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[bytes], None], quality: Quality) -> None:
+    Messages are CDR with its header of four bytes; types as in sensor_msgs/msg/Image.
+    """
+
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[bytes], None], quality: Quality
+    ) -> None:
         """Hand the messages of a topic to a function, which `spin` calls."""
 
     def advertise(self, topic: str, kind: str, quality: Quality) -> Callable[[bytes], None]:
@@ -53,7 +58,8 @@ def open_transport(name: TransportName = "auto", domain: int | None = None) -> T
         return RclpyTransport(domain)
     if importlib.util.find_spec("cyclonedds") is None:
         raise MissingDependencyError(
-            "ROS 2 needs the package cyclonedds, or an installed ROS 2 whose setup.bash was sourced; install it with: "
+            "ROS 2 needs the package cyclonedds, or an installed ROS 2 whose setup.bash was "
+            "sourced; install it with: "
             "pip install 'stereo-vio[ros2]'"
         )
     from vio.ros2.dds import DdsTransport
@@ -64,21 +70,33 @@ def open_transport(name: TransportName = "auto", domain: int | None = None) -> T
 class _Published:
     """Takes the place of a bag: each topic is advertised with its first message, or before."""
 
-    def __init__(self, transport: Transport, qualities: Mapping[str, Quality], default: Quality) -> None:
-        self._transport, self._qualities, self._default = transport, qualities, default
+    def __init__(
+        self, transport: Transport, qualities: Mapping[str, Quality], default: Quality
+    ) -> None:
+        self._transport = transport
+        self._qualities = qualities
+        self._default = default
         self._topics: dict[str, Callable[[bytes], None]] = {}
 
     def add_connection(self, topic: str, msgtype: str, **_: Any) -> Callable[[bytes], None]:
         if topic not in self._topics:
-            self._topics[topic] = self._transport.advertise(topic, msgtype, self._qualities.get(topic, self._default))
+            self._topics[topic] = self._transport.advertise(
+                topic, msgtype, self._qualities.get(topic, self._default)
+            )
         return self._topics[topic]
 
-    def write(self, connection: Callable[[bytes], None], timestamp: int, data: bytes | memoryview) -> None:
+    def write(
+        self, connection: Callable[[bytes], None], timestamp: int, data: bytes | memoryview
+    ) -> None:
         connection(bytes(data))
 
 
 def publisher(
-    transport: Transport, topics: Mapping[str, str], *, latched: tuple[str, ...] = (), default: Quality = "reliable"
+    transport: Transport,
+    topics: Mapping[str, str],
+    *,
+    latched: tuple[str, ...] = (),
+    default: Quality = "reliable",
 ) -> BagWriter:
     """Return what makes and publishes messages.
 

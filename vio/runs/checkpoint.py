@@ -1,10 +1,10 @@
 """The state of an unfinished run in a file, from which it goes on to the same bits.
 
-The file is a checksum, a line of JSON (the program that wrote it and the inputs of the run), the state as a tree in
-JSON, and the bytes of its arrays. A node of the tree is a plain value or a list that begins with the name of its kind;
-lists are numbered in the order in which they begin, and `["ref", n]` is one that came before. Loading makes objects of
-this package's classes without calling their constructors, and sets their attributes; it calls nothing that the file
-names.
+The file is a checksum, a line of JSON (the program that wrote it and the inputs of the run), the
+state as a tree in JSON, and the bytes of its arrays. A node of the tree is a plain value or a list
+that begins with the name of its kind; lists are numbered in the order in which they begin, and
+`["ref", n]` is one that came before. Loading makes objects of this package's classes without
+calling their constructors, and sets their attributes; it calls nothing that the file names.
 """
 
 from __future__ import annotations
@@ -32,11 +32,23 @@ from vio.protocols import Dataset
 _FORMAT = "stereo-vio checkpoint 2"
 _PACKAGE = __name__.split(".", maxsplit=1)[0]
 _MOST_BYTES = 4 << 30
-_BIT_GENERATORS = {own.__name__: own for own in (np.random.PCG64, np.random.PCG64DXSM, np.random.SFC64)}
+_BIT_GENERATORS = {
+    own.__name__: own for own in (np.random.PCG64, np.random.PCG64DXSM, np.random.SFC64)
+}
 _PLAIN = frozenset((type(None), bool, int, float, str))
 _SEQUENCES = frozenset((list, tuple, set, frozenset))
-_BASES = (object, Generic, Protocol)  # of the classes whose objects are saved, beside this package's own
-_DAMAGE = OSError, ValueError, ArithmeticError, AttributeError, TypeError, LookupError, ImportError, RecursionError
+# of the classes whose objects are saved, beside this package's own
+_BASES = (object, Generic, Protocol)
+_DAMAGE = (
+    OSError,
+    ValueError,
+    ArithmeticError,
+    AttributeError,
+    TypeError,
+    LookupError,
+    ImportError,
+    RecursionError,
+)
 _MOST_CHANGES = 3  # of the inputs, named in an error
 
 
@@ -44,11 +56,14 @@ class NotSavableError(Exception):
     """A part of the run holds what cannot be saved."""
 
 
-def save_checkpoint(path: Path, state: Any, dataset: Dataset, inputs: Mapping[str, Any] | None = None) -> None:
+def save_checkpoint(
+    path: Path, state: Any, dataset: Dataset, inputs: Mapping[str, Any] | None = None
+) -> None:
     """Write a state atomically; the recording itself, where the state refers to it, is left out.
 
-    A state is made of plain values, arrays, containers and objects of this package's classes. `inputs` is what the
-    results depend on, as JSON values by name; they must be the same when the run goes on.
+    A state is made of plain values, arrays, containers and objects of this package's classes.
+    `inputs` is what the results depend on, as JSON values by name; they must be the same when the
+    run goes on.
 
     Raises:
         NotSavableError: a part of the state cannot be saved.
@@ -59,7 +74,9 @@ def save_checkpoint(path: Path, state: Any, dataset: Dataset, inputs: Mapping[st
         tree = json.dumps(writer.node(state), separators=(",", ":"), check_circular=False).encode()
     except RecursionError as error:
         raise NotSavableError("its parts are nested too deeply") from error
-    head = json.dumps({"program": _program(), "inputs": dict(inputs or {}), "tree_bytes": len(tree)}).encode()
+    head = json.dumps(
+        {"program": _program(), "inputs": dict(inputs or {}), "tree_bytes": len(tree)}
+    ).encode()
     body = b"".join((head, b"\n", tree, *writer.blobs))
     atomic_write_bytes(path, b"".join((b"%08x" % zlib.crc32(body), body)))
 
@@ -73,13 +90,20 @@ def load_checkpoint(path: Path, dataset: Dataset, inputs: Mapping[str, Any] | No
     try:
         data = read_input(path, _MOST_BYTES)
         if data[:8] != b"%08x" % zlib.crc32(memoryview(data)[8:]):
-            raise ValueError("its checksum does not agree with its content; or an earlier version wrote it")
+            raise ValueError(
+                "its checksum does not agree with its content; or an earlier version wrote it"
+            )
         end = data.index(b"\n")
         head = json.loads(data[8:end])
         if program := _changes(head["program"], _program()):
-            raise DataError(f"{path}: was written by another program ({program}); repeat the run from its start")
+            raise DataError(
+                f"{path}: was written by another program ({program}); repeat the run from its start"
+            )
         if changed := _changes(head["inputs"], json.loads(json.dumps(dict(inputs or {})))):
-            raise DataError(f"{path}: what the run depends on has changed ({changed}); undo that, or repeat the run")
+            raise DataError(
+                f"{path}: what the run depends on has changed ({changed}); undo that, or repeat "
+                "the run"
+            )
         body = memoryview(data)[end + 1 :]
         tree = json.loads(bytes(body[: head["tree_bytes"]]))
         return _Reader(dataset, body[head["tree_bytes"] :]).node(tree)
@@ -104,8 +128,12 @@ def _program() -> dict[str, str]:
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Name the values that are not what they were; empty: all are."""
     names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-    texts = [f"{name} was {before.get(name)}, now {now.get(name)}" for name in names[:_MOST_CHANGES]]
-    return "; ".join(texts + [f"and {len(names) - _MOST_CHANGES} more"] * (len(names) > _MOST_CHANGES))
+    texts = [
+        f"{name} was {before.get(name)}, now {now.get(name)}" for name in names[:_MOST_CHANGES]
+    ]
+    return "; ".join(
+        texts + [f"and {len(names) - _MOST_CHANGES} more"] * (len(names) > _MOST_CHANGES)
+    )
 
 
 @cache
@@ -113,13 +141,20 @@ def _slots(cls: type) -> dict[str, types.MemberDescriptorType]:
     """Return the slots of one of this package's classes by name."""
     for base in cls.__mro__:
         if base not in _BASES and base.__module__.split(".")[0] != _PACKAGE:
-            raise TypeError(f"{base.__module__}.{base.__qualname__} does not belong into a checkpoint")
+            raise TypeError(
+                f"{base.__module__}.{base.__qualname__} does not belong into a checkpoint"
+            )
     members = {name: own for base in cls.__mro__ for name, own in vars(base).items()}
-    return {name: own for name, own in members.items() if isinstance(own, types.MemberDescriptorType)}
+    return {
+        name: own for name, own in members.items() if isinstance(own, types.MemberDescriptorType)
+    }
 
 
 def _own_hook(cls: type, name: str) -> Any:
-    """Return `__getstate__` or `__setstate__` where this package's code defines it; None: it does not."""
+    """Return `__getstate__` or `__setstate__` where this package's code defines it.
+
+    None: it does not.
+    """
     hook = getattr(cls, name, None)
     return hook if str(getattr(hook, "__module__", None)).split(".")[0] == _PACKAGE else None
 
@@ -131,7 +166,8 @@ class _Writer:
         self.blobs: list[bytes] = []
         self._dataset = dataset
         self._bytes = 0
-        self._numbers: dict[int, int] = {}  # of the objects, by id; -1: a tuple or set that has not ended
+        # of the objects, by id; -1: a tuple or set that has not ended
+        self._numbers: dict[int, int] = {}
         self._kept: list[Any] = []  # so that no id is used twice
 
     def node(self, value: Any) -> Any:
@@ -151,7 +187,8 @@ class _Writer:
         return ["ref", number]
 
     def _list(self, value: Any) -> list[Any]:
-        kind, node = type(value), self.node
+        kind = type(value)
+        node = self.node
         if kind in _SEQUENCES:
             return [kind.__name__, *map(node, value)]
         if kind is dict:
@@ -173,7 +210,11 @@ class _Writer:
             return ["generator", type(bits).__name__, node(bits.state)]
         if value is self._dataset:
             return ["dataset"]
-        if kind is types.MethodType and value.__self__ is self._dataset and value.__name__ == "observations":
+        if (
+            kind is types.MethodType
+            and value.__self__ is self._dataset
+            and value.__name__ == "observations"
+        ):
             return ["observations"]
         return self._object(value, kind)
 
@@ -182,7 +223,8 @@ class _Writer:
             raise NotSavableError("an array of objects does not belong into a checkpoint")
         order: Literal["C", "F"] = "F" if value.flags.fnc else "C"
         self.blobs.append(value.tobytes(order))
-        start, self._bytes = self._bytes, self._bytes + value.nbytes
+        start = self._bytes
+        self._bytes = self._bytes + value.nbytes
         dtype = np.lib.format.dtype_to_descr(value.dtype) if value.dtype.names else value.dtype.str
         return [kind, dtype, value.shape, order, start, value.flags.writeable]
 
@@ -196,15 +238,20 @@ class _Writer:
         if hook is not None:
             state = hook(value)
         else:
-            state = {key: getattr(value, key) for key in slots if hasattr(value, key)} | getattr(value, "__dict__", {})
+            state = {key: getattr(value, key) for key in slots if hasattr(value, key)} | getattr(
+                value, "__dict__", {}
+            )
         return ["object", name, {key: self.node(own) for key, own in state.items()}]
 
 
 class _Reader:
-    """Makes a state of its tree and the bytes of its arrays; what does not fit raises a built-in exception."""
+    """Makes a state of its tree and the bytes of its arrays; what does not fit raises a built-in
+    exception.
+    """
 
     def __init__(self, dataset: Dataset, blobs: memoryview) -> None:
-        self._dataset, self._blobs = dataset, blobs
+        self._dataset = dataset
+        self._blobs = blobs
         self._made: list[Any] = []  # by number; None: not yet
 
     def node(self, node: Any) -> Any:
@@ -227,7 +274,11 @@ class _Reader:
 
     def _container(self, number: int, kind: str, parts: list[Any]) -> Any:
         """Make a container, which its parts may refer to."""
-        made: Any = deque(maxlen=parts.pop(0)) if kind == "deque" else {"list": list, "dict": dict, "set": set}[kind]()
+        made: Any = (
+            deque(maxlen=parts.pop(0))
+            if kind == "deque"
+            else {"list": list, "dict": dict, "set": set}[kind]()
+        )
         self._made[number] = made
         values = map(self.node, parts)
         if kind == "dict":
@@ -240,7 +291,8 @@ class _Reader:
 
     def _object(self, number: int, name: str, state: dict[str, Any]) -> Any:
         cls = _own_class(name)
-        slots, restore = _slots(cls), _own_hook(cls, "__setstate__")
+        slots = _slots(cls)
+        restore = _own_hook(cls, "__setstate__")
         made: Any = object.__new__(cls)
         self._made[number] = made
         values = {key: self.node(node) for key, node in state.items()}
@@ -266,24 +318,36 @@ class _Reader:
             return generator
         kinds: dict[str, Any] = {"tuple": tuple, "frozenset": frozenset}
         values = [self.node(part) for part in parts]
-        return kinds[kind](values) if kind in kinds else {"slice": slice, "complex": complex}[kind](*values)
+        return (
+            kinds[kind](values)
+            if kind in kinds
+            else {"slice": slice, "complex": complex}[kind](*values)
+        )
 
     def _array(
         self, dtype: Any, shape: list[int], order: Literal["C", "F"], start: int, writeable: bool
     ) -> np.ndarray[Any, Any]:
         if min(start, *shape, 0) < 0:
             raise ValueError("the place of an array is negative")
-        kind = np.dtype([(name, of, *map(tuple, rest)) for name, of, *rest in dtype] if type(dtype) is list else dtype)
+        kind = np.dtype(
+            [(name, of, *map(tuple, rest)) for name, of, *rest in dtype]
+            if type(dtype) is list
+            else dtype
+        )
         if kind.hasobject:  # NumPy would take bytes for addresses
             raise ValueError("an array of objects does not belong into a checkpoint")
-        made: np.ndarray[Any, Any] = np.ndarray(shape, kind, self._blobs, start, order=order).copy(order="K")
+        made: np.ndarray[Any, Any] = np.ndarray(shape, kind, self._blobs, start, order=order).copy(
+            order="K"
+        )
         made.flags.writeable = writeable
         return made
 
 
 @cache
 def _own_class(name: str) -> type:
-    """Return a class of this package by `module:qualified name`, without a call of anything but its module's import."""
+    """Return a class of this package by `module:qualified name`, without a call of anything but
+    its module's import.
+    """
     module, _, path = name.partition(":")
     parents = module.split(".")
     if parents[0] != _PACKAGE or parents[-1] == "__main__":

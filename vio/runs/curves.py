@@ -35,11 +35,15 @@ class DrawnRun:
 
     def view(self) -> FloatArray:
         """Return `T_view_world` (4, 4) of the run alone."""
-        T, gravity = self.estimates["T_world_imu"], np.array(self.estimates["gravity_world"][-1])
+        T = self.estimates["T_world_imu"]
+        gravity = np.array(self.estimates["gravity_world"][-1])
         return upright_view(T, self.T_cam0_body, self.motion, gravity)
 
     def view_of_reference(self) -> FloatArray | None:
-        """Return the transform (4, 4) from the reference's world to an upright frame; None: there is none."""
+        """Return the transform (4, 4) from the reference's world to an upright frame.
+
+        None: there is none.
+        """
         if self.evaluation is None:
             return None
         R = self.view()[:3, :3] @ self.evaluation.T_ref_est[:3, :3].T
@@ -68,7 +72,8 @@ class Mapped:
 
     position: FloatArray  # (N, 3) right, ahead, up, metres
     keyframes: FloatArray  # (K, 3)
-    loops: FloatArray  # (L, 2, 3) from a frame to the keyframe of this run that it sees again; those that were kept
+    # (L, 2, 3) from a frame to the keyframe of this run that it sees again; those that were kept
+    loops: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +85,9 @@ class Curves:
     position: FloatArray  # (N, 3) right, ahead, up, metres
     position_sigma: FloatArray  # (N, 3)
     attitude: (
-        FloatArray  # (N, 3) heading (to the right), pitch (up), roll (right side down) of the left camera, degrees
+        # (N, 3) heading (to the right), pitch (up), roll (right side down) of the left camera,
+        # degrees
+        FloatArray
     )
     attitude_sigma: FloatArray  # (N, 3)
     velocity: FloatArray  # (N, 3) right, ahead, up, m/s; NaN where the filter has none
@@ -93,20 +100,30 @@ class Curves:
 
 
 def curves_of(runs: Sequence[FinishedRun]) -> list[Curves]:
-    """Return the curves of runs; those of one recording with a reference share its frame, and lie upon one another."""
+    """Return the curves of runs; those of one recording with a reference share its frame, and
+    lie upon one another.
+    """
     views: dict[str, FloatArray] = {}  # by recording
     curves = []
     for run in runs:
-        source, points = str(run.metrics.get("source")), run.points[_chosen_points(run)]
+        source = str(run.metrics.get("source"))
+        points = run.points[_chosen_points(run)]
         drawn = DrawnRun(
-            run.estimates, run.T_cam0_body, run.metrics.get("motion"), run.evaluation, run.dead_reckoning, points
+            run.estimates,
+            run.T_cam0_body,
+            run.metrics.get("motion"),
+            run.evaluation,
+            run.dead_reckoning,
+            points,
         )
         first = source not in views
         view = drawn.view_of_reference() if first else views[source]
         if view is not None:
             views[source] = view
         found = draw(drawn, view, most=_MOST)
-        curves.append(replace(found, mapped=_mapped(run, drawn, found.T_view_world, view), draws_truth=first))
+        curves.append(
+            replace(found, mapped=_mapped(run, drawn, found.T_view_world, view), draws_truth=first)
+        )
     return curves
 
 
@@ -124,7 +141,9 @@ def draw(run: DrawnRun, view_ref: FloatArray | None, *, most: int | None = None)
     estimates = run.estimates[rows]
     R_view_world = T_view_world[:3, :3]
     R_view_body = R_view_world @ estimates["T_world_imu"][:, :3, :3]
-    position_P, rotation_P = (rotated(R_view_body, estimates["covariance"][:, k : k + 3, k : k + 3]) for k in (0, 3))
+    position_P, rotation_P = (
+        rotated(R_view_body, estimates["covariance"][:, k : k + 3, k : k + 3]) for k in (0, 3)
+    )
     R_view_cam0 = R_view_body @ run.T_cam0_body[:3, :3].T
     reckoned = run.dead_reckoning
     return Curves(
@@ -140,24 +159,36 @@ def draw(run: DrawnRun, view_ref: FloatArray | None, *, most: int | None = None)
         dead_reckoning=None
         if reckoned is None
         else transform_points(T_view_world, reckoned.positions[thinned(len(reckoned), most)]),
-        truth=None if run.evaluation is None or view_ref is None else _truth(run, run.evaluation, view_ref, most),
+        truth=None
+        if run.evaluation is None or view_ref is None
+        else _truth(run, run.evaluation, view_ref, most),
     )
 
 
 def stereo_curves(estimates: Rows, focal: float) -> tuple[FloatArray, FloatArray]:
-    """Return what right columns are off by (N, 4) as (R3) has it, and standard deviations, in units of `focal`."""
+    """Return what right columns are off by (N, 4) as (R3) has it, and standard deviations, in
+    units of `focal`.
+    """
     P = np.diagonal(estimates["stereo_field_covariance"], axis1=1, axis2=2)[:, :RIGHT_TERMS]
     return focal * estimates["stereo_field"][:, :RIGHT_TERMS], focal * np.sqrt(np.maximum(P, 0.0))
 
 
 def binned(seconds: FloatArray, values: FloatArray, bins: int) -> tuple[FloatArray, FloatArray]:
-    """Return mean times and medians over equal groups of frames, so that thousands remain a readable curve."""
+    """Return mean times and medians over equal groups of frames, so that thousands remain a
+    readable curve.
+    """
     groups = np.array_split(np.arange(len(seconds)), min(bins, len(seconds)))
-    return np.array([seconds[g].mean() for g in groups]), np.array([np.median(values[g]) for g in groups])
+    return np.array([seconds[g].mean() for g in groups]), np.array(
+        [np.median(values[g]) for g in groups]
+    )
 
 
-def _mapped(run: FinishedRun, drawn: DrawnRun, T_view_world: FloatArray, view_ref: FloatArray | None) -> Mapped | None:
-    """Return a run in its map: aligned with the reference as the run itself is, else so that the first poses agree."""
+def _mapped(
+    run: FinishedRun, drawn: DrawnRun, T_view_world: FloatArray, view_ref: FloatArray | None
+) -> Mapped | None:
+    """Return a run in its map: aligned with the reference as the run itself is, else so that the
+    first poses agree.
+    """
     if run.mapped is None:
         return None
     T = run.mapped.T_world_body
@@ -179,7 +210,8 @@ def _mapped(run: FinishedRun, drawn: DrawnRun, T_view_world: FloatArray, view_re
 
 
 def _truth(run: DrawnRun, evaluation: Evaluation, view_ref: FloatArray, most: int | None) -> Truth:
-    rows, times = thinned(len(evaluation.rows), most), run.estimates["time_ns"]
+    rows = thinned(len(evaluation.rows), most)
+    times = run.estimates["time_ns"]
     body = view_ref @ run.reference_body()[rows]
     return Truth(
         seconds=np.asarray((times[evaluation.rows[rows]] - times[0]) * 1e-9, dtype=np.float64),
@@ -191,9 +223,11 @@ def _truth(run: DrawnRun, evaluation: Evaluation, view_ref: FloatArray, most: in
 
 
 def _attitude_sigma(R_view_cam0: FloatArray, P: FloatArray) -> FloatArray:
-    """Return the standard deviations (N, 3) of rotations about the vertical, the camera's right and its optical axis.
+    """Return the standard deviations (N, 3) of rotations about the vertical, the camera's right and
+    its optical axis.
 
-    P (N, 3, 3) is the covariance of rotations in the upright frame, rad^2, in which the attitudes (N, 3, 3) are.
+    P (N, 3, 3) is the covariance of rotations in the upright frame, rad^2, in which the attitudes
+    (N, 3, 3) are.
     """
     up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), R_view_cam0[:, :, 0].shape)
     axes = np.stack([up, R_view_cam0[:, :, 0], R_view_cam0[:, :, 2]], axis=1)  # (N, axis, 3)
@@ -205,12 +239,16 @@ def _sigmas(P: FloatArray) -> FloatArray:
 
 
 def thinned(count: int, most: int | None = _MOST) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Return at most `most` row numbers of `count` (None: all), evenly spread, with the first and the last."""
+    """Return at most `most` row numbers of `count` (None: all), evenly spread, with the first
+    and the last.
+    """
     return np.unique(np.linspace(0, count - 1, min(count, most or count)).round().astype(np.int64))
 
 
 def _chosen_points(run: FinishedRun) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Return the row numbers of the landmarks to draw: the most certain ones, relative to their distance."""
+    """Return the row numbers of the landmarks to draw: the most certain ones, relative to their
+    distance.
+    """
     if len(run.points) <= _MOST_POINTS:
         return np.arange(len(run.points))
     return np.sort(np.argsort(run.point_sigmas, kind="stable")[:_MOST_POINTS])

@@ -1,10 +1,13 @@
-"""Names of what lies in a run's folder: writers, readers and the check of what may be replaced take them from here."""
+"""Names of what lies in a run's folder: writers, readers and the check of what may be replaced
+take them from here.
+"""
 
 
 class RunFile:
     """Files of a run's folder."""
 
-    METRICS = "metrics.json"  # a folder with this file, and with nothing but `FILES`, is a run's and may be replaced
+    # a folder with this file, and with nothing but `FILES`, is a run's and may be replaced
+    METRICS = "metrics.json"
     CONFIG = "config.yaml"
     TRAJECTORY = "trajectory.tum"
     TRAJECTORY_KITTI = "trajectory.kitti"

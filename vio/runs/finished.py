@@ -1,4 +1,6 @@
-"""Reader of a run's folder for those who show it: estimates, the log of the frames, map, reference, settings."""
+"""Reader of a run's folder for those who show it: estimates, the log of the frames, map,
+reference, settings.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,8 @@ class FinishedRun:
     trajectory: Trajectory
     evaluation: Evaluation | None  # against the reference; None: there is none
     dead_reckoning: Trajectory | None
-    changed: Mapping[str, tuple[Any, Any]]  # settings that differ from the default: (value, default)
+    # settings that differ from the default: (value, default)
+    changed: Mapping[str, tuple[Any, Any]]
     T_cam0_body: FloatArray  # (4, 4)
     mapped: Trajectory | None  # poses of all frames in the map; None: the run had no map
     loops: tuple[LoopEvent, ...]  # places seen again
@@ -69,7 +72,10 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
     """
     metrics, T_cam0_body = read_metrics(folder)
     if not (folder / RunFile.ESTIMATES).is_file() and (folder / RunFile.UNFINISHED).is_dir():
-        raise DataError(f"{folder}: this run was ended before its end; `vio run --resume {folder}` goes on with it")
+        raise DataError(
+            f"{folder}: this run was ended before its end; `vio run --resume {folder}` goes on "
+            "with it"
+        )
     estimates = read_estimates(folder / RunFile.ESTIMATES)
     points = read_points(folder / RunFile.LANDMARKS)
     trajectory = Trajectory(
@@ -78,7 +84,8 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
         "cam0" if metrics.get("body") == "cam0" else "imu",
         frame_indices=np.array(estimates["index"]),
     )
-    reckoned, in_map = folder / RunFile.DEAD_RECKONING, folder / RunFile.MAP_TRAJECTORY
+    reckoned = folder / RunFile.DEAD_RECKONING
+    in_map = folder / RunFile.MAP_TRAJECTORY
     return FinishedRun(
         folder=folder,
         name=folder.resolve().name,
@@ -113,11 +120,23 @@ def read_estimates(path: Path) -> Rows:
     """Read the table of estimates; columns that an older version did not write are NaN."""
     try:
         found = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, TokenError) as error:  # NumPy takes a damaged header for one of Python 2
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        TokenError,
+    ) as error:  # NumPy takes a damaged header for one of Python 2
         reason = " ".join(str(error).split())
-        raise DataError(f"{path}: cannot be read ({reason}); the run wrote no estimates, repeat it") from error
+        raise DataError(
+            f"{path}: cannot be read ({reason}); the run wrote no estimates, repeat it"
+        ) from error
     needed = {"index", "time_ns", "T_world_imu", "covariance"}
-    if found.dtype.names is None or not needed <= set(found.dtype.names) or found.ndim != 1 or not len(found):
+    if (
+        found.dtype.names is None
+        or not needed <= set(found.dtype.names)
+        or found.ndim != 1
+        or not len(found)
+    ):
         raise DataError(f"{path}: is no table of estimates; repeat the run")
     rows = np.zeros(len(found), dtype=ESTIMATE)
     for name in ESTIMATE.names or ():
@@ -130,10 +149,14 @@ def _read_frames(path: Path, count: int) -> dict[str, FloatArray]:
     """Read the log of the frames by column; missing values are NaN."""
     header, *lines = list(csv.reader(read_lines(path))) or [[]]
     if len(lines) != count or any(len(line) != len(header) for line in lines):
-        raise DataError(f"{path}: has {len(lines)} frames where estimates.npy has {count}; repeat the run")
+        raise DataError(
+            f"{path}: has {len(lines)} frames where estimates.npy has {count}; repeat the run"
+        )
     try:
         return {
-            _FORMER.get(name, name): np.array([float(line[k]) if line[k] else np.nan for line in lines])
+            _FORMER.get(name, name): np.array(
+                [float(line[k]) if line[k] else np.nan for line in lines]
+            )
             for k, name in enumerate(header)
         }
     except ValueError as error:
@@ -167,7 +190,8 @@ def _positions(points: np.ndarray[Any, Any]) -> FloatArray:
 
 
 def up_of_odometry(folder: Path, metrics: dict[str, Any]) -> FloatArray | None:
-    """Return the direction (3,) that is up in the world of a run's odometry, as its end knows it, see `up_of`.
+    """Return the direction (3,) that is up in the world of a run's odometry, as its end knows it,
+    see `up_of`.
 
     Raises:
         DataError: the file of the estimates is damaged.
@@ -200,4 +224,8 @@ def _changed_settings(path: Path) -> dict[str, tuple[Any, Any]]:
     except ConfigError as error:
         log.warning("%s", error)
         return {}
-    return {row.key: (values[row.key], row.default) for row in describe(Config()) if values[row.key] != row.default}
+    return {
+        row.key: (values[row.key], row.default)
+        for row in describe(Config())
+        if values[row.key] != row.default
+    }

@@ -47,7 +47,8 @@ log = logging.getLogger(__name__)
 # Of a request: it may move, or be compared anew.
 _OF_THE_OUTPUT = ("source", "reference", "lengths_m", "save_calibration", "command", "plot")
 _SLOW = 10.0  # times the median; frames that take longer compile, or wait for something else
-_CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
+_CHUNK = 100_000  # points and frames at a time
+_CHUNK_FRAMES = 5_000
 
 
 def write_run_folder(
@@ -92,8 +93,8 @@ def finish_run_folder(
 ) -> dict[str, Any]:
     """Write the results of a run into the folder in which it grew, and return the metrics.
 
-    What a run that ended early needs to go on stays in `unfinished/`. The first arguments are those of
-    `write_run_folder`.
+    What a run that ended early needs to go on stays in `unfinished/`. The first arguments are those
+    of `write_run_folder`.
 
     Raises:
         VioError: the folder cannot be written.
@@ -107,7 +108,13 @@ def finish_run_folder(
             shutil.rmtree(final)
         final.mkdir()
         metrics, picture = _write_files(
-            final, folder, result, reference, lengths_m, save_observations=save_observations, more=more
+            final,
+            folder,
+            result,
+            reference,
+            lengths_m,
+            save_observations=save_observations,
+            more=more,
         )
         if result.stopped is None:
             (unfinished / RunFile.ESTIMATES).replace(folder / RunFile.ESTIMATES)
@@ -118,18 +125,24 @@ def finish_run_folder(
         (final / RunFile.METRICS).replace(folder / RunFile.METRICS)
         shutil.rmtree(unfinished if result.stopped is None else final)
     except OSError as error:
-        raise DataError(f"cannot write {folder}: {error.strerror or error}; the trajectory so far is there") from error
+        raise DataError(
+            f"cannot write {folder}: {error.strerror or error}; the trajectory so far is there"
+        ) from error
     if finished is not None:
         finished(metrics)
     if plot:
         try:
             picture.write(folder / RunFile.PICTURE)
         except KeyboardInterrupt:
-            log.warning("%s was not drawn: interrupted; all other results are complete", RunFile.PICTURE)
+            log.warning(
+                "%s was not drawn: interrupted; all other results are complete", RunFile.PICTURE
+            )
     return metrics
 
 
-def growing_folder(folder: Path, dataset: Dataset, config: Config, request: Mapping[str, Any]) -> GrowingFolder:
+def growing_folder(
+    folder: Path, dataset: Dataset, config: Config, request: Mapping[str, Any]
+) -> GrowingFolder:
     """Describe a run before its first frame, as its folder says it while the run goes on."""
     recording = dataset.recording
     metrics = {
@@ -144,21 +157,29 @@ def growing_folder(folder: Path, dataset: Dataset, config: Config, request: Mapp
     texts = {
         RunFile.CONFIG: to_yaml(config),
         RunFile.METRICS: json_text(metrics, indent=2) + "\n",
-        f"{RunFile.UNFINISHED}/{REQUEST}": json.dumps(request, indent=2) + "\n",  # names of files as they are
+        # names of files as they are
+        f"{RunFile.UNFINISHED}/{REQUEST}": json.dumps(request, indent=2) + "\n",
     }
     return GrowingFolder(folder, texts, replaces=FILES, inputs=_inputs(dataset, config, request))
 
 
 def _inputs(dataset: Dataset, config: Config, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the results depend on beside the images and samples themselves: settings, calibration, frames."""
+    """Return what the results depend on beside the images and samples themselves: settings,
+    calibration, frames.
+    """
     recording = dataset.recording
     times_ns = recording.frame_times_ns
     values = {row.key: row.default for row in describe(config)}
     values |= {name: value for name, value in request.items() if name not in _OF_THE_OUTPUT}
-    values |= {"number of frames": len(times_ns), "checksum of their times": zlib.crc32(times_ns.tobytes())}
+    values |= {
+        "number of frames": len(times_ns),
+        "checksum of their times": zlib.crc32(times_ns.tobytes()),
+    }
     values |= _flat("camera", recording.camera) | _flat("T_cam0_imu", recording.T_cam0_imu)
     values |= _flat("calibration", given_rig(dataset))
-    return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
+    return {
+        name: str(value) if isinstance(value, Path) else value for name, value in values.items()
+    }
 
 
 def _flat(name: str, value: Any) -> dict[str, Any]:
@@ -197,41 +218,57 @@ def _write_files(
     save_observations: bool,
     more: Mapping[str, Any] | None = None,
 ) -> tuple[dict[str, Any], RunPicture]:
-    """Write all results but `estimates.npy` into `target`; return the metrics, which name `folder`, and the picture."""
+    """Write all results but `estimates.npy` into `target`; return the metrics, which name
+    `folder`, and the picture.
+    """
     from vio.runs.picture import RunPicture  # which imports this module by way of finished runs
 
     evaluation, dead_reckoning = score(result, reference, lengths_m=lengths_m)
     metrics = {**metrics_of(result, evaluation, dead_reckoning, folder), **(more or {})}
     (target / RunFile.CONFIG).write_text(to_yaml(result.config), encoding="utf-8")
     write_tum(target / RunFile.TRAJECTORY, result.trajectory)
-    write_kitti(target / RunFile.TRAJECTORY_KITTI, in_first_cam0(result.trajectory, result.T_cam0_body))
+    write_kitti(
+        target / RunFile.TRAJECTORY_KITTI, in_first_cam0(result.trajectory, result.T_cam0_body)
+    )
     if evaluation is not None:
         times_ns = result.trajectory.times_ns
         assert times_ns is not None
-        # The poses that were compared, each at the time of its estimate: the folder alone then gives the errors.
-        write_tum(target / RunFile.REFERENCE, replace(evaluation.reference, times_ns=times_ns[evaluation.rows]))
+        # The poses that were compared, each at the time of its estimate: the folder alone then
+        # gives the errors.
+        write_tum(
+            target / RunFile.REFERENCE,
+            replace(evaluation.reference, times_ns=times_ns[evaluation.rows]),
+        )
     if result.dead_reckoning is not None:
         write_tum(target / RunFile.DEAD_RECKONING, result.dead_reckoning)
     if result.mapped is not None:
         metrics["map"] = _write_mapped(target, result, result.mapped, reference)
     write_landmarks_ply(target / RunFile.LANDMARKS, result.landmarks)
-    frames, stages = result.frames, sorted({name for frame in result.frames for name in frame.stages_ms})
+    frames = result.frames
+    stages = sorted({name for frame in result.frames for name in frame.stages_ms})
     with (target / RunFile.FRAMES).open("w", encoding="utf-8", newline="\n") as stream:
         for start in range(0, len(frames), _CHUNK_FRAMES):
-            stream.write(frames_csv(frames[start : start + _CHUNK_FRAMES], stages, header=start == 0))
+            stream.write(
+                frames_csv(frames[start : start + _CHUNK_FRAMES], stages, header=start == 0)
+            )
     if save_observations:
         from vio.datasets.observation_log import write_observation_log
 
-        seen, samples = result.observations, result.motion_samples
+        seen = result.observations
+        samples = result.motion_samples
         assert seen is not None
         assert samples is not None
         run_motion = result.motion or "none"
-        write_observation_log(target / RunFile.OBSERVATIONS, result.recording, seen, samples, run_motion=run_motion)
+        write_observation_log(
+            target / RunFile.OBSERVATIONS, result.recording, seen, samples, run_motion=run_motion
+        )
     (target / RunFile.METRICS).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
     return metrics, RunPicture.of(result, evaluation, dead_reckoning)
 
 
-def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference: Trajectory | None) -> dict[str, Any]:
+def _write_mapped(
+    target: Path, result: RunResult, mapped: MappedRun, reference: Trajectory | None
+) -> dict[str, Any]:
     """Write the poses in the map and the loops, and return their metrics."""
     final = replace(result.trajectory, T_world_body=mapped.T_map_body)
     write_tum(target / RunFile.MAP_TRAJECTORY, final)
@@ -242,7 +279,9 @@ def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference:
     np.save(target / RunFile.MAP_COVARIANCE, causal["covariance"])
     write_loops(target, mapped.loops)
     write_keyframes(target, mapped.in_map)
-    evaluation, _ = score(replace(result, dead_reckoning=None), reference, T_world_body=mapped.T_map_body)
+    evaluation, _ = score(
+        replace(result, dead_reckoning=None), reference, T_world_body=mapped.T_map_body
+    )
     return {
         "joined": mapped.joined,
         "keyframes": mapped.keyframes,
@@ -260,10 +299,11 @@ def score(
     lengths_m: Sequence[float] | None = None,
     T_world_body: FloatArray | None = None,
 ) -> tuple[Evaluation | None, Evaluation | None]:
-    """Evaluate a run's trajectory and its dead reckoning; None without a reference or dead reckoning.
+    """Evaluate a run's trajectory and its dead reckoning; None without a reference or dead
+    reckoning.
 
-    A reference that cannot be compared (too short, no common time) gives a warning only. `T_world_body` (N, 4, 4)
-    takes the place of the run's own poses.
+    A reference that cannot be compared (too short, no common time) gives a warning only.
+    `T_world_body` (N, 4, 4) takes the place of the run's own poses.
     """
     if reference is None:
         return None, None
@@ -284,22 +324,29 @@ def score(
 
 
 def start_s(work_ms: FloatArray) -> float:
-    """Return the seconds that slow frames took beyond the median: those that compile loops, where any were compiled."""
+    """Return the seconds that slow frames took beyond the median: those that compile loops,
+    where any were compiled.
+    """
     median = float(np.median(work_ms))
     return float(np.sum(work_ms[work_ms > _SLOW * median] - median)) * 1e-3
 
 
 def refused_share(used: npt.ArrayLike, gated: npt.ArrayLike) -> float | None:
-    """Return which share of the observations the gates refused, by the numbers (F,) used and gated in each frame.
+    """Return which share of the observations the gates refused, by the numbers (F,) used and gated
+    in each frame.
 
     None: there was nothing to refuse.
     """
-    kept, refused = float(np.nansum(used)), float(np.nansum(gated))
+    kept = float(np.nansum(used))
+    refused = float(np.nansum(gated))
     return refused / (kept + refused) if kept + refused else None
 
 
 def metrics_of(
-    result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None, folder: Path
+    result: RunResult,
+    evaluation: Evaluation | None,
+    dead_reckoning: Evaluation | None,
+    folder: Path,
 ) -> dict[str, Any]:
     """Collect the metrics for `--json` and metrics.json; null where there is no reference."""
     frames = result.frames
@@ -326,9 +373,13 @@ def metrics_of(
         "ms_per_frame_median": float(np.median(work_ms)),
         "ms_per_frame_95": float(np.percentile(work_ms, 95)),
         "start_s": start_s(work_ms) if has_compiled() else 0.0,
-        "stages_ms": {name: float(np.median([getattr(f, f"{name}_ms") for f in frames])) for name in STAGES},
+        "stages_ms": {
+            name: float(np.median([getattr(f, f"{name}_ms") for f in frames])) for name in STAGES
+        },
         "refused_share": refused_share(frames.column("used"), frames.column("gated")),
-        "innovation_ratio": None if np.isnan(innovations).all() else float(np.nanmedian(innovations)),
+        "innovation_ratio": None
+        if np.isnan(innovations).all()
+        else float(np.nanmedian(innovations)),
         "landmarks": len(result.landmarks.ids),
         **{name: scores.get(name) for name in ("ate_m", "rpe")},
         "drift_lengths_m": scores.get("drift_lengths_m", []),
@@ -349,19 +400,27 @@ def metrics_of(
 
 
 def stereo_field(result: RunResult) -> dict[str, Any] | None:
-    """Return what the stereo calibration was found to be off by at the end of the run; None: it was not estimated.
+    """Return what the stereo calibration was found to be off by at the end of the run; None: it was
+    not estimated.
 
-    Coefficients of equations (R3) and (R2) of docs/math.md and their standard deviations, times the focal length; and
-    what the rig is off by, as `vio.calibration.stereo_field` names it; None where no rig of the given lens models is.
+    Coefficients of equations (R3) and (R2) of docs/math.md and their standard deviations, times the
+    focal length; and what the rig is off by, as `vio.calibration.stereo_field` names it; None where
+    no rig of the given lens models is.
     """
     field = result.estimates[-1].stereo_field
     if field is None:
         return None
     f = result.recording.camera.fu
     found = None
-    coefficients, sigmas = f * field.coefficients, f * np.sqrt(np.diag(field.covariance))
+    coefficients = f * field.coefficients
+    sigmas = f * np.sqrt(np.diag(field.covariance))
     seen = [px for px in result.frames.column("disparity_median_px") if px is not None and px == px]
-    off = StereoError(field.rows_rms_px, float(np.median(seen or [0.0])), -float(coefficients[0]), float(sigmas[0]))
+    off = StereoError(
+        field.rows_rms_px,
+        float(np.median(seen or [0.0])),
+        -float(coefficients[0]),
+        float(sigmas[0]),
+    )
     if not result.recording.camera.is_cylinder:
         try:
             found = result.calibrated_rig()
@@ -387,31 +446,54 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
 
 
 def stereo_scale(result: RunResult) -> dict[str, Any] | None:
-    """Return by what baseline and focal length were found to differ at the end of the run; None: not estimated."""
+    """Return by what baseline and focal length were found to differ at the end of the run.
+
+    None: not estimated.
+    """
     scale = result.estimates[-1].stereo_scale
     if scale is None:
         return None
-    return {name.replace(" ", "_"): {"percent": p, "sigma_percent": s} for name, (p, s) in scale.percent().items()}
+    return {
+        name.replace(" ", "_"): {"percent": p, "sigma_percent": s}
+        for name, (p, s) in scale.percent().items()
+    }
 
 
 def final_scale_sigma(result: RunResult) -> float | None:
-    """Return the median standard deviation of the scale over the frames, over it; None: not of one camera."""
-    known = [sigma for sigma in result.estimates.column("scale_sigma") if sigma is not None and sigma == sigma]
+    """Return the median standard deviation of the scale over the frames, over it.
+
+    None: not of one camera.
+    """
+    known = [
+        sigma
+        for sigma in result.estimates.column("scale_sigma")
+        if sigma is not None and sigma == sigma
+    ]
     return float(np.median(known)) if known else None
 
 
 def rig_scale_sigma(result: RunResult) -> float | None:
-    """Return the standard deviation of the scale by the calibration, over it; None: it is estimated or left out."""
-    settings, camera = result.config.msckf, result.recording.camera
-    if result.config.backend != "msckf" or camera.kind == "mono" or result.estimates[-1].stereo_scale is not None:
+    """Return the standard deviation of the scale by the calibration, over it.
+
+    None: it is estimated or left out.
+    """
+    settings = result.config.msckf
+    camera = result.recording.camera
+    if (
+        result.config.backend != "msckf"
+        or camera.kind == "mono"
+        or result.estimates[-1].stereo_scale is not None
+    ):
         return None
     return float(np.hypot(settings.stereo_baseline_sigma, settings.stereo_focal_sigma))
 
 
 def camera_imu(result: RunResult) -> dict[str, Any] | None:
-    """Return the extrinsics and the time offset as estimated at the end of the run; None: neither was.
+    """Return the extrinsics and the time offset as estimated at the end of the run; None: neither
+    was.
 
-    Rotation and translation are those of `T_given^-1 T_cam0_imu` on the IMU's side, the correction of the given one.
+    Rotation and translation are those of `T_given^-1 T_cam0_imu` on the IMU's side, the correction
+    of the given one.
     """
     estimate = result.estimates[-1]
     out: dict[str, Any] = {}
@@ -432,19 +514,26 @@ def camera_imu(result: RunResult) -> dict[str, Any] | None:
 
 
 def imu_calibration(result: RunResult) -> dict[str, Any] | None:
-    """Return scale and misalignment of the IMU as estimated at the end of the run; None: they were not.
+    """Return scale and misalignment of the IMU as estimated at the end of the run; None: they were
+    not.
 
-    Entries of `M - I` of equation (A1) of docs/math.md, which multiply the readings: by sensor, the scales of x, y, z
-    in %, and the others by row and column in degrees, with their standard deviations.
+    Entries of `M - I` of equation (A1) of docs/math.md, which multiply the readings: by sensor, the
+    scales of x, y, z in %, and the others by row and column in degrees, with their standard
+    deviations.
     """
     estimate = result.estimates[-1]
-    terms, sigmas = estimate.imu_terms, estimate.imu_terms_sigma
+    terms = estimate.imu_terms
+    sigmas = estimate.imu_terms_sigma
     if terms is None or sigmas is None:
         return None
     out: dict[str, Any] = {}
-    for (sensor, row, column), value, sigma in zip(IMU_ENTRIES, terms.tolist(), sigmas.tolist(), strict=True):
+    for (sensor, row, column), value, sigma in zip(
+        IMU_ENTRIES, terms.tolist(), sigmas.tolist(), strict=True
+    ):
         own = out.setdefault(("accelerometer", "gyro")[sensor], {})
-        kind, factor = ("scale_percent", 100.0) if row == column else ("misalignment_deg", math.degrees(1.0))
+        kind, factor = (
+            ("scale_percent", 100.0) if row == column else ("misalignment_deg", math.degrees(1.0))
+        )
         axes = "xyz"[row] if row == column else "xyz"[row] + "xyz"[column]
         if sigma > 0:
             own.setdefault(kind, {})[axes] = factor * value
@@ -453,14 +542,19 @@ def imu_calibration(result: RunResult) -> dict[str, Any] | None:
 
 
 def landmark_error(result: RunResult, evaluation: Evaluation | None) -> dict[str, Any] | None:
-    """Compare the map with surveyed landmarks, after alignment of the trajectory; None: no such landmarks."""
+    """Compare the map with surveyed landmarks, after alignment of the trajectory.
+
+    None: no such landmarks.
+    """
     truth = result.recording.landmarks_reference
     if truth is None or evaluation is None:
         return None
     _, own, theirs = np.intersect1d(result.landmarks.ids, truth.ids, return_indices=True)
     if len(own) == 0:
         return None
-    aligned = transform_points(evaluation.T_ref_est, evaluation.scale * result.landmarks.p_world[own])
+    aligned = transform_points(
+        evaluation.T_ref_est, evaluation.scale * result.landmarks.p_world[own]
+    )
     errors_m = np.linalg.norm(aligned - truth.p_world[theirs], axis=1)
     return {
         "matched": len(own),
@@ -470,7 +564,8 @@ def landmark_error(result: RunResult, evaluation: Evaluation | None) -> dict[str
 
 
 def calibration_text(result: RunResult) -> str:
-    """Return the calibration with what a run found it to be off by, as Kalibr's camchain, which `vio.load_rig` reads.
+    """Return the calibration with what a run found it to be off by, as Kalibr's camchain, which
+    `vio.load_rig` reads.
 
     Raises:
         DataError: the recording holds features without an image size.
@@ -478,13 +573,22 @@ def calibration_text(result: RunResult) -> str:
     """
     found = result.calibrated_rig()
     if found is None:
-        raise DataError(f"{result.recording.path}: states no image size, which a calibration needs; nothing was saved")
+        raise DataError(
+            f"{result.recording.path}: states no image size, which a calibration needs; nothing "
+            "was saved"
+        )
     lines = [f"by vio run {__version__}, of {result.recording.path.name}"]
     lines += found.lines() or ["nothing was found to be off: the calibration as given"]
     if found.left_px:
-        lines.append(f"what this calibration cannot express of it: {found.left_px:.2f} px (rms over the images)")
+        lines.append(
+            f"what this calibration cannot express of it: {found.left_px:.2f} px (rms over the "
+            "images)"
+        )
     if result.recording.camera.is_cylinder and result.estimates[-1].stereo_field is not None:
-        lines.append("left and right are as given, though found to be off; run with dataset.projection=pinhole")
+        lines.append(
+            "left and right are as given, though found to be off; run with "
+            "dataset.projection=pinhole"
+        )
     if not result.recording.has_images:
         lines.append("of the rectified images that the features come from")
     return "".join(f"# {printable(line)}\n" for line in lines) + kalibr_text(found.rig)
@@ -510,22 +614,35 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
     """
     path = folder / RunFile.METRICS
     if not path.is_file():
-        raise DataError(f"{folder}: no run folder (it has no {RunFile.METRICS}); give a folder that `vio run` wrote")
+        raise DataError(
+            f"{folder}: no run folder (it has no {RunFile.METRICS}); give a folder that `vio run` "
+            "wrote"
+        )
     try:
         metrics = json.loads(read_input(path))
         T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
     if metrics.get("complete") is False:
-        log.warning("%s: the run has not reached the end of its recording; these are its results so far", folder)
+        log.warning(
+            "%s: the run has not reached the end of its recording; these are its results so far",
+            folder,
+        )
     return metrics, checked_transform(T_cam0_imu, f"{path}, T_cam0_imu")
 
 
 def write_landmarks_ply(path: Path, landmarks: Landmarks) -> None:
-    """Write the map as a binary PLY: x y z in metres, and the largest standard deviation of any direction."""
-    count, names = len(landmarks.ids), ("x", "y", "z", "sigma")
+    """Write the map as a binary PLY: x y z in metres, and the largest standard deviation of any
+    direction.
+    """
+    count = len(landmarks.ids)
+    names = ("x", "y", "z", "sigma")
     header = "ply\nformat binary_little_endian 1.0\ncomment landmarks in the world frame, metres\n"
-    header += f"element vertex {count}\n" + "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    header += (
+        f"element vertex {count}\n"
+        + "".join(f"property float {name}\n" for name in names)
+        + "end_header\n"
+    )
     with path.open("wb") as stream:
         stream.write(header.encode("ascii"))
         for start in range(0, count, _CHUNK):

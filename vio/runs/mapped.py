@@ -1,4 +1,6 @@
-"""A run in its map: poses as known at the time and at the end, and the files of its loops and keyframes."""
+"""A run in its map: poses as known at the time and at the end, and the files of its loops and
+keyframes.
+"""
 
 from __future__ import annotations
 
@@ -24,17 +26,47 @@ from vio.geometry.lie import (
     se3_inverse,
     se3_log,
 )
-from vio.records import Estimate, IntArray, LoopEvent, LoopMatches, MapKeyframes, Trajectory, no_map_keyframes
+from vio.records import (
+    Estimate,
+    IntArray,
+    LoopEvent,
+    LoopMatches,
+    MapKeyframes,
+    Trajectory,
+    no_map_keyframes,
+)
 from vio.runs.files import RunFile
 
 if TYPE_CHECKING:
     from vio.mapping.session import MapSession
 
 _LOOP_COLUMNS = (
-    *("frame", "time_ns", "keyframe", "keyframe_time_ns", "inliers", "gap_m", "joined", "keyframe_frame", "kept"),
+    *(
+        "frame",
+        "time_ns",
+        "keyframe",
+        "keyframe_time_ns",
+        "inliers",
+        "gap_m",
+        "joined",
+        "keyframe_frame",
+        "kept",
+    ),
 )
 _MATCH_COLUMNS = ("z_keyframe", "z_frame", "has_right_keyframe", "has_right_frame")
-_KEYFRAME_COLUMNS = ("keyframe", "frame", "time_ns", "own", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
+_KEYFRAME_COLUMNS = (
+    "keyframe",
+    "frame",
+    "time_ns",
+    "own",
+    "tx",
+    "ty",
+    "tz",
+    "qx",
+    "qy",
+    "qz",
+    "qw",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +79,8 @@ class MappedRun:
     keyframes: int  # of this run
     loops: tuple[LoopEvent, ...]
     in_map: MapKeyframes  # all keyframes that share the frame of `T_map_body`
-    adjustment: str | None = None  # what became of the adjustment with the IMU; None: there was nothing to adjust
+    # what became of the adjustment with the IMU; None: there was nothing to adjust
+    adjustment: str | None = None
 
 
 def mapped_run(session: MapSession, estimates: Records[Estimate], causal: Rows) -> MappedRun:
@@ -60,7 +93,9 @@ def mapped_run(session: MapSession, estimates: Records[Estimate], causal: Rows) 
 
 
 def _with_scale(in_map: MapKeyframes, sigma: float) -> MapKeyframes:
-    """Return keyframes with a scale in their covariance that none of their motions and loops knows: (G6)."""
+    """Return keyframes with a scale in their covariance that none of their motions and loops
+    knows: (G6).
+    """
     T = in_map.T_map_body
     xi_D_scale = np.zeros((len(T), 6))
     xi_D_scale[:, :3] = np.einsum("kji,kj->ki", T[:, :3, :3], T[:, :3, 3] - T[:1, :3, 3])
@@ -69,9 +104,14 @@ def _with_scale(in_map: MapKeyframes, sigma: float) -> MapKeyframes:
 
 
 def corrected(
-    T_odom_body: FloatArray, index: IntArray, frames: IntArray, T_map: FloatArray, T_odom: FloatArray
+    T_odom_body: FloatArray,
+    index: IntArray,
+    frames: IntArray,
+    T_map: FloatArray,
+    T_odom: FloatArray,
 ) -> FloatArray:
-    """Return poses (N, 4, 4) in the map: the odometry, with the corrections of the keyframes spread between them.
+    """Return poses (N, 4, 4) in the map: the odometry, with the corrections of the keyframes spread
+    between them.
 
     Args:
         T_odom_body: (N, 4, 4) odometry.
@@ -85,7 +125,8 @@ def corrected(
     before = np.clip(np.searchsorted(frames, index, side="right") - 1, 0, len(frames) - 1)
     after = np.minimum(before + 1, len(frames) - 1)
     out = T_map[before] @ se3_inverse(T_odom[before]) @ T_odom_body
-    # The correction of the next keyframe, in its own frame, comes in with the share of the frames that have passed.
+    # The correction of the next keyframe, in its own frame, comes in with the share of the frames
+    # that have passed.
     end = T_map[before] @ se3_inverse(T_odom[before]) @ T_odom[after]
     xi = se3_log(se3_inverse(end) @ T_map[after])
     share = (index - frames[before]) / np.maximum(frames[after] - frames[before], 1)
@@ -93,7 +134,8 @@ def corrected(
 
 
 def read_trajectories(folder: Path) -> tuple[Trajectory, Trajectory]:
-    """Return the poses of a run's frames, in its map where it had one, and the same by odometry, as the landmarks are.
+    """Return the poses of a run's frames, in its map where it had one, and the same by odometry, as
+    the landmarks are.
 
     Raises:
         DataError: a file cannot be used, or they are not of the same frames.
@@ -103,13 +145,20 @@ def read_trajectories(folder: Path) -> tuple[Trajectory, Trajectory]:
         return odometry, odometry
     in_map = read_trajectory(folder / RunFile.MAP_TRAJECTORY)
     if len(odometry) != len(in_map):
-        raise DataError(f"{folder}: its trajectories in the map and by odometry differ in length; repeat the run")
+        raise DataError(
+            f"{folder}: its trajectories in the map and by odometry differ in length; repeat the "
+            "run"
+        )
     return in_map, odometry
 
 
 def write_loops(folder: Path, loops: Sequence[LoopEvent]) -> None:
     """Write the loops of a run, one a line, and the features that agree with them."""
-    _write_rows(folder / RunFile.LOOPS, _LOOP_COLUMNS, [[getattr(o, name) for name in _LOOP_COLUMNS] for o in loops])
+    _write_rows(
+        folder / RunFile.LOOPS,
+        _LOOP_COLUMNS,
+        [[getattr(o, name) for name in _LOOP_COLUMNS] for o in loops],
+    )
     known = [(n, o.matches) for n, o in enumerate(loops) if o.matches is not None]
     of_loop = np.repeat([n for n, _ in known], [len(m) for _, m in known]).astype(np.int64)
     none = np.zeros((0, 4)), np.zeros(0, dtype=np.bool_)
@@ -125,7 +174,12 @@ def write_keyframes(folder: Path, keyframes: MapKeyframes) -> None:
     np.save(folder / RunFile.MAP_KEYFRAMES_COVARIANCE, keyframes.covariance)
     T = keyframes.T_map_body
     poses = np.concatenate([T[:, :3, 3], quat_xyzw_from_rotation(T[:, :3, :3])], axis=1).tolist()
-    columns = (keyframes.keyframe, keyframes.frame, keyframes.time_ns, keyframes.own.astype(np.int64))
+    columns = (
+        keyframes.keyframe,
+        keyframes.frame,
+        keyframes.time_ns,
+        keyframes.own.astype(np.int64),
+    )
     numbers = np.stack(columns, axis=1).tolist()
     rows = [[*row, *pose] for row, pose in zip(numbers, poses, strict=True)]
     _write_rows(folder / RunFile.MAP_KEYFRAMES, _KEYFRAME_COLUMNS, rows)
@@ -170,14 +224,18 @@ def read_keyframes(folder: Path) -> MapKeyframes:
     try:
         rows = [*csv.DictReader(read_lines(path))]
         keyframe, frame, time_ns, own = (
-            np.array([int(row[name]) for row in rows], dtype=np.int64) for name in _KEYFRAME_COLUMNS[:4]
+            np.array([int(row[name]) for row in rows], dtype=np.int64)
+            for name in _KEYFRAME_COLUMNS[:4]
         )
         values = [[float(row[name]) for name in _KEYFRAME_COLUMNS[4:]] for row in rows]
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
     poses = np.array(values).reshape(-1, 7)
     P = _read_covariances(folder / RunFile.MAP_KEYFRAMES_COVARIANCE, len(poses))
-    if not np.isfinite(poses).all() or (np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) > 1e-3).any():
+    if (
+        not np.isfinite(poses).all()
+        or (np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) > 1e-3).any()
+    ):
         raise DataError(f"{path}: is damaged (a pose is none); repeat the run")
     T = se3_from_parts(rotation_from_quat_xyzw(poses[:, 3:]), poses[:, :3])
     return MapKeyframes(keyframe, frame, time_ns, own > 0, T, P)
@@ -197,7 +255,9 @@ def _read_covariances(path: Path, count: int) -> FloatArray:
 
 
 def _write_rows(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    lines = [",".join("" if value is None else str(value) for value in row) for row in [columns, *rows]]
+    lines = [
+        ",".join("" if value is None else str(value) for value in row) for row in [columns, *rows]
+    ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -222,4 +282,7 @@ def _read_matches(path: Path) -> dict[int, LoopMatches]:
     loop = held.get("loop")
     if loop is None or shapes != [(len(loop), 4), (len(loop), 4), (len(loop),), (len(loop),)]:
         raise DataError(f"{path}: is damaged; repeat the run")
-    return {int(n): LoopMatches(*(held[name][loop == n] for name in _MATCH_COLUMNS)) for n in np.unique(loop)}
+    return {
+        int(n): LoopMatches(*(held[name][loop == n] for name in _MATCH_COLUMNS))
+        for n in np.unique(loop)
+    }

@@ -18,25 +18,48 @@ from vio.files.printable import printable
 from vio.files.tables import Rows
 from vio.geometry.lie import FloatArray
 from vio.records import STAGES
-from vio.runs.curves import COLOURS, SIGMAS, STAGE_COLOURS, Curves, DrawnRun, binned, draw, stereo_curves
+from vio.runs.curves import (
+    COLOURS,
+    SIGMAS,
+    STAGE_COLOURS,
+    Curves,
+    DrawnRun,
+    binned,
+    draw,
+    stereo_curves,
+)
 from vio.runs.pipeline import RunResult
 
 log = logging.getLogger(__name__)
 
-_ESTIMATE, _REFERENCE, _DEAD_RECKONING, _LANDMARKS = "#1f5fbf", "#111111", "#d9822b", "#9aa5b1"
-_GREEN, _PURPLE = "#3a9d5d", "#8a5fb0"
-_MOVED_SIGMAS = 3.0  # a stereo calibration that ends within so many standard deviations of zero is not drawn
+_ESTIMATE = "#1f5fbf"
+_REFERENCE = "#111111"
+_DEAD_RECKONING = "#d9822b"
+_LANDMARKS = "#9aa5b1"
+_GREEN = "#3a9d5d"
+_PURPLE = "#8a5fb0"
+# a stereo calibration that ends within so many standard deviations of zero is not drawn
+_MOVED_SIGMAS = 3.0
 _LEAST_MARGIN_M = 0.02  # about a rig that stands
 _MILLIMETRES_BELOW_M = 0.02  # largest error of trajectories that are compared
 _SCALE = 1.3  # of the largest value to the end of an axis
 _BINS = 250  # of the curves that are medians over frames
-# Of the panels, as shares of the figure and of a panel. A layout that matplotlib finds by itself draws all twice.
-_MARGINS = {"left": 0.06, "right": 0.985, "bottom": 0.06, "top": 0.925, "wspace": 0.18, "hspace": 0.26}
+# Of the panels, as shares of the figure and of a panel. A layout that matplotlib finds by itself
+# draws all twice.
+_MARGINS = {
+    "left": 0.06,
+    "right": 0.985,
+    "bottom": 0.06,
+    "top": 0.925,
+    "wspace": 0.18,
+    "hspace": 0.26,
+}
 
 
 @dataclass(frozen=True, slots=True)
 class RunPicture:
-    """The map from above, and height, attitude, errors, feature counts and times over the frames of a run.
+    """The map from above, and height, attitude, errors, feature counts and times over the frames of
+    a run.
 
     It keeps copies, and so can be drawn when the files that the run grew in are gone.
     """
@@ -48,8 +71,12 @@ class RunPicture:
     focal: float | None  # of the panel of the stereo calibration; None: there is none
 
     @classmethod
-    def of(cls, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> RunPicture:
-        """Keep what is drawn of a run, its trajectory and dead reckoning compared with a reference (None: without)."""
+    def of(
+        cls, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None
+    ) -> RunPicture:
+        """Keep what is drawn of a run, its trajectory and dead reckoning compared with a
+        reference (None: without).
+        """
         drawn = DrawnRun(
             np.array(result.estimates.rows),
             result.T_cam0_body,
@@ -59,33 +86,49 @@ class RunPicture:
             result.landmarks.p_world,
         )
         focal = result.recording.camera.fu if has_calibration_panel(result) else None
-        return cls(drawn, np.array(result.frames.rows), dead_reckoning, _title(result, evaluation), focal)
+        return cls(
+            drawn, np.array(result.frames.rows), dead_reckoning, _title(result, evaluation), focal
+        )
 
     def write(self, path: Path) -> None:
-        """Write a PNG; a picture that cannot be drawn or written gives a warning: the results do not depend on it."""
+        """Write a PNG; a picture that cannot be drawn or written gives a warning: the results do
+        not depend on it.
+        """
         write_picture(path, lambda: _figure(self))
 
 
 def write_picture(path: Path, draw: Callable[[], Any]) -> None:
-    """Write the matplotlib figure that `draw` returns as a PNG; a failure gives a warning and leaves no file."""
+    """Write the matplotlib figure that `draw` returns as a PNG; a failure gives a warning and
+    leaves no file.
+    """
     try:
         stream = io.BytesIO()
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # another script
-            draw().savefig(stream, format="png", pil_kwargs={"compress_level": 1})  # a tenth larger, sooner
+            # another script
+            warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)
+            # a tenth larger, sooner
+            draw().savefig(stream, format="png", pil_kwargs={"compress_level": 1})
         path.write_bytes(stream.getvalue())
     except Exception as error:
-        log.warning("%s was not drawn (%s: %s)", path.name, type(error).__name__, " ".join(str(error).split()))
+        log.warning(
+            "%s was not drawn (%s: %s)",
+            path.name,
+            type(error).__name__,
+            " ".join(str(error).split()),
+        )
         log.debug("the traceback of the picture", exc_info=True)
         with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)
 
 
 def _figure_class() -> Any:
-    """Load matplotlib without the texts of help that it writes for each of its classes, a third of its loading time."""
+    """Load matplotlib without the texts of help that it writes for each of its classes, a third
+    of its loading time.
+    """
     from matplotlib import artist
 
-    written, artist.kwdoc = artist.kwdoc, lambda _: ""  # type: ignore[assignment]
+    written = artist.kwdoc
+    artist.kwdoc = lambda _: ""  # type: ignore[assignment]
     try:
         from matplotlib.figure import Figure
     finally:
@@ -113,12 +156,15 @@ def _figure(picture: RunPicture) -> Any:
         axes.grid(alpha=0.25)
         axes.tick_params(labelbottom=axes is panels[-1])  # all have the time axis of the last one
     panels[-1].set_xlabel("time in the recording (s)")
-    figure.suptitle(picture.title, fontsize=12, parse_math=False)  # a $ in a file name is no formula
+    # a $ in a file name is no formula
+    figure.suptitle(picture.title, fontsize=12, parse_math=False)
     return figure
 
 
 def has_calibration_panel(result: RunResult) -> bool:
-    """Return whether the stereo calibration was estimated, and ended off by more than its standard deviations."""
+    """Return whether the stereo calibration was estimated, and ended off by more than its
+    standard deviations.
+    """
     field = result.estimates[-1].stereo_field
     if field is None:
         return False
@@ -145,9 +191,13 @@ def _draw_map(axes: Any, curves: Curves) -> None:
     points = curves.points[:, :2]
     box = axes.get_position()
     shape = box.width * axes.figure.get_figwidth() / (box.height * axes.figure.get_figheight())
-    low, high = _view(np.concatenate([path[1][:, :2] for path in paths if path[0] != "dead reckoning"]), shape)
+    low, high = _view(
+        np.concatenate([path[1][:, :2] for path in paths if path[0] != "dead reckoning"]), shape
+    )
     inside = np.all((points >= low) & (points <= high), axis=1)
-    axes.scatter(*points[inside].T, s=1.2, c=_LANDMARKS, linewidths=0, label="landmarks", rasterized=True)
+    axes.scatter(
+        *points[inside].T, s=1.2, c=_LANDMARKS, linewidths=0, label="landmarks", rasterized=True
+    )
     for label, positions, colour, style, width in paths:
         axes.plot(*positions[:, :2].T, color=colour, ls=style, lw=width, label=label)
     axes.plot(0, 0, "o", color=_REFERENCE, ms=6, mfc="white", label="start")
@@ -162,8 +212,11 @@ def _draw_map(axes: Any, curves: Curves) -> None:
 
 
 def _view(paths: FloatArray, shape: float) -> tuple[FloatArray, FloatArray]:
-    """Return limits of a panel whose width is `shape` times its height: all paths (N, 2), a margin, equal scales."""
-    low, high = paths.min(axis=0), paths.max(axis=0)
+    """Return limits of a panel whose width is `shape` times its height: all paths (N, 2), a
+    margin, equal scales.
+    """
+    low = paths.min(axis=0)
+    high = paths.max(axis=0)
     size = high - low + 2 * max(0.1 * float((high - low).max()), _LEAST_MARGIN_M)
     half = 0.5 * np.array([max(size[0], shape * size[1]), max(size[1], size[0] / shape)])
     return 0.5 * (low + high) - half, 0.5 * (low + high) + half
@@ -171,7 +224,9 @@ def _view(paths: FloatArray, shape: float) -> tuple[FloatArray, FloatArray]:
 
 def _draw_error(axes: Any, curves: Curves, dead_reckoning: Evaluation | None) -> None:
     if curves.truth is None:
-        axes.plot(curves.seconds, np.linalg.norm(curves.position_sigma, axis=1), color=_ESTIMATE, lw=1.2)
+        axes.plot(
+            curves.seconds, np.linalg.norm(curves.position_sigma, axis=1), color=_ESTIMATE, lw=1.2
+        )
         axes.set_ylabel("position σ (m)")
         axes.set_title("no reference: the filter's own uncertainty", fontsize=9, loc="left")
         return
@@ -180,15 +235,25 @@ def _draw_error(axes: Any, curves: Curves, dead_reckoning: Evaluation | None) ->
         seconds = curves.seconds[dead_reckoning.rows]
         axes.plot(seconds, dead_reckoning.errors_m, "--", color=_DEAD_RECKONING, lw=1.1)
     axes.set_ylabel("position error (m)")
-    axes.set_ylim(0, _SCALE * max(float(curves.truth.error_m.max()), 1e-6))  # dead reckoning may leave the panel
+    # dead reckoning may leave the panel
+    axes.set_ylim(0, _SCALE * max(float(curves.truth.error_m.max()), 1e-6))
 
 
 def _draw_height(axes: Any, curves: Curves) -> None:
     """Draw the height above the start with a band of three standard deviations."""
-    height, band = curves.position[:, 2], SIGMAS * curves.position_sigma[:, 2]
+    height = curves.position[:, 2]
+    band = SIGMAS * curves.position_sigma[:, 2]
     if curves.truth is not None:
-        axes.plot(curves.truth.seconds, curves.truth.position[:, 2], color=_REFERENCE, lw=2.0, label="ground truth")
-    axes.fill_between(curves.seconds, height - band, height + band, color=_ESTIMATE, alpha=0.2, lw=0)
+        axes.plot(
+            curves.truth.seconds,
+            curves.truth.position[:, 2],
+            color=_REFERENCE,
+            lw=2.0,
+            label="ground truth",
+        )
+    axes.fill_between(
+        curves.seconds, height - band, height + band, color=_ESTIMATE, alpha=0.2, lw=0
+    )
     axes.plot(curves.seconds, height, color=_ESTIMATE, lw=1.3, label="estimate, 3σ")
     spread = max(float(np.ptp(height)), 0.1)
     axes.set_ylim(height.min() - 0.5 * spread, height.max() + 0.5 * spread)
@@ -198,14 +263,20 @@ def _draw_height(axes: Any, curves: Curves) -> None:
 
 def _draw_attitude(axes: Any, curves: Curves) -> None:
     """Draw the left camera's heading, pitch and roll."""
-    for k, (name, colour) in enumerate((("heading", _ESTIMATE), ("pitch", _DEAD_RECKONING), ("roll", _GREEN))):
+    for k, (name, colour) in enumerate(
+        (("heading", _ESTIMATE), ("pitch", _DEAD_RECKONING), ("roll", _GREEN))
+    ):
         axes.plot(curves.seconds, curves.attitude[:, k], color=colour, lw=1.2, label=name)
     axes.set_ylabel("attitude (deg)")
     axes.legend(loc="best", fontsize=8, ncols=3)
 
 
 def _draw_counts(axes: Any, seconds: FloatArray, frames: Rows) -> None:
-    for name, colour in (("matched", _LANDMARKS), ("selected", _DEAD_RECKONING), ("used", _ESTIMATE)):
+    for name, colour in (
+        ("matched", _LANDMARKS),
+        ("selected", _DEAD_RECKONING),
+        ("used", _ESTIMATE),
+    ):
         axes.plot(*binned(seconds, frames[name], _BINS), color=colour, lw=1.2, label=name)
     axes.set_ylabel("features")
     axes.set_ylim(bottom=0)
@@ -217,12 +288,15 @@ def _draw_time(axes: Any, seconds: FloatArray, frames: Rows) -> None:
     medians = [binned(seconds, frames[f"{stage}_ms"], _BINS)[1] for stage in STAGES]
     axes.stackplot(times, medians, labels=STAGES, colors=STAGE_COLOURS, linewidth=0)
     axes.set_ylabel("time (ms)")
-    axes.set_ylim(0, max(2 * float(np.median(np.sum(medians, axis=0))), 1.0))  # frames that compile leave the panel
+    # frames that compile leave the panel
+    axes.set_ylim(0, max(2 * float(np.median(np.sum(medians, axis=0))), 1.0))
     axes.legend(loc="upper right", fontsize=8, ncols=5)
 
 
 def _draw_calibration(axes: Any, seconds: FloatArray, estimates: Rows, focal: float) -> None:
-    """Draw the right columns' coefficients of (R3) with a standard deviation, and how far the rows are off."""
+    """Draw the right columns' coefficients of (R3) with a standard deviation, and how far the
+    rows are off.
+    """
     values, sigmas = stereo_curves(estimates, focal)
     names = ("all columns", "along u", "with radius²", "with radius⁴")
     for name, colour, v, sigma in zip(
@@ -237,7 +311,9 @@ def _draw_calibration(axes: Any, seconds: FloatArray, estimates: Rows, focal: fl
 
 
 def draw_comparison(results: Mapping[str, Evaluation]) -> Any:
-    """Draw evaluations against one reference, by name, in the plane in which the reference extends furthest."""
+    """Draw evaluations against one reference, by name, in the plane in which the reference
+    extends furthest.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 5.6), dpi=110, layout="constrained")
@@ -248,13 +324,22 @@ def draw_comparison(results: Mapping[str, Evaluation]) -> Any:
     largest = max(float(r.errors_m.max()) for r in results.values())
     factor, unit = (1e3, "mm") if largest < _MILLIMETRES_BELOW_M else (1.0, "m")
     for k, (name, r) in enumerate(results.items()):
-        colour, label = COLOURS[k % len(COLOURS)], f"{name}: ATE {metres_text(r.ate_m.rmse)}"
-        above.plot(*((r.aligned.positions - truth[0]) @ plane.T).T, color=colour, lw=1.4, label=label)
+        colour = COLOURS[k % len(COLOURS)]
+        label = f"{name}: ATE {metres_text(r.ate_m.rmse)}"
+        above.plot(
+            *((r.aligned.positions - truth[0]) @ plane.T).T, color=colour, lw=1.4, label=label
+        )
         steps = np.linalg.norm(np.diff(r.reference.positions, axis=0), axis=1)
-        along.plot(np.concatenate([[0.0], np.cumsum(steps)]), factor * r.errors_m, color=colour, lw=1.4)
+        along.plot(
+            np.concatenate([[0.0], np.cumsum(steps)]), factor * r.errors_m, color=colour, lw=1.4
+        )
     above.set_aspect("equal", "datalim")
     above.set(xlabel="m, along the longest extent", ylabel="m", title="paths")
-    along.set(xlabel="way on the reference (m)", ylabel=f"position error ({unit})", title="errors after alignment")
+    along.set(
+        xlabel="way on the reference (m)",
+        ylabel=f"position error ({unit})",
+        title="errors after alignment",
+    )
     along.set_ylim(bottom=0)
     for panel in (above, along):
         panel.grid(alpha=0.25)

@@ -51,7 +51,8 @@ if TYPE_CHECKING:
 __all__ = ["STAGES", "FrameLog", "RunControl", "RunResult", "Viewers", "run"]
 
 _MOST_NAMED = 5  # frames that could not be read
-_LEAST_REFUSED = 10  # frames that the front end refused, and more of them than not, before a run gives up
+# frames that the front end refused, and more of them than not, before a run gives up
+_LEAST_REFUSED = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +77,11 @@ class RunResult:
     mapped: MappedRun | None = None  # where a map was built or used
 
     def calibrated_rig(self) -> CalibratedRig | None:
-        """Return the calibration with what the run found it to be off by; None: features without an image size.
+        """Return the calibration with what the run found it to be off by; None: features without an
+        image size.
 
-        On a cylinder left and right stay as given: its rectification error is not expressed as a rig.
+        On a cylinder left and right stay as given: its rectification error is not expressed as a
+        rig.
 
         Raises:
             CalibrationError: no rig of the given lens models is off as the run found it.
@@ -94,7 +97,9 @@ class RunResult:
         T_world_body, times_ns, indices = (
             np.array(self.estimates.column(name)) for name in ("T_world_imu", "time_ns", "index")
         )
-        return Trajectory(T_world_body=T_world_body, times_ns=times_ns, body=self.body, frame_indices=indices)
+        return Trajectory(
+            T_world_body=T_world_body, times_ns=times_ns, body=self.body, frame_indices=indices
+        )
 
 
 class Viewers:
@@ -128,7 +133,8 @@ class RunControl:
 
     folder: GrowingFolder | None = None  # None: everything stays in memory
     resume: bool = False  # go on from the checkpoint in the folder
-    should_stop: Callable[[], str | None] = lambda: None  # asked after each event; a reason ends the run in order
+    # asked after each event; a reason ends the run in order
+    should_stop: Callable[[], str | None] = lambda: None
 
 
 _TO_THE_END = RunControl()
@@ -147,7 +153,8 @@ def run(
     map: MapUse | None = None,
     control: RunControl = _TO_THE_END,
 ) -> RunResult:
-    """Process a recording from its frame `start` to before frame `stop`, with BLAS pinned to one thread meanwhile.
+    """Process a recording from its frame `start` to before frame `stop`, with BLAS pinned to one
+    thread meanwhile.
 
     Args:
         dataset: the recording.
@@ -161,15 +168,19 @@ def run(
         control: where the run is written while it goes on, and what may end it.
 
     Raises:
-        VioError: the configuration, the data or the estimation is at fault; the message says which. With a folder, a
-            fault after the first frame ends the run in order instead, and the result names it.
+        VioError: the configuration, the data or the estimation is at fault; the message says which.
+            With a folder, a fault after the first frame ends the run in order instead, and the
+            result names it.
     """
-    recording, folder = dataset.recording, control.folder
+    recording = dataset.recording
+    folder = control.folder
     _check_range(recording, start, stop)
     source = recorded_source(dataset, config)
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
     began = time.perf_counter()
-    recorder = RunRecorder(body, lag_frames=config.lag_frames, keep_observations=keep_observations, folder=folder)
+    recorder = RunRecorder(
+        body, lag_frames=config.lag_frames, keep_observations=keep_observations, folder=folder
+    )
     features = source.features or dataset
     shown = Viewers(() if viewer is None else (viewer,))
     if control.resume:
@@ -183,7 +194,8 @@ def run(
             DeadReckoning(source.camera, source.T_cam0_body, config.vislam) if reckoned else None,
             start,
         )
-    processor, stopped = state.processor, None
+    processor = state.processor
+    stopped = None
     with contextlib.closing(recorder), contextlib.closing(shown), contextlib.closing(processor):
         loop = _Loop(state, recorder, shown, _taken_frames(dataset, config, start, stop))
         try:
@@ -197,7 +209,8 @@ def run(
             stopped = str(error)
         if not len(recorder):
             _nothing_done(recording, processor, stopped)
-        reckoned, session = state.dead_reckoning is not None, processor.map
+        reckoned = state.dead_reckoning is not None
+        session = processor.map
         return RunResult(
             recording=recording,
             config=config,
@@ -214,12 +227,15 @@ def run(
             wall_s=time.perf_counter() - began,
             stopped=stopped,
             rig=given_rig(dataset),
-            mapped=None if session is None else mapped_run(session, recorder.estimates, recorder.mapped),
+            mapped=None
+            if session is None
+            else mapped_run(session, recorder.estimates, recorder.mapped),
         )
 
 
 def given_rig(dataset: Dataset) -> Rig | None:
-    """Return the calibration of a recording's images; None: it holds features, and no image size or a cylinder.
+    """Return the calibration of a recording's images; None: it holds features, and no image size or
+    a cylinder.
 
     For features it is that of the rectified images that they come from.
     """
@@ -227,17 +243,27 @@ def given_rig(dataset: Dataset) -> Rig | None:
     stereo = recording.camera.kind == "stereo"
     if not (stereo and isinstance(dataset, RectifyingDataset)) or dataset.rectifier.maps is None:
         return rig_of_rectified(recording.camera, recording.T_cam0_imu)
-    made, T_cam0_imu = dataset.rectifier, recording.T_cam0_imu
+    made = dataset.rectifier
+    T_cam0_imu = recording.T_cam0_imu
     rig = made.rig
     if T_cam0_imu is not None:
         T_cam0_imu = se3_inverse(rig.T_imu_cam0)
-    return Rig(rig.cam0, rig.cam1, se3_inverse(rig.T_cam0_cam1), T_cam0_imu, dataset.imu_noise, made.time_offset_s)
+    return Rig(
+        rig.cam0,
+        rig.cam1,
+        se3_inverse(rig.T_cam0_cam1),
+        T_cam0_imu,
+        dataset.imu_noise,
+        made.time_offset_s,
+    )
 
 
 def _reopen_map(session: MapSession | None, use: MapUse | None) -> None:
     """Give a restored session its map's file; the checkpoint itself names no file."""
     if (session is None) != (use is None):
-        raise ConfigError(f"the run began {'without' if session is None else 'with'} a map; go on in the same way")
+        raise ConfigError(
+            f"the run began {'without' if session is None else 'with'} a map; go on in the same way"
+        )
     if session is not None and use is not None:
         session.reopen(use.path)
 
@@ -245,7 +271,9 @@ def _reopen_map(session: MapSession | None, use: MapUse | None) -> None:
 def _nothing_done(recording: Recording, processor: EventProcessor, stopped: str | None) -> NoReturn:
     """Say why a run has no frame."""
     if stopped is not None:
-        raise StoppedError(f"{stopped} before the first frame was done; nothing was written", status=130)
+        raise StoppedError(
+            f"{stopped} before the first frame was done; nothing was written", status=130
+        )
     if waiting := processor.pipeline.monitor.frames_waiting:
         waited = f"none of the {waiting} frames has a pose"
         raise DataError(f"{recording.path}: {waited}; see the warnings above")
@@ -258,9 +286,11 @@ class _RunState:
 
     processor: EventProcessor
     dead_reckoning: DeadReckoning | None
-    next_frame: int  # where to take up the recording's events: the last frame taken, or the first one
+    # where to take up the recording's events: the last frame taken, or the first one
+    next_frame: int
     frame_ns: int | None = None  # newest time of a frame that was taken
-    unread: list[int] = field(default_factory=list)  # numbers of frames that the recording lists and did not give
+    # numbers of frames that the recording lists and did not give
+    unread: list[int] = field(default_factory=list)
     sample_ns: int | None = None  # newest time of a motion sample that was taken
 
     def is_new(self, event: Event) -> bool:
@@ -271,7 +301,8 @@ class _RunState:
     def note(self, event: Event) -> None:
         """Note that an event was taken."""
         if isinstance(event, StereoFrame):
-            self.frame_ns, self.next_frame = event.time_ns, event.index
+            self.frame_ns = event.time_ns
+            self.next_frame = event.index
         else:
             self.sample_ns = event.time_ns
 
@@ -279,16 +310,26 @@ class _RunState:
 class _Loop:
     """Takes a recording's events through the processor into the recorder."""
 
-    def __init__(self, state: _RunState, recorder: RunRecorder, viewer: Viewer, frames: set[int]) -> None:
+    def __init__(
+        self, state: _RunState, recorder: RunRecorder, viewer: Viewer, frames: set[int]
+    ) -> None:
         """Prepare; `frames` are the numbers of the recording's frames that the run is to take."""
-        self._state, self._recorder, self._viewer, self._frames = state, recorder, viewer, frames
+        self._state = state
+        self._recorder = recorder
+        self._viewer = viewer
+        self._frames = frames
         self._end = 1 + max(frames, default=-1)
         self._read_ms = 0.0  # that the recording took to give its events since the last result
 
-    def run(self, events: Iterable[Event], dataset: Dataset, should_stop: Callable[[], str | None]) -> str | None:
+    def run(
+        self, events: Iterable[Event], dataset: Dataset, should_stop: Callable[[], str | None]
+    ) -> str | None:
         """Take events to their end; return why they ended before."""
-        state, recorder, processor = self._state, self._recorder, self._state.processor
-        monitor, stopped = processor.pipeline.monitor, None
+        state = self._state
+        recorder = self._recorder
+        processor = self._state.processor
+        monitor = processor.pipeline.monitor
+        stopped = None
         resumed = state.frame_ns is not None
         for event in self._timed(events):
             if resumed and not state.is_new(event):
@@ -296,7 +337,9 @@ class _Loop:
             if isinstance(event, StereoFrame):
                 if event.index not in self._frames:
                     continue
-                state.unread += self._between(state.next_frame + (state.frame_ns is not None), event.index)
+                state.unread += self._between(
+                    state.next_frame + (state.frame_ns is not None), event.index
+                )
             self._take(event)
             state.note(event)
             if _LEAST_REFUSED <= monitor.frames_refused > len(recorder):
@@ -359,15 +402,28 @@ def _check_range(recording: Recording, start: int, stop: int | None) -> None:
     if start < 0 or (stop is not None and stop <= start):
         raise ConfigError(f"frames {start} to {stop} are no range; give 0 <= start < stop")
     if start >= len(recording.frame_times_ns):
-        raise ConfigError(f"--start {start} lies past the last frame, {len(recording.frame_times_ns) - 1}")
+        raise ConfigError(
+            f"--start {start} lies past the last frame, {len(recording.frame_times_ns) - 1}"
+        )
 
 
 def _taken_frames(dataset: Dataset, config: Config, start: int, stop: int | None) -> set[int]:
-    """Numbers of the frames of a recording that a run is to take; of features, those that the recording has."""
-    most_hz, times_ns = config.dataset.max_frame_rate, dataset.recording.frame_times_ns
+    """Numbers of the frames of a recording that a run is to take; of features, those that the
+    recording has.
+    """
+    most_hz = config.dataset.max_frame_rate
+    times_ns = dataset.recording.frame_times_ns
     indices = range(len(times_ns)) if most_hz is None else used_frames(times_ns, most_hz).tolist()
-    present = range(len(times_ns)) if not isinstance(dataset, FeatureDataset) else set(dataset.present.tolist())
-    return {index for index in indices if index >= start and (stop is None or index < stop) and index in present}
+    present = (
+        range(len(times_ns))
+        if not isinstance(dataset, FeatureDataset)
+        else set(dataset.present.tolist())
+    )
+    return {
+        index
+        for index in indices
+        if index >= start and (stop is None or index < stop) and index in present
+    }
 
 
 def _unread_line(unread: list[int], frames: int) -> str:
@@ -376,9 +432,17 @@ def _unread_line(unread: list[int], frames: int) -> str:
     return f"{len(unread)} of {frames} frames could not be read and were skipped: {named}"
 
 
-def _opencv_threads(dataset: Dataset, config: Config, given: Frontend | None) -> AbstractContextManager[None]:
-    """Limit OpenCV to one thread where the front end is `klt`, whose steps are too short for more."""
-    if given is not None or config.frontend.name not in ("auto", "klt") or not _needs_images(dataset, config):
+def _opencv_threads(
+    dataset: Dataset, config: Config, given: Frontend | None
+) -> AbstractContextManager[None]:
+    """Limit OpenCV to one thread where the front end is `klt`, whose steps are too short for
+    more.
+    """
+    if (
+        given is not None
+        or config.frontend.name not in ("auto", "klt")
+        or not _needs_images(dataset, config)
+    ):
         return contextlib.nullcontext()
     return one_opencv_thread()
 
@@ -389,16 +453,22 @@ def _needs_images(dataset: Dataset, config: Config) -> bool:
 
 
 def _dead_reckoned(rows: RunRecorder, body: BodyFrame) -> Trajectory:
-    """Return the poses by dead reckoning of the frames with an estimate; a run that an error ends may have one less."""
+    """Return the poses by dead reckoning of the frames with an estimate; a run that an error
+    ends may have one less.
+    """
     T = rows.dead_reckoned()
-    times_ns, indices = (np.asarray(rows.estimates.column(name))[: len(T)] for name in ("time_ns", "index"))
+    times_ns, indices = (
+        np.asarray(rows.estimates.column(name))[: len(T)] for name in ("time_ns", "index")
+    )
     return Trajectory(T, times_ns, body, indices)
 
 
 class DeadReckoning:
     """The paper's filter without its updates."""
 
-    def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, settings: VislamSettings) -> None:
+    def __init__(
+        self, camera: StereoCamera, T_cam0_body: FloatArray, settings: VislamSettings
+    ) -> None:
         settings = replace(settings, mode="dead_reckoning", motion_model="input")
         self._filter = Vislam(camera, T_cam0_body, settings, motion_sensor=True)
         self._begun = False

@@ -1,7 +1,8 @@
-"""What a run leaves behind, frame by frame: in memory, or in a folder that grows while the run goes on.
+"""What a run leaves behind, frame by frame: in memory, or in a folder that grows while the run goes
+on.
 
-A folder that is being written holds `unfinished/`: the tables, and checkpoints to go on from. A process that dies
-leaves all but the last second of it readable.
+A folder that is being written holds `unfinished/`: the tables, and checkpoints to go on from. A
+process that dies leaves all but the last second of it readable.
 """
 
 from __future__ import annotations
@@ -24,7 +25,15 @@ from vio.files.tables import Records, Rows, Table, check_table
 from vio.files.trajectories import tum_text
 from vio.geometry.lie import FloatArray
 from vio.protocols import Dataset
-from vio.records import BodyFrame, Estimate, FrameLog, FrameResult, Landmarks, MotionSample, Observations
+from vio.records import (
+    BodyFrame,
+    Estimate,
+    FrameLog,
+    FrameResult,
+    Landmarks,
+    MotionSample,
+    Observations,
+)
 from vio.runs.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
 from vio.runs.files import CHECKPOINT, RunFile
 from vio.runs.tables import (
@@ -71,22 +80,34 @@ class GrowingFolder:
     """Where a run writes while it goes on."""
 
     path: Path
-    texts: Mapping[str, str]  # files written at the beginning, by name: what is known of the run before its first frame
-    replaces: Sequence[str] = ()  # names of an earlier run's files, removed when the first frame has been processed
-    inputs: Mapping[str, Any] = field(default_factory=dict)  # JSON values by name: must be the same when it goes on
+    # files written at the beginning, by name: what is known of the run before its first frame
+    texts: Mapping[str, str]
+    # names of an earlier run's files, removed when the first frame has been processed
+    replaces: Sequence[str] = ()
+    # JSON values by name: must be the same when it goes on
+    inputs: Mapping[str, Any] = field(default_factory=dict)
 
 
 class RunRecorder:
     """Tables of a run; with a folder they are files, and text files grow beside them."""
 
     def __init__(
-        self, body: BodyFrame, *, lag_frames: int, keep_observations: bool, folder: GrowingFolder | None = None
+        self,
+        body: BodyFrame,
+        *,
+        lag_frames: int,
+        keep_observations: bool,
+        folder: GrowingFolder | None = None,
     ) -> None:
         """Prepare; files begin with the first frame. Without a folder everything stays in memory.
 
-        After `lag_frames` an estimate is final, smoothed by those; `keep_observations` keeps motion samples, too.
+        After `lag_frames` an estimate is final, smoothed by those; `keep_observations` keeps motion
+        samples, too.
         """
-        self._body, self._lag, self._keep, self._folder = body, lag_frames, keep_observations, folder
+        self._body = body
+        self._lag = lag_frames
+        self._keep = keep_observations
+        self._folder = folder
         self._rows = FrameRows()
         self._tables: dict[str, Table] = {}
         self._early: list[Rows] = []  # samples before the first frame
@@ -133,12 +154,16 @@ class RunRecorder:
             if self._keep:
                 seen = result.output.observations
                 self._tables["observations"].append(observation_rows(seen))
-                self._tables["seen"].append(np.array([(seen.frame_index, seen.time_ns, len(seen))], dtype=SEEN))
+                self._tables["seen"].append(
+                    np.array([(seen.frame_index, seen.time_ns, len(seen))], dtype=SEEN)
+                )
         if time.monotonic() - self._flushed_s > _FLUSH_S:
             self.flush()
 
     def revise(self, smoothed: Smoothed, first: int = 0, end: int | None = None) -> None:
-        """Replace estimates by the smoothed ones: pose, covariance, velocity and biases; without a lag, nothing."""
+        """Replace estimates by the smoothed ones: pose, covariance, velocity and biases; without
+        a lag, nothing.
+        """
         if not self._lag or not self._tables:
             return
         estimates = self._tables["estimates"]
@@ -208,8 +233,13 @@ class RunRecorder:
         """Observations of all frames; None: not kept."""
         if not self._keep:
             return None
-        seen, rows = self._tables["seen"], self._tables["observations"]
-        ends = dict(zip(seen.rows()["index"].tolist(), np.cumsum(seen.rows()["count"]).tolist(), strict=True))
+        seen = self._tables["seen"]
+        rows = self._tables["observations"]
+        ends = dict(
+            zip(
+                seen.rows()["index"].tolist(), np.cumsum(seen.rows()["count"]).tolist(), strict=True
+            )
+        )
         return Records(seen, lambda row: observations_of(row, rows, ends[int(row["index"])]))
 
     @property
@@ -222,7 +252,9 @@ class RunRecorder:
         return np.asarray(self._tables["dead_reckoning"].rows()["T"])
 
     def landmarks(self, newest: Landmarks) -> Landmarks:
-        """Join the points put away in the run's folder with the newest; a point that came back counts once."""
+        """Join the points put away in the run's folder with the newest; a point that came back
+        counts once.
+        """
         stored = self._tables["points"]
         if not len(stored):
             return newest
@@ -230,7 +262,8 @@ class RunRecorder:
             self._put_away(newest)
             rows = stored.rows()
             _, last = np.unique(rows["id"][::-1], return_index=True)
-            joined = Table(POINT, self._unfinished / "landmarks.npy")  # a file, as the map of an hour fills memory
+            # a file, as the map of an hour fills memory
+            joined = Table(POINT, self._unfinished / "landmarks.npy")
             for part in np.array_split(len(rows) - 1 - last, 1 + len(last) // _CHUNK):
                 joined.append(rows[part])
             joined.close()
@@ -239,14 +272,18 @@ class RunRecorder:
 
     def _put_away(self, points: Landmarks) -> None:
         rows = np.zeros(len(points.ids), dtype=POINT)
-        rows["id"], rows["p_world"], rows["covariance"] = points.ids, points.p_world, points.covariance
+        rows["id"] = points.ids
+        rows["p_world"] = points.p_world
+        rows["covariance"] = points.covariance
         self._tables["points"].append(rows)
 
     # Checkpoints
 
     @property
     def can_save(self) -> bool:
-        """Whether there is something to save, a folder to save it in, and nothing that cannot be saved."""
+        """Whether there is something to save, a folder to save it in, and nothing that cannot be
+        saved.
+        """
         return self._folder is not None and self._savable and bool(self._tables)
 
     @property
@@ -257,7 +294,8 @@ class RunRecorder:
     def save(self, state: Any, dataset: Dataset, finished: Landmarks) -> None:
         """Write a checkpoint of a run's state, less the recording, where `can_save` says so.
 
-        `finished` are points of the map that will not change any more, and that the state no longer has.
+        `finished` are points of the map that will not change any more, and that the state no longer
+        has.
         """
         assert self._folder is not None
         with self._writing():
@@ -274,7 +312,10 @@ class RunRecorder:
         own = {"tables": tables, "late": late, "stages": self._rows.stages}
         try:
             save_checkpoint(
-                self._unfinished / CHECKPOINT, {"recorder": own, "run": state}, dataset, self._folder.inputs
+                self._unfinished / CHECKPOINT,
+                {"recorder": own, "run": state},
+                dataset,
+                self._folder.inputs,
             )
         except NotSavableError as error:
             self._savable = False
@@ -285,7 +326,8 @@ class RunRecorder:
         """Go on from the folder's checkpoint; return the state that `save` was given.
 
         Raises:
-            DataError: there is none, it or a table is damaged, or the run depends on what has changed since.
+            DataError: there is none, it or a table is damaged, or the run depends on what has
+                changed since.
         """
         assert self._folder is not None
         for name in (RunFile.UNFINISHED, *_TEXTS):
@@ -328,7 +370,10 @@ class RunRecorder:
                 early = [name for name in texts if not name.startswith(RunFile.UNFINISHED)]
                 for name in early:  # they say whose folder it is
                     atomic_write_text(self._folder.path / name, texts[name])
-                for name in (RunFile.UNFINISHED, *(n for n in self._folder.replaces if n not in texts)):
+                for name in (
+                    RunFile.UNFINISHED,
+                    *(n for n in self._folder.replaces if n not in texts),
+                ):
                     if (old := self._folder.path / name).is_dir() and not old.is_symlink():
                         shutil.rmtree(old)
                     else:
@@ -336,7 +381,10 @@ class RunRecorder:
                 self._unfinished.mkdir()
                 for name in sorted(texts.keys() - early):
                     atomic_write_text(self._folder.path / name, texts[name])
-                self._tables = {name: Table(dtype, self._unfinished / f"{name}.npy") for name, dtype in _TABLES.items()}
+                self._tables = {
+                    name: Table(dtype, self._unfinished / f"{name}.npy")
+                    for name, dtype in _TABLES.items()
+                }
         for row in self._early:
             self._tables["samples"].append(row)
         self._early = []
@@ -357,7 +405,9 @@ class RunRecorder:
             self._csv_stages = sorted(self._rows.stages)
         first = start == 0
         tum = tum_text(rows["time_ns"], rows["T_world_imu"], body=self._body if first else None)
-        for name, text in zip(_TEXTS, (tum, frames_csv(frames, self._csv_stages, header=first)), strict=True):
+        for name, text in zip(
+            _TEXTS, (tum, frames_csv(frames, self._csv_stages, header=first)), strict=True
+        ):
             with open_own(folder / name, "wb" if first else "ab") as stream:
                 stream.write(text.encode())
                 stream.flush()

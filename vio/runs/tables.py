@@ -1,4 +1,5 @@
-"""What a run keeps of each frame, as rows of tables: estimates, the frame's log, observations, motion samples.
+"""What a run keeps of each frame, as rows of tables: estimates, the frame's log, observations,
+motion samples.
 
 A value that is missing (None) is NaN in a row.
 """
@@ -27,7 +28,11 @@ from vio.records import (
 )
 
 # Optional fields of an estimate, with their shapes.
-_KEPT = {field.name: field.metadata["shape"] for field in dataclasses.fields(Estimate) if "shape" in field.metadata}
+_KEPT = {
+    field.name: field.metadata["shape"]
+    for field in dataclasses.fields(Estimate)
+    if "shape" in field.metadata
+}
 ESTIMATE = np.dtype(
     [
         ("index", "<i8"),  # number of the frame
@@ -67,17 +72,29 @@ FRAME = np.dtype(
         ("stages_ms", "<f8", (_STAGES,)),
     ]
 )
-OBSERVATION = np.dtype([("id", "<i8"), ("z", "<f8", (4,)), ("has_right", "?"), ("stale", "?"), ("sigma", "<f4", (3,))])
-SEEN = np.dtype([("index", "<i8"), ("time_ns", "<i8"), ("count", "<i8")])  # one row a frame: its observations
+OBSERVATION = np.dtype(
+    [("id", "<i8"), ("z", "<f8", (4,)), ("has_right", "?"), ("stale", "?"), ("sigma", "<f4", (3,))]
+)
+# one row a frame: its observations
+SEEN = np.dtype([("index", "<i8"), ("time_ns", "<i8"), ("count", "<i8")])
 SAMPLE = np.dtype([("time_ns", "<i8"), ("is_imu", "?"), ("values", "<f8", (6,))])
-MAPPED = np.dtype([("index", "<i8"), ("time_ns", "<i8"), ("T_map_body", "<f8", (4, 4)), ("covariance", "<f8", (6, 6))])
+MAPPED = np.dtype(
+    [
+        ("index", "<i8"),
+        ("time_ns", "<i8"),
+        ("T_map_body", "<f8", (4, 4)),
+        ("covariance", "<f8", (6, 6)),
+    ]
+)
 POINT = np.dtype([("id", "<i8"), ("p_world", "<f8", (3,)), ("covariance", "<f8", (3, 3))])
 
 
 def mapped_row(index: int, estimate: Estimate) -> Rows:
     """Return the place in the map of an estimate that has one as a row (1,)."""
     row = np.zeros(1, dtype=MAPPED)
-    row["index"], row["time_ns"], row["T_map_body"] = index, estimate.time_ns, estimate.T_map_body
+    row["index"] = index
+    row["time_ns"] = estimate.time_ns
+    row["T_map_body"] = estimate.T_map_body
     covariance = estimate.T_map_body_covariance
     row["covariance"] = np.nan if covariance is None else covariance
     return row
@@ -86,8 +103,10 @@ def mapped_row(index: int, estimate: Estimate) -> Rows:
 def estimate_row(index: int, estimate: Estimate) -> Rows:
     """Return an estimate of frame `index` as a row (1,)."""
     row = np.zeros(1, dtype=ESTIMATE)
-    row["index"], row["time_ns"] = index, estimate.time_ns
-    row["T_world_imu"], row["covariance"] = estimate.T_world_imu, estimate.covariance
+    row["index"] = index
+    row["time_ns"] = estimate.time_ns
+    row["T_world_imu"] = estimate.T_world_imu
+    row["covariance"] = estimate.covariance
     for name in _KEPT:
         value = getattr(estimate, name)
         row[name] = np.nan if value is None else value
@@ -103,7 +122,8 @@ def estimate_of(row: np.void) -> Estimate:
     optional: dict[str, Any] = {
         name: _array(row[name]) if shape else _number(row[name]) for name, shape in _KEPT.items()
     }
-    scale, S = _array(row["stereo_scale"]), _array(row["stereo_scale_covariance"])
+    scale = _array(row["stereo_scale"])
+    S = _array(row["stereo_scale_covariance"])
     return Estimate(
         int(row["time_ns"]),
         np.array(row["T_world_imu"]),
@@ -115,10 +135,12 @@ def estimate_of(row: np.void) -> Estimate:
 
 
 def _stereo_field(row: np.void) -> StereoFieldEstimate | None:
-    coefficients, P = _array(row["stereo_field"]), _array(row["stereo_field_covariance"])
+    coefficients = _array(row["stereo_field"])
+    P = _array(row["stereo_field_covariance"])
     if coefficients is None or P is None:
         return None
-    rows, rows_P = _array(row["stereo_rows"]), _array(row["stereo_rows_covariance"])
+    rows = _array(row["stereo_rows"])
+    rows_P = _array(row["stereo_rows_covariance"])
     return StereoFieldEstimate(coefficients, P, row["stereo_rows_rms_px"], rows, rows_P)
 
 
@@ -134,7 +156,8 @@ class FrameRows:
         for field in dataclasses.fields(frame)[:-1]:
             value = getattr(frame, field.name)
             row[field.name] = np.nan if value is None else value
-        row["read_ms"], row["stages_ms"] = read_ms, np.nan
+        row["read_ms"] = read_ms
+        row["stages_ms"] = np.nan
         for name, ms in frame.stages_ms.items():
             if name not in self.stages and len(self.stages) < _STAGES:
                 self.stages.append(name)
@@ -146,7 +169,11 @@ class FrameRows:
         """Return the log of a row."""
         values: dict[str, Any] = {name: int(row[name]) for name in ("index", "time_ns", *_COUNTS)}
         values |= {name: float(row[name]) for name in _TIMES}
-        stages = {name: float(ms) for name, ms in zip(self.stages, row["stages_ms"], strict=False) if ms == ms}
+        stages = {
+            name: float(ms)
+            for name, ms in zip(self.stages, row["stages_ms"], strict=False)
+            if ms == ms
+        }
         values |= {name: _number(row[name]) for name in _NUMBERS}
         return FrameLog(**values, stages_ms=stages)
 
@@ -154,13 +181,18 @@ class FrameRows:
 def observation_rows(seen: Observations) -> Rows:
     """Return the observations of a frame as rows (N,)."""
     rows = np.zeros(len(seen), dtype=OBSERVATION)
-    rows["id"], rows["z"], rows["has_right"], rows["stale"] = seen.ids, seen.z, seen.has_right, seen.stale
+    rows["id"] = seen.ids
+    rows["z"] = seen.z
+    rows["has_right"] = seen.has_right
+    rows["stale"] = seen.stale
     rows["sigma"] = 0.0 if seen.sigma is None else seen.sigma
     return rows
 
 
 def observations_of(row: np.void, table: Table, end: int) -> Observations:
-    """Return the observations of a frame by its row in the table of frames; `end` is that of its rows in `table`."""
+    """Return the observations of a frame by its row in the table of frames; `end` is that of its
+    rows in `table`.
+    """
     own = table.rows(end - int(row["count"]), end)
     columns = (np.array(own[name]) for name in ("id", "z", "has_right", "stale", "sigma"))
     return Observations(int(row["index"]), int(row["time_ns"]), *columns)
@@ -170,8 +202,14 @@ def sample_row(sample: MotionSample) -> Rows:
     """Return a motion sample as a row (1,)."""
     row = np.zeros(1, dtype=SAMPLE)
     imu = isinstance(sample, ImuSample)
-    halves = (sample.gyro, sample.accel) if isinstance(sample, ImuSample) else (sample.linear, sample.angular)
-    row["time_ns"], row["is_imu"], row["values"] = sample.time_ns, imu, np.concatenate(halves)
+    halves = (
+        (sample.gyro, sample.accel)
+        if isinstance(sample, ImuSample)
+        else (sample.linear, sample.angular)
+    )
+    row["time_ns"] = sample.time_ns
+    row["is_imu"] = imu
+    row["values"] = np.concatenate(halves)
     return row
 
 
@@ -189,7 +227,10 @@ def frames_csv(frames: Sequence[FrameLog], stages: Sequence[str], *, header: boo
     if header:
         writer.writerow([*own, *(f"frontend_{name}_ms" for name in stages)])
     for frame in frames:
-        values = [*(getattr(frame, name) for name in own), *(frame.stages_ms.get(name) for name in stages)]
+        values = [
+            *(getattr(frame, name) for name in own),
+            *(frame.stages_ms.get(name) for name in stages),
+        ]
         writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
     return text.getvalue()
 

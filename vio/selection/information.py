@@ -1,10 +1,12 @@
-"""The information of features on the camera's motion, and a greedy choice of the most informative subset.
+"""The information of features on the camera's motion, and a greedy choice of the most informative
+subset.
 
-Notation as in docs/notes/selection.md. A motion of the camera is `T_curr_prev = exp(xi) T_hat` with `xi = [rho; phi]`;
-a feature at `p` in the current camera frame moves with it as `p <- exp(xi) p`. The information of N features on K
-motions is stored as factors `L` (N, K, 3, 6) with `L' L` the information matrix of xi.
-References: Carlone & Karaman, Attention and anticipation in fast visual-inertial navigation (2019); Zhao & Vela, Good
-feature matching (2020).
+Notation as in docs/notes/selection.md. A motion of the camera is `T_curr_prev = exp(xi) T_hat` with
+`xi = [rho; phi]`; a feature at `p` in the current camera frame moves with it as `p <- exp(xi) p`.
+The information of N features on K motions is stored as factors `L` (N, K, 3, 6) with `L' L` the
+information matrix of xi.
+References: Carlone & Karaman, Attention and anticipation in fast visual-inertial navigation (2019);
+Zhao & Vela, Good feature matching (2020).
 """
 
 from __future__ import annotations
@@ -24,10 +26,12 @@ _TIE = 1e-10  # relative difference below which two gains are the same
 
 
 def motion_rows(camera: StereoCamera, p_cam: FloatArray) -> FloatArray:
-    """Jacobian (..., 3, 6) of the pixels `[ul, sqrt(2) v, ur]` of points (..., 3) with respect to the camera's motion.
+    """Jacobian (..., 3, 6) of the pixels `[ul, sqrt(2) v, ur]` of points (..., 3) with respect to
+    the camera's motion.
 
-    The two vertical coordinates of a stereo pixel measure one quantity; their mean, times the square root of two,
-    has the noise of one pixel coordinate as `ul` and `ur` do, so the three rows are independent with equal noise.
+    The two vertical coordinates of a stereo pixel measure one quantity; their mean, times the
+    square root of two, has the noise of one pixel coordinate as `ul` and `ur` do, so the three rows
+    are independent with equal noise.
     """
     J = z_D_p_cam(camera, p_cam)[..., :3, :].copy()
     J[..., 1, :] *= np.sqrt(2.0)
@@ -35,15 +39,17 @@ def motion_rows(camera: StereoCamera, p_cam: FloatArray) -> FloatArray:
 
 
 def row_weights(sightings: npt.ArrayLike, has_right: BoolArray) -> FloatArray:
-    """Information (..., 3) of the rows of `motion_rows`, in units of one over the variance of a pixel coordinate.
+    """Information (..., 3) of the rows of `motion_rows`, in units of one over the variance of a
+    pixel coordinate.
 
     Args:
         sightings: (...) number of earlier stereo observations of the point; it may be a fraction.
         has_right: (...) False: the point is now visible in the left image only.
 
-    A point with n earlier stereo observations has its three pixels predicted with a variance of `1 / n`; the
-    information of a new observation on the motion is `S^-1` with `S = 1 + 1 / n`. In the left image `v` alone has
-    twice the variance of the mean. A new point adds no information on the motion before it.
+    A point with n earlier stereo observations has its three pixels predicted with a variance of
+    `1 / n`; the information of a new observation on the motion is `S^-1` with `S = 1 + 1 / n`. In
+    the left image `v` alone has twice the variance of the mean. A new point adds no information on
+    the motion before it.
     """
     n = np.asarray(sightings, dtype=np.float64)
     both = n / (n + 1)
@@ -56,7 +62,9 @@ def prior_information(motion: MotionPrior | None) -> FloatArray:
     if motion is None:
         return np.diag([1.0] * 3 + [1e2] * 3)
     # A covariance may be singular where a state is known.
-    return np.asarray(np.linalg.inv(motion.covariance + np.diag([1e-10] * 3 + [1e-12] * 3)), dtype=np.float64)
+    return np.asarray(
+        np.linalg.inv(motion.covariance + np.diag([1e-10] * 3 + [1e-12] * 3)), dtype=np.float64
+    )
 
 
 def log_det_gain(prior: FloatArray, L: FloatArray) -> float:
@@ -75,18 +83,21 @@ class Greedy:
     """The result of a greedy choice."""
 
     order: IntArray  # (S,) rows in the order in which they were chosen
-    gain: FloatArray  # (N,) nats gained when the row was chosen; other rows: an upper bound of their gain
+    # (N,) nats gained when the row was chosen; other rows: an upper bound of their gain
+    gain: FloatArray
 
 
 def lazy_greedy(prior: FloatArray, L: FloatArray, ids: IntArray, budget: int) -> Greedy:
-    """Choose up to `budget` of N features that together add most to the log-determinant, one at a time.
+    """Choose up to `budget` of N features that together add most to the log-determinant, one at a
+    time.
 
-    The result equals that of evaluating every candidate in every round, at least (1 - 1/e) of the optimum, as the
-    gain of a feature only decreases while others are chosen (submodularity). Only the candidates with the largest
-    upper bounds are evaluated: with `A = L M L'` (3, 3), `log det(I + A) <= 3 log(1 + tr A / 3)`, and the traces of
-    all candidates are one product with `M`. Ties go to the smaller id. Features without a gain are not chosen.
-    References: Nemhauser, Wolsey & Fisher (1978); Minoux, Accelerated greedy algorithms (1978), here with a
-    recomputed bound instead of the last gain.
+    The result equals that of evaluating every candidate in every round, at least (1 - 1/e) of the
+    optimum, as the gain of a feature only decreases while others are chosen (submodularity). Only
+    the candidates with the largest upper bounds are evaluated: with `A = L M L'` (3, 3),
+    `log det(I + A) <= 3 log(1 + tr A / 3)`, and the traces of all candidates are one product with
+    `M`. Ties go to the smaller id. Features without a gain are not chosen.
+    References: Nemhauser, Wolsey & Fisher (1978); Minoux, Accelerated greedy algorithms (1978),
+    here with a recomputed bound instead of the last gain.
 
     Args:
         prior: (K, 6, 6) information before, positive definite.
@@ -104,7 +115,8 @@ def lazy_greedy(prior: FloatArray, L: FloatArray, ids: IntArray, budget: int) ->
     while True:
         M: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
         traces = (flat @ (M.reshape(K, 36, 1) / 3))[..., 0]
-        bound = np.multiply.reduce(traces + 1.0, axis=0) * available  # exp of two thirds of the bound in nats
+        # exp of two thirds of the bound in nats
+        bound = np.multiply.reduce(traces + 1.0, axis=0) * available
         if len(order) >= budget or len(order) >= N:
             break
         rows, exact = _best_exact(L, M, bound, available)
@@ -114,22 +126,29 @@ def lazy_greedy(prior: FloatArray, L: FloatArray, ids: IntArray, budget: int) ->
         tied = rows[exact >= best * (1 - _TIE)]
         pick = int(tied[ids[tied].argmin()])
         order.append(pick)
-        gain[pick], available[pick] = best, 0.0
+        gain[pick] = best
+        available[pick] = 0.0
         information = information + delta[pick]
     left = available > 0
     gain[left] = 1.5 * np.log(bound[left])
     return Greedy(np.array(order, dtype=np.int64), gain)
 
 
-def _best_exact(L: FloatArray, M: FloatArray, bound: FloatArray, available: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Rows (R,) that include all candidates of largest gain, and the gains (R,) in nats; 0 for chosen rows."""
+def _best_exact(
+    L: FloatArray, M: FloatArray, bound: FloatArray, available: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Rows (R,) that include all candidates of largest gain, and the gains (R,) in nats; 0 for
+    chosen rows.
+    """
     count = _BATCH
     while True:
         if count < len(bound):
             ranked = np.argpartition(bound, len(bound) - count - 1)[len(bound) - count - 1 :]
-            rows, next_bound = ranked[1:], bound[ranked[0]]
+            rows = ranked[1:]
+            next_bound = bound[ranked[0]]
         else:
-            rows, next_bound = np.arange(len(bound)), 0.0
+            rows = np.arange(len(bound))
+            next_bound = 0.0
         some = L[rows]
         A = (some @ M) @ some.swapaxes(-1, -2) + _EYE
         exact = 0.5 * np.log(np.multiply.reduce(np.linalg.det(A), axis=1)) * available[rows]
@@ -166,10 +185,13 @@ _NO_FEATURES = _Tracked(
 
 
 class _Survival:
-    """The probability that a feature of a given age survives to the next frame, estimated online."""
+    """The probability that a feature of a given age survives to the next frame, estimated
+    online.
+    """
 
     _AGES = 7  # ages 1, 2-3, 4-7, …, 64 and more
-    _HITS, _TRIALS = 9.0, 10.0  # prior counts
+    _HITS = 9.0  # prior counts
+    _TRIALS = 10.0
 
     def __init__(self) -> None:
         self._hits = np.full(self._AGES, self._HITS)
@@ -190,29 +212,40 @@ class _Survival:
 
 
 class MotionInformation:
-    """Information of each frame's features on the camera's motion, given their earlier use by the filter."""
+    """Information of each frame's features on the camera's motion, given their earlier use by
+    the filter.
+    """
 
-    _MIN_DEPTH, _MAX_DEPTH = 0.5, 400.0  # baselines; the filters use no point outside
-    _HALF_WEIGHT_SIGMAS = 3.0  # innovation in standard deviations at which a feature's weight is halved
+    _MIN_DEPTH = 0.5  # baselines; the filters use no point outside
+    _MAX_DEPTH = 400.0
+    # innovation in standard deviations at which a feature's weight is halved
+    _HALF_WEIGHT_SIGMAS = 3.0
 
     def __init__(self, camera: StereoCamera, horizon_frames: int, pixel_sigma_px: float) -> None:
-        self._camera, self._sigma = camera, pixel_sigma_px
+        self._camera = camera
+        self._sigma = pixel_sigma_px
         self._steps = (0, *sorted({1, horizon_frames}))  # 0: the last motion, 1: the next one, …
-        self._tracked, self._survival = _NO_FEATURES, _Survival()
+        self._tracked = _NO_FEATURES
+        self._survival = _Survival()
 
     def add_frame(self, observations: Observations, motion: MotionPrior | None) -> FloatArray:
-        """Add one frame and return the factors (N, K, 3, 6) of its rows for K motions, equations (S3) to (S5).
+        """Add one frame and return the factors (N, K, 3, 6) of its rows for K motions, equations
+        (S3) to (S5).
 
-        The motions are the last one, the next one and the one at the horizon, under constant predicted motion.
+        The motions are the last one, the next one and the one at the horizon, under constant
+        predicted motion.
         """
-        ids, last = observations.ids, self._tracked
+        ids = observations.ids
+        last = self._tracked
         T_curr_prev = np.eye(4) if motion is None else motion.T_curr_prev
         at, known = last.find(ids)
         self._survival.count(last.age, np.isin(last.ids, ids))
-        age, sightings = np.ones(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.int64)
+        age = np.ones(len(ids), dtype=np.int64)
+        sightings = np.zeros(len(ids), dtype=np.int64)
         age[known] += last.age[at[known]]
         sightings[known] = last.sightings[at[known]]
-        predicted, was_valid = np.zeros((len(ids), 3)), np.zeros(len(ids), dtype=np.bool_)
+        predicted = np.zeros((len(ids), 3))
+        was_valid = np.zeros(len(ids), dtype=np.bool_)
         predicted[known] = transform_points(T_curr_prev, last.p_cam[at[known]])
         was_valid[known] = last.valid[at[known]]
         p_cam, valid = self._points(observations, predicted, was_valid & (sightings > 0))
@@ -226,19 +259,29 @@ class MotionInformation:
 
     def mark_used(self, observations: Observations, chosen: BoolArray) -> None:
         """Record which rows (N,) of the last added frame the filter uses."""
-        tracked, order = self._tracked, np.argsort(observations.ids)
+        tracked = self._tracked
+        order = np.argsort(observations.ids)
         sightings = np.where(
-            chosen & ~observations.stale, tracked.sightings + (observations.has_right & tracked.valid), 0
+            chosen & ~observations.stale,
+            tracked.sightings + (observations.has_right & tracked.valid),
+            0,
         )
         self._tracked = _Tracked(
-            tracked.ids[order], tracked.p_cam[order], tracked.valid[order], tracked.age[order], sightings[order]
+            tracked.ids[order],
+            tracked.p_cam[order],
+            tracked.valid[order],
+            tracked.age[order],
+            sightings[order],
         )
 
     def _points(
         self, observations: Observations, predicted: FloatArray, was_used: BoolArray
     ) -> tuple[FloatArray, BoolArray]:
-        """Points (N, 3) in the camera frame and a mask (N,) of valid ones: by stereo, or by the predicted depth."""
-        camera, z = self._camera, observations.z
+        """Points (N, 3) in the camera frame and a mask (N,) of valid ones: by stereo, or by the
+        predicted depth.
+        """
+        camera = self._camera
+        z = observations.z
         p_cam, valid = triangulate(camera, z)
         valid &= observations.has_right
         left_only = ~observations.has_right & was_used
@@ -247,10 +290,16 @@ class MotionInformation:
             p_cam[left_only] = left_rays(camera, z[left_only, :2]) * depth
             valid |= left_only
         baselines = depth_of(camera, p_cam) / camera.baseline_m
-        return p_cam, valid & ~observations.stale & (baselines > self._MIN_DEPTH) & (baselines < self._MAX_DEPTH)
+        return p_cam, valid & ~observations.stale & (baselines > self._MIN_DEPTH) & (
+            baselines < self._MAX_DEPTH
+        )
 
-    def _consistency_weight(self, z: FloatArray, predicted: FloatArray, motion: MotionPrior) -> FloatArray:
-        """Weights (N,) from 0 to 1 by the innovation of the pixels under the predicted motion (S4)."""
+    def _consistency_weight(
+        self, z: FloatArray, predicted: FloatArray, motion: MotionPrior
+    ) -> FloatArray:
+        """Weights (N,) from 0 to 1 by the innovation of the pixels under the predicted motion
+        (S4).
+        """
         ahead = depth_of(self._camera, predicted) > self._MIN_DEPTH * self._camera.baseline_m
         safe = np.where(ahead[:, None], predicted, [0.0, 0.0, 1.0])
         off = z - project(self._camera, safe)
@@ -264,7 +313,9 @@ class MotionInformation:
     def _factors(self, observations: Observations, T_curr_prev: FloatArray) -> FloatArray:
         valid = self._tracked.valid
         L = np.zeros((len(valid), len(self._steps), 3, 6))
-        now, right, n = self._tracked.p_cam[valid], observations.has_right[valid], self._tracked.sightings[valid]
+        now = self._tracked.p_cam[valid]
+        right = observations.has_right[valid]
+        n = self._tracked.sightings[valid]
         survival = self._survival.probability(self._tracked.age[valid])
         weight = row_weights(n, right)
         for k, step in enumerate(self._steps):
@@ -279,6 +330,9 @@ class MotionInformation:
         return L / self._sigma
 
     def _in_image(self, u: FloatArray, v: FloatArray) -> BoolArray:
-        """Mask of pixels inside the image; where its size is unknown, the principal point is assumed its centre."""
-        width, height = self._camera.width or 2 * self._camera.cu, self._camera.height or 2 * self._camera.cv
+        """Mask of pixels inside the image; where its size is unknown, the principal point is
+        assumed its centre.
+        """
+        width = self._camera.width or 2 * self._camera.cu
+        height = self._camera.height or 2 * self._camera.cv
         return np.asarray((u >= 0) & (u < width) & (v >= 0) & (v < height))

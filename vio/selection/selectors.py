@@ -1,8 +1,9 @@
 """Selectors of the observations that enter the filter's update.
 
-The paper sorts features by how often they are seen and keeps the first seventh. `visibility` does that frame by
-frame with the counts so far; `visibility_whole` counts over the whole record first, as the paper does. `information`
-keeps the features that together add most information on the camera's motion. docs/notes/selection.md compares them.
+The paper sorts features by how often they are seen and keeps the first seventh. `visibility` does
+that frame by frame with the counts so far; `visibility_whole` counts over the whole record first,
+as the paper does. `information` keeps the features that together add most information on the
+camera's motion. docs/notes/selection.md compares them.
 """
 
 from __future__ import annotations
@@ -18,11 +19,17 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.protocols import Selector
 from vio.records import BoolArray, IntArray, MotionPrior, Observations, Selection
-from vio.selection.information import MotionInformation, lazy_greedy, log_det_gain, prior_information
+from vio.selection.information import (
+    MotionInformation,
+    lazy_greedy,
+    log_det_gain,
+    prior_information,
+)
 from vio.setting import Section, setting
 
 _LEAST_KEPT = 12  # observations of a frame, where a share of them is kept
-_HORIZON_FRAMES = 4  # the gain is summed over the last motion, the next one and the one so many frames ahead
+# the gain is summed over the last motion, the next one and the one so many frames ahead
+_HORIZON_FRAMES = 4
 _PIXEL_SIGMA_PX = 0.5  # standard deviation of one pixel coordinate
 
 SelectorName = Literal["all", "visibility", "visibility_whole", "information"]
@@ -36,12 +43,18 @@ class SelectorSettings(Section):
 
     name: SelectorName = setting(
         "all",
-        "all; visibility: the most often seen so far; visibility_whole: the most often seen in the whole record, as "
-        "the paper does (precomputed features only); information: those that together add most information on the "
+        "all; visibility: the most often seen so far; visibility_whole: the most often seen in the "
+        "whole record, as "
+        "the paper does (precomputed features only); information: those that together add most "
+        "information on the "
         "camera's motion now and in the next frames",
     )
-    budget: int | None = setting(None, "observations kept of a frame; null: the share below", at_least=1)
-    keep_fraction: float = setting(1 / 7, "share of the features that is kept; the paper keeps 1/7", above=0, at_most=1)
+    budget: int | None = setting(
+        None, "observations kept of a frame; null: the share below", at_least=1
+    )
+    keep_fraction: float = setting(
+        1 / 7, "share of the features that is kept; the paper keeps 1/7", above=0, at_most=1
+    )
 
 
 class _VisibilityCount:
@@ -58,13 +71,17 @@ class _VisibilityCount:
         return np.array([count[i] for i in ids.tolist()], dtype=np.float64)
 
     def ranked_ids(self) -> list[int]:
-        """Return all ids, most often observed first; ties by id, so that the order is reproducible."""
+        """Return all ids, most often observed first; ties by id, so that the order is
+        reproducible.
+        """
         return [i for i, _ in sorted(self._count.items(), key=lambda item: (-item[1], item[0]))]
 
 
 def _budget(s: SelectorSettings, n: int) -> int:
     """Return how many of n rows may be chosen."""
-    return min(n, max(int(np.ceil(n * s.keep_fraction)), _LEAST_KEPT) if s.budget is None else s.budget)
+    return min(
+        n, max(int(np.ceil(n * s.keep_fraction)), _LEAST_KEPT) if s.budget is None else s.budget
+    )
 
 
 def _best(settings: SelectorSettings, score: FloatArray, ids: IntArray) -> BoolArray:
@@ -87,7 +104,8 @@ class CausalVisibility:
     """Ranks the features of each frame by their number of observations so far."""
 
     def __init__(self, settings: SelectorSettings) -> None:
-        self._seen, self._settings = _VisibilityCount(), settings
+        self._seen = _VisibilityCount()
+        self._settings = settings
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose the most often observed rows; ties go to the older feature."""
@@ -97,7 +115,8 @@ class CausalVisibility:
 
 
 class WholeRecordVisibility:
-    """The paper's selection: rank all features of the record by visibility and keep the first share of them.
+    """The paper's selection: rank all features of the record by visibility and keep the first share
+    of them.
 
     With a budget, the best-ranked features of each frame are kept.
     """
@@ -108,19 +127,28 @@ class WholeRecordVisibility:
             counts.add(frame.ids)
         ranked = counts.ranked_ids()
         self._rank = {feature: position for position, feature in enumerate(ranked)}
-        self._kept, self._settings = int(len(ranked) * settings.keep_fraction), settings
+        self._kept = int(len(ranked) * settings.keep_fraction)
+        self._settings = settings
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
-        """Choose the rows whose feature is in the kept share of the whole record, or the best-ranked ones."""
+        """Choose the rows whose feature is in the kept share of the whole record, or the
+        best-ranked ones.
+        """
         rank = np.array([self._rank[i] for i in observations.ids.tolist()], dtype=np.float64)
         if self._settings.budget is not None:
             chosen = _best(self._settings, -rank, observations.ids)
-            return Selection(chosen, -rank, f"most seen in the record, {chosen.sum()} of {len(rank)}")
-        return Selection(rank < self._kept, -rank, f"most seen in the record, {self._kept} of {len(self._rank)}")
+            return Selection(
+                chosen, -rank, f"most seen in the record, {chosen.sum()} of {len(rank)}"
+            )
+        return Selection(
+            rank < self._kept, -rank, f"most seen in the record, {self._kept} of {len(self._rank)}"
+        )
 
 
 class InformationGain:
-    """The features with the largest joint information on the last and the coming motions (docs/notes/selection.md)."""
+    """The features with the largest joint information on the last and the coming motions
+    (docs/notes/selection.md).
+    """
 
     def __init__(self, settings: SelectorSettings, camera: StereoCamera) -> None:
         self._settings = settings
@@ -147,8 +175,8 @@ def build_selector(
 ) -> Selector:
     """Build the selector named in the settings.
 
-    `whole_record` yields all observations of the record, None where they are not available in advance; the information
-    selector needs the camera.
+    `whole_record` yields all observations of the record, None where they are not available in
+    advance; the information selector needs the camera.
 
     Raises:
         ConfigError: the recording lacks data that the selector needs.
@@ -156,13 +184,16 @@ def build_selector(
     if settings.name == "visibility_whole":
         if whole_record is None:
             raise ConfigError(
-                "selector visibility_whole needs the whole record in advance: run once with --save-observations "
+                "selector visibility_whole needs the whole record in advance: run once with "
+                "--save-observations "
                 "and process that file, or use selector.name=visibility"
             )
         return WholeRecordVisibility(whole_record(), settings)
     if settings.name == "information":
         if camera is None:
-            raise ConfigError("selector information needs the calibration of the cameras; use visibility")
+            raise ConfigError(
+                "selector information needs the calibration of the cameras; use visibility"
+            )
         return InformationGain(settings, camera)
     if settings.name == "visibility":
         return CausalVisibility(settings)

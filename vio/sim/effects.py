@@ -1,4 +1,7 @@
-"""Camera effects on an ideal image: lens, exposure, blur, noise, response. Seeded and reproducible to the bit."""
+"""Camera effects on an ideal image: lens, exposure, blur, noise, response.
+
+Seeded and reproducible to the bit.
+"""
 
 from __future__ import annotations
 
@@ -23,35 +26,64 @@ class SensorEffects:
     """Camera effects; the defaults are a clean, well exposed sensor with a little read noise."""
 
     exposure: float = setting(1.0, "factor on the light of both cameras; 0.05 is near darkness")
-    right_gain: float = setting(1.0, "further factor on the right camera's signal, for cameras of unequal gain")
-    exposure_swing: float = setting(0.0, "relative amplitude of a slow change of exposure", unit="0..1")
+    right_gain: float = setting(
+        1.0, "further factor on the right camera's signal, for cameras of unequal gain"
+    )
+    exposure_swing: float = setting(
+        0.0, "relative amplitude of a slow change of exposure", unit="0..1"
+    )
     exposure_period_s: float = setting(6.0, "period of that change", unit="s")
     vignetting: float = setting(0.0, "loss of light in the image corners", unit="0..1")
     gamma: float = setting(1.0, "exponent of the response: output = input^(1/gamma)")
     read_noise: float = setting(0.8, "standard deviation of the read noise", unit="gray levels")
-    full_well: float = setting(0.0, "electrons at gray level 255, which sets the photon noise; 0 is none")
-    blur_exposure_ms: float = setting(0.0, "shutter time over which motion blurs the image", unit="ms")
+    full_well: float = setting(
+        0.0, "electrons at gray level 255, which sets the photon noise; 0 is none"
+    )
+    blur_exposure_ms: float = setting(
+        0.0, "shutter time over which motion blurs the image", unit="ms"
+    )
     blur_samples: int = setting(7, "sub-exposures, or taps of the approximate blur")
-    blur_exact: bool = setting(False, "render every sub-exposure; else blur one image along its exact optical flow")
-    auto_exposure: bool = setting(False, "each camera's own exposure control sets shutter time and gain of each frame")
-    shutter_ms: float = setting(8.0, "shutter time that leaves the scene's gray levels, with auto_exposure", unit="ms")
-    shutter_max_ms: float = setting(12.0, "longest shutter time; where it does not do, gain is added", unit="ms")
+    blur_exact: bool = setting(
+        False, "render every sub-exposure; else blur one image along its exact optical flow"
+    )
+    auto_exposure: bool = setting(
+        False, "each camera's own exposure control sets shutter time and gain of each frame"
+    )
+    shutter_ms: float = setting(
+        8.0, "shutter time that leaves the scene's gray levels, with auto_exposure", unit="ms"
+    )
+    shutter_max_ms: float = setting(
+        12.0, "longest shutter time; where it does not do, gain is added", unit="ms"
+    )
     gain_max: float = setting(8.0, "largest gain of the exposure control")
     exposure_target: float = setting(95.0, "mean gray level that the exposure control aims at")
-    camera_difference: float = setting(0.0, "how much the cameras differ: vignetting, mean gray level", unit="0..1")
-    glare: float = setting(0.0, "light of windows and sun scattered in the lens: halo and ghosts; 1 is a usual lens")
+    camera_difference: float = setting(
+        0.0, "how much the cameras differ: vignetting, mean gray level", unit="0..1"
+    )
+    glare: float = setting(
+        0.0, "light of windows and sun scattered in the lens: halo and ghosts; 1 is a usual lens"
+    )
 
     def __post_init__(self) -> None:
         if self.exposure < 0 or self.right_gain < 0 or self.gamma <= 0 or self.blur_samples < 1:
-            raise SimulationError("exposure and gain must not be negative; gamma and blur_samples must be positive")
+            raise SimulationError(
+                "exposure and gain must not be negative; gamma and blur_samples must be positive"
+            )
         if not (0 <= self.vignetting <= 1 and 0 <= self.exposure_swing <= 1):
             raise SimulationError("vignetting and exposure_swing must be between 0 and 1")
         if self.read_noise < 0 or self.full_well < 0 or self.blur_exposure_ms < 0:
             raise SimulationError("read_noise, full_well and blur_exposure_ms must not be negative")
-        if min(self.shutter_ms, self.shutter_max_ms, self.exposure_target) <= 0 or self.gain_max < 1:
-            raise SimulationError("shutter times and exposure_target must be positive, gain_max at least 1")
+        if (
+            min(self.shutter_ms, self.shutter_max_ms, self.exposure_target) <= 0
+            or self.gain_max < 1
+        ):
+            raise SimulationError(
+                "shutter times and exposure_target must be positive, gain_max at least 1"
+            )
         if not (0 <= self.camera_difference <= 1 and self.glare >= 0):
-            raise SimulationError("camera_difference must be between 0 and 1, and glare not negative")
+            raise SimulationError(
+                "camera_difference must be between 0 and 1, and glare not negative"
+            )
 
     @property
     def longest_shutter_ms(self) -> float:
@@ -77,7 +109,9 @@ def sensitivity(effects: SensorEffects, camera: int) -> float:
 
 def camera_factor(effects: SensorEffects, camera: int, seed: int) -> float:
     """Return a factor about 1 by which a camera's vignetting and mean gray level deviate."""
-    return 1 + effects.camera_difference * float(np.random.default_rng([seed, camera, 32]).uniform(-1, 1))
+    return 1 + effects.camera_difference * float(
+        np.random.default_rng([seed, camera, 32]).uniform(-1, 1)
+    )
 
 
 def apply_effects(
@@ -106,28 +140,34 @@ def apply_effects(
     if exposure is not None:
         amplifier = exposure.gain
         gain *= exposure.shutter_ms / effects.shutter_ms * amplifier
-    gain *= 1 + effects.exposure_swing * float(np.sin(2 * np.pi * time_ns * 1e-9 / effects.exposure_period_s))
+    gain *= 1 + effects.exposure_swing * float(
+        np.sin(2 * np.pi * time_ns * 1e-9 / effects.exposure_period_s)
+    )
     signal = radiance * np.float32(gain)
     if effects.vignetting > 0:
         signal *= _vignette(radiance.shape, effects, camera, seed)
     rng = np.random.default_rng([seed, frame_index, camera, 31])
     read = effects.read_noise * amplifier
     if effects.full_well > 0:
-        # One draw for both: electrons e have variance e, and a gray level is 255 gain / full_well electrons.
+        # One draw for both: electrons e have variance e, and a gray level is 255 gain / full_well
+        # electrons.
         variance = np.maximum(signal, 0) * np.float32(_FULL_SCALE * amplifier / effects.full_well)
         sigma = np.sqrt(variance + np.float32(read**2))
         signal = signal + sigma * rng.standard_normal(signal.shape, dtype=np.float32)
     elif read > 0:
         signal = signal + np.float32(read) * rng.standard_normal(signal.shape, dtype=np.float32)
     if effects.gamma != 1.0:
-        signal = _FULL_SCALE * (np.clip(signal, 0, _FULL_SCALE) / np.float32(_FULL_SCALE)) ** np.float32(
-            1 / effects.gamma
-        )
+        signal = _FULL_SCALE * (
+            np.clip(signal, 0, _FULL_SCALE) / np.float32(_FULL_SCALE)
+        ) ** np.float32(1 / effects.gamma)
     return np.clip(signal + np.float32(0.5), 0, 255).astype(np.uint8)
 
 
-def _vignette(shape: tuple[int, ...], effects: SensorEffects, camera: int, seed: int) -> npt.NDArray[np.float32]:
-    """Factor (H, W): 1 in the middle, falling with the square of the radius to 1 - loss in the corners.
+def _vignette(
+    shape: tuple[int, ...], effects: SensorEffects, camera: int, seed: int
+) -> npt.NDArray[np.float32]:
+    """Factor (H, W): 1 in the middle, falling with the square of the radius to 1 - loss in the
+    corners.
 
     With different cameras the middle is off the image's and the loss another one in each of them.
     """
@@ -139,23 +179,29 @@ def _vignette(shape: tuple[int, ...], effects: SensorEffects, camera: int, seed:
     return np.maximum(1 - np.float32(loss / 2) * (x * x + y * y), np.float32(0))
 
 
-def average_exposures(render_at: Callable[[int], Radiance], time_ns: int, shutter_ms: float, samples: int) -> Radiance:
+def average_exposures(
+    render_at: Callable[[int], Radiance], time_ns: int, shutter_ms: float, samples: int
+) -> Radiance:
     """Average sub-exposures spread evenly over the shutter time, centred at `time_ns`.
 
     `render_at(time_ns)` renders the sharp image at one time.
     """
-    offsets = np.round(((np.arange(samples) + 0.5) / samples - 0.5) * shutter_ms * 1e6).astype(np.int64)
+    offsets = np.round(((np.arange(samples) + 0.5) / samples - 0.5) * shutter_ms * 1e6).astype(
+        np.int64
+    )
     total = render_at(time_ns + int(offsets[0])).astype(np.float32)
     for offset in offsets[1:]:
         total = total + render_at(time_ns + int(offset))
     return total / np.float32(len(offsets))
 
 
-def blur_along_flow(sharp: Radiance, flow_before: FloatArray, flow_after: FloatArray, taps: int) -> Radiance:
+def blur_along_flow(
+    sharp: Radiance, flow_before: FloatArray, flow_after: FloatArray, taps: int
+) -> Radiance:
     """Blur one sharp image (H, W) along its optical flow: the approximate motion blur.
 
-    Each pixel is the mean of taps along the path on which its point crosses the image, so disocclusions are
-    ignored; `average_exposures` renders them.
+    Each pixel is the mean of taps along the path on which its point crosses the image, so
+    disocclusions are ignored; `average_exposures` renders them.
 
     Args:
         sharp: image at the middle of the shutter time.
@@ -164,7 +210,10 @@ def blur_along_flow(sharp: Radiance, flow_before: FloatArray, flow_after: FloatA
         taps: number of samples along the path.
     """
     height, width = sharp.shape
-    here = np.stack(np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), axis=-1)
+    here = np.stack(
+        np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)),
+        axis=-1,
+    )
     before, after = (np.asarray(flow, dtype=np.float32) for flow in (flow_before, flow_after))
     total = np.zeros_like(sharp)
     for position in (np.arange(taps) + 0.5) / taps * 2 - 1:

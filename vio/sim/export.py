@@ -11,7 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from vio.cameras.rig import Rig
-from vio.datasets.euroc_files import STATE_CSV, image_name, imu_csv, imu_yaml, median_rate_hz, state_csv, write_cameras
+from vio.datasets.euroc_files import (
+    STATE_CSV,
+    image_name,
+    imu_csv,
+    imu_yaml,
+    median_rate_hz,
+    state_csv,
+    write_cameras,
+)
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.datasets.rigs.kalibr import kalibr_text
@@ -51,7 +59,9 @@ def export_euroc(
     simulation = recording.simulation
     record = simulation.imu
     if record is None:
-        raise SimulationError("an EuRoC folder needs an IMU; simulate with imu=ImuNoise() or with a recorded one")
+        raise SimulationError(
+            "an EuRoC folder needs an IMU; simulate with imu=ImuNoise() or with a recorded one"
+        )
     stamps = simulation.stamps_ns
     origin = "recorded" if record.gyro_bias is None else "simulated"
     with atomic_folder(out, replace=replace, marker=MARKER) as folder:
@@ -59,31 +69,45 @@ def export_euroc(
         for name in ("cam0", "cam1"):
             (mav / name / "data").mkdir(parents=True)
         write_cameras(mav, simulation.calibration, stamps, int(stamps[-1]), kind="simulated")
-        for name, text in (("imu0", imu_csv(record)), (STATE_CSV.parent.name, _truth_csv(recording))):
+        for name, text in (
+            ("imu0", imu_csv(record)),
+            (STATE_CSV.parent.name, _truth_csv(recording)),
+        ):
             (mav / name).mkdir()
             write_text(mav / name / "data.csv", text)
-        calibration = imu_yaml(np.eye(4), noise, comment=f"{origin} imu0", rate_hz=median_rate_hz(record.times_ns))
+        calibration = imu_yaml(
+            np.eye(4), noise, comment=f"{origin} imu0", rate_hz=median_rate_hz(record.times_ns)
+        )
         write_text(mav / "imu0" / "sensor.yaml", calibration)
         write_text(folder / MARKER, description(recording))
         names = [image_name(t, int(stamps[-1])) for t in stamps.tolist()]
-        files = [tuple(mav / camera / "data" / name for camera in ("cam0", "cam1")) for name in names]
+        files = [
+            tuple(mav / camera / "data" / name for camera in ("cam0", "cam1")) for name in names
+        ]
         _write_images(recording, files, progress)
 
 
 def export_kitti(
-    recording: SimulatedRecording, out: Path, *, replace: bool = False, progress: Progress | None = None
+    recording: SimulatedRecording,
+    out: Path,
+    *,
+    replace: bool = False,
+    progress: Progress | None = None,
 ) -> None:
     """Render all frames as a self-contained KITTI odometry folder.
 
-    It holds `image_0 image_1 calib.txt times.txt poses.txt T_cam0_imu.txt` and, where the simulation has the velocity
-    sensor, `velocity.csv`. Times start at zero; poses are those of cam0 relative to its first pose.
+    It holds `image_0 image_1 calib.txt times.txt poses.txt T_cam0_imu.txt` and, where the
+    simulation has the velocity sensor, `velocity.csv`. Times start at zero; poses are those of cam0
+    relative to its first pose.
 
     Raises:
         SimulationError: the rig is not rectified.
         VioError: `out` exists and may not be replaced, or cannot be written.
     """
     simulation = recording.simulation
-    camera = simulation.rectified_camera("a KITTI folder needs a rectified rig; export this one as an EuRoC folder")
+    camera = simulation.rectified_camera(
+        "a KITTI folder needs a rectified rig; export this one as an EuRoC folder"
+    )
     stamps = simulation.stamps_ns
     T_cam0_imu = se3_inverse(simulation.calibration.T_imu_cam0)
     poses = in_first_cam0(recording.reference, T_cam0_imu).T_world_body
@@ -97,11 +121,16 @@ def export_kitti(
         if within:
             write_velocity(folder, within, int(stamps[0]))
         write_text(folder / MARKER, description(recording))
-        files = [tuple(folder / name / f"{i:06d}.png" for name in ("image_0", "image_1")) for i in range(len(stamps))]
+        files = [
+            tuple(folder / name / f"{i:06d}.png" for name in ("image_0", "image_1"))
+            for i in range(len(stamps))
+        ]
         _write_images(recording, files, progress)
 
 
-def _write_images(recording: SimulatedRecording, files: list[tuple[Path, ...]], progress: Progress | None) -> None:
+def _write_images(
+    recording: SimulatedRecording, files: list[tuple[Path, ...]], progress: Progress | None
+) -> None:
     """Render in this thread and compress in another."""
     waiting: deque[Future[None]] = deque()
     with ThreadPoolExecutor(max_workers=1) as writer:
@@ -122,7 +151,9 @@ def _truth_csv(recording: SimulatedRecording) -> str:
     state = motion_at(simulation.motion, times)
     biases = true_biases(simulation.imu, times)
     zero = np.zeros((len(times), 6))
-    return state_csv(times, state.T_world_imu, state.velocity_world, zero if biases is None else biases)
+    return state_csv(
+        times, state.T_world_imu, state.velocity_world, zero if biases is None else biases
+    )
 
 
 def description(recording: SimulatedRecording) -> str:
@@ -143,16 +174,22 @@ def description(recording: SimulatedRecording) -> str:
 
 _FACTOR = 5000  # levels per metre, as TUM's
 _NOISE = 1.5e-3  # 1/m, k of a depth's standard deviation k z^2: structured light
-_NEAREST_M, _FARTHEST_M = 0.4, 8.0  # beyond them such a sensor gives none
+_NEAREST_M = 0.4  # beyond them such a sensor gives none
+_FARTHEST_M = 8.0
 
 
 def export_rgbd(
-    recording: SimulatedRecording, out: Path, *, replace: bool = False, progress: Progress | None = None
+    recording: SimulatedRecording,
+    out: Path,
+    *,
+    replace: bool = False,
+    progress: Progress | None = None,
 ) -> None:
-    """Render the left camera's frames with depth images as TUM RGB-D's layout, and `imu.csv` where there is an IMU.
+    """Render the left camera's frames with depth images as TUM RGB-D's layout, and `imu.csv` where
+    there is an IMU.
 
-    A depth has the standard deviation 0.0015 z^2, and is unknown (0) nearer than 0.4 m and beyond 8 m. Ground truth is
-    that of the camera, or of the IMU where there is one.
+    A depth has the standard deviation 0.0015 z^2, and is unknown (0) nearer than 0.4 m and beyond 8
+    m. Ground truth is that of the camera, or of the IMU where there is one.
 
     Raises:
         VioError: `out` exists and may not be replaced, or cannot be written.
@@ -161,7 +198,11 @@ def export_rgbd(
     T_cam0_imu = se3_inverse(simulation.calibration.T_imu_cam0)
     T_stated = None if simulation.imu is None else T_cam0_imu
     rig = Rig(simulation.calibration.cam0, T_cam0_imu=T_stated, depth_factor=_FACTOR)
-    truth = recording.reference if simulation.imu is not None else recording.reference.in_cam0(T_cam0_imu)
+    truth = (
+        recording.reference
+        if simulation.imu is not None
+        else recording.reference.in_cam0(T_cam0_imu)
+    )
     stamps = simulation.stamps_ns.tolist()
     with atomic_folder(out, replace=replace, marker=MARKER) as folder:
         for name in ("rgb", "depth"):
@@ -178,7 +219,10 @@ def export_rgbd(
             depth, _ = recording.depth(0, int(simulation.taken_ns[index]))
             name = f"{seconds_text(stamp_ns)}.png"
             write_png(folder / "rgb" / name, image)
-            write_png(folder / "depth" / name, _levels(depth, np.random.default_rng([simulation.seed, index, 77])))
+            write_png(
+                folder / "depth" / name,
+                _levels(depth, np.random.default_rng([simulation.seed, index, 77])),
+            )
             if progress is not None:
                 progress(index + 1, len(stamps))
 

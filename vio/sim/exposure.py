@@ -1,9 +1,11 @@
-"""Exposure control: each camera meters its images and sets shutter time and gain for later ones, with a lag.
+"""Exposure control: each camera meters its images and sets shutter time and gain for later ones,
+with a lag.
 
-The loop is planned for all frames from a coarse grid of rays before anything is rendered, so any frame can be rendered
-at any time and in any process. It follows what industrial sensors do: the exposure changes at every third frame, from
-an image two frames old, towards a mean gray level; the shutter opens longer first, then gain is added in coarse steps
-whose true values are off by some per cent, so that the brightness jumps.
+The loop is planned for all frames from a coarse grid of rays before anything is rendered, so any
+frame can be rendered at any time and in any process. It follows what industrial sensors do: the
+exposure changes at every third frame, from an image two frames old, towards a mean gray level; the
+shutter opens longer first, then gain is added in coarse steps whose true values are off by some per
+cent, so that the brightness jumps.
 """
 
 from __future__ import annotations
@@ -21,9 +23,11 @@ from vio.sim.render import cast
 from vio.sim.world import World, surfaces_at
 
 _GRID = (12, 8)  # metered rays across and down
-_EVERY, _LATENCY = 3, 2  # frames between changes of the exposure, and from an image to the change it causes
+_EVERY = 3  # frames between changes of the exposure, and from an image to the change it causes
+_LATENCY = 2
 _DEAD_BAND = 0.1  # octaves of brightness that are left alone
-_SPEED, _LARGEST_STEP = 0.6, 0.6  # share of the error taken back at once, and the most, octaves
+_SPEED = 0.6  # share of the error taken back at once, and the most, octaves
+_LARGEST_STEP = 0.6
 _GAIN_STEP = 2**0.5
 _GAIN_ERROR = 0.05  # standard deviation of a gain step's true value, relative
 _SHORTEST_MS = 0.02
@@ -43,7 +47,13 @@ class ExposurePlan:
 
 
 def plan_exposures(
-    world: World, rig: StereoRig, motion: MotionSpline, taken_ns: IntArray, effects: SensorEffects, *, seed: int
+    world: World,
+    rig: StereoRig,
+    motion: MotionSpline,
+    taken_ns: IntArray,
+    effects: SensorEffects,
+    *,
+    seed: int,
 ) -> ExposurePlan:
     """Return the exposures that the cameras' loops set along a motion.
 
@@ -57,16 +67,25 @@ def plan_exposures(
     """
     times, frame = np.unique(taken_ns, return_inverse=True)
     loops = []
-    for camera, (model, T_imu_cam) in enumerate(((rig.cam0, rig.T_imu_cam0), (rig.cam1, rig.T_imu_cam1))):
+    for camera, (model, T_imu_cam) in enumerate(
+        ((rig.cam0, rig.T_imu_cam0), (rig.cam1, rig.T_imu_cam1))
+    ):
         metered = _meter(world, model, motion_at(motion, times).T_world_imu @ T_imu_cam, times)
         loops.append(_control(metered, effects, camera, seed))
-    shutter, gain, brightness = (np.stack(column, axis=1)[frame] for column in zip(*loops, strict=True))
+    shutter, gain, brightness = (
+        np.stack(column, axis=1)[frame] for column in zip(*loops, strict=True)
+    )
     return ExposurePlan(shutter, gain, brightness)
 
 
-def _meter(world: World, camera: CameraModel, T_world_cam: FloatArray, times: IntArray) -> FloatArray:
+def _meter(
+    world: World, camera: CameraModel, T_world_cam: FloatArray, times: IntArray
+) -> FloatArray:
     """Radiance (F, M) along a grid of rays."""
-    u, v = ((np.arange(n) + 0.5) / n * side for n, side in zip(_GRID, (camera.width, camera.height), strict=True))
+    u, v = (
+        (np.arange(n) + 0.5) / n * side
+        for n, side in zip(_GRID, (camera.width, camera.height), strict=True)
+    )
     rays, found = unproject_pixel(camera, np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
     rays = rays[found]
     out = np.empty((len(times), len(rays)))
@@ -79,17 +98,24 @@ def _meter(world: World, camera: CameraModel, T_world_cam: FloatArray, times: In
     return out
 
 
-def _control(radiance: FloatArray, effects: SensorEffects, camera: int, seed: int) -> tuple[FloatArray, ...]:
-    """Shutter times (F,), true gains (F,) and mean gray levels (F,) of one camera's loop, from radiance (F, M)."""
+def _control(
+    radiance: FloatArray, effects: SensorEffects, camera: int, seed: int
+) -> tuple[FloatArray, ...]:
+    """Shutter times (F,), true gains (F,) and mean gray levels (F,) of one camera's loop, from
+    radiance (F, M).
+    """
     rng = np.random.default_rng([seed, camera, 61])
     target = effects.exposure_target * camera_factor(effects, camera, seed)
     phase = int(rng.integers(_EVERY))
     steps = int(np.log(effects.gain_max) / np.log(_GAIN_STEP) + 1e-9)
-    true_gain = _GAIN_STEP ** np.arange(steps + 1) * (1 + _GAIN_ERROR * rng.standard_normal(steps + 1))
+    true_gain = _GAIN_STEP ** np.arange(steps + 1) * (
+        1 + _GAIN_ERROR * rng.standard_normal(steps + 1)
+    )
     true_gain[0] = 1.0
     per_ms = sensitivity(effects, camera) / effects.shutter_ms
     limits = np.log2([_SHORTEST_MS, effects.shutter_max_ms * _GAIN_STEP**steps])
-    wanted = float(np.log2(target / max(float(radiance[0].mean()) * per_ms, 1e-6)))  # octaves of 1 ms at gain 1
+    # octaves of 1 ms at gain 1
+    wanted = float(np.log2(target / max(float(radiance[0].mean()) * per_ms, 1e-6)))
     rows: list[tuple[float, float, float]] = []
     for k, seen in enumerate(radiance):
         if k >= _LATENCY and k % _EVERY == phase:
@@ -99,7 +125,8 @@ def _control(radiance: FloatArray, effects: SensorEffects, camera: int, seed: in
         wanted = float(np.clip(wanted, *limits))
         missing = np.log(2**wanted / effects.shutter_max_ms) / np.log(_GAIN_STEP)
         step = int(np.clip(np.ceil(missing - 1e-9), 0, steps))
-        shutter, gain = 2**wanted / _GAIN_STEP**step, float(true_gain[step])
+        shutter = 2**wanted / _GAIN_STEP**step
+        gain = float(true_gain[step])
         rows.append((shutter, gain, float(np.minimum(seen * per_ms * shutter * gain, 255).mean())))
     shutters, gains, means = (np.array(column) for column in zip(*rows, strict=True))
     return shutters, gains, means

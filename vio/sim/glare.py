@@ -1,8 +1,9 @@
-"""Light that a lens scatters: a halo about bright sources, also outside the image, and ghosts that move against them.
+"""Light that a lens scatters: a halo about bright sources, also outside the image, and ghosts that
+move against them.
 
-The halo falls with the square of the angle from the source (the veiling glare of dust and of the lens barrel); ghosts
-are discs on the line through the image's centre, reflections between lens surfaces. Both are light added before the
-shutter closes, so they follow the exposure and saturate.
+The halo falls with the square of the angle from the source (the veiling glare of dust and of the
+lens barrel); ghosts are discs on the line through the image's centre, reflections between lens
+surfaces. Both are light added before the shutter closes, so they follow the exposure and saturate.
 """
 
 from __future__ import annotations
@@ -17,12 +18,16 @@ from vio.sim.render import CameraRays, Radiance, View, cast
 from vio.sim.world import Surfaces, World, surfaces_at
 
 _GRID_PX = 4  # pixels between computed values; halos and ghosts are smooth
-_CORE_RAD, _CORE = 0.012, 3.0  # the sun's bright centre: its radius, and its light over the source's
-_HALO_RAD, _HALO = 0.12, 0.035  # the wide part of the halo: its radius, and its light over the source's
-_USUAL_SR = 0.05  # solid angle of a source for which these hold; the sun's light is stated for its small disc
+_CORE_RAD = 0.012  # the sun's bright centre: its radius, and its light over the source's
+_CORE = 3.0
+_HALO_RAD = 0.12  # the wide part of the halo: its radius, and its light over the source's
+_HALO = 0.035
+# solid angle of a source for which these hold; the sun's light is stated for its small disc
+_USUAL_SR = 0.05
 _SUN_STRENGTH = 0.025  # the sun instead of a source of that solid angle
 _DISTANT_M = 100.0  # what is farther away than this is sky and does not hide the sun
-_GHOSTS = ((-0.45, 0.05, 70.0), (-0.9, 0.03, 120.0), (0.4, 0.022, 90.0), (-1.5, 0.09, 40.0))  # place, radius, level
+# place, radius, level
+_GHOSTS = ((-0.45, 0.05, 70.0), (-0.9, 0.03, 120.0), (0.4, 0.022, 90.0), (-1.5, 0.09, 40.0))
 _GHOST_REACH_RAD = 0.9  # beyond this angle from the axis a source makes no ghosts
 
 
@@ -39,7 +44,8 @@ def glare(world: World, view: View, rays: CameraRays, strength: float) -> Radian
         if len(sources):
             share = min(1.0, weight * len(sources))
             total += _ghosts(directions, sources.mean(axis=0), np.float32(share))
-    height, width = view.camera.height, view.camera.width
+    height = view.camera.height
+    width = view.camera.width
     size = (directions.shape[2] * _GRID_PX, directions.shape[1] * _GRID_PX)
     # Values belong to every fourth pixel; `resize` puts them at the middles of four by four.
     shift = np.array([[1, 0, -(_GRID_PX - 1) / 2], [0, 1, -(_GRID_PX - 1) / 2]], dtype=np.float32)
@@ -49,8 +55,11 @@ def glare(world: World, view: View, rays: CameraRays, strength: float) -> Radian
 
 
 def _sources(light: Light, view: View, surfaces: Surfaces) -> tuple[FloatArray, float]:
-    """Visible points of a light as unit rays (N, 3) of the camera frame, and the strength of each of them."""
-    R, centre = view.T_world_cam[:3, :3], view.T_world_cam[:3, 3]
+    """Visible points of a light as unit rays (N, 3) of the camera frame, and the strength of
+    each of them.
+    """
+    R = view.T_world_cam[:3, :3]
+    centre = view.T_world_cam[:3, 3]
     if light.distant:
         rays = (light.position @ R)[None]
         hits = cast(surfaces, view.T_world_cam, rays)
@@ -68,7 +77,9 @@ def _sources(light: Light, view: View, surfaces: Surfaces) -> tuple[FloatArray, 
     return rays[seen], min(solid_angle / _USUAL_SR, 3.0) / len(corners)
 
 
-def _halo(directions: npt.NDArray[np.float32], source: FloatArray, light: Light) -> npt.NDArray[np.float32]:
+def _halo(
+    directions: npt.NDArray[np.float32], source: FloatArray, light: Light
+) -> npt.NDArray[np.float32]:
     """Halo (h, w) of a point of a source along unit rays (3, h, w)."""
     cosine = np.tensordot(source.astype(np.float32), directions, axes=1)
     square = 2 * np.maximum(1 - cosine, 0)  # of the chord, about the angle
@@ -78,16 +89,21 @@ def _halo(directions: npt.NDArray[np.float32], source: FloatArray, light: Light)
     return out.astype(np.float32)
 
 
-def _ghosts(directions: npt.NDArray[np.float32], source: FloatArray, share: np.float32) -> npt.NDArray[np.float32]:
+def _ghosts(
+    directions: npt.NDArray[np.float32], source: FloatArray, share: np.float32
+) -> npt.NDArray[np.float32]:
     """Ghosts (h, w): discs on the line from the source through the optical axis."""
     total = np.zeros(directions.shape[1:], dtype=np.float32)
     angle = float(np.arccos(np.clip(source[2] / np.linalg.norm(source), -1, 1)))
     if angle > _GHOST_REACH_RAD:
         return total
-    x, y = directions[0] / directions[2], directions[1] / directions[2]
+    x = directions[0] / directions[2]
+    y = directions[1] / directions[2]
     at = source[:2] / source[2]
     fade = float(np.cos(angle / _GHOST_REACH_RAD * np.pi / 2))
     for place, radius, level in _GHOSTS:
         from_edge = (np.hypot(x - place * at[0], y - place * at[1]) - radius) / (0.2 * radius)
-        total += share * np.float32(level * fade) * np.clip(0.5 - from_edge, 0, 1).astype(np.float32)
+        total += (
+            share * np.float32(level * fade) * np.clip(0.5 - from_edge, 0, 1).astype(np.float32)
+        )
     return total

@@ -1,8 +1,8 @@
 """Simulate inertial and velocity sensors along a motion, with noise and bias random walks.
 
-Reference: Furgale, Rehder, Siegwart, Unified temporal and spatial calibration for multi-sensor systems (2013), and the
-Kalibr IMU noise model: white noise of density s has standard deviation s sqrt(rate) per sample, a bias walks by
-s_b sqrt(dt).
+Reference: Furgale, Rehder, Siegwart, Unified temporal and spatial calibration for multi-sensor
+systems (2013), and the Kalibr IMU noise model: white noise of density s has standard deviation s
+sqrt(rate) per sample, a bias walks by s_b sqrt(dt).
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from vio.sim.motion import MotionSpline, motion_at
 GRAVITY_MPS2 = 9.81
 GRAVITY_WORLD = np.array([0.0, 0.0, -GRAVITY_MPS2])
 _S_PER_NS = 1e-9
-ADIS16448 = ImuDensities(gyro=1.6968e-4, gyro_walk=1.9393e-5, accel=2.0e-3, accel_walk=3.0e-3)  # EuRoC's figures
+# EuRoC's figures
+ADIS16448 = ImuDensities(gyro=1.6968e-4, gyro_walk=1.9393e-5, accel=2.0e-3, accel_walk=3.0e-3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +30,12 @@ class ImuNoise:
     """Errors of an inertial measurement unit; the defaults are those of EuRoC's."""
 
     densities: ImuDensities = ADIS16448  # white noise and bias walks
-    gyro_bias_sigma: float = setting(5e-3, "standard deviation of the gyroscope bias at the start", unit="rad/s")
-    accel_bias_sigma: float = setting(5e-2, "standard deviation of the accelerometer bias at the start", unit="m/s^2")
+    gyro_bias_sigma: float = setting(
+        5e-3, "standard deviation of the gyroscope bias at the start", unit="rad/s"
+    )
+    accel_bias_sigma: float = setting(
+        5e-2, "standard deviation of the accelerometer bias at the start", unit="m/s^2"
+    )
     gyro_limit: float = setting(17.45, "gyroscope saturation, each axis", unit="rad/s")
     accel_limit: float = setting(176.5, "accelerometer saturation, each axis", unit="m/s^2")
 
@@ -42,8 +47,12 @@ NO_IMU_NOISE = ImuNoise(ImuDensities(0.0, 0.0, 0.0, 0.0), gyro_bias_sigma=0.0, a
 class VelocityNoise:
     """White noise of the paper's control input."""
 
-    linear_sigma: float = setting(0.5, "standard deviation of the body velocity, each axis", unit="m/s")
-    angular_sigma: float = setting(0.05, "standard deviation of the angular rate, each axis", unit="rad/s")
+    linear_sigma: float = setting(
+        0.5, "standard deviation of the body velocity, each axis", unit="m/s"
+    )
+    angular_sigma: float = setting(
+        0.05, "standard deviation of the angular rate, each axis", unit="rad/s"
+    )
 
 
 def sample_times(spline: MotionSpline, rate_hz: float) -> IntArray:
@@ -58,13 +67,15 @@ def simulate_imu(
 ) -> ImuRecord:
     """Simulate gyroscope and accelerometer along a motion.
 
-    Without `noise` the defaults of `ImuNoise` apply; `NO_IMU_NOISE` yields exact values. Samples are instantaneous.
+    Without `noise` the defaults of `ImuNoise` apply; `NO_IMU_NOISE` yields exact values. Samples
+    are instantaneous.
     """
     noise = ImuNoise() if noise is None else noise
     times = sample_times(spline, rate_hz)
     state = motion_at(spline, times)
     n = len(times)
-    gyro_rng, accel_rng = np.random.default_rng([seed, 21]), np.random.default_rng([seed, 22])
+    gyro_rng = np.random.default_rng([seed, 21])
+    accel_rng = np.random.default_rng([seed, 22])
     gyro_bias = _walk(gyro_rng, n, rate_hz, noise.densities.gyro_walk, noise.gyro_bias_sigma)
     accel_bias = _walk(accel_rng, n, rate_hz, noise.densities.accel_walk, noise.accel_bias_sigma)
     gyro = state.angular_velocity + gyro_bias
@@ -77,7 +88,9 @@ def simulate_imu(
     return ImuRecord(times, gyro, accel, gyro_bias, accel_bias)
 
 
-def _walk(rng: np.random.Generator, n: int, rate_hz: float, density: float, start_sigma: float) -> FloatArray:
+def _walk(
+    rng: np.random.Generator, n: int, rate_hz: float, density: float, start_sigma: float
+) -> FloatArray:
     """Random-walk bias (n, 3) from a random start."""
     start = start_sigma * rng.standard_normal(3)
     steps = density / np.sqrt(rate_hz) * rng.standard_normal((n, 3))
@@ -86,9 +99,15 @@ def _walk(rng: np.random.Generator, n: int, rate_hz: float, density: float, star
 
 
 def simulate_velocity(
-    spline: MotionSpline, *, rate_hz: float = 10.0, noise: VelocityNoise | None = None, seed: int = 0
+    spline: MotionSpline,
+    *,
+    rate_hz: float = 10.0,
+    noise: VelocityNoise | None = None,
+    seed: int = 0,
 ) -> Sequence[VelocitySample]:
-    """Simulate the paper's control input `u = [v; omega]` along a motion, in the imu frame, with the paper's noise."""
+    """Simulate the paper's control input `u = [v; omega]` along a motion, in the imu frame, with
+    the paper's noise.
+    """
     noise = VelocityNoise() if noise is None else noise
     times = sample_times(spline, rate_hz)
     state = motion_at(spline, times)

@@ -1,7 +1,9 @@
-"""Light in a scene: bright windows or a sun, ambient light, and the illumination that they give to each surface.
+"""Light in a scene: bright windows or a sun, ambient light, and the illumination that they give to
+each surface.
 
-A simplified model: windows are small diffuse sources and cast no shadows, the sun casts the hard shadows of boxes
-and houses, light between surfaces is one ambient constant. Illumination 1 leaves a texture's gray levels as they are.
+A simplified model: windows are small diffuse sources and cast no shadows, the sun casts the hard
+shadows of boxes and houses, light between surfaces is one ambient constant. Illumination 1 leaves a
+texture's gray levels as they are.
 """
 
 from __future__ import annotations
@@ -13,9 +15,11 @@ import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray
 
-_BRIGHTEST = 3.0  # illumination right at a window; the model of a small source would go to infinity there
+# illumination right at a window; the model of a small source would go to infinity there
+_BRIGHTEST = 3.0
 _WRAP = 0.35  # share of a window's light that arrives from around it, off the walls beside it
-_SHADOW_START_M = 0.01  # a shadow's ray begins so far off its surface, outside the surface's own box
+# a shadow's ray begins so far off its surface, outside the surface's own box
+_SHADOW_START_M = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +45,9 @@ class Lighting:
 
 
 def illumination(lighting: Lighting, points: npt.ArrayLike, normal: npt.ArrayLike) -> FloatArray:
-    """Return the illumination (N,) of points (N, 3) of one surface, world, m, with its unit normal (3,)."""
+    """Return the illumination (N,) of points (N, 3) of one surface, world, m, with its unit
+    normal (3,).
+    """
     p = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     n = np.asarray(normal, dtype=np.float64)
     total = np.full(len(p), lighting.ambient)
@@ -49,19 +55,27 @@ def illumination(lighting: Lighting, points: npt.ArrayLike, normal: npt.ArrayLik
         if light.distant:
             facing = max(0.0, float(n @ light.position))
             if facing > 0:
-                total += light.power * facing * _sunlit(lighting, p + _SHADOW_START_M * n, light.position)
+                total += (
+                    light.power
+                    * facing
+                    * _sunlit(lighting, p + _SHADOW_START_M * n, light.position)
+                )
             continue
         towards = light.position - p
         square = np.einsum("ni,ni->n", towards, towards)
         ray = towards / np.sqrt(np.maximum(square, 1e-12))[:, None]
         received = _WRAP + (1 - _WRAP) * (ray @ n)
         sent = _WRAP + (1 - _WRAP) * -(ray @ light.normal)
-        total += light.power * np.maximum(received, 0) * np.maximum(sent, 0) / np.maximum(square, 1e-2)
+        total += (
+            light.power * np.maximum(received, 0) * np.maximum(sent, 0) / np.maximum(square, 1e-2)
+        )
     return np.minimum(total, _BRIGHTEST + lighting.ambient)
 
 
 def _sunlit(lighting: Lighting, points: FloatArray, direction: FloatArray) -> FloatArray:
-    """1 where the ray from a point (N, 3) towards the sun meets no box, else 0; the slab test, box by box."""
+    """1 where the ray from a point (N, 3) towards the sun meets no box, else 0; the slab test,
+    box by box.
+    """
     lit = np.ones(len(points))
     if lighting.caster_poses is None or lighting.caster_half_sizes is None:
         return lit
@@ -69,7 +83,8 @@ def _sunlit(lighting: Lighting, points: FloatArray, direction: FloatArray) -> Fl
         start = (points - T[:3, 3]) @ T[:3, :3]
         ray = direction @ T[:3, :3]
         safe = np.where(np.abs(ray) < 1e-9, 1e-9, ray)
-        near, far = (-half - start) / safe, (half - start) / safe
+        near = (-half - start) / safe
+        far = (half - start) / safe
         enters = np.minimum(near, far).max(axis=1)
         leaves = np.maximum(near, far).min(axis=1)
         lit[(enters < leaves) & (leaves > 0)] = 0.0
@@ -79,12 +94,27 @@ def _sunlit(lighting: Lighting, points: FloatArray, direction: FloatArray) -> Fl
 def sun(azimuth_rad: float, elevation_rad: float, *, power: float, radiance: float) -> Light:
     """Return the sun at an azimuth (from world x towards y) and elevation."""
     level = np.cos(elevation_rad)
-    towards = np.array([level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), np.sin(elevation_rad)])
+    towards = np.array(
+        [level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), np.sin(elevation_rad)]
+    )
     return Light(towards, -towards, np.zeros((2, 3)), power, radiance, distant=True)
 
 
 def window(
-    middle: npt.ArrayLike, normal: npt.ArrayLike, extent: npt.ArrayLike, *, power: float, radiance: float
+    middle: npt.ArrayLike,
+    normal: npt.ArrayLike,
+    extent: npt.ArrayLike,
+    *,
+    power: float,
+    radiance: float,
 ) -> Light:
-    """Return a window with its middle (3,), its normal (3,) into the room and half its sides (2, 3), world, m."""
-    return Light(np.asarray(middle, float), np.asarray(normal, float), np.asarray(extent, float), power, radiance)
+    """Return a window with its middle (3,), its normal (3,) into the room and half its sides (2,
+    3), world, m.
+    """
+    return Light(
+        np.asarray(middle, float),
+        np.asarray(normal, float),
+        np.asarray(extent, float),
+        power,
+        radiance,
+    )

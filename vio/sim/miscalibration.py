@@ -16,32 +16,50 @@ from vio.setting import setting
 class CalibrationErrors:
     """Sizes of a calibration's errors; their directions and signs follow from the seed."""
 
-    scale: float = setting(0.0, "factor on all of them: 0 is an exact calibration, 1 one as after a real one")
-    principal_point_px: float = setting(0.25, "principal point of each camera, in a random direction", unit="px")
+    scale: float = setting(
+        0.0, "factor on all of them: 0 is an exact calibration, 1 one as after a real one"
+    )
+    principal_point_px: float = setting(
+        0.25, "principal point of each camera, in a random direction", unit="px"
+    )
     distortion: float = setting(1e-3, "first radial coefficient of each camera, either sign")
     rotation_deg: float = setting(0.03, "right camera about a random axis", unit="deg")
     baseline_mm: float = setting(0.5, "right camera along the baseline, either way", unit="mm")
 
     def __post_init__(self) -> None:
-        values = (self.scale, self.principal_point_px, self.distortion, self.rotation_deg, self.baseline_mm)
+        values = (
+            self.scale,
+            self.principal_point_px,
+            self.distortion,
+            self.rotation_deg,
+            self.baseline_mm,
+        )
         if not all(np.isfinite(v) and v >= 0 for v in values):
             raise SimulationError("calibration errors are sizes: finite and not negative")
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSigmas:
-    """Standard deviations of a calibration's errors, from which the seed draws a rig, normally and independently.
+    """Standard deviations of a calibration's errors, from which the seed draws a rig, normally and
+    independently.
 
-    The right camera's terms that move rows of left and right against each other (its pitch and roll, and what its
-    height of the principal point, focal length and lens differ from the left one's) are scaled by `rows`. With 0 the
-    rows agree, as after a rectification that was adjusted by rows, and disparities are off all the same.
+    The right camera's terms that move rows of left and right against each other (its pitch and
+    roll, and what its height of the principal point, focal length and lens differ from the left
+    one's) are scaled by `rows`. With 0 the rows agree, as after a rectification that was adjusted
+    by rows, and disparities are off all the same.
     """
 
-    scale: float = setting(0.0, "factor on all of them: 0 draws nothing, 1 a rig as after a careful calibration")
-    rows: float = setting(1.0, "factor on what moves rows of left and right against each other; 0: rows agree")
+    scale: float = setting(
+        0.0, "factor on all of them: 0 draws nothing, 1 a rig as after a careful calibration"
+    )
+    rows: float = setting(
+        1.0, "factor on what moves rows of left and right against each other; 0: rows agree"
+    )
     baseline: float = setting(0.003, "length of the baseline, over it")
     focal_length: float = setting(0.002, "focal length of both cameras alike, over it")
-    focal_difference: float = setting(0.0005, "focal length of the right camera against the left one, over it")
+    focal_difference: float = setting(
+        0.0005, "focal length of the right camera against the left one, over it"
+    )
     yaw_deg: float = setting(0.02, "right camera about its vertical axis", unit="deg")
     pitch_deg: float = setting(0.02, "right camera about its horizontal axis", unit="deg")
     roll_deg: float = setting(0.02, "right camera about its optical axis", unit="deg")
@@ -63,7 +81,8 @@ def drawn_rig(calibrated: StereoRig, sigmas: CalibrationSigmas, *, seed: int) ->
     """
     if sigmas.scale == 0:
         return calibrated
-    s, rng = sigmas, np.random.default_rng([seed, 72])
+    s = sigmas
+    rng = np.random.default_rng([seed, 72])
     baseline, focal, difference, *turn_deg = s.scale * rng.standard_normal(6)
     lens = s.scale * rng.standard_normal((2, 4)) * [s.cx_px, s.cy_px, s.k1, s.k2]  # left, right
     lens[1, 1:] = lens[0, 1:] + s.rows * (lens[1, 1:] - lens[0, 1:])
@@ -77,14 +96,18 @@ def drawn_rig(calibrated: StereoRig, sigmas: CalibrationSigmas, *, seed: int) ->
 
 
 def miscalibrated(calibrated: StereoRig, errors: CalibrationErrors, *, seed: int) -> StereoRig:
-    """Return the true rig of which `calibrated` is the imperfect calibration; the left camera's pose is exact.
+    """Return the true rig of which `calibrated` is the imperfect calibration; the left camera's
+    pose is exact.
 
-    Cameras that are calibrated as pinholes (rectified images) have a radial distortion that rectification left over.
+    Cameras that are calibrated as pinholes (rectified images) have a radial distortion that
+    rectification left over.
     """
     if errors.scale == 0:
         return calibrated
     rng = np.random.default_rng([seed, 71])
-    cam0, cam1 = (_true_camera(camera, errors, rng) for camera in (calibrated.cam0, calibrated.cam1))
+    cam0, cam1 = (
+        _true_camera(camera, errors, rng) for camera in (calibrated.cam0, calibrated.cam1)
+    )
     axis = rng.standard_normal(3)
     axis /= np.linalg.norm(axis)
     turn = so3_exp(np.deg2rad(errors.scale * errors.rotation_deg) * axis)
@@ -92,26 +115,45 @@ def miscalibrated(calibrated: StereoRig, errors: CalibrationErrors, *, seed: int
     longer = rng.choice([-1.0, 1.0]) * errors.scale * errors.baseline_mm * 1e-3
     t = T[:3, 3] * (1 + longer / np.linalg.norm(T[:3, 3]))
     return replace(
-        calibrated, cam0=cam0, cam1=cam1, T_imu_cam1=calibrated.T_imu_cam0 @ se3_from_parts(T[:3, :3] @ turn, t)
+        calibrated,
+        cam0=cam0,
+        cam1=cam1,
+        T_imu_cam1=calibrated.T_imu_cam0 @ se3_from_parts(T[:3, :3] @ turn, t),
     )
 
 
-def _true_camera(camera: CameraModel, errors: CalibrationErrors, rng: np.random.Generator) -> CameraModel:
-    angle, sign = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
+def _true_camera(
+    camera: CameraModel, errors: CalibrationErrors, rng: np.random.Generator
+) -> CameraModel:
+    angle = rng.uniform(0, 2 * np.pi)
+    sign = rng.choice([-1.0, 1.0])
     shift = errors.scale * errors.principal_point_px * np.array([np.cos(angle), np.sin(angle)])
     return _changed(camera, shift, np.array([sign * errors.scale * errors.distortion]))
 
 
-def _changed(camera: CameraModel, shift_px: FloatArray, radial: FloatArray, zoom: float = 1.0) -> CameraModel:
+def _changed(
+    camera: CameraModel, shift_px: FloatArray, radial: FloatArray, zoom: float = 1.0
+) -> CameraModel:
     """Return the camera with its principal point (2,) and first radial terms moved, and zoomed."""
-    model, k = camera.model, camera.coefficients
+    model = camera.model
+    k = camera.coefficients
     if model == "pinhole":
-        model, k = "radtan", (0.0, 0.0, 0.0, 0.0)
+        model = "radtan"
+        k = (0.0, 0.0, 0.0, 0.0)
     elif model not in ("radtan", "equidistant"):
-        raise SimulationError(f"a {model} lens cannot be miscalibrated; use a pinhole, radtan or equidistant one")
+        raise SimulationError(
+            f"a {model} lens cannot be miscalibrated; use a pinhole, radtan or equidistant one"
+        )
     moved = [old + add for old, add in zip(k, radial.tolist(), strict=False)]
-    cu, cv = camera.cu + float(shift_px[0]), camera.cv + float(shift_px[1])
+    cu = camera.cu + float(shift_px[0])
+    cv = camera.cv + float(shift_px[1])
     coefficients = (*moved, *k[len(moved) :])
     return replace(
-        camera, fu=camera.fu * zoom, fv=camera.fv * zoom, cu=cu, cv=cv, model=model, coefficients=coefficients
+        camera,
+        fu=camera.fu * zoom,
+        fv=camera.fv * zoom,
+        cu=cu,
+        cv=cv,
+        model=model,
+        coefficients=coefficients,
     )

@@ -1,7 +1,9 @@
-"""Continuous motion: a B-spline for the position and a cumulative B-spline on SO(3) for the attitude.
+"""Continuous motion: a B-spline for the position and a cumulative B-spline on SO(3) for the
+attitude.
 
 Degree 5 with uniform knots, so velocity, acceleration and angular rate are analytic.
-Reference: Sommer, Usenko, Schubert, Demmel, Cremers, Efficient derivative computation for cumulative B-splines on Lie
+Reference: Sommer, Usenko, Schubert, Demmel, Cremers, Efficient derivative computation for
+cumulative B-splines on Lie
 groups (2020): cumulative basis, and the recurrence of the angular rate.
 """
 
@@ -51,7 +53,9 @@ class MotionSpline:
     @property
     def end_ns(self) -> int:
         """Last nanosecond at which the motion is defined."""
-        return self.start_ns + int(np.floor((len(self.p_control) - _DEGREE) * self.knot_s / _S_PER_NS))
+        return self.start_ns + int(
+            np.floor((len(self.p_control) - _DEGREE) * self.knot_s / _S_PER_NS)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,19 +83,25 @@ class FitReport:
 
 @cache
 def _blending() -> FloatArray:
-    """Matrix (6, 6) of the uniform B-spline: row i, column j is the factor of u^j in the weight of control point i.
+    """Matrix (6, 6) of the uniform B-spline: row i, column j is the factor of u^j in the weight of
+    control point i.
 
     Reference: Qin, General matrix representations for B-splines (1998), as given by Sommer et al.
     """
     out = np.zeros((_K, _K))
     for s, n in np.ndindex(_K, _K):
-        total = sum((-1.0) ** (i - s) * comb(_K, i - s) * float(_K - 1 - i) ** (_K - 1 - n) for i in range(s, _K))
+        total = sum(
+            (-1.0) ** (i - s) * comb(_K, i - s) * float(_K - 1 - i) ** (_K - 1 - n)
+            for i in range(s, _K)
+        )
         out[s, n] = comb(_K - 1, n) / factorial(_K - 1) * total
     return out
 
 
 def _weights(u: FloatArray, derivative: int) -> FloatArray:
-    """Weights (N, 6) of the control points at fractions u (N,) of a knot interval, or their derivative in u."""
+    """Weights (N, 6) of the control points at fractions u (N,) of a knot interval, or their
+    derivative in u.
+    """
     powers = np.zeros((len(u), _K))
     for n in range(derivative, _K):
         powers[:, n] = factorial(n) / factorial(n - derivative) * u ** (n - derivative)
@@ -106,7 +116,9 @@ def _locate(spline: MotionSpline, times_ns: npt.ArrayLike) -> tuple[IntArray, In
             f"the motion is defined from {spline.start_ns} to {spline.end_ns} ns; "
             f"requested {t.min()} to {t.max()}: shorten the request or lengthen the trajectory"
         )
-    position: FloatArray = np.multiply(t - spline.start_ns, _S_PER_NS / spline.knot_s, dtype=np.float64)
+    position: FloatArray = np.multiply(
+        t - spline.start_ns, _S_PER_NS / spline.knot_s, dtype=np.float64
+    )
     segments = len(spline.p_control) - _DEGREE
     first = np.clip(np.floor(position).astype(np.int64), 0, segments - 1)
     return t, first, position - first
@@ -137,13 +149,17 @@ def motion_at(spline: MotionSpline, times_ns: npt.ArrayLike) -> MotionState:
 
 
 def fit_spline(
-    times_ns: npt.ArrayLike, T_world_imu: npt.ArrayLike, *, knot_s: float = 0.1, robust: bool = False
+    times_ns: npt.ArrayLike,
+    T_world_imu: npt.ArrayLike,
+    *,
+    knot_s: float = 0.1,
+    robust: bool = False,
 ) -> tuple[MotionSpline, FitReport]:
     """Fit a spline to poses (N, 4, 4) at strictly increasing times (N,) by least squares.
 
-    The attitude is fitted by Gauss-Newton steps: the residual rotation vectors are fitted like a position and moved
-    into the control attitudes. With `robust`, samples farther than 5 robust standard deviations (and 2 mm
-    or 10 mrad) are rejected.
+    The attitude is fitted by Gauss-Newton steps: the residual rotation vectors are fitted like a
+    position and moved into the control attitudes. With `robust`, samples farther than 5 robust
+    standard deviations (and 2 mm or 10 mrad) are rejected.
 
     Raises:
         DataError: times do not increase, values are not finite, or there are too few poses.
@@ -169,31 +185,49 @@ def fit_spline(
 
     distance, angle = residuals()
     for _ in range(_ROBUST_ROUNDS if robust else 0):
-        good = (distance < _limit(distance[keep], _OUTLIER_FLOOR[0])) & (angle < _limit(angle[keep], _OUTLIER_FLOOR[1]))
+        good = (distance < _limit(distance[keep], _OUTLIER_FLOOR[0])) & (
+            angle < _limit(angle[keep], _OUTLIER_FLOOR[1])
+        )
         if np.array_equal(good, keep):
             break
         keep = good
         p_control, R_control = _fit(design, T, keep)
         distance, angle = residuals()
     spline = MotionSpline(int(t[0]), step, p_control, R_control)
-    left = [(float(np.sqrt(np.mean(r[keep] ** 2))), float(r[keep].max())) for r in (distance, angle)]
+    left = [
+        (float(np.sqrt(np.mean(r[keep] ** 2))), float(r[keep].max())) for r in (distance, angle)
+    ]
     return spline, FitReport(len(t), int((~keep).sum()), *left[0], *left[1])
 
 
-def _check_record(times_ns: npt.ArrayLike, T_world_imu: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
-    t, T = np.asarray(times_ns, dtype=np.int64).reshape(-1), np.asarray(T_world_imu, dtype=np.float64)
+def _check_record(
+    times_ns: npt.ArrayLike, T_world_imu: npt.ArrayLike
+) -> tuple[IntArray, FloatArray]:
+    t = np.asarray(times_ns, dtype=np.int64).reshape(-1)
+    T = np.asarray(T_world_imu, dtype=np.float64)
     if T.shape != (len(t), 4, 4):
-        raise DataError(f"{len(t)} times for poses of shape {T.shape}; give one 4x4 pose for each time")
+        raise DataError(
+            f"{len(t)} times for poses of shape {T.shape}; give one 4x4 pose for each time"
+        )
     if len(t) < 2:
         raise DataError(f"a trajectory needs at least two poses, got {len(t)}")
     if not np.all(np.isfinite(T)):
-        raise DataError(f"pose {int(np.argwhere(~np.isfinite(T))[0, 0])} of the trajectory is not finite; remove it")
+        raise DataError(
+            f"pose {int(np.argwhere(~np.isfinite(T))[0, 0])} of the trajectory is not finite; "
+            "remove it"
+        )
     return check_increasing(t, lambda k: f"pose {k} of the trajectory"), T
 
 
-def _fit(design: scipy.sparse.csr_matrix, T: FloatArray, keep: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Control positions (M, 3) and attitudes (M, 3, 3); a small curvature penalty determines them within gaps."""
-    A, p, R = design[keep], T[keep, :3, 3], T[keep, :3, :3]
+def _fit(
+    design: scipy.sparse.csr_matrix, T: FloatArray, keep: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Control positions (M, 3) and attitudes (M, 3, 3); a small curvature penalty determines
+    them within gaps.
+    """
+    A = design[keep]
+    p = T[keep, :3, 3]
+    R = T[keep, :3, :3]
     m = A.shape[1]
     curvature = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(m - 2, m))
     normal = A.T @ A + 1e-7 * (curvature.T @ curvature) + 1e-12 * scipy.sparse.identity(m)
@@ -202,9 +236,12 @@ def _fit(design: scipy.sparse.csr_matrix, T: FloatArray, keep: BoolArray) -> tup
     p_control = factor.solve(A.T @ (p - middle)) + middle
     # Initialise each control point from the sample nearest to its largest weight.
     sample = np.asarray(A @ np.arange(m, dtype=np.float64)).ravel()
-    nearest = np.abs(np.interp(np.arange(m), sample, np.arange(len(sample)))).round().astype(np.int64)
+    nearest = (
+        np.abs(np.interp(np.arange(m), sample, np.arange(len(sample)))).round().astype(np.int64)
+    )
     R_control: FloatArray = R[nearest]
-    first, weights = A.indices.reshape(-1, _K)[:, 0], A.data.reshape(-1, _K)
+    first = A.indices.reshape(-1, _K)[:, 0]
+    weights = A.data.reshape(-1, _K)
     for _ in range(_ROTATION_ROUNDS):
         residual = so3_log(np.swapaxes(_attitude(R_control, first, weights), 1, 2) @ R)
         delta = factor.solve(A.T @ residual)
@@ -229,7 +266,9 @@ def _limit(kept: FloatArray, floor: float) -> float:
     return max(floor, float(_OUTLIER_SIGMAS * 1.4826 * np.median(kept)))
 
 
-def spline_from_waypoints(T_world_imu: npt.ArrayLike, interval_s: float, *, start_ns: int = 0) -> MotionSpline:
+def spline_from_waypoints(
+    T_world_imu: npt.ArrayLike, interval_s: float, *, start_ns: int = 0
+) -> MotionSpline:
     """Return a smooth motion through waypoints (N, 4, 4) at equal intervals.
 
     Raises:
@@ -238,7 +277,9 @@ def spline_from_waypoints(T_world_imu: npt.ArrayLike, interval_s: float, *, star
     T = np.asarray(T_world_imu, dtype=np.float64)
     times = start_ns + np.round(np.arange(len(T)) * (interval_s / _S_PER_NS)).astype(np.int64)
     spline, report = fit_spline(times, T, knot_s=interval_s)
-    logger.debug("waypoints met within %.2g m, %.2g rad", report.position_max_m, report.rotation_max_rad)
+    logger.debug(
+        "waypoints met within %.2g m, %.2g rad", report.position_max_m, report.rotation_max_rad
+    )
     return spline
 
 
@@ -247,11 +288,14 @@ def rotate_body_axes(spline: MotionSpline, R_body_imu: npt.ArrayLike) -> MotionS
     return replace(spline, R_control=spline.R_control @ np.asarray(R_body_imu, dtype=np.float64))
 
 
-# --- ready motions --------------------------------------------------------------------------------------------------
+# --- ready motions
+# --------------------------------------------------------------------------------------------------
 
 
 def look_rotation(forward: npt.ArrayLike) -> FloatArray:
-    """Attitudes (..., 3, 3) of a body with x along `forward` (..., 3), y left, z as far up as possible."""
+    """Attitudes (..., 3, 3) of a body with x along `forward` (..., 3), y left, z as far up as
+    possible.
+    """
     x = np.asarray(forward, dtype=np.float64)
     x = x / np.linalg.norm(x, axis=-1, keepdims=True)
     y = np.cross(np.broadcast_to([0.0, 0.0, 1.0], x.shape), x)
@@ -269,7 +313,8 @@ def car_loop(
     seed: int = 0,
     start_ns: int = 0,
 ) -> MotionSpline:
-    """Drive counter-clockwise along a rectangle with rounded corners, slower in them, with small suspension motion.
+    """Drive counter-clockwise along a rectangle with rounded corners, slower in them, with small
+    suspension motion.
 
     It drives 10 m/s on the straights; the lateral acceleration in corners is at most 2.5 m/s^2.
 
@@ -283,7 +328,9 @@ def car_loop(
         start_ns: time of the first pose.
     """
     if corner_m <= 0 or min(loop_m) <= 2 * corner_m:
-        raise SimulationError(f"corners of {corner_m:g} m do not fit a loop of {loop_m[0]:g} x {loop_m[1]:g} m")
+        raise SimulationError(
+            f"corners of {corner_m:g} m do not fit a loop of {loop_m[0]:g} x {loop_m[1]:g} m"
+        )
     straight = np.array(loop_m) - 2 * corner_m
     length = 2 * float(straight.sum()) + 2 * np.pi * corner_m
     step = 0.05
@@ -309,7 +356,9 @@ def car_loop(
     where = np.interp(phase, clock, s)
     yaw = np.interp(where, s, heading) + 2 * np.pi * loops
     sway = _sway(t, seed, np.array([0.004, 0.006, 0.004, 0.012]), (0.3, 1.6))
-    p = np.stack([*(np.interp(where, s, xy[:, i]) for i in range(2)), height_m + sway[:, 3]], axis=1)
+    p = np.stack(
+        [*(np.interp(where, s, xy[:, i]) for i in range(2)), height_m + sway[:, 3]], axis=1
+    )
     R = so3_exp(np.stack([0 * yaw, 0 * yaw, yaw + sway[:, 2]], 1)) @ so3_exp(
         np.stack([sway[:, 0], sway[:, 1], 0 * yaw], 1)
     )
@@ -336,8 +385,12 @@ def _limit_acceleration(speed: FloatArray, step: float) -> FloatArray:
     return np.sqrt(square[n : 2 * n])
 
 
-def _sway(t: FloatArray, seed: int, amplitude: FloatArray, band_hz: tuple[float, float]) -> FloatArray:
-    """Smooth random motions (N, C) of given standard deviations, summed from sines in a frequency band."""
+def _sway(
+    t: FloatArray, seed: int, amplitude: FloatArray, band_hz: tuple[float, float]
+) -> FloatArray:
+    """Smooth random motions (N, C) of given standard deviations, summed from sines in a
+    frequency band.
+    """
     rng = np.random.default_rng([seed, 11])
     out = np.zeros((len(t), len(amplitude)))
     for channel, size in enumerate(amplitude):
@@ -357,7 +410,8 @@ def hand_held(
     seed: int = 0,
     start_ns: int = 0,
 ) -> MotionSpline:
-    """Carry the body around a room: a Lissajous path about `centre`, looking along the path and to the sides.
+    """Carry the body around a room: a Lissajous path about `centre`, looking along the path and to
+    the sides.
 
     The IMU axes are forward, left, up; for EuRoC's rig, whose body looks along its z axis, apply
     `rotate_body_axes(spline, R_FLU_EUROC_IMU)`.
@@ -384,7 +438,9 @@ def hand_held(
     shake = _sway(phase, seed + 1, np.array([0.06, 0.06, 0.15, 0.012, 0.012, 0.012]), (0.1, 0.7))
     yaw = angle + shift[0] + np.pi / 2 + 0.35 * np.sin(0.6 * angle + shift[2])
     zero = np.zeros_like(t)
-    R = so3_exp(np.stack([zero, zero, yaw + shake[:, 2]], 1)) @ so3_exp(np.stack([shake[:, 0], shake[:, 1], zero], 1))
+    R = so3_exp(np.stack([zero, zero, yaw + shake[:, 2]], 1)) @ so3_exp(
+        np.stack([shake[:, 0], shake[:, 1], zero], 1)
+    )
     times = start_ns + np.round(t / _S_PER_NS).astype(np.int64)
     return fit_spline(times, se3_from_parts(R, p + shake[:, 3:]), knot_s=0.1)[0]
 
@@ -396,23 +452,35 @@ def _ramped_time(t: FloatArray) -> FloatArray:
     return _RAMP_S * integral + np.maximum(t - _RAMP_S, 0.0)
 
 
-# --- recorded motion ------------------------------------------------------------------------------------------------
+# --- recorded motion
+# ------------------------------------------------------------------------------------------------
 
 
 def recorded_motion(path: Path) -> tuple[MotionSpline, FitReport]:
-    """Smooth a recorded ground truth (TUM file of the IMU's poses) so that it is twice differentiable.
+    """Smooth a recorded ground truth (TUM file of the IMU's poses) so that it is twice
+    differentiable.
 
     Raises:
         DataError: the file cannot be used, or describes the camera; the message names it.
     """
     truth = read_trajectory(path, fmt="tum")
     if truth.body != "imu" or truth.times_ns is None or len(truth) < 2:
-        raise DataError(f"{path}: describes {len(truth)} poses of {truth.body}; give two or more of the IMU")
+        raise DataError(
+            f"{path}: describes {len(truth)} poses of {truth.body}; give two or more of the IMU"
+        )
     times = truth.times_ns
     gap_s = float(np.diff(times).max()) * _S_PER_NS
     if gap_s > 0.5:
         logger.warning("%s has a gap of %.2f s; the motion is interpolated there", path, gap_s)
     spline, report = fit_spline(times, truth.T_world_body, robust=True)
-    within = f"{1e3 * report.position_rms_m:.1f} mm and {1e3 * report.rotation_rms_rad:.2f} mrad rms"
-    logger.info("%s: spline within %s, %d of %d poses rejected", path, within, report.rejected, report.samples)
+    within = (
+        f"{1e3 * report.position_rms_m:.1f} mm and {1e3 * report.rotation_rms_rad:.2f} mrad rms"
+    )
+    logger.info(
+        "%s: spline within %s, %d of %d poses rejected",
+        path,
+        within,
+        report.rejected,
+        report.samples,
+    )
     return spline, report

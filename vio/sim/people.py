@@ -14,8 +14,12 @@ from vio.sim.world import MovingBox, ObjectMotion, Solid, World
 
 _STEPS_PER_S = 1.8
 _PAUSE_S = 1.2  # at each end of the way, in which the person turns round
-_SWAY_M, _BOB_M, _TWIST_RAD, _LEAN_RAD = 0.03, 0.025, 0.08, 0.03
-_RADIUS_M, _HEIGHT_M = 0.3, 1.8  # of the space that a person takes
+_SWAY_M = 0.03
+_BOB_M = 0.025
+_TWIST_RAD = 0.08
+_LEAN_RAD = 0.03
+_RADIUS_M = 0.3  # of the space that a person takes
+_HEIGHT_M = 1.8
 _SPACING_NS = 50_000_000  # between the times at which camera and person are kept apart
 _COARSE = 20  # of these times one is tried first
 _ATTEMPTS = 300  # for each person
@@ -36,7 +40,8 @@ class Walk:
 def plan_walks(
     world: World, motion: MotionSpline, count: int, *, seed: int, reach_m: float, clearance_m: float
 ) -> tuple[Walk, ...]:
-    """Return ways that cross a camera's surroundings and never touch a box or come close to the camera.
+    """Return ways that cross a camera's surroundings and never touch a box or come close to the
+    camera.
 
     Args:
         world: the scene; its boxes are walked around.
@@ -63,9 +68,13 @@ def plan_walks(
 
 
 def along_walks(walks: Sequence[Walk]) -> FloatArray:
-    """Return points (N, 3) along the ways, a little above the ground, from which furniture is to stay away."""
+    """Return points (N, 3) along the ways, a little above the ground, from which furniture is to
+    stay away.
+    """
     shares = np.linspace(0, 1, 12)[:, None]
-    points = [walk.start + shares * (walk.end - walk.start) + [0.0, 0.0, _KEEP_CLEAR_M] for walk in walks]
+    points = [
+        walk.start + shares * (walk.end - walk.start) + [0.0, 0.0, _KEEP_CLEAR_M] for walk in walks
+    ]
     return np.concatenate(points) if points else np.zeros((0, 3))
 
 
@@ -75,18 +84,24 @@ def walking_people(walks: Sequence[Walk], *, seed: int) -> tuple[MovingBox, ...]
     return tuple(box for walk in walks for box in _body(walk, rng))
 
 
-def _random_walk(world: World, path: FloatArray, rng: np.random.Generator, reach_m: float, origin_ns: int) -> Walk:
+def _random_walk(
+    world: World, path: FloatArray, rng: np.random.Generator, reach_m: float, origin_ns: int
+) -> Walk:
     near = path[rng.integers(len(path))]
     middle = np.array([*(near[:2] + reach_m * rng.standard_normal(2)), world.bounds[0, 2]])
-    angle, half = rng.uniform(0, 2 * np.pi), rng.uniform(0.8, 2.0) * max(1.0, reach_m / 2)
+    angle = rng.uniform(0, 2 * np.pi)
+    half = rng.uniform(0.8, 2.0) * max(1.0, reach_m / 2)
     along = half * np.array([np.cos(angle), np.sin(angle), 0.0])
-    return Walk(middle - along, middle + along, rng.uniform(0.9, 1.5), rng.uniform(0.0, 10.0), origin_ns)
+    return Walk(
+        middle - along, middle + along, rng.uniform(0.9, 1.5), rng.uniform(0.0, 10.0), origin_ns
+    )
 
 
 def _unobstructed(world: World, walk: Walk) -> bool:
     """Whether the way is within the scene and clear of its boxes."""
     points = walk.start + np.linspace(0, 1, 30)[:, None] * (walk.end - walk.start)
-    low, high = world.bounds[0, :2] + _RADIUS_M, world.bounds[1, :2] - _RADIUS_M
+    low = world.bounds[0, :2] + _RADIUS_M
+    high = world.bounds[1, :2] - _RADIUS_M
     if ((points[:, :2] < low) | (points[:, :2] > high)).any():
         return False
     return all(_apart(solid, points) for solid in world.solids)
@@ -94,7 +109,8 @@ def _unobstructed(world: World, walk: Walk) -> bool:
 
 def _apart(solid: Solid, points: FloatArray) -> bool:
     """Whether people at points (N, 3) on the ground stay off a box."""
-    T, half = solid.T_world_box, solid.half_size
+    T = solid.T_world_box
+    half = solid.half_size
     if T[2, 3] - half[2] > points[0, 2] + _HEIGHT_M:
         return True
     local = (points - T[:3, 3]) @ T[:3, :3]
@@ -110,7 +126,9 @@ def _clearance(walk: Walk, times: IntArray, path: FloatArray) -> float:
 
 
 def _place(walk: Walk, time_ns: int) -> tuple[FloatArray, float, float]:
-    """Position (3,) on the ground, heading in radians, and whether the person walks (1) or turns (0)."""
+    """Position (3,) on the ground, heading in radians, and whether the person walks (1) or turns
+    (0).
+    """
     way = walk.end - walk.start
     length = float(np.linalg.norm(way))
     leg_s = length / walk.speed + _PAUSE_S
@@ -129,7 +147,9 @@ def _body(walk: Walk, rng: np.random.Generator) -> Sequence[MovingBox]:
     scale = rng.uniform(0.92, 1.06)
 
     def part(height: float) -> ObjectMotion:
-        return lambda time_ns: _step(walk, time_ns) @ se3_from_parts(np.eye(3), [0.0, 0.0, height * scale])
+        return lambda time_ns: (
+            _step(walk, time_ns) @ se3_from_parts(np.eye(3), [0.0, 0.0, height * scale])
+        )
 
     def size(depth: float, width: float, height: float) -> FloatArray:
         return scale * np.array([depth, width, height])
@@ -147,6 +167,12 @@ def _step(walk: Walk, time_ns: int) -> FloatArray:
     step = np.pi * _STEPS_PER_S * (time_ns - walk.origin_ns) / NS_PER_S
     swing = walking * float(np.sin(step))  # from foot to foot, so once in two steps
     left = np.array([-np.sin(heading), np.cos(heading), 0.0])
-    at = ground + _SWAY_M * swing * left + np.array([0.0, 0.0, _BOB_M * walking * abs(float(np.cos(step)))])
-    turn = so3_exp([0.0, 0.0, heading + _TWIST_RAD * swing]) @ so3_exp([_LEAN_RAD * swing, 0.0, 0.0])
+    at = (
+        ground
+        + _SWAY_M * swing * left
+        + np.array([0.0, 0.0, _BOB_M * walking * abs(float(np.cos(step)))])
+    )
+    turn = so3_exp([0.0, 0.0, heading + _TWIST_RAD * swing]) @ so3_exp(
+        [_LEAN_RAD * swing, 0.0, 0.0]
+    )
     return se3_from_parts(turn, at)

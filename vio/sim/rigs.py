@@ -1,4 +1,6 @@
-"""Predefined stereo rigs: KITTI-like, EuRoC-like, fisheye, wide, and a small one for demos and tests."""
+"""Predefined stereo rigs: KITTI-like, EuRoC-like, fisheye, wide, and a small one for demos and
+tests.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ def _forward_T_cam0_imu(cam0_in_imu: tuple[float, float, float]) -> FloatArray:
 
 
 def small_rig(width: int = 640, height: int = 360) -> StereoRig:
-    """Rectified rig for demos and tests: about 77 degrees wide, 12 cm baseline, IMU axes forward, left, up."""
+    """Rectified rig for demos and tests: about 77 degrees wide, 12 cm baseline, IMU axes
+    forward, left, up.
+    """
     f = 0.625 * width
     camera = StereoCamera(f, f, (width - 1) / 2, (height - 1) / 2, 0.12, width, height)
     return rig_from_rectified(camera, _forward_T_cam0_imu((0.05, 0.06, 0.02)))
@@ -38,15 +42,23 @@ def kitti_like_rig(width: int = 1242) -> StereoRig:
     scale = width / 1242
     f = 721.5377 * scale
     camera = StereoCamera(
-        f, f, (609.5593 + 0.5) * scale - 0.5, (172.854 + 0.5) * scale - 0.5, 0.5371657, width, round(375 * scale)
+        f,
+        f,
+        (609.5593 + 0.5) * scale - 0.5,
+        (172.854 + 0.5) * scale - 0.5,
+        0.5371657,
+        width,
+        round(375 * scale),
     )
     return rig_from_rectified(camera, _forward_T_cam0_imu((1.0891, -0.3141, 0.7195)))
 
 
 def euroc_like_rig() -> StereoRig:
-    """EuRoC's VI-Sensor: 752x480, radial-tangential, unrectified, with the published calibration of V1.
+    """EuRoC's VI-Sensor: 752x480, radial-tangential, unrectified, with the published calibration of
+    V1.
 
-    Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016), sensor.yaml of V1_01_easy.
+    Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016), sensor.yaml of
+    V1_01_easy.
     """
     T_imu_cam0 = np.array(
         [
@@ -74,7 +86,9 @@ def euroc_like_rig() -> StereoRig:
 
 
 def euroc_rectified_rig() -> StereoRig:
-    """Rectified 752x480 pair mounted as EuRoC's: the same body, focal length and baseline, without distortion."""
+    """Rectified 752x480 pair mounted as EuRoC's: the same body, focal length and baseline,
+    without distortion.
+    """
     rig = euroc_like_rig()
     baseline = float(np.linalg.norm(rig.T_cam0_cam1[:3, 3]))
     camera = StereoCamera(458.0, 458.0, 375.5, 239.5, baseline, 752, 480)
@@ -82,9 +96,12 @@ def euroc_rectified_rig() -> StereoRig:
 
 
 def fisheye_rig(width: int = 640, height: int = 480) -> StereoRig:
-    """Unrectified equidistant (fisheye) pair, about 130 degrees wide, slightly toed, IMU axes forward, left, up."""
+    """Unrectified equidistant (fisheye) pair, about 130 degrees wide, slightly toed, IMU axes
+    forward, left, up.
+    """
     f = 0.44 * width
-    lens0, lens1 = (-0.012, 0.006, -0.004, 0.0006), (-0.013, 0.007, -0.004, 0.0005)
+    lens0 = (-0.012, 0.006, -0.004, 0.0006)
+    lens1 = (-0.013, 0.007, -0.004, 0.0005)
     cam0 = CameraModel(f, f, 0.49 * width, 0.505 * height, width, height, "equidistant", lens0)
     centre1 = 0.503 * width, 0.497 * height
     cam1 = CameraModel(f * 1.003, f * 1.002, *centre1, width, height, "equidistant", lens1)
@@ -97,17 +114,22 @@ def fisheye_rig(width: int = 640, height: int = 480) -> StereoRig:
 
 
 def wide_rig(width: int = 512) -> StereoRig:
-    """Unrectified equidistant pair like TUM-VI's: square images, 154 degrees across and 220 from corner to corner.
+    """Unrectified equidistant pair like TUM-VI's: square images, 154 degrees across and 220 from
+    corner to corner.
 
-    The lenses are those of its 512x512 calibration, with the two cameras pitched against each other by 2.7 degrees as
-    there; IMU axes forward, left, up.
+    The lenses are those of its 512x512 calibration, with the two cameras pitched against each other
+    by 2.7 degrees as there; IMU axes forward, left, up.
     Reference: Schubert et al., The TUM VI benchmark for evaluating visual-inertial odometry (2018).
     """
     s = width / 512
     lens0 = (0.003482389, 0.000715035, -0.002053236, 0.000202937)
     lens1 = (0.003400317, 0.001766278, -0.002663126, 0.000329952)
-    cam0 = CameraModel(190.98 * s, 190.97 * s, 254.93 * s, 256.90 * s, width, width, "equidistant", lens0)
-    cam1 = CameraModel(190.44 * s, 190.43 * s, 252.60 * s, 254.92 * s, width, width, "equidistant", lens1)
+    cam0 = CameraModel(
+        190.98 * s, 190.97 * s, 254.93 * s, 256.90 * s, width, width, "equidistant", lens0
+    )
+    cam1 = CameraModel(
+        190.44 * s, 190.43 * s, 252.60 * s, 254.92 * s, width, width, "equidistant", lens1
+    )
     T_imu_cam0 = se3_inverse(_forward_T_cam0_imu((0.04, 0.0505, 0.01)))
     pitch = 0.0469
     T_cam1_cam0 = np.eye(4)

@@ -1,4 +1,6 @@
-"""Named recordings: scene, trajectory, rig and effects define one plan, identical in every process."""
+"""Named recordings: scene, trajectory, rig and effects define one plan, identical in every
+process.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,14 @@ from vio.sim.rigs import (
     small_rig,
     wide_rig,
 )
-from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate
+from vio.sim.sequence import (
+    FrameFaults,
+    SimulatedRecording,
+    Simulation,
+    read_flight,
+    room_around,
+    simulate,
+)
 from vio.sim.textures import TextureKind
 from vio.sim.world import MovingBox, SceneName, World, corridor, equal_doors, room, street
 
@@ -63,7 +72,8 @@ RIGS: dict[str, Callable[[], StereoRig]] = {
     "small": small_rig,
 }
 _EUROC_AXES = ("euroc", "euroc-rectified")  # rigs whose IMU axes are up, right, forward
-_MARGIN_S = 0.25  # of motion before the first and after the last frame, for shutters and clock offsets
+# of motion before the first and after the last frame, for shutters and clock offsets
+_MARGIN_S = 0.25
 _AHEAD = 3  # pending frames per process
 _LEAD_M = 14.0  # to the car ahead
 _WINDOWS = 2  # of a room with lighting
@@ -81,10 +91,14 @@ class Conditions:
     imu_noise: ImuNoise = field(default_factory=ImuNoise)  # of the simulated IMU
     calibration: CalibrationErrors = field(default_factory=CalibrationErrors)
     calibration_sigmas: CalibrationSigmas = field(default_factory=CalibrationSigmas)
-    bare_wall: bool = setting(False, "two walls without texture; in the street a third of the houses")
+    bare_wall: bool = setting(
+        False, "two walls without texture; in the street a third of the houses"
+    )
     moving: bool = setting(False, "boxes that move on their own")
     people: int = setting(0, "people who walk near the path")
-    lighting: bool = setting(False, "light from two windows, in the street from a low sun; else even light")
+    lighting: bool = setting(
+        False, "light from two windows, in the street from a low sun; else even light"
+    )
 
 
 def _with_effects(**values: Any) -> Callable[[Conditions], Conditions]:
@@ -112,7 +126,9 @@ EFFECTS: dict[str, Callable[[Conditions], Conditions]] = {
 
 
 def real_conditions(scene: SceneName, *, drawn_rig: bool = False) -> Conditions:
-    """Return the conditions of `--realism real`, or `drawn`: what real cameras and places do, all at once."""
+    """Return the conditions of `--realism real`, or `drawn`: what real cameras and places do,
+    all at once.
+    """
     outdoors = scene == "street"
     effects = SensorEffects(
         right_gain=0.85,
@@ -137,7 +153,8 @@ def real_conditions(scene: SceneName, *, drawn_rig: bool = False) -> Conditions:
 
 
 def conditions_of(names: Sequence[str], start: Conditions | None = None) -> Conditions:
-    """Return the conditions that named effects produce, applied in order to those at the start (None: the defaults).
+    """Return the conditions that named effects produce, applied in order to those at the start
+    (None: the defaults).
 
     Raises:
         SimulationError: there is no effect of that name.
@@ -168,7 +185,8 @@ class Scenario:
 
 
 def plan(scenario: Scenario) -> Simulation:
-    """Build scene, motion and sensors, and check that the recording can be simulated; nothing is rendered yet.
+    """Build scene, motion and sensors, and check that the recording can be simulated; nothing is
+    rendered yet.
 
     Raises:
         SimulationError: a value is invalid, or a camera would be outside the scene or in a box.
@@ -176,11 +194,15 @@ def plan(scenario: Scenario) -> Simulation:
     """
     _check(scenario)
     rig = scaled(RIGS[scenario.rig](), scenario.width)
-    motion, times, record = _recorded(scenario) if isinstance(scenario.trajectory, Path) else _ready(scenario)
+    motion, times, record = (
+        _recorded(scenario) if isinstance(scenario.trajectory, Path) else _ready(scenario)
+    )
     imu: ImuNoise | ImuRecord | None = record
     if scenario.imu == "simulated":
         imu = scenario.conditions.imu_noise
-    velocity = {"none": None, "paper": VelocityNoise(), "exact": VelocityNoise(0.0, 0.0)}[scenario.velocity]
+    velocity = {"none": None, "paper": VelocityNoise(), "exact": VelocityNoise(0.0, 0.0)}[
+        scenario.velocity
+    ]
     return simulate(
         _world(scenario, motion),
         rig,
@@ -200,19 +222,31 @@ def plan(scenario: Scenario) -> Simulation:
 def _check(scenario: Scenario) -> None:
     faults = scenario.conditions.faults
     if not (0 <= faults.dropped < 1 and 0 <= faults.duplicated < 1):
-        raise SimulationError("faults.dropped and faults.duplicated are shares of the frames, from 0 to below 1")
+        raise SimulationError(
+            "faults.dropped and faults.duplicated are shares of the frames, from 0 to below 1"
+        )
     if scenario.width is not None and not 64 <= scenario.width <= 8192:
-        raise SimulationError(f"images {scenario.width} px wide cannot be rendered; choose a width from 64 to 8192")
+        raise SimulationError(
+            f"images {scenario.width} px wide cannot be rendered; choose a width from 64 to 8192"
+        )
     if not 0 < scenario.rate_hz <= 1000:
-        raise SimulationError(f"{scenario.rate_hz:g} frames a second cannot be rendered; choose a rate up to 1000")
+        raise SimulationError(
+            f"{scenario.rate_hz:g} frames a second cannot be rendered; choose a rate up to 1000"
+        )
     if scenario.duration_s is not None and not 0 < scenario.duration_s <= 36000:
-        raise SimulationError(f"a recording of {scenario.duration_s:g} s cannot be rendered; choose up to 36000 s")
+        raise SimulationError(
+            f"a recording of {scenario.duration_s:g} s cannot be rendered; choose up to 36000 s"
+        )
     if scenario.seed < 0:
         raise SimulationError(f"the seed must not be negative, got {scenario.seed}")
     if not 0 <= scenario.conditions.people <= 100:
-        raise SimulationError(f"{scenario.conditions.people} people cannot be placed; choose 0 to 100")
+        raise SimulationError(
+            f"{scenario.conditions.people} people cannot be placed; choose 0 to 100"
+        )
     hard = scenario.conditions
-    if scenario.scene == "doors" and (hard.bare_wall or hard.moving or hard.people or hard.lighting):
+    if scenario.scene == "doors" and (
+        hard.bare_wall or hard.moving or hard.people or hard.lighting
+    ):
         raise SimulationError("the corridor of equal doors has no effects of a scene; use corridor")
 
 
@@ -236,21 +270,28 @@ def scaled(rig: StereoRig, width: int | None) -> StereoRig:
     return replace(rig, cam0=resized(rig.cam0), cam1=resized(rig.cam1))
 
 
-# --- motion ---------------------------------------------------------------------------------------------------------
+# --- motion
+# ---------------------------------------------------------------------------------------------------------
 
 
 def _recorded(scenario: Scenario) -> tuple[MotionSpline, IntArray, ImuRecord | None]:
     assert isinstance(scenario.trajectory, Path)
     csv = scenario.imu if isinstance(scenario.imu, Path) else None
     flight = read_flight(scenario.trajectory, scenario.frame_times, csv)
-    motion, times = flight.motion, flight.frame_times_ns
+    motion = flight.motion
+    times = flight.frame_times_ns
     if scenario.frame_times is None:
-        times = _regular(motion.start_ns, (motion.end_ns - motion.start_ns) / NS_PER_S, scenario.rate_hz)
+        times = _regular(
+            motion.start_ns, (motion.end_ns - motion.start_ns) / NS_PER_S, scenario.rate_hz
+        )
     if scenario.duration_s is not None:
         times = times[times < times[0] + round(scenario.duration_s * NS_PER_S)]
-    if flight.imu is not None and (flight.imu.times_ns[0] > times[0] or flight.imu.times_ns[-1] < times[-1]):
+    if flight.imu is not None and (
+        flight.imu.times_ns[0] > times[0] or flight.imu.times_ns[-1] < times[-1]
+    ):
         raise DataError(
-            f"{csv} does not span the frames ({times[0]} to {times[-1]} ns, the IMU {flight.imu.times_ns[0]} to "
+            f"{csv} does not span the frames ({times[0]} to {times[-1]} ns, the IMU "
+            f"{flight.imu.times_ns[0]} to "
             f"{flight.imu.times_ns[-1]} ns); use files of one flight and one clock"
         )
     return motion, times, flight.imu
@@ -260,7 +301,9 @@ def _ready(scenario: Scenario) -> tuple[MotionSpline, IntArray, None]:
     if scenario.frame_times is not None:
         raise SimulationError("frame times need a recorded trajectory; give a rate instead")
     if isinstance(scenario.imu, Path):
-        raise SimulationError("a recorded IMU needs its own recorded trajectory; simulate one instead")
+        raise SimulationError(
+            "a recorded IMU needs its own recorded trajectory; simulate one instead"
+        )
     duration_s = 30.0 if scenario.duration_s is None else scenario.duration_s
     # A whole number of frame periods, so that sensors of that rate sample at the frame times.
     before = math.ceil(_MARGIN_S * scenario.rate_hz)
@@ -285,7 +328,8 @@ def _walk(duration_s: float, seed: int) -> MotionSpline:
     t = np.arange(0.0, duration_s + interval_s, interval_s)
     rng = np.random.default_rng([seed, 13])
     phase = 0.5 + t * (1.2 / 12.5)  # 1.2 m/s in the middle
-    x, y = 15.0 - 12.5 * np.cos(phase), 0.15 + 0.1 * np.sin(0.7 * t)
+    x = 15.0 - 12.5 * np.cos(phase)
+    y = 0.15 + 0.1 * np.sin(0.7 * t)
     yaw = np.pi / 2 * (1 - np.tanh(4 * np.sin(phase)))
     R = look_rotation(np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(t)], axis=1))
     T = se3_from_parts(R, np.stack([x, y, np.full_like(t, 1.5)], axis=1))
@@ -295,19 +339,25 @@ def _walk(duration_s: float, seed: int) -> MotionSpline:
 
 def _regular(start_ns: int, duration_s: float, rate_hz: float, *, first: int = 0) -> IntArray:
     count = max(1, int(duration_s * rate_hz + 1e-6))
-    return start_ns + np.round(np.arange(first, first + count) * (NS_PER_S / rate_hz)).astype(np.int64)
+    return start_ns + np.round(np.arange(first, first + count) * (NS_PER_S / rate_hz)).astype(
+        np.int64
+    )
 
 
-# --- scenes ---------------------------------------------------------------------------------------------------------
+# --- scenes
+# ---------------------------------------------------------------------------------------------------------
 
 
 def _world(scenario: Scenario, motion: MotionSpline) -> World:
-    hard, seed = scenario.conditions, scenario.seed
+    hard = scenario.conditions
+    seed = scenario.seed
     walks: tuple[Walk, ...] = ()
     if hard.people:
         reach_m, clearance_m = (6.0, 2.0) if scenario.scene == "street" else (2.0, 0.5)
         free = _scene(scenario, motion, furnished=False)
-        walks = plan_walks(free, motion, hard.people, seed=seed, reach_m=reach_m, clearance_m=clearance_m)
+        walks = plan_walks(
+            free, motion, hard.people, seed=seed, reach_m=reach_m, clearance_m=clearance_m
+        )
     moving = walking_people(walks, seed=seed)
     if hard.moving:
         moving = (*_moving_boxes(scenario, motion, _scene(scenario, motion)), *moving)
@@ -322,9 +372,13 @@ def _scene(
     *,
     furnished: bool = True,
 ) -> World:
-    """The scene with some boxes moving in it; the furniture of a room stays off the ways of people."""
-    hard, seed = scenario.conditions, scenario.seed
-    bare: TextureKind = "plaster" if hard.lighting else "bare"  # in uneven light even a blank wall shows something
+    """The scene with some boxes moving in it; the furniture of a room stays off the ways of
+    people.
+    """
+    hard = scenario.conditions
+    seed = scenario.seed
+    # in uneven light even a blank wall shows something
+    bare: TextureKind = "plaster" if hard.lighting else "bare"
     if scenario.scene == "street":
         return street(seed, moving=moving, sunlit=hard.lighting, bare_houses=hard.bare_wall)
     if scenario.scene == "doors":
@@ -332,8 +386,11 @@ def _scene(
     if scenario.scene == "corridor":
         sides = ("+y", "-y") if hard.bare_wall else ("+y",)
         return corridor(seed, bare_walls=sides, bare_kind=bare, moving=moving)
-    walls, windows = ("+x", "+y") if hard.bare_wall else (), _WINDOWS if hard.lighting else 0
-    inside = functools.partial(room, seed, bare_walls=walls, bare_kind=bare, moving=moving, windows=windows)
+    walls = ("+x", "+y") if hard.bare_wall else ()
+    windows = _WINDOWS if hard.lighting else 0
+    inside = functools.partial(
+        room, seed, bare_walls=walls, bare_kind=bare, moving=moving, windows=windows
+    )
     recorded = isinstance(scenario.trajectory, Path)
     around = room_around(motion, seed=seed) if recorded else room(seed)
     if not furnished:
@@ -343,7 +400,9 @@ def _scene(
     if not (walls or moving or windows):
         return around
     times = np.arange(motion.start_ns, motion.end_ns, 100_000_000)
-    keep_clear = np.concatenate([motion_at(motion, times).T_world_imu[:, :3, 3], along_walks(walks)])
+    keep_clear = np.concatenate(
+        [motion_at(motion, times).T_world_imu[:, :3, 3], along_walks(walks)]
+    )
     return inside(bounds=around.bounds, furniture=20, pictures=20, keep_clear=keep_clear)
 
 
@@ -351,13 +410,18 @@ def _moving_boxes(scenario: Scenario, motion: MotionSpline, empty: World) -> tup
     if scenario.scene == "street":
         return _traffic(motion, scenario.seed)
     if scenario.scene == "corridor":
-        return (_oscillating_box(np.array([[3.0, 0.95, 1.1], [27.0, 0.95, 1.1]]), motion.start_ns, 25.0),)
+        return (
+            _oscillating_box(
+                np.array([[3.0, 0.95, 1.1], [27.0, 0.95, 1.1]]), motion.start_ns, 25.0
+            ),
+        )
     return _boxes_along_walls(empty, motion)
 
 
 def _boxes_along_walls(world: World, motion: MotionSpline) -> tuple[MovingBox, ...]:
     """Boxes that move back and forth along the four walls, clear of all camera trajectories."""
-    low, high = world.bounds[0] + _WALL_GAP_M, world.bounds[1] - _WALL_GAP_M
+    low = world.bounds[0] + _WALL_GAP_M
+    high = world.bounds[1] - _WALL_GAP_M
     z = (world.bounds[0, 2] + world.bounds[1, 2]) / 2
     corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
     lanes = [np.array([[*corners[i], z], [*corners[(i + 1) % 4], z]]) for i in range(4)]
@@ -377,7 +441,9 @@ def _oscillating_box(lane: FloatArray, start_ns: int, period_s: float) -> Moving
 def _traffic(motion: MotionSpline, seed: int) -> tuple[MovingBox, ...]:
     """A car ahead in the same lane, and an oncoming one that circles the inner lane."""
     seconds = (motion.end_ns - motion.start_ns) / NS_PER_S
-    ahead = car_loop(duration_s=seconds, start_m=_LEAD_M, height_m=0.85, seed=seed, start_ns=motion.start_ns)
+    ahead = car_loop(
+        duration_s=seconds, start_m=_LEAD_M, height_m=0.85, seed=seed, start_ns=motion.start_ns
+    )
     inner = car_loop(loop_m=(103.6, 63.6), corner_m=5.0, height_m=0.85, seed=seed + 1)
     loop_ns = inner.end_ns - inner.start_ns
 
@@ -391,22 +457,28 @@ def _traffic(motion: MotionSpline, seed: int) -> tuple[MovingBox, ...]:
     return MovingBox(size, leading, texel_m=0.01), MovingBox(size, oncoming, texel_m=0.01)
 
 
-# --- rendering in several processes ---------------------------------------------------------------------------------
+# --- rendering in several processes
+# ---------------------------------------------------------------------------------
 
 
 class ParallelRecording(SimulatedRecording, contextlib.AbstractContextManager["ParallelRecording"]):
-    """A scenario's recording, rendered ahead by other processes; the images equal those of one process to the bit.
+    """A scenario's recording, rendered ahead by other processes; the images equal those of one
+    process to the bit.
 
-    Use it as a context manager, and request frames in order. Every process plans the scenario itself, from the
-    same seed.
+    Use it as a context manager, and request frames in order. Every process plans the scenario
+    itself, from the same seed.
     """
 
-    def __init__(self, scenario: Scenario, *, workers: int, simulation: Simulation | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, *, workers: int, simulation: Simulation | None = None
+    ) -> None:
         """Prepare a pool of `workers` processes, started with the first request."""
         super().__init__(plan(scenario) if simulation is None else simulation)
         self._scenario = scenario
         self._workers = workers
-        self._pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start_worker)
+        self._pool = ProcessPoolExecutor(
+            workers, multiprocessing.get_context("spawn"), start_worker
+        )
         self._waiting: dict[int, Future[tuple[Image, Image]]] = {}
 
     def __exit__(self, *_: object) -> None:
@@ -425,12 +497,15 @@ class ParallelRecording(SimulatedRecording, contextlib.AbstractContextManager["P
             return self._waiting.pop(index).result()
         except BrokenProcessPool as error:
             raise SimulationError(
-                "a rendering process ended unexpectedly, perhaps for lack of memory; render in one process"
+                "a rendering process ended unexpectedly, perhaps for lack of memory; render in one "
+                "process"
             ) from error
 
 
 def default_workers(frames: int) -> int:
-    """Default number of processes: one for short recordings, which finish before a second one has started."""
+    """Default number of processes: one for short recordings, which finish before a second one
+    has started.
+    """
     return min(2, os.cpu_count() or 1) if frames >= 100 else 1
 
 
@@ -444,14 +519,18 @@ def _render_pair(scenario: Scenario, index: int) -> tuple[Image, Image]:
 
 
 def flight_files(folder: Path) -> tuple[Path, Path | None, Path | None]:
-    """Ground truth, image times and IMU of a recorded flight's folder; the latter two where they exist.
+    """Ground truth, image times and IMU of a recorded flight's folder; the latter two where they
+    exist.
 
     Raises:
         DataError: the folder holds no ground truth.
     """
     truth, times, imu = (folder / name for name in FLIGHT_FILES)
     if not truth.is_file():
-        raise DataError(f"{folder} holds no {FLIGHT_FILES[0]}; give the folder of a recorded flight, or a TUM file")
+        raise DataError(
+            f"{folder} holds no {FLIGHT_FILES[0]}; give the folder of a recorded flight, or a TUM "
+            "file"
+        )
     return truth, times if times.is_file() else None, imu if imu.is_file() else None
 
 
@@ -465,7 +544,8 @@ _START_M = 12.0  # the drive then covers a straight, a corner and another straig
 
 
 def write_demo_recording(out: Path, progress: Progress | None = None) -> Path:
-    """Render the demo's recording as a KITTI folder with ground truth, velocities and extrinsics; return the folder.
+    """Render the demo's recording as a KITTI folder with ground truth, velocities and extrinsics;
+    return the folder.
 
     Raises:
         VioError: the folder cannot be written, or holds foreign files.

@@ -1,4 +1,6 @@
-"""A simulated recording: rendered on the fly behind the `Dataset` protocol, with exact ground truth."""
+"""A simulated recording: rendered on the fly behind the `Dataset` protocol, with exact ground
+truth.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +33,27 @@ from vio.records import (
     Trajectory,
     VelocitySample,
 )
-from vio.sim.effects import Exposure, SensorEffects, apply_effects, average_exposures, blur_along_flow
+from vio.sim.effects import (
+    Exposure,
+    SensorEffects,
+    apply_effects,
+    average_exposures,
+    blur_along_flow,
+)
 from vio.sim.exposure import ExposurePlan, plan_exposures
 from vio.sim.glare import glare
 from vio.sim.imu import ImuNoise, VelocityNoise, simulate_imu, simulate_velocity
 from vio.sim.miscalibration import CalibrationErrors, CalibrationSigmas, drawn_rig, miscalibrated
 from vio.sim.motion import MotionSpline, motion_at, recorded_motion
-from vio.sim.render import CameraRays, Radiance, View, camera_rays, correspondence, depth_map, render
+from vio.sim.render import (
+    CameraRays,
+    Radiance,
+    View,
+    camera_rays,
+    correspondence,
+    depth_map,
+    render,
+)
 from vio.sim.world import World, check_clear, room
 
 logger = logging.getLogger(__name__)
@@ -65,17 +81,21 @@ class Simulation:
     world: World
     rig: StereoRig  # the true cameras
     motion: MotionSpline
-    taken_ns: IntArray  # (F,) when the content of each frame was exposed, true time; repeats where duplicated
+    # (F,) when the content of each frame was exposed, true time; repeats where duplicated
+    taken_ns: IntArray
     stamps_ns: IntArray  # (F,) time stamp of each frame, strictly increasing
     imu: ImuRecord | None
     velocity: Sequence[VelocitySample]
     effects: SensorEffects
     seed: int
-    calibration: StereoRig  # as calibrated, which is what is written and read; `rig` is the true one
+    # as calibrated, which is what is written and read; `rig` is the true one
+    calibration: StereoRig
     exposures: ExposurePlan | None = None  # of exposure control; None: it is off
 
     def rectified_camera(self, why_not: str) -> StereoCamera:
-        """Return the rectified pair as calibrated; raise SimulationError, which says `why_not`, where it is none."""
+        """Return the rectified pair as calibrated; raise SimulationError, which says `why_not`,
+        where it is none.
+        """
         if (camera := rectified_pair(self.calibration)) is None:
             raise SimulationError(why_not)
         return camera
@@ -115,9 +135,12 @@ def simulate(
         rig: cameras as calibrated, mounted on the body that `motion` moves.
         motion: motion of the body.
         rate_hz: frames per second.
-        frame_times_ns: true times (F,) of the frames instead of a fixed rate; those outside the motion are left out.
-        imu: noise of a simulated IMU of 200 Hz, or a recorded IMU to use with the images; None: no IMU.
-        velocity: noise of the paper's velocity sensor, at the rate of the frames; None: no such sensor.
+        frame_times_ns: true times (F,) of the frames instead of a fixed rate; those outside the
+            motion are left out.
+        imu: noise of a simulated IMU of 200 Hz, or a recorded IMU to use with the images; None: no
+            IMU.
+        velocity: noise of the paper's velocity sensor, at the rate of the frames; None: no such
+            sensor.
         effects: camera effects; None: the defaults of `SensorEffects`.
         faults: dropped and repeated frames, clock offset.
         calibration_errors: how far the true cameras are from `rig`; None: not at all.
@@ -129,8 +152,14 @@ def simulate(
     """
     faults = FrameFaults() if faults is None else faults
     effects = SensorEffects() if effects is None else effects
-    true_rig = rig if calibration_errors is None else miscalibrated(rig, calibration_errors, seed=seed)
-    true_rig = true_rig if calibration_sigmas is None else drawn_rig(true_rig, calibration_sigmas, seed=seed)
+    true_rig = (
+        rig if calibration_errors is None else miscalibrated(rig, calibration_errors, seed=seed)
+    )
+    true_rig = (
+        true_rig
+        if calibration_sigmas is None
+        else drawn_rig(true_rig, calibration_sigmas, seed=seed)
+    )
     times = _frame_times(motion, rate_hz, frame_times_ns, effects, faults)
     _check_cameras(world, true_rig, motion, times)
     taken, stamps = _apply_faults(times, faults, seed)
@@ -141,11 +170,17 @@ def simulate(
     exposures = None
     if effects.auto_exposure:
         exposures = plan_exposures(world, true_rig, motion, taken, effects, seed=seed)
-    return Simulation(world, true_rig, motion, taken, stamps, record, samples, effects, seed, rig, exposures)
+    return Simulation(
+        world, true_rig, motion, taken, stamps, record, samples, effects, seed, rig, exposures
+    )
 
 
 def _frame_times(
-    motion: MotionSpline, rate_hz: float, given: npt.ArrayLike | None, effects: SensorEffects, faults: FrameFaults
+    motion: MotionSpline,
+    rate_hz: float,
+    given: npt.ArrayLike | None,
+    effects: SensorEffects,
+    faults: FrameFaults,
 ) -> IntArray:
     """True times of all frames whose shutter interval and stamp are within the motion."""
     if given is None:
@@ -153,12 +188,16 @@ def _frame_times(
         times = motion.start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
     else:
         times = check_increasing(given, lambda k: f"frame time {k}")
-    half_shutter = int(effects.longest_shutter_ms * 0.5e6) + 1 if effects.longest_shutter_ms > 0 else 0
+    half_shutter = (
+        int(effects.longest_shutter_ms * 0.5e6) + 1 if effects.longest_shutter_ms > 0 else 0
+    )
     offset = _offset_ns(faults)
     inside = (times - half_shutter >= motion.start_ns) & (times + half_shutter <= motion.end_ns)
     inside &= (times + offset >= motion.start_ns) & (times + offset <= motion.end_ns)
     if not inside.any():
-        raise SimulationError("no frame is within the motion; check the frame times and the length of the motion")
+        raise SimulationError(
+            "no frame is within the motion; check the frame times and the length of the motion"
+        )
     return times[inside]
 
 
@@ -172,7 +211,8 @@ def _apply_faults(times: IntArray, faults: FrameFaults, seed: int) -> tuple[IntA
     draw = rng.random((2, len(times)))
     arrives = draw[0] >= faults.dropped
     arrives[0] = True
-    kept, repeats = times[arrives], draw[1][arrives] < faults.duplicated
+    kept = times[arrives]
+    repeats = draw[1][arrives] < faults.duplicated
     repeats[0] = False
     source = np.maximum.accumulate(np.where(repeats, 0, np.arange(len(kept))))
     return kept[source], kept + _offset_ns(faults)
@@ -181,12 +221,18 @@ def _apply_faults(times: IntArray, faults: FrameFaults, seed: int) -> tuple[IntA
 def _check_cameras(world: World, rig: StereoRig, motion: MotionSpline, times: IntArray) -> None:
     dense = np.unique(np.concatenate([times, np.arange(times[0], times[-1], _CLEARANCE_STEP_NS)]))
     T = motion_at(motion, dense).T_world_imu
-    for name, T_imu_cam in (("the left camera", rig.T_imu_cam0), ("the right camera", rig.T_imu_cam1)):
+    for name, T_imu_cam in (
+        ("the left camera", rig.T_imu_cam0),
+        ("the right camera", rig.T_imu_cam1),
+    ):
         check_clear(world, (T @ T_imu_cam)[:, :3, 3], what=name)
 
 
 def true_biases(record: ImuRecord | None, times_ns: npt.ArrayLike) -> FloatArray | None:
-    """Return biases (..., 6) of gyroscope and accelerometer at times (...); None: there is no simulated IMU."""
+    """Return biases (..., 6) of gyroscope and accelerometer at times (...).
+
+    None: there is no simulated IMU.
+    """
     if record is None or record.gyro_bias is None or record.accel_bias is None:
         return None
     known = np.hstack([record.gyro_bias, record.accel_bias])
@@ -227,7 +273,8 @@ class SimulatedRecording:
         """
         simulation = self.simulation
         why_not = "an unrectified rig has no rectified recording; export it as an EuRoC folder and read that"
-        camera, stamps = simulation.rectified_camera(why_not), simulation.stamps_ns
+        camera = simulation.rectified_camera(why_not)
+        stamps = simulation.stamps_ns
         motion: set[MotionSource] = set()
         if simulation.imu is not None:
             motion.add("imu")
@@ -254,7 +301,9 @@ class SimulatedRecording:
     def __len__(self) -> int:
         return len(self.simulation.stamps_ns)
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
         """Yield motion samples and frames in time order; see `vio.protocols.Dataset`.
 
         Raises:
@@ -265,7 +314,9 @@ class SimulatedRecording:
         chosen = frame_range(recording, start, stop)
         frames = (self.frame(k) for k in chosen) if images else blank_frames(recording, chosen)
         inertial = () if self.simulation.imu is None else imu_samples(self.simulation.imu)
-        return merge_events(recording, chosen, in_time_order(self.simulation.velocity, inertial), frames)
+        return merge_events(
+            recording, chosen, in_time_order(self.simulation.velocity, inertial), frames
+        )
 
     def observations(self, index: int) -> Observations | None:
         """Return None: a simulated recording holds images."""
@@ -282,26 +333,46 @@ class SimulatedRecording:
         time_ns = int(simulation.taken_ns[index])
         # A repeated frame is identical to the bit, so its noise is seeded by the frame it repeats.
         source = int(np.searchsorted(simulation.taken_ns, time_ns))
-        sensor = functools.partial(apply_effects, time_ns=time_ns, frame_index=source, seed=simulation.seed)
+        sensor = functools.partial(
+            apply_effects, time_ns=time_ns, frame_index=source, seed=simulation.seed
+        )
         exposures = [self.exposure(index, camera) for camera in (0, 1)]
         left, right = (
-            sensor(self._seen(camera, time_ns, exposure), simulation.effects, camera=camera, exposure=exposure)
+            sensor(
+                self._seen(camera, time_ns, exposure),
+                simulation.effects,
+                camera=camera,
+                exposure=exposure,
+            )
             for camera, exposure in enumerate(exposures)
         )
         return left, right
 
     def exposure(self, index: int, camera: int) -> Exposure | None:
-        """Exposure of one image as the camera's control has set it; None where there is no control."""
+        """Exposure of one image as the camera's control has set it.
+
+        None where there is no control.
+        """
         plan = self.simulation.exposures
         return None if plan is None else plan.at(index, camera)
 
     def _seen(self, camera: int, time_ns: int, exposure: Exposure | None) -> Radiance:
-        """Light (H, W) that reaches the sensor: blurred over the shutter time, with the lens's glare."""
-        shutter_ms = self.simulation.effects.blur_exposure_ms if exposure is None else exposure.shutter_ms
-        image = self._blurred(camera, time_ns, shutter_ms) if shutter_ms > 0 else self._sharp(camera, time_ns)
+        """Light (H, W) that reaches the sensor: blurred over the shutter time, with the lens's
+        glare.
+        """
+        shutter_ms = (
+            self.simulation.effects.blur_exposure_ms if exposure is None else exposure.shutter_ms
+        )
+        image = (
+            self._blurred(camera, time_ns, shutter_ms)
+            if shutter_ms > 0
+            else self._sharp(camera, time_ns)
+        )
         if self.simulation.effects.glare > 0 and self.simulation.world.lights:
             view = views(self.simulation, time_ns)[camera]
-            image += glare(self.simulation.world, view, self.rays[camera], self.simulation.effects.glare)
+            image += glare(
+                self.simulation.world, view, self.rays[camera], self.simulation.effects.glare
+            )
         return image
 
     def _sharp(self, camera: int, time_ns: int) -> Radiance:
@@ -311,29 +382,40 @@ class SimulatedRecording:
     def _blurred(self, camera: int, time_ns: int, shutter_ms: float) -> Radiance:
         effects = self.simulation.effects
         if effects.blur_exact:
-            return average_exposures(lambda t: self._sharp(camera, t), time_ns, shutter_ms, effects.blur_samples)
+            return average_exposures(
+                lambda t: self._sharp(camera, t), time_ns, shutter_ms, effects.blur_samples
+            )
         taps = effects.blur_samples
         if taps == 1:
             return self._sharp(camera, time_ns)
         half = round(shutter_ms * 0.5e6)
         before, after = (self.flow(camera, time_ns, time_ns + sign * half) for sign in (-1, 1))
-        if effects.auto_exposure:  # short shutters need fewer taps, and long ones leave no gaps between them
+        # short shutters need fewer taps, and long ones leave no gaps between them
+        if effects.auto_exposure:
             length = max(float(np.abs(before).max()), float(np.abs(after).max()))
             taps = int(np.clip(2 * round(length / _TAP_SPACING_PX) + 1, 1, _MOST_TAPS))
         return blur_along_flow(self._sharp(camera, time_ns), before, after, taps)
 
-    def flow(self, camera: int, from_ns: int, to_ns: int, *, step_px: int = _FLOW_GRID) -> FloatArray:
-        """Optical flow (H, W, 2) of one camera between two true times, exact on a grid and interpolated between nodes.
+    def flow(
+        self, camera: int, from_ns: int, to_ns: int, *, step_px: int = _FLOW_GRID
+    ) -> FloatArray:
+        """Optical flow (H, W, 2) of one camera between two true times, exact on a grid and
+        interpolated between nodes.
 
         Where a grid point leaves the image its flow is still that of its surface point.
         """
-        view, other = views(self.simulation, from_ns)[camera], views(self.simulation, to_ns)[camera]
-        width, height = view.camera.width, view.camera.height
-        u, v = np.linspace(0, width - 1, width // step_px + 2), np.linspace(0, height - 1, height // step_px + 2)
+        view = views(self.simulation, from_ns)[camera]
+        other = views(self.simulation, to_ns)[camera]
+        width = view.camera.width
+        height = view.camera.height
+        u = np.linspace(0, width - 1, width // step_px + 2)
+        v = np.linspace(0, height - 1, height // step_px + 2)
         grid = np.stack(np.meshgrid(u, v), axis=-1)
         there, _ = correspondence(self.simulation.world, view, other, grid.reshape(-1, 2))
         # Bilinear between the nodes, of which the outer ones are at the image's outer pixels.
-        shift, down, across = there.reshape(grid.shape) - grid, _weights(len(v), height), _weights(len(u), width)
+        shift = there.reshape(grid.shape) - grid
+        down = _weights(len(v), height)
+        across = _weights(len(u), width)
         return np.stack([down @ shift[..., k] @ across.T for k in (0, 1)], axis=-1)
 
     def depth(self, camera: int, time_ns: int) -> tuple[FloatArray, IntArray]:
@@ -347,22 +429,34 @@ class SimulatedRecording:
         Raises:
             SimulationError: the time is outside the motion.
         """
-        state, biases = motion_at(self.simulation.motion, time_ns), true_biases(self.simulation.imu, time_ns)
+        state = motion_at(self.simulation.motion, time_ns)
+        biases = true_biases(self.simulation.imu, time_ns)
         gyro, accel = (None, None) if biases is None else (biases[:3], biases[3:])
-        return TrueState(time_ns, state.T_world_imu[0], state.velocity_world[0], state.angular_velocity[0], gyro, accel)
+        return TrueState(
+            time_ns,
+            state.T_world_imu[0],
+            state.velocity_world[0],
+            state.angular_velocity[0],
+            gyro,
+            accel,
+        )
 
 
 @functools.lru_cache(maxsize=8)
 def _weights(nodes: int, size: int) -> FloatArray:
-    """Matrix (size, nodes) of linear interpolation between nodes that are spread over `size` pixels."""
+    """Matrix (size, nodes) of linear interpolation between nodes that are spread over `size`
+    pixels.
+    """
     at = np.linspace(0, nodes - 1, size)
     first = np.minimum(at.astype(int), nodes - 2)
     out = np.zeros((size, nodes))
-    out[np.arange(size), first], out[np.arange(size), first + 1] = 1 - (at - first), at - first
+    out[np.arange(size), first] = 1 - (at - first)
+    out[np.arange(size), first + 1] = at - first
     return out
 
 
-# --- recorded flights -----------------------------------------------------------------------------------------------
+# --- recorded flights
+# -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,7 +468,9 @@ class RecordedFlight:
     imu: ImuRecord | None = field(default=None)
 
 
-def read_flight(groundtruth: Path, image_times: Path | None = None, imu_csv: Path | None = None) -> RecordedFlight:
+def read_flight(
+    groundtruth: Path, image_times: Path | None = None, imu_csv: Path | None = None
+) -> RecordedFlight:
     """Read a recorded flight, to render images along it.
 
     Args:
@@ -392,7 +488,9 @@ def read_flight(groundtruth: Path, image_times: Path | None = None, imu_csv: Pat
         times, _, _ = stamped_rows(image_times, 1, "nanoseconds, one integer a line")
     times = times[(times >= motion.start_ns) & (times <= motion.end_ns)]
     if len(times) == 0:
-        raise DataError(f"no image time is within the ground truth {groundtruth}; use the same clock for both")
+        raise DataError(
+            f"no image time is within the ground truth {groundtruth}; use the same clock for both"
+        )
     imu = None if imu_csv is None else read_imu_table(imu_csv, whole_ns=True)[0]
     return RecordedFlight(motion, times, imu)
 
@@ -401,7 +499,8 @@ def room_around(motion: MotionSpline, *, seed: int = 0) -> World:
     """Build a room around a motion; its furniture keeps clear of the path."""
     times = np.arange(motion.start_ns, motion.end_ns, _CLEARANCE_STEP_NS)
     p = motion_at(motion, times).T_world_imu[:, :3, 3]
-    low, high = p.min(axis=0) - _WALL_MARGIN_M, p.max(axis=0) + _WALL_MARGIN_M
+    low = p.min(axis=0) - _WALL_MARGIN_M
+    high = p.max(axis=0) + _WALL_MARGIN_M
     area = float(np.prod((high - low)[:2]))
     return room(
         seed,

@@ -38,27 +38,34 @@ class MipTexture:
 
     page: Image  # (H, W)
     size: tuple[int, int]  # texels of level 0: along s, along t
-    levels: npt.NDArray[np.float32]  # (L, 4) scale_s, scale_t, offset_s, offset_t: level-0 texels to page pixels
+    # (L, 4) scale_s, scale_t, offset_s, offset_t: level-0 texels to page pixels
+    levels: npt.NDArray[np.float32]
     gain: float = 1.0  # radiance over the page's gray levels
 
     def coarse(self, share: FloatArray) -> FloatArray:
-        """Radiance (N,) at places (N, 2) given as shares of width and height, of a copy about 16 texels small."""
+        """Radiance (N,) at places (N, 2) given as shares of width and height, of a copy about 16
+        texels small.
+        """
         sizes = self.levels[:, :2] * self.size  # texels of each level
         level = self.levels[int(np.argmin(np.abs(np.log2(sizes.min(axis=1) / _COARSE_TEXELS))))]
         x, y = (np.clip(share, 0, 1) * self.size * level[:2] + level[2:]).T
         height, width = self.page.shape
-        column, row = np.clip(np.rint(x), 0, width - 1).astype(int), np.clip(np.rint(y), 0, height - 1).astype(int)
+        column = np.clip(np.rint(x), 0, width - 1).astype(int)
+        row = np.clip(np.rint(y), 0, height - 1).astype(int)
         return self.page[row, column] * float(self.gain)
 
 
 def build_mips(texture: Image) -> MipTexture:
     """Pack a texture (H, W) and its half-octave mip levels into one page.
 
-    A level-0 coordinate U in [0, W], texel centres at the halves, maps to `scale * U + offset` on the page.
+    A level-0 coordinate U in [0, W], texel centres at the halves, maps to `scale * U + offset` on
+    the page.
     """
     height, width = texture.shape
     if width > _MAX_SIDE:
-        raise SimulationError(f"a texture of {width} texels is too wide; choose a coarser texel size")
+        raise SimulationError(
+            f"a texture of {width} texels is too wide; choose a coarser texel size"
+        )
     levels = [texture]
     step = 0
     while min(levels[-1].shape) > _SMALLEST_LEVEL:
@@ -67,7 +74,11 @@ def build_mips(texture: Image) -> MipTexture:
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         # From the level an octave up: area averaging over at least two texels each way.
         source = levels[step - LEVELS_PER_OCTAVE] if step >= LEVELS_PER_OCTAVE else levels[0]
-        levels.append(np.ascontiguousarray(cv2.resize(source, size, interpolation=cv2.INTER_AREA)).reshape(size[::-1]))
+        levels.append(
+            np.ascontiguousarray(cv2.resize(source, size, interpolation=cv2.INTER_AREA)).reshape(
+                size[::-1]
+            )
+        )
     return _pack(levels)
 
 
@@ -78,7 +89,8 @@ def _pack(levels: list[Image]) -> MipTexture:
     places: list[tuple[int, int]] = []
     bottom = 0
     for level in levels:
-        h, w = level.shape[0] + 2 * _GUTTER, level.shape[1] + 2 * _GUTTER
+        h = level.shape[0] + 2 * _GUTTER
+        w = level.shape[1] + 2 * _GUTTER
         shelf = next((s for s in shelves if h <= s[1] and s[2] + w <= page_width), None)
         if shelf is None:
             shelf = [bottom, h, 0]
@@ -87,14 +99,23 @@ def _pack(levels: list[Image]) -> MipTexture:
         places.append((shelf[0], shelf[2]))
         shelf[2] += w
     if bottom > _MAX_SIDE:
-        raise SimulationError(f"a texture page of {bottom} rows is too tall; choose a coarser texel size")
+        raise SimulationError(
+            f"a texture page of {bottom} rows is too tall; choose a coarser texel size"
+        )
     page = np.zeros((bottom, page_width), dtype=np.uint8)
     rows = []
     height, width = levels[0].shape
     for level, (top, left) in zip(levels, places, strict=True):
         padded = cv2.copyMakeBorder(level, _GUTTER, _GUTTER, _GUTTER, _GUTTER, cv2.BORDER_REPLICATE)
         page[top : top + padded.shape[0], left : left + padded.shape[1]] = padded
-        rows.append((level.shape[1] / width, level.shape[0] / height, left + _GUTTER - 0.5, top + _GUTTER - 0.5))
+        rows.append(
+            (
+                level.shape[1] / width,
+                level.shape[0] / height,
+                left + _GUTTER - 0.5,
+                top + _GUTTER - 0.5,
+            )
+        )
     return MipTexture(page, (width, height), np.array(rows, dtype=np.float32))
 
 
@@ -109,8 +130,8 @@ def lit(texture: Image, light: FloatArray, rng: np.random.Generator) -> tuple[Im
     """Multiply a texture (H, W) by light (R, C), given at the middles of as many equal cells.
 
     Returns:
-        The texture under that light over its brightest value, rounded with dither so that no steps appear in the
-        dark, and that value, by which the texture is to be multiplied.
+        The texture under that light over its brightest value, rounded with dither so that no steps
+        appear in the dark, and that value, by which the texture is to be multiplied.
     """
     gain = float(light.max())
     relative = (light / gain).astype(np.float32)
@@ -120,7 +141,12 @@ def lit(texture: Image, light: FloatArray, rng: np.random.Generator) -> tuple[Im
 
 
 def octave_noise(
-    width: int, height: int, rng: np.random.Generator, *, coarsest_texels: float, falloff: float = 0.8
+    width: int,
+    height: int,
+    rng: np.random.Generator,
+    *,
+    coarsest_texels: float,
+    falloff: float = 0.8,
 ) -> _Canvas:
     """Zero-mean value noise (height, width) of about unit standard deviation, summed over octaves.
 
@@ -132,14 +158,17 @@ def octave_noise(
     while wavelengths[-1] / 2 >= 1.0:
         wavelengths.append(wavelengths[-1] / 2)
     noise: _Canvas | None = None
-    amplitude, power = 1.0, 0.0
+    amplitude = 1.0
+    power = 0.0
     for wavelength in wavelengths:
         shape = (int(np.ceil(height / wavelength)) + 3, int(np.ceil(width / wavelength)) + 3)
         fresh = (rng.random(shape, dtype=np.float32) - 0.5) * np.float32(3.4 * amplitude)
         if noise is None:
             noise = fresh
         else:
-            grown = cv2.resize(noise, (2 * noise.shape[1], 2 * noise.shape[0]), interpolation=cv2.INTER_LINEAR)
+            grown = cv2.resize(
+                noise, (2 * noise.shape[1], 2 * noise.shape[0]), interpolation=cv2.INTER_LINEAR
+            )
             grown = grown.astype(np.float32)[: shape[0], : shape[1]]
             noise = grown + fresh[: grown.shape[0], : grown.shape[1]]
         power += amplitude**2
@@ -152,7 +181,11 @@ def octave_noise(
 
 
 def _rectangles(
-    canvas: _Canvas, rng: np.random.Generator, count: int, side: tuple[float, float], contrast: float
+    canvas: _Canvas,
+    rng: np.random.Generator,
+    count: int,
+    side: tuple[float, float],
+    contrast: float,
 ) -> None:
     """Add axis-aligned rectangles with log-uniform sides (texels) to the canvas."""
     size = np.exp(rng.uniform(np.log(max(side[0], 1.5)), np.log(max(side[1], 2.0)), (count, 2)))
@@ -165,7 +198,11 @@ def _rectangles(
 
 
 def _polygons(
-    canvas: _Canvas, rng: np.random.Generator, count: int, side: tuple[float, float], contrast: float
+    canvas: _Canvas,
+    rng: np.random.Generator,
+    count: int,
+    side: tuple[float, float],
+    contrast: float,
 ) -> None:
     """Add rotated polygons of three to five corners with smooth edges to the canvas."""
     radius = np.exp(rng.uniform(np.log(max(side[0], 2.0)), np.log(max(side[1], 3.0)), (count, 1)))
@@ -187,7 +224,9 @@ def _polygons(
         canvas[y0:y1, x0:x1] += mask * change[i]
 
 
-def _scatter(canvas: _Canvas, per_m: float, rng: np.random.Generator, *, density: float, contrast: float) -> None:
+def _scatter(
+    canvas: _Canvas, per_m: float, rng: np.random.Generator, *, density: float, contrast: float
+) -> None:
     """Add marks of every size from half a metre to a centimetre, more of the smaller ones."""
     height, width = canvas.shape
     area = width * height / per_m**2
@@ -207,7 +246,12 @@ def _light(width: int, height: int, rng: np.random.Generator) -> _Canvas:
 
 
 def _noise(
-    width: int, height: int, per_m: float, rng: np.random.Generator, coarsest_m: float, falloff: float
+    width: int,
+    height: int,
+    per_m: float,
+    rng: np.random.Generator,
+    coarsest_m: float,
+    falloff: float,
 ) -> _Canvas:
     return octave_noise(width, height, rng, coarsest_texels=coarsest_m * per_m, falloff=falloff)
 
@@ -226,7 +270,8 @@ def _poster(canvas: _Canvas, per_m: float, rng: np.random.Generator) -> None:
     w, h = (int(x) for x in rng.uniform(0.3, 0.9, 2) * per_m)
     if w < 12 or h < 12 or w >= width or h >= height:
         return
-    x, y = int(rng.integers(0, width - w)), int(rng.integers(0, height - h))
+    x = int(rng.integers(0, width - w))
+    y = int(rng.integers(0, height - h))
     canvas[y : y + h, x : x + w] = _picture(w, h, per_m, rng)
 
 
@@ -235,8 +280,12 @@ def _bare(width: int, height: int, per_m: float, rng: np.random.Generator) -> _C
 
 
 def _plaster(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
-    """A painted wall: stains fainter than a sensor's noise, a socket or hook here and there, a skirting board."""
-    canvas = np.ascontiguousarray(150 + 1.5 * _noise(width, height, per_m, rng, 1.5, 0.7), dtype=np.float32)
+    """A painted wall: stains fainter than a sensor's noise, a socket or hook here and there, a
+    skirting board.
+    """
+    canvas = np.ascontiguousarray(
+        150 + 1.5 * _noise(width, height, per_m, rng, 1.5, 0.7), dtype=np.float32
+    )
     for _ in range(int(width * height / per_m**2 / 2) + 1):
         side = rng.choice([0.08, 0.02]) * per_m
         place = rng.uniform((0, 0.3 * height), (width, height - side))
@@ -253,7 +302,10 @@ def _picture(width: int, height: int, per_m: float, rng: np.random.Generator) ->
     _polygons(canvas, rng, 40, (0.01 * width, 0.06 * width), 100)
     frame = max(1, round(0.02 * per_m))
     shade = rng.choice([25.0, 60.0, 215.0])
-    canvas[:frame], canvas[-frame:], canvas[:, :frame], canvas[:, -frame:] = shade, shade, shade, shade
+    canvas[:frame] = shade
+    canvas[-frame:] = shade
+    canvas[:, :frame] = shade
+    canvas[:, -frame:] = shade
     return canvas
 
 
@@ -262,11 +314,13 @@ def _floor(width: int, height: int, per_m: float, rng: np.random.Generator) -> _
     canvas = 110 + 22 * _noise(width, height, per_m, rng, 2.0, 0.9)
     plank = 0.14 * per_m
     for row in range(int(height / plank) + 1):
-        top, bottom = round(row * plank), round((row + 1) * plank)
+        top = round(row * plank)
+        bottom = round((row + 1) * plank)
         x = -rng.uniform(0, 1.5) * per_m
         while x < width:
             length = rng.uniform(0.6, 1.9) * per_m
-            left, right = max(0, round(x)), max(0, round(x + length))
+            left = max(0, round(x))
+            right = max(0, round(x + length))
             canvas[top:bottom, left:right] += np.float32(rng.uniform(-26, 26))
             canvas[top:bottom, left : left + max(1, round(0.005 * per_m))] -= 45
             x += length
@@ -283,7 +337,9 @@ def _ceiling(width: int, height: int, per_m: float, rng: np.random.Generator) ->
 
 def _wood(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
     """Grain: noise stretched along s, with knots, labels and handles."""
-    stretched = octave_noise(max(8, width // 6), height, rng, coarsest_texels=0.15 * per_m, falloff=0.9)
+    stretched = octave_noise(
+        max(8, width // 6), height, rng, coarsest_texels=0.15 * per_m, falloff=0.9
+    )
     grain = cv2.resize(stretched, (width, height), interpolation=cv2.INTER_CUBIC)
     canvas = rng.uniform(80, 150) + 24 * grain + 16 * _noise(width, height, per_m, rng, 0.3, 0.95)
     canvas = np.ascontiguousarray(canvas, dtype=np.float32)
@@ -314,15 +370,20 @@ def _facade(width: int, height: int, per_m: float, rng: np.random.Generator) -> 
     canvas = np.ascontiguousarray(canvas, dtype=np.float32)
     course = rng.uniform(0.25, 0.4) * per_m
     for row in range(int(height / course) + 1):
-        top, bottom = round(row * course), round((row + 1) * course)
+        top = round(row * course)
+        bottom = round((row + 1) * course)
         x = -rng.uniform(0, 1) * per_m
         while x < width:
             length = rng.uniform(0.4, 1.1) * per_m
-            canvas[top:bottom, max(0, round(x)) : max(0, round(x + length))] += np.float32(rng.uniform(-14, 14))
+            canvas[top:bottom, max(0, round(x)) : max(0, round(x + length))] += np.float32(
+                rng.uniform(-14, 14)
+            )
             x += length
     _scatter(canvas, per_m, rng, density=0.35, contrast=40)
-    storey, bay = rng.uniform(2.6, 3.3) * per_m, rng.uniform(1.7, 2.8) * per_m
-    wide, tall = rng.uniform(0.45, 0.65) * bay, rng.uniform(0.45, 0.6) * storey
+    storey = rng.uniform(2.6, 3.3) * per_m
+    bay = rng.uniform(1.7, 2.8) * per_m
+    wide = rng.uniform(0.45, 0.65) * bay
+    tall = rng.uniform(0.45, 0.6) * storey
     for floor in range(int(height / storey)):
         for column in range(int(width / bay)):
             centre = np.array([(column + 0.5) * bay, height - (floor + 0.55) * storey])
@@ -331,17 +392,25 @@ def _facade(width: int, height: int, per_m: float, rng: np.random.Generator) -> 
             if rng.random() < 0.93:
                 _window(canvas, centre, size, per_m, rng)
     for _ in range(int(width / per_m / 3) + 1):
-        w, h = rng.uniform(0.6, 2.5) * per_m, rng.uniform(0.3, 0.9) * per_m
-        x, y = rng.uniform(0, max(1, width - w)), rng.uniform(height * 0.35, height - h)
+        w = rng.uniform(0.6, 2.5) * per_m
+        h = rng.uniform(0.3, 0.9) * per_m
+        x = rng.uniform(0, max(1, width - w))
+        y = rng.uniform(height * 0.35, height - h)
         _panel(canvas, (x, y, w, h), per_m, rng)
     return canvas * _light(width, height, rng)
 
 
-def _window(canvas: _Canvas, centre: FloatArray, size: FloatArray, per_m: float, rng: np.random.Generator) -> None:
+def _window(
+    canvas: _Canvas, centre: FloatArray, size: FloatArray, per_m: float, rng: np.random.Generator
+) -> None:
     x, y = centre - size / 2
     w, h = size
     rim = 0.09 * per_m
-    _fill(canvas, (x - rim, y - rim, w + 2 * rim, h + 2 * rim), float(rng.choice([200.0, 60.0, 175.0])))
+    _fill(
+        canvas,
+        (x - rim, y - rim, w + 2 * rim, h + 2 * rim),
+        float(rng.choice([200.0, 60.0, 175.0])),
+    )
     _panel(canvas, (x, y, w, h), per_m, rng, dark=True)
     if rng.random() < 0.7:
         _fill(canvas, (x + w / 2 - rim / 3, y, 2 * rim / 3, h), 190.0)
@@ -358,7 +427,9 @@ def _panel(
     *,
     dark: bool = False,
 ) -> None:
-    """Fill a box (x, y, width, height in texels) with content of its own: a pane, a sign, a shutter."""
+    """Fill a box (x, y, width, height in texels) with content of its own: a pane, a sign, a
+    shutter.
+    """
     region = _region(canvas, box)
     if region.size == 0:
         return
@@ -386,17 +457,28 @@ def _asphalt(width: int, height: int, per_m: float, rng: np.random.Generator) ->
     _rectangles(canvas, rng, min(int(area / 12), _MOST_MARKS), (0.4 * per_m, 3.0 * per_m), 22)
     _polygons(canvas, rng, min(int(area / 3), _MOST_MARKS), (0.05 * per_m, 0.4 * per_m), 45)
     if 0.08 * per_m > 2:
-        _polygons(canvas, rng, min(int(area * 2.5), 2 * _MOST_MARKS), (0.02 * per_m, 0.08 * per_m), 70)
+        _polygons(
+            canvas, rng, min(int(area * 2.5), 2 * _MOST_MARKS), (0.02 * per_m, 0.08 * per_m), 70
+        )
     for _ in range(min(int(area / 8), _MOST_MARKS)):
         steps = rng.normal(0, 0.35, (12, 2)).cumsum(axis=0) * per_m
         points = rng.uniform((0, 0), (width, height)) + steps
         dark = float(rng.uniform(25, 55))
         cv2.polylines(
-            canvas, [np.round(points * 16).astype(np.int32)], False, dark, max(1, round(0.02 * per_m)), shift=4
+            canvas,
+            [np.round(points * 16).astype(np.int32)],
+            False,
+            dark,
+            max(1, round(0.02 * per_m)),
+            shift=4,
         )
     for _ in range(min(int(area / 25), _MOST_MARKS)):
         x, y = rng.uniform((0, 0), (width, height))
-        _fill(canvas, (x, y, rng.uniform(0.12, 2.0) * per_m, rng.uniform(0.1, 0.5) * per_m), rng.uniform(150, 220))
+        _fill(
+            canvas,
+            (x, y, rng.uniform(0.12, 2.0) * per_m, rng.uniform(0.1, 0.5) * per_m),
+            rng.uniform(150, 220),
+        )
     return canvas
 
 
@@ -407,12 +489,19 @@ def _sky(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Ca
 
 def _skyline(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
     """Far hills and towers under a plain sky; t runs downwards."""
-    canvas = np.asarray(210 + 8 * octave_noise(width, height, rng, coarsest_texels=height / 2, falloff=0.6))
-    ridge = np.interp(np.arange(width), np.linspace(0, width, 40), height * rng.uniform(0.6, 0.8, 40))
+    canvas = np.asarray(
+        210 + 8 * octave_noise(width, height, rng, coarsest_texels=height / 2, falloff=0.6)
+    )
+    ridge = np.interp(
+        np.arange(width), np.linspace(0, width, 40), height * rng.uniform(0.6, 0.8, 40)
+    )
     hill = np.arange(height)[:, None] > ridge[None]
-    canvas[hill] = (120 + 25 * octave_noise(width, height, rng, coarsest_texels=height / 3, falloff=0.85))[hill]
+    canvas[hill] = (
+        120 + 25 * octave_noise(width, height, rng, coarsest_texels=height / 3, falloff=0.85)
+    )[hill]
     for _ in range(60):
-        w, h = rng.uniform(0.006, 0.03) * width, rng.uniform(0.15, 0.5) * height
+        w = rng.uniform(0.006, 0.03) * width
+        h = rng.uniform(0.15, 0.5) * height
         x = rng.uniform(0, width - w)
         box = (x, height * 0.95 - h, w, h)
         _fill(canvas, box, rng.uniform(60, 150))
@@ -427,7 +516,10 @@ def _glass(width: int, height: int, per_m: float, rng: np.random.Generator) -> _
     bar = max(2, round(0.05 * per_m))
     for edge in (canvas[:bar], canvas[-bar:], canvas[:, :bar], canvas[:, -bar:]):
         edge[:] = 12.0
-    for count, along in ((max(2, round(width / per_m / 0.8)), width), (max(2, round(height / per_m / 0.9)), height)):
+    for count, along in (
+        (max(2, round(width / per_m / 0.8)), width),
+        (max(2, round(height / per_m / 0.9)), height),
+    ):
         for k in range(1, count):
             at = round(k * along / count)
             if along == width:
@@ -439,10 +531,15 @@ def _glass(width: int, height: int, per_m: float, rng: np.random.Generator) -> _
 
 def _clothes(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
     """Cloth: one shade with soft folds, sometimes a stripe or a print."""
-    canvas = rng.choice([35.0, 60.0, 95.0, 150.0]) + 9 * _noise(width, height, per_m, rng, 0.25, 0.6)
+    canvas = rng.choice([35.0, 60.0, 95.0, 150.0]) + 9 * _noise(
+        width, height, per_m, rng, 0.25, 0.6
+    )
     canvas = np.ascontiguousarray(canvas, dtype=np.float32)
     if rng.random() < 0.5:
-        x, y, w, h = rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.5), rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.3)
+        x = rng.uniform(0.2, 0.5)
+        y = rng.uniform(0.1, 0.5)
+        w = rng.uniform(0.2, 0.5)
+        h = rng.uniform(0.1, 0.3)
         _fill(canvas, (x * width, y * height, w * width, h * height), rng.uniform(40, 200))
     return canvas
 

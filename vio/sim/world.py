@@ -1,7 +1,9 @@
-"""Seeded scenes of textured rectangles and boxes: a room, a street around a block, a corridor with a bare wall.
+"""Seeded scenes of textured rectangles and boxes: a room, a street around a block, a corridor with
+a bare wall.
 
-World frame: z up, metres. A surface is a rectangle seen from its front: s runs right, t down, both in metres from
-the upper left corner (`origin`). Surfaces are one-sided; boxes are visible from outside.
+World frame: z up, metres. A surface is a rectangle seen from its front: s runs right, t down, both
+in metres from the upper left corner (`origin`). Surfaces are one-sided; boxes are visible from
+outside.
 """
 
 from __future__ import annotations
@@ -26,18 +28,20 @@ ObjectMotion: TypeAlias = Callable[[int], FloatArray]  # time_ns to T_world_obje
 _OF_WOOD: tuple[TextureKind, ...] = ("wood", "crate")
 _CLEAR_M = 0.05  # of a camera from what it may not be in
 _CORRIDOR_M = np.array([30.0, 2.6, 2.7])  # length, width, height
-_DOORS, _DOOR_M = 10, 3.0  # of a corridor of equal doors, and from one to the next
+_DOORS = 10  # of a corridor of equal doors, and from one to the next
+_DOOR_M = 3.0
 _STREET_M = 15.0  # width
 _PARKED = 36  # boxes
 _ONWARD_M = 80.0  # length of the streets beyond the block
 _CORNER_FREE_M = 13.0  # no parked box this close to a corner, which cars cut
-# Radiance over the texture's own gray levels, of what is bright by itself: nine stops of a room's light and a window
-# do not fit one exposure, and a bright sky is about a stop above sunlit walls.
+# Radiance over the texture's own gray levels, of what is bright by itself: nine stops of a room's
+# light and a window do not fit one exposure, and a bright sky is about a stop above sunlit walls.
 _EMISSION: dict[TextureKind, float] = {"window": 7.0, "sky": 1.5, "skyline": 1.3}
 _MOVER_LIGHT = 0.7  # illumination of moving boxes, which is the same wherever they are
 _LIGHT_CELL_M = 0.25  # at which illumination is computed; also the width of a shadow's soft edge
 _MOST_LIGHT_CELLS = 400  # along each side of a surface
-_ROOM_AMBIENT, _STREET_AMBIENT = 0.22, 0.4
+_ROOM_AMBIENT = 0.22
+_STREET_AMBIENT = 0.4
 _SUN_ELEVATION_RAD = 0.3
 _BARE_HOUSES = 3  # one house in so many has a blank wall
 _FACES: dict[str, tuple[int, int]] = {
@@ -55,7 +59,8 @@ class Patch:
     size: FloatArray  # (2,) m along s and t
     kind: TextureKind
     texel_m: float
-    twins: int | None = None  # patches with equal numbers look the same; None: this one looks like no other
+    # patches with equal numbers look the same; None: this one looks like no other
+    twins: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +101,15 @@ class TextureStore:
     """The textures of a world, each painted from its own seed on first use."""
 
     def __init__(
-        self, patches: Sequence[Patch], seed: int, lighting: Lighting | None = None, movers: Sequence[int] = ()
+        self,
+        patches: Sequence[Patch],
+        seed: int,
+        lighting: Lighting | None = None,
+        movers: Sequence[int] = (),
     ) -> None:
-        """Store what to paint; `lighting` shades it, alike all over surfaces that move (`movers` > 0)."""
+        """Store what to paint; `lighting` shades it, alike all over surfaces that move (`movers`
+        > 0).
+        """
         self._patches = tuple(patches)
         self._seed = seed
         self._lighting = lighting
@@ -109,7 +120,8 @@ class TextureStore:
     def __getitem__(self, surface: int) -> MipTexture:
         with self._lock:
             if surface not in self._painted:
-                twins, twin = self._patches[surface].twins, surface
+                twins = self._patches[surface].twins
+                twin = surface
                 if twins is not None:
                     twin = next(k for k, other in enumerate(self._patches) if other.twins == twins)
                 if twin not in self._painted:
@@ -119,7 +131,9 @@ class TextureStore:
 
     def _paint(self, surface: int) -> MipTexture:
         patch = self._patches[surface]
-        texture = paint(patch.kind, patch.size, patch.texel_m, np.random.default_rng([self._seed, surface]))
+        texture = paint(
+            patch.kind, patch.size, patch.texel_m, np.random.default_rng([self._seed, surface])
+        )
         if self._lighting is None:
             return build_mips(texture)
         if patch.kind in _EMISSION or self._movers[surface]:
@@ -133,8 +147,13 @@ def _light_on(patch: Patch, lighting: Lighting) -> FloatArray:
     """Illumination (R, C) at the middles of a grid of cells over a fixed surface."""
     columns, rows = np.clip(np.ceil(patch.size / _LIGHT_CELL_M), 2, _MOST_LIGHT_CELLS).astype(int)
     s, t = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
-    along = s.reshape(-1, 1) * patch.size[0] * patch.axis_s + t.reshape(-1, 1) * patch.size[1] * patch.axis_t
-    return illumination(lighting, patch.origin + along, np.cross(patch.axis_t, patch.axis_s)).reshape(rows, columns)
+    along = (
+        s.reshape(-1, 1) * patch.size[0] * patch.axis_s
+        + t.reshape(-1, 1) * patch.size[1] * patch.axis_t
+    )
+    return illumination(
+        lighting, patch.origin + along, np.cross(patch.axis_t, patch.axis_s)
+    ).reshape(rows, columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,12 +174,15 @@ def surfaces_at(world: World, time_ns: int) -> Surfaces:
     if not world.movers:
         return world.surfaces
     fixed = world.surfaces
-    origin, axis_s, axis_t = fixed.origin.copy(), fixed.axis_s.copy(), fixed.axis_t.copy()
+    origin = fixed.origin.copy()
+    axis_s = fixed.axis_s.copy()
+    axis_t = fixed.axis_t.copy()
     for number, box in enumerate(world.movers, start=1):
         mine = fixed.mover == number
         T = box.motion(time_ns)
         origin[mine] = fixed.origin[mine] @ T[:3, :3].T + T[:3, 3]
-        axis_s[mine], axis_t[mine] = fixed.axis_s[mine] @ T[:3, :3].T, fixed.axis_t[mine] @ T[:3, :3].T
+        axis_s[mine] = fixed.axis_s[mine] @ T[:3, :3].T
+        axis_t[mine] = fixed.axis_t[mine] @ T[:3, :3].T
     return replace(fixed, origin=origin, axis_s=axis_s, axis_t=axis_t)
 
 
@@ -171,7 +193,8 @@ def check_clear(world: World, positions: npt.ArrayLike, what: str = "the camera"
         SimulationError: a position is not; the message names the first one.
     """
     p = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
-    low, high = world.bounds[0] + _CLEAR_M, world.bounds[1] - _CLEAR_M
+    low = world.bounds[0] + _CLEAR_M
+    high = world.bounds[1] - _CLEAR_M
     outside = ((p < low) | (p > high)).any(axis=1) | ~np.isfinite(p).all(1)
     if outside.any():
         i = int(np.flatnonzero(outside)[0])
@@ -186,7 +209,8 @@ def check_clear(world: World, positions: npt.ArrayLike, what: str = "the camera"
         if inside.any():
             i = int(np.flatnonzero(inside)[0])
             raise SimulationError(
-                f"{what} is inside box {number} of the {world.name} at position {i} of {len(p)}, ({_metres(p[i])}) m; "
+                f"{what} is inside box {number} of the {world.name} at position {i} of {len(p)}, "
+                f"({_metres(p[i])}) m; "
                 "choose another seed or trajectory, or pass the positions as keep_clear"
             )
 
@@ -215,20 +239,28 @@ def room(
         bounds: lower and upper corner (2, 3) of the room, metres.
         furniture: boxes to place; fewer where there is no space.
         pictures: thin boxes on the walls.
-        keep_clear: positions (N, 3) from which furniture stays 0.6 m away; None keeps the middle of the room free.
+        keep_clear: positions (N, 3) from which furniture stays 0.6 m away; None keeps the middle of
+            the room free.
         bare_walls: sides without texture, of "+x" "-x" "+y" "-y".
         moving: boxes that move.
         bare_kind: texture of the bare walls; "plaster" has a few marks.
-        windows: bright windows, each on a wall of its own (up to 4), which light the room; 0: even light everywhere.
+        windows: bright windows, each on a wall of its own (up to 4), which light the room; 0: even
+            light everywhere.
         texel_m: texture resolution; None chooses 2.5 mm, coarser in halls.
     """
     box = _bounds(bounds)
     rng = np.random.default_rng([seed, 1])
     texel = (
-        texel_m if texel_m is not None else max(0.0025, 0.0025 * float(np.prod(box[1, :2] - box[0, :2]) / 60) ** 0.5)
+        texel_m
+        if texel_m is not None
+        else max(0.0025, 0.0025 * float(np.prod(box[1, :2] - box[0, :2]) / 60) ** 0.5)
     )
     patches = _shell(box, bare_walls, texel, bare_kind)
-    clear = _default_clear(box) if keep_clear is None else np.asarray(keep_clear, dtype=np.float64).reshape(-1, 3)
+    clear = (
+        _default_clear(box)
+        if keep_clear is None
+        else np.asarray(keep_clear, dtype=np.float64).reshape(-1, 3)
+    )
     solids: list[Solid] = []
     scale = float(np.clip((box[1, 2] - box[0, 2]) / 2.8, 0.7, 2.5))
     for _ in range(furniture):
@@ -250,18 +282,24 @@ def room(
     return _build("room", patches + panes, solids, box, seed, moving, lighting)
 
 
-def _windows(box: FloatArray, count: int, seed: int, scale: float) -> tuple[tuple[Light, ...], list[Patch]]:
+def _windows(
+    box: FloatArray, count: int, seed: int, scale: float
+) -> tuple[tuple[Light, ...], list[Patch]]:
     """Windows on different walls of a room: their lights and their panes."""
     rng = np.random.default_rng([seed, 4])
-    lights, panes = [], []
+    lights = []
+    panes = []
     # Illumination 0.9 at half the width of a square room of that area, from each of them.
     power = 0.9 * float(np.prod(box[1, :2] - box[0, :2])) / 4
     for face in rng.permutation(["+x", "-x", "+y", "-y"])[:count]:
         axis, sign = _FACES[str(face)]
-        normal, up = np.zeros(3), np.array([0.0, 0.0, 1.0])
+        normal = np.zeros(3)
+        up = np.array([0.0, 0.0, 1.0])
         normal[axis] = -sign
         size = np.minimum(np.array([1.9, 1.3]) * scale, 0.6 * (box[1] - box[0])[[1 - axis, 2]])
-        middle = box[0] + (box[1] - box[0]) * np.array([*rng.uniform(0.3, 0.7, 2), rng.uniform(0.5, 0.62)])
+        middle = box[0] + (box[1] - box[0]) * np.array(
+            [*rng.uniform(0.3, 0.7, 2), rng.uniform(0.5, 0.62)]
+        )
         middle[axis] = box[1 if sign > 0 else 0, axis] - sign * 0.05  # in front of pictures
         pane = _rectangle(middle, normal, -up, size, "window", 0.005)
         half = np.stack([pane.axis_s * size[0], pane.axis_t * size[1]]) / 2
@@ -278,7 +316,9 @@ def corridor(
     moving: Sequence[MovingBox] = (),
     texel_m: float = 0.003,
 ) -> World:
-    """Build a corridor along x whose left wall (`bare_walls`) is bare, with cupboards along the right one."""
+    """Build a corridor along x whose left wall (`bare_walls`) is bare, with cupboards along the
+    right one.
+    """
     length_m, width_m, height_m = _CORRIDOR_M
     box = np.array([[0.0, -width_m / 2, 0.0], [length_m, width_m / 2, height_m]])
     rng = np.random.default_rng([seed, 2])
@@ -300,9 +340,11 @@ def corridor(
 
 
 def equal_doors(seed: int = 0, *, texel_m: float = 0.003) -> World:
-    """Build a corridor along x that repeats to the texel from door to door: walls, floor, ceiling, doors, pictures.
+    """Build a corridor along x that repeats to the texel from door to door: walls, floor, ceiling,
+    doors, pictures.
 
-    Only its two end walls differ. Whoever recognises places by their looks alone takes one door for another.
+    Only its two end walls differ. Whoever recognises places by their looks alone takes one door for
+    another.
     """
     _, width_m, height_m = _CORRIDOR_M
     box = np.array([[0.0, -width_m / 2, 0.0], [_DOORS * _DOOR_M, width_m / 2, height_m]])
@@ -312,7 +354,11 @@ def equal_doors(seed: int = 0, *, texel_m: float = 0.003) -> World:
     kinds: dict[str, TextureKind] = {"+y": "wall", "-y": "wall", "-z": "floor", "+z": "ceiling"}
     half = np.array([_DOOR_M, width_m, height_m]) / 2
     rng = np.random.default_rng([seed, 4])
-    places = [(side * (width_m / 2 - 0.02), rng.uniform(0.5, _DOOR_M - 0.5)) for side in (-1, 1) for _ in range(2)]
+    places = [
+        (side * (width_m / 2 - 0.02), rng.uniform(0.5, _DOOR_M - 0.5))
+        for side in (-1, 1)
+        for _ in range(2)
+    ]
     solids: list[Solid] = []
     for number in range(_DOORS):
         middle = np.array([(number + 0.5) * _DOOR_M, 0.0, height_m / 2])
@@ -321,7 +367,9 @@ def equal_doors(seed: int = 0, *, texel_m: float = 0.003) -> World:
         solids.append(door)
         cell += _box_patches(door, "wood", texel_m, hidden=("-z",))
         for y, along in places:
-            picture = Solid(_pose((number * _DOOR_M + along, y, 1.6), 0.0), np.array([0.3, 0.02, 0.25]))
+            picture = Solid(
+                _pose((number * _DOOR_M + along, y, 1.6), 0.0), np.array([0.3, 0.02, 0.25])
+            )
             solids.append(picture)
             cell += _box_patches(picture, "picture", texel_m)
         patches += [replace(patch, twins=k) for k, patch in enumerate(cell)]
@@ -337,17 +385,21 @@ def street(
     bare_houses: bool = False,
     texel_m: float = 0.015,
 ) -> World:
-    """Build a street around a block of houses, with facades at both sides, parked boxes, poles, a distant skyline.
+    """Build a street around a block of houses, with facades at both sides, parked boxes, poles, a
+    distant skyline.
 
-    The middle of the street is a rectangle of `loop_m` (along x, along y) about the origin, so a car loop along it
-    is about twice their sum long. `sunlit`: a low sun shines, with hard shadows, instead of even light;
-    `bare_houses`: the facades of every third house are blank.
+    The middle of the street is a rectangle of `loop_m` (along x, along y) about the origin, so a
+    car loop along it is about twice their sum long. `sunlit`: a low sun shines, with hard shadows,
+    instead of even light; `bare_houses`: the facades of every third house are blank.
     """
     rng = np.random.default_rng([seed, 3])
     half = np.array(loop_m) / 2
     if min(loop_m) < 2.5 * _STREET_M:
-        raise SimulationError(f"a street {_STREET_M:g} m wide needs loop_m of at least {2.5 * _STREET_M:g} m each way")
-    inner, outer = half - _STREET_M / 2, half + _STREET_M / 2
+        raise SimulationError(
+            f"a street {_STREET_M:g} m wide needs loop_m of at least {2.5 * _STREET_M:g} m each way"
+        )
+    inner = half - _STREET_M / 2
+    outer = half + _STREET_M / 2
     patches: list[Patch] = []
     solids: list[Solid] = []
     houses = [*_house_row(inner, rng, outwards=True), *_house_row(outer, rng, outwards=False)]
@@ -355,7 +407,9 @@ def street(
         solids.append(solid)
         onward = bool(abs(solid.T_world_box[0, 3]) > outer[0] + 10)
         kind: TextureKind = "plaster" if bare_houses and number % _BARE_HOUSES == 0 else "facade"
-        patches += _box_patches(solid, kind, (2 if onward else 1) * texel_m, hidden=("-z", "+z", back))
+        patches += _box_patches(
+            solid, kind, (2 if onward else 1) * texel_m, hidden=("-z", "+z", back)
+        )
     patches += _road(inner, outer, 0.8 * texel_m)
     for solid in _roadside(half, rng):
         solids.append(solid)
@@ -364,22 +418,29 @@ def street(
     patches += _far_box(reach)
     bounds = np.array([[-outer[0], -outer[1], 0.0], [outer[0], outer[1], 40.0]])
     lighting = _sunlight(solids, seed) if sunlit else None
-    solids.append(Solid(_pose((0.0, 0.0, 10.0), 0.0), np.array([inner[0] - 3.0, inner[1] - 3.0, 10.0])))
+    solids.append(
+        Solid(_pose((0.0, 0.0, 10.0), 0.0), np.array([inner[0] - 3.0, inner[1] - 3.0, 10.0]))
+    )
     return _build("street", patches, solids, bounds, seed, moving, lighting)
 
 
 def _sunlight(casters: Sequence[Solid], seed: int) -> Lighting:
-    """A low sun along the longer streets, half into the driver's face, and the shadows of all boxes."""
+    """A low sun along the longer streets, half into the driver's face, and the shadows of all
+    boxes.
+    """
     azimuth = np.random.default_rng([seed, 5]).choice([0.0, np.pi]) + 0.25
     light = sun(float(azimuth), _SUN_ELEVATION_RAD, power=1.1, radiance=60_000.0)
-    poses, halves = np.stack([s.T_world_box for s in casters]), np.stack([s.half_size for s in casters])
+    poses = np.stack([s.T_world_box for s in casters])
+    halves = np.stack([s.half_size for s in casters])
     return Lighting((light,), _STREET_AMBIENT, poses, halves)
 
 
 def _bounds(bounds: npt.ArrayLike) -> FloatArray:
     box = np.asarray(bounds, dtype=np.float64)
     if box.shape != (2, 3) or not np.all(np.isfinite(box)) or np.any(box[1] - box[0] < 0.5):
-        raise SimulationError("scene bounds must be a lower and an upper corner (2, 3) at least 0.5 m apart each way")
+        raise SimulationError(
+            "scene bounds must be a lower and an upper corner (2, 3) at least 0.5 m apart each way"
+        )
     return box
 
 
@@ -415,9 +476,16 @@ def _pose(centre: npt.ArrayLike, yaw: float) -> FloatArray:
 
 
 def _rectangle(
-    centre: FloatArray, normal: FloatArray, down: FloatArray, size: FloatArray, kind: TextureKind, texel_m: float
+    centre: FloatArray,
+    normal: FloatArray,
+    down: FloatArray,
+    size: FloatArray,
+    kind: TextureKind,
+    texel_m: float,
 ) -> Patch:
-    """Return the rectangle with the given middle, seen against `normal` with `down` pointing down."""
+    """Return the rectangle with the given middle, seen against `normal` with `down` pointing
+    down.
+    """
     right = np.cross(normal, down)
     origin = centre - right * size[0] / 2 - down * size[1] / 2
     return Patch(origin, right, down, np.asarray(size, dtype=np.float64), kind, texel_m)
@@ -436,30 +504,42 @@ def _axis_rectangles(
         across = 1 - axis if axis != 2 else 0
         size = 2 * np.array([half[across], half[1] if axis == 2 else half[2]])
         patch = _rectangle(side * half[axis], -side if inwards else side, down, size, kind, texel_m)
-        R, t = T[:3, :3], T[:3, 3]
-        out.append(replace(patch, origin=R @ patch.origin + t, axis_s=R @ patch.axis_s, axis_t=R @ patch.axis_t))
+        R = T[:3, :3]
+        t = T[:3, 3]
+        out.append(
+            replace(
+                patch, origin=R @ patch.origin + t, axis_s=R @ patch.axis_s, axis_t=R @ patch.axis_t
+            )
+        )
     return out
 
 
-def _box_patches(solid: Solid, kind: TextureKind, texel_m: float, *, hidden: tuple[str, ...] = ()) -> list[Patch]:
+def _box_patches(
+    solid: Solid, kind: TextureKind, texel_m: float, *, hidden: tuple[str, ...] = ()
+) -> list[Patch]:
     kinds = {face: kind for face in _FACES if face not in hidden}
     return _axis_rectangles(solid.T_world_box, solid.half_size, kinds, texel_m, inwards=False)
 
 
-def _shell(box: FloatArray, bare_walls: tuple[str, ...], texel_m: float, bare: TextureKind) -> list[Patch]:
+def _shell(
+    box: FloatArray, bare_walls: tuple[str, ...], texel_m: float, bare: TextureKind
+) -> list[Patch]:
     unknown = set(bare_walls) - set(_FACES)
     if unknown:
         raise SimulationError(f"unknown walls {sorted(unknown)}; use some of {', '.join(_FACES)}")
     kinds: dict[str, TextureKind] = dict.fromkeys(("+x", "-x", "+y", "-y"), "wall")
     kinds |= {"-z": "floor", "+z": "ceiling"}
     kinds |= dict.fromkeys(bare_walls, bare)
-    return _axis_rectangles(_pose((box[0] + box[1]) / 2, 0.0), (box[1] - box[0]) / 2, kinds, texel_m, inwards=True)
+    return _axis_rectangles(
+        _pose((box[0] + box[1]) / 2, 0.0), (box[1] - box[0]) / 2, kinds, texel_m, inwards=True
+    )
 
 
 def _default_clear(box: FloatArray) -> FloatArray:
     """An ellipse of positions at mid height that leaves the border of the room to furniture."""
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    middle, half = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
+    middle = (box[0] + box[1]) / 2
+    half = (box[1] - box[0]) / 2
     ring = np.stack([np.cos(angle) * half[0], np.sin(angle) * half[1], 0 * angle], axis=1)
     return np.concatenate([middle + ring * radius for radius in (0.0, 0.2, 0.4, 0.55)])
 
@@ -474,13 +554,18 @@ def _overlaps(a: Solid, others: Sequence[Solid]) -> bool:
     """Whether bounding circles on the floor intersect."""
     radius = float(np.linalg.norm(a.half_size[:2]))
     return any(
-        np.linalg.norm(a.T_world_box[:2, 3] - b.T_world_box[:2, 3]) < 0.8 * (radius + np.linalg.norm(b.half_size[:2]))
+        np.linalg.norm(a.T_world_box[:2, 3] - b.T_world_box[:2, 3])
+        < 0.8 * (radius + np.linalg.norm(b.half_size[:2]))
         for b in others
     )
 
 
 def _place_furniture(
-    box: FloatArray, clear: FloatArray, solids: Sequence[Solid], rng: np.random.Generator, scale: float
+    box: FloatArray,
+    clear: FloatArray,
+    solids: Sequence[Solid],
+    rng: np.random.Generator,
+    scale: float,
 ) -> Solid | None:
     """Find a free place on the floor; None after many attempts."""
     for _ in range(60):
@@ -506,15 +591,20 @@ def _stack(below: Solid, rng: np.random.Generator, scale: float) -> Solid | None
     return Solid(_pose(centre, yaw), size / 2)
 
 
-def _hang_picture(box: FloatArray, rng: np.random.Generator, scale: float, bare_walls: tuple[str, ...]) -> Solid | None:
+def _hang_picture(
+    box: FloatArray, rng: np.random.Generator, scale: float, bare_walls: tuple[str, ...]
+) -> Solid | None:
     """Hang a thin framed box on a wall that has texture; None where it would not fit."""
     walls = [face for face in ("+x", "-x", "+y", "-y") if face not in bare_walls]
     if not walls:
         return None
     axis, sign = _FACES[walls[int(rng.integers(len(walls)))]]
     along = 1 - axis
-    width, height, thick = rng.uniform(0.4, 1.1) * scale, rng.uniform(0.4, 0.9) * scale, 0.04
-    low, high = box[0] + 0.15, box[1] - 0.15
+    width = rng.uniform(0.4, 1.1) * scale
+    height = rng.uniform(0.4, 0.9) * scale
+    thick = 0.04
+    low = box[0] + 0.15
+    high = box[1] - 0.15
     if high[along] - low[along] < width or high[2] - low[2] < height:
         return None
     centre = np.zeros(3)
@@ -522,28 +612,44 @@ def _hang_picture(box: FloatArray, rng: np.random.Generator, scale: float, bare_
     centre[2] = rng.uniform(low[2] + height / 2, high[2] - height / 2)
     centre[axis] = box[1, axis] - thick / 2 if sign > 0 else box[0, axis] + thick / 2
     half = np.zeros(3)
-    half[axis], half[along], half[2] = thick / 2, width / 2, height / 2
+    half[axis] = thick / 2
+    half[along] = width / 2
+    half[2] = height / 2
     return Solid(_pose(centre, 0.0), half)
 
 
-def _house_row(rim: FloatArray, rng: np.random.Generator, *, outwards: bool) -> list[tuple[Solid, str]]:
-    """Houses along a rectangle of half size `rim`, each with its hidden face: inside it facing out, or around it."""
+def _house_row(
+    rim: FloatArray, rng: np.random.Generator, *, outwards: bool
+) -> list[tuple[Solid, str]]:
+    """Houses along a rectangle of half size `rim`, each with its hidden face: inside it facing
+    out, or around it.
+    """
     houses = []
     depth = 8.0
     for axis in (0, 1):
         for sign in (-1, 1):
             # The streets along x continue beyond the block, towards the skyline.
-            extent = rim[axis] if outwards else (rim[0] + _ONWARD_M if axis == 0 else rim[1] - _STREET_M)
+            extent = (
+                rim[axis] if outwards else (rim[0] + _ONWARD_M if axis == 0 else rim[1] - _STREET_M)
+            )
             x = -extent
             while x < extent - 3:
                 width = min(rng.uniform(9.0, 18.0), extent - x)
                 if extent - x - width < 5:
                     width = extent - x
-                height, setback = rng.uniform(7.0, 16.0), rng.uniform(0.1, 1.2)
-                across = rim[1 - axis] + (-(setback + depth / 2) if outwards else setback + depth / 2)
-                centre, half = np.zeros(3), np.zeros(3)
-                centre[axis], centre[1 - axis], centre[2] = x + width / 2, sign * across, height / 2
-                half[axis], half[1 - axis], half[2] = width / 2, depth / 2, height / 2
+                height = rng.uniform(7.0, 16.0)
+                setback = rng.uniform(0.1, 1.2)
+                across = rim[1 - axis] + (
+                    -(setback + depth / 2) if outwards else setback + depth / 2
+                )
+                centre = np.zeros(3)
+                half = np.zeros(3)
+                centre[axis] = x + width / 2
+                centre[1 - axis] = sign * across
+                centre[2] = height / 2
+                half[axis] = width / 2
+                half[1 - axis] = depth / 2
+                half[2] = height / 2
                 back = ("-" if (sign > 0) == outwards else "+") + "xy"[1 - axis]
                 houses.append((Solid(_pose(centre, 0.0), half), back))
                 x += width + (rng.uniform(1.5, 5.0) if rng.random() < 0.3 else 0.0)
@@ -552,12 +658,16 @@ def _house_row(rim: FloatArray, rng: np.random.Generator, *, outwards: bool) -> 
 
 def _road(inner: FloatArray, outer: FloatArray, texel_m: float) -> list[Patch]:
     """Four strips around the block, extending under the facades, above one coarse ground plane."""
-    low, high = inner - 2.0, outer + 2.0
-    up, down = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])
+    low = inner - 2.0
+    high = outer + 2.0
+    up = np.array([0.0, 0.0, 1.0])
+    down = np.array([0.0, -1.0, 0.0])
     out = []
     for sign in (-1, 1):
-        x, y = sign * (low[0] + high[0]) / 2, sign * (low[1] + high[1]) / 2
-        long_size, short_size = np.array([2 * high[0], high[1] - low[1]]), np.array([high[0] - low[0], 2 * low[1]])
+        x = sign * (low[0] + high[0]) / 2
+        y = sign * (low[1] + high[1]) / 2
+        long_size = np.array([2 * high[0], high[1] - low[1]])
+        short_size = np.array([high[0] - low[0], 2 * low[1]])
         out.append(_rectangle(np.array([0.0, y, 0.0]), up, down, long_size, "asphalt", texel_m))
         out.append(_rectangle(np.array([x, 0.0, 0.0]), up, down, short_size, "asphalt", texel_m))
         for other in (-1, 1):
@@ -580,10 +690,14 @@ def _roadside(half: FloatArray, rng: np.random.Generator) -> list[Solid]:
             point, heading, to_corner = _on_rectangle(half, place)
             if to_corner < _CORNER_FREE_M:
                 continue
-            side = rng.choice([-1.0, 1.0]) * (_STREET_M / 2 - (0.7 if is_pole else rng.uniform(1.5, 1.9)))
+            side = rng.choice([-1.0, 1.0]) * (
+                _STREET_M / 2 - (0.7 if is_pole else rng.uniform(1.5, 1.9))
+            )
             normal = np.array([-np.sin(heading), np.cos(heading)])
             size = (
-                np.array([0.22, 0.22, rng.uniform(3, 6)]) if is_pole else rng.uniform((3.4, 1.6, 1.3), (5.2, 2.0, 2.4))
+                np.array([0.22, 0.22, rng.uniform(3, 6)])
+                if is_pole
+                else rng.uniform((3.4, 1.6, 1.3), (5.2, 2.0, 2.4))
             )
             yaw = heading + rng.normal(0, 0.03)
             solid = Solid(_pose((*(point + side * normal), size[2] / 2), yaw), size / 2)
@@ -594,7 +708,9 @@ def _roadside(half: FloatArray, rng: np.random.Generator) -> list[Solid]:
 
 
 def _on_rectangle(half: FloatArray, s: float) -> tuple[FloatArray, float, float]:
-    """Point, heading and distance to the nearest corner at arc length s along a rectangle, counter-clockwise."""
+    """Point, heading and distance to the nearest corner at arc length s along a rectangle,
+    counter-clockwise.
+    """
     sides = [(np.array([-1, -1]), np.array([1, 0])), (np.array([1, -1]), np.array([0, 1]))]
     sides += [(np.array([1, 1]), np.array([-1, 0])), (np.array([-1, 1]), np.array([0, -1]))]
     for start, direction in sides:
@@ -609,6 +725,9 @@ def _on_rectangle(half: FloatArray, s: float) -> tuple[FloatArray, float, float]
 def _far_box(reach: float) -> list[Patch]:
     """A closed box of skyline and sky, so that every ray ends somewhere."""
     kinds: dict[str, TextureKind] = dict.fromkeys(("+x", "-x", "+y", "-y"), "skyline")
-    T, half = _pose((0.0, 0.0, 40.0), 0.0), np.array([reach, reach, 50.0])
+    T = _pose((0.0, 0.0, 40.0), 0.0)
+    half = np.array([reach, reach, 50.0])
     sky: dict[str, TextureKind] = {"+z": "sky"}
-    return _axis_rectangles(T, half, kinds, 0.2, inwards=True) + _axis_rectangles(T, half, sky, 0.5, inwards=True)
+    return _axis_rectangles(T, half, kinds, 0.2, inwards=True) + _axis_rectangles(
+        T, half, sky, 0.5, inwards=True
+    )

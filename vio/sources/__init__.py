@@ -1,1 +1,3 @@
-"""Cameras as sources of live frames and samples, one file each, behind the protocol of `vio.sources.source`."""
+"""Cameras as sources of live frames and samples, one file each, behind the protocol of
+`vio.sources.source`.
+"""

@@ -1,4 +1,5 @@
-"""Luxonis OAK with two mono cameras and an IMU, calibration of the device, by the package depthai 3.
+"""Luxonis OAK with two mono cameras and an IMU, calibration of the device, by the package depthai
+3.
 
 Not tried on a device: written against the types and docstrings of depthai 3.12.
 """
@@ -18,15 +19,21 @@ from vio.live.pairing import Pairing
 from vio.records import Image
 from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame
 
-_WIDTH, _HEIGHT, _RATE_HZ = 640, 400, 20.0
+_WIDTH = 640
+_HEIGHT = 400
+_RATE_HZ = 20.0
 _IMU_HZ = 200
-_COEFFICIENTS = 8  # of OpenCV's rational polynomial; the device stores thin prisms and tilt behind them
+# of OpenCV's rational polynomial; the device stores thin prisms and tilt behind them
+_COEFFICIENTS = 8
 _PAUSE_S = 0.002
 _LOST_S = 5.0
 
 
 class OakSource:
-    """A device, by its ID or the first one; see `LiveSource`. Stamps are those of the device's exposures."""
+    """A device, by its ID or the first one; see `LiveSource`.
+
+    Stamps are those of the device's exposures.
+    """
 
     def __init__(self, name: str) -> None:
         """Open the device and start it.
@@ -44,7 +51,8 @@ class OakSource:
             raise MissingDependencyError(
                 "oak: needs the package depthai; install it with: pip install 'stereo-vio[oak]'"
             ) from error
-        self._dai, self._name = dai, f"oak:{name}"
+        self._dai = dai
+        self._name = f"oak:{name}"
         devices = dai.Device.getAllAvailableDevices()
         found = [info for info in devices if not name or name in (info.getDeviceId(), info.name)]
         if not found:
@@ -52,8 +60,12 @@ class OakSource:
             raise DataError(f"{self._name}: no such device; connected are: {have}; check the cable")
         try:
             self._open(found[0])
-        except RuntimeError as error:  # what depthai raises of a device and of a calibration that lacks an entry
-            raise DataError(f"{self._name}: {error}; check the cable and its calibration") from error
+        except (
+            RuntimeError
+        ) as error:  # what depthai raises of a device and of a calibration that lacks an entry
+            raise DataError(
+                f"{self._name}: {error}; check the cable and its calibration"
+            ) from error
 
     def _open(self, info: Any) -> None:
         dai = self._dai
@@ -72,14 +84,18 @@ class OakSource:
         T_cam0_imu = None
         if self._device.getConnectedIMU() not in ("", "NONE"):
             node = self._pipeline.create(dai.node.IMU)
-            node.enableIMUSensor([dai.IMUSensor.ACCELEROMETER_RAW, dai.IMUSensor.GYROSCOPE_RAW], _IMU_HZ)
+            node.enableIMUSensor(
+                [dai.IMUSensor.ACCELEROMETER_RAW, dai.IMUSensor.GYROSCOPE_RAW], _IMU_HZ
+            )
             node.setBatchReportThreshold(1)
             node.setMaxBatchReports(10)
             self._imu = node.out.createOutputQueue()
             T_cam0_imu = _metres(stored.getImuToCameraExtrinsics(sockets[0]))
         lenses = [self._lens(stored, socket) for socket in sockets]
         self.has_imu = self._imu is not None
-        self.rig: Rig | None = Rig(lenses[0], lenses[1], _metres(stored.getCameraExtrinsics(*sockets)), T_cam0_imu)
+        self.rig: Rig | None = Rig(
+            lenses[0], lenses[1], _metres(stored.getCameraExtrinsics(*sockets)), T_cam0_imu
+        )
         self._pipeline.start()
 
     def _lens(self, stored: Any, socket: Any) -> CameraModel:
@@ -88,7 +104,9 @@ class OakSource:
         if stored.getDistortionModel(socket) == self._dai.CameraModel.Fisheye:
             return camera_from_matrix(K, _WIDTH, _HEIGHT, "equidistant", values[:4], self._name)
         if any(values[_COEFFICIENTS:]):
-            raise DataError(f"{self._name}: its lens model has thin prisms or tilt; give --calibration FILE")
+            raise DataError(
+                f"{self._name}: its lens model has thin prisms or tilt; give --calibration FILE"
+            )
         return camera_from_matrix(K, _WIDTH, _HEIGHT, "radtan", values[:_COEFFICIENTS], self._name)
 
     def events(self) -> Iterator[SourceEvent | None]:
@@ -97,14 +115,20 @@ class OakSource:
         Raises:
             DataError: nothing has come for seconds.
         """
-        imu, last_s = ImuInterpolation(), time.monotonic()
+        imu = ImuInterpolation()
+        last_s = time.monotonic()
         pairing: Pairing[Image] = Pairing()
         while True:
             came = False
             for packets in [] if self._imu is None else self._imu.tryGetAll():
                 for packet in packets.packets:
-                    for take, read in ((imu.accel, packet.acceleroMeter), (imu.gyro, packet.gyroscope)):
-                        yield from take(_ns(read.getTimestampDevice()), np.array([read.x, read.y, read.z]))
+                    for take, read in (
+                        (imu.accel, packet.acceleroMeter),
+                        (imu.gyro, packet.gyroscope),
+                    ):
+                        yield from take(
+                            _ns(read.getTimestampDevice()), np.array([read.x, read.y, read.z])
+                        )
                 came = True
             for side, images in enumerate(self._images):
                 for message in images.tryGetAll():

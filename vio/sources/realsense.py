@@ -1,6 +1,8 @@
-"""Intel RealSense D400 with an IMU: two infrared imagers, factory calibration, by the package pyrealsense2.
+"""Intel RealSense D400 with an IMU: two infrared imagers, factory calibration, by the package
+pyrealsense2.
 
-Reference: librealsense's own documentation of `rs2_intrinsics`, `rs2_extrinsics` and the D435i's IMU.
+Reference: librealsense's own documentation of `rs2_intrinsics`, `rs2_extrinsics` and the D435i's
+IMU.
 """
 
 from __future__ import annotations
@@ -22,16 +24,25 @@ from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame
 
 log = logging.getLogger(__name__)
 
-_WIDTH, _HEIGHT, _RATE_HZ = 640, 480, 30
-_SILENT_S, _LOST_S = 0.5, 5.0
+_WIDTH = 640
+_HEIGHT = 480
+_RATE_HZ = 30
+_SILENT_S = 0.5
+_LOST_S = 5.0
 _WAITING = 1000  # frames and samples that may wait for the reader
 
 # The distortion of the infrared images, which the device rectifies; of raw ones, OpenCV's.
-_MODELS: dict[str, Any] = {"none": "pinhole", "brown_conrady": "radtan", "kannala_brandt4": "equidistant"}
+_MODELS: dict[str, Any] = {
+    "none": "pinhole",
+    "brown_conrady": "radtan",
+    "kannala_brandt4": "equidistant",
+}
 
 
 class RealSenseSource:
-    """A device, by its serial number or the first one, or a recording of librealsense; see `LiveSource`."""
+    """A device, by its serial number or the first one, or a recording of librealsense; see
+    `LiveSource`.
+    """
 
     def __init__(self, name: str) -> None:
         """Open the device and start it, with the infrared projector off.
@@ -47,11 +58,15 @@ class RealSenseSource:
             import pyrealsense2 as rs
         except ModuleNotFoundError as error:
             raise MissingDependencyError(
-                "realsense: needs the package pyrealsense2; install it with: pip install 'stereo-vio[realsense]'"
+                "realsense: needs the package pyrealsense2; install it with: pip install "
+                "'stereo-vio[realsense]'"
             ) from error
         except ImportError as error:  # such as libusb, which the system must have
-            raise MissingDependencyError(f"realsense: pyrealsense2 cannot be loaded: {error}") from error
-        self._rs, self._name = rs, name or "realsense"
+            raise MissingDependencyError(
+                f"realsense: pyrealsense2 cannot be loaded: {error}"
+            ) from error
+        self._rs = rs
+        self._name = name or "realsense"
         self._is_file = name.endswith((".bag", ".db3"))
         if self._is_file and not Path(name).is_file():
             raise DataError(f"realsense:{name}: there is no such file")
@@ -66,7 +81,8 @@ class RealSenseSource:
         except RuntimeError as error:
             self.close()
             raise DataError(
-                f"realsense:{name}: {error}; check the cable (USB 3), and that no other program uses the camera"
+                f"realsense:{name}: {error}; check the cable (USB 3), and that no other program "
+                "uses the camera"
             ) from error
 
     def _opened(self, name: str) -> Any:
@@ -76,33 +92,46 @@ class RealSenseSource:
             playback = self._context.load_device(name)
             playback.set_real_time(False)
             return playback
-        found = {d.get_info(self._rs.camera_info.serial_number): d for d in self._context.query_devices()}
+        found = {
+            d.get_info(self._rs.camera_info.serial_number): d for d in self._context.query_devices()
+        }
         if not found or (name and name not in found):
             have = ", ".join(found) or "none"
             raise DataError(f"realsense:{name}: no such camera; connected are: {have}")
         return found[name] if name else next(iter(found.values()))
 
     def _chosen_profiles(self) -> dict[str, tuple[Any, Any]]:
-        """Return sensor and profile of each stream: left, right, and gyro and accel where the device has them."""
-        rs, found = self._rs, dict[str, tuple[Any, Any]]()
+        """Return sensor and profile of each stream: left, right, and gyro and accel where the
+        device has them.
+        """
+        rs = self._rs
+        found = dict[str, tuple[Any, Any]]()
         for sensor in self._device.query_sensors():
             for profile in sensor.get_stream_profiles():
-                kind, index = profile.stream_type(), profile.stream_index()
+                kind = profile.stream_type()
+                index = profile.stream_index()
                 if kind == rs.stream.infrared and index in (1, 2):
                     video = profile.as_video_stream_profile()
                     form = (video.width(), video.height(), video.fps())
-                    if profile.format() == rs.format.y8 and (self._is_file or form == (_WIDTH, _HEIGHT, _RATE_HZ)):
+                    if profile.format() == rs.format.y8 and (
+                        self._is_file or form == (_WIDTH, _HEIGHT, _RATE_HZ)
+                    ):
                         found[("left", "right")[index - 1]] = sensor, profile
                 elif kind in (rs.stream.gyro, rs.stream.accel):
                     name = "gyro" if kind == rs.stream.gyro else "accel"
                     if name not in found or profile.fps() > found[name][1].fps():
                         found[name] = sensor, profile
         if not {"left", "right"} <= set(found):
-            raise DataError(f"realsense:{self._name}: no two infrared imagers; a camera of the D400 series has them")
+            raise DataError(
+                f"realsense:{self._name}: no two infrared imagers; a camera of the D400 series has "
+                "them"
+            )
         return found
 
     def _start(self, profiles: dict[str, tuple[Any, Any]]) -> None:
-        """Start each sensor with its profiles, and the infrared projector off: its dots move with the camera."""
+        """Start each sensor with its profiles, and the infrared projector off: its dots move
+        with the camera.
+        """
         by_sensor: dict[int, tuple[Any, list[Any]]] = {}
         for sensor, profile in profiles.values():
             by_sensor.setdefault(id(sensor), (sensor, []))[1].append(profile)
@@ -113,14 +142,17 @@ class RealSenseSource:
             self._sensors.append(sensor)
         playback = self._device.as_playback() if self._is_file else None
         if playback is not None:
-            playback.pause()  # else it begins with the first sensor, and the others miss its beginning
+            # else it begins with the first sensor, and the others miss its beginning
+            playback.pause()
         for sensor in self._sensors:
             sensor.start(self._take)
         if playback is not None:
             playback.resume()
 
     def _take(self, frame: Any) -> None:
-        """Note what librealsense's threads bring; a reader that is too slow loses it, but of a file nothing is lost."""
+        """Note what librealsense's threads bring; a reader that is too slow loses it, but of a
+        file nothing is lost.
+        """
         frame.keep()
         try:
             self._come.put(frame, block=self._is_file)
@@ -137,20 +169,32 @@ class RealSenseSource:
             try:
                 T_cam0_imu = _transform(profiles["accel"][1].get_extrinsics_to(left))
             except RuntimeError as error:
-                log.warning("realsense:%s: no pose of the IMU (%s); give --calibration FILE", self._name, error)
+                log.warning(
+                    "realsense:%s: no pose of the IMU (%s); give --calibration FILE",
+                    self._name,
+                    error,
+                )
         lenses = [self._lens(p.as_video_stream_profile().get_intrinsics()) for p in (left, right)]
         return Rig(lenses[0], lenses[1], _transform(left.get_extrinsics_to(right)), T_cam0_imu)
 
     def _lens(self, found: Any) -> Any:
-        K = np.array([[found.fx, 0, found.ppx], [0, found.fy, found.ppy], [0, 0, 1]], dtype=np.float64)
+        K = np.array(
+            [[found.fx, 0, found.ppx], [0, found.fy, found.ppy], [0, 0, 1]], dtype=np.float64
+        )
         name = str(found.model).rpartition(".")[2]
         if name not in _MODELS:
             if not any(found.coeffs):
                 name = "none"
             else:
-                raise DataError(f"realsense:{self._name}: its distortion {name} is not known; give --calibration FILE")
-        model, number = _MODELS[name], {"none": 0, "kannala_brandt4": 4}.get(name, 5)
-        return camera_from_matrix(K, found.width, found.height, model, found.coeffs[:number], self._name)
+                raise DataError(
+                    f"realsense:{self._name}: its distortion {name} is not known; give "
+                    "--calibration FILE"
+                )
+        model = _MODELS[name]
+        number = {"none": 0, "kannala_brandt4": 4}.get(name, 5)
+        return camera_from_matrix(
+            K, found.width, found.height, model, found.coeffs[:number], self._name
+        )
 
     # Frames
 
@@ -160,20 +204,29 @@ class RealSenseSource:
         Raises:
             DataError: nothing has come for seconds.
         """
-        rs, imu, silent_s = self._rs, ImuInterpolation(), 0.0
+        rs = self._rs
+        imu = ImuInterpolation()
+        silent_s = 0.0
         pairing: Pairing[Image] = Pairing()
         while True:
             try:
                 frame = self._come.get(timeout=_SILENT_S)
             except queue.Empty:
                 silent_s += _SILENT_S
-                if self._is_file and self._device.as_playback().current_status() == rs.playback_status.stopped:
+                if (
+                    self._is_file
+                    and self._device.as_playback().current_status() == rs.playback_status.stopped
+                ):
                     return
                 if silent_s >= _LOST_S:
-                    raise DataError(f"realsense:{self._name}: nothing for {_LOST_S:.0f} s; check the cable") from None
+                    raise DataError(
+                        f"realsense:{self._name}: nothing for {_LOST_S:.0f} s; check the cable"
+                    ) from None
                 yield None
                 continue
-            silent_s, profile, time_ns = 0.0, frame.get_profile(), round(1e6 * frame.get_timestamp())  # of ms
+            silent_s = 0.0  # of ms
+            profile = frame.get_profile()
+            time_ns = round(1e6 * frame.get_timestamp())
             if frame.is_motion_frame():
                 data = frame.as_motion_frame().get_motion_data()
                 take = imu.gyro if profile.stream_type() == rs.stream.gyro else imu.accel

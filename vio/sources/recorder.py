@@ -1,4 +1,6 @@
-"""Keeps what a live source gives as a plain folder or a ROS 2 bag, so that the run can be repeated."""
+"""Keeps what a live source gives as a plain folder or a ROS 2 bag, so that the run can be
+repeated.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,8 @@ class Recorder:
         Args:
             folder: new or empty.
             rig: calibration of the raw images.
-            form: a plain folder, which is whole up to its last frame however it ends, or a bag, which has to be closed.
+            form: a plain folder, which is whole up to its last frame however it ends, or a bag,
+                which has to be closed.
 
         Raises:
             DataError: the folder holds something, or cannot be written.
@@ -94,12 +97,16 @@ class Recorder:
         self._room.release(1)  # who waits for room is the only one, and raises with its next event
 
     def _unwritable(self, error: OSError) -> DataError:
-        return DataError(f"{self._folder}: cannot be written: {error.strerror}; check disk and rights")
+        return DataError(
+            f"{self._folder}: cannot be written: {error.strerror}; check disk and rights"
+        )
 
 
 @contextlib.contextmanager
 def _plain(folder: Path, rig: Rig) -> Iterator[Callable[[SourceEvent], None]]:
-    """Open `left/`, `right/`, `times.txt` and `imu.csv`; times and samples are written out each frame."""
+    """Open `left/`, `right/`, `times.txt` and `imu.csv`; times and samples are written out each
+    frame.
+    """
     for name in ("left",) if rig.cam1 is None else ("left", "right"):
         (folder / name).mkdir()
     with contextlib.ExitStack() as stack:
@@ -127,7 +134,9 @@ def _plain(folder: Path, rig: Rig) -> Iterator[Callable[[SourceEvent], None]]:
 
 
 @contextlib.contextmanager
-def _bag(folder: Path, storage: Literal["rosbag2", "mcap"]) -> Iterator[Callable[[SourceEvent], None]]:
+def _bag(
+    folder: Path, storage: Literal["rosbag2", "mcap"]
+) -> Iterator[Callable[[SourceEvent], None]]:
     """Open a bag with the topics of EuRoC's; the calibration is the file beside it."""
     with bag_writer(folder, storage) as bag:
 

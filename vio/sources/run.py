@@ -1,4 +1,6 @@
-"""A live source through the odometry, with recording and results, until it ends or is asked to stop."""
+"""A live source through the odometry, with recording and results, until it ends or is asked to
+stop.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def run_source(
     record_as: Form = "plain",
     map: MapUse | None = None,
     drop: Drop = "oldest",
-    on_start: Callable[[LiveOdometry, Rig], Callable[[FrameResult], None] | None] = lambda odometry, rig: None,
+    on_start: Callable[
+        [LiveOdometry, Rig], Callable[[FrameResult], None] | None
+    ] = lambda odometry, rig: None,
 ) -> LiveRun:
     """Run until the source ends or is asked to stop; then write what was asked for.
 
@@ -60,14 +64,19 @@ def run_source(
         on_start: may return what is called with each result, a viewer's.
 
     Raises:
-        VioError: there is no calibration, images do not fit it, or source, disk or estimation have failed.
+        VioError: there is no calibration, images do not fit it, or source, disk or estimation have
+            failed.
     """
     with contextlib.closing(source):
         rig = rig or source.rig
         if rig is None:
-            raise CalibrationError("this source has no calibration of its own; give --calibration FILE")
+            raise CalibrationError(
+                "this source has no calibration of its own; give --calibration FILE"
+            )
         if source.has_imu and rig.T_cam0_imu is None:
-            raise CalibrationError("the calibration has no T_cam_imu for this camera's IMU; give one that has")
+            raise CalibrationError(
+                "the calibration has no T_cam_imu for this camera's IMU; give one that has"
+            )
         if not source.has_imu:
             config = replace(config, motion="none")
             rig = replace(rig, T_cam0_imu=None)
@@ -80,7 +89,9 @@ def run_source(
                 watcher(result)
 
         samples = 0
-        with LiveOdometry(rig, config, on_frame=on_frame, map=map, drop=drop, copy_images=False) as odometry:
+        with LiveOdometry(
+            rig, config, on_frame=on_frame, map=map, drop=drop, copy_images=False
+        ) as odometry:
             say("warming up")
             odometry.warm_up()
             watcher = on_start(odometry, rig)

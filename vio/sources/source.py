@@ -25,17 +25,20 @@ class SourceFrame:
     right: Image | None  # None: one camera
 
 
-SourceEvent: TypeAlias = "SourceFrame | ImuSample"  # samples on the IMU's own clock as the rig states it
+# samples on the IMU's own clock as the rig states it
+SourceEvent: TypeAlias = "SourceFrame | ImuSample"
 
 
 class LiveSource(Protocol):
     """A camera, with or without an IMU."""
 
-    rig: Rig | None  # the calibration that the device has stored; None: it has none, and the user gives one
+    # the calibration that the device has stored; None: it has none, and the user gives one
+    rig: Rig | None
     has_imu: bool  # whether samples come
 
     def events(self) -> Iterator[SourceEvent | None]:
-        """Yield frames and samples as they come, each kind in order of time; None at least each second without any.
+        """Yield frames and samples as they come, each kind in order of time; None at least each
+        second without any.
 
         It ends where the source ends.
 
@@ -60,8 +63,8 @@ def open_source(name: str, layout: Layout = "side-by-side") -> LiveSource:
     """Open a source by its name.
 
     Args:
-        name: `v4l2:/dev/video0`, `video:FILE`, a URL that OpenCV opens (`rtsp://…`), `realsense:[SERIAL or FILE.bag]`,
-            `oak:[ID]`.
+        name: `v4l2:/dev/video0`, `video:FILE`, a URL that OpenCV opens (`rtsp://…`),
+            `realsense:[SERIAL or FILE.bag]`, `oak:[ID]`.
         layout: how the two images of a pair lie in one video.
 
     Raises:
@@ -71,7 +74,9 @@ def open_source(name: str, layout: Layout = "side-by-side") -> LiveSource:
     """
     scheme, colon, rest = name.partition(":")
     if not colon or scheme not in SOURCES:
-        raise ConfigError(f"{name!r} is no live source; give one of {', '.join(f'{known}:' for known in SOURCES)}")
+        raise ConfigError(
+            f"{name!r} is no live source; give one of {', '.join(f'{known}:' for known in SOURCES)}"
+        )
     module, kind = SOURCES[scheme].split(":")
     made: Callable[..., LiveSource] = getattr(import_module(f"vio.sources.{module}"), kind)
     if module == "video":
@@ -82,7 +87,8 @@ def open_source(name: str, layout: Layout = "side-by-side") -> LiveSource:
 class ImuInterpolation:
     """Holds samples of the gyro until the accelerometer has samples around them.
 
-    The accelerometer's readings are interpolated linearly; samples of the gyro before its first one are left out.
+    The accelerometer's readings are interpolated linearly; samples of the gyro before its first one
+    are left out.
     """
 
     def __init__(self) -> None:
@@ -106,7 +112,8 @@ class ImuInterpolation:
             time_ns, gyro = self._gyro.popleft()
             while len(self._accel) > 1 and self._accel[1][0] <= time_ns:
                 self._accel.popleft()
-            (t0, a0), (t1, a1) = self._accel[0], self._accel[min(1, len(self._accel) - 1)]
+            (t0, a0) = self._accel[0]
+            (t1, a1) = self._accel[min(1, len(self._accel) - 1)]
             if time_ns < t0:
                 continue
             share = (time_ns - t0) / (t1 - t0) if t1 > t0 else 0.0

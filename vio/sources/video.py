@@ -21,8 +21,8 @@ _PAUSE_S = 0.02  # between them
 class VideoSource:
     """A device, a URL or a file that OpenCV opens; see `LiveSource`.
 
-    A file's frames have the times of the file and come as fast as they are taken; those of a device or a URL have the
-    time at which they arrived, on the computer's monotonic clock.
+    A file's frames have the times of the file and come as fast as they are taken; those of a device
+    or a URL have the time at which they arrived, on the computer's monotonic clock.
     """
 
     rig: Rig | None = None  # a video has no calibration
@@ -38,7 +38,8 @@ class VideoSource:
         Raises:
             DataError: it cannot be opened.
         """
-        self._name, self._layout = name, layout
+        self._name = name
+        self._layout = layout
         self._is_file = Path(name).is_file()
         device = name.isdigit() or name.startswith("/dev/")
         if device and not name.isdigit() and not Path(name).exists():
@@ -47,7 +48,9 @@ class VideoSource:
         where = int(name) if name.isdigit() else name
         self._video = cv2.VideoCapture(where, cv2.CAP_V4L2) if device else cv2.VideoCapture(where)
         if not self._video.isOpened():
-            raise DataError(f"{name}: OpenCV cannot open it; check the name, and that no other program uses it")
+            raise DataError(
+                f"{name}: OpenCV cannot open it; check the name, and that no other program uses it"
+            )
 
     def events(self) -> Iterator[SourceEvent | None]:
         """Yield frames until the file ends.
@@ -66,23 +69,33 @@ class VideoSource:
                 failed += 1
                 if failed > _MOST_FAILED:
                     raise DataError(
-                        f"{self._name}: no image for {failed * _PAUSE_S:.0f} s; check the cable or the network"
+                        f"{self._name}: no image for {failed * _PAUSE_S:.0f} s; check the cable or "
+                        "the network"
                     )
                 time.sleep(_PAUSE_S)
                 yield None
                 continue
             failed = 0
-            stamp_ns = round(1e6 * self._video.get(cv2.CAP_PROP_POS_MSEC)) if self._is_file else arrived_ns
+            stamp_ns = (
+                round(1e6 * self._video.get(cv2.CAP_PROP_POS_MSEC)) if self._is_file else arrived_ns
+            )
             yield SourceFrame(stamp_ns, *self._halves(np.asarray(picture, dtype=np.uint8)))
 
     def _halves(self, picture: Image) -> tuple[Image, Image | None]:
         """Return the left and the right image (H, W) of a picture (H, W, 3) BGR or (H, W)."""
-        gray = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8) if picture.ndim == 3 else picture
+        gray = (
+            np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+            if picture.ndim == 3
+            else picture
+        )
         if self._layout == "single":
             return gray, None
         axis = 1 if self._layout == "side-by-side" else 0
         if gray.shape[axis] % 2:
-            raise DataError(f"{self._name}: {gray.shape[1]}x{gray.shape[0]} is no picture of two images {self._layout}")
+            raise DataError(
+                f"{self._name}: {gray.shape[1]}x{gray.shape[0]} is no picture of two images "
+                f"{self._layout}"
+            )
         left, right = (np.ascontiguousarray(half) for half in np.split(gray, 2, axis=axis))
         return left, right
 

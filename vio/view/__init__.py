@@ -1,1 +1,3 @@
-"""Runs in the rerun viewer, while they go on or from their folders; the only package that imports rerun."""
+"""Runs in the rerun viewer, while they go on or from their folders; the only package that
+imports rerun.
+"""

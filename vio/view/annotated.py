@@ -1,4 +1,6 @@
-"""One annotated image of a run: its features, coloured by their disparity, each with a stroke as long as that."""
+"""One annotated image of a run: its features, coloured by their disparity, each with a stroke as
+long as that.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,8 @@ class AnnotatedImage:
         for (u, v), long, colour, has_right in zip(
             zoom * seen.z[:, :2], zoom * disparity, colours.tolist(), seen.has_right, strict=True
         ):
-            at, colour = (round(16 * u), round(16 * v)), colour if has_right else (160, 160, 160)
+            at = (round(16 * u), round(16 * v))
+            colour = colour if has_right else (160, 160, 160)
             cv2.line(image, at, (round(16 * (u - long)), at[1]), colour, 1, cv2.LINE_AA, shift=4)
             cv2.circle(image, at, 16 * 3, colour, -1 if has_right else 1, cv2.LINE_AA, shift=4)
         if image.shape[1] >= _LEGEND_PX:
@@ -67,7 +70,9 @@ def _coloured(share: np.ndarray) -> np.ndarray:
 
     if not len(share):
         return np.zeros((0, 3), np.uint8)
-    return cv2.applyColorMap((255 * share).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO).reshape(-1, 3)
+    return cv2.applyColorMap((255 * share).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO).reshape(
+        -1, 3
+    )
 
 
 def _legend(width: int, low: float, high: float) -> np.ndarray:
@@ -79,5 +84,7 @@ def _legend(width: int, low: float, high: float) -> np.ndarray:
     bar[6:-6, scale] = _coloured(np.linspace(0, 1, scale.stop - scale.start))
     texts = ((8, "disparity (strokes: to scale)"), (scale.start - 60, f"{low:.1f} px"))
     for x, text in (*texts, (scale.stop + 8, f"{high:.0f} px")):
-        cv2.putText(bar, text, (x, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
+        cv2.putText(
+            bar, text, (x, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA
+        )
     return bar

@@ -32,7 +32,8 @@ _NOTHING_DONE = UpdateReport(0, 0, 0, 0, None, None)
 
 
 def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
-    """Show a run from its folder, with its features where they were saved, and its images where they still are.
+    """Show a run from its folder, with its features where they were saved, and its images where
+    they still are.
 
     Raises:
         DataError: the folder was written by a version that did not keep the camera.
@@ -53,7 +54,10 @@ def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
     keyframes = set(run.map_keyframes.frame[run.map_keyframes.own].tolist())
     for row, estimate in enumerate(map(estimate_of, run.estimates)):
         index = int(run.estimates["index"][row])
-        numbers = {curve: [float(run.frames[name][row]) for name in columns] for curve, columns in names.items()}
+        numbers = {
+            curve: [float(run.frames[name][row]) for name in columns]
+            for curve, columns in names.items()
+        }
         seen = None if log_of_features is None else log_of_features.observations(index)
         states = None if seen is None else states_of(seen, seen.has_right, _NOTHING_DONE)
         image = next(images, None) if row % _EVERY_IMAGE == 0 else None
@@ -66,15 +70,21 @@ def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
 
 
 def _show_mesh(stream: rr.RecordingStream, folder: Path) -> None:
-    """Show the mesh of `vio mesh`, where there is one; its file has y up, the run's world need not."""
+    """Show the mesh of `vio mesh`, where there is one; its file has y up, the run's world need
+    not.
+    """
     import rerun as rr
 
     if not (folder / MeshFile.GLTF).is_file() or not (folder / MeshFile.FACTS).is_file():
         return
     try:
-        R = np.array(json.loads(read_input(folder / MeshFile.FACTS))["R_upright_world"], dtype=np.float64)
+        R = np.array(
+            json.loads(read_input(folder / MeshFile.FACTS))["R_upright_world"], dtype=np.float64
+        )
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{folder / MeshFile.FACTS}: is damaged ({error}); repeat vio mesh") from error
+        raise DataError(
+            f"{folder / MeshFile.FACTS}: is damaged ({error}); repeat vio mesh"
+        ) from error
     stream.log("world/run/mesh", rr.Transform3D(mat3x3=(R_GLTF_UPRIGHT @ R).T), static=True)
     stream.log("world/run/mesh", rr.Asset3D(path=folder / MeshFile.GLTF), static=True)
 
@@ -84,13 +94,17 @@ def _rig_of(run: FinishedRun) -> ViewedRig:
     try:
         camera = StereoCamera(**run.metrics["camera"])
     except (KeyError, TypeError) as error:
-        raise DataError(f"{run.folder}: its metrics.json does not hold the camera; repeat the run") from error
+        raise DataError(
+            f"{run.folder}: its metrics.json does not hold the camera; repeat the run"
+        ) from error
     reference = None if run.evaluation is None else run.evaluation.reference
     return ViewedRig(camera, run.T_cam0_body, run.metrics.get("motion"), reference)
 
 
 def _images_of(run: FinishedRun, projection: Projection) -> Iterator[Image]:
-    """Yield the left images of every fifth frame of a run; none where the recording is not there any more."""
+    """Yield the left images of every fifth frame of a run; none where the recording is not there
+    any more.
+    """
     source = f"{run.metrics.get('kind')}:{run.metrics.get('source')}"
     try:
         dataset = open_dataset(source, DatasetSettings(projection=projection))
@@ -100,7 +114,11 @@ def _images_of(run: FinishedRun, projection: Projection) -> Iterator[Image]:
     if not dataset.recording.has_images:
         return
     for index in run.estimates["index"][::_EVERY_IMAGE].tolist():
-        found = [e for e in dataset.events(index, index + 1) if isinstance(e, StereoFrame) and e.left is not None]
+        found = [
+            e
+            for e in dataset.events(index, index + 1)
+            if isinstance(e, StereoFrame) and e.left is not None
+        ]
         if not found or found[0].left is None:
             return
         yield found[0].left

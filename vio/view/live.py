@@ -1,7 +1,8 @@
 """A run in the rerun viewer, frame by frame.
 
-Reference: rerun's Python SDK, https://ref.rerun.io/docs/python. Entities below `world/run` are in the world of the run,
-which `world` turns upright (`vio.geometry.upright`); pixels are those of the rectified left image.
+Reference: rerun's Python SDK, https://ref.rerun.io/docs/python. Entities below `world/run` are in
+the world of the run, which `world` turns upright (`vio.geometry.upright`); pixels are those of the
+rectified left image.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ _MARKS = ("features", "tracks_by_age")
 _OUTLINE = f"{_LEFT}/outline"  # of what a camera sees whose image is not a pinhole's
 _SIDE = 25  # points of a side of it
 _OUTLINE_BASELINES = 5.0  # distance from the camera at which it is drawn
-_SHARE = 0.08  # of the run's time that images, tracks and points may take; the rest is drawn in every frame
+# of the run's time that images, tracks and points may take; the rest is drawn in every frame
+_SHARE = 0.08
 _WIDEST_PX = 752  # images are shown at this width at most
 _JPEG_QUALITY = 75
 _CHUNK = 64  # poses of a path that are sent together; the last chunk is sent again with every pose
@@ -78,7 +80,12 @@ class RerunViewer:
     """Shows a run frame by frame."""
 
     def __init__(
-        self, stream: rr.RecordingStream, rig: ViewedRig, *, address: str | None = None, share: float = _SHARE
+        self,
+        stream: rr.RecordingStream,
+        rig: ViewedRig,
+        *,
+        address: str | None = None,
+        share: float = _SHARE,
     ) -> None:
         """Draw what does not change.
 
@@ -86,34 +93,55 @@ class RerunViewer:
             stream: of `open_stream`, or any other.
             rig: of the run.
             address: of the page, where the run is shown in a browser.
-            share: of the time since the first frame that images, tracks and points may take; 1: all of them are shown.
+            share: of the time since the first frame that images, tracks and points may take; 1: all
+                of them are shown.
         """
-        self._stream, self._rig, self._share = stream, rig, share
+        self._stream = stream
+        self._rig = rig
+        self._share = share
         self.address = address
         self._T_view_world: FloatArray | None = None
         self._start_ns: int | None = None  # of the first frame that was shown
         self._path: list[FloatArray] = []  # positions of the present chunk
         self._chunks = 0
-        self._scale = min(_WIDEST_PX / (rig.camera.width or _WIDEST_PX), 1.0)  # of the image that is shown
+        # of the image that is shown
+        self._scale = min(_WIDEST_PX / (rig.camera.width or _WIDEST_PX), 1.0)
         self._tails: dict[int, list[FloatArray]] = {}
         self._ages: dict[int, int] = {}
         self._places: dict[int, FloatArray] = {}  # positions of the keyframes of a map, by frame
         self._loops: list[list[FloatArray]] = []  # from a frame to the keyframe that it sees again
-        self._spent_s, self._began_s = 0.0, time.perf_counter()
+        self._spent_s = 0.0
+        self._began_s = time.perf_counter()
         self._layout()
 
     def frame(self, result: FrameResult) -> None:
         """Show one frame."""
-        output, report = result.output, result.report
+        output = result.output
+        report = result.report
         chosen = result.selection.chosen
         numbers: dict[str, Sequence[float | None]] = {
-            "features": [output.tracked, output.matched, int(chosen.sum()), report.used, report.gated],
+            "features": [
+                output.tracked,
+                output.matched,
+                int(chosen.sum()),
+                report.used,
+                report.gated,
+            ],
             "innovation": [report.innovation_median_px, report.nis_per_dof],
             "time": [getattr(result.log, f"{name}_ms") for name in SERIES["time"]],
         }
         states = states_of(output.observations, chosen, report)
-        self.show(result.frame.index, result.estimate, numbers, result.frame.left, output.observations, states)
-        self.places(result.frame.index, result.estimate, is_keyframe=result.is_keyframe, loops=result.loops)
+        self.show(
+            result.frame.index,
+            result.estimate,
+            numbers,
+            result.frame.left,
+            output.observations,
+            states,
+        )
+        self.places(
+            result.frame.index, result.estimate, is_keyframe=result.is_keyframe, loops=result.loops
+        )
 
     def show(
         self,
@@ -150,31 +178,46 @@ class RerunViewer:
                 self._points(seen, estimate)
             self._spent_s += time.perf_counter() - start
 
-    def places(self, index: int, estimate: Estimate, *, is_keyframe: bool, loops: Sequence[LoopEvent]) -> None:
-        """Show keyframes of a map, and its loops within this run as lines between the odometry's positions."""
+    def places(
+        self, index: int, estimate: Estimate, *, is_keyframe: bool, loops: Sequence[LoopEvent]
+    ) -> None:
+        """Show keyframes of a map, and its loops within this run as lines between the odometry's
+        positions.
+        """
         import rerun as rr
 
         if is_keyframe:
             self._places[index] = estimate.T_world_imu[:3, 3]
-            marks = rr.Points3D(list(self._places.values()), colors=_STATES["landmark"], radii=rr.Radius.ui_points(3))
+            marks = rr.Points3D(
+                list(self._places.values()),
+                colors=_STATES["landmark"],
+                radii=rr.Radius.ui_points(3),
+            )
             self._stream.log("world/run/keyframes", marks)
         for loop in loops:
-            other = "an earlier session" if loop.keyframe_frame is None else f"frame {loop.keyframe_frame}"
-            text = (
-                f"frame {loop.frame} sees the place of {other} again: {loop.inliers} features, {loop.gap_m:.3f} m off"
+            other = (
+                "an earlier session"
+                if loop.keyframe_frame is None
+                else f"frame {loop.keyframe_frame}"
             )
+            match = f"{loop.inliers} features, {loop.gap_m:.3f} m off"
+            text = f"frame {loop.frame} sees the place of {other} again: {match}"
             self._stream.log("loops", rr.TextLog(text))
             ends = [self._places[k] for k in (loop.frame, loop.keyframe_frame) if k in self._places]
             self._loops += [ends] if len(ends) == 2 else []
         if loops and self._loops:
-            lines = rr.LineStrips3D(self._loops, colors=_STATES["gated"], radii=rr.Radius.ui_points(2))
+            lines = rr.LineStrips3D(
+                self._loops, colors=_STATES["gated"], radii=rr.Radius.ui_points(2)
+            )
             self._stream.log("world/run/loops", lines)
 
     def landmarks(self, landmarks: Landmarks) -> None:
         """Show the map at the end of the run."""
         import rerun as rr
 
-        self._stream.log("world/run/landmarks", rr.Points3D(landmarks.p_world, radii=rr.Radius.ui_points(1.5)))
+        self._stream.log(
+            "world/run/landmarks", rr.Points3D(landmarks.p_world, radii=rr.Radius.ui_points(1.5))
+        )
 
     def close(self) -> None:
         """Send what is not sent yet."""
@@ -184,18 +227,25 @@ class RerunViewer:
         import rerun as rr
         import rerun.blueprint as rrb
 
-        plots = rrb.Tabs(*(rrb.TimeSeriesView(origin=f"plots/{name}", name=name) for name in SERIES))
+        plots = rrb.Tabs(
+            *(rrb.TimeSeriesView(origin=f"plots/{name}", name=name) for name in SERIES)
+        )
         camera = self._rig.camera
-        flat = (*_MARKS, "image") if camera.is_cylinder else _MARKS  # a pinhole's image is also drawn in space
+        # a pinhole's image is also drawn in space
+        flat = (*_MARKS, "image") if camera.is_cylinder else _MARKS
         in_space = ["+ $origin/**", *(f"- /{_LEFT}/{name}" for name in flat)]
         in_image = ["+ $origin/**", f"- /{_OUTLINE}"]
         views = rrb.Horizontal(
             rrb.Spatial3DView(origin="world", name="world", contents=in_space),
-            rrb.Vertical(rrb.Spatial2DView(origin=_LEFT, name="left image", contents=in_image), plots),
+            rrb.Vertical(
+                rrb.Spatial2DView(origin=_LEFT, name="left image", contents=in_image), plots
+            ),
         )
         self._stream.send_blueprint(rrb.Blueprint(views, collapse_panels=True))
         self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        legend = [rr.AnnotationInfo(k, name, colour) for k, (name, colour) in enumerate(_STATES.items())]
+        legend = [
+            rr.AnnotationInfo(k, name, colour) for k, (name, colour) in enumerate(_STATES.items())
+        ]
         self._stream.log(_LEFT, rr.AnnotationContext(legend), static=True)
         for name, series in SERIES.items():
             self._stream.log(f"plots/{name}", rr.SeriesLines(names=list(series)), static=True)
@@ -205,15 +255,24 @@ class RerunViewer:
             return
         scale = self._scale
         size = scale * np.array(_size(camera))
-        focal, centre = scale * np.array([camera.fu, camera.fv]), self._pixels(np.array([camera.cu, camera.cv]))
-        self._stream.log(_LEFT, rr.Pinhole(focal_length=focal, principal_point=centre, resolution=size), static=True)
+        focal = scale * np.array([camera.fu, camera.fv])
+        centre = self._pixels(np.array([camera.cu, camera.cv]))
+        self._stream.log(
+            _LEFT,
+            rr.Pinhole(focal_length=focal, principal_point=centre, resolution=size),
+            static=True,
+        )
 
     def _start(self, T_world_body: FloatArray) -> FloatArray:
-        """Set the upright frame from the first pose, and draw the reference from there; return `T_view_world`."""
+        """Set the upright frame from the first pose, and draw the reference from there; return
+        `T_view_world`.
+        """
         import rerun as rr
 
         view = upright_view(T_world_body[None], self._rig.T_cam0_body, self._rig.motion)
-        self._stream.log("world/run", rr.Transform3D(translation=view[:3, 3], mat3x3=view[:3, :3]), static=True)
+        self._stream.log(
+            "world/run", rr.Transform3D(translation=view[:3, 3], mat3x3=view[:3, :3]), static=True
+        )
         return view
 
     def _pose(self, estimate: Estimate) -> None:
@@ -230,12 +289,16 @@ class RerunViewer:
         path = rr.LineStrips3D([self._path], colors=_STATES["used"], radii=rr.Radius.ui_points(1.5))
         send(f"world/run/path/{self._chunks:05d}", path)
         if len(self._path) >= _CHUNK:
-            self._path, self._chunks = self._path[-1:], self._chunks + 1
+            self._path = self._path[-1:]
+            self._chunks = self._chunks + 1
         values, axes = np.linalg.eigh(rotated(T[:3, :3], estimate.covariance[:3, :3]))
         axes[:, 2] *= np.sign(np.linalg.det(axes))
         send("world/run/sigma", rr.Transform3D(translation=T[:3, 3], mat3x3=axes))
         sizes = _SIGMAS * np.sqrt(np.maximum(values, 0.0))
-        send("world/run/sigma", rr.Ellipsoids3D(half_sizes=[sizes], centers=[[0, 0, 0]], colors=[_STATES["landmark"]]))
+        send(
+            "world/run/sigma",
+            rr.Ellipsoids3D(half_sizes=[sizes], centers=[[0, 0, 0]], colors=[_STATES["landmark"]]),
+        )
 
     def _reference(self, first: Estimate) -> None:
         """Draw the reference so that it agrees with the first pose."""
@@ -244,9 +307,19 @@ class RerunViewer:
         truth = self._rig.reference
         if truth is None:
             return
-        own = "imu" if self._rig.motion == "imu" or not np.array_equal(self._rig.T_cam0_body, np.eye(4)) else "cam0"
-        poses = truth.in_imu(self._rig.T_cam0_body) if own == "imu" else truth.in_cam0(self._rig.T_cam0_body)
-        near = 0 if truth.times_ns is None else int(np.argmin(np.abs(truth.times_ns - first.time_ns)))
+        own = (
+            "imu"
+            if self._rig.motion == "imu" or not np.array_equal(self._rig.T_cam0_body, np.eye(4))
+            else "cam0"
+        )
+        poses = (
+            truth.in_imu(self._rig.T_cam0_body)
+            if own == "imu"
+            else truth.in_cam0(self._rig.T_cam0_body)
+        )
+        near = (
+            0 if truth.times_ns is None else int(np.argmin(np.abs(truth.times_ns - first.time_ns)))
+        )
         T = first.T_world_imu @ se3_inverse(poses.T_world_body[near])
         line = rr.LineStrips3D([transform_points(T, poses.positions)], colors=(120, 120, 120))
         self._stream.log("world/run/reference", line, static=True)
@@ -263,7 +336,9 @@ class RerunViewer:
             if value is not None and self._rig.motion == "imu":
                 known[name] = value.tolist()
         if estimate.stereo_field is not None:
-            known["stereo_calibration"] = (self._rig.camera.fu * estimate.stereo_field.coefficients[:3]).tolist()
+            known["stereo_calibration"] = (
+                self._rig.camera.fu * estimate.stereo_field.coefficients[:3]
+            ).tolist()
         for name, values in known.items():
             plain = [np.nan if value is None else float(value) for value in values]
             if np.isfinite(plain).any():
@@ -283,31 +358,42 @@ class RerunViewer:
 
         shown: Any = image
         if self._scale < 1:
-            shown = cv2.resize(image, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_AREA)
+            shown = cv2.resize(
+                image, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_AREA
+            )
         good, data = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         if good:
-            self._stream.log(f"{_LEFT}/image", rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg"))
+            self._stream.log(
+                f"{_LEFT}/image", rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg")
+            )
 
     def _tracks(self, seen: Observations, states: IntArray) -> None:
         import rerun as rr
 
         pixels = self._pixels(seen.z[:, :2])
-        self._stream.log(f"{_LEFT}/features", rr.Points2D(pixels, class_ids=states, radii=rr.Radius.ui_points(3)))
+        self._stream.log(
+            f"{_LEFT}/features", rr.Points2D(pixels, class_ids=states, radii=rr.Radius.ui_points(3))
+        )
         tails = [self._tails[name] for name in seen.ids.tolist()]
         long = [k for k, tail in enumerate(tails) if len(tail) > 1]
         ages = np.array([self._ages[name] for name in seen.ids[long].tolist()])
-        strips = rr.LineStrips2D([self._pixels(np.array(tails[k])) for k in long], colors=age_colours(ages))
+        strips = rr.LineStrips2D(
+            [self._pixels(np.array(tails[k])) for k in long], colors=age_colours(ages)
+        )
         self._stream.log(f"{_LEFT}/tracks_by_age", strips)
 
     def _pixels(self, pixels: FloatArray) -> FloatArray:
-        """Return pixels (..., 2) of the shown image; rerun counts from the first one's corner, we from its centre."""
+        """Return pixels (..., 2) of the shown image; rerun counts from the first one's corner,
+        we from its centre.
+        """
         return self._scale * (pixels + 0.5)
 
     def _points(self, seen: Observations, estimate: Estimate) -> None:
         """Draw the features of this frame where their stereo views see them."""
         import rerun as rr
 
-        camera, z = self._rig.camera, seen.z
+        camera = self._rig.camera
+        z = seen.z
         near = seen.has_right & (z[:, 0] - z[:, 2] > _LEAST_DISPARITY_PX)
         depth = camera.fu * camera.baseline_m / (z[near, 0] - z[near, 2])
         p_cam = left_rays(camera, z[near, :2]) * depth[:, None]
@@ -317,24 +403,33 @@ class RerunViewer:
 
 
 def _size(camera: StereoCamera) -> tuple[float, float]:
-    """Return width and height of the left image, pixels; of features alone, what the principal point suggests."""
+    """Return width and height of the left image, pixels; of features alone, what the principal
+    point suggests.
+    """
     return camera.width or 2 * camera.cu, camera.height or 2 * camera.cv
 
 
 def outline(camera: StereoCamera) -> list[FloatArray]:
-    """Return lines (N, 3) in the cam0 frame: the left image's border at depth 1, and from the camera to its corners.
+    """Return lines (N, 3) in the cam0 frame: the left image's border at depth 1, and from the
+    camera to its corners.
 
-    The border of a pinhole is a plane rectangle, that of a cylinder lies on the cylinder about the baseline.
+    The border of a pinhole is a plane rectangle, that of a cylinder lies on the cylinder about the
+    baseline.
     """
     width, height = _size(camera)
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
     share = np.linspace(0, 1, _SIDE)[:, None]
     border = np.concatenate([a + share * (b - a) for a, b in pairwise(corners)])
-    return [left_rays(camera, border), *(np.stack([np.zeros(3), ray]) for ray in left_rays(camera, corners[:4]))]
+    return [
+        left_rays(camera, border),
+        *(np.stack([np.zeros(3), ray]) for ray in left_rays(camera, corners[:4])),
+    ]
 
 
 def states_of(seen: Observations, chosen: BoolArray, report: UpdateReport) -> IntArray:
-    """Return the state (N,) of each feature as a number of `_STATES`: what the filter made of it."""
+    """Return the state (N,) of each feature as a number of `_STATES`: what the filter made of
+    it.
+    """
     names = list(_STATES)
     out = np.where(seen.has_right, names.index("stereo, not used"), names.index("left only"))
     out[chosen] = names.index("used")
@@ -344,8 +439,11 @@ def states_of(seen: Observations, chosen: BoolArray, report: UpdateReport) -> In
 
 
 def age_colours(ages: IntArray) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """Return colours (N, 3) of ages (N,) in frames, from yellow for new tracks to blue for old ones."""
+    """Return colours (N, 3) of ages (N,) in frames, from yellow for new tracks to blue for old
+    ones.
+    """
     share: FloatArray = np.clip(np.asarray(ages, dtype=np.float64) / _OLD_FRAMES, 0, 1)[:, None]
-    new, old = np.array([255.0, 214.0, 10.0]), np.array([20.0, 60.0, 200.0])
+    new = np.array([255.0, 214.0, 10.0])
+    old = np.array([20.0, 60.0, 200.0])
     colours = np.round(new + share * (old - new))
     return np.asarray(colours, dtype=np.uint8)

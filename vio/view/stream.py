@@ -22,21 +22,27 @@ _WEB_PORT = 9090
 
 
 def open_stream(where: str, name: str) -> tuple[rr.RecordingStream, str | None]:
-    """Return a stream into the viewer (`spawn`), a file (`*.rrd`) or a browser (`web`), and the address of the latter.
+    """Return a stream into the viewer (`spawn`), a file (`*.rrd`) or a browser (`web`), and the
+    address of the latter.
 
     Raises:
-        ConfigError: rerun is not installed, `where` is something else, or there is no screen for a window.
+        ConfigError: rerun is not installed, `where` is something else, or there is no screen for a
+            window.
         DataError: the file cannot be written.
     """
     try:
         import rerun as rr
     except ImportError as error:
-        raise ConfigError("--view needs rerun; install it with: pip install 'stereo-vio[view]'") from error
+        raise ConfigError(
+            "--view needs rerun; install it with: pip install 'stereo-vio[view]'"
+        ) from error
     stream = rr.RecordingStream("stereo-vio", recording_id=None)
     stream.send_recording_name(name)
     address = None
     if where == "spawn":
-        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        if sys.platform.startswith("linux") and not (
+            os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        ):
             raise ConfigError("--view: there is no screen here; use --view web, or --view FILE.rrd")
         stream.spawn()
     elif where == "web":
@@ -53,7 +59,10 @@ def open_stream(where: str, name: str) -> tuple[rr.RecordingStream, str | None]:
             raise DataError(f"{path}: cannot be written ({error.strerror})") from error
         stream.save(path)
     else:
-        raise ConfigError(f"--view {where}: takes nothing (a window), web, or a file *.rrd; write SOURCE before it")
+        raise ConfigError(
+            f"--view {where}: takes nothing (a window), web, or a file *.rrd; write SOURCE before "
+            "it"
+        )
     return stream, address
 
 

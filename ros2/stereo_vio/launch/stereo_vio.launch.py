@@ -1,4 +1,6 @@
-"""ros2 launch stereo_vio stereo_vio.launch.py left:=/cam0/image_raw right:=/cam1/image_raw imu:=/imu0."""
+"""ros2 launch stereo_vio stereo_vio.launch.py left:=/cam0/image_raw right:=/cam1/image_raw
+imu:=/imu0.
+"""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess

@@ -1,15 +1,21 @@
-"""ROS bags: ROS 1 `.bag`, ROS 2 folders, `.db3` and `.mcap` files, read with the library rosbags."""
+"""ROS bags: ROS 1 `.bag`, ROS 2 folders, `.db3` and `.mcap` files, read with the library
+rosbags.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-_ROS1, _SQLITE, _MCAP = b"#ROSBAG V", b"SQLite format 3\0", b"\x89MCAP0\r\n"
+_ROS1 = b"#ROSBAG V"
+_SQLITE = b"SQLite format 3\0"
+_MCAP = b"\x89MCAP0\r\n"
 _SUFFIXES = (".bag", ".db3", ".mcap")
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a file or folder is a ROS bag, by its beginning or by ROS 2's `metadata.yaml`."""
+    """Return whether a file or folder is a ROS bag, by its beginning or by ROS 2's
+    `metadata.yaml`.
+    """
     if path.is_dir():
         return bool(bag_files(path))
     with path.open("rb") as stream:
@@ -17,7 +23,9 @@ def is_bag(path: Path) -> bool:
 
 
 def bag_files(path: Path) -> tuple[Path, ...]:
-    """Return what is opened together: a ROS 2 folder or a file itself, or all bags of one kind of a folder by name."""
+    """Return what is opened together: a ROS 2 folder or a file itself, or all bags of one kind
+    of a folder by name.
+    """
     if not path.is_dir() or _is_ros2_folder(path):
         return (path,)
     children = sorted(path.iterdir())

@@ -1,4 +1,6 @@
-"""What goes with the images of a bag: topics, calibration, the IMU's pose, motion samples, the level of white."""
+"""What goes with the images of a bag: topics, calibration, the IMU's pose, motion samples, the
+level of white.
+"""
 
 from __future__ import annotations
 
@@ -50,9 +52,11 @@ def contents(path: Path, settings: DatasetSettings) -> Contents:
         roles, notes = choose(bag.topics, settings.topics, str(path))
         infos = tuple(info_topic(bag.topics, topic) for topic in roles.cameras)
         if settings.calibration is None and beside is None and None in infos:
-            missing, whose = roles.cameras[infos.index(None)].name, "camera's" if roles.right is None else "cameras'"
+            missing = roles.cameras[infos.index(None)].name
+            whose = "camera's" if roles.right is None else "cameras'"
             raise CalibrationError(
-                f"{path}: holds no CameraInfo for {missing}; give the {whose} calibration with --calibration FILE"
+                f"{path}: holds no CameraInfo for {missing}; give the {whose} calibration with "
+                "--calibration FILE"
             )
         index = index_bag(bag, roles, [name for name in infos if name is not None])
         size = index.left.size or _compressed_size(bag, roles.left)
@@ -60,17 +64,28 @@ def contents(path: Path, settings: DatasetSettings) -> Contents:
 
 
 def _calibration_beside(path: Path, settings: DatasetSettings) -> tuple[Path | None, list[str]]:
-    """Return the calibration file in a bag's folder where no other is named, and a note on bags that are joined."""
+    """Return the calibration file in a bag's folder where no other is named, and a note on bags
+    that are joined.
+    """
     parts = bag_files(path)
-    notes = [f"{len(parts)} bags are joined: {', '.join(part.name for part in parts)}"] if len(parts) > 1 else []
+    notes = (
+        [f"{len(parts)} bags are joined: {', '.join(part.name for part in parts)}"]
+        if len(parts) > 1
+        else []
+    )
     if settings.calibration is not None:
         return None, notes
     folders = [folder for folder in dict.fromkeys((path, *parts)) if folder.is_dir()]
-    return next((found for folder in folders if (found := find_calibration(folder)) is not None), None), notes
+    return next(
+        (found for folder in folders if (found := find_calibration(folder)) is not None), None
+    ), notes
 
 
 def _compressed_size(bag: Bag, topic: Topic) -> tuple[int, int] | None:
-    """Return width and height of the first compressed image that decodes; None: none of the first few does."""
+    """Return width and height of the first compressed image that decodes.
+
+    None: none of the first few does.
+    """
     for count, message in enumerate(bag.messages([topic.name])):
         try:
             image = decode_gray(bytes(bag.decoded(message).data), topic.name)
@@ -83,14 +98,16 @@ def _compressed_size(bag: Bag, topic: Topic) -> tuple[int, int] | None:
 
 
 def chosen_rig(found: Contents, settings: DatasetSettings) -> tuple[Rig, Path | None, list[str]]:
-    """Return the rig of the named file, else of one beside the bag, else of the CameraInfos; its file; and notes.
+    """Return the rig of the named file, else of one beside the bag, else of the CameraInfos; its
+    file; and notes.
 
     Where the calibration states no pose of the IMU, the static frames do.
 
     Raises:
         CalibrationError: there is no calibration, or it is invalid.
     """
-    named, beside = settings.calibration, found.beside
+    named = settings.calibration
+    beside = found.beside
     if named is not None or beside is None:
         return _with_static_pose(_rig(found, named), found), named, []
     try:
@@ -98,18 +115,31 @@ def chosen_rig(found: Contents, settings: DatasetSettings) -> tuple[Rig, Path | 
     except CalibrationError as error:
         if None in found.infos:
             raise
-        return _with_static_pose(_rig(found, None), found), None, [f"the bag's CameraInfo serves, as {error}"]
-    return _with_static_pose(rig, found), beside, [f"the calibration is {beside.name}, not the bag's CameraInfo"]
+        return (
+            _with_static_pose(_rig(found, None), found),
+            None,
+            [f"the bag's CameraInfo serves, as {error}"],
+        )
+    return (
+        _with_static_pose(rig, found),
+        beside,
+        [f"the calibration is {beside.name}, not the bag's CameraInfo"],
+    )
 
 
 def _rig(found: Contents, file: Path | None) -> Rig:
     """Return the rig of a calibration file; of None, that of the CameraInfos."""
-    topics, infos = found.roles.cameras, found.infos
+    topics = found.roles.cameras
+    infos = found.infos
     if file is not None:
         return load_rig(file, image_size=found.size, cameras=1 if len(topics) == 1 else 2)
-    stated = [found.index.infos[name] for name in infos if name is not None and name in found.index.infos]
+    stated = [
+        found.index.infos[name] for name in infos if name is not None and name in found.index.infos
+    ]
     if len(stated) != len(topics):
-        raise CalibrationError(f"{found.path}: no CameraInfo could be read; give --calibration FILE")
+        raise CalibrationError(
+            f"{found.path}: no CameraInfo could be read; give --calibration FILE"
+        )
     if len(set(infos)) != len(topics):
         raise CalibrationError(f"{infos[0]} belongs to both images; give --calibration FILE")
     return rig_from_camera_infos(stated, rectified=_is_rectified(topics[0]))
@@ -131,9 +161,12 @@ def _is_rectified(topic: Topic) -> bool:
     return "rect" in topic.name.removesuffix("/compressed").rsplit("/", 1)[-1]
 
 
-def motion_of(found: Contents, rig: Rig, times_ns: IntArray) -> tuple[MotionSamples[MotionSample], list[str]]:
+def motion_of(
+    found: Contents, rig: Rig, times_ns: IntArray
+) -> tuple[MotionSamples[MotionSample], list[str]]:
     """Return the samples in time order on the cameras' clock, and notes."""
-    index, roles = found.index, found.roles
+    index = found.index
+    roles = found.roles
     notes = [
         f"{count} messages of {topic} were recorded out of order and are sorted"
         for topic, count in index.disordered.items()
@@ -143,12 +176,15 @@ def motion_of(found: Contents, rig: Rig, times_ns: IntArray) -> tuple[MotionSamp
     if rig.T_cam0_imu is None and (record is not None or index.velocities):
         which = " and ".join(t.name for t in (roles.imu, roles.velocity) if t is not None)
         notes.append(
-            f"{which} cannot be used: its pose in the camera is unknown; give --calibration FILE with T_cam_imu, as "
+            f"{which} cannot be used: its pose in the camera is unknown; give --calibration FILE "
+            "with T_cam_imu, as "
             "Kalibr's camchain-imucam; images alone"
         )
         return in_time_order(), notes
     if record is not None and roles.imu is not None:
-        samples, moved = imu_on_camera_clock(record, rig, times_ns, f"{found.path}, {roles.imu.name}")
+        samples, moved = imu_on_camera_clock(
+            record, rig, times_ns, f"{found.path}, {roles.imu.name}"
+        )
         notes += [*moved, *imu_notes(record.times_ns, roles.imu.name)]
         parts.append(samples)
     if roles.velocity is not None and (speeds := index.velocity_samples()):

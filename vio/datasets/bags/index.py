@@ -1,4 +1,5 @@
-"""One pass over a bag: the stamps of its images, its inertial samples, velocities, poses, calibration and frames.
+"""One pass over a bag: the stamps of its images, its inertial samples, velocities, poses,
+calibration and frames.
 
 Nothing of an image is kept but its stamp, so memory does not grow with the images.
 """
@@ -44,10 +45,16 @@ class Stamps:
         return len(self.times_ns) > 1 and not any(self.times_ns)
 
     def ordered(self) -> tuple[IntArray, IntArray, int]:
-        """Return increasing stamps (N,), the times they were logged (N,), and how many stamps were repeated."""
+        """Return increasing stamps (N,), the times they were logged (N,), and how many stamps
+        were repeated.
+        """
         stamps = self.logged_ns if self.unstamped else self.times_ns
         times, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)
-        return times, np.array(self.logged_ns, dtype=np.int64)[first], len(self.times_ns) - len(times)
+        return (
+            times,
+            np.array(self.logged_ns, dtype=np.int64)[first],
+            len(self.times_ns) - len(times),
+        )
 
 
 @dataclass(slots=True)
@@ -60,9 +67,11 @@ class BagIndex:
     imu_frame: str = ""
     velocities: list[tuple[int, tuple[float, ...]]] = field(default_factory=list)
     poses: list[tuple[int, tuple[float, ...]]] = field(default_factory=list)  # x y z qx qy qz qw
-    moving: dict[tuple[str, str], list[tuple[int, tuple[float, ...]]]] = field(default_factory=dict)  # likewise, of /tf
+    # likewise, of /tf
+    moving: dict[tuple[str, str], list[tuple[int, tuple[float, ...]]]] = field(default_factory=dict)
     infos: dict[str, CameraInfo] = field(default_factory=dict)  # by topic
-    frames: dict[tuple[str, str], FloatArray] = field(default_factory=dict)  # T_parent_child of tf_static
+    # T_parent_child of tf_static
+    frames: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
     disordered: dict[str, int] = field(default_factory=dict)  # samples that came late, by topic
 
     def imu_record(self) -> ImuRecord | None:
@@ -80,32 +89,47 @@ class BagIndex:
         return velocity_samples(times, values[:, :3], values[:, 3:])
 
     def reference(self, *, imu: bool) -> Trajectory | None:
-        """The poses as those of the IMU, or of the left camera where there is none; None: there are none.
+        """The poses as those of the IMU, or of the left camera where there is none; None: there are
+        none.
 
         Raises:
             DataError: poses were to come from /tf, where no moving frame carries the body.
         """
         if self.moving:
             of_imu = imu and bool(self.imu_frame)
-            return self._carried((self.imu_frame if of_imu else self.left.frame_id).lstrip("/"), imu=of_imu)
+            return self._carried(
+                (self.imu_frame if of_imu else self.left.frame_id).lstrip("/"), imu=of_imu
+            )
         return _trajectory(self.poses, imu=imu)
 
     def _carried(self, body: str, *, imu: bool) -> Trajectory | None:
         """Return the poses of a frame in the parent of the moving frame that carries it."""
-        carriers = {key: T for key in self.moving if (T := self.transform(key[1], body)) is not None}
+        carriers = {
+            key: T for key in self.moving if (T := self.transform(key[1], body)) is not None
+        }
         if not carriers:
             names = ", ".join(f"{parent} to {child}" for parent, child in self.moving)
-            raise DataError(f"/tf: of its moving frames ({names}) none carries {body}; name another reference=/TOPIC")
+            raise DataError(
+                f"/tf: of its moving frames ({names}) none carries {body}; name another "
+                "reference=/TOPIC"
+            )
         key = max(carriers, key=lambda name: len(self.moving[name]))
         found = _trajectory(self.moving[key], imu=imu)
-        return None if found is None else replace(found, T_world_body=found.T_world_body @ carriers[key])
+        return (
+            None
+            if found is None
+            else replace(found, T_world_body=found.T_world_body @ carriers[key])
+        )
 
     def add_frames(self, fields: Any) -> None:
         """Take the transforms of a tf2_msgs/TFMessage as static ones."""
         for item in fields.transforms:
-            t, q = item.transform.translation, item.transform.rotation
+            t = item.transform.translation
+            q = item.transform.rotation
             R = rotation_from_quat_xyzw(np.array([q.x, q.y, q.z, q.w]))
-            parent, child = (str(name).lstrip("/") for name in (item.header.frame_id, item.child_frame_id))
+            parent, child = (
+                str(name).lstrip("/") for name in (item.header.frame_id, item.child_frame_id)
+            )
             self.frames[(parent, child)] = se3_from_parts(R, [t.x, t.y, t.z])
 
     def transform(self, target: str, source: str) -> FloatArray | None:
@@ -134,7 +158,9 @@ def _trajectory(rows: Sequence[tuple[int, tuple[float, ...]]], *, imu: bool) -> 
     norm = np.linalg.norm(q, axis=1)
     usable = norm > 0.5
     R = rotation_from_quat_xyzw(q[usable] / norm[usable, None])
-    return Trajectory(se3_from_parts(R, values[usable, :3]), times[usable], "imu" if imu else "cam0")
+    return Trajectory(
+        se3_from_parts(R, values[usable, :3]), times[usable], "imu" if imu else "cam0"
+    )
 
 
 def _sorted(rows: Sequence[tuple[int, tuple[float, ...]]]) -> tuple[IntArray, FloatArray]:
@@ -150,7 +176,9 @@ def stamp_of(fields: Any) -> int:
 
 
 def info_topic(topics: Sequence[Topic], image: Topic) -> str | None:
-    """Return the CameraInfo topic of an image topic: `camera_info` in its namespace, or in one above."""
+    """Return the CameraInfo topic of an image topic: `camera_info` in its namespace, or in one
+    above.
+    """
     known = {t.name for t in topics if t.kind == CAMERA_INFO and t.count}
     parts = image.name.split("/")
     for depth in range(len(parts) - 1, 1, -1):
@@ -166,7 +194,8 @@ def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
         DataError: the bag is damaged, or an image topic mixes encodings of different depth.
     """
     index = BagIndex()
-    cameras = tuple(zip(roles.cameras, (index.left, index.right), strict=False))  # one has no right images
+    # one has no right images
+    cameras = tuple(zip(roles.cameras, (index.left, index.right), strict=False))
     takers: dict[str, list[Callable[[Any, Message], None]]] = {
         topic.name: [partial(_image, bag, stamps, topic)] for topic, stamps in cameras
     }
@@ -184,7 +213,10 @@ def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
     for images, stamps in cameras:
         depths = {"16" in name for name in stamps.encodings}
         if len(depths) > 1:
-            raise DataError(f"{bag.path}: {images.name} mixes {', '.join(stamps.encodings)}; record one encoding")
+            raise DataError(
+                f"{bag.path}: {images.name} mixes {', '.join(stamps.encodings)}; record one "
+                "encoding"
+            )
     return index
 
 
@@ -205,25 +237,32 @@ def _image(bag: Bag, stamps: Stamps, topic: Topic, fields: Any, message: Message
         stamps.white = max(stamps.white, brightest(pixels))
 
 
-def _add(index: BagIndex, rows: list[tuple[int, tuple[float, ...]]], topic: str, row: tuple[int, Any]) -> None:
+def _add(
+    index: BagIndex, rows: list[tuple[int, tuple[float, ...]]], topic: str, row: tuple[int, Any]
+) -> None:
     if rows and row[0] < rows[-1][0]:
         index.disordered[topic] = index.disordered.get(topic, 0) + 1
     rows.append(row)
 
 
 def _imu(index: BagIndex, fields: Any, message: Message) -> None:
-    w, a = fields.angular_velocity, fields.linear_acceleration
+    w = fields.angular_velocity
+    a = fields.linear_acceleration
     values = (w.x, w.y, w.z, a.x, a.y, a.z)
     time_ns = stamp_of(fields)
     if not np.isfinite(values).all():
-        raise DataError(f"{message.topic}: the sample at {time_ns} ns is not finite ({values}); record the IMU again")
+        raise DataError(
+            f"{message.topic}: the sample at {time_ns} ns is not finite ({values}); record the IMU "
+            "again"
+        )
     index.imu_frame = index.imu_frame or str(fields.header.frame_id)
     _add(index, index.imu, message.topic, (time_ns, values))
 
 
 def _velocity(index: BagIndex, fields: Any, message: Message) -> None:
     twist = fields.twist.twist if hasattr(fields.twist, "twist") else fields.twist
-    v, w = twist.linear, twist.angular
+    v = twist.linear
+    w = twist.angular
     _add(index, index.velocities, message.topic, (stamp_of(fields), (v.x, v.y, v.z, w.x, w.y, w.z)))
 
 
@@ -231,14 +270,19 @@ def _pose(index: BagIndex, fields: Any, message: Message) -> None:
     if message.kind == TF:
         for item in fields.transforms:
             key = (str(item.header.frame_id).lstrip("/"), str(item.child_frame_id).lstrip("/"))
-            p, q = item.transform.translation, item.transform.rotation
-            index.moving.setdefault(key, []).append((stamp_of(item), (p.x, p.y, p.z, q.x, q.y, q.z, q.w)))
+            p = item.transform.translation
+            q = item.transform.rotation
+            index.moving.setdefault(key, []).append(
+                (stamp_of(item), (p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+            )
         return
     if hasattr(fields, "transform"):
-        p, q = fields.transform.translation, fields.transform.rotation
+        p = fields.transform.translation
+        q = fields.transform.rotation
     else:
         pose = fields.pose.pose if hasattr(fields.pose, "pose") else fields.pose
-        p, q = pose.position, pose.orientation
+        p = pose.position
+        q = pose.orientation
     _add(index, index.poses, message.topic, (stamp_of(fields), (p.x, p.y, p.z, q.x, q.y, q.z, q.w)))
 
 
@@ -248,7 +292,14 @@ def _info(index: BagIndex, fields: Any, message: Message) -> None:
 
 
 def camera_info_of(fields: Any, topic: str) -> CameraInfo:
-    """Return a sensor_msgs/CameraInfo; ROS 1 and ROS 2 write its matrices in capitals and in small letters."""
-    D, K, R, P = (np.array(getattr(fields, n, getattr(fields, n.upper(), None)), dtype=np.float64) for n in "dkrp")
-    size, matrices = (int(fields.width), int(fields.height)), (K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4))
+    """Return a sensor_msgs/CameraInfo.
+
+    ROS 1 and ROS 2 write its matrices in capitals and in small letters.
+    """
+    D, K, R, P = (
+        np.array(getattr(fields, n, getattr(fields, n.upper(), None)), dtype=np.float64)
+        for n in "dkrp"
+    )
+    size = (int(fields.width), int(fields.height))
+    matrices = (K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4))
     return CameraInfo(topic, *size, str(fields.distortion_model), tuple(D.tolist()), *matrices)

@@ -16,8 +16,11 @@ _BAYER = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
 _YUV = {"yuv422": "UYVY", "uyvy": "UYVY", "yuv422_yuy2": "YUY2", "yuyv": "YUY2"}
 
 
-def gray_of(fields: Any, where: str, *, compressed: bool, white: int = WHITE_16, colour: bool = False) -> Image:
-    """Return a sensor_msgs/Image or CompressedImage as gray (H, W), or in colour (H, W, 3) where it is asked for.
+def gray_of(
+    fields: Any, where: str, *, compressed: bool, white: int = WHITE_16, colour: bool = False
+) -> Image:
+    """Return a sensor_msgs/Image or CompressedImage as gray (H, W), or in colour (H, W, 3) where it
+    is asked for.
 
     Args:
         fields: the decoded message.
@@ -36,32 +39,48 @@ def gray_of(fields: Any, where: str, *, compressed: bool, white: int = WHITE_16,
 
 
 def raw_gray(fields: Any, where: str, *, colour: bool = False) -> npt.NDArray[Any]:
-    """Return the pixels of a sensor_msgs/Image as gray (H, W), or colour (H, W, 3), of its own depth."""
+    """Return the pixels of a sensor_msgs/Image as gray (H, W), or colour (H, W, 3), of its own
+    depth.
+    """
     import cv2
 
-    encoding, height, width = str(fields.encoding), int(fields.height), int(fields.width)
+    encoding = str(fields.encoding)
+    height = int(fields.height)
+    width = int(fields.width)
     bayer = encoding.startswith("bayer_")
     yuv = _YUV.get(encoding.lower())
     depth, channels = _form(encoding, where, bayer=bayer, yuv=yuv)
     dtype = np.dtype(depth).newbyteorder(">" if fields.is_bigendian else "<")
-    row, needed = int(fields.step), width * channels * dtype.itemsize
+    row = int(fields.step)
+    needed = width * channels * dtype.itemsize
     data = np.frombuffer(bytes(fields.data), dtype=np.uint8)
     if not (width > 0 and height > 0 and row >= needed and len(data) >= row * height):
         raise UnreadableImageError(
-            f"{where}: {len(data)} bytes are not {width} x {height} pixels of {encoding} in rows of {row}; the "
+            f"{where}: {len(data)} bytes are not {width} x {height} pixels of {encoding} in rows "
+            f"of {row}; the "
             "message is truncated"
         )
     rows = np.ascontiguousarray(data[: row * height].reshape(height, row)[:, :needed])
     pixels = rows.view(dtype).astype(np.dtype(depth), copy=False).reshape(height, width, channels)
     to = "RGB" if colour else "GRAY"
     if bayer:
-        return np.asarray(cv2.cvtColor(pixels[..., 0], getattr(cv2, f"COLOR_Bayer{_BAYER[encoding[6:10]]}2{to}")))
+        return np.asarray(
+            cv2.cvtColor(pixels[..., 0], getattr(cv2, f"COLOR_Bayer{_BAYER[encoding[6:10]]}2{to}"))
+        )
     if yuv is not None:
         return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_YUV2{to}_{yuv}")))
     if channels == 1:
         return pixels[..., 0]
-    name = encoding.rstrip("0123456789").upper() if not encoding[:1].isdigit() else {3: "BGR", 4: "BGRA"}[channels]
-    return pixels if name == to else np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{name}2{to}")))
+    name = (
+        encoding.rstrip("0123456789").upper()
+        if not encoding[:1].isdigit()
+        else {3: "BGR", 4: "BGRA"}[channels]
+    )
+    return (
+        pixels
+        if name == to
+        else np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{name}2{to}")))
+    )
 
 
 def _form(encoding: str, where: str, *, bayer: bool, yuv: str | None) -> tuple[str, int]:
@@ -76,4 +95,7 @@ def _form(encoding: str, where: str, *, bayer: bool, yuv: str | None) -> tuple[s
     for bits in (8, 16):
         if encoding.startswith(f"{bits}UC") and encoding[len(f"{bits}UC") :] in ("1", "3", "4"):
             return f"u{bits // 8}", int(encoding[-1])
-    raise DataError(f"{where}: images of encoding {encoding!r} are not read; use mono8, mono16, bgr8, rgb8 or bayer_*8")
+    raise DataError(
+        f"{where}: images of encoding {encoding!r} are not read; use mono8, mono16, bgr8, rgb8 or "
+        "bayer_*8"
+    )

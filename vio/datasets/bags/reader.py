@@ -26,25 +26,30 @@ from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
 from vio.records import IntArray, Recording, StereoFrame
 
-_Messages = tuple[int, list[Any]]  # of a frame: its number, and the image of each camera, decoded but for its pixels
+# of a frame: its number, and the image of each camera, decoded but for its pixels
+_Messages = tuple[int, list[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class BagDataset(ImageRecording):
-    """Implements `vio.protocols.Dataset` over the images of one or two topics; every pass streams the bag again."""
+    """Implements `vio.protocols.Dataset` over the images of one or two topics; every pass
+    streams the bag again.
+    """
 
     topics: tuple[Topic, ...]  # of the images: left, and right where there is one
     stamps_ns: tuple[IntArray, ...]  # (F,) stamps of the images of each topic, of a pair in one row
     logged_ns: IntArray  # (F,) when the bag received the first image of each frame
     white: int  # level of white of 16-bit images
-    unstamped: tuple[bool, ...]  # of each topic: the headers have no stamps, the times of logging serve
+    # of each topic: the headers have no stamps, the times of logging serve
+    unstamped: tuple[bool, ...]
 
     def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
         return readable_frames(self._load, self._messages(chosen), self.settings)
 
     def _messages(self, chosen: Sequence[int]) -> Generator[_Messages]:
         """Yield the chosen frames' messages in the order of frames, however they were recorded."""
-        frame_of = [{int(stamps[k]): k for k in chosen} for stamps in self.stamps_ns]  # each entry is taken once
+        # each entry is taken once
+        frame_of = [{int(stamps[k]): k for k in chosen} for stamps in self.stamps_ns]
         names = [topic.name for topic in self.topics]
         waiting: dict[int, list[Any]] = {}
         complete: list[_Messages] = []
@@ -53,7 +58,9 @@ class BagDataset(ImageRecording):
             for message in bag.messages(names, int(self.logged_ns[chosen].min())):
                 side = names.index(message.topic)
                 fields = bag.decoded(message)
-                k = frame_of[side].pop(message.logged_ns if self.unstamped[side] else stamp_of(fields), None)
+                k = frame_of[side].pop(
+                    message.logged_ns if self.unstamped[side] else stamp_of(fields), None
+                )
                 if k is None:
                     continue
                 waiting.setdefault(k, [None] * len(names))[side] = fields
@@ -70,11 +77,17 @@ class BagDataset(ImageRecording):
         """Decode and rectify one frame; runs in the prefetch thread."""
         index, messages = item
         images = []
-        for topic, fields, size in islice(zip(self.topics, messages, self.sizes, strict=True), self.settings.cameras):
+        for topic, fields, size in islice(
+            zip(self.topics, messages, self.sizes, strict=True), self.settings.cameras
+        ):
             where = f"{self.recording.path}, {topic.name}, frame {index}"
             try:
                 compressed = topic.kind == COMPRESSED
-                images.append(gray_of(fields, where, compressed=compressed, white=self.white, colour=self.colour))
+                images.append(
+                    gray_of(
+                        fields, where, compressed=compressed, white=self.white, colour=self.colour
+                    )
+                )
                 size.check(images[-1], Path(where))
             except UnreadableImageError as error:
                 return BadFrame(index, str(error))
@@ -87,18 +100,23 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
     Raises:
         MissingDependencyError: the package rosbags is not installed.
         DataError: the bag is damaged, its topics do not make a recording, or no images match.
-        CalibrationError: there is no calibration, it is invalid, or that of one camera states no pose of its IMU.
+        CalibrationError: there is no calibration, it is invalid, or that of one camera states no
+            pose of its IMU.
     """
     found = contents(path, settings)
-    roles, index = found.roles, found.index
+    roles = found.roles
+    index = found.index
     rig, file, rig_notes = chosen_rig(found, settings)
     if rig.cam1 is None and rig.T_cam0_imu is None and roles.imu is not None:
         raise CalibrationError(
-            f"{path}: the pose of {roles.imu.name} in the camera is unknown, and one camera needs its IMU; give "
+            f"{path}: the pose of {roles.imu.name} in the camera is unknown, and one camera needs "
+            "its IMU; give "
             "--calibration FILE with T_cam_imu (Kalibr's camchain-imucam), or record /tf_static"
         )
     stamps = (index.left, index.right)[: len(roles.cameras)]
-    stamps_ns, logged_ns, image_notes = _frames(stamps, [topic.name for topic in roles.cameras], path)
+    stamps_ns, logged_ns, image_notes = _frames(
+        stamps, [topic.name for topic in roles.cameras], path
+    )
     with naming(file or path):
         rectifier = rig.rectifier(settings.interpolation, settings.projection)
     motion, motion_notes = motion_of(found, rig, stamps_ns[0])
@@ -123,15 +141,20 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         for camera, info in zip(rig.cameras, found.infos, strict=True)
     )
     images = roles.cameras, stamps_ns, logged_ns, white, tuple(each.unstamped for each in stamps)
-    return BagDataset(recording, motion, sizes, settings, rectifier, *images, imu_noise=rig.imu_noise)
+    return BagDataset(
+        recording, motion, sizes, settings, rectifier, *images, imu_noise=rig.imu_noise
+    )
 
 
 def _frames(
     images: Sequence[Stamps], names: Sequence[str], path: Path
 ) -> tuple[tuple[IntArray, ...], IntArray, list[str]]:
-    """Return the stamps of each topic's images (F,), when the first of each frame was logged (F,), and notes."""
+    """Return the stamps of each topic's images (F,), when the first of each frame was logged
+    (F,), and notes.
+    """
     ordered = [stamps.ordered() for stamps in images]
-    times, logged = [each[0] for each in ordered], [each[1] for each in ordered]
+    times = [each[0] for each in ordered]
+    logged = [each[1] for each in ordered]
     if not all(len(each) for each in times):
         raise DataError(f"{path}: no image could be read of {' and '.join(names)}; copy it again")
     notes = [

@@ -1,4 +1,6 @@
-"""Read bags with the library rosbags: open them, list topics, stream messages, and name damage in one line."""
+"""Read bags with the library rosbags: open them, list topics, stream messages, and name damage
+in one line.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,10 @@ class Message:
 
 
 class Bag:
-    """Opened bags; use it as a context. Messages are streamed, so memory does not grow with the file."""
+    """Opened bags; use it as a context.
+
+    Messages are streamed, so memory does not grow with the file.
+    """
 
     _reader: AnyReader
 
@@ -71,7 +76,8 @@ class Bag:
         from rosbags.highlevel import AnyReader
 
         with named_damage(self.path):
-            # ROS 2 bags of before Iron carry no definitions; those of its usual types have not changed since.
+            # ROS 2 bags of before Iron carry no definitions; those of its usual types have not
+            # changed since.
             self._reader = AnyReader(bag_files(self.path), default_typestore=typestore)
             self._reader.open()
         return self
@@ -89,7 +95,8 @@ class Bag:
         return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
     def messages(self, topics: Collection[str], start_ns: int | None = None) -> Iterator[Message]:
-        """Yield the messages of some topics in the order in which they were recorded, from a time of the bag's clock.
+        """Yield the messages of some topics in the order in which they were recorded, from a time
+        of the bag's clock.
 
         Raises:
             DataError: the bag is damaged; what came before was yielded.
@@ -127,12 +134,22 @@ def named_damage(where: Path | str) -> Iterator[None]:
 
     errors = (AnyReaderError, ReaderError1, ReaderError2, SerdeError, TypesysError, apsw.Error)
     # Damaged bytes reach the parsers of headers, chunks and compression as the built-in errors.
-    builtin = (OSError, ValueError, KeyError, IndexError, EOFError, AssertionError, RuntimeError, struct.error)
+    builtin = (
+        OSError,
+        ValueError,
+        KeyError,
+        IndexError,
+        EOFError,
+        AssertionError,
+        RuntimeError,
+        struct.error,
+    )
     try:
         yield
     except (*errors, *builtin) as error:
         why = " ".join(str(error).split()) or type(error).__name__
         raise DataError(
-            f"{where}: the bag is truncated or damaged ({why[:200]}); copy it again, or repair it with ROS's own tools "
+            f"{where}: the bag is truncated or damaged ({why[:200]}); copy it again, or repair it "
+            "with ROS's own tools "
             "(rosbag reindex, ros2 bag reindex, mcap recover)"
         ) from error

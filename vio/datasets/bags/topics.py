@@ -1,4 +1,6 @@
-"""Which topics of a bag are cameras, IMU, velocities and ground truth: by type and name, or as named."""
+"""Which topics of a bag are cameras, IMU, velocities and ground truth: by type and name, or as
+named.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +12,11 @@ from vio.datasets.bags.store import Topic
 from vio.datasets.unused import listed
 from vio.errors import DataError
 
-IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO, IMU, TF = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "tf2_msgs/msg/TFMessage"
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+IMU = "sensor_msgs/msg/Imu"
+TF = "tf2_msgs/msg/TFMessage"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped")
 POSES = (
@@ -33,9 +38,15 @@ _SIDES = (
     ("image_0", "image_1"), ("0", "1"),
 )  # fmt: skip
 _TRANSPORT = "/compressed"  # what image_transport appends to the topic of the raw images
-_WHOLE = 0.9  # share of the other's messages that raw images must have, to be taken in the place of compressed ones
-_NO_GRAY = re.compile(r"depth|disparity|mask|label|semantic|thermal|theora|confidence|points", re.IGNORECASE)
-_TRUTH = re.compile(r"ground_?truth|\bgt\b|_gt|gt_|vicon|mocap|optitrack|leica|truth|vrpn", re.IGNORECASE)
+# share of the other's messages that raw images must have, to be taken in the place of compressed
+# ones
+_WHOLE = 0.9
+_NO_GRAY = re.compile(
+    r"depth|disparity|mask|label|semantic|thermal|theora|confidence|points", re.IGNORECASE
+)
+_TRUTH = re.compile(
+    r"ground_?truth|\bgt\b|_gt|gt_|vicon|mocap|optitrack|leica|truth|vrpn", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,17 +70,20 @@ def choose(topics: Sequence[Topic], named: str | None, where: str) -> tuple[Role
 
     Args:
         topics: all topics of the bag.
-        named: `left=/a,right=/b,imu=/c`, which takes the place of the choice; a role named `none` is left out.
+        named: `left=/a,right=/b,imu=/c`, which takes the place of the choice; a role named `none`
+            is left out.
         where: the bag, for messages.
 
     Raises:
-        DataError: a named topic is missing, empty or of another type, or no pair can be chosen of several image topics.
+        DataError: a named topic is missing, empty or of another type, or no pair can be chosen of
+            several image topics.
     """
     given = _named(topics, named, where)
     filled = [t for t in topics if t.count]
     notes: list[str] = []
     if "left" in given and "right" in given:
-        left, right = given["left"], given["right"]
+        left = given["left"]
+        right = given["right"]
         assert left is not None
     else:
         left, right = _cameras(filled, given, where, notes)
@@ -91,18 +105,27 @@ def _named(topics: Sequence[Topic], named: str | None, where: str) -> dict[str, 
     for part in named.split(","):
         role, equals, name = (x.strip() for x in part.partition("="))
         if role not in _ROLES or not equals or not name:
-            raise DataError(f"--topics {named!r}: {part!r} is no ROLE=/TOPIC; roles are {', '.join(_ROLES)}")
+            raise DataError(
+                f"--topics {named!r}: {part!r} is no ROLE=/TOPIC; roles are {', '.join(_ROLES)}"
+            )
         if name == "none" and role != "left":
             given[role] = None
             continue
         topic = by_name.get(name) or by_name.get(f"/{name}")
         if topic is None:
             fit = [t.name for t in topics if t.kind in _ROLES[role] and t.count]
-            raise DataError(f"{where}: holds no topic {name!r} for {role}; those of its type are {listed(fit)}")
+            raise DataError(
+                f"{where}: holds no topic {name!r} for {role}; those of its type are {listed(fit)}"
+            )
         if topic.kind not in _ROLES[role]:
-            raise DataError(f"{where}: {name} holds {topic.kind}, not {' or '.join(_ROLES[role])} as {role} must")
+            raise DataError(
+                f"{where}: {name} holds {topic.kind}, not {' or '.join(_ROLES[role])} as {role} "
+                "must"
+            )
         if not topic.count:
-            raise DataError(f"{where}: {name} ({role}) holds no message; name another topic, or another bag")
+            raise DataError(
+                f"{where}: {name} ({role}) holds no message; name another topic, or another bag"
+            )
         given[role] = topic
     return given
 
@@ -110,7 +133,10 @@ def _named(topics: Sequence[Topic], named: str | None, where: str) -> dict[str, 
 def _cameras(
     filled: Sequence[Topic], given: dict[str, Topic | None], where: str, notes: list[str]
 ) -> tuple[Topic, Topic | None]:
-    """Choose the left and right image topic; None in the place of the right one where there is one camera."""
+    """Choose the left and right image topic.
+
+    None in the place of the right one where there is one camera.
+    """
     images = [t for t in filled if t.kind in (IMAGE, COMPRESSED) and not _NO_GRAY.search(t.name)]
     left_named = given.get("left")
     cameras = images if left_named is None or left_named in images else [*images, left_named]
@@ -121,11 +147,16 @@ def _cameras(
             notes.append(f"{same} (choose with --topics left=/NAME)")
         return left_named or alone, None
     if "right" in given and given["right"] is None:
-        raise DataError(f"{where}: of {listed([t.name for t in images])}, name the camera: --topics left=/A,right=none")
+        raise DataError(
+            f"{where}: of {listed([t.name for t in images])}, name the camera: --topics "
+            "left=/A,right=none"
+        )
     if len(images) < 2:
         have = listed([t.name for t in images])
         needed = "stereo needs two" if images else "one camera needs one, stereo two"
-        raise DataError(f"{where}: holds {len(images)} image topics with messages ({have}); {needed}")
+        raise DataError(
+            f"{where}: holds {len(images)} image topics with messages ({have}); {needed}"
+        )
     by_name = {t.name: t for t in images}
     pairs = []
     for a, b in _SIDES:
@@ -143,14 +174,20 @@ def _cameras(
         best = min(_rank(left) for left, _ in pairs)
         pairs = [p for p in pairs if _rank(p[0]) == best]
     if len(pairs) != 1:
-        what = "several topics could be the pair" if pairs else "no two topics are named as left and right"
+        what = (
+            "several topics could be the pair"
+            if pairs
+            else "no two topics are named as left and right"
+        )
         names = listed([t.name for t in images])
         raise DataError(f"{where}: {what} ({names}); name them with --topics left=/A,right=/B")
     return pairs[0]
 
 
 def _one_camera(images: Sequence[Topic]) -> tuple[Topic | None, list[str]]:
-    """Return the topic of the only camera and its others, as one may be recorded raw and compressed; None: several."""
+    """Return the topic of the only camera and its others, as one may be recorded raw and
+    compressed; None: several.
+    """
     if len({t.name.removesuffix(_TRANSPORT) for t in images}) != 1:
         return None, []
     most = max(t.count for t in images)
@@ -160,17 +197,27 @@ def _one_camera(images: Sequence[Topic]) -> tuple[Topic | None, list[str]]:
 
 def _rank(topic: Topic) -> tuple[int, int, int]:
     """Raw images before rectified ones, uncompressed before compressed, gray before colour."""
-    return int("rect" in topic.name), int(topic.kind == COMPRESSED), int("color" in topic.name or "rgb" in topic.name)
+    return (
+        int("rect" in topic.name),
+        int(topic.kind == COMPRESSED),
+        int("color" in topic.name or "rgb" in topic.name),
+    )
 
 
-def _single(filled: Sequence[Topic], kinds: tuple[str, ...], role: str, left: Topic, notes: list[str]) -> Topic | None:
-    """Choose the topic of a role: the only one, or the one whose name shares most with the left camera's."""
+def _single(
+    filled: Sequence[Topic], kinds: tuple[str, ...], role: str, left: Topic, notes: list[str]
+) -> Topic | None:
+    """Choose the topic of a role: the only one, or the one whose name shares most with the left
+    camera's.
+    """
     found = [t for t in filled if t.kind in kinds]
     if len(found) < 2:
         return found[0] if found else None
     best = max(found, key=lambda t: (_shared(t.name, left.name), t.count))
     others = listed([t.name for t in found if t != best])
-    notes.append(f"{best.name} is taken as {role}; others are {others} (choose with --topics {role}=/NAME)")
+    notes.append(
+        f"{best.name} is taken as {role}; others are {others} (choose with --topics {role}=/NAME)"
+    )
     return best
 
 
@@ -181,19 +228,26 @@ def _shared(a: str, b: str) -> int:
 
 
 def _reference(filled: Sequence[Topic], notes: list[str]) -> Topic | None:
-    """Choose ground truth: a pose topic whose name states it; other poses, maybe estimates, are only reported."""
+    """Choose ground truth: a pose topic whose name states it; other poses, maybe estimates, are
+    only reported.
+    """
     poses = [t for t in filled if t.kind in (*POSES, ODOMETRY)]
     named = [t for t in poses if _TRUTH.search(t.name)]
     if named:
         return named[0]
     if poses:
-        notes.append(f"{listed([t.name for t in poses])} may be ground truth: if so, give --topics reference=/NAME")
+        notes.append(
+            f"{listed([t.name for t in poses])} may be ground truth: if so, give --topics "
+            "reference=/NAME"
+        )
     return None
 
 
 def _not_used(topics: Sequence[Topic], roles: Roles) -> list[str]:
     used = {roles.left, roles.right, roles.imu, roles.velocity, roles.reference}
     empty = [t.name for t in topics if not t.count]
-    others = [t.name for t in topics if t.count and t not in used and t.kind not in (CAMERA_INFO, TF)]
+    others = [
+        t.name for t in topics if t.count and t not in used and t.kind not in (CAMERA_INFO, TF)
+    ]
     notes = [f"topics without a message: {listed(empty)}"] if empty else []
     return [*notes, f"not used: {listed(others)}"] if others else notes

@@ -22,9 +22,11 @@ if TYPE_CHECKING:
 Storage: TypeAlias = Literal["rosbag2", "mcap"]
 
 _NAME = "recording"
-_VERSION: Literal[8] = 8  # of metadata.yaml: readers of version 9 read it, those of before do not read 9
+# of metadata.yaml: readers of version 9 read it, those of before do not read 9
+_VERSION: Literal[8] = 8
 _FLOAT32 = 7  # sensor_msgs/PointField
-_UNKNOWN = np.array([-1.0, *np.zeros(8)])  # sensor_msgs/Imu: the covariance of an orientation that is not measured
+# sensor_msgs/Imu: the covariance of an orientation that is not measured
+_UNKNOWN = np.array([-1.0, *np.zeros(8)])
 _LATCHED = ("/tf_static",)  # a subscriber gets the last message however late it comes
 
 
@@ -45,7 +47,8 @@ class BagWriter:
     """
 
     def __init__(self, writer: Writer | MessageSink, latched: Sequence[str] = ()) -> None:
-        self._writer, self._store = writer, ros2_types()
+        self._writer = writer
+        self._store = ros2_types()
         self._connections: dict[str, Any] = {}
         self._latched = (*_LATCHED, *latched)
 
@@ -53,29 +56,59 @@ class BagWriter:
         """Write a gray image (H, W)."""
         height, width = image.shape
         data = np.ascontiguousarray(image).reshape(-1)
-        self._put(topic, time_ns, "sensor_msgs/msg/Image", frame, height, width, "mono8", 0, width, data)
+        self._put(
+            topic, time_ns, "sensor_msgs/msg/Image", frame, height, width, "mono8", 0, width, data
+        )
 
-    def camera_info(self, topic: str, frame: str, time_ns: int, camera: StereoCamera, *, right: bool) -> None:
+    def camera_info(
+        self, topic: str, frame: str, time_ns: int, camera: StereoCamera, *, right: bool
+    ) -> None:
         """Write the calibration of one half of a rectified pair."""
-        P = np.column_stack([camera.K, [-camera.fu * camera.baseline_m if right else 0.0, 0.0, 0.0]])
+        P = np.column_stack(
+            [camera.K, [-camera.fu * camera.baseline_m if right else 0.0, 0.0, 0.0]]
+        )
         matrices = (np.zeros(5), camera.K.ravel(), np.eye(3).ravel(), P.ravel())
         whole = self._make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
         size = (camera.height, camera.width)
-        self._put(topic, time_ns, "sensor_msgs/msg/CameraInfo", frame, *size, "plumb_bob", *matrices, 0, 0, whole)
+        self._put(
+            topic,
+            time_ns,
+            "sensor_msgs/msg/CameraInfo",
+            frame,
+            *size,
+            "plumb_bob",
+            *matrices,
+            0,
+            0,
+            whole,
+        )
 
     def imu(self, topic: str, frame: str, sample: ImuSample) -> None:
         """Write angular rate and specific force; there is no orientation."""
         values = (self._quaternion(np.eye(3)), _UNKNOWN, self._vector(sample.gyro), np.zeros(9))
         kind = "sensor_msgs/msg/Imu"
-        self._put(topic, sample.time_ns, kind, frame, *values, self._vector(sample.accel), np.zeros(9))
+        self._put(
+            topic, sample.time_ns, kind, frame, *values, self._vector(sample.accel), np.zeros(9)
+        )
 
     def twist(self, topic: str, frame: str, sample: VelocitySample) -> None:
         """Write linear and angular velocity in the frame."""
-        twist = self._make("geometry_msgs/msg/Twist", self._vector(sample.linear), self._vector(sample.angular))
+        twist = self._make(
+            "geometry_msgs/msg/Twist", self._vector(sample.linear), self._vector(sample.angular)
+        )
         self._put(topic, sample.time_ns, "geometry_msgs/msg/TwistStamped", frame, twist)
 
-    def pose(self, topic: str, frame: str, time_ns: int, T: FloatArray, covariance: FloatArray | None = None) -> None:
-        """Write a pose (4, 4), with the covariance (6, 6) of its position and of its rotation about fixed axes."""
+    def pose(
+        self,
+        topic: str,
+        frame: str,
+        time_ns: int,
+        T: FloatArray,
+        covariance: FloatArray | None = None,
+    ) -> None:
+        """Write a pose (4, 4), with the covariance (6, 6) of its position and of its rotation
+        about fixed axes.
+        """
         if covariance is None:
             self._put(topic, time_ns, "geometry_msgs/msg/PoseStamped", frame, self._pose(T))
             return
@@ -95,18 +128,38 @@ class BagWriter:
         """Write a moving transform of /tf."""
         self._transforms("/tf", time_ns, [(parent, child, T)])
 
-    def static_transforms(self, time_ns: int, transforms: Sequence[tuple[str, str, FloatArray]]) -> None:
+    def static_transforms(
+        self, time_ns: int, transforms: Sequence[tuple[str, str, FloatArray]]
+    ) -> None:
         """Write the transforms (parent, child, T) of /tf_static as one message."""
         self._transforms("/tf_static", time_ns, transforms)
 
-    def points(self, topic: str, frame: str, time_ns: int, points: FloatArray, sigmas: FloatArray) -> None:
+    def points(
+        self, topic: str, frame: str, time_ns: int, points: FloatArray, sigmas: FloatArray
+    ) -> None:
         """Write points (M, 3) with standard deviations (M,) as a PointCloud2 of x y z sigma."""
         data = np.column_stack([points, sigmas]).astype("<f4")
         names = ("x", "y", "z", "sigma")
-        fields = [self._make("sensor_msgs/msg/PointField", name, 4 * k, _FLOAT32, 1) for k, name in enumerate(names)]
+        fields = [
+            self._make("sensor_msgs/msg/PointField", name, 4 * k, _FLOAT32, 1)
+            for k, name in enumerate(names)
+        ]
         raw = np.frombuffer(data.tobytes(), dtype=np.uint8)
         row = 16 * len(data)
-        self._put(topic, time_ns, "sensor_msgs/msg/PointCloud2", frame, 1, len(data), fields, False, 16, row, raw, True)
+        self._put(
+            topic,
+            time_ns,
+            "sensor_msgs/msg/PointCloud2",
+            frame,
+            1,
+            len(data),
+            fields,
+            False,
+            16,
+            row,
+            raw,
+            True,
+        )
 
     def odometry(
         self,
@@ -133,9 +186,13 @@ class BagWriter:
         motion = self._make("geometry_msgs/msg/TwistWithCovariance", motion, spread.ravel())
         self._put(topic, time_ns, "nav_msgs/msg/Odometry", frames[0], frames[1], pose, motion)
 
-    def diagnostics(self, name: str, time_ns: int, level: int, text: str, values: Mapping[str, str]) -> None:
+    def diagnostics(
+        self, name: str, time_ns: int, level: int, text: str, values: Mapping[str, str]
+    ) -> None:
         """Write the state of a part on /diagnostics: level 0 is fine, 1 a warning, 2 an error."""
-        pairs = [self._make("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
+        pairs = [
+            self._make("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()
+        ]
         status = self._make("diagnostic_msgs/msg/DiagnosticStatus", level, name, text, "", pairs)
         self._put("/diagnostics", time_ns, "diagnostic_msgs/msg/DiagnosticArray", "", [status])
 
@@ -143,11 +200,22 @@ class BagWriter:
         """Write a message without content."""
         self._write(topic, 0, self._make("std_msgs/msg/Empty"))
 
-    def _transforms(self, topic: str, time_ns: int, transforms: Sequence[tuple[str, str, FloatArray]]) -> None:
+    def _transforms(
+        self, topic: str, time_ns: int, transforms: Sequence[tuple[str, str, FloatArray]]
+    ) -> None:
         items = []
         for parent, child, T in transforms:
-            moved = self._make("geometry_msgs/msg/Transform", self._vector(T[:3, 3]), self._quaternion(T[:3, :3]))
-            items.append(self._make("geometry_msgs/msg/TransformStamped", self._header(time_ns, parent), child, moved))
+            moved = self._make(
+                "geometry_msgs/msg/Transform", self._vector(T[:3, 3]), self._quaternion(T[:3, :3])
+            )
+            items.append(
+                self._make(
+                    "geometry_msgs/msg/TransformStamped",
+                    self._header(time_ns, parent),
+                    child,
+                    moved,
+                )
+            )
         self._write(topic, time_ns, self._make("tf2_msgs/msg/TFMessage", items))
 
     def _put(self, topic: str, time_ns: int, kind: str, frame: str, *values: Any) -> None:
@@ -162,7 +230,8 @@ class BagWriter:
                 topic, kind, typestore=self._store, offered_qos_profiles=qos
             )
         data = self._store.serialize_cdr(message, kind)
-        self._writer.write(self._connections[topic], max(time_ns, 0), data)  # a bag's clock has no sign
+        # a bag's clock has no sign
+        self._writer.write(self._connections[topic], max(time_ns, 0), data)
 
     def _make(self, kind: str, *values: Any) -> Any:
         return self._store.types[kind](*values)
@@ -178,11 +247,20 @@ class BagWriter:
         return self._vector(quat_xyzw_from_rotation(R), "Quaternion")
 
     def _pose(self, T: FloatArray) -> Any:
-        return self._make("geometry_msgs/msg/Pose", self._vector(T[:3, 3], "Point"), self._quaternion(T[:3, :3]))
+        return self._make(
+            "geometry_msgs/msg/Pose", self._vector(T[:3, 3], "Point"), self._quaternion(T[:3, :3])
+        )
 
 
 def _latched_qos() -> Any:
-    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+    from rosbags.interfaces import (
+        Qos,
+        QosDurability,
+        QosHistory,
+        QosLiveliness,
+        QosReliability,
+        QosTime,
+    )
 
     forever = QosTime(2147483647, 4294967295)
     last = QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL
@@ -190,8 +268,11 @@ def _latched_qos() -> Any:
 
 
 @contextlib.contextmanager
-def bag_writer(folder: Path, storage: Storage, *, latched: Sequence[str] = ()) -> Iterator[BagWriter]:
-    """Open a new bag in an existing folder: `metadata.yaml` and `recording.db3` or `recording.mcap`.
+def bag_writer(
+    folder: Path, storage: Storage, *, latched: Sequence[str] = ()
+) -> Iterator[BagWriter]:
+    """Open a new bag in an existing folder: `metadata.yaml` and `recording.db3` or
+    `recording.mcap`.
 
     Args:
         folder: without a bag.
@@ -217,4 +298,6 @@ def bag_writer(folder: Path, storage: Storage, *, latched: Sequence[str] = ()) -
             shutil.move(file, folder / file.name)
         inner.rmdir()
     except (apsw.Error, WriterError) as error:
-        raise DataError(f"cannot write the bag {folder}: {error}; check the disk's free space") from error
+        raise DataError(
+            f"cannot write the bag {folder}: {error}; check the disk's free space"
+        ) from error

@@ -1,4 +1,6 @@
-"""Calibration files as a `Rig`: Kalibr, EuRoC, KITTI, OpenCV, ROS CameraInfo and BoofCV, detected from the content."""
+"""Calibration files as a `Rig`: Kalibr, EuRoC, KITTI, OpenCV, ROS CameraInfo and BoofCV,
+detected from the content.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,12 @@ from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
 from vio.datasets.kitti import read_calibration, read_extrinsics
 from vio.datasets.kitti_raw import CAMERAS, read_cam_to_cam, read_imu_pose
 from vio.datasets.rigs.boofcv import is_boofcv, read_boofcv
-from vio.datasets.rigs.camera_info import is_camera_info, pair_of_files, read_camera_info, rig_from_camera_infos
+from vio.datasets.rigs.camera_info import (
+    is_camera_info,
+    pair_of_files,
+    read_camera_info,
+    rig_from_camera_infos,
+)
 from vio.datasets.rigs.kalibr import is_camchain, read_camchain
 from vio.datasets.rigs.opencv import is_opencv, read_entries, rig_from_opencv
 from vio.datasets.yaml_files import read_yaml_file
@@ -25,11 +32,14 @@ from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 __all__ = ["find_calibration", "kitti_rig", "load_rig"]
 
 Size = tuple[int, int]
-_OFF_AXIS_NOTE_M = 1e-3  # by which KITTI's right camera may be off the left one's x axis before it is noted
+# by which KITTI's right camera may be off the left one's x axis before it is noted
+_OFF_AXIS_NOTE_M = 1e-3
 
 KNOWN = (
-    "Kalibr's camchain.yaml or camchain-imucam.yaml, EuRoC's sensor.yaml (mav0), KITTI's calib.txt or "
-    "calib_cam_to_cam.txt, OpenCV's stereo .yml or .xml (M1 D1 M2 D2 R T), ROS's left.yaml and right.yaml, or BoofCV's "
+    "Kalibr's camchain.yaml or camchain-imucam.yaml, EuRoC's sensor.yaml (mav0), KITTI's calib.txt "
+    "or "
+    "calib_cam_to_cam.txt, OpenCV's stereo .yml or .xml (M1 D1 M2 D2 R T), ROS's left.yaml and "
+    "right.yaml, or BoofCV's "
     "stereo.xml"
 )
 # File names looked for in a folder, in this order; the content decides what they are.
@@ -41,20 +51,26 @@ _IN_FOLDER = (
 
 
 def load_rig(
-    path: str | os.PathLike[str], *, image_size: Size | None = None, cameras: Literal[1, 2] | None = None
+    path: str | os.PathLike[str],
+    *,
+    image_size: Size | None = None,
+    cameras: Literal[1, 2] | None = None,
 ) -> Rig:
-    """Read the calibration of one camera or of a stereo pair; the format is detected from the content.
+    """Read the calibration of one camera or of a stereo pair; the format is detected from the
+    content.
 
     Args:
         path: a calibration file, or a folder that holds one.
-        image_size: width and height of the images in pixels, for formats that do not state it (KITTI's calib.txt,
-            OpenCV). With KITTI's calib_cam_to_cam.txt, the size decides between the raw and the rectified cameras.
-        cameras: 1: of a pair, the left camera alone; 2: a pair; None: whichever the calibration holds.
+        image_size: width and height of the images in pixels, for formats that do not state it
+            (KITTI's calib.txt, OpenCV). With KITTI's calib_cam_to_cam.txt, the size decides between
+            the raw and the rectified cameras.
+        cameras: 1: of a pair, the left camera alone; 2: a pair; None: whichever the calibration
+            holds.
 
     Raises:
-        CalibrationError: there is no calibration of a known format, an entry is missing or impossible, the image size
-            is neither stated nor given, or there is one camera of the two asked for; the message names file, entry and
-            remedy.
+        CalibrationError: there is no calibration of a known format, an entry is missing or
+            impossible, the image size is neither stated nor given, or there is one camera of the
+            two asked for; the message names file, entry and remedy.
     """
     file = Path(path)
     if not file.exists():
@@ -67,7 +83,8 @@ def load_rig(
     rig = _read(file, image_size, cameras)
     if cameras == 2 and rig.cam1 is None:
         raise CalibrationError(
-            f"{file}: is the calibration of one camera; name the pair left.yaml and right.yaml (ROS), or add cam1 and "
+            f"{file}: is the calibration of one camera; name the pair left.yaml and right.yaml "
+            "(ROS), or add cam1 and "
             "its pose (Kalibr)"
         )
     return rig.left_alone() if cameras == 1 else rig
@@ -92,7 +109,11 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
     if suffix == ".txt":
         return kitti_rig(path, image_size)[0]
     if suffix == ".xml":
-        return read_boofcv(path) if is_boofcv(path) else rig_from_opencv(read_entries(path), str(path), image_size)
+        return (
+            read_boofcv(path)
+            if is_boofcv(path)
+            else rig_from_opencv(read_entries(path), str(path), image_size)
+        )
     entries = read_yaml_file(path, "the cameras' calibration")
     if is_camchain(entries):
         return read_camchain(path)
@@ -108,9 +129,12 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
 
 
 def _euroc(path: Path, cameras: int | None) -> Rig:
-    """Read EuRoC's `cam0/sensor.yaml`, `cam1/sensor.yaml` and, where it is beside them, `imu0/sensor.yaml`."""
+    """Read EuRoC's `cam0/sensor.yaml`, `cam1/sensor.yaml` and, where it is beside them,
+    `imu0/sensor.yaml`.
+    """
     mav = path.parent.parent
-    T_body_imu, noise = np.eye(4), None
+    T_body_imu = np.eye(4)
+    noise = None
     if (imu := mav / "imu0" / "sensor.yaml").is_file():
         T_body_imu, noise = read_imu_yaml(imu)
     if cameras == 1 or (cameras is None and not (mav / "cam1" / "sensor.yaml").is_file()):
@@ -124,8 +148,11 @@ def _euroc(path: Path, cameras: int | None) -> Rig:
         return Rig(cam0, cam1, se3_inverse(T_imu_cam1) @ T_imu_cam0, se3_inverse(T_imu_cam0), noise)
 
 
-def kitti_rig(path: Path, image_size: Size | None, cameras: tuple[int, int] | None = None) -> tuple[Rig, FloatArray]:
-    """Return KITTI's `calib.txt`, with `T_cam0_imu.txt` beside it, and `T_left_cam0` (4, 4) from KITTI's camera 0.
+def kitti_rig(
+    path: Path, image_size: Size | None, cameras: tuple[int, int] | None = None
+) -> tuple[Rig, FloatArray]:
+    """Return KITTI's `calib.txt`, with `T_cam0_imu.txt` beside it, and `T_left_cam0` (4, 4) from
+    KITTI's camera 0.
 
     Args:
         path: the file.
@@ -140,25 +167,36 @@ def kitti_rig(path: Path, image_size: Size | None, cameras: tuple[int, int] | No
     calibration = read_calibration(path, cameras)
     if image_size is None:
         raise CalibrationError(f"{path}: states no image size; pass image_size=(W, H)")
-    c, T_cam0_imu = calibration.camera, read_extrinsics(path.with_name("T_cam0_imu.txt"))
+    c = calibration.camera
+    T_cam0_imu = read_extrinsics(path.with_name("T_cam0_imu.txt"))
     T_left_imu = None if T_cam0_imu is None else calibration.T_left_cam0 @ T_cam0_imu
     with naming(path):
-        rig = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, *image_size, T_cam0_imu=T_left_imu)
+        rig = Rig.rectified(
+            c.fu, c.fv, c.cu, c.cv, c.baseline_m, *image_size, T_cam0_imu=T_left_imu
+        )
     if calibration.off_axis_m > _OFF_AXIS_NOTE_M:
-        off_axis = f"is {1e3 * calibration.off_axis_m:.1f} mm off the x axis of that of image_{cameras[0]}"
-        note = f"the camera of image_{cameras[1]} {off_axis}; the pair is treated as rectified anyway"
+        off_axis = (
+            f"is {1e3 * calibration.off_axis_m:.1f} mm off the x axis of that of image_{cameras[0]}"
+        )
+        note = (
+            f"the camera of image_{cameras[1]} {off_axis}; the pair is treated as rectified anyway"
+        )
         rig = rig.noting(note)
     return rig, calibration.T_left_cam0
 
 
 def _kitti_raw(path: Path, image_size: Size | None) -> Rig:
-    """Read `calib_cam_to_cam.txt`: the raw gray pair, or KITTI's rectified one where the images have its size."""
+    """Read `calib_cam_to_cam.txt`: the raw gray pair, or KITTI's rectified one where the images
+    have its size.
+    """
     c = read_cam_to_cam(path)
     T_cam0_imu, notes = read_imu_pose(path.parent)
-    raw, rectified = (c.cam0.width, c.cam0.height), (c.rect0.width, c.rect0.height)
+    raw = (c.cam0.width, c.cam0.height)
+    rectified = (c.rect0.width, c.rect0.height)
     if image_size is not None and image_size not in (raw, rectified):
         raise CalibrationError(
-            f"{path}: is for images of {raw[0]} x {raw[1]} (raw) or {rectified[0]} x {rectified[1]} (rectified), not "
+            f"{path}: is for images of {raw[0]} x {raw[1]} (raw) or {rectified[0]} x "
+            f"{rectified[1]} (rectified), not "
             f"{image_size[0]} x {image_size[1]} pixels; give the calibration of these images"
         )
     with naming(path):

@@ -1,4 +1,6 @@
-"""BoofCV's stereo calibration in XML (`stereo.xml`): pinhole with radial distortion, `rightToLeft` in metres."""
+"""BoofCV's stereo calibration in XML (`stereo.xml`): pinhole with radial distortion,
+`rightToLeft` in metres.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +32,13 @@ def read_boofcv(path: Path) -> Rig:
         CalibrationError: an entry is missing or impossible.
     """
     root = read_xml(path)
-    cam0, cam1 = (_camera(_child(root, name, path), f"{path}, {name}") for name in ("left", "right"))
+    cam0, cam1 = (
+        _camera(_child(root, name, path), f"{path}, {name}") for name in ("left", "right")
+    )
     pose = _child(root, "rightToLeft", path)
-    R = _numbers([d.text for d in _child(_child(pose, "r", path), "data", path)], 9, f"{path}, r").reshape(3, 3)
+    R = _numbers(
+        [d.text for d in _child(_child(pose, "r", path), "data", path)], 9, f"{path}, r"
+    ).reshape(3, 3)
     t = _numbers([_child(pose, "t", path).findtext(axis) for axis in "xyz"], 3, f"{path}, t")
     T_cam0_cam1 = checked_transform(np.column_stack([R, t]), f"{path}, rightToLeft")
     with naming(path):
@@ -41,7 +47,9 @@ def read_boofcv(path: Path) -> Rig:
 
 def _camera(block: ElementTree.Element, where: str) -> CameraModel:
     fx, fy, cx, cy, skew, width, height = _numbers(
-        [block.findtext(name) for name in ("fx", "fy", "cx", "cy", "skew", "width", "height")], 7, where
+        [block.findtext(name) for name in ("fx", "fy", "cx", "cy", "skew", "width", "height")],
+        7,
+        where,
     )
     radial = [d.text for d in block.findall("radial/double")]
     k = [*_numbers(radial, len(radial), f"{where}, radial"), 0.0, 0.0, 0.0][:3]
@@ -56,12 +64,16 @@ def _camera(block: ElementTree.Element, where: str) -> CameraModel:
 def _child(parent: ElementTree.Element, name: str, path: Path) -> ElementTree.Element:
     found = parent.find(name)
     if found is None:
-        raise CalibrationError(f"{path}: has no entry <{name}> in <{parent.tag}>; copy the calibration again")
+        raise CalibrationError(
+            f"{path}: has no entry <{name}> in <{parent.tag}>; copy the calibration again"
+        )
     return found
 
 
 def _numbers(texts: list[str | None], count: int, where: str) -> FloatArray:
     values = np.array([as_number(text) for text in texts])
     if len(values) != count or not np.isfinite(values).all():
-        raise CalibrationError(f"{where}: expected {count} finite numbers; copy the calibration again")
+        raise CalibrationError(
+            f"{where}: expected {count} finite numbers; copy the calibration again"
+        )
     return values

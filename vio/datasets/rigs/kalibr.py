@@ -1,7 +1,7 @@
 """Kalibr's results: `camchain.yaml`, `camchain-imucam.yaml`, and the `imu.yaml` beside them.
 
-`T_cn_cnm1` maps coordinates of the camera before to this one, `T_cam_imu` those of the IMU to the camera; times of the
-IMU are `t_imu = t_cam + timeshift_cam_imu`.
+`T_cn_cnm1` maps coordinates of the camera before to this one, `T_cam_imu` those of the IMU to the
+camera; times of the IMU are `t_imu = t_cam + timeshift_cam_imu`.
 Reference: the page "yaml formats" of Kalibr's documentation.
 """
 
@@ -16,14 +16,23 @@ import yaml
 
 from vio.cameras.rig import Rig
 from vio.datasets.common import image_size, naming
-from vio.datasets.yaml_files import Entries, imu_densities, lens_model, matrix, numbers, read_yaml_file, section
+from vio.datasets.yaml_files import (
+    Entries,
+    imu_densities,
+    lens_model,
+    matrix,
+    numbers,
+    read_yaml_file,
+    section,
+)
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
 from vio.records import ImuDensities
 
 _LEADING = {"pinhole": 0, "omni": 1, "ds": 2}  # parameters of the projection before fu fv cu cv
-_SAME_M, _SAME_RAD = 2e-3, 5e-3  # how far the two statements of the stereo pose may be apart before it is said
+_SAME_M = 2e-3  # how far the two statements of the stereo pose may be apart before it is said
+_SAME_RAD = 5e-3
 
 
 def is_camchain(entries: Entries) -> bool:
@@ -35,14 +44,18 @@ def is_camchain(entries: Entries) -> bool:
 def read_camchain(path: Path) -> Rig:
     """Read a camchain of one camera or two and, beside it, the IMU's file.
 
-    A depth camera's `depth_factor`, levels per metre, is no entry of Kalibr's and may be added to cam0.
+    A depth camera's `depth_factor`, levels per metre, is no entry of Kalibr's and may be added to
+    cam0.
 
     Raises:
-        CalibrationError: an entry is missing or impossible, or a model is not known; the message names it.
+        CalibrationError: an entry is missing or impossible, or a model is not known; the message
+            names it.
     """
     entries = read_yaml_file(path, "Kalibr's calibration of the cameras")
     if not is_camchain(entries):
-        raise CalibrationError(f"{path}: is no camchain of Kalibr; it must hold the block cam0 and, for stereo, cam1")
+        raise CalibrationError(
+            f"{path}: is no camchain of Kalibr; it must hold the block cam0 and, for stereo, cam1"
+        )
     names = [name for name in ("cam0", "cam1") if name in entries]
     blocks = [section(entries, name, str(path)) for name in names]
     where = [f"{path}, {name}" for name in names]
@@ -54,47 +67,77 @@ def read_camchain(path: Path) -> Rig:
     if further := sorted(name for name in entries if name.startswith("cam") and name not in names):
         notes.append(f"{path}: {' and '.join(names)} are used, {', '.join(further)} not")
     noise, imu_notes = _imu_beside(path)
-    offset_s, residual_px = _time_shift(blocks, where), _residual(blocks[-1], where[-1])
-    factor = numbers(blocks[0], "depth_factor", where[0], 1)[0] if "depth_factor" in blocks[0] else None
+    offset_s = _time_shift(blocks, where)
+    residual_px = _residual(blocks[-1], where[-1])
+    factor = (
+        numbers(blocks[0], "depth_factor", where[0], 1)[0] if "depth_factor" in blocks[0] else None
+    )
     with naming(path):
         notes += imu_notes
-        return Rig(cameras[0], cam1, T_cam1_cam0, T_cam0_imu, noise, offset_s, tuple(notes), residual_px, factor)
+        return Rig(
+            cameras[0],
+            cam1,
+            T_cam1_cam0,
+            T_cam0_imu,
+            noise,
+            offset_s,
+            tuple(notes),
+            residual_px,
+            factor,
+        )
 
 
-def _stereo_pose(right: Mapping[str, Any], T_cam0_imu: FloatArray | None, path: Path, notes: list[str]) -> FloatArray:
-    """Return `T_cam1_cam0` (4, 4) as stated, or by way of the IMU; add a note where both are stated and disagree."""
+def _stereo_pose(
+    right: Mapping[str, Any], T_cam0_imu: FloatArray | None, path: Path, notes: list[str]
+) -> FloatArray:
+    """Return `T_cam1_cam0` (4, 4) as stated, or by way of the IMU; add a note where both are
+    stated and disagree.
+    """
     where = f"{path}, cam1"
-    T_cam1_imu, T_cam1_cam0 = _pose(right, "T_cam_imu", where), _pose(right, "T_cn_cnm1", where)
+    T_cam1_imu = _pose(right, "T_cam_imu", where)
+    T_cam1_cam0 = _pose(right, "T_cn_cnm1", where)
     if T_cam0_imu is not None and T_cam1_imu is not None:
         through_imu = T_cam1_imu @ se3_inverse(T_cam0_imu)
         if T_cam1_cam0 is None:
             return through_imu
         if _apart(T_cam1_cam0, through_imu):
-            notes.append(f"{path}: T_cn_cnm1 of cam1 and the T_cam_imu of both cameras disagree; T_cn_cnm1 is used")
+            notes.append(
+                f"{path}: T_cn_cnm1 of cam1 and the T_cam_imu of both cameras disagree; T_cn_cnm1 "
+                "is used"
+            )
     if T_cam1_cam0 is None:
-        raise CalibrationError(f"{path}: states no pose of cam1; add T_cn_cnm1 to cam1, or T_cam_imu to both cameras")
+        raise CalibrationError(
+            f"{path}: states no pose of cam1; add T_cn_cnm1 to cam1, or T_cam_imu to both cameras"
+        )
     return T_cam1_cam0
 
 
 def _camera(block: Mapping[str, Any], where: str) -> CameraModel:
-    kind, bend = block.get("camera_model", "pinhole"), str(block.get("distortion_model", "none"))
+    kind = block.get("camera_model", "pinhole")
+    bend = str(block.get("distortion_model", "none"))
     if kind not in _LEADING:
-        raise CalibrationError(f"{where}: camera_model {kind!r} is not read; calibrate with {', '.join(_LEADING)}")
+        raise CalibrationError(
+            f"{where}: camera_model {kind!r} is not read; calibrate with {', '.join(_LEADING)}"
+        )
     leading = _LEADING[str(kind)]
     values = numbers(block, "intrinsics", where, leading + 4)
     fu, fv, cu, cv = values[leading:]
     model = lens_model(bend, where)
     coefficients = () if model == "pinhole" else numbers(block, "distortion_coeffs", where)
     if kind == "ds" and not any(coefficients):
-        model, coefficients = "double_sphere", values[:2]
+        model = "double_sphere"
+        coefficients = values[:2]
     elif kind == "omni" and (model == "radtan" or not any(coefficients)):
-        model, coefficients = "unified", (values[0], *(coefficients if any(coefficients) else ()))
+        model = "unified"
+        coefficients = (values[0], *(coefficients if any(coefficients) else ()))
     elif kind != "pinhole":
         raise CalibrationError(
-            f"{where}: {kind} with distortion {bend!r} is not read; calibrate {kind}-none or omni-radtan"
+            f"{where}: {kind} with distortion {bend!r} is not read; calibrate {kind}-none or "
+            "omni-radtan"
         )
     elif model == "radtan" and not any(coefficients):
-        model, coefficients = "pinhole", ()
+        model = "pinhole"
+        coefficients = ()
     width, height = image_size(numbers(block, "resolution", where, 2), f"{where}, resolution")
     with naming(where):
         return CameraModel(fu, fv, cu, cv, width, height, model, coefficients)
@@ -108,7 +151,10 @@ def _pose(block: Mapping[str, Any], key: str, where: str) -> FloatArray | None:
 
 def _apart(A: FloatArray, B: FloatArray) -> bool:
     difference = A @ se3_inverse(B)
-    return bool(np.linalg.norm(difference[:3, 3]) > _SAME_M or np.abs(difference[:3, :3] - np.eye(3)).max() > _SAME_RAD)
+    return bool(
+        np.linalg.norm(difference[:3, 3]) > _SAME_M
+        or np.abs(difference[:3, :3] - np.eye(3)).max() > _SAME_RAD
+    )
 
 
 def _time_shift(blocks: Sequence[Mapping[str, Any]], where: Sequence[str]) -> float:
@@ -122,7 +168,10 @@ def _time_shift(blocks: Sequence[Mapping[str, Any]], where: Sequence[str]) -> fl
 
 
 def _residual(right: Mapping[str, Any], where: str) -> float:
-    """Return what a calibration by `vio run` could not express, pixels; Kalibr itself states nothing of the kind."""
+    """Return what a calibration by `vio run` could not express, pixels.
+
+    Kalibr itself states nothing of the kind.
+    """
     value = numbers(right, "residual_px", where, 1)[0] if "residual_px" in right else 0.0
     if not value >= 0:
         raise CalibrationError(f"{where}: residual_px is {value:g}; it must not be negative")
@@ -137,7 +186,9 @@ def _imu_beside(path: Path) -> tuple[ImuDensities | None, tuple[str, ...]]:
             continue
         entries = read_yaml_file(file, "Kalibr's IMU noise")
         block = entries.get("imu0")  # plain, or a block for each IMU
-        noise = imu_densities({str(k): v for k, v in block.items()} if isinstance(block, dict) else entries, file)
+        noise = imu_densities(
+            {str(k): v for k, v in block.items()} if isinstance(block, dict) else entries, file
+        )
         if noise is not None:
             found.append((file, noise))
     if not found:
@@ -170,13 +221,22 @@ def kalibr_text(rig: Rig) -> str:
 
 
 def _camera_sheet(camera: CameraModel) -> dict[str, Any]:
-    """Return a camera's entries; the parameters of the sphere models are before the focal lengths."""
-    kind, bend = "pinhole", "none" if camera.model == "pinhole" else camera.model
-    leading, coefficients = list[float](), camera.coefficients
+    """Return a camera's entries; the parameters of the sphere models are before the focal
+    lengths.
+    """
+    kind = "pinhole"
+    bend = "none" if camera.model == "pinhole" else camera.model
+    leading = list[float]()
+    coefficients = camera.coefficients
     if camera.model == "double_sphere":
-        kind, bend, leading, coefficients = "ds", "none", [float(x) for x in coefficients], ()
+        kind = "ds"
+        bend = "none"
+        leading = [float(x) for x in coefficients]
+        coefficients = ()
     elif camera.model == "unified":
-        kind, bend, leading = "omni", "radtan" if len(coefficients) > 1 else "none", [float(coefficients[0])]
+        kind = "omni"
+        bend = "radtan" if len(coefficients) > 1 else "none"
+        leading = [float(coefficients[0])]
         coefficients = coefficients[1:]
     return {
         "camera_model": kind,

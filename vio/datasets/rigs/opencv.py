@@ -1,8 +1,10 @@
-"""OpenCV's stereo calibrations: FileStorage YAML or XML with the matrices of `stereoCalibrate` and `stereoRectify`.
+"""OpenCV's stereo calibrations: FileStorage YAML or XML with the matrices of `stereoCalibrate` and
+`stereoRectify`.
 
-`R` and `T` map points of the first camera to the second. Names are those of OpenCV's samples (`M1 D1 M2 D2 R T` in one
-file, or in `intrinsics.yml` and `extrinsics.yml`), of common tutorials, and of ORB-SLAM's `LEFT.K`. A file with
-`P1` and `P2` and no raw matrices describes images that are rectified already.
+`R` and `T` map points of the first camera to the second. Names are those of OpenCV's samples
+(`M1 D1 M2 D2 R T` in one file, or in `intrinsics.yml` and `extrinsics.yml`), of common tutorials,
+and of ORB-SLAM's `LEFT.K`. A file with `P1` and `P2` and no raw matrices describes images that are
+rectified already.
 """
 
 from __future__ import annotations
@@ -83,14 +85,17 @@ def rig_from_opencv(entries: Entries, where: str, image_size: tuple[int, int] | 
     for camera in rig.cameras:
         if not (0 < camera.cu < width and 0 < camera.cv < height):
             raise CalibrationError(
-                f"{where}: the principal point {camera.cu:.0f}, {camera.cv:.0f} lies outside images of {width} x "
-                f"{height} pixels; it is the calibration of images of another size: scale it, or calibrate with these"
+                f"{where}: the principal point {camera.cu:.0f}, {camera.cv:.0f} lies outside "
+                f"images of {width} x "
+                f"{height} pixels; it is the calibration of images of another size: scale it, or "
+                "calibrate with these"
             )
     baseline = float(np.linalg.norm(rig.right[1][:3, 3]))
     if baseline <= _TOO_WIDE_M:
         return rig
     return rig.noting(
-        f"{where}: the cameras are {baseline:g} m apart; where the board was measured in millimetres, T is too: divide "
+        f"{where}: the cameras are {baseline:g} m apart; where the board was measured in "
+        "millimetres, T is too: divide "
         "it by 1000, or all lengths of the run will be in that unit"
     )
 
@@ -104,15 +109,22 @@ def _raw(entries: Entries, where: str, width: int, height: int) -> Rig:
     cameras = []
     for K, key in ((K0, "D0"), (K1, "D1")):
         found = _find(entries, key)
-        D = () if found is None else tuple(np.ravel(matrix(found, None, f"{where}, {_name(entries, key)}")).tolist())
+        D = (
+            ()
+            if found is None
+            else tuple(np.ravel(matrix(found, None, f"{where}, {_name(entries, key)}")).tolist())
+        )
         if len(D) == 4 and stated is None and any(D):
             notes.append(
-                f"{where}: four coefficients without a model's name are read as k1 k2 p1 p2; for a fisheye lens add "
+                f"{where}: four coefficients without a model's name are read as k1 k2 p1 p2; for a "
+                "fisheye lens add "
                 "'distortion_model: equidistant'"
             )
         with naming(where):
             cameras.append(
-                camera_from_matrix(K, width, height, model, trimmed_coefficients(D) if model == "radtan" else D)
+                camera_from_matrix(
+                    K, width, height, model, trimmed_coefficients(D) if model == "radtan" else D
+                )
             )
     pose = _stereo_pose(entries, where)
     with naming(where):
@@ -120,19 +132,26 @@ def _raw(entries: Entries, where: str, width: int, height: int) -> Rig:
 
 
 def _stereo_pose(entries: Entries, where: str) -> FloatArray:
-    """`T_cam1_cam0` (4, 4) from R and T or, where only the rectification is given, from R1, R2 and P2."""
+    """`T_cam1_cam0` (4, 4) from R and T or, where only the rectification is given, from R1, R2
+    and P2.
+    """
     if _find(entries, "T") is not None:
         R = _required(entries, "R", None, where)
         if R.size == 3:
-            raise CalibrationError(f"{where}: R holds 3 numbers (a rotation vector); write the 3x3 matrix")
+            raise CalibrationError(
+                f"{where}: R holds 3 numbers (a rotation vector); write the 3x3 matrix"
+            )
         T = np.ravel(_required(entries, "T", None, where))
         if R.shape != (3, 3) or T.shape != (3,):
-            raise CalibrationError(f"{where}: R must be 3x3 and T hold 3 numbers, not {R.shape} and {T.shape}")
+            raise CalibrationError(
+                f"{where}: R must be 3x3 and T hold 3 numbers, not {R.shape} and {T.shape}"
+            )
         return checked_transform(np.column_stack([R, T]), f"{where}, R")
     R0, R1 = (_required(entries, key, (3, 3), where) for key in ("R0", "R1"))
     P = _required(entries, "P1", None, where)[:3, :4]
     return checked_transform(
-        np.column_stack([R1.T @ R0, R1.T @ np.linalg.solve(P[:, :3], P[:, 3])]), f"{where}, rectification"
+        np.column_stack([R1.T @ R0, R1.T @ np.linalg.solve(P[:, :3], P[:, 3])]),
+        f"{where}, rectification",
     )
 
 
@@ -140,16 +159,19 @@ def _rectified(entries: Entries, where: str, width: int, height: int) -> Rig:
     P0, P1 = (_required(entries, key, (3, 4), where) for key in ("P0", "P1"))
     with naming(where):
         if not np.allclose(P0[:, :3], P1[:, :3], rtol=1e-6):
-            raise CalibrationError("P1 and P2 differ in focal length or centre; calibrate with CALIB_ZERO_DISPARITY")
+            raise CalibrationError(
+                "P1 and P2 differ in focal length or centre; calibrate with CALIB_ZERO_DISPARITY"
+            )
         camera = camera_from_matrix(P0[:, :3], width, height, name="P1")
         baseline = -float(P1[0, 3] / P1[0, 0])
-        return Rig.rectified(camera.fu, camera.fv, camera.cu, camera.cv, baseline, width, height).noting(
-            f"{where}: holds P1 and P2 only, so the images are taken to be rectified"
-        )
+        return Rig.rectified(
+            camera.fu, camera.fv, camera.cu, camera.cv, baseline, width, height
+        ).noting(f"{where}: holds P1 and P2 only, so the images are taken to be rectified")
 
 
 def trimmed_coefficients(D: Sequence[float]) -> tuple[float, ...]:
-    """Return OpenCV's `k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 .. s4 [tx ty]]]]` without the part that is zero.
+    """Return OpenCV's `k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 .. s4 [tx ty]]]]` without the part that is
+    zero.
 
     Raises:
         CalibrationError: thin-prism or tilt terms are used, or the count is none of OpenCV's.
@@ -157,7 +179,9 @@ def trimmed_coefficients(D: Sequence[float]) -> tuple[float, ...]:
     if len(D) not in (0, 4, 5, 8, 12, 14):
         raise CalibrationError(f"{len(D)} distortion coefficients; OpenCV has 4, 5, 8, 12 or 14")
     if any(D[8:]):
-        raise CalibrationError("thin-prism or tilt coefficients are not read; calibrate without CALIB_THIN_PRISM_MODEL")
+        raise CalibrationError(
+            "thin-prism or tilt coefficients are not read; calibrate without CALIB_THIN_PRISM_MODEL"
+        )
     kept = D[:8] if any(D[5:8]) else D[:5]
     return tuple(float(d) for d in kept)
 
@@ -173,7 +197,8 @@ def _size(entries: Entries, where: str, image_size: tuple[int, int] | None) -> t
             return int(width), int(height)
     if image_size is None:
         raise CalibrationError(
-            f"{where}: states no image size; add 'image_width: W' and 'image_height: H', or pass image_size=(W, H)"
+            f"{where}: states no image size; add 'image_width: W' and 'image_height: H', or pass "
+            "image_size=(W, H)"
         )
     return image_size
 
@@ -190,7 +215,8 @@ def _required(entries: Entries, key: str, shape: tuple[int, int] | None, where: 
     value = _find(entries, key)
     if value is None:
         raise CalibrationError(
-            f"{where}: has no entry {' or '.join(_NAMES[key][:3])}; save the whole stereo calibration"
+            f"{where}: has no entry {' or '.join(_NAMES[key][:3])}; save the whole stereo "
+            "calibration"
         )
     return matrix(value, shape, f"{where}, {_name(entries, key)}")
 
@@ -219,9 +245,13 @@ def read_xml(path: Path) -> ElementTree.Element:
     try:
         text = path.read_bytes()
     except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror or error}; give a readable file") from error
+        raise CalibrationError(
+            f"cannot read {path}: {error.strerror or error}; give a readable file"
+        ) from error
     if b"<!ENTITY" in text or len(text) > 1_000_000:
-        raise CalibrationError(f"{path}: declares entities or is too large for a calibration; give the original file")
+        raise CalibrationError(
+            f"{path}: declares entities or is too large for a calibration; give the original file"
+        )
     try:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError as error:

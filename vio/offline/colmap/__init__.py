@@ -1,8 +1,9 @@
-"""Interface to COLMAP: model files, bundle adjustment, reconstruction. The only package that imports pycolmap.
+"""Interface to COLMAP: model files, bundle adjustment, reconstruction. The only package that
+imports pycolmap.
 
-Two conventions of COLMAP are converted here. Its pixels put the *corner* of the top-left pixel at (0, 0), ours its
-centre: half a pixel is added on input and subtracted on output. Its poses map the world to the camera
-(`cam_from_world`, our `T_cam_world`), ours are the inverse.
+Two conventions of COLMAP are converted here. Its pixels put the *corner* of the top-left pixel at
+(0, 0), ours its centre: half a pixel is added on input and subtracted on output. Its poses map the
+world to the camera (`cam_from_world`, our `T_cam_world`), ours are the inverse.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ try:
     import pycolmap
 except ImportError as _error:
     raise MissingDependencyError(
-        "this command needs pycolmap, which has wheels for Linux and Windows on x86-64 and macOS 14 on ARM; "
+        "this command needs pycolmap, which has wheels for Linux and Windows on x86-64 and macOS "
+        "14 on ARM; "
         "install it with: pip install 'pycolmap>=4.2'"
     ) from _error
 

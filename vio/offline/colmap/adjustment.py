@@ -12,12 +12,21 @@ from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.robust import robust_sigma
-from vio.offline.colmap.model import LEFT, RIGHT, build_model, frame_id, image_id, numbered_images, pose_rows
+from vio.offline.colmap.model import (
+    LEFT,
+    RIGHT,
+    build_model,
+    frame_id,
+    image_id,
+    numbered_images,
+    pose_rows,
+)
 from vio.offline.points import PointTracks, keep_rows, reprojection
 from vio.records import BoolArray
 
 _LEAST_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
-_GATE_SIGMAS = 5.0  # robust standard deviations beyond which rows are excluded from the second round
+# robust standard deviations beyond which rows are excluded from the second round
+_GATE_SIGMAS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +60,10 @@ def adjust(
 ) -> Adjustment:
     """Bundle-adjust keyframes and points, with fixed intrinsics and stereo extrinsics.
 
-    Two rounds: all rows with a robust loss, then from the initial values again without the outliers of the first. The
-    pose of the first keyframe is fixed. Rows of points that loops join have a standard deviation of their own in what
-    counts as an outlier: ORB's pixels are less exact than those of tracks.
+    Two rounds: all rows with a robust loss, then from the initial values again without the outliers
+    of the first. The pose of the first keyframe is fixed. Rows of points that loops join have a
+    standard deviation of their own in what counts as an outlier: ORB's pixels are less exact than
+    those of tracks.
 
     Args:
         camera: the rectified pair.
@@ -71,12 +81,19 @@ def adjust(
     progress()
     residual, ahead = reprojection(camera, first_T, replace(tracks, p_world=first_points))
     sigma_px = _sigma_px(residual, tracks.has_right, ~tracks.by_loop)
-    sigmas = np.where(tracks.by_loop, _sigma_px(residual, tracks.has_right, tracks.by_loop), sigma_px)
+    sigmas = np.where(
+        tracks.by_loop, _sigma_px(residual, tracks.has_right, tracks.by_loop), sigma_px
+    )
     good = ahead & (np.abs(residual).max(axis=1) < _GATE_SIGMAS * sigmas)
     start = keep_rows(tracks, good)
     if not len(start.ids):
-        raise EstimationError("not observable because no track is consistent over the keyframes; check the run's poses")
-    T, points = _solve(camera, T_world_cam0, start, priors, 2 * sigma_px, threads, sigma_px=sigma_px)
+        raise EstimationError(
+            "not observable because no track is consistent over the keyframes; check the run's "
+            "poses"
+        )
+    T, points = _solve(
+        camera, T_world_cam0, start, priors, 2 * sigma_px, threads, sigma_px=sigma_px
+    )
     progress()
     done = replace(start, p_world=points)
     after, _ = reprojection(camera, T, done)
@@ -123,18 +140,30 @@ def _solve(
         adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
     else:
         adjuster = pycolmap.create_pose_prior_bundle_adjuster(
-            options, pycolmap.PosePriorBundleAdjustmentOptions(), config, _pose_priors(model, priors, sigma_px), model
+            options,
+            pycolmap.PosePriorBundleAdjustmentOptions(),
+            config,
+            _pose_priors(model, priors, sigma_px),
+            model,
         )
     solve(adjuster)
-    T_cam0_world = np.array([pose_rows(model.frame(frame_id(k)).rig_from_world) for k in range(count)])
+    T_cam0_world = np.array(
+        [pose_rows(model.frame(frame_id(k)).rig_from_world) for k in range(count)]
+    )
     points = np.array([model.point3D(m + 1).xyz for m in range(len(tracks.ids))])
     return se3_inverse(T_cam0_world), points
 
 
-def _pose_priors(model: pycolmap.Reconstruction, priors: PositionPriors, sigma_px: float) -> list[pycolmap.PosePrior]:
-    """Return a prior for each keyframe's left image; covariances are scaled to pixels of unit weight."""
+def _pose_priors(
+    model: pycolmap.Reconstruction, priors: PositionPriors, sigma_px: float
+) -> list[pycolmap.PosePrior]:
+    """Return a prior for each keyframe's left image; covariances are scaled to pixels of unit
+    weight.
+    """
     out = []
-    for k, (position, covariance) in enumerate(zip(priors.positions, priors.covariances, strict=True)):
+    for k, (position, covariance) in enumerate(
+        zip(priors.positions, priors.covariances, strict=True)
+    ):
         out.append(
             pycolmap.PosePrior(
                 pose_prior_id=k + 1,
@@ -160,7 +189,9 @@ def adjustment_config(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustme
 def solver_options(loss_px: float, threads: int) -> pycolmap.BundleAdjustmentOptions:
     """Return options with a soft-L1 loss of a width in pixels, and fixed intrinsics and rig."""
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
+    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = (
+        False
+    )
     options.refine_sensor_from_rig = False
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
@@ -179,4 +210,6 @@ def solve(adjuster: pycolmap.BundleAdjuster) -> None:
     """
     summary = adjuster.solve()
     if not summary.is_solution_usable():
-        raise EstimationError(f"the bundle adjustment failed ({summary.brief_report()}); check poses and calibration")
+        raise EstimationError(
+            f"the bundle adjustment failed ({summary.brief_report()}); check poses and calibration"
+        )

@@ -18,7 +18,8 @@ from vio.records import IntArray
 
 ColourArray = npt.NDArray[np.uint8]
 
-LEFT, RIGHT = 1, 2  # camera ids
+LEFT = 1  # camera ids
+RIGHT = 2
 RIG = 1
 _GRAY = 128  # of points without an image
 
@@ -32,13 +33,19 @@ class ModelImages:
 
     def below(self, folder: str) -> ModelImages:
         """Return the same names with a parent folder as prefix."""
-        left, right = (tuple(f"{folder}/{name}" for name in side) for side in (self.left, self.right))
+        left, right = (
+            tuple(f"{folder}/{name}" for name in side) for side in (self.left, self.right)
+        )
         return ModelImages(left, right)
 
 
 def keyframe_images(frames: IntArray) -> ModelImages:
-    """Name the image files of keyframes by frame numbers (K,): left images in one folder, right ones in another."""
-    left, right = (tuple(f"{side}/{k:06d}.png" for k in frames.tolist()) for side in ("left", "right"))
+    """Name the image files of keyframes by frame numbers (K,): left images in one folder, right
+    ones in another.
+    """
+    left, right = (
+        tuple(f"{side}/{k:06d}.png" for k in frames.tolist()) for side in ("left", "right")
+    )
     return ModelImages(left, right)
 
 
@@ -48,7 +55,9 @@ def numbered_images(count: int) -> ModelImages:
 
 
 def pinhole(camera_id: int, size: tuple[int, int], params: Sequence[float]) -> pycolmap.Camera:
-    """Return a camera with an image of (width, height) pixels and `params` fu, fv, cu, cv in COLMAP's pixels."""
+    """Return a camera with an image of (width, height) pixels and `params` fu, fv, cu, cv in
+    COLMAP's pixels.
+    """
     return pycolmap.Camera(
         camera_id=camera_id,
         model="PINHOLE",
@@ -62,7 +71,9 @@ def pinhole(camera_id: int, size: tuple[int, int], params: Sequence[float]) -> p
 def rig_model(
     size: tuple[int, int], params: Sequence[float], cam1_from_cam0: pycolmap.Rigid3d
 ) -> pycolmap.Reconstruction:
-    """Return an empty model of two equal cameras, as `pinhole` makes them, in a rig whose reference is the left one."""
+    """Return an empty model of two equal cameras, as `pinhole` makes them, in a rig whose
+    reference is the left one.
+    """
     model = pycolmap.Reconstruction()
     for camera_id in (LEFT, RIGHT):
         model.add_camera(pinhole(camera_id, size, params))
@@ -74,7 +85,9 @@ def rig_model(
 
 
 def without_scale(T_cam1_cam0: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rotation `R_cam1_cam0` (3, 3) and unit direction (3,) from cam0 to cam1 in cam0, of a transform (4, 4)."""
+    """Return rotation `R_cam1_cam0` (3, 3) and unit direction (3,) from cam0 to cam1 in cam0, of
+    a transform (4, 4).
+    """
     R = T_cam1_cam0[:3, :3]
     direction = -R.T @ T_cam1_cam0[:3, 3]
     return R, direction / np.linalg.norm(direction)
@@ -87,7 +100,8 @@ def build_model(
     names: ModelImages,
     colours: ColourArray | None = None,
 ) -> pycolmap.Reconstruction:
-    """Build a COLMAP model: two pinhole cameras in a rig, a frame for each keyframe, points with tracks and colours.
+    """Build a COLMAP model: two pinhole cameras in a rig, a frame for each keyframe, points with
+    tracks and colours.
 
     Args:
         camera: the rectified pair; its image size must be known.
@@ -100,14 +114,17 @@ def build_model(
         DataError: the image size is unknown.
     """
     if camera.width is None or camera.height is None:
-        raise DataError("a COLMAP model needs the image size, which these features lack; run on images")
+        raise DataError(
+            "a COLMAP model needs the image size, which these features lack; run on images"
+        )
     params = [camera.fu, camera.fv, camera.cu + HALF_PX, camera.cv + HALF_PX]
     model = rig_model((camera.width, camera.height), params, rectified_rig(camera))
     begins = np.searchsorted(tracks.keyframe, np.arange(len(T_world_cam0) + 1))
     right_index = np.full(len(tracks.point), -1, dtype=np.int64)
     for k, T_cam0_world in enumerate(se3_inverse(T_world_cam0)):
         rows = slice(int(begins[k]), int(begins[k + 1]))
-        z, right = tracks.z[rows], tracks.has_right[rows]
+        z = tracks.z[rows]
+        right = tracks.has_right[rows]
         right_index[rows][right] = np.arange(int(right.sum()))
         add_frame(model, k, T_cam0_world, names, z[:, :2], z[right, 2:])
     _add_points(model, tracks, begins, right_index, colours)
@@ -124,8 +141,9 @@ def _add_points(
 ) -> None:
     """Add the points with their tracks and colours (M, 3) to a model that has the frames.
 
-    The pixels of a keyframe's left image are its rows from `begins` (K + 1,) on, in order; `right_index` (R,) is the
-    index of each row among the pixels of its right image, -1 where it has none.
+    The pixels of a keyframe's left image are its rows from `begins` (K + 1,) on, in order;
+    `right_index` (R,) is the index of each row among the pixels of its right image, -1 where it has
+    none.
     """
     by_point = np.argsort(tracks.point, kind="stable")
     parts = np.searchsorted(tracks.point[by_point], np.arange(len(tracks.ids) + 1))
@@ -180,7 +198,10 @@ def add_frame(
             image_id=image_id(keyframe, camera_id),
             points2D=pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in uv + HALF_PX]),
         )
-        for name, camera_id, uv in ((names.left[keyframe], LEFT, left), (names.right[keyframe], RIGHT, right))
+        for name, camera_id, uv in (
+            (names.left[keyframe], LEFT, left),
+            (names.right[keyframe], RIGHT, right),
+        )
     ]
     frame = pycolmap.Frame(frame_id=frame_id(keyframe), rig_id=RIG)
     for image in images:
@@ -202,6 +223,8 @@ def pose_rows(T: pycolmap.Rigid3d | None) -> FloatArray:
 
 
 def mean_reprojection_error_px(model: pycolmap.Reconstruction) -> float:
-    """Return COLMAP's mean reprojection error: the mean over points of their mean residual length."""
+    """Return COLMAP's mean reprojection error: the mean over points of their mean residual
+    length.
+    """
     model.update_point_3d_errors()
     return float(model.compute_mean_reprojection_error())

@@ -1,4 +1,6 @@
-"""Single stereo pairs: SIFT matches, relative pose by RANSAC, and bundle adjustment of the rig over all pairs."""
+"""Single stereo pairs: SIFT matches, relative pose by RANSAC, and bundle adjustment of the rig
+over all pairs.
+"""
 
 from __future__ import annotations
 
@@ -33,17 +35,23 @@ _ESSENTIAL_PX = 1.0
 
 
 def sift_matches(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
-    """Return pixels (N, 2) and (N, 2) of mutual best SIFT matches of two images (H, W), including outliers.
+    """Return pixels (N, 2) and (N, 2) of mutual best SIFT matches of two images (H, W), including
+    outliers.
 
-    By OpenCV: a quarter of the time of COLMAP's, and rows of rectified pairs spread by a fifth less.
+    By OpenCV: a quarter of the time of COLMAP's, and rows of rectified pairs spread by a fifth
+    less.
     """
     sift = cv2.SIFT_create(SIFT_FEATURES, enable_precise_upscale=True)  # type: ignore[attr-defined] # not in the stubs
-    (keys0, features0), (keys1, features1) = (sift.detectAndCompute(image, None) for image in (left, right))
+    (keys0, features0), (keys1, features1) = (
+        sift.detectAndCompute(image, None) for image in (left, right)
+    )
     if len(keys0) < 2 or len(keys1) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    norm0, norm1 = np.sum(features0**2, axis=1), np.sum(features1**2, axis=1)
+    norm0 = np.sum(features0**2, axis=1)
+    norm1 = np.sum(features1**2, axis=1)
     distance = norm0[:, None] + norm1[None, :] - 2 * features0 @ features1.T
-    best1, best0 = np.argmin(distance, axis=1), np.argmin(distance, axis=0)
+    best1 = np.argmin(distance, axis=1)
+    best0 = np.argmin(distance, axis=0)
     two = np.partition(distance, 1, axis=1)[:, :2]
     good = (best0[best1] == np.arange(len(keys0))) & (two[:, 0] < _RATIO**2 * two[:, 1])
     uv0, uv1 = (np.array([key.pt for key in keys], dtype=np.float64) for keys in (keys0, keys1))
@@ -51,14 +59,19 @@ def sift_matches(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
 
 
 def relative_pose(matches: RayMatches) -> tuple[FloatArray, FloatArray] | None:
-    """Estimate `R_cam1_cam0` (3, 3) and the unit direction (3,) of cam1 in cam0, by RANSAC over all matches.
+    """Estimate `R_cam1_cam0` (3, 3) and the unit direction (3,) of cam1 in cam0, by RANSAC over all
+    matches.
 
     None: no consensus.
     """
     pixels = _virtual_pixels(matches)
     camera = pinhole(LEFT, _VIRTUAL_SIZE, _VIRTUAL_PARAMS)
     options = pycolmap.RANSACOptions(
-        max_error=_ESSENTIAL_PX, random_seed=SEED, min_num_trials=200, max_num_trials=2000, num_threads=1
+        max_error=_ESSENTIAL_PX,
+        random_seed=SEED,
+        min_num_trials=200,
+        max_num_trials=2000,
+        num_threads=1,
     )
     found = pycolmap.estimate_essential_matrix(*pixels, camera, camera, options)
     if found is None:
@@ -66,11 +79,14 @@ def relative_pose(matches: RayMatches) -> tuple[FloatArray, FloatArray] | None:
     return without_scale(pose_rows(found["cam2_from_cam1"]))
 
 
-def adjust_rig(matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Bundle-adjust the pose of cam1 in a rig over the matches (inliers) of all pairs; same form as the input.
+def adjust_rig(
+    matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Bundle-adjust the pose of cam1 in a rig over the matches (inliers) of all pairs; same form as
+    the input.
 
-    Each pair is a frame of one rig with its own points. Only the rig's extrinsics and the points are free; the result
-    is without scale, which two cameras do not determine.
+    Each pair is a frame of one rig with its own points. Only the rig's extrinsics and the points
+    are free; the result is without scale, which two cameras do not determine.
 
     Raises:
         EstimationError: the solver failed.
@@ -78,16 +94,27 @@ def adjust_rig(matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArr
     rig = pycolmap.Rigid3d(pycolmap.Rotation3d(R_cam1_cam0), -R_cam1_cam0 @ direction)
     model = rig_model(_VIRTUAL_SIZE, _VIRTUAL_PARAMS, rig)
     points, valid = _two_view_points(matches, R_cam1_cam0, direction)
-    matches, points = matches.take(valid), points[valid]
+    matches = matches.take(valid)
+    points = points[valid]
     names, pair = np.unique(matches.pair, return_inverse=True)
     left, right = _virtual_pixels(matches)
     order = np.argsort(pair, kind="stable")
     for k in range(len(names)):
         rows = order[pair[order] == k]
-        add_frame(model, k, np.eye(4), numbered_images(len(names)), left[rows] - HALF_PX, right[rows] - HALF_PX)
+        add_frame(
+            model,
+            k,
+            np.eye(4),
+            numbered_images(len(names)),
+            left[rows] - HALF_PX,
+            right[rows] - HALF_PX,
+        )
         for at, row in enumerate(rows.tolist()):
             track = pycolmap.Track(
-                [pycolmap.TrackElement(image_id(k, LEFT), at), pycolmap.TrackElement(image_id(k, RIGHT), at)]
+                [
+                    pycolmap.TrackElement(image_id(k, LEFT), at),
+                    pycolmap.TrackElement(image_id(k, RIGHT), at),
+                ]
             )
             model.add_point3D(points[row], track, np.zeros(3, dtype=np.uint8))
     config = adjustment_config(model)
@@ -101,7 +128,9 @@ def adjust_rig(matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArr
 
 
 def _virtual_pixels(matches: RayMatches) -> tuple[FloatArray, FloatArray]:
-    """Return COLMAP's pixels (N, 2) of the rays of both cameras in pinhole cameras without distortion."""
+    """Return COLMAP's pixels (N, 2) of the rays of both cameras in pinhole cameras without
+    distortion.
+    """
     left, right = (_VIRTUAL_PX * ray[:, :2] / ray[:, 2:] for ray in (matches.ray0, matches.ray1))
     return left, right
 
@@ -109,14 +138,19 @@ def _virtual_pixels(matches: RayMatches) -> tuple[FloatArray, FloatArray]:
 def _two_view_points(
     matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Return points (N, 3) in cam0, in units of the baseline, nearest to both rays, and a mask of those ahead."""
-    a, b = matches.ray0, matches.ray1 @ R_cam1_cam0
+    """Return points (N, 3) in cam0, in units of the baseline, nearest to both rays, and a mask
+    of those ahead.
+    """
+    a = matches.ray0
+    b = matches.ray1 @ R_cam1_cam0
     cosine = np.sum(a * b, axis=1)
-    along_a, along_b = a @ direction, b @ direction
+    along_a = a @ direction
+    along_b = b @ direction
     sine2 = 1 - cosine**2
     valid = sine2 > 1e-6
     safe = np.where(valid, sine2, 1.0)
-    s, t = (along_a - cosine * along_b) / safe, (cosine * along_a - along_b) / safe
+    s = (along_a - cosine * along_b) / safe
+    t = (cosine * along_a - along_b) / safe
     valid &= (s > 0.5) & (t > 0.5)
     points = (s[:, None] * a + direction + t[:, None] * b) / 2
     return points, valid

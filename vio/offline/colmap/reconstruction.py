@@ -1,4 +1,6 @@
-"""Reconstruction of keyframes from their images alone, by COLMAP's features, matches and mappers."""
+"""Reconstruction of keyframes from their images alone, by COLMAP's features, matches and
+mappers.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +15,25 @@ import pycolmap
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.offline.colmap import HALF_PX, SEED, SIFT_FEATURES
-from vio.offline.colmap.model import ModelImages, mean_reprojection_error_px, pose_rows, rectified_rig
+from vio.offline.colmap.model import (
+    ModelImages,
+    mean_reprojection_error_px,
+    pose_rows,
+    rectified_rig,
+)
 from vio.records import BoolArray, IntArray
 
 Mapper: TypeAlias = Literal["incremental", "global"]
 _NEXT = (1, 2, 3, 5, 8, 16)  # index offsets of later keyframes that left images are matched with
 _CROSS_NEXT = (1,)  # likewise between right images and later left ones
-_EXHAUSTIVE = 60  # keyframes up to which all left images are matched, so that a loop that the run missed is found
-_AROUND_LOOP = (-1, 0, 1)  # index offsets from both keyframes of a loop, whose left images are matched with one another
+# keyframes up to which all left images are matched, so that a loop that the run missed is found
+_EXHAUSTIVE = 60
+# index offsets from both keyframes of a loop, whose left images are matched with one another
+_AROUND_LOOP = (-1, 0, 1)
 _LEAST_REGISTERED = 3
 LEAST_SHARED = 15  # points that two left images show, from which the model counts as joined there
-_LINK = 6  # keyframes across which a step of the path may be joined; those further apart are joined by a loop
+# keyframes across which a step of the path may be joined; those further apart are joined by a loop
+_LINK = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,26 +41,38 @@ class Reconstructed:
     """A reconstruction by COLMAP."""
 
     mapper: Mapper
-    T_world_cam0: FloatArray  # (R, 4, 4) of the registered keyframes, in COLMAP's world frame, metric by the rig
+    # (R, 4, 4) of the registered keyframes, in COLMAP's world frame, metric by the rig
+    T_world_cam0: FloatArray
     keyframes: IntArray  # (R,) their indices, increasing
     points: int
     mean_reprojection_error_px: float
     shared: IntArray  # (L,) points that both left images of each loop show
-    linked: BoolArray  # (R - 1,) whether the model is joined from each keyframe to the next, and not by a loop alone
-    revisits: IntArray  # (M, 2) keyframes far apart in time that show one place by the model, best first
+    # (R - 1,) whether the model is joined from each keyframe to the next, and not by a loop alone
+    linked: BoolArray
+    # (M, 2) keyframes far apart in time that show one place by the model, best first
+    revisits: IntArray
 
 
 def match_images(
-    database: Path, images: Path, names: ModelImages, camera: StereoCamera, loops: IntArray, *, threads: int = 1
+    database: Path,
+    images: Path,
+    names: ModelImages,
+    camera: StereoCamera,
+    loops: IntArray,
+    *,
+    threads: int = 1,
 ) -> None:
-    """Find SIFT features in image files and match them within and between keyframes, into a new COLMAP database.
+    """Find SIFT features in image files and match them within and between keyframes, into a new
+    COLMAP database.
 
     Args:
         database: the file to create.
-        images: folder that the names are relative to; left images must be in one folder, right ones in another.
+        images: folder that the names are relative to; left images must be in one folder, right ones
+            in another.
         names: the keyframes' images.
         camera: the rectified pair, intrinsics and baseline of the rig.
-        loops: (L, 2) keyframes that show one place, which are matched as well, and those next to them.
+        loops: (L, 2) keyframes that show one place, which are matched as well, and those next to
+            them.
         threads: for all steps; one makes the result repeatable.
     """
     pycolmap.set_random_seed(SEED)
@@ -79,7 +101,9 @@ def match_images(
     with pycolmap.Database.open(database) as opened:
         pycolmap.apply_rig_config([rig], opened)
     pairs = database.with_name("pairs.txt")
-    pairs.write_text("".join(f"{a} {b}\n" for a, b in pairs_to_match(names, loops)), encoding="utf-8")
+    pairs.write_text(
+        "".join(f"{a} {b}\n" for a, b in pairs_to_match(names, loops)), encoding="utf-8"
+    )
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     verification.ransac.max_error = 2.0
@@ -99,16 +123,26 @@ def pairs_to_match(names: ModelImages, loops: IntArray) -> list[tuple[str, str]]
     out = list(zip(names.left, names.right, strict=True))
     steps = range(1, count) if count <= _EXHAUSTIVE else _NEXT
     out += [(names.left[k], names.left[k + step]) for step in steps for k in range(count - step)]
-    out += [(names.right[k], names.left[k + step]) for step in _CROSS_NEXT for k in range(count - step)]
+    out += [
+        (names.right[k], names.left[k + step]) for step in _CROSS_NEXT for k in range(count - step)
+    ]
     around = {(a + i, b + j) for a, b in loops.tolist() for i in _AROUND_LOOP for j in _AROUND_LOOP}
     out += [(names.left[a], names.left[b]) for a, b in sorted(around) if 0 <= a < b < count]
     return list(dict.fromkeys(out))
 
 
 def reconstruct(
-    database: Path, images: Path, names: ModelImages, mapper: Mapper, out: Path, loops: IntArray, *, threads: int = 1
+    database: Path,
+    images: Path,
+    names: ModelImages,
+    mapper: Mapper,
+    out: Path,
+    loops: IntArray,
+    *,
+    threads: int = 1,
 ) -> Reconstructed | None:
-    """Reconstruct keyframes from a database of matches, with fixed rig and intrinsics; None: not successful.
+    """Reconstruct keyframes from a database of matches, with fixed rig and intrinsics; None: not
+    successful.
 
     Args:
         database: made by `match_images`; not modified.
@@ -122,7 +156,9 @@ def reconstruct(
     pycolmap.set_random_seed(SEED)
     out.mkdir(parents=True, exist_ok=True)
     if mapper == "incremental":
-        models = pycolmap.incremental_mapping(database, images, out, options=_incremental_options(threads))
+        models = pycolmap.incremental_mapping(
+            database, images, out, options=_incremental_options(threads)
+        )
     else:
         models = pycolmap.global_mapping(database, images, out, options=_global_options(threads))
     if not models:
@@ -160,7 +196,9 @@ def _common_points(model: pycolmap.Reconstruction, names: Sequence[str]) -> IntA
 
 
 def linked_steps(points: IntArray, keyframes: IntArray) -> BoolArray:
-    """Return whether a model is joined from each keyframe (R,) to the next (R - 1,), by the points (R, R) shared."""
+    """Return whether a model is joined from each keyframe (R,) to the next (R - 1,), by the
+    points (R, R) shared.
+    """
     near = np.abs(keyframes[None, :] - keyframes[:, None]) <= _LINK
     joined = near & (points >= LEAST_SHARED)
     return np.array([joined[:n, n:].any() for n in range(1, len(points))], dtype=np.bool_)
@@ -177,10 +215,15 @@ def _incremental_options(threads: int) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=SEED)
     options.multiple_models = options.extract_colors = False
     options.min_model_size = _LEAST_REGISTERED
-    options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+    options.ba_refine_focal_length = options.ba_refine_principal_point = (
+        options.ba_refine_extra_params
+    ) = False
     options.ba_refine_sensor_from_rig = False
-    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    options.mapper.init_min_tri_angle = 4.0  # keyframes of one drive see the scene from nearly one direction
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = (
+        False
+    )
+    # keyframes of one drive see the scene from nearly one direction
+    options.mapper.init_min_tri_angle = 4.0
     options.mapper.init_min_num_inliers = 50
     options.mapper.filter_max_reproj_error = 2.0
     options.mapper.filter_min_tri_angle = 0.5
@@ -192,12 +235,15 @@ def _incremental_options(threads: int) -> pycolmap.IncrementalPipelineOptions:
 def _global_options(threads: int) -> pycolmap.GlobalPipelineOptions:
     options = pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=SEED)
     mapper = options.mapper
-    mapper.num_threads, mapper.random_seed = threads, SEED
+    mapper.num_threads = threads
+    mapper.random_seed = SEED
     mapper.refine_sensor_from_rig = False
     mapper.min_tri_angle_deg = 0.5
     mapper.global_positioning.use_gpu = False
     adjustment = mapper.bundle_adjustment
-    adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = False
+    adjustment.refine_focal_length = adjustment.refine_principal_point = (
+        adjustment.refine_extra_params
+    ) = False
     adjustment.refine_sensor_from_rig = False
     adjustment.ceres.use_gpu = False
     mapper.retriangulation.min_angle = 0.5

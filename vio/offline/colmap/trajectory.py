@@ -18,23 +18,30 @@ _STAMP = re.compile(r"\d{15,19}")  # nanoseconds, as in EuRoC's file names
 
 
 def read_colmap_trajectory(folder: Path) -> Trajectory:
-    """Read the poses of a COLMAP model as a trajectory of cam0: the rig's reference camera, or the only camera.
+    """Read the poses of a COLMAP model as a trajectory of cam0: the rig's reference camera, or the
+    only camera.
 
-    A file name of 15 to 19 digits is a time in nanoseconds; otherwise its last number is the frame number.
+    A file name of 15 to 19 digits is a time in nanoseconds; otherwise its last number is the frame
+    number.
 
     Raises:
         DataError: no model, or its image names contain no numbers.
     """
     place = model_folder(folder)
     if place is None:
-        raise DataError(f"{folder}: no COLMAP model (no images.bin or images.txt, also not in sparse/0)")
+        raise DataError(
+            f"{folder}: no COLMAP model (no images.bin or images.txt, also not in sparse/0)"
+        )
     try:
         model = pycolmap.Reconstruction(place)
     except (ValueError, RuntimeError, OSError, IndexError, MemoryError) as error:
         raise DataError(
-            f"{place}: pycolmap cannot read the model ({' '.join(str(error).split())[:160]}); export it again"
+            f"{place}: pycolmap cannot read the model ({' '.join(str(error).split())[:160]}); "
+            "export it again"
         ) from error
-    images = [image for image in model.images.values() if image.has_pose and _is_reference(model, image)]
+    images = [
+        image for image in model.images.values() if image.has_pose and _is_reference(model, image)
+    ]
     if not images:
         raise DataError(f"{place}: the model contains no image with a pose")
     stamps = [_number(image.name, place) for image in images]
@@ -42,7 +49,8 @@ def read_colmap_trajectory(folder: Path) -> Trajectory:
     numbers = np.array(stamps, dtype=np.int64)[order]
     if (np.diff(numbers) <= 0).any():
         raise DataError(
-            f"{place}: two images of the reference camera have the same number; keep one camera in the model"
+            f"{place}: two images of the reference camera have the same number; keep one camera in "
+            "the model"
         )
     poses = se3_inverse(np.array([pose_rows(images[k].cam_from_world()) for k in order.tolist()]))
     if all(_STAMP.fullmatch(Path(image.name).stem) for image in images):
@@ -51,9 +59,14 @@ def read_colmap_trajectory(folder: Path) -> Trajectory:
 
 
 def model_folder(folder: Path) -> Path | None:
-    """Return the folder with a model's files: this one, or its `sparse/0` or `sparse`; None: no model."""
+    """Return the folder with a model's files: this one, or its `sparse/0` or `sparse`.
+
+    None: no model.
+    """
     places = (folder, folder / "sparse" / "0", folder / "sparse")
-    return next((place for place in places if any((place / name).is_file() for name in _MODEL_FILES)), None)
+    return next(
+        (place for place in places if any((place / name).is_file() for name in _MODEL_FILES)), None
+    )
 
 
 def _is_reference(model: pycolmap.Reconstruction, image: pycolmap.Image) -> bool:
@@ -64,5 +77,8 @@ def _is_reference(model: pycolmap.Reconstruction, image: pycolmap.Image) -> bool
 def _number(name: str, place: Path) -> int:
     found = re.findall(r"\d+", Path(name).stem)
     if not found:
-        raise DataError(f"{place}: the image name {name!r} contains no frame number or time; name images by number")
+        raise DataError(
+            f"{place}: the image name {name!r} contains no frame number or time; name images by "
+            "number"
+        )
     return int(found[-1])
