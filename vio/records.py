@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import DataError
+from vio.findings import Finding, Integrity
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 
@@ -119,6 +120,19 @@ class StereoFrame:
     right: Image | None  # (H, W) rectified; None for one camera
     # (H, W) metres along the optical axis, 0 where unknown; with depth images only
     depth: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedFrame(StereoFrame):
+    """A frame as the guards hand it to a front end."""
+
+    left_half: Image | None = None  # (H/2, W/2) the left image at half resolution
+    right_half: Image | None = None  # likewise
+    # False: the right image is frozen, dark or covered; no match in it counts
+    right_usable: bool = True
+    right_delay: int = 0  # frames by which the right image is known to be late
+    # the pairs so far were wrong: depths of features that were seen in them do not count
+    begin_again: bool = False
 
 
 MotionSample: TypeAlias = ImuSample | VelocitySample
@@ -326,7 +340,8 @@ class FrontendOutput:
     matched: int  # features with a right match
     detected: int  # features new in this frame
     stages_ms: dict[str, float] = field(default_factory=dict)  # wall time per stage
-    warnings: tuple[str, ...] = ()  # what is wrong with the images, one line an event
+    warnings: tuple[str, ...] = ()  # remarks of a front end of one's own, one line an event
+    findings: tuple[Finding, ...] = ()  # what is wrong with the images
 
 
 def no_features(frame: StereoFrame) -> FrontendOutput:
@@ -502,6 +517,10 @@ class Estimate:
     # The pose in a map; None without one, or without a place in it yet.
     T_map_body: FloatArray | None = None  # (4, 4)
     T_map_body_covariance: FloatArray | None = None  # (6, 6) of xi in T_map_body = T_hat exp(xi)
+    # Whether it may be used, by all that was found; the covariance alone is conditional on what the
+    # filter assumes.
+    integrity: Integrity = "nominal"
+    findings: tuple[str, ...] = ()  # codes of what makes it other than nominal
 
 
 def _no_ids() -> IntArray:

@@ -41,6 +41,7 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets import open_dataset
     from vio.frontend import build_frontend
+    from vio.guard.guarded import guarded
     from vio.inspection.inspect import inspect_recording
     from vio.numerics.threads import one_blas_thread
 
@@ -53,7 +54,10 @@ def execute(args: argparse.Namespace) -> int:
     with one_blas_thread(), ProgressBar(f"inspect {recording.path.name}") as bar:
         report = inspect_recording(
             dataset,
-            lambda d: build_frontend(config.frontend.name, d.recording.camera, config.frontend, d),
+            lambda d: guarded(
+                build_frontend(config.frontend.name, d.recording.camera, config.frontend, d),
+                d.recording.camera,
+            ),
             pairs=args.pairs,
             tracked=args.frames,
             progress=bar.update,

@@ -86,7 +86,7 @@ class FramePipeline:
             self.monitor.refused(frame.index, str(error))
             return None
         timer.end("frontend")
-        self.monitor.observations(output.observations, output.warnings)
+        self.monitor.observations(output.observations, output.warnings, output.findings)
         self.begin_again(frame.index)
         timer.end("monitor")
         seen = output.observations
@@ -110,6 +110,7 @@ class FramePipeline:
         estimate = self.backend.estimate()
         timer.end("update")
         self.monitor.update(frame.index, report, estimate)
+        estimate = self.monitor.judged(frame.index, estimate)
         timer.ms["filter"] = timer.ms["predict"] + timer.ms["update"] + self._propagate_ms
         self._propagate_ms = 0.0
         return FrameResult(
@@ -170,7 +171,7 @@ class FramePipeline:
                 self.monitor.restarted(seen.frame_index, str(error), self.backend.estimate())
             else:
                 lost = f"{error}; there are no poses until the scale is observable again"
-                self.monitor.say(f"frame {seen.frame_index}: {lost}")
+                self.monitor.say(f"frame {seen.frame_index}: {lost}", "estimate-lost")
             return report
 
 

@@ -26,8 +26,9 @@ from vio.live.event_inputs import EventInputs
 from vio.live.inputs import GivenFrame, Inputs, Shapes, checked_time, gray
 from vio.live.prediction import PosePredictor, PredictedPose
 from vio.numerics.threads import BlasLimit
-from vio.protocols import Frontend
+from vio.protocols import FollowsRight, Frontend
 from vio.records import (
+    CheckedFrame,
     Estimate,
     Event,
     FrameResult,
@@ -38,6 +39,7 @@ from vio.records import (
     Observations,
     StereoFrame,
     TrackPrior,
+    no_features,
 )
 
 if TYPE_CHECKING:
@@ -371,3 +373,9 @@ class _LiveFrontend:
         frontend = self._replay if frame.left is None else self._images
         assert frontend is not None
         return frontend.process(frame, prior)
+
+    def follow_right(self, frame: CheckedFrame, prior: TrackPrior | None = None) -> FrontendOutput:
+        """Go on with the right image where the front end can; see `vio.guard.FollowsRight`."""
+        if isinstance(self._images, FollowsRight):
+            return self._images.follow_right(frame, prior)
+        return no_features(frame)

@@ -354,7 +354,8 @@ class _Loop:
                 state.unread += self._between(state.next_frame + 1, self._end)
         if state.unread:
             last = max(state.next_frame, *state.unread)
-            monitor.say(_unread_line(state.unread, sum(index <= last for index in self._frames)))
+            line = _unread_line(state.unread, sum(index <= last for index in self._frames))
+            monitor.say(line, "frames-unread")
         self._record(processor.finish())
         recorder.revise(processor.pipeline.backend.smoothed)
         if monitor.frames_refused > len(recorder):
