@@ -118,6 +118,11 @@ CODES: dict[str, Code] = {
         "each left image was paired with the right image of another frame",
         _EXPOSURES,
     ),
+    "pairs-put-right": Code(
+        "nominal",
+        "right images of another frame were found, and the run began again with the right ones",
+        _EXPOSURES,
+    ),
     "object-covers-image": Code(
         "degraded",
         "points that move together, but not as the camera does, cover much of the image",

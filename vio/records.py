@@ -714,6 +714,7 @@ class FrameLog:
     # of the features with a right match; None: there is none
     disparity_median_px: float | None = None
     innovation_ratio: float | None = None
+    integrity: int = 0  # of the estimate: 0 nominal, 1 degraded, 2 unusable
     stages_ms: dict[str, float] = field(default_factory=dict)  # the front end's own stages
 
     @property

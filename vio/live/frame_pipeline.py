@@ -7,6 +7,7 @@ from __future__ import annotations
 import time
 
 from vio.errors import DataError, DivergedError
+from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.imu_trial import AS_GIVEN, ImuTrial, corrected
@@ -119,7 +120,7 @@ class FramePipeline:
             selection,
             report,
             estimate,
-            _frame_log(frame, timer.ms, output, selection, report),
+            _frame_log(frame, timer.ms, output, selection, report, estimate),
         )
 
     def usable(self, sample: MotionSample) -> MotionSample | None:
@@ -195,6 +196,7 @@ def _frame_log(
     output: FrontendOutput,
     selection: Selection,
     report: UpdateReport,
+    estimate: Estimate,
 ) -> FrameLog:
     z = output.observations.z[output.observations.has_right]
     return FrameLog(
@@ -217,5 +219,6 @@ def _frame_log(
         nis_per_dof=report.nis_per_dof,
         disparity_median_px=median(z[:, 0] - z[:, 2]) if len(z) else None,
         innovation_ratio=report.innovation_ratio,
+        integrity=INTEGRITIES.index(estimate.integrity),
         stages_ms=output.stages_ms,
     )

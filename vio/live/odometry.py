@@ -16,6 +16,7 @@ from vio.cameras.rig import Rig, rig_of_rectified
 from vio.config import Config
 from vio.errors import ConfigError, DataError
 from vio.filters.inputs import checked_extrinsics
+from vio.findings import Finding
 from vio.frontend import build_frontend
 from vio.frontend.precomputed import PrecomputedFrontend
 from vio.frontend.settings import FrontendSettings
@@ -245,6 +246,11 @@ class Odometry(EventInputs["Estimate | None"]):
     def warnings(self) -> tuple[str, ...]:
         """What the checks have found so far, one line each."""
         return tuple(self._processor.pipeline.monitor.lines)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the checks have found so far, with codes."""
+        return tuple(self._processor.pipeline.monitor.findings)
 
     @property
     def frames_refused(self) -> int:

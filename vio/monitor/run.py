@@ -79,6 +79,8 @@ class RunMonitor:
         self._scale_lines: list[Finding] = []  # not reported yet
         self.imu_verdict = ImuVerdict()  # by the findings so far
         self.findings: list[Finding] = []
+        # whether the run begins again where right images belong to other frames
+        self.ends_at_shifted_pairs = False
         self._integrity = IntegrityMonitor()
 
     def sample(self, sample: MotionSample) -> None:
@@ -179,6 +181,14 @@ class RunMonitor:
             if check.imu_at_fault and check.rotation_comparison.agree
             else check.rotation_comparison
         )
+
+    @property
+    def pairs_shifted_by(self) -> int:
+        """Frames by which right images were found to be late from the start; -1: early."""
+        for finding in self.findings:
+            if finding.code == "pairs-shifted":
+                return round(finding.figures["delay_frames"])
+        return 0
 
     @property
     def lines(self) -> list[str]:
@@ -326,7 +336,8 @@ class RunMonitor:
 
     def _add(self, findings: Iterable[Finding]) -> None:
         for finding in findings:
-            log.warning("%s", finding.message)
+            if not (finding.code == "pairs-shifted" and self.ends_at_shifted_pairs):
+                log.warning("%s", finding.message)
             self.findings.append(finding)
             self._integrity.take(finding)
 
