@@ -123,7 +123,9 @@ class ExchangeDetector(ImageCheck):
         assert self._last is not None
         own = [image_change(a, b) for a, b in zip(now, self._last, strict=True)]
         other = [image_change(a, b) for a, b in zip(now, self._last[::-1], strict=True)]
-        return abs(own[0] - own[1]) > abs(other[0] - other[1])
+        # The motion shifts both images alike; or it shifts them by less than the disparity does.
+        unlike = abs(own[0] - own[1]) > abs(other[0] - other[1])
+        return unlike or sum(own) > sum(other)
 
     def _report(self, index: int, order: Order) -> None:
         if order == "given":
