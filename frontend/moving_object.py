@@ -103,7 +103,9 @@ def choose_motion(
     hidden = in_event and (measured or not depths_off)
     if voting is not None and not measured:
         voted = _voted(problem, p_prev, pixels, found, voting)
-        if voted is not None:
+        if voted is not None and not _prediction_overrules(
+            problem, p_prev, found, voted, None if depths_off else predicted
+        ):
             return TwoMotions(voted, _if_large((found.inliers & ~voted.inliers).mean()), "voted")
     others = np.flatnonzero(~found.inliers)
     least = max(_LEAST_POINTS, _LEAST_SUPPORT * found.inliers.sum())
@@ -169,6 +171,27 @@ def choose_motion(
     return TwoMotions(
         Consensus(second, follows_second), _if_large(share_of(found.inliers)), "predicted"
     )
+
+
+def _prediction_overrules(
+    problem: RansacProblem,
+    p_prev: FloatArray,
+    found: Consensus,
+    voted: Consensus,
+    predicted: MotionPrior | None,
+) -> bool:
+    """Return whether a prediction agrees with the consensus, and better than with the vote.
+
+    The oldest points may all be far away: what they vote for is a rotation, and a translation that
+    they hardly know. An object that comes into view has no prediction on its side.
+    """
+    if predicted is None or found.inliers.sum() < voted.inliers.sum():
+        return False
+    of_found, of_voted = (
+        _squared_distance(problem.camera, each.T_curr_prev, p_prev[each.inliers], predicted)
+        for each in (found, voted)
+    )
+    return of_found <= min(of_voted, float(chi_square_quantile(_PROBABILITY, 6)))
 
 
 def _if_large(share: float) -> float:
