@@ -20,6 +20,7 @@ from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, se3_inverse
 
 CAMERAS = "calib_cam_to_cam.txt"
+PERSPECTIVE = "perspective.txt"  # of KITTI-360, in the same form
 VELO = "calib_velo_to_cam.txt"
 IMU = "calib_imu_to_velo.txt"
 _MAX_PARENTS = 3

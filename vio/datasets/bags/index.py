@@ -17,7 +17,7 @@ from vio.datasets.bags.pictures import raw_gray
 from vio.datasets.bags.store import Bag, Message, Topic
 from vio.datasets.bags.topics import CAMERA_INFO, COMPRESSED, IMAGE, TF, Roles
 from vio.datasets.images import UnreadableImageError, brightest
-from vio.datasets.rigs.camera_info import CameraInfo
+from vio.datasets.rigs.camera_info import CameraInfo, region_of
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, se3_inverse
@@ -302,4 +302,8 @@ def camera_info_of(fields: Any, topic: str) -> CameraInfo:
     )
     size = (int(fields.width), int(fields.height))
     matrices = (K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4))
-    return CameraInfo(topic, *size, str(fields.distortion_model), tuple(D.tolist()), *matrices)
+    model = str(fields.distortion_model)
+    roi = fields.roi
+    region = region_of([int(x) for x in (roi.x_offset, roi.y_offset, roi.width, roi.height)])
+    binning = (max(int(fields.binning_x), 1), max(int(fields.binning_y), 1))
+    return CameraInfo(topic, *size, model, tuple(D.tolist()), *matrices, binning, region)

@@ -1,0 +1,74 @@
+"""Which of two names is the left camera's: `left right`, `cam0 cam1`, `img_l img_r` and others."""
+
+from __future__ import annotations
+
+import re
+from itertools import combinations
+
+# what may differ between the names of a pair, left first; in small letters, numbers as numbers
+_SIDES = (
+    ("left", "right"),
+    ("l", "r"),
+    ("lcam", "rcam"),
+    ("port", "starboard"),
+    ("0", "1"),
+    ("1", "2"),
+    ("2", "3"),
+    ("a", "b"),
+)
+_WORDS = re.compile(r"\d+|[A-Z]?[a-z]+|[A-Z]+(?![a-z])|/|\\")
+
+
+def words_of(name: str) -> tuple[str, ...]:
+    """Return the words and numbers of a name in small letters, numbers without leading zeros."""
+    return tuple(
+        str(int(word)) if word.isdigit() else word.lower() for word in _WORDS.findall(name)
+    )
+
+
+def is_pair(left: str, right: str) -> bool:
+    """Return whether two names differ in their side alone, and the first one is the left one."""
+    a = words_of(left)
+    b = words_of(right)
+    if len(a) != len(b):
+        return False
+    differing = {(x, y) for x, y in zip(a, b, strict=True) if x != y}
+    return len(differing) == 1 and next(iter(differing)) in _SIDES
+
+
+def pairs_of(names: list[str]) -> list[tuple[str, str]]:
+    """Return all pairs among names, left first; words such as `left` go before numbers."""
+    found = []
+    for a, b in combinations(names, 2):
+        if is_pair(a, b):
+            found.append((a, b))
+        elif is_pair(b, a):
+            found.append((b, a))
+    return found
+
+
+def side_word(name: str) -> str | None:
+    """Return the word of a name that states a side, as `left` or `right`; None: none does."""
+    words = words_of(name)
+    for left, right in _SIDES[:2]:
+        if left in words:
+            return "left"
+        if right in words:
+            return "right"
+    return None
+
+
+def without_side(stem: str) -> str:
+    """Return an image's name without the part that names its camera: `000012_cam0` as `000012`.
+
+    Names that hold nothing else stay what they are.
+    """
+    bare = _CAMERA_PART.sub("", stem)
+    return bare if re.search(r"\d", bare) else stem
+
+
+# of an image's name, at its beginning or end, or between separators
+_CAMERA_PART = re.compile(
+    r"(?:(?<=^)|(?<=[_\-. ]))(?:(?:cam(?:era)?|image|img|infra|fisheye)[_\-]?\d{1,2}|left|right|l|r)(?=$|[_\-. ])",
+    re.IGNORECASE,
+)
