@@ -178,7 +178,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     cameras = _choose_cameras(path, settings.colour)
     layout = Layout(path, path, *(path / f"image_{k}" for k in cameras))
     pairs = pair_images(layout.left, layout.right)
-    size, white, notes = measured_images(pairs)
+    size, levels, notes = measured_images(pairs)
     file = path / "calib.txt"
     times_file = path / "times.txt"
     rig, T_left_cam0 = kitti_rig(file, size, cameras)
@@ -192,7 +192,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     parts = read_companions(
         "kitti", layout, (file, rig), settings, times, notes, used, reference=reference
     )
-    return ImageDataset(*parts, pairs, white=white)
+    return ImageDataset(*parts, pairs, levels=levels)
 
 
 def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
@@ -221,7 +221,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
             f"{path}: {CAMERAS} is neither there nor in the folders above; copy KITTI's "
             "calibration of that day there"
         )
-    size, white, notes = measured_images(pairs)
+    size, levels, notes = measured_images(pairs)
     rig = load_rig(file, image_size=size, cameras=2)
     # one trigger: the left ones serve
     used = [path / name / "timestamps.txt" for name in ("image_00", "image_01")]
@@ -234,7 +234,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
     parts = read_companions(
         "kitti_raw", layout, (file, rig), settings, (times_ns, used[0]), notes, used
     )
-    return ImageDataset(*parts, pairs, white=white)
+    return ImageDataset(*parts, pairs, levels=levels)
 
 
 def read_mono(path: Path, settings: DatasetSettings) -> ImageDataset:
@@ -286,7 +286,7 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> ImageDataset:
 
 def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings) -> ImageDataset:
     """Read what goes with the images: calibration, times, motion samples and ground truth."""
-    size, white, notes = measured_images(images.pairs)
+    size, levels, notes = measured_images(images.pairs)
     is_tum = images.listed_ns is not None
     used = list[Path]()
     file = settings.calibration or (
@@ -321,7 +321,7 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
         *parts,
         images.pairs,
         imu_noise=rig.imu_noise,
-        white=white,
+        levels=levels,
         depths=images.depths,
         depth_factor=depth_factor,
     )
