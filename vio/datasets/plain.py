@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +33,16 @@ from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, 
 from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.kitti_raw import CAMERAS, find_above
 from vio.datasets.rigs import find_calibration, kitti_rig, load_rig
+from vio.datasets.rigs.bare import NAMES as BARE_NAMES
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import drive_times, is_date, stamped_rows
-from vio.datasets.tum_rgbd import LISTS, associated_images, is_tum_folder, published_camera
+from vio.datasets.tum_rgbd import (
+    DEPTH_FACTOR,
+    LISTS,
+    associated_images,
+    is_tum_folder,
+    published_camera,
+)
 from vio.datasets.unused import Layout
 from vio.errors import CalibrationError, DataError
 from vio.files.text import parse_stamps, text_lines
@@ -297,6 +304,8 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
         rig = published_camera(layout.root, size)
     else:
         rig = load_rig(file, image_size=size, cameras=2 if kind == "plain" else 1)
+        if is_tum and rig.depth_factor is None and file.name in BARE_NAMES:
+            rig = replace(rig, depth_factor=DEPTH_FACTOR)
     depth_factor = 1.0
     if images.depths is not None:
         depth_factor, factor_notes = _depth_factor(rig, settings, layout.root)

@@ -16,7 +16,7 @@ from vio.datasets.common import naming
 from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
 from vio.datasets.kitti import read_calibration, read_extrinsics
 from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, read_cam_to_cam, read_imu_pose
-from vio.datasets.rigs import basalt, boofcv, camodocal, depthai, okvis, orbslam, zed
+from vio.datasets.rigs import bare, basalt, boofcv, camodocal, depthai, okvis, orbslam, zed
 from vio.datasets.rigs.boofcv import is_boofcv, read_boofcv
 from vio.datasets.rigs.camera_info import (
     is_camera_info,
@@ -53,7 +53,7 @@ _IN_FOLDER = (
     "calibration.yaml", "calibration.yml", "camchain-imucam*.yaml", "*camchain-imucam*.yaml", "camchain*.yaml",
     "*camchain*.yaml", "*imucam_chain*.y*ml", "calib_cam_to_cam.txt", "perspective.txt", "calib.txt", "left.y*ml",
     "stereo*.y*ml", "intrinsics.y*ml", "stereo*.xml", "calibration.xml", "calib.xml", "calib.y*ml",
-    "calibration.json", "calib.json", "SN*.conf", "undistorted_calib_0.txt",
+    "calibration.json", "calib.json", "SN*.conf", "undistorted_calib_0.txt", *bare.NAMES,
 )  # fmt: skip
 _OTHERS = (".yaml", ".yml", ".json", ".xml", ".conf")  # whose content decides in any folder
 _MAX_OTHERS = 40  # files looked into; a folder with more is no recording's
@@ -168,6 +168,8 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
         return checked_rig(_kitti_raw(path, image_size), path)
     if is_four_seasons(path):
         return read_four_seasons(path, image_size)
+    if suffix == ".txt" and bare.is_bare(path):
+        return bare.read_bare(path, image_size)
     if suffix == ".txt":
         return kitti_rig(path, image_size)[0]
     if suffix == ".xml" and is_boofcv(path):
