@@ -13,6 +13,7 @@ named as the images, or in the layout of TUM RGB-D, it is one with depth images 
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -31,10 +32,11 @@ from vio.datasets.frame_times import pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
 from vio.datasets.images import SUFFIXES, list_images
-from vio.datasets.kitti_raw import CAMERAS, find_above
+from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
 from vio.datasets.rigs import find_calibration, kitti_rig, load_rig
 from vio.datasets.rigs.bare import NAMES as BARE_NAMES
 from vio.datasets.settings import DatasetSettings
+from vio.datasets.sides import pairs_of, side_word, without_side
 from vio.datasets.tables import drive_times, is_date, stamped_rows
 from vio.datasets.tum_rgbd import (
     DEPTH_FACTOR,
@@ -54,13 +56,17 @@ _PAIRS: tuple[tuple[str, ...], ...] = (
     ("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_00", "image_01"),
     ("image_2", "image_3"), ("image_02", "image_03"), ("images_left", "images_right"),
     ("image_left", "image_right"), ("left_images", "right_images"), ("camera_left", "camera_right"), ("L", "R"),
-    ("image_lcam_front", "image_rcam_front"), ("infra1", "infra2"),
+    ("image_lcam_front", "image_rcam_front"), ("infra1", "infra2"), ("fisheye1", "fisheye2"),
+    ("stereo_left", "stereo_right"), ("stereo/left", "stereo/right"), ("img_l", "img_r"),
+    ("undistorted_images/cam0", "undistorted_images/cam1"),
 )  # fmt: skip
 ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
 _GRAY = (0, 1)  # of KITTI
 _COLOUR = (2, 3)
 _INSIDE = ("data", "images", "")
 _DRIVE_NS = 100_000_000  # between frames of a KITTI drive
+_DEEPEST = 3  # levels of folders that are looked into for images
+_MAX_FOLDERS = 200
 _SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 
@@ -76,8 +82,77 @@ def is_kitti_raw_folder(path: Path) -> bool:
 
 
 def is_plain_folder(path: Path) -> bool:
-    """Return whether a folder holds two image folders of known names."""
-    return _layout(path) is not None
+    """Return whether a folder holds two image folders of known names, or of names that differ in
+    their side alone.
+    """
+    return pair_layout(path) is not None
+
+
+def pair_layout(path: Path, folders: str | None = None) -> Layout | None:
+    """Return where the images of a pair lie; None: it is not clear.
+
+    Args:
+        path: of the recording.
+        folders: the left and the right folder, by setting; None: found by their names.
+
+    Raises:
+        DataError: the setting names no two folders of images.
+    """
+    if folders is not None:
+        return _named_layout(path, folders)
+    known = _layout(path)
+    if known is not None:
+        return known
+    names = [str(folder) for folder in image_folders(path)]
+    pairs = pairs_of(names)
+    stated = [pair for pair in pairs if side_word(pair[0]) == "left"] or pairs
+    if len(stated) != 1:
+        return None
+    return Layout(path, path, *(path / name for name in stated[0]))
+
+
+def _named_layout(path: Path, folders: str) -> Layout:
+    names = [name.strip() for name in folders.split(",")]
+    sides = [path / name for name in names]
+    if len(names) != 2 or not all(_holds_images(folder) for folder in sides):
+        raise DataError(
+            f"{path}: dataset.folders is {folders!r}, which names no two folders of images; it "
+            f"holds {seen_folders(path)}"
+        )
+    return Layout(path, path, *sides)
+
+
+def image_folders(path: Path) -> dict[Path, int]:
+    """Return the folders below a folder that hold images, and how many each."""
+    found: dict[Path, int] = {}
+    waiting = [(path, 0)]
+    looked = 0
+    while waiting and looked < _MAX_FOLDERS:
+        folder, depth = waiting.pop(0)
+        looked = looked + 1
+        try:
+            entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        except OSError:
+            continue
+        count = sum(os.path.splitext(entry.name)[1].lower() in SUFFIXES for entry in entries)
+        if count and depth:
+            found[folder.relative_to(path)] = count
+        if depth < _DEEPEST:
+            waiting += [(Path(entry.path), depth + 1) for entry in entries if entry.is_dir()]
+    return found
+
+
+def seen_folders(path: Path) -> str:
+    """Return the folders of images in words: 'img_l and img_r with 90 images each'."""
+    found = image_folders(path)
+    if not found:
+        return "no folder of images"
+    names = [str(folder) for folder in found]
+    listed = f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else names[0]
+    counts = set(found.values())
+    if len(counts) == 1:
+        return f"{listed} with {counts.pop()} images{' each' if len(names) > 1 else ''}"
+    return ", ".join(f"{folder} with {count} images" for folder, count in found.items())
 
 
 def holds_more_than_kitti(path: Path) -> bool:
@@ -95,7 +170,7 @@ def lacks_sensor_yaml(path: Path) -> bool:
     """Return whether a folder with EuRoC's names has its calibration elsewhere, as TUM-VI's
     export.
     """
-    layout = _layout(path)
+    layout = pair_layout(path)
     if layout is None or any(
         (base / "cam0" / "sensor.yaml").is_file() for base in (layout.base, layout.root)
     ):
@@ -158,12 +233,12 @@ def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
         DataError: images, times or samples cannot be used; the message names file and remedy.
         CalibrationError: there is no calibration, or it is invalid.
     """
-    layout = _layout(path)
+    layout = pair_layout(path, settings.folders)
     if layout is None:
         names = ", ".join(" ".join(names) for names in _PAIRS[:4])
         raise DataError(
-            f"{path}: holds no pair of image folders ({names} or others); give one with left/ and "
-            "right/"
+            f"{path}: holds no pair of image folders ({names} or others) but {seen_folders(path)}; "
+            "name the two with --set dataset.folders=LEFT,RIGHT"
         )
     pairs, notes = pair_files(list_images(layout.left), list_images(layout.right))
     return _read("plain", layout, _Images(pairs, notes), settings)
@@ -214,7 +289,8 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
             remedy.
         CalibrationError: the calibration is missing or invalid.
     """
-    layout = Layout(path, path, *(path / name / "data" for name in ("image_00", "image_01")))
+    inside = "data_rect" if (path / "image_00" / "data_rect").is_dir() else "data"  # KITTI-360
+    layout = Layout(path, path, *(path / name / inside for name in ("image_00", "image_01")))
     for folder in (layout.left, layout.right):
         if not folder.is_dir():
             raise DataError(
@@ -222,7 +298,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
                 "cameras"
             )
     pairs = pair_images(layout.left, layout.right)
-    file = find_above(path, CAMERAS)
+    file = find_above(path, CAMERAS) or find_above(path, f"calibration/{PERSPECTIVE}")
     if file is None:
         raise CalibrationError(
             f"{path}: {CAMERAS} is neither there nor in the folders above; copy KITTI's "
@@ -400,13 +476,15 @@ def _depth_factor(
 
 
 def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple[str, ...]]:
-    """Pair image files by equal names, by the last number in their names, or by stamps in their
-    names.
+    """Pair image files by equal names, by names without their camera (`000012_cam0`), by the last
+    number in their names, or by stamps in their names.
 
     Raises:
         DataError: the names share nothing.
     """
     keys: list[list[str | int]] = [[p.stem for p in lefts], [p.stem for p in rights]]
+    if not set(keys[0]) & set(keys[1]):
+        keys = [[without_side(p.stem) for p in files] for files in (lefts, rights)]
     if not set(keys[0]) & set(keys[1]):
         keys = [[_last_number(p) for p in files] for files in (lefts, rights)]
     if not set(keys[0]) & set(keys[1]) and all(_is_stamp(p.stem) for p in (*lefts, *rights)):

@@ -292,7 +292,8 @@ def _kitti_raw(path: Path, image_size: Size | None) -> Rig:
             f"{image_size[0]} x {image_size[1]} pixels; give the calibration of these images"
         )
     with naming(path):
-        if image_size == rectified != raw:
+        # KITTI-360 publishes rectified images, of the size of its raw ones
+        if image_size == rectified != raw or path.name == PERSPECTIVE:
             turn = se3_from_parts(c.R_rect_cam0, np.zeros(3))
             T = None if T_cam0_imu is None else turn @ T_cam0_imu
             return Rig(c.rect0, c.rect1, c.T_rect1_rect0, T, notes=notes)
