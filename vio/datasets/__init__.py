@@ -222,14 +222,19 @@ def _folder_kind(path: Path) -> str | None:
         return "plain" if plain.lacks_sensor_yaml(path) else "euroc"
     if plain.is_plain_folder(path):
         return "plain"
-    if video_files(path) is not None:
+    videos = video_files(path)
+    if videos is not None and videos[0] != videos[1]:
         return "video"
     if factor_files(path):
         return "gtsam"
     if plain.is_rgbd_folder(path):
         return "rgbd"
+    if plain.side_by_side(path) is not None:
+        return "plain"
     if plain.is_mono_folder(path):
         return "mono"
+    if videos is not None:
+        return "video"
     if "sequences" in names:
         raise DataError(
             f"{path} holds several KITTI sequences; name one of them, such as "

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from vio.cameras.rig import Rectifier
 from vio.datasets.common import blank_frames, chosen_frames, merge_events
 from vio.datasets.image_files import FilePairs, stem_of
@@ -235,6 +237,8 @@ class ImageDataset(ImageRecording):
     # depth image of each frame; None: there are none
     depths: Sequence[Path] | None = field(default=None, kw_only=True)
     depth_factor: float = field(default=1.0, kw_only=True)  # levels of a depth image per metre
+    # each file holds the left and the right image side by side
+    side_by_side: bool = field(default=False, kw_only=True)
 
     def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
         return readable_frames(self._load, chosen, self.settings)
@@ -247,7 +251,8 @@ class ImageDataset(ImageRecording):
             for size, path in zip(
                 self.sizes[: self.settings.cameras], self.pairs[index], strict=False
             ):
-                images.append(load_gray(path, self.levels, colour=self.colour)[0])
+                image = load_gray(path, self.levels, colour=self.colour)[0]
+                images.append(half_of(image, len(images)) if self.side_by_side else image)
                 size.check(images[-1], path)
             depth_m = (
                 None
@@ -257,6 +262,12 @@ class ImageDataset(ImageRecording):
             return self.rectifier.frame(index, time_ns, *images, depth_m=depth_m)
         except UnreadableImageError as error:
             return BadFrame(index, str(error))
+
+
+def half_of(image: Image, side: int) -> Image:
+    """Return the left (0) or right (1) half of an image (H, 2 W) or (H, 2 W, 3)."""
+    width = image.shape[1] // 2
+    return np.ascontiguousarray(image[:, side * width : (side + 1) * width])
 
 
 def _depth_m(file: Path, image: Image, factor: float) -> FloatArray:

@@ -31,7 +31,7 @@ from vio.datasets.companions import (
 from vio.datasets.frame_times import pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
-from vio.datasets.images import SUFFIXES, list_images
+from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_gray
 from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
 from vio.datasets.rigs import find_calibration, kitti_rig, load_rig
 from vio.datasets.rigs.bare import NAMES as BARE_NAMES
@@ -109,6 +109,30 @@ def pair_layout(path: Path, folders: str | None = None) -> Layout | None:
     if len(stated) != 1:
         return None
     return Layout(path, path, *(path / name for name in stated[0]))
+
+
+def side_by_side(path: Path, calibration: Path | None = None) -> Layout | None:
+    """Return where images lie each of which holds a pair, left and right; None: there are none.
+
+    They are twice as wide as the calibration of a pair states.
+    """
+    layout = _layout_of_one(path)
+    if layout is None and _holds_images(path):
+        layout = Layout(path, path, path, path)
+    if layout is None:
+        return None
+    file = calibration or calibration_beside(layout)
+    if file is None:
+        return None
+    try:
+        image = load_gray(list_images(layout.left)[0])[0]
+        half = (image.shape[1] // 2, image.shape[0])
+        # a size that the file does not state cannot tell; a ZED's states several
+        stated = half if file.suffix.lower() == ".conf" else None
+        rig = load_rig(file, image_size=stated, cameras=2)
+    except (UnreadableImageError, CalibrationError):
+        return None
+    return layout if (rig.cam0.width, rig.cam0.height) == half else None
 
 
 def _named_layout(path: Path, folders: str) -> Layout:
@@ -224,6 +248,7 @@ class _Images:
     notes: tuple[str, ...] = ()
     depths: Sequence[Path] | None = None  # depth images; None: there are none
     listed_ns: IntArray | None = None  # times in TUM's lists; None: those of any plain folder
+    side_by_side: bool = False  # each file holds a pair
 
 
 def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
@@ -234,6 +259,10 @@ def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
         CalibrationError: there is no calibration, or it is invalid.
     """
     layout = pair_layout(path, settings.folders)
+    if layout is None and (layout := side_by_side(path, settings.calibration)) is not None:
+        files = list_images(layout.left)
+        images = _Images(FilePairs(files, files), side_by_side=True)
+        return _read("plain", layout, images, settings)
     if layout is None:
         names = ", ".join(" ".join(names) for names in _PAIRS[:4])
         raise DataError(
@@ -370,6 +399,9 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> ImageDataset:
 def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings) -> ImageDataset:
     """Read what goes with the images: calibration, times, motion samples and ground truth."""
     size, levels, notes = measured_images(images.pairs)
+    if images.side_by_side:
+        size = (size[0] // 2, size[1])
+        notes = (*notes, "each image holds the left and the right one side by side")
     is_tum = images.listed_ns is not None
     used = list[Path]()
     file = settings.calibration or (
@@ -409,6 +441,7 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
         levels=levels,
         depths=images.depths,
         depth_factor=depth_factor,
+        side_by_side=images.side_by_side,
     )
 
 
