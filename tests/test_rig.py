@@ -552,6 +552,18 @@ def test_pairs_of_ros_files_by_other_names(names: tuple[str, str], tmp_path: Pat
         np.testing.assert_allclose(vio.load_rig(path).right[1], T_CAM1_CAM0, atol=1e-9)
 
 
+def test_vertical_pairs_are_called_that(tmp_path: Path) -> None:
+    down = replace(RIG, T_cam1_cam0=se3_from_parts(np.eye(3), [0.001, -0.2, 0.0]))
+    with pytest.raises(CalibrationError, match=r"a vertical pair: the cameras are 0\.2 m apart"):
+        down.rectifier()
+    P0 = np.array([[40.0, 0, 32, 0], [0, 40, 24, 0], [0, 0, 1, 0]])
+    P1 = P0.copy()
+    P1[1, 3] = -8.0
+    path = write_storage(tmp_path / "p.yml", {"P1": P0, "P2": P1}, (64, 48))
+    with pytest.raises(CalibrationError, match="a vertical pair"):
+        vio.load_rig(path)
+
+
 def test_camchain_beside_the_yaml_of_another_tool(tmp_path: Path) -> None:
     path = _camchain(lambda c: None)(tmp_path)
     (tmp_path / "euroc_imu_orb.yaml").write_text("%YAML:1.0\na: 1\n  b:[1, 2\nViewer.Size:2\n")

@@ -33,6 +33,7 @@ from vio.datasets.yaml_files import (
 from vio.errors import CalibrationError, VioError
 from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts
+from vio.geometry.rectify import vertical_fault
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,6 +219,8 @@ def _rig(infos: Sequence[CameraInfo], *, rectified: bool) -> Rig:
     left, right = infos
     offsets = [np.linalg.solve(info.P[:, :3], info.P[:, 3]) for info in infos]
     shift = offsets[1] - offsets[0]  # rectified left to rectified right
+    if (fault := vertical_fault(shift)) is not None:
+        raise CalibrationError(f"{right.where}: {fault}")
     if not shift[0] < 0:
         raise CalibrationError(
             f"{right.where}: P gives a stereo baseline of {-shift[0]:g} m, not a positive one "

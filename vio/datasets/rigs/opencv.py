@@ -22,6 +22,7 @@ from vio.datasets.yaml_files import Entries, as_number, lens_model, matrix, read
 from vio.errors import CalibrationError
 from vio.geometry.distortion import DistortionModel
 from vio.geometry.lie import FloatArray, checked_transform
+from vio.geometry.rectify import vertical_fault
 
 _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
     "K0": ("M1", "K1", "cameraMatrix1", "camera_matrix_1", "cameraMatrixL", "K_left", "left_camera_matrix", "LEFT.K",
@@ -148,7 +149,10 @@ def _rectified(entries: Entries, where: str, width: int, height: int) -> Rig:
                 "P1 and P2 differ in focal length or centre; calibrate with CALIB_ZERO_DISPARITY"
             )
         camera = camera_from_matrix(P0[:, :3], width, height, name="P1")
-        baseline = -float(P1[0, 3] / P1[0, 0])
+        shift = np.linalg.solve(P1[:, :3], P1[:, 3] - P0[:, 3])
+        if (fault := vertical_fault(shift)) is not None:
+            raise CalibrationError(fault)
+        baseline = -float(shift[0])
         return Rig.rectified(
             camera.fu, camera.fv, camera.cu, camera.cv, baseline, width, height
         ).noting(f"{where}: holds P1 and P2 only, so the images are taken to be rectified")
