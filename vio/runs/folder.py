@@ -388,6 +388,7 @@ def metrics_of(
         "dead_reckoning": None if dead_reckoning is None else dead_reckoning.as_dict(),
         "landmark_error": landmark_error(result, evaluation),
         "warnings": list(result.warnings),
+        "doubts": list(result.recording.doubts),
         "stereo_field": stereo_field(result),
         "stereo_scale": stereo_scale(result),
         "scale_sigma": final_scale_sigma(result),
