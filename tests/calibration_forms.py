@@ -329,6 +329,20 @@ def depthai(folder: Path, *, inverted: bool = False) -> Path:
     return _save(folder, "oak_calib.json", json.dumps(sheet))
 
 
+def zed_x(folder: Path) -> Path:
+    """The distortion in sections of its own, here of a fisheye."""
+    path = zed(folder) / "SN21531.conf"
+    kept = [
+        line
+        for line in path.read_text().splitlines()
+        if line[:2] not in ("k1", "k2", "k3", "p1", "p2")
+    ]
+    for side, c in zip(("LEFT", "RIGHT"), true_rig("equidistant").cameras, strict=True):
+        kept.append(f"[{side}_DISTO]")
+        kept += [f"k{k} = {value}" for k, value in enumerate(c.coefficients, start=1)]
+    return _save(folder, "SN21531.conf", "\n".join(kept) + "\n").parent
+
+
 def zed(folder: Path) -> Path:
     rig = true_rig()
     text = ""
@@ -394,6 +408,19 @@ def ncamera(folder: Path) -> Path:
     }
     sheet = {"label": "rig", "cameras": cameras, "imu_params": imu}
     return _save(folder, "ncamera.yaml", yaml.safe_dump(sheet, sort_keys=False))
+
+
+def maplab(folder: Path) -> Path:
+    """`sensors.yaml`, with the inverse pose."""
+    path = ncamera(folder)
+    sheet = yaml.safe_load(path.read_text())
+    for item in sheet["cameras"]:
+        block = item.pop("T_B_C")
+        T = np.array(block["data"]).reshape(4, 4)
+        item["T_C_B"] = {**block, "data": se3_inverse(T).ravel().tolist()}
+    path.unlink()
+    sensor = {"sensor_type": "NCAMERA", "cameras": sheet["cameras"]}
+    return _save(folder, "sensors.yaml", yaml.safe_dump({"sensors": [sensor]}))
 
 
 def kimera(folder: Path) -> Path:
@@ -528,9 +555,16 @@ FORMS = (
         replace(true_rig(), imu_noise=None, time_offset_s=0.0),
     ),
     Form("ZED", "`SN*.conf`", zed, imu_free(true_rig()), SIZE),
+    Form("ZED", "`SN*.conf` with `LEFT_DISTO`, fisheye", zed_x, imu_free(true_rig("equidistant")), SIZE),
     Form("ZED", "`SN*.conf`, images of another size", zed, None, (640, 480)),
     Form("OKVIS, OKVIS2", "`cameras:` with `T_SC`", okvis, true_rig()),
     Form("maplab, SVO", "`cameras:` with `T_B_C`", ncamera, true_rig()),
+    Form(
+        "maplab",
+        "`sensors.yaml` with `T_C_B`",
+        maplab,
+        replace(true_rig(), imu_noise=None, time_offset_s=0.0),
+    ),
     Form("Kimera", "`LeftCameraParams.yaml`, `ImuParams.yaml`", kimera, true_rig()),
     Form("4Seasons", "`undistorted_calib_*.txt`", four_seasons, imu_free(rectified_rig())),
     Form("OpenCV", "`M1 D1 M2 D2 R T`, size stated", lambda f: _opencv(f, 1.0, sized=True), imu_free(true_rig())),

@@ -21,8 +21,8 @@ from vio.cameras.rig import Rig
 from vio.datasets import open_dataset
 from vio.datasets.kitti import read_calibration
 from vio.datasets.plain import read_kitti
-from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.rigs import kitti_rig
+from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import se3_from_parts, se3_inverse, se3_log

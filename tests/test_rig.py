@@ -469,6 +469,20 @@ def test_fisheye_without_distortion_is_no_pinhole(tmp_path: Path) -> None:
     assert at_45_deg - rig.cam0.cu == pytest.approx(np.pi / 4 * rig.cam0.fu)
 
 
+def test_printed_camera_info_is_read_as_the_file(tmp_path: Path) -> None:
+    """As `ros2 topic echo --once /left/camera_info` prints it."""
+    m = opencv_matrices()
+    for side, k in (("left", 1), ("right", 2)):
+        values = {"d": m[f"D{k}"], "k": m[f"M{k}"], "r": m[f"R{k}"], "p": m[f"P{k}"]}
+        text = "header:\n  frame_id: x\nheight: 48\nwidth: 64\ndistortion_model: plumb_bob\n"
+        text += "".join(f"{n}: {np.ravel(v).tolist()}\n" for n, v in values.items())
+        text += "binning_x: 0\nbinning_y: 0\nroi:\n  x_offset: 0\n  width: 0\n  height: 0\n"
+        (tmp_path / f"{side}.yaml").write_text(text)
+    rig = vio.load_rig(tmp_path)
+    np.testing.assert_allclose(rig.right[1], T_CAM1_CAM0, atol=1e-9)
+    assert rig.cam1.coefficients[:4] == RIG.cam1.coefficients
+
+
 @pytest.mark.parametrize("roi", [None, (8, 4, 48, 40)])
 def test_camera_info_of_a_binned_part_describes_its_images(
     roi: tuple[int, int, int, int] | None,

@@ -79,6 +79,24 @@ def read_cam_to_cam(path: Path) -> KittiRawCalibration:
     )
 
 
+def read_perspective(path: Path) -> tuple[CameraModel, CameraModel, FloatArray]:
+    """Return KITTI-360's rectified cameras and `T_rect1_rect0` (4, 4) of `perspective.txt`, whose
+    published images are rectified.
+
+    Raises:
+        CalibrationError: an entry is missing, malformed or impossible.
+    """
+    entries = _read_entries(path)
+    cameras = []
+    offsets = []
+    for k in ("00", "01"):
+        size = _size(entries, f"S_rect_{k}", path)
+        P = _entry(entries, f"P_rect_{k}", 12, path).reshape(3, 4)
+        cameras.append(_camera(P[:, :3], size, (), f"{path}, P_rect_{k}"))
+        offsets.append(np.linalg.solve(P[:, :3], P[:, 3]))
+    return cameras[0], cameras[1], se3_from_parts(np.eye(3), offsets[1] - offsets[0])
+
+
 def _camera(
     K: FloatArray, size: tuple[int, int], coefficients: tuple[float, ...], where: str
 ) -> CameraModel:

@@ -15,7 +15,13 @@ from vio.cameras.rig import Rig
 from vio.datasets.common import naming
 from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
 from vio.datasets.kitti import read_calibration, read_extrinsics
-from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, read_cam_to_cam, read_imu_pose
+from vio.datasets.kitti_raw import (
+    CAMERAS,
+    PERSPECTIVE,
+    read_cam_to_cam,
+    read_imu_pose,
+    read_perspective,
+)
 from vio.datasets.rigs import bare, basalt, boofcv, camodocal, depthai, okvis, orbslam, zed
 from vio.datasets.rigs.boofcv import is_boofcv, read_boofcv
 from vio.datasets.rigs.camera_info import (
@@ -164,8 +170,12 @@ def _entries(path: Path) -> Entries:
 
 def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
     suffix = path.suffix.lower()
-    if path.name in (CAMERAS, PERSPECTIVE):
+    if path.name == CAMERAS:
         return checked_rig(_kitti_raw(path, image_size), path)
+    if path.name == PERSPECTIVE:
+        rect0, rect1, T_rect1_rect0 = read_perspective(path)
+        with naming(path):
+            return checked_rig(Rig(rect0, rect1, T_rect1_rect0), path)
     if is_four_seasons(path):
         return read_four_seasons(path, image_size)
     if suffix == ".txt" and bare.is_bare(path):
@@ -292,8 +302,7 @@ def _kitti_raw(path: Path, image_size: Size | None) -> Rig:
             f"{image_size[0]} x {image_size[1]} pixels; give the calibration of these images"
         )
     with naming(path):
-        # KITTI-360 publishes rectified images, of the size of its raw ones
-        if image_size == rectified != raw or path.name == PERSPECTIVE:
+        if image_size == rectified != raw:
             turn = se3_from_parts(c.R_rect_cam0, np.zeros(3))
             T = None if T_cam0_imu is None else turn @ T_cam0_imu
             return Rig(c.rect0, c.rect1, c.T_rect1_rect0, T, notes=notes)

@@ -80,10 +80,31 @@ class CameraInfo:
 
 
 def is_camera_info(entries: Entries) -> bool:
-    """Return whether entries are those of a CameraInfo file."""
+    """Return whether entries are those of a CameraInfo file, or of a message that was printed."""
+    if _printed(entries) is not None:
+        return True
     return "camera_matrix" in entries and (
         "projection_matrix" in entries or "image_width" in entries
     )
+
+
+def _printed(entries: Entries) -> dict[str, object] | None:
+    """Return the entries of a message as `rostopic echo` prints it, by their names in files.
+
+    None: it is none. ROS 1 and ROS 2 write its matrices in capitals and in small letters.
+    """
+    found = {name: entries.get(name, entries.get(name.upper())) for name in "dkrp"}
+    if any(found[name] is None for name in "krp") or "width" not in entries:
+        return None
+    return {
+        **entries,
+        "image_width": entries["width"],
+        "image_height": entries.get("height"),
+        "distortion_coefficients": found["d"] or [],
+        "camera_matrix": {"rows": 3, "cols": 3, "data": found["k"]},
+        "rectification_matrix": {"rows": 3, "cols": 3, "data": found["r"]},
+        "projection_matrix": {"rows": 3, "cols": 4, "data": found["p"]},
+    }
 
 
 def pair_of_files(path: Path) -> tuple[Path, Path] | None:
@@ -126,7 +147,8 @@ def read_camera_info(path: Path) -> CameraInfo:
     Raises:
         CalibrationError: an entry is missing or malformed.
     """
-    entries = read_yaml_file(path, "the camera's calibration")
+    read = read_yaml_file(path, "the camera's calibration")
+    entries: Entries = _printed(read) or read
     where = str(path)
     size = [numbers(entries, key, where, 1)[0] for key in ("image_width", "image_height")]
     width, height = image_size(size, where)

@@ -28,6 +28,7 @@ from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, checked_transform
 
 _NOISE = ("acc_n", "gyr_n")
+_UNKNOWN_POSES = 2  # of estimate_extrinsic
 
 
 def matches(entries: Entries) -> bool:
@@ -93,6 +94,11 @@ def _imu(source: Source) -> ImuSheet:
     notes: tuple[str, ...] = ()
     if any(name in entries for name in _NOISE):
         notes = (f"{source.where}: acc_n and gyr_n are of a sample and not used",)
+    if as_number(entries.get("estimate_extrinsic", 0)) == _UNKNOWN_POSES:
+        notes += (
+            f"{source.where}: doubtful: estimate_extrinsic is 2, which says that the poses of the "
+            "cameras on the IMU are not known; they are read as they stand",
+        )
     return ImuSheet(time_offset_s=offset_s, notes=notes)
 
 

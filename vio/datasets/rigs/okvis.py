@@ -5,7 +5,7 @@ the `T_BS` of the IMU is its pose on a body and not needed. `image_delay` is sub
 the cameras' stamps to have the IMU's. Noise: `sigma_g_c sigma_gw_c sigma_a_c sigma_aw_c`, densities.
 
 ncamera: `cameras` with a `camera` block each and `T_B_C`, which maps coordinates of the camera to the
-body, which is the IMU; SVO's `imu_params.delay_imu_cam` is subtracted likewise. Noise:
+body, which is the IMU (or `T_C_B`, its inverse); SVO's `imu_params.delay_imu_cam` is subtracted likewise. Noise:
 `sigma_omega_c sigma_omega_bias_c sigma_acc_c sigma_acc_bias_c`.
 Reference: OKVIS2's settings ("timestamp_camera_correct = timestamp_camera - image_delay"); SVO Pro's
 `imu_handler.cpp` (it integrates from `t - delay_imu_cam`); aslam_cv2's `camera-yaml-serialization`.
@@ -24,7 +24,7 @@ from vio.datasets.rigs.source import ImuSheet, Source, rig_of_poses
 from vio.datasets.yaml_files import Entries, as_number, lens_model, matrix, numbers, section
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel
-from vio.geometry.lie import FloatArray, checked_transform
+from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
 from vio.records import ImuDensities
 
 _NOISE = (  # gyro, its walk, accelerometer, its walk
@@ -37,10 +37,10 @@ _UNIFIED = ("unified-projection", "omni")
 
 def matches(entries: Entries) -> bool:
     """Return whether entries hold a list of cameras in one of these forms."""
-    cameras = entries.get("cameras")
-    if not isinstance(cameras, list) or not cameras:
-        return False
-    return all(isinstance(item, dict) and ("T_SC" in item or "camera" in item) for item in cameras)
+    cameras = _items(entries)
+    return bool(cameras) and all(
+        isinstance(item, dict) and ("T_SC" in item or "camera" in item) for item in cameras
+    )
 
 
 def read(source: Source) -> Rig:
@@ -50,8 +50,7 @@ def read(source: Source) -> Rig:
         CalibrationError: an entry is missing or impossible, or a lens model is not read.
     """
     where = source.where
-    items = source.entries["cameras"]
-    assert isinstance(items, list)
+    items = _items(source.entries)
     cameras = []
     poses = []
     for k, item in enumerate(items[:2]):
@@ -61,11 +60,28 @@ def read(source: Source) -> Rig:
             poses.append(_pose(item["T_SC"], f"{here}, T_SC"))
         else:
             cameras.append(_ncamera(section(item, "camera", here), here))
-            poses.append(_pose(item.get("T_B_C"), f"{here}, T_B_C"))
+            poses.append(_body_pose(item, here))
     rig = rig_of_poses(cameras, poses, where, _imu(source.entries, where))
     if len(items) > 2:
         rig = rig.noting(f"{where}: of {len(items)} cameras the first two are used")
     return checked_rig(rig, where)
+
+
+def _items(entries: Entries) -> list[Any]:
+    """Return the cameras, which maplab's `sensors.yaml` has within one of its sensors."""
+    cameras = entries.get("cameras")
+    sensors = entries.get("sensors")
+    for sensor in sensors if isinstance(sensors, list) else []:
+        if cameras is None and isinstance(sensor, dict):
+            cameras = sensor.get("cameras")
+    return cameras if isinstance(cameras, list) else []
+
+
+def _body_pose(item: Mapping[str, Any], where: str) -> FloatArray:
+    """Return `T_B_C` (4, 4) of a camera of an ncamera, which may have its inverse."""
+    if "T_B_C" not in item and "T_C_B" in item:
+        return se3_inverse(_pose(item["T_C_B"], f"{where}, T_C_B"))
+    return _pose(item.get("T_B_C"), f"{where}, T_B_C")
 
 
 def _pose(value: object, where: str) -> FloatArray:
@@ -73,6 +89,9 @@ def _pose(value: object, where: str) -> FloatArray:
 
 
 def _okvis_camera(item: Mapping[str, Any], where: str) -> CameraModel:
+    kind = str(item.get("cam_model", "pinhole")).lower()
+    if kind != "pinhole":
+        raise CalibrationError(f"{where}: cam_model {kind!r} is not read; calibrate with pinhole")
     size = image_size(numbers(item, "image_dimension", where, 2), f"{where}, image_dimension")
     focal = numbers(item, "focal_length", where, 2)
     centre = numbers(item, "principal_point", where, 2)

@@ -1,7 +1,8 @@
 """Stereolabs' factory calibration of a ZED, `SN12345.conf`: an INI file for all resolutions.
 
 `[LEFT_CAM_HD]`, `[RIGHT_CAM_HD]`: fx fy cx cy k1 k2 p1 p2 k3 of OpenCV's model (k4 and more of its
-rational one) at 1280 x 720; likewise 2K, FHD, VGA and others. `[STEREO]`: `Baseline`, `TY`, `TZ` in
+rational one) at 1280 x 720; likewise 2K, FHD, VGA and others. Files of the ZED X have the distortion in
+`[LEFT_DISTO]` and `[RIGHT_DISTO]`, k1 to k4 alone where the lens is a fisheye. `[STEREO]`: `Baseline`, `TY`, `TZ` in
 millimetres, and rotations `RX CV RZ` in radians about x, y, z for each resolution, a rotation vector
 that maps coordinates of the left camera to the right one. Baseline is positive, so that T of
 OpenCV's `X_right = R X_left + T` has -Baseline along x, as in Stereolabs' Python sample; its C++
@@ -33,6 +34,7 @@ SIZES: dict[str, Size] = {
     "2K": (2208, 1242), "FHD": (1920, 1080), "FHD1200": (1920, 1200), "HD": (1280, 720), "HD1200": (1920, 1200),
     "SVGA": (960, 600), "VGA": (672, 376), "QHDPLUS": (3200, 1800), "QHD": (2560, 1440), "4K": (3856, 2180),
 }  # fmt: skip
+_FISHEYE = ["k1", "k2", "k3", "k4"]
 _COEFFICIENTS = ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]
 
 
@@ -107,8 +109,14 @@ def _camera(source: Source, name: str, size: Size) -> CameraModel:
     block = _block(source.entries, name, source.where)
     fx, fy, cx, cy = (_number(block, (key,), where) for key in ("fx", "fy", "cx", "cy"))
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    D = [_number(block, (key,), where, 0.0) for key in _COEFFICIENTS]
+    side = name.split("_")[0]
+    stated = source.entries.get(f"{side}_DISTO", block)
+    bend = stated if isinstance(stated, dict) else block
     with naming(where):
+        if "k4" in bend and "p1" not in bend:
+            D = [_number(bend, (key,), where, 0.0) for key in _FISHEYE]
+            return camera_from_matrix(K, *size, "equidistant", D)
+        D = [_number(bend, (key,), where, 0.0) for key in _COEFFICIENTS]
         return camera_from_matrix(K, *size, "radtan", trimmed_coefficients(D))
 
 
