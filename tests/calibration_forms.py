@@ -209,7 +209,8 @@ def orbslam_old(folder: Path) -> Path:
     rig = true_rig()
     cams = [rig.cam0, rig.right[0]]
     D = [np.array([*c.coefficients, 0.0]) for c in cams]
-    R, t = T_CAM1_CAM0[:3, :3], T_CAM1_CAM0[:3, 3:]
+    R = T_CAM1_CAM0[:3, :3]
+    t = T_CAM1_CAM0[:3, 3:]
     R0, R1, P0, P1, *_ = cv2.stereoRectify(cams[0].K, D[0], cams[1].K, D[1], SIZE, R, t)
     text = f'%YAML:1.0\n\nCamera.type: "PinHole"\nCamera.fx: {P0[0, 0]}\nCamera.fy: {P0[0, 0]}\n'
     text += f"Camera.cx: {P0[0, 2]}\nCamera.cy: {P0[1, 2]}\nCamera.k1: 0.0\n"
@@ -217,7 +218,7 @@ def orbslam_old(folder: Path) -> Path:
     for side, c, d, R_rect, P in zip(("LEFT", "RIGHT"), cams, D, (R0, R1), (P0, P1), strict=True):
         text += f"{side}.height: {SIZE[1]}\n{side}.width: {SIZE[0]}\n"
         for name, M in (("D", d), ("K", c.K), ("R", R_rect), ("P", P)):
-            text += _cv(f"{side}.{name}", M, space="")
+            text += _cv(f"{side}.{name}", np.asarray(M, dtype=np.float64), space="")
     return _save(folder, "EuRoC.yaml", text + "Viewer.PointSize:2\n")
 
 

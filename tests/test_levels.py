@@ -59,7 +59,7 @@ def test_thermal_folder_has_contrast_in_every_frame_and_says_so(tmp_path: Path) 
     for k, offset in enumerate((0, 100, 200)):
         for side in ("left", "right"):
             file = tmp_path / side / f"{k}.png"
-            size = cv2.imread(str(file)).shape[:2]
+            size = load_gray(file)[0].shape
             scene = cv2.resize(THERMAL, size[::-1]) + offset
             assert cv2.imwrite(str(file), scene.astype(np.uint16))
     dataset = open_dataset(tmp_path)
@@ -109,7 +109,7 @@ def test_folder_of_raw_mosaics_is_doubted(tmp_path: Path) -> None:
     for side in ("left", "right"):
         for k in range(2):
             file = tmp_path / side / f"{k}.png"
-            size = cv2.imread(str(file)).shape[:2]
+            size = load_gray(file)[0].shape
             assert cv2.imwrite(str(file), _mosaic((0.6, 1.0, 0.5))[: size[0], : size[1]])
     notes = open_dataset(tmp_path).recording.notes
     assert sum("as in raw images of a colour camera (Bayer)" in note for note in notes) == 1

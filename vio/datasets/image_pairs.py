@@ -247,7 +247,7 @@ class ImageDataset(ImageRecording):
         """Read and rectify one frame; runs in the prefetch thread."""
         time_ns = int(self.recording.frame_times_ns[index])
         try:
-            images = []
+            images = list[Image]()
             for size, path in zip(
                 self.sizes[: self.settings.cameras], self.pairs[index], strict=False
             ):
