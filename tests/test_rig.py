@@ -513,6 +513,8 @@ def test_halved_images_of_a_calibration_without_a_size_are_doubted(tmp_path: Pat
     assert vio.load_rig(tmp_path, image_size=(640, 480)).notes == ()
     (note,) = vio.load_rig(tmp_path, image_size=(384, 288)).notes
     assert "the middle of images of about 610 x 500 pixels, not of 384 x 288" in note
+    (note,) = vio.load_rig(tmp_path, image_size=(640, 360)).notes
+    assert "if they were cropped, subtract what was cut" in note
     with pytest.raises(CalibrationError, match="principal point 305, 250 lies outside images"):
         vio.load_rig(tmp_path, image_size=(320, 240))
 
@@ -555,6 +557,14 @@ def test_one_file_of_a_pair_is_said_to_be_one_camera(tmp_path: Path) -> None:
     (note,) = vio.load_rig(tmp_path / "right.yaml").notes
     assert "is read as one camera, and seems to be one of a pair" in note
     assert vio.load_rig(tmp_path / "right.yaml", cameras=1).notes == ()
+
+
+def test_first_two_of_three_cameras_are_the_pair(tmp_path: Path) -> None:
+    write_ros_pair(tmp_path)
+    shutil.copy(tmp_path / "right.yaml", tmp_path / "cam2.yaml")
+    (tmp_path / "left.yaml").rename(tmp_path / "cam0.yaml")
+    (tmp_path / "right.yaml").rename(tmp_path / "cam1.yaml")
+    np.testing.assert_allclose(vio.load_rig(tmp_path).right[1], T_CAM1_CAM0, atol=1e-9)
 
 
 @pytest.mark.parametrize("names", [("cam_l", "cam_r"), ("ost_1", "ost_2"), ("CamLeft", "CamRight")])

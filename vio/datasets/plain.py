@@ -36,7 +36,7 @@ from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
 from vio.datasets.rigs import find_calibration, kitti_rig, load_rig
 from vio.datasets.rigs.bare import NAMES as BARE_NAMES
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.sides import pairs_of, side_word, without_side
+from vio.datasets.sides import first_pair, pairs_of, without_side
 from vio.datasets.tables import drive_times, is_date, stamped_rows
 from vio.datasets.tum_rgbd import (
     DEPTH_FACTOR,
@@ -105,10 +105,8 @@ def pair_layout(path: Path, folders: str | None = None) -> Layout | None:
         return known
     names = [str(folder) for folder in image_folders(path)]
     pairs = pairs_of(names)
-    stated = [pair for pair in pairs if side_word(pair[0]) == "left"] or pairs
-    if len(stated) != 1:
-        return None
-    return Layout(path, path, *(path / name for name in stated[0]))
+    pair = first_pair(pairs)
+    return None if pair is None else Layout(path, path, *(path / name for name in pair))
 
 
 def side_by_side(path: Path, calibration: Path | None = None) -> Layout | None:

@@ -37,7 +37,7 @@ def is_pair(left: str, right: str) -> bool:
 
 
 def pairs_of(names: list[str]) -> list[tuple[str, str]]:
-    """Return all pairs among names, left first; words such as `left` go before numbers."""
+    """Return all pairs among names, left first."""
     found = []
     for a, b in combinations(names, 2):
         if is_pair(a, b):
@@ -45,6 +45,20 @@ def pairs_of(names: list[str]) -> list[tuple[str, str]]:
         elif is_pair(b, a):
             found.append((b, a))
     return found
+
+
+def first_pair(pairs: list[tuple[str, str]]) -> tuple[str, str] | None:
+    """Return the only pair that is named as left and right, else the only one that is numbered 0
+    and 1, else the only one; None: it is not clear, as of cameras 1, 2 and 3.
+    """
+    named = [pair for pair in pairs if side_word(pair[0]) == "left"]
+    zero = [pair for pair in pairs if "0" in _differing(*pair)]
+    best = named or zero or pairs
+    return best[0] if len(best) == 1 else None
+
+
+def _differing(left: str, right: str) -> set[str]:
+    return {a for a, b in zip(words_of(left), words_of(right), strict=True) if a != b}
 
 
 def side_word(name: str) -> str | None:

@@ -240,7 +240,8 @@ def _euroc(source: Source) -> Rig:
     if cameras == 1 or (cameras is None and not (mav / "cam1" / "sensor.yaml").is_file()):
         camera, T_body_cam = read_camera_yaml(path)
         rig = Rig(camera, T_cam0_imu=se3_inverse(T_body_cam) @ T_body_imu, imu_noise=noise)
-        return checked_rig(rig, path)
+        rig = checked_rig(rig, path)
+        return _alone(rig, source, stated=(mav / "cam1").is_dir())
     (cam0, T_body_cam0), (cam1, T_body_cam1) = (
         read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1")
     )

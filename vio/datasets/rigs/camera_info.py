@@ -20,7 +20,7 @@ from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.opencv import coefficients_of
 from vio.datasets.rigs.plausible import checked_rig
-from vio.datasets.sides import pairs_of, side_word
+from vio.datasets.sides import first_pair, pairs_of
 from vio.datasets.yaml_files import (
     Entries,
     as_number,
@@ -118,19 +118,13 @@ def pair_of_files(path: Path) -> tuple[Path, Path] | None:
         for file in folder.iterdir()
         if file.suffix in (".yaml", ".yml") and file.is_file()
     )
+    pairs = pairs_of(names)
     if path.is_dir():
-        stated = [pair for pair in pairs_of(names) if side_word(pair[0]) == "left"]
-        found = [
-            pair
-            for pair in (stated or pairs_of(names))
-            if all(_holds_camera_info(folder / name) for name in pair)
-        ]
+        found = [p for p in pairs if all(_holds_camera_info(folder / name) for name in p)]
     else:
-        found = [pair for pair in pairs_of(names) if path.name in pair]
-        found = [p for p in found if side_word(p[0]) == "left"] or found
-    if len(found) != 1:
-        return None
-    return folder / found[0][0], folder / found[0][1]
+        found = [pair for pair in pairs if path.name in pair]
+    pair = first_pair(found)
+    return None if pair is None else (folder / pair[0], folder / pair[1])
 
 
 def _holds_camera_info(file: Path) -> bool:

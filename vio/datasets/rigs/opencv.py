@@ -149,7 +149,7 @@ def _rectified(entries: Entries, where: str, width: int, height: int) -> Rig:
                 "P1 and P2 differ in focal length or centre; calibrate with CALIB_ZERO_DISPARITY"
             )
         camera = camera_from_matrix(P0[:, :3], width, height, name="P1")
-        shift: FloatArray = np.linalg.solve(P1[:, :3], P1[:, 3] - P0[:, 3])
+        shift = np.asarray(np.linalg.solve(P1[:, :3], P1[:, 3] - P0[:, 3]), dtype=np.float64)
         if (fault := vertical_fault(shift)) is not None:
             raise CalibrationError(fault)
         baseline = -float(shift[0])

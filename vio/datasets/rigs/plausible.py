@@ -18,6 +18,8 @@ from vio.geometry.distortion import CameraModel
 # Ratio of twice the principal point to the image size, along both axes in one direction, beyond
 # which the images are of another size: real principal points are within a tenth of the middle.
 _OTHER_SIZE = 1.2
+# Likewise along one axis, as of images that were cropped
+_CROPPED = 1.3
 # A board's square is 0.02 to 0.1 m and a rig's baseline 0.05 to 0.6 m, so that in squares a
 # baseline is seldom below 1, and in metres seldom above.
 _SQUARES_M = 1.0
@@ -55,18 +57,25 @@ def check_principal_point(camera: CameraModel, where: Path | str) -> None:
 
 def _size_doubt(camera: CameraModel, where: Path | str) -> str | None:
     """Return the doubt about a size that is not stated; None: the principal point is near its
-    middle, or off along one axis only, as that of cropped images.
+    middle.
     """
     ratios = np.array([2 * camera.cu / camera.width, 2 * camera.cv / camera.height])
-    if ratios.max() > 1 / _OTHER_SIZE and ratios.min() < _OTHER_SIZE:
+    scaled = ratios.min() > _OTHER_SIZE or ratios.max() < 1 / _OTHER_SIZE
+    cropped = ratios.max() > _CROPPED or ratios.min() < 2 - _CROPPED
+    if not (scaled or cropped):
         return None
-    scale = float(ratios.mean())
+    remedy = (
+        f"if they were scaled, divide its focal lengths and principal points by "
+        f"{ratios.mean():.3g}, or all depths are off by this factor"
+        if scaled
+        else "if they were cropped, subtract what was cut from its principal points, or directions "
+        "are off"
+    )
     return (
         f"{where}: doubtful: it states no image size, and its principal point {camera.cu:.0f}, "
         f"{camera.cv:.0f} is the middle of images of about {2 * camera.cu:.0f} x "
         f"{2 * camera.cv:.0f} pixels, not of {camera.width} x {camera.height}; it is read as that "
-        f"of these images; if they were scaled, divide its focal lengths and principal points by "
-        f"{scale:.3g}, or all depths are off by this factor"
+        f"of these images; {remedy}"
     )
 
 
