@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.dataset_makers import make_kitti
 from tests.plain_maker import make_plain
+from vio.cli import main
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.image_files import ImageFiles
 from vio.datasets.plain import pair_files
@@ -174,3 +177,22 @@ def test_monado_folder_with_basalts_calibration(tmp_path: Path) -> None:
     basalt("equidistant", tmp_path / "extras")
     recording = open_dataset(tmp_path).recording
     assert recording.camera.baseline_m == pytest.approx(0.11, abs=1e-3)
+
+
+def test_inspect_names_a_doubt_and_its_verdict_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A calibration for images of 32 x 24 pixels, which does not state their size."""
+    folder = make_kitti(tmp_path / "seq", frames=3)
+    rng = np.random.default_rng(2)
+    for side in ("image_0", "image_1"):
+        for file in (folder / side).iterdir():
+            assert cv2.imwrite(str(file), rng.integers(0, 256, (36, 48), dtype=np.uint8))
+    assert len(open_dataset(folder).recording.doubts) == 1
+    main(["inspect", str(folder), "--frames", "0", "--json"])
+    (doubt,) = json.loads(capsys.readouterr().out)["doubts"]
+    assert "the middle of images of about 32 x 24 pixels, not of 48 x 36" in doubt
+    main(["inspect", str(folder), "--frames", "0"])
+    out = capsys.readouterr().out
+    assert "DOUBT" in out
+    assert ("settle the doubt above first" in out) == ("FAULT" not in out)
