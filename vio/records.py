@@ -596,6 +596,14 @@ class Trajectory:
         return replace(self, T_world_body=self.T_world_body @ T_cam0_imu, body="imu")
 
 
+DOUBT = "doubtful: "  # begins what a note says after its file where it names two readings
+
+
+def doubts_among(notes: Sequence[str]) -> tuple[str, ...]:
+    """Return the notes that name two readings of a file, of which one had to be taken."""
+    return tuple(note for note in notes if DOUBT in note)
+
+
 @dataclass(frozen=True, slots=True)
 class Recording:
     """What is known of a recording before its first frame is read."""
@@ -613,6 +621,11 @@ class Recording:
     motion_notes: tuple[str, ...] = ()  # those of them that are on motion samples only
     # observation logs: what the run behind the log used; None: not known
     run_motion: RunMotion | None = None
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The notes on what the files do not state and what their own numbers contradict."""
+        return doubts_among(self.notes)
 
     @property
     def T_cam0_body(self) -> FloatArray:

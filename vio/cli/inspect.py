@@ -69,19 +69,25 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _facts(report: Inspection) -> dict[str, Any]:
+    from vio.records import doubts_among
+
     return {
         "parts": {part.name: dict(part.facts) for part in report.parts},
         "faults": list(report.faults),
+        "doubts": list(doubts_among(report.notes)),
         "notes": list(report.notes),
     }
 
 
 def _rows(report: Inspection, source: str) -> list[tuple[str, str]]:
+    from vio.records import doubts_among
+
     rows = [(part.name, part.text) for part in report.parts]
-    rows += [("note", note) for note in report.notes]
+    doubts = doubts_among(report.notes)
+    rows += [("note", note) for note in report.notes if note not in doubts]
+    rows += [("DOUBT", note) for note in doubts]
     rows += [("FAULT", fault) for fault in report.faults]
-    return (
-        rows
-        if report.faults
-        else [*rows, ("verdict", "can be run"), ("next", f"vio run {shlex.quote(source)}")]
-    )
+    if report.faults:
+        return rows
+    verdict = "can be run; settle the doubt above first" if doubts else "can be run"
+    return [*rows, ("verdict", verdict), ("next", f"vio run {shlex.quote(source)}")]

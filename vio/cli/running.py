@@ -388,7 +388,9 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
         share = metrics["rig_scale_sigma"]
         path_m = metrics["path_length_m"]
         of_path = f"{metres_text(share * path_m)} of {path_m:.2f} m"
-        rows.append(("scale", f"known to {100 * share:.2g} % by the calibration: {of_path}"))
+        known = f"known to {100 * share:.2g} % by the calibration: {of_path}"
+        doubted = bool(metrics.get("doubts"))
+        rows.append(("scale", "in doubt: settle what the notes above name" if doubted else known))
     if metrics["stereo_field"] is not None:
         field = metrics["stereo_field"]
         rows.append(("stereo", f"{field['text']}; corrected in this run"))

@@ -391,6 +391,7 @@ def metrics_of(
         "warnings": list(result.warnings),
         "findings": [finding.to_json() for finding in result.findings],
         "integrity": integrity_counts(result),
+        "doubts": list(result.recording.doubts),
         "stereo_field": stereo_field(result),
         "stereo_scale": stereo_scale(result),
         "scale_sigma": final_scale_sigma(result),
