@@ -17,8 +17,8 @@ diagnostics of [ROS 2](ros2.md) have them while it runs.
 **Integrity.** A covariance is conditional on what the filter assumes. `Estimate.integrity` says whether these
 assumptions hold: *nominal*, *degraded* (a sensor or a part of the images is left out; the covariance still covers the
 error), *unusable* (an assumption does not hold; the covariance also covers that the rig has moved in any direction
-since then, at the fastest speed so far). The column `integrity` of `frames.csv` is 0, 1, 2; where a fault began before it was
-found, earlier frames are marked in the files. An event without an end counts for one second.
+since then, at the fastest speed so far). The column `integrity` of `frames.csv` is 0, 1, 2; where a fault began before
+it was found, earlier frames are marked in the files. An event without an end counts for one second.
 
 `vio.protection_level(estimate)` gives the radius in the horizontal plane and the half height that contain the true
 position with a probability (0.997 unless given), as receivers of satellite navigation state it.
