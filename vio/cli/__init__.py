@@ -33,7 +33,7 @@ BY_PURPOSE = {
     purpose: tuple(import_module(f"vio.cli.{name}") for name in names.split())
     for purpose, names in {
         "Try it": "demo",
-        "Before a run": "inspect calibrate rectify convert",
+        "Before a run": "inspect target calibrate_rig imu_noise calibrate rectify convert",
         "Run": "run config",
         "Live": "live ros2 play",
         "Look and compare": "report view mesh evaluate export",

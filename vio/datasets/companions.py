@@ -75,7 +75,8 @@ def find_calibration_of(layout: Layout) -> Path:
     raise CalibrationError(
         f"{layout.root}: no calibration; add one as calibration.yaml (Kalibr's camchain, OpenCV's "
         "M1 D1 M2 D2 R T), "
-        "calib.txt (KITTI's) or another that vio.load_rig reads, or name it with --calibration FILE"
+        "calib.txt (KITTI's) or another that vio.load_rig reads, or name it with "
+        "--calibration FILE; vio calibrate-rig makes one from a printed board"
     )
 
 

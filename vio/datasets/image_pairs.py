@@ -218,6 +218,10 @@ class ImageRecording(ABC):
         frames = self._frames(chosen) if images else blank_frames(self.recording, chosen)
         return merge_events(self.recording, chosen, self.motion, frames)
 
+    def frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
+        """Yield frames by their numbers, increasing, as `events` does, and read no others."""
+        return self._frames(chosen)
+
     def observations(self, index: int) -> Observations | None:
         """Return None: the recording holds images only."""
         return None

@@ -200,6 +200,11 @@ def lacks_sensor_yaml(path: Path) -> bool:
     return calibration_beside(layout) is not None
 
 
+def image_layout(path: Path) -> Layout | None:
+    """Return where a folder has the images of two cameras, else of one; None: it has none."""
+    return _layout(path) or _layout_of_one(path)
+
+
 def images_of_one_camera(path: Path) -> Path | None:
     """Return the folder of images that a folder holds or is, whether or not anything else
     identifies them.

@@ -1,0 +1,94 @@
+"""Views of a board for tests: exact corners with noise, and rendered recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets.images import write_png
+from vio.geometry.distortion import CameraModel, project_point
+from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, transform_points
+from vio.targets.corners import Corners
+from vio.targets.description import Target
+from vio.targets.rendering import BoardRenderer, Exposure, board_points
+from vio.targets.views import View
+
+GRID = Target("aprilgrid", 6, 6, 0.088, 0.3)
+LEFT = CameraModel(460, 461, 372.5, 241.5, 752, 480, "radtan", (-0.28, 0.07, 2e-4, 1e-4))
+RIGHT = CameraModel(458, 457.5, 378, 236, 752, 480, "radtan", (-0.27, 0.065, -2e-4, 3e-4))
+T_RIGHT_LEFT = se3_from_parts(so3_exp([0.004, -0.01, 0.006]), [-0.11, 0.0005, 0.001])
+
+
+@dataclass(frozen=True)
+class Flaws:
+    """What is wrong with corners."""
+
+    noise_px: float = 0.05
+    bow_m: tuple[float, float] = (0.0, 0.0)
+    wrong_share: float = 0.0  # of the corners, which are 10 px off
+    moved_m: float = 0.0  # of the board between the exposures of left and right
+
+
+def board_pose(target: Target, rng: np.random.Generator, nearest_m: float = 0.4) -> FloatArray:
+    """A pose of the board in front of the left camera."""
+    z = rng.uniform(nearest_m, 3 * nearest_m)
+    R = so3_exp(rng.normal(size=3) * [0.4, 0.4, 0.3])
+    p = np.array([rng.uniform(-0.45, 0.45) * z, rng.uniform(-0.3, 0.3) * z, z])
+    return se3_from_parts(R, p - R @ [*(0.5 * np.array(target.extent_m)), 0.0])
+
+
+def made_views(
+    seed: int,
+    count: int = 30,
+    flaws: Flaws | None = None,
+    cameras: tuple[CameraModel, ...] = (LEFT, RIGHT),
+) -> list[View]:
+    """Views with enough corners in all images."""
+    rng = np.random.default_rng(seed)
+    flaws = flaws or Flaws()
+    points = board_points(GRID, np.array(flaws.bow_m))
+    views: list[View] = []
+    while len(views) < count:
+        T_left_board = board_pose(GRID, rng)
+        found = []
+        for k, camera in enumerate(cameras):
+            T = T_left_board if k == 0 else T_RIGHT_LEFT @ T_left_board
+            if k and flaws.moved_m:
+                T = T.copy()
+                T[:3, 3] += flaws.moved_m * rng.normal(size=3)
+            uv, seen = project_point(camera, transform_points(T, points))
+            limit = np.array([camera.width, camera.height]) - 5
+            ids = np.flatnonzero(seen & (uv > 4).all(axis=1) & (uv < limit).all(axis=1))
+            noisy = uv[ids] + flaws.noise_px * rng.normal(size=(len(ids), 2))
+            wrong = rng.random(len(ids)) < flaws.wrong_share
+            noisy[wrong] += 10 * rng.normal(size=(int(wrong.sum()), 2))
+            found.append(Corners(ids, noisy))
+        if min(len(one) for one in found) >= 20:
+            views.append(View(len(views) * 100_000_000, tuple(found)))
+    return views
+
+
+SMALL = Target("aprilgrid", 3, 4, 0.08, 0.3)
+SMALL_LEFT = CameraModel(230, 231, 186, 121, 376, 240, "radtan", (-0.25, 0.06, 1e-4, 1e-4))
+SMALL_RIGHT = CameraModel(231, 230, 189, 118, 376, 240, "radtan", (-0.26, 0.06, 1e-4, -1e-4))
+
+
+def render_pairs(folder: Path, count: int, seed: int = 0, target: Target = SMALL) -> Path:
+    """Write small rendered pairs into `left` and `right`."""
+    rng = np.random.default_rng(seed)
+    renderers = [BoardRenderer(target, camera) for camera in (SMALL_LEFT, SMALL_RIGHT)]
+    for name in ("left", "right"):
+        (folder / name).mkdir(parents=True)
+    for k in range(count):
+        T_left_board = board_pose(target, rng, nearest_m=0.25)
+        for name, renderer, T in zip(
+            ("left", "right"),
+            renderers,
+            (T_left_board, T_RIGHT_LEFT @ T_left_board),
+            strict=True,
+        ):
+            image = renderer.render(T, Exposure(0.6, 2.0, seed=100 * k + len(name)))
+            write_png(folder / name / f"{k:04d}.png", image)
+    return folder

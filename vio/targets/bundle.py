@@ -1,0 +1,344 @@
+"""Bundle adjustment of a board: lenses, the pair's pose, the bow of the board, and each view's pose.
+
+One robust least-squares problem over all views and cameras. Its normal equations are arrow-shaped:
+the poses of the views are eliminated (Schur complement), which leaves some thirty unknowns.
+References: Triggs et al., Bundle adjustment: a modern synthesis (2000); Geman & McClure,
+Statistical methods for tomographic image reconstruction (1987), for the weights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.errors import CalibrationError
+from vio.geometry.distortion import CameraModel, project_point
+from vio.geometry.lie import FloatArray, se3_exp, so3_hat
+from vio.numerics.robust import median
+from vio.targets.views import Sightings
+
+BoolArray = npt.NDArray[np.bool_]
+
+_INTRINSIC = 4  # fu fv cu cv, before a lens's coefficients
+_BOW = 2
+_STEP = 1e-6  # of numerical differences, relative for points
+_POSE = 6
+_STEPS = 60
+_CONVERGED = 1e-6  # relative change of the cost
+_MAX_DAMPING = 1e8
+_WIDTH = 3.0  # standard deviations at which a corner's weight is a quarter
+_CUT = 4.5  # standard deviations beyond which a corner has no weight at the end
+_MIN_SIGMA_PX = 0.01
+# by which coefficients of a lens may be off zero: holds those that no view shows
+_COEFFICIENT_SIGMA = 10.0
+_BOW_SHARE = 0.01  # of the board's width: standard deviation of its bow before any view
+_BEHIND_PX = 100.0  # residual of a corner that the lens cannot project
+_MEDIAN_TO_SIGMA = 1.1774  # of the length of a vector of two Gaussian components
+
+
+@dataclass(frozen=True, slots=True)
+class RigFit:
+    """Unknowns of the adjustment."""
+
+    cameras: tuple[CameraModel, ...]
+    T_cam_cam0: FloatArray  # (C, 4, 4) the first one is the identity
+    T_cam0_board: FloatArray  # (V, 4, 4)
+    bow: FloatArray  # (2,) height of the board's middle over its edges, along x and along y, metres
+
+
+@dataclass(frozen=True, slots=True)
+class Adjusted:
+    """Where an adjustment ended."""
+
+    at: RigFit
+    sigma_px: FloatArray  # (C,) of a corner's coordinate, of each camera, as its residuals show
+    covariance: FloatArray  # (S, S) of the shared unknowns, see `Layout`
+    used: BoolArray  # (R,) corners with weight
+    residuals_px: FloatArray  # (R, 2) measured minus expected
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where the shared unknowns lie: lens by lens, poses of the further cameras, the bow."""
+
+    lenses: tuple[slice, ...]
+    poses: tuple[slice, ...]  # xi of `exp(xi) T_cam_cam0` of cameras 1 and on
+    bow: slice
+    size: int
+
+
+def layout_of(cameras: tuple[CameraModel, ...]) -> Layout:
+    """Return where the shared unknowns of cameras lie."""
+    lenses: list[slice] = []
+    start = 0
+    for camera in cameras:
+        lenses.append(slice(start, start + _INTRINSIC + len(camera.coefficients)))
+        start = lenses[-1].stop
+    poses: list[slice] = []
+    for _ in cameras[1:]:
+        poses.append(slice(start, start + _POSE))
+        start += _POSE
+    return Layout(tuple(lenses), tuple(poses), slice(start, start + _BOW), start + _BOW)
+
+
+def lens_moved(camera: CameraModel, step: FloatArray) -> CameraModel:
+    """Return a camera with intrinsics and coefficients changed by a step (4 + n,).
+
+    Raises:
+        CalibrationError: the lens model does not allow the result.
+    """
+    values = np.array([camera.fu, camera.fv, camera.cu, camera.cv, *camera.coefficients]) + step
+    fu, fv, cu, cv, *coefficients = values.tolist()
+    return replace(camera, fu=fu, fv=fv, cu=cu, cv=cv, coefficients=tuple(coefficients))
+
+
+def bow_shape(points_m: FloatArray) -> FloatArray:
+    """Return the depths (N, 2) in the board's frame by each term of a bow, at points (N, 2)."""
+    low = points_m.min(axis=0)
+    half = 0.5 * (points_m.max(axis=0) - low)
+    return np.asarray(1 - ((points_m - low - half) / half) ** 2)
+
+
+def pixels_by_point(camera: CameraModel, p_cam: FloatArray, uv: FloatArray) -> FloatArray:
+    """Derivative (N, 2, 3) of pixels (N, 2) by their points (N, 3) in the camera, by forward
+    differences.
+    """
+    step = _STEP * np.linalg.norm(p_cam, axis=1, keepdims=True)
+    out = np.empty((len(p_cam), 2, 3))
+    for k in range(3):
+        ahead, _ = project_point(camera, p_cam + step * np.eye(3)[k])
+        out[:, :, k] = (ahead - uv) / step
+    return out
+
+
+def pixels_by_lens(camera: CameraModel, p_cam: FloatArray, uv: FloatArray) -> FloatArray:
+    """Derivative (N, 2, 4 + n) of pixels (N, 2) of points (N, 3) by `fu fv cu cv` and the
+    coefficients, of these by differences to the side that the model allows.
+    """
+    count = len(camera.coefficients)
+    out = np.zeros((len(p_cam), 2, _INTRINSIC + count))
+    out[:, 0, 0] = (uv[:, 0] - camera.cu) / camera.fu
+    out[:, 1, 1] = (uv[:, 1] - camera.cv) / camera.fv
+    out[:, 0, 2] = 1
+    out[:, 1, 3] = 1
+    for k in range(count):
+        step = np.zeros(_INTRINSIC + count)
+        step[_INTRINSIC + k] = _STEP
+        moved = _allowed(camera, step)
+        change = moved.coefficients[k] - camera.coefficients[k]
+        out[:, :, _INTRINSIC + k] = (project_point(moved, p_cam)[0] - uv) / change
+    return out
+
+
+def _allowed(camera: CameraModel, step: FloatArray) -> CameraModel:
+    """Return the camera moved by a step, or by its opposite where the model ends."""
+    try:
+        return lens_moved(camera, step)
+    except CalibrationError:
+        return lens_moved(camera, -step)
+
+
+class BoardAdjustment:
+    """Adjusts a rig to what it saw of a board."""
+
+    def __init__(self, seen: Sightings, *, fixed_lenses: bool = False) -> None:
+        order = np.argsort(seen.view, kind="stable")
+        self.seen = seen.take(order)
+        self._order = order
+        self._first = np.searchsorted(self.seen.view, np.arange(seen.views + 1))
+        self._shape = bow_shape(seen.points_m)
+        self._fixed = fixed_lenses  # and the pair and the bow: only the views' poses are found
+        self._bow_sigma_m = _BOW_SHARE * float(np.ptp(seen.points_m, axis=0).max())
+
+    def solve(self, start: RigFit, steps: int = _STEPS) -> Adjusted:
+        """Return the optimum from a start on."""
+        at = self._descend(start, steps, cut=False)
+        at = self._descend(at, steps, cut=True)
+        r = self._residuals(at)
+        used = self._weights(r, self._sigmas(r), cut=True) > 0
+        sigma = self._final_sigmas(r, used)
+        weight = used / sigma[self.seen.camera] ** 2
+        A, B, C, _, _ = self._normal(at, weight)
+        S = C - np.einsum("vij,vik->jk", B, np.linalg.solve(A, B))
+        covariance = np.zeros_like(S) if self._fixed else np.asarray(np.linalg.inv(S))
+        back = np.argsort(self._order)
+        return Adjusted(at, sigma, 0.5 * (covariance + covariance.T), used[back], r[back])
+
+    def pose_information(self, found: Adjusted) -> FloatArray:
+        """Return the inverse covariance (V, 6, 6) of xi in `exp(xi) T_cam0_board` of each view,
+        lenses and pair as known.
+        """
+        used = found.used[self._order]
+        A = self._normal(found.at, used / found.sigma_px[self.seen.camera] ** 2)[0]
+        return np.asarray(A)
+
+    def _descend(self, at: RigFit, steps: int, *, cut: bool) -> RigFit:
+        damping = 1e-4
+        for _ in range(steps):
+            r = self._residuals(at)
+            weight = self._weights(r, self._sigmas(r), cut=cut)
+            before = self._cost(r, weight, at)
+            system = self._normal(at, weight)
+            while True:
+                new = self._moved(at, *_solved(system, damping, fixed=self._fixed))
+                after = np.inf if new is None else self._cost(self._residuals(new), weight, new)
+                if new is not None and after <= before:
+                    break
+                damping *= 10
+                if damping > _MAX_DAMPING:
+                    return at
+            at = new
+            damping = max(damping / 10, 1e-9)
+            if before - after < _CONVERGED * before:
+                return at
+        return at
+
+    def _points_cam0(self, at: RigFit) -> FloatArray:
+        """Corners (R, 3) of the rows in the first camera."""
+        depth = self._shape @ at.bow
+        p = np.column_stack([self.seen.points_m, depth])[self.seen.point]
+        T = at.T_cam0_board[self.seen.view]
+        return np.asarray(np.einsum("rij,rj->ri", T[:, :3, :3], p) + T[:, :3, 3])
+
+    def _residuals(self, at: RigFit) -> FloatArray:
+        """Measured minus expected pixels (R, 2)."""
+        p_cam0 = self._points_cam0(at)
+        out = np.empty((len(p_cam0), 2))
+        for c, camera in enumerate(at.cameras):
+            rows = np.flatnonzero(self.seen.camera == c)
+            T = at.T_cam_cam0[c]
+            uv, valid = project_point(camera, p_cam0[rows] @ T[:3, :3].T + T[:3, 3])
+            out[rows] = np.where(valid[:, None], self.seen.uv[rows] - uv, _BEHIND_PX)
+        return out
+
+    def _sigmas(self, r: FloatArray) -> FloatArray:
+        """Robust standard deviation (C,) of a coordinate, of each camera."""
+        length = np.linalg.norm(r, axis=1)
+        out = np.full(self.seen.cameras, _MIN_SIGMA_PX)
+        for c in range(self.seen.cameras):
+            mine = length[self.seen.camera == c]
+            if len(mine):
+                out[c] = max(median(mine) / _MEDIAN_TO_SIGMA, _MIN_SIGMA_PX)
+        return out
+
+    def _final_sigmas(self, r: FloatArray, used: BoolArray) -> FloatArray:
+        """Root mean square (C,) of the residuals that are used, freed of the fit's own unknowns."""
+        out = np.full(self.seen.cameras, _MIN_SIGMA_PX)
+        for c in range(self.seen.cameras):
+            rows = used & (self.seen.camera == c)
+            unknowns = _POSE * len(np.unique(self.seen.view[rows])) / self.seen.cameras
+            freedom = max(2 * int(rows.sum()) - unknowns - 10, 1)
+            out[c] = max(float(np.sqrt(np.sum(r[rows] ** 2) / freedom)), _MIN_SIGMA_PX)
+        return out
+
+    def _weights(self, r: FloatArray, sigma: FloatArray, *, cut: bool) -> FloatArray:
+        """Weights (R,) of squared residuals: Geman and McClure's, or all or nothing."""
+        squared = np.sum(r**2, axis=1) / sigma[self.seen.camera] ** 2
+        if cut:
+            robust = (squared < _CUT**2).astype(np.float64)
+        else:
+            robust = 1 / (1 + squared / _WIDTH**2) ** 2
+        return np.asarray(robust / sigma[self.seen.camera] ** 2)
+
+    def _cost(self, r: FloatArray, weight: FloatArray, at: RigFit) -> float:
+        prior = 0.0
+        for camera in at.cameras:
+            prior += float(np.sum(np.square(camera.coefficients))) / _COEFFICIENT_SIGMA**2
+        prior += float(np.sum(at.bow**2)) / self._bow_sigma_m**2
+        return float(weight @ np.sum(r**2, axis=1)) + prior
+
+    def _normal(self, at: RigFit, weight: FloatArray) -> tuple[FloatArray, ...]:
+        """Blocks of the normal equations: views (V, 6, 6), views by shared (V, 6, S), shared
+        (S, S), and the right-hand sides (V, 6) and (S,).
+        """
+        layout = layout_of(at.cameras)
+        seen = self.seen
+        p_cam0 = self._points_cam0(at)
+        shared = np.zeros((len(p_cam0), 2, layout.size))
+        own = np.zeros((len(p_cam0), 2, _POSE))
+        r = np.zeros((len(p_cam0), 2))
+        for c, camera in enumerate(at.cameras):
+            rows = np.flatnonzero(seen.camera == c)
+            T = at.T_cam_cam0[c]
+            p_cam = p_cam0[rows] @ T[:3, :3].T + T[:3, 3]
+            uv, valid = project_point(camera, p_cam)
+            D = pixels_by_point(camera, p_cam, uv) * valid[:, None, None]
+            by_cam0 = D @ T[:3, :3]
+            shared[rows, :, layout.lenses[c]] = (
+                pixels_by_lens(camera, p_cam, uv) * valid[:, None, None]
+            )
+            if c:
+                shared[rows, :, layout.poses[c - 1]] = _by_twist(D, p_cam)
+            axis = at.T_cam0_board[seen.view[rows], :3, 2]
+            along = np.einsum("rij,rj->ri", by_cam0, axis)
+            shared[rows, :, layout.bow] = along[:, :, None] * self._shape[seen.point[rows]][:, None]
+            own[rows] = _by_twist(by_cam0, p_cam0[rows])
+            r[rows] = np.where(valid[:, None], seen.uv[rows] - uv, 0.0)
+        scale = np.sqrt(weight)[:, None]
+        r = r * scale
+        own = own * scale[..., None]
+        flat = (shared * scale[..., None]).reshape(-1, layout.size)
+        C = flat.T @ flat
+        g = flat.T @ r.ravel()
+        self._add_priors(C, g, at, layout)
+        A = np.zeros((seen.views, _POSE, _POSE))
+        B = np.zeros((seen.views, _POSE, layout.size))
+        b = np.zeros((seen.views, _POSE))
+        for v in range(seen.views):
+            rows_of = slice(2 * self._first[v], 2 * self._first[v + 1])
+            J = own.reshape(-1, _POSE)[rows_of]
+            A[v] = J.T @ J + 1e-12 * np.eye(_POSE)
+            B[v] = J.T @ flat[rows_of]
+            b[v] = J.T @ r.ravel()[rows_of]
+        return A, B, C, b, g
+
+    def _add_priors(self, C: FloatArray, g: FloatArray, at: RigFit, layout: Layout) -> None:
+        """Add what is known before any view to the shared equations."""
+        for camera, lens in zip(at.cameras, layout.lenses, strict=True):
+            rows = np.arange(lens.start + _INTRINSIC, lens.stop)
+            C[rows, rows] += 1 / _COEFFICIENT_SIGMA**2
+            g[rows] -= np.array(camera.coefficients) / _COEFFICIENT_SIGMA**2
+        rows = np.arange(layout.bow.start, layout.bow.stop)
+        C[rows, rows] += 1 / self._bow_sigma_m**2
+        g[rows] -= at.bow / self._bow_sigma_m**2
+
+    def _moved(self, at: RigFit, own: FloatArray, shared: FloatArray) -> RigFit | None:
+        """Return the unknowns moved by a step; None: a lens model does not allow it."""
+        T_cam0_board = se3_exp(own) @ at.T_cam0_board
+        if self._fixed:
+            return replace(at, T_cam0_board=T_cam0_board)
+        layout = layout_of(at.cameras)
+        try:
+            cameras = tuple(
+                lens_moved(camera, shared[lens])
+                for camera, lens in zip(at.cameras, layout.lenses, strict=True)
+            )
+        except CalibrationError:
+            return None
+        T_cam_cam0 = at.T_cam_cam0.copy()
+        for c, pose in enumerate(layout.poses):
+            T_cam_cam0[c + 1] = se3_exp(shared[pose]) @ T_cam_cam0[c + 1]
+        return RigFit(cameras, T_cam_cam0, T_cam0_board, at.bow + shared[layout.bow])
+
+
+def _by_twist(uv_D_p: FloatArray, p: FloatArray) -> FloatArray:
+    """Derivative (N, 2, 6) by xi of `exp(xi) p`."""
+    return np.concatenate([uv_D_p, -uv_D_p @ so3_hat(p)], axis=2)
+
+
+def _solved(
+    system: tuple[FloatArray, ...], damping: float, *, fixed: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Steps of the views (V, 6) and of the shared unknowns (S,)."""
+    A, B, C, b, g = system
+    A = A + damping * A * np.eye(_POSE)
+    own_alone = np.asarray(np.linalg.solve(A, b[..., None])[..., 0], dtype=np.float64)
+    if fixed:
+        return own_alone, np.zeros_like(g)
+    A_B = np.linalg.solve(A, B)
+    S = C + damping * np.diag(np.diag(C)) - np.einsum("vij,vik->jk", B, A_B)
+    shared = np.linalg.solve(S, g - np.einsum("vij,vi->j", B, own_alone))
+    own: FloatArray = own_alone - A_B @ shared
+    return own, np.asarray(shared, dtype=np.float64)

@@ -1,0 +1,154 @@
+"""From the views of a board to calibrated cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.cameras.rig import Rig
+from vio.errors import CalibrationError, DataError
+from vio.numerics.robust import median
+from vio.records import ImuDensities, IntArray
+from vio.targets.bundle import Adjusted, BoardAdjustment
+from vio.targets.description import Target
+from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu
+from vio.targets.lenses import LENSES, LensScore, choose_lens
+from vio.targets.recording import Filmed
+from vio.targets.start import one_camera, pair_start, pose_only
+from vio.targets.verdict import MIN_VIEWS, Verdict, judge
+from vio.targets.views import Sightings, sightings
+
+_MIN_CORNERS = 12  # of a view that is used
+_MAX_VIEWS = 60
+_MAX_RESIDUAL_PX = 3.0  # beyond which the board or the lens is another one
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """Cameras calibrated with a board."""
+
+    rig: Rig
+    lens: str  # a key of `LENSES`
+    scores: tuple[LensScore, ...]  # of the models that were compared; empty: one was asked for
+    found: Adjusted
+    seen: Sightings
+    alone_sigma_px: tuple[float, ...]  # residual of each camera without the other
+    verdict: Verdict
+
+
+def calibrate_cameras(
+    filmed: Filmed,
+    target: Target,
+    lens: str | None = None,
+    progress: Callable[[str], None] = lambda what: None,
+) -> CameraCalibration:
+    """Calibrate one camera or a pair.
+
+    Args:
+        filmed: what they saw of the board.
+        target: the board.
+        lens: a key of `LENSES`; None: chosen by cross-validation.
+        progress: called with what is done next.
+
+    Raises:
+        DataError: there are too few views, or the cameras never see the board together.
+        CalibrationError: no lens fits: the board is another one.
+    """
+    _check_views(filmed)
+    seen = chosen_views(sightings(filmed.views, target.points_m))
+    scores: list[LensScore] = []
+    if lens is None:
+        progress("choose the lens model")
+        lens, scores = choose_lens(seen.of_camera(0), filmed.sizes[0])
+    model, count = LENSES[lens]
+    progress("adjust each camera")
+    alone = [
+        one_camera(seen.of_camera(c), size, model, count) for c, size in enumerate(filmed.sizes)
+    ]
+    for c, one in enumerate(alone):
+        _check_fit(one, c)
+    found = alone[0]
+    if len(alone) > 1:
+        progress("adjust the pair")
+        start = pair_start(seen, (alone[0], alone[1]))
+        found = BoardAdjustment(seen).solve(start)
+    progress("compare halves")
+    sigmas = tuple(float(one.sigma_px[0]) for one in alone)
+    verdict = judge(found, seen, sigmas)
+    return CameraCalibration(_rig_of(found), lens, tuple(scores), found, seen, sigmas, verdict)
+
+
+def calibrate_with_imu(
+    filmed: Filmed, target: Target, cameras: CameraCalibration, densities: ImuDensities
+) -> CameraImu:
+    """Calibrate the IMU of a recording whose cameras are calibrated.
+
+    Raises:
+        DataError: the recording has no IMU, or its motion shows too little; says what to record.
+    """
+    if filmed.imu is None:
+        raise DataError("the recording has no IMU; record its samples with the images")
+    seen = sightings(filmed.views, target.points_m)
+    left = np.bincount(seen.view[seen.camera == 0], minlength=seen.views)
+    chosen = np.flatnonzero(left >= _MIN_CORNERS)
+    problem, found = pose_only(cameras.found.at, seen.of_views(chosen))
+    times_ns = np.array([filmed.views[v].time_ns for v in chosen.tolist()], dtype=np.int64)
+    information = problem.pose_information(found) / cameras.verdict.inflation**2
+    poses = BoardPoses(times_ns, found.at.T_cam0_board, information)
+    return calibrate_imu(poses, filmed.imu, densities)
+
+
+def chosen_views(seen: Sightings) -> Sightings:
+    """Return views that hold enough corners, at most `_MAX_VIEWS` spread over the recording, and
+    of each camera only images with enough corners.
+    """
+    image = seen.view * seen.cameras + seen.camera
+    counts = np.bincount(image, minlength=seen.views * seen.cameras)
+    kept = seen.take(np.flatnonzero(counts[image] >= _MIN_CORNERS))
+    views: IntArray = np.unique(kept.view)
+    if len(views) > _MAX_VIEWS:
+        total = np.bincount(kept.view, minlength=seen.views)
+        parts = np.array_split(views, _MAX_VIEWS)
+        views = np.array([part[np.argmax(total[part])] for part in parts], dtype=np.int64)
+    return kept.of_views(views)
+
+
+def _check_views(filmed: Filmed) -> None:
+    names = ("left", "right") if len(filmed.sizes) > 1 else ("only",)
+    for c, name in enumerate(names):
+        count = sum(len(view.corners[c]) >= _MIN_CORNERS for view in filmed.views)
+        if count < MIN_VIEWS:
+            raise DataError(
+                f"the {name} camera sees the board in {count} of {filmed.frames} frames, and "
+                f"{MIN_VIEWS} are needed; check that the target file is that of the board, move it "
+                "closer, light it well, and record 30 s of it at several distances and tilts"
+            )
+    together = sum(min(map(len, view.corners)) >= _MIN_CORNERS for view in filmed.views)
+    if together < MIN_VIEWS // 2:
+        raise DataError(
+            f"the cameras see the board together in {together} frames, and {MIN_VIEWS // 2} are "
+            "needed; record it where both images show it"
+        )
+
+
+def _check_fit(one: Adjusted, camera: int) -> None:
+    residual = median(np.linalg.norm(one.residuals_px, axis=1))
+    if residual > _MAX_RESIDUAL_PX:
+        raise CalibrationError(
+            f"camera {camera}: corners are off by {residual:.1f} px (median) with the best lens; "
+            "check rows, columns, tag spacing and numbering in the target file"
+        )
+
+
+def _rig_of(found: Adjusted) -> Rig:
+    cameras = found.at.cameras
+    if len(cameras) == 1:
+        return Rig(cameras[0])
+    return Rig(cameras[0], cameras[1], found.at.T_cam_cam0[1])
+
+
+def with_inflated(found: Adjusted, factor: float) -> Adjusted:
+    """Return an adjustment whose standard deviations are larger by a factor."""
+    return replace(found, covariance=found.covariance * factor**2)

@@ -1,0 +1,371 @@
+"""A camera and an IMU by a board: extrinsics, time offset, gravity and biases.
+
+The board's poses in the camera are measurements; states of the IMU at the exposures, joined by its
+preintegrated samples, are adjusted to them. The start comes from the rotations alone: of the rates
+of camera and gyroscope, and of the mean force, which is up. No guess is needed, at rest or moving.
+References: Furgale, Rehder & Siegwart, Unified temporal and spatial calibration for multi-sensor
+systems (2013), for the problem; `vio.imu.preintegration` for the IMU's terms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse.linalg import splu
+
+from vio.calibration.egomotion import CameraMotion
+from vio.calibration.findings import NotObservable
+from vio.calibration.gyro import align_gyro
+from vio.calibration.inertial import Rates
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
+from vio.imu.preintegration import BodyStates, Preintegrated, Readings, preintegrate
+from vio.records import ImuDensities, ImuRecord, IntArray
+
+_STATE = 15  # of a view: xi of its pose, velocity, biases
+_SHARED = 9  # xi of `T_cam0_imu exp(xi)`, time, two turns of gravity
+_STEPS = 20
+_CONVERGED = 1e-5  # relative change of the cost
+_MIN_VIEWS = 20
+_MAX_STEP_S = 1.0  # between views from which rates are taken for the start
+_BIAS_SIGMA = np.repeat([0.1, 0.5], 3)  # at the first view, rad/s and m/s^2
+_WIDTH = 9.0  # chi-square over its degrees of freedom at which a view's weight is a quarter
+_MIN_MEAN_CHI = 1.0
+_WEAK_ROTATION_DEG = 0.2  # standard deviations beyond which a quantity is called weak
+_WEAK_M = 0.005
+_WEAK_S = 1e-3
+_NUMERIC_STEP = 1e-6
+_GAUGE = 1e-9
+_MAX_DAMPING = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class BoardPoses:
+    """The board as the left camera saw it."""
+
+    times_ns: IntArray  # (K,) by the camera's clock
+    T_cam0_board: FloatArray  # (K, 4, 4)
+    information: FloatArray  # (K, 6, 6) of xi in `exp(xi) T_cam0_board`
+
+
+@dataclass(frozen=True, slots=True)
+class CameraImu:
+    """A camera and an IMU as calibrated."""
+
+    T_cam0_imu: FloatArray  # (4, 4)
+    time_offset_s: float  # a frame stamped t was exposed at t + offset of the IMU's clock
+    gyro_bias: FloatArray  # (3,) rad/s, at the first view
+    accel_bias: FloatArray  # (3,) m/s^2
+    up_board: FloatArray  # (3,) unit vector against gravity in the board's frame
+    covariance: FloatArray  # (7, 7) of xi in `T_cam0_imu exp(xi)`, [rho; phi], and the time offset
+    camera_chi: float  # mean squared whitened residual of the poses; 1 expected
+    imu_chi: float  # likewise of the IMU's motions
+    views: int
+    weak: tuple[str, ...]  # what the motion hardly shows, with what to record
+
+
+@dataclass(frozen=True, slots=True)
+class _States:
+    body: BodyStates
+    T_cam0_imu: FloatArray
+    offset_s: float
+    R_world_board: FloatArray  # (3, 3) the world's z axis is up
+
+
+def calibrate_imu(
+    poses: BoardPoses, imu: ImuRecord, densities: ImuDensities, gravity_mps2: float = 9.81
+) -> CameraImu:
+    """Calibrate a camera and an IMU.
+
+    Raises:
+        DataError: too few views lie within the IMU's record, or the motion shows no rotation.
+    """
+    problem = _Problem(poses, imu, densities, gravity_mps2)
+    return problem.result(problem.solve(problem.start()))
+
+
+class _Problem:
+    def __init__(
+        self, poses: BoardPoses, imu: ImuRecord, densities: ImuDensities, gravity: float
+    ) -> None:
+        self._origin = int(imu.times_ns[0])
+        inside = (poses.times_ns > imu.times_ns[0]) & (poses.times_ns < imu.times_ns[-1])
+        if inside.sum() < _MIN_VIEWS:
+            raise DataError(
+                f"{int(inside.sum())} views of the board lie within the IMU's record, and "
+                f"{_MIN_VIEWS} are needed: check that both clocks are one and in nanoseconds, and "
+                "record a minute of the board with images and IMU"
+            )
+        self.poses = BoardPoses(
+            poses.times_ns[inside], poses.T_cam0_board[inside], poses.information[inside]
+        )
+        self._imu = imu
+        self._gravity = gravity
+        seconds = _seconds(imu.times_ns, self._origin)
+        self._readings = Readings(seconds, imu.gyro, imu.accel, densities)
+        self._seconds = _seconds(self.poses.times_ns, self._origin)
+        self._root = np.swapaxes(np.linalg.cholesky(self.poses.information), 1, 2)
+
+    def start(self) -> _States:
+        """Return states from the rotations and the mean force."""
+        T_board_cam = se3_inverse(self.poses.T_cam0_board)
+        steps = np.diff(self._seconds)
+        frames = np.flatnonzero(steps < _MAX_STEP_S)
+        moved = se3_inverse(T_board_cam[frames]) @ T_board_cam[frames + 1]
+        twists = se3_log(moved) / steps[frames, None]
+        motion = CameraMotion(self.poses.times_ns, frames, twists)
+        rates = Rates(self._imu.times_ns, self._imu.gyro, self._imu.accel, True)
+        found = align_gyro(motion, rates)
+        if isinstance(found, NotObservable):
+            raise DataError(
+                f"{found}: turn the rig about all three axes before the board, quickly but without "
+                "blur, and move it to and fro"
+            )
+        T_cam0_imu = se3_from_parts(found.R_cam0_imu, np.zeros(3))
+        T_board_imu = T_board_cam @ T_cam0_imu
+        at = self._seconds + found.time_offset_s
+        force = self._at(self._imu.accel, at)
+        up = np.einsum("kij,kj->i", T_board_imu[:, :3, :3], force)
+        R_world_board = _turn_to_z(up / np.linalg.norm(up))
+        T_world_imu = se3_from_parts(R_world_board, np.zeros(3)) @ T_board_imu
+        velocity = np.gradient(T_world_imu[:, :3, 3], self._seconds, axis=0)
+        bias = np.zeros((len(at), 6))
+        bias[:, :3] = found.gyro_bias
+        body = BodyStates(T_world_imu, velocity, bias)
+        return _States(body, T_cam0_imu, found.time_offset_s, R_world_board)
+
+    def _at(self, values: FloatArray, seconds: FloatArray) -> FloatArray:
+        t = self._readings.seconds
+        return np.stack([np.interp(seconds, t, values[:, k]) for k in range(3)], axis=1)
+
+    def solve(self, at: _States) -> _States:
+        """Return the optimum, by Gauss-Newton with Levenberg's damping."""
+        damping = 1e-4
+        before = np.inf
+        for _ in range(_STEPS):
+            steps = self._preintegrated(at)
+            weight = self._weights(at)
+            H, g, cost = self._system(at, steps, weight)
+            new = (at, 0.0)
+            while damping < _MAX_DAMPING:
+                x = splu(csc_matrix(H + damping * _diagonal(H))).solve(g)
+                new = self._moved(at, x)
+                if self._cost(new, steps, weight) <= cost:
+                    break
+                new = (at, 0.0)
+                damping *= 10
+            damping = max(damping / 10, 1e-9)
+            at = self._with_offset_applied(new)
+            if abs(before - cost) < _CONVERGED * cost:
+                return at
+            before = cost
+        return at
+
+    def _preintegrated(self, at: _States) -> Preintegrated:
+        seconds = self._seconds + at.offset_s
+        return preintegrate(self._readings, seconds[:-1], seconds[1:], at.body.bias[:-1])
+
+    def _moved(self, at: _States, x: FloatArray) -> tuple[_States, float]:
+        K = len(self._seconds)
+        shared = x[_STATE * K :]
+        turn = so3_exp(np.array([shared[7], shared[8], 0.0]))
+        states = _States(
+            at.body.moved(x[: _STATE * K].reshape(K, _STATE)),
+            at.T_cam0_imu @ se3_exp(shared[:6]),
+            at.offset_s,
+            turn @ at.R_world_board,
+        )
+        return states, float(shared[6])
+
+    def _twists(self, at: _States) -> FloatArray:
+        gyro = self._at(self._imu.gyro, self._seconds + at.offset_s)
+        R = at.body.T_world_imu[:, :3, :3]
+        v = np.einsum("kji,kj->ki", R, at.body.velocity)
+        return np.concatenate([v, gyro - at.body.bias[:, :3]], axis=1)
+
+    def _with_offset_applied(self, moved: tuple[_States, float]) -> _States:
+        """Return states at the exposures by the time offset that a step has found."""
+        at, late_s = moved
+        twists = self._twists(at)
+        body = replace(at.body, T_world_imu=at.body.T_world_imu @ se3_exp(late_s * twists))
+        return replace(at, body=body, offset_s=at.offset_s + late_s)
+
+    def _camera(self, at: _States, late_s: float = 0.0) -> FloatArray:
+        """Whitened residuals (K, 6) of the board's poses, exposed late by a time."""
+        T_world_imu = at.body.T_world_imu @ se3_exp(late_s * self._twists(at))
+        T_world_board = se3_from_parts(at.R_world_board, np.zeros(3))
+        expected = at.T_cam0_imu @ se3_inverse(T_world_imu) @ T_world_board
+        r = se3_log(self.poses.T_cam0_board @ se3_inverse(expected))
+        return np.asarray(np.einsum("kij,kj->ki", self._root, r))
+
+    def _weights(self, at: _States) -> FloatArray:
+        chi = np.mean(self._camera(at) ** 2, axis=1)
+        scale = max(float(np.median(chi)), _MIN_MEAN_CHI)
+        return np.asarray(1 / (1 + chi / (_WIDTH * scale)) / np.sqrt(scale))
+
+    def _inertial(self, at: _States, steps: Preintegrated) -> FloatArray:
+        i = at.body.take(slice(None, -1))
+        j = at.body.take(slice(1, None))
+        r = steps.residual(i, j, self._gravity)
+        return np.asarray(np.einsum("fij,fj->fi", _whitening(steps.covariance), r))
+
+    def _walk_sigmas(self) -> FloatArray:
+        d = self._readings.densities
+        return np.sqrt(np.diff(self._seconds))[:, None] * np.repeat([d.gyro_walk, d.accel_walk], 3)
+
+    def _cost(self, moved: tuple[_States, float], steps: Preintegrated, w: FloatArray) -> float:
+        at, late_s = moved
+        cost = float(np.sum((w[:, None] * self._camera(at, late_s)) ** 2))
+        cost += float(np.sum(self._inertial(at, steps) ** 2))
+        cost += float(np.sum((np.diff(at.body.bias, axis=0) / self._walk_sigmas()) ** 2))
+        return cost + float(np.sum((at.body.bias[0] / _BIAS_SIGMA) ** 2))
+
+    def _camera_jacobian(self, at: _States) -> tuple[FloatArray, FloatArray]:
+        """Derivatives (K, 6, 15) and (K, 6, 9) of the whitened residuals, by differences."""
+        K = len(self._seconds)
+        own = np.zeros((K, 6, _STATE))
+        shared = np.zeros((K, 6, _SHARED))
+        for k in range(_STATE + _SHARED):
+            ends = []
+            for sign in (1.0, -1.0):
+                x = np.zeros(_STATE * K + _SHARED)
+                column = slice(k, _STATE * K, _STATE) if k < _STATE else _STATE * K + k - _STATE
+                x[column] = sign * _NUMERIC_STEP
+                ends.append(self._camera(*self._moved(at, x)))
+            D = (ends[0] - ends[1]) / (2 * _NUMERIC_STEP)
+            if k < _STATE:
+                own[:, :, k] = D
+            else:
+                shared[:, :, k - _STATE] = D
+        return own, shared
+
+    def _system(
+        self, at: _States, steps: Preintegrated, w: FloatArray
+    ) -> tuple[csc_matrix, FloatArray, float]:
+        K = len(self._seconds)
+        rows = _Rows(_STATE * K + _SHARED)
+        own, shared = self._camera_jacobian(at)
+        scale = w[:, None, None]
+        states = np.arange(K)
+        common = np.tile(_STATE * K + np.arange(_SHARED), (K, 1))
+        columns = _STATE * states[:, None] + np.arange(_STATE)
+        rows.add(w[:, None] * self._camera(at), [(columns, scale * own), (common, scale * shared)])
+        r, A, B = steps.linearised(
+            at.body.take(slice(None, -1)), at.body.take(slice(1, None)), self._gravity
+        )
+        W = _whitening(steps.covariance)
+        r = np.einsum("fij,fj->fi", W, r)
+        rows.add(r, [(columns[:-1], W @ A), (columns[1:], W @ B)])
+        inverse = 1 / self._walk_sigmas()
+        change = np.diff(at.body.bias, axis=0) * inverse
+        D = inverse[:, :, None] * np.eye(6)
+        rows.add(change, [(columns[:-1, 9:], -D), (columns[1:, 9:], D)])
+        rows.add(
+            (at.body.bias[:1] / _BIAS_SIGMA), [(columns[:1, 9:], np.diag(1 / _BIAS_SIGMA)[None])]
+        )
+        return rows.normal()
+
+    def result(self, at: _States) -> CameraImu:
+        """Return the calibration with its covariance."""
+        steps = self._preintegrated(at)
+        weight = self._weights(at)
+        H, _, _ = self._system(at, steps, weight)
+        K = len(self._seconds)
+        wanted = np.zeros((H.shape[0], 7))
+        wanted[_STATE * K + np.arange(7), np.arange(7)] = 1
+        P = splu(H).solve(wanted)[_STATE * K : _STATE * K + 7]
+        inertial = float(np.mean(self._inertial(at, steps) ** 2))
+        P = 0.5 * (P + P.T) * max(inertial, 1.0)
+        return CameraImu(
+            at.T_cam0_imu,
+            at.offset_s,
+            at.body.bias[0, :3],
+            at.body.bias[0, 3:],
+            at.R_world_board[2],
+            P,
+            float(np.mean(self._camera(at) ** 2)),
+            inertial,
+            K,
+            _weak(np.sqrt(np.diag(P))),
+        )
+
+
+def _seconds(times_ns: IntArray, origin_ns: int) -> FloatArray:
+    return np.asarray((times_ns - origin_ns) * 1e-9, dtype=np.float64)
+
+
+def _weak(sigma: FloatArray) -> tuple[str, ...]:
+    """Return what the motion hardly shows."""
+    out: list[str] = []
+    for k, axis in enumerate("xyz"):
+        if sigma[k] > _WEAK_M:
+            out.append(
+                f"the IMU's position along its {axis} is known to {1e3 * sigma[k]:.0f} mm: turn "
+                "the rig faster, about the other two axes"
+            )
+        if np.degrees(sigma[3 + k]) > _WEAK_ROTATION_DEG:
+            out.append(
+                f"the rotation about the IMU's {axis} is known to "
+                f"{np.degrees(sigma[3 + k]):.2f} deg: turn the rig about the other axes, too"
+            )
+    if sigma[6] > _WEAK_S:
+        out.append(f"the time offset is known to {1e3 * sigma[6]:.1f} ms: turn the rig faster")
+    return tuple(out)
+
+
+def _turn_to_z(up: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) that brings a unit vector to the z axis by the shortest way."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        return np.eye(3) if up[2] > 0 else np.diag([1.0, -1.0, -1.0])
+    return so3_exp(axis / sine * np.arctan2(sine, up[2]))
+
+
+def _whitening(covariance: FloatArray) -> FloatArray:
+    """Matrices (F, 9, 9) that whiten residuals of these covariances."""
+    floor = 1e-16 * np.eye(covariance.shape[1])
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance + floor)))
+
+
+def _diagonal(H: csc_matrix) -> csc_matrix:
+    values = np.maximum(H.diagonal(), _GAUGE)
+    index: npt.NDArray[np.int64] = np.arange(len(values))
+    return csc_matrix((values, (index, index)), shape=H.shape)
+
+
+class _Rows:
+    """Residuals and the blocks of their derivatives, for normal equations."""
+
+    def __init__(self, columns: int) -> None:
+        self._columns = columns
+        self._rows = 0
+        self._residuals: list[FloatArray] = []
+        self._parts: list[tuple[IntArray, IntArray, FloatArray]] = []
+
+    def add(self, r: FloatArray, blocks: list[tuple[IntArray, FloatArray]]) -> None:
+        """Add residuals (F, m), and derivatives (F, m, n) by columns (F, n)."""
+        count, size = r.shape
+        rows = self._rows + np.arange(count * size).reshape(count, size)
+        for columns, D in blocks:
+            at = np.broadcast_to(rows[:, :, None], D.shape)
+            by = np.broadcast_to(columns[:, None, :], D.shape)
+            self._parts.append((at.ravel(), by.ravel(), np.asarray(D).ravel()))
+        self._residuals.append(r.ravel())
+        self._rows += count * size
+
+    def normal(self) -> tuple[csc_matrix, FloatArray, float]:
+        """Return H, the right-hand side of the step, and the sum of squares."""
+        at, by, values = (np.concatenate([part[k] for part in self._parts]) for k in range(3))
+        J = coo_matrix((values, (at, by)), shape=(self._rows, self._columns)).tocsc()
+        r = np.concatenate(self._residuals)
+        H = csc_matrix(J.T @ J)
+        return H + _GAUGE * _eye(self._columns), -(J.T @ r), float(r @ r)
+
+
+def _eye(size: int) -> csc_matrix:
+    index: npt.NDArray[np.int64] = np.arange(size)
+    return csc_matrix((np.ones(size), (index, index)), shape=(size, size))

@@ -1,0 +1,108 @@
+"""A board as a page to print, SVG or PDF, with a ruler: what is measured on paper is used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vio.files.atomic import atomic_write_bytes, atomic_write_text
+from vio.geometry.lie import FloatArray
+from vio.targets.description import Target
+
+_MM = 1000.0
+_MARGIN_MM = 15.0
+_RULER_MM = 25.0  # height of the strip below the board that holds ruler and words
+_TICK_MM = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """Dark rectangles and words on paper, in millimetres from its top left corner."""
+
+    width: float
+    height: float
+    rectangles: FloatArray  # (N, 4) left, top, right, bottom
+    words: tuple[tuple[float, float, str], ...]  # where a line begins, and its text
+
+
+def page_of(target: Target) -> Page:
+    """Lay out a board and, below it, a ruler of whole centimetres."""
+    board = target.dark_rectangles() * _MM
+    shift = _MARGIN_MM - board[:, :2].min(axis=0)
+    board = board + np.tile(shift, 2)
+    right, bottom = board[:, 2:].max(axis=0).tolist()
+    ruler_top = bottom + 8.0
+    length = _TICK_MM * max(int((right - _MARGIN_MM) / _TICK_MM), 1)
+    ticks = []
+    for x in np.arange(0.0, length + 0.5, _TICK_MM).tolist():
+        left = _MARGIN_MM + x
+        ticks.append((left - 0.1, ruler_top, left + 0.1, ruler_top + 4.0))
+    line = (_MARGIN_MM - 0.1, ruler_top, _MARGIN_MM + length + 0.1, ruler_top + 0.2)
+    one = "tag with its border" if target.kind == "aprilgrid" else "square"
+    words = (
+        (_MARGIN_MM, ruler_top + 9.0, f"ruler {length:g} mm; {target}"),
+        (
+            _MARGIN_MM,
+            ruler_top + 14.0,
+            f"measure the side of a {one} over many of them, and write it into the target file",
+        ),
+    )
+    rectangles = np.concatenate([board, np.array([*ticks, line])])
+    return Page(right + _MARGIN_MM, ruler_top + _RULER_MM, rectangles, words)
+
+
+def write_page(target: Target, path: Path) -> None:
+    """Write a board as SVG or PDF, by the file's suffix.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    page = page_of(target)
+    if path.suffix.lower() == ".pdf":
+        _write_pdf(page, path)
+        return
+    atomic_write_text(path, svg_text(page))
+
+
+def svg_text(page: Page) -> str:
+    """Return a page as SVG whose unit is the millimetre."""
+    size = f'width="{page.width:.4f}mm" height="{page.height:.4f}mm"'
+    box = f'viewBox="0 0 {page.width:.4f} {page.height:.4f}"'
+    lines = [f'<svg xmlns="http://www.w3.org/2000/svg" {size} {box}>']
+    lines.append('<rect width="100%" height="100%" fill="white"/>')
+    lines.append('<g fill="black" shape-rendering="crispEdges">')
+    for left, top, right, bottom in page.rectangles.tolist():
+        at = f'x="{left:.4f}" y="{top:.4f}"'
+        lines.append(f'<rect {at} width="{right - left:.4f}" height="{bottom - top:.4f}"/>')
+    lines.append('</g><g font-family="sans-serif" font-size="3.5">')
+    lines += [f'<text x="{x:.3f}" y="{y:.3f}">{text}</text>' for x, y, text in page.words]
+    lines.append("</g></svg>")
+    return "\n".join(lines) + "\n"
+
+
+def _write_pdf(page: Page, path: Path) -> None:
+    import io
+
+    from matplotlib.backends.backend_pdf import FigureCanvasPdf
+    from matplotlib.collections import PatchCollection
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+
+    figure = Figure(figsize=(page.width / 25.4, page.height / 25.4))
+    FigureCanvasPdf(figure)
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set_xlim(0, page.width)
+    axes.set_ylim(page.height, 0)
+    axes.axis("off")
+    patches = [
+        Rectangle((left, top), right - left, bottom - top)
+        for left, top, right, bottom in page.rectangles.tolist()
+    ]
+    axes.add_collection(PatchCollection(patches, facecolor="black", linewidth=0))
+    for x, y, text in page.words:
+        axes.text(x, y, text, fontsize=9)
+    out = io.BytesIO()
+    figure.savefig(out, format="pdf")
+    atomic_write_bytes(path, out.getvalue())

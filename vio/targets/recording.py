@@ -1,0 +1,248 @@
+"""A recording of a board: its raw images, whatever its calibration says, and its IMU.
+
+Any recording that the readers know can be read, and needs no calibration: it is opened with a
+stand-in, two equal pinholes with rows aligned, by which images pass unchanged. A folder with files
+`left*` and `right*` is read as well.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from vio.cameras.rig import Rig
+from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.image_files import ImageFiles
+from vio.datasets.image_pairs import ImagePairs, ImageRecording, measured_images, pair_images
+from vio.datasets.images import SUFFIXES, list_images, load_gray
+from vio.datasets.plain import image_layout, pair_files
+from vio.datasets.rigs.kalibr import kalibr_text
+from vio.datasets.videos import video_files
+from vio.errors import CalibrationError, DataError
+from vio.geometry.distortion import CameraModel
+from vio.protocols import Dataset, Progress
+from vio.records import Image, ImuRecord, ImuSample
+from vio.targets.corners import CornerDetector
+from vio.targets.views import View
+
+MAX_FRAMES = 80  # in which the board is looked for, spread over the recording
+_ASSUMED_STEP_NS = 1_000_000_000  # between the pairs of a folder of photographs
+_MIN_MOTION_HZ = 5.0  # of frames, where an IMU is calibrated
+_MAX_MOTION_FRAMES = 400
+
+Images = tuple[Image, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Filmed:
+    """What a recording shows of a board."""
+
+    views: list[View]  # those in which a camera sees the board
+    sizes: tuple[tuple[int, int], ...]  # width and height of each camera's images
+    frames: int  # in which it was looked for
+    imu: ImuRecord | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RawRecording:
+    """Raw images of one or two cameras, and an IMU where there is one."""
+
+    path: Path
+    times_ns: Sequence[int]
+    load: Callable[[Sequence[int]], Iterator[tuple[int, Images]]]  # chosen frames: time and images
+    imu: Callable[[], ImuRecord | None]
+    notes: tuple[str, ...] = ()
+
+
+def open_raw(
+    source: str, *, topics: str | None = None, size: tuple[int, int] | None = None
+) -> RawRecording:
+    """Open a recording without its calibration.
+
+    Args:
+        source: a recording, or a folder with files `left*` and `right*`.
+        topics: of a bag, as for the other commands.
+        size: width and height of the images where no file states it, pixels.
+
+    Raises:
+        DataError: it is no recording with images.
+        CalibrationError: the size of the images is not known.
+    """
+    path = Path(source)
+    flat = _flat_pairs(path) if path.is_dir() and image_layout(path) is None else None
+    if flat is not None:
+        return _folder_of_pairs(path, flat)
+    known, cameras = _size_and_cameras(source, path, size)
+    dataset = _with_stand_in(source, known, cameras, topics)
+    recording = dataset.recording
+    if not isinstance(dataset, ImageRecording):
+        raise DataError(f"{recording.path}: holds no images; give a recording of a board")
+
+    def load(chosen: Sequence[int]) -> Iterator[tuple[int, Images]]:
+        return _frames_of(dataset, chosen)
+
+    def imu() -> ImuRecord | None:
+        return _imu_of(dataset)
+
+    times = recording.frame_times_ns.tolist()
+    return RawRecording(recording.path, times, load, imu, recording.notes)
+
+
+def _flat_pairs(path: Path) -> ImagePairs | None:
+    """Return pairs of one folder's files `left*` and `right*`; None: there are none."""
+    names = sorted(child.name for child in path.iterdir() if child.suffix.lower() in SUFFIXES)
+    lefts = tuple(name for name in names if name.lower().startswith("left"))
+    rights = tuple(name for name in names if name.lower().startswith("right"))
+    if not lefts or not rights:
+        return None
+    return pair_files(ImageFiles(path, lefts), ImageFiles(path, rights))[0]
+
+
+def _folder_of_pairs(path: Path, pairs: ImagePairs) -> RawRecording:
+    times = [k * _ASSUMED_STEP_NS for k in range(len(pairs))]
+
+    def load(chosen: Sequence[int]) -> Iterator[tuple[int, Images]]:
+        for k in chosen:
+            left, right = pairs[k]
+            yield times[k], (load_gray(left)[0], load_gray(right)[0])
+
+    return RawRecording(path, times, load, lambda: None)
+
+
+def _size_and_cameras(
+    source: str, path: Path, size: tuple[int, int] | None
+) -> tuple[tuple[int, int], int]:
+    """Return width and height of the images, and the number of cameras."""
+    layout = image_layout(path) if path.is_dir() else None
+    if layout is not None and layout.left == layout.right:
+        files = list_images(layout.left)
+        return size or measured_images([(file, file) for file in files[:3]])[0], 1
+    if layout is not None:
+        return size or measured_images(_some_pairs(layout.left, layout.right))[0], 2
+    if size is not None:
+        return size, 2
+    videos = video_files(path) if path.is_dir() else None
+    if videos is not None:
+        return _size_of_video(videos[0]), 2
+    try:
+        dataset = open_dataset(source)
+    except CalibrationError as error:
+        raise CalibrationError(
+            f"{path}: the size of its images is not known; give it by --image-size WIDTHxHEIGHT"
+        ) from error
+    if not isinstance(dataset, ImageRecording):
+        raise DataError(f"{path}: holds no images; give a recording of a board")
+    first = dataset.sizes[0]
+    return (first.width, first.height), len(dataset.sizes)
+
+
+def _some_pairs(left: Path, right: Path) -> ImagePairs:
+    lefts = list_images(left)
+    rights = list_images(right)
+    return [(lefts[0], rights[0])] if len(lefts) and len(rights) else pair_images(left, right)
+
+
+def _size_of_video(file: Path) -> tuple[int, int]:
+    import cv2
+
+    capture = cv2.VideoCapture(str(file))
+    try:
+        width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    finally:
+        capture.release()
+    if width < 1 or height < 1:
+        raise DataError(f"{file}: is no video that can be read; copy it again")
+    return width, height
+
+
+def _with_stand_in(source: str, size: tuple[int, int], cameras: int, topics: str | None) -> Dataset:
+    """Open a recording by a calibration that leaves its images as they are."""
+    width, height = size
+    rig = Rig.rectified(
+        width, width, 0.5 * width, 0.5 * height, 0.1, width, height, T_cam0_imu=np.eye(4)
+    )
+    if cameras == 1:
+        rig = Rig(CameraModel(width, width, 0.5 * width, 0.5 * height, width, height))
+        rig = Rig(rig.cam0, T_cam0_imu=np.eye(4))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "camchain.yaml"
+        file.write_text(kalibr_text(rig), encoding="utf-8")
+        return open_dataset(source, DatasetSettings(calibration=file, topics=topics))
+
+
+def _frames_of(dataset: ImageRecording, chosen: Sequence[int]) -> Iterator[tuple[int, Images]]:
+    """Yield time and images of frames, increasing."""
+    for frame in dataset.frames(chosen):
+        if frame.left is not None:
+            images = (frame.left,) if frame.right is None else (frame.left, frame.right)
+            yield frame.time_ns, images
+
+
+def _imu_of(dataset: ImageRecording) -> ImuRecord | None:
+    samples = [sample for sample in dataset.motion if isinstance(sample, ImuSample)]
+    if len(samples) < 2:
+        return None
+    return ImuRecord(
+        np.array([sample.time_ns for sample in samples], dtype=np.int64),
+        np.array([sample.gyro for sample in samples]),
+        np.array([sample.accel for sample in samples]),
+    )
+
+
+def film(
+    raw: RawRecording,
+    detector: CornerDetector,
+    *,
+    max_frames: int | None = None,
+    progress: Progress = lambda done, total: None,
+) -> Filmed:
+    """Look for the board in frames that are spread over a recording.
+
+    Args:
+        raw: the recording.
+        detector: of the board.
+        max_frames: in which it is looked for; None: `MAX_FRAMES`, or more where an IMU needs them.
+        progress: called after each frame.
+
+    Raises:
+        DataError: no frame can be read.
+    """
+    imu = raw.imu()
+    count = len(raw.times_ns)
+    wanted = max_frames or _frames_wanted(raw, has_imu=imu is not None)
+    chosen = np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int)).tolist()
+    views: list[View] = []
+    sizes: tuple[tuple[int, int], ...] = ()
+    frames = 0
+    workers = os.cpu_count() or 1
+    loaded = raw.load(chosen)
+    with ThreadPoolExecutor(workers) as pool:
+        while batch := list(islice(loaded, 2 * workers)):
+            flat = [image for _, images in batch for image in images]
+            found = iter(list(pool.map(detector.detect, flat)))
+            for time_ns, images in batch:
+                frames += 1
+                sizes = tuple((image.shape[1], image.shape[0]) for image in images)
+                corners = tuple(next(found) for _ in images)
+                if any(len(one) for one in corners):
+                    views.append(View(time_ns, corners))
+                progress(frames, len(chosen))
+    if not frames:
+        raise DataError(f"{raw.path}: no image could be read; copy it again")
+    return Filmed(views, sizes, frames, imu, raw.notes)
+
+
+def _frames_wanted(raw: RawRecording, *, has_imu: bool) -> int:
+    if not has_imu or len(raw.times_ns) < 2:
+        return MAX_FRAMES
+    seconds = 1e-9 * (raw.times_ns[-1] - raw.times_ns[0])
+    return int(np.clip(_MIN_MOTION_HZ * seconds, MAX_FRAMES, _MAX_MOTION_FRAMES))

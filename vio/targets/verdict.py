@@ -1,0 +1,297 @@
+"""How good a calibration is: uncertainty over the image and in metres, halves of the views against
+each other, and what the views do not show.
+
+A lens's uncertainty is that of where it projects a fixed point, after the motion of the camera that
+compensates most of it: a shift of the centre that a rotation undoes costs nothing.
+Reference: Kogan, mrcal, a camera-calibration toolkit (2021), sections "projection uncertainty" and
+"differencing".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.geometry.distortion import CameraModel, project_point, unproject_pixel
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, transform_points
+from vio.targets.bundle import (
+    Adjusted,
+    BoardAdjustment,
+    BoolArray,
+    RigFit,
+    layout_of,
+    lens_moved,
+    pixels_by_lens,
+    pixels_by_point,
+)
+from vio.targets.views import Sightings
+
+DEPTH_M = 5.0  # where a pair's uncertainty is stated
+_GRID = (13, 9)  # pixels along width and height at which maps are made
+_STEP_SIGMAS = 0.1  # of numerical differences
+_HONEST = 1.5  # halves further apart than so many times what is stated inflate the sigmas
+_MEDIAN_LENGTH = 1.1774  # of a vector of two Gaussian components of unit variance
+_UNSYNCHRONISED = 1.5  # residual of the pair over that of the cameras alone
+_MIN_TILT_DEG = 15.0
+_CELLS = 3  # along each side of the image, which must hold corners
+_MIN_CELL_SHARE = 0.01  # of all corners, in a cell of the image
+_ROWS = ("upper", "middle", "lower")
+_COLS = ("left", "centre", "right")
+MIN_VIEWS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Halves:
+    """Calibrations by every other view, against each other."""
+
+    off_px: tuple[FloatArray, ...]  # (G,) difference of each camera's projection over the image
+    depth_m: float  # of the pair at `DEPTH_M`: rms over the image of half the difference; 0: one
+
+    @property
+    def rms_px(self) -> tuple[float, ...]:
+        """Root mean square of each camera's difference over the image."""
+        return tuple(float(np.sqrt(np.nanmean(off**2))) for off in self.off_px)
+
+    @property
+    def max_px(self) -> tuple[float, ...]:
+        """Largest difference of each camera over the image."""
+        return tuple(float(np.nanmax(off)) for off in self.off_px)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What is known of a calibration's quality."""
+
+    grid: tuple[FloatArray, ...]  # pixels (G, 2) of each camera at which maps are made
+    projection_sigma_px: tuple[FloatArray, ...]  # (G,) of each camera, at infinity
+    depth_sigma_m: FloatArray  # (G,) of the pair at `DEPTH_M`; NaN: not seen by both
+    halves: Halves
+    inflation: float  # factor by which stated sigmas were multiplied
+    findings: tuple[str, ...]  # what is wrong or missing, each with what to record
+
+    @property
+    def depth_m(self) -> float:
+        """Standard deviation of depth at `DEPTH_M`, rms over the image, inflated."""
+        sigma = self.depth_sigma_m[np.isfinite(self.depth_sigma_m)]
+        return self.inflation * float(np.sqrt(np.mean(sigma**2))) if len(sigma) else float("nan")
+
+
+def pixel_grid(camera: CameraModel) -> FloatArray:
+    """Return pixels (G, 2) spread over the image."""
+    u = np.linspace(0, camera.width - 1, _GRID[0])
+    v = np.linspace(0, camera.height - 1, _GRID[1])
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+
+def projection_sigma(
+    camera: CameraModel, covariance: FloatArray, distance_m: float | None = None
+) -> FloatArray:
+    """Standard deviation (G,) in pixels of the projection, in its worst direction.
+
+    Args:
+        camera: as calibrated.
+        covariance: (4 + n, 4 + n) of `fu fv cu cv` and the coefficients.
+        distance_m: of the points; None: at infinity, where a translation compensates nothing.
+    """
+    uv = pixel_grid(camera)
+    rays, valid = unproject_pixel(camera, uv)
+    p = rays * (1.0 if distance_m is None else distance_m)
+    D = pixels_by_lens(camera, p, uv)
+    by_p = pixels_by_point(camera, p, uv)
+    motion = -by_p @ so3_hat(p)
+    if distance_m is not None:
+        motion = np.concatenate([by_p, motion], axis=2)
+    rows = D[valid].reshape(-1, D.shape[2])
+    M = motion[valid].reshape(-1, motion.shape[2])
+    left = rows - M @ np.linalg.lstsq(M, rows, rcond=None)[0]
+    J = left.reshape(-1, 2, D.shape[2])
+    P = J @ covariance @ np.swapaxes(J, 1, 2)
+    out = np.full(len(uv), np.nan)
+    out[valid] = np.sqrt(np.maximum(np.linalg.eigvalsh(P)[:, 1], 0))
+    return out
+
+
+def projection_difference(a: CameraModel, b: CameraModel) -> FloatArray:
+    """Distance (G,) in pixels between two calibrations of one camera, at infinity, after the
+    rotation that brings them together best.
+    """
+    uv = pixel_grid(a)
+    rays, valid = unproject_pixel(a, uv)
+    R = np.eye(3)
+    off = np.full((len(uv), 2), np.nan)
+    for _ in range(5):
+        turned = rays @ R.T
+        there, seen = project_point(b, turned)
+        both = valid & seen
+        off = np.where(both[:, None], uv - there, np.nan)
+        D = (-pixels_by_point(b, turned, there) @ so3_hat(turned))[both].reshape(-1, 3)
+        R = so3_exp(np.linalg.lstsq(D, off[both].ravel(), rcond=None)[0]) @ R
+    return np.asarray(np.linalg.norm(off, axis=1))
+
+
+def depths(fit: RigFit, uv0: FloatArray, uv1: FloatArray) -> FloatArray:
+    """Depths (G,) in the first camera of points by their pixels (G, 2) in both."""
+    rays0, _ = unproject_pixel(fit.cameras[0], uv0)
+    rays1, _ = unproject_pixel(fit.cameras[1], uv1)
+    T_cam0_cam1 = se3_inverse(fit.T_cam_cam0[1])
+    turned = rays1 @ T_cam0_cam1[:3, :3].T
+    origin = T_cam0_cam1[:3, 3]
+    cosine = np.sum(rays0 * turned, axis=1)
+    along = rays0 @ origin - cosine * (turned @ origin)
+    return np.asarray(rays0[:, 2] * along / np.maximum(1 - cosine**2, 1e-15))
+
+
+def _pixels_at_depth(fit: RigFit, depth_m: float) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Pixels (G, 2) of both cameras of points at a depth, and which (G,) both images show."""
+    uv0 = pixel_grid(fit.cameras[0])
+    rays, valid = unproject_pixel(fit.cameras[0], uv0)
+    valid = valid & (rays[:, 2] > 0.2)
+    p = rays * (depth_m / np.where(valid, rays[:, 2], 1.0))[:, None]
+    uv1, seen = project_point(fit.cameras[1], transform_points(fit.T_cam_cam0[1], p))
+    c = fit.cameras[1]
+    inside = (uv1 >= 0).all(axis=1) & (uv1[:, 0] <= c.width - 1) & (uv1[:, 1] <= c.height - 1)
+    return uv0, uv1, valid & seen & inside
+
+
+def _shifted(fit: RigFit, step: FloatArray) -> RigFit:
+    layout = layout_of(fit.cameras)
+    cameras = tuple(
+        lens_moved(camera, step[lens])
+        for camera, lens in zip(fit.cameras, layout.lenses, strict=True)
+    )
+    T = fit.T_cam_cam0.copy()
+    for c, pose in enumerate(layout.poses):
+        T[c + 1] = se3_exp(step[pose]) @ T[c + 1]
+    return replace(fit, cameras=cameras, T_cam_cam0=T)
+
+
+def depth_sigma(found: Adjusted, depth_m: float = DEPTH_M) -> FloatArray:
+    """Standard deviation (G,) of depth at a depth, over the first image; NaN: not seen by both."""
+    fit = found.at
+    uv0, uv1, both = _pixels_at_depth(fit, depth_m)
+    out = np.full(len(uv0), np.nan)
+    if not both.any():
+        return out
+    values, vectors = np.linalg.eigh(found.covariance)
+    total = np.zeros(int(both.sum()))
+    for value, vector in zip(values, vectors.T, strict=True):
+        step = _STEP_SIGMAS * np.sqrt(max(value, 0.0)) * vector
+        ahead = depths(_shifted(fit, step), uv0[both], uv1[both])
+        behind = depths(_shifted(fit, -step), uv0[both], uv1[both])
+        total += ((ahead - behind) / (2 * _STEP_SIGMAS)) ** 2
+    out[both] = np.sqrt(total)
+    return out
+
+
+def compare_halves(found: Adjusted, seen: Sightings) -> Halves:
+    """Calibrate by every other view and return how far apart the results are."""
+    fits: list[RigFit] = []
+    for part in (0, 1):
+        chosen = np.arange(part, seen.views, 2)
+        start = replace(found.at, T_cam0_board=found.at.T_cam0_board[chosen])
+        fits.append(BoardAdjustment(seen.of_views(chosen)).solve(start).at)
+    off = [
+        projection_difference(a, b) for a, b in zip(fits[0].cameras, fits[1].cameras, strict=True)
+    ]
+    depth_m = 0.0
+    if seen.cameras > 1:
+        uv0, uv1, both = _pixels_at_depth(found.at, DEPTH_M)
+        if both.any():
+            apart = depths(fits[0], uv0[both], uv1[both]) - depths(fits[1], uv0[both], uv1[both])
+            depth_m = 0.5 * float(np.sqrt(np.mean(apart**2)))
+    return Halves(tuple(off), depth_m)
+
+
+def judge(found: Adjusted, seen: Sightings, alone_sigma_px: Sequence[float]) -> Verdict:
+    """Return the verdict on a calibration.
+
+    Args:
+        found: the adjustment.
+        seen: what it was made of.
+        alone_sigma_px: residuals of each camera when adjusted without the other.
+    """
+    layout = layout_of(found.at.cameras)
+    cameras = found.at.cameras
+    sigma = tuple(
+        projection_sigma(camera, found.covariance[lens, lens])
+        for camera, lens in zip(cameras, layout.lenses, strict=True)
+    )
+    depth = depth_sigma(found) if seen.cameras > 1 else np.full(1, np.nan)
+    halves = compare_halves(found, seen)
+    inflation = _inflation(halves, sigma, depth)
+    findings = [
+        *_unsynchronised(found, alone_sigma_px),
+        *coverage_findings(seen, cameras),
+        *tilt_findings(found.at),
+    ]
+    if inflation > 1:
+        findings.append(
+            f"halves of the views disagree {inflation:.1f} times more than the residuals explain "
+            "(a lens that the model does not hold, a board that bends, or blurred corners): "
+            "standard deviations are multiplied by that"
+        )
+    grid = tuple(pixel_grid(camera) for camera in cameras)
+    return Verdict(grid, sigma, depth, halves, inflation, tuple(findings))
+
+
+def _inflation(halves: Halves, sigma: Sequence[FloatArray], depth: FloatArray) -> float:
+    """Return the factor by which stated sigmas are too small, as halves show it; 1: they are not.
+
+    The difference of halves has twice the standard deviation of the whole.
+    """
+    factors = [1.0]
+    for off, mine in zip(halves.off_px, sigma, strict=True):
+        expected = 2 * _MEDIAN_LENGTH * np.maximum(mine, 1e-9)
+        factors.append(float(np.nanmedian(off / expected)))
+    stated = depth[np.isfinite(depth)]
+    if len(stated):
+        factors.append(halves.depth_m / max(float(np.sqrt(np.mean(stated**2))), 1e-9))
+    worst = max(factors)
+    return worst if worst > _HONEST else 1.0
+
+
+def _unsynchronised(found: Adjusted, alone_sigma_px: Sequence[float]) -> list[str]:
+    pairs = zip(found.sigma_px.tolist(), alone_sigma_px, strict=True)
+    worst = max(together / alone for together, alone in pairs)
+    if len(alone_sigma_px) < 2 or worst < _UNSYNCHRONISED:
+        return []
+    return [
+        f"corners fit each camera alone {worst:.1f} times better than the pair: left and right "
+        "images were not exposed at the same moment, or the cameras moved against each other; "
+        "record with a hardware trigger, or hold the board still for each pair"
+    ]
+
+
+def coverage_findings(seen: Sightings, cameras: Sequence[CameraModel]) -> list[str]:
+    """Return which parts of the images hold no corners, one line for each camera."""
+    out: list[str] = []
+    names = ("left", "right") if len(cameras) > 1 else ("",)
+    for c, camera in enumerate(cameras):
+        uv = seen.uv[seen.camera == c]
+        cell = np.minimum(uv * _CELLS / [camera.width, camera.height], _CELLS - 0.01).astype(int)
+        counts = np.bincount(_CELLS * cell[:, 1] + cell[:, 0], minlength=_CELLS**2)
+        empty = [
+            f"{_ROWS[k // _CELLS]} {_COLS[k % _CELLS]}"
+            for k in np.flatnonzero(counts < _MIN_CELL_SHARE * len(uv)).tolist()
+        ]
+        if empty:
+            image = f"{names[c]} image" if names[c] else "image"
+            out.append(f"the {image} is empty at {', '.join(empty)}: show the board there")
+    return out
+
+
+def tilt_findings(fit: RigFit) -> list[str]:
+    """Return the axes about which the board was not tilted."""
+    normal = fit.T_cam0_board[:, :3, 2]
+    about_x = np.degrees(np.arctan2(normal[:, 1], normal[:, 2]))
+    about_y = np.degrees(np.arctan2(normal[:, 0], normal[:, 2]))
+    out: list[str] = []
+    for tilt, words in ((about_x, "forwards and backwards"), (about_y, "to the left and right")):
+        if float(np.percentile(np.abs(tilt), 90)) < _MIN_TILT_DEG:
+            out.append(
+                f"the board is tilted {words} by less than {_MIN_TILT_DEG:.0f} degrees: tilt it "
+                "more, up to 40 degrees"
+            )
+    return out
