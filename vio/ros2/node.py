@@ -4,6 +4,7 @@ it finds.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from vio.errors import CalibrationError, VioError
 from vio.live.build import MapUse
 from vio.live.live_odometry import LiveOdometry
 from vio.live.worker import Drop
+from vio.mavlink.output import MavlinkOutput, MavlinkSettings
 from vio.ros2.calibration import CameraInfos
 from vio.ros2.outputs import RESET, SAVE, FrameNames, Outputs
 from vio.ros2.sensors import SILENT_S, Sensors, SensorTopics, Silence, check_types
@@ -41,6 +43,7 @@ class NodeSettings:
     # folder for the trajectory, which grows, and the calibration, at the end and on request
     out: Path | None = None
     map: MapUse | None = None
+    mavlink: MavlinkSettings | None = None  # where poses also go
 
 
 def run_node(
@@ -71,11 +74,14 @@ def run_node(
             "out"
         )
     outputs: Outputs | None = None
+    others = contextlib.ExitStack()
     odometry = LiveOdometry(found, config, drop=settings.drop, map=settings.map, copy_images=False)
     try:
-        with odometry:
+        with others, odometry:  # which is closed first
             say("warming up")
             odometry.warm_up()
+            if settings.mavlink is not None:
+                others.enter_context(MavlinkOutput(odometry, settings.mavlink))
             sensors = Sensors(transport, topics, odometry, settings.quality)
             outputs = Outputs(
                 transport,
