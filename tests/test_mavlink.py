@@ -177,8 +177,10 @@ def test_stamps_are_placed_on_a_clock_that_the_autopilot_can_be_told() -> None:
     assert placed == [100, 1040, 2040, 3040]
 
 
-def test_the_quality_is_unknown_until_something_judges_it() -> None:
-    assert quality_of(_estimate(np.eye(3), np.zeros(3))) in range(-1, 101)
+def test_the_quality_follows_from_the_integrity() -> None:
+    estimate = _estimate(np.eye(3), np.zeros(3))
+    words: tuple[Any, ...] = ("nominal", "degraded", "unusable")
+    assert [quality_of(replace(estimate, integrity=word)) for word in words] == [100, 50, -1]
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from vio.records import Estimate
 _R_FRD_CAM0: FloatArray = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _UPPER = np.triu_indices(6)
 _MIN_HORIZONTAL = 0.1  # of a unit vector, to have a heading
+_QUALITY = {"nominal": 100, "degraded": 50, "unusable": -1}
 _CLOCK_NS = 10_000_000_000  # a stamp so near to a clock of this computer is of that clock
 _ARRIVALS = 200  # among which the quickest is looked for
 
@@ -147,8 +148,10 @@ class LocalFrame:
 
 
 def quality_of(estimate: Estimate) -> int:
-    """Return ODOMETRY's quality in percent; 0: unknown, which both autopilots accept by default."""
-    return 0
+    """Return ODOMETRY's quality in percent by the integrity of an estimate; -1: it is not to be
+    used.
+    """
+    return _QUALITY[estimate.integrity]
 
 
 class StampClock:
