@@ -35,7 +35,8 @@ def camera_driver(live):
 
 def controller(live):
     for estimate in live:  # ends when the odometry is closed
-        ahead = live.predict(estimate.time_ns + 20_000_000)  # from the samples that have come since
+        newest = live.latest() or estimate  # where this loop lags, later than its own
+        ahead = live.predict(newest.time_ns + 20_000_000)  # from the samples that have come since
         x, y, z = ahead.T_world_imu[:3, 3]
         print(f"{ahead.time_ns * 1e-9:.3f} s  {x:8.3f} {y:8.3f} {z:8.3f} m")
 

@@ -4,8 +4,9 @@ from left to right.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypeAlias
 
 import cv2
 import numpy as np
@@ -171,12 +172,30 @@ def _product(a: Vectors, b: Vectors) -> np.float32:
     return total
 
 
+_OPENCV: dict[str, Callable[[int], cv2.Feature2D]] = {
+    "orb": lambda most: cv2.ORB.create(nfeatures=most, fastThreshold=10),
+    "sift": lambda most: cv2.SIFT.create(nfeatures=most, contrastThreshold=0.02),
+}
+
+
 @dataclass(frozen=True, slots=True)
 class OpenCvExtractor:
-    """ORB or SIFT of OpenCV."""
+    """ORB or SIFT of OpenCV, which an unfinished run keeps as its settings."""
 
-    engine: cv2.Feature2D
     name: str
+    max_keypoints: int
+    engine: cv2.Feature2D = field(init=False, repr=False, compare=False)  # without a state
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "engine", _OPENCV[self.name](self.max_keypoints))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"name": self.name, "max_keypoints": self.max_keypoints}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for key, value in state.items():
+            object.__setattr__(self, key, value)
+        self.__post_init__()
 
     def __call__(self, *images: Image) -> list[Keypoints]:
         """Return the key points of each image; see `Extractor`."""
@@ -201,9 +220,7 @@ class OpenCvExtractor:
 
 def orb_extractor(settings: MatchSettings) -> OpenCvExtractor:
     """ORB. Reference: Rublee et al., ORB: an efficient alternative to SIFT or SURF, ICCV (2011)."""
-    return OpenCvExtractor(
-        cv2.ORB.create(nfeatures=settings.max_keypoints, fastThreshold=10), "orb"
-    )
+    return OpenCvExtractor("orb", settings.max_keypoints)
 
 
 def sift_extractor(settings: MatchSettings) -> OpenCvExtractor:
@@ -211,9 +228,7 @@ def sift_extractor(settings: MatchSettings) -> OpenCvExtractor:
 
     Reference: Lowe, Distinctive image features from scale-invariant keypoints, IJCV (2004).
     """
-    return OpenCvExtractor(
-        cv2.SIFT.create(nfeatures=settings.max_keypoints, contrastThreshold=0.02), "sift"
-    )
+    return OpenCvExtractor("sift", settings.max_keypoints)
 
 
 @dataclass(frozen=True, slots=True)

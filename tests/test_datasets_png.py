@@ -85,6 +85,20 @@ def test_damaged_pixels_are_refused(raw: bytes, tmp_path: Path) -> None:
             decode_gray(data, tmp_path / "a.png")
 
 
+@pytest.mark.parametrize("shape", [(0, 0), (0, 30), (20, 0)])
+@pytest.mark.parametrize("depth", [8, 16])
+def test_an_image_without_pixels_is_refused(
+    shape: tuple[int, int], depth: int, tmp_path: Path
+) -> None:
+    height, width = shape
+    header = struct.pack(">IIBBBBB", width, height, depth, 0, 0, 0, 0)
+    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+    data = b"\x89PNG\r\n\x1a\n" + parts
+    assert decode_gray8(data) is None
+    with pytest.raises(UnreadableImageError, match=f"states {width} x {height} pixels"):
+        decode_gray(data, tmp_path / "a.png")
+
+
 @pytest.mark.parametrize("cut_end", [1, 4])
 def test_pixels_without_their_checksum_are_refused(cut_end: int) -> None:
     assert decode_gray8(png(np.zeros((20, 30), dtype=np.uint8), [0] * 20, cut_end=cut_end)) is None

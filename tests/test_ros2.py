@@ -28,11 +28,12 @@ from vio.config import Config
 from vio.datasets.bags.cdr import decoded, fields_of
 from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
 from vio.datasets.rigs import load_rig
-from vio.errors import DataError, MissingDependencyError
+from vio.errors import DataError, EstimationError, MissingDependencyError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw
 from vio.live.live_odometry import LiveOdometry
 from vio.live.pairing import Pairing
+from vio.live.results import GrowingTrajectory
 from vio.records import ImuSample
 from vio.ros2.node import NodeSettings, run_node
 from vio.ros2.play import play
@@ -212,6 +213,9 @@ class Taken:
     def reset(self) -> None:
         self.resets += 1
 
+    def check(self) -> None:
+        """Has not failed."""
+
 
 def _sent(graph: Graph, topics: SensorTopics = TOPICS) -> tuple[Taken, Sensors, Member]:
     taken, member = Taken(), Member(graph)
@@ -232,6 +236,7 @@ def _send(graph: Graph, topic: str, time_ns: int, encoding: str, pixels: Any) ->
 
 
 GRAY = np.random.default_rng(0).integers(0, 256, (12, 16), dtype=np.uint8)
+FITTING = np.zeros((90, 160), dtype=np.uint8)  # of the size of the rendered flight
 SMOOTH = np.tile(np.arange(16, dtype=np.uint8) * 8, (16, 1))
 
 
@@ -390,17 +395,109 @@ def test_pairs_are_made_of_near_stamps() -> None:
     assert pairing.alone == 11
 
 
-def test_images_of_another_size_end_the_node(flight: Path) -> None:
+def test_images_of_another_size_are_left_out_by_name(
+    flight: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     graph = Graph()
     with LiveOdometry(load_rig(flight), Config()) as odometry:
         member = Member(graph)
-        Sensors(member, TOPICS, odometry, "reliable")
-        for topic in TOPICS.cameras:
-            _send(graph, topic, 10**9, "mono8", GRAY)
-        with pytest.raises(
-            DataError, match="left image is 16x12, but the calibration is for 160x90"
-        ):
-            member.spin(0.0)
+        sensors = Sensors(member, TOPICS, odometry, "reliable")
+        for time_ns, image in ((10**9, GRAY), (2 * 10**9, GRAY), (3 * 10**9, FITTING)):
+            for topic in TOPICS.cameras:
+                _send(graph, topic, time_ns, "mono8", image)
+        member.spin(0.0)
+        assert odometry.inputs._count == 1
+    assert sensors.refused == 2
+    assert caplog.text.count("left image is 16x12, but the calibration is for 160x90") == 1
+
+
+def _random_message(size: int) -> bytes:
+    return b"\x00\x01\x00\x00" + np.random.default_rng(size).bytes(size)
+
+
+UNUSABLE: dict[str, tuple[str, bytes, str]] = {
+    "nothing": ("/cam0/image_raw", b"", "truncated or of another type"),
+    "a header": ("/imu0", b"\x00\x01\x00\x00", "truncated or of another type"),
+    "noise for an IMU": ("/imu0", _random_message(37), "truncated or of another type"),
+    "noise for an image": ("/cam0/image_raw", _random_message(60), "/cam0/image_raw"),
+}
+
+
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_a_message_that_cannot_be_read_is_left_out_by_name(
+    name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    topic, data, said = UNUSABLE[name]
+    graph = Graph()
+    taken, sensors, member = _sent(graph)
+    publish = Member(graph).advertise(topic, TOPICS.kinds[topic], "reliable")
+    for _ in range(3):
+        publish(data)
+    publisher(Member(graph), {}).imu("/imu0", "imu", ImuSample(10**9, np.zeros(3), np.ones(3)))
+    member.spin(0.0)
+    assert sensors.refused == 3
+    assert taken.samples == [10**9]
+    assert len(caplog.records) == 1
+    assert said in caplog.text
+    assert "bag" not in caplog.text
+
+
+@pytest.mark.parametrize(("encoding", "shape"), [("32FC1", (12, 16)), ("mono8", (0, 0))])
+def test_an_image_that_is_not_read_is_left_out_by_name(
+    encoding: str, shape: tuple[int, int], caplog: pytest.LogCaptureFixture
+) -> None:
+    graph = Graph()
+    taken, sensors, member = _sent(graph)
+    kind = np.float32 if encoding == "32FC1" else np.uint8
+    out = publisher(Member(graph), {})
+    data = np.zeros(shape, dtype=kind)
+    for k in range(2):
+        step = shape[1] * data.itemsize
+        fields = ("cam", *shape, encoding, 0, step, data.reshape(-1).view(np.uint8))
+        out._put("/cam0/image_raw", 10**9 + k, IMAGE, *fields)
+    member.spin(0.0)
+    assert sensors.refused == 2
+    assert taken.pairs == []
+    assert len(caplog.records) == 1
+
+
+def test_the_fault_of_the_odometry_is_no_message_s() -> None:
+    class Failed(Taken):
+        def add_imu(self, time_ns: int, gyro: Any, accel: Any) -> None:
+            raise EstimationError("lost")
+
+        def check(self) -> None:
+            raise EstimationError("lost")
+
+    graph = Graph()
+    member = Member(graph)
+    Sensors(member, TOPICS, Failed(), "reliable")  # type: ignore[arg-type]
+    publisher(Member(graph), {}).imu("/imu0", "imu", ImuSample(10**9, np.zeros(3), np.ones(3)))
+    with pytest.raises(EstimationError, match="lost"):
+        member.spin(0.0)
+
+
+def test_a_live_trajectory_grows_and_keeps_those_before(tmp_path: Path) -> None:
+    file = GrowingTrajectory(tmp_path / "out", "imu")
+    assert not file.has_poses
+    for k in range(3):
+        file.add(k * 10**8, np.eye(4))
+    file.flush()
+    assert len(read_trajectory(tmp_path / "out" / "trajectory.tum")) == 3
+    file.close()
+    file.add(10**9, np.eye(4))  # after a reset
+    file.add(2 * 10**9, np.eye(4))
+    file.close()
+    other = GrowingTrajectory(tmp_path / "out", "imu")  # of another process
+    for k in range(4):
+        other.add(k, np.eye(4))
+    other.close()
+    names = ("trajectory-1.tum", "trajectory-2.tum", "trajectory.tum")
+    assert [len(read_trajectory(tmp_path / "out" / name)) for name in names] == [3, 2, 4]
+    assert read_trajectory(tmp_path / "out" / "trajectory.tum").body == "imu"
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="cannot write"):
+        GrowingTrajectory(tmp_path / "file", "imu").add(0, np.eye(4))
 
 
 def test_silent_unknown_and_wrong_topics_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -134,6 +134,42 @@ def test_recordings_have_all_digits_and_ending_early_keeps_everything(
     np.testing.assert_array_equal(live.T_world_body[:, :3, 3], again.T_world_body[:, :3, 3])
 
 
+def test_a_camera_that_fails_leaves_the_trajectory_so_far(flight: Path, tmp_path: Path) -> None:
+    class Failing(Replayed):
+        def events(self) -> Iterator[SourceEvent | None]:
+            for event in super().events():
+                if self.given >= 8:
+                    raise DataError("the camera was unplugged")
+                yield event
+
+    class Slow:
+        """Lets the odometry keep up, as what waits is forgotten where an error ends a run."""
+
+        def __init__(self) -> None:
+            self.odometry: Any = None
+
+        def start(self, odometry: Any, rig: Any) -> None:
+            self.odometry = odometry
+
+        def should_stop(self) -> bool:
+            self.odometry._worker.ask(lambda: None)
+            return False
+
+    slow = Slow()
+    with pytest.raises(DataError, match="was unplugged"):
+        run_source(
+            Failing(flight),
+            Config(),
+            None,
+            should_stop=slow.should_stop,
+            say=lambda _: None,
+            out=tmp_path / "out",
+            drop="none",
+            on_start=slow.start,
+        )
+    assert len(read_trajectory(tmp_path / "out" / "trajectory.tum")) >= 6
+
+
 @pytest.mark.parametrize("form", get_args(Form))
 def test_a_disk_that_cannot_be_written_ends_the_recording(
     form: Form, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -208,6 +208,22 @@ def test_a_run_goes_on_to_the_same_bits(
     assert [s.time_ns for s in whole.motion_samples] == [s.time_ns for s in second.motion_samples]
 
 
+@pytest.mark.parametrize("name", ["orb", "sift"])
+def test_a_run_with_opencv_s_features_goes_on_to_the_same_bits(name: str, tmp_path: Path) -> None:
+    """OpenCV's extractors have no state that can be saved: they are built again."""
+    config = replace(Config(), frontend=replace(Config().frontend, name=name))
+    whole = run(_rendered(), config, keep_observations=True)
+    folder = GrowingFolder(tmp_path / "run", {})
+    stop = RunControl(folder, should_stop=Stop(120))
+    first = run(_rendered(), config, keep_observations=True, control=stop)
+    assert 5 < len(first.frames) < len(whole.frames)
+    go_on = RunControl(folder, resume=True)
+    second = run(_rendered(), config, keep_observations=True, control=go_on)
+    _assert_same(whole, second)
+    for a, b in zip(whole.observations, second.observations, strict=True):
+        np.testing.assert_array_equal(a.z, b.z)
+
+
 def test_points_put_away_while_running_stay_in_the_map(
     flight_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

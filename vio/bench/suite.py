@@ -234,7 +234,7 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
     if "render" in given:
         words = given["render"]
         given["render"] = tuple(shlex.split(words) if isinstance(words, str) else map(str, words))
-        if own := [word for word in given["render"] if word.partition("=")[0] in _RENDER_OWN]:
+        if own := [word for word in given["render"] if _names_own_option(word)]:
             raise ConfigError(f"{place}: {own[0]} is set by the bench; leave it out")
     try:
         for key in ("start", "stop"):
@@ -261,6 +261,12 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
             given[key] = str(given[key])
     _mapping(given.get("settings") or {}, where, f"settings of sequence {name}")
     return Sequence(name=name, **given)
+
+
+def _names_own_option(word: str) -> bool:
+    """Whether a word is an option that the bench itself gives, in full or abbreviated."""
+    name = word.partition("=")[0]
+    return len(name) > 2 and any(option.startswith(name) for option in _RENDER_OWN)
 
 
 def _published(value: Any, where: str, sequences: Iterable[str]) -> Published:

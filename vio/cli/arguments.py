@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from vio.config import Config
     from vio.datasets.frame_times import Seconds
     from vio.live.build import MapUse
+    from vio.mavlink.output import MavlinkSettings
 
 
 def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,6 +90,46 @@ def map_from(args: argparse.Namespace) -> MapUse | None:
     if args.localise and args.map is None:
         raise ConfigError("--localise needs --map FILE")
     return None if args.map is None else MapUse(args.map, args.localise)
+
+
+def add_mavlink_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the way to a flight controller."""
+    parser.add_argument(
+        "--mavlink",
+        metavar="ADDRESS",
+        help="send poses to an autopilot: udp:HOST:PORT or serial:DEVICE[:BAUD] (extra mavlink)",
+    )
+    parser.add_argument(
+        "--mavlink-message",
+        choices=("odometry", "vision"),
+        default="odometry",
+        help="ODOMETRY, or VISION_POSITION_ESTIMATE",
+    )
+    parser.add_argument(
+        "--mount",
+        default="0,0,0",
+        metavar="R,P,Y",
+        help="how the left camera looks out of the vehicle, degrees (default 0,0,0: ahead, level)",
+    )
+    parser.add_argument(
+        "--heading",
+        type=float,
+        metavar="DEG",
+        help="of the vehicle at the start, from north to the right",
+    )
+
+
+def mavlink_from(args: argparse.Namespace) -> MavlinkSettings | None:
+    """Return where the arguments send poses to; None: nowhere."""
+    if args.mavlink is None:
+        return None
+    from vio.mavlink.output import MavlinkSettings, checked_mounting
+
+    heading = args.heading
+    if heading is not None and not abs(heading) <= 360:
+        raise ConfigError(f"--heading {heading:g}: give -360 to 360 degrees")
+    mounting = checked_mounting(args.mount)
+    return MavlinkSettings(args.mavlink, args.mavlink_message, mounting, heading)
 
 
 def bound(text: str) -> int | Seconds:

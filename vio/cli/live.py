@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 from pathlib import Path
 from typing import Any
 
-from vio.cli.arguments import add_map_arguments, add_settings_arguments, config_from, map_from
+from vio.cli.arguments import (
+    add_map_arguments,
+    add_mavlink_arguments,
+    add_settings_arguments,
+    config_from,
+    map_from,
+    mavlink_from,
+)
 from vio.cli.stopping import StopRequest
 
 
@@ -40,6 +48,7 @@ def add_parser(commands: Any) -> None:
         help="folder or ROS 2 bag (default plain)",
     )
     add_map_arguments(parser)
+    add_mavlink_arguments(parser)
     parser.add_argument(
         "--view", nargs="?", const="spawn", metavar="WHERE", help="show it in rerun (extra view)"
     )
@@ -52,12 +61,19 @@ def execute(args: argparse.Namespace) -> int:
 
     config = config_from(args)
     map_use = map_from(args)
+    mavlink = mavlink_from(args)
     rig = None
     if args.calibration is not None:
         rig = load_rig(args.calibration, cameras=1 if args.layout == "single" else 2)
     viewers: list[Any] = []
 
+    outputs = contextlib.ExitStack()
+
     def show(odometry: Any, rig: Any) -> Any:
+        if mavlink is not None:
+            from vio.mavlink.output import MavlinkOutput
+
+            outputs.enter_context(MavlinkOutput(odometry, mavlink))
         if args.view is None:
             return None
         from vio.view.live import RerunViewer, ViewedRig
@@ -72,7 +88,7 @@ def execute(args: argparse.Namespace) -> int:
         )
         return viewers[0].frame
 
-    with StopRequest() as asked:
+    with outputs, StopRequest() as asked:
         run = run_source(
             open_source(args.source, args.layout),
             config,

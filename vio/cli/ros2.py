@@ -8,7 +8,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vio.cli.arguments import add_map_arguments, add_settings_arguments, config_from, map_from
+from vio.cli.arguments import (
+    add_map_arguments,
+    add_mavlink_arguments,
+    add_settings_arguments,
+    config_from,
+    map_from,
+    mavlink_from,
+)
 from vio.cli.stopping import StopRequest
 from vio.errors import ConfigError
 
@@ -33,6 +40,7 @@ def add_parser(commands: Any) -> None:
     )
     add_settings_arguments(parser)
     add_map_arguments(parser)
+    add_mavlink_arguments(parser)
     parser.add_argument("--prefix", default="/vio", help="of the published topics (default /vio)")
     parser.add_argument(
         "--frames",
@@ -64,6 +72,7 @@ def execute(args: argparse.Namespace) -> int:
 
     config = config_from(args)
     map_use = map_from(args)
+    mavlink = mavlink_from(args)
     names = args.frames.split(",")
     if len(names) != 3 or not all(names):
         raise ConfigError(f"--frames {args.frames}: give three names, map,odom,base")
@@ -83,6 +92,7 @@ def execute(args: argparse.Namespace) -> int:
         not args.no_tf,
         args.out,
         map_use,
+        mavlink,
     )
 
     def say(line: str) -> None:

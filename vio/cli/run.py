@@ -82,8 +82,8 @@ def add_parser(commands: Any) -> None:
 
 
 _OF_A_NEW_RUN = (
-    "reference", "start", "stop", "lengths", "out", "save_observations", "save_calibration", "map", "map_density",
-    "view", "no_plot", "set", "config", "motion", "backend", "frontend", "calibration", "camera", "topics",
+    "reference", "start", "stop", "lengths", "out", "save_observations", "map_density", "view",
+    "no_plot", "set", "config", "motion", "backend", "frontend", "calibration", "camera", "topics",
 )  # fmt: skip
 
 
@@ -92,7 +92,8 @@ def execute(args: argparse.Namespace) -> int:
 
     if args.open and not args.report:
         raise ConfigError("--open shows the page of --report; give both")
-    if args.map_density is not None and (args.map is None or args.map_density < 1):
+    mapped = args.map is not None or args.resume is not None
+    if args.map_density is not None and (not mapped or args.map_density < 1):
         raise ConfigError("--map-density is of a --map, and at least 1")
 
     def finished(metrics: dict[str, Any]) -> None:
@@ -103,8 +104,14 @@ def execute(args: argparse.Namespace) -> int:
         given = [f"--{name.replace('_', '-')}" for name in _OF_A_NEW_RUN if getattr(args, name)]
         if given:
             raise ConfigError(f"--resume goes on as the run began; leave out {', '.join(given)}")
-        folder = Path(resume(args.resume, progress=not args.quiet, finished=finished)["out"])
-        return _reported(folder, shown=args.open) if args.report else 0
+        resume(
+            args.resume,
+            save_calibration=args.save_calibration,
+            map_file=args.map,
+            progress=not args.quiet,
+            finished=finished,
+        )
+        return _reported(args.resume, shown=args.open) if args.report else 0
     metrics = process(
         args.source,
         config_from(args),

@@ -105,7 +105,7 @@ def process(
         "stop": end,
         "lengths_m": None if lengths_m is None else list(lengths_m),
         "save_observations": save_observations,
-        "save_calibration": None if calibration is None else str(calibration.absolute()),
+        "save_calibration": _stated_calibration(folder, calibration),
         "map": None if map_file is None else str(map_file.absolute()),
         "map_density": map_density,
         "localise": localise,
@@ -124,6 +124,15 @@ def process(
     )
 
 
+def _stated_calibration(folder: Path, file: Path | None) -> str | None:
+    """Return how a run's folder states where the calibration goes: in the folder, which may move,
+    by the name alone.
+    """
+    if file is None or file == folder / RunFile.CALIBRATION:
+        return None if file is None else file.name
+    return str(file.absolute())
+
+
 def _map_use(request: Mapping[str, Any]) -> MapUse | None:
     if request.get("map") is None:
         return None
@@ -140,22 +149,93 @@ def _opened(source: str, config: Config, *, mapped: bool) -> Dataset:
 
 
 def resume(
-    folder: Path, *, progress: bool = True, finished: Callable[[dict[str, Any]], None] | None = None
+    folder: Path,
+    *,
+    save_calibration: Path | None = None,
+    map_file: Path | None = None,
+    progress: bool = True,
+    finished: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Go on with an unfinished run and return its metrics; `finished` is that of `process`.
 
+    The folder may be of another hand: what it wants written outside of itself is written only where
+    the caller names the same file, and all is checked as for a new run.
+
     Raises:
-        VioError: the folder holds no unfinished run, or one that another program began.
+        VioError: the folder holds no unfinished run, one that another program began, or one that
+            writes a file outside of it that was not named.
     """
     request = read_request(folder)
+    check_out(folder)
+    request["save_calibration"] = _named_again(
+        folder,
+        request.get("save_calibration"),
+        "--save-calibration",
+        save_calibration,
+        inside=folder / RunFile.CALIBRATION,
+    )
+    if not request.get("localise", False):  # which only reads the map
+        request["map"] = _named_again(folder, request.get("map"), "--map", map_file)
+    density = request.get("map_density")
+    if density is not None and density < 1:
+        raise DataError(f"{folder}: its map_density is {density}, not at least 1; repeat the run")
     config = load_config(folder / RunFile.CONFIG)
-    dataset = _opened(request["source"], config, mapped=request["map"] is not None)
+    dataset = _opened(request["source"], config, mapped=request.get("map") is not None)
+    if request["save_calibration"] is not None:
+        _calibration_file(dataset, folder, _asked_calibration(folder, request))
+    frames_between(dataset.recording, request["start"], request["stop"])
     saved = (folder / RunFile.UNFINISHED / CHECKPOINT).is_file()
     if not saved:
         log.warning("%s: the run ended before its first checkpoint; it begins again", folder)
     return _process(
         dataset, config, folder, request, progress=progress, resume=saved, finished=finished
     )
+
+
+def _named_again(
+    folder: Path, stated: str | None, flag: str, given: Path | None, inside: Path | None = None
+) -> str | None:
+    """Return a file that a run writes, as its folder states it; outside of the folder, only what
+    the caller names too.
+
+    Raises:
+        ConfigError: the folder states another file than the caller, or the caller names none.
+    """
+    if stated is None:
+        if given is not None:
+            raise ConfigError(f"{flag}: the run in {folder} began without; leave it out")
+        return None
+    if inside is not None and stated in (inside.name, str(inside.absolute())):
+        return inside.name
+    if given is None:
+        raise ConfigError(
+            f"{folder}: this run writes {stated}, which lies outside of its folder; to go on, name "
+            f"it again: {flag} {shlex.quote(stated)}"
+        )
+    if given.absolute() != Path(stated).absolute():
+        raise ConfigError(f"{flag} {given}: the run in {folder} began with {stated}; name that one")
+    return stated
+
+
+def _asked_calibration(folder: Path, request: Mapping[str, Any]) -> Path | None:
+    """Return the file of `--save-calibration` as the command line has it; `Path()`: in the
+    folder.
+    """
+    stated = request.get("save_calibration")
+    if stated is None:
+        return None
+    return Path() if stated == RunFile.CALIBRATION else Path(stated)
+
+
+def _resume_command(folder: Path, request: Mapping[str, Any]) -> str:
+    """Return what goes on with a run, with the files outside of its folder that it writes."""
+    words = ["vio", "run", "--resume", str(folder)]
+    asked = _asked_calibration(folder, request)
+    if asked not in (None, Path()):
+        words += ["--save-calibration", str(asked)]
+    if request.get("map") is not None and not request.get("localise", False):
+        words += ["--map", request["map"]]
+    return shlex.join(words)
 
 
 def _process(
@@ -213,7 +293,8 @@ def _process(
                 from vio.offline.map_adjustment import adjust_map
 
                 result = adjust_map(result, Path(request["map"]), asked.reason)
-            file = request.get("save_calibration")  # unfinished runs of earlier versions have none
+            stated = request.get("save_calibration")  # unfinished runs of before have none
+            file = None if stated is None else folder / stated  # an absolute path stays itself
             calibration = None if file is None else _calibration_or_fault(result)
             metrics = finish_run_folder(
                 folder,
@@ -223,7 +304,9 @@ def _process(
                 save_observations=save_observations,
                 more={
                     "command": request.get("command"),
-                    "calibration": file if isinstance(calibration, str) else None,
+                    "calibration": str(file.absolute())
+                    if file is not None and isinstance(calibration, str)
+                    else None,
                 },
                 plot=request.get("plot", True),
                 finished=complete,
@@ -233,7 +316,10 @@ def _process(
         except KeyboardInterrupt as error:
             if not (folder / RunFile.UNFINISHED).is_dir():
                 raise
-            text = f"interrupted; what was flushed is in {folder}; go on with: vio run --resume {folder}"
+            text = (
+                f"interrupted; what was flushed is in {folder}; go on with: "
+                f"{_resume_command(folder, request)}"
+            )
             raise StoppedError(text, status=130) from error
     if shown is not None:
         shown.landmarks(result.landmarks)
@@ -247,7 +333,7 @@ def _process(
         if asked.number is None:
             raise StoppedError(f"error: {text}", status=1)
         raise StoppedError(
-            f"{text}; go on with: vio run --resume {folder}", status=128 + asked.number
+            f"{text}; go on with: {_resume_command(folder, request)}", status=128 + asked.number
         )
     return metrics
 

@@ -149,7 +149,7 @@ def _decoded(data: bytes, path: Path | str, *, colour: bool) -> npt.NDArray[Any]
         raise UnreadableImageError(
             f"{path}: does not decode ({' '.join(str(error).split())})"
         ) from error
-    if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+    if pixels is None or not pixels.size or pixels.dtype not in (np.uint8, np.uint16):
         raise UnreadableImageError(
             f"{path}: does not decode as an image of 8 or 16 bits; copy the image again"
         )
@@ -200,7 +200,10 @@ def _damage(data: bytes) -> str | None:
     return other_damage(data)
 
 
-def _too_large(width: int, height: int) -> str | None:
+def _size_fault(width: int, height: int) -> str | None:
+    """Say what is wrong with the size that a header states; None: nothing."""
+    if width * height <= 0:
+        return f"its header states {width} x {height} pixels, which is no image"
     if width * height <= MOST_PIXELS:
         return None
     return f"its header states {width} x {height} pixels, more than {MOST_PIXELS / 2**20:g} Mpx"
@@ -225,7 +228,7 @@ def _jpeg_damage(data: bytes) -> str | None:
         (size,) = struct.unpack_from(">H", data, at + 2)
         if kind in _JPEG_FRAMES and at + 9 <= len(data):
             height, width = struct.unpack_from(">HH", data, at + 5)
-            if problem := _too_large(width, height):
+            if problem := _size_fault(width, height):
                 return problem
         at += 2 + size
         if kind == 0xDA:  # the compressed pixels of a scan, up to a marker
@@ -263,7 +266,7 @@ def _png_damage(data: bytes) -> str | None:
         if (
             kind == b"IHDR"
             and size >= 8
-            and (problem := _too_large(*struct.unpack_from(">II", data, at + 8)))
+            and (problem := _size_fault(*struct.unpack_from(">II", data, at + 8)))
         ):
             return problem
         if kind == b"IEND":

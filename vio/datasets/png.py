@@ -41,8 +41,8 @@ def decode_gray8(data: bytes) -> Image | None:
     """Return the pixels (H, W) of a PNG file in memory, which are whole by the checksum of all of
     them.
 
-    None where the file is not of 8-bit gray without interlacing, or where it is damaged or too
-    large: OpenCV reads the other kinds, and `vio.datasets.images` says what is damaged, by the
+    None where the file is not of 8-bit gray without interlacing, or where it is damaged, empty or
+    too large: OpenCV reads the other kinds, and `vio.datasets.images` says what is damaged, by the
     checksums of the chunks.
     """
     parts = []
@@ -58,7 +58,7 @@ def decode_gray8(data: bytes) -> Image | None:
             width, height, *form = struct.unpack_from(">IIBBBBB", data, at + 8)
             size = (
                 (height, width)
-                if tuple(form) == _GRAY_8 and height * width <= MOST_PIXELS
+                if tuple(form) == _GRAY_8 and 0 < height * width <= MOST_PIXELS
                 else None
             )
         elif kind == b"IEND":

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -26,7 +27,7 @@ from vio.live.inputs import GivenFrame, Inputs, checked_time
 from vio.live.odometry import Odometry
 from vio.live.prediction import PredictedPose, SharedPredictor
 from vio.live.warm_up import warm_up
-from vio.live.worker import DROPS, Drop, QuietCollector, Worker
+from vio.live.worker import DROPS, Drop, QuietCollector, Worker, WorkerState
 from vio.records import Estimate, FrameResult, Landmarks, MotionSample
 
 log = logging.getLogger(__name__)
@@ -39,7 +40,7 @@ _MOST_WAITING = 1000
 
 class EstimateStream(Iterator[Estimate]):
     """Estimates as they come; it ends when the odometry is closed. `trajectory` counts the
-    resets before the last.
+    resets before the last. Of a reader that is slower, the oldest of 1000 estimates are forgotten.
     """
 
     def __init__(self, raise_failure: Callable[[], None]) -> None:
@@ -80,14 +81,53 @@ class EstimateStream(Iterator[Estimate]):
         raise StopIteration
 
 
+class _Streams:
+    """The streams that somebody still reads; one that nobody holds any more is forgotten."""
+
+    def __init__(self) -> None:
+        self._held: list[weakref.ref[EstimateStream]] = []
+        self._lock = threading.Lock()
+        self._ended = False
+
+    def open(self, raise_failure: Callable[[], None]) -> EstimateStream:
+        """Return a new stream, which has ended already where all have."""
+        stream = EstimateStream(raise_failure)
+        with self._lock:
+            if self._ended:
+                stream.end()
+            else:
+                self._held = [held for held in self._held if held() is not None]
+                self._held.append(weakref.ref(stream))
+        return stream
+
+    def read(self) -> list[EstimateStream]:
+        """Return the streams that are read."""
+        with self._lock:
+            found = [held() for held in self._held]
+        return [stream for stream in found if stream is not None]
+
+    def end(self) -> None:
+        """End all streams, and those that will be opened."""
+        with self._lock:
+            self._ended = True
+        for stream in self.read():
+            stream.end()
+
+    def __len__(self) -> int:
+        return len(self.read())
+
+
 class LiveOdometry(EventInputs[None]):
     """`Odometry` with a queue and a worker: calls that add return at once, results come from the
     worker.
 
     Units, frames and clocks are those of `Odometry`; where no frame is left out, poses are the same
     to the bit. Samples and images may come from different threads, each in order of its own time.
-    An error of the processing ends the worker, and is raised by the next call that adds, by the
-    iterator and by `close`.
+
+    It is running, failed or closed (`state`). What the processing or a callback raises ends the
+    worker: then every call that adds or waits raises it, and so do `predict`, the iterator and
+    `close`. After `close`, calls that add or wait raise VioError. `latest`, `figures`, `warnings`
+    and `calibrated_rig` answer in any state.
     """
 
     def __init__(
@@ -147,7 +187,7 @@ class LiveOdometry(EventInputs[None]):
         self._predictor = SharedPredictor(self._config.msckf.gravity_mps2)
         self._monitor = LiveMonitor(judges_latency=drop != "block")
         self._collector = QuietCollector()
-        self._streams: list[EstimateStream] = []
+        self._streams = _Streams()
         self._points: deque[Landmarks] = deque()  # that do not change any more
         self._keep_landmarks = keep_landmarks
         self._copies = copy_images
@@ -193,16 +233,17 @@ class LiveOdometry(EventInputs[None]):
                 self._predictor.add(sample)
 
     def reset(self) -> None:
-        """Forget all: the next frame begins a new trajectory in a new world frame.
+        """Forget all: the next frame begins a new trajectory in a new world frame; see
+        `Odometry.reset`.
 
         Raises:
-            ConfigError: there is a map, or parts of the caller's own were given.
+            ConfigError: parts of the caller's own were given.
         """
         self._worker.ask(self._reset)
 
     def _reset(self) -> None:
         self._odometry.reset()
-        for stream in self._streams:
+        for stream in self._streams.read():
             stream.reset()
         self._forget()
 
@@ -219,6 +260,11 @@ class LiveOdometry(EventInputs[None]):
         """
         self._worker.end(discard=False)
         self._worker.raise_failure()
+
+    @property
+    def state(self) -> WorkerState:
+        """Whether the worker is running, has failed, or was closed."""
+        return self._worker.state
 
     def check(self) -> None:
         """Raise what the worker ended with, if it failed; calls that add do the same.
@@ -238,19 +284,20 @@ class LiveOdometry(EventInputs[None]):
         """Return the estimates from now on, for a thread of the caller's own; they end when the
         odometry is closed.
         """
-        stream = EstimateStream(self._worker.raise_failure)
-        self._streams.append(stream)
-        if not self._worker.is_alive:
-            stream.end()
-        return stream
+        return self._streams.open(self._worker.raise_failure)
 
     def predict(self, t_ns: int) -> PredictedPose:
-        """Return the pose at a time at or after the newest estimate, from all samples added; it
-        waits for no frame.
+        """Return the pose at a time, from the estimates and all samples added; it waits for no
+        frame.
+
+        A time before the newest estimate, as of a reader that lags, is answered from what was
+        known of the last seconds.
 
         Raises:
-            DataError: there is no estimate yet, or the time is before it.
+            DataError: there is no estimate yet, or the time is seconds before the newest one.
+            Exception: what the worker failed with: no pose will come any more.
         """
+        self._worker.raise_failure()
         return self._predictor.predict(checked_time(t_ns))
 
     @property
@@ -312,12 +359,12 @@ class LiveOdometry(EventInputs[None]):
         line = self._monitor.result(result.frame.time_ns)
         if line is not None:
             self._say(line)
-        for stream in self._streams:
+        for stream in self._streams.read():
             stream.put(result.estimate)
         if self._on_frame is not None:
             try:
                 self._on_frame(result)
-            except Exception as error:  # noqa: BLE001 # raised by the next call
+            except BaseException as error:  # noqa: BLE001 # raised by the next call
                 self._worker.fail(error)
         if self._monitor.results == 1:
             self._collector.hold()
@@ -341,8 +388,7 @@ class LiveOdometry(EventInputs[None]):
             self._odometry.close()
         finally:
             self._collector.release()
-            for stream in self._streams:
-                stream.end()
+            self._streams.end()
 
     def _say(self, line: str) -> None:
         log.warning("%s", line)

@@ -123,19 +123,22 @@ class Odometry(EventInputs["Estimate | None"]):
     def reset(self) -> None:
         """Forget all: the next frame begins a new trajectory in a new world frame.
 
+        A map is written, and takes the new trajectory as another session, which finds its place in
+        it like one of a later day.
+
         Raises:
             ConfigError: parts of the caller's own were given, which only the caller can make new.
+            DataError: the map cannot be written, or opened again.
         """
         if self._parts != CONFIGURED:
             raise ConfigError(
                 "reset: front end, selector or back end were given; build a new Odometry with new "
                 "ones"
             )
-        if self._map is not None:
-            raise ConfigError(
-                "reset: a map takes one trajectory of an Odometry; close it, and build a new one"
-            )
-        self._begin()
+        with self._lock:
+            if self._map is not None:
+                self._processor.close()
+            self._begin()
 
     def _begin(self) -> None:
         """Begin a trajectory."""

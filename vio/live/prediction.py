@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
 
@@ -40,6 +41,10 @@ class _State:
     accel: FloatArray  # (3,) world frame, without gravity and bias
 
 
+def _time_ns(state: _State) -> int:
+    return state.time_ns
+
+
 class PosePredictor:
     """Carries the newest estimate over the motion samples after it.
 
@@ -56,6 +61,7 @@ class PosePredictor:
         self._matrices: tuple[FloatArray, FloatArray] | None = None
         self._last: Estimate | None = None
         self._states: list[_State] = []  # at the newest estimate and at the samples after it
+        self._past: list[_State] = []  # at the estimates and samples of the last seconds before it
 
     def sample(self, sample: MotionSample) -> None:
         """Take a motion sample."""
@@ -89,23 +95,29 @@ class PosePredictor:
         for sample in self._samples:
             if sample.time_ns > estimate.time_ns:
                 states.append(self._carried(states[-1], sample))
+        known = [*self._past, *self._states]
+        first = bisect_left(known, estimate.time_ns - _KEPT_NS, key=_time_ns)
+        self._past = known[first : bisect_left(known, estimate.time_ns, key=_time_ns)]
         self._last = estimate
         self._states = states
 
     def predict(self, time_ns: int) -> PredictedPose:
-        """Return the pose at a time at or after the newest estimate.
+        """Return the pose at a time; one of the last seconds is as it was known then.
 
         Raises:
-            DataError: there is no estimate yet, or the time is before it.
+            DataError: there is no estimate yet, or the time is seconds before the newest.
         """
         states = self._states
         if not states:
             raise DataError("no pose can be predicted before the first estimate")
         if time_ns < states[0].time_ns:
-            raise DataError(
-                f"{time_ns} ns is before the newest estimate at {states[0].time_ns} ns; take that "
-                "one"
-            )
+            newest_ns = states[0].time_ns
+            states = self._past
+            if not states or time_ns < states[0].time_ns:
+                raise DataError(
+                    f"{time_ns} ns is too long before the newest estimate at {newest_ns} ns; take "
+                    "that one"
+                )
         state = next(state for state in reversed(states) if state.time_ns <= time_ns)
         R, p, v = _moved(state, min((time_ns - state.time_ns) * _NS, _LONGEST_STEP_S))
         return PredictedPose(time_ns, se3_from_parts(R, p), v)

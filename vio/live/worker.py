@@ -11,8 +11,9 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
+from types import TracebackType
 from typing import Any, Literal, TypeAlias, TypeVar
 
 from vio.errors import VioError
@@ -20,6 +21,8 @@ from vio.errors import VioError
 Answer = TypeVar("Answer")
 Drop: TypeAlias = Literal["oldest", "none", "block"]
 DROPS: tuple[Drop, ...] = ("oldest", "none", "block")
+# running: calls are made; failed: one ended the worker; closed: its owner did
+WorkerState: TypeAlias = Literal["running", "failed", "closed"]
 
 
 @dataclass(slots=True, eq=False)
@@ -34,6 +37,13 @@ class QueuedCall:
         """Tell who waits for an answer that the call is never made."""
         if self.answer is not None:
             self.answer.cancel()
+
+
+class ClosedError(VioError):
+    """The odometry was closed."""
+
+    def __init__(self) -> None:
+        super().__init__("this odometry is closed; build a new one")
 
 
 class EventQueue:
@@ -61,7 +71,7 @@ class EventQueue:
         """Add a call; False: another frame, which waited longer, was left out for it.
 
         Raises:
-            VioError: the queue is closed.
+            ClosedError: the queue is closed.
         """
         if not call.frame and call.answer is None:
             self._add(call)
@@ -85,7 +95,7 @@ class EventQueue:
 
     def _add(self, call: QueuedCall) -> None:
         if self._closed:
-            raise VioError("this odometry is closed; build a new one")
+            raise ClosedError
         self._calls.put(call)
 
     def take(self) -> Callable[[], object] | None:
@@ -125,11 +135,17 @@ class EventQueue:
         """Number of frames that wait."""
         return len(self._frames)
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether no call can be added any more."""
+        return self._closed
+
 
 class Worker:
-    """Makes calls in a thread of its own.
+    """Makes calls in a thread of its own, and is running, failed or closed.
 
-    An error that a call raises ends it, and is raised by all later calls.
+    What a call raises ends it, of whatever class; all later calls raise it, too. Every method
+    answers by the state: none waits for a thread that has ended.
     """
 
     def __init__(
@@ -149,6 +165,7 @@ class Worker:
         self._finish = finish
         self._close = close
         self._failure: Exception | None = None
+        self._failed_at: TracebackType | None = None
         self._forgets = False
         self._thread = threading.Thread(target=self._run, name="vio", daemon=True)
         self._thread.start()
@@ -160,22 +177,33 @@ class Worker:
         return self._queue.frames
 
     @property
-    def is_alive(self) -> bool:
-        """Whether calls are still made."""
-        return self._thread.is_alive()
+    def state(self) -> WorkerState:
+        """What the worker does; once it is not running, it will never be again."""
+        if self._failure is not None:
+            return "failed"
+        return "closed" if self._queue.is_closed else "running"
 
     def put(self, make: Callable[[], object], *, frame: bool = False) -> bool:
         """Add a call; False: a frame that waited was left out for it.
 
         Raises:
-            Exception: what the worker failed with; VioError: it was closed.
+            Exception: what the worker failed with.
+            ClosedError: it was closed.
         """
         self.raise_failure()
-        return self._queue.put(QueuedCall(make, frame))
+        try:
+            return self._queue.put(QueuedCall(make, frame))
+        except ClosedError:
+            self.raise_failure()  # which closed the queue meanwhile
+            raise
 
     def ask(self, function: Callable[[], Answer]) -> Answer:
         """Call a function in the thread, after all calls so far, and return or raise what it
         does.
+
+        Raises:
+            Exception: what the worker failed with, also meanwhile.
+            ClosedError: it was closed, or was told meanwhile to forget what waits.
         """
         if threading.current_thread() is self._thread:
             return function()
@@ -185,21 +213,33 @@ class Worker:
         def make() -> None:
             try:
                 answer.set_result(function())
-            except Exception as error:  # noqa: BLE001 # raised in the caller's thread
+            except BaseException as error:  # noqa: BLE001 # raised in the caller's thread
                 answer.set_exception(error)
 
-        self._queue.put(QueuedCall(make, answer=answer))
-        return answer.result()
+        try:
+            self._queue.put(QueuedCall(make, answer=answer))
+            return answer.result()
+        except (ClosedError, CancelledError) as error:
+            self.raise_failure()
+            raise ClosedError from error
 
-    def fail(self, error: Exception) -> None:
-        """End the worker with an error; what waits is forgotten."""
-        self._failure = self._failure or error
+    def fail(self, error: BaseException) -> None:
+        """End the worker with an error; what waits is forgotten.
+
+        What would end a program or a thread without a word, as SystemExit, is named by a VioError:
+        it is raised in threads of others.
+        """
+        if self._failure is None:
+            failure = error if isinstance(error, Exception) else _named(error)
+            self._failed_at = failure.__traceback__
+            self._failure = failure
         self._queue.close(discard=True)
 
     def raise_failure(self) -> None:
         """Raise what the worker failed with, if it did."""
         if self._failure is not None:
-            raise self._failure
+            # else each raise would add to its traceback, for a driver that tries again and again
+            raise self._failure.with_traceback(self._failed_at)
 
     def end(self, *, discard: bool) -> None:
         """Make the calls that wait, or forget them, and end the thread."""
@@ -219,12 +259,19 @@ class Worker:
                 make()
             if self._failure is None and not self._forgets:
                 self._finish()
-        except Exception as error:  # noqa: BLE001 # raised by the next call
+        except BaseException as error:  # noqa: BLE001 # raised by the next call
             self.fail(error)
         try:
             self._close()
-        except Exception as error:  # noqa: BLE001 # likewise
+        except BaseException as error:  # noqa: BLE001 # likewise
             self.fail(error)
+
+
+def _named(error: BaseException) -> VioError:
+    """Return an error that says which exception, that is no error, ended the worker."""
+    named = VioError(f"{type(error).__name__} {error} ended this odometry; build a new one")
+    named.__cause__ = error
+    return named
 
 
 # Objects more than before until the young ones are searched. Frames make no cycles, so that few are

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from vio.cameras.rig import Rig
-from vio.datasets.bags.cdr import decoded
+from vio.datasets.bags.cdr import live_decoded
 from vio.datasets.bags.index import BagIndex, camera_info_of
 from vio.datasets.bags.topics import CAMERA_INFO, IMU, TF
 from vio.datasets.rigs.camera_info import rig_from_camera_infos
-from vio.errors import CalibrationError
+from vio.errors import CalibrationError, VioError
 from vio.ros2.sensors import SensorTopics
 from vio.ros2.transport import Transport
+
+log = logging.getLogger(__name__)
 
 STATIC = "/tf_static"
 
@@ -32,27 +36,41 @@ class CameraInfos:
         self._frames = dict[str, str]()
         self.kinds = {info_topic(camera): CAMERA_INFO for camera in topics.cameras}
         self.received = dict.fromkeys(self.kinds, 0)
+        self._named: set[str] = set()  # topics of which a message was left out
         for name in self.kinds:
-            transport.subscribe(name, CAMERA_INFO, self._info_taker(name), "sensor")
-        transport.subscribe(
-            STATIC, TF, lambda data: self._index.add_frames(decoded(data, TF, STATIC)), "latched"
-        )
+            take = functools.partial(self._info, name)
+            transport.subscribe(name, CAMERA_INFO, self._guarded(name, take), "sensor")
+        transport.subscribe(STATIC, TF, self._guarded(STATIC, self._transforms), "latched")
         if topics.imu is not None:
-            transport.subscribe(topics.imu, IMU, self._imu, "sensor")
+            transport.subscribe(topics.imu, IMU, self._guarded(topics.imu, self._imu), "sensor")
 
-    def _info_taker(self, topic: str) -> Callable[[bytes], None]:
-        def take(data: bytes) -> None:
-            fields: Any = decoded(data, CAMERA_INFO, topic)
-            self.received[topic] += 1
-            self._frames[topic] = str(fields.header.frame_id).lstrip("/")
-            self._index.infos[topic] = camera_info_of(fields, topic)
+    def _guarded(self, topic: str, take: Callable[[bytes], None]) -> Callable[[bytes], None]:
+        """Return what takes the messages of a topic, and leaves out those that cannot be used."""
 
-        return take
+        def guarded(data: bytes) -> None:
+            try:
+                take(data)
+            except VioError as error:
+                if topic not in self._named:
+                    self._named.add(topic)
+                    log.warning("%s; such messages are left out", error)
+
+        return guarded
+
+    def _info(self, topic: str, data: bytes) -> None:
+        fields: Any = live_decoded(data, CAMERA_INFO, topic)
+        info = camera_info_of(fields, topic)
+        self.received[topic] += 1
+        self._frames[topic] = str(fields.header.frame_id).lstrip("/")
+        self._index.infos[topic] = info
+
+    def _transforms(self, data: bytes) -> None:
+        self._index.add_frames(live_decoded(data, TF, STATIC))
 
     def _imu(self, data: bytes) -> None:
         assert self._topics.imu is not None
         self._frames[self._topics.imu] = str(
-            decoded(data, IMU, self._topics.imu).header.frame_id
+            live_decoded(data, IMU, self._topics.imu).header.frame_id
         ).lstrip("/")
 
     def rig(self) -> Rig | None:

@@ -4,6 +4,7 @@ it finds.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable
@@ -12,10 +13,11 @@ from pathlib import Path
 
 from vio.cameras.rig import Rig
 from vio.config import Config
-from vio.errors import CalibrationError
+from vio.errors import CalibrationError, VioError
 from vio.live.build import MapUse
 from vio.live.live_odometry import LiveOdometry
 from vio.live.worker import Drop
+from vio.mavlink.output import MavlinkOutput, MavlinkSettings
 from vio.ros2.calibration import CameraInfos
 from vio.ros2.outputs import RESET, SAVE, FrameNames, Outputs
 from vio.ros2.sensors import SILENT_S, Sensors, SensorTopics, Silence, check_types
@@ -38,9 +40,10 @@ class NodeSettings:
     quality: Quality = "sensor"
     drop: Drop = "oldest"  # see `LiveOdometry`
     with_tf: bool = True
-    # folder for the trajectory and the calibration, at the end and on request
+    # folder for the trajectory, which grows, and the calibration, at the end and on request
     out: Path | None = None
     map: MapUse | None = None
+    mavlink: MavlinkSettings | None = None  # where poses also go
 
 
 def run_node(
@@ -52,11 +55,11 @@ def run_node(
     should_stop: Callable[[], object],
     say: Callable[[str], None],
 ) -> None:
-    """Run until it is asked to stop; then write the map and what was asked for.
+    """Run until it is asked to stop; the map and the trajectory are written as they come, and
+    finished however the node ends.
 
     Raises:
-        VioError: a topic has another type, images do not fit the calibration, or the estimation has
-            failed.
+        VioError: a topic has another type, or the estimation has failed.
     """
     topics = settings.topics
     check_types(topics.kinds, transport)
@@ -70,36 +73,59 @@ def run_node(
             f"the calibration has no T_cam_imu, so that {topics.imu} cannot be used; leave --imu "
             "out"
         )
-    with LiveOdometry(
-        found, config, drop=settings.drop, map=settings.map, copy_images=False
-    ) as odometry:
-        say("warming up")
-        odometry.warm_up()
-        sensors = Sensors(transport, topics, odometry, settings.quality)
-        outputs = Outputs(
-            transport,
-            odometry,
-            sensors,
-            frames=settings.frames,
-            prefix=settings.prefix,
-            with_tf=settings.with_tf,
-        )
-        transport.subscribe(
-            f"{settings.prefix}/{RESET}", _EMPTY, lambda _: odometry.reset(), "reliable"
-        )
-        transport.subscribe(
-            f"{settings.prefix}/{SAVE}", _EMPTY, lambda _: _save(outputs, settings), "reliable"
-        )
-        say(f"ready: {', '.join(topics.kinds)} to {settings.prefix}")
-        silence = Silence(topics.kinds)
-        while not should_stop():
-            transport.spin(_SPIN_S)
-            for line in silence.check(sensors.received, transport):
-                log.warning("%s", line)
+    outputs: Outputs | None = None
+    others = contextlib.ExitStack()
+    odometry = LiveOdometry(found, config, drop=settings.drop, map=settings.map, copy_images=False)
+    try:
+        with others, odometry:  # which is closed first
+            say("warming up")
+            odometry.warm_up()
+            if settings.mavlink is not None:
+                others.enter_context(MavlinkOutput(odometry, settings.mavlink))
+            sensors = Sensors(transport, topics, odometry, settings.quality)
+            outputs = Outputs(
+                transport,
+                odometry,
+                sensors,
+                frames=settings.frames,
+                prefix=settings.prefix,
+                with_tf=settings.with_tf,
+                out=settings.out,
+            )
+            _take_requests(transport, settings, odometry, outputs)
+            say(f"ready: {', '.join(topics.kinds)} to {settings.prefix}")
+            silence = Silence(topics.kinds)
+            while not should_stop():
+                transport.spin(_SPIN_S)
+                for line in silence.check(sensors.received, transport):
+                    log.warning("%s", line)
+                odometry.check()
+                outputs.check()
+    finally:
+        if outputs is not None:
+            outputs.finish(settings.out)
+
+
+def _take_requests(
+    transport: Transport, settings: NodeSettings, odometry: LiveOdometry, outputs: Outputs
+) -> None:
+    """Subscribe to the topics of reset and save; what cannot be done is said, and ends nothing."""
+
+    def reset(_: bytes) -> None:
+        try:
+            odometry.reset()
+        except VioError as error:
             odometry.check()
-    outputs.join()
-    if settings.out is not None:
-        outputs.save(settings.out)
+            log.warning("reset: %s", error)
+
+    def save(_: bytes) -> None:
+        try:
+            _save(outputs, settings)
+        except VioError as error:
+            log.warning("save: %s", error)
+
+    transport.subscribe(f"{settings.prefix}/{RESET}", _EMPTY, reset, "reliable")
+    transport.subscribe(f"{settings.prefix}/{SAVE}", _EMPTY, save, "reliable")
 
 
 def _save(outputs: Outputs, settings: NodeSettings) -> None:

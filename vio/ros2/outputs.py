@@ -7,7 +7,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-from concurrent.futures import CancelledError
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import numpy as np
 from vio.errors import VioError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.live.live_odometry import EstimateStream, LiveOdometry
-from vio.live.results import live_trajectory, write_results
+from vio.live.results import GrowingTrajectory, live_body, live_trajectory, write_calibration
 from vio.offline.export_bag import ros_covariance
 from vio.records import NS_PER_S, Estimate
 from vio.ros2.sensors import Sensors
@@ -65,8 +65,9 @@ class Outputs:
         frames: FrameNames,
         prefix: str,
         with_tf: bool,
+        out: Path | None = None,
     ) -> None:
-        """Advertise, and begin to publish."""
+        """Advertise, and begin to publish, and to write the trajectory into the folder `out`."""
         self._odometry = odometry
         self._sensors = sensors
         self._frames = frames
@@ -77,38 +78,74 @@ class Outputs:
             topics["/tf"] = "tf2_msgs/msg/TFMessage"
         late = (self._names[PATH], self._names[POINTS])
         self._out = publisher(transport, topics, latched=late)
-        self._poses: list[tuple[int, FloatArray]] = []
+        self._recent: deque[tuple[int, FloatArray]] = deque(maxlen=_PATH_POSES)
+        self._file = None if out is None else GrowingTrajectory(out, live_body(odometry))
+        self._save_asked = threading.Event()
+        self._failure: Exception | None = None
         self._slow_ns: int | None = None  # newest time of path, landmarks and diagnostics
         self._thread = threading.Thread(
             target=self._run, args=(iter(odometry),), name="ros2", daemon=True
         )
         self._thread.start()
 
-    def join(self) -> None:
-        """Wait for the last estimate, after the odometry was closed."""
-        self._thread.join()
+    def check(self) -> None:
+        """Raise what publishing or writing has failed with.
 
-    def save(self, folder: Path) -> None:
-        """Write the trajectory so far and, once it is estimated, the calibration."""
-        poses = list(self._poses)
-        if not poses:
+        Raises:
+            Exception: that error.
+        """
+        if self._failure is not None:
+            raise self._failure
+
+    def finish(self, folder: Path | None) -> None:
+        """Publish and write what is left, after the odometry was closed or has failed, and the
+        calibration.
+        """
+        self._thread.join()
+        if self._file is None or folder is None:
+            return
+        if not self._file.has_poses:
             log.warning("%s: there is no pose yet, nothing was written", folder)
             return
-        write_results(folder, self._odometry, poses)
+        self._file.close()
+        write_calibration(folder, self._odometry)
+
+    def save(self, folder: Path) -> None:
+        """Bring the trajectory so far to the disk and, once it is estimated, the calibration."""
+        if self._file is None or not self._file.has_poses:
+            log.warning("%s: there is no pose yet, nothing was written", folder)
+            return
+        self._save_asked.set()
+        write_calibration(folder, self._odometry)
 
     def _run(self, estimates: EstimateStream) -> None:
         trajectory = 0
-        for estimate in estimates:
-            if estimates.trajectory != trajectory:
-                trajectory = estimates.trajectory
-                self._poses = []
-                self._slow_ns = None
-            self._publish(estimate)
+        while (estimate := _next(estimates)) is not None:
+            try:
+                if estimates.trajectory != trajectory:
+                    trajectory = estimates.trajectory
+                    self._recent.clear()
+                    self._slow_ns = None
+                    if self._file is not None:
+                        self._file.close()
+                self._write(estimate)
+                self._publish(estimate)
+            except Exception as error:  # noqa: BLE001 # raised by `check`
+                self._failure = error
+                return
+
+    def _write(self, estimate: Estimate) -> None:
+        if self._file is None:
+            return
+        self._file.add(estimate.time_ns, estimate.T_world_imu)
+        if self._save_asked.is_set():
+            self._save_asked.clear()
+            self._file.flush()
 
     def _publish(self, estimate: Estimate) -> None:
         time_ns = estimate.time_ns
         T = estimate.T_world_imu
-        self._poses.append((time_ns, T))
+        self._recent.append((time_ns, T))
         names = self._frames
         covariance = ros_covariance(T, estimate.covariance)
         self._out.odometry(
@@ -130,12 +167,12 @@ class Outputs:
             self._publish_slowly(time_ns)
 
     def _publish_slowly(self, time_ns: int) -> None:
-        recent = self._poses[-_PATH_POSES:]
+        recent = list(self._recent)
         self._out.path(
             self._names[PATH], self._frames.odom, live_trajectory(self._odometry, recent), time_ns
         )
         figures = self._odometry.figures
-        with contextlib.suppress(VioError, CancelledError):  # the odometry is being closed
+        with contextlib.suppress(VioError):  # the odometry is being closed
             points = self._odometry.landmarks()
             sigmas = np.sqrt(np.trace(points.covariance[-_POINTS:], axis1=1, axis2=2) / 3.0)
             self._out.points(
@@ -170,6 +207,16 @@ class Outputs:
             angular = self._sensors.gyro - estimate.gyro_bias
             spread[3:, 3:] = np.eye(3) * _GYRO_VARIANCE
         return linear, angular, spread
+
+
+def _next(estimates: EstimateStream) -> Estimate | None:
+    """Return the next estimate; None: the odometry was closed, or has failed, which the node itself
+    notices.
+    """
+    try:
+        return next(estimates, None)
+    except Exception:  # noqa: BLE001 # what the odometry has failed with
+        return None
 
 
 def _number(value: float | None) -> str:

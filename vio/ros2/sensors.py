@@ -6,20 +6,20 @@ from __future__ import annotations
 
 import functools
 import logging
+import re
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from vio.datasets.bags.cdr import decoded
+from vio.datasets.bags.cdr import live_decoded
 from vio.datasets.bags.index import stamp_of
 from vio.datasets.bags.pictures import band_of_message, gray_of
 from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
-from vio.datasets.images import UnreadableImageError
 from vio.datasets.levels import Band, Levels, levels_of
-from vio.errors import DataError, OrderError
+from vio.errors import DataError, VioError
 from vio.geometry.lie import FloatArray
 from vio.live.live_odometry import LiveOdometry
 from vio.live.pairing import Pairing
@@ -32,6 +32,7 @@ SILENT_S = 5.0  # without a message, before it is said
 # a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
 _BACK_NS = 500_000_000
 _LEVEL_IMAGES = 8  # of 16 bits, looked at for the levels of black and white
+_MAX_REASONS = 50  # that are named
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,8 @@ class SensorTopics:
 class Sensors:
     """Subscribes, and adds what comes to an odometry.
 
-    All of it happens in the thread that spins the transport.
+    A message that cannot be used is left out, counted, and named once for each topic and reason; it
+    ends nothing. All of it happens in the thread that spins the transport.
     """
 
     def __init__(
@@ -74,51 +76,56 @@ class Sensors:
         self.gyro: FloatArray | None = None  # (3,) rad/s, of the newest sample
         self.received = dict.fromkeys(topics.kinds, 0)  # messages
         self.refused = 0
+        self._reasons: set[str] = set()  # that were named
         for side, name in enumerate(topics.cameras):
             transport.subscribe(
-                name, topics.kinds[name], functools.partial(self._image, name, side), quality
+                name,
+                topics.kinds[name],
+                self._taker(name, functools.partial(self._image, side=side)),
+                quality,
             )
         if topics.imu is not None:
-            transport.subscribe(topics.imu, IMU, self._imu, quality)
+            transport.subscribe(topics.imu, IMU, self._taker(topics.imu, self._imu), quality)
 
-    def _image(self, topic: str, side: int, data: bytes) -> None:
+    def _taker(self, topic: str, use: Callable[[str, Any], None]) -> Callable[[bytes], None]:
+        """Return what takes the messages of a topic, of which those are left out that cannot be
+        used.
+        """
+
+        def take(data: bytes) -> None:
+            self.received[topic] += 1
+            try:
+                use(topic, live_decoded(data, self._topics.kinds[topic], topic))
+            except VioError as error:
+                self._odometry.check()  # what the odometry has failed with is no message's fault
+                self._refuse(topic, str(error))
+
+        return take
+
+    def _image(self, topic: str, fields: Any, side: int) -> None:
         kind = self._topics.kinds[topic]
-        fields = decoded(data, kind, topic)
         time_ns = self._stamped(topic, fields)
         if time_ns is None:
             return
         where = f"{topic} at {time_ns} ns"
-        try:
-            image = gray_of(
-                fields,
-                where,
-                compressed=kind == COMPRESSED,
-                levels=self._gray_levels(fields, kind, where),
-            )
-        except UnreadableImageError as error:
-            self._refuse(str(error))
-            return
-        try:
-            if self._topics.right is None:
-                self._odometry.add_images(time_ns, image)
-            elif (pair := self._pairing.add(side, time_ns, image)) is not None:
-                self._odometry.add_stereo(*pair)
-        except OrderError as error:  # the last one was ahead
-            self._refuse(str(error))
+        image = gray_of(
+            fields,
+            where,
+            compressed=kind == COMPRESSED,
+            levels=self._gray_levels(fields, kind, where),
+        )
+        if self._topics.right is None:
+            self._odometry.add_images(time_ns, image)
+        elif (pair := self._pairing.add(side, time_ns, image)) is not None:
+            self._odometry.add_stereo(*pair)
 
-    def _imu(self, data: bytes) -> None:
-        assert self._topics.imu is not None
-        fields = decoded(data, IMU, self._topics.imu)
-        time_ns = self._stamped(self._topics.imu, fields)
+    def _imu(self, topic: str, fields: Any) -> None:
+        time_ns = self._stamped(topic, fields)
         if time_ns is None:
             return
         w = fields.angular_velocity
         a = fields.linear_acceleration
-        try:
-            self._odometry.add_imu(time_ns, [w.x, w.y, w.z], [a.x, a.y, a.z])
-        except DataError as error:  # as of a sample that is not finite
-            self._refuse(str(error))
-            return
+        self._odometry.add_imu(time_ns, [w.x, w.y, w.z], [a.x, a.y, a.z])
         self.gyro = np.array([w.x, w.y, w.z])
 
     def _stamped(self, topic: str, fields: Any) -> int | None:
@@ -126,7 +133,6 @@ class Sensors:
 
         Where two in a row lie far before that one, all begins anew.
         """
-        self.received[topic] += 1
         time_ns = stamp_of(fields)
         before, last = self._newest.get(topic, (None, None))
         back = last is not None and time_ns < last - _BACK_NS
@@ -147,7 +153,7 @@ class Sensors:
         elif last is not None and time_ns <= last:
             if back:
                 self._back.add(topic)
-            self._refuse(f"{topic}: the stamp {time_ns} ns is not after the last one, {last} ns")
+            self._refuse(topic, f"the stamp {time_ns} ns is not after the last one, {last} ns")
             return None
         self._newest[topic] = last, time_ns
         self._back.discard(topic)
@@ -160,10 +166,14 @@ class Sensors:
             self._bands += [] if band is None else [band]
         return levels_of(self._bands)
 
-    def _refuse(self, why: str) -> None:
+    def _refuse(self, topic: str, why: str) -> None:
         self.refused += 1
-        if self.refused == 1:
-            log.warning("%s; such messages are left out, and counted in /diagnostics", why)
+        line = why if topic in why else f"{topic}: {why}"
+        reason = re.sub(r"-?\d[\d.]*", "", line)  # the same for other stamps and sizes
+        if reason in self._reasons or len(self._reasons) >= _MAX_REASONS:
+            return
+        self._reasons.add(reason)
+        log.warning("%s; such messages are left out, and counted in /diagnostics", line)
 
 
 class Silence:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import math
 import platform
 import shutil
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -26,7 +27,6 @@ from vio.errors import CalibrationError, DataError, EvaluationError
 from vio.evaluation.errors_along_path import error_statistics, path_length_m
 from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.files.atomic import atomic_folder, check_own
-from vio.files.inputs import read_input
 from vio.files.printable import json_text, printable
 from vio.files.trajectories import in_first_cam0, read_trajectory, write_kitti, write_tum
 from vio.findings import INTEGRITIES
@@ -38,6 +38,7 @@ from vio.runs.files import FILES, REQUEST, RunFile
 from vio.runs.mapped import MappedRun, write_keyframes, write_loops
 from vio.runs.pipeline import STAGES, RunResult, given_rig
 from vio.runs.recorder import GrowingFolder
+from vio.runs.stated import METRICS_SHAPE, REQUEST_SHAPE, read_stated
 from vio.runs.tables import frames_csv
 
 if TYPE_CHECKING:
@@ -94,8 +95,9 @@ def finish_run_folder(
 ) -> dict[str, Any]:
     """Write the results of a run into the folder in which it grew, and return the metrics.
 
-    What a run that ended early needs to go on stays in `unfinished/`. The first arguments are those
-    of `write_run_folder`.
+    What a run that ended early needs to go on stays in `unfinished/`. That of a whole run goes last
+    of all, so that a process which is killed at any moment leaves either a run that can be gone on
+    with, or all results. The first arguments are those of `write_run_folder`.
 
     Raises:
         VioError: the folder cannot be written.
@@ -104,7 +106,7 @@ def finish_run_folder(
     final = unfinished / "final"
     check_own(unfinished)
     check_own(final)
-    try:
+    with _writing_results(folder):
         if final.exists():  # of a process that died
             shutil.rmtree(final)
         final.mkdir()
@@ -117,18 +119,11 @@ def finish_run_folder(
             save_observations=save_observations,
             more=more,
         )
-        if result.stopped is None:
-            (unfinished / RunFile.ESTIMATES).replace(folder / RunFile.ESTIMATES)
-        else:
-            shutil.copyfile(unfinished / RunFile.ESTIMATES, final / RunFile.ESTIMATES)
+        shutil.copyfile(unfinished / RunFile.ESTIMATES, final / RunFile.ESTIMATES)
         for name in sorted(path.name for path in final.iterdir() if path.name != RunFile.METRICS):
             (final / name).replace(folder / name)
         (final / RunFile.METRICS).replace(folder / RunFile.METRICS)
-        shutil.rmtree(unfinished if result.stopped is None else final)
-    except OSError as error:
-        raise DataError(
-            f"cannot write {folder}: {error.strerror or error}; the trajectory so far is there"
-        ) from error
+        shutil.rmtree(final)
     if finished is not None:
         finished(metrics)
     if plot:
@@ -138,7 +133,21 @@ def finish_run_folder(
             log.warning(
                 "%s was not drawn: interrupted; all other results are complete", RunFile.PICTURE
             )
+    if result.stopped is None:
+        with _writing_results(folder):
+            (unfinished / REQUEST).unlink(missing_ok=True)  # without it, the run is over
+            shutil.rmtree(unfinished)
     return metrics
+
+
+@contextlib.contextmanager
+def _writing_results(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            f"cannot write {folder}: {error.strerror or error}; the trajectory so far is there"
+        ) from error
 
 
 def growing_folder(
@@ -201,12 +210,7 @@ def read_request(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         read_metrics(folder)
         raise DataError(f"{folder}: its run is complete; there is nothing to go on with")
-    try:
-        request: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        request["source"], request["start"]
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise DataError(f"{path}: is damaged ({error}); repeat the run from its start") from error
-    return request
+    return read_stated(path, REQUEST_SHAPE, "repeat the run from its start")
 
 
 def _write_files(
@@ -628,10 +632,10 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
             f"{folder}: no run folder (it has no {RunFile.METRICS}); give a folder that `vio run` "
             "wrote"
         )
+    metrics = read_stated(path, METRICS_SHAPE, "repeat the run")
     try:
-        metrics = json.loads(read_input(path))
         T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
-    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+    except ValueError as error:  # rows of different lengths
         raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
     if metrics.get("complete") is False:
         log.warning(

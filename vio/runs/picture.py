@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from vio.evaluation.trajectories import Evaluation, metres_text
+from vio.files.atomic import atomic_write_bytes
 from vio.files.printable import printable
 from vio.files.tables import Rows
 from vio.geometry.lie import FloatArray
@@ -108,7 +109,7 @@ def write_picture(path: Path, draw: Callable[[], Any]) -> None:
             warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)
             # a tenth larger, sooner
             draw().savefig(stream, format="png", pil_kwargs={"compress_level": 1})
-        path.write_bytes(stream.getvalue())
+        atomic_write_bytes(path, stream.getvalue())
     except Exception as error:
         log.warning(
             "%s was not drawn (%s: %s)",

@@ -89,13 +89,14 @@ def run_source(
                 watcher(result)
 
         samples = 0
-        with LiveOdometry(
+        odometry = LiveOdometry(
             rig, config, on_frame=on_frame, map=map, drop=drop, copy_images=False
-        ) as odometry:
-            say("warming up")
-            odometry.warm_up()
-            watcher = on_start(odometry, rig)
-            with contextlib.ExitStack() as stack:
+        )
+        try:
+            with odometry, contextlib.ExitStack() as stack:
+                say("warming up")
+                odometry.warm_up()
+                watcher = on_start(odometry, rig)
                 recorder = None if record is None else Recorder(record, rig, record_as)
                 if recorder is not None:
                     stack.callback(recorder.close)
@@ -113,8 +114,9 @@ def run_source(
                     else:
                         samples += 1
                         odometry.add_imu(event.time_ns, event.gyro, event.accel)
-        if out is not None:
-            if not poses:
-                raise DataError(f"{out}: no frame has a pose; nothing was written")
-            write_results(out, odometry, poses)
+        finally:  # however it ends, what was computed is kept
+            if out is not None and poses:
+                write_results(out, odometry, poses)
+        if out is not None and not poses:
+            raise DataError(f"{out}: no frame has a pose; nothing was written")
         return LiveRun(odometry.figures, odometry.warnings, samples)

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _WEB_PORT = 9090
+_APPLICATION = "stereo-vio"  # rerun's name of the program, which stands in the head of its files
+_RRD = b"RRF"  # what a file of rerun begins with
+_HEAD_BYTES = 4096
 
 
 def open_stream(where: str, name: str) -> tuple[rr.RecordingStream, str | None]:
@@ -36,7 +39,7 @@ def open_stream(where: str, name: str) -> tuple[rr.RecordingStream, str | None]:
         raise ConfigError(
             "--view needs rerun; install it with: pip install 'stereo-vio[view]'"
         ) from error
-    stream = rr.RecordingStream("stereo-vio", recording_id=None)
+    stream = rr.RecordingStream(_APPLICATION, recording_id=None)
     stream.send_recording_name(name)
     address = None
     if where == "spawn":
@@ -54,7 +57,12 @@ def open_stream(where: str, name: str) -> tuple[rr.RecordingStream, str | None]:
         if not path.parent.is_dir():
             raise DataError(f"{path}: its folder does not exist; create it or choose another")
         try:
-            path.open("wb").close()
+            if not _is_replaceable(path):
+                raise DataError(
+                    f"{path} exists and was not made by this command; remove it, or choose "
+                    "another name"
+                )
+            path.open("ab").close()  # leaves what is there, until the first frame comes
         except OSError as error:
             raise DataError(f"{path}: cannot be written ({error.strerror})") from error
         stream.save(path)
@@ -64,6 +72,17 @@ def open_stream(where: str, name: str) -> tuple[rr.RecordingStream, str | None]:
             "it"
         )
     return stream, address
+
+
+def _is_replaceable(path: Path) -> bool:
+    """Whether a file is not there, empty, or a recording that this program made."""
+    if not os.path.lexists(path):
+        return True
+    if path.is_symlink() or not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    return not head or (head.startswith(_RRD) and _APPLICATION.encode() in head)
 
 
 def wait_for_interrupt(address: str) -> None:

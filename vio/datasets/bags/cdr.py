@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from vio.datasets.bags.store import named_damage, ros2_types
+from vio.datasets.bags.store import OF_A_MESSAGE, named_damage, ros2_types
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +25,16 @@ def decoded(data: bytes, kind: str, where: str) -> Any:
         DataError: the message does not fit its type.
     """
     with named_damage(where):
+        return ros2_types().deserialize_cdr(data, kind)
+
+
+def live_decoded(data: bytes, kind: str, topic: str) -> Any:
+    """Return the fields of a message that came over a topic.
+
+    Raises:
+        DataError: the message does not fit its type.
+    """
+    with named_damage(topic, OF_A_MESSAGE):
         return ros2_types().deserialize_cdr(data, kind)
 
 

@@ -18,6 +18,11 @@ from vio.errors import DataError, MissingDependencyError
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
+_OF_A_BAG = (
+    "the bag is truncated or damaged ({why}); copy it again, or repair it with ROS's own tools "
+    "(rosbag reindex, ros2 bag reindex, mcap recover)"
+)
+OF_A_MESSAGE = "a message is truncated or of another type ({why}); check its publisher"
 MISSING = "ROS bags need the package rosbags; install it with: pip install rosbags"
 
 
@@ -119,8 +124,10 @@ class Bag:
 
 
 @contextlib.contextmanager
-def named_damage(where: Path | str) -> Iterator[None]:
+def named_damage(where: Path | str, damage: str = _OF_A_BAG) -> Iterator[None]:
     """Turn what the readers of bags raise on damaged files into one line.
+
+    `damage` says what is damaged and what to do, with the reason in the place of `{why}`.
 
     Raises:
         DataError: instead of any error of rosbags, its storages, or of the file system.
@@ -142,14 +149,13 @@ def named_damage(where: Path | str) -> Iterator[None]:
         EOFError,
         AssertionError,
         RuntimeError,
+        ArithmeticError,
+        MemoryError,
+        TypeError,
         struct.error,
     )
     try:
         yield
     except (*errors, *builtin) as error:
         why = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(
-            f"{where}: the bag is truncated or damaged ({why[:200]}); copy it again, or repair it "
-            "with ROS's own tools "
-            "(rosbag reindex, ros2 bag reindex, mcap recover)"
-        ) from error
+        raise DataError(f"{where}: {damage.format(why=why[:200])}") from error

@@ -1,0 +1,1 @@
+"""Poses to a flight controller by MAVLink."""

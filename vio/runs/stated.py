@@ -1,0 +1,129 @@
+"""What the JSON files of a run's folder state, checked before it is used: the folder may be of
+another hand.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from vio.errors import DataError
+from vio.files.inputs import read_input
+from vio.files.schema import (
+    NUMBER,
+    NUMBER_OR_NULL,
+    TEXT,
+    TEXT_OR_NULL,
+    TRUTH,
+    WHOLE,
+    WHOLE_OR_NULL,
+    Shape,
+    a_list,
+    an_object,
+)
+
+_MOST_BYTES = 2**26
+_NUMBERS = a_list(NUMBER)
+
+REQUEST_SHAPE = an_object(
+    {
+        "source": TEXT,
+        "reference": TEXT_OR_NULL,
+        "start": WHOLE,
+        "stop": WHOLE_OR_NULL,
+        "lengths_m": a_list(NUMBER, or_null=True),
+        "save_observations": TRUTH,
+        "save_calibration": TEXT_OR_NULL,
+        "map": TEXT_OR_NULL,
+        "map_density": WHOLE_OR_NULL,
+        "localise": TRUTH,
+        "plot": TRUTH,
+        "command": TEXT_OR_NULL,
+    },
+    "source",
+    "reference",
+    "start",
+    "stop",
+    "lengths_m",
+    "save_observations",
+)
+
+_CAMERA = an_object(
+    {
+        **dict.fromkeys(("fu", "fv", "cu", "cv", "baseline_m"), NUMBER),
+        **dict.fromkeys(("width", "height"), WHOLE_OR_NULL),
+        **dict.fromkeys(("projection", "kind"), TEXT),
+    }
+)
+_STEREO_FIELD = an_object(
+    {
+        "text": TEXT_OR_NULL,
+        "coefficients_px": _NUMBERS,
+        "rows_px": a_list(NUMBER, or_null=True),
+        "rig": an_object({"lines": a_list(TEXT)}, "lines", or_null=True),
+    },
+    or_null=True,
+)
+_SCALE = an_object({"percent": NUMBER, "sigma_percent": NUMBER}, "percent", "sigma_percent")
+_CAMERA_IMU = an_object(
+    {
+        "rotation_deg": _NUMBERS,
+        "rotation_sigma_deg": _NUMBERS,
+        "translation_mm": _NUMBERS,
+        "translation_sigma_mm": _NUMBERS,
+        "time_offset_ms": NUMBER,
+        "time_offset_sigma_ms": NUMBER,
+    },
+    or_null=True,
+)
+_TOGETHER = (  # members of `camera_imu`: all, or none
+    ("rotation_deg", "rotation_sigma_deg", "translation_mm", "translation_sigma_mm"),
+    ("time_offset_ms", "time_offset_sigma_ms"),
+)
+
+METRICS_SHAPE = an_object(
+    {
+        "T_cam0_imu": a_list(_NUMBERS),
+        "complete": TRUTH,
+        **dict.fromkeys(("source", "kind", "version"), TEXT),
+        **dict.fromkeys(("stopped", "backend", "motion", "body", "command"), TEXT_OR_NULL),
+        **dict.fromkeys(("frames", "first_frame", "last_frame", "landmarks"), WHOLE),
+        **dict.fromkeys(("innovation_ratio", "ate_m", "path_length_m"), NUMBER_OR_NULL),
+        "warnings": a_list(TEXT, or_null=True),
+        "stereo_field": _STEREO_FIELD,
+        "stereo_scale": an_object({}, each=_SCALE, or_null=True),
+        "camera_imu": _CAMERA_IMU,
+        "camera": _CAMERA,
+        "map": an_object({"joined": TRUTH}, or_null=True),
+    },
+    "T_cam0_imu",
+)
+
+
+def read_stated(path: Path, shape: Shape, remedy: str) -> dict[str, Any]:
+    """Read a JSON file of a run's folder.
+
+    Raises:
+        DataError: it cannot be read, or a value is of the wrong type; the message ends with the
+            remedy.
+    """
+    try:
+        values = json.loads(read_input(path, _MOST_BYTES))
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: is damaged ({error}); {remedy}") from error
+    fault = shape.fault(values, "") or _parted(values)
+    if fault is not None:
+        raise DataError(f"{path}: is damaged ({fault}); {remedy}")
+    checked: dict[str, Any] = values
+    return checked
+
+
+def _parted(values: dict[str, Any]) -> str | None:
+    """Say which member lacks the others that belong to it."""
+    found = values.get("camera_imu") or {}
+    for names in _TOGETHER:
+        there = [name in found for name in names]
+        if any(there) and not all(there):
+            return f"camera_imu.{names[there.index(False)]} is missing"
+    return None
