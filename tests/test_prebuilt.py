@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from tools.prebuild import TARGETS, Target, tag_of, write_code
+from vio.errors import NOTE
 from vio.numerics import prebuilt
 from vio.numerics.compiled import Loop, compiled, compiled_sums
 
@@ -212,12 +213,14 @@ def _another_processor(folder: Path) -> None:
     ],
 )
 def test_code_that_is_damaged_or_for_another_machine_is_not_used(
-    change: Callable[[Path], None], folder: Path
+    change: Callable[[Path], None], folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     change(folder)
     loop = _fresh("total")
-    assert not _is_loaded(loop, np.arange(3.0), 0)
+    with caplog.at_level(NOTE):
+        assert not _is_loaded(loop, np.arange(3.0), 0)
     assert loop(np.arange(3.0), 0) == 1.0
+    assert f"the compiled loops in {folder} are not used: " in caplog.text
 
 
 @pytest.mark.parametrize("name", ["flags\t\t", "Features\t"])

@@ -25,8 +25,7 @@ from importlib import import_module
 from types import FrameType, ModuleType
 
 from vio._version import __version__
-from vio.cli.output import NOTE
-from vio.errors import StoppedError, VioError
+from vio.errors import NOTE, StoppedError, VioError
 from vio.files.printable import printable
 
 # The commands by what they are for, and the files of those that have another name.
@@ -165,7 +164,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         format="%(levelname)s: %(message)s",
         stream=sys.stderr,
     )
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)
+    for library in ("matplotlib", "numba"):  # thousands of lines at the level of --debug
+        logging.getLogger(library).setLevel(logging.WARNING)
     try:
         with _orderly_end():
             _check_address_space(args.command)

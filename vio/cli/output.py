@@ -9,10 +9,6 @@ from typing import Any
 
 from vio.files.printable import json_text, printable
 
-# level of a log line that says what was found or assumed, and asks for nothing: between info and
-# warning
-NOTE = 25
-
 
 def print_result(
     facts: Mapping[str, Any],

@@ -10,12 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vio.cli.output import NOTE, ProgressBar
+from vio.cli.output import ProgressBar
 from vio.cli.stopping import StopRequest
 from vio.config import Config, load_config
 from vio.datasets import open_dataset
 from vio.datasets.frame_times import Seconds, frames_between, used_frames
-from vio.errors import CalibrationError, ConfigError, DataError, StoppedError, VioError
+from vio.errors import NOTE, CalibrationError, ConfigError, DataError, StoppedError, VioError
 from vio.evaluation.trajectories import lengths_text, metres_text, rotation_drift_text
 from vio.files.atomic import (
     atomic_write_bytes,
