@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import shlex
+import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from vio.files.atomic import (
 )
 from vio.files.trajectories import read_trajectory
 from vio.live.build import MapUse, resolve_motion
+from vio.live.first_use import Part, compiled_beside
 from vio.protocols import Dataset, Viewer
 from vio.records import FrameResult, Trajectory
 from vio.report.words import camera_imu_findings, scale_findings
@@ -46,10 +48,10 @@ _LINES = 3  # of what the calibration is off by, in the summary; all are in metr
 
 
 class ProgressViewer:
-    """A progress bar on stderr with frames per second; silent where stderr is no terminal."""
+    """A progress bar on stderr with frames per second; lines where stderr is no terminal."""
 
     def __init__(self, frames: int, label: str) -> None:
-        self._bar = ProgressBar(label, frames, unit="frames")
+        self._bar = ProgressBar(label, frames, unit="frames", announced=True)
 
     def frame(self, result: FrameResult) -> None:
         """Advance by one frame."""
@@ -181,7 +183,7 @@ def _process(
     )
     builds_map = bool(request.get("map")) and not request.get("localise", False)
     annotated = AnnotatedImage(frames)
-    viewers: list[Viewer] = [ProgressViewer(frames, recording.path.name)] if progress else []
+    viewers: list[Viewer] = [ProgressViewer(frames, f"running {recording.path.name}")] if progress else []
     viewers.append(annotated)
     shown = None if view is None else _open_view(view, dataset, config, truth)
     if shown is not None:
@@ -195,7 +197,9 @@ def _process(
         if finished is not None and metrics["complete"]:
             finished(metrics)
 
-    with locked_folder(folder), StopRequest() as asked:
+    beside: tuple[Part, ...] = ("filter",) if recording.camera.kind == "stereo" else ()
+    motion = resolve_motion(recording, config) or "none"
+    with locked_folder(folder), compiled_beside(beside, motion), StopRequest() as asked:
         try:
             result = run(
                 dataset,
@@ -233,8 +237,10 @@ def _process(
         except KeyboardInterrupt as error:
             if not (folder / RunFile.UNFINISHED).is_dir():
                 raise
-            text = f"interrupted; what was flushed is in {folder}; go on with: vio run --resume {folder}"
-            raise StoppedError(text, status=130) from error
+            why = asked.reason() or "interrupted"
+            text = f"{why}; what was flushed is in {folder}; go on with: vio run --resume {folder}"
+            number = signal.SIGINT if asked.number is None else asked.number
+            raise StoppedError(text, status=128 + number) from error
     if shown is not None:
         shown.landmarks(result.landmarks)
         shown.close()

@@ -153,6 +153,11 @@ def _load_extension() -> tuple[ModuleType, Mapping[str, Mapping[str, Any]]]:
     return module, loops
 
 
+def is_usable() -> bool:
+    """Whether there is an extension module for this machine."""
+    return _extension()[0] is not None
+
+
 def code_of(function: Callable[..., Any], made_from: Callable[[], str]) -> list[Callable[..., Any]]:
     """Return a function's machine code, one for each set of types; none where there is none for it
     as it is now.
