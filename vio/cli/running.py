@@ -183,7 +183,9 @@ def _process(
     )
     builds_map = bool(request.get("map")) and not request.get("localise", False)
     annotated = AnnotatedImage(frames)
-    viewers: list[Viewer] = [ProgressViewer(frames, f"running {recording.path.name}")] if progress else []
+    viewers: list[Viewer] = (
+        [ProgressViewer(frames, f"running {recording.path.name}")] if progress else []
+    )
     viewers.append(annotated)
     shown = None if view is None else _open_view(view, dataset, config, truth)
     if shown is not None:
