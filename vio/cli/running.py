@@ -194,7 +194,7 @@ def _process(
     def complete(metrics: dict[str, Any]) -> None:
         if isinstance(calibration, str) and file is not None:
             atomic_write_text(file, calibration)
-        if request.get("plot", True) and (picture := annotated.jpeg()) is not None:
+        if (picture := annotated.jpeg()) is not None:
             atomic_write_bytes(folder / RunFile.FEATURES, picture)
         if finished is not None and metrics["complete"]:
             finished(metrics)
