@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 USUAL_S = 60.0  # of CPU time that the loops of a usual run take
 USUAL_LOOPS = 110  # that a usual run compiles, and what each part of it does
-LOOPS_OF = {"frontend": 50, "filter": 60}
+LOOPS_OF = {"frontend": 45, "filter": 75}
 # Packages of the loops of each part of a run.
 PACKAGES = {"frontend": "vio.frontend", "filter": "vio.filters"}
 _LINE_S = 10.0  # between two lines
