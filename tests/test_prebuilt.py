@@ -51,7 +51,15 @@ def total(values: Any, first: int) -> float:
     return out / (len(values) - first)
 
 
-LOOPS = {"halved": halved, "add_halves": add_halves, "total": total}
+@compiled
+def longest(values: Any) -> float:
+    out = 0.0
+    for k in range(len(values) - 1):
+        out = max(out, np.hypot(values[k], values[k + 1]))
+    return out
+
+
+LOOPS = {"halved": halved, "add_halves": add_halves, "total": total, "longest": longest}
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +76,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _called_loops() -> list[Loop]:
     loops = [Loop(loop.function, loop.options) for loop in LOOPS.values()]
-    add_halves_, total_ = loops[1:]
+    add_halves_, total_, longest_ = loops[1:]
+    assert longest_(np.array([3.0, 4.0, 0.0])) == 5.0
     add_halves_(np.arange(3.0), np.zeros(3))
     total_(np.arange(5.0), 0)
     total_(np.arange(5.0, dtype=np.float32), 0)

@@ -116,6 +116,20 @@ TARGETS = (
 )
 # Functions of libm of which glibc has newer versions than the targets' other symbols need.
 _OLD_SYMBOLS = ("hypot",)
+# The linker lets every call of such a function, also in the loops, call this one, which asks for
+# the oldest version.
+_OLD_SYMBOL = """
+#ifdef __cplusplus
+extern "C" {{
+#endif
+__asm__(".symver old_{name},{name}@GLIBC_{glibc}");
+double old_{name}(double, double);
+double __wrap_{name}(double, double) __attribute__((weak, visibility("hidden")));
+double __wrap_{name}(double x, double y) {{ return old_{name}(x, y); }}
+#ifdef __cplusplus
+}}
+#endif
+"""
 _OLDEST_GLIBC = 17  # minor version, of the oldest manylinux tag in use
 
 # Bytes from the start of an object, as NumPy's and Python's headers have them: ndarray, dtype,
@@ -236,9 +250,13 @@ def _compiling_for(target: Target, module: Any) -> Iterator[None]:
         mock.patch.object(toolchain.Toolchain, "get_ext_filename", lambda _, name: name + suffix),
     ):
         header = Path(folder) / "old_symbols.h"
-        lines = [f'__asm__(".symver {f},{f}@GLIBC_{target.glibc}");' for f in _OLD_SYMBOLS]
-        header.write_text("\n".join([*lines, ""]), encoding="utf-8")
+        header.write_text(
+            "".join(_OLD_SYMBOL.format(name=name, glibc=target.glibc) for name in _OLD_SYMBOLS),
+            encoding="utf-8",
+        )
+        wrapped = [f"-Wl,--wrap={name}" for name in _OLD_SYMBOLS]
         module._extra_cflags = {"posix": [*module._get_extra_cflags(), "-include", str(header)]}
+        module._extra_ldflags = {"posix": [*module._get_extra_ldflags(), *wrapped]}
         module._toolchain = toolchain.Toolchain()
         module.output_file = prebuilt.MODULE + suffix
         yield
