@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from packaging.requirements import Requirement
 
+from tools.prebuild import TARGETS
 from vio.files.trajectories import read_trajectory
 
 _EMULATOR = "qemu-aarch64-static"
@@ -39,11 +40,23 @@ def main(argv: list[str]) -> int:
         return 2
     root = Path(argv[0]).resolve()
     wheel = Path(argv[1]).resolve()
+    _name_processor(root)
     with tempfile.TemporaryDirectory() as folder:
         site = Path(folder) / "site"
         _install(wheel, site)
         far = [name for name in argv[2:] if _difference_m(root, site, name, Path(folder)) is None]
     return 1 if far else 0
+
+
+def _name_processor(root: Path) -> None:
+    """Let programs below `root` read which instructions are emulated: older emulators show them
+    the list of this machine.
+    """
+    file = root / "proc" / "cpuinfo"
+    (flags,) = (target.flags for target in TARGETS if target.machine == "aarch64")
+    file.parent.mkdir(exist_ok=True)
+    if not file.exists():
+        file.write_text(f"processor\t: 0\nFeatures\t: {flags}\n", encoding="utf-8")
 
 
 def _install(wheel: Path, site: Path) -> None:
