@@ -30,7 +30,7 @@ from vio.files.trajectories import read_trajectory
 from vio.live.build import MapUse, resolve_motion
 from vio.live.first_use import Part, compiled_beside
 from vio.protocols import Dataset, Viewer
-from vio.records import FrameResult, Trajectory
+from vio.records import FrameResult, Recording, RunMotion, Trajectory
 from vio.report.words import camera_imu_findings, scale_findings
 from vio.runs.files import CHECKPOINT, FILES, RunFile
 from vio.runs.folder import calibration_text, finish_run_folder, growing_folder, read_request
@@ -200,7 +200,7 @@ def _process(
             finished(metrics)
 
     beside: tuple[Part, ...] = ("filter",) if recording.camera.kind == "stereo" else ()
-    motion = resolve_motion(recording, config) or "none"
+    motion = _likely_motion(recording, config)
     with locked_folder(folder), compiled_beside(beside, motion), StopRequest() as asked:
         try:
             result = run(
@@ -258,6 +258,15 @@ def _process(
             f"{text}; go on with: vio run --resume {folder}", status=128 + asked.number
         )
     return metrics
+
+
+def _likely_motion(recording: Recording, config: Config) -> RunMotion:
+    """Return what a run will take to propagate poses, without the checks of the run itself."""
+    if config.motion != "auto":
+        return config.motion
+    if "imu" in recording.motion:
+        return "imu"
+    return "velocity" if "velocity" in recording.motion else "none"
 
 
 def _calibration_or_fault(result: RunResult) -> str | CalibrationError:
