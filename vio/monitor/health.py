@@ -40,7 +40,6 @@ def is_corrected(finding: Finding) -> bool:
     return rows_grade(finding.figures["rows_rms_px"]) == "worth calibrating"
 
 
-
 class RunHealth:
     """Monitor each frame's report and estimate; return a finding when an event begins or ends."""
 
