@@ -18,10 +18,14 @@ TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 CONSTRAINTS ?= constraints.txt
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(addprefix -c ,$(CONSTRAINTS))
 
-.PHONY: demo quick test lint unit oldest coverage mutations bench results wheel docs release clean constraints
+.PHONY: demo quick test lint unit oldest coverage mutations bench results wheel arm docs release clean constraints
 
+# The demo compiles what it needs itself, while it renders; the extension module with all loops comes afterwards.
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
+	@test -d vio/numerics/machine_code || { \
+		echo "compiling the other loops in the background, once: about 200 s of computing; until then each run loads 130 MiB more"; \
+		nice $(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 & }
 
 # Algebra, records, settings, filters, and runs on features; under a minute on two cores once the loops are compiled.
 QUICK := lie stereo_geometry distortion statistics robust jacobian_registry records config selectors information \
@@ -76,11 +80,17 @@ docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 # Build the wheel, and run it in an environment and a folder of its own, with the newest versions of what it needs. On Linux
-# x86-64 this also writes, and then runs, a wheel with the machine code of its loops for this Python.
+# x86-64 and aarch64 this also writes, and then runs, a wheel with the machine code of its loops for this Python; where there
+# is a cross compiler (Debian: g++-aarch64-linux-gnu), on x86-64 one for aarch64 as well.
 wheel: | $(BIN)/python$(EXE)
 	rm -rf build dist
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
 	$(BIN)/python tools/check_wheel.py dist
+
+# Run two short recordings on an emulated Arm processor, by hand: tools/arm.py says what ARM_ROOT is.
+ARM_ROOT ?=
+arm: $(VENV)/.base
+	$(BIN)/python -m tools.arm "$(ARM_ROOT)" dist/*_aarch64.whl "$(VIO_DATA)/kitti_06_head" "$(VIO_DATA)/euroc/MH_01_head"
 
 # All of a release but the upload: CONTRIBUTING.md tells the rest.
 release: $(VENV)/.base
@@ -93,9 +103,6 @@ $(BIN)/python$(EXE):
 $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e . setuptools
 	@touch $@
-	@# What tests compile, they compile themselves; here the first command still renders or reads meanwhile.
-	@echo "compiling loops in the background, once: about 100 s of CPU"
-	@nice $(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 &
 
 $(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[docs]'

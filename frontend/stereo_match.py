@@ -108,10 +108,13 @@ def _learn(
     kept = normal.copy()
     kept_moment = moment.copy()
     for _ in range(_FIELD_ITERATIONS):
-        normal[:] = kept
-        moment[:] = kept_moment
+        for i in range(size):
+            for j in range(size):
+                normal[i, j] = kept[i, j]
+            moment[i] = kept_moment[i]
         add_equations(terms, off, field, _FIELD_SIGMA_PX, normal, moment)
-        field[:] = moment
+        for i in range(size):
+            field[i] = moment[i]
         solve_positive(normal.copy(), field)
 
 

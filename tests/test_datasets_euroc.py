@@ -34,7 +34,6 @@ from tests.euroc_maker import (
 from tests.same_events import frames_of
 from tests.sift import match_sift
 from vio.cameras.rig import rectifier_of
-from vio.cli.output import NOTE
 from vio.cli.running import process
 from vio.config import load_config
 from vio.datasets import DatasetSettings, open_dataset
@@ -43,7 +42,7 @@ from vio.datasets.euroc_files import camera_yaml, read_camera_yaml, rig_read_as
 from vio.datasets.frame_times import pair_stamps
 from vio.datasets.image_pairs import ImageDataset
 from vio.datasets.images import load_gray
-from vio.errors import CalibrationError, DataError
+from vio.errors import NOTE, CalibrationError, DataError
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import rectified_cameras, rectifying_rotations

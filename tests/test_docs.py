@@ -62,10 +62,13 @@ def _make(target: str) -> list[str]:
 
 def _make_demo() -> None:
     """The environment, then the command that `readme_folder` has run."""
-    *before, last = _make("demo")
+    lines = _make("demo")
+    (demo,) = (k for k, line in enumerate(lines) if line.endswith("/vio demo --out demo"))
+    before = lines[:demo]
     assert any("-m venv" in line for line in before)
     assert any("pip install" in line and line.endswith("-e . setuptools") for line in before)
-    assert last.endswith("/vio demo --out demo")
+    assert not any("tools.prebuild" in line for line in before)
+    assert any("tools.prebuild" in line for line in lines[demo:]), "all other loops come after it"
 
 
 def _make_quick() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vio.monitor.health import RunHealth
+from vio.monitor.health import RunHealth, is_corrected
 from vio.records import Estimate, StereoFieldEstimate, StereoScaleEstimate, UpdateReport
 
 GOOD = UpdateReport(50, 2, 1, 30, 0.3, 1.0)
@@ -76,6 +76,13 @@ def test_rows_that_no_rig_comes_to_are_not_laid_on_the_calibration_alone(
     (line,) = RunHealth().frame(0, GOOD, _estimate(0, stereo_field=field))
     assert f"frame 0: the rows of left and right images differ by {rows_px:.2f} px (rms)" in line
     assert words in line
+
+
+def test_what_a_run_corrects_of_the_calibration_is_no_warning() -> None:
+    for rows_px, corrected in ((0.42, True), (4.3, False), (26.0, False)):
+        field = StereoFieldEstimate(np.zeros(8), np.eye(8), rows_px)
+        (finding,) = RunHealth().frame(0, GOOD, _estimate(0, stereo_field=field))
+        assert is_corrected(finding) == corrected
 
 
 def test_a_restart_is_one_event_and_its_jump_is_not_reported_as_a_speed() -> None:

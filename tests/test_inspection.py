@@ -268,3 +268,26 @@ def test_real_recordings(name: str, data_dir: Path, capsys: pytest.CaptureFixtur
     status, facts = inspect(data_dir / name, capsys, "--frames", "0", "--pairs", "1")
     assert status == 0, facts["faults"]
     assert facts["parts"]["IMU"]["count"] > 500
+
+
+def test_a_span_of_the_recording_is_examined_alone(
+    flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--pairs", "2", "--frames", "3", "--start", "2", "--stop", "7"]
+    parts = inspect(flight, capsys, *options)[1]["parts"]
+    assert parts["frames"]["count"] == 5
+    assert parts["tracking"]["frames"] == 3
+    assert parts["frames"]["duration_s"] < parts["IMU"]["duration_s"]
+    assert parts["IMU"]["covered"] == 1.0
+    whole = inspect(flight, capsys, "--frames", "0")[1]["parts"]
+    assert whole["IMU"]["count"] > parts["IMU"]["count"]
+
+
+def test_stamps_that_are_even_but_for_rounding_have_no_jitter(
+    flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["inspect", str(flight), "--pairs", "1", "--frames", "0"]) == 0
+    out = capsys.readouterr().out
+    assert "Hz, even, no gap" in out
+    assert "e-0" not in out
+    assert "(1: blurred by 2 px or more)" in out

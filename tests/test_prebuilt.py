@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tools.prebuild import write_code
+from tools.prebuild import TARGETS, Target, tag_of, write_code
+from vio.errors import NOTE
 from vio.numerics import prebuilt
 from vio.numerics.compiled import Loop, compiled, compiled_sums
 
@@ -50,7 +51,15 @@ def total(values: Any, first: int) -> float:
     return out / (len(values) - first)
 
 
-LOOPS = {"halved": halved, "add_halves": add_halves, "total": total}
+@compiled
+def longest(values: Any) -> float:
+    out = 0.0
+    for k in range(len(values) - 1):
+        out = max(out, np.hypot(values[k], values[k + 1]))
+    return out
+
+
+LOOPS = {"halved": halved, "add_halves": add_halves, "total": total, "longest": longest}
 
 
 @pytest.fixture(scope="module")
@@ -59,15 +68,20 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if shutil.which("cc") is None:
         pytest.skip("needs a C compiler")
     folder = tmp_path_factory.mktemp("made") / "machine_code"
-    loops = [Loop(loop.function, loop.options) for loop in LOOPS.values()]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(prebuilt, "_extension", lambda: (None, {}))
-        add_halves_, total_ = loops[1:]
-        add_halves_(np.arange(3.0), np.zeros(3))
-        total_(np.arange(5.0), 0)
-        total_(np.arange(5.0, dtype=np.float32), 0)
-        write_code(folder, loops, "host", prebuilt.processor_flags())
+        write_code(folder, _called_loops(), "host", prebuilt.processor_flags())
     return folder
+
+
+def _called_loops() -> list[Loop]:
+    loops = [Loop(loop.function, loop.options) for loop in LOOPS.values()]
+    add_halves_, total_, longest_ = loops[1:]
+    assert longest_(np.array([3.0, 4.0, 0.0])) == 5.0
+    add_halves_(np.arange(3.0), np.zeros(3))
+    total_(np.arange(5.0), 0)
+    total_(np.arange(5.0, dtype=np.float32), 0)
+    return loops
 
 
 @pytest.fixture
@@ -208,12 +222,14 @@ def _another_processor(folder: Path) -> None:
     ],
 )
 def test_code_that_is_damaged_or_for_another_machine_is_not_used(
-    change: Callable[[Path], None], folder: Path
+    change: Callable[[Path], None], folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     change(folder)
     loop = _fresh("total")
-    assert not _is_loaded(loop, np.arange(3.0), 0)
+    with caplog.at_level(NOTE):
+        assert not _is_loaded(loop, np.arange(3.0), 0)
     assert loop(np.arange(3.0), 0) == 1.0
+    assert f"the compiled loops in {folder} are not used: " in caplog.text
 
 
 @pytest.mark.parametrize("name", ["flags\t\t", "Features\t"])
@@ -247,3 +263,26 @@ def test_a_loop_that_was_edited_is_compiled_anew(
 def test_options_belong_to_a_loop(folder: Path) -> None:
     loop = Loop(total.function, halved.options)  # type: ignore[attr-defined]
     assert not _is_loaded(loop, np.arange(3.0), 0)
+
+
+# of the header of an ELF file: the machine that its code is for
+_ELF_MACHINES = {"x86_64": 62, "aarch64": 183}
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.machine)
+def test_a_module_for_a_wheel_is_for_its_machine_and_loads_with_older_libraries(
+    target: Target, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if sys.platform != "linux" or shutil.which(f"{target.tools}g++") is None:
+        pytest.skip(f"needs {target.tools}g++ on Linux")
+    monkeypatch.setattr(prebuilt, "_extension", lambda: (None, {}))
+    folder = tmp_path / "machine_code"
+    write_code(folder, _called_loops(), target.processor, target.flags.split(), target)
+    (file,) = folder.glob("*.so")
+    assert int.from_bytes(file.read_bytes()[18:20], "little") == _ELF_MACHINES[target.machine]
+    manifest = json.loads((folder / prebuilt.MANIFEST).read_text())
+    assert manifest["environment"]["system"] == f"linux {target.machine}"
+    assert manifest["file"] == file.name
+    assert sorted(manifest["flags"]) == sorted(target.flags.split())
+    # the newest symbols are pow, exp and log; hypot would ask for glibc 2.35
+    assert tag_of(folder, target).endswith(f"manylinux_2_29_{target.machine}")

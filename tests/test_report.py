@@ -91,7 +91,7 @@ def test_a_page_needs_no_network_and_shows_every_part(runs: tuple[Path, Path]) -
         "Velocity",
         "Errors",
         "Features",
-        "Innovations",
+        "Innovations and residuals",
         "IMU biases",
     )
     for title in (

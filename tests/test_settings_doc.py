@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tools import commands_table
 from tools.settings_page import page
-from vio.cli import _COMMANDS
+from vio.cli import COMMANDS
 from vio.config import BASIC, Config, describe
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "settings.md"
@@ -32,4 +32,4 @@ def test_every_setting_has_one_row_and_about_twenty_are_basic() -> None:
 def test_the_table_of_commands_is_that_of_todays_commands() -> None:
     text = commands_table.PAGE.read_text(encoding="utf-8")
     assert commands_table.with_table(text) == text, "run: python -m tools.commands_table"
-    assert commands_table.table().count("`vio ") == len(_COMMANDS) == len(set(_COMMANDS))
+    assert commands_table.table().count("`vio ") == len(COMMANDS) == len(set(COMMANDS))

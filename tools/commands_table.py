@@ -10,7 +10,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from vio.cli import BY_PURPOSE
+from vio.cli import BY_PURPOSE, command_module
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "commands.md"
 _BEGIN = "<!-- commands -->\n"
@@ -20,10 +20,10 @@ _END = "<!-- end commands -->\n"
 def table() -> str:
     """Return the table as Markdown."""
     rows = ["| | command | |", "|---|---|---|"]
-    for purpose, modules in BY_PURPOSE.items():
+    for purpose, names in BY_PURPOSE.items():
         commands = argparse.ArgumentParser().add_subparsers()
-        for module in modules:
-            module.add_parser(commands)
+        for name in names:
+            command_module(name).add_parser(commands)
         for k, action in enumerate(commands._choices_actions):
             rows.append(f"| {'' if k else purpose} | `vio {action.dest}` | {action.help} |")
     return "\n".join(rows) + "\n"

@@ -1,8 +1,13 @@
-"""Compile the loops ahead of the first run: into the wheel, or for a checkout.
+"""Compile the loops ahead of the first run: into wheels, or for a checkout.
 
 python -m tools.prebuild dist     # beside the wheel in dist/, write one for this Python on Linux
-x86-64 python -m tools.prebuild          # for this checkout: numba's cache, and with a C++ compiler
-the extension module
+                                  # x86-64, and with a cross compiler one on Linux aarch64
+python -m tools.prebuild          # for this checkout: numba's cache, and with a C++ compiler the
+                                  # extension module
+
+LLVM writes code for all of its targets; the cross compiler (Debian: g++-aarch64-linux-gnu) compiles
+what numba adds in C, and links. macOS is not among the targets: LLVM can write its objects, but
+they are linked against Apple's own libraries, which Linux has not.
 
 `vio/numerics/prebuilt.py` loads the module. numba's ahead-of-time compiler writes it. That takes no
 options for a function, trusts the types of arguments, and takes the address of an exception for the
@@ -15,7 +20,10 @@ import base64
 import hashlib
 import importlib
 import json
+import multiprocessing
 import os
+import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -23,10 +31,13 @@ import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
+import llvmlite.binding as llvm
 from llvmlite import ir
 
 from vio.numerics import compiled, prebuilt
@@ -65,11 +76,61 @@ _COMMANDS = (
     "run drive --no-plot --out matched --frontend orb",
     "run depth --no-plot --out depths",
 )
-_TAG = f"cp{sys.version_info[0]}{sys.version_info[1]}-none-manylinux_2_29_x86_64"
-# The processors that a wheel is for: LLVM's names, and those of Linux for what must be there.
-_CPU_NAME = "x86-64-v3"
-_FEATURES = "sse3 ssse3 sse4.1 sse4.2 popcnt cx16 sahf avx avx2 bmi bmi2 f16c fma lzcnt movbe xsave"
-_FLAGS = "pni ssse3 sse4_1 sse4_2 popcnt cx16 lahf_lm avx avx2 bmi1 bmi2 f16c fma abm movbe xsave"
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A kind of machine that a wheel is for."""
+
+    machine: str  # as Python and the tags of wheels name it
+    processor: str  # the oldest, LLVM's name
+    features: str  # of that processor, LLVM's names; needed where this process compiles for it
+    flags: str  # what a processor must have, Linux' names
+    glibc: str  # the version of the oldest symbols
+
+    @property
+    def triple(self) -> str:
+        """LLVM's name of the machine and its system."""
+        return f"{self.machine}-unknown-linux-gnu"
+
+    @property
+    def is_here(self) -> bool:
+        """Whether this machine is one."""
+        return (sys.platform, platform.machine()) == ("linux", self.machine)
+
+    @property
+    def tools(self) -> str:
+        """Prefix of the names of a compiler's programs."""
+        return "" if self.is_here else f"{self.machine}-linux-gnu-"
+
+
+TARGETS = (
+    Target(
+        "x86_64",
+        "x86-64-v3",
+        "sse3 ssse3 sse4.1 sse4.2 popcnt cx16 sahf avx avx2 bmi bmi2 f16c fma lzcnt movbe xsave",
+        "pni ssse3 sse4_1 sse4_2 popcnt cx16 lahf_lm avx avx2 bmi1 bmi2 f16c fma abm movbe xsave",
+        "2.2.5",
+    ),
+    Target("aarch64", "generic", "fp-armv8 neon", "fp asimd", "2.17"),
+)
+# Functions of libm of which glibc has newer versions than the targets' other symbols need.
+_OLD_SYMBOLS = ("hypot",)
+# The linker lets every call of such a function, also in the loops, call this one, which asks for
+# the oldest version.
+_OLD_SYMBOL = """
+#ifdef __cplusplus
+extern "C" {{
+#endif
+__asm__(".symver old_{name},{name}@GLIBC_{glibc}");
+double old_{name}(double, double);
+double __wrap_{name}(double, double) __attribute__((weak, visibility("hidden")));
+double __wrap_{name}(double x, double y) {{ return old_{name}(x, y); }}
+#ifdef __cplusplus
+}}
+#endif
+"""
+_OLDEST_GLIBC = 17  # minor version, of the oldest manylinux tag in use
 
 # Bytes from the start of an object, as NumPy's and Python's headers have them: ndarray, dtype,
 # type.
@@ -109,7 +170,13 @@ def _check(status: int) -> None:
         raise RuntimeError("a recording could not be processed: see above")
 
 
-def write_code(folder: Path, loops: Iterable[Loop], processor: str, flags: Iterable[str]) -> None:
+def write_code(
+    folder: Path,
+    loops: Iterable[Loop],
+    processor: str,
+    flags: Iterable[str],
+    target: Target | None = None,
+) -> None:
     """Write an extension module and its manifest into a new folder.
 
     Args:
@@ -118,6 +185,7 @@ def write_code(folder: Path, loops: Iterable[Loop], processor: str, flags: Itera
             with.
         processor: to compile for, LLVM's name; "host" for this one.
         flags: instruction sets without which the module must not be used, Linux' names.
+        target: machines of a wheel, also others than this one; None: this machine.
     """
     folder.mkdir(parents=True)
     with warnings.catch_warnings():
@@ -143,17 +211,65 @@ def write_code(folder: Path, loops: Iterable[Loop], processor: str, flags: Itera
         for symbol, signature in zip(symbols, signatures, strict=True):
             module.export(symbol, signature)(loop.function)
         places[name] = {"fingerprint": loop.fingerprint, "symbols": symbols}
-    with _mended(options):
+    environment = prebuilt.environment()
+    if target is not None:
+        environment["system"] = f"linux {target.machine}"
+    with _mended(options), nullcontext() if target is None else _compiling_for(target, module):
         module.compile()
-    file = folder / module.output_file
+    (file,) = folder.glob(f"{prebuilt.MODULE}*")
     manifest = {
-        "environment": prebuilt.environment(),
+        "environment": environment,
         "flags": sorted(flags),
         "file": file.name,
         "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
         "loops": places,
     }
     (folder / prebuilt.MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+
+
+@contextmanager
+def _compiling_for(target: Target, module: Any) -> Iterator[None]:
+    """Let numba's ahead-of-time compiler write an extension module for a target, which loads with
+    its oldest libraries.
+    """
+    toolchain: Any = importlib.import_module("numba.pycc.platform")
+    codegen: Any = importlib.import_module("numba.core.codegen")
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    suffix = f".{sys.implementation.cache_tag}-{target.machine}-linux-gnu.so"
+    compilers = {
+        "CC": f"{target.tools}gcc",
+        "CXX": f"{target.tools}g++",
+        "LDSHARED": f"{target.tools}gcc -shared",
+    }
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        mock.patch.dict(os.environ, {} if target.is_here else compilers),
+        mock.patch.object(codegen.ll, "get_process_triple", return_value=target.triple),
+        mock.patch.object(toolchain, "external_compiler_works", return_value=True),
+        mock.patch.object(toolchain.Toolchain, "get_ext_filename", lambda _, name: name + suffix),
+    ):
+        header = Path(folder) / "old_symbols.h"
+        header.write_text(
+            "".join(_OLD_SYMBOL.format(name=name, glibc=target.glibc) for name in _OLD_SYMBOLS),
+            encoding="utf-8",
+        )
+        wrapped = [f"-Wl,--wrap={name}" for name in _OLD_SYMBOLS]
+        module._extra_cflags = {"posix": [*module._get_extra_cflags(), "-include", str(header)]}
+        module._extra_ldflags = {"posix": [*module._get_extra_ldflags(), *wrapped]}
+        module._toolchain = toolchain.Toolchain()
+        module.output_file = prebuilt.MODULE + suffix
+        yield
+
+
+def tag_of(folder: Path, target: Target) -> str:
+    """Return a wheel's tag: this Python, and the oldest glibc that has all symbols of its
+    extension module.
+    """
+    (file,) = folder.glob(f"{prebuilt.MODULE}*")
+    versions = {int(minor) for minor in re.findall(rb"GLIBC_2\.(\d+)", file.read_bytes())}
+    python = f"cp{sys.version_info[0]}{sys.version_info[1]}"
+    return f"{python}-none-manylinux_2_{max(versions | {_OLDEST_GLIBC})}_{target.machine}"
 
 
 def _has_plain_types(signature: Any) -> bool:
@@ -266,10 +382,11 @@ def _fits(kind: Any, argument: Any, c: Any) -> Any:
     return builder.load(fits)
 
 
-def write_wheel(plain: Path) -> Path:
-    """Write a wheel with machine code beside one without, and return it."""
-    name, version, *_ = plain.name.split("-")
-    made = plain.with_name(f"{name}-{version}-{_TAG}.whl")
+def write_wheels(plain: Path) -> list[Path]:
+    """Write wheels with machine code beside one without, one for each target that this machine has
+    a compiler for, and return them.
+    """
+    (here,) = (target for target in TARGETS if target.is_here)
     with tempfile.TemporaryDirectory() as temporary:
         site = Path(temporary) / "site"
         code = Path(temporary) / "code"
@@ -278,35 +395,66 @@ def write_wheel(plain: Path) -> Path:
         environment = os.environ | {
             "PYTHONPATH": str(site),
             "NUMBA_CACHE_DIR": f"{temporary}/cache",
-            "NUMBA_CPU_NAME": _CPU_NAME,
-            "NUMBA_CPU_FEATURES": ",".join(f"+{name}" for name in _FEATURES.split()),
+            "NUMBA_CPU_NAME": here.processor,
+            "NUMBA_CPU_FEATURES": ",".join(f"+{name}" for name in here.features.split()),
             "NUMBA_DISABLE_INTEL_SVML": "1",
         }
         subprocess.run(
             [sys.executable, __file__, "--write", str(code)], env=environment, check=True
         )
-        target = site / "vio" / "numerics" / prebuilt.FOLDER.name
-        code.rename(target)
-        info = f"{name}-{version}.dist-info"
-        header = site / info / "WHEEL"
-        text = header.read_text(encoding="utf-8").replace("Tag: py3-none-any", f"Tag: {_TAG}")
-        header.write_text(
-            text.replace("Root-Is-Purelib: true", "Root-Is-Purelib: false"), encoding="utf-8"
-        )
-        record = f"{info}/RECORD"
-        lines = []
-        with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
-            for path in sorted(p for p in site.rglob("*") if p.is_file()):
-                inside = path.relative_to(site).as_posix()
-                content = path.read_bytes()
-                if inside == record or "__pycache__" in inside:
-                    continue
-                digest = (
-                    base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
-                )
-                lines.append(f"{inside},sha256={digest},{len(content)}\n")
-                _add(archive, inside, content)
-            _add(archive, record, "".join([*lines, f"{record},,\n"]).encode())
+        return [
+            _write_wheel(plain, site, code / target.machine, target)
+            for target in TARGETS
+            if (code / target.machine).is_dir()
+        ]
+
+
+def write_codes(folder: Path) -> None:
+    """Write the machine code of each target into a folder of its name, in processes side by side,
+    for the loops that this process has called.
+    """
+    context = multiprocessing.get_context(
+        "fork"
+    )  # each has the types that the loops were called for
+    processes = []
+    for target in TARGETS:
+        if shutil.which(f"{target.tools}g++") is None:
+            print(f"no wheel for {target.machine}: no {target.tools}g++ here", file=sys.stderr)
+            continue
+        own = folder / target.machine
+        arguments = (own, compiled.LOOPS, target.processor, target.flags.split(), target)
+        processes.append(context.Process(target=write_code, args=arguments))
+        processes[-1].start()
+    for process in processes:
+        process.join()
+        if process.exitcode:
+            raise RuntimeError("the loops could not be compiled: see above")
+
+
+def _write_wheel(plain: Path, site: Path, code: Path, target: Target) -> Path:
+    """Write the wheel of one target, from the files of the plain wheel and a folder of code."""
+    name, version, *_ = plain.name.split("-")
+    tag = tag_of(code, target)
+    made = plain.with_name(f"{name}-{version}-{tag}.whl")
+    info = f"{name}-{version}.dist-info"
+    record = f"{info}/RECORD"
+    files = {p.relative_to(site).as_posix(): p for p in site.rglob("*") if p.is_file()}
+    files |= {f"vio/numerics/{prebuilt.FOLDER.name}/{p.name}": p for p in code.iterdir()}
+    lines = []
+    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
+        for inside, path in sorted(files.items()):
+            if inside == record or "__pycache__" in inside:
+                continue
+            content = path.read_bytes()
+            if inside == f"{info}/WHEEL":
+                content = content.replace(b"Tag: py3-none-any", f"Tag: {tag}".encode())
+                content = content.replace(b"Root-Is-Purelib: true", b"Root-Is-Purelib: false")
+            digest = (
+                base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+            )
+            lines.append(f"{inside},sha256={digest},{len(content)}\n")
+            _add(archive, inside, content)
+        _add(archive, record, "".join([*lines, f"{record},,\n"]).encode())
     return made
 
 
@@ -342,10 +490,10 @@ def main(argv: list[str]) -> int:
     """Compile for a wheel or a checkout."""
     if argv[:1] == ["--write"]:
         compile_loops()
-        write_code(Path(argv[1]), compiled.LOOPS, _CPU_NAME, _FLAGS.split())
+        write_codes(Path(argv[1]))
     elif argv:
         (plain,) = Path(argv[0]).glob("*-py3-none-any.whl")
-        print(write_wheel(plain))
+        print(*write_wheels(plain), sep="\n")
     else:
         build_here()
     return 0

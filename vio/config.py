@@ -211,7 +211,9 @@ def as_dict(section: Any) -> dict[str, Any]:
 
 def to_yaml(config: Config) -> str:
     """Return the effective configuration as YAML; `load_config` reads it back to an equal one."""
-    return yaml.safe_dump(as_dict(config), sort_keys=False, allow_unicode=True)
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # the same text in a quarter of the time
+    text: str = yaml.dump(as_dict(config), Dumper=dumper, sort_keys=False, allow_unicode=True)
+    return text
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+# Level of a log line that says what was found or assumed, and asks for nothing: between info and
+# warning.
+NOTE = 25
+
 
 class VioError(Exception):
     """An expected failure; the command line prints its message in one line and exits with 1."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 
 import numpy as np
 
@@ -296,6 +297,9 @@ class _Frame:
     R_rect_cam0: FloatArray  # (3, 3)
     R_rect_cam1: FloatArray  # (3, 3)
     grid: FloatArray  # (N, 4) equal left and right positions over the rectified image
+    # Where the grid's left pixels (N, 2) are seen, by the true left camera: most parameters leave
+    # it as it is.
+    seen_left: dict[CameraModel, FloatArray] = dataclass_field(default_factory=dict)
 
     @classmethod
     def of(cls, rig: Rig) -> _Frame:
@@ -340,19 +344,22 @@ class _Frame:
         parameters (14,).
         """
         true = self.moved(x)
-        out = np.empty(self.grid.shape)
+        left = self.seen_left.get(true.cam0)
+        if left is None:
+            left = self._seen(self.given.cam0, true.cam0, self.R_rect_cam0.T, self.R_rect_cam0)
+            self.seen_left[true.cam0] = left
         cam1, T_cam1_cam0 = true.right
-        turn1 = T_cam1_cam0[:3, :3] @ self.R_rect_cam0.T
-        sides = (
-            (self.given.cam0, true.cam0, self.R_rect_cam0.T, self.R_rect_cam0),
-            (self.given.right[0], cam1, turn1, self.R_rect_cam1),
-        )
-        for column, (believed, real, turn, R_rect_cam) in zip((0, 2), sides, strict=True):
-            raw, _ = project_point(
-                real, left_rays(self.camera, self.grid[:, column : column + 2]) @ turn.T
-            )
-            out[:, column : column + 2], _ = rectify_pixels(believed, R_rect_cam, self.camera, raw)
-        return out
+        turn = T_cam1_cam0[:3, :3] @ self.R_rect_cam0.T
+        right = self._seen(self.given.right[0], cam1, turn, self.R_rect_cam1)
+        return np.hstack([left, right])
+
+    def _seen(
+        self, believed: CameraModel, real: CameraModel, turn: FloatArray, R_rect_cam: FloatArray
+    ) -> FloatArray:
+        """Return where a camera shows the grid's pixels (N, 2) if it is another than believed."""
+        raw, _ = project_point(real, left_rays(self.camera, self.grid[:, :2]) @ turn.T)
+        seen, _ = rectify_pixels(believed, R_rect_cam, self.camera, raw)
+        return seen
 
     def where_read(self, seen: FloatArray) -> FloatArray:
         """Return the pixels (N, 4) at which (R2) and (R3) are evaluated: those seen, in the rows

@@ -1,4 +1,5 @@
-"""The command `vio`: subcommands, one file each; nothing heavy is imported before a command runs.
+"""The command `vio`: subcommands, one file each, of which only the one that runs is imported;
+nothing heavy is imported before it runs.
 
 Such a file has `add_parser`, which adds its options, and `execute`, which runs it and returns the
 exit status.
@@ -19,31 +20,36 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import import_module
-from types import FrameType
+from types import FrameType, ModuleType
 
 from vio._version import __version__
-from vio.cli.output import NOTE
-from vio.errors import StoppedError, VioError
+from vio.errors import NOTE, StoppedError, VioError
 from vio.files.printable import printable
 
-# The file of each command, by what it is for.
+# The commands by what they are for, and the files of those that have another name.
 BY_PURPOSE = {
-    purpose: tuple(import_module(f"vio.cli.{name}") for name in names.split())
-    for purpose, names in {
-        "Try it": "demo",
-        "Before a run": "inspect target calibrate_rig imu_noise calibrate rectify convert",
-        "Run": "run config",
-        "Live": "live ros2 play",
-        "Look and compare": "report view mesh evaluate export",
-        "Maps": "map localise georeference",
-        "Check without ground truth": "check refine",
-        "Measure": "bench render reproduce",
-        "Shell": "completion",
-    }.items()
+    "Try it": ("demo",),
+    "Before a run": (
+        "inspect",
+        "target",
+        "calibrate-rig",
+        "imu-noise",
+        "calibrate",
+        "rectify",
+        "convert",
+    ),
+    "Run": ("run", "config"),
+    "Live": ("live", "ros2", "play"),
+    "Look and compare": ("report", "view", "mesh", "eval", "export"),
+    "Maps": ("map", "localise", "georeference"),
+    "Check without ground truth": ("check", "refine"),
+    "Measure": ("bench", "render", "reproduce"),
+    "Shell": ("completion",),
 }
-_COMMANDS = tuple(module for modules in BY_PURPOSE.values() for module in modules)
+_FILES = {"eval": "evaluate", "calibrate-rig": "calibrate_rig", "imu-noise": "imu_noise"}
+COMMANDS = tuple(name for names in BY_PURPOSE.values() for name in names)
 
 # Objects made before Python looks for cycles among the young ones: a tenth of a command's start
 # went into that search, over modules and samples that stay.
@@ -90,8 +96,13 @@ def _orderly_end() -> Iterator[None]:
                 signal.signal(number, handler)
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of the whole command line."""
+def command_module(name: str) -> ModuleType:
+    """Return the module of a command."""
+    return import_module(f"vio.cli.{_FILES.get(name, name)}")
+
+
+def build_parser(names: Iterable[str] = COMMANDS) -> argparse.ArgumentParser:
+    """Return the parser of the command line with some commands."""
     parser = argparse.ArgumentParser(
         prog="vio",
         description="Stereo visual-inertial odometry: from rectified stereo images to a "
@@ -104,10 +115,10 @@ def build_parser() -> argparse.ArgumentParser:
         help="show the traceback of an expected error, and debug logs",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in _COMMANDS:
+    for name in names:
+        module = command_module(name)
         module.add_parser(commands)
-    for parser_of_one, module in zip(commands.choices.values(), _COMMANDS, strict=True):
-        parser_of_one.set_defaults(execute=module.execute)
+        commands.choices[name].set_defaults(execute=module.execute)
     return parser
 
 
@@ -115,14 +126,16 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line; an unknown option shows the usage of its subcommand, not that of
     `vio`.
     """
-    parser = build_parser()
-    args, unknown = parser.parse_known_args(argv)
+    words = sys.argv[1:] if argv is None else list(argv)
+    command = next((word for word in words if not word.startswith("-")), None)
+    parser = build_parser([command]) if command in COMMANDS else build_parser()
+    args, unknown = parser.parse_known_args(words)
     if unknown:
         chosen = next(
             a for a in parser._actions if isinstance(a, argparse._SubParsersAction)
         ).choices[args.command]
         chosen.error(f"unrecognized arguments: {' '.join(unknown)}")
-    args.command_line = shlex.join(["vio", *(sys.argv[1:] if argv is None else argv)])
+    args.command_line = shlex.join(["vio", *words])
     return args
 
 
@@ -159,7 +172,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         format="%(levelname)s: %(message)s",
         stream=sys.stderr,
     )
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)
+    for library in ("matplotlib", "numba"):  # thousands of lines at the level of --debug
+        logging.getLogger(library).setLevel(logging.WARNING)
     try:
         with _orderly_end():
             _check_address_space(args.command)

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from vio.cli.arguments import add_config_arguments, add_span_arguments, config_from
-from vio.cli.output import NOTE, ProgressBar, print_result
-from vio.errors import ConfigError
+from vio.cli.output import ProgressBar, print_result
+from vio.errors import NOTE, ConfigError
 
 MARKER = "conversion.json"
 _FORMS = ("euroc", "kitti", "plain", "rosbag2", "mcap")

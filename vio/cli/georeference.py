@@ -8,8 +8,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from vio.cli.output import NOTE, print_result
-from vio.errors import ConfigError
+from vio.cli.output import print_result
+from vio.errors import NOTE, ConfigError
 from vio.files.printable import json_text
 
 

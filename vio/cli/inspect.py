@@ -7,7 +7,7 @@ import shlex
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from vio.cli.arguments import add_config_arguments, config_from
+from vio.cli.arguments import add_config_arguments, add_span_arguments, config_from
 from vio.cli.output import ProgressBar, print_result
 from vio.errors import ConfigError
 
@@ -29,6 +29,7 @@ def add_parser(commands: Any) -> None:
         "source", metavar="SOURCE", help="a recording: folder or file, or kind:path"
     )
     add_config_arguments(parser)
+    add_span_arguments(parser)
     parser.add_argument(
         "--pairs", type=int, default=12, metavar="N", help="frames looked at (default 12)"
     )
@@ -40,6 +41,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets import open_dataset
+    from vio.datasets.frame_times import frames_between
     from vio.frontend import build_frontend
     from vio.guard.guarded import guarded
     from vio.inspection.inspect import inspect_recording
@@ -51,6 +53,7 @@ def execute(args: argparse.Namespace) -> int:
     # A limit on the frame rate is a run's: here any frame may be looked at.
     dataset = open_dataset(args.source, replace(config.dataset, max_frame_rate=None))
     recording = dataset.recording
+    span = frames_between(recording, args.start, args.stop)
     with one_blas_thread(), ProgressBar(f"inspect {recording.path.name}") as bar:
         report = inspect_recording(
             dataset,
@@ -60,6 +63,7 @@ def execute(args: argparse.Namespace) -> int:
             ),
             pairs=args.pairs,
             tracked=args.frames,
+            span=span,
             progress=bar.update,
         )
     facts = {"source": str(recording.path), "kind": recording.kind, **_facts(report)}

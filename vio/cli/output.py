@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import logging
+import math
 import sys
+import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from vio.errors import NOTE
 from vio.files.printable import json_text, printable
 
-# level of a log line that says what was found or assumed, and asks for nothing: between info and
-# warning
-NOTE = 25
+log = logging.getLogger(__name__)
+
+_LINE_S = 15.0  # between two lines of progress where there is no terminal
 
 
 def print_result(
@@ -33,14 +37,30 @@ def print_result(
 
 
 class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
-    """A tqdm bar on stderr for work whose total may become known only during it; silent where
-    stderr is no terminal.
+    """A tqdm bar on stderr for work whose total may become known only during it.
+
+    Where stderr is no terminal, a line now and then says how far the work is, and where it is
+    `announced`, one that it begins; short work is silent otherwise.
     """
 
-    def __init__(self, label: str, total: int | None = None, *, unit: str = "steps") -> None:
+    def __init__(
+        self,
+        label: str,
+        total: int | None = None,
+        *,
+        unit: str = "steps",
+        announced: bool = False,
+    ) -> None:
         from tqdm import tqdm
 
         hidden = not sys.stderr.isatty()
+        self._label = label
+        self._unit = unit
+        self._done = 0
+        self._total = total
+        self._next_line_s = time.monotonic() + _LINE_S if hidden else math.inf
+        if hidden and announced:
+            log.log(NOTE, "%s%s", label, "" if total is None else f": {total} {unit}")
         self._bar = tqdm(
             desc=label,
             total=total,
@@ -54,10 +74,22 @@ class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
         """Set the number of steps done, and optionally the total."""
         self._bar.total = self._bar.total if total is None else total
         self._bar.update(done - self._bar.n)
+        self._total = self._total if total is None else total
+        self._advance_to(done)
 
     def advance(self) -> None:
         """Advance by one step."""
         self._bar.update()
+        self._advance_to(self._done + 1)
+
+    def _advance_to(self, done: int) -> None:
+        self._done = done
+        now_s = time.monotonic()
+        if now_s < self._next_line_s:
+            return
+        self._next_line_s = now_s + _LINE_S
+        of = "" if self._total is None else f" of {self._total}"
+        log.log(NOTE, "%s: %d%s %s", self._label, done, of, self._unit)
 
     def close(self) -> None:
         """Keep the bar as it is, and move the cursor below it."""

@@ -7,8 +7,8 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from vio.cli.output import NOTE, ProgressBar, print_result
-from vio.errors import DataError
+from vio.cli.output import ProgressBar, print_result
+from vio.errors import NOTE, DataError
 from vio.files.printable import json_text
 
 MARKER = "rectification.json"

@@ -5,17 +5,18 @@ from __future__ import annotations
 import logging
 import math
 import shlex
+import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vio.cli.output import NOTE, ProgressBar
+from vio.cli.output import ProgressBar
 from vio.cli.stopping import StopRequest
 from vio.config import Config, load_config
 from vio.datasets import open_dataset
 from vio.datasets.frame_times import Seconds, frames_between, used_frames
-from vio.errors import CalibrationError, ConfigError, DataError, StoppedError, VioError
+from vio.errors import NOTE, CalibrationError, ConfigError, DataError, StoppedError, VioError
 from vio.evaluation.trajectories import lengths_text, metres_text, rotation_drift_text
 from vio.files.atomic import (
     atomic_write_bytes,
@@ -27,8 +28,9 @@ from vio.files.atomic import (
 )
 from vio.files.trajectories import read_trajectory
 from vio.live.build import MapUse, resolve_motion
+from vio.live.first_use import Part, compiled_beside
 from vio.protocols import Dataset, Viewer
-from vio.records import FrameResult, Trajectory
+from vio.records import FrameResult, Recording, RunMotion, Trajectory
 from vio.report.words import camera_imu_findings, scale_findings
 from vio.runs.files import CHECKPOINT, FILES, RunFile
 from vio.runs.folder import calibration_text, finish_run_folder, growing_folder, read_request
@@ -46,10 +48,10 @@ _LINES = 3  # of what the calibration is off by, in the summary; all are in metr
 
 
 class ProgressViewer:
-    """A progress bar on stderr with frames per second; silent where stderr is no terminal."""
+    """A progress bar on stderr with frames per second; lines where stderr is no terminal."""
 
     def __init__(self, frames: int, label: str) -> None:
-        self._bar = ProgressBar(label, frames, unit="frames")
+        self._bar = ProgressBar(label, frames, unit="frames", announced=True)
 
     def frame(self, result: FrameResult) -> None:
         """Advance by one frame."""
@@ -261,7 +263,9 @@ def _process(
     )
     builds_map = bool(request.get("map")) and not request.get("localise", False)
     annotated = AnnotatedImage(frames)
-    viewers: list[Viewer] = [ProgressViewer(frames, recording.path.name)] if progress else []
+    viewers: list[Viewer] = (
+        [ProgressViewer(frames, f"running {recording.path.name}")] if progress else []
+    )
     viewers.append(annotated)
     shown = None if view is None else _open_view(view, dataset, config, truth)
     if shown is not None:
@@ -270,12 +274,14 @@ def _process(
     def complete(metrics: dict[str, Any]) -> None:
         if isinstance(calibration, str) and file is not None:
             atomic_write_text(file, calibration)
-        if request.get("plot", True) and (picture := annotated.jpeg()) is not None:
+        if (picture := annotated.jpeg()) is not None:
             atomic_write_bytes(folder / RunFile.FEATURES, picture)
         if finished is not None and metrics["complete"]:
             finished(metrics)
 
-    with locked_folder(folder), StopRequest() as asked:
+    beside: tuple[Part, ...] = ("filter",) if recording.camera.kind == "stereo" else ()
+    motion = _likely_motion(recording, config)
+    with locked_folder(folder), compiled_beside(beside, motion), StopRequest() as asked:
         try:
             result = run(
                 dataset,
@@ -316,11 +322,13 @@ def _process(
         except KeyboardInterrupt as error:
             if not (folder / RunFile.UNFINISHED).is_dir():
                 raise
+            why = asked.reason() or "interrupted"
             text = (
-                f"interrupted; what was flushed is in {folder}; go on with: "
+                f"{why}; what was flushed is in {folder}; go on with: "
                 f"{_resume_command(folder, request)}"
             )
-            raise StoppedError(text, status=130) from error
+            number = signal.SIGINT if asked.number is None else asked.number
+            raise StoppedError(text, status=128 + number) from error
     if shown is not None:
         shown.landmarks(result.landmarks)
         shown.close()
@@ -336,6 +344,15 @@ def _process(
             f"{text}; go on with: {_resume_command(folder, request)}", status=128 + asked.number
         )
     return metrics
+
+
+def _likely_motion(recording: Recording, config: Config) -> RunMotion:
+    """Return what a run will take to propagate poses, without the checks of the run itself."""
+    if config.motion != "auto":
+        return config.motion
+    if "imu" in recording.motion:
+        return "imu"
+    return "velocity" if "velocity" in recording.motion else "none"
 
 
 def _calibration_or_fault(result: RunResult) -> str | CalibrationError:

@@ -1,5 +1,5 @@
 """Ending a long run in order: the first signal asks it to stop after the present frame, the
-second one ends it.
+second one ends it; while loops are compiled the first one does.
 """
 
 from __future__ import annotations
@@ -8,6 +8,8 @@ import signal
 import threading
 from types import FrameType
 from typing import Any
+
+from vio.numerics.compiling import PROGRESS
 
 _SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
@@ -49,3 +51,5 @@ class StopRequest:
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.number = number
         self.__exit__()  # a second signal does what it did before
+        if PROGRESS.is_compiling:  # the present frame may take minutes, and has no result yet
+            signal.raise_signal(number)

@@ -15,7 +15,6 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from vio.errors import ConfigError, DivergedError, EstimationError
 from vio.filters.frame_update import FrameUpdate
@@ -307,7 +306,11 @@ class Msckf(Backend):
     def _first_window(self, nav: NavState, P: FloatArray, calibration: Calibration) -> Window:
         """A window without clones; P (15, 15) is the covariance of the navigation state."""
         own = self._rig.first_covariance(calibration, nav.T_world_imu)
-        window = Window(self._propagation.motion, nav, np.asarray(block_diag(P, own)), calibration)
+        of_nav = len(P)
+        covariance = np.zeros((of_nav + len(own), of_nav + len(own)))
+        covariance[:of_nav, :of_nav] = P
+        covariance[of_nav:, of_nav:] = own
+        window = Window(self._propagation.motion, nav, covariance, calibration)
         before = None if self._window is None else self._window.prior.scale_test
         self._rig.test_scale(window, self._source, before)
         return window

@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import blas, lapack
 
 from vio.cameras.rectification_error import CONSIDERED
 from vio.filters import pose_loops as loops
 from vio.filters.scale_test import ScaleTest
 from vio.geometry.lie import FloatArray
+from vio.numerics.scipy_extensions import blas, lapack
 from vio.records import IntArray
 
 _SINGULAR = 1e-12  # of the largest eigenvalue of a matrix of correlations

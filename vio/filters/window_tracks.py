@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy.linalg import lapack
 
 from vio.filters import track_loops as loops
 from vio.filters.multiview import (
@@ -38,6 +37,7 @@ from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.robust import median
+from vio.numerics.scipy_extensions import lapack
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 

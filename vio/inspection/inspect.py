@@ -37,28 +37,29 @@ def inspect_recording(
     *,
     pairs: int = PAIRS,
     tracked: int = TRACKED,
+    span: tuple[int, int | None] = (0, None),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Inspection:
-    """Examine a recording.
+    """Examine a recording, or its frames from the first of `span` to before the second.
 
     Raises:
         DataError: an image has a wrong size, or too many cannot be read.
     """
     recording = dataset.recording
-    parts = [frames_part(recording), camera_part(recording)]
-    if recording.has_images:
-        frames = _spread(dataset, pairs, progress)
+    frames_seen = range(len(recording.frame_times_ns))[slice(*span)]
+    times_ns = recording.frame_times_ns[slice(*span)]
+    parts = [frames_part(times_ns), camera_part(recording)]
+    if recording.has_images and frames_seen:
+        frames = _spread(dataset, frames_seen, pairs, progress)
         parts.append(images_part(frames))
         if recording.camera.kind != "mono":
             parts += (
                 rows_parts(frames) if recording.camera.kind == "stereo" else [depths_part(frames)]
             )
-    parts += _motion_parts(dataset)
-    if recording.has_images and tracked > 1:
-        parts += _tracking_parts(
-            dataset, build_frontend, min(tracked, len(recording.frame_times_ns)), progress
-        )
-    parts += [_reference_part(recording), _missing_part(recording)]
+    parts += _motion_parts(dataset, span, times_ns)
+    if recording.has_images and tracked > 1 and frames_seen:
+        parts += _tracking_parts(dataset, build_frontend, frames_seen[:tracked], progress)
+    parts += [_reference_part(recording, times_ns), _missing_part(recording)]
     return Inspection(tuple(parts), recording.notes)
 
 
@@ -94,13 +95,13 @@ def camera_part(recording: Recording) -> Part:
 
 
 def _spread(
-    dataset: Dataset, pairs: int, progress: Callable[[int, int], None]
+    dataset: Dataset, of: range, pairs: int, progress: Callable[[int, int], None]
 ) -> list[StereoFrame]:
-    """Read some frames, spread over the recording."""
-    count = len(dataset.recording.frame_times_ns)
+    """Read some frames, spread over a range."""
+    last = of[-1]
     if dataset.recording.kind == "video":
-        count = min(count, _VIDEO_FRAMES)
-    chosen = np.unique(np.linspace(0, count - 1, pairs).astype(int)).tolist()
+        last = min(last, of[0] + _VIDEO_FRAMES - 1)
+    chosen = np.unique(np.linspace(of[0], last, pairs).astype(int)).tolist()
     frames: list[StereoFrame] = []
     for done, k in enumerate(chosen):
         frames += [event for event in dataset.events(k, k + 1) if isinstance(event, StereoFrame)]
@@ -108,13 +109,13 @@ def _spread(
     return frames
 
 
-def _motion_parts(dataset: Dataset) -> list[Part]:
-    """Describe the samples of velocity sensor and IMU."""
+def _motion_parts(dataset: Dataset, span: tuple[int, int | None], times_ns: IntArray) -> list[Part]:
+    """Describe the samples of velocity sensor and IMU beside frames at some times."""
     recording = dataset.recording
-    events = list(dataset.events(images=False))
+    events = list(dataset.events(*span, images=False))
     velocities = [event.time_ns for event in events if isinstance(event, VelocitySample)]
     parts = (
-        [clock_part("velocity", recording, np.array(velocities, dtype=np.int64))]
+        [clock_part("velocity", times_ns, np.array(velocities, dtype=np.int64))]
         if velocities
         else []
     )
@@ -123,7 +124,7 @@ def _motion_parts(dataset: Dataset) -> list[Part]:
         return parts
     arrays = motion_samples(samples)
     record = ImuRecord(arrays.times_ns, arrays.values[:, :3], arrays.values[:, 3:])
-    parts.append(clock_part("IMU", recording, record.times_ns))
+    parts.append(clock_part("IMU", times_ns, record.times_ns))
     if len(samples) > 1:
         noise = noise_part(record, getattr(dataset, "imu_noise", None))
         parts += [rest_part(record, recording.T_cam0_imu), *([noise] if noise is not None else [])]
@@ -135,10 +136,10 @@ def _motion_parts(dataset: Dataset) -> list[Part]:
 def _tracking_parts(
     dataset: Dataset,
     build_frontend: Callable[[Dataset], Frontend],
-    frames: int,
+    frames: range,
     progress: Callable[[int, int], None],
 ) -> list[Part]:
-    """Track the first frames, and compare the IMU with the images' motion as a run does."""
+    """Track some frames, and compare the IMU with the images' motion as a run does."""
     recording = dataset.recording
     frontend = build_frontend(dataset)
     imu = "imu" in recording.motion and recording.T_cam0_imu is not None
@@ -151,12 +152,12 @@ def _tracking_parts(
     matched: list[int] = []
     findings: list[str] = []
     mono = recording.camera.kind == "mono"
-    for event in dataset.events(0, frames):
+    for event in dataset.events(frames.start, frames.stop):
         if isinstance(event, StereoFrame):
             output = frontend.process(event)
             tracked.append(output.tracked)
             matched.append(output.matched)
-            progress(len(tracked), frames)
+            progress(len(tracked), len(frames))
             if imu and check is not None:
                 findings += _messages(check.frame(output.observations), mono=mono)
         elif isinstance(event, ImuSample) and check is not None:
@@ -194,14 +195,13 @@ def _messages(found: tuple[InertialFinding, ...], *, mono: bool) -> list[str]:
     return [f.message for f in found if not (mono and f.group == "size")]
 
 
-def _reference_part(recording: Recording) -> Part:
+def _reference_part(recording: Recording, times: IntArray) -> Part:
     truth = recording.reference
     if truth is None:
         return Part("ground truth", "none", {"poses": 0})
     text = f"{len(truth)} poses ({truth.body})"
     if truth.times_ns is None:
         return Part("ground truth", text, {"poses": len(truth)})
-    times = recording.frame_times_ns
     covered = float(np.mean((times >= truth.times_ns[0]) & (times <= truth.times_ns[-1])))
     return Part(
         "ground truth", f"{text}, over {100 * covered:.0f} % of the frames", {"poses": len(truth)}
@@ -233,20 +233,20 @@ def _missing_part(recording: Recording) -> Part:
 
 
 _GAP = 1.5  # intervals longer than this multiple of the median are gaps
+_EVEN_MS = 1e-3  # a jitter below it is rounding of the stamps
 _LEAST_IMU_HZ = 50.0  # as the readers say it
 
 
-def frames_part(recording: Recording) -> Part:
-    """Describe the frames' stamps."""
-    times = recording.frame_times_ns
+def frames_part(times: IntArray) -> Part:
+    """Describe the frames' stamps (N,)."""
     facts = clock_facts(times)
     text = f"{len(times)} frames{_text(facts)}"
     faults = ["a run needs at least two frames; give a longer recording"] if len(times) < 2 else []
     return Part("frames", text, facts, faults)
 
 
-def clock_part(name: str, recording: Recording, times_ns: IntArray) -> Part:
-    """Describe the stamps of a motion sensor, and how they cover the frames."""
+def clock_part(name: str, frame_times_ns: IntArray, times_ns: IntArray) -> Part:
+    """Describe the stamps (N,) of a motion sensor, and how they cover the frames' (M,)."""
     facts = clock_facts(times_ns)
     faults = []
     if name == "IMU":
@@ -256,8 +256,8 @@ def clock_part(name: str, recording: Recording, times_ns: IntArray) -> Part:
                 "record at least "
                 f"{_LEAST_IMU_HZ:g} Hz, or use --motion none"
             )
-        faults += [finding.message for finding in judge_clocks(recording.frame_times_ns, times_ns)]
-    inside = (recording.frame_times_ns >= times_ns[0]) & (recording.frame_times_ns <= times_ns[-1])
+        faults += [finding.message for finding in judge_clocks(frame_times_ns, times_ns)]
+    inside = (frame_times_ns >= times_ns[0]) & (frame_times_ns <= times_ns[-1])
     text = f"{len(times_ns)} samples{_text(facts)}; they cover {100 * float(inside.mean()):.0f} % of the frames"
     return Part(name, text, {**facts, "covered": float(inside.mean())}, faults)
 
@@ -289,4 +289,6 @@ def _text(facts: dict[str, float | int | None]) -> str:
         if facts["gaps"]
         else ", no gap"
     )
-    return f" in {facts['duration_s']:.2f} s, {facts['rate_hz']:.4g} Hz, jitter {facts['jitter_ms']:.3g} ms{gaps}"
+    jitter_ms = facts["jitter_ms"] or 0.0
+    jitter = "even" if jitter_ms < _EVEN_MS else f"jitter {jitter_ms:.3g} ms"
+    return f" in {facts['duration_s']:.2f} s, {facts['rate_hz']:.4g} Hz, {jitter}{gaps}"

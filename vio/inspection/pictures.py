@@ -89,7 +89,10 @@ def images_part(frames: Sequence[StereoFrame]) -> Part:
             "images"
         )
     gray = f"{means[0]:.0f} left and {means[1]:.0f} right" if cameras == 2 else f"{means[0]:.0f}"
-    text = f"{width} x {height}, mean gray {gray}, at most {100 * clipped:.1f} % at 0 or 255, sharpness {sharpness:.1f}"
+    text = (
+        f"{width} x {height}, mean gray {gray}, at most {100 * clipped:.1f} % at 0 or 255, "
+        f"sharpness {sharpness:.1f} (1: blurred by 2 px or more)"
+    )
     return Part("images", text, facts, faults)
 
 

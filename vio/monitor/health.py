@@ -31,6 +31,15 @@ _MAX_GYRO_BIAS_RADPS = 0.5
 _MAX_ACCEL_BIAS_MPS2 = 3.0
 
 
+def is_corrected(finding: Finding) -> bool:
+    """Whether a run corrects what was found, so that it is information, not a warning: a stereo
+    calibration that is off by no more than other rigs' are.
+    """
+    if finding.code != "stereo-calibration-off":
+        return False
+    return rows_grade(finding.figures["rows_rms_px"]) == "worth calibrating"
+
+
 class RunHealth:
     """Monitor each frame's report and estimate; return a finding when an event begins or ends."""
 

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vio.errors import NOTE
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.imu.findings import ImuVerdict
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
-from vio.monitor.health import RefusalReport, RunHealth
+from vio.monitor.health import RefusalReport, RunHealth, is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import IntegrityMonitor, Mark
 from vio.records import (
@@ -337,7 +338,8 @@ class RunMonitor:
     def _add(self, findings: Iterable[Finding]) -> None:
         for finding in findings:
             if not (finding.code == "pairs-shifted" and self.ends_at_shifted_pairs):
-                log.warning("%s", finding.message)
+                level = NOTE if is_corrected(finding) else logging.WARNING
+                log.log(level, "%s", finding.message)
             self.findings.append(finding)
             self._integrity.take(finding)
 

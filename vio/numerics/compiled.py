@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray
-from vio.numerics import prebuilt
+from vio.numerics import compiling, prebuilt
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +32,7 @@ _OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True, "no_cfunc_wra
 # does by another name does not compile.
 _ALLOCATE = {"empty", "zeros", "copy", "reshape", "searchsorted"}
 LOOPS: list[Loop] = []
+_FUNCTIONS: set[Callable[..., Any]] = set()  # of the loops
 
 
 class Loop:
@@ -44,6 +45,7 @@ class Loop:
         functools.update_wrapper(self, function)
         self.function = function
         self.options = options
+        _FUNCTIONS.add(function)
         self._call: Callable[..., Any] = self._first_call
 
     def __call__(self, *arguments: Any) -> Any:
@@ -58,6 +60,8 @@ class Loop:
     def _first_call(self, *arguments: Any) -> Any:
         codes = prebuilt.code_of(self.function, lambda: self.fingerprint)
         if not codes:
+            if compiling.before_first_call is not None:
+                compiling.before_first_call(self.function.__module__)
             self._call = self.by_numba
         elif len(codes) == 1:
             self._call = codes[0]
@@ -82,6 +86,7 @@ class Loop:
         """
         import numba
 
+        compiling.watch(_FUNCTIONS.__contains__)
         try:
             return numba.njit(self.function, cache=True, **self.options)
         except RuntimeError:  # numba found no folder that it may write to

@@ -13,6 +13,7 @@ import functools
 import hashlib
 import importlib.util
 import json
+import logging
 import os
 import platform
 import sys
@@ -22,6 +23,10 @@ from types import CodeType, ModuleType
 from typing import Any
 
 import numpy as np
+
+from vio.errors import NOTE
+
+log = logging.getLogger(__name__)
 
 FOLDER = Path(__file__).with_name("machine_code")
 MANIFEST = "manifest.json"
@@ -94,36 +99,63 @@ def _text(value: Any) -> str:
     return str(value.fingerprint)  # of a compiled function
 
 
+class _UnusableError(Exception):
+    """Why the extension module must not be used."""
+
+
 @functools.cache
 def _extension() -> tuple[ModuleType | None, Mapping[str, Mapping[str, Any]]]:
     """Return the extension module and what its manifest says of each loop; none where it must
-    not be used.
+    not be used, which a line says where there is one.
     """
-    if any(name.startswith("NUMBA_") and name not in _HARMLESS for name in os.environ):
+    if not FOLDER.is_dir():
         return None, {}
+    try:
+        return _load_extension()
+    except _UnusableError as error:
+        log.log(NOTE, "the compiled loops in %s are not used: %s", FOLDER, error)
+        return None, {}
+
+
+def _load_extension() -> tuple[ModuleType, Mapping[str, Mapping[str, Any]]]:
+    """Load the extension module.
+
+    Raises:
+        _UnusableError: it is for another machine, or damaged.
+    """
+    changed = [name for name in os.environ if name.startswith("NUMBA_") and name not in _HARMLESS]
+    if changed:
+        raise _UnusableError(f"{', '.join(sorted(changed))} set, which numba compiles for")
     try:
         manifest = json.loads((FOLDER / MANIFEST).read_bytes())
         loops: Mapping[str, Mapping[str, Any]] = manifest["loops"]
         file = FOLDER / manifest["file"]
-        here = (
-            manifest["environment"] == environment() and set(manifest["flags"]) <= processor_flags()
-        )
-        if not here or hashlib.sha256(file.read_bytes()).hexdigest() != manifest["sha256"]:
-            return None, {}
-        spec = importlib.util.spec_from_file_location(MODULE, file)
-        assert spec is not None
-        assert spec.loader is not None
+        made_for = manifest["environment"]
+        lacking = set(manifest["flags"]) - processor_flags()
+        is_whole = hashlib.sha256(file.read_bytes()).hexdigest() == manifest["sha256"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise _UnusableError("files are missing or damaged; install again") from error
+    if made_for != environment():
+        here = " ".join(environment().values())
+        raise _UnusableError(f"they are for {' '.join(made_for.values())}, this is {here}")
+    if lacking:
+        raise _UnusableError(f"this processor has no {' '.join(sorted(lacking))}")
+    if not is_whole:
+        raise _UnusableError(f"{file.name} is damaged; install again")
+    spec = importlib.util.spec_from_file_location(MODULE, file)
+    assert spec is not None
+    assert spec.loader is not None
+    try:
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        ImportError,
-    ):  # there is none, or it is damaged
-        return None, {}
+    except ImportError as error:  # it asks for newer libraries
+        raise _UnusableError(str(error)) from error
     return module, loops
+
+
+def is_usable() -> bool:
+    """Whether there is an extension module for this machine."""
+    return _extension()[0] is not None
 
 
 def code_of(function: Callable[..., Any], made_from: Callable[[], str]) -> list[Callable[..., Any]]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammainc, gammaincinv
 
 from vio.geometry.lie import FloatArray
+from vio.numerics.scipy_extensions import special
 
 
 def chi_square_quantile(probability: npt.ArrayLike, dof: npt.ArrayLike) -> FloatArray:
@@ -16,10 +16,10 @@ def chi_square_quantile(probability: npt.ArrayLike, dof: npt.ArrayLike) -> Float
     Twice the quantile of the gamma distribution of shape `dof / 2`, equal to
     `scipy.stats.chi2.ppf`, without the slow import of `scipy.stats`.
     """
-    quantile: FloatArray = 2 * np.asarray(gammaincinv(np.asarray(dof) / 2, probability))
+    quantile: FloatArray = 2 * np.asarray(special.gammaincinv(np.asarray(dof) / 2, probability))
     return quantile
 
 
 def chi_square_cdf(x: float, dof: int) -> float:
     """Probability that a chi-square variable of `dof` degrees of freedom is below x."""
-    return float(gammainc(0.5 * dof, 0.5 * x))
+    return float(special.gammainc(0.5 * dof, 0.5 * x))

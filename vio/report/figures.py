@@ -11,6 +11,7 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.runs.curves import (
     COLOURS,
+    FEATURE_WORDS,
     SIGMAS,
     STAGE_COLOURS,
     Curves,
@@ -29,7 +30,9 @@ _TRUTH = "#111111"
 _POINTS = "#9aa5b1"
 _LOOPS = "#c82828"
 _BULK = (10, 90)  # percentiles of the bands' edges that an axis shows at least
-_LONGEST_SIDE = 1.8  # of the box in three dimensions; seen whole from where plotly puts the eye
+_LONGEST_SIDE = 1.5  # of the box in three dimensions, which is seen whole from the eye's place
+_EYE = {"x": 1.2, "y": -1.2, "z": 0.8}
+_ENDS = (("start", "circle-open", 0), ("end", "diamond-open", -1))  # name, symbol, row of a path
 _AXES = ("right", "ahead", "up")
 
 
@@ -100,6 +103,11 @@ def _paths(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSecti
                     width=1,
                 )
             _line(figure, curve.position[:, (first, second)], run.name, colour, 1, column)
+        for curve in curves:
+            for label, symbol, row in _ENDS:
+                end = curve.position[[row]][:, (first, second)]
+                marks = {"size": 9, "symbol": symbol}
+                _line(figure, end, label, _TRUTH, 1, column, mode="markers", marker=marks)
         figure.update_xaxes(title_text=f"{_AXES[first]} (m)", row=1, col=column)
         figure.update_yaxes(title_text=f"{_AXES[second]} (m)", row=1, col=column)
         figure.update_yaxes(scaleanchor=f"x{'' if column == 1 else column}", row=1, col=column)
@@ -123,7 +131,14 @@ def _path_3d(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSec
         figure.add_trace(
             go.Scatter3d(x=x, y=y, z=z, mode="lines", line=line, **_named(figure, label))
         )
-    low, high = _extent([c.position for c in curves], (0, 1, 2), 0.05, 0.02)
+    for curve in curves:
+        for label, symbol, row in _ENDS:
+            x, y, z = ([value] for value in _short(curve.position[row]))
+            marker = {"size": 6, "color": _TRUTH, "symbol": symbol}
+            figure.add_trace(
+                go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, **_named(figure, label))
+            )
+    low, high = _extent([p for _, p, _, _ in paths], (0, 1, 2), 0.05, 0.02)
     points = curves[0].points[
         np.all((curves[0].points >= low) & (curves[0].points <= high), axis=1)
     ]
@@ -138,7 +153,8 @@ def _path_3d(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSec
     ratio = dict(
         zip("xyz", (_LONGEST_SIDE * (high - low) / (high - low).max()).tolist(), strict=True)
     )
-    figure.update_layout(height=560, scene={**axes, "aspectmode": "manual", "aspectratio": ratio})
+    scene = {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": {"eye": _EYE}}
+    figure.update_layout(height=620, scene=scene)
     return ReportSection("Path in three dimensions", figure, "Turn it with the mouse.")
 
 
@@ -257,8 +273,9 @@ def _errors(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSect
 def _features(runs: Sequence[FinishedRun]) -> ReportSection:
     figure = _subplots(1, 1)
     for run, colour in zip(runs, COLOURS, strict=False):
-        for name, dash in (("matched", "dot"), ("selected", "dash"), ("used", "solid")):
-            label = name if len(runs) == 1 else f"{run.name}, {name}"
+        for name, dash in (("selected", "dash"), ("matched", "dot"), ("used", "solid")):
+            words = FEATURE_WORDS[name]
+            label = words if len(runs) == 1 else f"{run.name}, {words}"
             shade = (
                 colour
                 if len(runs) > 1
@@ -271,15 +288,16 @@ def _features(runs: Sequence[FinishedRun]) -> ReportSection:
     return _over_time(
         "Features",
         figure,
-        "With a match in the right image; chosen by the selector; used by the filter.",
+        "Chosen by the selector, of those in the left image; with a match in the right one; used "
+        "by the filter.",
     )
 
 
 def _innovations(runs: Sequence[FinishedRun]) -> ReportSection:
     shown = {
-        "innovation_median_px": "median (px)",
-        "innovation_ratio": "over their sigma",
-        "nis_per_dof": "NIS per dof",
+        "innovation_median_px": "innovations (px)",
+        "innovation_ratio": "innovations / σ",
+        "nis_per_dof": "residuals² / σ²",
     }
     shown = {
         name: title for name, title in shown.items() if any(name in run.frames for run in runs)
@@ -291,11 +309,12 @@ def _innovations(runs: Sequence[FinishedRun]) -> ReportSection:
                 _frame_curve(figure, run, name, run.name, colour, row)
         figure.update_yaxes(title_text=title, rangemode="tozero", row=row, col=1)
     text = (
-        "How far features lie from where the filter expects them, and that over its standard "
-        "deviation (median): 1 is consistent, less is cautious, more is overconfident; and the "
-        "squared residuals of tracks over the noise."
+        "Innovations: how far features lie from where the filter expects them, and that over its "
+        "standard deviation (median): 1 is consistent, less is cautious, more is overconfident. "
+        "Residuals: what the update leaves of tracks, squared, over the noise (NIS per degree of "
+        "freedom)."
     )
-    return _over_time("Innovations", figure, text)
+    return _over_time("Innovations and residuals", figure, text)
 
 
 def _biases(runs: Sequence[FinishedRun]) -> list[ReportSection]:

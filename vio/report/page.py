@@ -54,7 +54,7 @@ def page(runs: Sequence[FinishedRun]) -> str:
         _figure(section, number) for number, section in enumerate(sections(runs, curves_of(runs)))
     )
     warnings = _lists(
-        "Warnings",
+        "Warnings and notes",
         runs,
         [[str(line) for line in run.metrics.get("warnings") or []] for run in runs],
     )

@@ -62,10 +62,13 @@ def summary(run: FinishedRun) -> list[str]:
         else None
     )
     if nis is not None:
-        lines.append(f"The median innovation (NIS) is {nis:.2g} of its covariance.")
+        lines.append(
+            f"The squared residuals of tracks are {nis:.2g} of what their noise predicts (NIS per "
+            "degree of freedom, median)."
+        )
     warnings = m.get("warnings") or []
-    many = f"{len(warnings)} warnings, below."
-    return [*lines, {0: "No warnings.", 1: "One warning, below."}.get(len(warnings), many)]
+    many = f"{len(warnings)} warnings or notes, below."
+    return [*lines, {0: "No warnings.", 1: "One warning or note, below."}.get(len(warnings), many)]
 
 
 def _speed(run: FinishedRun) -> str:
@@ -144,10 +147,10 @@ def run_figures(run: FinishedRun) -> dict[str, str]:
         else rotation_drift_text(kitti.r_err_deg_per_100m, kitti.lengths_m),
         "features used, median": f"{np.nanmedian(run.frames['used']):.0f}",
         "observations refused (%)": "–" if refused is None else f"{100 * refused:.1f}",
-        "innovations (sigmas), median": "–" if innovations is None else f"{innovations:.2g}",
+        "innovations over their σ, median": "–" if innovations is None else f"{innovations:.2g}",
         "ms a frame, median": f"{np.nanmedian(work):.1f}",
         "ms a frame, 95 %": f"{np.nanpercentile(work, 95):.1f}",
         "landmarks": str(len(run.points)),
-        "warnings": str(len(m.get("warnings") or [])),
+        "warnings and notes": str(len(m.get("warnings") or [])),
         "version": str(m.get("version", "–")),
     }

@@ -17,7 +17,6 @@ import zlib
 from collections import deque
 from collections.abc import Mapping
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol
 
@@ -113,6 +112,8 @@ def load_checkpoint(path: Path, dataset: Dataset, inputs: Mapping[str, Any] | No
 
 def _program() -> dict[str, str]:
     """What must be equal for equal bits."""
+    from importlib import metadata  # slow, and short runs flush nothing
+
     import cv2
 
     return {

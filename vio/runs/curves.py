@@ -18,6 +18,12 @@ from vio.runs.finished import FinishedRun
 SIGMAS = 3.0  # half width of the bands
 COLOURS = ("#1f5fbf", "#d9822b", "#2e8b57", "#a83279", "#7a5195", "#0f8b8d", "#b5533c", "#6b7280")
 STAGE_COLOURS = ("#c9d1d9", "#6aa2d8", "#b7a2d8", "#e8b04b", "#1f5fbf")
+# what counts of features in a run's table are called
+FEATURE_WORDS = {
+    "selected": "selected",
+    "matched": "with a right match",
+    "used": "used",
+}
 _MOST = 3000  # samples of a curve; more are not seen on a screen
 _MOST_POINTS = 6000
 

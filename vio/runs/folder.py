@@ -22,7 +22,6 @@ from vio._version import __version__
 from vio.calibration.severity import StereoError
 from vio.calibration.stereo_field import PARAMETERS
 from vio.config import Config, describe, to_yaml
-from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, DataError, EvaluationError
 from vio.evaluation.errors_along_path import error_statistics, path_length_m
 from vio.evaluation.trajectories import Evaluation, evaluate
@@ -585,6 +584,8 @@ def calibration_text(result: RunResult) -> str:
         DataError: the recording holds features without an image size.
         CalibrationError: no rig of the given lens models is off as the run found it.
     """
+    from vio.datasets.rigs.kalibr import kalibr_text  # with all other formats of a calibration
+
     found = result.calibrated_rig()
     if found is None:
         raise DataError(

@@ -21,6 +21,7 @@ from vio.geometry.lie import FloatArray
 from vio.records import STAGES
 from vio.runs.curves import (
     COLOURS,
+    FEATURE_WORDS,
     SIGMAS,
     STAGE_COLOURS,
     Curves,
@@ -240,6 +241,21 @@ def _draw_error(axes: Any, curves: Curves, dead_reckoning: Evaluation | None) ->
     axes.set_ylim(0, _SCALE * max(float(curves.truth.error_m.max()), 1e-6))
 
 
+def _legend_above(axes: Any) -> None:
+    """Put a panel's legend above it, where it hides no curve."""
+    axes.legend(
+        loc="lower right",
+        bbox_to_anchor=(1.0, 0.98),
+        borderaxespad=0.0,
+        borderpad=0.1,
+        columnspacing=1.2,
+        handlelength=1.6,
+        fontsize=8,
+        frameon=False,
+        ncols=len(axes.get_legend_handles_labels()[1]),
+    )
+
+
 def _draw_height(axes: Any, curves: Curves) -> None:
     """Draw the height above the start with a band of three standard deviations."""
     height = curves.position[:, 2]
@@ -259,7 +275,7 @@ def _draw_height(axes: Any, curves: Curves) -> None:
     spread = max(float(np.ptp(height)), 0.1)
     axes.set_ylim(height.min() - 0.5 * spread, height.max() + 0.5 * spread)
     axes.set_ylabel("height (m)")
-    axes.legend(loc="best", fontsize=8, ncols=2)
+    _legend_above(axes)
 
 
 def _draw_attitude(axes: Any, curves: Curves) -> None:
@@ -269,19 +285,21 @@ def _draw_attitude(axes: Any, curves: Curves) -> None:
     ):
         axes.plot(curves.seconds, curves.attitude[:, k], color=colour, lw=1.2, label=name)
     axes.set_ylabel("attitude (deg)")
-    axes.legend(loc="best", fontsize=8, ncols=3)
+    _legend_above(axes)
 
 
 def _draw_counts(axes: Any, seconds: FloatArray, frames: Rows) -> None:
     for name, colour in (
-        ("matched", _LANDMARKS),
         ("selected", _DEAD_RECKONING),
+        ("matched", _LANDMARKS),
         ("used", _ESTIMATE),
     ):
-        axes.plot(*binned(seconds, frames[name], _BINS), color=colour, lw=1.2, label=name)
+        axes.plot(
+            *binned(seconds, frames[name], _BINS), color=colour, lw=1.2, label=FEATURE_WORDS[name]
+        )
     axes.set_ylabel("features")
     axes.set_ylim(bottom=0)
-    axes.legend(loc="best", fontsize=8, ncols=3)
+    _legend_above(axes)
 
 
 def _draw_time(axes: Any, seconds: FloatArray, frames: Rows) -> None:
@@ -291,7 +309,7 @@ def _draw_time(axes: Any, seconds: FloatArray, frames: Rows) -> None:
     axes.set_ylabel("time (ms)")
     # frames that compile leave the panel
     axes.set_ylim(0, max(2 * float(np.median(np.sum(medians, axis=0))), 1.0))
-    axes.legend(loc="upper right", fontsize=8, ncols=5)
+    _legend_above(axes)
 
 
 def _draw_calibration(axes: Any, seconds: FloatArray, estimates: Rows, focal: float) -> None:
@@ -306,9 +324,8 @@ def _draw_calibration(axes: Any, seconds: FloatArray, estimates: Rows, focal: fl
         axes.plot(seconds, v, color=colour, lw=1.2, label=name)
         axes.fill_between(seconds, v - sigma, v + sigma, color=colour, alpha=0.2, lw=0)
     axes.plot(seconds, estimates["stereo_rows_rms_px"], color=_LANDMARKS, lw=1.2, label="rows, rms")
-    axes.set_title("stereo calibration is off by", fontsize=9, loc="left")
-    axes.set_ylabel("px")
-    axes.legend(loc="best", fontsize=8, ncols=4)
+    axes.set_ylabel("stereo off by (px)")
+    _legend_above(axes)
 
 
 def draw_comparison(results: Mapping[str, Evaluation]) -> Any:

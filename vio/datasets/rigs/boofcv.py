@@ -6,7 +6,7 @@ of the target, which the file does not state.
 from __future__ import annotations
 
 from pathlib import Path
-from xml.etree import ElementTree
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from vio.datasets.yaml_files import Entries, as_number, matrix, numbers, section
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
+
+if TYPE_CHECKING:
+    from xml.etree import ElementTree
 
 _ROOT = "StereoParameters"
 

@@ -1,0 +1,97 @@
+"""What numba compiles in this process: that it does so now, and how far it is."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from vio.errors import NOTE
+
+log = logging.getLogger(__name__)
+
+USUAL_S = 60.0  # of CPU time that the loops of a usual run take
+USUAL_LOOPS = 110  # that a usual run compiles, and what each part of it does
+LOOPS_OF = {"frontend": 45, "filter": 75}
+# Packages of the loops of each part of a run.
+PACKAGES = {"frontend": "vio.frontend", "filter": "vio.filters"}
+_LINE_S = 10.0  # between two lines
+
+# Called with the module of a loop, before numba compiles or loads it.
+before_first_call: Callable[[str], None] | None = None
+label = ""  # what this process compiles, in its lines
+
+
+class Progress:
+    """Counts the loops that this process compiles, and says every few seconds how many."""
+
+    def __init__(self) -> None:
+        self.compiled = 0
+        self._depth = 0  # a loop is compiled while another one that calls it is
+        self._said_s = time.monotonic()
+
+    @property
+    def is_compiling(self) -> bool:
+        """Whether numba compiles a loop now, or another process does for this one."""
+        return self._depth > 0
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Wait for another process that compiles, inside the block."""
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+
+    def begin(self) -> None:
+        """Count a loop."""
+        self._depth += 1
+        self.compiled += 1
+        now_s = time.monotonic()
+        if now_s - self._said_s < _LINE_S:
+            return
+        self._said_s = now_s
+        of = f" of the {label}" if label else ""
+        about = max(LOOPS_OF.get(label, USUAL_LOOPS), self.compiled)
+        log.log(NOTE, "compiling loops%s, once: %d of about %d", of, self.compiled, about)
+
+    def end(self) -> None:
+        """End a loop."""
+        self._depth -= 1
+
+
+PROGRESS = Progress()
+_watched: list[object] = []  # the listener, once numba is loaded
+
+
+def watch(is_own: Callable[[Any], bool]) -> None:
+    """Count what numba compiles from now on, of functions for which `is_own` holds."""
+    if _watched:
+        return
+    from numba.core import event
+
+    class Listener(event.Listener):
+        def on_start(self, event: Any) -> None:
+            if is_own(event.data["dispatcher"].py_func):
+                PROGRESS.begin()
+
+        def on_end(self, event: Any) -> None:
+            if is_own(event.data["dispatcher"].py_func):
+                PROGRESS.end()
+
+    _watched.append(Listener())
+    event.register("numba:compile", _watched[0])  # type: ignore[no-untyped-call]
+
+
+def is_cached() -> bool:
+    """Whether numba's cache holds loops of an earlier run, or can hold none."""
+    from vio.numerics import compiled
+
+    stats = getattr(compiled.index_of.by_numba, "stats", None)  # type: ignore[attr-defined]
+    if stats is None or stats.cache_path is None:
+        return True
+    return any(Path(stats.cache_path).glob("compiled.*.nbi"))

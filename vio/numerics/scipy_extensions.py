@@ -1,0 +1,46 @@
+"""The few compiled functions of SciPy that every run needs, without the packages around them.
+
+`import scipy.special` or `import scipy.linalg` runs SciPy's support of other array libraries, which
+costs more time than all else that a short run imports. The extension modules alone need none of it.
+They are those that the packages import, too, whichever comes first, so results are the same to the
+bit.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.machinery
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import scipy
+
+
+def _extension(package: str, name: str, functions: tuple[str, ...]) -> ModuleType:
+    """Return an extension module of a package of SciPy that has some functions.
+
+    Where a version of SciPy keeps them elsewhere, that is the package itself.
+    """
+    whole = f"scipy.{package}"
+    full_name = f"{whole}.{name}"
+    if whole not in sys.modules:
+        folder = Path(scipy.__file__).with_name(package)
+        spec = importlib.machinery.PathFinder.find_spec(full_name, [str(folder)])
+        if spec is not None and spec.loader is not None:
+            module = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(module)
+            if all(hasattr(module, function) for function in functions):
+                return module
+    return importlib.import_module(_PUBLIC[name])
+
+
+_PUBLIC = {
+    "_flapack": "scipy.linalg.lapack",
+    "_fblas": "scipy.linalg.blas",
+    "_special_ufuncs": "scipy.special",
+}
+lapack = _extension("linalg", "_flapack", ("dpotrf", "dpotrs", "dpstrf", "dsygst", "dtrtrs"))
+blas = _extension("linalg", "_fblas", ("dtrsm",))
+special = _extension("special", "_special_ufuncs", ("gammainc", "gammaincinv"))
