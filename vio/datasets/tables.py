@@ -31,6 +31,7 @@ from vio.files.units import (
     without_unit,
 )
 from vio.geometry.lie import FloatArray
+from vio.imu.sampling import sampling_notes
 from vio.records import ImuRecord, IntArray, VelocitySample
 
 _NUMBER = re.compile(
@@ -40,8 +41,6 @@ _PLAIN = re.compile(r"[0-9.eE+-]*")  # numbers in these are written as `_NUMBER`
 _IMU_COLUMNS = 7
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
-# below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
-_LEAST_IMU_HZ = 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,8 +243,7 @@ def read_imu_table(
         gyro if gyro_factor == 1.0 else gyro * gyro_factor,
         accel if accel_factor == 1.0 else accel * accel_factor,
     )
-    notes += [*gyro_notes, *accel_notes, *imu_notes(times_ns, str(path))]
-    return record, (*notes, *silent_sensors(record, str(path)))
+    return record, (*notes, *gyro_notes, *accel_notes, *sampling_notes(record, str(path)))
 
 
 def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
@@ -343,29 +341,6 @@ def _sensor(letters: str) -> str:
     ):
         return "w"
     return "a" if letters.startswith(("a", "lin")) or "acc" in letters else ""
-
-
-def silent_sensors(record: ImuRecord, where: str) -> tuple[str, ...]:
-    """Return a note on a sensor of an IMU whose readings are all exactly zero."""
-    return tuple(
-        f"{where}: the {name} is 0 in all {len(values)} samples; that sensor was not recorded here"
-        for name, values in (("gyro", record.gyro), ("accelerometer", record.accel))
-        if len(values) and not values.any()
-    )
-
-
-def imu_notes(times_ns: IntArray, where: str) -> tuple[str, ...]:
-    """Return a note where an IMU is too slow to be integrated between images."""
-    if len(times_ns) < 2:
-        return ()
-    rate_hz = 1e9 / float(np.median(np.diff(times_ns)))
-    if rate_hz >= _LEAST_IMU_HZ:
-        return ()
-    return (
-        f"{where}: the IMU has {rate_hz:.3g} Hz, too few to integrate the motion between images; "
-        "record at least "
-        f"{_LEAST_IMU_HZ:g} Hz, or use --motion none",
-    )
 
 
 def read_velocity_table(path: Path) -> MotionSamples[VelocitySample]:
