@@ -21,6 +21,7 @@ _AROUND = 20  # messages on either side that tell how far stamps are behind the 
 _TOGETHER_NS = NS_PER_S  # steps of several topics within this time are one
 _NEAR_NS = 100_000_000  # messages are recorded within this time after they are stamped
 _ALIKE = 0.25  # of a step, by which those of several topics may differ to be one
+_MOST = 0.8  # of the messages after a step are behind by it
 _SHARE = 0.5  # of the messages after a step whose stamps were given before it
 
 
@@ -114,7 +115,7 @@ def _size_of_step(times: IntArray, logged: IntArray, row: int, last_ns: int) -> 
         return None
     after = times[row : row + _AROUND]
     after = after[after <= last_ns]
-    half_ns = _usual_ns(times[:row]) / 2
+    half_ns = _usual_ns(np.unique(times)) / 2
     earlier = times[:row]
     if after.max() < earlier.min():  # before the recording began
         return size_ns
@@ -129,11 +130,13 @@ def _usual_ns(times: IntArray) -> float:
 
 def _fallen_behind(times: IntArray, logged: IntArray, row: int) -> float:
     """Return by how much more stamps are behind the recorder's clock after a message than before
-    it.
+    it; 0 where not all of those after it are.
     """
     behind = (logged - times).astype(np.float64)
-    before = behind[max(row - _AROUND, 0) : row]
-    return median(behind[row : row + _AROUND]) - median(before)
+    before = median(behind[max(row - _AROUND, 0) : row])
+    more = behind[row : row + _AROUND] - before
+    size_ns = median(more)
+    return size_ns if np.mean(more > 0.5 * size_ns) > _MOST else 0.0
 
 
 def _joined(found: Sequence[_Found]) -> list[list[_Found]]:
