@@ -112,6 +112,18 @@ def test_two_topics_of_an_imu_may_be_named_and_one_that_has_both_is_preferred(
     assert "not used: /camera/accel/sample, /camera/gyro/sample" in recording.notes
 
 
+def test_one_topic_that_has_either_sensor_in_turn(tmp_path: Path) -> None:
+    script = _split(plain_script(frames=4), "/imu", "/imu", vectors=False)
+    dataset = open_dataset(script.write(tmp_path / "f"))
+    samples = _imu_of(dataset)
+    assert len(samples) > 30
+    for sample in samples:
+        force = [1e-9 * (sample.time_ns - START_NS), 0, 9.8]
+        np.testing.assert_allclose(sample.accel, force, atol=1e-12)
+        assert sample.gyro[0] == 0.1
+    assert any("in messages of their own" in note for note in dataset.recording.notes)
+
+
 def test_an_accelerometer_is_not_interpolated_over_a_gap() -> None:
     gyro_ns = np.arange(0, 3_000_000_000, 5_000_000)
     accel_ns = np.concatenate([np.arange(0, 10**9, 10**7), np.arange(2 * 10**9, 3 * 10**9, 10**7)])

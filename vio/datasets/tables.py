@@ -258,6 +258,11 @@ def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
         return read_table(path, _IMU_COLUMNS, _IMU_FORM, cut)
     table = read_table(path, count, _IMU_FORM, cut)
     order = _imu_order(table) if table.header else None
+    named = [bool(re.search(r"time|stamp|sec|\bt\b", cell)) for cell in table.header]
+    if any(named) and not named[0]:
+        raise DataError(
+            f"{path}: its first column, {table.header[0]!r}, is no time; write the time first"
+        )
     if order is None:
         raise DataError(
             f"{table.where(0)}: {count} values instead of {_IMU_COLUMNS} ({_IMU_FORM}); name the "

@@ -29,17 +29,15 @@ def sampling_notes(record: ImuRecord, where: str) -> tuple[str, ...]:
     if len(record.times_ns) < 2:
         return ()
     notes = [*_silent(record, where)]
-    repeats = repeated_readings(np.hstack([record.gyro, record.accel]))
-    mean_hz = (len(record.times_ns) - 1) * NS_PER_S / float(np.ptp(record.times_ns))
-    burst = burst_length(record.times_ns)
-    rate_hz = mean_hz if burst else NS_PER_S / median(np.diff(record.times_ns))
-    if burst:
+    rate_hz = sampled_hz(record)
+    repeats = _repeats(record)
+    if burst := burst_length(record.times_ns):
         notes.append(
             f"{where}: the stamps come in bursts of {burst}, as where they are times of arrival; "
-            f"the IMU has {mean_hz:.3g} Hz in the mean; record the sensor's own stamps"
+            f"the IMU has {_stamped_hz(record.times_ns):.3g} Hz in the mean; record the sensor's "
+            "own stamps"
         )
     if repeats:
-        rate_hz /= repeats
         notes.append(
             f"{where}: each reading is given {repeats} times, so the IMU has {rate_hz:.3g} Hz, not "
             f"{rate_hz * repeats:.3g}; record each reading once"
@@ -50,6 +48,22 @@ def sampling_notes(record: ImuRecord, where: str) -> tuple[str, ...]:
             f"images; record at least {_LEAST_HZ:g} Hz, or use --motion none"
         )
     return tuple(notes)
+
+
+def sampled_hz(record: ImuRecord) -> float:
+    """Return the rate of a record of two samples and more, without readings that are given again."""
+    return _stamped_hz(record.times_ns) / max(_repeats(record), 1)
+
+
+def _stamped_hz(times_ns: IntArray) -> float:
+    """Return the usual rate of stamps (N,); of bursts the mean one."""
+    if burst_length(times_ns):
+        return (len(times_ns) - 1) * NS_PER_S / float(np.ptp(times_ns))
+    return NS_PER_S / median(np.diff(times_ns))
+
+
+def _repeats(record: ImuRecord) -> int:
+    return repeated_readings(np.hstack([record.gyro, record.accel]))
 
 
 def _silent(record: ImuRecord, where: str) -> list[str]:

@@ -38,6 +38,8 @@ __all__ = ["BagIndex", "Stamps", "camera_info_of", "index_bag", "info_topic", "s
 # An accelerometer's readings further apart than so many usual intervals, and so much time, are a
 # gap, over which its readings are not interpolated.
 _GAP_STEPS = 8.0
+_OF_EACH = 0.1  # least share of the messages with one sensor alone, where a topic mixes the two
+_ALONE = 0.9  # and of both together
 # Names of RealSense's recorder for the distortions that ROS has names for.
 _SDK_MODELS = {
     "none": "plumb_bob",
@@ -65,6 +67,15 @@ class Rows:
         self.times_ns.append(time_ns)
         self.logged_ns.append(message.recorded_ns)
         self.values.append(values)
+
+    def taken(self, rows: IntArray, columns: slice) -> Rows:
+        """Return some samples, and some of their values."""
+        kept = rows.tolist()
+        return Rows(
+            [self.times_ns[k] for k in kept],
+            [self.logged_ns[k] for k in kept],
+            [self.values[k][columns] for k in kept],
+        )
 
     def in_order(self) -> tuple[IntArray, FloatArray]:
         """Return increasing times (N,) and values (N, K); of equal stamps the first."""
@@ -404,6 +415,7 @@ def _settle_stamps(index: BagIndex, roles: Roles) -> None:
     """Give each stream stamps that tell one time: without those of no time, and without the steps
     of a clock that was set back.
     """
+    _split_mixed(index, roles)
     streams = _streams(index, roles)
     behind_ns = _behind_the_log(index)
     for name, rows in streams.items():
@@ -434,6 +446,27 @@ def _settle_stamps(index: BagIndex, roles: Roles) -> None:
                 index.disordered[name] = late
 
 
+def _split_mixed(index: BagIndex, roles: Roles) -> None:
+    """Part the messages of one topic that hold the gyro or the accelerometer alone, as two streams
+    that a driver sends on one topic.
+    """
+    if roles.imu is None or roles.accel is not None or len(index.imu) < 2:
+        return
+    values = np.array(index.imu.values)
+    gyro_alone = ~values[:, 3:].any(axis=1)
+    accel_alone = ~values[:, :3].any(axis=1) & ~gyro_alone
+    fewer = min(gyro_alone.mean(), accel_alone.mean())
+    if fewer < _OF_EACH or (gyro_alone | accel_alone).mean() < _ALONE:
+        return
+    whole = index.imu
+    index.imu = whole.taken(np.flatnonzero(gyro_alone), slice(0, 3))
+    index.accel = whole.taken(np.flatnonzero(accel_alone), slice(3, 6))
+    index.notes.append(
+        f"{roles.imu.name} holds gyro and accelerometer in messages of their own: they are joined, "
+        "the acceleration interpolated at the gyro's stamps"
+    )
+
+
 def _streams(index: BagIndex, roles: Roles) -> dict[str, Stamps | Rows]:
     """Return the stamped messages of the topics in use, by topic."""
     images = (index.left, index.right)
@@ -442,14 +475,14 @@ def _streams(index: BagIndex, roles: Roles) -> dict[str, Stamps | Rows]:
     }
     samples = (
         (roles.imu, index.imu),
-        (roles.accel, index.accel),
+        (roles.imu if roles.accel is None else roles.accel, index.accel),
         (roles.velocity, index.velocities),
         (roles.reference, index.poses),
     )
     for topic, rows in samples:
         if topic is not None and rows:
-            # one odometry may be both velocity and reference
-            found[topic.name if topic.name not in found else f"{topic.name} (poses)"] = rows
+            # one odometry may be both velocity and reference, and one topic both sensors
+            found[topic.name if topic.name not in found else f"{topic.name} (2)"] = rows
     for (parent, child), rows in index.moving.items():
         found[f"{_MOVING}{parent} to {child}"] = rows
     return found
@@ -480,10 +513,10 @@ def _stamped(name: str, rows: Rows, behind_ns: int) -> list[str]:
         ]
     if not without or min(rows.times_ns) < 0 or _begins_at_zero(rows):
         return []
-    kept = [k for k, time_ns in enumerate(rows.times_ns) if time_ns != 0]
-    rows.times_ns = [rows.times_ns[k] for k in kept]
-    rows.logged_ns = [rows.logged_ns[k] for k in kept]
-    rows.values = [rows.values[k] for k in kept]
+    stamped = rows.taken(np.flatnonzero(rows.times_ns), slice(None))
+    rows.times_ns = stamped.times_ns
+    rows.logged_ns = stamped.logged_ns
+    rows.values = stamped.values
     return [f"{len(without)} messages of {name} have no stamp and are left out"]
 
 
