@@ -132,9 +132,10 @@ def _fallen_behind(times: IntArray, logged: IntArray, row: int) -> float:
     """Return by how much more stamps are behind the recorder's clock after a message than before
     it; 0 where not all of those after it are.
     """
-    behind = (logged - times).astype(np.float64)
-    before = median(behind[max(row - _AROUND, 0) : row])
-    more = behind[row : row + _AROUND] - before
+    first = max(row - _AROUND, 0)
+    around = slice(first, row + _AROUND)
+    behind = (logged[around] - times[around]).astype(np.float64)
+    more = behind[row - first :] - median(behind[: row - first])
     size_ns = median(more)
     return size_ns if np.mean(more > 0.5 * size_ns) > _MOST else 0.0
 
