@@ -172,15 +172,35 @@ class Script:
             self.make("geometry_msgs/msg/Quaternion", *map(float, q)),
         )
 
-    def write(self, path: Path) -> Path:
-        """Write the bag; a ROS 2 bag is a folder."""
+    def vector(self, topic: str, time_ns: int, values: FloatArray) -> None:
+        """Add a geometry_msgs/Vector3Stamped."""
+        kind = "geometry_msgs/msg/Vector3Stamped"
+        vector = self.make("geometry_msgs/msg/Vector3", *map(float, values))
+        self.add(topic, kind, time_ns, self.make(kind, self.header(time_ns, "imu"), vector))
+
+    def transform(self, topic: str, time_ns: int, T: FloatArray) -> None:
+        """Add a geometry_msgs/Transform."""
+        kind = "geometry_msgs/msg/Transform"
+        p, q = T[:3, 3], quat_xyzw_from_rotation(T[:3, :3])
+        fields = self.make(
+            kind,
+            self.make("geometry_msgs/msg/Vector3", *map(float, p)),
+            self.make("geometry_msgs/msg/Quaternion", *map(float, q)),
+        )
+        self.add(topic, kind, time_ns, fields)
+
+    def write(self, path: Path, *, sort: bool = True) -> Path:
+        """Write the bag, its messages sorted by their times of recording unless that order is to
+        be kept in which they were added; a ROS 2 bag is a folder.
+        """
         store = STORES[self.storage]
         ros1 = self.storage == "bag"
         plugin = StoragePlugin.MCAP if self.storage == "mcap" else StoragePlugin.SQLITE3
         with Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=plugin) as writer:
             pairs = dict.fromkeys([(n.topic, n.kind) for n in self.notes] + self.empty)
             connections = {pair: writer.add_connection(*pair, typestore=store) for pair in pairs}
-            for note in sorted(self.notes, key=lambda n: n.logged_ns):
+            notes = sorted(self.notes, key=lambda n: n.logged_ns) if sort else self.notes
+            for note in notes:
                 serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
                 data = serialize(note.fields, note.kind)
                 writer.write(connections[(note.topic, note.kind)], note.logged_ns, data)

@@ -28,7 +28,7 @@ from vio.datasets.plain import read_plain
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.tables import read_imu_table
 from vio.errors import CalibrationError, DataError, VioError
-from vio.files.text import parse_stamps
+from vio.files.stamps import parse_stamps
 from vio.records import ImuSample
 
 DEFAULT = DatasetSettings()
@@ -157,13 +157,14 @@ def test_times_may_name_the_images(tmp_path: Path) -> None:
     assert np.diff(open_dataset(folder).recording.frame_times_ns).tolist() == [50_000_000] * 3
 
 
-def test_times_in_milliseconds_since_the_start_are_doubted(tmp_path: Path) -> None:
+def test_times_in_milliseconds_since_the_start_are_read_and_doubted(tmp_path: Path) -> None:
     folder = make_plain(tmp_path, times=False, imu=False, reference=False)
     (folder / "times.txt").write_text("0\n50\n100\n150\n")
-    (note,) = open_dataset(folder).recording.notes
-    assert note.endswith(
-        "frames are 50 s apart, as its times are taken for seconds; if they are not, write seconds"
-    )
+    recording = open_dataset(folder).recording
+    (note,) = recording.notes
+    assert "times are taken for milliseconds (frames 0.05 s apart)" in note
+    assert "as they would be 50 s apart in seconds" in note
+    assert recording.frame_times_ns.tolist() == [0, 50_000_000, 100_000_000, 150_000_000]
 
 
 def test_without_times_images_alone_are_read_and_it_is_said(tmp_path: Path) -> None:

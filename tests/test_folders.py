@@ -16,7 +16,7 @@ from tests.plain_maker import make_plain
 from vio.cli import main
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.image_files import ImageFiles
-from vio.datasets.plain import pair_files
+from vio.datasets.image_times import pair_files
 from vio.datasets.sides import is_pair, pairs_of, without_side
 from vio.errors import DataError
 from vio.geometry.lie import quat_xyzw_from_rotation, se3_exp

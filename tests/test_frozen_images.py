@@ -183,6 +183,15 @@ def test_black_images_are_not_laid_on_a_driver_that_repeats(gray: int | None, wo
     assert words in line
 
 
+@pytest.mark.parametrize("exact", [True, False])
+def test_of_one_camera_no_line_speaks_of_both_images(exact: bool) -> None:
+    one = replace(_frame(2, LEFT, RIGHT), right=None)
+    (line,) = RepeatReport(IMAGES).frame(one, Repeated(1, exact))
+    assert "both" not in line
+    (line,) = RepeatReport(IMAGES).frame(_frame(2, LEFT, RIGHT), Repeated(1, exact))
+    assert "both images" in line
+
+
 def test_corner_flow_measures_small_motions_and_leaves_out_the_border() -> None:
     at = np.concatenate([GRID, [[1.0, 1.0], [399.0, 100.0]]])
     flow = corner_flow(LEFT, _shifted(LEFT, 0.25), at)

@@ -16,9 +16,11 @@ from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray
 from vio.imu.clocks import SampleCoverage
 from vio.imu.faults import ImuSampleCheck
+from vio.imu.sampling import sampling_notes
 from vio.live.processor import EventOrder
 from vio.monitor.run import RunMonitor
-from vio.records import Event, ImuSample, StereoFrame
+from vio.monitor.samples import Samples
+from vio.records import Event, ImuRecord, ImuSample, IntArray, StereoFrame
 
 FRAMES = 60
 AXES = np.eye(3)
@@ -221,16 +223,75 @@ def test_samples_that_are_missing_for_seconds_are_no_matter_of_clocks() -> None:
     shifted.
     """
 
-    def at_end(covered_s: Callable[[float], bool]) -> list[str]:
+    def at_end(covered_s: Callable[[float], bool], begin_s: float, end_s: float) -> list[str]:
         coverage, last_ns = SampleCoverage(), None
         for k in range(200):
             last_ns = k * 50_000_000 if covered_s(0.05 * k) else last_ns
             coverage.frame(k * 50_000_000, last_ns)
-        return [f.fault for f in coverage.at_end((0, 10**10), 5e6)]
+        return [f.fault for f in coverage.at_end((round(begin_s * 1e9), round(end_s * 1e9)), 5e6)]
 
-    assert at_end(lambda t: not 4 < t < 7) == []
-    assert at_end(lambda t: t < 7) == ["clocks overlap in part"]
-    assert at_end(lambda t: t > 4) == ["clocks overlap in part"]
+    assert at_end(lambda t: not 4 < t < 7, 0, 10) == []
+    assert at_end(lambda t: t < 7, 0, 7) == ["clocks overlap in part"]
+    assert at_end(lambda t: t > 4, 4, 10) == ["clocks overlap in part"]
+
+
+def test_samples_that_come_behind_their_frames_are_no_matter_of_clocks() -> None:
+    """Live use under load: frames pass before their samples, which come in the end."""
+    coverage = SampleCoverage()
+    for k in range(200):
+        coverage.frame(k * 50_000_000, min(k, 100) * 50_000_000)
+    assert coverage.at_end((0, 10**10), 5e6) == []
+
+
+@pytest.mark.parametrize("kind", ["planar turn", "turn while it sways"])
+def test_a_simulator_without_noise_is_not_saturated(kind: str) -> None:
+    """Gyro readings of exactly 0 at rest, and of one value in a steady turn, are no range."""
+    samples = Samples()
+    for k in range(800):
+        moving = 200 <= k < 600
+        ramp = np.clip((k - 200) / 100, 0, 1) * np.clip((600 - k) / 100, 0, 1) if moving else 0.0
+        gyro = np.array([0.0, 0.0, 0.5 * ramp])
+        if kind == "turn while it sways":
+            gyro[:2] = moving * 0.2 * np.sin(0.01 * (k - 200)) ** 2
+        samples.add(ImuSample(k * 5_000_000, gyro, np.array([0.1 * ramp, 0.0, 9.81])))
+    assert samples.check_new(keep=True) == []
+
+
+def test_a_range_that_ends_is_still_named() -> None:
+    rng = np.random.default_rng(1)
+    samples = Samples()
+    for k in range(800):
+        clipped = float(np.clip(6 * np.sin(0.02 * k), -4, 4))
+        gyro = np.array([clipped, *rng.normal(0, 1e-3, 2)])
+        force = np.array([0, 0, 9.81]) + rng.normal(0, 0.01, 3)
+        samples.add(ImuSample(k * 5_000_000, gyro, force))
+    assert [f.fault for f in samples.check_new(keep=True)] == ["saturation"]
+
+
+def _record(times_ns: IntArray, repeats: int) -> ImuRecord:
+    rng = np.random.default_rng(2)
+    values = np.repeat(rng.normal(0, 1, (len(times_ns) // repeats + 1, 6)), repeats, axis=0)
+    return ImuRecord(times_ns, values[: len(times_ns), :3], values[: len(times_ns), 3:])
+
+
+def test_readings_given_again_and_again_are_named_with_the_true_rate() -> None:
+    times_ns = 5_000_000 * np.arange(700)
+    (repeated, slow) = sampling_notes(_record(times_ns, 7), "imu.csv")
+    assert "each reading is given 7 times, so the IMU has 28.6 Hz, not 200" in repeated
+    assert "28.6 Hz, too few" in slow
+    assert sampling_notes(_record(times_ns, 1), "imu.csv") == ()
+    still = ImuRecord(times_ns, np.zeros((700, 3)) + 0.1, np.zeros((700, 3)) + 9.8)
+    assert sampling_notes(still, "imu.csv") == ()
+
+
+def test_stamps_in_bursts_are_named_with_the_mean_rate() -> None:
+    k = np.arange(1000)
+    times_ns = 50_000_000 * (k // 10) + 100_000 * (k % 10)
+    (note,) = sampling_notes(_record(times_ns, 1), "imu.csv")
+    assert "come in bursts of 10" in note
+    assert "202 Hz in the mean" in note
+    gaps = np.cumsum(np.where(k % 200 == 199, 900_000_000, 5_000_000))
+    assert sampling_notes(_record(gaps, 1), "imu.csv") == ()
 
 
 @pytest.mark.parametrize("fault", [_one_gyro_spike, _two_per_mille, _zeros, _stuck, _dead_gyro])

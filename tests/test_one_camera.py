@@ -658,3 +658,17 @@ def test_odometry_of_one_camera_waits_for_the_scale() -> None:
 
 def test_rays_of_one_camera_are_those_of_its_pair() -> None:
     np.testing.assert_array_equal(left_rays(LEFT, [[1.0, 2.0]]), left_rays(CAMERA, [[1.0, 2.0]]))
+
+
+def test_a_filter_that_waits_to_begin_again_keeps_its_points() -> None:
+    """A run that ends there ended in an error, and all of its results were lost."""
+    flight = Path3(40, "curve")
+    flown = Flown(flight, 0)
+    assert flown.begun is not None
+    before = flown.filter.landmarks()
+    seen = flight.observe(39, PIXEL, np.random.default_rng(1), 80)
+    report = flown.filter.restart(replace(_left_only(seen), time_ns=39 * STEP_NS))
+    assert not report.started
+    after = flown.filter.landmarks()
+    assert set(after.ids.tolist()) <= set(before.ids.tolist())
+    assert len(after.ids)

@@ -25,6 +25,10 @@ IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 SigmaArray: TypeAlias = npt.NDArray[np.float32]  # standard deviations
 BodyFrame: TypeAlias = Literal["imu", "cam0"]
+# How a trajectory's orientations are known: its file states the order of the quaternions' numbers,
+# or it was assumed that w is the first of them, or the last; or there are none, and its rotations
+# are the identity.
+Orientations: TypeAlias = Literal["stated", "w first, assumed", "w last, assumed", "none"]
 MotionSource: TypeAlias = Literal["imu", "velocity"]
 RunMotion: TypeAlias = Literal["imu", "velocity", "none"]  # none: images alone
 
@@ -566,6 +570,7 @@ class Trajectory:
     times_ns: IntArray | None
     body: BodyFrame  # what the poses describe
     frame_indices: IntArray | None = None  # (N,) frame number of each pose where known
+    orientations: Orientations = "stated"
 
     def __len__(self) -> int:
         return len(self.T_world_body)
@@ -584,16 +589,28 @@ class Trajectory:
         return replace(self, frame_indices=np.arange(len(self), dtype=np.int64))
 
     def in_cam0(self, T_cam0_imu: FloatArray) -> Trajectory:
-        """Return the same motion described by the left camera; unchanged if it already is."""
+        """Return the same motion described by the left camera; unchanged if it already is.
+
+        Positions without orientations stay where they are.
+        """
         if self.body == "cam0":
             return self
-        return replace(self, T_world_body=self.T_world_body @ se3_inverse(T_cam0_imu), body="cam0")
+        return self._of("cam0", se3_inverse(T_cam0_imu))
 
     def in_imu(self, T_cam0_imu: FloatArray) -> Trajectory:
-        """Return the same motion described by the IMU; unchanged if it already is."""
+        """Return the same motion described by the IMU; unchanged if it already is.
+
+        Positions without orientations stay where they are.
+        """
         if self.body == "imu":
             return self
-        return replace(self, T_world_body=self.T_world_body @ T_cam0_imu, body="imu")
+        return self._of("imu", T_cam0_imu)
+
+    def _of(self, body: BodyFrame, T_body_other: FloatArray) -> Trajectory:
+        if self.orientations == "none":
+            return replace(self, body=body)
+        moved = self.T_world_body @ T_body_other
+        return replace(self, T_world_body=moved, body=body, orientations="stated")
 
 
 DOUBT = "doubtful: "  # begins what a note says after its file where it names two readings

@@ -184,9 +184,11 @@ def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
         _ALIGNMENTS[result.align]
         + (f", scale {result.scale:.6f}" if result.align == "sim3" else ""),
     )
+    alone = "none" in (result.aligned.orientations, result.reference.orientations)
     small = result.ate_m.rmse < 0.01
     position = ("ATE", result.ate_m, *((1e3, "mm") if small else (1.0, "m")))
-    for name, errors, factor, unit in (position, ("attitude", result.ate_deg, 1.0, "deg")):
+    attitude = ("attitude", result.ate_deg, 1.0, "deg")
+    for name, errors, factor, unit in (position,) if alone else (position, attitude):
         mean, middle, largest = (
             factor * value for value in (errors.mean, errors.median, errors.max)
         )
@@ -203,6 +205,12 @@ def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
                 else f"{result.scale_free.ate_m:.4g} m"
             )
             yield "scale", f"off by {off:+.3f} %; ATE {without} (rms) without it, after Sim(3)"
+    if alone:
+        yield (
+            "attitude",
+            "not compared: a trajectory has positions alone, so RPE and drift say nothing",
+        )
+        return
     if result.rpe is not None:
         step = result.rpe.trans_rmse_m
         moved = f"{1e3 * step:.4g} mm" if step < 0.01 else f"{step:.4g} m"

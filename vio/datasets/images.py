@@ -301,7 +301,13 @@ def list_images(folder: Path) -> ImageFiles:
 def natural_key(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
     """Sort key of a name with its runs of digits as numbers; equal ones (`1.png`, `01.png`) by
     their text.
+
+    Digits behind a point are those of a decimal where seconds since 1970 stand before it.
     """
+    seconds = re.fullmatch(r"(.*?)(\d{9,10})\.(\d{1,9})", stem_of(name))
+    if seconds is not None:
+        fraction = seconds[3].ljust(9, "0")
+        return ((-1, seconds[1]), (int(seconds[2]), ""), (-1, "."), (int(fraction), "")), name
     parts = re.split(r"(\d+)", stem_of(name))
     return tuple((int(p), "") if k % 2 else (-1, p) for k, p in enumerate(parts)), name
 

@@ -28,16 +28,16 @@ from vio.datasets.companions import (
     find_calibration_of,
     read_companions,
 )
-from vio.datasets.frame_times import pair_stamps
-from vio.datasets.image_files import FilePairs, ImageFiles
+from vio.datasets.image_files import FilePairs
 from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
+from vio.datasets.image_times import frame_times, pair_files, times_of
 from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_gray
 from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
 from vio.datasets.rigs import find_calibration, kitti_rig, load_rig
 from vio.datasets.rigs.bare import NAMES as BARE_NAMES
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.sides import first_pair, pairs_of, without_side
-from vio.datasets.tables import drive_times, is_date, stamped_rows
+from vio.datasets.sides import first_pair, pairs_of
+from vio.datasets.tables import drive_times
 from vio.datasets.tum_rgbd import (
     DEPTH_FACTOR,
     LISTS,
@@ -47,10 +47,9 @@ from vio.datasets.tum_rgbd import (
 )
 from vio.datasets.unused import Layout
 from vio.errors import CalibrationError, DataError
-from vio.files.text import parse_stamps, text_lines
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.records import NS_PER_S, IntArray, Trajectory
+from vio.records import IntArray, Trajectory
 
 _PAIRS: tuple[tuple[str, ...], ...] = (
     ("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_00", "image_01"),
@@ -67,8 +66,6 @@ _INSIDE = ("data", "images", "")
 _DRIVE_NS = 100_000_000  # between frames of a KITTI drive
 _DEEPEST = 3  # levels of folders that are looked into for images
 _MAX_FOLDERS = 200
-_SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
-_ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 
 
 def is_kitti_folder(path: Path) -> bool:
@@ -298,7 +295,9 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     rig, T_left_cam0 = kitti_rig(file, size, cameras)
     if not times_file.is_file():
         raise DataError(f"{times_file} is missing; it holds one time in seconds for each image")
-    times_ns = times_of(times_file, pairs)
+    doubts = list[str]()
+    times_ns = times_of(times_file, pairs, doubts)
+    notes = (*notes, *doubts)
     poses = _poses_file(path)
     reference = None if poses is None else _read_reference(poses, times_ns, T_left_cam0)
     used = [] if poses is None else [poses]
@@ -431,6 +430,8 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
     # EuRoC's list repeats the times that the images are named by
     if kind != "plain" and times_file == layout.left:
         used.append(layout.left.parent / "data.csv")
+    if times_file == layout.left.parent / "data.csv":
+        used.append(layout.right.parent / "data.csv")
     times = (times_ns, times_file)
     notes = (*images.notes, *notes)
     has_depths = images.depths is not None
@@ -505,149 +506,6 @@ def _depth_factor(
         f"dataset.depth_factor {factor:g} takes the place of the calibration's "
         f"{rig.depth_factor:g}",
     )
-
-
-# --- images and times
-# -----------------------------------------------------------------------------------------------
-
-
-def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple[str, ...]]:
-    """Pair image files by equal names, by names without their camera (`000012_cam0`), by the last
-    number in their names, or by stamps in their names.
-
-    Raises:
-        DataError: the names share nothing.
-    """
-    keys: list[list[str | int]] = [[p.stem for p in lefts], [p.stem for p in rights]]
-    if not set(keys[0]) & set(keys[1]):
-        keys = [[without_side(p.stem) for p in files] for files in (lefts, rights)]
-    if not set(keys[0]) & set(keys[1]):
-        keys = [[_last_number(p) for p in files] for files in (lefts, rights)]
-    if not set(keys[0]) & set(keys[1]) and all(_is_stamp(p.stem) for p in (*lefts, *rights)):
-        a, b = pair_stamps(
-            *(np.array([int(p.stem) for p in files], dtype=np.int64) for files in (lefts, rights))
-        )
-        keys = [list(range(len(lefts))), [-1] * len(rights)]
-        for i, j in zip(a.tolist(), b.tolist(), strict=True):
-            keys[1][j] = i
-    right_of = {key: k for k, key in enumerate(keys[1])}
-    if len(right_of) < len(rights) and -1 not in right_of:
-        raise DataError(
-            f"{rights[0].parent}: several images have the same number; number them uniquely"
-        )
-    rows = [(k, right_of[key]) for k, key in enumerate(keys[0]) if key in right_of]
-    pairs = FilePairs(lefts.take(k for k, _ in rows), rights.take(k for _, k in rows))
-    if not pairs:
-        raise DataError(
-            f"{lefts[0].parent} and {rights[0].parent}: no name of the one fits one of the other "
-            f"({lefts[0].name}, "
-            f"{rights[0].name}); give both images of a pair the same name or number"
-        )
-    alone = len(lefts) - len(pairs), len(rights) - len(pairs)
-    if not any(alone):
-        return pairs, ()
-    return pairs, (f"{alone[0]} left and {alone[1]} right images have no partner and are skipped",)
-
-
-def _last_number(path: Path) -> int | str:
-    found = re.findall(r"\d+", path.stem)
-    return int(found[-1]) if found else path.stem
-
-
-def _is_stamp(stem: str) -> bool:
-    """Return whether a name is a time since 1970 in milliseconds to nanoseconds."""
-    return re.fullmatch(r"\d{13,19}", stem) is not None
-
-
-def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | None, tuple[str, ...]]:
-    """Return the times (F,) of the pairs, where they come from (None: assumed), and notes.
-
-    Raises:
-        DataError: `times.txt` does not fit the images, or the times do not increase.
-    """
-    for folder in dict.fromkeys((layout.base, layout.root, layout.left, layout.left.parent)):
-        for name in ("times.txt", "timestamps.txt"):
-            if (file := folder / name).is_file():
-                times_ns = times_of(file, pairs)
-                return times_ns, file, _slow_note(file, times_ns)
-    stems = [left.stem for left, _ in pairs]
-    has_list = (file := layout.left.parent / "data.csv").is_file()
-    missing = _missing_note(file, pairs) if has_list else ()
-    if all(_is_stamp(stem) or re.fullmatch(r"\d{9,10}\.\d{1,9}", stem) for stem in stems):
-        return parse_stamps(stems, lambda k: str(pairs[k][0])), layout.left, missing
-    if has_list:
-        return _listed_times(file, pairs), file, missing
-    note = (
-        f"{layout.root}: no times.txt; frames are taken to be {1 / _ASSUMED_HZ:g} s apart, so "
-        "speeds are unknown; "
-        "write one time an image (seconds or nanoseconds) into times.txt"
-    )
-    return np.arange(len(pairs), dtype=np.int64) * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
-
-
-def _slow_note(file: Path, times_ns: IntArray) -> tuple[str, ...]:
-    """Doubt the unit of times that are further apart than those of any camera that moves."""
-    apart_s = float(np.median(np.diff(times_ns))) / NS_PER_S if len(times_ns) > 1 else 0.0
-    if apart_s <= _SLOWEST_S:
-        return ()
-    return (
-        f"{file}: frames are {apart_s:g} s apart, as its times are taken for seconds; if they are "
-        "not, write seconds",
-    )
-
-
-def _missing_note(file: Path, pairs: ImagePairs) -> tuple[str, ...]:
-    """Say how many of the images in EuRoC's list of a camera are there, if not all are."""
-    listed = sum(line.strip()[:1] not in ("#", "") for _, line in text_lines(file))
-    return (
-        (f"{file} lists {listed} images; the {len(pairs)} that are there are used",)
-        if listed > len(pairs)
-        else ()
-    )
-
-
-def _listed_times(file: Path, pairs: ImagePairs) -> IntArray:
-    """Read the times (F,) of images from EuRoC's list of a camera."""
-    times_ns, names, _ = stamped_rows(file, 2, "timestamp [ns], filename")
-    time_of = dict(zip(names, times_ns.tolist(), strict=True))
-    missing = next((left.name for left, _ in pairs if left.name not in time_of), None)
-    if missing is not None:
-        raise DataError(f"{file}: does not list {missing}; copy both again, or remove the image")
-    return np.array([time_of[left.name] for left, _ in pairs], dtype=np.int64)
-
-
-def times_of(file: Path, pairs: ImagePairs) -> IntArray:
-    """Read the times (F,) of image pairs: one a line, or `name time` where the first column names
-    the images.
-
-    Dates are those of a KITTI raw drive, which is a plain folder where it is run with another
-    calibration.
-
-    Raises:
-        DataError: the file does not fit the images, or the times do not increase.
-    """
-    numbers = [_last_number(left) for left, _ in pairs]
-    if is_date(next((line for _, line in text_lines(file)), "")) and all(
-        isinstance(n, int) for n in numbers
-    ):
-        return drive_times(file, np.array(numbers, dtype=np.int64))
-    rows = [
-        (n, line.replace(",", " ").split())
-        for n, line in text_lines(file)
-        if line.strip()[:1] not in ("#", "")
-    ]
-    by_name = {Path(fields[0]).stem: (n, fields[1]) for n, fields in rows if len(fields) > 1}
-    if by_name and all(left.stem in by_name for left, _ in pairs):
-        chosen = [by_name[left.stem] for left, _ in pairs]
-    elif len(rows) == len(pairs) and all(len(fields) == 1 for _, fields in rows):
-        chosen = [(n, fields[0]) for n, fields in rows]
-    else:
-        raise DataError(
-            f"{file} holds {len(rows)} times for {len(pairs)} image pairs; there must be one time "
-            "an image, or lines "
-            "'name time'"
-        )
-    return parse_stamps([text for _, text in chosen], lambda k: f"{file}, line {chosen[k][0]}")
 
 
 def _frame_numbers(pairs: ImagePairs) -> IntArray:

@@ -7,8 +7,8 @@ from __future__ import annotations
 import contextlib
 import re
 from array import array
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +16,31 @@ import numpy as np
 from vio.datasets.common import check_gravity_column
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
-from vio.files.text import check_increasing, lines_of, parse_stamps, text_lines, whole_ns_stamps
+from vio.files.stamps import SAMPLE_PACE, Pace, parse_stamps
+from vio.files.text import check_increasing, lines_of, text_lines, whole_ns_stamps
+from vio.files.units import (
+    ACCEL_UNITS,
+    GYRO_UNITS,
+    factor_in_words,
+    factor_of,
+    header_cells,
+    split_cells,
+    time_unit,
+    time_unit_in_words,
+    unknown_unit,
+    without_unit,
+)
 from vio.geometry.lie import FloatArray
+from vio.imu.sampling import sampling_notes
 from vio.records import ImuRecord, IntArray, VelocitySample
 
 _NUMBER = re.compile(
     r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE
 )
 _PLAIN = re.compile(r"[0-9.eE+-]*")  # numbers in these are written as `_NUMBER` says, or are none
+_IMU_COLUMNS = 7
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
-# below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
-_LEAST_IMU_HZ = 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +48,8 @@ class NumberTable:
     """The stamps of a file as text, and its other columns as numbers."""
 
     path: Path
-    header: tuple[str, ...]  # lower case; empty: none
+    header: tuple[str, ...]  # lower case, with the units of a line below it; empty: none
+    comments: tuple[str, ...]  # lines above the data that are no header
     stamps: tuple[str, ...]
     values: FloatArray  # (N, K); NaN: no number
     lines: Sequence[int]  # (N,) line numbers from 1
@@ -47,7 +61,8 @@ class NumberTable:
 
 def read_table(path: Path, columns: int, form: str, cut: list[str] | None = None) -> NumberTable:
     """Read a table of stamps and numbers; see `table_rows`."""
-    rows = table_rows(path, columns, form, cut)
+    comments = list[str]()
+    rows = table_rows(path, columns, form, cut, comments)
     header = tuple(field.lower() for field in next(rows)[1])
     stamps = list[str]()
     values = array("d")
@@ -56,9 +71,8 @@ def read_table(path: Path, columns: int, form: str, cut: list[str] | None = None
         stamps.append(fields[0])
         lines.append(number)
         values.extend(_numbers(fields[1:]))
-    return NumberTable(
-        path, header, tuple(stamps), np.array(values).reshape(-1, columns - 1), lines
-    )
+    table = np.array(values).reshape(-1, columns - 1)
+    return NumberTable(path, header, tuple(comments), tuple(stamps), table, lines)
 
 
 def _numbers(texts: Sequence[str]) -> list[float]:
@@ -70,28 +84,40 @@ def _numbers(texts: Sequence[str]) -> list[float]:
 
 
 def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[str], list[int]]:
-    """Return the times (N,) of a table that are in whole nanoseconds, the last field of each line,
-    and its number.
+    """Return the times (N,) of a table that are in whole nanoseconds, or in the unit that its
+    header states, the last field of each line, and its number.
 
     Raises:
         DataError: as `table_rows`, or a stamp is another number, or not later than the one before.
     """
-    rows = list(table_rows(path, columns, form))[1:]
+    (_, header), *rows = table_rows(path, columns, form)
     lines = [number for number, _ in rows]
-    times_ns = whole_ns_stamps(
-        [fields[0] for _, fields in rows], lambda k: f"{path}, line {lines[k]}"
-    )
+    stamps = [fields[0] for _, fields in rows]
+    stated = time_unit(header[0]) if header else None
+    times_ns = _times_ns(stamps, lambda k: f"{path}, line {lines[k]}", stated)
     return times_ns, [fields[-1] for _, fields in rows], lines
 
 
+def _times_ns(stamps: Sequence[str], where: Callable[[int], str], stated: str | None) -> IntArray:
+    """Return times (N,) that are whole nanoseconds where no other unit is stated."""
+    if stated in (None, "ns"):
+        return whole_ns_stamps(stamps, where)
+    return parse_stamps(stamps, where, stated)
+
+
 def table_rows(
-    path: Path, columns: int, form: str, cut: list[str] | None = None
+    path: Path,
+    columns: int,
+    form: str,
+    cut: list[str] | None = None,
+    comments: list[str] | None = None,
 ) -> Iterator[tuple[int, list[str]]]:
     """Yield the number and the fields of each line of a table, and before the first one 0 and those
     of the header.
 
     Commas, semicolons or white space separate. The header is the last comment or text line above;
-    it may have none.
+    it may have none. Where that line holds units alone, they are put behind the names of the line
+    above it.
 
     Args:
         path: the file.
@@ -99,6 +125,7 @@ def table_rows(
         form: their names, for messages.
         cut: where to note a last line that ends too early, which is left out then; None: it is an
             error.
+        comments: where to note the other lines above the data.
 
     Raises:
         DataError: the file cannot be read or is empty, or a line has another number of columns.
@@ -109,12 +136,16 @@ def table_rows(
     lines = lines_of(path)
     for number, line in lines:
         text = line.strip()
-        fields = _split(text.lstrip("#"))
+        fields = split_cells(text.lstrip("#"))
         if not text or text.startswith("#") or (not is_data and not _NUMBER.fullmatch(fields[0])):
             if header and text and not text.startswith("#"):
                 unread = f"; line {number}, {text[:40]!r}, does not begin with a number (decimals need a point)"
-            if not is_data and len(fields) == columns:
-                header = fields
+            if not is_data and text:
+                cells = header_cells(text, columns)
+                if cells:
+                    header = _with_units(header, cells)
+                elif comments is not None:
+                    comments.append(text)
             continue
         if len(fields) != columns:
             if cut is not None and is_data and len(fields) < columns and next(lines, None) is None:
@@ -134,38 +165,55 @@ def table_rows(
         )
 
 
-def _split(text: str) -> list[str]:
-    for separator in (",", ";"):
-        if separator in text:
-            return [field.strip() for field in text.split(separator)]
-    return text.split()
+def _with_units(header: list[str], cells: list[str]) -> list[str]:
+    """Return the cells of the last line above the data; units alone go behind the names above."""
+    units = [cell.strip("[](){} ") for cell in cells]
+    alone = all(
+        not unit
+        or time_unit(f"[{unit}]") is not None
+        or factor_of(f"[{unit}]", GYRO_UNITS) is not None
+        or factor_of(f"[{unit}]", ACCEL_UNITS) is not None
+        for unit in units
+    )
+    if not (header and alone):
+        return cells
+    return [f"{name} [{unit}]" for name, unit in zip(header, units, strict=True)]
 
 
-def stamps_ns(table: NumberTable) -> IntArray:
+def stamps_ns(
+    table: NumberTable, pace: Pace | None = None, doubts: list[str] | None = None
+) -> IntArray:
     """Return the first column as nanoseconds (N,), strictly increasing; the unit as stated, else by
     its size.
+
+    Args:
+        table: the file's.
+        pace: how far apart the rows may be, see `parse_stamps`.
+        doubts: where to note a unit that the pace decided.
 
     Raises:
         DataError: a stamp is no number, or not later than the one before.
     """
-    stated = (
-        re.search(r"(?:\[|_|\()\s*(ns|us|ms|sec|s)\s*(?:\]|\)|$)", table.header[0])
-        if table.header
-        else None
-    )
-    return parse_stamps(table.stamps, table.where, None if stated is None else stated[1])
+    return parse_stamps(table.stamps, table.where, _stated_unit(table), pace=pace, doubts=doubts)
+
+
+def _stated_unit(table: NumberTable) -> str | None:
+    """Return the unit of the stamps that the header states, or a comment above it."""
+    unit = time_unit(table.header[0]) if table.header else None
+    return time_unit_in_words(table.comments) if unit is None else unit
 
 
 def read_imu_table(
     path: Path, *, cut: list[str] | None = None, whole_ns: bool = False
 ) -> tuple[ImuRecord, tuple[str, ...]]:
-    """Read raw inertial readings; a header may name the order of its columns, and the units deg/s
-    and g.
+    """Read raw inertial readings; a header may name the order of its columns, and their units.
+
+    With a header that names them, there may be other columns.
 
     Args:
         path: the file.
         cut: see `table_rows`.
-        whole_ns: whether stamps must be in whole nanoseconds.
+        whole_ns: whether stamps are in whole nanoseconds where the header states no other unit.
 
     Returns:
         The record, and notes about what was converted or looks wrong.
@@ -174,69 +222,130 @@ def read_imu_table(
         DataError: a line lacks seven finite numbers, the stamps do not increase, or the order of
             columns is unclear.
     """
-    table = read_table(path, 7, _IMU_FORM, cut)
-    times_ns = whole_ns_stamps(table.stamps, table.where) if whole_ns else stamps_ns(table)
+    table = _imu_table(path, cut)
+    notes: list[str] = []
+    if whole_ns:
+        times_ns = _times_ns(table.stamps, table.where, _stated_unit(table))
+    else:
+        times_ns = stamps_ns(table, SAMPLE_PACE, notes)
     values = _finite(table)
     order = _imu_order(table)
     if order is None:
         remedy = "exchange these columns with 5 to 7, or add a header such as 'timestamp [ns],ax,ay,az,wx,wy,wz'"
         check_gravity_column(values, str(path), _IMU_FORM, remedy)
-        return ImuRecord(times_ns, values[:, :3], values[:, 3:]), imu_notes(times_ns, str(path))
+        order = range(6)
+    gyro_factor, gyro_notes = _factor(table, order[:3], GYRO_UNITS, "gyro", "rad/s")
+    accel_factor, accel_notes = _factor(table, order[3:], ACCEL_UNITS, "accelerometer", "m/s^2")
     gyro = values[:, order[:3]]
     accel = values[:, order[3:]]
-    notes: list[str] = []
-    if any("deg" in table.header[1 + k] for k in order[:3]):
-        gyro = np.radians(gyro)
-        notes.append(f"{path}: the header states degrees; the gyro is converted to rad/s")
-    if any(re.search(r"[\[(_]g[\])]?$", table.header[1 + k]) for k in order[3:]):
-        accel = accel * 9.80665
-        notes.append(f"{path}: the header states g; the accelerometer is converted to m/s^2")
-    return ImuRecord(times_ns, gyro, accel), (*notes, *imu_notes(times_ns, str(path)))
+    record = ImuRecord(
+        times_ns,
+        gyro if gyro_factor == 1.0 else gyro * gyro_factor,
+        accel if accel_factor == 1.0 else accel * accel_factor,
+    )
+    return record, (*notes, *gyro_notes, *accel_notes, *sampling_notes(record, str(path)))
 
 
-def _imu_order(table: NumberTable) -> list[int] | None:
+def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
+    """Read the stamps and six readings, or what the header names of more columns."""
+    count = 0
+    for _, line in lines_of(path):
+        fields = split_cells(line.strip())
+        if _NUMBER.fullmatch(fields[0]):
+            count = len(fields)
+            break
+    if count <= _IMU_COLUMNS:
+        return read_table(path, _IMU_COLUMNS, _IMU_FORM, cut)
+    table = read_table(path, count, _IMU_FORM, cut)
+    order = _imu_order(table) if table.header else None
+    named = [bool(re.search(r"time|stamp|sec|\bt\b", cell)) for cell in table.header]
+    if any(named) and not named[0]:
+        raise DataError(
+            f"{path}: its first column, {table.header[0]!r}, is no time; write the time first"
+        )
+    if order is None:
+        raise DataError(
+            f"{table.where(0)}: {count} values instead of {_IMU_COLUMNS} ({_IMU_FORM}); name the "
+            "columns in a header, or write these seven"
+        )
+    return replace(
+        table,
+        header=(table.header[0], *(table.header[1 + k] for k in order)),
+        values=table.values[:, order],
+    )
+
+
+def _factor(
+    table: NumberTable, columns: Sequence[int], units: Mapping[str, float], name: str, si: str
+) -> tuple[float, list[str]]:
+    """Return the factor to SI units of three columns, as the header or a comment states it, and
+    notes.
+
+    Raises:
+        DataError: the header states several units of them.
+    """
+    cells = [table.header[1 + k] for k in columns] if table.header else []
+    stated = {factor_of(cell, units) for cell in cells} - {None}
+    if len(stated) > 1:
+        raise DataError(
+            f"{table.path}: the header states several units of the {name} ({', '.join(cells)}); "
+            "write all in one"
+        )
+    factor = next(iter(stated), None)
+    if factor is None:
+        factor = factor_in_words(table.comments, units)
+    if factor is None:
+        unknown = [word for cell in cells if (word := unknown_unit(cell, units)) is not None]
+        note = (
+            f"{table.path}: the unit {unknown[0]!r} of the {name} is not known; it is read as {si}"
+            if unknown
+            else ""
+        )
+        return 1.0, [note] if note else []
+    if factor == 1.0:
+        return 1.0, []
+    note = f"{table.path}: the header states {_words(factor)}; the {name} is converted to {si}"
+    return factor, [note]
+
+
+def _words(factor: float) -> str:
+    """Return the name of a unit, given its factor to SI units."""
+    names = {GYRO_UNITS["deg/s"]: "degrees", ACCEL_UNITS["g"]: "g"}
+    return names.get(factor, f"units of {factor:.6g} SI units")
+
+
+def _imu_order(table: NumberTable) -> Sequence[int] | None:
     """Return the columns of gyro x y z and accel x y z by the header's names.
 
     None: it names no axes.
     """
-    found: dict[tuple[str, str], int] = {}
+    found: dict[tuple[str, str], list[int]] = {}
     for k, cell in enumerate(table.header[1:]):
-        name = re.sub(r"[\[(].*", "", cell)
-        name = re.sub(r"(_?(radps|rad_s|mps2|m_s2|dps|degps|deg_s|ms2|rads|g))$", "", name.strip())
-        letters = re.sub(r"[^a-z]", "", name)
-        kind = (
-            "w"
-            if re.match(r"w|g|om|ang|rot|rs?sw", letters)
-            else "a"
-            if letters.startswith(("a", "lin"))
-            else ""
-        )
+        letters = re.sub(r"[^a-z]", "", without_unit(cell)).replace("axis", "")
         axis = next((c for c in reversed(letters) if c in "xyz"), "")
-        found[(kind, axis)] = k
-    wanted = [(kind, axis) for kind in "wa" for axis in "xyz"]
+        found.setdefault((_sensor(letters), axis), []).append(k)
     if not any(kind and axis for kind, axis in found):
         return None
-    if set(found) != set(wanted):
+    wanted = [(kind, axis) for kind in "wa" for axis in "xyz"]
+    others = set(found) - set(wanted)
+    may_have_others = len(table.header) > _IMU_COLUMNS
+    missing = any(len(found.get(key, ())) != 1 for key in wanted)
+    if missing or (others and not may_have_others):
         raise DataError(
             f"{table.path}: the header {','.join(table.header)[:80]!r} does not name gyro and "
             "accel; write "
             "'timestamp [ns],wx,wy,wz,ax,ay,az', or no header for that order"
         )
-    return [found[key] for key in wanted]
+    return [found[key][0] for key in wanted]
 
 
-def imu_notes(times_ns: IntArray, where: str) -> tuple[str, ...]:
-    """Return a note where an IMU is too slow to be integrated between images."""
-    if len(times_ns) < 2:
-        return ()
-    rate_hz = 1e9 / float(np.median(np.diff(times_ns)))
-    if rate_hz >= _LEAST_IMU_HZ:
-        return ()
-    return (
-        f"{where}: the IMU has {rate_hz:.3g} Hz, too few to integrate the motion between images; "
-        "record at least "
-        f"{_LEAST_IMU_HZ:g} Hz, or use --motion none",
-    )
+def _sensor(letters: str) -> str:
+    """Return w for the name of a gyro's column, a for an accelerometer's, else nothing."""
+    if re.match(r"w|g(?!rav|ps|nss)|om|ang|rot|rs?sw", letters) or re.search(
+        r"gyr|angularvel|omega", letters
+    ):
+        return "w"
+    return "a" if letters.startswith(("a", "lin")) or "acc" in letters else ""
 
 
 def read_velocity_table(path: Path) -> MotionSamples[VelocitySample]:

@@ -16,7 +16,7 @@ from vio.datasets.frame_times import nearest
 from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.tables import table_rows
 from vio.errors import DataError
-from vio.files.text import parse_stamps
+from vio.files.stamps import parse_stamps
 from vio.geometry.distortion import CameraModel
 from vio.records import IntArray
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from vio.datasets.companions import find_calibration_of, read_companions
 from vio.datasets.image_pairs import ImageRecording, half_of
+from vio.datasets.image_times import times_of
 from vio.datasets.images import prefetch
-from vio.datasets.plain import times_of
 from vio.datasets.rigs import load_rig
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.sides import pairs_of
@@ -135,7 +135,9 @@ def _times(
     """Return the times (F,) of the frames, the file that states them, and notes."""
     if (file := path / "times.txt").is_file():
         names = [(Path(f"{k}"), Path(f"{k}")) for k in range(count)]
-        return times_of(file, tuple(names)), file, []
+        doubts = list[str]()
+        times_ns = times_of(file, tuple(names), doubts)
+        return times_ns, file, doubts
     if rate_hz == 0.0:
         raise DataError(
             f"{files[0]}: states no frame rate; write one time a frame into times.txt beside it"

@@ -4,6 +4,8 @@ axes, another order.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from vio.evaluation.errors_along_path import rotation_angle_deg
@@ -23,11 +25,20 @@ _CONSTANT = 0.2  # of that error may vary where one rotation explains it
 _BETTER = 3.0
 _SIGMAS = 5.0  # of the rotation about the path, where the positions leave it uncertain
 _NO_MEASURE = ", so attitude, RPE and drift, which use them, say nothing of the error"
+_ORDERS: dict[Literal["w last", "w first"], str] = {
+    "w last": "quaternions with w first, read as if w came last",
+    "w first": "quaternions with w last, read as if w came first",
+}
 # a rotation so near one of the 24 that exchange axes is called by its whole degrees
 _AXES_DEG = 5.0
 
 
-def attitude_note(R_est: FloatArray, R_ref: FloatArray, sigma_rad: float) -> str | None:
+def attitude_note(
+    R_est: FloatArray,
+    R_ref: FloatArray,
+    sigma_rad: float,
+    R_ref_est: FloatArray | None = None,
+) -> str | None:
     """Return which convention explains a large attitude error; None: the error is small.
 
     Args:
@@ -35,7 +46,10 @@ def attitude_note(R_est: FloatArray, R_ref: FloatArray, sigma_rad: float) -> str
             of positions.
         R_ref: (M, 3, 3) world from body, by the reference.
         sigma_rad: standard deviation of the alignment's rotation about the path.
+        R_ref_est: (3, 3) that alignment's rotation; None: the identity.
     """
+    R_align = np.eye(3) if R_ref_est is None else R_ref_est
+    R_raw = R_align.T @ R_est
     off_deg = float(np.median(rotation_angle_deg(np.swapaxes(R_ref, 1, 2) @ R_est)))
     if off_deg < max(_LARGE_DEG, _SIGMAS * float(np.degrees(sigma_rad))):
         return None
@@ -44,26 +58,41 @@ def attitude_note(R_est: FloatArray, R_ref: FloatArray, sigma_rad: float) -> str
         return (
             f"{head}: the reference's never change; its orientations are placeholders{_NO_MEASURE}"
         )
-    x, y, z, w = quat_xyzw_from_rotation(R_ref).T
-    w_last = rotation_from_quat_xyzw(np.stack([y, z, w, x], axis=1))
     body = np.swapaxes(R_ref, 1, 2) @ R_est
     others = {
-        "in a world with other axes than its positions": R_est @ np.swapaxes(R_ref, 1, 2),
-        "inverse (body from world)": R_ref @ R_est,
-        "quaternions with w first, read as if w came last": np.swapaxes(w_last, 1, 2) @ R_est,
+        ("reference", "in a world with other axes than its positions"): R_est
+        @ np.swapaxes(R_ref, 1, 2),
+        ("reference", "inverse (body from world)"): R_ref @ R_est,
+        ("estimate", "inverse (body from world)"): (
+            np.swapaxes(R_ref, 1, 2) @ R_align @ np.swapaxes(R_raw, 1, 2)
+        ),
     }
-    left = {words: _spread_deg(differences) for words, differences in others.items()}
-    words = min(left, key=lambda name: left[name])
+    for order, words in _ORDERS.items():
+        others["reference", words] = np.swapaxes(with_other_order(R_ref, order), 1, 2) @ R_est
+        others["estimate", words] = (
+            np.swapaxes(R_ref, 1, 2) @ R_align @ with_other_order(R_raw, order)
+        )
+    left = {key: _spread_deg(differences) for key, differences in others.items()}
+    best = min(left, key=lambda key: left[key])
     of_body = _spread_deg(body)
-    if min(of_body, left[words]) > _CONSTANT * off_deg:
+    if min(of_body, left[best]) > _CONSTANT * off_deg:
         return f"{head}, and no exchange of axes explains it; check what the reference's orientations mean"
-    if _BETTER * left[words] < of_body:
-        return f"{head}: the reference's orientations are {words}{_NO_MEASURE}; correct the file it was written from"
+    if _BETTER * left[best] < of_body:
+        whose, words = best
+        return f"{head}: the {whose}'s orientations are {words}{_NO_MEASURE}; correct the file it was written from"
     return (
         f"{head}, always by the same rotation ({_name(_mean(body))}): the reference describes a "
         "body with other axes"
         f"{_NO_MEASURE}; compare positions, or turn the reference's poses by it"
     )
+
+
+def with_other_order(R: FloatArray, read: Literal["w last", "w first"]) -> FloatArray:
+    """Return rotations (M, 3, 3) whose quaternions were read with w last, or first, as if the other
+    order were theirs.
+    """
+    shift = -1 if read == "w last" else 1
+    return rotation_from_quat_xyzw(np.roll(quat_xyzw_from_rotation(R), shift, axis=1))
 
 
 def _varies_deg(R: FloatArray) -> float:

@@ -34,6 +34,7 @@ from vio.evaluation.errors_along_path import (
     relative_error_frames,
     rotation_angle_deg,
 )
+from vio.evaluation.quaternion_order import settled_orders
 from vio.evaluation.reference_axes import attitude_note
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.records import BodyFrame, IntArray, Trajectory
@@ -181,6 +182,7 @@ def evaluate(
             "the reference "
             f"{reference.body}, whose world frames differ; take align first, or se3"
         )
+    estimate, reference, order_notes = settled_orders(estimate, reference, max_time_difference_s)
     moved = _in_frame_of(estimate, reference, T_cam0_imu)
     association, rows, reference_rows = associate(
         moved, reference, max_time_difference_s=max_time_difference_s
@@ -228,7 +230,11 @@ def evaluate(
                 moved,
                 reference,
             ),
-            *_attitude_notes(alignment, T_est, T_ref, T_aligned),
+            *order_notes,
+            *(
+                _positions_alone(estimate, reference)
+                or _attitude_notes(alignment, T_est, T_ref, T_aligned)
+            ),
         ),
     )
 
@@ -345,6 +351,16 @@ def _notes(
     return tuple(notes)
 
 
+def _positions_alone(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
+    """Say that a trajectory has no orientations, so that only positions are compared."""
+    return tuple(
+        f"the {name} has positions without orientations: attitude, RPE and drift, which use them, "
+        "say nothing of the error"
+        for name, trajectory in (("estimate", estimate), ("reference", reference))
+        if trajectory.orientations == "none"
+    )
+
+
 def _attitude_notes(
     alignment: Alignment, T_est: FloatArray, T_ref: FloatArray, T_aligned: FloatArray
 ) -> tuple[str, ...]:
@@ -358,5 +374,5 @@ def _attitude_notes(
         if alignment.rotation_from == "positions"
         else 0.0
     )
-    note = attitude_note(T_aligned[:, :3, :3], T_ref[:, :3, :3], sigma)
+    note = attitude_note(T_aligned[:, :3, :3], T_ref[:, :3, :3], sigma, alignment.R)
     return () if note is None else (note,)

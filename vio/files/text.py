@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +17,11 @@ from vio.geometry.lie import FloatArray
 from vio.records import NS_PER_S, IntArray
 
 INT64_MAX = 2**63 - 1
-_UNITS = {"s": 9, "sec": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanoseconds
-# Stamps of 1973 and later in ns, us and ms; smaller ones are seconds from any zero.
-_NS_SINCE = Decimal("1e17")
-_US_SINCE = Decimal("1e14")
-_MS_SINCE = Decimal("1e11")
-_WHOLE = re.compile(r"\d{1,19}")
-_SIGNED = re.compile(r"[+-]?\d{1,19}")
+# ORB-SLAM writes nanoseconds with a point and zeros behind it
+_WHOLE = re.compile(r"(\d{1,19})(?:\.0*)?")
+_SIGNED = re.compile(r"([+-]?\d{1,19})(?:\.0*)?")
+# what else than ASCII files of Windows have in units: ° ² ³ µ · ¹ º
+_LATIN = frozenset("°²³µ·¹º")
 _PIECE = 2**16  # characters that are split into lines at a time
 
 
@@ -45,11 +42,7 @@ def lines_of(path: Path) -> Iterator[tuple[int, str]]:
         DataError: the file is missing or is no text.
     """
     try:
-        text = read_input(path).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(
-            f"{path}: not a text file ({error.reason}); give the original file"
-        ) from error
+        text = _decoded(read_input(path), path)
     except OSError as error:
         raise DataError(
             f"cannot read {path}: {error.strerror or error}; give a readable file"
@@ -63,6 +56,20 @@ def lines_of(path: Path) -> Iterator[tuple[int, str]]:
             yield from blank
             blank = []
         yield number, line
+
+
+def _decoded(data: bytes, path: Path) -> str:
+    """Return text in UTF-8, or in Latin-1 where nothing but signs of units tells the two apart."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        text = data.decode("latin-1")
+        others = {letter for letter in text if not (letter.isascii() and letter >= "\t")}
+        if others <= _LATIN:
+            return text
+        raise DataError(
+            f"{path}: not a text file ({error.reason}); give the original file"
+        ) from error
 
 
 def _split_lines(text: str) -> Iterator[str]:
@@ -140,43 +147,6 @@ def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> In
     return times
 
 
-def parse_stamps(
-    texts: Sequence[str], where: Callable[[int], str], unit: str | None = None
-) -> IntArray:
-    """Parse stamps as exact decimals.
-
-    Args:
-        texts: one stamp each.
-        where: returns the place of an entry, for messages.
-        unit: "s", "ms", "us" or "ns"; None: by the size of the first (seconds since 1970 or since
-            the start, or milliseconds, microseconds or nanoseconds since 1970).
-
-    Raises:
-        DataError: a stamp is no number, or not later than the one before.
-    """
-    values: list[Decimal] = []
-    for k, text in enumerate(texts):
-        try:
-            value = Decimal(text)
-        except InvalidOperation:
-            value = Decimal("NaN")
-        if not value.is_finite():
-            raise DataError(f"{where(k)}: {text!r} is no time; remove or correct that entry")
-        values.append(value)
-    size = values[0].copy_abs()
-    by_size = 0 if size >= _NS_SINCE else 3 if size >= _US_SINCE else 6 if size >= _MS_SINCE else 9
-    power = _UNITS[unit] if unit is not None else by_size
-    limit = Decimal(INT64_MAX).scaleb(-power)
-    for k, value in enumerate(values):
-        # abs() would round, which no context can do with an exponent of any size
-        if value.copy_abs() > limit:
-            remedy = "divide nanoseconds by 1e9, or state their unit in a header ([ns])"
-            raise DataError(f"{where(k)}: {texts[k]!r} is out of range for a time; {remedy}")
-    return check_increasing(
-        [int(value.scaleb(power).to_integral_value()) for value in values], where
-    )
-
-
 def whole_ns_stamps(
     texts: Sequence[str], where: Callable[[int], str], *, signed: bool = False
 ) -> IntArray:
@@ -191,8 +161,11 @@ def whole_ns_stamps(
         DataError: a stamp is another number, or not later than the one before.
     """
     form = _SIGNED if signed else _WHOLE
+    times = list[int]()
     for k, text in enumerate(texts):
-        if not form.fullmatch(text) or abs(int(text)) > INT64_MAX:
+        found = form.fullmatch(text)
+        if found is None or abs(int(found[1])) > INT64_MAX:
             remedy = "write seconds times 1e9, without a point or exponent"
             raise DataError(f"{where(k)}: {text!r} is no time in whole nanoseconds; {remedy}")
-    return check_increasing([int(text) for text in texts], where)
+        times.append(int(found[1]))
+    return check_increasing(times, where)

@@ -9,6 +9,7 @@ import logging
 import os
 import re
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +19,10 @@ import numpy as np
 
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
-from vio.files.text import exact_text, lines_of, parse_stamps, seconds_text, whole_ns_stamps
+from vio.files.pose_columns import PoseColumns, pose_columns
+from vio.files.stamps import POSE_PACE, parse_stamps
+from vio.files.text import exact_text, lines_of, seconds_text, whole_ns_stamps
+from vio.files.units import header_cells, split_cells
 from vio.geometry.lie import (
     FloatArray,
     nearest_rotation,
@@ -27,7 +31,7 @@ from vio.geometry.lie import (
     se3_from_parts,
     se3_inverse,
 )
-from vio.records import BodyFrame, IntArray, Trajectory
+from vio.records import BodyFrame, BoolArray, IntArray, Orientations, Trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +39,10 @@ TrajectoryFormat: TypeAlias = Literal["tum", "kitti", "euroc"]
 
 # deviation of a quaternion's norm or of R^T R from one accepted as rounding
 ROTATION_TOLERANCE = 1e-3
+_LEAST_COLUMNS = 4  # a stamp and a position
+_POSE_COLUMNS = 8
+_KITTI_COLUMNS = 12
+_WHOLE = re.compile(r"[+-]?\d+")
 _LARGEST = 1e12  # of a coordinate, in metres: beyond, squares overflow
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _COLUMNS: dict[TrajectoryFormat, str] = {
@@ -58,11 +66,21 @@ class _Table:
     comments: list[str]  # without the leading '#'
     rows: list[str]
     line_numbers: list[int]  # from 1, one per row
-    commas: bool  # what separates the fields of the first row; else white space
+    separator: str | None  # of the fields of the first row; None: white space
+
+    @property
+    def commas(self) -> bool:
+        """Whether commas or semicolons separate the fields."""
+        return self.separator is not None
 
     def fields(self, row: int, most: int = -1) -> list[str]:
         """Return the fields of a row as text; behind the first `most`, the rest is one field."""
-        return self.rows[row].split("," if self.commas else None, most)
+        return self.rows[row].split(self.separator, most)
+
+    def column(self, column: int) -> list[str]:
+        """Return the fields of one column as text."""
+        last = column + 1
+        return [self.fields(row, last)[column].strip() for row in range(len(self.rows))]
 
     def where(self, row: int) -> str:
         return f"{self.path}, line {self.line_numbers[row]}"
@@ -81,7 +99,10 @@ def read_trajectory(
 
     A KITTI file describes cam0 and has no times; an EuRoC file describes the IMU; a TUM file
     describes the frame of its comment `# body: imu` or `# body: cam0`, else the IMU. `body`
-    overrides all of these. A comment `# frames: 0-41 45-99` in a TUM file (written by `write_tum`)
+    overrides all of these. A header may name the columns, in any order and among others, and the
+    unit of the stamps. Where it does not, a quaternion has w first between commas and last between
+    white space, which `Trajectory.orientations` says; quaternions of zeros, and files with four
+    columns, state positions alone. A comment `# frames: 0-41 45-99` in a TUM file (written by `write_tum`)
     numbers the poses.
 
     Raises:
@@ -96,24 +117,73 @@ def read_trajectory(
     if not table.rows:
         raise DataError(f"{table.path}: holds no poses; give a TUM, KITTI or EuRoC trajectory file")
     kind = fmt or _detect(table)
-    _check_columns(table, kind)
+    _check_columns(table, kind, as_requested=fmt is not None)
     if kind == "kitti":
         return Trajectory(_kitti_poses(table), None, body or _DEFAULT_BODY[kind])
-    stamps = [table.fields(row, 1)[0].strip() for row in range(len(table.rows))]
-    times_ns = (
-        whole_ns_stamps(stamps, table.where, signed=True)
-        if kind == "euroc"
-        else parse_stamps(stamps, table.where, "s")
-    )
-    poses = _quaternion_poses(table, kind)
+    columns = pose_columns(table.comments, len(table.fields(0)), w_first=kind == "euroc")
+    times_ns = _times_ns(table, columns, kind)
+    poses, orientations = _quaternion_poses(table, columns, kind)
     header_body = _header(table, r"body:\s*(\S+)") if kind == "tum" else None
     frames = _header(table, r"frames:\s*(.*\S)") if kind == "tum" else None
-    return Trajectory(
-        poses,
-        times_ns,
-        _body(table, header_body, body) or _DEFAULT_BODY[kind],
-        None if frames is None else _parse_frames(table, frames),
+    numbers = None if frames is None else _parse_frames(table, frames)
+    trajectory = Trajectory(
+        poses, times_ns, _body(table, header_body, body) or _DEFAULT_BODY[kind], numbers
     )
+    return _with_orientations(table, trajectory, orientations, columns.orientations)
+
+
+def _with_orientations(
+    table: _Table, trajectory: Trajectory, known: BoolArray, orientations: Orientations
+) -> Trajectory:
+    """Return the poses whose orientation is known (N,), or positions alone where none is."""
+    if not known.any():
+        return replace(trajectory, orientations="none")
+    if not known.all():
+        logger.warning(
+            "%s: %d of %d poses have no orientation (a quaternion of zeros); they are left out",
+            table.path,
+            int((~known).sum()),
+            len(known),
+        )
+        times_ns = trajectory.times_ns
+        frames = trajectory.frame_indices
+        trajectory = replace(
+            trajectory,
+            T_world_body=trajectory.T_world_body[known],
+            times_ns=None if times_ns is None else times_ns[known],
+            frame_indices=None if frames is None else frames[known],
+        )
+    return replace(trajectory, orientations=orientations)
+
+
+def _times_ns(table: _Table, columns: PoseColumns, kind: TrajectoryFormat) -> IntArray:
+    """Return the stamps (N,): in the unit that is stated, else in nanoseconds where a table of
+    EuRoC's form has whole numbers, else by their size and by how far apart poses are.
+    """
+    stamps = table.column(columns.stamp)
+    if columns.nanoseconds is not None:
+        parts = table.column(columns.nanoseconds)
+        stamps = [f"{s}.{ns.zfill(9)}" for s, ns in zip(stamps, parts, strict=True)]
+    unit = columns.unit
+    if unit is None and kind == "euroc" and _are_nanoseconds(stamps):
+        unit = "ns"
+    if unit == "ns":
+        return whole_ns_stamps(stamps, table.where, signed=True)
+    doubts = list[str]()
+    # TUM's form has decimals of seconds
+    pace = None if kind == "tum" and any("." in stamp for stamp in stamps) else POSE_PACE
+    times_ns = parse_stamps(stamps, table.where, unit, pace=pace, doubts=doubts)
+    for doubt in doubts:
+        logger.warning("%s", doubt)
+    return times_ns
+
+
+def _are_nanoseconds(stamps: Sequence[str]) -> bool:
+    """Return whether stamps are whole numbers and, in nanoseconds, as far apart as poses are."""
+    if not all(_WHOLE.fullmatch(stamp) for stamp in stamps):
+        return False
+    step_s = 1e-9 * (int(stamps[-1]) - int(stamps[0])) / max(len(stamps) - 1, 1)
+    return len(stamps) < 2 or abs(step_s) >= POSE_PACE.least_s
 
 
 def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
@@ -227,8 +297,9 @@ def is_trajectory_file(path: Path) -> bool:
         return False
     with path.open("rb") as stream:
         lines = iter(lambda: stream.readline(_LONGEST_LINE).decode("utf-8", errors="replace"), "")
-        first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    fields = first.split("," if "," in first else None)
+        rows = (line for line in lines if line.strip() and line[0] not in "#%")
+        first = next((line for line in rows if not _is_header(line)), "")
+    fields = split_cells(first.rstrip().rstrip(",;"))
     try:
         [float(field) for field in fields]
     except ValueError:
@@ -248,49 +319,84 @@ def _read_table(path: Path) -> _Table:
     line_numbers: list[int] = []
     for number, text in lines_of(path):
         line = text.strip()
-        if line.startswith("#"):
+        if line[:1] in ("#", "%"):
             comments.append(line[1:].strip())
+        elif line and not rows and _is_header(line):
+            comments.append(line)
         elif line:
-            rows.append(line)
+            rows.append(line.rstrip(",;").rstrip())
             line_numbers.append(number)
-    return _Table(path, comments, rows, line_numbers, commas=bool(rows) and "," in rows[0])
+    first = rows[0] if rows else ""
+    separator = "," if "," in first else ";" if ";" in first else None
+    return _Table(path, comments, rows, line_numbers, separator)
+
+
+def _is_header(line: str) -> bool:
+    """Return whether no cell of a line is a number."""
+    cells = split_cells(line)
+    return len(cells) >= _LEAST_COLUMNS and not any(map(_is_number, cells))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _detect(table: _Table) -> TrajectoryFormat:
-    """Detect the format from the first row."""
+    """Detect the format from the first row, and from a header that names more columns."""
     if table.commas:
         return "euroc"
     n = len(table.fields(0))
-    if n not in (8, 12):
+    named = _names_poses(table, n)
+    if n not in (_LEAST_COLUMNS, _POSE_COLUMNS, _KITTI_COLUMNS) and not named:
         forms = "; ".join(f"{kind}: {columns}" for kind, columns in _COLUMNS.items())
         table.fail(0, f"{n} columns fit no known format ({forms})")
-    return "tum" if n == 8 else "kitti"
+    return "kitti" if n == _KITTI_COLUMNS and not named else "tum"
 
 
-def _check_columns(table: _Table, kind: TrajectoryFormat) -> None:
-    expected = len(table.fields(0)) if kind == "euroc" else {"tum": 8, "kitti": 12}[kind]
-    if kind == "euroc":
-        expected = max(expected, 8)
+def _names_poses(table: _Table, count: int) -> bool:
+    """Return whether a header names the columns of positions and quaternions."""
+    if count < _POSE_COLUMNS:
+        return False
+    named = [text for text in table.comments if header_cells(text, count)]
+    return bool(named) and pose_columns(named, count, w_first=False).orientations == "stated"
+
+
+def _check_columns(table: _Table, kind: TrajectoryFormat, *, as_requested: bool) -> None:
+    count = len(table.fields(0))
+    expected = {"tum": _POSE_COLUMNS, "kitti": _KITTI_COLUMNS, "euroc": max(count, _POSE_COLUMNS)}[
+        kind
+    ]
+    if kind != "kitti" and (
+        count == _LEAST_COLUMNS or (not as_requested and _names_poses(table, count))
+    ):
+        expected = count
     for row, line in enumerate(table.rows):
-        count = line.count(",") + 1 if table.commas else len(line.split())
+        separator = table.separator
+        count = len(line.split()) if separator is None else line.count(separator) + 1
         if count != expected:
             table.fail(
                 row, f"{count} columns instead of {expected}; {kind} form has {_COLUMNS[kind]}"
             )
 
 
-def _floats(table: _Table, first: int, last: int) -> FloatArray:
-    """Columns `first <= column < last` as finite numbers (N, last - first)."""
+def _floats(table: _Table, columns: Sequence[int], *, finite: bool = True) -> FloatArray:
+    """Return columns as numbers (N, K), finite ones unless others may be among them."""
+    last = max(columns) + 1
     values = array("d")
     row = 0
     try:
         for row in range(len(table.rows)):
-            values.extend(map(float, table.fields(row, last)[first:last]))
+            fields = table.fields(row, last)
+            values.extend(float(fields[column]) for column in columns)
     except ValueError as error:
         table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
-    out = np.array(values).reshape(-1, last - first)
+    out = np.array(values).reshape(-1, len(columns))
     bad = ~(np.abs(out) < _LARGEST).all(axis=1)
-    if bad.any():
+    if finite and bad.any():
         table.fail(
             int(np.argmax(bad)),
             f"a pose is not finite, or beyond {_LARGEST:g} (first of {int(bad.sum())}); remove "
@@ -299,13 +405,29 @@ def _floats(table: _Table, first: int, last: int) -> FloatArray:
     return out
 
 
-def _quaternion_poses(table: _Table, kind: TrajectoryFormat) -> FloatArray:
-    values = _floats(table, 1, 8)
-    p = values[:, :3]
-    q = values[:, 3:]
-    q_xyzw = q if kind == "tum" else np.roll(q, -1, axis=1)
-    with np.errstate(over="ignore"):
-        norm = np.linalg.norm(q_xyzw, axis=1)
+def _quaternion_poses(
+    table: _Table, columns: PoseColumns, kind: TrajectoryFormat
+) -> tuple[FloatArray, BoolArray]:
+    """Return poses (N, 4, 4), and whether the orientation of each is known (N,).
+
+    Those without one (a quaternion of zeros, or of NaN in all poses) have the identity's.
+    """
+    p = _floats(table, columns.position)
+    if columns.quaternion is None:
+        return se3_from_parts(np.eye(3), p), np.zeros(len(p), dtype=np.bool_)
+    q_xyzw = _floats(table, columns.quaternion, finite=False)
+    if np.isnan(q_xyzw).all():
+        q_xyzw = np.zeros_like(q_xyzw)
+    known = np.any(q_xyzw != 0, axis=1)
+    q_xyzw[~known] = (0.0, 0.0, 0.0, 1.0)
+    not_finite = ~(np.abs(q_xyzw) < _LARGEST).all(axis=1)
+    if not_finite.any():
+        table.fail(
+            int(np.argmax(not_finite)),
+            f"a pose is not finite, or beyond {_LARGEST:g} (first of {int(not_finite.sum())}); "
+            "remove such lines",
+        )
+    norm = np.linalg.norm(q_xyzw, axis=1)
     bad = np.abs(norm - 1) > ROTATION_TOLERANCE
     if bad.any():
         row = int(np.argmax(bad))
@@ -314,11 +436,11 @@ def _quaternion_poses(table: _Table, kind: TrajectoryFormat) -> FloatArray:
             f"the quaternion has norm {norm[row]:.6g}, not 1; check the column order "
             f"({_COLUMNS[kind]})",
         )
-    return se3_from_parts(rotation_from_quat_xyzw(q_xyzw), p)
+    return se3_from_parts(rotation_from_quat_xyzw(q_xyzw), p), known
 
 
 def _kitti_poses(table: _Table) -> FloatArray:
-    values = _floats(table, 0, 12).reshape(-1, 3, 4)
+    values = _floats(table, range(_KITTI_COLUMNS)).reshape(-1, 3, 4)
     R = values[:, :, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))

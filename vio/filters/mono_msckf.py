@@ -27,6 +27,7 @@ from vio.records import (
     Estimate,
     ImuSample,
     Initialisation,
+    Landmarks,
     MotionSample,
     MotionSource,
     Observations,
@@ -160,6 +161,14 @@ class MonoMsckf(Msckf):
 
     def _wait(self, observations: Observations) -> UpdateReport:
         return replace(super()._wait(observations), started=False)
+
+    def landmarks(self) -> Landmarks:
+        """Return the points of all tracks that fix their depth, see `Msckf`; while it waits to
+        begin again, those of before.
+        """
+        if self._window is None and self._resumed is not None:
+            return self._points.stored()
+        return super().landmarks()
 
     def estimate(self) -> Estimate:
         """Return the estimate at the time of the last event, with the standard deviation of its

@@ -34,10 +34,14 @@ class PointMap:
 
     def take(self) -> Landmarks:
         """Return all points, and forget them."""
-        taken = newest_points(self.parts) if self.parts else no_landmarks()
+        taken = self.stored()
         self.parts = []
         self._stored = 0
         return taken
+
+    def stored(self) -> Landmarks:
+        """Return all points, without the landmarks that are states."""
+        return newest_points(self.parts) if self.parts else no_landmarks()
 
     def with_landmarks(self, window: Window, covariances: FloatArray) -> Landmarks:
         """Return all points, and the landmarks that are states, with their covariances (M, 3,

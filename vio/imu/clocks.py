@@ -75,6 +75,9 @@ class SampleCoverage:
         share = self._covered / self._frames
         if imu is None or (1 - share) * self._seconds < _UNCOVERED_S:
             return []
+        late_ns = _LATE_S / _NS
+        if imu[0] - late_ns <= self._span[0] and self._span[1] <= imu[1] + late_ns:
+            return []  # samples that came late, as where live use is under load
         return [_part_overlap(self._span, imu, step_ns, share)]
 
     @property

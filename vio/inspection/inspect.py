@@ -10,6 +10,7 @@ from vio.datasets.samples import motion_samples
 from vio.geometry.rectify import field_of_view
 from vio.imu.clocks import judge_clocks
 from vio.imu.findings import InertialFinding
+from vio.imu.sampling import sampled_hz
 from vio.inspection.finding import Inspection, Part
 from vio.inspection.inertial import extrinsics_part, noise_part, rest_part
 from vio.inspection.pictures import depths_part, images_part, rows_parts
@@ -124,7 +125,8 @@ def _motion_parts(dataset: Dataset, span: tuple[int, int | None], times_ns: IntA
         return parts
     arrays = motion_samples(samples)
     record = ImuRecord(arrays.times_ns, arrays.values[:, :3], arrays.values[:, 3:])
-    parts.append(clock_part("IMU", times_ns, record.times_ns))
+    rate_hz = sampled_hz(record) if len(samples) > 1 else None
+    parts.append(clock_part("IMU", times_ns, record.times_ns, rate_hz))
     if len(samples) > 1:
         noise = noise_part(record, getattr(dataset, "imu_noise", None))
         parts += [rest_part(record, recording.T_cam0_imu), *([noise] if noise is not None else [])]
@@ -245,9 +247,19 @@ def frames_part(times: IntArray) -> Part:
     return Part("frames", text, facts, faults)
 
 
-def clock_part(name: str, frame_times_ns: IntArray, times_ns: IntArray) -> Part:
-    """Describe the stamps (N,) of a motion sensor, and how they cover the frames' (M,)."""
+def clock_part(
+    name: str, frame_times_ns: IntArray, times_ns: IntArray, rate_hz: float | None = None
+) -> Part:
+    """Describe the stamps of a motion sensor, and how they cover the frames.
+
+    Args:
+        name: of the sensor.
+        frame_times_ns: stamps (M,) of the frames.
+        times_ns: stamps (N,).
+        rate_hz: of its readings; None: that of the stamps.
+    """
     facts = clock_facts(times_ns)
+    facts |= {} if rate_hz is None else {"rate_hz": rate_hz}
     faults = []
     if name == "IMU":
         if facts["rate_hz"] is not None and facts["rate_hz"] < _LEAST_IMU_HZ:

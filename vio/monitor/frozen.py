@@ -215,6 +215,7 @@ class RepeatWords:
 
     what: str
     exact: str
+    exact_of_one: str  # of one camera
     cause: str
     effect: str
     summary: str
@@ -223,12 +224,14 @@ class RepeatWords:
 IMAGES = RepeatWords(
     "images",
     "both images are the same to the last bit",
+    "the image is the same to the last bit",
     "the camera or its driver gave them again",
     "the pose is a prediction",
     "repeated earlier images and were left out",
 )
 DEPTHS = RepeatWords(
     "depth images",
+    "the depth image is the same to the last bit",
     "the depth image is the same to the last bit",
     "the depth camera or its driver gave it again",
     "its features have no depth",
@@ -270,7 +273,7 @@ class RepeatReport:
                 "were not delivered; "
                 f"left out, {self._words.effect}"
             ]
-        seen = self._words.exact if repeated.exact else "both images show nothing that has moved"
+        seen = self._seen(frame, exact=repeated.exact)
         cause = (
             self._words.cause
             if repeated.exact
@@ -281,6 +284,13 @@ class RepeatReport:
             f"{cause}; "
             f"left out, {self._words.effect}"
         ]
+
+    def _seen(self, frame: StereoFrame, *, exact: bool) -> str:
+        """Return what was seen of a frame's images."""
+        if len(_images(frame)) > 1:
+            both = "both images show nothing that has moved"
+            return self._words.exact if exact else both
+        return self._words.exact_of_one if exact else "the image shows nothing that has moved"
 
     def finish(self) -> list[str]:
         """Return the line at the end of the run."""

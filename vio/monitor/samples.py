@@ -20,6 +20,7 @@ MEMORY_S = 60.0  # older readings and motions are dropped
 
 _LEAST_RUN = 5  # equal readings at the extreme in a row
 _LEAST_CHANCE = 1e-8  # probability of such a run by quantisation alone
+_SMOOTH = 0.1  # share of changes of another sign than the one before; of noise it is 2/3
 _LEAST_LEVELS = 20  # different readings on the axis
 
 _SMOOTH_S = 0.2  # readings are averaged over this time before their magnitude is judged
@@ -116,7 +117,10 @@ def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFind
     for axis in range(6):
         for extreme in (values[:, axis].max(), values[:, axis].min()):
             at = values[:, axis] == extreme
-            if at.sum() < _LEAST_RUN or at.all():
+            # no sensor's range ends at 0: that of a simulator without noise, at rest
+            if extreme == 0.0 or at.sum() < _LEAST_RUN or at.all():
+                continue
+            if _has_no_noise(values, at, axis):
                 continue
             # Equal neighbours elsewhere are due to chance: a run of n has the probability
             # held^(n-1).
@@ -135,6 +139,25 @@ def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFind
                 "there",
             )
             return
+
+
+def _has_no_noise(values: FloatArray, at: BoolArray, axis: int) -> bool:
+    """Return whether the other axes of a sensor are smooth, where one is at its extreme.
+
+    A range ends one axis, or two, and the noise of the others goes on: their changes have either
+    sign. A simulator without noise gives a steady motion the same reading again and again.
+
+    Args:
+        values: (S, 6) readings.
+        at: (S,) whether the axis is at its extreme.
+        axis: of gyro and accelerometer.
+    """
+    first = 3 * (axis // 3)
+    others = [k for k in range(first, first + 3) if k != axis]
+    changes = np.diff(values[:, others], axis=0)
+    turns = changes[1:] * changes[:-1] < 0
+    inside = at[2:] & at[1:-1] & at[:-2]
+    return bool(inside.any() and turns[inside].mean() < _SMOOTH)
 
 
 def _longest_run(mask: BoolArray) -> int:

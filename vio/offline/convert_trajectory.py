@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
+from vio.datasets.image_times import time_lines
 from vio.datasets.kitti import read_extrinsics
 from vio.datasets.rigs import load_rig
 from vio.errors import CalibrationError, DataError
-from vio.files.text import parse_stamps, text_lines
+from vio.files.stamps import POSE_PACE, parse_stamps
 from vio.files.trajectories import (
     TrajectoryFormat,
     read_trajectory,
@@ -21,6 +23,8 @@ from vio.files.trajectories import (
 from vio.geometry.lie import FloatArray
 from vio.protocols import Dataset
 from vio.records import BodyFrame, IntArray, Trajectory
+
+logger = logging.getLogger(__name__)
 
 _Writer: TypeAlias = Callable[[Path, Trajectory], None]
 _WRITERS: dict[TrajectoryFormat, _Writer] = {
@@ -113,13 +117,19 @@ def _extrinsics(path: Path) -> FloatArray:
 
 
 def _read_times(path: Path, count: int) -> IntArray:
-    rows = [
-        (n, line.split())
-        for n, line in text_lines(path)
-        if line.strip() and not line.startswith("#")
-    ]
+    rows, stated = time_lines(path)
     if len(rows) != count:
         raise DataError(
             f"{path} holds {len(rows)} times for {count} poses; there must be one a line"
         )
-    return parse_stamps([fields[0] for _, fields in rows], lambda k: f"{path}, line {rows[k][0]}")
+    doubts = list[str]()
+    times_ns = parse_stamps(
+        [fields[0] for _, fields in rows],
+        lambda k: f"{path}, line {rows[k][0]}",
+        stated,
+        pace=POSE_PACE,
+        doubts=doubts,
+    )
+    for doubt in doubts:
+        logger.warning("%s", doubt)
+    return times_ns

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from vio.cameras.rig import Rig
 from vio.datasets.bags import bag_files
+from vio.datasets.bags.frames import add_frames_of_tf, rig_with_baseline, states_baseline
 from vio.datasets.bags.index import BagIndex, index_bag, info_topic
 from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import Roles, choose
@@ -19,8 +20,8 @@ from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.rigs.camera_info import rig_from_camera_infos
 from vio.datasets.samples import MotionSamples, in_time_order
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.tables import imu_notes
-from vio.errors import CalibrationError
+from vio.errors import CalibrationError, DataError
+from vio.imu.sampling import sampling_notes
 from vio.records import IntArray, MotionSample
 
 Size = tuple[int, int]
@@ -59,6 +60,8 @@ def contents(path: Path, settings: DatasetSettings) -> Contents:
                 "--calibration FILE"
             )
         index = index_bag(bag, roles, [name for name in infos if name is not None])
+        if settings.calibration is None:
+            add_frames_of_tf(bag, index, roles, infos)
         size = index.left.size or _compressed_size(bag, roles.left)
     return Contents(path, roles, index, infos, size, beside, (*joined, *notes))
 
@@ -136,13 +139,21 @@ def _rig(found: Contents, file: Path | None) -> Rig:
     stated = [
         found.index.infos[name] for name in infos if name is not None and name in found.index.infos
     ]
+    rectified = _is_rectified(topics[0])
     if len(stated) != len(topics):
         raise CalibrationError(
             f"{found.path}: no CameraInfo could be read; give --calibration FILE"
         )
     if len(set(infos)) != len(topics):
         raise CalibrationError(f"{infos[0]} belongs to both images; give --calibration FILE")
-    rectified = _is_rectified(topics[0])
+    if len(stated) > 1 and not states_baseline(stated[1]):
+        T_right_left = found.index.transform(
+            found.index.right.frame_id.lstrip("/"), found.index.left.frame_id.lstrip("/")
+        )
+        if T_right_left is not None and found.index.left.frame_id != found.index.right.frame_id:
+            source = found.index.frames_from
+            images = [info.of_images(found.size) for info in stated]
+            return rig_with_baseline(images, T_right_left, source, rectified=rectified)
     return rig_from_camera_infos(stated, rectified=rectified, image_size=found.size)
 
 
@@ -153,7 +164,8 @@ def _with_static_pose(rig: Rig, found: Contents) -> Rig:
     T = index.transform(index.left.frame_id.lstrip("/"), index.imu_frame.lstrip("/"))
     if T is None or index.left.frame_id == index.imu_frame:
         return rig
-    note = f"the IMU's pose is that of /tf_static ({index.imu_frame} in {index.left.frame_id})"
+    source = index.frames_from
+    note = f"the IMU's pose is that of {source} ({index.imu_frame} in {index.left.frame_id})"
     return replace(rig, T_cam0_imu=T).noting(note)
 
 
@@ -172,8 +184,18 @@ def motion_of(
         f"{count} messages of {topic} were recorded out of order and are sorted"
         for topic, count in index.disordered.items()
     ]
+    notes += [
+        f"{count} messages of {topic} are not finite and are left out"
+        for topic, count in index.not_finite.items()
+    ]
     parts: list[Sequence[MotionSample]] = []
     record = index.imu_record()
+    if roles.imu is not None and record is not None and not record.accel.any():
+        raise DataError(
+            f"{found.path}: {roles.imu.name} holds no acceleration (0 in all {len(record.accel)} "
+            "messages), as where gyro and accelerometer are two topics; name both with --topics "
+            "imu=/GYRO,accel=/ACCEL, or leave it out with imu=none"
+        )
     if rig.T_cam0_imu is None and (record is not None or index.velocities):
         which = " and ".join(t.name for t in (roles.imu, roles.velocity) if t is not None)
         notes.append(
@@ -186,7 +208,7 @@ def motion_of(
         samples, moved = imu_on_camera_clock(
             record, rig, times_ns, f"{found.path}, {roles.imu.name}"
         )
-        notes += [*moved, *imu_notes(record.times_ns, roles.imu.name)]
+        notes += [*moved, *sampling_notes(record, roles.imu.name)]
         parts.append(samples)
     if roles.velocity is not None and (speeds := index.velocity_samples()):
         check_overlap(times_ns, speeds.times_ns, roles.velocity.name)

@@ -13,28 +13,84 @@ from typing import Any
 
 import numpy as np
 
+from vio.datasets.bags.clock_steps import mended
 from vio.datasets.bags.pictures import band_of_message, raw_gray
 from vio.datasets.bags.store import Bag, Message, Topic
-from vio.datasets.bags.topics import CAMERA_INFO, COMPRESSED, IMAGE, TF, Roles
+from vio.datasets.bags.topics import (
+    CAMERA_INFO,
+    COMPRESSED,
+    IMAGE,
+    TF,
+    VECTOR,
+    Roles,
+)
 from vio.datasets.images import UnreadableImageError
 from vio.datasets.levels import Band, is_mosaic
 from vio.datasets.rigs.camera_info import CameraInfo, region_of
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, se3_inverse
+from vio.numerics.robust import median
 from vio.records import NS_PER_S, ImuRecord, IntArray, Trajectory, VelocitySample
 
 __all__ = ["BagIndex", "Stamps", "camera_info_of", "index_bag", "info_topic", "stamp_of"]
 
+# An accelerometer's readings further apart than so many usual intervals, and so much time, are a
+# gap, over which its readings are not interpolated.
+_GAP_STEPS = 8.0
+_OF_EACH = 0.1  # least share of the messages with one sensor alone, where a topic mixes the two
+_ALONE = 0.9  # and of both together
+# Names of RealSense's recorder for the distortions that ROS has names for.
+_SDK_MODELS = {
+    "none": "plumb_bob",
+    "brown conrady": "plumb_bob",
+    "kannala brandt4": "equidistant",
+}
+_MOVING = "/tf, "  # how the moving frames are named among the streams
+_GAP_NS = 100_000_000
 _LEVEL_SAMPLES = 8  # images looked at for black and white, spread over the recording
 
 
 @dataclass(slots=True)
+class Rows:
+    """The samples of one topic, in the order of recording."""
+
+    times_ns: list[int] = field(default_factory=list)  # stamps; 0: there is none
+    logged_ns: list[int] = field(default_factory=list)
+    values: list[tuple[float, ...]] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+    def add(self, time_ns: int, message: Message, values: tuple[float, ...]) -> None:
+        """Add a sample."""
+        self.times_ns.append(time_ns)
+        self.logged_ns.append(message.recorded_ns)
+        self.values.append(values)
+
+    def taken(self, rows: IntArray, columns: slice) -> Rows:
+        """Return some samples, and some of their values."""
+        kept = rows.tolist()
+        return Rows(
+            [self.times_ns[k] for k in kept],
+            [self.logged_ns[k] for k in kept],
+            [self.values[k][columns] for k in kept],
+        )
+
+    def in_order(self) -> tuple[IntArray, FloatArray]:
+        """Return increasing times (N,) and values (N, K); of equal stamps the first."""
+        times, first = np.unique(np.array(self.times_ns, dtype=np.int64), return_index=True)
+        return times, np.array([self.values[k] for k in first.tolist()], dtype=np.float64)
+
+
+@dataclass(slots=True)
 class Stamps:
-    """The images of one topic, in the order of their stamps."""
+    """The images of one topic, in the order of recording."""
 
     times_ns: list[int] = field(default_factory=list)
-    logged_ns: list[int] = field(default_factory=list)
+    logged_ns: list[int] = field(default_factory=list)  # see `Message.recorded_ns`
+    # stamp and time of recording as they were written
+    raw: list[tuple[int, int]] = field(default_factory=list)
     encodings: dict[str, int] = field(default_factory=dict)  # and how many images have each
     size: tuple[int, int] | None = None  # width and height of the first raw image, pixels
     frame_id: str = ""
@@ -44,19 +100,15 @@ class Stamps:
     @property
     def unstamped(self) -> bool:
         """Whether no header has a stamp, so that the times of logging must serve."""
-        return len(self.times_ns) > 1 and not any(self.times_ns)
+        return len(self.raw) > 1 and not any(stamp for stamp, _ in self.raw)
 
     def ordered(self) -> tuple[IntArray, IntArray, int]:
-        """Return increasing stamps (N,), the times they were logged (N,), and how many stamps
-        were repeated.
+        """Return increasing stamps (N,), the rows in the order of recording that have them (N,),
+        and how many stamps were repeated.
         """
         stamps = self.logged_ns if self.unstamped else self.times_ns
         times, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)
-        return (
-            times,
-            np.array(self.logged_ns, dtype=np.int64)[first],
-            len(self.times_ns) - len(times),
-        )
+        return times, first.astype(np.int64), len(stamps) - len(times)
 
 
 @dataclass(slots=True)
@@ -65,29 +117,37 @@ class BagIndex:
 
     left: Stamps = field(default_factory=Stamps)
     right: Stamps = field(default_factory=Stamps)
-    imu: list[tuple[int, tuple[float, ...]]] = field(default_factory=list)
+    imu: Rows = field(default_factory=Rows)  # gyro and accelerometer, or the gyro alone
+    accel: Rows = field(default_factory=Rows)  # where it is a topic of its own
     imu_frame: str = ""
-    velocities: list[tuple[int, tuple[float, ...]]] = field(default_factory=list)
-    poses: list[tuple[int, tuple[float, ...]]] = field(default_factory=list)  # x y z qx qy qz qw
+    velocities: Rows = field(default_factory=Rows)
+    poses: Rows = field(default_factory=Rows)  # x y z qx qy qz qw
     # likewise, of /tf
-    moving: dict[tuple[str, str], list[tuple[int, tuple[float, ...]]]] = field(default_factory=dict)
+    moving: dict[tuple[str, str], Rows] = field(default_factory=dict)
     infos: dict[str, CameraInfo] = field(default_factory=dict)  # by topic
-    # T_parent_child of tf_static
+    # T_parent_child of frames that do not move
     frames: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
+    frames_from: str = "/tf_static"
     disordered: dict[str, int] = field(default_factory=dict)  # samples that came late, by topic
+    not_finite: dict[str, int] = field(default_factory=dict)  # samples left out, by topic
+    notes: list[str] = field(default_factory=list)  # about clocks and stamps
 
     def imu_record(self) -> ImuRecord | None:
-        """The inertial samples in the order of their stamps; None: there are none."""
+        """The inertial samples in the order of their stamps, at those of the gyro where the
+        accelerometer is another topic; None: there are none.
+        """
         if not self.imu:
             return None
-        times, values = _sorted(self.imu)
+        times, values = self.imu.in_order()
+        if self.accel:
+            return joined_record((times, values[:, :3]), self.accel.in_order())
         return ImuRecord(times, values[:, :3], values[:, 3:])
 
     def velocity_samples(self) -> MotionSamples[VelocitySample] | None:
         """The velocities in the order of their stamps; None: there are none."""
         if not self.velocities:
             return None
-        times, values = _sorted(self.velocities)
+        times, values = self.velocities.in_order()
         return velocity_samples(times, values[:, :3], values[:, 3:])
 
     def reference(self, *, imu: bool) -> Trajectory | None:
@@ -126,13 +186,7 @@ class BagIndex:
     def add_frames(self, fields: Any) -> None:
         """Take the transforms of a tf2_msgs/TFMessage as static ones."""
         for item in fields.transforms:
-            t = item.transform.translation
-            q = item.transform.rotation
-            R = rotation_from_quat_xyzw(np.array([q.x, q.y, q.z, q.w]))
-            parent, child = (
-                str(name).lstrip("/") for name in (item.header.frame_id, item.child_frame_id)
-            )
-            self.frames[(parent, child)] = se3_from_parts(R, [t.x, t.y, t.z])
+            self.frames[names_of(item)] = transform_of(item.transform)
 
     def transform(self, target: str, source: str) -> FloatArray | None:
         """`T_target_source` (4, 4) through the static frames; None: they are not connected."""
@@ -151,11 +205,42 @@ class BagIndex:
         return reached.get(target)
 
 
-def _trajectory(rows: Sequence[tuple[int, tuple[float, ...]]], *, imu: bool) -> Trajectory | None:
+def joined_record(
+    gyro: tuple[IntArray, FloatArray], accel: tuple[IntArray, FloatArray]
+) -> ImuRecord | None:
+    """Return one record of a gyro and an accelerometer with stamps of their own.
+
+    The acceleration is interpolated at the gyro's stamps (N,); those before its first reading,
+    behind its last one, or in a gap of it are left out.
+
+    Args:
+        gyro: increasing stamps (N,) and rad/s (N, 3).
+        accel: increasing stamps (M,) and m/s^2 (M, 3).
+
+    Returns:
+        The record; None where no stamp of the gyro lies between readings of the accelerometer.
+    """
+    times, rates = gyro
+    accel_ns, forces = accel
+    if len(accel_ns) < 2:
+        return None
+    after = np.clip(np.searchsorted(accel_ns, times), 1, len(accel_ns) - 1)
+    steps = np.diff(accel_ns)
+    longest = max(_GAP_STEPS * float(np.median(steps)), _GAP_NS)
+    inside = (times >= accel_ns[0]) & (times <= accel_ns[-1]) & (steps[after - 1] <= longest)
+    if not inside.any():
+        return None
+    at = (times[inside] - accel_ns[0]).astype(np.float64)
+    known = (accel_ns - accel_ns[0]).astype(np.float64)
+    columns = [np.interp(at, known, forces[:, axis]) for axis in range(3)]
+    return ImuRecord(times[inside], rates[inside], np.stack(columns, axis=1))
+
+
+def _trajectory(rows: Rows, *, imu: bool) -> Trajectory | None:
     """Return poses x y z qx qy qz qw in the order of their stamps; None: there are none."""
     if not rows:
         return None
-    times, values = _sorted(rows)
+    times, values = rows.in_order()
     q = values[:, 3:]
     norm = np.linalg.norm(q, axis=1)
     usable = norm > 0.5
@@ -165,10 +250,17 @@ def _trajectory(rows: Sequence[tuple[int, tuple[float, ...]]], *, imu: bool) -> 
     )
 
 
-def _sorted(rows: Sequence[tuple[int, tuple[float, ...]]]) -> tuple[IntArray, FloatArray]:
-    """Return increasing times (N,) and values (N, K); of equal stamps the first."""
-    times, first = np.unique(np.array([t for t, _ in rows], dtype=np.int64), return_index=True)
-    return times, np.array([rows[k][1] for k in first.tolist()], dtype=np.float64)
+def names_of(item: Any) -> tuple[str, str]:
+    """Return the parent and the child of a geometry_msgs/TransformStamped."""
+    return str(item.header.frame_id).lstrip("/"), str(item.child_frame_id).lstrip("/")
+
+
+def transform_of(fields: Any) -> FloatArray:
+    """Return a geometry_msgs/Transform as a matrix (4, 4)."""
+    t = fields.translation
+    q = fields.rotation
+    R = rotation_from_quat_xyzw(np.array([q.x, q.y, q.z, q.w]))
+    return se3_from_parts(R, [t.x, t.y, t.z])
 
 
 def stamp_of(fields: Any) -> int:
@@ -179,10 +271,13 @@ def stamp_of(fields: Any) -> int:
 
 def info_topic(topics: Sequence[Topic], image: Topic) -> str | None:
     """Return the CameraInfo topic of an image topic: `camera_info` in its namespace, or in one
-    above.
+    above; in the bags of RealSense's own recorder, `info/camera_info` of the stream.
     """
     known = {t.name for t in topics if t.kind == CAMERA_INFO and t.count}
     parts = image.name.split("/")
+    sdk = image.name.removesuffix("/image/data") + "/info/camera_info"
+    if sdk in known:
+        return sdk
     for depth in range(len(parts) - 1, 1, -1):
         if (name := "/".join([*parts[:depth], "camera_info"])) in known:
             return name
@@ -201,7 +296,13 @@ def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
     takers: dict[str, list[Callable[[Any, Message], None]]] = {
         topic.name: [partial(_image, bag, stamps, topic)] for topic, stamps in cameras
     }
-    for topic, take in ((roles.imu, _imu), (roles.velocity, _velocity), (roles.reference, _pose)):
+    streams = (
+        (roles.imu, _gyro if roles.accel is not None else _imu),
+        (roles.accel, _accel),
+        (roles.velocity, _velocity),
+        (roles.reference, _pose),
+    )
+    for topic, take in streams:
         if topic is not None:  # one odometry may be both velocity and reference
             takers.setdefault(topic.name, []).append(partial(take, index))
     for name in infos:
@@ -212,6 +313,7 @@ def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
         fields = bag.decoded(message)
         for taker in takers[message.topic]:
             taker(fields, message)
+    _settle_stamps(index, roles)
     for images, stamps in cameras:
         depths = {"16" in name for name in stamps.encodings}
         if len(depths) > 1:
@@ -224,7 +326,8 @@ def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
 
 def _image(bag: Bag, stamps: Stamps, topic: Topic, fields: Any, message: Message) -> None:
     stamps.times_ns.append(stamp_of(fields))
-    stamps.logged_ns.append(message.logged_ns)
+    stamps.raw.append((stamps.times_ns[-1], message.logged_ns))
+    stamps.logged_ns.append(message.recorded_ns)
     stamps.frame_id = stamps.frame_id or str(fields.header.frame_id)
     name = str(fields.encoding) if topic.kind == IMAGE else "compressed"
     stamps.encodings[name] = stamps.encodings.get(name, 0) + 1
@@ -247,32 +350,45 @@ def _looks_like_mosaic(fields: Any, where: str) -> bool:
 
 
 def _add(
-    index: BagIndex, rows: list[tuple[int, tuple[float, ...]]], topic: str, row: tuple[int, Any]
+    index: BagIndex, rows: Rows, message: Message, time_ns: int, values: tuple[float, ...]
 ) -> None:
-    if rows and row[0] < rows[-1][0]:
-        index.disordered[topic] = index.disordered.get(topic, 0) + 1
-    rows.append(row)
+    if not np.isfinite(values).all():
+        index.not_finite[message.topic] = index.not_finite.get(message.topic, 0) + 1
+        return
+    rows.add(time_ns, message, values)
 
 
 def _imu(index: BagIndex, fields: Any, message: Message) -> None:
-    w = fields.angular_velocity
-    a = fields.linear_acceleration
-    values = (w.x, w.y, w.z, a.x, a.y, a.z)
-    time_ns = stamp_of(fields)
-    if not np.isfinite(values).all():
-        raise DataError(
-            f"{message.topic}: the sample at {time_ns} ns is not finite ({values}); record the IMU "
-            "again"
-        )
+    values = (*_rates(fields, message), *_forces(fields, message))
     index.imu_frame = index.imu_frame or str(fields.header.frame_id)
-    _add(index, index.imu, message.topic, (time_ns, values))
+    _add(index, index.imu, message, stamp_of(fields), values)
+
+
+def _gyro(index: BagIndex, fields: Any, message: Message) -> None:
+    index.imu_frame = index.imu_frame or str(fields.header.frame_id)
+    _add(index, index.imu, message, stamp_of(fields), _rates(fields, message))
+
+
+def _accel(index: BagIndex, fields: Any, message: Message) -> None:
+    _add(index, index.accel, message, stamp_of(fields), _forces(fields, message))
+
+
+def _rates(fields: Any, message: Message) -> tuple[float, float, float]:
+    w = fields.vector if message.kind == VECTOR else fields.angular_velocity
+    return w.x, w.y, w.z
+
+
+def _forces(fields: Any, message: Message) -> tuple[float, float, float]:
+    a = fields.vector if message.kind == VECTOR else fields.linear_acceleration
+    return a.x, a.y, a.z
 
 
 def _velocity(index: BagIndex, fields: Any, message: Message) -> None:
     twist = fields.twist.twist if hasattr(fields.twist, "twist") else fields.twist
     v = twist.linear
     w = twist.angular
-    _add(index, index.velocities, message.topic, (stamp_of(fields), (v.x, v.y, v.z, w.x, w.y, w.z)))
+    values = (v.x, v.y, v.z, w.x, w.y, w.z)
+    _add(index, index.velocities, message, stamp_of(fields), values)
 
 
 def _pose(index: BagIndex, fields: Any, message: Message) -> None:
@@ -281,9 +397,8 @@ def _pose(index: BagIndex, fields: Any, message: Message) -> None:
             key = (str(item.header.frame_id).lstrip("/"), str(item.child_frame_id).lstrip("/"))
             p = item.transform.translation
             q = item.transform.rotation
-            index.moving.setdefault(key, []).append(
-                (stamp_of(item), (p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-            )
+            values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+            _add(index, index.moving.setdefault(key, Rows()), message, stamp_of(item), values)
         return
     if hasattr(fields, "transform"):
         p = fields.transform.translation
@@ -292,7 +407,123 @@ def _pose(index: BagIndex, fields: Any, message: Message) -> None:
         pose = fields.pose.pose if hasattr(fields.pose, "pose") else fields.pose
         p = pose.position
         q = pose.orientation
-    _add(index, index.poses, message.topic, (stamp_of(fields), (p.x, p.y, p.z, q.x, q.y, q.z, q.w)))
+    values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+    _add(index, index.poses, message, stamp_of(fields), values)
+
+
+def _settle_stamps(index: BagIndex, roles: Roles) -> None:
+    """Give each stream stamps that tell one time: without those of no time, and without the steps
+    of a clock that was set back.
+    """
+    _split_mixed(index, roles)
+    streams = _streams(index, roles)
+    behind_ns = _behind_the_log(index)
+    for name, rows in streams.items():
+        if isinstance(rows, Rows):
+            index.notes += _stamped(name, rows, behind_ns)
+    usable = {
+        name: rows
+        for name, rows in streams.items()
+        if len(rows.times_ns) > 1 and any(rows.times_ns)
+    }
+    arrays = {
+        name: (
+            np.array(rows.times_ns, dtype=np.int64),
+            np.array(rows.logged_ns, dtype=np.int64),
+        )
+        for name, rows in usable.items()
+    }
+    stamps, steps = mended(arrays)
+    if steps:
+        begin_ns = min(int(logged.min()) for _, logged in arrays.values())
+        index.notes += [step.note(begin_ns) for step in steps]
+        for name, rows in usable.items():
+            rows.times_ns = stamps[name].tolist()
+    for name, rows in streams.items():
+        if isinstance(rows, Rows) and not name.startswith(_MOVING):
+            late = int((np.diff(np.array(rows.times_ns, dtype=np.int64)) < 0).sum())
+            if late and name not in index.disordered:
+                index.disordered[name] = late
+
+
+def _split_mixed(index: BagIndex, roles: Roles) -> None:
+    """Part the messages of one topic that hold the gyro or the accelerometer alone, as two streams
+    that a driver sends on one topic.
+    """
+    if roles.imu is None or roles.accel is not None or len(index.imu) < 2:
+        return
+    values = np.array(index.imu.values)
+    gyro_alone = ~values[:, 3:].any(axis=1)
+    accel_alone = ~values[:, :3].any(axis=1) & ~gyro_alone
+    fewer = min(gyro_alone.mean(), accel_alone.mean())
+    if fewer < _OF_EACH or (gyro_alone | accel_alone).mean() < _ALONE:
+        return
+    whole = index.imu
+    index.imu = whole.taken(np.flatnonzero(gyro_alone), slice(0, 3))
+    index.accel = whole.taken(np.flatnonzero(accel_alone), slice(3, 6))
+    index.notes.append(
+        f"{roles.imu.name} holds gyro and accelerometer in messages of their own: they are joined, "
+        "the acceleration interpolated at the gyro's stamps"
+    )
+
+
+def _streams(index: BagIndex, roles: Roles) -> dict[str, Stamps | Rows]:
+    """Return the stamped messages of the topics in use, by topic."""
+    images = (index.left, index.right)
+    found: dict[str, Stamps | Rows] = {
+        topic.name: stamps for topic, stamps in zip(roles.cameras, images, strict=False)
+    }
+    samples = (
+        (roles.imu, index.imu),
+        (roles.imu if roles.accel is None else roles.accel, index.accel),
+        (roles.velocity, index.velocities),
+        (roles.reference, index.poses),
+    )
+    for topic, rows in samples:
+        if topic is not None and rows:
+            # one odometry may be both velocity and reference, and one topic both sensors
+            found[topic.name if topic.name not in found else f"{topic.name} (2)"] = rows
+    for (parent, child), rows in index.moving.items():
+        found[f"{_MOVING}{parent} to {child}"] = rows
+    return found
+
+
+def _behind_the_log(index: BagIndex) -> int:
+    """Return what must be added to the times of recording to get the clock of the stamps, ns.
+
+    Zero where the two tell the same time but for the delays of messages.
+    """
+    for stamps in (index.left, index.right):
+        if any(stamps.times_ns):
+            logged = np.array(stamps.logged_ns, dtype=np.int64)
+            offset_ns = round(median(np.array(stamps.times_ns, dtype=np.int64) - logged))
+            return offset_ns if abs(offset_ns) > NS_PER_S else 0
+    return 0
+
+
+def _stamped(name: str, rows: Rows, behind_ns: int) -> list[str]:
+    """Leave out the samples without a stamp, or give all of them the times of recording where none
+    has one; return a note of it.
+    """
+    without = [k for k, time_ns in enumerate(rows.times_ns) if time_ns == 0]
+    if len(without) == len(rows) > 1:
+        rows.times_ns = [logged_ns + behind_ns for logged_ns in rows.logged_ns]
+        return [
+            f"the headers of {name} have no stamps; the times of logging are used, which jitter"
+        ]
+    if not without or min(rows.times_ns) < 0 or _begins_at_zero(rows):
+        return []
+    stamped = rows.taken(np.flatnonzero(rows.times_ns), slice(None))
+    rows.times_ns = stamped.times_ns
+    rows.logged_ns = stamped.logged_ns
+    rows.values = stamped.values
+    return [f"{len(without)} messages of {name} have no stamp and are left out"]
+
+
+def _begins_at_zero(rows: Rows) -> bool:
+    """Return whether the stamps count from the first one, so that 0 is a time."""
+    steps = np.diff(np.unique(np.array(rows.times_ns, dtype=np.int64)))
+    return len(steps) > 1 and int(steps[0]) <= _GAP_STEPS * float(np.median(steps[1:]))
 
 
 def _info(index: BagIndex, fields: Any, message: Message) -> None:
@@ -310,8 +541,9 @@ def camera_info_of(fields: Any, topic: str) -> CameraInfo:
         for n in "dkrp"
     )
     size = (int(fields.width), int(fields.height))
-    matrices = (K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4))
     model = str(fields.distortion_model)
+    model = _SDK_MODELS.get(model.lower(), model)
+    matrices = (K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4))
     roi = fields.roi
     region = region_of([int(x) for x in (roi.x_offset, roi.y_offset, roi.width, roi.height)])
     binning = (max(int(fields.binning_x), 1), max(int(fields.binning_y), 1))

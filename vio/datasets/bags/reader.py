@@ -19,12 +19,13 @@ from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import COMPRESSED
 from vio.datasets.common import naming
 from vio.datasets.companions import reference_of_body
-from vio.datasets.frame_times import paired
+from vio.datasets.frame_times import nearest, paired
 from vio.datasets.image_pairs import BadFrame, ImageRecording, ImageSize, readable_frames
 from vio.datasets.images import UnreadableImageError
 from vio.datasets.levels import Levels, levels_of, mosaic_note
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
+from vio.numerics.robust import median
 from vio.records import IntArray, Recording, StereoFrame
 
 # of a frame: its number, and the image of each camera, decoded but for its pixels
@@ -38,11 +39,10 @@ class BagDataset(ImageRecording):
     """
 
     topics: tuple[Topic, ...]  # of the images: left, and right where there is one
-    stamps_ns: tuple[IntArray, ...]  # (F,) stamps of the images of each topic, of a pair in one row
+    # stamp and time of recording of the images of each topic (F, 2), of a pair in one row
+    keys: tuple[IntArray, ...]
     logged_ns: IntArray  # (F,) when the bag received the first image of each frame
     levels: Levels  # of 16-bit images
-    # of each topic: the headers have no stamps, the times of logging serve
-    unstamped: tuple[bool, ...]
 
     def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
         return readable_frames(self._load, self._messages(chosen), self.settings)
@@ -50,7 +50,7 @@ class BagDataset(ImageRecording):
     def _messages(self, chosen: Sequence[int]) -> Generator[_Messages]:
         """Yield the chosen frames' messages in the order of frames, however they were recorded."""
         # each entry is taken once
-        frame_of = [{int(stamps[k]): k for k in chosen} for stamps in self.stamps_ns]
+        frame_of = [{(int(keys[k, 0]), int(keys[k, 1])): k for k in chosen} for keys in self.keys]
         names = [topic.name for topic in self.topics]
         waiting: dict[int, list[Any]] = {}
         complete: list[_Messages] = []
@@ -59,9 +59,7 @@ class BagDataset(ImageRecording):
             for message in bag.messages(names, int(self.logged_ns[chosen].min())):
                 side = names.index(message.topic)
                 fields = bag.decoded(message)
-                k = frame_of[side].pop(
-                    message.logged_ns if self.unstamped[side] else stamp_of(fields), None
-                )
+                k = frame_of[side].pop((stamp_of(fields), message.logged_ns), None)
                 if k is None:
                     continue
                 waiting.setdefault(k, [None] * len(names))[side] = fields
@@ -115,12 +113,11 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
             "--calibration FILE with T_cam_imu (Kalibr's camchain-imucam), or record /tf_static"
         )
     stamps = (index.left, index.right)[: len(roles.cameras)]
-    stamps_ns, logged_ns, image_notes = _frames(
-        stamps, [topic.name for topic in roles.cameras], path
-    )
+    times_ns, keys, image_notes = _frames(stamps, [topic.name for topic in roles.cameras], path)
+    logged_ns = np.min([key[:, 1] for key in keys], axis=0)
     with naming(file or path):
         rectifier = rig.rectifier(settings.interpolation, settings.projection)
-    motion, motion_notes = motion_of(found, rig, stamps_ns[0])
+    motion, motion_notes = motion_of(found, rig, times_ns)
     truth = index.reference(imu=rig.T_cam0_imu is not None)
     levels = levels_of([*index.left.bands, *index.right.bands])
     level_notes = [
@@ -136,20 +133,20 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         path=path,
         camera=rectifier.camera,
         T_cam0_imu=None if rig.T_cam0_imu is None else rectifier.T_rect0_imu,
-        frame_times_ns=stamps_ns[0],
+        frame_times_ns=times_ns,
         has_images=True,
         motion=motion.kinds,
         reference=None if truth is None else reference_of_body(truth, rig, rectifier),
         notes=(
             *(*rig.notes, *rectifier.notes, *image_notes, *motion_notes),
-            *(*level_notes, *rig_notes, *found.notes),
+            *(*level_notes, *rig_notes, *index.notes, *found.notes),
         ),
     )
     sizes = tuple(
         ImageSize(camera.width, camera.height, Path(file or info or path))
         for camera, info in zip(rig.cameras, found.infos, strict=True)
     )
-    images = roles.cameras, stamps_ns, logged_ns, levels, tuple(each.unstamped for each in stamps)
+    images = roles.cameras, keys, logged_ns, levels
     return BagDataset(
         recording, motion, sizes, settings, rectifier, *images, imu_noise=rig.imu_noise
     )
@@ -157,13 +154,13 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
 
 def _frames(
     images: Sequence[Stamps], names: Sequence[str], path: Path
-) -> tuple[tuple[IntArray, ...], IntArray, list[str]]:
-    """Return the stamps of each topic's images (F,), when the first of each frame was logged
-    (F,), and notes.
+) -> tuple[IntArray, tuple[IntArray, ...], list[str]]:
+    """Return the times of the frames (F,), the stamp and the time of recording of each topic's
+    images (F, 2), and notes.
     """
     ordered = [stamps.ordered() for stamps in images]
     times = [each[0] for each in ordered]
-    logged = [each[1] for each in ordered]
+    keys = [_keys(stamps)[each[1]] for stamps, each in zip(images, ordered, strict=True)]
     if not all(len(each) for each in times):
         raise DataError(f"{path}: no image could be read of {' and '.join(names)}; copy it again")
     notes = [
@@ -176,7 +173,29 @@ def _frames(
         which = f"{twice[0]}" if len(twice) == 1 else f"{twice[0]} left and {twice[1]} right"
         notes.append(f"{which} images repeat a stamp and are skipped")
     if len(images) == 1:
-        return (times[0],), logged[0], notes
+        return times[0], (keys[0],), notes
     left, right = times
+    if images[0].unstamped != images[1].unstamped:
+        a, b = _paired_by_logging(keys[0][:, 1], keys[1][:, 1])
+        stamped = left if images[1].unstamped else right
+        rows = a if images[1].unstamped else b
+        notes.append("the images are paired by their times of logging")
+        return stamped[rows], (keys[0][a], keys[1][b]), notes
     a, b, differing = paired(left, right, names, path)
-    return (left[a], right[b]), np.minimum(logged[0][a], logged[1][b]), [*notes, *differing]
+    return left[a], (keys[0][a], keys[1][b]), [*notes, *differing]
+
+
+def _keys(stamps: Stamps) -> IntArray:
+    return np.array(stamps.raw, dtype=np.int64).reshape(-1, 2)
+
+
+def _paired_by_logging(left_ns: IntArray, right_ns: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the rows (F,), (F,) of images that were recorded closest to each other, and closer
+    than half of the left camera's interval.
+    """
+    interval_ns = median(np.diff(left_ns)) if len(left_ns) > 1 else 0.0
+    b = nearest(left_ns, right_ns)
+    a = np.arange(len(left_ns))
+    close = np.abs(right_ns[b] - left_ns) <= interval_ns / 2
+    rows = np.flatnonzero(close & (nearest(right_ns, left_ns)[b] == a))
+    return rows, b[rows]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vio.datasets.bags import bag_files
+from vio.datasets.bags.storage_order import STEP_NS, as_stored, is_set_back
 from vio.errors import DataError, MissingDependencyError
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ class Message:
     kind: str
     logged_ns: int  # when the bag received it
     data: bytes
+    # likewise, where the recorder's clock was set back: on a clock that went on
+    recorded_ns: int
 
 
 class Bag:
@@ -66,6 +69,7 @@ class Bag:
     """
 
     _reader: AnyReader
+    _set_back: bool
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -85,6 +89,9 @@ class Bag:
             # changed since.
             self._reader = AnyReader(bag_files(self.path), default_typestore=typestore)
             self._reader.open()
+            # of several files each is in order, and they are merged by time
+            only = self._reader.readers[0] if len(self._reader.readers) == 1 else None
+            self._set_back = only is not None and is_set_back(only)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -101,7 +108,7 @@ class Bag:
 
     def messages(self, topics: Collection[str], start_ns: int | None = None) -> Iterator[Message]:
         """Yield the messages of some topics in the order in which they were recorded, from a time
-        of the bag's clock.
+        of the bag's clock (all of them where that clock was set back).
 
         Raises:
             DataError: the bag is damaged; what came before was yielded.
@@ -110,8 +117,19 @@ class Bag:
         if not chosen:
             return
         with named_damage(self.path):
-            for connection, logged_ns, data in self._reader.messages(chosen, start=start_ns):
-                yield Message(connection.topic, connection.msgtype, logged_ns, bytes(data))
+            if not self._set_back:
+                for connection, logged_ns, data in self._reader.messages(chosen, start=start_ns):
+                    name = connection.topic
+                    yield Message(name, connection.msgtype, logged_ns, bytes(data), logged_ns)
+                return
+            last_ns = shift_ns = 0
+            for connection, logged_ns, data in as_stored(self._reader.readers[0], chosen):
+                if logged_ns < last_ns - STEP_NS:
+                    shift_ns += last_ns - logged_ns
+                last_ns = logged_ns
+                name = connection.topic
+                recorded_ns = logged_ns + shift_ns
+                yield Message(name, connection.msgtype, logged_ns, bytes(data), recorded_ns)
 
     def decoded(self, message: Message) -> Any:
         """Return the fields of a message.

@@ -16,6 +16,8 @@ IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMU = "sensor_msgs/msg/Imu"
+VECTOR = "geometry_msgs/msg/Vector3Stamped"
+TRANSFORM = "geometry_msgs/msg/Transform"
 TF = "tf2_msgs/msg/TFMessage"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped")
@@ -27,15 +29,18 @@ POSES = (
 _ROLES: dict[str, tuple[str, ...]] = {
     "left": (IMAGE, COMPRESSED),
     "right": (IMAGE, COMPRESSED),
-    "imu": (IMU,),
+    "imu": (IMU, VECTOR),
+    "accel": (IMU, VECTOR),
     "velocity": (ODOMETRY, *TWISTS),
     "reference": (*POSES, ODOMETRY, TF),
 }
 # What distinguishes the two cameras of a pair in topics' names, left first.
 _SIDES = (
-    ("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("camera0", "camera1"), ("camera_0", "camera_1"),
-    ("infra1", "infra2"), ("fisheye1", "fisheye2"), ("cam_0", "cam_1"), ("cam1", "cam2"),
-    ("image_0", "image_1"), ("0", "1"),
+    ("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("Infrared_1", "Infrared_2"),
+    ("infrared_1", "infrared_2"), ("infrared1", "infrared2"), ("infra_1", "infra_2"),
+    ("cam0", "cam1"), ("camera0", "camera1"), ("camera_0", "camera_1"), ("infra1", "infra2"),
+    ("fisheye1", "fisheye2"), ("fisheye_1", "fisheye_2"), ("Fisheye_1", "Fisheye_2"),
+    ("cam_0", "cam_1"), ("cam1", "cam2"), ("image_0", "image_1"), ("0", "1"),
 )  # fmt: skip
 _TRANSPORT = "/compressed"  # what image_transport appends to the topic of the raw images
 # share of the other's messages that raw images must have, to be taken in the place of compressed
@@ -44,9 +49,14 @@ _WHOLE = 0.9
 _NO_GRAY = re.compile(
     r"depth|disparity|mask|label|semantic|thermal|theora|confidence|points", re.IGNORECASE
 )
+_NO_STREAMS = (CAMERA_INFO, TF, TRANSFORM)
 _TRUTH = re.compile(
     r"ground_?truth|\bgt\b|_gt|gt_|vicon|mocap|optitrack|leica|truth|vrpn", re.IGNORECASE
 )
+# Drivers that publish the two sensors of an IMU apart: `/camera/gyro/sample`, `/imu/acceleration`.
+_GYRO = re.compile(r"gyr|angular_?vel", re.IGNORECASE)
+_ACCEL = re.compile(r"acc", re.IGNORECASE)
+_NO_FORCE = re.compile(r"free|linear_acc|gravity|filtered_acc", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +65,8 @@ class Roles:
 
     left: Topic
     right: Topic | None  # None: the recording is that of one camera
-    imu: Topic | None
+    imu: Topic | None  # the gyro alone where `accel` is another topic
+    accel: Topic | None
     velocity: Topic | None
     reference: Topic | None
 
@@ -87,13 +98,13 @@ def choose(topics: Sequence[Topic], named: str | None, where: str) -> tuple[Role
         assert left is not None
     else:
         left, right = _cameras(filled, given, where, notes)
-    imu = given.get("imu") if "imu" in given else _single(filled, (IMU,), "imu", left, notes)
+    imu, accel = _imu(filled, given, left, notes)
     reference = given["reference"] if "reference" in given else _reference(filled, notes)
     velocity = given.get("velocity")
     if "velocity" not in given and imu is None:
         moving = [t for t in filled if t.kind in (ODOMETRY, *TWISTS) and t != reference]
         velocity = moving[0] if len(moving) == 1 else None
-    roles = Roles(left, right, imu, velocity, reference)
+    roles = Roles(left, right, imu, accel, velocity, reference)
     return roles, (*notes, *_not_used(topics, roles))
 
 
@@ -204,19 +215,54 @@ def _rank(topic: Topic) -> tuple[int, int, int]:
     )
 
 
-def _single(
-    filled: Sequence[Topic], kinds: tuple[str, ...], role: str, left: Topic, notes: list[str]
-) -> Topic | None:
-    """Choose the topic of a role: the only one, or the one whose name shares most with the left
+def _imu(
+    filled: Sequence[Topic], given: dict[str, Topic | None], left: Topic, notes: list[str]
+) -> tuple[Topic | None, Topic | None]:
+    """Choose the topic of the IMU, or those of gyro and accelerometer where no topic has both."""
+    named = given.get("imu")
+    if "imu" in given and (named is None or "accel" in given or _sensor_of(named) != "gyro"):
+        return named, given.get("accel")
+    sensors = [t for t in filled if t.kind == IMU or (t.kind == VECTOR and _sensor_of(t))]
+    both = [t for t in sensors if not _sensor_of(t)]
+    if named is not None:
+        sensors = [named, *(t for t in sensors if _sensor_of(t) == "accel")]
+        both = []
+    gyros = [t for t in sensors if _sensor_of(t) == "gyro"]
+    accels = [t for t in sensors if _sensor_of(t) == "accel"]
+    if given.get("accel") is not None:
+        accels = [t for t in (given["accel"],) if t is not None]
+    if both or not (gyros and accels):
+        return _single([t for t in both or gyros if t.kind == IMU], left, notes), None
+    gyro = max(gyros, key=lambda t: (_shared(t.name, left.name), t.count))
+    accel = max(accels, key=lambda t: (_shared(t.name, gyro.name), t.count))
+    notes.append(
+        f"{gyro.name} and {accel.name} are joined to one IMU: the acceleration is interpolated at "
+        "the gyro's stamps (choose with --topics imu=/GYRO,accel=/ACCEL)"
+    )
+    return gyro, accel
+
+
+def _sensor_of(topic: Topic) -> str:
+    """Return gyro or accel where a topic's name says that it holds one of them alone, else
+    nothing.
+    """
+    gyro = _GYRO.search(topic.name) is not None
+    accel = _ACCEL.search(topic.name) is not None
+    if topic.kind == VECTOR and _NO_FORCE.search(topic.name):
+        return ""
+    return "" if gyro == accel else "gyro" if gyro else "accel"
+
+
+def _single(found: Sequence[Topic], left: Topic, notes: list[str]) -> Topic | None:
+    """Choose the topic of the IMU: the only one, or the one whose name shares most with the left
     camera's.
     """
-    found = [t for t in filled if t.kind in kinds]
     if len(found) < 2:
         return found[0] if found else None
     best = max(found, key=lambda t: (_shared(t.name, left.name), t.count))
     others = listed([t.name for t in found if t != best])
     notes.append(
-        f"{best.name} is taken as {role}; others are {others} (choose with --topics {role}=/NAME)"
+        f"{best.name} is taken as imu; others are {others} (choose with --topics imu=/NAME)"
     )
     return best
 
@@ -244,10 +290,15 @@ def _reference(filled: Sequence[Topic], notes: list[str]) -> Topic | None:
 
 
 def _not_used(topics: Sequence[Topic], roles: Roles) -> list[str]:
-    used = {roles.left, roles.right, roles.imu, roles.velocity, roles.reference}
+    used = {
+        roles.left,
+        roles.right,
+        roles.imu,
+        roles.accel,
+        roles.velocity,
+        roles.reference,
+    }
     empty = [t.name for t in topics if not t.count]
-    others = [
-        t.name for t in topics if t.count and t not in used and t.kind not in (CAMERA_INFO, TF)
-    ]
+    others = [t.name for t in topics if t.count and t not in used and t.kind not in _NO_STREAMS]
     notes = [f"topics without a message: {listed(empty)}"] if empty else []
     return [*notes, f"not used: {listed(others)}"] if others else notes

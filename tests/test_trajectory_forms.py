@@ -1,0 +1,196 @@
+"""Trajectories as other systems write them: their headers are believed, and what no header states
+is tried against the other trajectory.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vio.evaluation.trajectories import evaluate
+from vio.files.trajectories import is_trajectory_file, read_trajectory, write_tum
+from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, se3_from_parts, so3_exp
+from vio.records import Trajectory
+
+COUNT = 60
+START_NS = 1_700_000_000_000_000_000
+TIMES_NS = START_NS + 100_000_000 * np.arange(COUNT)
+
+
+def _poses() -> FloatArray:
+    k = np.arange(COUNT)
+    phi = np.stack([0.02 * k, 0.03 * k + 0.4, 0.5 * np.sin(0.1 * k)], axis=1)
+    positions = np.stack([0.1 * k, 2 * np.sin(0.1 * k), np.cos(0.07 * k)], axis=1)
+    return se3_from_parts(so3_exp(phi), positions)
+
+
+TRUTH = Trajectory(_poses(), TIMES_NS, "imu")
+Q = quat_xyzw_from_rotation(TRUTH.T_world_body[:, :3, :3])
+P = TRUTH.positions
+
+
+def _write(
+    path: Path, header: str, stamps: list[str], columns: list[FloatArray], separator: str = " "
+) -> Path:
+    values = np.column_stack(columns)
+    rows = [
+        separator.join([t, *map(repr, map(float, row))])
+        for t, row in zip(stamps, values, strict=True)
+    ]
+    path.write_text("\n".join([*([header] if header else []), *rows]) + "\n")
+    return path
+
+
+SECONDS = [f"{t // 10**9}.{t % 10**9:09d}" for t in TIMES_NS.tolist()]
+NS = [str(t) for t in TIMES_NS.tolist()]
+XYZW = [P, Q]
+WXYZ = [P, Q[:, [3, 0, 1, 2]]]
+ZERO = np.zeros((COUNT, 6))
+_OKVIS = (
+    "timestamp, p_WS_W_x, p_WS_W_y, p_WS_W_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w, "
+    "v_WS_W_x, v_WS_W_y, v_WS_W_z, b_g_x, b_g_y, b_g_z, b_a_x, b_a_y, b_a_z"
+)
+STATED = {
+    "csv with xyzw": ("#timestamp [ns],x [m],y [m],z [m],qx,qy,qz,qw", NS, XYZW, ","),
+    "euroc": ("#timestamp [ns],p_RS_R_x [m],p_y,p_z,q_RS_w [],q_RS_x [],q_y,q_z", NS, WXYZ, ","),
+    "okvis2": (_OKVIS, NS, [*XYZW, ZERO, ZERO[:, :3]], ","),
+    "tum with w first": ("# timestamp tx ty tz qw qx qy qz", SECONDS, WXYZ, " "),
+    "tum in ns": ("# timestamp [ns] tx ty tz qx qy qz qw", NS, XYZW, " "),
+    "tum, csv": ("timestamp [s],tx,ty,tz,qx,qy,qz,qw", SECONDS, XYZW, ","),
+    "semicolons": ("#timestamp [ns];x;y;z;qx;qy;qz;qw", NS, XYZW, ";"),
+    "openvins": (
+        "# timestamp(s) tx ty tz qx qy qz qw Pr11 Pr12 Pr13 Pr22 Pr23 Pr33",
+        SECONDS,
+        [*XYZW, ZERO],
+        " ",
+    ),
+    "4seasons": (
+        "# frame_id [ns], translation (t_x, t_y, t_z), rotation (q_x, q_y, q_z, w), scale, quality",
+        NS,
+        [*XYZW, ZERO[:, :2]],
+        ",",
+    ),
+    "rostopic": (
+        "%time [ns],field.header.seq,field.pose.position.x,field.pose.position.y,"
+        "field.pose.position.z,field.pose.orientation.x,field.pose.orientation.y,"
+        "field.pose.orientation.z,field.pose.orientation.w",
+        NS,
+        [ZERO[:, 0], *XYZW],
+        ",",
+    ),
+}
+
+
+@pytest.mark.parametrize("form", STATED)
+def test_what_a_header_states_is_believed(form: str, tmp_path: Path) -> None:
+    header, stamps, columns, separator = STATED[form]
+    file = _write(tmp_path / "poses.txt", header, stamps, columns, separator)
+    found = read_trajectory(file)
+    assert found.orientations == "stated"
+    np.testing.assert_array_equal(found.times_ns, TIMES_NS)
+    np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body, atol=1e-12)
+
+
+def test_seconds_and_nanoseconds_in_two_columns(tmp_path: Path) -> None:
+    whole = [str(t // 10**9) for t in TIMES_NS.tolist()]
+    rows = [
+        ",".join([s, str(t % 10**9), *map(repr, map(float, [*p, *q]))])
+        for s, t, p, q in zip(whole, TIMES_NS.tolist(), P, Q, strict=True)
+    ]
+    (tmp_path / "poses.csv").write_text("#sec,nsec,x,y,z,qx,qy,qz,qw\n" + "\n".join(rows) + "\n")
+    found = read_trajectory(tmp_path / "poses.csv")
+    np.testing.assert_array_equal(found.times_ns, TIMES_NS)
+    np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body, atol=1e-12)
+
+
+def test_orb_slam3_writes_nanoseconds_with_a_point(tmp_path: Path) -> None:
+    file = _write(tmp_path / "kf.txt", "", [f"{t}.000000" for t in NS], XYZW)
+    np.testing.assert_array_equal(read_trajectory(file).times_ns, TIMES_NS)
+
+
+def test_rows_that_end_with_a_comma(tmp_path: Path) -> None:
+    """VINS-Fusion writes a comma behind each number, and no header."""
+    file = _write(tmp_path / "vio.csv", "", NS, [*WXYZ, ZERO[:, :3]], ",")
+    file.write_text(file.read_text().replace("\n", ",\n"))
+    assert is_trajectory_file(file)
+    found = read_trajectory(file)
+    assert found.orientations == "w first, assumed"
+    np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body, atol=1e-12)
+
+
+UNSTATED = {
+    "csv with w last": (NS, XYZW, ",", "first"),
+    "tum with w first": (SECONDS, WXYZ, " ", "last"),
+}
+
+
+@pytest.mark.parametrize("form", UNSTATED)
+@pytest.mark.parametrize("which", ["estimate", "reference"])
+def test_the_other_trajectory_tells_an_order_that_is_not_stated(
+    form: str, which: str, tmp_path: Path
+) -> None:
+    stamps, columns, separator, read = UNSTATED[form]
+    found = read_trajectory(_write(tmp_path / "poses.txt", "", stamps, columns, separator))
+    assert found.orientations == f"w {read}, assumed"
+    pair = (found, TRUTH) if which == "estimate" else (TRUTH, found)
+    result = evaluate(*pair)
+    assert result.ate_deg.rmse < 1e-6
+    (note,) = result.notes
+    assert f"the {which} does not state the order of its quaternions" in note
+    assert f"w {read} would leave" in note
+
+
+def test_a_stated_order_is_not_exchanged_and_the_wrong_one_is_blamed(tmp_path: Path) -> None:
+    wrong = _write(tmp_path / "e.txt", "# timestamp tx ty tz qx qy qz qw", SECONDS, WXYZ)
+    estimate = read_trajectory(wrong)
+    assert estimate.orientations == "stated"
+    (note,) = evaluate(estimate, TRUTH).notes
+    assert (
+        "the estimate's orientations are quaternions with w first, read as if w came last" in note
+    )
+
+
+def test_a_right_order_that_is_assumed_stays(tmp_path: Path) -> None:
+    found = read_trajectory(_write(tmp_path / "poses.txt", "", NS, WXYZ, ","))
+    result = evaluate(found, TRUTH)
+    assert (result.notes, result.ate_deg.rmse < 1e-6) == ((), True)
+
+
+POSITIONS = {
+    "zeros": [P, np.zeros((COUNT, 4))],
+    "nan": [P, np.full((COUNT, 4), np.nan)],
+    "four columns": [P],
+}
+
+
+@pytest.mark.parametrize("form", POSITIONS)
+@pytest.mark.parametrize("separator", [" ", ","])
+def test_positions_without_orientations_are_compared_alone(
+    form: str, separator: str, tmp_path: Path
+) -> None:
+    header = "# timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]" * (form[0] == "f")
+    columns = POSITIONS[form]
+    truth = read_trajectory(_write(tmp_path / "truth.txt", header, NS, columns, separator))
+    assert truth.orientations == "none"
+    np.testing.assert_allclose(truth.positions, P)
+    result = evaluate(TRUTH, truth)
+    assert result.ate_m.rmse < 1e-9
+    assert "the reference has positions without orientations" in result.notes[0]
+    np.testing.assert_array_equal(truth.in_cam0(TRUTH.T_world_body[5]).positions, truth.positions)
+
+
+def test_single_poses_without_orientation_are_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    q = Q.copy()
+    q[5:8] = 0
+    found = read_trajectory(_write(tmp_path / "truth.txt", "", SECONDS, [P, q]))
+    assert len(found) == COUNT - 3
+    assert "3 of 60 poses have no orientation" in caplog.text
+
+
+def test_what_is_written_states_its_order(tmp_path: Path) -> None:
+    write_tum(tmp_path / "out.tum", TRUTH)
+    assert read_trajectory(tmp_path / "out.tum").orientations == "stated"

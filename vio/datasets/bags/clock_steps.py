@@ -1,0 +1,183 @@
+"""Steps of a clock during a recording: stamps go back while messages go on being recorded.
+
+A computer whose clock is set back stamps the messages after it with times that were given before,
+and sorted by their stamps two periods interleave. The order of recording tells them apart: at a
+step the stamps go back, and stay behind the recorder's clock by as much. A message that is recorded
+late goes back, too, but into a place that no other message had.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.numerics.robust import median
+from vio.records import NS_PER_S, IntArray
+
+_LEAST_NS = 10_000_000  # smaller corrections are those of a clock that is steered
+_AROUND = 20  # messages on either side that tell how far stamps are behind the recorder's clock
+_TOGETHER_NS = NS_PER_S  # steps of several topics within this time are one
+_NEAR_NS = 100_000_000  # messages are recorded within this time after they are stamped
+_ALIKE = 0.25  # of a step, by which those of several topics may differ to be one
+_MOST = 0.8  # of the messages after a step are behind by it
+_SHARE = 0.5  # of the messages after a step whose stamps were given before it
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStep:
+    """A clock that was set back, and the first message after it of each topic concerned."""
+
+    size_ns: int
+    logged_ns: int  # when
+    first: Mapping[str, int]  # row in the order of recording, by topic
+
+    def note(self, begin_ns: int) -> str:
+        """Return what was found and done, given when the recording began."""
+        size_s = self.size_ns / NS_PER_S
+        topics = ", ".join(sorted(self.first))
+        return (
+            f"the clock was set back by {size_s:.3f} s at "
+            f"{(self.logged_ns - begin_ns) / NS_PER_S:.2f} s of the recording ({topics}): what was "
+            f"recorded after it is moved by {size_s:+.3f} s, so that no two periods mix"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A step of one topic."""
+
+    topic: str
+    row: int
+    size_ns: float
+    logged_ns: int
+
+
+def mended(
+    streams: Mapping[str, tuple[IntArray, IntArray]],
+) -> tuple[dict[str, IntArray], list[ClockStep]]:
+    """Return the stamps of each topic with the steps of its clock taken out, and these steps.
+
+    Args:
+        streams: stamps (N,) and times of recording (N,) of each topic, in the order of recording.
+    """
+    stamps = {topic: times.copy() for topic, (times, _) in streams.items()}
+    logged = {topic: log for topic, (_, log) in streams.items()}
+    found = [step for topic in stamps for step in _steps_of(topic, stamps[topic], logged[topic])]
+    steps = []
+    for together in _joined(found):
+        size_ns = _common_size(together, stamps)
+        first = {step.topic: step.row for step in together}
+        begin_ns = min(step.logged_ns for step in together)
+        for topic in stamps.keys() - first.keys():
+            row = _row_without_descent(stamps[topic], logged[topic], begin_ns, size_ns)
+            if row is not None:
+                first[topic] = row
+        for topic, row in first.items():
+            stamps[topic][row:] += size_ns
+        steps.append(ClockStep(size_ns, begin_ns, first))
+    return stamps, steps
+
+
+def _steps_of(topic: str, stamps: IntArray, logged: IntArray) -> list[_Found]:
+    """Return the steps of one topic, in the order of recording."""
+    times = stamps.copy()
+    found: list[_Found] = []
+    row = 0
+    while row < len(times):
+        highest = np.maximum.accumulate(times)
+        back = np.flatnonzero(times[1:] < highest[:-1]) + 1
+        step = None
+        for k in back[back > row].tolist():
+            step = _size_of_step(times, logged, k, int(highest[k - 1]))
+            if step is not None:
+                row = k
+                break
+        if step is None:
+            break
+        found.append(_Found(topic, row, step, int(logged[row])))
+        times[row:] += round(step)
+    return found
+
+
+def _size_of_step(times: IntArray, logged: IntArray, row: int, last_ns: int) -> float | None:
+    """Return by how much the clock was set back before a message; None: it was not.
+
+    Args:
+        times: stamps (N,), whose earlier steps are taken out.
+        logged: times of recording (N,).
+        row: the message, which is stamped earlier than one before it.
+        last_ns: the last stamp before it.
+    """
+    size_ns = _fallen_behind(times, logged, row)
+    if size_ns < max(_LEAST_NS, 0.5 * (last_ns - int(times[row]))):
+        return None
+    after = times[row : row + _AROUND]
+    after = after[after <= last_ns]
+    half_ns = _usual_ns(np.unique(times)) / 2
+    earlier = times[:row]
+    if after.max() < earlier.min():  # before the recording began
+        return size_ns
+    same = (earlier >= after.min() - half_ns) & (earlier <= after.max() + half_ns)
+    return size_ns if same.sum() >= _SHARE * len(after) else None
+
+
+def _usual_ns(times: IntArray) -> float:
+    """Return the usual interval of stamps (N,); of one stamp 0."""
+    return median(np.diff(times)) if len(times) > 1 else 0.0
+
+
+def _fallen_behind(times: IntArray, logged: IntArray, row: int) -> float:
+    """Return by how much more stamps are behind the recorder's clock after a message than before
+    it; 0 where not all of those after it are.
+    """
+    first = max(row - _AROUND, 0)
+    around = slice(first, row + _AROUND)
+    behind = (logged[around] - times[around]).astype(np.float64)
+    more = behind[row - first :] - median(behind[: row - first])
+    size_ns = median(more)
+    return size_ns if np.mean(more > 0.5 * size_ns) > _MOST else 0.0
+
+
+def _joined(found: Sequence[_Found]) -> list[list[_Found]]:
+    """Return the steps of several topics that are one."""
+    groups: list[list[_Found]] = []
+    for step in sorted(found, key=lambda each: each.logged_ns):
+        last = groups[-1] if groups else []
+        alike = last and abs(step.size_ns - last[0].size_ns) <= max(
+            _ALIKE * last[0].size_ns, _LEAST_NS
+        )
+        near = last and step.logged_ns - last[0].logged_ns <= _TOGETHER_NS
+        if alike and near and step.topic not in {each.topic for each in last}:
+            last.append(step)
+        else:
+            groups.append([step])
+    return groups
+
+
+def _common_size(together: Sequence[_Found], stamps: Mapping[str, IntArray]) -> int:
+    """Return the size of a step of several topics: that of the one with most messages, and no less
+    than lets the stamps of each go on.
+    """
+    best = max(together, key=lambda step: len(stamps[step.topic]))
+    before = stamps[best.topic][: best.row]
+    back_ns = int(before.max()) - int(stamps[best.topic][best.row])
+    return round(max(best.size_ns, back_ns + _usual_ns(before)))
+
+
+def _row_without_descent(
+    times: IntArray, logged: IntArray, begin_ns: int, size_ns: int
+) -> int | None:
+    """Return the first message after a step of a topic whose stamps did not go back, as its
+    messages are further apart than the step; None: its clock was not set.
+    """
+    low, high = np.searchsorted(logged, [begin_ns - _NEAR_NS, begin_ns + _NEAR_NS]).tolist()
+    if low == 0 or high == len(times):
+        return None
+    behind = (logged - times).astype(np.float64)
+    before = median(behind[max(low - _AROUND, 0) : low])
+    after = median(behind[high : high + _AROUND])
+    if abs(after - before - size_ns) > 0.5 * size_ns:
+        return None
+    return low + int(np.argmax(behind[low:] > (before + after) / 2))

@@ -1,0 +1,277 @@
+"""When the images of a folder were taken, and which belong together: by a list of times, or by
+their names.
+
+What a file states goes before what a name looks like: `data.csv` names each image beside its time,
+in the unit of its header. Names alone are read by their size, and by how far apart frames can be.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets.frame_times import pair_stamps
+from vio.datasets.image_files import FilePairs, ImageFiles
+from vio.datasets.image_pairs import ImagePairs
+from vio.datasets.sides import without_side
+from vio.datasets.tables import drive_times, is_date, table_rows
+from vio.datasets.unused import Layout
+from vio.errors import DataError
+from vio.files.stamps import FRAME_PACE, parse_stamps
+from vio.files.text import text_lines
+from vio.files.units import TIME_UNITS, time_unit, time_unit_in_words
+from vio.records import NS_PER_S, IntArray
+
+_SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
+_ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
+_LIST_FORM = "timestamp [ns], filename"
+_NUMBER = r"\d+(?:\.\d*)?(?:[eE][+-]?\d+)?"
+# `cam0_1403636579763555584`, `1403636579763555584_left`, `1700000001.33713`, `17000000013371ms`
+_STAMP = re.compile(
+    r"(?:[A-Za-z]+\d?[_-])?(?P<time>\d{10,19}|\d{1,10}\.\d{1,9})(?:_?(?P<unit>ns|us|ms|s))?"
+    r"(?:[_-][A-Za-z]+\d?)?"
+)
+# Since 1970: milliseconds to nanoseconds, or seconds with a point.
+_SINCE_1970 = re.compile(r"\d{13,19}|\d{9,10}\.\d{1,9}")
+_SECONDS = re.compile(r"\d{9,10}(\.\d{1,9})?")  # whose zeros may be cut, and the point with them
+# `000000_cam0`: the camera's number behind that of the frame
+_OF_CAMERA = re.compile(
+    r"(.*\d)[_-](?:cam(?:era)?|infra(?:red)?|image|img|left|right)[_-]?\d?", re.I
+)
+
+
+def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple[str, ...]]:
+    """Pair image files by equal names, by stamps in their names, by names without their camera
+    (`000012_cam0`), or by the last number in them.
+
+    Raises:
+        DataError: the names share nothing.
+    """
+    keys: list[list[str | int]] = [[p.stem for p in lefts], [p.stem for p in rights]]
+    shared = len(set(keys[0]) & set(keys[1]))
+    stamps = [_name_times(files) for files in (lefts, rights)]
+    left_ns, right_ns = stamps
+    if left_ns is not None and right_ns is not None and 2 * shared < min(len(lefts), len(rights)):
+        a, b = pair_stamps(left_ns, right_ns)
+        keys = [list(range(len(lefts))), [-1] * len(rights)]
+        for i, j in zip(a.tolist(), b.tolist(), strict=True):
+            keys[1][j] = i
+    elif not shared:
+        keys = [[without_side(p.stem) for p in files] for files in (lefts, rights)]
+        if not set(keys[0]) & set(keys[1]):
+            keys = [[_last_number(p) for p in files] for files in (lefts, rights)]
+    right_of = {key: k for k, key in enumerate(keys[1])}
+    if len(right_of) < len(rights) and -1 not in right_of:
+        raise DataError(
+            f"{rights[0].parent}: several images have the same number; number them uniquely"
+        )
+    rows = [(k, right_of[key]) for k, key in enumerate(keys[0]) if key in right_of]
+    pairs = FilePairs(lefts.take(k for k, _ in rows), rights.take(k for _, k in rows))
+    if not pairs:
+        raise DataError(
+            f"{lefts[0].parent} and {rights[0].parent}: no name of the one fits one of the other "
+            f"({lefts[0].name}, "
+            f"{rights[0].name}); give both images of a pair the same name or number"
+        )
+    alone = len(lefts) - len(pairs), len(rights) - len(pairs)
+    if not any(alone):
+        return pairs, ()
+    return pairs, (f"{alone[0]} left and {alone[1]} right images have no partner and are skipped",)
+
+
+def _last_number(path: Path) -> int | str:
+    of_camera = _OF_CAMERA.fullmatch(path.stem)
+    found = re.findall(r"\d+", path.stem if of_camera is None else of_camera[1])
+    return int(found[-1]) if found else path.stem
+
+
+def _name_times(
+    files: Sequence[Path], doubts: list[str] | None = None, *, since_1970_alone: bool = False
+) -> IntArray | None:
+    """Return the times (F,) that all files are named by; None: they are named by something else.
+
+    Args:
+        files: the images.
+        doubts: where to note a unit that how far apart the frames are decided.
+        since_1970_alone: whether other numbers, as those since a boot, are no times.
+    """
+    found = [_STAMP.fullmatch(file.stem) for file in files]
+    texts = [match["time"] for match in found if match is not None]
+    units = {match["unit"] for match in found if match is not None}
+    if len(texts) < len(files) or len(units) != 1:
+        return None
+    unit = units.pop()
+    stated = None if unit is None else TIME_UNITS[unit]
+    seconds = any("." in text for text in texts) and all(map(_SECONDS.fullmatch, texts))
+    since_1970 = seconds or all(map(_SINCE_1970.fullmatch, texts))
+    boot = stated is not None or _could_be_times(texts)
+    if not since_1970 and (since_1970_alone or not boot):
+        return None
+    try:
+        return parse_stamps(texts, lambda k: str(files[k]), stated, pace=FRAME_PACE, doubts=doubts)
+    except DataError:  # numbers of something else, which do not increase
+        return None
+
+
+def _could_be_times(texts: Sequence[str]) -> bool:
+    """Return whether numbers that are no times since 1970 can be times since a boot.
+
+    Whole numbers of ten digits and more, in microseconds or nanoseconds, or decimals of seconds,
+    as far apart as frames are; numbers of frames are one apart.
+    """
+    values = np.array([float(text) for text in texts])
+    if len(values) < 2 or any(text.startswith("00") for text in texts):
+        return False
+    step = float(np.median(np.diff(values)))
+    if all("." in text for text in texts):
+        return FRAME_PACE.least_s <= step <= FRAME_PACE.most_s
+    return step * 1e-6 >= FRAME_PACE.least_s and bool((np.diff(values) > 0).all())
+
+
+def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | None, tuple[str, ...]]:
+    """Return the times (F,) of the pairs, where they come from (None: assumed), and notes.
+
+    Raises:
+        DataError: `times.txt` does not fit the images, or the times do not increase.
+    """
+    doubts = list[str]()
+    for folder in dict.fromkeys((layout.base, layout.root, layout.left, layout.left.parent)):
+        for name in ("times.txt", "timestamps.txt"):
+            if (file := folder / name).is_file():
+                times_ns = times_of(file, pairs, doubts)
+                return times_ns, file, (*doubts, *_slow_note(file, times_ns))
+    lefts = [left for left, _ in pairs]
+    file = layout.left.parent / "data.csv"
+    missing: tuple[str, ...] = ()
+    if file.is_file():
+        missing = _missing_note(file, pairs)
+        listed_ns = _listed_times(file, lefts, doubts)
+        if listed_ns is not None:
+            return listed_ns, file, (*missing, *doubts)
+    named_ns = _name_times(lefts, doubts, since_1970_alone=file.is_file())
+    if named_ns is not None:
+        return named_ns, layout.left, (*missing, *doubts)
+    if file.is_file():
+        listed = file.read_text(encoding="utf-8", errors="replace")
+        unlisted = next((left.name for left in lefts if left.stem not in listed), lefts[0].name)
+        raise DataError(
+            f"{file}: does not list {unlisted} ({_LIST_FORM}); copy both again, or remove the image"
+        )
+    note = (
+        f"{layout.root}: no times.txt; frames are taken to be {1 / _ASSUMED_HZ:g} s apart, so "
+        "speeds are unknown; "
+        "write one time an image (seconds or nanoseconds) into times.txt"
+    )
+    return np.arange(len(pairs), dtype=np.int64) * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
+
+
+def _slow_note(file: Path, times_ns: IntArray) -> tuple[str, ...]:
+    """Doubt the unit of times that are further apart than those of any camera that moves."""
+    apart_s = float(np.median(np.diff(times_ns))) / NS_PER_S if len(times_ns) > 1 else 0.0
+    if apart_s <= _SLOWEST_S:
+        return ()
+    return (
+        f"{file}: frames are {apart_s:g} s apart, as its times are taken for seconds; if they are "
+        "not, write seconds",
+    )
+
+
+def _missing_note(file: Path, pairs: ImagePairs) -> tuple[str, ...]:
+    """Say how many of the images in EuRoC's list of a camera are there, if not all are."""
+    listed = sum(line.strip()[:1] not in ("#", "") for _, line in text_lines(file))
+    return (
+        (f"{file} lists {listed} images; the {len(pairs)} that are there are used",)
+        if listed > len(pairs)
+        else ()
+    )
+
+
+def _listed_times(file: Path, lefts: Sequence[Path], doubts: list[str]) -> IntArray | None:
+    """Read the times (F,) of images from EuRoC's list of a camera; None: it does not list them
+    all.
+    """
+    try:
+        (_, header), *rows = table_rows(file, 2, _LIST_FORM)
+    except DataError:
+        return None
+    row_of = {Path(name).stem: k for k, (_, (_, name)) in enumerate(rows)}
+    if not all(left.stem in row_of for left in lefts):
+        return None
+    chosen = [rows[row_of[left.stem]] for left in lefts]
+    stated = time_unit(header[0]) if header else None
+    return parse_stamps(
+        [time for _, (time, _) in chosen],
+        lambda k: f"{file}, line {chosen[k][0]}",
+        stated,
+        pace=FRAME_PACE,
+        doubts=doubts,
+    )
+
+
+def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> IntArray:
+    """Read the times (F,) of image pairs: one a line, or `name time` where the first column names
+    the images.
+
+    A comment or a header may state their unit. Dates are those of a KITTI raw drive, which is a
+    plain folder where it is run with another calibration.
+
+    Args:
+        file: the list.
+        pairs: the images.
+        doubts: where to note a unit that how far apart the frames are decided.
+
+    Raises:
+        DataError: the file does not fit the images, or the times do not increase.
+    """
+    numbers = [_last_number(left) for left, _ in pairs]
+    if is_date(next((line for _, line in text_lines(file)), "")) and all(
+        isinstance(n, int) for n in numbers
+    ):
+        return drive_times(file, np.array(numbers, dtype=np.int64))
+    rows, stated = time_lines(file)
+    by_name = {Path(fields[0]).stem: (n, fields[1]) for n, fields in rows if len(fields) > 1}
+    if by_name and all(left.stem in by_name for left, _ in pairs):
+        chosen = [by_name[left.stem] for left, _ in pairs]
+    elif len(rows) == len(pairs) and all(len(fields) == 1 for _, fields in rows):
+        chosen = [(n, fields[0]) for n, fields in rows]
+    else:
+        raise DataError(
+            f"{file} holds {len(rows)} times for {len(pairs)} image pairs; there must be one time "
+            "an image, or lines "
+            "'name time'"
+        )
+    return parse_stamps(
+        [text for _, text in chosen],
+        lambda k: f"{file}, line {chosen[k][0]}",
+        stated,
+        pace=FRAME_PACE,
+        doubts=doubts,
+    )
+
+
+def time_lines(file: Path) -> tuple[list[tuple[int, list[str]]], str | None]:
+    """Return the lines of a list of times, as their numbers and fields, and the unit that a comment
+    or a header states (None: none does).
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    rows: list[tuple[int, list[str]]] = []
+    above: list[str] = []
+    for number, line in text_lines(file):
+        text = line.strip()
+        fields = text.replace(",", " ").split()
+        header = not rows and not any(re.fullmatch(_NUMBER, field) for field in fields)
+        if text[:1] in ("#", "%", "") or header:
+            above.append(text.lstrip("#% "))
+        else:
+            rows.append((number, fields))
+    # nanoseconds have no decimals: such a comment is of something else
+    decimals = any(re.search(r"\.\d*[1-9]", fields[:2][-1]) for _, fields in rows)
+    cells = [cell for text in above for cell in re.split(r"[,;\t]|\s(?=[A-Za-z])", text)]
+    stated = next((unit for cell in cells if (unit := time_unit(cell)) is not None), None)
+    stated = time_unit_in_words(above) if stated is None else stated
+    return rows, None if stated == "ns" and decimals else stated

@@ -1,0 +1,90 @@
+"""The order of a quaternion's numbers where a file does not state it: w first or last, whichever
+the other trajectory bears out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vio.errors import EvaluationError
+from vio.evaluation.alignment import align_poses
+from vio.evaluation.association import associate
+from vio.evaluation.errors_along_path import rotation_angle_deg
+from vio.evaluation.reference_axes import with_other_order
+from vio.geometry.lie import FloatArray, nearest_rotation
+from vio.records import Trajectory
+
+_LARGE_DEG = 5.0  # of a spread, below which no order is doubted
+_BETTER = 5.0  # by which the right order must explain the attitudes better
+_FEWEST = 3
+
+
+def settled_orders(
+    estimate: Trajectory, reference: Trajectory, max_time_difference_s: float
+) -> tuple[Trajectory, Trajectory, tuple[str, ...]]:
+    """Return both trajectories, one of them in the other order where that order was assumed and the
+    other trajectory contradicts it, and a note that names both readings.
+
+    The positions must determine how the worlds are turned to each other: then the attitudes differ
+    by one rotation of the body in the right order, and by any in the wrong one.
+
+    Args:
+        estimate: as it was read, in the body that its file describes.
+        reference: likewise.
+        max_time_difference_s: poses further apart in time are not compared.
+    """
+    assumed = {
+        name: _exchanged(trajectory)
+        for name, trajectory in (("estimate", estimate), ("reference", reference))
+        if trajectory.orientations.endswith("assumed")
+    }
+    if not assumed or "none" in (estimate.orientations, reference.orientations):
+        return estimate, reference, ()
+    as_read = _spread_deg(estimate, reference, max_time_difference_s)
+    if as_read is None or as_read < _LARGE_DEG:
+        return estimate, reference, ()
+    for name, exchanged in assumed.items():
+        pair = (exchanged, reference) if name == "estimate" else (estimate, exchanged)
+        spread = _spread_deg(*pair, max_time_difference_s)
+        if spread is not None and _BETTER * spread < as_read:
+            read = "first" if exchanged.orientations == "w first, assumed" else "last"
+            other = "last" if read == "first" else "first"
+            note = (
+                f"the {name} does not state the order of its quaternions: they are read with w "
+                f"{read}, which leaves {spread:.2g} deg between the attitudes, and w {other} would "
+                f"leave {as_read:.0f} deg; name the columns in its header (qx,qy,qz,qw)"
+            )
+            return *pair, (note,)
+    return estimate, reference, ()
+
+
+def _exchanged(trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory in the order that was not assumed."""
+    first = trajectory.orientations == "w first, assumed"
+    poses = trajectory.T_world_body.copy()
+    poses[:, :3, :3] = with_other_order(poses[:, :3, :3], "w first" if first else "w last")
+    other = "w last, assumed" if first else "w first, assumed"
+    return replace(trajectory, T_world_body=poses, orientations=other)  # type: ignore[arg-type]
+
+
+def _spread_deg(estimate: Trajectory, reference: Trajectory, limit_s: float) -> float | None:
+    """Return by how much the attitudes differ (median) beside a constant rotation of the body.
+
+    None: the positions do not determine the rotation between the worlds, or no poses match.
+    """
+    try:
+        _, rows, reference_rows = associate(estimate, reference, max_time_difference_s=limit_s)
+        if len(rows) < _FEWEST:
+            return None
+        T_est = estimate.T_world_body[rows]
+        T_ref = reference.T_world_body[reference_rows]
+        alignment = align_poses(T_est, T_ref, "se3")
+    except EvaluationError:
+        return None
+    if alignment.rotation_from != "positions":
+        return None
+    R = np.swapaxes(T_ref[:, :3, :3], 1, 2) @ alignment.R @ T_est[:, :3, :3]
+    mean: FloatArray = nearest_rotation(R.sum(axis=0))
+    return float(np.median(rotation_angle_deg(mean.T @ R)))

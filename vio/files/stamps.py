@@ -1,0 +1,140 @@
+"""Stamps as people write them, in integer nanoseconds: in a unit that is stated, else by their size
+and by how far apart they are.
+
+Seconds since 1970 in s, ms, us and ns differ in size, and stamps since the boot of a device or
+since the start of a recording do not: 9,000,000,000,000 is two and a half hours in ns, and a date
+in the year 2255 in ms. What tells them is how far apart they are, as a camera takes an image every
+few milliseconds to seconds. A reading that the size alone would not give is a doubt, which names
+both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from vio.errors import DataError
+from vio.files.text import INT64_MAX, check_increasing
+from vio.records import IntArray
+
+TimeUnit: TypeAlias = Literal["s", "ms", "us", "ns"]
+_POWERS: dict[str, int] = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # of ten, to nanoseconds
+_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+# Stamps of 1973 and later in ns, us and ms; smaller ones are seconds from any zero.
+_SIZES: tuple[tuple[TimeUnit, Decimal], ...] = (
+    ("ns", Decimal("1e17")),
+    ("us", Decimal("1e14")),
+    ("ms", Decimal("1e11")),
+)
+_DECADES = 1000.0  # between two units
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How far apart entries of a kind are."""
+
+    what: str  # entries, for messages
+    least_s: float  # closer ones are not believed
+    most_s: float  # nor are ones further apart
+    # Other units are tried so that the median interval is between this and a thousand times it.
+    usual_s: float
+
+
+FRAME_PACE = Pace("frames", 1e-3, 5.0, 2e-3)
+SAMPLE_PACE = Pace("samples", 1e-5, 0.5, 5e-5)
+POSE_PACE = Pace("poses", 1e-4, 60.0, 1e-3)
+
+
+def parse_stamps(
+    texts: Sequence[str],
+    where: Callable[[int], str],
+    unit: str | None = None,
+    *,
+    pace: Pace | None = None,
+    doubts: list[str] | None = None,
+) -> IntArray:
+    """Parse stamps (N,) as exact decimals.
+
+    Args:
+        texts: one stamp each.
+        where: returns the place of an entry, for messages.
+        unit: "s", "ms", "us" or "ns"; None: by the size of the first (seconds since 1970 or since
+            the start, or milliseconds, microseconds or nanoseconds since 1970), and by `pace`.
+        pace: how far apart the entries may be, which decides where no unit is stated; None: the
+            size alone decides.
+        doubts: where to note that a unit was taken by the pace, with both readings.
+
+    Raises:
+        DataError: a stamp is no number, or not later than the one before.
+    """
+    values = [_decimal(text, where, k) for k, text in enumerate(texts)]
+    if unit is None:
+        unit = _unit_of(values, where, pace, doubts)
+    power = _POWERS[unit]
+    limit = Decimal(INT64_MAX).scaleb(-power)
+    for k, value in enumerate(values):
+        # abs() would round, which no context can do with an exponent of any size
+        if value.copy_abs() > limit:
+            remedy = "divide nanoseconds by 1e9, or state their unit in a header ([ns])"
+            raise DataError(f"{where(k)}: {texts[k]!r} is out of range for a time; {remedy}")
+    return check_increasing(
+        [int(value.scaleb(power).to_integral_value()) for value in values], where
+    )
+
+
+def _decimal(text: str, where: Callable[[int], str], row: int) -> Decimal:
+    try:
+        value = Decimal(text)
+    except InvalidOperation:
+        value = Decimal("NaN")
+    if not value.is_finite():
+        raise DataError(f"{where(row)}: {text!r} is no time; remove or correct that entry")
+    return value
+
+
+def _unit_of(
+    values: Sequence[Decimal],
+    where: Callable[[int], str],
+    pace: Pace | None,
+    doubts: list[str] | None,
+) -> TimeUnit:
+    """Return the unit by size; where that makes the entries too close or too far, that by pace."""
+    size = values[0].copy_abs()
+    by_size: TimeUnit = next((unit for unit, least in _SIZES if size >= least), "s")
+    if pace is None or len(values) < 2 or any(value.copy_abs() > INT64_MAX for value in values):
+        return by_size
+    mean = float(values[-1] - values[0]) / (len(values) - 1)
+    if pace.least_s <= mean * _seconds(by_size) <= pace.most_s:
+        return by_size
+    steps = [float(b - a) for a, b in pairwise(values)]
+    step = float(np.median(steps))
+    if pace.least_s <= step * _seconds(by_size) <= pace.most_s:
+        return by_size
+    by_pace: TimeUnit | None = next(
+        (
+            unit
+            for unit in ("s", "ms", "us", "ns")
+            if pace.usual_s <= step * _seconds(unit) < _DECADES * pace.usual_s
+            and values[-1].copy_abs() <= Decimal(INT64_MAX).scaleb(-_POWERS[unit])
+        ),
+        None,
+    )
+    if by_pace is None:
+        return by_size
+    if doubts is not None:
+        apart, other = (f"{step * _seconds(unit):.4g} s" for unit in (by_pace, by_size))
+        doubts.append(
+            f"{where(0)}: its times are taken for {_NAMES[by_pace]} ({pace.what} {apart} apart), "
+            f"as they would be {other} apart in {_NAMES[by_size]}; if that is wrong, state the "
+            "unit in a header, as '# time [s]'"
+        )
+    return by_pace
+
+
+def _seconds(unit: str) -> float:
+    return 10.0 ** (_POWERS[unit] - 9)
