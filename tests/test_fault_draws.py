@@ -109,7 +109,9 @@ def _result(error_m: float, sigma_m: float) -> Any:
     wrong = steps.copy()
     wrong[-1, 1, 3] += error_m
     reference = Trajectory(se3_exp(np.array([1, 2, 3, 0.1, 0.2, 0.3])) @ steps, times, "cam0")
-    columns = {"covariance": [np.eye(6) * sigma_m**2 / 3] * 10, "index": list(range(10))}
+    columns: dict[str, Any] = {"covariance": [np.eye(6) * sigma_m**2 / 3] * 10}
+    columns |= {"index": list(range(10)), "gravity_world": [np.full(3, np.nan)] * 10}
+    columns |= {"tilt_sigma_rad": [np.nan] * 10}
     return SimpleNamespace(
         recording=SimpleNamespace(reference=reference, path=Path("x")),
         T_cam0_body=np.eye(4),

@@ -29,7 +29,7 @@ class Source:
 _SHORT_S = 5.0
 _WIDTH_PX = 376
 SOURCES = (
-    Source("euroc/MH_01_head", ("imu", None), "work", 0.002),
+    Source("euroc/MH_01_head", ("imu", None), "work", 0.005),
     Source("kitti_06_head", (None,), "work", 0.03),
     Source("kitti_05_clip", (None,), "work", 0.03),
     Source("kitti_03_head", (None,), "kept", 0.03),

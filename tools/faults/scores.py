@@ -12,8 +12,9 @@ import numpy as np
 
 from vio.errors import EvaluationError
 from vio.evaluation.association import associate
-from vio.geometry.lie import FloatArray, se3_inverse
-from vio.records import FrameResult, IntArray, Trajectory
+from vio.geometry.lie import FloatArray, se3_inverse, transform_points
+from vio.geometry.upright import yaw_and_position
+from vio.records import BoolArray, FrameResult, IntArray, Trajectory
 from vio.runs.pipeline import RunResult
 
 COVERED = 3.0  # standard deviations
@@ -90,7 +91,11 @@ class PoseErrors:
 
 
 def pose_errors(result: RunResult, truth_sigma_m: float) -> PoseErrors:
-    """Compare a run's positions with the reference, both relative to their first pose.
+    """Compare a run's positions with the reference, whose world is identified at the first pose.
+
+    That is the whole pose where the estimate's world is that of its first frame, and position and
+    yaw where both are upright, as the first tilt is an estimate like any other; where that ends,
+    the worlds are identified anew.
 
     Args:
         result: of a run whose recording has a reference with orientations.
@@ -110,15 +115,38 @@ def pose_errors(result: RunResult, truth_sigma_m: float) -> PoseErrors:
     _, rows, reference_rows = associate(estimate, in_body.numbered())
     T_est = estimate.T_world_body[rows]
     T_ref = in_body.T_world_body[reference_rows]
-    T_world_ref = T_est[0] @ se3_inverse(T_ref[0])
-    p_ref = T_ref[:, :3, 3] @ T_world_ref[:3, :3].T + T_world_ref[:3, 3]
-    error_m = np.linalg.norm(T_est[:, :3, 3] - p_ref, axis=1)
+    error_m = _errors_m(T_est, T_ref, _is_upright(result)[rows])
     covariances = np.array(result.estimates.column("covariance"))[rows]
     variance = np.trace(covariances[:, :3, :3], axis1=1, axis2=2)
     sigma_m = np.sqrt(variance + truth_sigma_m**2 + _LEAST_SIGMA_M**2)
     indices = np.array(result.estimates.column("index"))[rows]
     kept = slice(_SETTLED_FRAMES, None)
     return PoseErrors(indices[kept], error_m[kept], sigma_m[kept])
+
+
+def _is_upright(result: RunResult) -> BoolArray:
+    """Whether the world of each estimate (N,) is the one that gravity shows at present."""
+    gravity = np.array(result.estimates.column("gravity_world"), dtype=np.float64)
+    tilt = np.array(result.estimates.column("tilt_sigma_rad"), dtype=np.float64)
+    stays = np.isfinite(gravity.reshape(len(gravity), -1)).all(axis=1)
+    return np.asarray(np.isfinite(tilt) & ~stays, dtype=np.bool_)
+
+
+def _errors_m(T_est: FloatArray, T_ref: FloatArray, upright: BoolArray) -> FloatArray:
+    """Errors (M,) of the positions of paired poses (M, 4, 4); see `pose_errors`."""
+    error_m = np.empty(len(T_est))
+    for rows in (np.flatnonzero(upright), np.flatnonzero(~upright)):
+        if len(rows):
+            first_est = T_est[rows[0]]
+            first_ref = T_ref[rows[0]]
+            T_world_ref = (
+                yaw_and_position(first_est, first_ref)
+                if upright[rows[0]]
+                else first_est @ se3_inverse(first_ref)
+            )
+            p_ref = transform_points(T_world_ref, T_ref[rows, :3, 3])
+            error_m[rows] = np.linalg.norm(T_est[rows, :3, 3] - p_ref, axis=1)
+    return error_m
 
 
 @dataclass(frozen=True, slots=True)
