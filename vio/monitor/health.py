@@ -63,6 +63,12 @@ class RunHealth:
         """Return the warnings of a frame, by what its update did and the estimate after it."""
         lines = [*self._gap(index, estimate), *self._features(index, report, estimate)]
         lines += self._stereo(index, estimate)
+        if report.gyro_jump_radps is not None:
+            lines.append(
+                f"frame {index}: the gyro's bias has jumped by {report.gyro_jump_radps:.2g} rad/s, "
+                "as all images show: the sensor was shocked or restarted; the bias was estimated "
+                "anew, by the images"
+            )
         lines += self._implausible(index, estimate)
         return tuple(lines)
 

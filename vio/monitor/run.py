@@ -242,6 +242,8 @@ class RunMonitor:
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
         self._report(self._health.frame(index, report, estimate))
+        if report.gyro_jump_radps is not None and self._inertial is not None:
+            self._inertial.reset()  # as no linear map fits readings before and after a jump
         if self._seen is not None:
             self._report(self._refusals.frame(self._seen, report, estimate))
         self._scale_lines += self._health.scale(index, estimate)
