@@ -79,6 +79,8 @@ _MAP_DEPTH_SIGMA = 0.2
 # pixels by which the predicted pose may be off before one step over the window is too few
 _FAR = 0.5
 _NEARER = 1.25  # by which factor a step must have come nearer for another one
+# innovations over their standard deviation (median): more, and the gyro may have jumped
+_CONTRADICTED = 2.0
 # over the window in a frame: one is the rule, two bring in a start in motion, a third is an
 # exception
 _MOST_STEPS = 4
@@ -180,7 +182,8 @@ class FrameUpdate:
             missing = step.missing_noise()
             doubted = False
             turn = None
-            if missing[1] and self._has_imu:
+            contradicted = (innovation_ratio or 0.0) > _CONTRADICTED
+            if (missing[1] or contradicted) and self._has_imu:
                 turn = turn_of_images(at_prediction, expected, T_world_predicted)
             if turn is None:
                 jump_radps = self._gyro_jump.agrees(window.nav.gyro_bias)

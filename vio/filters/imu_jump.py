@@ -31,7 +31,9 @@ def turn_of_images(
     predicted: LinearTracks, moved: FloatArray, T_world_imu: FloatArray
 ) -> FloatArray | None:
     """Fit the rotation (3,) of the body, world frame, by which the newest pixels of old tracks
-    differ from the predicted ones; None: no single one explains nearly all of them.
+    differ from the predicted ones.
+
+    None: it is within what was predicted, or no single one explains nearly all of them.
 
     Args:
         predicted: tracks linearised where the motion model has the newest clone.
@@ -49,15 +51,19 @@ def turn_of_images(
     B = np.concatenate([J, -J @ so3_hat(arms)], axis=2)  # by the body's motion about itself
     about_body = np.eye(6)
     about_body[:3, 3:] = -so3_hat(p_body)
-    covariance = about_body @ moved @ about_body.T
+    expected = about_body @ moved @ about_body.T
+    covariance = expected.copy()
     covariance[3:, 3:] += _MAX_TURN_RAD**2 * np.eye(3)
     information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-    motion, left = _robust_fit(B, r, information, predicted.variance)
+    motion, P, left = _robust_fit(B, r, information, predicted.variance)
+    turn: FloatArray = motion[3:]
+    squared = float(turn @ np.linalg.solve(expected[3:, 3:] + P[3:, 3:], turn))
+    if squared < chi_square_table(VIEW_PROBABILITY)[3]:
+        return None
     pixels = np.any(J != 0.0, axis=2).sum(axis=1)
     limits = predicted.variance * chi_square_table(VIEW_PROBABILITY)[pixels]
     if np.mean(np.sum(left**2, axis=1) < limits) <= _AGREEMENT:
         return None
-    turn: FloatArray = motion[3:]
     return turn
 
 
@@ -132,15 +138,16 @@ def _is_old(at: Residuals) -> BoolArray:
 
 def _robust_fit(
     B: FloatArray, r: FloatArray, information: FloatArray, variance: float
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Fit a motion (6,) with a prior's information to residuals (F, 4) by Cauchy weights.
 
     Returns:
-        The motion, `r = B motion + noise`, and the residuals left (F, 4).
+        The motion, `r = B motion + noise`, its covariance (6, 6), and the residuals left (F, 4).
     """
     width = CAUCHY * CAUCHY * variance
     left = r
     motion = np.zeros(6)
+    A = information
     # the first scale is that of the residuals themselves, as all of them are off together
     scale = max(width, float(np.median(np.sum(r**2, axis=1))))
     for _ in range(_ITERATIONS):
@@ -150,4 +157,4 @@ def _robust_fit(
         motion = np.linalg.solve(A, b)
         left = r - B @ motion
         scale = max(width, 0.25 * scale)
-    return motion, left
+    return motion, np.asarray(np.linalg.inv(A), dtype=np.float64), left

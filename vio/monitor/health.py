@@ -63,14 +63,20 @@ class RunHealth:
         """Return the warnings of a frame, by what its update did and the estimate after it."""
         lines = [*self._gap(index, estimate), *self._features(index, report, estimate)]
         lines += self._stereo(index, estimate)
-        if report.gyro_jump_radps is not None:
-            lines.append(
-                f"frame {index}: the gyro's bias has jumped by {report.gyro_jump_radps:.2g} rad/s, "
-                "as all images show: the sensor was shocked or restarted; the bias was estimated "
-                "anew, by the images"
-            )
+        lines += self._jump(index, report)
         lines += self._implausible(index, estimate)
         return tuple(lines)
+
+    def _jump(self, index: int, report: UpdateReport) -> list[str]:
+        """Report the first time that the gyro's bias has jumped."""
+        if report.gyro_jump_radps is None or "gyro jump" in self._reported:
+            return []
+        self._reported.add("gyro jump")
+        return [
+            f"frame {index}: the gyro's bias has jumped by {report.gyro_jump_radps:.2g} rad/s, as "
+            "all images show: the sensor was shocked or restarted; the bias was estimated anew, by "
+            "the images"
+        ]
 
     def _gap(self, index: int, estimate: Estimate) -> list[str]:
         """Report a time without frames, with what is known of the pose after it."""

@@ -243,7 +243,7 @@ class RunMonitor:
         """Add the back end's report and estimate of a frame."""
         self._report(self._health.frame(index, report, estimate))
         if report.gyro_jump_radps is not None and self._inertial is not None:
-            self._inertial.reset()  # as no linear map fits readings before and after a jump
+            self._inertial.begin_after_jump()
         if self._seen is not None:
             self._report(self._refusals.frame(self._seen, report, estimate))
         self._scale_lines += self._health.scale(index, estimate)
