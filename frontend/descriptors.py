@@ -28,12 +28,19 @@ from vio.frontend.patches import inside
 from vio.frontend.prediction import moved_pixels, prior_pixels, usable_prior
 from vio.frontend.settings import FrontendSettings, MatchSettings
 from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX
-from vio.frontend.swap import SwapDetector
 from vio.frontend.tracks import ANCHOR_RADIUS_PX
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, triangulate
 from vio.numerics.compiled import compiled, compiled_sums
-from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
+from vio.records import (
+    BoolArray,
+    CheckedFrame,
+    FrontendOutput,
+    Image,
+    IntArray,
+    StereoFrame,
+    TrackPrior,
+)
 
 Vectors: TypeAlias = npt.NDArray[np.float32]
 Descriptors: TypeAlias = Vectors | npt.NDArray[np.uint8]
@@ -47,7 +54,6 @@ _REFINE_ITERATIONS = 6
 _REFINE_MIN_CORRELATION = 0.8
 _FAR_M = 1e6  # depth assumed where it is unknown
 _MIN_DEPTH_M = 0.05
-_SWAP_FEW = 0.2  # share of matches below which left and right may be swapped
 _BORDER_PX = 8.0  # key points closer to the image border are dropped: their patch would not fit
 
 
@@ -264,7 +270,6 @@ class DescriptorFrontend:
         self._extract = extract
         self._match = match
         self._validator = FrameValidator(camera, name)
-        self._swap = SwapDetector(_SWAP_FEW)
         self._previous: _PreviousFrame | None = None
         self._next_id = 0
 
@@ -273,25 +278,23 @@ class DescriptorFrontend:
         watch = Stopwatch()
         images = self._validator.validate(frame)
         watch.lap("prepare")
-        left, right = (
+        if isinstance(frame, CheckedFrame) and frame.begin_again:
+            self._previous = None
+        usable = not isinstance(frame, CheckedFrame) or frame.right_usable
+        shown = images if usable else images[:1]
+        extracted = [
             take(points, inside(images[0], points.pixels, _BORDER_PX))
-            for points in self._extract(*images)
-        )
+            for points in self._extract(*shown)
+        ]
         watch.lap("extract")
-        pair = self._stereo(left, right, images)
+        left = extracted[0]
+        pair = self._stereo(left, extracted[1], images) if usable else _unmatched(left)
         watch.lap("stereo")
         tracks, twist, used = self._track(frame, pair, images[0], usable_prior(prior))
         watch.lap("track")
         tracked = len(tracks)
         tracks = self._add_new_features(tracks, pair, used, images[0])
         self._previous = _PreviousFrame(frame.time_ns, images[0].copy(), tracks, twist)
-        width = images[0].shape[1]
-        self._swap.check(
-            frame,
-            len(left),
-            int(pair.has_right.sum()),
-            lambda: len(self._match(right, left, self._allowed(right, left, width))),
-        )
         watch.lap("check")
         return make_output(frame, tracks, tracked, watch)
 
@@ -466,6 +469,12 @@ class DescriptorFrontend:
             take(pair.keypoints, chosen),
         )
         return joined(tracks, new)
+
+
+def _unmatched(left: Keypoints) -> _MatchedKeypoints:
+    """The key points of a left image whose right one is not used."""
+    count = len(left)
+    return _MatchedKeypoints(left, np.zeros((count, 2)), np.zeros(count, dtype=np.bool_))
 
 
 @compiled

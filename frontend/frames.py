@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from vio.errors import DataError
+from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import (
@@ -166,7 +167,7 @@ def make_output(
     features: Features,
     tracked: int,
     watch: Stopwatch,
-    warnings: tuple[str, ...] = (),
+    findings: tuple[Finding, ...] = (),
     *,
     shown: BoolArray | None = None,
     sigma: SigmaArray | None = None,
@@ -178,7 +179,7 @@ def make_output(
         features: those tracked.
         tracked: how many of those output were in the previous output, too.
         watch: the times of the stages.
-        warnings: what the frame says of the images.
+        findings: what is wrong with the images.
         shown: mask (N,) of the features to output; None: all.
         sigma: (N, 3) as in `Observations`.
     """
@@ -195,5 +196,5 @@ def make_output(
         matched=int(has_right.sum()),
         detected=len(rows) - tracked,
         stages_ms=watch.stages_ms,
-        warnings=warnings,
+        findings=findings,
     )

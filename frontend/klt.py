@@ -4,20 +4,18 @@ along the row.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import cv2
 import numpy as np
 
+from vio.findings import Finding
 from vio.frontend.anchor_fit import AnchorFit
 from vio.frontend.columns import changed
-from vio.frontend.contrast import LostContrast
 from vio.frontend.detect import detect_corners, half_mask, load_mask
-from vio.frontend.exchange import ExchangeDetector
-from vio.frontend.flicker import BandRemoval
 from vio.frontend.flow import track_with_retries
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output
-from vio.frontend.image_check import FrameImages, ImageCheck
 from vio.frontend.moving_object import (
     ObjectReport,
     choose_motion,
@@ -43,7 +41,6 @@ from vio.frontend.right_delay import RightDelay
 from vio.frontend.right_match import RightMatcher
 from vio.frontend.settings import FrontendSettings
 from vio.frontend.stereo_fit import StereoFit
-from vio.frontend.swap import SwapDetector
 from vio.frontend.tracks import (
     ANCHOR_RADIUS_PX,
     INLIER_PX,
@@ -54,18 +51,34 @@ from vio.frontend.tracks import (
 )
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, FrontendOutput, Image, StereoFrame, TrackPrior
+from vio.records import (
+    BoolArray,
+    CheckedFrame,
+    FrontendOutput,
+    Image,
+    StereoFrame,
+    TrackPrior,
+)
 
 # extra corners tried, over the number of missing features; the best stereo matches are kept
 _SPARE_CORNERS = 1.5
 # for which a new corner must be tracked, in time and stereo, before it is output
 _PROBATION_FRAMES = 1
-_SWAP_FEW = 0.3  # share of matches below which left and right may be swapped
 _FEW_MISSING = 0.1  # share of the features; detection takes more time than it is worth for fewer
 _VERY_FEW = 0.25  # share of the target below which new features are output at once
 _LONG_GAP_S = 0.8  # a rig that flies or is carried shows other things after it …
 _LONG_GAP_STEPS = 5.0  # … where frames usually come so many times as often
 _BANK_SPARE = 3  # templates allocated, over the number of features
+
+
+@dataclass(frozen=True, slots=True)
+class _FrameImages:
+    """The images of a frame in the forms that tracking needs."""
+
+    frame: StereoFrame
+    left: ImageLevels
+    right: ImageLevels | None  # None: one camera
+    stereo: StereoFit
 
 
 class KltFrontend:
@@ -88,18 +101,6 @@ class KltFrontend:
         self._right = RightCamera()
         self._delay = RightDelay(camera)
         self._objects = ObjectReport()
-        contrast = LostContrast()
-        self._checks: tuple[ImageCheck, ...] = (contrast, self._objects)  # in this order
-        if camera.kind == "stereo":
-            # A frozen image looks as if it were the other camera's, so that is asked first.
-            pair = (
-                self._right,
-                self._delay,
-                SwapDetector(_SWAP_FEW),
-                ExchangeDetector(),
-                self._objects,
-            )
-            self._checks = (BandRemoval(), contrast, *pair)
         self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, ANCHOR_RADIUS_PX)
         self._anchor_fit = AnchorFit(camera, self._grid, self._bank)
         self._new_features = NewFeatures(camera, self._grid, self._bank)
@@ -121,24 +122,10 @@ class KltFrontend:
         """
         watch = Stopwatch()
         kind = self._camera.kind
-        raw = (
-            self._validator.validate(frame)
-            if kind == "stereo"
-            else self._validator.validate_one(frame)
-        )
-        stereo, allowed = self._set_up(raw[0].shape)
-        images = FrameImages(frame, raw, self._view, self._previous, stereo, self._right.usable)
-        for check in self._checks:
-            checked = check.inspect(images)
-            if checked is None:
-                left_frozen = check is self._right
-                alone = (
-                    self._follow_in_right(images, usable_prior(prior))
-                    if left_frozen
-                    else no_tracks()
-                )
-                return make_output(frame, alone, len(alone), watch, self._take_lines())
-            images = checked
+        images, allowed = self._images(frame)
+        if images is None:
+            return make_output(frame, no_tracks(), 0, watch, self._take_findings())
+        stereo = images.stereo
         left = images.left
         right = images.right
         watch.lap("prepare")
@@ -158,16 +145,24 @@ class KltFrontend:
         if kind == "rgbd" and frame.depth is not None:
             tracks = with_depths(self._camera, tracks, frame.depth)
         watch.lap("stereo")
-        for check in self._checks:
-            check.conclude(images, tracks)
         tracked = int(tracks.shown.sum())  # those shown now that were shown before
         tracks = self._promote(tracks)
         self._store(images, tracks, motion)
         watch.lap("check")
         sigma = self._bank.sigma(tracks.slot, depth_image=kind == "rgbd")
-        return make_output(
-            frame, tracks, tracked, watch, self._take_lines(), shown=tracks.shown, sigma=sigma
-        )
+        found = self._take_findings()
+        return make_output(frame, tracks, tracked, watch, found, shown=tracks.shown, sigma=sigma)
+
+    def follow_right(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
+        """Follow the features of the last good pair in the right image of a frame whose left one
+        is frozen; see `vio.guard.guarded.FollowsRight`.
+        """
+        watch = Stopwatch()
+        images, _ = self._images(frame)
+        alone = no_tracks()
+        if images is not None:
+            alone = self._follow_in_right(images, usable_prior(prior))
+        return make_output(frame, alone, len(alone), watch, self._take_findings())
 
     @property
     def _needs_right(self) -> bool:
@@ -183,15 +178,54 @@ class KltFrontend:
         self._rested = not self._rested and missing <= _FEW_MISSING * target
         return 0 if self._rested else round(missing * (1.0 + _SPARE_CORNERS))
 
-    def _take_lines(self) -> tuple[str, ...]:
-        """Return the events of a frame, one line each."""
-        return tuple(line for check in self._checks for line in check.take_lines())
+    def _take_findings(self) -> tuple[Finding, ...]:
+        """Return what was found since the last frame."""
+        parts = (self._right, self._delay, self._objects)
+        return tuple(found for part in parts for found in part.take_findings())
 
-    def _view(self, image: Image) -> ImageLevels:
-        """Equalise and convert an image; the result may share memory with it."""
+    def _images(self, frame: StereoFrame) -> tuple[_FrameImages | None, BoolArray | None]:
+        """Return the images of a frame, and the mask (H/2, W/2) of allowed corners.
+
+        None: the right image of its time was not kept.
+        """
+        if self._camera.kind != "stereo":
+            (left,) = self._validator.validate_one(frame)
+            stereo, allowed = self._set_up(left.shape)
+            return _FrameImages(
+                frame, self._view(left, _half(frame, "left")), None, stereo
+            ), allowed
+        left, right = self._validator.validate(frame)
+        stereo, allowed = self._set_up(left.shape)
+        lives = not isinstance(frame, CheckedFrame) or frame.right_usable
+        self._right.by_image(frame.index, usable=lives)
+        right_half = _half(frame, "right")
+        if isinstance(frame, CheckedFrame) and frame.begin_again:
+            self._delay.know(frame.right_delay)
+            self._begin_again(stereo)
+        paired = self._delay.paired(right)
+        if paired is not right:
+            right_half = None
+        if paired is None:
+            return None, allowed
+        levels = self._view(paired, right_half)
+        return _FrameImages(frame, self._view(left, _half(frame, "left")), levels, stereo), allowed
+
+    def _begin_again(self, stereo: StereoFit) -> None:
+        """Forget all features: their depths are those of images of different times."""
+        self._right.explained()
+        stereo.restart_rows()
+        if self._previous is not None:
+            self._previous = replace(self._previous, tracks=no_tracks())
+
+    def _view(self, image: Image, half: Image | None) -> ImageLevels:
+        """Equalise and convert an image; the result may share memory with it.
+
+        `half` is the image as given at half resolution, where that is known.
+        """
         if self._clahe is not None:
             image = np.asarray(self._clahe.apply(image), dtype=np.uint8)
-        return ImageLevels(image, half_image(image))
+            half = None
+        return ImageLevels(image, half_image(image) if half is None else half)
 
     def _set_up(self, shape: tuple[int, ...]) -> tuple[StereoFit, BoolArray | None]:
         """Return the stereo matcher and the mask (H/2, W/2) of allowed corners, set up with the
@@ -204,7 +238,7 @@ class KltFrontend:
             self._setup = stereo, allowed
         return self._setup
 
-    def _follow_in_right(self, images: FrameImages, prior: TrackPrior | None) -> Tracks:
+    def _follow_in_right(self, images: _FrameImages, prior: TrackPrior | None) -> Tracks:
         """The features of the last good pair, by the right image of a frame whose left one is
         frozen.
         """
@@ -229,7 +263,7 @@ class KltFrontend:
         self._alone = alone
         return alone.in_left(self._camera, images.stereo)
 
-    def _store(self, images: FrameImages, tracks: Tracks, motion: Consensus | None) -> None:
+    def _store(self, images: _FrameImages, tracks: Tracks, motion: Consensus | None) -> None:
         """Store the state that the next frame needs."""
         frame = images.frame
         left = images.left
@@ -248,7 +282,7 @@ class KltFrontend:
         )
 
     def _track(
-        self, images: FrameImages, prior: TrackPrior | None, watch: Stopwatch
+        self, images: _FrameImages, prior: TrackPrior | None, watch: Stopwatch
     ) -> tuple[Tracks, Consensus | None]:
         """Track the features of the previous frame; return those kept and the consensus motion.
 
@@ -300,7 +334,7 @@ class KltFrontend:
 
     def _found_again(
         self,
-        images: FrameImages,
+        images: _FrameImages,
         previous: PreviousFrame,
         expected: FloatArray,
         prior: TrackPrior | None,
@@ -412,3 +446,10 @@ class KltFrontend:
         ids[first] = np.arange(int(first.sum())) + self._next_id
         self._next_id += int(first.sum())
         return changed(tracks, ids=ids, shown=proven)
+
+
+def _half(frame: StereoFrame, camera: Literal["left", "right"]) -> Image | None:
+    """The image (H/2, W/2) of a camera at half resolution, where the guards have made it."""
+    if not isinstance(frame, CheckedFrame):
+        return None
+    return frame.left_half if camera == "left" else frame.right_half

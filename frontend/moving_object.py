@@ -21,8 +21,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.findings import Finding
 from vio.frontend.columns import share_of
-from vio.frontend.image_check import ImageCheck
 from vio.frontend.outliers import (
     Consensus,
     RansacProblem,
@@ -103,7 +103,9 @@ def choose_motion(
     hidden = in_event and (measured or not depths_off)
     if voting is not None and not measured:
         voted = _voted(problem, p_prev, pixels, found, voting)
-        if voted is not None:
+        if voted is not None and not _prediction_overrules(
+            problem, p_prev, found, voted, None if depths_off else predicted
+        ):
             return TwoMotions(voted, _if_large((found.inliers & ~voted.inliers).mean()), "voted")
     others = np.flatnonzero(~found.inliers)
     least = max(_LEAST_POINTS, _LEAST_SUPPORT * found.inliers.sum())
@@ -169,6 +171,27 @@ def choose_motion(
     return TwoMotions(
         Consensus(second, follows_second), _if_large(share_of(found.inliers)), "predicted"
     )
+
+
+def _prediction_overrules(
+    problem: RansacProblem,
+    p_prev: FloatArray,
+    found: Consensus,
+    voted: Consensus,
+    predicted: MotionPrior | None,
+) -> bool:
+    """Return whether a prediction agrees with the consensus, and better than with the vote.
+
+    The oldest points may all be far away: what they vote for is a rotation, and a translation that
+    they hardly know. An object that comes into view has no prediction on its side.
+    """
+    if predicted is None or found.inliers.sum() < voted.inliers.sum():
+        return False
+    of_found, of_voted = (
+        _squared_distance(problem.camera, each.T_curr_prev, p_prev[each.inliers], predicted)
+        for each in (found, voted)
+    )
+    return of_found <= min(of_voted, float(chi_square_quantile(_PROBABILITY, 6)))
 
 
 def _if_large(share: float) -> float:
@@ -376,15 +399,20 @@ def voters(age: IntArray) -> BoolArray:
     return np.asarray(age >= max(oldest, _VOTING_FRAMES))
 
 
-class ObjectReport(ImageCheck):
+class ObjectReport:
     """Reports once per event that an object covers much of the image, and what decided which
     motion is the camera's.
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        self._frames = self._clear = self._hidden = 0  # in a row
-        self._said = self._said_hidden = self._active = False
+        self._found: list[Finding] = []
+        self._frames = 0  # with an object, in a row
+        self._since = 0  # the first of them
+        self._clear = 0  # without one, in a row
+        self._hidden = 0  # that an object hides, in a row
+        self._reported: str | None = None  # code of the event that goes on
+        self._hidden_reported = False
+        self._active = False
 
     @property
     def active(self) -> bool:
@@ -393,50 +421,72 @@ class ObjectReport(ImageCheck):
         """
         return self._active
 
+    def take_findings(self) -> tuple[Finding, ...]:
+        """Return the findings since the last call."""
+        found = tuple(self._found)
+        self._found = []
+        return found
+
     def hides_scene(self, index: int, motions: TwoMotions) -> bool:
         """Return whether a known object has left too few points of the scene for some frames, so
         that none is used.
         """
         hidden = self._active and float(motions.motion.inliers.mean()) < _HIDDEN_SHARE
         self._hidden = self._hidden + 1 if hidden else 0
-        if self._hidden >= _HIDDEN_FRAMES and not self._said_hidden:
-            self._said_hidden = True
-            self._lines.append(
+        if self._hidden >= _HIDDEN_FRAMES and not self._hidden_reported:
+            self._hidden_reported = True
+            message = (
                 f"frame {index}: fewer than {100 * _HIDDEN_SHARE:.0f} % of the points are left of "
-                "the scene: the "
-                "object hides it, and no feature is used"
+                "the scene: the object hides it, and no feature is used"
             )
+            self._found.append(Finding("object-hides-scene", message, index, lasts=True))
         return self._hidden >= _HIDDEN_FRAMES
 
     def frame(self, index: int, motions: TwoMotions) -> None:
         """Take the motions of a frame."""
         if motions.object_share == 0.0:
-            self._frames = 0
-            self._clear = self._clear + 1
-            self._said = self._said and self._clear < _CLEAR_FRAMES
-            self._said_hidden = self._said_hidden and self._said
-            self._active = self._active and self._clear < _FRAMES
+            self._no_object(index)
             return
+        if self._frames == 0:
+            self._since = index
         self._frames = self._frames + 1
         self._clear = 0
-        self._active = self._active or (self._frames >= _FRAMES and motions.decision != "undecided")
-        if self._frames < _FRAMES or self._said:
+        undecided = motions.decision == "undecided"
+        self._active = self._active or (self._frames >= _FRAMES and not undecided)
+        if self._frames >= _FRAMES and self._reported is None:
+            self._report(index, motions)
+
+    def _no_object(self, index: int) -> None:
+        self._frames = 0
+        self._clear = self._clear + 1
+        self._active = self._active and self._clear < _FRAMES
+        if self._reported is None or self._clear < _CLEAR_FRAMES:
             return
-        self._said = True
+        message = f"frame {index}: no object covers much of the image any more"
+        self._found.append(Finding(self._reported, message, index, ended=True))
+        if self._hidden_reported:
+            self._found.append(Finding("object-hides-scene", message, index, ended=True))
+        self._reported = None
+        self._hidden_reported = False
+
+    def _report(self, index: int, motions: TwoMotions) -> None:
         share = round(100 * motions.object_share)
+        self._reported = "object-covers-image"
         by = "the points seen before" if motions.decision == "voted" else "its predicted motion"
-        line = (
+        message = (
             f"frame {index}: {share} % of the points move together, but not as the camera does by "
-            f"{by}: an object that "
-            "moves on its own covers much of the image; its points are left out"
+            f"{by}: an object that moves on its own covers much of the image; its points are left "
+            "out"
         )
         if motions.decision == "undecided":
+            self._reported = "object-or-scene"
             rest = round(100 * float(motions.motion.inliers.mean()))
-            line = (
+            message = (
                 f"frame {index}: two groups of points move differently, {rest} % and {share} % of "
-                "all: an object that "
-                "moves on its own covers much of the image, and the predicted motion does not tell "
-                "which group it is; "
-                "the larger one is taken for the scene"
+                "all: an object that moves on its own covers much of the image, and the predicted "
+                "motion does not tell which group it is; the larger one is taken for the scene"
             )
-        self._lines.append(line)
+        figures = {"object_share": motions.object_share}
+        self._found.append(
+            Finding(self._reported, message, index, self._since, lasts=True, figures=figures)
+        )

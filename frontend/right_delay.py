@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vio.frontend.image_check import FrameImages, ImageCheck
+from vio.findings import Finding
 from vio.frontend.tracks import Tracks
 from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
@@ -51,11 +51,11 @@ class PairingCounts:
     early: int  # this left image, and the right one before
 
 
-class RightDelay(ImageCheck):
+class RightDelay:
     """Estimates the right camera's delay from the matches of all frames."""
 
     def __init__(self, camera: StereoCamera) -> None:
-        super().__init__()
+        self._found: list[Finding] = []
         self._camera = camera
         self._normal: FloatArray = np.zeros((_TERMS + 1, _TERMS + 1))
         self._moment: FloatArray = np.zeros(_TERMS + 1)
@@ -64,17 +64,29 @@ class RightDelay(ImageCheck):
         self._solution: FloatArray = np.zeros(_TERMS + 1)
         self._suspected = (0.0, 0)  # delay by the pairings, and in how many frames in a row
         self.frames = 0.0  # the delay in frames to be taken out; 0: none is significant
+        self._code = "right-image-late"  # of the last finding
         self._early = False  # each right image is used with the next left one
         # that came with the last frame, where it is used with this one
         self._last_right: Image | None = None
 
-    def inspect(self, images: FrameImages) -> FrameImages | None:
-        """Return the left image with the right one of its time; None: that one was not kept."""
+    def paired(self, right: Image) -> Image | None:
+        """Return the right image (H, W) of the present left image's time; None: it was not kept."""
         if not self._early:
-            return images
-        right = self._last_right
-        self._last_right = images.raw[1].copy()
-        return None if right is None else images.with_raw((images.raw[0], right))
+            return right
+        before = self._last_right
+        self._last_right = right.copy()
+        return before
+
+    def know(self, frames: int) -> None:
+        """Take a delay in whole frames that is known from elsewhere."""
+        self._forget()
+        self.frames = float(frames)
+
+    def take_findings(self) -> tuple[Finding, ...]:
+        """Return the findings since the last call."""
+        found = tuple(self._found)
+        self._found = []
+        return found
 
     def update(
         self, index: int, left: FloatArray, flow: FloatArray, rows: FloatArray, frame_s: float
@@ -121,8 +133,7 @@ class RightDelay(ImageCheck):
         rounded = whole if abs(delay - whole) < _WHOLE else delay
         if self.frames != 0.0:
             if abs(delay) < _FORGET:
-                self.frames = 0.0
-                self._lines.append(f"frame {index}: the right camera is no longer late or early")
+                self._end(index)
             elif rounded != 0.0:
                 self.frames = rounded
         elif abs(delay) > _LEAST_DELAY and explained > _EXPLAINS:
@@ -159,7 +170,8 @@ class RightDelay(ImageCheck):
 
     def _forget(self) -> None:
         """Forget what was learned of the rows."""
-        self._normal, self._moment = np.zeros_like(self._normal), np.zeros_like(self._moment)
+        self._normal = np.zeros_like(self._normal)
+        self._moment = np.zeros_like(self._moment)
         self._square = self._count = 0.0
         self._frames = 0
         self._solution = np.zeros(_TERMS + 1)
@@ -171,18 +183,25 @@ class RightDelay(ImageCheck):
             self._last_right = None
             self._forget()
             if not self._early:
-                self._lines.append(f"frame {index}: the right camera is no longer late or early")
+                self._end(index)
                 return
         else:
             self.frames = rounded
         late = "late" if delay > 0 else "early"
-        self._lines.append(
+        message = (
             f"frame {index}: the right camera is {late} by {1e3 * abs(delay) * frame_s:.0f} ms "
-            f"({abs(delay):.2f} "
-            "frames) against the left one, by how its image moves; it is taken out of the matches; "
-            "pair the images by "
-            "their times of exposure, or synchronise the cameras"
+            f"({abs(delay):.2f} frames) against the left one, by how its image moves; it is taken "
+            "out of the matches; pair the images by their times of exposure, or synchronise the "
+            "cameras"
         )
+        self._code = f"right-image-{late}"
+        figures = {"delay_frames": delay, "delay_ms": 1e3 * delay * frame_s}
+        self._found.append(Finding(self._code, message, index, lasts=True, figures=figures))
+
+    def _end(self, index: int) -> None:
+        self.frames = 0.0
+        message = f"frame {index}: the right camera is no longer late or early"
+        self._found.append(Finding(self._code, message, index, ended=True))
 
     def _significance(self) -> tuple[float, float, float]:
         """The delay in frames, its standard deviation, and the share of the rows' scatter that

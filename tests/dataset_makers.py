@@ -142,7 +142,7 @@ def make_images(folder: Path, frames: int, *, channels: int = 1, depth: int = 8)
 def calib_text(*offsets_m: float) -> str:
     """The lines `P0: …` of rectified cameras at the given places on the x axis of camera 0."""
     lines = [
-        f"P{k}: 7.0e+02 0 6.0e+02 {-700 * x:e} 0 7.0e+02 1.8e+02 0 0 0 1 0"
+        f"P{k}: 7.0e+02 0 1.6e+01 {-700 * x:e} 0 7.0e+02 1.2e+01 0 0 0 1 0"
         for k, x in enumerate(offsets_m)
     ]
     return "\n".join([*lines, "Tr: 1 0 0 0 0 1 0 0 0 0 1 0"]) + "\n"

@@ -17,7 +17,15 @@ FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py"
 
 # Only the configuration, live use, the pipeline, the simulated front end and the command line know
 # the front end.
-USES_FRONTEND = ("vio.config", "vio.live", "vio.runs", "vio.sim.oracle", "vio.cli", "vio.frontend")
+USES_FRONTEND = (
+    "vio.config",
+    "vio.guard",
+    "vio.live",
+    "vio.runs",
+    "vio.sim.oracle",
+    "vio.cli",
+    "vio.frontend",
+)
 # The estimator, free of images and files.
 ESTIMATOR = (
     "vio.filters",

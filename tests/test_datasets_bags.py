@@ -18,7 +18,7 @@ from tests.same_events import assert_same_events, frames_of  # noqa: E402
 from vio.cameras.rig import Rig  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
 from vio.datasets.bags.pictures import raw_gray  # noqa: E402
-from vio.datasets.images import white_of  # noqa: E402
+from vio.datasets.levels import Levels, levels_of  # noqa: E402
 from vio.datasets.rigs.kalibr import kalibr_text  # noqa: E402
 from vio.errors import CalibrationError, DataError, VioError  # noqa: E402
 from vio.geometry.lie import se3_exp, se3_inverse  # noqa: E402
@@ -391,7 +391,7 @@ def test_bayer_patterns_are_told_apart(pattern: str) -> None:
     ("level", "white"), [(900, 1023), (4000, 4095), (16000, 16383), (60000, 65535), (65520, 65535)]
 )
 def test_sixteen_bits_are_scaled_by_the_bits_in_use(level: float, white: int) -> None:
-    assert white_of(level) == white
+    assert levels_of([(0.0, level)]) == Levels(0, white)
 
 
 def test_twelve_bits_in_sixteen_are_scaled_and_said(tmp_path: Path) -> None:

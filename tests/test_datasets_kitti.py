@@ -21,6 +21,7 @@ from vio.cameras.rig import Rig
 from vio.datasets import open_dataset
 from vio.datasets.kitti import read_calibration
 from vio.datasets.plain import read_kitti
+from vio.datasets.rigs import kitti_rig
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
@@ -51,7 +52,7 @@ def test_reads_a_self_contained_folder_completely(tmp_path: Path) -> None:
     folder = make_kitti(tmp_path / "seq", frames=5)
     dataset = read_kitti(folder, DEFAULT)
     recording = dataset.recording
-    assert recording.camera == StereoCamera(700.0, 700.0, 600.0, 180.0, 0.54, width=32, height=24)
+    assert recording.camera == StereoCamera(700.0, 700.0, 16.0, 12.0, 0.54, width=32, height=24)
     assert recording.frame_times_ns.tolist() == [k * 100_000_000 for k in range(5)]
     np.testing.assert_allclose(recording.T_cam0_imu, T_CAM0_IMU, atol=1e-12)
     assert recording.motion == {"velocity"}
@@ -190,9 +191,8 @@ def test_official_calibration_of_sequence_00(tmp_path: Path) -> None:
 
 
 def test_a_pair_off_its_axis_is_noted(tmp_path: Path) -> None:
-    folder = make_kitti(tmp_path / "seq", gray=False, colour=True)
-    (folder / "calib.txt").write_text(OFFICIAL_00)
-    notes = read_kitti(folder, DEFAULT).recording.notes
+    (tmp_path / "calib.txt").write_text(OFFICIAL_00)
+    notes = kitti_rig(tmp_path / "calib.txt", (1241, 376), (2, 3))[0].notes
     assert len(notes) == 1
     assert "image_3 is 3." in notes[0]
 
@@ -337,7 +337,7 @@ BAD = [
         r"stereo baseline of -0\.54 m.*exchanged",
     ),
     (
-        _write("calib.txt", GOOD.replace("6.0e+02", "x", 1)),
+        _write("calib.txt", GOOD.replace("1.6e+01", "x", 1)),
         CalibrationError,
         r"line 1: P0 holds no number",
     ),
@@ -362,12 +362,12 @@ BAD = [
         r"P0 is no intrinsic matrix .* fu and fv positive",
     ),
     (
-        _write("calib.txt", GOOD.replace("6.0e+02", "5.0e+02", 1)),
+        _write("calib.txt", GOOD.replace("1.6e+01", "1.5e+01", 1)),
         CalibrationError,
         r"P0 and P1 differ in focal length",
     ),
     (
-        _write("calib.txt", GOOD.replace("1.8e+02 0 0 0 1 0\nTr", "1.8e+02 99 0 0 1 0\nTr")),
+        _write("calib.txt", GOOD.replace("1.2e+01 0 0 0 1 0\nTr", "1.2e+01 99 0 0 1 0\nTr")),
         CalibrationError,
         "off the",
     ),

@@ -57,6 +57,45 @@ def make_videos(flight: Path, folder: Path) -> Path:
     return folder
 
 
+def test_side_by_side_images_and_video_are_the_same_recording(
+    videos: Path, flight: Path, tmp_path: Path
+) -> None:
+    """As a ZED records: the left image beside the right one."""
+    both = []
+    stamps = sorted((f.stem for f in (flight / "mav0" / "cam0" / "data").iterdir()), key=int)
+    for stamp in stamps:
+        sides = [
+            cv2.imread(str(flight / "mav0" / cam / "data" / f"{stamp}.png"), cv2.IMREAD_GRAYSCALE)
+            for cam in ("cam0", "cam1")
+        ]
+        both.append(np.hstack(sides))
+    companions = ("times.txt", "camchain-imucam.yaml", "imu.csv")
+    video = tmp_path / "video"
+    images = tmp_path / "images"
+    (images / "images").mkdir(parents=True)
+    video.mkdir()
+    write_video(video / "HD720_SN123.avi", both)
+    for stamp, image in zip(stamps, both, strict=True):
+        assert cv2.imwrite(str(images / "images" / f"{stamp}.png"), image)
+    usual = open_dataset(videos)
+    for folder, kind in ((video, "video"), (images, "plain")):
+        for name in companions:
+            shutil.copyfile(videos / name, folder / name)
+        dataset = open_dataset(folder)
+        assert dataset.recording.kind == kind
+        assert any("side by side" in note for note in dataset.recording.notes)
+        assert_same_events(dataset, usual)
+        left = open_dataset(folder, DatasetSettings(camera="left"))
+        assert all(frame.right is None for frame in frames_of(left))
+
+
+def test_one_video_of_one_camera_is_not_cut(videos: Path, tmp_path: Path) -> None:
+    shutil.copytree(videos, tmp_path / "r")
+    (tmp_path / "r" / "right.avi").unlink()
+    with pytest.raises(DataError, match=r"is the only video, of .* side by side they would have"):
+        open_dataset(tmp_path / "r")
+
+
 def test_two_lossless_videos_are_the_same_recording_to_the_bit(videos: Path, flight: Path) -> None:
     euroc, video = open_dataset(flight), open_dataset(videos)
     assert video.recording.kind == "video"

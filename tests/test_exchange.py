@@ -9,12 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.guards import guarded_klt, lines_of
 from tests.test_frontend_klt import FRAMES
 from tests.test_frontend_scene import CAMERA
 from tests.test_right_camera import pair
-from vio.frontend.exchange import ExchangeDetector, MatchCounts
-from vio.frontend.klt import KltFrontend
 from vio.frontend.settings import FrontendSettings, GridSettings
+from vio.guard.exchange import ExchangeDetector, MatchCounts
+from vio.guard.probe import RowProbe
 from vio.records import FrontendOutput
 
 SETTINGS = FrontendSettings(grid=GridSettings(target_features=150))
@@ -24,7 +25,7 @@ FEW = MatchCounts(80, 3, 5)
 
 def run(swapped: range, there: MatchCounts = SWAPPED) -> tuple[list[str], list[str], int]:
     """The order of each of ten frames, the lines, and how often matches were counted."""
-    detector, orders, lines, counted = ExchangeDetector(), [], [], []
+    detector, orders, lines, counted = ExchangeDetector(RowProbe()), [], [], []
     for k in range(10):
         left, right = pair(k)[:: -1 if k in swapped else 1]
 
@@ -33,7 +34,7 @@ def run(swapped: range, there: MatchCounts = SWAPPED) -> tuple[list[str], list[s
             return there if k in swapped else IN_ORDER
 
         orders.append(detector.order(k, left, right, count, suspicious=False))
-        lines += detector.take_lines()
+        lines += lines_of(detector)
     return orders, lines, len(counted)
 
 
@@ -71,7 +72,7 @@ def test_what_looks_exchanged_but_does_not_match_so_is_used_as_given(there: Matc
 
 def test_front_end_gives_the_same_output_to_the_bit_where_two_frames_are_exchanged() -> None:
     def outputs(swapped: range) -> list[FrontendOutput]:
-        frontend = KltFrontend(CAMERA, SETTINGS)
+        frontend = guarded_klt(CAMERA, SETTINGS)
         return [
             frontend.process(replace(f, left=f.right, right=f.left) if f.index in swapped else f)
             for f in FRAMES[:5]
@@ -80,4 +81,4 @@ def test_front_end_gives_the_same_output_to_the_bit_where_two_frames_are_exchang
     for expected, found in zip(outputs(range(0)), outputs(range(2, 4)), strict=True):
         np.testing.assert_array_equal(found.observations.ids, expected.observations.ids)
         np.testing.assert_array_equal(found.observations.z, expected.observations.z)
-        assert bool(found.warnings) == (found.observations.frame_index in (2, 4))
+        assert bool(found.findings) == (found.observations.frame_index in (2, 4))

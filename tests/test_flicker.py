@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.guards import guarded_klt, lines_of
 from tests.test_frontend_klt import FRAMES, step_errors
 from tests.test_frontend_scene import CAMERA
 from tests.test_right_camera import pair
-from vio.frontend.flicker import BandRemoval
-from vio.frontend.klt import KltFrontend
 from vio.frontend.settings import FrontendSettings, GridSettings
+from vio.guard.bands import BandRemoval
 from vio.records import FrontendOutput, Image, StereoFrame
 
 
@@ -31,7 +31,7 @@ def test_images_without_bands_are_returned_as_they_are() -> None:
         left, right = pair(k)
         right = dark if k % 3 == 2 else right  # a camera that loses frames makes no bands
         assert removal.flatten(k, left, right)[0] is left
-    assert removal.take_lines() == ()
+    assert lines_of(removal) == []
 
 
 def test_a_late_right_camera_makes_no_bands() -> None:
@@ -41,7 +41,7 @@ def test_a_late_right_camera_makes_no_bands() -> None:
     for k in range(12):
         left, right = (rows[12 * j : 12 * j + 150].astype(np.uint8) for j in (k + 1, k))
         assert removal.flatten(k, left, right)[0] is left
-    assert removal.take_lines() == ()
+    assert lines_of(removal) == []
 
 
 def test_cameras_that_set_their_exposure_alone_make_no_bands() -> None:
@@ -57,7 +57,7 @@ def test_cameras_that_set_their_exposure_alone_make_no_bands() -> None:
             for gain in gains
         )
         assert removal.flatten(k, left, right)[0] is left
-    assert removal.take_lines() == ()
+    assert lines_of(removal) == []
 
 
 def test_bands_are_named_once_and_taken_out() -> None:
@@ -65,7 +65,7 @@ def test_bands_are_named_once_and_taken_out() -> None:
     for k in range(12):
         images = tuple(banded(image, k, camera) for camera, image in enumerate(pair(k)))
         out = removal.flatten(k, *images)
-        lines += removal.take_lines()
+        lines += lines_of(removal)
     (line,) = lines
     assert line.startswith("frame 3: bands of brightness move through the images")
     for image, flat in zip(images, out, strict=True):
@@ -77,7 +77,7 @@ def test_bands_are_named_once_and_taken_out() -> None:
 def test_features_are_tracked_through_bands(removed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not removed:
         monkeypatch.setattr(BandRemoval, "flatten", lambda self, index, left, right: (left, right))
-    frontend = KltFrontend(CAMERA, FrontendSettings(grid=GridSettings(target_features=150)))
+    frontend = guarded_klt(CAMERA, FrontendSettings(grid=GridSettings(target_features=150)))
 
     def process(frame: StereoFrame) -> FrontendOutput:
         k = frame.index

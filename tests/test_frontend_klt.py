@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.guards import guarded_klt, messages
 from tests.test_frontend_scene import (
     CAMERA,
     SLANTED,
@@ -22,7 +23,7 @@ from tests.test_frontend_scene import (
     view,
 )
 from vio.errors import ConfigError, DataError
-from vio.frontend import contrast, detect, flow, klt, new_features, one_opencv_thread, stereo_fit
+from vio.frontend import detect, flow, klt, new_features, one_opencv_thread, stereo_fit
 from vio.frontend.detect import cell_index, grid_shape, min_distance_px
 from vio.frontend.klt import KltFrontend
 from vio.frontend.outliers import _refine
@@ -32,6 +33,7 @@ from vio.frontend.settings import FrontendSettings, GridSettings, KltSettings
 from vio.frontend.tracks import INLIER_PX
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
+from vio.guard import contrast
 from vio.records import FrontendOutput, MotionPrior, StereoFrame, TrackPrior
 
 GRID = GridSettings(target_features=200)
@@ -41,7 +43,7 @@ FRAMES = [stereo_frame(k, pose) for k, pose in enumerate(POSES)]
 
 
 def run(frames: list[StereoFrame], settings: FrontendSettings = SETTINGS) -> list[FrontendOutput]:
-    frontend = KltFrontend(CAMERA, settings)
+    frontend = guarded_klt(CAMERA, settings)
     return [frontend.process(frame) for frame in frames]
 
 
@@ -245,7 +247,7 @@ def test_tracks_outlast_a_right_camera_that_loses_its_contrast(
     seen, later = outputs[0].observations, outputs[4].observations
     assert np.isin(seen.ids[seen.has_right], later.ids).mean() > 0.8
     assert not later.has_right.any()
-    (line,) = [line for output in outputs for line in output.warnings]
+    (line,) = [line for output in outputs for line in messages(output)]
     assert line.startswith("frame 3: the right camera is dark or covered")
 
 
@@ -313,13 +315,13 @@ def test_prior_bridges_a_jump_too_large_for_tracking_alone() -> None:
     frames = [stereo_frame(0, first), stereo_frame(1, second)]
     settings = with_klt(pyramid_levels=1)
     without_prior = run(frames, settings)[1]
-    frontend = KltFrontend(CAMERA, settings)
+    frontend = guarded_klt(CAMERA, settings)
     seen = frontend.process(frames[0]).observations
     z = truth(SLANTED, first, seen.z[:, :2], second) + np.random.default_rng(0).normal(
         0, 2, (len(seen), 4)
     )
     by_pixels = frontend.process(frames[1], TrackPrior(seen.ids, z))
-    frontend = KltFrontend(CAMERA, settings)
+    frontend = guarded_klt(CAMERA, settings)
     frontend.process(frames[0])
     nothing = TrackPrior(
         np.zeros(0, dtype=np.int64), np.zeros((0, 4)), (se3_inverse(second) @ first)[:3, :3]
@@ -418,7 +420,7 @@ def test_features_failing_the_forward_backward_check_are_dropped(
 
 
 def test_swapped_images_are_detected() -> None:
-    frontend = KltFrontend(CAMERA, SETTINGS)
+    frontend = guarded_klt(CAMERA, SETTINGS)
     swapped = [replace(frame, left=frame.right, right=frame.left) for frame in FRAMES]
     for frame in swapped[:2]:
         assert frontend.process(frame).matched < 30
@@ -440,7 +442,7 @@ def test_unrelated_right_image_is_not_reported_as_swapped() -> None:
 
 def test_swapped_images_of_a_real_drive_are_detected(data_dir: Path) -> None:
     camera, frames, _ = kitti(data_dir / "kitti_05_clip", 12)
-    frontend = KltFrontend(camera)
+    frontend = guarded_klt(camera)
     swapped = [replace(frame, left=frame.right, right=frame.left) for frame in frames]
     frontend.process(swapped[0])
     frontend.process(swapped[1])

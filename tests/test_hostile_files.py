@@ -30,8 +30,9 @@ from tests.test_datasets_png import chunk
 from vio.config import SettingInfo, load_config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.common import read_npz
-from vio.datasets.image_pairs import full_scale
-from vio.datasets.images import UnreadableImageError, load_gray, white_level
+from vio.datasets.image_pairs import gray_levels
+from vio.datasets.images import UnreadableImageError, levels_in, load_gray
+from vio.datasets.levels import Levels
 from vio.errors import ConfigError, DataError
 from vio.files.tables import check_table
 from vio.files.text import text_lines
@@ -130,7 +131,7 @@ def test_bits_in_use_are_scaled_by_one_factor_for_the_whole_run(
 
 
 def test_no_image_is_taken_for_one_of_16_bits() -> None:
-    assert white_level([]) == full_scale(())[0] == 65535
+    assert levels_in([]) == gray_levels(())[0] == Levels(0, 65535)
 
 
 # --- archives

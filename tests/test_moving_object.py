@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.guards import lines_of
 from tests.test_frontend_outliers import CAMERA, T_TRUE, make_problem, pixels, scene
 from vio.frontend.klt import KltFrontend
 from vio.frontend.moving_object import (
@@ -265,7 +266,7 @@ def test_a_scene_that_is_nearly_hidden_is_not_used_and_it_is_said() -> None:
     assert [
         report.hides_scene(k, motions) for k, motions in enumerate([half, *[little] * 5, half])
     ] == ([False] * 3 + [True] * 3 + [False])
-    (line,) = [line for line in report.take_lines() if "hides it" in line]
+    (line,) = [line for line in lines_of(report) if "hides it" in line]
     assert line.startswith("frame 3: fewer than 10 % of the points are left of the scene")
 
 
@@ -274,22 +275,23 @@ def test_an_object_is_reported_once_per_event_with_what_decided() -> None:
     nothing, object_ = TwoMotions(everything, 0.0, None), TwoMotions(everything, 0.4, "predicted")
     report = ObjectReport()
 
-    def lines_of(frames: range, motions: TwoMotions) -> list[str]:
+    def lines_during(frames: range, motions: TwoMotions) -> list[str]:
         for k in frames:
             report.frame(k, motions)
-        return list(report.take_lines())
+        return lines_of(report)
 
-    assert lines_of(range(4), object_) == []
-    assert lines_of(range(4, 5), nothing) == []
+    assert lines_during(range(4), object_) == []
+    assert lines_during(range(4, 5), nothing) == []
     assert not report.active
-    lines = lines_of(range(5, 40), object_)
+    lines = lines_during(range(5, 40), object_)
     assert [line[:36] for line in lines] == ["frame 9: 40 % of the points move tog"]
     assert "its points are left out" in lines[0]
     assert report.active
-    assert lines_of(range(40, 70), nothing) == []
+    (line,) = lines_during(range(40, 70), nothing)
+    assert line == "frame 59: no object covers much of the image any more"
     assert not report.active
     undecided = TwoMotions(everything, 0.4, "undecided")
-    (line,) = lines_of(range(70, 80), undecided)
+    (line,) = lines_during(range(70, 80), undecided)
     assert "60 % and 40 % of all" in line
     assert "does not tell which group it is; the larger one is taken for the scene" in line
 
@@ -310,7 +312,7 @@ def _lines(p: FloatArray, z: FloatArray, uv: FloatArray) -> list[str]:
         frontend._reject_outliers(
             make_problem(), tracks, uv, everything, None, np.eye(4), stereo, k
         )
-    return list(frontend._take_lines())
+    return [finding.message for finding in frontend._take_findings()]
 
 
 def _yawed(z: FloatArray) -> FloatArray:

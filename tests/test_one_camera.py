@@ -431,6 +431,30 @@ def test_tum_rgbd_is_associated_by_stamps_and_its_camera_is_known(tmp_path: Path
 
 
 @pytest.mark.parametrize(
+    ("name", "calibration", "focal", "word"),
+    [
+        ("table_3", "241.2 242.3 239.5 149.5", 241.2, None),
+        ("table_3", "# K\n241.2 0 239.5\n0 242.3 149.5\n0 0 1", 241.2, None),
+        ("rgbd_bonn_balloon", "", 542.822841, "Bonn's"),
+        ("living_room_traj0_frei_png", "", 481.2, "ICL-NUIM's"),
+        ("kitchen", "", 525.0, "doubtful: no calibration"),
+    ],
+)
+def test_rgbd_folder_has_its_own_calibration_or_the_published_one(
+    name: str, calibration: str, focal: float, word: str | None, tmp_path: Path
+) -> None:
+    folder = _tum_folder(tmp_path / name)
+    if calibration:
+        (folder / "calibration.txt").write_text(calibration + "\n")
+    recording = open_dataset(folder).recording
+    assert recording.camera.fu == pytest.approx(focal, rel=0.2 if "bonn" in name else 1e-9)
+    notes = " ".join(recording.notes)
+    assert "not used: calibration.txt" not in notes
+    assert word is None or word in notes
+    assert (word is None) == ("no calibration" not in notes)
+
+
+@pytest.mark.parametrize(
     ("spoil", "message"),
     [
         (lambda f: (f / "depth.txt").write_text("# nothing\n"), "holds no line of data"),

@@ -18,6 +18,7 @@ import vio
 from tests.euroc_maker import EQUIDISTANT_RIG, RADTAN_RIG, calib_cam_to_cam, make_euroc, rigid_text
 from vio.cameras.rig import Rig, remap
 from vio.datasets.kitti import write_calibration
+from vio.datasets.rigs.camera_info import CameraInfo, rig_from_camera_infos
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel
@@ -381,7 +382,7 @@ def test_opencv_rectified_matrices_alone_and_a_board_in_millimetres(tmp_path: Pa
     assert "taken to be rectified" in rig.notes[0]
     path = write_storage(tmp_path / "mm.yml", {**whole, "T": 1000 * whole["T"]}, (64, 48))
     assert (
-        "the cameras are 110.002 m apart; where the board was measured in millimetres"
+        "T puts the cameras 110.002 m apart, if its unit is the metre; where the board was measured in millimetres"
         in vio.load_rig(path).notes[0]
     )
 
@@ -446,6 +447,170 @@ def test_boofcv_is_read(tmp_path: Path) -> None:
     rig = vio.load_rig(tmp_path)
     np.testing.assert_allclose(rig.T_cam1_cam0, T_CAM1_CAM0, atol=1e-12)
     assert rig.cam0.coefficients == (-0.36, 0.17, 0.0, 0.0)
+
+
+# --- read in silence before
+# ------------------------------------------------------------------------------------------------
+
+
+def test_fisheye_without_distortion_is_no_pinhole(tmp_path: Path) -> None:
+    """An ideal fisheye, as simulators publish it; 27 % off at 45 degrees as a pinhole."""
+    write_ros_pair(tmp_path)
+    for name in ("left.yaml", "right.yaml"):
+        text = (tmp_path / name).read_text().replace("plumb_bob", "equidistant")
+        lines = text.split("distortion_coefficients:")
+        zeros = "\n  rows: 1\n  cols: 4\n  data: [0.0, 0.0, 0.0, 0.0]\nrectification"
+        (tmp_path / name).write_text(
+            lines[0] + "distortion_coefficients:" + zeros + lines[1].split("rectification", 1)[1]
+        )
+    rig = vio.load_rig(tmp_path)
+    assert [c.model for c in rig.cameras] == ["equidistant"] * 2
+    at_45_deg = project_point(rig.cam0, [1.0, 0.0, 1.0])[0][0]
+    assert at_45_deg - rig.cam0.cu == pytest.approx(np.pi / 4 * rig.cam0.fu)
+
+
+def test_printed_camera_info_is_read_as_the_file(tmp_path: Path) -> None:
+    """As `ros2 topic echo --once /left/camera_info` prints it."""
+    m = opencv_matrices()
+    for side, k in (("left", 1), ("right", 2)):
+        values = {"d": m[f"D{k}"], "k": m[f"M{k}"], "r": m[f"R{k}"], "p": m[f"P{k}"]}
+        text = "header:\n  frame_id: x\nheight: 48\nwidth: 64\ndistortion_model: plumb_bob\n"
+        text += "".join(f"{n}: {np.ravel(v).tolist()}\n" for n, v in values.items())
+        text += "binning_x: 0\nbinning_y: 0\nroi:\n  x_offset: 0\n  width: 0\n  height: 0\n"
+        (tmp_path / f"{side}.yaml").write_text(text)
+    rig = vio.load_rig(tmp_path)
+    np.testing.assert_allclose(rig.right[1], T_CAM1_CAM0, atol=1e-9)
+    assert rig.cam1.coefficients[:4] == RIG.cam1.coefficients
+
+
+@pytest.mark.parametrize("roi", [None, (8, 4, 48, 40)])
+def test_camera_info_of_a_binned_part_describes_its_images(
+    roi: tuple[int, int, int, int] | None,
+) -> None:
+    """A pixel u of the sensor is (u - x_offset) / binning_x, as image_geometry has it."""
+    m = opencv_matrices()
+    info = CameraInfo("t", 64, 48, "plumb_bob", RIG.cam0.coefficients, m["M1"], m["R1"], m["P1"])
+    right = replace(
+        info, D=RIG.cam1.coefficients, K=m["M2"], R=m["R2"], P=m["P2"], binning=(2, 2), roi=roi
+    )
+    infos = [replace(info, binning=(2, 2), roi=roi), right]
+    x, y, width, height = roi or (0, 0, 64, 48)
+    whole = rig_from_camera_infos([info, replace(right, binning=(1, 1), roi=None)])
+    rig = rig_from_camera_infos(infos, image_size=(width // 2, height // 2))
+    np.testing.assert_allclose(rig.right[1], T_CAM1_CAM0, atol=1e-9)
+    for found, full in zip(rig.cameras, whole.cameras, strict=True):
+        assert (found.width, found.height) == (width // 2, height // 2)
+        at = project_point(full, [0.1, 0.2, 1.0])[0]
+        part = (at - (x, y)) / 2
+        np.testing.assert_allclose(project_point(found, [0.1, 0.2, 1.0])[0], part, atol=1e-9)
+    same = rig_from_camera_infos(infos, image_size=(64, 48))
+    assert same.cam0 == whole.cam0, "images of the whole sensor are neither binned nor a part"
+
+
+def test_halved_images_of_a_calibration_without_a_size_are_doubted(tmp_path: Path) -> None:
+    camera = Rig.rectified(400.0, 400.0, 305.0, 250.0, 0.12, 640, 480).camera
+    write_calibration(tmp_path, camera, None)
+    assert vio.load_rig(tmp_path, image_size=(640, 480)).notes == ()
+    (note,) = vio.load_rig(tmp_path, image_size=(384, 288)).notes
+    assert "the middle of images of about 610 x 500 pixels, not of 384 x 288" in note
+    (note,) = vio.load_rig(tmp_path, image_size=(640, 360)).notes
+    assert "if they were cropped, subtract what was cut" in note
+    with pytest.raises(CalibrationError, match="principal point 305, 250 lies outside images"):
+        vio.load_rig(tmp_path, image_size=(320, 240))
+
+
+def test_principal_point_outside_stated_images_is_refused(tmp_path: Path) -> None:
+    make = _camchain(lambda c: c["cam1"].update(intrinsics=[40.0, 40.0, 70.0, 24.0]))
+    with pytest.raises(CalibrationError, match="principal point 70, 24 lies outside images"):
+        vio.load_rig(make(tmp_path))
+
+
+def test_translation_in_squares_of_the_board_is_doubted(tmp_path: Path) -> None:
+    """OpenCV's own sample writes squares of 1; here they are of 25 mm."""
+    whole = opencv_matrices()
+    path = write_storage(tmp_path / "s.yml", {**whole, "T": 40 * whole["T"]}, (64, 48))
+    (note,) = vio.load_rig(path).notes
+    assert "4.40009 m apart" in note
+    assert "which makes 0.11 m of squares of 25 mm" in note
+    path = write_storage(tmp_path / "m.yml", {**whole, "T": 5 * whole["T"]}, (64, 48))
+    assert vio.load_rig(path).notes == (), "0.55 m is a car's"
+
+
+def test_pose_of_the_camera_on_the_imu_is_taken_as_its_inverse(tmp_path: Path) -> None:
+    def turn(chain: dict[str, dict[str, object]]) -> None:
+        for name in ("cam0", "cam1"):
+            T = np.array(chain[name].pop("T_cam_imu"))
+            chain[name]["T_imu_cam"] = se3_inverse(T).tolist()
+
+    assert_same(vio.load_rig(_camchain(turn)(tmp_path)), replace(RIG, imu_noise=None))
+
+    def contradict(chain: dict[str, dict[str, object]]) -> None:
+        chain["cam0"]["T_imu_cam"] = np.array(chain["cam0"]["T_cam_imu"]).tolist()
+
+    with pytest.raises(CalibrationError, match="T_cam_imu is not the inverse of T_imu_cam"):
+        vio.load_rig(_camchain(contradict)(tmp_path))
+
+
+def test_one_file_of_a_pair_is_said_to_be_one_camera(tmp_path: Path) -> None:
+    write_ros_pair(tmp_path)
+    (tmp_path / "left.yaml").unlink()
+    (note,) = vio.load_rig(tmp_path / "right.yaml").notes
+    assert "is read as one camera, and seems to be one of a pair" in note
+    assert vio.load_rig(tmp_path / "right.yaml", cameras=1).notes == ()
+
+
+def test_first_two_of_three_cameras_are_the_pair(tmp_path: Path) -> None:
+    write_ros_pair(tmp_path)
+    shutil.copy(tmp_path / "right.yaml", tmp_path / "cam2.yaml")
+    (tmp_path / "left.yaml").rename(tmp_path / "cam0.yaml")
+    (tmp_path / "right.yaml").rename(tmp_path / "cam1.yaml")
+    np.testing.assert_allclose(vio.load_rig(tmp_path).right[1], T_CAM1_CAM0, atol=1e-9)
+
+
+@pytest.mark.parametrize("names", [("cam_l", "cam_r"), ("ost_1", "ost_2"), ("CamLeft", "CamRight")])
+def test_pairs_of_ros_files_by_other_names(names: tuple[str, str], tmp_path: Path) -> None:
+    write_ros_pair(tmp_path)
+    for old, new in zip(("left", "right"), names, strict=True):
+        (tmp_path / f"{old}.yaml").rename(tmp_path / f"{new}.yaml")
+    for path in (tmp_path, tmp_path / f"{names[1]}.yaml"):
+        np.testing.assert_allclose(vio.load_rig(path).right[1], T_CAM1_CAM0, atol=1e-9)
+
+
+def test_vertical_pairs_are_called_that(tmp_path: Path) -> None:
+    down = replace(RIG, T_cam1_cam0=se3_from_parts(np.eye(3), [0.001, -0.2, 0.0]))
+    with pytest.raises(CalibrationError, match=r"a vertical pair: the cameras are 0\.2 m apart"):
+        down.rectifier()
+    P0 = np.array([[40.0, 0, 32, 0], [0, 40, 24, 0], [0, 0, 1, 0]])
+    P1 = P0.copy()
+    P1[1, 3] = -8.0
+    path = write_storage(tmp_path / "p.yml", {"P1": P0, "P2": P1}, (64, 48))
+    with pytest.raises(CalibrationError, match="a vertical pair"):
+        vio.load_rig(path)
+
+
+def test_camchain_beside_the_yaml_of_another_tool(tmp_path: Path) -> None:
+    path = _camchain(lambda c: None)(tmp_path)
+    (tmp_path / "euroc_imu_orb.yaml").write_text("%YAML:1.0\na: 1\n  b:[1, 2\nViewer.Size:2\n")
+    assert_same(vio.load_rig(path), replace(RIG, imu_noise=None))
+
+
+def test_yaml_as_opencv_alone_reads_it(tmp_path: Path) -> None:
+    path = write_storage(tmp_path / "s.yml", opencv_matrices(), (64, 48))
+    text = path.read_text().replace("data: [", "data:[").replace("image_width: ", "image_width:")
+    assert "data:[" in text
+    path.write_text(text + "Viewer.PointSize:2\n")
+    np.testing.assert_allclose(vio.load_rig(path).right[1], T_CAM1_CAM0, atol=1e-12)
+
+
+def test_boofcv_with_capital_letters_and_a_calibration_in_xml(tmp_path: Path) -> None:
+    T = se3_inverse(T_CAM1_CAM0)
+    data = "".join(f"<double>{x!r}</double>" for x in np.ravel(T[:3, :3]).tolist())
+    x, y, z = T[:3, 3].tolist()
+    text = BOOFCV.format(data=data, x=x, y=y, z=z)
+    for small, capital in (("<r>", "<R>"), ("</r>", "</R>"), ("<t>", "<T>"), ("</t>", "</T>")):
+        text = text.replace(small, capital)
+    (tmp_path / "calib.xml").write_text(text)
+    np.testing.assert_allclose(vio.load_rig(tmp_path).right[1], T_CAM1_CAM0, atol=1e-12)
 
 
 # --- bad files

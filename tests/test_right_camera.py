@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.guards import codes, guarded_klt, lines_of, messages
 from tests.test_frontend_scene import (
     CAMERA,
     SLANTED,
@@ -21,12 +22,12 @@ from tests.test_frontend_scene import (
     truth,
     view,
 )
-from vio.frontend.klt import KltFrontend
 from vio.frontend.prediction import prior_depths
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.frontend.stereo_fit import common_offset
 from vio.geometry.lie import FloatArray, se3_exp
+from vio.guard.frozen_image import FrozenCamera
 from vio.records import FrontendOutput, Image, StereoFrame, TrackPrior
 
 SETTINGS = FrontendSettings(grid=GridSettings(target_features=150))
@@ -59,14 +60,12 @@ def run(frames: list[Pair]) -> tuple[list[bool], list[bool], list[str]]:
     """Whether the right image could be used, whether the left one was frozen, and the lines,
     frame by frame.
     """
-    camera = RightCamera()
+    camera = FrozenCamera()
     usable, frozen, lines = [], [], []
     for k, (left, right) in enumerate(frames):
         frozen.append(camera.left_is_frozen(k, left, right))
-        if not frozen[-1]:
-            camera.check_matches(k, np.ones(50, dtype=np.bool_), moved=True)
-        usable.append(camera.usable)
-        lines += camera.take_lines()
+        usable.append(camera.right_usable)
+        lines += lines_of(camera)
     return usable, frozen, lines
 
 
@@ -90,12 +89,11 @@ def test_a_frozen_right_image_is_not_used_and_named_once(
         frames[k] = frames[k][0], repeat(frames[2][1], k)
     usable, frozen, lines = run(frames)
     assert not any(frozen)
-    # three frames must agree before it is
-    assert [k for k, good in enumerate(usable) if not good] == [*FROZEN, 8, 9]
+    assert [k for k, good in enumerate(usable) if not good] == [*FROZEN]
     said, again = lines
     assert said.startswith("frame 5: the right camera is frozen")
     assert "since frame 2; going on with the left images" in said
-    assert again == "frame 10: the right images agree with the left ones again, and are used"
+    assert again == "frame 8: the right camera gives new images again"
 
 
 def test_a_single_repeated_right_image_is_not_used_and_not_an_event() -> None:
@@ -113,7 +111,8 @@ def test_a_frozen_left_image_is_known_and_named_once() -> None:
         frames[k] = frames[2][0], frames[k][1]
     _, frozen, lines = run(frames)
     assert [k for k, bad in enumerate(frozen) if bad] == [*FROZEN]
-    (line,) = lines
+    line, again = lines
+    assert again == "frame 8: the left camera gives new images again"
     assert line.startswith(
         "frame 5: the left camera is frozen: its image does not change since frame 2"
     )
@@ -147,10 +146,9 @@ def test_matches_decide_where_the_images_are_plausible() -> None:
     """
     camera, lines = RightCamera(), []
     for k in range(16):
-        camera.left_is_frozen(k, *pair(k))
         matched = np.arange(40) < (4 if 5 <= k < 11 else 36)
         assert camera.check_matches(k, matched, moved=True) == (not 5 <= k < 13)
-        lines += camera.take_lines()
+        lines += lines_of(camera)
     assert [line.partition(",")[0] for line in lines] == [
         "frame 8: the right image contradicts the left one",
         "frame 13: the right images agree with the left ones again",
@@ -159,7 +157,6 @@ def test_matches_decide_where_the_images_are_plausible() -> None:
 
 def test_few_points_or_an_unknown_motion_contradict_nothing() -> None:
     camera = RightCamera()
-    camera.left_is_frozen(0, *pair(0))
     assert camera.check_matches(0, np.zeros(10, dtype=np.bool_), moved=True)
     assert camera.check_matches(0, np.zeros(80, dtype=np.bool_), moved=False)
 
@@ -169,7 +166,7 @@ def _contradicted() -> RightCamera:
     for k in range(4):
         camera.check_matches(k, np.zeros(80, dtype=np.bool_), moved=True)
     assert not camera.usable
-    camera.take_lines()
+    lines_of(camera)
     return camera
 
 
@@ -189,12 +186,11 @@ def test_where_no_feature_is_left_the_right_image_is_tried_again() -> None:
     camera = _contradicted()
     camera.try_again(4)
     assert camera.usable
-    assert camera.take_lines() == (
-        "frame 4: no feature is left that contradicts the right images; they are used again",
-    )
+    assert lines_of(camera) == [
+        "frame 4: no feature is left that contradicts the right images; they are used again"
+    ]
     frozen = RightCamera()
-    for k, (left, right) in enumerate([(pair(k)[0], pair(0)[1]) for k in range(4)]):
-        frozen.left_is_frozen(k, left, right)
+    frozen.by_image(3, usable=False)
     frozen.try_again(4)
     assert not frozen.usable
 
@@ -218,7 +214,7 @@ def run_frozen(camera: str) -> tuple[list[StereoFrame], list[FrontendOutput]]:
         replace(f, **{camera: getattr(frames[2], camera)}) if f.index in FROZEN else f
         for f in frames
     ]
-    frontend = KltFrontend(CAMERA, SETTINGS)
+    frontend = guarded_klt(CAMERA, SETTINGS)
     outputs: list[FrontendOutput] = []
     for k, frame in enumerate(frames):
         prior = None
@@ -248,8 +244,7 @@ def test_the_right_images_carry_the_features_of_a_frozen_left_camera() -> None:
         assert np.median(np.abs(error)) < 0.1
         assert np.mean(np.abs(error) > 1.0) < 0.01
         assert seen.has_right.any() == (k == 8)
-    (line,) = [line for output in outputs for line in output.warnings]
-    assert "the left camera is frozen" in line
+    assert codes(outputs) == ["left-image-frozen", "-left-image-frozen"]
 
 
 @pytest.mark.parametrize("camera", ["left", "right"])
@@ -263,8 +258,8 @@ def test_a_frozen_image_is_not_taken_for_the_other_cameras(camera: str) -> None:
         replace(f, **{camera: getattr(frames[2], camera)}) if f.index in FROZEN else f
         for f in frames
     ]
-    frontend = KltFrontend(CAMERA, SETTINGS)
-    lines = [line for frame in frames for line in frontend.process(frame).warnings]
+    frontend = guarded_klt(CAMERA, SETTINGS)
+    lines = [line for frame in frames for line in messages(frontend.process(frame))]
     assert lines
     assert not [line for line in lines if "exchanged" in line]
 
@@ -284,10 +279,7 @@ def test_front_end_goes_on_with_the_left_images_of_a_frozen_pair(
         expected = truth(SLANTED, poses[k], matched.z[:, :2], poses[k])
         assert np.abs(matched.z[:, 2] - expected[:, 2]).max(initial=0.0) < 1.0
     assert outputs[-1].observations.has_right.mean() > 0.6
-    assert [line[:36] for output in outputs for line in output.warnings] == [
-        "frame 5: the right camera is frozen:",
-        "frame 10: the right images agree wit",
-    ]
+    assert codes(outputs) == ["right-image-frozen", "-right-image-frozen"]
 
 
 def turned_frame(index: int, pose: FloatArray, yaw_deg: float) -> StereoFrame:
@@ -298,7 +290,7 @@ def turned_frame(index: int, pose: FloatArray, yaw_deg: float) -> StereoFrame:
 
 
 def flight_with_turns(yaw_deg: Callable[[int], float]) -> list[FrontendOutput]:
-    frontend = KltFrontend(CAMERA, SETTINGS)
+    frontend = guarded_klt(CAMERA, SETTINGS)
     return [
         frontend.process(turned_frame(k, pose, yaw_deg(k))) for k, pose in enumerate(flight(FRAMES))
     ]
@@ -310,7 +302,7 @@ def test_a_right_camera_that_turns_a_little_is_used_without_the_offset(yaw_deg: 
     good.
     """
     outputs = flight_with_turns(lambda k: yaw_deg if k == 3 or k >= 6 else 0.0)
-    assert [line for output in outputs for line in output.warnings] == []
+    assert [line for output in outputs for line in messages(output)] == []
     for k, pose in enumerate(flight(FRAMES)):
         seen = outputs[k].observations
         assert seen.has_right.mean() > 0.6
@@ -325,7 +317,7 @@ def test_a_right_camera_that_turns_far_is_not_used() -> None:
     assert [output.observations.has_right.any() for output in outputs] == [
         k < 5 for k in range(FRAMES)
     ]
-    (line,) = [line for output in outputs for line in output.warnings]
+    (line,) = [line for output in outputs for line in messages(output)]
     assert line.startswith("frame 8: the right image contradicts the left one")
 
 

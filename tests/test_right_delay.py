@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.guards import lines_of, messages
 from tests.test_frontend_scene import CAMERA, SLANTED, stereo_frame, truth
 from vio.frontend.klt import KltFrontend
 from vio.frontend.right_delay import PairingCounts, RightDelay, at_exposure, at_present
@@ -36,7 +37,7 @@ def feed(
         rows = field * (1 + x - 0.5 * y + x * y) - delay * flow[:, 1] + rng.normal(0, noise, 80)
         rows[:8] += rng.uniform(-20, 20, 8)  # mismatches
         estimator.update(k, left, flow, rows, FRAME_S)
-        lines += estimator.take_lines()
+        lines += lines_of(estimator)
     return estimator, lines
 
 
@@ -73,7 +74,7 @@ def test_the_pairing_that_matches_names_a_whole_frame() -> None:
         assert not estimator.suspect(0, counts, FRAME_S)
         assert estimator.suspect(1, counts, FRAME_S)
         assert estimator.frames == frames
-        assert len(estimator.take_lines()) == 1
+        assert len(lines_of(estimator)) == 1
     for counts in (
         PairingCounts(150, 100, 120, 90),
         PairingCounts(150, 5, 30, 5),
@@ -89,7 +90,7 @@ def test_an_early_camera_that_is_on_time_again_is_late_against_its_repair() -> N
     assert [estimator.suspect(k, early, FRAME_S) for k in range(2)] == [False, True]
     assert [estimator.suspect(k, late, FRAME_S) for k in range(2, 4)] == [False, True]
     assert estimator.frames == 0.0
-    assert estimator.take_lines()[-1] == "frame 3: the right camera is no longer late or early"
+    assert lines_of(estimator)[-1] == "frame 3: the right camera is no longer late or early"
 
 
 def test_matches_of_a_late_image_are_brought_to_the_present_exactly() -> None:
@@ -141,7 +142,7 @@ def test_front_end_matches_a_late_or_early_right_camera_as_if_it_were_on_time(
         expected = truth(SLANTED, poses[k], seen.z[:, :2], poses[k])
         return float(np.median(np.abs(seen.z[:, 2] - expected[:, 2])))
 
-    line = [line for output in outputs for line in output.warnings][-1]
+    line = [line for output in outputs for line in messages(output)][-1]
     assert f"the right camera is {named} by 50 ms (1.00 frames)" in line
     begun = int(line.split()[1].rstrip(":"))
     assert begun < 12

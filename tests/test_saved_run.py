@@ -96,7 +96,7 @@ def test_yields_images_in_order_and_reports_an_unreadable_one(
 ) -> None:
     kitti = make_kitti(tmp_path / "kitti", frames=FRAMES)
     (kitti / "calib.txt").write_text(calib_text(0.0, 0.54))
-    camera = replace(run.tracked.camera, fu=700.0, fv=700.0, cu=600.0, cv=180.0, baseline_m=0.54)
+    camera = replace(run.tracked.camera, fu=700.0, fv=700.0, cu=16.0, cv=12.0, baseline_m=0.54)
     run = replace(run, tracked=replace(run.tracked, camera=camera))
     frames = list(run.images.frames(run.tracked.frames[np.array([1, 4])], str(kitti)))
     assert [frame.index for frame in frames] == [1, 4]

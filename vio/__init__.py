@@ -34,6 +34,7 @@ __all__ = [
     "load_config",
     "load_rig",
     "open_dataset",
+    "protection_level",
     "run",
     "write_observations",
 ]
@@ -49,6 +50,7 @@ _MODULES = {  # loaded when the name is first used
     "load_config": "vio.config",
     "load_rig": "vio.datasets.rigs",
     "open_dataset": "vio.datasets",
+    "protection_level": "vio.integrity",
     "run": "vio.runs.pipeline",
     "write_observations": "vio.datasets.observation_log",
 }

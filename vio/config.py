@@ -230,7 +230,8 @@ class SettingInfo:
 def describe(section: Any, prefix: str = "") -> Iterator[SettingInfo]:
     """Yield every setting with its default, unit and meaning."""
     hints = get_type_hints(type(section))
-    group = (type(section).__doc__ or "").partition("\n")[0].rstrip(".")
+    summary = (type(section).__doc__ or "").partition("\n\n")[0]
+    group = " ".join(summary.split()).rstrip(".")
     for f in fields(section):
         value = getattr(section, f.name)
         if is_dataclass(value):

@@ -11,6 +11,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.records import (
+    CheckedFrame,
     Estimate,
     Event,
     FrameResult,
@@ -96,6 +97,14 @@ class Frontend(Protocol):
             DataError: the frame lacks what the front end needs, its images have a wrong size or
                 type, its time is not after the last one's, or left and right look swapped.
         """
+
+
+@runtime_checkable
+class FollowsRight(Protocol):
+    """A front end that goes on with the right images while the left camera is frozen."""
+
+    def follow_right(self, frame: CheckedFrame, prior: TrackPrior | None = None) -> FrontendOutput:
+        """Return the features of the last good pair, followed in the right image of a frame."""
 
 
 class Selector(Protocol):

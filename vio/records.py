@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import DataError
+from vio.findings import Finding, Integrity
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 
@@ -119,6 +120,19 @@ class StereoFrame:
     right: Image | None  # (H, W) rectified; None for one camera
     # (H, W) metres along the optical axis, 0 where unknown; with depth images only
     depth: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedFrame(StereoFrame):
+    """A frame as the guards hand it to a front end."""
+
+    left_half: Image | None = None  # (H/2, W/2) the left image at half resolution
+    right_half: Image | None = None  # likewise
+    # False: the right image is frozen, dark or covered; no match in it counts
+    right_usable: bool = True
+    right_delay: int = 0  # frames by which the right image is known to be late
+    # the pairs so far were wrong: depths of features that were seen in them do not count
+    begin_again: bool = False
 
 
 MotionSample: TypeAlias = ImuSample | VelocitySample
@@ -326,7 +340,8 @@ class FrontendOutput:
     matched: int  # features with a right match
     detected: int  # features new in this frame
     stages_ms: dict[str, float] = field(default_factory=dict)  # wall time per stage
-    warnings: tuple[str, ...] = ()  # what is wrong with the images, one line an event
+    warnings: tuple[str, ...] = ()  # remarks of a front end of one's own, one line an event
+    findings: tuple[Finding, ...] = ()  # what is wrong with the images
 
 
 def no_features(frame: StereoFrame) -> FrontendOutput:
@@ -502,6 +517,10 @@ class Estimate:
     # The pose in a map; None without one, or without a place in it yet.
     T_map_body: FloatArray | None = None  # (4, 4)
     T_map_body_covariance: FloatArray | None = None  # (6, 6) of xi in T_map_body = T_hat exp(xi)
+    # Whether it may be used, by all that was found; the covariance alone is conditional on what the
+    # filter assumes.
+    integrity: Integrity = "nominal"
+    findings: tuple[str, ...] = ()  # codes of what makes it other than nominal
 
 
 def _no_ids() -> IntArray:
@@ -579,6 +598,14 @@ class Trajectory:
         return replace(self, T_world_body=self.T_world_body @ T_cam0_imu, body="imu")
 
 
+DOUBT = "doubtful: "  # begins what a note says after its file where it names two readings
+
+
+def doubts_among(notes: Sequence[str]) -> tuple[str, ...]:
+    """Return the notes that name two readings of a file, of which one had to be taken."""
+    return tuple(note for note in notes if DOUBT in note)
+
+
 @dataclass(frozen=True, slots=True)
 class Recording:
     """What is known of a recording before its first frame is read."""
@@ -596,6 +623,11 @@ class Recording:
     motion_notes: tuple[str, ...] = ()  # those of them that are on motion samples only
     # observation logs: what the run behind the log used; None: not known
     run_motion: RunMotion | None = None
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The notes on what the files do not state and what their own numbers contradict."""
+        return doubts_among(self.notes)
 
     @property
     def T_cam0_body(self) -> FloatArray:
@@ -697,6 +729,7 @@ class FrameLog:
     # of the features with a right match; None: there is none
     disparity_median_px: float | None = None
     innovation_ratio: float | None = None
+    integrity: int = 0  # of the estimate: 0 nominal, 1 degraded, 2 unusable
     stages_ms: dict[str, float] = field(default_factory=dict)  # the front end's own stages
 
     @property

@@ -111,8 +111,10 @@ def execute(args: argparse.Namespace) -> int:
 def _frontend(dataset: Dataset) -> Frontend:
     """Return the default front end."""
     from vio.frontend import FrontendSettings, build_frontend
+    from vio.guard.guarded import guarded
 
-    return build_frontend("auto", dataset.recording.camera, FrontendSettings(), dataset)
+    camera = dataset.recording.camera
+    return guarded(build_frontend("auto", camera, FrontendSettings(), dataset), camera)
 
 
 def _facts(report: CalibrationReport) -> dict[str, Any]:

@@ -41,6 +41,7 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets import open_dataset
     from vio.frontend import build_frontend
+    from vio.guard.guarded import guarded
     from vio.inspection.inspect import inspect_recording
     from vio.numerics.threads import one_blas_thread
 
@@ -53,7 +54,10 @@ def execute(args: argparse.Namespace) -> int:
     with one_blas_thread(), ProgressBar(f"inspect {recording.path.name}") as bar:
         report = inspect_recording(
             dataset,
-            lambda d: build_frontend(config.frontend.name, d.recording.camera, config.frontend, d),
+            lambda d: guarded(
+                build_frontend(config.frontend.name, d.recording.camera, config.frontend, d),
+                d.recording.camera,
+            ),
             pairs=args.pairs,
             tracked=args.frames,
             progress=bar.update,
@@ -65,19 +69,25 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _facts(report: Inspection) -> dict[str, Any]:
+    from vio.records import doubts_among
+
     return {
         "parts": {part.name: dict(part.facts) for part in report.parts},
         "faults": list(report.faults),
+        "doubts": list(doubts_among(report.notes)),
         "notes": list(report.notes),
     }
 
 
 def _rows(report: Inspection, source: str) -> list[tuple[str, str]]:
+    from vio.records import doubts_among
+
     rows = [(part.name, part.text) for part in report.parts]
-    rows += [("note", note) for note in report.notes]
+    doubts = doubts_among(report.notes)
+    rows += [("note", note) for note in report.notes if note not in doubts]
+    rows += [("DOUBT", note) for note in doubts]
     rows += [("FAULT", fault) for fault in report.faults]
-    return (
-        rows
-        if report.faults
-        else [*rows, ("verdict", "can be run"), ("next", f"vio run {shlex.quote(source)}")]
-    )
+    if report.faults:
+        return rows
+    verdict = "can be run; settle the doubt above first" if doubts else "can be run"
+    return [*rows, ("verdict", verdict), ("next", f"vio run {shlex.quote(source)}")]

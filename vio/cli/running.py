@@ -337,6 +337,12 @@ def free_folder(source: Path, root: Path = Path("runs")) -> Path:
     return folder
 
 
+def _integrity_text(integrity: dict[str, int]) -> str:
+    """How many estimates may be used, in words."""
+    counts = ", ".join(f"{count} {name}" for name, count in integrity.items() if count)
+    return f"{counts}; see the findings above, and the column `integrity` of frames.csv"
+
+
 def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str, str]]:
     """Return a run's metrics as a few table rows, ended by what to do next; `plot`: whether its
     picture is drawn.
@@ -374,7 +380,14 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
             else f"; innovations are {ratio:.2g} of their standard deviation (median)"
         )
         rows.append(("refused", refused + more))
-    if metrics.get("scale_sigma") is not None:
+    integrity = metrics.get("integrity") or {}
+    unusable = integrity.get("unusable", 0)
+    if unusable or integrity.get("degraded"):
+        rows.append(("integrity", _integrity_text(integrity)))
+    if unusable:
+        share = 100 * unusable / frames
+        rows.append(("scale", f"not stated, as {share:.0f} % of the estimates are unusable"))
+    elif metrics.get("scale_sigma") is not None:
         sigma = f"{100 * metrics['scale_sigma']:.2g} %"
         rows.append(
             (
@@ -388,7 +401,9 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
         share = metrics["rig_scale_sigma"]
         path_m = metrics["path_length_m"]
         of_path = f"{metres_text(share * path_m)} of {path_m:.2f} m"
-        rows.append(("scale", f"known to {100 * share:.2g} % by the calibration: {of_path}"))
+        known = f"known to {100 * share:.2g} % by the calibration: {of_path}"
+        doubted = bool(metrics.get("doubts"))
+        rows.append(("scale", "in doubt: settle what the notes above name" if doubted else known))
     if metrics["stereo_field"] is not None:
         field = metrics["stereo_field"]
         rows.append(("stereo", f"{field['text']}; corrected in this run"))

@@ -69,7 +69,9 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
     if not path.exists():
         raise DataError(_missing(path))
     settings = options or DatasetSettings()
-    module, reader = READERS[_for_settings(kind or _detect(path), path, settings)].split(":")
+    if kind is None:
+        kind = "plain" if settings.folders is not None and path.is_dir() else _detect(path)
+    module, reader = READERS[_for_settings(kind, path, settings)].split(":")
     read: Callable[[Path, DatasetSettings], Dataset] = getattr(
         import_module(f"vio.datasets.{module}"), reader
     )
@@ -101,6 +103,11 @@ def _for_settings(kind: str, path: Path, settings: DatasetSettings) -> str:
     if settings.topics is not None and kind != "bag":
         raise DataError(
             f"{path}: --topics names topics of a ROS bag, but this is of kind {kind}; leave it out"
+        )
+    if settings.folders is not None and kind != "plain":
+        raise DataError(
+            f"{path}: dataset.folders names two folders of images, but this is of kind {kind}; "
+            "leave it out"
         )
     if settings.calibration is None or kind in ("plain", "mono", "rgbd", "bag", "video"):
         return kind
@@ -153,9 +160,14 @@ def _missing(path: Path) -> str:
 
 def _unknown(path: Path) -> str:
     """Say what is missing where there are images or a video, else what was looked for."""
-    from vio.datasets import images, videos
+    from vio.datasets import images, plain, videos
     from vio.datasets.plain import ALONE, images_of_one_camera
 
+    if path.is_dir() and len(plain.image_folders(path)) > 1:
+        return (
+            f"{path}: holds {plain.seen_folders(path)}, but it is not clear which is the left and "
+            "which the right camera's; name them with --set dataset.folders=LEFT,RIGHT"
+        )
     if path.is_dir() and (found := images_of_one_camera(path)) is not None:
         if found == path:
             return (
@@ -210,14 +222,19 @@ def _folder_kind(path: Path) -> str | None:
         return "plain" if plain.lacks_sensor_yaml(path) else "euroc"
     if plain.is_plain_folder(path):
         return "plain"
-    if video_files(path) is not None:
+    videos = video_files(path)
+    if videos is not None and videos[0] != videos[1]:
         return "video"
     if factor_files(path):
         return "gtsam"
     if plain.is_rgbd_folder(path):
         return "rgbd"
+    if plain.side_by_side(path) is not None:
+        return "plain"
     if plain.is_mono_folder(path):
         return "mono"
+    if videos is not None:
+        return "video"
     if "sequences" in names:
         raise DataError(
             f"{path} holds several KITTI sequences; name one of them, such as "

@@ -16,6 +16,7 @@ from vio.datasets.common import naming
 from vio.datasets.image_pairs import ImageSize
 from vio.datasets.kitti import read_extrinsics
 from vio.datasets.rigs import find_calibration
+from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transform
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import read_imu_table, read_velocity_table
@@ -39,16 +40,27 @@ _REFERENCES = (
     "reference.tum", "reference.txt", "groundtruth.tum", "groundtruth_tum.txt", "groundtruth.txt", "gt_imu.csv",
     "mocap0/data.csv", "state_groundtruth_estimate0/data.csv", "poses.txt",
 )  # fmt: skip
-_CALIBRATION_FOLDERS = ("", "dso", "calibration", "calib")
+_CALIBRATION_FOLDERS = ("", "dso", "calibration", "calib", "extras")
+_SHARED_FOLDERS = ("calibration", "extras")  # of 4Seasons and Monado
 
 
 def calibration_beside(layout: Layout) -> Path | None:
     """Return the calibration file of a recording; None: there is none."""
     above = [layout.root.parent] if layout.root.name == "mav0" else []
-    for base in dict.fromkeys((layout.root, layout.base, *above)):
-        for inside in _CALIBRATION_FOLDERS:
-            if (base / inside).is_dir() and (found := find_calibration(base / inside)) is not None:
-                return found
+    folders = [
+        base / inside
+        for base in dict.fromkeys((layout.root, layout.base, *above))
+        for inside in _CALIBRATION_FOLDERS
+    ]
+    # beside the recordings of one rig
+    folders += [layout.root.absolute().parent / name for name in _SHARED_FOLDERS]
+    for folder in folders:
+        if not folder.is_dir():
+            continue
+        if "undistorted" in str(layout.left) and (folder / STEREO).is_file():
+            return folder / "undistorted_calib_0.txt"
+        if (found := find_calibration(folder)) is not None:
+            return found
     return None
 
 
@@ -183,8 +195,13 @@ def read_companions(
 
 
 def _with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Path]]:
-    """Add `T_cam0_imu.txt` where the calibration itself has none."""
+    """Add `T_cam0_imu.txt`, or what 4Seasons has in its place, where the calibration itself has
+    none.
+    """
     path = layout.root / "T_cam0_imu.txt"
+    transforms = layout.root / TRANSFORMS
+    if rig.T_cam0_imu is None and not path.is_file() and transforms.is_file():
+        return replace(rig, T_cam0_imu=read_imu_transform(transforms)), [transforms]
     if rig.T_cam0_imu is not None or not path.is_file():
         return rig, [path] if file.name == "calib.txt" else []
     return replace(rig, T_cam0_imu=read_extrinsics(path)), [path]

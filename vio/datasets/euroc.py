@@ -24,8 +24,9 @@ from vio.datasets.companions import Beside, check_overlap, parts_of
 from vio.datasets.euroc_files import STATE_CSV, TUM_FILE, read_camera_yaml, read_imu_yaml
 from vio.datasets.frame_times import paired
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
-from vio.datasets.image_pairs import ImageDataset, full_scale
+from vio.datasets.image_pairs import ImageDataset, gray_levels
 from vio.datasets.images import list_images
+from vio.datasets.rigs.plausible import check_principal_point
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import read_imu_table, stamped_rows
@@ -67,6 +68,8 @@ def read_euroc(path: Path, settings: DatasetSettings) -> ImageDataset:
     """
     mav = euroc_base(path)
     left, right = (_read_camera(mav / name) for name in ("cam0", "cam1"))
+    for name, camera in (("cam0", left), ("cam1", right)):
+        check_principal_point(camera.model, mav / name / "sensor.yaml")
     T_body_imu, noise, samples, imu_notes = _read_imu(mav / "imu0")
     T_imu_body = se3_inverse(T_body_imu)
     rig = StereoRig(
@@ -79,7 +82,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> ImageDataset:
     if samples:
         check_overlap(times_ns, samples.times_ns, mav / "imu0")
     pairs = FilePairs(left.files.take(of_left.tolist()), right.files.take(of_right.tolist()))
-    white, depth_notes = full_scale(pairs)
+    levels, depth_notes = gray_levels(pairs)
     candidates = (mav / STATE_CSV, mav.absolute().parent / TUM_FILE)
     truth = next((file for file in candidates if file.is_file()), None)
     read = [
@@ -94,7 +97,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> ImageDataset:
     parts = parts_of(
         "euroc", layout, rectifier, settings, times_ns, beside, (*notes, *depth_notes), sheets
     )
-    return ImageDataset(*parts, pairs, imu_noise=noise, white=white)
+    return ImageDataset(*parts, pairs, imu_noise=noise, levels=levels)
 
 
 def euroc_base(path: Path) -> Path:

@@ -12,19 +12,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from vio.cameras.rig import Rectifier
 from vio.datasets.common import blank_frames, chosen_frames, merge_events
 from vio.datasets.image_files import FilePairs, stem_of
 from vio.datasets.images import (
-    WHITE_16,
     UnreadableImageError,
+    levels_in,
     list_images,
     load_depth,
     load_gray,
     prefetch,
-    white_level,
-    white_note,
 )
+from vio.datasets.levels import FULL_SCALE, Levels, is_mosaic, mosaic_note
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
@@ -127,26 +128,32 @@ def _say_skipped(unsaid: list[BadFrame]) -> None:
     unsaid.clear()
 
 
-# that determine the level of white, spread over the recording: the first may be dark
-_WHITE_FRAMES = 8
+# that determine the levels of black and white, spread over the recording: the first may be dark
+_LEVEL_FRAMES = 8
 
 
-def full_scale(pairs: ImagePairs) -> tuple[int, tuple[str, ...]]:
-    """Return the level of white of a recording's 16-bit images, for `load_gray`, with a note
-    where it is not 65535.
+def gray_levels(pairs: ImagePairs) -> tuple[Levels, tuple[str, ...]]:
+    """Return the levels of black and white of a recording's images, for `load_gray`, with notes
+    where they are not 0 and 65535, and where the images look like raw ones of a colour camera.
     """
-    chosen = (
-        {(len(pairs) - 1) * k // (_WHITE_FRAMES - 1) for k in range(_WHITE_FRAMES)}
-        if pairs
-        else set()
-    )
-    white = white_level([path for k in sorted(chosen) for path in pairs[k]])
-    return white, white_note(white)
+    last = len(pairs) - 1
+    chosen = {last * k // (_LEVEL_FRAMES - 1) for k in range(_LEVEL_FRAMES)} if pairs else set()
+    levels = levels_in([path for k in sorted(chosen) for path in pairs[k]])
+    return levels, (*levels.note, *_mosaic_notes(pairs))
 
 
-def measured_images(pairs: ImagePairs) -> tuple[tuple[int, int], int, tuple[str, ...]]:
-    """Return width and height of the first left image that can be read, the level of white of all,
-    and notes.
+def _mosaic_notes(pairs: ImagePairs) -> tuple[str, ...]:
+    """Return the doubt about the first pair of images, each of which may be a mosaic."""
+    for path in dict.fromkeys(pairs[0] if pairs else ()):
+        with contextlib.suppress(UnreadableImageError):
+            if is_mosaic(load_gray(path, colour=True)[0]):
+                return (mosaic_note(str(path.parent)),)
+    return ()
+
+
+def measured_images(pairs: ImagePairs) -> tuple[tuple[int, int], Levels, tuple[str, ...]]:
+    """Return width and height of the first left image that can be read, the levels of black and
+    white of all, and notes.
 
     Raises:
         UnreadableImageError: all left images are unreadable.
@@ -158,10 +165,10 @@ def measured_images(pairs: ImagePairs) -> tuple[tuple[int, int], int, tuple[str,
         except UnreadableImageError:
             if index == len(pairs):
                 raise
-    white, notes = full_scale(pairs)
-    if bits == 16 and not notes:
-        notes = (f"images have 16 bits ({path.name}); scaled to 8 bits by 1/257",)
-    return (image.shape[1], image.shape[0]), white, notes
+    levels, notes = gray_levels(pairs)
+    if bits == 16 and not levels.note:
+        notes = (f"images have 16 bits ({path.name}); scaled to 8 bits by 1/257", *notes)
+    return (image.shape[1], image.shape[0]), levels, notes
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,11 +232,13 @@ class ImageDataset(ImageRecording):
     """Implements `vio.protocols.Dataset` over image files."""
 
     pairs: ImagePairs
-    # level of white of 16-bit files, from `full_scale`
-    white: int = field(default=WHITE_16, kw_only=True)
+    # of 16-bit files, from `gray_levels`
+    levels: Levels = field(default=FULL_SCALE, kw_only=True)
     # depth image of each frame; None: there are none
     depths: Sequence[Path] | None = field(default=None, kw_only=True)
     depth_factor: float = field(default=1.0, kw_only=True)  # levels of a depth image per metre
+    # each file holds the left and the right image side by side
+    side_by_side: bool = field(default=False, kw_only=True)
 
     def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
         return readable_frames(self._load, chosen, self.settings)
@@ -238,11 +247,12 @@ class ImageDataset(ImageRecording):
         """Read and rectify one frame; runs in the prefetch thread."""
         time_ns = int(self.recording.frame_times_ns[index])
         try:
-            images = []
+            images = list[Image]()
             for size, path in zip(
                 self.sizes[: self.settings.cameras], self.pairs[index], strict=False
             ):
-                images.append(load_gray(path, self.white, colour=self.colour)[0])
+                image = load_gray(path, self.levels, colour=self.colour)[0]
+                images.append(half_of(image, len(images)) if self.side_by_side else image)
                 size.check(images[-1], path)
             depth_m = (
                 None
@@ -252,6 +262,12 @@ class ImageDataset(ImageRecording):
             return self.rectifier.frame(index, time_ns, *images, depth_m=depth_m)
         except UnreadableImageError as error:
             return BadFrame(index, str(error))
+
+
+def half_of(image: Image, side: int) -> Image:
+    """Return the left (0) or right (1) half of an image (H, 2 W) or (H, 2 W, 3)."""
+    width = image.shape[1] // 2
+    return np.ascontiguousarray(image[:, side * width : (side + 1) * width])
 
 
 def _depth_m(file: Path, image: Image, factor: float) -> FloatArray:

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.datasets.image_files import ImageFiles, stem_of
+from vio.datasets.levels import FULL_SCALE, Band, Levels, band_of, levels_of, to_8_bits
 from vio.datasets.png import MOST_PIXELS, crc32, decode_gray8
 from vio.errors import DataError
 from vio.files.inputs import check_regular, read_input
@@ -34,10 +35,7 @@ _TIFF_STARTS = (b"II*\0", b"MM\0*")
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
-WHITE_16 = 65535  # the level of white in an image that uses all of its 16 bits
 _MOST_BYTES = 2**29  # of a file: more than 64 Mpx of 16 bits in colour
-_SENSOR_BITS = (10, 12, 14)  # of cameras whose pixels are stored in the low bits of 16
-_WHITE_SHARE = 0.999  # of the pixels are no brighter than the level that shows the bits in use
 # start-of-frame markers, with the image size
 _JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 _PNG_LEVEL = 1  # files a tenth larger than at the usual level 3, in a third of the time
@@ -53,7 +51,9 @@ class UnreadableImageError(DataError):
     """
 
 
-def load_gray(path: Path, white: int = WHITE_16, *, colour: bool = False) -> tuple[Image, int]:
+def load_gray(
+    path: Path, levels: Levels = FULL_SCALE, *, colour: bool = False
+) -> tuple[Image, int]:
     """Read a PNG or JPEG as 8-bit gray (H, W); return it with the file's own bits per channel (8 or
     16).
 
@@ -62,8 +62,7 @@ def load_gray(path: Path, white: int = WHITE_16, *, colour: bool = False) -> tup
 
     Args:
         path: the file.
-        white: the level of a file of 16 bits that becomes 255; brighter pixels do, too. See
-            `white_level`.
+        levels: those of a file of 16 bits that become 0 and 255; see `levels_in`.
         colour: keep red, green and blue, where the file has them.
 
     Raises:
@@ -71,66 +70,58 @@ def load_gray(path: Path, white: int = WHITE_16, *, colour: bool = False) -> tup
             decode.
     """
     pixels = _load(path, colour=colour)
-    return to_8_bits(pixels, white), pixels.dtype.itemsize * 8
+    return to_8_bits(pixels, levels), pixels.dtype.itemsize * 8
 
 
-def decode_gray(data: bytes, path: Path | str, *, colour: bool = False) -> Image:
-    """Decode an image file in memory as `load_gray` does, 16 bits by full scale; `path` names it
-    in messages.
-    """
-    return to_8_bits(_decoded(data, path, colour=colour), WHITE_16)
+def decode_gray(
+    data: bytes, path: Path | str, levels: Levels = FULL_SCALE, *, colour: bool = False
+) -> Image:
+    """Decode an image file in memory as `load_gray` does; `path` names it in messages."""
+    return to_8_bits(_decoded(data, path, colour=colour), levels)
 
 
-def to_8_bits(pixels: npt.NDArray[Any], white: int) -> Image:
-    """Return pixels of 8 or 16 bits as uint8; of 16 bits, the level `white` becomes 255."""
-    if pixels.dtype.itemsize == 2:
-        pixels = np.minimum(np.rint(pixels / (white / 255)), 255)
-    return np.ascontiguousarray(pixels, dtype=np.uint8)
+def levels_in(paths: Sequence[Path]) -> Levels:
+    """Return the levels of black and white of 16-bit images, see `vio.datasets.levels`.
 
-
-def white_level(paths: Sequence[Path]) -> int:
-    """Return the level of white of 16-bit images: that of 10, 12, 14 or 16 bits, the fewest that
-    hold the images.
-
-    Cameras of 12 bits store 0 to 4095 in 16 bits, which full scale would make almost black. One
-    level serves all frames of a recording, so that its brightness does not jump. Images of 8 bits,
-    and unreadable ones, are passed over.
+    One pair of levels serves all frames of a recording, so that its brightness does not jump.
+    Images of 8 bits, and unreadable ones, are passed over.
 
     Args:
         paths: some images of the recording, spread over it.
     """
-    level = 0.0
+    bands = []
     for path in paths:
         with contextlib.suppress(UnreadableImageError, OSError):
             check_regular(path)
             with path.open("rb") as stream:
-                start = stream.read(25)
-            if start.startswith(_PNG_START) and start[24:] == b"\x10":  # the depth in the header
-                level = max(level, brightest(_load(path)))
-    return white_of(level)
+                start = stream.read(64)
+            if has_16_bits(start) is not False:
+                pixels = _load(path)
+                bands += [band_of(pixels)] if pixels.dtype.itemsize == 2 else []
+    return levels_of(bands)
 
 
-def brightest(pixels: npt.NDArray[Any]) -> float:
-    """Return the level that hardly any pixel exceeds."""
-    return float(np.quantile(pixels, _WHITE_SHARE))
-
-
-def white_of(level: float) -> int:
-    """Return the level of white of 16-bit images whose brightest pixels have `level`; 0: it is
-    not known.
+def has_16_bits(start: bytes) -> bool | None:
+    """Return whether an encoded image has 16 bits a channel, by its first 64 bytes; None: they do
+    not say.
     """
-    fitting = (2**bits - 1 for bits in _SENSOR_BITS if level <= 2**bits - 1)
-    return next(fitting, WHITE_16) if level > 0 else WHITE_16
+    if start.startswith(_PNG_START):
+        return start[24:25] == b"\x10"  # the depth in the header
+    if start.startswith(_TIFF_STARTS) or start[:2] in (b"P5", b"P6"):
+        return None
+    return False
 
 
-def white_note(white: int) -> tuple[str, ...]:
-    """Return a note on the level of white of 16-bit images where it is not full scale."""
-    if white == WHITE_16:
-        return ()
-    return (
-        f"the images have 16 bits but use {white.bit_length()}: the levels 0 to {white} are scaled "
-        "to 8 bits",
-    )
+def band_in(data: bytes, where: str) -> Band | None:
+    """Return the band of levels of an encoded image in memory; None: it has 8 bits.
+
+    Raises:
+        UnreadableImageError: it does not decode.
+    """
+    if has_16_bits(data[:64]) is False:
+        return None
+    pixels = _decoded(data, where, colour=False)
+    return band_of(pixels) if pixels.dtype.itemsize == 2 else None
 
 
 def _load(path: Path, *, colour: bool = False) -> npt.NDArray[Any]:

@@ -17,6 +17,7 @@ from vio.datasets.tables import VELOCITY_HEADER
 from vio.errors import CalibrationError
 from vio.files.text import exact_text, read_numbers, seconds_text, text_lines, write_text
 from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts
+from vio.geometry.rectify import vertical_fault
 from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, VelocitySample
 
@@ -51,6 +52,8 @@ def read_calibration(path: Path, cameras: tuple[int, int]) -> _Calibration:
     K = left[:, :3]
     offsets = [np.linalg.solve(K, P[:, 3]) for P in (left, right)]
     x, y, z = offsets[0] - offsets[1]  # the right camera in the left camera's frame
+    if (fault := vertical_fault(np.array([x, y, z]))) is not None:
+        raise CalibrationError(f"{path}: {fault}")
     if not x > 0:
         raise CalibrationError(
             f"{path}: {names} imply a stereo baseline of {x:g} m; it must be positive (the right "

@@ -20,6 +20,7 @@ from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, se3_inverse
 
 CAMERAS = "calib_cam_to_cam.txt"
+PERSPECTIVE = "perspective.txt"  # of KITTI-360, in the same form
 VELO = "calib_velo_to_cam.txt"
 IMU = "calib_imu_to_velo.txt"
 _MAX_PARENTS = 3
@@ -76,6 +77,24 @@ def read_cam_to_cam(path: Path) -> KittiRawCalibration:
         R_rect_cam0=_transform(entries, path, "R_rect_00")[:3, :3],
         R_rect_cam1=_transform(entries, path, "R_rect_01")[:3, :3],
     )
+
+
+def read_perspective(path: Path) -> tuple[CameraModel, CameraModel, FloatArray]:
+    """Return KITTI-360's rectified cameras and `T_rect1_rect0` (4, 4) of `perspective.txt`, whose
+    published images are rectified.
+
+    Raises:
+        CalibrationError: an entry is missing, malformed or impossible.
+    """
+    entries = _read_entries(path)
+    cameras = []
+    offsets = []
+    for k in ("00", "01"):
+        size = _size(entries, f"S_rect_{k}", path)
+        P = _entry(entries, f"P_rect_{k}", 12, path).reshape(3, 4)
+        cameras.append(_camera(P[:, :3], size, (), f"{path}, P_rect_{k}"))
+        offsets.append(np.linalg.solve(P[:, :3], P[:, 3]))
+    return cameras[0], cameras[1], se3_from_parts(np.eye(3), offsets[1] - offsets[0])
 
 
 def _camera(

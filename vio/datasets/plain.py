@@ -13,9 +13,10 @@ named as the images, or in the layout of TUM RGB-D, it is one with depth images 
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,12 +31,20 @@ from vio.datasets.companions import (
 from vio.datasets.frame_times import pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
-from vio.datasets.images import SUFFIXES, list_images
-from vio.datasets.kitti_raw import CAMERAS, find_above
+from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_gray
+from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
 from vio.datasets.rigs import find_calibration, kitti_rig, load_rig
+from vio.datasets.rigs.bare import NAMES as BARE_NAMES
 from vio.datasets.settings import DatasetSettings
+from vio.datasets.sides import first_pair, pairs_of, without_side
 from vio.datasets.tables import drive_times, is_date, stamped_rows
-from vio.datasets.tum_rgbd import LISTS, associated_images, is_tum_folder, published_camera
+from vio.datasets.tum_rgbd import (
+    DEPTH_FACTOR,
+    LISTS,
+    associated_images,
+    is_tum_folder,
+    published_camera,
+)
 from vio.datasets.unused import Layout
 from vio.errors import CalibrationError, DataError
 from vio.files.text import parse_stamps, text_lines
@@ -47,13 +56,17 @@ _PAIRS: tuple[tuple[str, ...], ...] = (
     ("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_00", "image_01"),
     ("image_2", "image_3"), ("image_02", "image_03"), ("images_left", "images_right"),
     ("image_left", "image_right"), ("left_images", "right_images"), ("camera_left", "camera_right"), ("L", "R"),
-    ("image_lcam_front", "image_rcam_front"), ("infra1", "infra2"),
+    ("image_lcam_front", "image_rcam_front"), ("infra1", "infra2"), ("fisheye1", "fisheye2"),
+    ("stereo_left", "stereo_right"), ("stereo/left", "stereo/right"), ("img_l", "img_r"),
+    ("undistorted_images/cam0", "undistorted_images/cam1"),
 )  # fmt: skip
 ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
 _GRAY = (0, 1)  # of KITTI
 _COLOUR = (2, 3)
 _INSIDE = ("data", "images", "")
 _DRIVE_NS = 100_000_000  # between frames of a KITTI drive
+_DEEPEST = 3  # levels of folders that are looked into for images
+_MAX_FOLDERS = 200
 _SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 
@@ -69,8 +82,99 @@ def is_kitti_raw_folder(path: Path) -> bool:
 
 
 def is_plain_folder(path: Path) -> bool:
-    """Return whether a folder holds two image folders of known names."""
-    return _layout(path) is not None
+    """Return whether a folder holds two image folders of known names, or of names that differ in
+    their side alone.
+    """
+    return pair_layout(path) is not None
+
+
+def pair_layout(path: Path, folders: str | None = None) -> Layout | None:
+    """Return where the images of a pair lie; None: it is not clear.
+
+    Args:
+        path: of the recording.
+        folders: the left and the right folder, by setting; None: found by their names.
+
+    Raises:
+        DataError: the setting names no two folders of images.
+    """
+    if folders is not None:
+        return _named_layout(path, folders)
+    known = _layout(path)
+    if known is not None:
+        return known
+    names = [str(folder) for folder in image_folders(path)]
+    pairs = pairs_of(names)
+    pair = first_pair(pairs)
+    return None if pair is None else Layout(path, path, *(path / name for name in pair))
+
+
+def side_by_side(path: Path, calibration: Path | None = None) -> Layout | None:
+    """Return where images lie each of which holds a pair, left and right; None: there are none.
+
+    They are twice as wide as the calibration of a pair states.
+    """
+    layout = _layout_of_one(path)
+    if layout is None and _holds_images(path):
+        layout = Layout(path, path, path, path)
+    if layout is None:
+        return None
+    file = calibration or calibration_beside(layout)
+    if file is None:
+        return None
+    try:
+        image = load_gray(list_images(layout.left)[0])[0]
+        half = (image.shape[1] // 2, image.shape[0])
+        # a size that the file does not state cannot tell; a ZED's states several
+        stated = half if file.suffix.lower() == ".conf" else None
+        rig = load_rig(file, image_size=stated, cameras=2)
+    except (UnreadableImageError, CalibrationError):
+        return None
+    return layout if (rig.cam0.width, rig.cam0.height) == half else None
+
+
+def _named_layout(path: Path, folders: str) -> Layout:
+    names = [name.strip() for name in folders.split(",")]
+    sides = [path / name for name in names]
+    if len(names) != 2 or not all(_holds_images(folder) for folder in sides):
+        raise DataError(
+            f"{path}: dataset.folders is {folders!r}, which names no two folders of images; it "
+            f"holds {seen_folders(path)}"
+        )
+    return Layout(path, path, *sides)
+
+
+def image_folders(path: Path) -> dict[Path, int]:
+    """Return the folders below a folder that hold images, and how many each."""
+    found: dict[Path, int] = {}
+    waiting = [(path, 0)]
+    looked = 0
+    while waiting and looked < _MAX_FOLDERS:
+        folder, depth = waiting.pop(0)
+        looked = looked + 1
+        try:
+            entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        except OSError:
+            continue
+        count = sum(os.path.splitext(entry.name)[1].lower() in SUFFIXES for entry in entries)
+        if count and depth:
+            found[folder.relative_to(path)] = count
+        if depth < _DEEPEST:
+            waiting += [(Path(entry.path), depth + 1) for entry in entries if entry.is_dir()]
+    return found
+
+
+def seen_folders(path: Path) -> str:
+    """Return the folders of images in words: 'img_l and img_r with 90 images each'."""
+    found = image_folders(path)
+    if not found:
+        return "no folder of images"
+    names = [str(folder) for folder in found]
+    listed = f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else names[0]
+    counts = set(found.values())
+    if len(counts) == 1:
+        return f"{listed} with {counts.pop()} images{' each' if len(names) > 1 else ''}"
+    return ", ".join(f"{folder} with {count} images" for folder, count in found.items())
 
 
 def holds_more_than_kitti(path: Path) -> bool:
@@ -88,7 +192,7 @@ def lacks_sensor_yaml(path: Path) -> bool:
     """Return whether a folder with EuRoC's names has its calibration elsewhere, as TUM-VI's
     export.
     """
-    layout = _layout(path)
+    layout = pair_layout(path)
     if layout is None or any(
         (base / "cam0" / "sensor.yaml").is_file() for base in (layout.base, layout.root)
     ):
@@ -142,6 +246,7 @@ class _Images:
     notes: tuple[str, ...] = ()
     depths: Sequence[Path] | None = None  # depth images; None: there are none
     listed_ns: IntArray | None = None  # times in TUM's lists; None: those of any plain folder
+    side_by_side: bool = False  # each file holds a pair
 
 
 def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
@@ -151,12 +256,16 @@ def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
         DataError: images, times or samples cannot be used; the message names file and remedy.
         CalibrationError: there is no calibration, or it is invalid.
     """
-    layout = _layout(path)
+    layout = pair_layout(path, settings.folders)
+    if layout is None and (layout := side_by_side(path, settings.calibration)) is not None:
+        files = list_images(layout.left)
+        images = _Images(FilePairs(files, files), side_by_side=True)
+        return _read("plain", layout, images, settings)
     if layout is None:
         names = ", ".join(" ".join(names) for names in _PAIRS[:4])
         raise DataError(
-            f"{path}: holds no pair of image folders ({names} or others); give one with left/ and "
-            "right/"
+            f"{path}: holds no pair of image folders ({names} or others) but {seen_folders(path)}; "
+            "name the two with --set dataset.folders=LEFT,RIGHT"
         )
     pairs, notes = pair_files(list_images(layout.left), list_images(layout.right))
     return _read("plain", layout, _Images(pairs, notes), settings)
@@ -178,7 +287,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     cameras = _choose_cameras(path, settings.colour)
     layout = Layout(path, path, *(path / f"image_{k}" for k in cameras))
     pairs = pair_images(layout.left, layout.right)
-    size, white, notes = measured_images(pairs)
+    size, levels, notes = measured_images(pairs)
     file = path / "calib.txt"
     times_file = path / "times.txt"
     rig, T_left_cam0 = kitti_rig(file, size, cameras)
@@ -192,7 +301,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     parts = read_companions(
         "kitti", layout, (file, rig), settings, times, notes, used, reference=reference
     )
-    return ImageDataset(*parts, pairs, white=white)
+    return ImageDataset(*parts, pairs, levels=levels)
 
 
 def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
@@ -207,7 +316,8 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
             remedy.
         CalibrationError: the calibration is missing or invalid.
     """
-    layout = Layout(path, path, *(path / name / "data" for name in ("image_00", "image_01")))
+    inside = "data_rect" if (path / "image_00" / "data_rect").is_dir() else "data"  # KITTI-360
+    layout = Layout(path, path, *(path / name / inside for name in ("image_00", "image_01")))
     for folder in (layout.left, layout.right):
         if not folder.is_dir():
             raise DataError(
@@ -215,13 +325,13 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
                 "cameras"
             )
     pairs = pair_images(layout.left, layout.right)
-    file = find_above(path, CAMERAS)
+    file = find_above(path, CAMERAS) or find_above(path, f"calibration/{PERSPECTIVE}")
     if file is None:
         raise CalibrationError(
             f"{path}: {CAMERAS} is neither there nor in the folders above; copy KITTI's "
             "calibration of that day there"
         )
-    size, white, notes = measured_images(pairs)
+    size, levels, notes = measured_images(pairs)
     rig = load_rig(file, image_size=size, cameras=2)
     # one trigger: the left ones serve
     used = [path / name / "timestamps.txt" for name in ("image_00", "image_01")]
@@ -234,7 +344,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
     parts = read_companions(
         "kitti_raw", layout, (file, rig), settings, (times_ns, used[0]), notes, used
     )
-    return ImageDataset(*parts, pairs, white=white)
+    return ImageDataset(*parts, pairs, levels=levels)
 
 
 def read_mono(path: Path, settings: DatasetSettings) -> ImageDataset:
@@ -286,7 +396,10 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> ImageDataset:
 
 def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings) -> ImageDataset:
     """Read what goes with the images: calibration, times, motion samples and ground truth."""
-    size, white, notes = measured_images(images.pairs)
+    size, levels, notes = measured_images(images.pairs)
+    if images.side_by_side:
+        size = (size[0] // 2, size[1])
+        notes = (*notes, "each image holds the left and the right one side by side")
     is_tum = images.listed_ns is not None
     used = list[Path]()
     file = settings.calibration or (
@@ -297,6 +410,8 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
         rig = published_camera(layout.root, size)
     else:
         rig = load_rig(file, image_size=size, cameras=2 if kind == "plain" else 1)
+        if is_tum and rig.depth_factor is None and file.name in BARE_NAMES:
+            rig = replace(rig, depth_factor=DEPTH_FACTOR)
     depth_factor = 1.0
     if images.depths is not None:
         depth_factor, factor_notes = _depth_factor(rig, settings, layout.root)
@@ -321,9 +436,10 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
         *parts,
         images.pairs,
         imu_noise=rig.imu_noise,
-        white=white,
+        levels=levels,
         depths=images.depths,
         depth_factor=depth_factor,
+        side_by_side=images.side_by_side,
     )
 
 
@@ -391,13 +507,15 @@ def _depth_factor(
 
 
 def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple[str, ...]]:
-    """Pair image files by equal names, by the last number in their names, or by stamps in their
-    names.
+    """Pair image files by equal names, by names without their camera (`000012_cam0`), by the last
+    number in their names, or by stamps in their names.
 
     Raises:
         DataError: the names share nothing.
     """
     keys: list[list[str | int]] = [[p.stem for p in lefts], [p.stem for p in rights]]
+    if not set(keys[0]) & set(keys[1]):
+        keys = [[without_side(p.stem) for p in files] for files in (lefts, rights)]
     if not set(keys[0]) & set(keys[1]):
         keys = [[_last_number(p) for p in files] for files in (lefts, rights)]
     if not set(keys[0]) & set(keys[1]) and all(_is_stamp(p.stem) for p in (*lefts, *rights)):

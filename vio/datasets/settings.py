@@ -43,6 +43,11 @@ class DatasetSettings(Section):
         None,
         "plain folders, bags and videos: the calibration file, in the place of the recording's own",
     )
+    folders: str | None = setting(
+        None,
+        "folders of images: those of the left and the right camera within the recording, such as "
+        "img_l,img_r, in the place of those found by their names",
+    )
     camera: Literal["both", "left"] = setting(
         "both",
         "stereo recordings: use both cameras, or the left one alone, which needs an IMU for the "

@@ -13,6 +13,7 @@ import numpy as np
 
 from vio.cameras.rig import Rig
 from vio.datasets.frame_times import nearest
+from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.tables import table_rows
 from vio.errors import DataError
 from vio.files.text import parse_stamps
@@ -20,37 +21,24 @@ from vio.geometry.distortion import CameraModel
 from vio.records import IntArray
 
 LISTS = ("rgb.txt", "depth.txt")
-_FACTOR = 5000.0  # levels per metre of TUM's depth images
+DEPTH_FACTOR = 5000.0  # levels per metre of TUM's depth images
 # as TUM's own tool associates colour and depth, which have exposures of their own
 _ASSOCIATED_NS = 20_000_000
-# Intrinsics and radial-tangential distortion that TUM publishes for its three cameras, whose
-# sequences have no file of them, and ROS's default for others.
-_CAMERAS = {
-    "freiburg1": (
-        517.306408,
-        516.469215,
-        318.643040,
-        255.313989,
-        0.262383,
-        -0.953104,
-        -0.005358,
-        0.002628,
-        1.163314,
-    ),
-    "freiburg2": (
-        520.908620,
-        521.007327,
-        325.141442,
-        249.701764,
-        0.231222,
-        -0.784899,
-        -0.003257,
-        -0.000105,
-        0.917205,
-    ),
-    "freiburg3": (535.4, 539.2, 320.1, 247.6),
-    "default": (525.0, 525.0, 319.5, 239.5),
-}
+# Words of the folder's name, and the intrinsics with radial-tangential distortion of the camera that
+# is published for it, where the sequences have no file of them: TUM's three cameras, Bonn's dynamic
+# sequences (Palazzolo et al., ReFusion, 2019), and ICL-NUIM's rendered rooms (Handa et al., 2014).
+_PUBLISHED: tuple[tuple[str, tuple[str, ...], tuple[float, ...]], ...] = (
+    ("TUM's freiburg1", ("freiburg1",),
+     (517.306408, 516.469215, 318.643040, 255.313989, 0.262383, -0.953104, -0.005358, 0.002628, 1.163314)),
+    ("TUM's freiburg2", ("freiburg2",),
+     (520.908620, 521.007327, 325.141442, 249.701764, 0.231222, -0.784899, -0.003257, -0.000105, 0.917205)),
+    ("TUM's freiburg3", ("freiburg3",), (535.4, 539.2, 320.1, 247.6)),
+    ("Bonn's", ("rgbd_bonn", "bonn_"),
+     (542.822841, 542.576870, 315.593520, 237.756098, 0.039903, -0.099343, -0.000730, -0.000144, 0.0)),
+    ("ICL-NUIM's", ("frei_png", "living_room_traj", "office_room_traj", "office_traj", "icl_nuim", "icl-nuim"),
+     (481.20, 480.0, 319.5, 239.5)),
+)  # fmt: skip
+_DEFAULT = (525.0, 525.0, 319.5, 239.5)  # ROS's of a Kinect
 
 
 def is_tum_folder(path: Path) -> bool:
@@ -93,11 +81,25 @@ def _read_list(file: Path) -> tuple[IntArray, list[Path]]:
 
 
 def published_camera(path: Path, size: tuple[int, int]) -> Rig:
-    """Return the camera that TUM publishes for a folder of this name, for images of a width and
+    """Return the camera that is published for a folder of this name, for images of a width and
     height in pixels.
+
+    For a name that is not known it is that of a Kinect by default, which is doubted.
     """
-    name = next((name for name in _CAMERAS if name in path.absolute().name), "default")
-    fu, fv, cu, cv, *bend = _CAMERAS[name]
-    note = f"{path}: no calibration; that of TUM's camera {name!r} is taken (give another with --calibration)"
+    folder = path.absolute().name.lower()
+    named = next(
+        ((whose, values) for whose, words, values in _PUBLISHED if any(w in folder for w in words)),
+        None,
+    )
+    whose, values = named or ("a Kinect's default", _DEFAULT)
+    fu, fv, cu, cv, *bend = values
+    note = f"{path}: no calibration; that of {whose} camera is taken, by the folder's name"
+    if named is None:
+        note = (
+            f"{path}: doubtful: no calibration, and the folder is named as no data set that is "
+            f"known; {fu:g} px, a Kinect's default, is taken"
+        )
+    note += " (give another with --calibration, or as calibration.txt with 'fx fy cx cy')"
     model = CameraModel(fu, fv, cu, cv, *size, "radtan" if bend else "pinhole", tuple(bend))
-    return Rig(model, notes=(note,), depth_factor=_FACTOR)
+    rig = Rig(model, notes=(note,), depth_factor=DEPTH_FACTOR)
+    return checked_rig(rig, path, size_stated=False)

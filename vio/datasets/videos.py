@@ -1,7 +1,8 @@
-"""Two video files, left and right, with a calibration and, as in a plain folder, what else is
-beside them.
+"""Two video files, left and right, or one with both images side by side, with a calibration and, as
+in a plain folder, what else is beside them.
 
-Frame k of the one file belongs to frame k of the other. Frames are decoded in order, from the first
+Frame k of the one file belongs to frame k of the other. One file alone is taken to be side by side
+where the calibration is that of a pair whose images have half of its width. Frames are decoded in order, from the first
 on, because seeking in compressed video is not exact. Times come from `times.txt`, else from the
 frame rate that the files state.
 """
@@ -17,11 +18,12 @@ from typing import Any
 import numpy as np
 
 from vio.datasets.companions import find_calibration_of, read_companions
-from vio.datasets.image_pairs import ImageRecording
+from vio.datasets.image_pairs import ImageRecording, half_of
 from vio.datasets.images import prefetch
 from vio.datasets.plain import times_of
 from vio.datasets.rigs import load_rig
 from vio.datasets.settings import DatasetSettings
+from vio.datasets.sides import pairs_of
 from vio.datasets.unused import Layout
 from vio.errors import DataError
 from vio.records import NS_PER_S, Image, IntArray, StereoFrame
@@ -48,11 +50,18 @@ class _Facts:
 
 
 def video_files(path: Path) -> tuple[Path, Path] | None:
-    """Return the left and right video file of a folder; None: it has none."""
+    """Return the left and right video file of a folder, twice the same where there is one alone;
+    None: it has none, or several that are no pair.
+    """
     found = {
         child.stem: child for child in sorted(path.iterdir()) if child.suffix.lower() in SUFFIXES
     }
-    return next(((found[a], found[b]) for a, b in _NAMES if a in found and b in found), None)
+    if len(found) == 1:
+        (alone,) = found.values()
+        return alone, alone
+    pairs = pairs_of(list(found))
+    known = [pair for pair in pairs if pair in _NAMES] or pairs
+    return (found[known[0][0]], found[known[0][1]]) if len(known) == 1 else None
 
 
 def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
@@ -78,8 +87,18 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
         )
     layout = Layout(path, path, *files)
     file = settings.calibration or find_calibration_of(layout)
-    rig = load_rig(file, image_size=(left.width, left.height), cameras=2)
+    one = files[0] == files[1]
+    size = (left.width // 2, left.height) if one else (left.width, left.height)
+    rig = load_rig(file, image_size=size, cameras=2)
+    if one and (rig.cam0.width, rig.cam0.height) != size:
+        raise DataError(
+            f"{files[0]} is the only video, of {left.width} x {left.height} pixels, and {file} is "
+            f"for images of {rig.cam0.width} x {rig.cam0.height}; side by side they would have "
+            "twice that width; give left.mp4 and right.mp4, or the calibration of these images"
+        )
     times_ns, times_file, notes = _times(path, files, min(left.count, right.count), left.rate_hz)
+    if one:
+        notes.append(f"{files[0].name} holds the left and the right image side by side")
     if left.count != right.count:
         notes.append(
             f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the "
@@ -137,7 +156,9 @@ class VideoDataset(ImageRecording):
         """Decode in order; the prefetch thread is the only one that uses the decoders."""
         import cv2
 
-        captures = [cv2.VideoCapture(str(file)) for file in self.files[: self.settings.cameras]]
+        one = self.files[0] == self.files[1]
+        files = self.files[: 1 if one else self.settings.cameras]
+        captures = [cv2.VideoCapture(str(file)) for file in files]
 
         # where the decoders are before a frame
         after = dict(zip(chosen, [0, *(k + 1 for k in chosen)], strict=False))
@@ -147,6 +168,10 @@ class VideoDataset(ImageRecording):
                 for _ in range(after[index], index):
                     capture.grab()
             images = [self._image(capture, side, index) for side, capture in enumerate(captures)]
+            if one:
+                images = [half_of(images[0], side) for side in range(self.settings.cameras)]
+            for side, image in enumerate(images):
+                self.sizes[side].check(image, self.files[side])
             return self.rectifier.frame(index, int(self.recording.frame_times_ns[index]), *images)
 
         try:
@@ -170,5 +195,4 @@ class VideoDataset(ImageRecording):
             )
         code = cv2.COLOR_BGR2RGB if self.colour else cv2.COLOR_BGR2GRAY
         image: Image = np.asarray(pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, code))
-        self.sizes[side].check(image, self.files[side])
         return image

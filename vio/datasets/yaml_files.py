@@ -4,6 +4,8 @@ with strict checks.
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -29,8 +31,11 @@ NOISE_UNITS = {
 _LENS_MODELS: dict[str, DistortionModel] = {  # by the names that calibrations give them
     **dict.fromkeys(("radial-tangential", "radtan", "plumb_bob", "rational_polynomial"), "radtan"),
     **dict.fromkeys(("equidistant", "equi", "fisheye", "kannala_brandt"), "equidistant"),
-    "none": "pinhole",
+    **dict.fromkeys(("radialtangential", "radialtangential8"), "radtan"),  # OKVIS
+    **dict.fromkeys(("none", ""), "pinhole"),
 }
+# 'data:[1, 2]' and 'Viewer.PointSize:2', which OpenCV's reader takes for 'key: value'
+_LAX_KEY = re.compile(r"^(\s*(?:- )?[A-Za-z_][\w.\-]*):(?=[^\s:/\\])", re.MULTILINE)
 _MAX_BYTES = 1_000_000  # a calibration is some kilobytes; a larger file is another one
 
 
@@ -48,8 +53,9 @@ def read_yaml_file(path: Path, what: str = "the sensor's calibration") -> dict[s
         )
     # OpenCV's writer begins with '%YAML:1.0', which is no YAML directive, and tags its matrices.
     lines = [line for _, line in text_lines(path) if not line.startswith("%YAML")]
+    text = "\n".join(lines).replace("!!opencv-matrix", "")
     try:
-        entries = read_yaml_text("\n".join(lines).replace("!!opencv-matrix", ""))
+        entries = _strict_or_lax(text)
     except ValueError as error:
         raise CalibrationError(
             f"{path}: not a YAML file of plain values ({error}); write plain numbers, or copy it "
@@ -59,6 +65,42 @@ def read_yaml_file(path: Path, what: str = "the sensor's calibration") -> dict[s
         raise CalibrationError(
             f"{path}: holds no calibration (expected 'key: value' lines); copy it again"
         )
+    return {str(key): value for key, value in entries.items()}
+
+
+def _strict_or_lax(text: str) -> Any:
+    """Return the data of a YAML text, or of one that only OpenCV's lax reader takes.
+
+    Raises:
+        ValueError: it is neither; the message is that of strict YAML.
+    """
+    try:
+        return read_yaml_text(text)
+    except ValueError:
+        lax = _LAX_KEY.sub(r"\1: ", text.replace("\t", "    "))
+        if lax == text:
+            raise
+        try:
+            return read_yaml_text(lax)
+        except ValueError:
+            pass
+        raise
+
+
+def read_json_file(path: Path) -> dict[str, object]:
+    """Read a JSON file that holds one object.
+
+    Raises:
+        CalibrationError: the file is missing, too large, or no JSON object.
+    """
+    if not path.is_file() or path.stat().st_size > _MAX_BYTES:
+        raise CalibrationError(f"{path}: is missing or too large for a calibration")
+    try:
+        entries = json.loads("\n".join(line for _, line in text_lines(path)))
+    except (ValueError, RecursionError) as error:
+        raise CalibrationError(f"{path}: not a JSON file ({error}); copy it again") from error
+    if not isinstance(entries, dict):
+        raise CalibrationError(f"{path}: holds no calibration (expected a JSON object)")
     return {str(key): value for key, value in entries.items()}
 
 

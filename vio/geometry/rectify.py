@@ -113,6 +113,8 @@ def rectifying_rotations(rig: StereoRig) -> tuple[FloatArray, FloatArray, float]
         raise CalibrationError(
             "both cameras have the same position: the baseline is zero; check both T_BS"
         )
+    if (fault := vertical_fault(t)) is not None:
+        raise CalibrationError(fault)
     x = t / baseline_m
     forward = np.array([0.0, 0, 1]) + R_cam0_cam1[:, 2]
     z = forward - (forward @ x) * x
@@ -132,6 +134,22 @@ def rectifying_rotations(rig: StereoRig) -> tuple[FloatArray, FloatArray, float]
                 "so the cameras may be swapped, or an extrinsic T_BS inverted"
             )
     return R_rect_cam0, R_rect_cam1, baseline_m
+
+
+def vertical_fault(t: FloatArray) -> str | None:
+    """Return what is wrong where one camera is above the other; None: they are side by side.
+
+    Args:
+        t: position (3,) of the right camera in the left one, or of the left one in the right, m.
+    """
+    across, down, ahead = np.abs(t)
+    if down <= max(across, ahead):
+        return None
+    return (
+        f"a vertical pair: the cameras are {down:g} m apart along their y axes, and "
+        f"{across:g} m along x; turn the images of both by 90 degrees and calibrate these, so that "
+        "the cameras are side by side"
+    )
 
 
 def rectify_pixels(

@@ -51,6 +51,29 @@ _UNUSABLE = {
 }
 
 
+_CODES: dict[InertialFault, str] = {
+    "clocks without overlap": "imu-clock",
+    "clocks overlap in part": "imu-clock",
+    "clocks apart": "imu-clock",
+    "accelerometer units": "imu-units",
+    "gravity removed": "imu-units",
+    "gyro units": "imu-units",
+    "gyro sign": "imu-axes",
+    "gyro axes": "imu-axes",
+    "gyro disagrees": "imu-disagrees",
+    "extrinsics inverted": "imu-axes",
+    "extrinsics rotation": "imu-axes",
+    "extrinsics translation": "imu-axes",
+    "accelerometer sign": "imu-axes",
+    "accelerometer axes": "imu-axes",
+    "upside down": "imu-axes",
+    "saturation": "imu-saturated",
+    "IMU gap": "imu-gap",
+    "camera stamps": "imu-clock",
+    "camera turns": "imu-disagrees",
+}
+
+
 @dataclass(frozen=True, slots=True)
 class ImuVerdict:
     """What is left of an IMU by what was found."""
@@ -80,6 +103,11 @@ class InertialFinding:
     certain: bool = True  # False: a hint; correct data can look like this
     # that takes the unit of these readings to rad/s or m/s^2; None: none does
     factor: float | None = None
+
+    @property
+    def code(self) -> str:
+        """Its code in `vio.findings`."""
+        return _CODES[self.fault] if self.certain else "imu-suspected"
 
     @property
     def message(self) -> str:

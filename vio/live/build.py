@@ -183,6 +183,8 @@ def build_processor(
         ConfigError: the settings contradict one another, the camera or the back end.
         DataError: the map cannot be used.
     """
+    from vio.guard.guarded import guarded  # it loads OpenCV
+
     camera = source.camera
     features = source.features
     backend = parts.backend or build_backend(camera, source.T_cam0_body, config, source.motion)
@@ -196,7 +198,9 @@ def build_processor(
         camera,
         source.T_cam0_body,
         source.motion,
-        frontend=parts.frontend or build_frontend(name, seen, config.frontend, features),
+        frontend=guarded(
+            parts.frontend or build_frontend(name, seen, config.frontend, features), seen
+        ),
         selector=parts.selector
         or build_selector(config.selector, whole_record=_record(features), camera=seen),
         backend=backend,

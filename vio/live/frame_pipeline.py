@@ -7,6 +7,7 @@ from __future__ import annotations
 import time
 
 from vio.errors import DataError, DivergedError
+from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.imu_trial import AS_GIVEN, ImuTrial, corrected
@@ -86,7 +87,7 @@ class FramePipeline:
             self.monitor.refused(frame.index, str(error))
             return None
         timer.end("frontend")
-        self.monitor.observations(output.observations, output.warnings)
+        self.monitor.observations(output.observations, output.warnings, output.findings)
         self.begin_again(frame.index)
         timer.end("monitor")
         seen = output.observations
@@ -110,6 +111,7 @@ class FramePipeline:
         estimate = self.backend.estimate()
         timer.end("update")
         self.monitor.update(frame.index, report, estimate)
+        estimate = self.monitor.judged(frame.index, estimate)
         timer.ms["filter"] = timer.ms["predict"] + timer.ms["update"] + self._propagate_ms
         self._propagate_ms = 0.0
         return FrameResult(
@@ -118,7 +120,7 @@ class FramePipeline:
             selection,
             report,
             estimate,
-            _frame_log(frame, timer.ms, output, selection, report),
+            _frame_log(frame, timer.ms, output, selection, report, estimate),
         )
 
     def usable(self, sample: MotionSample) -> MotionSample | None:
@@ -170,7 +172,7 @@ class FramePipeline:
                 self.monitor.restarted(seen.frame_index, str(error), self.backend.estimate())
             else:
                 lost = f"{error}; there are no poses until the scale is observable again"
-                self.monitor.say(f"frame {seen.frame_index}: {lost}")
+                self.monitor.say(f"frame {seen.frame_index}: {lost}", "estimate-lost")
             return report
 
 
@@ -194,6 +196,7 @@ def _frame_log(
     output: FrontendOutput,
     selection: Selection,
     report: UpdateReport,
+    estimate: Estimate,
 ) -> FrameLog:
     z = output.observations.z[output.observations.has_right]
     return FrameLog(
@@ -216,5 +219,6 @@ def _frame_log(
         nis_per_dof=report.nis_per_dof,
         disparity_median_px=median(z[:, 0] - z[:, 2]) if len(z) else None,
         innovation_ratio=report.innovation_ratio,
+        integrity=INTEGRITIES.index(estimate.integrity),
         stages_ms=output.stages_ms,
     )

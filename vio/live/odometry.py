@@ -16,6 +16,7 @@ from vio.cameras.rig import Rig, rig_of_rectified
 from vio.config import Config
 from vio.errors import ConfigError, DataError
 from vio.filters.inputs import checked_extrinsics
+from vio.findings import Finding
 from vio.frontend import build_frontend
 from vio.frontend.precomputed import PrecomputedFrontend
 from vio.frontend.settings import FrontendSettings
@@ -26,8 +27,9 @@ from vio.live.event_inputs import EventInputs
 from vio.live.inputs import GivenFrame, Inputs, Shapes, checked_time, gray
 from vio.live.prediction import PosePredictor, PredictedPose
 from vio.numerics.threads import BlasLimit
-from vio.protocols import Frontend
+from vio.protocols import FollowsRight, Frontend
 from vio.records import (
+    CheckedFrame,
     Estimate,
     Event,
     FrameResult,
@@ -38,6 +40,7 @@ from vio.records import (
     Observations,
     StereoFrame,
     TrackPrior,
+    no_features,
 )
 
 if TYPE_CHECKING:
@@ -245,6 +248,11 @@ class Odometry(EventInputs["Estimate | None"]):
         return tuple(self._processor.pipeline.monitor.lines)
 
     @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the checks have found so far, with codes."""
+        return tuple(self._processor.pipeline.monitor.findings)
+
+    @property
     def frames_refused(self) -> int:
         """Number of frames that the front end refused."""
         return self._processor.pipeline.monitor.frames_refused
@@ -371,3 +379,9 @@ class _LiveFrontend:
         frontend = self._replay if frame.left is None else self._images
         assert frontend is not None
         return frontend.process(frame, prior)
+
+    def follow_right(self, frame: CheckedFrame, prior: TrackPrior | None = None) -> FrontendOutput:
+        """Go on with the right image where the front end can; see `vio.guard.FollowsRight`."""
+        if isinstance(self._images, FollowsRight):
+            return self._images.follow_right(frame, prior)
+        return no_features(frame)

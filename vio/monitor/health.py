@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.calibration.severity import rows_grade
+from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.numerics.robust import median
 from vio.records import BoolArray, Estimate, IntArray, Observations, UpdateReport
@@ -31,7 +32,7 @@ _MAX_ACCEL_BIAS_MPS2 = 3.0
 
 
 class RunHealth:
-    """Monitor each frame's report and estimate; return one line when an event begins or ends."""
+    """Monitor each frame's report and estimate; return a finding when an event begins or ends."""
 
     def __init__(self) -> None:
         self._last: tuple[int, FloatArray] | None = None  # time and position of the frame before
@@ -43,8 +44,8 @@ class RunHealth:
         self._reported: set[str] = set()
         self._restarted_ns: int | None = None  # time of the last restart
 
-    def restarted(self, index: int, why: str, estimate: Estimate) -> tuple[str, ...]:
-        """Return the line on a restart from an estimate, with the reason; none within a second
+    def restarted(self, index: int, why: str, estimate: Estimate) -> tuple[Finding, ...]:
+        """Return the finding on a restart from an estimate, with the reason; none within a second
         of the last one.
         """
         last_ns = self._restarted_ns
@@ -53,32 +54,33 @@ class RunHealth:
         if last_ns is not None and (estimate.time_ns - last_ns) * 1e-9 < _RESTART_EVENT_S:
             return ()
         sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
-        return (
+        message = (
             f"frame {index}: {why}; started again from the last good pose, the standard deviation "
-            "of its position is "
-            f"{sigma:.2f} m",
+            f"of its position is {sigma:.2f} m"
         )
+        return (Finding("estimate-restarted", message, index, figures={"sigma_m": sigma}),)
 
-    def frame(self, index: int, report: UpdateReport, estimate: Estimate) -> tuple[str, ...]:
-        """Return the warnings of a frame, by what its update did and the estimate after it."""
-        lines = [*self._gap(index, estimate), *self._features(index, report, estimate)]
-        lines += self._stereo(index, estimate)
-        lines += self._jump(index, report)
-        lines += self._implausible(index, estimate)
-        return tuple(lines)
+    def frame(self, index: int, report: UpdateReport, estimate: Estimate) -> tuple[Finding, ...]:
+        """Return the findings of a frame, by what its update did and the estimate after it."""
+        found = [*self._gap(index, estimate), *self._features(index, report, estimate)]
+        found += self._stereo(index, estimate)
+        found += self._jump(index, report)
+        found += self._implausible(index, estimate)
+        return tuple(found)
 
-    def _jump(self, index: int, report: UpdateReport) -> list[str]:
+    def _jump(self, index: int, report: UpdateReport) -> list[Finding]:
         """Report the first time that the gyro's bias has jumped."""
-        if report.gyro_jump_radps is None or "gyro jump" in self._reported:
+        jump_radps = report.gyro_jump_radps
+        if jump_radps is None or "gyro jump" in self._reported:
             return []
         self._reported.add("gyro jump")
-        return [
-            f"frame {index}: the gyro's bias has jumped by {report.gyro_jump_radps:.2g} rad/s, as "
-            "all images show: the sensor was shocked or restarted; the bias was estimated anew, by "
-            "the images"
-        ]
+        message = (
+            f"frame {index}: the gyro's bias has jumped by {jump_radps:.2g} rad/s, as all images "
+            "show: the sensor was shocked or restarted; the bias was estimated anew, by the images"
+        )
+        return [Finding("gyro-jumped", message, index, figures={"jump_radps": jump_radps})]
 
-    def _gap(self, index: int, estimate: Estimate) -> list[str]:
+    def _gap(self, index: int, estimate: Estimate) -> list[Finding]:
         """Report a time without frames, with what is known of the pose after it."""
         last = self._last
         last_index = self._last_index
@@ -94,13 +96,15 @@ class RunHealth:
         if step_s <= max(_GAP_S, _GAP_STEPS * usual_s):
             return []
         sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
-        return [
+        message = (
             f"frame {index}: no frame for {step_s:.2f} s since frame {last_index}; the motion in "
-            "between is a "
-            f"prediction, the standard deviation of the position is {sigma:.2g} m after it"
-        ]
+            f"between is a prediction, the standard deviation of the position is {sigma:.2g} m "
+            "after it"
+        )
+        figures = {"gap_s": step_s, "sigma_m": sigma}
+        return [Finding("frames-missing", message, index, figures=figures)]
 
-    def _stereo(self, index: int, estimate: Estimate) -> list[str]:
+    def _stereo(self, index: int, estimate: Estimate) -> list[Finding]:
         """Report once that the filter estimates the stereo calibration, as the rows show that it
         is off.
         """
@@ -113,25 +117,27 @@ class RunHealth:
             return []
         self._reported.add("stereo")
         seen = f"frame {index}: the rows of left and right images differ by {field.rows_rms_px:.2f} px (rms)"
+        figures = {"rows_rms_px": field.rows_rms_px}
         if field.rows_rms_px > _OTHER_PAIR_PX:
-            return [
+            message = (
                 f"{seen}: left and right are exchanged, the calibration is not that of these "
-                "images, or a camera was "
-                "moved; `vio calibrate` finds which; what the calibration is off by is estimated "
-                "while running, which "
-                "may not suffice (msckf.calibrate_stereo)"
-            ]
-        return [
+                "images, or a camera was moved; `vio calibrate` finds which; what the calibration "
+                "is off by is estimated while running, which may not suffice "
+                "(msckf.calibrate_stereo)"
+            )
+            return [Finding("other-calibration", message, index, lasts=True, figures=figures)]
+        message = (
             f"{seen} in a smooth pattern: the stereo calibration is off, "
             f"{rows_grade(field.rows_rms_px)}; what it is "
             "off by is estimated while running (msckf.calibrate_stereo)"
-        ]
+        )
+        return [Finding("stereo-calibration-off", message, index, figures=figures)]
 
-    def scale(self, index: int, estimate: Estimate) -> list[str]:
+    def scale(self, index: int, estimate: Estimate) -> list[Finding]:
         """Return once that baseline or focal length differ from the calibration significantly
         and harmfully.
         """
-        lines: list[str] = []
+        lines: list[Finding] = []
         found = {} if estimate.stereo_scale is None else estimate.stereo_scale.percent()
         for name, (percent, sigma) in found.items():
             if (
@@ -144,7 +150,7 @@ class RunHealth:
             named = (
                 f"{name}, or the focal length," if len(found) == 1 and name == "baseline" else name
             )
-            lines.append(
+            message = (
                 f"frame {index}: the {named} is {abs(percent):.1f} % "
                 f"{'longer' if percent > 0 else 'shorter'} than "
                 f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor "
@@ -154,9 +160,11 @@ class RunHealth:
                 "dataset.depth_factor); then calibrate the cameras anew, or run with what "
                 "--save-calibration keeps"
             )
+            figures = {"off_percent": percent, "sigma_percent": sigma}
+            lines.append(Finding("scale-off", message, index, lasts=True, figures=figures))
         return lines
 
-    def _features(self, index: int, report: UpdateReport, estimate: Estimate) -> list[str]:
+    def _features(self, index: int, report: UpdateReport, estimate: Estimate) -> list[Finding]:
         """Report when features have been missing for long, and when they are back."""
         time_ns = estimate.time_ns
         starts = report.initialised > 0 and not self._without_features
@@ -165,28 +173,32 @@ class RunHealth:
             away_s = 0.0 if self._last_used is None else (time_ns - self._last_used[1]) * 1e-9
             self._last_used = (index, time_ns)
             self._without_features = False
-            return [f"frame {index}: features again, after {away_s:.1f} s without"] if ended else []
+            if not ended:
+                return []
+            message = f"frame {index}: features again, after {away_s:.1f} s without"
+            return [Finding("no-features", message, index, ended=True)]
         seconds = (time_ns - self._last_used[1]) * 1e-9
         if self._without_features or seconds < _NO_FEATURES_S:
             return []
         self._without_features = True
         sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
-        return [
+        message = (
             f"frame {index}: no usable feature since frame {self._last_used[0]} ({seconds:.1f} s); "
-            "the pose is a "
-            f"prediction, the standard deviation of its position is {sigma:.2f} m"
-        ]
+            f"the pose is a prediction, the standard deviation of its position is {sigma:.2f} m"
+        )
+        since = self._last_used[0] + 1
+        return [Finding("no-features", message, index, since, lasts=True)]
 
-    def _implausible(self, index: int, estimate: Estimate) -> list[str]:
+    def _implausible(self, index: int, estimate: Estimate) -> list[Finding]:
         """Report once when the state is implausible for a vehicle."""
-        lines = []
+        lines: list[Finding] = []
         position = estimate.T_world_imu[:3, 3].copy()
         if self._last is not None and estimate.time_ns > self._last[0]:
             speed = float(np.linalg.norm(position - self._last[1])) / (
                 (estimate.time_ns - self._last[0]) * 1e-9
             )
             line = f"frame {index}: the estimate moves at {speed:.0f} m/s: the filter has diverged"
-            lines += self._once("speed", speed, _MAX_SPEED_MPS, line)
+            lines += self._once(index, "speed", speed, _MAX_SPEED_MPS, line)
         self._last = estimate.time_ns, position
         for name, bias, limit, unit in (
             ("gyro bias", estimate.gyro_bias, _MAX_GYRO_BIAS_RADPS, "rad/s"),
@@ -195,14 +207,15 @@ class RunHealth:
             if bias is not None:
                 size = float(np.linalg.norm(bias))
                 line = f"frame {index}: the {name} is estimated as {size:.2g} {unit}, which no working sensor has"
-                lines += self._once(name, size, limit, line)
+                lines += self._once(index, name, size, limit, line)
         return lines
 
-    def _once(self, what: str, value: float, limit: float, line: str) -> list[str]:
+    def _once(self, index: int, what: str, value: float, limit: float, line: str) -> list[Finding]:
         if value <= limit or what in self._reported:
             return []
         self._reported.add(what)
-        return [f"{line}; check the order of the images, calibration, units and clocks"]
+        message = f"{line}; check the order of the images, calibration, units and clocks"
+        return [Finding("estimate-implausible", message, index, lasts=True)]
 
 
 _SPAN_S = 1.0
@@ -237,8 +250,8 @@ class RefusalReport:
         self._reported = False
         self._frames: deque[_Frame] = deque()
 
-    def frame(self, seen: Observations, report: UpdateReport, estimate: Estimate) -> list[str]:
-        """Add the features of a frame and what the filter did with them; return the line to
+    def frame(self, seen: Observations, report: UpdateReport, estimate: Estimate) -> list[Finding]:
+        """Add the features of a frame and what the filter did with them; return the finding to
         report, if any.
         """
         if self._reported:
@@ -257,11 +270,13 @@ class RefusalReport:
         if not full or len(self._frames) < _LEAST_FRAMES or gone <= _MOST_REFUSED * (kept + gone):
             return []
         self._reported = True
-        return [
-            f"frame {seen.frame_index}: {100 * gone / (kept + gone):.0f} % of the features of the "
-            "last second were "
-            f"refused, as they contradict the others: {self._cause(estimate)}"
-        ]
+        share = gone / (kept + gone)
+        message = (
+            f"frame {seen.frame_index}: {100 * share:.0f} % of the features of the last second "
+            f"were refused, as they contradict the others: {self._cause(estimate)}"
+        )
+        figures = {"refused_share": share}
+        return [Finding("features-refused", message, seen.frame_index, figures=figures)]
 
     def _cause(self, estimate: Estimate) -> str:
         """The likeliest cause by the evidence."""

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.imu.findings import ImuVerdict
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RefusalReport, RunHealth
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
+from vio.monitor.integrity import IntegrityMonitor, Mark
 from vio.records import (
     Estimate,
     ImuSample,
@@ -39,7 +41,7 @@ _PREVENTS_START = ("size", "overlap")
 
 
 class RunMonitor:
-    """Monitor all events of a run in time order; log warnings, and keep them in `lines`.
+    """Monitor all events of a run in time order; log findings, and keep them in `findings`.
 
     `repeats` and `without_repeated_depth` decide which frames and depth images are dropped.
     """
@@ -74,9 +76,12 @@ class RunMonitor:
         self._waiting_since: int | None = None
         self._waits_for = ""
         self._imu_at_fault = False
-        self._scale_lines: list[str] = []  # not reported yet
+        self._scale_lines: list[Finding] = []  # not reported yet
         self.imu_verdict = ImuVerdict()  # by the findings so far
-        self.lines: list[str] = []
+        self.findings: list[Finding] = []
+        # whether the run begins again where right images belong to other frames
+        self.ends_at_shifted_pairs = False
+        self._integrity = IntegrityMonitor()
 
     def sample(self, sample: MotionSample) -> None:
         """Add one motion sample; it is judged with all others before the next frame."""
@@ -94,7 +99,7 @@ class RunMonitor:
             gap = self._silence.sample(sample.time_ns)
             if gap:  # what is to be said of earlier samples comes first
                 self._check(new[taken:k])
-                self._report(gap)
+                self._report("imu-gap", gap)
                 taken = k
         self._check(new[taken:])
 
@@ -103,7 +108,7 @@ class RunMonitor:
         if self._faults is None or self._inertial is None:
             return
         usable, lines = self._faults.samples(samples)
-        self._report(lines)
+        self._report("imu-readings", lines)
         for x in usable:
             self._inertial.imu(x)
             self._frozen.sample(x)
@@ -118,7 +123,7 @@ class RunMonitor:
         self._take_new()
         repeated = self._frozen.check(frame, expected)
         self._repeated = repeated is not None
-        self._report(self._repeats.frame(frame, repeated))
+        self._report("frames-repeated", self._repeats.frame(frame, repeated))
         return self._repeated
 
     def without_repeated_depth(self, frame: StereoFrame) -> StereoFrame:
@@ -128,22 +133,29 @@ class RunMonitor:
         if frame.depth is None:
             return frame
         repeated = self._frozen.check_depth(frame)
-        self._report(self._depths.frame(frame, repeated))
+        self._report("depths-repeated", self._depths.frame(frame, repeated))
         return frame if repeated is None else replace(frame, depth=np.zeros_like(frame.depth))
 
-    def observations(self, seen: Observations, warnings: tuple[str, ...] = ()) -> None:
-        """Add the front end's observations, before feature selection, and its warnings on the
-        images.
+    def observations(
+        self,
+        seen: Observations,
+        warnings: tuple[str, ...] = (),
+        findings: tuple[Finding, ...] = (),
+    ) -> None:
+        """Add the front end's observations, before feature selection, its own remarks, and the
+        findings on the images.
         """
         self._take_new()
         if self._baseline_fault is not None and not self._frames:
-            self._report([f"{self._baseline_fault}, or the path has another unit"])
-        self._report(warnings)
+            line = f"{self._baseline_fault}, or the path has another unit"
+            self._report("baseline-implausible", [line])
+        self._report("front-end", warnings)
+        self._add(findings)
         self._frames += 1
         self._features += len(seen)
         self._seen = seen
         if self._silence is not None:
-            self._report(self._silence.frame(seen.frame_index, seen.time_ns))
+            self._report("imu-gap", self._silence.frame(seen.frame_index, seen.time_ns))
         if self._faults is not None:
             self._faults.frame(seen.frame_index)
         if self._repeated:
@@ -170,16 +182,29 @@ class RunMonitor:
             else check.rotation_comparison
         )
 
-    def say(self, line: str) -> None:
+    @property
+    def pairs_shifted_by(self) -> int:
+        """Frames by which right images were found to be late from the start; -1: early."""
+        for finding in self.findings:
+            if finding.code == "pairs-shifted":
+                return round(finding.figures["delay_frames"])
+        return 0
+
+    @property
+    def lines(self) -> list[str]:
+        """What was found so far, one line each."""
+        return [finding.message for finding in self.findings]
+
+    def say(self, line: str, code: str = "run") -> None:
         """Report what was found elsewhere, in one line."""
-        self._report([line])
+        self._report(code, [line])
 
     def refused(self, index: int, reason: str) -> None:
         """Add a frame that the front end refused, with its reason; a row of such frames is
         reported once.
         """
         if self._refused_last != self._index_before:
-            self._report([f"frame skipped: {reason}"])
+            self._report("frame-refused", [f"frame skipped: {reason}"])
         self._refused_last = index
         self.frames_refused = self.frames_refused + 1
         self.refusal = reason
@@ -201,7 +226,8 @@ class RunMonitor:
                 if factor != 1
             ]
             what = " and ".join(factors)
-        self._report([f"frame {index}: {what}; the {frames} frames so far were estimated again"])
+        line = f"frame {index}: {what}; the {frames} frames so far were estimated again"
+        self._report("imu-not-used", [line])
 
     def waiting(self, frame: StereoFrame, why: str) -> None:
         """Add a frame without a pose, as the back end's start is not observable yet; `why` is
@@ -226,26 +252,27 @@ class RunMonitor:
             else f"in motion, its scale known to {100 * scale_sigma:.1f} % by the IMU"
         )
         self._report(
+            "one-camera-start",
             [
                 f"frame {frame.index}: one camera: the trajectory begins here, {how}; the frames "
                 "of "
                 f"{(frame.time_ns - since) * 1e-9:.1f} s before have no pose"
-            ]
+            ],
         )
 
     def restarted(self, index: int, why: str, estimate: Estimate) -> None:
         """Report that the back end diverged in a frame and was started again; repeats within a
         second are one event.
         """
-        self._report(self._health.restarted(index, why, estimate))
+        self._add(self._health.restarted(index, why, estimate))
 
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
-        self._report(self._health.frame(index, report, estimate))
+        self._add(self._health.frame(index, report, estimate))
         if report.gyro_jump_radps is not None and self._inertial is not None:
             self._inertial.begin_after_jump()
         if self._seen is not None:
-            self._report(self._refusals.frame(self._seen, report, estimate))
+            self._add(self._refusals.frame(self._seen, report, estimate))
         self._scale_lines += self._health.scale(index, estimate)
         self._report_scale(last=False)
 
@@ -255,7 +282,7 @@ class RunMonitor:
         """
         check = self._inertial
         if check is None or (not check.imu_at_fault and (check.axes_compared or last)):
-            self._report(self._scale_lines)
+            self._add(self._scale_lines)
             self._scale_lines = []
 
     def close(self) -> None:
@@ -263,16 +290,18 @@ class RunMonitor:
         self._take_new()
         if self._frames and not self._features:
             self._report(
+                "no-features",
                 [
                     f"no feature in any of {self._frames} frames: the trajectory contains no "
                     "information on the motion"
-                ]
+                ],
             )
-        self._report([*self._repeats.finish(), *self._depths.finish()])
+        self._report("frames-repeated", self._repeats.finish())
+        self._report("depths-repeated", self._depths.finish())
         if self._silence is not None:
-            self._report(self._silence.finish())
+            self._report("imu-gap", self._silence.finish())
         if self._faults is not None:
-            self._report(self._faults.finish())
+            self._report("imu-readings", self._faults.finish())
         if self._inertial is not None:
             findings = self._inertial.finish()
             # which is no matter of clocks
@@ -286,7 +315,8 @@ class RunMonitor:
                 if self._imu_at_fault
                 else self._waits_for
             )
-            self._report([f"one camera: {self.frames_waiting} frames have no pose; {why}"])
+            line = f"one camera: {self.frames_waiting} frames have no pose; {why}"
+            self._report("no-pose", [line])
 
     def _report_findings(self, findings: Iterable[InertialFinding]) -> None:
         """Log findings; gaps are reported one by one by `ImuSilence`."""
@@ -294,9 +324,29 @@ class RunMonitor:
         self._imu_at_fault |= any(f.certain and f.group in _PREVENTS_START for f in findings)
         for finding in findings:
             self.imu_verdict = self.imu_verdict.after(finding)
-        self._report(finding.message for finding in findings if finding.fault != "IMU gap")
+        for finding in findings:
+            if finding.fault != "IMU gap":
+                self._add([self._of_imu(finding)])
 
-    def _report(self, lines: Iterable[str]) -> None:
-        for line in lines:
-            log.warning("%s", line)
-            self.lines.append(line)
+    def _of_imu(self, finding: InertialFinding) -> Finding:
+        """Return a finding of the IMU as one of the run."""
+        return Finding(finding.code, finding.message, self._index, certain=finding.certain)
+
+    def _report(self, code: str, lines: Iterable[str]) -> None:
+        """Report events of one kind, one line each."""
+        self._add(Finding(code, line, max(self._index, 0)) for line in lines)
+
+    def _add(self, findings: Iterable[Finding]) -> None:
+        for finding in findings:
+            if not (finding.code == "pairs-shifted" and self.ends_at_shifted_pairs):
+                log.warning("%s", finding.message)
+            self.findings.append(finding)
+            self._integrity.take(finding)
+
+    def judged(self, index: int, estimate: Estimate) -> Estimate:
+        """Return the estimate of a frame with its integrity, by what was found so far."""
+        return self._integrity.judged(index, estimate)
+
+    def take_marks(self) -> tuple[Mark, ...]:
+        """Return which earlier frames are to be marked, as a fault began before it was found."""
+        return self._integrity.take_marks()

@@ -34,7 +34,7 @@ from vio.calibration.verdicts import (
     judge_stereo,
     judge_velocity_lever_arm,
 )
-from vio.datasets.image_pairs import full_scale
+from vio.datasets.image_pairs import gray_levels
 from vio.datasets.images import load_gray
 from vio.errors import EstimationError
 from vio.geometry.distortion import StereoRig, unproject_pixel
@@ -197,12 +197,12 @@ def _match_images(
     rays: list[RayMatches] = []
     exchanged: list[RayMatches] = []
     z: list[FloatArray] = [np.zeros((0, 4))]
-    white, _ = full_scale(source.raw_pairs)
+    levels, _ = gray_levels(source.raw_pairs)
     chosen = np.unique(
         np.linspace(0, len(source.raw_pairs) - 1, min(pairs, len(source.raw_pairs))).astype(int)
     )
     for done, k in enumerate(chosen.tolist()):
-        left, right = (load_gray(path, white)[0] for path in source.raw_pairs[k])
+        left, right = (load_gray(path, levels)[0] for path in source.raw_pairs[k])
         uv0, uv1 = sift_matches(left, right)
         matches, valid = _rays(rig, uv0, uv1, k)
         rays.append(matches)

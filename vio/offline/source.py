@@ -83,7 +83,7 @@ def open_source(text: str) -> CalibrationSource:
         return found
     recording = dataset.recording
     need_stereo(recording, "a calibration of cameras")
-    if isinstance(dataset, ImageDataset):
+    if isinstance(dataset, ImageDataset) and not dataset.side_by_side:
         return CalibrationSource(
             recording.path, dataset.rectifier.rig, dataset.pairs, dataset, None
         )

@@ -15,9 +15,10 @@ import numpy as np
 
 from vio.datasets.bags.cdr import decoded
 from vio.datasets.bags.index import stamp_of
-from vio.datasets.bags.pictures import gray_of, raw_gray
+from vio.datasets.bags.pictures import band_of_message, gray_of
 from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
-from vio.datasets.images import UnreadableImageError, brightest, white_of
+from vio.datasets.images import UnreadableImageError
+from vio.datasets.levels import Band, Levels, levels_of
 from vio.errors import DataError, OrderError
 from vio.geometry.lie import FloatArray
 from vio.live.live_odometry import LiveOdometry
@@ -30,7 +31,7 @@ log = logging.getLogger(__name__)
 SILENT_S = 5.0  # without a message, before it is said
 # a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
 _BACK_NS = 500_000_000
-_WHITE_IMAGES = 8  # of 16 bits, looked at for the level of white
+_LEVEL_IMAGES = 8  # of 16 bits, looked at for the levels of black and white
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +70,7 @@ class Sensors:
         self._pairing: Pairing[Image] = Pairing()
         self._newest: dict[str, tuple[int | None, int]] = {}  # the last two stamps, ns
         self._back: set[str] = set()  # topics whose last stamp lay far before these
-        self._levels: list[float] = []  # brightest ones of 16-bit images
+        self._bands: list[Band] = []  # of the levels of 16-bit images
         self.gyro: FloatArray | None = None  # (3,) rad/s, of the newest sample
         self.received = dict.fromkeys(topics.kinds, 0)  # messages
         self.refused = 0
@@ -89,7 +90,10 @@ class Sensors:
         where = f"{topic} at {time_ns} ns"
         try:
             image = gray_of(
-                fields, where, compressed=kind == COMPRESSED, white=self._white(fields, kind, where)
+                fields,
+                where,
+                compressed=kind == COMPRESSED,
+                levels=self._gray_levels(fields, kind, where),
             )
         except UnreadableImageError as error:
             self._refuse(str(error))
@@ -149,11 +153,12 @@ class Sensors:
         self._back.discard(topic)
         return time_ns
 
-    def _white(self, fields: Any, kind: str, where: str) -> int:
-        """Return the level of white of 16-bit images, from the first ones."""
-        if kind == IMAGE and len(self._levels) < _WHITE_IMAGES and "16" in fields.encoding:
-            self._levels.append(brightest(raw_gray(fields, where)))
-        return white_of(max(self._levels, default=0.0))
+    def _gray_levels(self, fields: Any, kind: str, where: str) -> Levels:
+        """Return the levels of black and white of 16-bit images, from the first ones."""
+        if len(self._bands) < _LEVEL_IMAGES:
+            band = band_of_message(fields, where, compressed=kind == COMPRESSED)
+            self._bands += [] if band is None else [band]
+        return levels_of(self._bands)
 
     def _refuse(self, why: str) -> None:
         self.refused += 1

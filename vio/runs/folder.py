@@ -29,6 +29,7 @@ from vio.files.atomic import atomic_folder, check_own
 from vio.files.inputs import read_input
 from vio.files.printable import json_text, printable
 from vio.files.trajectories import in_first_cam0, read_trajectory, write_kitti, write_tum
+from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray, checked_transform, se3_inverse, se3_log, transform_points
 from vio.numerics.compiled import has_compiled
 from vio.protocols import Dataset
@@ -388,6 +389,9 @@ def metrics_of(
         "dead_reckoning": None if dead_reckoning is None else dead_reckoning.as_dict(),
         "landmark_error": landmark_error(result, evaluation),
         "warnings": list(result.warnings),
+        "findings": [finding.to_json() for finding in result.findings],
+        "integrity": integrity_counts(result),
+        "doubts": list(result.recording.doubts),
         "stereo_field": stereo_field(result),
         "stereo_scale": stereo_scale(result),
         "scale_sigma": final_scale_sigma(result),
@@ -470,6 +474,12 @@ def final_scale_sigma(result: RunResult) -> float | None:
         if sigma is not None and sigma == sigma
     ]
     return float(np.median(known)) if known else None
+
+
+def integrity_counts(result: RunResult) -> dict[str, int]:
+    """Return how many estimates are nominal, degraded and unusable."""
+    states = np.array(result.frames.column("integrity"))
+    return {name: int((states == k).sum()) for k, name in enumerate(INTEGRITIES)}
 
 
 def rig_scale_sigma(result: RunResult) -> float | None:

@@ -20,9 +20,11 @@ from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.files.tables import Records
 from vio.filters.settings import VislamSettings
 from vio.filters.vislam import Vislam
+from vio.findings import Finding
 from vio.frontend import one_opencv_thread
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
+from vio.guard.repairing import repaired
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, recorded_source
 from vio.live.processor import EventProcessor
 from vio.numerics.threads import one_blas_thread
@@ -70,7 +72,7 @@ class RunResult:
     frames: Records[FrameLog]
     observations: Sequence[Observations] | None  # kept on request
     motion_samples: Sequence[MotionSample] | None  # kept on request
-    warnings: tuple[str, ...]  # what went wrong in the run, or with its IMU
+    findings: tuple[Finding, ...]  # what went wrong in the run, or with its IMU
     wall_s: float
     stopped: str | None = None  # why the run ended before the recording; None: it did not
     rig: Rig | None = None  # the calibration as given; None: features without an image size
@@ -90,6 +92,11 @@ class RunResult:
             return None
         recording = self.recording
         return estimated_rig(self.rig, self.estimates[-1], recording.camera, str(recording.path))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What went wrong in the run, or with its IMU, one line each."""
+        return tuple(finding.message for finding in self.findings)
 
     @property
     def trajectory(self) -> Trajectory:
@@ -172,17 +179,70 @@ def run(
             With a folder, a fault after the first frame ends the run in order instead, and the
             result names it.
     """
+    _check_range(dataset.recording, start, stop)
+    with contextlib.closing(Viewers(() if viewer is None else (viewer,))) as shown:
+        what = _Run(dataset, config, start, stop, keep_observations, shown, parts, map, control)
+        try:
+            return what.process(0)
+        except _PairsShiftedError as found:
+            return what.process(found.delay)
+
+
+class _PairsShiftedError(Exception):
+    """The first frames show that right images belong to the left images of other frames."""
+
+    def __init__(self, delay: int) -> None:
+        super().__init__(f"right images are late by {delay} frames")
+        self.delay = delay
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """The arguments of `run`."""
+
+    dataset: Dataset
+    config: Config
+    start: int
+    stop: int | None
+    keep_observations: bool
+    shown: Viewers
+    parts: Parts
+    map: MapUse | None
+    control: RunControl
+
+    @property
+    def can_begin_again(self) -> bool:
+        """Whether all parts can be built anew, and nothing outside of the run has seen a frame."""
+        return self.parts == CONFIGURED and self.map is None and not self.control.resume
+
+    def process(self, delay: int) -> RunResult:
+        """Process the recording, its right images late by `delay` frames."""
+        return _process(self, delay)
+
+
+def _process(what: _Run, delay: int) -> RunResult:
+    """Process a recording; see `run`.
+
+    Raises:
+        _PairsShiftedError: the run is to begin again with right images paired anew.
+    """
+    dataset = what.dataset
+    config = what.config
+    start = what.start
+    stop = what.stop
+    shown = what.shown
+    parts = what.parts
+    map = what.map
+    control = what.control
     recording = dataset.recording
     folder = control.folder
-    _check_range(recording, start, stop)
     source = recorded_source(dataset, config)
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
     began = time.perf_counter()
     recorder = RunRecorder(
-        body, lag_frames=config.lag_frames, keep_observations=keep_observations, folder=folder
+        body, lag_frames=config.lag_frames, keep_observations=what.keep_observations, folder=folder
     )
     features = source.features or dataset
-    shown = Viewers(() if viewer is None else (viewer,))
     if control.resume:
         state = recorder.restore(features)
         _reopen_map(state.processor.map, map)
@@ -193,15 +253,21 @@ def run(
             build_processor(source, config, parts, map),
             DeadReckoning(source.camera, source.T_cam0_body, config.vislam) if reckoned else None,
             start,
+            delay=delay,
         )
     processor = state.processor
+    monitor = processor.pipeline.monitor
+    if delay:
+        monitor.say(_paired_anew_line(delay), "pairs-put-right")
+    monitor.ends_at_shifted_pairs = what.can_begin_again and not delay
     stopped = None
-    with contextlib.closing(recorder), contextlib.closing(shown), contextlib.closing(processor):
+    with contextlib.closing(recorder), contextlib.closing(processor):
         loop = _Loop(state, recorder, shown, _taken_frames(dataset, config, start, stop))
         try:
             with _opencv_threads(dataset, config, parts.frontend):
                 images = _needs_images(dataset, config) or processor.map is not None
                 events = dataset.events(state.next_frame, stop, images=images)
+                events = repaired(events, state.delay)
                 stopped = loop.run(events, features, control.should_stop)
         except VioError as error:
             if folder is None or not len(recorder):
@@ -223,7 +289,7 @@ def run(
             frames=recorder.frames,
             observations=recorder.observations,
             motion_samples=recorder.samples,
-            warnings=tuple(processor.pipeline.monitor.lines),
+            findings=tuple(processor.pipeline.monitor.findings),
             wall_s=time.perf_counter() - began,
             stopped=stopped,
             rig=given_rig(dataset),
@@ -292,6 +358,7 @@ class _RunState:
     # numbers of frames that the recording lists and did not give
     unread: list[int] = field(default_factory=list)
     sample_ns: int | None = None  # newest time of a motion sample that was taken
+    delay: int = 0  # frames by which the recording's right images are late
 
     def is_new(self, event: Event) -> bool:
         """Whether an event of a recording that is read again has not been taken before."""
@@ -354,7 +421,8 @@ class _Loop:
                 state.unread += self._between(state.next_frame + 1, self._end)
         if state.unread:
             last = max(state.next_frame, *state.unread)
-            monitor.say(_unread_line(state.unread, sum(index <= last for index in self._frames)))
+            line = _unread_line(state.unread, sum(index <= last for index in self._frames))
+            monitor.say(line, "frames-unread")
         self._record(processor.finish())
         recorder.revise(processor.pipeline.backend.smoothed)
         if monitor.frames_refused > len(recorder):
@@ -381,6 +449,9 @@ class _Loop:
         if not isinstance(event, StereoFrame):
             self._recorder.sample(event)
         results = state.processor.add(event)
+        monitor = state.processor.pipeline.monitor
+        if monitor.ends_at_shifted_pairs and monitor.pairs_shifted_by:
+            raise _PairsShiftedError(monitor.pairs_shifted_by)
         if results:
             self._record(results)
         if state.dead_reckoning is not None:
@@ -395,6 +466,16 @@ class _Loop:
                 self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))
             self._viewer.frame(result)
         self._recorder.replace(state.processor.pipeline.take_revised())
+        self._recorder.mark(state.processor.pipeline.monitor.take_marks())
+
+
+def _paired_anew_line(delay: int) -> str:
+    """Say that a run has begun again."""
+    which = "after" if delay > 0 else "before"
+    return (
+        f"each left image belongs to the right image of the frame {which} it, by the rows that "
+        "match; the run began again with these pairs; pair the images by their times of exposure"
+    )
 
 
 def _check_range(recording: Recording, start: int, stop: int | None) -> None:

@@ -23,9 +23,12 @@ from vio.errors import DataError
 from vio.files.atomic import atomic_write_text, check_own, open_own
 from vio.files.tables import Records, Rows, Table, check_table
 from vio.files.trajectories import tum_text
+from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
+from vio.monitor.integrity import Mark, marked
 from vio.protocols import Dataset
 from vio.records import (
+    NS_PER_S,
     BodyFrame,
     Estimate,
     FrameLog,
@@ -192,6 +195,27 @@ class RunRecorder:
             for k, index in enumerate(table.rows()["index"].tolist()):
                 if index in estimates:
                     table.replace(k, estimate_row(index, estimates[index]))
+        self._written = 0
+        self._saved_s = -np.inf  # the last checkpoint is that of other rows
+
+    def mark(self, marks: Sequence[Mark]) -> None:
+        """Mark the estimates of earlier frames; the text files begin anew."""
+        if not marks or not self._tables:
+            return
+        estimates = self._tables["estimates"]
+        frames = self._tables["frames"]
+        with self._writing():
+            for mark in marks:
+                rows = np.array(estimates.rows())
+                held = (rows["index"] >= mark.since) & (rows["index"] < mark.before)
+                speed = _fastest_mps(rows)
+                for k in np.flatnonzero(held).tolist():
+                    elapsed_s = (rows["time_ns"][k] - rows["time_ns"][held][0]) / NS_PER_S
+                    estimate = marked(estimate_of(rows[k]), mark, speed * elapsed_s)
+                    estimates.replace(k, estimate_row(int(rows["index"][k]), estimate))
+                    log_row = np.array(frames.rows(k, k + 1))
+                    log_row["integrity"] = INTEGRITIES.index(estimate.integrity)
+                    frames.replace(k, log_row)
         self._written = 0
         self._saved_s = -np.inf  # the last checkpoint is that of other rows
 
@@ -412,3 +436,12 @@ class RunRecorder:
                 stream.write(text.encode())
                 stream.flush()
                 os.fsync(stream.fileno())
+
+
+def _fastest_mps(rows: Rows) -> float:
+    """The largest speed between the estimates (N,) of frames that may be used."""
+    usable = rows[rows["integrity"] < INTEGRITIES.index("unusable")]
+    if len(usable) < 2:
+        return 0.0
+    steps_m = np.linalg.norm(np.diff(usable["T_world_imu"][:, :3, 3], axis=0), axis=1)
+    return float(np.max(steps_m / (np.diff(usable["time_ns"]) / NS_PER_S)))

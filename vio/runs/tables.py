@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from vio.files.tables import Rows, Table
+from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
 from vio.records import (
     Estimate,
@@ -47,6 +48,7 @@ ESTIMATE = np.dtype(
         ("stereo_rows_covariance", "<f8", (7, 7)),
         ("stereo_scale", "<f8", (2,)),
         ("stereo_scale_covariance", "<f8", (2, 2)),
+        ("integrity", "i1"),  # index in `vio.findings.INTEGRITIES`
     ]
 )
 # Columns of an estimate's records, by their fields there.
@@ -59,7 +61,17 @@ _FIELD = {
 }
 _SCALE = {"stereo_scale": "logs", "stereo_scale_covariance": "covariance"}
 _STAGES = 16  # of the front end, at most
-_COUNTS = ("detected", "tracked", "matched", "selected", "stale", "used", "gated", "landmarks")
+_COUNTS = (
+    "detected",
+    "tracked",
+    "matched",
+    "selected",
+    "stale",
+    "used",
+    "gated",
+    "landmarks",
+    "integrity",
+)
 _TIMES = ("read_ms", "frontend_ms", "monitor_ms", "select_ms", "filter_ms")
 _NUMBERS = ("innovation_median_px", "nis_per_dof", "disparity_median_px", "innovation_ratio")
 FRAME = np.dtype(
@@ -107,6 +119,7 @@ def estimate_row(index: int, estimate: Estimate) -> Rows:
     row["time_ns"] = estimate.time_ns
     row["T_world_imu"] = estimate.T_world_imu
     row["covariance"] = estimate.covariance
+    row["integrity"] = INTEGRITIES.index(estimate.integrity)
     for name in _KEPT:
         value = getattr(estimate, name)
         row[name] = np.nan if value is None else value
@@ -131,6 +144,7 @@ def estimate_of(row: np.void) -> Estimate:
         **optional,
         stereo_field=_stereo_field(row),
         stereo_scale=None if scale is None or S is None else StereoScaleEstimate(scale, S),
+        integrity=INTEGRITIES[int(row["integrity"])],
     )
 
 

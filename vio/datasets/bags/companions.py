@@ -142,7 +142,8 @@ def _rig(found: Contents, file: Path | None) -> Rig:
         )
     if len(set(infos)) != len(topics):
         raise CalibrationError(f"{infos[0]} belongs to both images; give --calibration FILE")
-    return rig_from_camera_infos(stated, rectified=_is_rectified(topics[0]))
+    rectified = _is_rectified(topics[0])
+    return rig_from_camera_infos(stated, rectified=rectified, image_size=found.size)
 
 
 def _with_static_pose(rig: Rig, found: Contents) -> Rig:

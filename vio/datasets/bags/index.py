@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from vio.datasets.bags.pictures import raw_gray
+from vio.datasets.bags.pictures import band_of_message, raw_gray
 from vio.datasets.bags.store import Bag, Message, Topic
 from vio.datasets.bags.topics import CAMERA_INFO, COMPRESSED, IMAGE, TF, Roles
-from vio.datasets.images import UnreadableImageError, brightest
-from vio.datasets.rigs.camera_info import CameraInfo
+from vio.datasets.images import UnreadableImageError
+from vio.datasets.levels import Band, is_mosaic
+from vio.datasets.rigs.camera_info import CameraInfo, region_of
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, se3_inverse
@@ -25,7 +26,7 @@ from vio.records import NS_PER_S, ImuRecord, IntArray, Trajectory, VelocitySampl
 
 __all__ = ["BagIndex", "Stamps", "camera_info_of", "index_bag", "info_topic", "stamp_of"]
 
-_WHITE_SAMPLES = 8  # images looked at for the level of white, spread over the recording
+_LEVEL_SAMPLES = 8  # images looked at for black and white, spread over the recording
 
 
 @dataclass(slots=True)
@@ -37,7 +38,8 @@ class Stamps:
     encodings: dict[str, int] = field(default_factory=dict)  # and how many images have each
     size: tuple[int, int] | None = None  # width and height of the first raw image, pixels
     frame_id: str = ""
-    white: float = 0.0  # brightest level seen in 16-bit images
+    bands: list[Band] = field(default_factory=list)  # of levels of 16-bit images
+    mosaic: bool = False  # the first raw gray image looks like one of a Bayer pattern
 
     @property
     def unstamped(self) -> bool:
@@ -226,15 +228,22 @@ def _image(bag: Bag, stamps: Stamps, topic: Topic, fields: Any, message: Message
     stamps.frame_id = stamps.frame_id or str(fields.header.frame_id)
     name = str(fields.encoding) if topic.kind == IMAGE else "compressed"
     stamps.encodings[name] = stamps.encodings.get(name, 0) + 1
-    if topic.kind == COMPRESSED:
-        return
-    stamps.size = stamps.size or (int(fields.width), int(fields.height))
-    if "16" in name and (len(stamps.times_ns) - 1) % max(topic.count // _WHITE_SAMPLES, 1) == 0:
-        try:
-            pixels = raw_gray(fields, f"{bag.path}, {topic.name}")
-        except UnreadableImageError:
-            return  # the reader skips it and says so
-        stamps.white = max(stamps.white, brightest(pixels))
+    compressed = topic.kind == COMPRESSED
+    where = f"{bag.path}, {topic.name}"
+    if not compressed:
+        stamps.size = stamps.size or (int(fields.width), int(fields.height))
+        if len(stamps.times_ns) == 1 and name in ("mono8", "mono16", "8UC1", "16UC1"):
+            stamps.mosaic = _looks_like_mosaic(fields, where)
+    if (len(stamps.times_ns) - 1) % max(topic.count // _LEVEL_SAMPLES, 1) == 0:
+        band = band_of_message(fields, where, compressed=compressed)
+        stamps.bands += [] if band is None else [band]
+
+
+def _looks_like_mosaic(fields: Any, where: str) -> bool:
+    try:
+        return is_mosaic(raw_gray(fields, where))
+    except UnreadableImageError:
+        return False
 
 
 def _add(
@@ -302,4 +311,8 @@ def camera_info_of(fields: Any, topic: str) -> CameraInfo:
     )
     size = (int(fields.width), int(fields.height))
     matrices = (K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4))
-    return CameraInfo(topic, *size, str(fields.distortion_model), tuple(D.tolist()), *matrices)
+    model = str(fields.distortion_model)
+    roi = fields.roi
+    region = region_of([int(x) for x in (roi.x_offset, roi.y_offset, roi.width, roi.height)])
+    binning = (max(int(fields.binning_x), 1), max(int(fields.binning_y), 1))
+    return CameraInfo(topic, *size, model, tuple(D.tolist()), *matrices, binning, region)

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vio.datasets.images import WHITE_16, UnreadableImageError, decode_gray, to_8_bits
+from vio.datasets.images import UnreadableImageError, band_in, decode_gray
+from vio.datasets.levels import FULL_SCALE, Band, Levels, band_of, to_8_bits
 from vio.errors import DataError
 from vio.records import Image
 
@@ -17,7 +18,7 @@ _YUV = {"yuv422": "UYVY", "uyvy": "UYVY", "yuv422_yuy2": "YUY2", "yuyv": "YUY2"}
 
 
 def gray_of(
-    fields: Any, where: str, *, compressed: bool, white: int = WHITE_16, colour: bool = False
+    fields: Any, where: str, *, compressed: bool, levels: Levels = FULL_SCALE, colour: bool = False
 ) -> Image:
     """Return a sensor_msgs/Image or CompressedImage as gray (H, W), or in colour (H, W, 3) where it
     is asked for.
@@ -26,7 +27,7 @@ def gray_of(
         fields: the decoded message.
         where: topic and frame, for messages.
         compressed: whether it is a CompressedImage.
-        white: the level of 16-bit pixels that becomes 255.
+        levels: those of 16-bit pixels that become 0 and 255.
         colour: keep red, green and blue, where the message has them.
 
     Raises:
@@ -34,8 +35,18 @@ def gray_of(
         DataError: the encoding is not read.
     """
     if compressed:
-        return decode_gray(bytes(fields.data), where, colour=colour)
-    return to_8_bits(raw_gray(fields, where, colour=colour), white)
+        return decode_gray(bytes(fields.data), where, levels, colour=colour)
+    return to_8_bits(raw_gray(fields, where, colour=colour), levels)
+
+
+def band_of_message(fields: Any, where: str, *, compressed: bool) -> Band | None:
+    """Return the band of levels of a 16-bit image; None: it has 8 bits, or is damaged."""
+    try:
+        if compressed:
+            return band_in(bytes(fields.data), where)
+        return band_of(raw_gray(fields, where)) if "16" in str(fields.encoding) else None
+    except UnreadableImageError:
+        return None  # the reader skips it and says so
 
 
 def raw_gray(fields: Any, where: str, *, colour: bool = False) -> npt.NDArray[Any]:

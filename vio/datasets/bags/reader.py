@@ -21,7 +21,8 @@ from vio.datasets.common import naming
 from vio.datasets.companions import reference_of_body
 from vio.datasets.frame_times import paired
 from vio.datasets.image_pairs import BadFrame, ImageRecording, ImageSize, readable_frames
-from vio.datasets.images import UnreadableImageError, white_note, white_of
+from vio.datasets.images import UnreadableImageError
+from vio.datasets.levels import Levels, levels_of, mosaic_note
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
 from vio.records import IntArray, Recording, StereoFrame
@@ -39,7 +40,7 @@ class BagDataset(ImageRecording):
     topics: tuple[Topic, ...]  # of the images: left, and right where there is one
     stamps_ns: tuple[IntArray, ...]  # (F,) stamps of the images of each topic, of a pair in one row
     logged_ns: IntArray  # (F,) when the bag received the first image of each frame
-    white: int  # level of white of 16-bit images
+    levels: Levels  # of 16-bit images
     # of each topic: the headers have no stamps, the times of logging serve
     unstamped: tuple[bool, ...]
 
@@ -85,7 +86,7 @@ class BagDataset(ImageRecording):
                 compressed = topic.kind == COMPRESSED
                 images.append(
                     gray_of(
-                        fields, where, compressed=compressed, white=self.white, colour=self.colour
+                        fields, where, compressed=compressed, levels=self.levels, colour=self.colour
                     )
                 )
                 size.check(images[-1], Path(where))
@@ -121,7 +122,15 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         rectifier = rig.rectifier(settings.interpolation, settings.projection)
     motion, motion_notes = motion_of(found, rig, stamps_ns[0])
     truth = index.reference(imu=rig.T_cam0_imu is not None)
-    white = white_of(max(index.left.white, index.right.white))
+    levels = levels_of([*index.left.bands, *index.right.bands])
+    level_notes = [
+        *levels.note,
+        *(
+            mosaic_note(f"{path}, {topic.name}")
+            for topic, images in zip(roles.cameras, stamps, strict=True)
+            if images.mosaic
+        ),
+    ]
     recording = Recording(
         kind="bag",
         path=path,
@@ -133,14 +142,14 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         reference=None if truth is None else reference_of_body(truth, rig, rectifier),
         notes=(
             *(*rig.notes, *rectifier.notes, *image_notes, *motion_notes),
-            *(*white_note(white), *rig_notes, *found.notes),
+            *(*level_notes, *rig_notes, *found.notes),
         ),
     )
     sizes = tuple(
         ImageSize(camera.width, camera.height, Path(file or info or path))
         for camera, info in zip(rig.cameras, found.infos, strict=True)
     )
-    images = roles.cameras, stamps_ns, logged_ns, white, tuple(each.unstamped for each in stamps)
+    images = roles.cameras, stamps_ns, logged_ns, levels, tuple(each.unstamped for each in stamps)
     return BagDataset(
         recording, motion, sizes, settings, rectifier, *images, imu_noise=rig.imu_noise
     )

@@ -1,10 +1,11 @@
-"""Calibration files as a `Rig`: Kalibr, EuRoC, KITTI, OpenCV, ROS CameraInfo and BoofCV,
-detected from the content.
+"""Calibration files as a `Rig`, of the tools that people calibrate with and the data sets that
+they use, detected from the content. A format is a file here and a line in `_FORMATS`.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +15,14 @@ from vio.cameras.rig import Rig
 from vio.datasets.common import naming
 from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
 from vio.datasets.kitti import read_calibration, read_extrinsics
-from vio.datasets.kitti_raw import CAMERAS, read_cam_to_cam, read_imu_pose
+from vio.datasets.kitti_raw import (
+    CAMERAS,
+    PERSPECTIVE,
+    read_cam_to_cam,
+    read_imu_pose,
+    read_perspective,
+)
+from vio.datasets.rigs import bare, basalt, boofcv, camodocal, depthai, okvis, orbslam, zed
 from vio.datasets.rigs.boofcv import is_boofcv, read_boofcv
 from vio.datasets.rigs.camera_info import (
     is_camera_info,
@@ -22,10 +30,15 @@ from vio.datasets.rigs.camera_info import (
     read_camera_info,
     rig_from_camera_infos,
 )
+from vio.datasets.rigs.four_seasons import is_four_seasons, read_four_seasons
 from vio.datasets.rigs.kalibr import is_camchain, read_camchain
+from vio.datasets.rigs.kimera import pair_beside, read_kimera
 from vio.datasets.rigs.opencv import is_opencv, read_entries, rig_from_opencv
-from vio.datasets.yaml_files import read_yaml_file
-from vio.errors import CalibrationError
+from vio.datasets.rigs.plausible import checked_rig
+from vio.datasets.rigs.source import Source
+from vio.datasets.sides import side_word
+from vio.datasets.yaml_files import Entries, read_json_file
+from vio.errors import CalibrationError, DataError
 from vio.files.text import text_lines
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 
@@ -37,17 +50,33 @@ _OFF_AXIS_NOTE_M = 1e-3
 
 KNOWN = (
     "Kalibr's camchain.yaml or camchain-imucam.yaml, EuRoC's sensor.yaml (mav0), KITTI's calib.txt "
-    "or "
-    "calib_cam_to_cam.txt, OpenCV's stereo .yml or .xml (M1 D1 M2 D2 R T), ROS's left.yaml and "
-    "right.yaml, or BoofCV's "
-    "stereo.xml"
+    "or calib_cam_to_cam.txt, OpenCV's stereo .yml or .xml (M1 D1 M2 D2 R T), ROS's left.yaml and "
+    "right.yaml, or BoofCV's stereo.xml; or the settings of ORB-SLAM, VINS, OKVIS, Kimera or SVO, "
+    "Basalt's or DepthAI's JSON, or a ZED's SN*.conf"
 )
 # File names looked for in a folder, in this order; the content decides what they are.
 _IN_FOLDER = (
     "calibration.yaml", "calibration.yml", "camchain-imucam*.yaml", "*camchain-imucam*.yaml", "camchain*.yaml",
-    "*camchain*.yaml", "calib_cam_to_cam.txt", "calib.txt", "left.y*ml", "stereo*.y*ml", "intrinsics.y*ml",
-    "stereo*.xml", "calibration.xml", "calib.y*ml",
+    "*camchain*.yaml", "*imucam_chain*.y*ml", "calib_cam_to_cam.txt", "perspective.txt", "calib.txt", "left.y*ml",
+    "stereo*.y*ml", "intrinsics.y*ml", "stereo*.xml", "calibration.xml", "calib.xml", "calib.y*ml",
+    "calibration.json", "calib.json", "SN*.conf", "undistorted_calib_0.txt", *bare.NAMES,
 )  # fmt: skip
+_OTHERS = (".yaml", ".yml", ".json", ".xml", ".conf")  # whose content decides in any folder
+_MAX_OTHERS = 40  # files looked into; a folder with more is no recording's
+# whether entries are of a format, and what reads it; the first that fits does
+_FORMATS: tuple[tuple[Callable[[Entries], bool], Callable[[Source], Rig]], ...] = (
+    (is_camchain, lambda source: read_camchain(source.path)),
+    (camodocal.matches, camodocal.read),
+    (okvis.matches, okvis.read),
+    (orbslam.matches, orbslam.read),
+    (boofcv.matches, boofcv.read),
+    (basalt.matches, basalt.read),
+    (depthai.matches, depthai.read),
+    (zed.matches, zed.read),
+    (lambda entries: _is_sensor_sheet(entries), lambda source: _euroc(source)),
+    (is_camera_info, lambda source: _camera_infos(source)),
+    (is_opencv, lambda source: rig_from_opencv(source.entries, source.where, source.image_size)),
+)
 
 
 def load_rig(
@@ -91,7 +120,11 @@ def load_rig(
 
 
 def find_calibration(folder: Path) -> Path | None:
-    """Return the calibration file in a folder; None where there is none."""
+    """Return the calibration file in a folder; None where there is none.
+
+    Usual names go first; else the content of the files there decides, that of a pair before that
+    of one camera.
+    """
     for mav in (folder / "mav0", folder):
         if (mav / "cam0" / "sensor.yaml").is_file():
             return mav / "cam0" / "sensor.yaml"
@@ -99,39 +132,106 @@ def find_calibration(folder: Path) -> Path | None:
         if found := sorted(file for file in folder.glob(pattern) if file.is_file()):
             return found[0]
     pair = pair_of_files(folder)
-    return None if pair is None else pair[0]
+    return _by_content(folder) if pair is None else pair[0]
+
+
+def _by_content(folder: Path) -> Path | None:
+    """Return the first file of a folder whose content is that of a known format."""
+    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in _OTHERS and f.is_file())
+    known = [file for file in files[:_MAX_OTHERS] if _is_known(file)]
+    # the settings name the files of their cameras
+    return min(known, key=_is_of_one_camera, default=None)
+
+
+def _is_known(file: Path) -> bool:
+    try:
+        entries = _entries(file)
+    except DataError:
+        return False
+    return any(fits(entries) for fits, _ in _FORMATS)
+
+
+def _is_of_one_camera(file: Path) -> bool:
+    entries = _entries(file)
+    return "model_type" in entries or side_word(file.stem) == "right"
+
+
+def _entries(path: Path) -> Entries:
+    """Return what a file holds, by its suffix."""
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return read_json_file(path)
+    if suffix == ".conf":
+        return zed.read_conf(path)
+    if suffix == ".xml":
+        return {} if is_boofcv(path) else read_entries(path)
+    return read_entries(path)
 
 
 def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
     suffix = path.suffix.lower()
     if path.name == CAMERAS:
-        return _kitti_raw(path, image_size)
+        return checked_rig(_kitti_raw(path, image_size), path)
+    if path.name == PERSPECTIVE:
+        rect0, rect1, T_rect1_rect0 = read_perspective(path)
+        with naming(path):
+            return checked_rig(Rig(rect0, rect1, T_rect1_rect0), path)
+    if is_four_seasons(path):
+        return read_four_seasons(path, image_size)
+    if suffix == ".txt" and bare.is_bare(path):
+        return bare.read_bare(path, image_size)
     if suffix == ".txt":
         return kitti_rig(path, image_size)[0]
-    if suffix == ".xml":
-        return (
-            read_boofcv(path)
-            if is_boofcv(path)
-            else rig_from_opencv(read_entries(path), str(path), image_size)
-        )
-    entries = read_yaml_file(path, "the cameras' calibration")
-    if is_camchain(entries):
-        return read_camchain(path)
-    if "T_BS" in entries:
-        return _euroc(path, cameras)
-    if is_camera_info(entries):
-        pair = None if cameras == 1 else pair_of_files(path)
-        return rig_from_camera_infos([read_camera_info(file) for file in pair or (path,)])
-    whole = read_entries(path)
-    if is_opencv(whole):
-        return rig_from_opencv(whole, str(path), image_size)
+    if suffix == ".xml" and is_boofcv(path):
+        return read_boofcv(path)
+    entries = _entries(path)
+    for fits, read in _FORMATS:
+        if fits(entries):
+            return read(Source(path, entries, image_size, cameras))
     raise CalibrationError(f"{path}: is no calibration of a known format; give {KNOWN}")
 
 
-def _euroc(path: Path, cameras: int | None) -> Rig:
-    """Read EuRoC's `cam0/sensor.yaml`, `cam1/sensor.yaml` and, where it is beside them,
-    `imu0/sensor.yaml`.
+def _is_sensor_sheet(entries: Entries) -> bool:
+    """Return whether entries are those of a camera's `sensor.yaml`."""
+    return "T_BS" in entries and ("intrinsics" in entries or "camera_model" in entries)
+
+
+def _camera_infos(source: Source) -> Rig:
+    pair = None if source.cameras == 1 else pair_of_files(source.path)
+    infos = [read_camera_info(file) for file in pair or (source.path,)]
+    rig = rig_from_camera_infos(infos, image_size=source.image_size)
+    return rig if pair is not None else _alone(rig, source, stated=bool(infos[0].P[0, 3]))
+
+
+def _alone(rig: Rig, source: Source, *, stated: bool) -> Rig:
+    """Return a rig of one camera with a note where it seems to be one of a pair.
+
+    Args:
+        rig: of one camera.
+        source: its file.
+        stated: whether the file states a baseline.
     """
+    if source.cameras == 1 or not (stated or side_word(source.path.stem)):
+        return rig
+    return rig.noting(
+        f"{source.where}: is read as one camera, and seems to be one of a pair, whose other file "
+        "is not beside it; name the two left.yaml and right.yaml"
+    )
+
+
+def _euroc(source: Source) -> Rig:
+    """Read EuRoC's `cam0/sensor.yaml`, `cam1/sensor.yaml` and, where it is beside them,
+    `imu0/sensor.yaml`; of Kimera, the three files of one folder.
+    """
+    path = source.path
+    cameras = source.cameras
+    if path.name != "sensor.yaml":
+        pair = None if cameras == 1 else pair_beside(path)
+        if pair is not None:
+            return read_kimera(*pair)
+        camera, T_body_cam = read_camera_yaml(path)
+        rig = Rig(camera, T_cam0_imu=se3_inverse(T_body_cam))
+        return _alone(checked_rig(rig, path), source, stated=False)
     mav = path.parent.parent
     T_body_imu = np.eye(4)
     noise = None
@@ -139,13 +239,16 @@ def _euroc(path: Path, cameras: int | None) -> Rig:
         T_body_imu, noise = read_imu_yaml(imu)
     if cameras == 1 or (cameras is None and not (mav / "cam1" / "sensor.yaml").is_file()):
         camera, T_body_cam = read_camera_yaml(path)
-        return Rig(camera, T_cam0_imu=se3_inverse(T_body_cam) @ T_body_imu, imu_noise=noise)
+        rig = Rig(camera, T_cam0_imu=se3_inverse(T_body_cam) @ T_body_imu, imu_noise=noise)
+        rig = checked_rig(rig, path)
+        return _alone(rig, source, stated=(mav / "cam1").is_dir())
     (cam0, T_body_cam0), (cam1, T_body_cam1) = (
         read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1")
     )
     T_imu_cam0, T_imu_cam1 = (se3_inverse(T_body_imu) @ T for T in (T_body_cam0, T_body_cam1))
+    T_cam1_cam0 = se3_inverse(T_imu_cam1) @ T_imu_cam0
     with naming(mav):
-        return Rig(cam0, cam1, se3_inverse(T_imu_cam1) @ T_imu_cam0, se3_inverse(T_imu_cam0), noise)
+        return checked_rig(Rig(cam0, cam1, T_cam1_cam0, se3_inverse(T_imu_cam0), noise), mav)
 
 
 def kitti_rig(
@@ -182,7 +285,7 @@ def kitti_rig(
             f"the camera of image_{cameras[1]} {off_axis}; the pair is treated as rectified anyway"
         )
         rig = rig.noting(note)
-    return rig, calibration.T_left_cam0
+    return checked_rig(rig, path, size_stated=False), calibration.T_left_cam0
 
 
 def _kitti_raw(path: Path, image_size: Size | None) -> Rig:

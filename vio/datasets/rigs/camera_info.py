@@ -3,33 +3,37 @@
 
 `K` and `D` are those of the raw image, `R` rotates the camera to the rectified one,
 `P = K' [I | t]` projects from the rectified left camera; `P[0, 3]` of the right camera is -focal
-length times baseline.
-Reference: the definition of sensor_msgs/CameraInfo.
+length times baseline. Size, K and P are those of the whole sensor; its images may be a part of it
+(`roi`, in pixels of the sensor) and binned: a pixel u of the sensor is (u - x_offset) / binning_x.
+Reference: the definition of sensor_msgs/CameraInfo, and image_geometry's PinholeCameraModel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import image_size, naming
-from vio.datasets.rigs.opencv import trimmed_coefficients
-from vio.datasets.yaml_files import Entries, lens_model, matrix, numbers, read_yaml_file, section
-from vio.errors import CalibrationError
+from vio.datasets.rigs.opencv import coefficients_of
+from vio.datasets.rigs.plausible import checked_rig
+from vio.datasets.sides import first_pair, pairs_of
+from vio.datasets.yaml_files import (
+    Entries,
+    as_number,
+    lens_model,
+    matrix,
+    numbers,
+    read_yaml_file,
+    section,
+)
+from vio.errors import CalibrationError, VioError
 from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts
-
-_PAIRS = (
-    ("left", "right"),
-    ("LEFT", "RIGHT"),
-    ("cam0", "cam1"),
-    ("camera_0", "camera_1"),
-    ("infra1", "infra2"),
-)
+from vio.geometry.rectify import vertical_fault
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,33 +48,90 @@ class CameraInfo:
     K: FloatArray  # (3, 3) raw
     R: FloatArray  # (3, 3) from the raw to the rectified camera
     P: FloatArray  # (3, 4) of the rectified image
+    binning: tuple[int, int] = (1, 1)  # pixels of the sensor in one of the image, along u and v
+    # part of the sensor: x_offset, y_offset, width, height in its pixels; None: the whole
+    roi: tuple[int, int, int, int] | None = None
+
+    def of_images(self, size: tuple[int, int] | None) -> CameraInfo:
+        """Return what describes the images themselves, which may be binned, or a part.
+
+        Args:
+            size: width and height of the images, where known; images of the whole sensor's size
+                are neither, whatever the message states.
+        """
+        x, y, width, height = self.roi or (0, 0, self.width, self.height)
+        along_u = max(self.binning[0], 1)
+        along_v = max(self.binning[1], 1)
+        whole = size == (self.width, self.height)
+        if whole or (self.roi is None and along_u == along_v == 1):
+            return self
+        change = np.array(
+            [[1 / along_u, 0, -x / along_u], [0, 1 / along_v, -y / along_v], [0, 0, 1]]
+        )
+        return replace(
+            self,
+            width=width // along_u,
+            height=height // along_v,
+            K=change @ self.K,
+            P=change @ self.P,
+            binning=(1, 1),
+            roi=None,
+        )
 
 
 def is_camera_info(entries: Entries) -> bool:
-    """Return whether entries are those of a CameraInfo file."""
+    """Return whether entries are those of a CameraInfo file, or of a message that was printed."""
+    if _printed(entries) is not None:
+        return True
     return "camera_matrix" in entries and (
         "projection_matrix" in entries or "image_width" in entries
     )
 
 
+def _printed(entries: Entries) -> dict[str, object] | None:
+    """Return the entries of a message as `rostopic echo` prints it, by their names in files.
+
+    None: it is none. ROS 1 and ROS 2 write its matrices in capitals and in small letters.
+    """
+    found = {name: entries.get(name, entries.get(name.upper())) for name in "dkrp"}
+    if any(found[name] is None for name in "krp") or "width" not in entries:
+        return None
+    return {
+        **entries,
+        "image_width": entries["width"],
+        "image_height": entries.get("height"),
+        "distortion_coefficients": found["d"] or [],
+        "camera_matrix": {"rows": 3, "cols": 3, "data": found["k"]},
+        "rectification_matrix": {"rows": 3, "cols": 3, "data": found["r"]},
+        "projection_matrix": {"rows": 3, "cols": 4, "data": found["p"]},
+    }
+
+
 def pair_of_files(path: Path) -> tuple[Path, Path] | None:
     """Return the left and right file of a pair, given a folder or one of the two.
 
-    None: there is no pair.
+    None: there is no pair, or several.
     """
-    for left, right in _PAIRS:
-        for suffix in (".yaml", ".yml"):
-            if path.is_dir():
-                found = (path / f"{left}{suffix}", path / f"{right}{suffix}")
-            elif left in path.name:
-                found = (path, path.with_name(path.name.replace(left, right)))
-            elif right in path.name:
-                found = (path.with_name(path.name.replace(right, left)), path)
-            else:
-                continue
-            if all(file.is_file() for file in found):
-                return found
-    return None
+    folder = path if path.is_dir() else path.parent
+    names = sorted(
+        file.name
+        for file in folder.iterdir()
+        if file.suffix in (".yaml", ".yml") and file.is_file()
+    )
+    pairs = pairs_of(names)
+    if path.is_dir():
+        found = [p for p in pairs if all(_holds_camera_info(folder / name) for name in p)]
+    else:
+        found = [pair for pair in pairs if path.name in pair]
+    pair = first_pair(found)
+    return None if pair is None else (folder / pair[0], folder / pair[1])
+
+
+def _holds_camera_info(file: Path) -> bool:
+    try:
+        return is_camera_info(read_yaml_file(file))
+    except VioError:
+        return False
 
 
 def read_camera_info(path: Path) -> CameraInfo:
@@ -80,7 +141,8 @@ def read_camera_info(path: Path) -> CameraInfo:
     Raises:
         CalibrationError: an entry is missing or malformed.
     """
-    entries = read_yaml_file(path, "the camera's calibration")
+    read = read_yaml_file(path, "the camera's calibration")
+    entries: Entries = _printed(read) or read
     where = str(path)
     size = [numbers(entries, key, where, 1)[0] for key in ("image_width", "image_height")]
     width, height = image_size(size, where)
@@ -105,21 +167,59 @@ def read_camera_info(path: Path) -> CameraInfo:
         np.zeros((3, 4))
         if alone
         else matrix(found["projection_matrix"], (3, 4), f"{where}, projection_matrix"),
+        _binning_of(entries),
+        _roi_of(entries),
     )
 
 
-def rig_from_camera_infos(infos: Sequence[CameraInfo], *, rectified: bool = False) -> Rig:
+def _binning_of(entries: Entries) -> tuple[int, int]:
+    """Return the binning that a file may state; a dump of the message does."""
+    along_u, along_v = (as_number(entries.get(f"binning_{axis}", 1)) for axis in "xy")
+    return (int(along_u) if along_u >= 1 else 1, int(along_v) if along_v >= 1 else 1)
+
+
+def _roi_of(entries: Entries) -> tuple[int, int, int, int] | None:
+    block = entries.get("roi")
+    if not isinstance(block, dict):
+        return None
+    names = ("x_offset", "y_offset", "width", "height")
+    return region_of([as_number(block.get(name, 0)) for name in names])
+
+
+def region_of(values: Sequence[float]) -> tuple[int, int, int, int] | None:
+    """Return a region x_offset, y_offset, width, height; None: it is empty, which stands for the
+    whole image.
+    """
+    if not all(np.isfinite(values)) or min(values[2:]) < 1:
+        return None
+    x, y, width, height = (int(value) for value in values)
+    return x, y, width, height
+
+
+def rig_from_camera_infos(
+    infos: Sequence[CameraInfo],
+    *,
+    rectified: bool = False,
+    image_size: tuple[int, int] | None = None,
+) -> Rig:
     """Return the rig of the CameraInfo of one camera, or of those of a left and a right camera.
 
     Args:
         infos: one, or left and right.
         rectified: the images are those after ROS's rectification (`image_rect`), so that only P
             applies.
+        image_size: width and height of the images, where known; see `CameraInfo.of_images`.
 
     Raises:
         CalibrationError: a camera is not calibrated (K or P of zeros; of one camera, the one that
             applies), its lens is not read, or the two are no stereo pair.
     """
+    infos = [info.of_images(image_size) for info in infos]
+    rig = _rig(infos, rectified=rectified)
+    return checked_rig(rig, infos[0].where)
+
+
+def _rig(infos: Sequence[CameraInfo], *, rectified: bool) -> Rig:
     if len(infos) == 1:
         K, name = (infos[0].P[:, :3], "P") if rectified else (infos[0].K, "K")
         if not K[0, 0] > 0:
@@ -135,6 +235,8 @@ def rig_from_camera_infos(infos: Sequence[CameraInfo], *, rectified: bool = Fals
     left, right = infos
     offsets = [np.linalg.solve(info.P[:, :3], info.P[:, 3]) for info in infos]
     shift = offsets[1] - offsets[0]  # rectified left to rectified right
+    if (fault := vertical_fault(shift)) is not None:
+        raise CalibrationError(f"{right.where}: {fault}")
     if not shift[0] < 0:
         raise CalibrationError(
             f"{right.where}: P gives a stereo baseline of {-shift[0]:g} m, not a positive one "
@@ -165,9 +267,5 @@ def _camera(info: CameraInfo, *, rectified: bool) -> CameraModel:
 
 def _lens(info: CameraInfo) -> tuple[DistortionModel, tuple[float, ...]]:
     model = lens_model(info.model or "plumb_bob", info.where)
-    if model == "pinhole" or not any(info.D):
-        return "pinhole", ()
-    if model == "equidistant":
-        return model, info.D[:4]
     with naming(info.where):
-        return model, trimmed_coefficients(info.D)
+        return model, coefficients_of(model, info.D)

@@ -1,8 +1,10 @@
 """Kalibr's results: `camchain.yaml`, `camchain-imucam.yaml`, and the `imu.yaml` beside them.
 
 `T_cn_cnm1` maps coordinates of the camera before to this one, `T_cam_imu` those of the IMU to the
-camera; times of the IMU are `t_imu = t_cam + timeshift_cam_imu`.
-Reference: the page "yaml formats" of Kalibr's documentation.
+camera; times of the IMU are `t_imu = t_cam + timeshift_cam_imu`. OpenVINS reads the same file, as
+`kalibr_imucam_chain.yaml`, and ships it with `T_imu_cam` as well, which maps coordinates of the
+camera to the IMU.
+Reference: the page "yaml formats" of Kalibr's documentation; OpenVINS's `config/*`.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import yaml
 
 from vio.cameras.rig import Rig
 from vio.datasets.common import image_size, naming
+from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.yaml_files import (
     Entries,
     imu_densities,
@@ -25,7 +28,7 @@ from vio.datasets.yaml_files import (
     read_yaml_file,
     section,
 )
-from vio.errors import CalibrationError
+from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
 from vio.records import ImuDensities
@@ -61,7 +64,7 @@ def read_camchain(path: Path) -> Rig:
     where = [f"{path}, {name}" for name in names]
     cameras = [_camera(*of_one) for of_one in zip(blocks, where, strict=True)]
     cam1 = cameras[1] if "cam1" in names else None
-    T_cam0_imu = _pose(blocks[0], "T_cam_imu", where[0])
+    T_cam0_imu = _imu_pose(blocks[0], where[0])
     notes: list[str] = []
     T_cam1_cam0 = _stereo_pose(blocks[1], T_cam0_imu, path, notes) if "cam1" in names else None
     if further := sorted(name for name in entries if name.startswith("cam") and name not in names):
@@ -74,7 +77,7 @@ def read_camchain(path: Path) -> Rig:
     )
     with naming(path):
         notes += imu_notes
-        return Rig(
+        rig = Rig(
             cameras[0],
             cam1,
             T_cam1_cam0,
@@ -85,6 +88,7 @@ def read_camchain(path: Path) -> Rig:
             residual_px,
             factor,
         )
+    return checked_rig(rig, path)
 
 
 def _stereo_pose(
@@ -94,7 +98,7 @@ def _stereo_pose(
     stated and disagree.
     """
     where = f"{path}, cam1"
-    T_cam1_imu = _pose(right, "T_cam_imu", where)
+    T_cam1_imu = _imu_pose(right, where)
     T_cam1_cam0 = _pose(right, "T_cn_cnm1", where)
     if T_cam0_imu is not None and T_cam1_imu is not None:
         through_imu = T_cam1_imu @ se3_inverse(T_cam0_imu)
@@ -143,6 +147,23 @@ def _camera(block: Mapping[str, Any], where: str) -> CameraModel:
         return CameraModel(fu, fv, cu, cv, width, height, model, coefficients)
 
 
+def _imu_pose(block: Mapping[str, Any], where: str) -> FloatArray | None:
+    """Return `T_cam_imu` (4, 4) as stated, or as the inverse of a stated `T_imu_cam`.
+
+    Raises:
+        CalibrationError: both are stated, and differ.
+    """
+    stated = _pose(block, "T_cam_imu", where)
+    other = _pose(block, "T_imu_cam", where)
+    if other is None:
+        return stated
+    if stated is not None and _apart(stated, se3_inverse(other)):
+        raise CalibrationError(
+            f"{where}: T_cam_imu is not the inverse of T_imu_cam; remove the one that is wrong"
+        )
+    return se3_inverse(other) if stated is None else stated
+
+
 def _pose(block: Mapping[str, Any], key: str, where: str) -> FloatArray | None:
     if key not in block:
         return None
@@ -179,12 +200,19 @@ def _residual(right: Mapping[str, Any], where: str) -> float:
 
 
 def _imu_beside(path: Path) -> tuple[ImuDensities | None, tuple[str, ...]]:
-    """Find the IMU's file in the folder of a camchain: its noise, and a note where several fit."""
+    """Find the IMU's file in the folder of a camchain: its noise, and a note where several fit, or
+    one cannot be used.
+
+    Files of other tools, which may be no YAML at all, are passed over.
+    """
     found: list[tuple[Path, ImuDensities]] = []
     for file in sorted([*path.parent.glob("*imu*.yaml"), *path.parent.glob("*imu*.yml")]):
-        if "camchain" in file.name or file == path or not file.is_file():
+        if "chain" in file.name.replace("imu_chain", "") or file == path or not file.is_file():
             continue
-        entries = read_yaml_file(file, "Kalibr's IMU noise")
+        try:
+            entries = read_yaml_file(file, "Kalibr's IMU noise")
+        except DataError:
+            continue
         block = entries.get("imu0")  # plain, or a block for each IMU
         noise = imu_densities(
             {str(k): v for k, v in block.items()} if isinstance(block, dict) else entries, file

@@ -17,9 +17,12 @@ import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import naming
+from vio.datasets.rigs.plausible import checked_rig, unit_doubt
 from vio.datasets.yaml_files import Entries, as_number, lens_model, matrix, read_yaml_file
 from vio.errors import CalibrationError
+from vio.geometry.distortion import DistortionModel
 from vio.geometry.lie import FloatArray, checked_transform
+from vio.geometry.rectify import vertical_fault
 
 _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
     "K0": ("M1", "K1", "cameraMatrix1", "camera_matrix_1", "cameraMatrixL", "K_left", "left_camera_matrix", "LEFT.K",
@@ -42,7 +45,6 @@ _SIZES = (
     ("imageWidth", "imageHeight"),
     ("LEFT.width", "LEFT.height"),
 )
-_TOO_WIDE_M = 5.0  # a longer baseline is taken for millimetres, or squares of the board, and said
 
 
 def is_opencv(entries: Entries) -> bool:
@@ -80,24 +82,12 @@ def rig_from_opencv(entries: Entries, where: str, image_size: tuple[int, int] | 
     Raises:
         CalibrationError: a matrix is missing or impossible, or no image size is known.
     """
-    width, height = _size(entries, where, image_size)
+    width, height, stated = _size(entries, where, image_size)
     rig = (_rectified if _find(entries, "K0") is None else _raw)(entries, where, width, height)
-    for camera in rig.cameras:
-        if not (0 < camera.cu < width and 0 < camera.cv < height):
-            raise CalibrationError(
-                f"{where}: the principal point {camera.cu:.0f}, {camera.cv:.0f} lies outside "
-                f"images of {width} x "
-                f"{height} pixels; it is the calibration of images of another size: scale it, or "
-                "calibrate with these"
-            )
+    rig = checked_rig(rig, where, size_stated=stated)
     baseline = float(np.linalg.norm(rig.right[1][:3, 3]))
-    if baseline <= _TOO_WIDE_M:
-        return rig
-    return rig.noting(
-        f"{where}: the cameras are {baseline:g} m apart; where the board was measured in "
-        "millimetres, T is too: divide "
-        "it by 1000, or all lengths of the run will be in that unit"
-    )
+    doubt = unit_doubt(baseline, where)
+    return rig if doubt is None else rig.noting(doubt)
 
 
 def _raw(entries: Entries, where: str, width: int, height: int) -> Rig:
@@ -121,11 +111,7 @@ def _raw(entries: Entries, where: str, width: int, height: int) -> Rig:
                 "'distortion_model: equidistant'"
             )
         with naming(where):
-            cameras.append(
-                camera_from_matrix(
-                    K, width, height, model, trimmed_coefficients(D) if model == "radtan" else D
-                )
-            )
+            cameras.append(camera_from_matrix(K, width, height, model, coefficients_of(model, D)))
     pose = _stereo_pose(entries, where)
     with naming(where):
         return Rig(cameras[0], cameras[1], pose, notes=tuple(dict.fromkeys(notes)))
@@ -163,10 +149,29 @@ def _rectified(entries: Entries, where: str, width: int, height: int) -> Rig:
                 "P1 and P2 differ in focal length or centre; calibrate with CALIB_ZERO_DISPARITY"
             )
         camera = camera_from_matrix(P0[:, :3], width, height, name="P1")
-        baseline = -float(P1[0, 3] / P1[0, 0])
+        shift = np.asarray(np.linalg.solve(P1[:, :3], P1[:, 3] - P0[:, 3]), dtype=np.float64)
+        if (fault := vertical_fault(shift)) is not None:
+            raise CalibrationError(fault)
+        baseline = -float(shift[0])
         return Rig.rectified(
             camera.fu, camera.fv, camera.cu, camera.cv, baseline, width, height
         ).noting(f"{where}: holds P1 and P2 only, so the images are taken to be rectified")
+
+
+def coefficients_of(model: DistortionModel, D: Sequence[float]) -> tuple[float, ...]:
+    """Return what a lens model takes of OpenCV's coefficients; an absent or shorter list ends in
+    zeros.
+
+    A fisheye lens of zeros is the ideal one, of which the radius grows as the angle; it is no
+    pinhole.
+    """
+    if model == "pinhole":
+        return ()
+    if model == "equidistant":
+        if len(D) not in (0, 4) and any(D[4:]):
+            raise CalibrationError(f"{len(D)} distortion coefficients; a fisheye lens has 4")
+        return tuple([*(float(d) for d in D[:4]), 0.0, 0.0, 0.0, 0.0][:4])
+    return trimmed_coefficients(D)
 
 
 def trimmed_coefficients(D: Sequence[float]) -> tuple[float, ...]:
@@ -186,21 +191,25 @@ def trimmed_coefficients(D: Sequence[float]) -> tuple[float, ...]:
     return tuple(float(d) for d in kept)
 
 
-def _size(entries: Entries, where: str, image_size: tuple[int, int] | None) -> tuple[int, int]:
+def _size(
+    entries: Entries, where: str, image_size: tuple[int, int] | None
+) -> tuple[int, int, bool]:
+    """Return width and height in pixels, and whether the file states them."""
     for names in _SIZES:
         found = [as_number(entries.get(name)) for name in names]
         if all(value >= 1 for value in found):
-            return int(found[0]), int(found[1])
-    for name in ("image_size", "imageSize", "imgSize", "size"):
+            return int(found[0]), int(found[1]), True
+    for name in ("image_size", "imageSize", "imgSize", "size", "image_Size", "imageResolution"):
         if name in entries:
-            width, height = np.ravel(matrix(entries[name], None, f"{where}, {name}"))[:2]
-            return int(width), int(height)
+            values = np.ravel(matrix(entries[name], None, f"{where}, {name}"))
+            if len(values) == 2 and values.min() >= 1:
+                return int(values[0]), int(values[1]), True
     if image_size is None:
         raise CalibrationError(
             f"{where}: states no image size; add 'image_width: W' and 'image_height: H', or pass "
             "image_size=(W, H)"
         )
-    return image_size
+    return image_size[0], image_size[1], False
 
 
 def _find(entries: Entries, key: str) -> object | None:

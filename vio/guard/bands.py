@@ -14,9 +14,10 @@ import math
 import cv2
 import numpy as np
 
-from vio.frontend.image_check import FrameImages, ImageCheck
+from vio.findings import Finding
 from vio.frontend.patches import mean_and_contrast
 from vio.geometry.lie import FloatArray
+from vio.guard.image_check import FrameImages, ImageCheck
 from vio.records import Image
 
 # Change of the difference of row means in a frame, gray levels (root mean square over the rows).
@@ -26,7 +27,7 @@ _CHANGE = 25.0
 _FRAMES = 3  # such frames among the last ones before bands are taken out
 _MEMORY = 10  # frames
 # of an image over the other's: a camera that goes dark now and then has no bands
-_LEAST_CONTRAST = 0.3
+_MIN_CONTRAST = 0.3
 _STRIDE = 8  # of the pixels that the contrast is computed from
 # standard deviation: bands are wider, and horizontal edges of the scene are narrower
 _SMOOTH_ROWS = 3.0
@@ -44,14 +45,14 @@ class BandRemoval(ImageCheck):
     def inspect(self, images: FrameImages) -> FrameImages:
         """Return the images without bands."""
         left, right = images.raw
-        return images.with_raw(self.flatten(images.frame.index, left, right))
+        return images.with_raw(self.flatten(images.index, left, right))
 
     def flatten(self, index: int, left: Image, right: Image) -> tuple[Image, Image]:
         """Return both images (H, W) of a frame, without bands where there are such."""
         rows_left = _row_means(left)
         rows_right = _row_means(right)
         contrast = sorted(mean_and_contrast(image, _STRIDE)[1] for image in (left, right))
-        if not self._active and contrast[0] > _LEAST_CONTRAST * contrast[1]:
+        if not self._active and contrast[0] > _MIN_CONTRAST * contrast[1]:
             self._detect(index, _smoothed(_without_gain(rows_left, rows_right)))
         if not self._active:
             return left, right
@@ -67,11 +68,11 @@ class BandRemoval(ImageCheck):
         self._last = centred
         if len(self._changed) >= _FRAMES:
             self._active = True
-            self._lines.append(
+            message = (
                 f"frame {index}: bands of brightness move through the images, differently in both "
-                "cameras (flickering "
-                "light, or an unstable exposure); they are taken out row by row"
+                "cameras (flickering light, or an unstable exposure); they are taken out row by row"
             )
+            self._found.append(Finding("bands", message, index, self._changed[0], lasts=True))
 
 
 def _row_means(image: Image) -> FloatArray:

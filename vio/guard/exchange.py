@@ -10,15 +10,16 @@ round, matches decide: exchanged images match with negative disparities only.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
 
-from vio.frontend.image_check import FrameImages, ImageCheck
-from vio.frontend.patches import inside
-from vio.frontend.right_camera import image_change
+from vio.findings import Finding
+from vio.guard.image_change import image_change
+from vio.guard.image_check import FrameImages, ImageCheck
+from vio.guard.probe import RowProbe
 from vio.records import Image
 
 Order: TypeAlias = Literal["given", "exchanged", "refused"]
@@ -26,8 +27,7 @@ Order: TypeAlias = Literal["given", "exchanged", "refused"]
 # width and height, so coarse that a shift of the image by some pixels changes little
 _THUMBNAIL = (48, 30)
 _BLOCK = 4  # averaged first: OpenCV averages whole pixels five times as fast as fractions of them
-_POINTS = 80  # that matches of either sign are counted at, at most
-_LEAST_POINTS = 20
+_MIN_POINTS = 20
 _MANY = 0.4  # share of points with a negative disparity that proves an exchange
 # share of them above which a frame that looks exchanged is refused: its rows do not fit when put
 # back
@@ -46,29 +46,45 @@ class MatchCounts:
 class ExchangeDetector(ImageCheck):
     """Compares the images of consecutive frames."""
 
-    def __init__(self) -> None:
+    def __init__(self, probe: RowProbe) -> None:
         super().__init__()
+        self._probe = probe
         # left and right, sparsely sampled, in their right order
         self._last: tuple[Image, Image] | None = None
         self._since: int | None = None  # first frame of a run of exchanged ones
+        # the matches of the last frame contradicted each other, so matches are counted in any case
+        self.suspicious = False
 
-    def inspect(self, images: FrameImages) -> FrameImages | None:
-        """Return the images in their right order; None: they do not fit each other."""
-        if not images.right_lives or images.swapped:
+    def inspect(self, images: FrameImages) -> FrameImages:
+        """Return the images in their right order, or left out where they do not fit each other."""
+        if not (images.right_usable and images.left_usable):
             return images
-        left, right = images.views
-        suspicious = not images.right_trusted
+        left, right = images.halves
         exchanged = self._since is not None
         order = self.order(
-            images.frame.index,
-            left.half,
-            right.half,
-            lambda: _count_matches(images, exchanged),
-            suspicious=suspicious,
+            images.index,
+            left,
+            right,
+            lambda: self._count(images, exchanged=exchanged),
+            suspicious=self.suspicious,
         )
         if order == "refused":
-            return None
-        return images if order == "given" else images.with_raw(images.raw[::-1])
+            return replace(images, skipped=True)
+        return images if order == "given" else images.exchanged()
+
+    def _count(self, images: FrameImages, *, exchanged: bool) -> MatchCounts:
+        """Count matches of either sign.
+
+        Those with a positive disparity are not counted where those with a negative one decide:
+        while the images were not `exchanged` in the last frame, too few of these leave them in
+        order.
+        """
+        left, right = images.halves
+        points = self._probe.corners(left)
+        negative = self._probe.negative(left, right, points)
+        if not exchanged and negative < _SOME * len(points):
+            return MatchCounts(len(points), 0, negative)
+        return MatchCounts(len(points), self._probe.positive(left, right, points), negative)
 
     def order(
         self,
@@ -107,43 +123,24 @@ class ExchangeDetector(ImageCheck):
         assert self._last is not None
         own = [image_change(a, b) for a, b in zip(now, self._last, strict=True)]
         other = [image_change(a, b) for a, b in zip(now, self._last[::-1], strict=True)]
-        return abs(own[0] - own[1]) > abs(other[0] - other[1])
+        # The motion shifts both images alike; or it shifts them by less than the disparity does.
+        unlike = abs(own[0] - own[1]) > abs(other[0] - other[1])
+        return unlike or sum(own) > sum(other)
 
     def _report(self, index: int, order: Order) -> None:
         if order == "given":
             if self._since is not None:
-                self._lines.append(f"frame {index}: left and right images are in order again")
+                message = f"frame {index}: left and right images are in order again"
+                self._found.append(Finding("images-exchanged", message, index, ended=True))
             self._since = None
         elif self._since is None:
             self._since = index
             done = "they are put back" if order == "exchanged" else "the frames are skipped"
-            self._lines.append(
+            message = (
                 f"frame {index}: left and right images are exchanged from here on, as they match "
-                "with negative "
-                f"disparities only; {done}"
+                f"with negative disparities only; {done}"
             )
-
-
-def _count_matches(images: FrameImages, exchanged: bool) -> MatchCounts:
-    """Count matches of either sign, at the points that the other camera saw last.
-
-    Those with a positive disparity are not counted where those with a negative one decide: while
-    the images were not `exchanged` in the last frame, too few of these leave them in order.
-    """
-    if images.previous is None:
-        return MatchCounts(0, 0, 0)
-    left, right = images.views
-    tracks = images.previous.tracks
-    points = np.where(tracks.has_right[:, None], tracks.right, tracks.left)
-    points = points[inside(left.full, points, 0.0)][:_POINTS]
-    negative = images.stereo.count_mirrored(left, right, points)
-    if not exchanged and negative < _SOME * len(points):
-        # no exchange, however many match with a positive one
-        return MatchCounts(len(points), 0, negative)
-    positive = int(images.stereo.search(left.half, right.half, points)[1].sum())
-    return MatchCounts(
-        len(points), positive + images.stereo.count_beyond(left, right, points), negative
-    )
+            self._found.append(Finding("images-exchanged", message, index, lasts=True))
 
 
 def _thumbnail(image: Image) -> Image:
@@ -161,7 +158,7 @@ def _judge(found: MatchCounts, likely: Order) -> Order:
     """Decide by matches about a frame that looks exchanged; where they are too few, the decision
     is as before.
     """
-    if found.points < _LEAST_POINTS or max(found.negative, found.positive) < _SOME * found.points:
+    if found.points < _MIN_POINTS or max(found.negative, found.positive) < _SOME * found.points:
         return likely
     if found.negative < 2 * found.positive:
         return "given"

@@ -1,0 +1,69 @@
+"""The intrinsics of one camera as bare numbers in a text file, as folders of RGB-D images have them.
+
+`fx fy cx cy` in a line, with `k1 k2 p1 p2 [k3]` behind (ETH3D's `calibration.txt` has the four), or a
+matrix of 3 x 3 or 4 x 4 numbers (`intrinsics.txt`, ScanNet's `intrinsic_color.txt`). Pixels; neither
+the size of the images nor the unit of depths is stated.
+Reference: ETH3D's SLAM documentation ("fx fy cx cy"); Schops et al., BAD SLAM (2019).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from vio.cameras.rig import Rig, camera_from_matrix
+from vio.datasets.common import naming
+from vio.datasets.rigs.plausible import checked_rig
+from vio.datasets.rigs.source import Size
+from vio.errors import CalibrationError
+from vio.files.text import text_lines
+from vio.geometry.lie import FloatArray
+
+NAMES = (
+    "calibration.txt",
+    "intrinsics.txt",
+    "camera-intrinsics.txt",
+    "intrinsic_color.txt",
+    "intrinsic.txt",
+)
+
+
+def is_bare(path: Path) -> bool:
+    """Return whether a text file holds the numbers of one camera and nothing else."""
+    return _numbers(path) is not None
+
+
+def read_bare(path: Path, size: Size | None) -> Rig:
+    """Read the camera.
+
+    Raises:
+        CalibrationError: the numbers are no intrinsics, or no image size is given.
+    """
+    rows = _numbers(path)
+    if rows is None:
+        raise CalibrationError(f"{path}: is neither 'fx fy cx cy' nor a matrix of 3 x 3 numbers")
+    if size is None:
+        raise CalibrationError(f"{path}: states no image size; pass image_size=(W, H)")
+    if len(rows) == 1:
+        fx, fy, cx, cy, *bend = rows[0].tolist()
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    else:
+        K = rows[:3, :3]
+        bend = []
+    with naming(path):
+        rig = Rig(camera_from_matrix(K, *size, "radtan", bend))
+    return checked_rig(rig, path, size_stated=False)
+
+
+def _numbers(path: Path) -> FloatArray | None:
+    """Return one row of 4, 8 or 9 numbers, or a matrix; None: the file holds something else."""
+    lines = [line for _, line in text_lines(path) if line.strip()[:1] not in ("#", "")]
+    try:
+        rows = [[float(x) for x in line.replace(",", " ").split()] for line in lines[:5]]
+    except ValueError:
+        return None
+    widths = {len(row) for row in rows}
+    one = len(rows) == 1 and widths <= {4, 8, 9}
+    square = widths in ({3}, {4}) and len(rows) in widths
+    return np.array(rows) if one or square else None

@@ -1,0 +1,141 @@
+"""Settings of ORB-SLAM2 and ORB-SLAM3, which are OpenCV's YAML, in their old and new form.
+
+Old: `Camera.fx … Camera.bf`, `Camera2.fx …` with `Tlr`, or `LEFT.K … RIGHT.P`; `Tbc`. New
+(`File.version`): `Camera1.fx …`, `Camera2.fx …`, `Stereo.T_c1_c2` or `Stereo.b`; `IMU.T_b_c1`.
+
+`Tlr` and `Stereo.T_c1_c2` map coordinates of the right camera to the left one, `Tbc` and
+`IMU.T_b_c1` those of the left camera to the IMU; metres. `Camera.bf` is focal length times
+baseline, pixels times metres. Neither form has a time shift. Noise: densities in SI units.
+Reference: ORB-SLAM3's `Settings.cc` and `Tracking.cc`, and its document Calibration_Tutorial.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vio.cameras.rig import Rig, camera_from_matrix
+from vio.datasets.common import image_size, naming
+from vio.datasets.rigs.opencv import rig_from_opencv
+from vio.datasets.rigs.plausible import checked_rig
+from vio.datasets.rigs.source import Size, Source
+from vio.datasets.yaml_files import Entries, as_number, matrix, numbers
+from vio.errors import CalibrationError
+from vio.geometry.distortion import CameraModel
+from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
+from vio.records import ImuDensities
+
+_NOISE = ("IMU.NoiseGyro", "IMU.GyroWalk", "IMU.NoiseAcc", "IMU.AccWalk")
+_POSES_OF_CAMERA = ("IMU.T_b_c1", "Tbc")
+_POSES_OF_RIGHT = ("Stereo.T_c1_c2", "Tlr")
+_FISHEYE = "kannalabrandt8"
+
+
+def matches(entries: Entries) -> bool:
+    """Return whether entries are settings of ORB-SLAM with a camera."""
+    return any(key in entries for key in ("Camera.fx", "Camera1.fx", "LEFT.K"))
+
+
+def read(source: Source) -> Rig:
+    """Read the settings: a raw pair, a rectified one, one camera, or one with depth images.
+
+    Raises:
+        CalibrationError: an entry is missing or impossible, or the image size is not known.
+    """
+    rig = _cameras(source)
+    entries = source.entries
+    pose = _transform(entries, _POSES_OF_CAMERA, source.where)
+    T_cam0_imu = None if pose is None else se3_inverse(pose)
+    noise = None if pose is None else _noise(entries, source.where)
+    return replace(rig, T_cam0_imu=T_cam0_imu, imu_noise=noise)
+
+
+def _cameras(source: Source) -> Rig:
+    entries = source.entries
+    where = source.where
+    if "LEFT.K" in entries and "RIGHT.K" in entries:
+        return rig_from_opencv(entries, where, source.image_size)
+    size, stated = _size(source)
+    first = "Camera1" if "Camera1.fx" in entries else "Camera"
+    cam0 = _camera(entries, first, size, where)
+    pose = _transform(entries, _POSES_OF_RIGHT, where)
+    factor = _depth_factor(entries)
+    rig = Rig(cam0, depth_factor=factor)
+    if factor is None and pose is not None and "Camera2.fx" in entries:
+        cam1 = _camera(entries, "Camera2", size, where)
+        with naming(where):
+            rig = Rig(cam0, cam1, se3_inverse(pose))
+    elif factor is None and (baseline := _baseline(entries, cam0, where)) is not None:
+        if cam0.model != "pinhole":
+            raise CalibrationError(
+                f"{where}: states Camera.bf, as of a rectified pair, and a distortion, which "
+                "rectified images do not have; give the calibration of both cameras (LEFT.K …)"
+            )
+        with naming(where):
+            rig = Rig.rectified(cam0.fu, cam0.fv, cam0.cu, cam0.cv, baseline, *size)
+    return checked_rig(rig, where, size_stated=stated)
+
+
+def _size(source: Source) -> tuple[Size, bool]:
+    """Return width and height, and whether the file states them (ORB-SLAM2's does not)."""
+    found = [as_number(source.entries.get(f"Camera.{name}")) for name in ("width", "height")]
+    if all(value >= 1 for value in found):
+        return image_size(found, source.where), True
+    if source.image_size is None:
+        raise CalibrationError(
+            f"{source.where}: states no image size; add 'Camera.width: W' and 'Camera.height: H', "
+            "or pass image_size=(W, H)"
+        )
+    return source.image_size, False
+
+
+def _camera(entries: Entries, name: str, size: Size, where: str) -> CameraModel:
+    fx, fy, cx, cy = (
+        numbers(entries, f"{name}.{key}", where, 1)[0] for key in ("fx", "fy", "cx", "cy")
+    )
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    kind = str(entries.get("Camera.type", "PinHole")).lower()
+    with naming(f"{where}, {name}"):
+        if kind == _FISHEYE:
+            return camera_from_matrix(K, *size, "equidistant", _bend(entries, name, "k1 k2 k3 k4"))
+        if kind == "rectified":
+            return camera_from_matrix(K, *size)
+        if kind != "pinhole":
+            raise CalibrationError(f"Camera.type {kind!r} is not read")
+        bend = _bend(entries, name, "k1 k2 p1 p2 k3")
+        return camera_from_matrix(K, *size, "radtan", bend if bend[4] else bend[:4])
+
+
+def _bend(entries: Entries, name: str, keys: str) -> tuple[float, ...]:
+    """Return distortion coefficients; absent ones are zero."""
+    return tuple(as_number(entries.get(f"{name}.{key}", 0.0)) for key in keys.split())
+
+
+def _baseline(entries: Entries, cam0: CameraModel, where: str) -> float | None:
+    """Return the baseline of a rectified pair in metres; None: there is one camera."""
+    if "Stereo.b" in entries:
+        return numbers(entries, "Stereo.b", where, 1)[0]
+    if "Camera.bf" in entries:
+        return numbers(entries, "Camera.bf", where, 1)[0] / cam0.fu
+    return None
+
+
+def _depth_factor(entries: Entries) -> float | None:
+    """Return the levels per metre of depth images; None: there are none of 16 bits."""
+    stated = as_number(entries.get("RGBD.DepthMapFactor", entries.get("DepthMapFactor")))
+    return stated if stated > 1 else None
+
+
+def _transform(entries: Entries, names: tuple[str, ...], where: str) -> FloatArray | None:
+    name = next((name for name in names if name in entries), None)
+    if name is None:
+        return None
+    return checked_transform(matrix(entries[name], None, f"{where}, {name}"), f"{where}, {name}")
+
+
+def _noise(entries: Entries, where: str) -> ImuDensities | None:
+    if not all(name in entries for name in _NOISE):
+        return None
+    values = [numbers(entries, name, where, 1)[0] for name in _NOISE]
+    return ImuDensities(*values) if min(values) > 0 else None

@@ -1,0 +1,100 @@
+"""What a calibration file does not state, and what its own numbers say of it.
+
+A size or a unit that the file states is believed. Where it states none, a calibration that fits
+another reading better is doubted: a note names both readings. What no reading makes sense of is an
+error.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from vio.cameras.rig import Rig
+from vio.errors import CalibrationError
+from vio.geometry.distortion import CameraModel
+
+# Ratio of twice the principal point to the image size, along both axes in one direction, beyond
+# which the images are of another size: real principal points are within a tenth of the middle.
+_OTHER_SIZE = 1.2
+# Likewise along one axis, as of images that were cropped
+_CROPPED = 1.3
+# A board's square is 0.02 to 0.1 m and a rig's baseline 0.05 to 0.6 m, so that in squares a
+# baseline is seldom below 1, and in metres seldom above.
+_SQUARES_M = 1.0
+
+
+def checked_rig(rig: Rig, where: Path | str, *, size_stated: bool = True) -> Rig:
+    """Return a rig with a note where its calibration fits images of another size better.
+
+    Args:
+        rig: as read.
+        where: the file or topic, for messages.
+        size_stated: whether it states the size of its images, which is then believed.
+
+    Raises:
+        CalibrationError: a principal point lies outside the images.
+    """
+    for camera in rig.cameras:
+        check_principal_point(camera, where)
+    if size_stated:
+        return rig
+    doubt = _size_doubt(rig.cam0, where)
+    return rig if doubt is None else rig.noting(doubt)
+
+
+def check_principal_point(camera: CameraModel, where: Path | str) -> None:
+    """Raise CalibrationError where the principal point of a camera is outside its images."""
+    if 0 < camera.cu < camera.width and 0 < camera.cv < camera.height:
+        return
+    raise CalibrationError(
+        f"{where}: the principal point {camera.cu:.0f}, {camera.cv:.0f} lies outside images of "
+        f"{camera.width} x {camera.height} pixels; it is the calibration of images of another "
+        "size: scale it, or calibrate with these"
+    )
+
+
+def _size_doubt(camera: CameraModel, where: Path | str) -> str | None:
+    """Return the doubt about a size that is not stated; None: the principal point is near its
+    middle.
+    """
+    ratios = np.array([2 * camera.cu / camera.width, 2 * camera.cv / camera.height])
+    scaled = ratios.min() > _OTHER_SIZE or ratios.max() < 1 / _OTHER_SIZE
+    cropped = ratios.max() > _CROPPED or ratios.min() < 2 - _CROPPED
+    if not (scaled or cropped):
+        return None
+    remedy = (
+        f"if they were scaled, divide its focal lengths and principal points by "
+        f"{ratios.mean():.3g}, or all depths are off by this factor"
+        if scaled
+        else "if they were cropped, subtract what was cut from its principal points, or directions "
+        "are off"
+    )
+    return (
+        f"{where}: doubtful: it states no image size, and its principal point {camera.cu:.0f}, "
+        f"{camera.cv:.0f} is the middle of images of about {2 * camera.cu:.0f} x "
+        f"{2 * camera.cv:.0f} pixels, not of {camera.width} x {camera.height}; it is read as that "
+        f"of these images; {remedy}"
+    )
+
+
+def unit_doubt(baseline: float, where: Path | str) -> str | None:
+    """Return the doubt about a stereo translation whose unit OpenCV's files do not state.
+
+    OpenCV's sample `stereo_calib.cpp` writes T in squares of the board, as its `squareSize` is 1
+    by default; other scripts in millimetres, centimetres or inches.
+
+    Args:
+        baseline: length of T, as the file has it.
+        where: the file.
+    """
+    if baseline <= _SQUARES_M:
+        return None
+    return (
+        f"{where}: doubtful: T puts the cameras {baseline:g} m apart, if its unit is the metre; "
+        "where the board was measured in millimetres, T is too: divide it by 1000; where it was "
+        "not measured, T is in squares of the board, as OpenCV's sample writes it: multiply it by "
+        f"the side of a square, which makes {0.025 * baseline:.3g} m of squares of 25 mm; or all "
+        "lengths of the run will be in that unit"
+    )

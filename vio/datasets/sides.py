@@ -1,0 +1,88 @@
+"""Which of two names is the left camera's: `left right`, `cam0 cam1`, `img_l img_r` and others."""
+
+from __future__ import annotations
+
+import re
+from itertools import combinations
+
+# what may differ between the names of a pair, left first; in small letters, numbers as numbers
+_SIDES = (
+    ("left", "right"),
+    ("l", "r"),
+    ("lcam", "rcam"),
+    ("port", "starboard"),
+    ("0", "1"),
+    ("1", "2"),
+    ("2", "3"),
+    ("a", "b"),
+)
+_WORDS = re.compile(r"\d+|[A-Z]?[a-z]+|[A-Z]+(?![a-z])|/|\\")
+
+
+def words_of(name: str) -> tuple[str, ...]:
+    """Return the words and numbers of a name in small letters, numbers without leading zeros."""
+    return tuple(
+        str(int(word)) if word.isdigit() else word.lower() for word in _WORDS.findall(name)
+    )
+
+
+def is_pair(left: str, right: str) -> bool:
+    """Return whether two names differ in their side alone, and the first one is the left one."""
+    a = words_of(left)
+    b = words_of(right)
+    if len(a) != len(b):
+        return False
+    differing = {(x, y) for x, y in zip(a, b, strict=True) if x != y}
+    return len(differing) == 1 and next(iter(differing)) in _SIDES
+
+
+def pairs_of(names: list[str]) -> list[tuple[str, str]]:
+    """Return all pairs among names, left first."""
+    found = []
+    for a, b in combinations(names, 2):
+        if is_pair(a, b):
+            found.append((a, b))
+        elif is_pair(b, a):
+            found.append((b, a))
+    return found
+
+
+def first_pair(pairs: list[tuple[str, str]]) -> tuple[str, str] | None:
+    """Return the only pair that is named as left and right, else the only one that is numbered 0
+    and 1, else the only one; None: it is not clear, as of cameras 1, 2 and 3.
+    """
+    named = [pair for pair in pairs if side_word(pair[0]) == "left"]
+    zero = [pair for pair in pairs if "0" in _differing(*pair)]
+    best = named or zero or pairs
+    return best[0] if len(best) == 1 else None
+
+
+def _differing(left: str, right: str) -> set[str]:
+    return {a for a, b in zip(words_of(left), words_of(right), strict=True) if a != b}
+
+
+def side_word(name: str) -> str | None:
+    """Return the word of a name that states a side, as `left` or `right`; None: none does."""
+    words = words_of(name)
+    for left, right in _SIDES[:2]:
+        if left in words:
+            return "left"
+        if right in words:
+            return "right"
+    return None
+
+
+def without_side(stem: str) -> str:
+    """Return an image's name without the part that names its camera: `000012_cam0` as `000012`.
+
+    Names that hold nothing else stay what they are.
+    """
+    bare = _CAMERA_PART.sub("", stem)
+    return bare if re.search(r"\d", bare) else stem
+
+
+# of an image's name, at its beginning or end, or between separators
+_CAMERA_PART = re.compile(
+    r"(?:(?<=^)|(?<=[_\-. ]))(?:(?:cam(?:era)?|image|img|infra|fisheye)[_\-]?\d{1,2}|left|right|l|r)(?=$|[_\-. ])",
+    re.IGNORECASE,
+)

@@ -1,0 +1,212 @@
+"""What checks report: one record for every fault of images, sensors, calibration and estimate.
+
+A finding has a code that stays the same from version to version, so that programs and tests compare
+codes and not sentences. `CODES` lists them all, with their effect on the integrity of the estimates
+of the frames that they hold for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from vio.errors import ConfigError
+
+# of the estimates: use them; they are less certain than usual; do not use them
+Integrity: TypeAlias = Literal["nominal", "degraded", "unusable"]
+INTEGRITIES: tuple[Integrity, ...] = ("nominal", "degraded", "unusable")
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """What a code means."""
+
+    effect: Integrity  # on the estimates of the frames that it holds for
+    meaning: str  # one line
+    remedy: str  # one line
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One event: something is wrong from a frame on, or no longer."""
+
+    code: str  # a key of `CODES`
+    message: str  # one line: what was seen, its likely cause, what to do
+    frame: int | None = None  # frame that it was found at; None: of the whole recording
+    since: int | None = None  # first frame that it holds for; None: `frame`
+    ended: bool = False  # it no longer holds from `frame` on
+    lasts: bool = False  # it holds until a finding of the same code says that it has ended
+    certain: bool = True  # False: suspected, correct data can look like this
+    figures: Mapping[str, float] = field(default_factory=dict)  # with units in their names
+
+    def __post_init__(self) -> None:
+        """Refuse a code that is not documented."""
+        if self.code not in CODES:
+            raise ConfigError(f"there is no finding {self.code!r}; add it to vio.findings.CODES")
+
+    def __str__(self) -> str:
+        return self.message
+
+    @property
+    def effect(self) -> Integrity:
+        """Effect on the estimates of the frames that it holds for."""
+        return "nominal" if self.ended else CODES[self.code].effect
+
+    @property
+    def first_frame(self) -> int | None:
+        """First frame that it holds for."""
+        return self.frame if self.since is None else self.since
+
+    def to_json(self) -> dict[str, object]:
+        """Return the finding as plain values for `metrics.json`."""
+        return {
+            "code": self.code,
+            "frame": self.frame,
+            "since": self.first_frame,
+            "ended": self.ended,
+            "certain": self.certain,
+            "effect": self.effect,
+            "figures": dict(self.figures),
+            "message": self.message,
+        }
+
+
+def worst(effects: list[Integrity]) -> Integrity:
+    """Return the worst of some effects; nominal for none."""
+    return max(effects, key=INTEGRITIES.index, default="nominal")
+
+
+_EXPOSURES = "pair images by their times of exposure, or synchronise the cameras"
+_CAMERA = "check the camera, its cable and its driver"
+
+MONITORED = "run"  # code of a remark without a code of its own
+
+CODES: dict[str, Code] = {
+    "bands": Code(
+        "nominal",
+        "bands of brightness move through the images; they are taken out",
+        "use a light that does not flicker, or an exposure of whole periods of the mains",
+    ),
+    "images-exchanged": Code(
+        "degraded",
+        "left and right images are exchanged for a while; they are put back, or left out",
+        "check how the two streams are told apart",
+    ),
+    "right-image-frozen": Code(
+        "degraded", "the right image does not change; the left one alone is used", _CAMERA
+    ),
+    "right-image-dark": Code(
+        "degraded", "the right image has no contrast; the left one alone is used", _CAMERA
+    ),
+    "left-image-frozen": Code(
+        "degraded", "the left image does not change; the right one alone is used", _CAMERA
+    ),
+    "right-contradicts-left": Code(
+        "degraded",
+        "points of known depth are not where the right image should show them",
+        "check the mount of the right camera, and that the cameras expose together",
+    ),
+    "right-image-late": Code(
+        "degraded", "the right camera exposes later than the left one", _EXPOSURES
+    ),
+    "right-image-early": Code(
+        "degraded", "the right camera exposes earlier than the left one", _EXPOSURES
+    ),
+    "pairs-shifted": Code(
+        "unusable",
+        "each left image was paired with the right image of another frame",
+        _EXPOSURES,
+    ),
+    "pairs-put-right": Code(
+        "nominal",
+        "right images of another frame were found, and the run began again with the right ones",
+        _EXPOSURES,
+    ),
+    "gyro-jumped": Code(
+        "degraded",
+        "the gyro's bias has jumped; the images estimate it anew",
+        "check the IMU's mount and supply; an IMU that restarts loses its calibration",
+    ),
+    "object-covers-image": Code(
+        "degraded",
+        "points that move together, but not as the camera does, cover much of the image",
+        "mask what moves with the rig (frontend.klt.mask)",
+    ),
+    "object-or-scene": Code(
+        "unusable",
+        "two groups of points move differently, and nothing decides which one is the scene",
+        "add an IMU, or mask what moves with the rig (frontend.klt.mask)",
+    ),
+    "object-hides-scene": Code(
+        "degraded", "an object hides nearly all of the scene; no feature is used", ""
+    ),
+    "frame-refused": Code("degraded", "the front end refused a frame", "see the message"),
+    "frames-missing": Code("degraded", "no frame came for some time", _CAMERA),
+    "frames-repeated": Code("degraded", "frames show an earlier exposure again", _CAMERA),
+    "depths-repeated": Code("nominal", "depth images repeat an earlier one", _CAMERA),
+    "frames-unread": Code("degraded", "frames of the recording could not be read", "see the files"),
+    "no-features": Code(
+        "degraded",
+        "no feature can be used; the pose is a prediction",
+        "more light or texture, or a shorter exposure",
+    ),
+    "features-refused": Code(
+        "degraded",
+        "many features contradict the others, and are refused",
+        "see the cause that the message names",
+    ),
+    "estimate-restarted": Code(
+        "degraded", "the estimate diverged, and was started again from the last good pose", ""
+    ),
+    "estimate-lost": Code("unusable", "the estimate diverged, and there is no pose", ""),
+    "estimate-implausible": Code(
+        "unusable",
+        "the estimate is none that a working rig can have",
+        "check the order of the images, calibration, units and clocks",
+    ),
+    "stereo-calibration-off": Code(
+        "nominal",
+        "rows of left and right images differ in a smooth pattern; corrected while running",
+        "vio calibrate",
+    ),
+    "other-calibration": Code(
+        "degraded",
+        "rows of left and right images differ by far more than a calibration can be off",
+        "check that calibration and images belong together",
+    ),
+    "scale-off": Code(
+        "degraded",
+        "baseline or focal length differ from the calibration, by the motion sensor",
+        "check the sensor and the image size, then calibrate anew",
+    ),
+    "baseline-implausible": Code(
+        "degraded", "the baseline is not that of a stereo camera", "check its unit"
+    ),
+    "one-camera-start": Code("nominal", "the trajectory of one camera begins here", ""),
+    "no-pose": Code("nominal", "frames have no pose, as the state was not observable yet", ""),
+    "imu-gap": Code("degraded", "no IMU sample came for some time", "check the IMU's driver"),
+    "imu-readings": Code(
+        "degraded", "IMU samples are spikes, or repeat to the last bit", "check the IMU's driver"
+    ),
+    "imu-not-used": Code(
+        "degraded",
+        "the IMU was found to be wrong; frames were estimated again without it, or with corrected "
+        "units",
+        "correct the fault that is named before",
+    ),
+    "imu-clock": Code(
+        "degraded", "the clocks of camera and IMU are apart", "use one clock, or calibrate"
+    ),
+    "imu-units": Code("degraded", "readings of the IMU have another unit", "see the message"),
+    "imu-axes": Code(
+        "degraded", "axes of the IMU, or its extrinsics, are wrong", "see the message"
+    ),
+    "imu-disagrees": Code("degraded", "IMU and images measure different motions", "vio check"),
+    "imu-saturated": Code(
+        "degraded", "readings of the IMU are at the end of their range", "use a larger range"
+    ),
+    "imu-suspected": Code("nominal", "something about the IMU may be wrong", "vio check"),
+    "front-end": Code("nominal", "a remark of a front end of the caller's own", ""),
+    "run": Code("nominal", "a remark on the run", ""),
+}

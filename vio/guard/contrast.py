@@ -1,0 +1,34 @@
+"""Images without contrast: black, saturated or covered for a moment."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from vio.frontend.patches import mean_and_contrast
+from vio.guard.image_check import FrameImages, ImageCheck
+
+_MAX_FRAMES = 5  # in a row that are left out; then the front end sees them, and drops its tracks
+_STRIDE = 4  # every fourth pixel of the half image is used
+_LOST_SHARE = 0.1  # share of the last image's contrast below which the contrast counts as lost
+
+
+class LostContrast(ImageCheck):
+    """Leaves frames out whose left image lost its contrast; tracking continues from the frame
+    before.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._contrast: float | None = None  # of the last frame that was not left out
+        self._skipped = 0  # frames in a row
+
+    def inspect(self, images: FrameImages) -> FrameImages:
+        """Leave out a frame without contrast where the previous one had some."""
+        contrast = mean_and_contrast(images.halves[0], _STRIDE)[1]
+        lost = self._contrast is not None and contrast < _LOST_SHARE * self._contrast
+        if lost and self._skipped < _MAX_FRAMES:
+            self._skipped += 1
+            return replace(images, skipped=True)
+        self._skipped = 0
+        self._contrast = contrast
+        return images

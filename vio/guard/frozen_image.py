@@ -1,0 +1,159 @@
+"""A camera of the pair that is frozen, dark or covered, by the images themselves.
+
+A right image that stays the same while the left one changes is frozen; so is a left image that
+stays the same while the right one changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from vio.findings import Finding
+from vio.frontend.patches import mean_and_contrast
+from vio.guard.image_change import image_change
+from vio.guard.image_check import FrameImages, ImageCheck
+from vio.records import Image
+
+Cause: TypeAlias = Literal["right-image-frozen", "right-image-dark"]
+
+_STRIDE = 4  # of the half-resolution images' pixels that are compared
+# change of a frozen camera's image over that of the other's, at most: sensor noise is left
+_FROZEN_SHARE = 0.3
+# change of a frozen camera's image by noise of the sensor or an encoder, gray levels at the common
+# contrast
+_MAX_NOISE = 3.0
+# the same of the other camera's image: where it changes by less, nothing can be concluded
+_MIN_CHANGE = 1.0
+# how fast the usual ratio of the two changes is learned, which depends on gains and scene
+_RATIO_GAIN = 0.1
+_FRAMES = 3  # in a row before it is reported
+_DARK_SHARE = 0.1  # contrast of a dark or covered image over that of the other one
+
+_SEEN: dict[Cause, str] = {
+    "right-image-frozen": "the right camera is frozen: its image does not change while the left "
+    "one does",
+    "right-image-dark": "the right camera is dark or covered: its image has no contrast while the "
+    "left one has",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _SparseImages:
+    """Both images of a frame, sparsely sampled."""
+
+    index: int
+    left: Image
+    right: Image
+
+
+class FrozenCamera(ImageCheck):
+    """Marks frames in which one camera of the pair gives nothing new."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._last: _SparseImages | None = None  # the last frame in which no image was frozen
+        self._ratio = 1.0  # usual change of the right image over that of the left one
+        self._cause: Cause | None = None  # why the right image is not used
+        self._since = 0  # frame before the first such frame
+        self._count = 0  # such frames in a row
+        self._reported: Cause = "right-image-frozen"  # the cause that was reported last
+        self._left_frozen = 0  # frames in a row
+
+    def inspect(self, images: FrameImages) -> FrameImages:
+        """Mark frames with a frozen left image, or with a frozen or dark right one."""
+        left, right = images.halves
+        if self.left_is_frozen(images.index, left, right):
+            return replace(images, left_usable=False)
+        if self._cause is None:
+            return images
+        out = replace(images, right_usable=False)
+        out.__dict__["halves"] = images.halves
+        return out
+
+    @property
+    def right_usable(self) -> bool:
+        """Whether the right image of the last frame is neither frozen nor dark."""
+        return self._cause is None
+
+    def left_is_frozen(self, index: int, left: Image, right: Image) -> bool:
+        """Compare the images (H/2, W/2) of a frame with those before; return whether the left one
+        is frozen.
+
+        A frozen or dark right image is noted: `right_usable` is False then.
+        """
+        now = _SparseImages(
+            index, left[::_STRIDE, ::_STRIDE].copy(), right[::_STRIDE, ::_STRIDE].copy()
+        )
+        last = self._last
+        if last is None:
+            self._last = now
+            return False
+        if np.array_equal(now.left, last.left) and not np.array_equal(now.right, last.right):
+            self._count_left(last.index, index)
+            return True
+        self._end_left(index)
+        if mean_and_contrast(now.right, 1)[1] < _DARK_SHARE * mean_and_contrast(now.left, 1)[1]:
+            self._distrust("right-image-dark", last.index, index)
+            return False
+        change_left = image_change(now.left, last.left)
+        change_right = image_change(now.right, last.right)
+        if _is_frozen(change_right / self._ratio, change_left):
+            self._distrust("right-image-frozen", last.index, index)
+            return False
+        if self._cause is not None:
+            self._end_right(index)
+        elif change_left > _MIN_CHANGE:
+            self._ratio += _RATIO_GAIN * (change_right / change_left - self._ratio)
+        self._last = now
+        return False
+
+    def _distrust(self, cause: Cause, since: int, index: int) -> None:
+        """Count a frame whose right image is not used; one cause that lasts is reported once."""
+        if self._cause is None:
+            self._since = since
+            self._count = 0
+        self._cause = cause
+        self._count += 1
+        if self._count == _FRAMES:
+            self._reported = cause
+            message = (
+                f"frame {index}: {_SEEN[cause]}, since frame {self._since}; going on with the left "
+                "images"
+            )
+            self._found.append(Finding(cause, message, index, self._since + 1, lasts=True))
+
+    def _end_right(self, index: int) -> None:
+        assert self._cause is not None
+        if self._count >= _FRAMES:
+            message = f"frame {index}: the right camera gives new images again"
+            self._found.append(Finding(self._reported, message, index, ended=True))
+        self._cause = None
+
+    def _count_left(self, since: int, index: int) -> None:
+        """Count frames with a frozen left image, and report it once."""
+        self._left_frozen += 1
+        if self._left_frozen == _FRAMES:
+            message = (
+                f"frame {index}: the left camera is frozen: its image does not change since frame "
+                f"{since} while the right one does; the right images alone follow what the last "
+                "pair has seen"
+            )
+            self._found.append(Finding("left-image-frozen", message, index, since + 1, lasts=True))
+
+    def _end_left(self, index: int) -> None:
+        if self._left_frozen >= _FRAMES:
+            message = f"frame {index}: the left camera gives new images again"
+            self._found.append(Finding("left-image-frozen", message, index, ended=True))
+        self._left_frozen = 0
+
+
+def _is_frozen(change: float, other_change: float) -> bool:
+    """Whether one image is the same as before while the other is not: to the bit, or up to
+    noise.
+    """
+    if change == 0.0:
+        return other_change > 0.0
+    return change < _MAX_NOISE and other_change > max(_MIN_CHANGE, change / _FROZEN_SHARE)

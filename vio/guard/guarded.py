@@ -1,0 +1,129 @@
+"""A front end between the checks: the same checks for every front end."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.findings import Finding
+from vio.geometry.stereo import StereoCamera
+from vio.guard.bands import BandRemoval
+from vio.guard.contrast import LostContrast
+from vio.guard.exchange import ExchangeDetector
+from vio.guard.frozen_image import FrozenCamera
+from vio.guard.image_check import FrameImages, ImageCheck, images_of
+from vio.guard.pairing import PairingCheck
+from vio.guard.probe import RowProbe
+from vio.guard.swap import SwapDetector
+from vio.protocols import FollowsRight, Frontend
+from vio.records import (
+    FrontendOutput,
+    Observations,
+    StereoFrame,
+    TrackPrior,
+    no_features,
+)
+
+# Features and share of them with a right match, below which left and right may be exchanged.
+_MIN_FEATURES = 20
+_FEW_MATCHES = 0.2
+
+
+def image_checks(camera: StereoCamera) -> tuple[ImageCheck, ...]:
+    """Return the checks of the images of a camera, in their order.
+
+    A frozen image looks as if it were the other camera's, so that is asked first.
+    """
+    if camera.kind != "stereo":
+        return (LostContrast(),)
+    probe = RowProbe()
+    return (
+        BandRemoval(),
+        LostContrast(),
+        FrozenCamera(),
+        SwapDetector(probe),
+        ExchangeDetector(probe),
+        PairingCheck(probe),
+    )
+
+
+class GuardedFrontend:
+    """Checks the images of each frame before a front end sees them; see `vio.protocols.Frontend`.
+
+    Frames without images, and images that no front end takes, are handed on as they are.
+    """
+
+    def __init__(self, frontend: Frontend, camera: StereoCamera) -> None:
+        self.frontend = frontend
+        self._pair = camera.kind == "stereo"
+        self._checks = image_checks(camera)
+        self._exchange = next((c for c in self._checks if isinstance(c, ExchangeDetector)), None)
+
+    def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
+        """Check, and process what is left of a frame.
+
+        Raises:
+            DataError: the recording cannot be used, or the front end refuses the frame.
+        """
+        images = images_of(frame, pair=self._pair)
+        if images is None:
+            return self.frontend.process(frame, prior)
+        images = self._inspect(images)
+        output = self._output(images, prior)
+        if self._exchange is not None and images.right_usable:
+            self._exchange.suspicious = _few_matches(output.observations)
+        found = tuple(f for check in self._checks for f in check.take_findings())
+        return _with_findings(output, found, right_usable=images.right_usable)
+
+    def _inspect(self, images: FrameImages) -> FrameImages:
+        """Return the images after all checks, up to the first that leaves the frame out."""
+        for check in self._checks:
+            images = check.inspect(images)
+            if images.skipped or not images.left_usable:
+                break
+        return images
+
+    def _output(self, images: FrameImages, prior: TrackPrior | None) -> FrontendOutput:
+        if images.skipped:
+            return no_features(images.frame)
+        if images.left_usable:
+            return self.frontend.process(images.checked(), prior)
+        if isinstance(self.frontend, FollowsRight):
+            return self.frontend.follow_right(images.checked(), prior)
+        return no_features(images.frame)
+
+
+def guarded(frontend: Frontend, camera: StereoCamera) -> GuardedFrontend:
+    """Return a front end between the checks; itself where it is already."""
+    if isinstance(frontend, GuardedFrontend):
+        return frontend
+    return GuardedFrontend(frontend, camera)
+
+
+def _few_matches(seen: Observations) -> bool:
+    """Whether hardly any feature has a right match."""
+    if len(seen) < _MIN_FEATURES:
+        return False
+    return bool(seen.has_right.mean() < _FEW_MATCHES)
+
+
+def _with_findings(
+    output: FrontendOutput, found: tuple[Finding, ...], *, right_usable: bool
+) -> FrontendOutput:
+    """Return an output with findings, and without right pixels where these are not usable."""
+    seen = output.observations
+    if not right_usable and seen.has_right.any():
+        none = np.zeros(len(seen), dtype=np.bool_)
+        seen = Observations(
+            seen.frame_index, seen.time_ns, seen.ids, seen.z, none, seen.stale, seen.sigma
+        )
+    elif not found:
+        return output
+    return FrontendOutput(
+        seen,
+        output.tracked,
+        int(seen.has_right.sum()),
+        output.detected,
+        output.stages_ms,
+        output.warnings,
+        (*found, *output.findings),
+    )

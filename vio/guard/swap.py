@@ -1,0 +1,82 @@
+"""Recordings with swapped left and right images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from vio.errors import DataError
+from vio.guard.image_check import FrameImages, ImageCheck
+from vio.guard.probe import RowProbe
+
+_FRAMES = 3  # consecutive suspicious frames before an error is raised
+_MIN_POINTS = 20  # with fewer corners the check is skipped
+_FEW = 0.3  # share of corners with a match below which the mirrored images are checked
+_MANY = 0.4  # share of corners matched in the mirrored images that indicates a swap
+
+
+class SwapDetector(ImageCheck):
+    """Detects a recording with swapped left and right images: few matches, but many in the mirrored
+    images.
+
+    Several frames must show it; all after them are refused until one is in order. Once a few frames
+    were in order, so is the recording: `ExchangeDetector` judges later ones.
+    """
+
+    def __init__(self, probe: RowProbe) -> None:
+        super().__init__()
+        self._probe = probe
+        self._suspicious = 0  # frames in a row
+        self._in_order = 0  # frames
+
+    @property
+    def decided(self) -> bool:
+        """Whether the recording is known to be in order."""
+        return self._in_order >= _FRAMES
+
+    def inspect(self, images: FrameImages) -> FrameImages:
+        """Compare the images of the first frames.
+
+        Raises:
+            DataError: left and right look swapped.
+        """
+        if self.decided or not images.right_usable:
+            return images
+        left, right = images.halves
+        points = self._probe.corners(left)
+        matched = 0
+        if len(points) >= _MIN_POINTS:
+            matched = self._probe.positive(left, right, points)
+        self.check(
+            images.index,
+            len(points),
+            matched,
+            lambda: self._probe.negative(left, right, points),
+        )
+        return images
+
+    def check(
+        self, index: int, corners: int, matched: int, count_mirrored: Callable[[], int]
+    ) -> None:
+        """Check the number of matched corners of a frame; `count_mirrored` counts the matches in
+        the mirrored images.
+
+        Raises:
+            DataError: left and right look swapped.
+        """
+        if corners < _MIN_POINTS:
+            return
+        if matched >= _FEW * corners:
+            self._suspicious = 0
+            self._in_order += 1
+            return
+        mirrored = count_mirrored()
+        if mirrored >= max(_MANY * corners, 2 * matched):
+            self._suspicious += 1
+        elif self._suspicious < _FRAMES:
+            self._suspicious = 0
+        if self._suspicious >= _FRAMES:
+            raise DataError(
+                f"frame {index}: left and right images look swapped ({mirrored} of "
+                f"{corners} features match with a negative disparity, {matched} with a positive "
+                f"one, in {_FRAMES} frames); exchange the image folders or the cameras' calibration"
+            )

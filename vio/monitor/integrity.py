@@ -1,0 +1,126 @@
+"""Whether the estimate of a frame may be used, by the findings that hold for it.
+
+A covariance is conditional on what the filter assumes. Where a finding says that an assumption does
+not hold, the estimate is marked, and the covariance of one that is unusable also covers that the
+rig has moved in any direction since the fault began, as fast as it moves at most: what the filter
+says of the motion since then may be wrong by all of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.findings import CODES, INTEGRITIES, Finding, Integrity, worst
+from vio.geometry.lie import FloatArray
+from vio.records import NS_PER_S, Estimate
+
+_HOLDS_NS = NS_PER_S  # an event without an end is one of the second after it
+_MIN_SPEED_MPS = 0.1  # of a rig that stands still as far as the estimate says
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """Frames that are marked after their estimates were given."""
+
+    since: int  # first frame
+    before: int  # frame after the last one
+    integrity: Integrity
+    code: str
+
+
+@dataclass(slots=True)
+class _Holding:
+    """A finding that holds at present."""
+
+    finding: Finding
+    until_ns: int | None  # None: until it is said to have ended
+
+
+class IntegrityMonitor:
+    """Collects findings, and judges each estimate by those that hold."""
+
+    def __init__(self) -> None:
+        self._new: list[Finding] = []
+        self._holding: dict[str, _Holding] = {}
+        self._marks: list[Mark] = []
+        self._last: tuple[int, FloatArray] | None = None  # time and position of the last frame
+        self._speed_mps = _MIN_SPEED_MPS  # the fastest so far
+        self._unusable_since_ns: int | None = None
+
+    def take(self, finding: Finding) -> None:
+        """Take a finding; it counts from the next estimate on."""
+        self._new.append(finding)
+
+    def take_marks(self) -> tuple[Mark, ...]:
+        """Return the marks of earlier frames since the last call."""
+        marks = tuple(self._marks)
+        self._marks = []
+        return marks
+
+    def judged(self, index: int, estimate: Estimate) -> Estimate:
+        """Return the estimate of a frame with its integrity and, where it is not nominal, the codes
+        of what holds.
+        """
+        self._update(index, estimate.time_ns)
+        held = [entry.finding for entry in self._holding.values()]
+        integrity = worst([finding.effect for finding in held])
+        self._measure_speed(estimate, usable=integrity != "unusable")
+        if integrity == "nominal":
+            self._unusable_since_ns = None
+            return estimate
+        codes = tuple(sorted(f.code for f in held if f.effect != "nominal"))
+        covariance = estimate.covariance
+        if integrity == "unusable":
+            if self._unusable_since_ns is None:
+                self._unusable_since_ns = estimate.time_ns
+            elapsed_s = (estimate.time_ns - self._unusable_since_ns) / NS_PER_S
+            covariance = inflated(covariance, self._speed_mps * elapsed_s)
+        return replace(estimate, integrity=integrity, findings=codes, covariance=covariance)
+
+    def _update(self, index: int, now_ns: int) -> None:
+        """Take the new findings, and let go of those that have ended."""
+        for code, entry in list(self._holding.items()):
+            if entry.until_ns is not None and entry.until_ns <= now_ns:
+                del self._holding[code]
+        for finding in self._new:
+            if finding.ended:
+                self._holding.pop(finding.code, None)
+                continue
+            if CODES[finding.code].effect == "nominal":
+                continue
+            until_ns = None if finding.lasts else now_ns + _HOLDS_NS
+            self._holding[finding.code] = _Holding(finding, until_ns)
+            since = finding.first_frame
+            if since is not None and since < index:
+                self._marks.append(Mark(since, index, finding.effect, finding.code))
+        self._new = []
+
+    def _measure_speed(self, estimate: Estimate, *, usable: bool) -> None:
+        position = estimate.T_world_imu[:3, 3]
+        last = self._last
+        self._last = estimate.time_ns, position.copy()
+        if last is None or not usable or estimate.time_ns <= last[0]:
+            return
+        step_m = float(np.linalg.norm(position - last[1]))
+        self._speed_mps = max(self._speed_mps, step_m * NS_PER_S / (estimate.time_ns - last[0]))
+
+
+def inflated(covariance: FloatArray, sigma_m: float) -> FloatArray:
+    """Return a covariance (6, 6) of a pose, with a standard deviation of its position added on
+    each axis.
+    """
+    out = covariance.copy()
+    out[:3, :3] += sigma_m**2 * np.eye(3)
+    return out
+
+
+def marked(estimate: Estimate, mark: Mark, sigma_m: float) -> Estimate:
+    """Return an earlier estimate with a mark; `sigma_m` is what its position may be off by more."""
+    integrity = max(estimate.integrity, mark.integrity, key=INTEGRITIES.index)
+    codes = tuple(sorted({*estimate.findings, mark.code}))
+    covariance = estimate.covariance
+    if mark.integrity == "unusable":
+        covariance = inflated(covariance, sigma_m)
+    return replace(estimate, integrity=integrity, findings=codes, covariance=covariance)
