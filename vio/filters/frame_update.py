@@ -140,6 +140,7 @@ class FrameUpdate:
         self.tracks = WindowTracks(self._rig.camera, self._settings)
         self.smoothed = None
         self._landmark_gate = LandmarkGate(self._settings.gate_probability)
+        self._gyro_jump = GyroJump()
 
     def turn(self, R: FloatArray) -> None:
         """Turn the world by R (3, 3)."""
@@ -183,7 +184,8 @@ class FrameUpdate:
             doubted = False
             turn = None
             contradicted = (innovation_ratio or 0.0) > _CONTRADICTED
-            if (missing[1] or contradicted) and self._has_imu:
+            settled = self._gyro_jump.is_settled()
+            if (missing[1] or contradicted) and self._has_imu and settled:
                 turn = turn_of_images(at_prediction, expected, T_world_predicted)
             if turn is None:
                 jump_radps = self._gyro_jump.agrees(window.nav.gyro_bias)

@@ -23,6 +23,7 @@ _MIN_OLD_TRACKS = 15
 _AGREEMENT = 0.8  # share of the old tracks that one rotation must explain
 _MAX_TURN_RAD = 0.2  # standard deviation of the rotation before it is fitted
 _ITERATIONS = 8  # of the robust fit
+_START_STEPS = 30  # of a filter that has begun, in which a bias that is learned looks like a jump
 _CHANGED_SIGMAS = 3.0  # of the bias before: less is no jump
 _LIKE = 0.5  # of the larger one: rates of two steps that differ by less are one jump
 
@@ -92,9 +93,15 @@ class GyroJump:
     """Tells a gyro whose bias has jumped from single steps that contradict it, as shocks do."""
 
     def __init__(self) -> None:
+        self._steps = 0  # of the filter since its start
         self._rate: FloatArray | None = None  # (3,) that the last step was off by
         # (3,) the bias before it was doubted, and its standard deviations then; None: it is not
         self._before: tuple[FloatArray, FloatArray] | None = None
+
+    def is_settled(self) -> bool:
+        """Take a step; return whether the start, which learns bias and tilt, is over."""
+        self._steps += 1
+        return self._steps > _START_STEPS
 
     def repeats(self, rate: FloatArray) -> bool:
         """Take the rate (3,) that a step was off by; return whether the last step was off by the
