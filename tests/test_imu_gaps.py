@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from vio.evaluation.consistency import nees, nees_bounds
+from vio.filters.imu_gaps import ImuHistory
 from vio.filters.msckf import Msckf
 from vio.filters.navigation import ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
@@ -358,3 +359,19 @@ def test_a_prediction_over_seconds_is_made_by_an_imu_alone(
             if sample.time_ns > 7 * STEP_NS:
                 filt.propagate(sample)
     assert (filt.predict(7 * STEP_NS + 3_000_000_000) is not None) is useful
+
+
+@pytest.mark.parametrize(("rate_hz", "slow"), [(5, True), (20, True), (50, False), (200, False)])
+def test_a_slow_imu_hides_motion_between_its_samples(rate_hz: int, slow: bool) -> None:
+    """Straight lines between samples 0.2 s apart are bridges; nothing is missing, so no gap."""
+    history = ImuHistory()
+    rng = np.random.default_rng(0)
+    times_ns = np.arange(0, 2_000_000_000, 1_000_000_000 // rate_hz)
+    samples = [ImuSample(int(t), *rng.normal(0, 1, (2, 3))) for t in times_ns]
+    history.take(samples)
+    cuts_ns = np.array([times_ns[-3], times_ns[-2]], dtype=np.float64)
+    hidden = history.hidden(cuts_ns, times_ns.astype(np.float64))
+    assert (hidden is not None) == slow
+    if hidden is not None:
+        assert not hidden.gap
+        assert (hidden.variance.sum(axis=1) > 0).all()

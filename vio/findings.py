@@ -123,6 +123,11 @@ CODES: dict[str, Code] = {
         "right images of another frame were found, and the run began again with the right ones",
         _EXPOSURES,
     ),
+    "gyro-jumped": Code(
+        "degraded",
+        "the gyro's bias has jumped; the images estimate it anew",
+        "check the IMU's mount and supply; an IMU that restarts loses its calibration",
+    ),
     "object-covers-image": Code(
         "degraded",
         "points that move together, but not as the camera does, cover much of the image",

@@ -559,6 +559,8 @@ class UpdateReport:
     # median innovation over its standard deviation; about 1 when consistent
     innovation_ratio: float | None = None
     started: bool = True  # False: nothing can be estimated yet, and the frame has no pose
+    # by which the gyro's bias has jumped, rad/s, as the images show; None: it has not
+    gyro_jump_radps: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections import deque
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -25,19 +26,19 @@ from vio.protocols import Dataset
 from vio.records import Image, StereoFrame
 
 
-def _late(dataset: Dataset, period: Period, late: int) -> PairChange:
-    """One camera's image (0: left) is that of the frame before, all the time."""
-    last: list[Image] = []
+def late_images(dataset: Dataset, period: Period, late: int, frames: int = 1) -> PairChange:
+    """One camera's image (0: left) is that of some frames before, all the time."""
+    earlier: deque[Image] = deque(maxlen=frames)
 
     def delayed(frame: StereoFrame, *pair: Image) -> Pair:
-        before = last.pop() if last else pair[late]
-        last.append(pair[late])
+        before = earlier[0] if earlier else pair[late]
+        earlier.append(pair[late])
         return (before, pair[1]) if late == 0 else (pair[0], before)
 
     return delayed
 
 
-def _frozen(dataset: Dataset, period: Period, *cameras: int) -> PairChange:
+def frozen_images(dataset: Dataset, period: Period, *cameras: int) -> PairChange:
     """The image of some cameras stays what it was before the fault."""
     held: dict[int, Image] = {}
 
@@ -51,12 +52,21 @@ def _frozen(dataset: Dataset, period: Period, *cameras: int) -> PairChange:
     return frozen
 
 
-def _moving_object(dataset: Dataset, period: Period, speed_px: float) -> PairChange:
-    """A textured wall that covers the middle half of both images and moves sideways, pixels a
-    frame.
-    """
-    disparity_px = 30
-    texture = blurred(np.random.default_rng(7).integers(0, 256, (1200, 6000)).astype(np.uint8), 3.0)
+@dataclass(frozen=True, slots=True)
+class Wall:
+    """A textured wall before the cameras that moves sideways."""
+
+    speed_px: float  # a frame
+    share: float = 0.5  # of the image's width
+    begin: float = 0.25  # its left edge in the left image, share of the width
+    disparity_px: int = 30
+    seed: int = 7  # of its texture
+
+
+def moving_object(dataset: Dataset, period: Period, wall: Wall) -> PairChange:
+    """A wall covers a part of both images during the fault's period."""
+    noise = np.random.default_rng(wall.seed).integers(0, 256, (1200, 6000)).astype(np.uint8)
+    texture = blurred(noise, 3.0)
     texture = np.asarray(
         cv2.normalize(texture, texture.copy(), 20, 235, cv2.NORM_MINMAX), dtype=np.uint8
     )
@@ -67,18 +77,20 @@ def _moving_object(dataset: Dataset, period: Period, speed_px: float) -> PairCha
             return left, right
         first.append(frame.index)
         height, width = left.shape
-        at = 1000 + round(speed_px * (frame.index - first[0]))
-        wall = texture[:height, at : at + width // 2]
+        at = 1000 + round(wall.speed_px * (frame.index - first[0]))
+        columns = round(wall.share * width)
+        begin = round(wall.begin * width)
         left = left.copy()
         right = right.copy()
-        for image, begin in ((left, width // 4), (right, width // 4 - disparity_px)):
-            image[:, begin : begin + width // 2] = wall
+        for image, column in ((left, begin), (right, begin - wall.disparity_px)):
+            seen = slice(max(column, 0), max(column + columns, 0))
+            image[:, seen] = texture[:height, at + seen.start - column : at + seen.stop - column]
         return left, right
 
     return covered
 
 
-def _turned_right(
+def turned_right(
     dataset: Dataset,
     period: Period,
     degrees: float,
@@ -100,7 +112,7 @@ def _turned_right(
     return turned
 
 
-def _shaking_right(dataset: Dataset, period: Period, degrees: float) -> PairChange:
+def shaking_right(dataset: Dataset, period: Period, degrees: float) -> PairChange:
     """The right camera turns about its vertical axis by a random angle of its own in each frame."""
     fu = dataset.recording.camera.fu
     rng = np.random.default_rng(1)
@@ -115,19 +127,19 @@ def _shaking_right(dataset: Dataset, period: Period, degrees: float) -> PairChan
     return shaken
 
 
-def _repeated_tenth(dataset: Dataset, period: Period) -> PairChange:
-    """Every tenth pair is that of the frame before."""
+def repeated_pairs(dataset: Dataset, period: Period, every: int = 10) -> PairChange:
+    """Every pair of some number is that of the frame before."""
     last: list[Pair] = []
 
     def repeated(frame: StereoFrame, *pair: Image) -> Pair:
-        if frame.index % 10 != 0 or not last:
+        if frame.index % every != 0 or not last:
             last[:] = [(pair[0], pair[1])]
         return last[0]
 
     return repeated
 
 
-def _calibration(**factors: float) -> Variant:
+def wrong_calibration(**factors: float) -> Variant:
     """Entries of the calibration off by factors."""
 
     def variant(dataset: Dataset, period: Period) -> Changed:
@@ -139,22 +151,22 @@ def _calibration(**factors: float) -> Variant:
 
 
 CAMERAS: dict[str, Variant] = {
-    "right late": pairs(_late, 1),
-    "left late": pairs(_late, 0),
-    "right frozen": pairs(_frozen, 1),
-    "left frozen": pairs(_frozen, 0),
-    "both frozen": pairs(_frozen, 0, 1),
+    "right late": pairs(late_images, 1),
+    "left late": pairs(late_images, 0),
+    "right frozen": pairs(frozen_images, 1),
+    "left frozen": pairs(frozen_images, 0),
+    "both frozen": pairs(frozen_images, 0, 1),
     "exchanged 3 s": pairs_during(lambda frame, left, right: (right, left)),
     "exchanged": every_pair(lambda frame, left, right: (right, left)),
     "black": pairs_during(lambda frame, left, right: (np.zeros_like(left), np.zeros_like(right))),
-    "object": pairs(_moving_object, 6.0),
-    "slow object": pairs(_moving_object, 1.5),
-    "right turned": pairs(_turned_right, 1.0, (0.3, 1.0, 0.3), all_along=True),
-    "right yaw later": pairs(_turned_right, 1.0, (0.0, 1.0, 0.0), all_along=False),
-    "right shaking": pairs(_shaking_right, 0.1),
-    "focal +5 %": _calibration(fu=1.05, fv=1.05),
-    "baseline +10 %": _calibration(baseline_m=1.1),
-    "every 10th repeated": pairs(_repeated_tenth),
+    "object": pairs(moving_object, Wall(6.0)),
+    "slow object": pairs(moving_object, Wall(1.5)),
+    "right turned": pairs(turned_right, 1.0, (0.3, 1.0, 0.3), all_along=True),
+    "right yaw later": pairs(turned_right, 1.0, (0.0, 1.0, 0.0), all_along=False),
+    "right shaking": pairs(shaking_right, 0.1),
+    "focal +5 %": wrong_calibration(fu=1.05, fv=1.05),
+    "baseline +10 %": wrong_calibration(baseline_m=1.1),
+    "every 10th repeated": pairs(repeated_pairs),
     "no frames": gap(frames=True, samples=False),
     "nothing": gap(frames=True, samples=True),
 }

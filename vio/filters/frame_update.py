@@ -11,6 +11,7 @@ import numpy as np
 
 from vio.cameras.rectification_error import CONSIDERED, ErrorColumns
 from vio.filters import track_loops
+from vio.filters.imu_jump import GyroJump, gyro_doubt, turn_of_images
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
     MIN_DEPTH,
@@ -78,6 +79,8 @@ _MAP_DEPTH_SIGMA = 0.2
 # pixels by which the predicted pose may be off before one step over the window is too few
 _FAR = 0.5
 _NEARER = 1.25  # by which factor a step must have come nearer for another one
+# innovations over their standard deviation (median): more, and the gyro may have jumped
+_CONTRADICTED = 2.0
 # over the window in a frame: one is the rule, two bring in a start in motion, a third is an
 # exception
 _MOST_STEPS = 4
@@ -102,6 +105,7 @@ class FrameUpdate:
         self.smoothed: WindowPosterior | None = None  # after the last frame
         self._landmark_gate = LandmarkGate(settings.gate_probability)
         self._overdispersion = Overdispersion()
+        self._gyro_jump = GyroJump()
 
     @property
     def _variance(self) -> float:
@@ -136,6 +140,7 @@ class FrameUpdate:
         self.tracks = WindowTracks(self._rig.camera, self._settings)
         self.smoothed = None
         self._landmark_gate = LandmarkGate(self._settings.gate_probability)
+        self._gyro_jump = GyroJump()
 
     def turn(self, R: FloatArray) -> None:
         """Turn the world by R (3, 3)."""
@@ -166,25 +171,33 @@ class FrameUpdate:
         self.tracks.table.add_frame(len(window.clones) - 1, seen.take(of_tracks))
 
         predicted = window.camera_move_since(-2) if len(window.clones) > 1 else None
+        T_world_predicted = window.nav.T_world_imu
         tracks = self._linearise(window, self.tracks.choose(len(window.clones)), _FIRST_STEPS)
         at_prediction = tracks
         innovation = tracks.newest_innovation()
         innovation_ratio = self.tracks.innovation_ratio(tracks, expected)
         tracks, fitted = self._fit(window, tracks, pixels, innovation)
         step = self._step_errors(window, tracks, predicted, fitted, expected)
+        jump_radps = None
         if step is not None:
             missing = step.missing_noise()
             doubted = False
-            if missing.any() and self.tracks.agree(tracks.at):
+            turn = None
+            contradicted = (innovation_ratio or 0.0) > _CONTRADICTED
+            settled = self._gyro_jump.is_settled()
+            if (missing[1] or contradicted) and self._has_imu and settled:
+                turn = turn_of_images(at_prediction, expected, T_world_predicted)
+            if turn is None:
+                jump_radps = self._gyro_jump.agrees(window.nav.gyro_bias)
+            if turn is not None and self._doubts_gyro(window, turn, tracks):
+                doubted = True
+                tracks, fitted = self._fit(window, tracks, pixels, innovation)
+            elif missing.any() and self.tracks.agree(tracks.at):
                 window.inflate_process_noise(
                     np.einsum("k,kij->ij", missing, propagation.since_frame.Q_parts)
                 )
                 tracks, fitted = self._fit(window, tracks, pixels, innovation)
-            elif (
-                missing.any()
-                and propagation.source == "imu"
-                and not propagation.since_frame.bridged
-            ):
+            elif missing.any() and self._has_imu:
                 doubted = self.tracks.drop_unpredicted(at_prediction, expected)
                 pixels = Views(pixels.z, np.zeros_like(pixels.weight))
                 tracks, fitted = self._fit_again(window, pixels)
@@ -210,7 +223,28 @@ class FrameUpdate:
             gated_ids=gated_ids,
             landmark_ids=window.landmark_ids.copy(),
             innovation_ratio=innovation_ratio,
+            gyro_jump_radps=jump_radps,
         )
+
+    def _doubts_gyro(self, window: Window, turn: FloatArray, tracks: LinearTracks) -> bool:
+        """Whether the newest step contradicts the gyro by a rotation (3,) that inflated noise of
+        one step does not explain; then its bias becomes uncertain by that.
+        """
+        seconds = window.last_step_s
+        repeats = self._gyro_jump.repeats(turn / seconds)
+        if not repeats and self.tracks.agree(tracks.at):
+            return False
+        sigma = np.sqrt(np.diag(window.prior.P)[9:12])
+        self._gyro_jump.doubt(window.nav.gyro_bias, sigma)
+        growth = self._propagation.since_frame
+        window.inflate_process_noise(gyro_doubt(growth, window.nav, turn, seconds))
+        return True
+
+    @property
+    def _has_imu(self) -> bool:
+        """Whether an IMU has measured the motion since the last frame."""
+        propagation = self._propagation
+        return propagation.source == "imu" and not propagation.since_frame.bridged
 
     def _keep_landmarks(self, window: Window, kept: BoolArray) -> None:
         """Drop the landmarks outside a mask (M,) from the state; their points go to the map."""

@@ -32,6 +32,9 @@ _UNKNOWN = np.array([3.0, 1.0]) ** 2
 _MEASURED_SHARE = 8  # of the samples in memory, 1 / 8: so many new ones change their median little
 # an interval longer than so many median periods lacks a sample; jitter of the clock stays below
 _LONG_PERIODS = 1.5
+# between samples; a slower IMU misses motions that matter, and its straight lines are bridges, too
+_SLOW_NS = 30e6
+_SLOW_CUT_NS = 10e6  # of its intervals
 _SHORTEST_CUT_NS = 1e6  # of a gap, for the integration
 _MOST_CUTS = 1000
 
@@ -83,18 +86,18 @@ class ImuHistory:
             times_ns: (S,) of the samples at hand, on the same scale, increasing.
         """
         period_ns = self.period_ns()
-        if not lacks_samples(cuts_ns, times_ns, _LONG_PERIODS * period_ns):
+        longest_ns = _LONG_PERIODS * period_ns
+        if not lacks_samples(cuts_ns, times_ns, min(longest_ns, _SLOW_NS)):
             return None
         after = np.searchsorted(times_ns, 0.5 * (cuts_ns[1:] + cuts_ns[:-1]))
         left = np.concatenate([[-np.inf], times_ns])[after]  # the samples around each step
         right = np.concatenate([times_ns, [np.inf]])[after]
         held = np.isinf(right - left)
         silent = np.where(held, np.minimum(cuts_ns[1:] - left, right - cuts_ns[:-1]), right - left)
-        gap = silent > _LONG_PERIODS * period_ns
-        uncertain = gap | held
-        counts = np.where(
-            uncertain, np.ceil(np.diff(cuts_ns) / max(period_ns, _SHORTEST_CUT_NS)), 1
-        )
+        gap = silent > longest_ns
+        uncertain = gap | held | (silent > _SLOW_NS)
+        cut_ns = _SLOW_CUT_NS if period_ns > _SLOW_NS else max(period_ns, _SHORTEST_CUT_NS)
+        counts = np.where(uncertain, np.ceil(np.diff(cuts_ns) / cut_ns), 1)
         parts = np.clip(counts, 1, _MOST_CUTS).astype(np.int64)
         ends = [
             np.linspace(a, b, n + 1)[:-1]

@@ -212,6 +212,12 @@ class Window:
             rows[:, 3:, self.state["first_attitude"]] -= np.eye(3)
         return out_D_error
 
+    @property
+    def last_step_s(self) -> float:
+        """Time between the two newest clones."""
+        times_ns = self.clones.times_ns
+        return float(times_ns[-1] - times_ns[-2]) * 1e-9
+
     def inflate_process_noise(self, extra: FloatArray) -> None:
         """Add noise (15, 15) to the last step, as if its motion had been known less; the newest
         clone ends it.

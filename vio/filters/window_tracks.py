@@ -53,7 +53,7 @@ _MOST_CHANGE = 4.0  # of the variance from frame to frame that is believed in th
 # Degrees of freedom: 2 for the mean of an inverse chi-square, over the efficiency of a median,
 # 0.64.
 _SPENT_ON_NOISE = 3.0
-_VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
+VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
 # of the tracks used, at least, that the newest frame shows and that stay in the window
 _GOING_ON = 0.1
@@ -190,7 +190,7 @@ class WindowTracks:
         what is left.
         """
         at = tracks.at
-        limits = chi_square_table(_VIEW_PROBABILITY)
+        limits = chi_square_table(VIEW_PROBABILITY)
         wrong: BoolArray = np.empty(at.r.shape[:2], dtype=np.bool_)
         enough: BoolArray = np.empty(len(wrong), dtype=np.bool_)
         if not loops.mark_wrong_views(at.r, at.z_D_p, self.variance, limits, wrong, enough):
@@ -246,7 +246,7 @@ class WindowTracks:
             Whether there were any.
         """
         squared, pixels = self.innovations(predicted, moved)
-        wrong: BoolArray = squared > chi_square_table(_VIEW_PROBABILITY)[pixels]
+        wrong: BoolArray = squared > chi_square_table(VIEW_PROBABILITY)[pixels]
         views = np.zeros(predicted.at.r.shape[:2], dtype=np.bool_)
         views[:, -1] = wrong
         self.table.drop_views(predicted.rows, views)
@@ -304,7 +304,7 @@ class WindowTracks:
         squares = of_views[:, -1]
         pixels = counts[:, -1]
         used = pixels > 0
-        limits = chi_square_table(_VIEW_PROBABILITY)[pixels]
+        limits = chi_square_table(VIEW_PROBABILITY)[pixels]
         return bool(
             used.any() and np.mean(squares[used] < self.variance * limits[used]) > _AGREEMENT
         )

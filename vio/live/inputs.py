@@ -7,6 +7,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -38,6 +39,10 @@ Kind: TypeAlias = Literal["stereo", "mono", "rgbd"]
 Shapes: TypeAlias = "tuple[tuple[int, int] | None, ...]"
 
 _CAME = {"stereo": "two images", "mono": "one image", "rgbd": "an image with depths"}
+# Steps that are shorter from the start are of another unit: frames at 2 kHz, samples at 100 kHz.
+_MIN_FRAME_STEP_NS = 500_000
+_MIN_SAMPLE_STEP_NS = 10_000
+_SHORT_STEPS = 2  # in a row before the unit is doubted: two frames may share an arrival
 _TAKES = {
     "stereo": "two images; give both, or load_rig(..., cameras=1)",
     "mono": "one image without depth_m; depths need a rig with a depth_factor",
@@ -87,8 +92,8 @@ class Inputs:
         self._offset_ns = offset_ns
         self._limit = FrameRateLimit(most_hz)
         self._say = say
-        self._frames = _Stamps("frame")
-        self._samples = _Stamps("sample")
+        self._frames = _Stamps("frame", _MIN_FRAME_STEP_NS)
+        self._samples = _Stamps("sample", _MIN_SAMPLE_STEP_NS)
         self._count = 0  # of frames
         self._kind: str | None = None  # of frames: images or observations
 
@@ -174,6 +179,7 @@ class Inputs:
         times, rows = checked_samples(t_ns, dict(zip(names, (first, second), strict=True)))
         if times:
             self._samples.check_order(times[0])
+            self._samples.check_steps(times)
         sample = ImuSample if source == "imu" else VelocitySample
         return [
             sample(time_ns - self._offset_ns, a, b)
@@ -199,8 +205,12 @@ class _Stamps:
     refused for it.
     """
 
-    def __init__(self, of: str) -> None:
+    def __init__(self, of: str, min_step_ns: int) -> None:
+        """Begin; no sensor gives `of` at steps below `min_step_ns` all the time."""
         self._of = of
+        self._min_step_ns = min_step_ns
+        self._short = 0  # steps so far, where all of them are shorter than that
+        self._units_known = False  # one was longer
         self._last_ns: int | None = None  # taken
         self._step_ns = 0
         self._held_ns: int | None = None  # left out
@@ -212,6 +222,26 @@ class _Stamps:
                 f"{self._of} at {time_ns} ns is not after the last one at {self._last_ns} ns; give "
                 "them in order of "
                 "time, each once"
+            )
+        self._check_unit(time_ns)
+
+    def _check_unit(self, time_ns: int) -> None:
+        """Raise DataError where all steps so far are too short for nanoseconds."""
+        if self._last_ns is None or self._units_known or self._short < _SHORT_STEPS:
+            return
+        self._refuse(time_ns - self._last_ns)
+
+    def check_steps(self, times_ns: list[int]) -> None:
+        """Raise DataError where all steps between several first stamps are too short."""
+        if len(times_ns) > _SHORT_STEPS and not self._units_known:
+            self._refuse(max(b - a for a, b in pairwise(times_ns)))
+
+    def _refuse(self, step_ns: int) -> None:
+        """Raise DataError if a step is too short for nanoseconds."""
+        if step_ns < self._min_step_ns:
+            raise DataError(
+                f"{self._of}s come {step_ns} ns apart, which no sensor does: the stamps are "
+                "numbers, milliseconds or microseconds; give integer nanoseconds"
             )
 
     def takes(self, time_ns: int, say: Callable[[str], None]) -> bool:
@@ -231,6 +261,9 @@ class _Stamps:
                 )
                 return False
             step_ns = since_held_ns if is_as_long else self._step_ns
+        if last_ns is not None:
+            self._units_known |= step_ns >= self._min_step_ns
+            self._short += 1
         self._last_ns = time_ns
         self._held_ns = None
         self._step_ns = step_ns or self._step_ns

@@ -73,8 +73,21 @@ class RunHealth:
         """Return the findings of a frame, by what its update did and the estimate after it."""
         found = [*self._gap(index, estimate), *self._features(index, report, estimate)]
         found += self._stereo(index, estimate)
+        found += self._jump(index, report)
         found += self._implausible(index, estimate)
         return tuple(found)
+
+    def _jump(self, index: int, report: UpdateReport) -> list[Finding]:
+        """Report the first time that the gyro's bias has jumped."""
+        jump_radps = report.gyro_jump_radps
+        if jump_radps is None or "gyro jump" in self._reported:
+            return []
+        self._reported.add("gyro jump")
+        message = (
+            f"frame {index}: the gyro's bias has jumped by {jump_radps:.2g} rad/s, as all images "
+            "show: the sensor was shocked or restarted; the bias was estimated anew, by the images"
+        )
+        return [Finding("gyro-jumped", message, index, figures={"jump_radps": jump_radps})]
 
     def _gap(self, index: int, estimate: Estimate) -> list[Finding]:
         """Report a time without frames, with what is known of the pose after it."""

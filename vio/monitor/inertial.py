@@ -52,6 +52,7 @@ class InertialCheck:
         self._samples = Samples()
         self._coverage = SampleCoverage()
         self._frames = 0
+        self._jumped = False
         self.reset()
 
     def reset(self) -> None:
@@ -67,6 +68,16 @@ class InertialCheck:
         self.axes_compared = False
         # by the newest judgement of units, axes, signs and clocks, reported yet or not
         self.imu_at_fault = False
+
+    def begin_after_jump(self) -> None:
+        """Restart where the gyro's bias has jumped, as no linear map fits readings before and
+        after it.
+
+        Only once in a run: wrong axes or units look like jumps, too, one after the other.
+        """
+        if not self._jumped:
+            self._jumped = True
+            self.reset()
 
     def imu(self, sample: ImuSample) -> None:
         """Add one sample."""

@@ -270,6 +270,8 @@ class RunMonitor:
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
         self._add(self._health.frame(index, report, estimate))
+        if report.gyro_jump_radps is not None and self._inertial is not None:
+            self._inertial.begin_after_jump()
         if self._seen is not None:
             self._add(self._refusals.frame(self._seen, report, estimate))
         self._scale_lines += self._health.scale(index, estimate)

@@ -1,0 +1,131 @@
+"""The page of the documentation on faults that were drawn, and its tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from tools.faults.kinds import KINDS
+from tools.faults.scores import COVERED, SOON_FRAMES
+
+Row: TypeAlias = dict[str, Any]
+_FAR = 10.0  # standard deviations
+_PAGE = """# Faults that are drawn
+
+`python -m tools.faults.draws` draws kind, recording, size, moment and length of a fault from a seed; the recordings are
+real ones and renders, short (2 to 11 s). Commit {commit}, seeds {seeds}.
+
+*Covered*: the position, relative to the first pose, is within {covered:g} stated standard deviations (root of the
+trace) in every frame, or at most a fifth further off than in the recording as it is. *Flagged*: something is said that
+is not said of the recording as it is; *soon* within {soon} frames of the fault's first frame. *Silent*: neither covered
+nor flagged before the end of the run. *Refused*: the run ends with an error. Kinds marked * were kept aside while the
+checks were written.
+
+## By kind
+
+{kinds}
+
+## Healthy variants
+
+Nothing may be said of these that is not said of the recording as it is.
+
+{healthy}
+
+## Recordings as they are
+
+{clean}
+"""
+
+
+def page(rows: Sequence[Row], commit: str) -> str:
+    """Return the page, Markdown."""
+    kinds, healthy, clean = tables(rows)
+    seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in rows if "seed" in row}))
+    return _PAGE.format(
+        commit=commit,
+        seeds=seeds,
+        covered=COVERED,
+        soon=SOON_FRAMES,
+        kinds=kinds,
+        healthy=healthy,
+        clean=clean,
+    )
+
+
+def tables(rows: Sequence[Row]) -> tuple[str, str, str]:
+    """Return the tables of faults by kind, of healthy variants and of clean runs, Markdown."""
+    faults = [row for row in rows if row.get("half")]
+    healthy = [row for row in rows if "half" in row and row["half"] is None]
+    clean = {(row["source"], row["motion"]): row for row in rows if row["kind"] == "clean"}
+    return _kinds_table(faults), _healthy_table(healthy), _clean_table(list(clean.values()))
+
+
+def _kinds_table(rows: Sequence[Row]) -> str:
+    head = (
+        "| kind | sizes | draws | covered | flagged soon | later | silent | beyond 10 sigma, silent "
+        "| refused | covered or soon | error over sigma: median, worst | ATE over clean: median, "
+        "worst |"
+    )
+    lines = [head, "|---" * 12 + "|"]
+    for name, kind in KINDS.items():
+        own = [row for row in rows if row["kind"] == name]
+        if own:
+            mark = "*" if own[0]["half"] == "kept" else ""
+            same = kind.smallest == kind.largest
+            sizes = "" if same else f"{kind.smallest:g} to {kind.largest:g} {kind.unit}"
+            lines.append(f"| {kind.group}: {name}{mark} | {sizes} | {_figures(own)} |")
+    return "\n".join([*lines, f"| all | | {_figures(rows)} |"])
+
+
+def _figures(rows: Sequence[Row]) -> str:
+    """The cells of a table's line from the number of draws on."""
+    refused = [row for row in rows if "error" in row]
+    ended = [row for row in rows if "error" not in row]
+    covered = sum(row["covered"] for row in ended)
+    soon = [row for row in ended if _is_soon(row)]
+    later = sum(row["flagged_after"] is not None and not _is_soon(row) for row in ended)
+    silent = [row for row in ended if row["silent"]]
+    far = sum(row["ratio"] > _FAR for row in silent)
+    good = len(refused) + sum(row["covered"] or _is_soon(row) for row in ended)
+    share = f"{100 * good / len(rows):.0f} %" if rows else ""
+    ratios = _spread([row["ratio"] for row in ended])
+    ates = _spread([row["ate_m"] / row["clean_ate_m"] for row in ended if row["clean_ate_m"]])
+    counts = (len(rows), covered, len(soon), later, len(silent), far, len(refused))
+    return " | ".join([*map(str, counts), share, ratios, ates])
+
+
+def _is_soon(row: Row) -> bool:
+    after = row["flagged_after"]
+    return after is not None and after <= SOON_FRAMES
+
+
+def _spread(values: Sequence[float]) -> str:
+    return f"{np.median(values):.2g}, {max(values):.3g}" if values else ""
+
+
+def _healthy_table(rows: Sequence[Row]) -> str:
+    lines = [
+        "| variant | draws | flagged | ATE over clean: median, worst | said |",
+        "|---" * 5 + "|",
+    ]
+    for name in dict.fromkeys(row["kind"] for row in rows):
+        own = [row for row in rows if row["kind"] == name]
+        flagged = [row for row in own if row.get("said") or "error" in row]
+        ates = _spread([row["ate_m"] / row["clean_ate_m"] for row in own if row.get("ate_m")])
+        said = "; ".join(
+            dict.fromkeys(line for row in flagged for line in row.get("said", [row.get("error")]))
+        )
+        lines.append(f"| {name} | {len(own)} | {len(flagged)} | {ates} | {said} |")
+    flags = sum(bool(row.get("said")) or "error" in row for row in rows)
+    return "\n".join([*lines, f"| all | {len(rows)} | {flags} | | |"])
+
+
+def _clean_table(rows: Sequence[Row]) -> str:
+    lines = ["| recording | motion | ATE mm | error over sigma, worst |", "|---" * 4 + "|"]
+    for row in rows:
+        if "error" not in row:
+            cells = (row["source"], row["motion"] or "images", f"{1e3 * row['ate_m']:.3g}")
+            lines.append(f"| {' | '.join(cells)} | {row['ratio']:.2g} |")
+    return "\n".join(lines)

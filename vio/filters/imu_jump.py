@@ -1,0 +1,167 @@
+"""A gyro whose bias jumps: the images show another rotation than it does, the same one in all old
+tracks.
+
+A scene that stands still, seen by a body whose gyro is wrong, is off by one rotation in all its
+tracks, while the translation stays as predicted. Things that move by themselves contradict the rest
+of the scene, and what comes into view is not old. Where one rotation explains nearly all old
+tracks, the gyro's bias and this step's rotation become uncertain by its size, and the images
+estimate both anew: equation (N15) of docs/math.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.filters.multiview import CAUCHY, Residuals
+from vio.filters.navigation import Growth, NavState
+from vio.filters.window_tracks import VIEW_PROBABILITY, LinearTracks, chi_square_table
+from vio.geometry.lie import FloatArray, so3_hat
+from vio.records import BoolArray
+
+_MIN_OLD_VIEWS = 4  # of a track before the newest: what it shows has been part of the scene
+_MIN_OLD_TRACKS = 15
+_AGREEMENT = 0.8  # share of the old tracks that one rotation must explain
+_MAX_TURN_RAD = 0.2  # standard deviation of the rotation before it is fitted
+_ITERATIONS = 8  # of the robust fit
+_START_STEPS = 30  # of a filter that has begun, in which a bias that is learned looks like a jump
+_CHANGED_SIGMAS = 3.0  # of the bias before: less is no jump
+_LIKE = 0.5  # of the larger one: rates of two steps that differ by less are one jump
+
+
+def turn_of_images(
+    predicted: LinearTracks, moved: FloatArray, T_world_imu: FloatArray
+) -> FloatArray | None:
+    """Fit the rotation (3,) of the body, world frame, by which the newest pixels of old tracks
+    differ from the predicted ones.
+
+    None: it is within what was predicted, or no single one explains nearly all of them.
+
+    Args:
+        predicted: tracks linearised where the motion model has the newest clone.
+        moved: covariance (6, 6) of its motion since the clone before, `[rho; phi]` on the world's
+            side.
+        T_world_imu: (4, 4) the body's pose there.
+    """
+    old = _is_old(predicted.at)
+    if int(old.sum()) < _MIN_OLD_TRACKS:
+        return None
+    p_body = T_world_imu[:3, 3]
+    J = predicted.at.z_D_p[old, -1]
+    r = predicted.at.r[old, -1]
+    arms = predicted.p_world[old] - p_body
+    B = np.concatenate([J, -J @ so3_hat(arms)], axis=2)  # by the body's motion about itself
+    about_body = np.eye(6)
+    about_body[:3, 3:] = -so3_hat(p_body)
+    expected = about_body @ moved @ about_body.T
+    covariance = expected.copy()
+    covariance[3:, 3:] += _MAX_TURN_RAD**2 * np.eye(3)
+    information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    motion, P, left = _robust_fit(B, r, information, predicted.variance)
+    turn: FloatArray = motion[3:]
+    squared = float(turn @ np.linalg.solve(expected[3:, 3:] + P[3:, 3:], turn))
+    if squared < chi_square_table(VIEW_PROBABILITY)[3]:
+        return None
+    pixels = np.any(J != 0.0, axis=2).sum(axis=1)
+    limits = predicted.variance * chi_square_table(VIEW_PROBABILITY)[pixels]
+    if np.mean(np.sum(left**2, axis=1) < limits) <= _AGREEMENT:
+        return None
+    return turn
+
+
+def gyro_doubt(growth: Growth, nav: NavState, turn: FloatArray, seconds: float) -> FloatArray:
+    """Return the covariance (15, 15) that a navigation state lacks after a step over which the
+    gyro was off by a rotation (3,): that of a bias of this size, and of such a rotation alone.
+
+    Args:
+        growth: of the state's error over the step.
+        nav: the state after it.
+        turn: the rotation, rad.
+        seconds: length of the step.
+    """
+    size = float(np.linalg.norm(turn))
+    by_bias = growth.Phi[:, 9:12] * (size / seconds)
+    by_turn = np.zeros((len(growth.Phi), 3))
+    by_turn[:3] = so3_hat(nav.T_world_imu[:3, 3])
+    by_turn[3:6] = np.eye(3)
+    by_turn[6:9] = so3_hat(nav.velocity)
+    by_turn *= size
+    out: FloatArray = by_bias @ by_bias.T + by_turn @ by_turn.T
+    return out
+
+
+class GyroJump:
+    """Tells a gyro whose bias has jumped from single steps that contradict it, as shocks do."""
+
+    def __init__(self) -> None:
+        self._steps = 0  # of the filter since its start
+        self._rate: FloatArray | None = None  # (3,) that the last step was off by
+        # (3,) the bias before it was doubted, and its standard deviations then; None: it is not
+        self._before: tuple[FloatArray, FloatArray] | None = None
+
+    def is_settled(self) -> bool:
+        """Take a step; return whether the start, which learns bias and tilt, is over."""
+        self._steps += 1
+        return self._steps > _START_STEPS
+
+    def repeats(self, rate: FloatArray) -> bool:
+        """Take the rate (3,) that a step was off by; return whether the last step was off by the
+        like.
+        """
+        last = self._rate
+        self._rate = rate
+        if last is None:
+            return False
+        size = max(float(np.linalg.norm(rate)), float(np.linalg.norm(last)))
+        return float(np.linalg.norm(rate - last)) < _LIKE * size
+
+    def doubt(self, bias: FloatArray, sigma: FloatArray) -> None:
+        """Take the bias (3,) and its standard deviations (3,) as they were before they are
+        doubted.
+        """
+        if self._before is None:
+            self._before = bias, sigma
+
+    def agrees(self, bias: FloatArray) -> float | None:
+        """Take the bias (3,) after a step that the gyro has predicted.
+
+        Return by how much it has changed since it was doubted, rad/s; None: it was not, or it has
+        come back.
+        """
+        self._rate = None
+        if self._before is None:
+            return None
+        before, sigma = self._before
+        self._before = None
+        changed = float(np.linalg.norm(bias - before))
+        return changed if changed > _CHANGED_SIGMAS * float(np.linalg.norm(sigma)) else None
+
+
+def _is_old(at: Residuals) -> BoolArray:
+    """Which tracks (F,) the newest clone sees, and several before it have seen."""
+    seen = np.any(at.z_D_p != 0.0, axis=(2, 3))
+    old: BoolArray = seen[:, -1] & (seen[:, :-1].sum(axis=1) >= _MIN_OLD_VIEWS)
+    return old
+
+
+def _robust_fit(
+    B: FloatArray, r: FloatArray, information: FloatArray, variance: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit a motion (6,) with a prior's information to residuals (F, 4) by Cauchy weights.
+
+    Returns:
+        The motion, `r = B motion + noise`, its covariance (6, 6), and the residuals left (F, 4).
+    """
+    width = CAUCHY * CAUCHY * variance
+    left = r
+    motion = np.zeros(6)
+    A = information
+    # the first scale is that of the residuals themselves, as all of them are off together
+    scale = max(width, float(np.median(np.sum(r**2, axis=1))))
+    for _ in range(_ITERATIONS):
+        weight = 1 / (1 + np.sum(left**2, axis=1) / scale)
+        A = np.einsum("f,fki,fkj->ij", weight, B, B) / variance + information
+        b = np.einsum("f,fki,fk->i", weight, B, r) / variance
+        motion = np.linalg.solve(A, b)
+        left = r - B @ motion
+        scale = max(width, 0.25 * scale)
+    return motion, np.asarray(np.linalg.inv(A), dtype=np.float64), left
