@@ -93,6 +93,9 @@ def test_gtsam() -> None:
     pose = gtsam.to_pose3(T)
     np.testing.assert_allclose(gtsam.from_pose3(pose), T, atol=1e-14)
     np.testing.assert_allclose(pose.transformFrom(POINTS[0]), transform_points(T, POINTS[0]))
+    x, y, z, w = quat_xyzw_from_rotation(T[:3, :3])
+    np.testing.assert_allclose(theirs.Rot3.Quaternion(w, x, y, z).matrix(), T[:3, :3], atol=1e-14)
+    np.testing.assert_allclose(pose.rotation().toQuaternion().coeffs(), [x, y, z, w], atol=1e-14)
     stated = gtsam.to_pose3_covariance(COVARIANCE)
     np.testing.assert_array_equal(gtsam.from_pose3_covariance(stated), COVARIANCE)
     errors = [pose.localCoordinates(gtsam.to_pose3(sample)) for sample in _samples()]
@@ -213,6 +216,8 @@ def test_kornia() -> None:
     assert (camera.width, camera.height, camera.K.tolist()) == (640, 480, CAMERA.K.tolist())
     se3 = kornia.to_se3(T)
     np.testing.assert_allclose(kornia.from_se3(se3), T, atol=1e-12)
+    xyzw = quat_xyzw_from_rotation(T[:3, :3])
+    np.testing.assert_allclose(se3.so3.q.data.detach().numpy()[0], np.roll(xyzw, 1), atol=1e-12)
     many = type(se3).from_matrix(torch.tensor(_samples()))
     inverse = type(se3).from_matrix(torch.tensor(np.repeat(se3_inverse(T)[None], SAMPLES, axis=0)))
     assert_predicts(COVARIANCE, (inverse * many).log().detach().numpy())
