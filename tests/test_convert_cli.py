@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ from tests.same_events import assert_same_events
 from vio.cli import main
 from vio.config import load_config
 from vio.datasets import open_dataset
-from vio.records import VelocitySample
+from vio.records import ImuSample, StereoFrame, VelocitySample
 from vio.runs.pipeline import run
 
 BAGS = ("rosbag2", "mcap")
@@ -200,3 +202,42 @@ def test_rectify_names_convert_for_other_kinds(
     assert main(["convert", str(flight), "--to", "plain", "--out", str(plain)]) == 0
     assert main(["rectify", str(plain), "--out", str(tmp_path / "r")]) == 1
     assert "is of kind plain; rectify it with vio convert --to euroc" in capsys.readouterr().err
+
+
+def test_a_recording_becomes_one_of_spectacular_ai(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    given = ["convert", str(flight), "--to", "spectacularai", "--out", str(out), "--stop", "5"]
+    assert main(given) == 0
+    dataset = open_dataset(flight)
+    events = list(dataset.events(0, 5))
+    frames = [event for event in events if isinstance(event, StereoFrame)]
+    samples = [event for event in events if isinstance(event, ImuSample)]
+    rows = [json.loads(line) for line in (out / "data.jsonl").read_text().splitlines()]
+    origin_ns = events[0].time_ns
+    for kind, name in (("gyroscope", "gyro"), ("accelerometer", "accel")):
+        found = [row for row in rows if row.get("sensor", {}).get("type") == kind]
+        assert [row["sensor"]["values"] for row in found] == [
+            getattr(sample, name).tolist() for sample in samples
+        ]
+        assert [origin_ns + round(1e9 * row["time"]) for row in found] == [
+            sample.time_ns for sample in samples
+        ]
+    assert [row["number"] for row in rows if "frames" in row] == [0, 1, 2, 3, 4]
+    cameras = json.loads((out / "calibration.json").read_text())["cameras"]
+    T0, T1 = (np.array(camera["imuToCamera"]) for camera in cameras)
+    np.testing.assert_array_equal(T0, dataset.recording.T_cam0_imu)
+    assert (T1 @ np.linalg.inv(T0))[0, 3] == pytest.approx(-dataset.recording.camera.baseline_m)
+    for side, name in (("left", "data.avi"), ("right", "data2.avi")):
+        video = cv2.VideoCapture(str(out / name))
+        for frame in frames:
+            read, image = video.read()
+            assert read
+            assert np.abs(image[:, :, 0].astype(int) - getattr(frame, side)).max() <= 1
+        assert not video.read()[0]
+
+
+def test_spectacular_ai_needs_an_imu(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = make_kitti(tmp_path / "drive")
+    given = ["convert", str(source), "--to", "spectacularai", "--out", str(tmp_path / "out")]
+    assert main(given) == 1
+    assert "needs an IMU" in capsys.readouterr().err

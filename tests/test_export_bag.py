@@ -10,7 +10,7 @@ import pytest
 from tests.commands import json_of, refused
 from vio.cli import main
 from vio.geometry.lie import rotation_from_quat_xyzw, se3_exp, se3_inverse, so3_log
-from vio.offline.export_bag import ros_covariance
+from vio.interop.ros import to_fixed_axes_covariance
 from vio.runs.finished import read_finished_run
 
 rosbags = pytest.importorskip("rosbags", reason="needs rosbags")
@@ -84,7 +84,7 @@ def test_covariances_are_those_of_ros() -> None:
     ros_D_xi = np.array(columns).T
     root = np.random.default_rng(0).normal(size=(6, 6))
     expected = ros_D_xi @ root @ root.T @ ros_D_xi.T
-    np.testing.assert_allclose(ros_covariance(T, root @ root.T), expected, atol=1e-4)
+    np.testing.assert_allclose(to_fixed_axes_covariance(T, root @ root.T), expected, atol=1e-4)
 
 
 def test_options_of_another_form_are_refused(

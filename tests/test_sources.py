@@ -29,7 +29,10 @@ from vio.config import Config
 from vio.datasets.rigs import load_rig
 from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.files.trajectories import read_trajectory
+from vio.geometry.distortion import project_point
 from vio.records import ImuSample, StereoFrame
+from vio.sources.oak import OakSource
+from vio.sources.realsense import RealSenseSource
 from vio.sources.recorder import Form, Recorder
 from vio.sources.run import run_source
 from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame, open_source
@@ -394,10 +397,11 @@ class _OakDevice:
     """
 
     CameraBoardSocket = SimpleNamespace(CAM_B="left", CAM_C="right")
-    CameraModel = SimpleNamespace(Perspective=0, Fisheye=1)
+    CameraModel = SimpleNamespace(Perspective=0, Fisheye=1, RadialDivision=4)
     IMUSensor = SimpleNamespace(ACCELEROMETER_RAW=0, GYROSCOPE_RAW=1)
     ImgFrame = SimpleNamespace(Type=SimpleNamespace(GRAY8="gray"))
     node = SimpleNamespace(Camera="Camera", IMU="IMU")
+    model = 0
     out = property(lambda self: self)
 
     def __init__(self) -> None:
@@ -454,11 +458,12 @@ class _OakDevice:
     def getCameraIntrinsics(self, socket: str, width: int, height: int) -> Any:
         return [[400.0, 0.0, width / 2], [0.0, 400.0, height / 2], [0.0, 0.0, 1.0]]
 
-    def getDistortionCoefficients(self, socket: str) -> list[float]:
-        return self.coefficients
+    def getEepromData(self) -> Any:
+        stored = SimpleNamespace(distortionCoeff=self.coefficients)
+        return SimpleNamespace(cameraData={"left": stored, "right": stored})
 
     def getDistortionModel(self, socket: str) -> int:
-        return self.CameraModel.Perspective
+        return self.model
 
     def start(self) -> None:
         self.is_open = True
@@ -510,6 +515,59 @@ def test_an_oak_gives_pairs_samples_and_calibration_in_metres(
         open_source("oak:")
     with pytest.raises(DataError, match="no such device; connected are: 14442C"):
         open_source("oak:other")
+
+
+def test_an_oak_takes_each_lens_model_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = _OakDevice()
+    monkeypatch.setitem(sys.modules, "depthai", device)  # type: ignore[arg-type]
+    device.coefficients = []
+    assert open_source("oak:").rig.cam0.model == "pinhole"
+    device.model = device.CameraModel.Fisheye
+    with pytest.raises(DataError, match="a fisheye lens with 0 stored coefficients"):
+        open_source("oak:")
+    device.coefficients = [0.1, 0.02, 0.0, 0.0, *[0.0] * 10]
+    lens = open_source("oak:").rig.cam0
+    assert (lens.model, lens.coefficients) == ("equidistant", (0.1, 0.02, 0.0, 0.0))
+    device.model = device.CameraModel.RadialDivision
+    with pytest.raises(DataError, match="lens model 4 is not known; give --calibration FILE"):
+        open_source("oak:")
+
+
+@pytest.mark.parametrize("name", ["brown_conrady", "inverse_brown_conrady"])
+def test_a_realsense_lens_projects_as_librealsense(name: str) -> None:
+    rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed")
+    found = rs.intrinsics()
+    found.width, found.height, found.fx, found.fy = 640, 480, 430.0, 430.0
+    found.ppx, found.ppy, found.model = 322.0, 238.0, getattr(rs.distortion, name)
+    found.coeffs = [0.15, -0.45, -0.001, 0.0005, 0.4]
+    source = object.__new__(RealSenseSource)
+    source._name = "realsense:"
+    lens = source._lens(found)
+    points = np.array([[x, y, 1.0] for x in (-0.7, 0.1, 0.7) for y in (-0.5, 0.2, 0.5)])
+    theirs = [rs.rs2_project_point_to_pixel(found, point.tolist()) for point in points]
+    plain = points[:, :2] * 430.0 + [322.0, 238.0]
+    assert np.abs(theirs - plain).max() > 5.0
+    np.testing.assert_allclose(project_point(lens, points)[0], theirs, atol=0.04)
+
+
+def test_what_depthai_stores_is_read_without_its_distortion() -> None:
+    """With depthai's own classes: a fisheye lens that has no coefficients stored ends the process
+    in `getDistortionCoefficients`.
+    """
+    dai = pytest.importorskip("depthai", reason="depthai is not installed")
+    stored = dai.CalibrationHandler()
+    socket = dai.CameraBoardSocket.CAM_B
+    stored.setCameraIntrinsics(socket, [[400.0, 0, 320], [0, 400.0, 200], [0, 0, 1]], 640, 400)
+    source = object.__new__(OakSource)
+    source._dai = dai
+    source._name = "oak:"
+    for model in ("Fisheye", "RadialDivision", "Equirectangular", "Cylindrical"):
+        stored.setCameraType(socket, getattr(dai.CameraModel, model))
+        with pytest.raises(DataError, match="fisheye lens with 0|" + model):
+            source._lens(stored, socket)
+    stored.setDistortionCoefficients(socket, [0.1, 0.02, 0.0, 0.0])
+    stored.setCameraType(socket, dai.CameraModel.Fisheye)
+    assert source._lens(stored, socket).model == "equidistant"
 
 
 def test_the_stand_in_has_only_names_of_depthai() -> None:

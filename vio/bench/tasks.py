@@ -198,6 +198,12 @@ def _source(text: str, data: Path) -> tuple[str, Path]:
     return "", (data / text).absolute()
 
 
+def source_of(text: str, data: Path) -> str:
+    """Return a sequence's source with an absolute path, as `open_dataset` takes it."""
+    kind, path = _source(text, data)
+    return f"{kind}{path}"
+
+
 def _without_files(
     config: dict[str, Any],
     data: Path,

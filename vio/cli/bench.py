@@ -61,6 +61,13 @@ def add_parser(commands: Any) -> None:
         metavar="DIR",
         help="other systems' SEQUENCE.SYSTEM.tum, for the tables",
     )
+    parser.add_argument(
+        "--run-peer",
+        choices=("spectacularai",),
+        help="first run this system on the suite's recordings, in an environment of its own below "
+        "--cache (made on request; its licence is said: free for non-commercial use), as further "
+        "rows of the tables",
+    )
     parser.add_argument("--only", default="", metavar="NAME,…", help="these sequences alone")
     parser.add_argument(
         "--configurations", default="", metavar="NAME,…", help="these configurations alone"
@@ -147,6 +154,8 @@ def _bench(args: argparse.Namespace) -> int:
     )
     if args.list:
         return _list(suite, place.data, args)
+    if args.run_peer is not None:
+        place = _with_peer(suite, place, args)
     if args.revision is not None:
         run_in_turns(
             suite,
@@ -163,6 +172,22 @@ def _bench(args: argparse.Namespace) -> int:
         text = f"interrupted; finished tasks are kept in {place.cache}, and the same command goes on with the others"
         raise StoppedError(text, status=128 + getattr(stop, "number", 2)) from stop
     return _report(args, place.out, result)
+
+
+def _with_peer(suite: Any, place: Any, args: argparse.Namespace) -> Any:
+    """Run another system, and return the place with its trajectories."""
+    from vio.bench.run_peers import run_peer
+
+    if args.peers is not None:
+        raise ConfigError("give --peers or --run-peer, not both")
+    folder = run_peer(
+        args.run_peer,
+        suite,
+        place.data,
+        place.cache,
+        lambda text: None if args.quiet else print(text, file=sys.stderr),
+    )
+    return replace(place, peers=folder)
 
 
 def _list(suite: Any, data: Path, args: argparse.Namespace) -> int:

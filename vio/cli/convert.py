@@ -16,7 +16,7 @@ from vio.cli.output import ProgressBar, print_result
 from vio.errors import NOTE, ConfigError
 
 MARKER = "conversion.json"
-_FORMS = ("euroc", "kitti", "plain", "rosbag2", "mcap")
+_FORMS = ("euroc", "kitti", "plain", "rosbag2", "mcap", "spectacularai")
 _TRAJECTORIES = ("tum", "kitti", "euroc")
 
 
@@ -26,7 +26,8 @@ def add_parser(commands: Any) -> None:
         help="write a recording or a trajectory in another format",
         description="Write any recording of images, such as a ROS bag or two videos, as an EuRoC, "
         "a KITTI or a plain "
-        "folder or as a ROS 2 bag: frame by frame, rectified as a run sees them, with IMU, "
+        "folder, as a ROS 2 bag, or for the SDK of Spectacular AI: frame by frame, rectified as a "
+        "run sees them, with IMU, "
         "velocities and ground "
         "truth. Write a trajectory file (TUM, KITTI, EuRoC) in another of these forms; --to tum "
         "writes a recording's "

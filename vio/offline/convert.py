@@ -37,6 +37,7 @@ from vio.errors import DataError
 from vio.files.text import exact_text, seconds_text, write_text
 from vio.files.trajectories import in_first_cam0, write_tum
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.offline.convert_spectacularai import write_spectacularai
 from vio.protocols import Dataset, Progress
 from vio.records import (
     Event,
@@ -49,7 +50,7 @@ from vio.records import (
 )
 
 Folder: TypeAlias = Literal["euroc", "kitti", "plain"]
-Form: TypeAlias = Literal["euroc", "kitti", "plain", "rosbag2", "mcap"]
+Form: TypeAlias = Literal["euroc", "kitti", "plain", "rosbag2", "mcap", "spectacularai"]
 
 
 @dataclass(slots=True)
@@ -87,8 +88,8 @@ def convert(
         dataset: a recording with images.
         out: the folder.
         form: "euroc" (mav0), "kitti" (image_0 image_1 calib.txt times.txt), "plain" (left right,
-            Kalibr's file), or a ROS 2 bag of SQLite ("rosbag2") or MCAP ("mcap") with Kalibr's file
-            beside it.
+            Kalibr's file), a ROS 2 bag of SQLite ("rosbag2") or MCAP ("mcap") with Kalibr's file
+            beside it, or what the SDK of Spectacular AI replays ("spectacularai").
         start: first frame.
         stop: frame after the last one; None: to the end.
         progress: called after each frame.
@@ -106,6 +107,11 @@ def convert(
         _check_frames(done.frames, recording)
         _write_kalibr(out, recording, noise if done.imu_samples else None)
         return replace(done, notes=_bag_notes(done, recording))
+    if form == "spectacularai":
+        frames, samples, origin_ns = write_spectacularai(dataset, out, start, stop, progress)
+        _check_frames(frames, recording)
+        note = f"times are seconds from {origin_ns} ns; velocities and ground truth have no place"
+        return Converted(frames, samples, 0, (note,))
     written = _write_images(dataset, out, form, start, stop, progress)
     _check_frames(len(written.times_ns), recording)
     writers: dict[Folder, Callable[[Path, Recording, _Written, ImuDensities | None], list[str]]] = {

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from vio.datasets.bags.writer import Storage, bag_writer
 from vio.files.trajectories import read_trajectory
-from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.lie import se3_inverse
+from vio.interop.ros import to_fixed_axes_covariance
 from vio.records import Trajectory
 from vio.runs.finished import FinishedRun, read_finished_run
 
@@ -62,23 +61,8 @@ def export_bag(run: Path, out: Path, storage: Storage) -> ExportedBag:
         covariances = finished.estimates["covariance"]
         for time_ns, T, covariance in zip(times, trajectory.T_world_body, covariances, strict=True):
             bag.transform(_WORLD, body, time_ns, T)
-            bag.pose(POSE, _WORLD, time_ns, T, ros_covariance(T, covariance))
+            bag.pose(POSE, _WORLD, time_ns, T, to_fixed_axes_covariance(T, covariance))
     return ExportedBag(len(times), len(finished.points), 0 if reference is None else len(reference))
-
-
-def ros_covariance(T_world_body: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the covariance (6, 6) of x y z and of rotations about the world's axes, as
-    PoseWithCovariance has it.
-
-    Args:
-        T_world_body: (4, 4).
-        covariance: (6, 6) of xi in T_body_world = exp(xi) T_body_world_hat, [rho; phi].
-
-    To first order xi moves the position by -R rho and the orientation by -R phi about the world's
-    axes; R is the rotation of T_world_body.
-    """
-    turn = np.kron(np.eye(2), T_world_body[:3, :3])
-    return turn @ covariance @ turn.T
 
 
 def _reference(run: FinishedRun) -> Trajectory | None:

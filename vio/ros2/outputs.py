@@ -15,9 +15,9 @@ import numpy as np
 
 from vio.errors import VioError
 from vio.geometry.lie import FloatArray, se3_inverse
+from vio.interop.ros import to_fixed_axes_covariance
 from vio.live.live_odometry import EstimateStream, LiveOdometry
 from vio.live.results import GrowingTrajectory, live_body, live_trajectory, write_calibration
-from vio.offline.export_bag import ros_covariance
 from vio.records import NS_PER_S, Estimate
 from vio.ros2.sensors import Sensors
 from vio.ros2.transport import Transport, publisher
@@ -147,7 +147,7 @@ class Outputs:
         T = estimate.T_world_imu
         self._recent.append((time_ns, T))
         names = self._frames
-        covariance = ros_covariance(T, estimate.covariance)
+        covariance = to_fixed_axes_covariance(T, estimate.covariance)
         self._out.odometry(
             self._names[ODOMETRY],
             (names.odom, names.base),

@@ -14,7 +14,7 @@ import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.errors import DataError, MissingDependencyError
-from vio.geometry.distortion import CameraModel
+from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.live.pairing import Pairing
 from vio.records import Image
 from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame
@@ -25,6 +25,7 @@ _RATE_HZ = 20.0
 _IMU_HZ = 200
 # of OpenCV's rational polynomial; the device stores thin prisms and tilt behind them
 _COEFFICIENTS = 8
+_FISHEYE_COEFFICIENTS = 4
 _PAUSE_S = 0.002
 _LOST_S = 5.0
 
@@ -99,15 +100,36 @@ class OakSource:
         self._pipeline.start()
 
     def _lens(self, stored: Any, socket: Any) -> CameraModel:
+        """Return the lens of a camera as the device has stored it.
+
+        Raises:
+            DataError: it is none of OpenCV's models, or lacks its coefficients.
+        """
         K = np.array(stored.getCameraIntrinsics(socket, _WIDTH, _HEIGHT), dtype=np.float64)
-        values = stored.getDistortionCoefficients(socket)
-        if stored.getDistortionModel(socket) == self._dai.CameraModel.Fisheye:
-            return camera_from_matrix(K, _WIDTH, _HEIGHT, "equidistant", values[:4], self._name)
+        models = self._dai.CameraModel
+        model = stored.getDistortionModel(socket)
+        # depthai ends the process where it is asked for those of a fisheye lens that has none
+        values = list(stored.getEepromData().cameraData[socket].distortionCoeff)
+        if model == models.Fisheye:
+            if len(values) < _FISHEYE_COEFFICIENTS:
+                raise DataError(
+                    f"{self._name}: a fisheye lens with {len(values)} stored coefficients, where "
+                    f"{_FISHEYE_COEFFICIENTS} are needed; calibrate the device, or give "
+                    "--calibration FILE"
+                )
+            found = values[:_FISHEYE_COEFFICIENTS]
+            return camera_from_matrix(K, _WIDTH, _HEIGHT, "equidistant", found, self._name)
+        if model != models.Perspective:
+            raise DataError(
+                f"{self._name}: its lens model {getattr(model, 'name', model)} is not known; give "
+                "--calibration FILE"
+            )
         if any(values[_COEFFICIENTS:]):
             raise DataError(
                 f"{self._name}: its lens model has thin prisms or tilt; give --calibration FILE"
             )
-        return camera_from_matrix(K, _WIDTH, _HEIGHT, "radtan", values[:_COEFFICIENTS], self._name)
+        kind: DistortionModel = "radtan" if values else "pinhole"
+        return camera_from_matrix(K, _WIDTH, _HEIGHT, kind, values[:_COEFFICIENTS], self._name)
 
     def events(self) -> Iterator[SourceEvent | None]:
         """Yield pairs and samples.

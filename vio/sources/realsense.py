@@ -32,9 +32,12 @@ _LOST_S = 5.0
 _WAITING = 1000  # frames and samples that may wait for the reader
 
 # The distortion of the infrared images, which the device rectifies; of raw ones, OpenCV's.
+# `inverse_brown_conrady` distorts as `brown_conrady` does, whatever its name says, but for second
+# order terms: below 0.04 px by librealsense's own projection.
 _MODELS: dict[str, Any] = {
     "none": "pinhole",
     "brown_conrady": "radtan",
+    "inverse_brown_conrady": "radtan",
     "kannala_brandt4": "equidistant",
 }
 
