@@ -368,6 +368,16 @@ def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatAr
     return A, b
 
 
+def radial_focal(camera: StereoCamera) -> FloatArray:
+    """Return the shares (2,) of (R8) by integrals over the image: the stretch that is nearest to
+    the displacement by k1 and by k2.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    x, y = np.meshgrid(nodes * camera.cu / camera.fu, nodes * camera.cv / camera.fv)
+    r2, area = x * x + y * y, np.outer(weights, weights)
+    return np.array([np.sum(area * r2 * r2**n) / np.sum(area * r2) for n in (1, 2)])
+
+
 def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
     """Derivatives of pixels (..., 4) by the coefficients of (R3) and (R4), (..., 4, 10)."""
     x, xr = ((z[..., c] - camera.cu) / camera.fu for c in (0, 2))
@@ -380,6 +390,8 @@ def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
         out[..., column, 4:8], out[..., column, 9] = camera.fu * along, camera.fu * u
         if column == 0:
             out[..., 1, 4:8], out[..., 1, 9] = camera.fv * across, camera.fv * y
+    for axis, moved in ((0, camera.fu * x), (1, camera.fv * y), (2, camera.fu * x)):
+        out[..., axis, 4:6] -= moved[..., None] * radial_focal(camera)
     r2 = xr * xr + y * y
     out[..., 2, :4] = camera.fu * np.stack([one, xr, r2, r2 * r2], axis=-1)
     out[..., 2, 8] = z[..., 2] - z[..., 0]

@@ -674,7 +674,7 @@ def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     info = multiview.track_information(CAMERA, T, at, p, weight)
     H = ErrorColumns(CAMERA).jacobian(expected[: len(p)])
     np.testing.assert_allclose(
-        H, numpy_twins.field_jacobian(CAMERA, expected[: len(p)]), rtol=1e-12
+        H, numpy_twins.field_jacobian(CAMERA, expected[: len(p)]), rtol=1e-12, atol=1e-12
     )
     ours = stereo_calibration.stereo_columns(ErrorColumns(CAMERA), at, expected[: len(p)], weight)
     columns = numpy_twins.stereo_columns(at, H, info.q.p_D_q, weight)

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from tests import test_filter_truth
 from tests.numerics import numeric_jacobian
-from tests.numpy_twins import point_D_pose
+from tests.numpy_twins import point_D_pose, radial_focal
 from tests.test_filter_truth import SETTINGS, Course, Run, Spoil, fly
 from tests.test_multiview import T_CAM0_WORLD
 from vio.cameras.rectification_error import (
@@ -92,6 +92,10 @@ def test_error_jacobian_equals_central_differences_of_distorted_projections() ->
         left = [CAMERA.cu, CAMERA.cv] + (left - [CAMERA.cu, CAMERA.cv]) * np.exp(s[9])
         right[:, 0] = CAMERA.cu + (right[:, 0] - CAMERA.cu) * np.exp(s[9])
         right[:, 0] += (z[:, 0] - z[:, 2]) * (1 - np.exp(s[8]))
+        longer = radial_focal(CAMERA) @ s[4:6]
+        moved = longer * (z[:, :2] - [CAMERA.cu, CAMERA.cv])
+        left -= moved
+        right[:, 0] -= moved[:, 0]
         right[:, 1] = z[:, 3]  # right rows are not measured
         return np.concatenate([left, right], axis=1)
 

@@ -18,7 +18,7 @@ from dataclasses import field as dataclass_field
 
 import numpy as np
 
-from vio.cameras.rectification_error import error_basis
+from vio.cameras.rectification_error import error_basis, radial_focal
 from vio.cameras.rig import Rig, rig_of_rectified
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, project_point, rectified_pair
@@ -337,7 +337,9 @@ class _Frame:
         centre = se3_inverse(T_cam1_cam0)[:3, 3]
         down = self.R_rect_cam0[1] * named["ty"] * np.linalg.norm(centre)
         centre = (centre + down) / np.hypot(1.0, named["ty"])
-        return replace(given, cam0=cam0, cam1=cam1, T_cam1_cam0=se3_from_parts(R, -R @ centre))
+        out = replace(given, cam0=cam0, cam1=cam1, T_cam1_cam0=se3_from_parts(R, -R @ centre))
+        longer = float(radial_focal(self.camera) @ [k, k2])
+        return _scaled(out, longer, -longer)
 
     def as_seen(self, x: FloatArray) -> FloatArray:
         """Return where the given rectification shows the grid's pixels (N, 4) if it is off by

@@ -76,6 +76,13 @@ def vertical_disparity_terms(camera: StereoCamera, z: FloatArray) -> tuple[Float
     return rows, common
 
 
+def radial_focal(camera: StereoCamera) -> FloatArray:
+    """Return by how much (2,) the logarithm of a calibrated focal length is too large for one unit
+    of k1 and of k2, equation (R8).
+    """
+    return np.array(_radial_focal(camera_args(camera)))
+
+
 def corrected_pixels(
     camera: StereoCamera,
     coefficients: FloatArray,
@@ -140,6 +147,24 @@ def _common_terms(
     r2 = x * x + y * y
     of_columns = fu * x * r2, fu * x * r2 * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x)
     return of_columns, (fv * y * r2, fv * y * r2 * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y)
+
+
+@compiled
+def _radial_focal(camera: CameraArgs) -> tuple[float, float]:
+    """What the focal length of a pinhole is too long by for one unit of k1 and of k2, equation
+    (R8); zero on a cylinder.
+
+    The image is taken to be the rectangle about its principal point.
+    """
+    fu, fv, cu, cv, _, cylinder = camera
+    if cylinder:
+        return 0.0, 0.0
+    xx = (cu / fu) ** 2
+    yy = (cv / fv) ** 2
+    r2 = (xx + yy) / 3.0
+    r4 = (xx**2 + yy**2) / 5.0 + 2.0 * xx * yy / 9.0
+    r6 = (xx**3 + yy**3) / 7.0 + xx * yy * (xx + yy) / 5.0
+    return r4 / r2, r6 / r2
 
 
 @compiled
@@ -263,6 +288,11 @@ def write_view(
             out[0, 4 + k] = left[k]
             out[1, 4 + k] = row[k]
             out[2, 4 + k] = right[k]
+        focal = _radial_focal(camera)
+        for k in range(2):
+            out[0, 4 + k] -= focal[k] * fu * x
+            out[1, 4 + k] -= focal[k] * fv * y
+            out[2, 4 + k] -= focal[k] * fu * x
         out[0, 9] = fu * x
         out[1, 9] = fv * y
         out[2, 9] = fu * xr
@@ -312,12 +342,18 @@ def _write_basis(camera: CameraArgs, z: FloatArray, out: FloatArray) -> None:
     fu, fv, cu, cv, _, _ = camera
     left = np.empty((2, _COLUMNS))
     right = np.empty((2, _COLUMNS))
+    focal = _radial_focal(camera)
     for m in range(len(z)):
         x = (z[m, 0] - cu) / fu
         y = (z[m, 1] - cv) / fv
         xr = (z[m, 2] - cu) / fu
         _write_terms(camera, x, y, 1.0, 1.0, left)
         _write_terms(camera, xr, y, 1.0, 1.0, right)
+        for k in range(2):
+            left[0, 4 + k] -= focal[k] * x
+            left[1, 4 + k] -= focal[k] * y
+            right[0, 4 + k] -= focal[k] * x
+            right[1, 4 + k] -= focal[k] * y
         for k in range(_COLUMNS):
             out[m, 0, k] = left[0, k] * fu if 4 <= k < 8 else 0.0
             out[m, 1, k] = left[1, k] * fv if 4 <= k < 8 else 0.0
@@ -371,6 +407,8 @@ def _correct_pinhole(
     by_focal = np.exp(-focal)
     by_both = np.exp(-focal - baseline)
     metric = baseline != 0.0 or focal != 0.0
+    of_radial = _radial_focal(camera)
+    longer = of_radial[0] * k1 + of_radial[1] * k2
     for m in range(len(z)):
         x = (z[m, 0] - cu) / fu
         y = (z[m, 1] - cv) / fv
@@ -379,10 +417,11 @@ def _correct_pinhole(
         rr2 = xr * xr + y * y
         radial = r2 * (k1 + r2 * k2)
         right_radial = rr2 * (k1 + rr2 * k2)
-        left = x * radial + 2.0 * x * y * q1 + (r2 + 2.0 * x * x) * q2
-        row = y * radial + (r2 + 2.0 * y * y) * q1 + 2.0 * x * y * q2
+        left = x * (radial - longer) + 2.0 * x * y * q1 + (r2 + 2.0 * x * x) * q2
+        row = y * (radial - longer) + (r2 + 2.0 * y * y) * q1 + 2.0 * x * y * q2
         right = a0 + a1 * xr + rr2 * (a2 + rr2 * a3)
         right += xr * right_radial + 2.0 * xr * y * q1 + (rr2 + 2.0 * xr * xr) * q2
+        right -= x * longer
         right += -rows[1] * y + (rows[5] - rows[4]) * xr * y - rows[3] * y * y
         out[m, 0] = z[m, 0] - fu * left if weight[m, 0] > 0.0 else z[m, 0]
         out[m, 1] = z[m, 1] - fv * row if weight[m, 1] > 0.0 else z[m, 1]

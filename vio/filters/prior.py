@@ -171,9 +171,9 @@ class Prior:
             scaled: for measurements in metres, how the errors (D,) move with the logarithm of the
                 world's scale.
             repeated: rows of constants, and the factor by which the measurements repeat what was
-                said of them: these take in that part of it only, while all others take in the
-                whole; the partial-update filter of Brink, Partial-update Schmidt-Kalman filter,
-                JGCD (2017), which keeps the covariance of all errors true.
+                said of them: mean and variance of these go that part of the way only, as if the
+                noise were larger by the factor, while all others take in the whole, equation
+                (R9).
             considered: `H' R^-1 C` (D, 4), C being the derivatives of the residuals by the
                 constants considered.
         """
@@ -193,9 +193,9 @@ class Prior:
         if repeated is not None:
             rows = repeated[0]
             kept = 1 - 1 / repeated[1]
-            delta[rows] += np.sqrt(kept) * (self.delta[rows] - delta[rows])
+            delta[rows] += kept * (self.delta[rows] - delta[rows])
             P[rows, rows] += kept * (self.P[rows, rows] - P[rows, rows])
-            V[rows] += np.sqrt(kept) * (self.error_D_constants[rows] - V[rows])
+            V[rows] += kept * (self.error_D_constants[rows] - V[rows])
         self.P = P
         self.delta = delta
         self.error_D_constants = V
