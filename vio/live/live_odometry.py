@@ -18,6 +18,7 @@ from vio.cameras.rig import Rig
 from vio.config import Config
 from vio.errors import ConfigError, DataError
 from vio.filters.point_map import newest_points
+from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.build import CONFIGURED, MapUse, Parts
@@ -311,6 +312,11 @@ class LiveOdometry(EventInputs[None]):
         each.
         """
         return (*self._odometry.warnings, *self._lines)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the checks have found so far, with codes; see `vio.findings`."""
+        return self._odometry.findings
 
     def landmarks(self) -> Landmarks:
         """Return the points of the map so far, of those that do not change any more the newest;

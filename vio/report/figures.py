@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
 from vio.runs.curves import (
     COLOURS,
@@ -58,6 +59,7 @@ def sections(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Repo
         found.append(_velocity(runs, curves))
     if any(c.truth is not None for c in curves):
         found.append(_errors(runs, curves))
+    found += _integrity(runs)
     found += [_features(runs), _innovations(runs), *_biases(runs), _timing(runs), *_stereo(runs)]
     return found
 
@@ -268,6 +270,25 @@ def _errors(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSect
     return _over_time(
         "Errors", figure, "Against the reference, after one rigid alignment of the whole path."
     )
+
+
+def _integrity(runs: Sequence[FinishedRun]) -> list[ReportSection]:
+    """Draw the integrity of runs that had a finding that matters."""
+    chosen = [
+        (run, colour)
+        for run, colour in zip(runs, COLOURS, strict=False)
+        if "integrity" in run.frames and run.frames["integrity"].any()
+    ]
+    if not chosen:
+        return []
+    figure = _subplots(1, 1)
+    for run, colour in chosen:
+        _frame_curve(figure, run, "integrity", run.name, colour, 1)
+    figure.update_yaxes(
+        tickvals=[0, 1, 2], ticktext=list(INTEGRITIES), range=[-0.1, 2.1], row=1, col=1
+    )
+    text = "Whether estimates may be used, by what was found in images, sensors and estimate."
+    return [_over_time("Integrity", figure, text)]
 
 
 def _features(runs: Sequence[FinishedRun]) -> ReportSection:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.errors import VioError
+from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.interop.ros import to_fixed_axes_covariance
 from vio.live.live_odometry import EstimateStream, LiveOdometry
@@ -164,9 +165,9 @@ class Outputs:
                 )
         if self._slow_ns is None or time_ns - self._slow_ns >= _SLOW_NS:
             self._slow_ns = time_ns
-            self._publish_slowly(time_ns)
+            self._publish_slowly(time_ns, estimate)
 
-    def _publish_slowly(self, time_ns: int) -> None:
+    def _publish_slowly(self, time_ns: int, estimate: Estimate) -> None:
         recent = list(self._recent)
         self._out.path(
             self._names[PATH], self._frames.odom, live_trajectory(self._odometry, recent), time_ns
@@ -179,7 +180,10 @@ class Outputs:
                 self._names[POINTS], self._frames.odom, time_ns, points.p_world[-_POINTS:], sigmas
             )
         warnings = self._odometry.warnings
+        integrity = estimate.integrity
         values = {
+            "integrity": integrity,
+            "findings": ", ".join(estimate.findings),
             "results": str(figures.results),
             "dropped": str(figures.dropped),
             "refused messages": str(self._sensors.refused + figures.refused),
@@ -189,7 +193,8 @@ class Outputs:
             "warnings": str(len(warnings)),
         }
         text = warnings[-1] if warnings else "running"
-        self._out.diagnostics("vio", time_ns, 1 if warnings else 0, text, values)
+        level = max(INTEGRITIES.index(integrity), 1 if warnings else 0)
+        self._out.diagnostics("vio", time_ns, level, text, values)
 
     def _twist(self, estimate: Estimate) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return linear and angular velocity (3,) of the body in its own axes, and their

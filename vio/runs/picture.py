@@ -18,7 +18,7 @@ from vio.files.atomic import atomic_write_bytes
 from vio.files.printable import printable
 from vio.files.tables import Rows
 from vio.geometry.lie import FloatArray
-from vio.records import STAGES
+from vio.records import STAGES, IntArray
 from vio.runs.curves import (
     COLOURS,
     FEATURE_WORDS,
@@ -39,6 +39,8 @@ _REFERENCE = "#111111"
 _DEAD_RECKONING = "#d9822b"
 _LANDMARKS = "#9aa5b1"
 _GREEN = "#3a9d5d"
+_DEGRADED = "#e8b94a"  # behind the curves, while estimates are less certain …
+_UNUSABLE = "#d64545"  # … or not to be used
 _PURPLE = "#8a5fb0"
 # a stereo calibration that ends within so many standard deviations of zero is not drawn
 _MOVED_SIGMAS = 3.0
@@ -156,11 +158,22 @@ def _figure(picture: RunPicture) -> Any:
     for axes in panels:
         axes.set_xlim(0, max(float(curves.seconds[-1]), 1e-3))
         axes.grid(alpha=0.25)
+        _shade(axes, curves.seconds, picture.frames["integrity"])
         axes.tick_params(labelbottom=axes is panels[-1])  # all have the time axis of the last one
     panels[-1].set_xlabel("time in the recording (s)")
     # a $ in a file name is no formula
     figure.suptitle(picture.title, fontsize=12, parse_math=False)
     return figure
+
+
+def _shade(axes: Any, seconds: FloatArray, integrity: IntArray) -> None:
+    """Shade the time (N,) of the estimates that are degraded or unusable."""
+    for state, colour in ((1, _DEGRADED), (2, _UNUSABLE)):
+        held = np.concatenate([[0], integrity == state, [0]]).astype(np.int8)
+        edges = np.flatnonzero(np.diff(held)).reshape(-1, 2)
+        for first, end in edges.tolist():
+            last = min(end, len(seconds) - 1)
+            axes.axvspan(seconds[first], seconds[last], color=colour, alpha=0.25, lw=0)
 
 
 def has_calibration_panel(result: RunResult) -> bool:
