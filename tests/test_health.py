@@ -24,7 +24,9 @@ def _estimate(k: int, x: float | None = None, **more: object) -> Estimate:
 def _lines(reports: list[UpdateReport]) -> list[str]:
     health = RunHealth()
     return [
-        line for k, report in enumerate(reports) for line in health.frame(k, report, _estimate(k))
+        finding.message
+        for k, report in enumerate(reports)
+        for finding in health.frame(k, report, _estimate(k))
     ]
 
 
@@ -51,7 +53,8 @@ def test_reports_once_a_focal_length_that_differs_beyond_doubt_and_beyond_harm(
         np.array([0.0, np.log1p(percent / 100)]), np.diag([0.0, (sigma / 100) ** 2])
     )
     health = RunHealth()
-    lines = [line for k in range(5) for line in health.scale(k, _estimate(k, stereo_scale=scale))]
+    found = [f for k in range(5) for f in health.scale(k, _estimate(k, stereo_scale=scale))]
+    lines = [finding.message for finding in found]
     assert [
         f"frame 0: the focal length is 5.0 % {word} than calibrated" in line for line in lines
     ] == [True] * (word is not None)
@@ -61,7 +64,8 @@ def test_a_scale_that_is_off_is_laid_on_baseline_or_focal_length_where_nothing_t
     None
 ):
     scale = StereoScaleEstimate(np.array([np.log(1.1), 0.0]), np.diag([0.01**2, 0.0]))
-    (line,) = RunHealth().scale(0, _estimate(0, stereo_scale=scale))
+    (finding,) = RunHealth().scale(0, _estimate(0, stereo_scale=scale))
+    line = finding.message
     assert "the baseline, or the focal length, is 10.0 % longer than calibrated" in line
     assert "check the sensor (unit, axes, clock)" in line
 
@@ -73,7 +77,8 @@ def test_rows_that_no_rig_comes_to_are_not_laid_on_the_calibration_alone(
     rows_px: float, words: str
 ) -> None:
     field = StereoFieldEstimate(np.zeros(8), np.eye(8), rows_px)
-    (line,) = RunHealth().frame(0, GOOD, _estimate(0, stereo_field=field))
+    (finding,) = RunHealth().frame(0, GOOD, _estimate(0, stereo_field=field))
+    line = finding.message
     assert f"frame 0: the rows of left and right images differ by {rows_px:.2f} px (rms)" in line
     assert words in line
 
@@ -88,7 +93,8 @@ def test_what_a_run_corrects_of_the_calibration_is_no_warning() -> None:
 def test_a_restart_is_one_event_and_its_jump_is_not_reported_as_a_speed() -> None:
     health = RunHealth()
     assert health.frame(0, GOOD, _estimate(0)) == ()
-    (line,) = health.restarted(1, "msckf diverged at frame 1", _estimate(1, x=50.0))
+    (finding,) = health.restarted(1, "msckf diverged at frame 1", _estimate(1, x=50.0))
+    line = finding.message
     assert line.startswith(
         "frame 1: msckf diverged at frame 1; started again from the last good pose"
     )
@@ -107,7 +113,7 @@ def test_new_landmarks_alone_do_not_end_a_gap_without_features() -> None:
 def _gaps(times_s: list[float]) -> list[str]:
     health = RunHealth()
     estimates = [replace(_estimate(k, 0.0), time_ns=round(1e9 * t)) for k, t in enumerate(times_s)]
-    return [line for k, e in enumerate(estimates) for line in health.frame(k, GOOD, e)]
+    return [f.message for k, e in enumerate(estimates) for f in health.frame(k, GOOD, e)]
 
 
 def test_reports_a_time_without_frames_once() -> None:
@@ -146,7 +152,7 @@ def test_two_gaps_without_features_are_two_events() -> None:
 def test_reports_an_implausible_state_once(more: dict[str, object], message: str) -> None:
     health = RunHealth()
     assert health.frame(0, GOOD, _estimate(0)) == ()
-    (line,) = health.frame(1, GOOD, _estimate(1, **more))  # type: ignore[arg-type]
-    assert message in line
+    (finding,) = health.frame(1, GOOD, _estimate(1, **more))  # type: ignore[arg-type]
+    assert message in finding.message
     assert line.endswith("calibration, units and clocks")
     assert health.frame(2, GOOD, _estimate(2, **more)) == ()  # type: ignore[arg-type]

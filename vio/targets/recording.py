@@ -21,8 +21,9 @@ from vio.cameras.rig import Rig
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.image_files import ImageFiles
 from vio.datasets.image_pairs import ImagePairs, ImageRecording, measured_images, pair_images
+from vio.datasets.image_times import pair_files
 from vio.datasets.images import SUFFIXES, list_images, load_gray
-from vio.datasets.plain import image_layout, pair_files
+from vio.datasets.plain import image_layout
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.videos import video_files
 from vio.errors import CalibrationError, DataError
