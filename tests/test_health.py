@@ -154,5 +154,5 @@ def test_reports_an_implausible_state_once(more: dict[str, object], message: str
     assert health.frame(0, GOOD, _estimate(0)) == ()
     (finding,) = health.frame(1, GOOD, _estimate(1, **more))  # type: ignore[arg-type]
     assert message in finding.message
-    assert line.endswith("calibration, units and clocks")
+    assert finding.message.endswith("calibration, units and clocks")
     assert health.frame(2, GOOD, _estimate(2, **more)) == ()  # type: ignore[arg-type]
