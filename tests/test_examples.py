@@ -48,7 +48,7 @@ def _run(name: str, *arguments: object, process: bool = False) -> str:
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
 def test_examples_are_short_and_tested(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    assert len(text.splitlines()) < 60
+    assert len(text.splitlines()) < 90  # at 100 columns, one thing a line
     assert f"python examples/{path.name}" in text
     assert f'_run("{path.name}"' in Path(__file__).read_text(encoding="utf-8")
 
