@@ -22,7 +22,7 @@ from vio.datasets import png_rows
 from vio.filters import gate_loops, multiview, pose_loops, stereo_calibration, track_loops
 from vio.filters.landmark_gate import leave_one_out_nis
 from vio.filters.multiview import Views
-from vio.frontend import outliers, patches, right_camera
+from vio.frontend import outliers, patches
 from vio.frontend.align import (
     align,
     cut_patches,
@@ -49,6 +49,7 @@ from vio.geometry.lie import (
     transform_points,
 )
 from vio.geometry.stereo import StereoCamera, project, triangulate
+from vio.guard import image_change
 from vio.numerics.compiled import Loop, eigenvectors, invert_positive, move_by_twist, solve_positive
 
 CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
@@ -233,11 +234,11 @@ def test_no_loop_is_compiled_for_one_number_alone() -> None:
     """
     raw = np.zeros((40, 31), dtype=np.uint8)
     png_rows.unfilter(raw, np.zeros((40, 30), dtype=np.uint8))
-    assert right_camera.image_change(PLAIN, PLAIN) == 0.0
+    assert image_change.image_change(PLAIN, PLAIN) == 0.0
     p = np.random.default_rng(16).uniform([-1, -1, 3], [1, 1, 9], (20, 3))
     _refine(CAMERA, np.eye(4), p, project(CAMERA, p)[:, :2], 1.0, slice(0, 6))
     loops = [
-        f for module in (outliers, patches, png_rows, right_camera) for f in vars(module).values()
+        f for module in (outliers, patches, png_rows, image_change) for f in vars(module).values()
     ]
     signatures = [s for f in loops if isinstance(f, Loop) for s in f.by_numba.signatures]
     assert signatures

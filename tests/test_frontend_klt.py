@@ -33,7 +33,7 @@ from vio.frontend.settings import FrontendSettings, GridSettings, KltSettings
 from vio.frontend.tracks import INLIER_PX
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
-from vio.guard import contrast
+from vio.guard import contrast, image_check
 from vio.records import FrontendOutput, MotionPrior, StereoFrame, TrackPrior
 
 GRID = GridSettings(target_features=200)
@@ -758,8 +758,9 @@ def test_opencv_has_its_threads_back_after_a_run_that_failed() -> None:
 
 def test_each_image_is_halved_once(monkeypatch: pytest.MonkeyPatch) -> None:
     halved: list[object] = []
-    monkeypatch.setattr(
-        klt, "half_image", lambda image: (halved.append(image), half_image(image))[1]
-    )
+    for module in (klt, image_check):
+        monkeypatch.setattr(
+            module, "half_image", lambda image: (halved.append(image), half_image(image))[1]
+        )
     run(FRAMES[:3])
     assert len(halved) == 6

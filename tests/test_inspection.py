@@ -5,6 +5,7 @@ status 1 and a remedy.
 from __future__ import annotations
 
 import json
+import logging
 import re
 import shutil
 from collections.abc import Callable
@@ -84,6 +85,7 @@ def test_a_turned_right_camera_is_named_before_and_in_the_run(
     capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
 ) -> None:
+    caplog.set_level(logging.INFO)
     folder = tmp_path / "turned"
     shutil.copytree(flight, folder)
     _turn_right_camera(folder, w_deg)

@@ -302,8 +302,7 @@ def test_live_estimates_have_their_pose_in_the_map(
                 np.testing.assert_allclose(estimate.T_map_body, estimate.T_world_imu, atol=1e-12)
         assert odometry.loops == ()
         assert [r.is_keyframe for r in results][:2] == [True, False]
-        with pytest.raises(ConfigError, match="a map takes one trajectory"):
-            odometry.reset()
+        odometry.reset()  # a new session of the map
     assert len(MapStore(path, read_only=True).keyframes()) >= 1
     with pytest.raises(ConfigError, match="a map needs the back end msckf"):
         vio.Odometry(recording.camera, replace(config, backend="vislam"), map=path)

@@ -59,9 +59,10 @@ def _lines(
             gone + first_id,
             innovation_ratio=ratio,
         )
-        lines += report.frame(
+        found = report.frame(
             seen, update, replace(Estimate(seen.time_ns, np.eye(4), np.eye(6)), stereo_field=field)
         )
+        lines += [finding.message for finding in found]
     return lines
 
 

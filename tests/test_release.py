@@ -47,6 +47,6 @@ def test_the_workflow_uploads_without_a_password() -> None:
     text = (ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8")
     jobs = yaml.safe_load(text)["jobs"]
     assert jobs["publish"]["permissions"] == {"id-token": "write"}
-    assert jobs["publish"]["needs"] == ["build", "compiled"]
+    assert jobs["publish"]["needs"] == ["build", "compiled", "arm"]
     assert "secrets." not in text
     assert any(step.get("run") == "make release" for step in jobs["build"]["steps"])

@@ -56,6 +56,7 @@ class GuardedFrontend:
         self.frontend = frontend
         self._pair = camera.kind == "stereo"
         self._checks = image_checks(camera)
+        self._swap = next((c for c in self._checks if isinstance(c, SwapDetector)), None)
         self._exchange = next((c for c in self._checks if isinstance(c, ExchangeDetector)), None)
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
@@ -70,7 +71,9 @@ class GuardedFrontend:
         images = self._inspect(images)
         output = self._output(images, prior)
         if self._exchange is not None and images.right_usable:
-            self._exchange.suspicious = _few_matches(output.observations)
+            # before, few matches are a matter of the whole recording
+            known = self._swap is not None and self._swap.decided
+            self._exchange.suspicious = known and _few_matches(output.observations)
         found = tuple(f for check in self._checks for f in check.take_findings())
         return _with_findings(output, found, right_usable=images.right_usable)
 
