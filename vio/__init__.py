@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from vio.datasets.observation_log import write_observations
     from vio.datasets.rigs import load_rig
     from vio.evaluation.trajectories import evaluate
+    from vio.integrity import protection_level
     from vio.live.build import MapUse, Parts
     from vio.live.live_odometry import LiveOdometry
     from vio.live.odometry import Odometry
