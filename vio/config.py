@@ -212,11 +212,11 @@ def as_dict(section: Any) -> dict[str, Any]:
 def to_yaml(config: Config) -> str:
     """Return the effective configuration as YAML; `load_config` reads it back to an equal one."""
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # the same text in a quarter of the time
-    options = {"sort_keys": False, "allow_unicode": True}
     try:
-        return str(yaml.dump(as_dict(config), Dumper=dumper, **options))
+        text: str = yaml.dump(as_dict(config), Dumper=dumper, sort_keys=False, allow_unicode=True)
     except UnicodeEncodeError:  # a path with a byte that is no text
-        return str(yaml.dump(as_dict(config), Dumper=yaml.SafeDumper, **options))
+        text = yaml.safe_dump(as_dict(config), sort_keys=False, allow_unicode=True)
+    return text
 
 
 @dataclass(frozen=True, slots=True)
