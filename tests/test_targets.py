@@ -48,7 +48,8 @@ from vio.targets.start import one_camera, pair_start, poses_of
 from vio.targets.verdict import depths, projection_sigma
 from vio.targets.views import View, sightings
 
-DATA = Path(os.environ.get("VIO_DATA", "../shared/data")) / "targets"
+ROOT = Path(__file__).resolve().parent.parent
+DATA = Path(os.environ.get("VIO_DATA") or ROOT.parent / "shared" / "data") / "targets"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="needs the real boards of VIO_DATA")
 
 DESCRIPTIONS = {
