@@ -18,7 +18,8 @@ diagnostics of [ROS 2](ros2.md) have them while it runs.
 assumptions hold: *nominal*, *degraded* (a sensor or a part of the images is left out; the covariance still covers the
 error), *unusable* (an assumption does not hold; the covariance also covers that the rig has moved in any direction
 since then, at the fastest speed so far). The column `integrity` of `frames.csv` is 0, 1, 2; where a fault began before
-it was found, earlier frames are marked in the files. An event without an end counts for one second.
+it was found, earlier frames are marked in the files. An event without an end counts for one second. In `trajectory.png`
+the time of degraded estimates is yellow, that of unusable ones red.
 
 `vio.protection_level(estimate)` gives the radius in the horizontal plane and the half height that contain the true
 position with a probability (0.997 unless given), as receivers of satellite navigation state it.
