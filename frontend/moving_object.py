@@ -21,7 +21,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import Finder, Finding
 from vio.frontend.columns import share_of
 from vio.frontend.outliers import (
     Consensus,
@@ -399,13 +399,13 @@ def voters(age: IntArray) -> BoolArray:
     return np.asarray(age >= max(oldest, _VOTING_FRAMES))
 
 
-class ObjectReport:
+class ObjectReport(Finder):
     """Reports once per event that an object covers much of the image, and what decided which
     motion is the camera's.
     """
 
     def __init__(self) -> None:
-        self._found: list[Finding] = []
+        super().__init__()
         self._frames = 0  # with an object, in a row
         self._since = 0  # the first of them
         self._clear = 0  # without one, in a row
@@ -420,12 +420,6 @@ class ObjectReport:
         frames.
         """
         return self._active
-
-    def take_findings(self) -> tuple[Finding, ...]:
-        """Return the findings since the last call."""
-        found = tuple(self._found)
-        self._found = []
-        return found
 
     def hides_scene(self, index: int, motions: TwoMotions) -> bool:
         """Return whether a known object has left too few points of the scene for some frames, so

@@ -9,7 +9,7 @@ until they agree again. That its image is frozen or dark, `vio.guard` sees befor
 
 from __future__ import annotations
 
-from vio.findings import Finding
+from vio.findings import Finder, Finding
 from vio.frontend.columns import share_of
 from vio.records import BoolArray
 
@@ -24,10 +24,11 @@ _BLIND_FRAMES = 40  # after as many without points to test by, the right image i
 _CODE = "right-contradicts-left"
 
 
-class RightCamera:
+class RightCamera(Finder):
     """Decides frame by frame whether the right image may be used."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._lives = True  # the right image of this frame is neither frozen nor dark
         self._contradicts = False  # matches contradicted each other, and have not agreed since
         self._since = 0  # first such frame
@@ -35,7 +36,6 @@ class RightCamera:
         self._agreeing = 0
         self._untested = 0
         self._reported = False
-        self._found: list[Finding] = []
 
     @property
     def contradicts(self) -> bool:
@@ -48,12 +48,6 @@ class RightCamera:
     def usable(self) -> bool:
         """Whether the right image of the last frame was used."""
         return self._lives and not self._contradicts
-
-    def take_findings(self) -> tuple[Finding, ...]:
-        """Return the findings since the last call."""
-        found = tuple(self._found)
-        self._found = []
-        return found
 
     def by_image(self, index: int, *, usable: bool) -> None:
         """Take whether the image itself of a frame is usable: neither frozen nor dark.

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import Finder, Finding
 from vio.frontend.tracks import Tracks
 from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
@@ -51,11 +51,11 @@ class PairingCounts:
     early: int  # this left image, and the right one before
 
 
-class RightDelay:
+class RightDelay(Finder):
     """Estimates the right camera's delay from the matches of all frames."""
 
     def __init__(self, camera: StereoCamera) -> None:
-        self._found: list[Finding] = []
+        super().__init__()
         self._camera = camera
         self._normal: FloatArray = np.zeros((_TERMS + 1, _TERMS + 1))
         self._moment: FloatArray = np.zeros(_TERMS + 1)
@@ -81,12 +81,6 @@ class RightDelay:
         """Take a delay in whole frames that is known from elsewhere."""
         self._forget()
         self.frames = float(frames)
-
-    def take_findings(self) -> tuple[Finding, ...]:
-        """Return the findings since the last call."""
-        found = tuple(self._found)
-        self._found = []
-        return found
 
     def update(
         self, index: int, left: FloatArray, flow: FloatArray, rows: FloatArray, frame_s: float

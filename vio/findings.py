@@ -72,6 +72,19 @@ class Finding:
         }
 
 
+class Finder:
+    """Base of what finds something: keeps findings until they are taken."""
+
+    def __init__(self) -> None:
+        self._found: list[Finding] = []
+
+    def take_findings(self) -> tuple[Finding, ...]:
+        """Return the findings since the last call."""
+        found = tuple(self._found)
+        self._found = []
+        return found
+
+
 def worst(effects: list[Integrity]) -> Integrity:
     """Return the worst of some effects; nominal for none."""
     return max(effects, key=INTEGRITIES.index, default="nominal")
@@ -79,8 +92,6 @@ def worst(effects: list[Integrity]) -> Integrity:
 
 _EXPOSURES = "pair images by their times of exposure, or synchronise the cameras"
 _CAMERA = "check the camera, its cable and its driver"
-
-MONITORED = "run"  # code of a remark without a code of its own
 
 CODES: dict[str, Code] = {
     "bands": Code(

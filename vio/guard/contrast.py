@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from vio.frontend.patches import mean_and_contrast
 from vio.guard.image_check import FrameImages, ImageCheck
 
@@ -28,7 +26,7 @@ class LostContrast(ImageCheck):
         lost = self._contrast is not None and contrast < _LOST_SHARE * self._contrast
         if lost and self._skipped < _MAX_FRAMES:
             self._skipped += 1
-            return replace(images, skipped=True)
+            return images.marked(skipped=True)
         self._skipped = 0
         self._contrast = contrast
         return images

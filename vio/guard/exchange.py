@@ -10,7 +10,7 @@ round, matches decide: exchanged images match with negative disparities only.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import cv2
@@ -69,7 +69,7 @@ class ExchangeDetector(ImageCheck):
             suspicious=self.suspicious,
         )
         if order == "refused":
-            return replace(images, skipped=True)
+            return images.marked(skipped=True)
         return images if order == "given" else images.exchanged()
 
     def _count(self, images: FrameImages, *, exchanged: bool) -> MatchCounts:

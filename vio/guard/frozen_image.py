@@ -6,7 +6,7 @@ stays the same while the right one changes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -66,12 +66,8 @@ class FrozenCamera(ImageCheck):
         """Mark frames with a frozen left image, or with a frozen or dark right one."""
         left, right = images.halves
         if self.left_is_frozen(images.index, left, right):
-            return replace(images, left_usable=False)
-        if self._cause is None:
-            return images
-        out = replace(images, right_usable=False)
-        out.__dict__["halves"] = images.halves
-        return out
+            return images.marked(left_usable=False)
+        return images if self._cause is None else images.marked(right_usable=False)
 
     @property
     def right_usable(self) -> bool:

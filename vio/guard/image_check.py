@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import Finder
 from vio.frontend.patches import half_image
 from vio.records import CheckedFrame, Image, StereoFrame
 
@@ -39,11 +40,20 @@ class FrameImages:
         same = all(a is b for a, b in zip(raw, self.raw, strict=True))
         return self if same else replace(self, raw=raw)
 
+    def marked(self, **changes: Any) -> FrameImages:
+        """Return the frame with other marks; its images, and what was made of them, stay."""
+        return self._copy(self.halves if "halves" in self.__dict__ else None, **changes)
+
     def exchanged(self) -> FrameImages:
         """Return the frame with left and right images exchanged."""
-        out = replace(self, raw=self.raw[::-1])
-        if "halves" in self.__dict__:
-            out.__dict__["halves"] = self.halves[::-1]
+        halves = self.halves[::-1] if "halves" in self.__dict__ else None
+        return self._copy(halves, raw=self.raw[::-1])
+
+    def _copy(self, halves: tuple[Image, ...] | None, **changes: Any) -> FrameImages:
+        """Return a changed copy whose halves are known, unless they are None."""
+        out = replace(self, **changes)
+        if halves is not None:
+            out.__dict__["halves"] = halves
         return out
 
     def checked(self) -> CheckedFrame:
@@ -83,13 +93,10 @@ def images_of(frame: StereoFrame, *, pair: bool) -> FrameImages | None:
     return FrameImages(frame, tuple(images))
 
 
-class ImageCheck:
+class ImageCheck(Finder):
     """Base of the checks: sees all frames of a recording in order of time, and reports each
     event once.
     """
-
-    def __init__(self) -> None:
-        self._found: list[Finding] = []
 
     def inspect(self, images: FrameImages) -> FrameImages:
         """Return the images to use, corrected or marked where necessary.
@@ -98,9 +105,3 @@ class ImageCheck:
             DataError: the recording cannot be used.
         """
         return images
-
-    def take_findings(self) -> tuple[Finding, ...]:
-        """Return the findings since the last call."""
-        found = tuple(self._found)
-        self._found = []
-        return found

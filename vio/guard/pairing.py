@@ -12,9 +12,9 @@ belongs to the left image *before* (it is late) is marked, as its left image is 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
 
 from vio.findings import Finding
+from vio.frontend.right_delay import PairingCounts
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.image_change import image_change
@@ -31,23 +31,13 @@ _MIN_SHARE = 0.4  # of the corners that match in the best pairing
 _CLEARLY = 1.3  # times as many as in both others
 
 
-@dataclass(frozen=True, slots=True)
-class PairingCounts:
-    """How many corners of a frame match in three pairings of left and right images."""
-
-    points: int  # that were tried
-    same: int  # left and right image of this frame
-    late: int  # the left image before, and this right one
-    early: int  # this left image, and the right one before
-
-    @property
-    def delay(self) -> int | None:
-        """Frames by which the right image is late; None: this frame does not tell."""
-        counts = {0: self.same, 1: self.late, -1: self.early}
-        best = max(counts, key=lambda delay: counts[delay])
-        others = max(count for delay, count in counts.items() if delay != best)
-        clear = counts[best] >= max(_MIN_SHARE * self.points, _CLEARLY * others)
-        return best if clear and self.points >= _MIN_POINTS else None
+def told_delay(counts: PairingCounts) -> int | None:
+    """Return the frames by which a right image is late; None: this frame does not tell."""
+    by_delay = {0: counts.same, 1: counts.late, -1: counts.early}
+    best = max(by_delay, key=lambda delay: by_delay[delay])
+    others = max(count for delay, count in by_delay.items() if delay != best)
+    clear = by_delay[best] >= max(_MIN_SHARE * counts.points, _CLEARLY * others)
+    return best if clear and counts.points >= _MIN_POINTS else None
 
 
 class PairingCheck(ImageCheck):
@@ -72,11 +62,11 @@ class PairingCheck(ImageCheck):
         if self.delay == -1:
             images = self._with_held(images)
         else:
-            images = replace(images, right_delay=1)
+            images = images.marked(right_delay=1)
         if images.skipped or self._begun_again:
             return images
         self._begun_again = True
-        return replace(images, begin_again=True)
+        return images.marked(begin_again=True)
 
     def _test(self, images: FrameImages) -> None:
         if not (images.left_usable and images.right_usable):
@@ -103,7 +93,7 @@ class PairingCheck(ImageCheck):
     def _count(self, index: int, counts: PairingCounts) -> None:
         """Count what a frame tells, and decide once enough frames tell the same."""
         self._tests += 1
-        told = counts.delay
+        told = told_delay(counts)
         if told is not None:
             self._votes.append(told)
         recent = self._votes[-_FRAMES:]
@@ -131,7 +121,7 @@ class PairingCheck(ImageCheck):
         held = self._held
         self._held = images.raw[1].copy()
         if held is None:
-            return replace(images, skipped=True)
+            return images.marked(skipped=True)
         return images.with_raw((images.raw[0], held))
 
 

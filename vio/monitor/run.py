@@ -82,6 +82,8 @@ class RunMonitor:
         self.findings: list[Finding] = []
         # whether the run begins again where right images belong to other frames
         self.ends_at_shifted_pairs = False
+        # frames by which right images were found to be late from the start; -1: early
+        self.pairs_shifted_by = 0
         self._integrity = IntegrityMonitor()
 
     def sample(self, sample: MotionSample) -> None:
@@ -182,14 +184,6 @@ class RunMonitor:
             if check.imu_at_fault and check.rotation_comparison.agree
             else check.rotation_comparison
         )
-
-    @property
-    def pairs_shifted_by(self) -> int:
-        """Frames by which right images were found to be late from the start; -1: early."""
-        for finding in self.findings:
-            if finding.code == "pairs-shifted":
-                return round(finding.figures["delay_frames"])
-        return 0
 
     @property
     def lines(self) -> list[str]:
@@ -339,7 +333,10 @@ class RunMonitor:
 
     def _add(self, findings: Iterable[Finding]) -> None:
         for finding in findings:
-            if not (finding.code == "pairs-shifted" and self.ends_at_shifted_pairs):
+            shifted = finding.code == "pairs-shifted"
+            if shifted:
+                self.pairs_shifted_by = round(finding.figures["delay_frames"])
+            if not (shifted and self.ends_at_shifted_pairs):
                 level = NOTE if is_corrected(finding) else logging.WARNING
                 log.log(level, "%s", finding.message)
             self.findings.append(finding)
