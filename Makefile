@@ -28,10 +28,12 @@ demo: $(VENV)/.base
 		nice $(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 & }
 
 # Algebra, records, settings, filters, and runs on features; under a minute on two cores once the loops are compiled.
-QUICK := lie stereo_geometry distortion statistics robust jacobian_registry records config selectors information \
-	navigation multiview window window_tracks motion_noise vislam filter_inputs pipeline
+QUICK := geometry/test_lie geometry/test_stereo_geometry geometry/test_distortion numerics/test_statistics numerics/test_robust \
+	project/test_jacobian_registry records/test_records cli/test_config filters/test_selectors filters/test_information \
+	filters/test_navigation filters/test_multiview filters/test_window filters/test_window_tracks filters/test_motion_noise \
+	filters/test_vislam filters/test_filter_inputs runs/test_pipeline
 quick: $(TESTED)
-	$(BIN)/python -m pytest -q -n auto --dist loadfile $(QUICK:%=tests/test_%.py)
+	$(BIN)/python -m pytest -q -n auto --dist loadfile $(QUICK:%=tests/%.py)
 
 test: lint unit
 

@@ -30,8 +30,8 @@ _ROW_WEIGHT = (_GRAY_SIGMA / _ROW_SIGMA_PX) ** 2
 MAX_MOVE_PX = 2.5  # of a fitted pixel from its start; beyond, it has left the correlation peak
 # step at which a template has converged; the remaining error is a small fraction of it
 _DONE_PX = 0.05
-_LEAST_SCORE = 0.1  # that a standard deviation is computed with
-_MOST_SCORE = 0.99999
+_MIN_SCORE = 0.1  # that a standard deviation is computed with
+_MAX_SCORE = 0.99999
 _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
 _DAMPING = 1e-6  # relative to the diagonal: limits the step in weakly textured directions
@@ -441,7 +441,7 @@ def _refine(
             _undo(warp[n], fit)
             if max(abs(fit[0]), abs(fit[1])) <= _DONE_PX:
                 break
-        share = 1.0 / min(max(score[n], _LEAST_SCORE), _MOST_SCORE) ** 2 - 1.0
+        share = 1.0 / min(max(score[n], _MIN_SCORE), _MAX_SCORE) ** 2 - 1.0
         gray2 = share * energy[slot] / size
         if row_weight > 0.0:
             sigma[slot, 2] = np.sqrt(gray2 * inverse[slot, 0, 0])

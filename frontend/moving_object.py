@@ -40,15 +40,15 @@ Decision: TypeAlias = Literal["predicted", "voted", "undecided"]
 _PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test
 # ratio of two motions' squared distances from a measured one, above which the nearer agrees
 _CLEARLY_NEARER = 10.0
-_LEAST_POINTS = 12  # of a second motion
-_LEAST_SUPPORT = 0.1  # points of a second motion that may replace the first, over the first's
+_MIN_POINTS = 12  # of a second motion
+_MIN_SUPPORT = 0.1  # points of a second motion that may replace the first, over the first's
 _LARGE_SHARE = 0.25  # share of all points above which a second motion is reported
 # of the smaller group's points that must be off the epipolar lines of the others to prove an object
 _SEEN_SHARE = 0.5
 _PIXEL_SIGMA = 0.5  # of a point's position by its depth and its track
 # errors of neighbours have much in common: a fit is no better than that of so many points
 _INDEPENDENT_POINTS = 50
-_LEAST_STATIC = 0.8  # share of a consensus without depths that a measured motion must explain
+_MIN_STATIC = 0.8  # share of a consensus without depths that a measured motion must explain
 _FAR_M = 1e4  # depth of what is infinitely far away
 # of the length of a fitted translation: depths of one frame have errors in common
 _SCALE_SIGMA = 0.01
@@ -108,7 +108,7 @@ def choose_motion(
         ):
             return TwoMotions(voted, _if_large((found.inliers & ~voted.inliers).mean()), "voted")
     others = np.flatnonzero(~found.inliers)
-    least = max(_LEAST_POINTS, _LEAST_SUPPORT * found.inliers.sum())
+    least = max(_MIN_POINTS, _MIN_SUPPORT * found.inliers.sum())
     if len(others) < least and not hidden:
         return TwoMotions(found, 0.0, None)
     second = np.eye(4)
@@ -224,13 +224,13 @@ def _near_prediction(
         pixel_errors(problem.camera, predicted.T_curr_prev, p_prev, pixels)
         <= 2.0 * problem.limit_px
     )
-    if near.sum() < _LEAST_POINTS:
+    if near.sum() < _MIN_POINTS:
         return None
     T, _ = best_motion(problem, p_prev[near], pixels[near], predicted.T_curr_prev[None])
     inliers = _followers(problem, T, p_prev, pixels)
     alone = inliers & ~found.inliers
     others = found.inliers & ~inliers
-    if alone.sum() < max(_LEAST_POINTS, _LEAST_SUPPORT * others.sum()):
+    if alone.sum() < max(_MIN_POINTS, _MIN_SUPPORT * others.sum()):
         return None
     agrees = _squared_distance(problem.camera, T, p_prev[inliers], predicted) <= limit
     return Consensus(T, inliers) if agrees else None
@@ -244,14 +244,14 @@ def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] 
     """
     for_first = int((first & ~second).sum())
     for_second = int((second & ~first).sum())
-    if max(for_first, for_second) < max(_LEAST_POINTS, _CLEAR_VOTE * (for_first + for_second)):
+    if max(for_first, for_second) < max(_MIN_POINTS, _CLEAR_VOTE * (for_first + for_second)):
         return None
     return "first" if for_first > for_second else "second"
 
 
 def _votes_for(found: Consensus, voting: BoolArray) -> bool:
     """Whether most of the voting points (N,) follow a motion."""
-    return bool(voting.sum() >= _LEAST_POINTS and found.inliers[voting].mean() >= _CLEAR_VOTE)
+    return bool(voting.sum() >= _MIN_POINTS and found.inliers[voting].mean() >= _CLEAR_VOTE)
 
 
 def _voted(
@@ -264,7 +264,7 @@ def _voted(
     """Return the motion that most of the voting points (N,) follow, where the consensus is not
     theirs; else None.
     """
-    if voting.sum() < _LEAST_POINTS or _votes_for(found, voting):
+    if voting.sum() < _MIN_POINTS or _votes_for(found, voting):
         return None
     starts = np.stack([found.T_curr_prev, np.eye(4)])
     T, follows = best_motion(problem, p_prev[voting], pixels[voting], starts)
@@ -299,7 +299,7 @@ def static_by_prediction(
         near_m: the smallest depth.
     """
     static = _agree_with(problem.camera, predicted, before, after, near_m, problem.limit_px)
-    if static.sum() < _LEAST_POINTS or share_of(static[kept]) >= _LEAST_STATIC:
+    if static.sum() < _MIN_POINTS or share_of(static[kept]) >= _MIN_STATIC:
         return kept
     return static
 

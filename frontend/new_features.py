@@ -18,7 +18,7 @@ from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
 from vio.records import BoolArray, Image, IntArray
 
 # share of the target below which corners that leave the image sooner are added, too
-_LEAST_FEATURES = 0.7
+_MIN_FEATURES = 0.7
 _WANTED_LIFE_FRAMES = 7  # for which a new corner should stay in the image
 _MAX_LEFT_ONLY_FRAMES = 10  # in a row without a right match, before a feature is dropped
 _FEW = 0.5  # share of the least number of features below which corners without depth are added
@@ -138,7 +138,7 @@ class NewFeatures:
         target = self._grid.target_features
         matched = int(tracks.has_right.sum())
         room = max(0, target - len(tracks))
-        least = _LEAST_FEATURES * target
+        least = _MIN_FEATURES * target
         tried = round(_TRIED * room)
         staying = (unique & stays).nonzero()[0][:tried]
         leaving = (unique & ~stays).nonzero()[0][:tried]

@@ -17,7 +17,7 @@ from vio.records import BoolArray, TrackPrior
 # Disparities of four neighbouring pixels on a surface differ by less, also where it is seen at a
 # slant of 80 degrees; at the outline of an object they differ by more, and which side a feature
 # lies on is not known.
-_MOST_SLOPE_PX = 1.0
+_MAX_SLOPE_PX = 1.0
 _MIN_DEPTH_M = 0.05
 
 
@@ -69,5 +69,5 @@ def disparities(
     a = u - x
     b = v - y
     out = (1 - b) * ((1 - a) * d[0] + a * d[1]) + b * ((1 - a) * d[2] + a * d[3])
-    known: BoolArray = has_depth & (np.ptp(d, axis=0) <= _MOST_SLOPE_PX)
+    known: BoolArray = has_depth & (np.ptp(d, axis=0) <= _MAX_SLOPE_PX)
     return np.where(known, out, 0.0), known

@@ -54,7 +54,7 @@ _SURE_BEARING_SHARE = 0.9
 _FIVE_POINT_CONFIDENCE = 0.999
 _EPSILON = 1e-9  # added to denominators
 # of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as large
-_LEAST_FORWARD = 0.5
+_MIN_FORWARD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -768,7 +768,7 @@ def _pinhole_pixels(
     cylinder's (N, 2).
     """
     rays = [left_rays(camera, pixels) for pixels in (previous, current)]
-    ahead = np.all([r[:, 2] > _LEAST_FORWARD * np.linalg.norm(r, axis=1) for r in rays], axis=0)
+    ahead = np.all([r[:, 2] > _MIN_FORWARD * np.linalg.norm(r, axis=1) for r in rays], axis=0)
     a, b = (
         r[ahead, :2] / r[ahead, 2:] * [camera.fu, camera.fv] + [camera.cu, camera.cv] for r in rays
     )

@@ -23,8 +23,8 @@ from vio.geometry.stereo import depth_of, left_rays
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import MotionPrior
 
-_LEAST_POINTS = 15  # that must agree on the motion …
-_LEAST_SHARE = 0.4  # … and of all matches with depths
+_MIN_POINTS = 15  # that must agree on the motion …
+_MIN_SHARE = 0.4  # … and of all matches with depths
 _DEPTHS_AGREE = 0.5  # share of these whose new disparity must be that of the moved point
 _ROTATION_SIGMA_DEG = 0.3  # of a motion by key points
 _ROTATION_PROBABILITY = 0.9999  # of a rotation measured beside it
@@ -74,16 +74,16 @@ def motion_across(
     a = a[known]
     b = b[known]
     d_before = d_before[known]
-    if len(a) < _LEAST_POINTS:
+    if len(a) < _MIN_POINTS:
         return None
     f_baseline = camera.fu * camera.baseline_m
     points = left_rays(camera, a) * (f_baseline / d_before)[:, None]
     T, agree = best_motion(problem, points, b, starts)
-    if agree.sum() < max(_LEAST_POINTS, _LEAST_SHARE * len(agree)):
+    if agree.sum() < max(_MIN_POINTS, _MIN_SHARE * len(agree)):
         return None
     d_now, known = stereo.search(left.half, right.half, b[agree])
     depth = depth_of(camera, transform_points(T, points[agree]))
     same = np.abs(d_now - f_baseline / np.maximum(depth, 1e-3)) <= _DISPARITY_PX
-    if known.sum() < _LEAST_POINTS or share_of(same[known]) < _DEPTHS_AGREE:
+    if known.sum() < _MIN_POINTS or share_of(same[known]) < _DEPTHS_AGREE:
         return None
     return T

@@ -36,7 +36,7 @@ from vio.records import BoolArray, Image, TrackPrior
 
 _ITERATIONS = 5
 _MIN_CORRELATION = 0.8  # normalised, with the anchor
-_LEAST_POINTS = 20  # a few features that have slipped together would pass for a motion
+_MIN_POINTS = 20  # a few features that have slipped together would pass for a motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ class RightAlone:
         warp, score = align(bank.store, old.slot[rows], right.full, warp, _ITERATIONS)
         good: BoolArray = (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start)
         good &= pixel_errors(camera, T, old.point[rows], warp[:, :, 2]) <= problem.limit_px
-        if good.sum() < _LEAST_POINTS:
+        if good.sum() < _MIN_POINTS:
             return None
         tracks = replace(take(old, rows), left=warp[:, :, 2].copy(), point=point, warp=warp)
         tracks = with_prior_depths(camera, take(tracks, good), prior)

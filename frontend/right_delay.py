@@ -25,9 +25,9 @@ from vio.numerics.compiled import solve_positive
 from vio.records import Image
 
 _MEMORY = 0.97  # per frame, of the normal equations
-_LEAST_MATCHES = 30  # in a frame that is learned from
-_LEAST_FRAMES = 10  # before a delay is believed
-_LEAST_DELAY = 0.25  # frames; less does little harm, and small errors of the rows look like it
+_MIN_MATCHES = 30  # in a frame that is learned from
+_MIN_FRAMES = 10  # before a delay is believed
+_MIN_DELAY = 0.25  # frames; less does little harm, and small errors of the rows look like it
 _EXPLAINS = 0.5  # share of the rows' scatter about the constant field that the delay must explain
 # standard deviations of the delay: errors of a feature's rows last for as long as the feature
 _SIGMAS = 10.0
@@ -94,7 +94,7 @@ class RightDelay(Finder):
             rows: right rows minus left rows (N,), pixels, as measured.
             frame_s: time since the last frame.
         """
-        if len(left) < _LEAST_MATCHES:
+        if len(left) < _MIN_MATCHES:
             return False
         camera = self._camera
         x = (left[:, 0] - camera.cu) / camera.fu
@@ -117,11 +117,11 @@ class RightDelay(Finder):
 
     def _decide(self, index: int, frame_s: float) -> None:
         """Take a delay out where it is significant, and report it once."""
-        small = abs(self._solution[_TERMS]) <= _LEAST_DELAY
-        if self._frames < _LEAST_FRAMES or (self.frames == 0.0 and small):
+        small = abs(self._solution[_TERMS]) <= _MIN_DELAY
+        if self._frames < _MIN_FRAMES or (self.frames == 0.0 and small):
             return
         delay, sigma, explained = self._significance()
-        if _SIGMAS * sigma > _LEAST_DELAY:
+        if _SIGMAS * sigma > _MIN_DELAY:
             return
         whole = float(np.rint(delay))
         rounded = whole if abs(delay - whole) < _WHOLE else delay
@@ -130,7 +130,7 @@ class RightDelay(Finder):
                 self._end(index)
             elif rounded != 0.0:
                 self.frames = rounded
-        elif abs(delay) > _LEAST_DELAY and explained > _EXPLAINS:
+        elif abs(delay) > _MIN_DELAY and explained > _EXPLAINS:
             self._begin(index, rounded, delay, frame_s)
 
     def suspect(self, index: int, counts: PairingCounts, frame_s: float) -> bool:
@@ -147,9 +147,7 @@ class RightDelay(Finder):
         """
         best = max(counts.late, counts.early)
         clear = best >= _SUSPECT_SHARE * counts.points and best >= _CLEARLY * counts.same
-        clear &= counts.points >= _LEAST_MATCHES and best >= _CLEARLY * min(
-            counts.late, counts.early
-        )
+        clear &= counts.points >= _MIN_MATCHES and best >= _CLEARLY * min(counts.late, counts.early)
         delay = 1.0 if counts.late == best else -1.0
         self._suspected = (
             (delay, self._suspected[1] + 1 if self._suspected[0] == delay else 1)

@@ -39,22 +39,22 @@ _MIN_DISPARITY_PX = 0.1  # below, a point is too far away to be located
 # share of features with a right match below which other row differences are tried
 _FEW_MATCHES = 0.2
 _GOOD_MATCH = 0.9  # correlation of patches whose rows agree
-_LEAST_POINTS = 20
+_MIN_POINTS = 20
 # root mean square over the matches: from here on the run reports the calibration, too
 _ROWS_OFF_PX = 0.2
 _ROW_SEARCH_FRAMES = 10  # between two such searches, while matches are few
-_MOST_REACH = 0.64  # of the image width: largest disparity that is searched where the scene is near
+_MAX_REACH = 0.64  # of the image width: largest disparity that is searched where the scene is near
 _REACH_FRAMES = 10  # between two searches beyond the present reach
 # of the points without a match that must have one beyond the reach for it to be doubled …
 _BEYOND_SHARE = 0.1
-_LEAST_BEYOND = 10  # … and this many at least …
+_MIN_BEYOND = 10  # … and this many at least …
 _WITHIN_REACH = 0.9  # … until this share of them is within it
 # A pair turns so much in its mount, three times the prior of its calibration, or exposes so far
 # apart.
-_MOST_TURN_RAD = 0.3 * np.pi / 180.0
+_MAX_TURN_RAD = 0.3 * np.pi / 180.0
 _OFFSET_GAIN = 0.2  # part of a frame's common offset that is believed
 _DEPTH_SLACK = 0.1  # standard deviation of a point's depth by motion alone, over it
-_LEAST_SPREAD_PX = 2.0  # between near and far disparities, to tell an offset from a factor
+_MIN_SPREAD_PX = 2.0  # between near and far disparities, to tell an offset from a factor
 _MAX_ROWS_HALF = 16  # row difference, pixels at half resolution
 
 
@@ -75,7 +75,7 @@ class StereoFit:
         """
         # doubled where the scene is nearer
         self.max_disparity_px = disparity.max_disparity * size[0]
-        self._most_reach_px = _MOST_REACH * size[0]
+        self._most_reach_px = _MAX_REACH * size[0]
         self._reach_wait = 0  # frames until the reach is tried again
         self._camera = camera
         self._bank = bank
@@ -130,14 +130,14 @@ class StereoFit:
         skew = skew[valid]
         off = tracks.left[rows, 0] - pixels[:, 0] - expected
         grows = self._offset_growth(tracks.left[rows])
-        if len(off) < _LEAST_POINTS:
+        if len(off) < _MIN_POINTS:
             return tracks
         offset, slope = (
             common_offset(expected / grows, off / grows)
             if by_motion
             else (median(off / grows), 0.0)
         )
-        if abs(offset) > self._camera.fu * _MOST_TURN_RAD:
+        if abs(offset) > self._camera.fu * _MAX_TURN_RAD:
             return tracks
         tolerance = INLIER_PX + (_DEPTH_SLACK * expected if by_motion else 0.0)
         agree = np.abs(off - offset * grows - slope * expected) <= tolerance
@@ -237,7 +237,7 @@ class StereoFit:
             for rows in tried
         ]
         best = int(np.argmax(counts))
-        if counts[best] < max(_LEAST_POINTS, 2 * counts[offset + _MAX_ROWS_HALF]):
+        if counts[best] < max(_MIN_POINTS, 2 * counts[offset + _MAX_ROWS_HALF]):
             return offset
         self._rows.restart(2.0 * tried[best])
         return tried[best]
@@ -293,7 +293,7 @@ class StereoFit:
 
     def update_rows(self, tracks: Tracks) -> None:
         """Update the row differences with the matches of a frame."""
-        few = len(tracks) >= _LEAST_POINTS and share_of(tracks.has_right) < _FEW_MATCHES
+        few = len(tracks) >= _MIN_POINTS and share_of(tracks.has_right) < _FEW_MATCHES
         self._unmatched = self._unmatched + 1 if few else 0
         self._rows.update(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
         self._reach_wait = max(0, self._reach_wait - 1)
@@ -368,7 +368,7 @@ class StereoFit:
 
 def _are_enough(beyond: int, points: int) -> bool:
     """Whether so many of some points are beyond the reach that the search is to go further."""
-    return beyond >= max(_LEAST_BEYOND, _BEYOND_SHARE * points)
+    return beyond >= max(_MIN_BEYOND, _BEYOND_SHARE * points)
 
 
 @compiled
@@ -440,7 +440,7 @@ def common_offset(expected: FloatArray, off: FloatArray) -> tuple[float, float]:
     far = order[: len(order) // 2]
     d_near = median(expected[near])
     d_far = median(expected[far])
-    if d_near - d_far < _LEAST_SPREAD_PX:
+    if d_near - d_far < _MIN_SPREAD_PX:
         return median(off), 0.0
     slope = (median(off[near]) - median(off[far])) / (d_near - d_far)
     return median(off - slope * expected), slope

@@ -11,8 +11,8 @@ import scipy.linalg
 
 from vio.filters.multiview import (
     CAUCHY,
-    LEAST_DISPARITY_PX,
     MIN_DEPTH,
+    MIN_DISPARITY_PX,
     InverseDepth,
     Residuals,
     TrackInformation,
@@ -252,7 +252,7 @@ def moved(q: InverseDepth, dq: FloatArray, most: FloatArray | float) -> FloatArr
     """Points (F, 3) in the world after steps (F, 3); the disparity stays between its least value
     and `most`.
     """
-    disparity = np.maximum(np.minimum(q.disparity + dq[:, 2], most), LEAST_DISPARITY_PX)
+    disparity = np.maximum(np.minimum(q.disparity + dq[:, 2], most), MIN_DISPARITY_PX)
     across = np.squeeze(q.p_D_q[:, :, :2] @ dq[:, :2, None], axis=2)
     ray = across - q.p_D_q[:, :, 2] * q.disparity[:, None]
     out: FloatArray = q.centre + ray * (q.disparity / disparity)[:, None]
@@ -281,7 +281,7 @@ def refined(
     first = np.argmax(seen, axis=1)
     for _ in range(steps):
         p_first = np.einsum("fij,fj->fi", T[first, :3, :3], p) + T[first, :3, 3]
-        far = on_rays(camera, T[first], views.z[np.arange(len(p)), first, :2], LEAST_DISPARITY_PX)
+        far = on_rays(camera, T[first], views.z[np.arange(len(p)), first, :2], MIN_DISPARITY_PX)
         p = np.where((depth_of(camera, p_first) > least)[:, None], p, far)
         at, q = residuals(camera, T, p, views), inverse_depth(camera, T, p, seen)
         w = 1 / (1 + np.sum(at.r**2, axis=2) / (4 * scale_px**2))

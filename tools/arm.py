@@ -30,7 +30,7 @@ _EMULATOR = "qemu-aarch64-static"
 _PACKAGE = "stereo-vio"
 _FRAMES = 8
 _GLIBC = (17, 24, 26, 27, 28, 34)  # minor versions in the tags of wheels
-_MOST_APART_M = 1e-3  # sums in another order; a wrong loop is off by far more
+_MAX_APART_M = 1e-3  # sums in another order; a wrong loop is off by far more
 
 
 def main(argv: list[str]) -> int:
@@ -121,7 +121,7 @@ def _difference_m(root: Path, site: Path, source: str, folder: Path) -> float | 
         return None
     apart_m = float(np.abs(paths[0] - paths[1]).max())
     print(f"{name}: positions of {len(paths[0])} frames differ by {1e6 * apart_m:.2f} um at most")
-    return apart_m if apart_m < _MOST_APART_M else None
+    return apart_m if apart_m < _MAX_APART_M else None
 
 
 if __name__ == "__main__":

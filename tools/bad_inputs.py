@@ -2,7 +2,7 @@
 
     python -m tools.bad_inputs
 
-The cases are the dictionaries `BAD` of the tests of the readers; `tests/test_bad_inputs.py`
+The cases are the dictionaries `BAD` of the tests of the readers; `tests/project/test_bad_inputs.py`
 compares the page's rows.
 """
 
@@ -22,19 +22,19 @@ from vio.files.trajectories import read_trajectory
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "bad_inputs.md"
 _MAKERS = {
-    "tests.test_datasets_euroc": "make_euroc",
-    "tests.test_datasets_kitti_raw": "make_kitti_raw",
+    "tests.datasets.test_datasets_euroc": "make_euroc",
+    "tests.datasets.test_datasets_kitti_raw": "make_kitti_raw",
 }
 MODULES = {
-    "tests.test_rig": "Calibration files (`vio.load_rig`)",
-    "tests.test_datasets_plain": "Plain folders",
-    "tests.test_datasets_bags": "ROS bags",
-    "tests.test_datasets_videos": "Videos",
-    "tests.test_datasets_euroc": "EuRoC folders",
-    "tests.test_datasets_kitti_raw": "KITTI raw drives",
-    "tests.test_datasets_gtsam": "GTSAM's stereo factors",
-    "tests.test_hostile_recordings": "Damaged and hostile files",
-    "tests.test_trajectory_io": "Trajectories",
+    "tests.datasets.test_rig": "Calibration files (`vio.load_rig`)",
+    "tests.datasets.test_datasets_plain": "Plain folders",
+    "tests.datasets.test_datasets_bags": "ROS bags",
+    "tests.datasets.test_datasets_videos": "Videos",
+    "tests.datasets.test_datasets_euroc": "EuRoC folders",
+    "tests.datasets.test_datasets_kitti_raw": "KITTI raw drives",
+    "tests.datasets.test_datasets_gtsam": "GTSAM's stereo factors",
+    "tests.datasets.test_hostile_recordings": "Damaged and hostile files",
+    "tests.files.test_trajectory_io": "Trajectories",
 }
 _HEAD = """# Bad inputs
 
@@ -54,12 +54,12 @@ def cases(module: str) -> dict[str, Any]:
 def message_of(module: str, case: Any, folder: Path) -> str:
     """Return the line that a case gives, with its folder written as '…'."""
     try:
-        if module == "tests.test_rig":
+        if module == "tests.datasets.test_rig":
             load_rig(case[0](folder), cameras=2)
-        elif module == "tests.test_datasets_videos":
+        elif module == "tests.datasets.test_datasets_videos":
             case[0](folder)
             list(open_dataset(folder).events())
-        elif module == "tests.test_trajectory_io":
+        elif module == "tests.files.test_trajectory_io":
             (folder / "a.txt").write_text(case[0], encoding="utf-8")
             read_trajectory(folder / "a.txt", fmt=case[1])
         elif module in _MAKERS:
@@ -86,11 +86,13 @@ def main() -> int:
             parts.append(f"\n## {title}\n\n| input | message |\n|---|---|\n")
             for k, (label, case) in enumerate(cases(module).items()):
                 folder = root / f"{title[:3]}{k}"
-                if module == "tests.test_datasets_videos":
+                if module == "tests.datasets.test_datasets_videos":
                     shutil.copytree(videos, folder)
                 else:
                     folder.mkdir()
-                    (folder / "r").mkdir() if module == "tests.test_datasets_bags" else None
+                    (
+                        folder / "r"
+                    ).mkdir() if module == "tests.datasets.test_datasets_bags" else None
                 parts.append(f"| {label} | {message_of(module, case, folder)} |\n")
     PAGE.write_text("".join(parts), encoding="utf-8")
     return 0
@@ -114,7 +116,7 @@ def _videos(root: Path) -> Path:
         "euroc",
     ]
     assert vio(["render", "--out", str(flight), "--workers", "1", "--json", *options]) == 0
-    folder: Path = importlib.import_module("tests.test_datasets_videos").make_videos(
+    folder: Path = importlib.import_module("tests.datasets.test_datasets_videos").make_videos(
         flight, root / "videos"
     )
     return folder

@@ -198,11 +198,11 @@ class Scenario:
         """Inside the block, use the priors of these flights and, unless it is learned, the true
         pixel noise.
         """
-        least_px = window_tracks.LEAST_PIXEL_SIGMA_PX if learn_noise else self.pixel_sigma_px
+        least_px = window_tracks.MIN_PIXEL_SIGMA_PX if learn_noise else self.pixel_sigma_px
         with (
             patch.object(imu_start, "START_TILT_SIGMA_DEG", 1.0),
             patch.object(navigation, "START_VELOCITY_SIGMA_MPS", 2.0),
-            patch.object(window_tracks, "LEAST_PIXEL_SIGMA_PX", least_px),
+            patch.object(window_tracks, "MIN_PIXEL_SIGMA_PX", least_px),
         ):
             yield
 

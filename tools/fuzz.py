@@ -40,7 +40,7 @@ from vio.ros2.transport import Quality, publisher
 from vio.runs.folder import growing_folder
 from vio.runs.pipeline import RunControl, run
 
-_MOST_S = 120.0  # that a case may take, on a busy computer
+_MAX_S = 120.0  # that a case may take, on a busy computer
 _FRAMES = 8  # of a case
 _WRONG: tuple[Any, ...] = (
     None,
@@ -288,12 +288,12 @@ def _calls(rng: np.random.Generator) -> None:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(_MOST_S)
+        thread.join(_MAX_S)
         if thread.is_alive():
             raise FoundError("a call hangs")
     closing = threading.Thread(target=_close, args=(live,), daemon=True)
     closing.start()
-    closing.join(_MOST_S)
+    closing.join(_MAX_S)
     if closing.is_alive():
         raise FoundError("close() hangs")
     if failures:

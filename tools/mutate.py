@@ -36,7 +36,7 @@ _COPIED = (
     "README.md",
     "pyproject.toml",
 )
-_MOST_S = 900.0
+_MAX_S = 900.0
 # The profile is one of tests/conftest.py.
 _PYTEST = ("-q", "--tb=no", "-p", "no:cacheprovider", "--hypothesis-profile=once")
 
@@ -65,7 +65,7 @@ def read_mutations(text: str) -> tuple[Mutation, ...]:
     while lines:
         if not lines[0].startswith("  "):
             file, _, names = lines.pop(0).partition(": ")
-            tests = tuple(f"tests/test_{name}.py" for name in names.split())
+            tests = tuple(f"tests/{name}.py" for name in names.split())
         name, old, new, *lines = lines
         if not (old.startswith("  - ") and new.startswith("  + ")):
             raise MutationError(f"{name.strip()!r} needs a line '  - old' and a line '  + new'")
@@ -130,7 +130,7 @@ def run_tests(copy: Path, tests: Sequence[str], *options: str) -> tuple[list[str
         capture_output=True,
         text=True,
         check=False,
-        timeout=_MOST_S,
+        timeout=_MAX_S,
     )
     seconds = time.perf_counter() - begin
     imported = done.stdout.partition("\n")[0].split()

@@ -35,7 +35,7 @@ _POINTS = 400
 _WINDOW_PX = 21
 _LEVELS = 3
 # times the last commit's; calls hardly vary, times do between machines
-_MOST = {"calls": 1.1, "cpu": 2.0}
+_MAX = {"calls": 1.1, "cpu": 2.0}
 
 
 def measured(path: Path) -> dict[str, float]:
@@ -107,7 +107,7 @@ def slower(now: dict[str, float], last: dict[str, float]) -> list[str]:
     """Return what is beyond its bound, a line each."""
     return [
         f"{name}: {now[name]:g} in place of {last[name]:g}, more than {factor:g} times"
-        for name, factor in _MOST.items()
+        for name, factor in _MAX.items()
         if now[name] > factor * last[name]
     ]
 

@@ -22,7 +22,7 @@ import yaml
 from vio.datasets.settings import DatasetSettings
 from vio.errors import ConfigError
 from vio.files.inputs import read_input
-from vio.files.yaml_text import MOST_BYTES, read_yaml
+from vio.files.yaml_text import MAX_BYTES, read_yaml
 from vio.filters import BACKENDS
 from vio.filters.settings import MsckfSettings, VislamSettings
 from vio.frontend.settings import FrontendSettings
@@ -74,8 +74,8 @@ _TYPES = {
     str: "text",
     Path: "a path",
 }
-_MOST_NAMED = 8  # settings in the message on an unknown one
-_MOST_SHOWN = 200  # characters of a wrong value in a message
+_MAX_NAMED = 8  # settings in the message on an unknown one
+_MAX_SHOWN = 200  # characters of a wrong value in a message
 
 _Section = TypeVar("_Section")
 
@@ -252,7 +252,7 @@ def describe(section: Any, prefix: str = "") -> Iterator[SettingInfo]:
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:
     try:
-        text = read_input(path, MOST_BYTES).decode("utf-8-sig")
+        text = read_input(path, MAX_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot read the configuration ({error.strerror}); check the path"
@@ -335,11 +335,11 @@ def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
         if found:
             return f"; did you mean '{found[0]}'?"
     more = (
-        f" and {len(names) - _MOST_NAMED} more, see vio config --all"
-        if len(names) > _MOST_NAMED
+        f" and {len(names) - _MAX_NAMED} more, see vio config --all"
+        if len(names) > _MAX_NAMED
         else ""
     )
-    return f"; valid here: {', '.join(prefix + name for name in names[:_MOST_NAMED])}{more}"
+    return f"; valid here: {', '.join(prefix + name for name in names[:_MAX_NAMED])}{more}"
 
 
 def _plain(value: Any) -> Any:
@@ -351,4 +351,4 @@ def _plain(value: Any) -> Any:
 def _short(value: Any) -> str:
     """Return a value for a message, cut where it is long."""
     text = value if isinstance(value, str) else repr(value)
-    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}…"
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}…"

@@ -20,6 +20,7 @@ from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 
 NS_PER_S = 10**9
+S_PER_NS = 1e-9  # products with it and quotients by NS_PER_S differ in the last bit
 Image: TypeAlias = npt.NDArray[np.uint8]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]

@@ -20,9 +20,7 @@ from tools.faults.changes import (
 )
 from vio.geometry.lie import FloatArray, so3_exp
 from vio.protocols import Dataset
-from vio.records import Event, ImuSample, StereoFrame
-
-_NS = 1e-9
+from vio.records import S_PER_NS, Event, ImuSample, StereoFrame
 
 
 def stuck_samples(dataset: Dataset, period: Period) -> Changed:
@@ -53,7 +51,7 @@ def restamped(shift_s: float, jitter_s: float = 0.0) -> Variant:
         def changed(events: Iterable[Event]) -> Iterator[Event]:
             held = list(events)
             old = np.array([e.time_ns for e in held if isinstance(e, ImuSample)], dtype=np.int64)
-            scatter = np.random.default_rng(10).normal(shift_s, jitter_s, len(old)) / _NS
+            scatter = np.random.default_rng(10).normal(shift_s, jitter_s, len(old)) / S_PER_NS
             new = (
                 np.sort(old + scatter.astype(np.int64))
                 if jitter_s

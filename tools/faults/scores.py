@@ -21,7 +21,7 @@ COVERED = 3.0  # standard deviations
 WORSE = 1.2  # times the ratio of the recording as it is: no worse than that
 SOON_FRAMES = 10
 _SETTLED_FRAMES = 5  # the first poses are millimetres apart, with a stated sigma near zero
-_LEAST_SIGMA_M = 1e-4
+_MIN_SIGMA_M = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ def pose_errors(result: RunResult, truth_sigma_m: float) -> PoseErrors:
     error_m = _errors_m(T_est, T_ref, _is_upright(result)[rows])
     covariances = np.array(result.estimates.column("covariance"))[rows]
     variance = np.trace(covariances[:, :3, :3], axis1=1, axis2=2)
-    sigma_m = np.sqrt(variance + truth_sigma_m**2 + _LEAST_SIGMA_M**2)
+    sigma_m = np.sqrt(variance + truth_sigma_m**2 + _MIN_SIGMA_M**2)
     indices = np.array(result.estimates.column("index"))[rows]
     kept = slice(_SETTLED_FRAMES, None)
     return PoseErrors(indices[kept], error_m[kept], sigma_m[kept])

@@ -37,7 +37,7 @@ _JUDGED = ("ate_m", "rpe_m", "drift_percent", "drift_deg_per_100m", "coverage")
 # Reported, but no regression: times depend on the machine, the others say why the judged figures
 # changed.
 _NOT_JUDGED = ("ate_sim3_m", "refused_share", "cpu_ms", "memory_mib")
-_LEAST_CHANGE = 0.01  # a mean change below is none, however certain
+_MIN_CHANGE = 0.01  # a mean change below is none, however certain
 # Below this, in the unit of the figure, two values are the same: ATE of 0.01 mm is that of a
 # recording at rest.
 _FLOOR = 1e-5
@@ -286,7 +286,7 @@ def holm(p: Sequence[float]) -> list[float]:
 
 def _verdict(effect: Effect, p: float, margin: float, larger_is_better: bool = False) -> Verdict:
     change = math.log(effect.ratio) * (-1 if larger_is_better else 1)
-    if p <= LEVEL and abs(change) >= math.log1p(_LEAST_CHANGE):
+    if p <= LEVEL and abs(change) >= math.log1p(_MIN_CHANGE):
         return "worse" if change > 0 else "better"
     if effect.low is None or effect.high is None:
         return "cannot tell"

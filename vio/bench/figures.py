@@ -34,7 +34,7 @@ _QUANTILES = (0, 5, 25, 50, 75, 95, 100)
 _FRAME_NS = 10_000_000  # a pose within 10 ms of a frame is that frame's, as in `vio eval`
 # Condition of a pose covariance below which it is inverted: the first frames of a run know their
 # pose exactly.
-_MOST_CONDITION = 1e14
+_MAX_CONDITION = 1e14
 
 
 def figures_of(evaluation: Evaluation, *, positions_only: bool) -> dict[str, Any]:
@@ -107,7 +107,7 @@ def pose_nees(
             first = yaw_and_position(a, b) if upright[rows[0]] else a @ se3_inverse(b)
             world = first if T_world_true is None else T_world_true
             errors[rows] = se3_log(se3_inverse(world @ truth[rows]) @ T[rows])
-    invertible = np.linalg.cond(P) < _MOST_CONDITION
+    invertible = np.linalg.cond(P) < _MAX_CONDITION
     if not invertible.any():
         return None
     try:

@@ -20,8 +20,8 @@ from vio.files.atomic import atomic_write_text
 
 log = logging.getLogger(__name__)
 _COLOURS = ("#1f5fbf", "#d9822b", "#5aa469", "#c23b5a", "#8e63b8", "#6b7785", "#b59f3b", "#2a9d8f")
-_MOST_SEQUENCES = 24  # with figures of their own: the worst ones of a larger suite
-_MOST_POINTS = 500  # of a box: evenly spaced among the sorted ones of a larger suite
+_MAX_SEQUENCES = 24  # with figures of their own: the worst ones of a larger suite
+_MAX_POINTS = 500  # of a box: evenly spaced among the sorted ones of a larger suite
 _STYLE = (
     "body{font:15px/1.45 system-ui,sans-serif;max-width:1180px;margin:2em auto;padding:0 "
     "1em;color:#1b2733}"
@@ -80,7 +80,7 @@ def _worst_sequences(rows: Sequence[Row]) -> list[str]:
         cell = row.cells.get(METRICS[0].name)
         if cell is not None:
             worst[row.sequence] = max(worst.get(row.sequence, 0.0), cell.worst)
-    chosen = set(sorted(worst, key=lambda name: -worst[name])[:_MOST_SEQUENCES])
+    chosen = set(sorted(worst, key=lambda name: -worst[name])[:_MAX_SEQUENCES])
     return [name for name in worst if name in chosen]
 
 
@@ -184,7 +184,7 @@ def _system_boxes(rows: Sequence[Row]) -> Any:
         q1, median, q3 = (float(v) for v in np.percentile(known, (25, 50, 75)))
         axes.plot([q1, q3], [k, k], color="#c9d1d9", lw=10, solid_capstyle="butt", zorder=1)
         axes.plot([median, median], [k - 0.2, k + 0.2], color="#111111", lw=1.5)
-        shown = np.sort(known)[np.unique(np.linspace(0, len(known) - 1, _MOST_POINTS).astype(int))]
+        shown = np.sort(known)[np.unique(np.linspace(0, len(known) - 1, _MAX_POINTS).astype(int))]
         axes.plot(shown, [k] * len(shown), ".", color=_COLOURS[k % len(_COLOURS)], ms=6, alpha=0.7)
     axes.set_xscale("log")
     axes.set_yticks(range(len(values)), list(values), parse_math=False)

@@ -14,12 +14,12 @@ from vio.config import Config, load_config, merge
 from vio.datasets.frame_times import parse_bound
 from vio.errors import ConfigError
 from vio.files.inputs import read_input
-from vio.files.yaml_text import MOST_BYTES, read_yaml
+from vio.files.yaml_text import MAX_BYTES, read_yaml
 
 SHIPPED = Path(__file__).resolve().parent / "suites"
 # of a sequence or configuration: it becomes part of a command line and of a CSV file
 _NAME = re.compile(r"[\w.+-]+")
-_MOST_SEEDS = 1000
+_MAX_SEEDS = 1000
 SUCCESS_PERCENT = 1.0  # of the path, where a suite says nothing else
 PUBLISHED_MEAN = "all"  # in the place of a sequence: the source's own mean
 _PUBLISHED_FIGURES = ("ate_m", "drift_percent", "drift_deg_per_100m")
@@ -107,7 +107,7 @@ def read_suite(what: str) -> Suite:
     if not path.is_file() and what in shipped_suites():
         path = SHIPPED / f"{what}.yaml"
     try:
-        values = read_yaml(read_input(path, MOST_BYTES).decode("utf-8-sig"))
+        values = read_yaml(read_input(path, MAX_BYTES).decode("utf-8-sig"))
     except OSError as error:
         names = ", ".join(shipped_suites())
         reason = error.strerror or error
@@ -320,7 +320,7 @@ def _seeds(value: Any, where: str) -> tuple[int, ...]:
     seeds = list(range(value)) if isinstance(value, int) and not isinstance(value, bool) else value
     fine = (
         isinstance(seeds, list)
-        and 0 < len(seeds) <= _MOST_SEEDS
+        and 0 < len(seeds) <= _MAX_SEEDS
         and len(set(map(str, seeds))) == len(seeds)
     )
     if not fine or any(

@@ -40,7 +40,7 @@ from vio.datasets.frame_times import frames_between, parse_bound, used_frames
 from vio.errors import DataError, EvaluationError, VioError
 from vio.evaluation.association import associate
 from vio.evaluation.errors_along_path import path_length_m
-from vio.evaluation.trajectories import LEAST_POSES, Evaluation, evaluate
+from vio.evaluation.trajectories import MIN_POSES, Evaluation, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
 from vio.protocols import Dataset
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 # in which compiled functions are loaded: left out of the CPU time a frame, as its wall times
 _WARM_FRAMES = 8
-_MOST_WARNINGS = 5
+_MAX_WARNINGS = 5
 JOB = "job.json"
 RESULT = "result.json"
 _BODY = re.compile(r"^#\s*body:\s*(\S+)", re.MULTILINE)
@@ -180,7 +180,7 @@ def reference_fault(job: dict[str, Any]) -> str | None:
         return f"{name}: {str(error).replace('the estimate', 'the recording')}"
     return (
         f"{name}: it has poses of {matched} of {len(frames)} frames"
-        if matched < LEAST_POSES
+        if matched < MIN_POSES
         else None
     )
 
@@ -300,7 +300,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         record = {
             "figures": figures,
             "failure": result.stopped,
-            "warnings": list(result.warnings[:_MOST_WARNINGS]),
+            "warnings": list(result.warnings[:_MAX_WARNINGS]),
         }
         if truth.reference is not None:
             score = _evaluate(job, trajectory, truth.reference, result.T_cam0_body)

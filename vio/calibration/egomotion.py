@@ -13,7 +13,7 @@ from vio.cameras.projection import CameraArgs, camera_args, turn_to
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.numerics.compiled import compiled, move_by_twist, solve_positive
-from vio.records import BoolArray, FeatureTracks, IntArray
+from vio.records import S_PER_NS, BoolArray, FeatureTracks, IntArray
 
 _MIN_LINKS = 8  # tracks needed between two frames
 _MIN_DISPARITY_PX = 2.0
@@ -22,9 +22,8 @@ _WIDTHS_PX = (30.0, 15.0, 8.0, 4.0, 2.0, 2.0)
 _MIN_DEPTH_M = 0.5
 # relative size of a normal matrix's smallest eigenvalue below which a motion is not determined
 _DEGENERATE = 1e-9
-_LEAST_TWISTS = 40  # frame intervals for a calibration
+_MIN_TWISTS = 40  # frame intervals for a calibration
 _LARGEST_GAP_S = 0.25
-_NS = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +63,7 @@ def stereo_twists(
     frames, begins = np.unique(of, return_index=True)
     if not len(frames):
         return CameraMotion(times_ns, frames.astype(np.int64), np.zeros((0, 6)))
-    dt = (np.diff(times_ns) * _NS)[frames]
+    dt = (np.diff(times_ns) * S_PER_NS)[frames]
     T_next_prev = se3_exp(-dt[:, None] * guess[frames])
     determined = np.empty(len(frames), dtype=np.bool_)
     _fit_motions(
@@ -196,15 +195,15 @@ def camera_motion(
         times_ns: (F,) frame times.
     """
     found = stereo_twists(camera, tracks, times_ns, np.zeros((len(times_ns) - 1, 6)))
-    dt = np.diff(times_ns)[found.frames] * _NS
+    dt = np.diff(times_ns)[found.frames] * S_PER_NS
     brief = dt < _LARGEST_GAP_S
     found = CameraMotion(times_ns, found.frames[brief], found.twists[brief])
-    if len(found.frames) < _LEAST_TWISTS:
-        gap = float(np.median(np.diff(times_ns))) * _NS if len(times_ns) > 1 else float("inf")
+    if len(found.frames) < _MIN_TWISTS:
+        gap = float(np.median(np.diff(times_ns))) * S_PER_NS if len(times_ns) > 1 else float("inf")
         return NotObservable(
             "IMU-camera calibration",
             f"only {len(found.frames)} frame intervals determine the camera's motion "
-            f"({_LEAST_TWISTS} needed; frames "
+            f"({_MIN_TWISTS} needed; frames "
             f"are {gap:.3g} s apart); too few images, too far apart, or too little texture",
         )
     return found

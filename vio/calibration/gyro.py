@@ -9,7 +9,7 @@ from vio.calibration.findings import NotObservable
 from vio.calibration.inertial import ImuAlignment, Rates
 from vio.geometry.lie import FloatArray, nearest_rotation, so3_exp, so3_log
 from vio.numerics.robust import jackknife, robust_sigma
-from vio.records import BoolArray
+from vio.records import S_PER_NS, BoolArray
 
 _BLOCKS = 10  # of the jackknife
 _ROTATION_DEG = 1.0  # standard deviations beyond these are called weak …
@@ -18,7 +18,6 @@ _MIN_RATE_RADPS = 0.02  # spread of the rotation rate below which the alignment 
 _LARGEST_OFFSET_S = 0.1
 _OFFSET_STEP_S = 0.004
 _VELOCITY_WEIGHT = 0.02  # rad/s per m/s: weight of a velocity's error relative to a rotation rate's
-_NS = 1e-9
 
 
 def align_gyro(motion: CameraMotion, rates: Rates) -> ImuAlignment | NotObservable:
@@ -69,11 +68,11 @@ class _GyroProblem:
 
     def __init__(self, motion: CameraMotion, rates: Rates) -> None:
         self._origin = int(motion.times_ns[0])
-        self._t = (rates.times_ns - self._origin) * _NS
+        self._t = (rates.times_ns - self._origin) * S_PER_NS
         steps = np.diff(self._t)[:, None] * (rates.angular[1:] + rates.angular[:-1]) / 2
         self._turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        self._begin = (motion.times_ns[motion.frames] - self._origin) * _NS
-        self._end = (motion.times_ns[motion.frames + 1] - self._origin) * _NS
+        self._begin = (motion.times_ns[motion.frames] - self._origin) * S_PER_NS
+        self._end = (motion.times_ns[motion.frames + 1] - self._origin) * S_PER_NS
         self._dt = self._end - self._begin
         self._omega = motion.twists[:, 3:]
         margin = _LARGEST_OFFSET_S

@@ -15,17 +15,16 @@ from vio.calibration.inertial import ImuAlignment, Rates
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.robust import jackknife, robust_sigma
-from vio.records import FeatureTracks, IntArray
+from vio.records import S_PER_NS, FeatureTracks, IntArray
 
 _BLOCKS = 10  # of the jackknife over windows
 _MAX_SIGMA_M = 0.02  # with a larger standard deviation the value is not observable
 _WINDOW_S = 1.0
-_LEAST_WINDOWS = 12
-_NS = 1e-9
+_MIN_WINDOWS = 12
 
 _MIN_INTERVALS = 40  # frame intervals needed to judge two lever arms
 _JUDGED_BLOCKS = 12  # of the jackknife over them
-_LEAST_SIGMA = 0.1  # lower bound: a jackknife over few blocks is unreliable below this
+_MIN_SIGMA = 0.1  # lower bound: a jackknife over few blocks is unreliable below this
 _LOG_ODDS = 10.0  # log-likelihood ratio that decides between two lever arms
 _HUBER = 2.0  # standard deviations
 _REWEIGHTINGS = 4
@@ -56,11 +55,11 @@ def estimate_lever_arm(
     if alignment.weak is not None:
         return NotObservable(what, f"the motion leaves unobservable the {alignment.weak}")
     blocks = _windows(motion, rates, alignment)
-    if len(blocks) < _LEAST_WINDOWS:
+    if len(blocks) < _MIN_WINDOWS:
         return NotObservable(
             what,
             f"only {len(blocks)} windows of {_WINDOW_S:g} s are without tracking loss "
-            f"({_LEAST_WINDOWS} needed)",
+            f"({_MIN_WINDOWS} needed)",
         )
     x = _solve_windows(blocks)
     refits = [
@@ -116,7 +115,7 @@ def _windows(
 
 
 def _seconds(times_ns: IntArray, origin_ns: int) -> FloatArray:
-    return np.asarray((times_ns - origin_ns) * _NS, dtype=np.float64)
+    return np.asarray((times_ns - origin_ns) * S_PER_NS, dtype=np.float64)
 
 
 def _window(
@@ -247,7 +246,7 @@ def judge_lever_arms(
     place = _fit_place(y, signal, nuisance)
     left_out = [np.setdiff1d(every, block) for block in np.array_split(every, _JUDGED_BLOCKS)]
     refits = [_fit_place(y[keep], signal[keep], nuisance[keep]) for keep in left_out]
-    sigma = max(float(jackknife(refits)), _LEAST_SIGMA)
+    sigma = max(float(jackknife(refits)), _MIN_SIGMA)
     better = int(place > 0) if 2 * abs(place) / sigma**2 > _LOG_ODDS else None
     return LeverArmVerdict(better, place, sigma, count)
 

@@ -18,8 +18,8 @@ from vio.records import BoolArray, IntArray
 _BLOCKS = 10  # of a jackknife
 _WIDEST_DEG = 1.0  # gates on epipolar angles in successive fits
 _NARROWER_DEG = 0.3
-_LEAST_MATCHES = 150
-_LEAST_PAIRS = 3
+_MIN_MATCHES = 150
+_MIN_PAIRS = 3
 _STEREO_ROTATION_DEG = 0.2  # with larger standard deviations the value is not observable
 _STEREO_DIRECTION_DEG = 2.0
 # What a lens model that is off by half a pixel in the corners does to the rotation from single
@@ -27,7 +27,7 @@ _STEREO_DIRECTION_DEG = 2.0
 _LENS_DEG = 0.15
 _EDGE = 0.95  # quantile of the rays' angles off the axis at which a lens model is off by that
 _CELLS = 5  # across the image, a side of the grid on which residuals show a distortion
-_LEAST_IN_CELL = 15  # matches that make a cell's median
+_MIN_IN_CELL = 15  # matches that make a cell's median
 
 # R_cam1_cam0 (3, 3), unit direction (3,) from cam0 to cam1 in cam0
 _Pose: TypeAlias = tuple[FloatArray, FloatArray]
@@ -172,9 +172,7 @@ def _cells(angles: FloatArray) -> IntArray:
 def _structure(values: FloatArray, cells: IntArray) -> float:
     """Return the rms over the cells (N,) of the medians of values (N,)."""
     medians = [
-        np.median(values[cells == k])
-        for k, n in enumerate(np.bincount(cells))
-        if n >= _LEAST_IN_CELL
+        np.median(values[cells == k]) for k, n in enumerate(np.bincount(cells)) if n >= _MIN_IN_CELL
     ]
     return float(np.sqrt(np.mean(np.square(medians)))) if medians else float("inf")
 
@@ -215,12 +213,12 @@ def too_few(matches: RayMatches) -> NotObservable | None:
     None: there are enough.
     """
     pairs = len(np.unique(matches.pair))
-    if len(matches.pair) >= _LEAST_MATCHES and pairs >= _LEAST_PAIRS:
+    if len(matches.pair) >= _MIN_MATCHES and pairs >= _MIN_PAIRS:
         return None
     return NotObservable(
         "left-right extrinsics",
         f"only {len(matches.pair)} consistent matches in {pairs} pairs were found "
-        f"({_LEAST_MATCHES} in {_LEAST_PAIRS} "
+        f"({_MIN_MATCHES} in {_MIN_PAIRS} "
         "are needed); the images are too few, do not overlap, or have no texture",
     )
 
@@ -282,7 +280,7 @@ def row_residuals(z: FloatArray, width: float, height: float) -> RowResiduals | 
     """Describe the row differences of matches (N, 4) `[ul vl ur vr]` in rectified pixels, over
     the image.
     """
-    if len(z) < _LEAST_MATCHES:
+    if len(z) < _MIN_MATCHES:
         return NotObservable("row alignment", f"only {len(z)} matches were found")
     off = z[:, 1] - z[:, 3]
     median = float(np.median(off))
@@ -293,7 +291,7 @@ def row_residuals(z: FloatArray, width: float, height: float) -> RowResiduals | 
     for i in range(3):
         for j in range(3):
             here = (row == i) & (column == j)
-            if here.sum() >= _LEAST_IN_CELL:
+            if here.sum() >= _MIN_IN_CELL:
                 grid[i, j] = smooth[here] = np.median(off[here])
     disparity = z[:, 0] - z[:, 2]
     return RowResiduals(

@@ -403,7 +403,7 @@ def _bent(camera: CameraModel, radial: tuple[float, float], p1: float, p2: float
 
 
 # a rig that leaves more of what the run saw is none of these cameras; true ones leave 0.3 px
-_MOST_LEFT_PX = 5.0
+_MAX_LEFT_PX = 5.0
 
 
 def estimated_rig(
@@ -422,7 +422,7 @@ def estimated_rig(
     cause: CalibrationError | None = None
     try:
         found = calibrated_rig(given, estimate)
-        if found.left_px <= _MOST_LEFT_PX:
+        if found.left_px <= _MAX_LEFT_PX:
             return found
     except CalibrationError as error:  # the fit's steps led out of the possible rigs
         cause = error

@@ -14,7 +14,7 @@ from vio.numerics.compiled import compiled
 CameraArgs: TypeAlias = tuple[float, float, float, float, float, bool]
 
 
-_MOST_KNOWN = 8
+_MAX_KNOWN = 8
 # by identity: a camera's hash costs more than the answer
 _known: dict[int, tuple[StereoCamera, CameraArgs]] = {}
 
@@ -27,7 +27,7 @@ def camera_args(camera: StereoCamera) -> CameraArgs:
         fv = float(camera.fv)
         cu = float(camera.cu)
         cv = float(camera.cv)
-        if len(_known) == _MOST_KNOWN:
+        if len(_known) == _MAX_KNOWN:
             _known.clear()
         known = _known[id(camera)] = (
             camera,

@@ -55,9 +55,9 @@ COMMANDS = tuple(name for names in BY_PURPOSE.values() for name in names)
 # went into that search, over modules and samples that stay.
 _GC_OBJECTS = 100_000
 # bytes; a short run of MH_01 takes 976 MB, and OpenCV fails to load in 820
-_LEAST_ADDRESS_SPACE = 1_000_000_000
+_MIN_ADDRESS_SPACE = 1_000_000_000
 _LIGHT = ("config", "completion")  # commands that load no library
-_MOST_SHOWN = 200  # characters of a path in a message
+_MAX_SHOWN = 200  # characters of a path in a message
 _ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
@@ -148,11 +148,11 @@ def _check_address_space(command: str) -> None:
     import resource
 
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if 0 <= limit < _LEAST_ADDRESS_SPACE:  # RLIM_INFINITY is -1
+    if 0 <= limit < _MIN_ADDRESS_SPACE:  # RLIM_INFINITY is -1
         raise VioError(
             f"the address space is limited to {limit / 1e6:.0f} MB (ulimit -v), and vio {command} "
             "loads "
-            f"{_LEAST_ADDRESS_SPACE / 1e6:.0f} MB of libraries; raise the limit, or limit the "
+            f"{_MIN_ADDRESS_SPACE / 1e6:.0f} MB of libraries; raise the limit, or limit the "
             "resident memory "
             "instead (a container, systemd-run -p MemoryMax)"
         )
@@ -205,11 +205,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _message(error: VioError | OSError | MemoryError) -> str:
     """Return what an expected error says."""
     if isinstance(error, MemoryError):
-        return f"out of memory ({str(error)[:_MOST_SHOWN] or 'no details'}); process less at once"
+        return f"out of memory ({str(error)[:_MAX_SHOWN] or 'no details'}); process less at once"
     if isinstance(error, VioError):
         return str(error)
     # A path that no check foresaw: too long a name, a folder that may not be entered, a disk that
     # fails.
     file = error.filename
-    where = "cannot write the output" if file is None else f"cannot use {str(file)[:_MOST_SHOWN]}"
+    where = "cannot write the output" if file is None else f"cannot use {str(file)[:_MAX_SHOWN]}"
     return f"{where}: {error.strerror or error}"

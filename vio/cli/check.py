@@ -104,7 +104,7 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _facts(result: MapperResult) -> dict[str, Any]:
-    from vio.offline.colmap.reconstruction import LEAST_SHARED
+    from vio.offline.colmap.reconstruction import MIN_SHARED
 
     if result.found is None:
         return {"verdict": result.verdict, "registered": 0}
@@ -116,7 +116,7 @@ def _facts(result: MapperResult) -> dict[str, Any]:
         "points": model.points,
         "mean_reprojection_error_px": model.mean_reprojection_error_px,
         "loops": len(model.shared),
-        "loops_in_model": int((model.shared >= LEAST_SHARED).sum()),
+        "loops_in_model": int((model.shared >= MIN_SHARED).sum()),
         "points_across_loops": model.shared.tolist(),
         **facts,
         "piece": comparison.frames[comparison.piece].tolist(),
@@ -129,7 +129,7 @@ def _facts(result: MapperResult) -> dict[str, Any]:
 def _rows(result: MapperResult) -> list[tuple[str, str]]:
     if result.found is None:
         return [("result", result.verdict)]
-    from vio.offline.colmap.reconstruction import LEAST_SHARED
+    from vio.offline.colmap.reconstruction import MIN_SHARED
 
     model, comparison = result.found
     apart = f"{comparison.end_m:.4f} m and {comparison.end_deg:.3f} deg"
@@ -153,12 +153,12 @@ def _rows(result: MapperResult) -> list[tuple[str, str]]:
         ("end", f"{apart} apart at the end; up to {expected} expected"),
     ]
     if len(model.shared):
-        joined = int((model.shared >= LEAST_SHARED).sum())
+        joined = int((model.shared >= MIN_SHARED).sum())
         rows.insert(
             1,
             (
                 "loops",
-                f"{joined} of {len(model.shared)} in the model, with {LEAST_SHARED} points or more",
+                f"{joined} of {len(model.shared)} in the model, with {MIN_SHARED} points or more",
             ),
         )
     if comparison.scale is not None and comparison.scale_sigma is not None:

@@ -116,7 +116,7 @@ def _evaluated(
     reference: tuple[Trajectory, FloatArray | None],
 ) -> Evaluation:
     """Compare one trajectory with the reference, both with their extrinsics."""
-    from vio.evaluation.trajectories import LEAST_POSES, evaluate
+    from vio.evaluation.trajectories import MIN_POSES, evaluate
 
     T_cam0_imu = estimate[1]
     if args.extrinsics is not None:
@@ -136,9 +136,9 @@ def _evaluated(
         T_cam0_imu=reference[1] if T_cam0_imu is None else T_cam0_imu,
         lengths_m=args.lengths,
     )
-    if result.matched < LEAST_POSES:
+    if result.matched < MIN_POSES:
         raise EvaluationError(
-            f"only {result.matched} poses match; a comparison needs at least {LEAST_POSES}"
+            f"only {result.matched} poses match; a comparison needs at least {MIN_POSES}"
         )
     for note in result.notes:
         log.warning("%s", note)

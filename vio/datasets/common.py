@@ -29,7 +29,7 @@ from vio.records import NS_PER_S, BoolArray, Event, IntArray, MotionSample, Reco
 _GRAVITY = 9.81  # m/s^2; by what accelerations and biases move the median of a motion's readings
 _GRAVITY_OFF = 1.5
 # the largest published course file takes 140 MB; a bomb of kilobytes claims terabytes
-_MOST_ARRAY_BYTES = 2**31
+_MAX_ARRAY_BYTES = 2**31
 # What a damaged or encrypted archive also raises: an unknown compression, a header that is no
 # literal.
 _DAMAGE = (
@@ -305,12 +305,12 @@ def read_npz(path: Path, keys: Iterable[str] | None = None) -> Mapping[str, np.n
 
 def check_array_bytes(sizes: Mapping[str, int], path: Path) -> None:
     """Raise DataError if arrays of these sizes in bytes take more memory than a recording may."""
-    if (total := sum(sizes.values())) > _MOST_ARRAY_BYTES:
+    if (total := sum(sizes.values())) > _MAX_ARRAY_BYTES:
         largest = max(sizes, key=lambda key: sizes[key])
         raise DataError(
             f"{path}: its arrays take {total / 2**30:.1f} GiB ({largest} alone "
             f"{sizes[largest] / 2**30:.1f}), more "
-            f"than {_MOST_ARRAY_BYTES / 2**30:g} GiB; split the recording"
+            f"than {_MAX_ARRAY_BYTES / 2**30:g} GiB; split the recording"
         )
 
 

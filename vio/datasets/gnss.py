@@ -17,7 +17,7 @@ from vio.files.text import text_lines
 _FORM = "time_s,latitude_deg,longitude_deg,height_m,sigma_east_m,sigma_north_m,sigma_up_m"
 _OXTS_COLUMNS = 30
 _OXTS_ACCURACY = 23  # column of pos_accuracy, m
-_OXTS_LEAST_M = 0.02
+_OXTS_MIN_M = 0.02
 _NAVSATFIX = "sensor_msgs/msg/NavSatFix"
 _NO_FIX = -1  # of status.status and of position_covariance_type
 _UNKNOWN = 0
@@ -84,7 +84,7 @@ def _read_oxts(folder: Path) -> GnssFixes:
     times_ns = drive_times(
         folder / "timestamps.txt", np.array([int(file.stem) for file in files], dtype=np.int64)
     )
-    sigma = np.maximum(values[:, _OXTS_ACCURACY], _OXTS_LEAST_M)
+    sigma = np.maximum(values[:, _OXTS_ACCURACY], _OXTS_MIN_M)
     return checked_fixes(
         times_ns, values[:, :3], sigma[:, None, None] ** 2 * np.eye(3), str(folder)
     )

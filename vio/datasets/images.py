@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from vio.datasets.image_files import ImageFiles, stem_of
 from vio.datasets.levels import FULL_SCALE, Band, Levels, band_of, levels_of, to_8_bits
-from vio.datasets.png import MOST_PIXELS, crc32, decode_gray8
+from vio.datasets.png import MAX_PIXELS, crc32, decode_gray8
 from vio.errors import DataError
 from vio.files.inputs import check_regular, read_input
 from vio.geometry.lie import FloatArray
@@ -35,7 +35,7 @@ _TIFF_STARTS = (b"II*\0", b"MM\0*")
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
-_MOST_BYTES = 2**29  # of a file: more than 64 Mpx of 16 bits in colour
+_MAX_BYTES = 2**29  # of a file: more than 64 Mpx of 16 bits in colour
 # start-of-frame markers, with the image size
 _JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 _PNG_LEVEL = 1  # files a tenth larger than at the usual level 3, in a third of the time
@@ -129,7 +129,7 @@ def _load(path: Path, *, colour: bool = False) -> npt.NDArray[Any]:
     it is asked for.
     """
     try:
-        data = read_input(path, _MOST_BYTES)
+        data = read_input(path, _MAX_BYTES)
     except OSError as error:
         raise UnreadableImageError(f"cannot read {path}: {error.strerror or error}") from error
     return _decoded(data, path, colour=colour)
@@ -204,9 +204,9 @@ def _size_fault(width: int, height: int) -> str | None:
     """Say what is wrong with the size that a header states; None: nothing."""
     if width * height <= 0:
         return f"its header states {width} x {height} pixels, which is no image"
-    if width * height <= MOST_PIXELS:
+    if width * height <= MAX_PIXELS:
         return None
-    return f"its header states {width} x {height} pixels, more than {MOST_PIXELS / 2**20:g} Mpx"
+    return f"its header states {width} x {height} pixels, more than {MAX_PIXELS / 2**20:g} Mpx"
 
 
 def _jpeg_damage(data: bytes) -> str | None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from vio.records import Image
 
-__all__ = ["MOST_PIXELS", "crc32", "decode_gray8"]
+__all__ = ["MAX_PIXELS", "crc32", "decode_gray8"]
 
 try:
     from isal.isal_zlib import IsalError as ZlibError  # inflates in half to two thirds of the time
@@ -26,7 +26,7 @@ except ImportError:  # a processor without its wheels
     from zlib import error as ZlibError  # type: ignore[assignment]  # noqa: N812
 
 # 8192 x 8192; a header may state 2^62, and decoding would try to get the memory
-MOST_PIXELS = 2**26
+MAX_PIXELS = 2**26
 _START = b"\x89PNG\r\n\x1a\n"
 _GRAY_8 = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method, no interlacing
 # Chunks that change no pixel. With any other, such as transparency or an animation, the file is
@@ -58,7 +58,7 @@ def decode_gray8(data: bytes) -> Image | None:
             width, height, *form = struct.unpack_from(">IIBBBBB", data, at + 8)
             size = (
                 (height, width)
-                if tuple(form) == _GRAY_8 and 0 < height * width <= MOST_PIXELS
+                if tuple(form) == _GRAY_8 and 0 < height * width <= MAX_PIXELS
                 else None
             )
         elif kind == b"IEND":

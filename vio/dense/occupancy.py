@@ -15,8 +15,8 @@ from vio.geometry.lie import FloatArray
 _STEP_M = 0.2  # above the ground beside it, a surface is an obstacle …
 _CLEARANCE_M = 2.0  # … below this height; what is higher is passed under
 _GROUND_M = 1.5  # radius within which the lowest surface is the ground
-_LEAST_VERTICES = 2  # of a cell's ground or obstacle
-_MOST_CELLS = 1 << 26
+_MIN_VERTICES = 2  # of a cell's ground or obstacle
+_MAX_CELLS = 1 << 26
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ def occupancy_grid(mesh: Mesh, R_upright_world: FloatArray, voxel_m: float) -> O
     low = np.floor(p[:, :2].min(axis=0) / cell_m).astype(np.int64)
     at = np.floor(p[:, :2] / cell_m).astype(np.int64) - low
     width, height = (at.max(axis=0) + 1).tolist()
-    if width * height > _MOST_CELLS:
+    if width * height > _MAX_CELLS:
         return None
     cell = at[:, 1] * width + at[:, 0]
     lowest = np.full(width * height, np.inf)
@@ -59,7 +59,7 @@ def occupancy_grid(mesh: Mesh, R_upright_world: FloatArray, voxel_m: float) -> O
         cell[(above > _STEP_M) & (above < _CLEARANCE_M)], minlength=width * height
     )
     flat = np.bincount(cell[above <= _STEP_M], minlength=width * height).reshape(height, width)
-    occupied = standing.reshape(height, width) >= _LEAST_VERTICES
-    free = binary_closing(flat >= _LEAST_VERTICES, iterations=1) & ~occupied
+    occupied = standing.reshape(height, width) >= _MIN_VERTICES
+    free = binary_closing(flat >= _MIN_VERTICES, iterations=1) & ~occupied
     levels = np.where(occupied, OCCUPIED, np.where(free, FREE, UNKNOWN)).astype(np.uint8)
     return OccupancyGrid(levels, cell_m, low * cell_m)

@@ -20,7 +20,7 @@ _SPECKLE_PX = 200  # smaller regions of one disparity are dropped
 _SPECKLE_RANGE = 2
 _SLANT_BOX_PX = 9  # over which the surface's direction is measured
 _SLANT_STEP_PX = 12
-_LEAST_SLANT = 0.05  # a road 1.6 m below the camera, 30 m ahead
+_MIN_SLANT = 0.05  # a road 1.6 m below the camera, 30 m ahead
 _FIXED_POINT = 16.0  # parts of a pixel in OpenCV's disparities
 
 
@@ -108,7 +108,7 @@ def slant(depth: DepthImage, camera: StereoCamera) -> DepthImage:
     third = inverse - slopes[0] * x - slopes[1] * y
     length = np.sqrt(slopes[0] ** 2 + slopes[1] ** 2 + third**2)
     return np.clip(
-        inverse / np.maximum(length, np.float32(1e-9)), np.float32(_LEAST_SLANT), np.float32(1.5)
+        inverse / np.maximum(length, np.float32(1e-9)), np.float32(_MIN_SLANT), np.float32(1.5)
     )
 
 

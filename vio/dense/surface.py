@@ -19,8 +19,8 @@ from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
 from vio.records import IntArray
 
-_LEAST_SEEN = 3  # images that must show a sample
-_LEAST_TRIANGLES = 100  # of a connected piece; smaller ones are noise
+_MIN_SEEN = 3  # images that must show a sample
+_MIN_TRIANGLES = 100  # of a connected piece; smaller ones are noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Mesh:
     triangles: npt.NDArray[np.uint32]  # (T, 3) vertices, counter-clockwise from where it was seen
 
 
-def extract_surface(grid: VoxelGrid, *, least_seen: int = _LEAST_SEEN) -> Mesh:
+def extract_surface(grid: VoxelGrid, *, least_seen: int = _MIN_SEEN) -> Mesh:
     """Return the surface between samples that at least so many images show, without small loose
     pieces.
     """
@@ -85,7 +85,7 @@ def _tidied(
     )
     _, piece = connected_components(graph, directed=False)
     sizes = np.bincount(piece[triangles[:, 0]], minlength=int(piece.max()) + 1)
-    triangles = triangles[sizes[piece[triangles[:, 0]]] >= _LEAST_TRIANGLES]
+    triangles = triangles[sizes[piece[triangles[:, 0]]] >= _MIN_TRIANGLES]
     used = np.unique(triangles)
     place = np.zeros(count, dtype=np.int64)
     place[used] = np.arange(len(used))

@@ -23,9 +23,9 @@ from vio.records import Image, IntArray
 
 SIDE = 8  # samples along a block's edge
 TRUNCATION = 4  # voxels
-MOST_BLOCKS = 1 << 15  # in memory, 200 MB; those farthest from the camera go to a file
+MAX_BLOCKS = 1 << 15  # in memory, 200 MB; those farthest from the camera go to a file
 _HALF = 1 << 20  # block coordinates are within it
-_MOST_WEIGHT = 64.0  # so that a surface that changed is taken over in time
+_MAX_WEIGHT = 64.0  # so that a surface that changed is taken over in time
 _SHAPE = (SIDE, SIDE, SIDE)
 BLOCK = np.dtype(
     [
@@ -53,7 +53,7 @@ def unpack(keys: IntArray) -> IntArray:
 class VoxelGrid:
     """Depth images, fused."""
 
-    def __init__(self, voxel_m: float, *, most_blocks: int = MOST_BLOCKS) -> None:
+    def __init__(self, voxel_m: float, *, most_blocks: int = MAX_BLOCKS) -> None:
         """Begin empty.
 
         Args:
@@ -286,7 +286,7 @@ def _integrate(
                     distance[s, i, j, k] += (
                         (min(off / truncation, 1.0) - distance[s, i, j, k]) * w / (old + w)
                     )
-                    weight[s, i, j, k] = min(old + w, _MOST_WEIGHT)
+                    weight[s, i, j, k] = min(old + w, _MAX_WEIGHT)
                     if off < truncation:
                         n = seen[s, i, j, k]
                         share = max(w / (old + w), 0.125)

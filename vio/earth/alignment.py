@@ -37,18 +37,18 @@ from vio.records import BoolArray, IntArray
 # random walks.
 _DRIFT_M = 0.02  # per square root of a metre
 _DRIFT_RAD = float(np.radians(0.03))
-_LEAST_M = 1e-3  # of a motion at standstill
-_LEAST_RAD = 1e-5
+_MIN_M = 1e-3  # of a motion at standstill
+_MIN_RAD = 1e-5
 _SCALE_SIGMA = 0.01  # prior
 _CORRELATED_S = 5.0  # errors of GNSS last: positions within it count as one
 # of the antenna beside the stated error: 10 ms of the clocks at 10 m/s, the lever arm
 _TIMING_M = 0.1
 _TRUNCATION = 0.999  # probability at which a residual is cut off
 _MU_GROWTH = 1.6
-_MOST_STEPS = 40
+_MAX_STEPS = 40
 _SETTLED = 1e-5
 _START_STEPS = 20  # of the robust alignment that it starts from
-_LEAST_FIXES = 3
+_MIN_FIXES = 3
 _HEIGHT_SIGMA_M = 1e3  # of the first pose, where no position states a height
 _METRE_PER_RAD = 100.0  # weights a turn of a pose against its position in the rigid fit
 
@@ -113,7 +113,7 @@ def georeference(
             determine nothing.
     """
     before, share, inside = _between(path, fixes.times_ns + time_offset_ns)
-    if int(inside.sum()) < _LEAST_FIXES:
+    if int(inside.sum()) < _MIN_FIXES:
         own_ns = fixes.times_ns + time_offset_ns
         spans = [f"{t[0] * 1e-9:.3f} to {t[-1] * 1e-9:.3f} s" for t in (own_ns, path.times_ns)]
         raise EstimationError(
@@ -137,7 +137,7 @@ def georeference(
     residuals = np.full((len(fixes), 3), np.nan)
     used[inside] = weight[:, 0] > 0.5
     used_height[inside] = weight[:, 1] > 0.5
-    if int(used.sum()) < _LEAST_FIXES:
+    if int(used.sum()) < _MIN_FIXES:
         raise EstimationError(
             f"only {int(used.sum())} of {int(inside.sum())} GNSS positions agree with the "
             "trajectory"
@@ -207,8 +207,8 @@ class _Problem:
         self._T_i_j = se3_inverse(path.T_map_body[self._i]) @ path.T_map_body[self._j]
         length = np.linalg.norm(self._T_i_j[:, :3, 3], axis=1)
         root = np.sqrt(length + np.linalg.norm(se3_log(self._T_i_j)[:, 3:], axis=1))
-        sigma_m = np.maximum(_DRIFT_M * root, _LEAST_M)
-        sigma_rad = np.maximum(_DRIFT_RAD * root, _LEAST_RAD)
+        sigma_m = np.maximum(_DRIFT_M * root, _MIN_M)
+        sigma_rad = np.maximum(_DRIFT_RAD * root, _MIN_RAD)
         self._edge_weight = 1 / np.repeat(np.stack([sigma_m, sigma_rad], axis=1), 3, axis=1) ** 2
         self._up_body = path.up_map @ path.T_map_body[:, :3, :3]
         covariance = covariance + _TIMING_M**2 * np.eye(3)
@@ -240,7 +240,7 @@ class _Problem:
         weight = known
         limits = np.array([chi_square_quantile(_TRUNCATION, n) for n in (2, 1)], dtype=np.float64)
         mu = None
-        for _ in range(_MOST_STEPS):
+        for _ in range(_MAX_STEPS):
             squared = self._squared(T)
             if mu is None:
                 worst = (squared / limits * (weight > 0)).max(axis=0)
@@ -255,7 +255,7 @@ class _Problem:
                 break
             mu = mu * _MU_GROWTH
         weight = (self._squared(T) < limits) * known
-        for _ in range(_MOST_STEPS):
+        for _ in range(_MAX_STEPS):
             T, log_scale, moved = self._step(T, log_scale, weight)
             if moved < _SETTLED:
                 break

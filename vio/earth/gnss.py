@@ -12,7 +12,7 @@ from vio.records import BoolArray, IntArray
 
 SIGMA_M = 3.0  # horizontal, where nothing states it: a receiver without corrections under open sky
 UP_SHARE = 2.0  # of a vertical standard deviation to a horizontal one, likewise
-_LEAST_SIGMA_M = 0.01
+_MIN_SIGMA_M = 0.01
 _HEIGHTS_M = (-1000.0, 50_000.0)
 
 
@@ -87,6 +87,6 @@ def checked_fixes(
     if not stated.all():
         taken = f"{SIGMA_M:g} m is taken, {UP_SHARE * SIGMA_M:g} m in height"
         notes += (f"{int((~stated).sum())} positions state no covariance; {taken}",)
-    C = (C + np.swapaxes(C, 1, 2)) / 2 + _LEAST_SIGMA_M**2 * np.eye(3)
+    C = (C + np.swapaxes(C, 1, 2)) / 2 + _MIN_SIGMA_M**2 * np.eye(3)
     C[np.linalg.eigvalsh(C)[:, 0] <= 0] = SIGMA_M**2 * np.diag([1.0, 1.0, UP_SHARE**2])
     return GnssFixes(times_ns, geodetic, C, has_height, notes)

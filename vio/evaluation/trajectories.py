@@ -45,7 +45,7 @@ _PATH_RATIO = 1.5  # ratio of path lengths above which the reference may be anot
 _UNITS = {"millimetres": 1000.0, "centimetres": 100.0}
 # a ratio of path lengths so near one of these is no chance; odometry without a scale has any ratio
 _UNIT_SHARE = 0.1
-_PATH_LEAST_M = 1.0  # paths below this may consist of noise
+_PATH_MIN_M = 1.0  # paths below this may consist of noise
 _MATCHED_SHARE = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
 # span of the matched poses, of the estimate; below, the figures are those of a part
 _MATCHED_ESTIMATE = 0.2
@@ -64,7 +64,7 @@ _FIGURES = (
     ),
     *("reference_path_length_m", "scale", "rotation_from"),
 )
-LEAST_POSES = 3  # that determine a scale, and make a figure
+MIN_POSES = 3  # that determine a scale, and make a figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +244,7 @@ def _scale_free(T_est: FloatArray, T_ref: FloatArray) -> ScaleFree | None:
 
     None with too few poses or without motion.
     """
-    if len(T_est) < LEAST_POSES:
+    if len(T_est) < MIN_POSES:
         return None
     try:
         fit = align_poses(T_est, T_ref, "sim3")
@@ -319,7 +319,7 @@ def _notes(
     """Name signs that the reference belongs to another recording."""
     notes = []
     short, long = sorted((estimate_m, reference_m))
-    if long > _PATH_LEAST_M and long > _PATH_RATIO * short:
+    if long > _PATH_MIN_M and long > _PATH_RATIO * short:
         units = {
             name: size
             for name, size in _UNITS.items()

@@ -11,7 +11,7 @@ import os
 import stat
 from pathlib import Path
 
-MOST_BYTES = 2**30  # of a text file: an hour of IMU at 1 kHz is half of that
+MAX_BYTES = 2**30  # of a text file: an hour of IMU at 1 kHz is half of that
 # `vio eval <(command) …` reads a pipe with a writer.
 _READABLE = (os.devnull, "/dev/fd/", "/proc/self/fd/", "/dev/stdin")
 
@@ -27,7 +27,7 @@ def check_regular(path: Path) -> None:
         raise OSError(errno.EINVAL, "it is a pipe, socket or device, no file", os.fspath(path))
 
 
-def read_input(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
+def read_input(path: Path, most_bytes: int = MAX_BYTES) -> bytes:
     """Read a whole file.
 
     Raises:

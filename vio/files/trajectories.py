@@ -39,7 +39,7 @@ TrajectoryFormat: TypeAlias = Literal["tum", "kitti", "euroc"]
 
 # deviation of a quaternion's norm or of R^T R from one accepted as rounding
 ROTATION_TOLERANCE = 1e-3
-_LEAST_COLUMNS = 4  # a stamp and a position
+_MIN_COLUMNS = 4  # a stamp and a position
 _POSE_COLUMNS = 8
 _KITTI_COLUMNS = 12
 _WHOLE = re.compile(r"[+-]?\d+")
@@ -334,7 +334,7 @@ def _read_table(path: Path) -> _Table:
 def _is_header(line: str) -> bool:
     """Return whether no cell of a line is a number."""
     cells = split_cells(line)
-    return len(cells) >= _LEAST_COLUMNS and not any(map(_is_number, cells))
+    return len(cells) >= _MIN_COLUMNS and not any(map(_is_number, cells))
 
 
 def _is_number(text: str) -> bool:
@@ -351,7 +351,7 @@ def _detect(table: _Table) -> TrajectoryFormat:
         return "euroc"
     n = len(table.fields(0))
     named = _names_poses(table, n)
-    if n not in (_LEAST_COLUMNS, _POSE_COLUMNS, _KITTI_COLUMNS) and not named:
+    if n not in (_MIN_COLUMNS, _POSE_COLUMNS, _KITTI_COLUMNS) and not named:
         forms = "; ".join(f"{kind}: {columns}" for kind, columns in _COLUMNS.items())
         table.fail(0, f"{n} columns fit no known format ({forms})")
     return "kitti" if n == _KITTI_COLUMNS and not named else "tum"
@@ -371,7 +371,7 @@ def _check_columns(table: _Table, kind: TrajectoryFormat, *, as_requested: bool)
         kind
     ]
     if kind != "kitti" and (
-        count == _LEAST_COLUMNS or (not as_requested and _names_poses(table, count))
+        count == _MIN_COLUMNS or (not as_requested and _names_poses(table, count))
     ):
         expected = count
     for row, line in enumerate(table.rows):

@@ -6,10 +6,10 @@ from typing import Any
 
 import yaml
 
-MOST_BYTES = 2**22  # of a configuration or calibration
+MAX_BYTES = 2**22  # of a configuration or calibration
 # a long list of views of a calibration; aliases of aliases make a kilobyte a billion
-_MOST_NODES = 20_000
-_MOST_DEPTH = 32  # the deepest known calibration has five levels
+_MAX_NODES = 20_000
+_MAX_DEPTH = 32  # the deepest known calibration has five levels
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -31,10 +31,10 @@ class _PlainLoader(yaml.SafeLoader):
         self._nodes += self._nodes_of.get(event.anchor, 0) if alias else 1
         if alias and event.anchor in self.anchors and event.anchor not in self._nodes_of:
             raise self._refused(f"the value of &{event.anchor} contains itself", event)
-        if self._nodes > _MOST_NODES:
-            raise self._refused(f"more than {_MOST_NODES} values", event)
-        if self._depth >= _MOST_DEPTH:
-            raise self._refused(f"nested deeper than {_MOST_DEPTH} levels", event)
+        if self._nodes > _MAX_NODES:
+            raise self._refused(f"more than {_MAX_NODES} values", event)
+        if self._depth >= _MAX_DEPTH:
+            raise self._refused(f"nested deeper than {_MAX_DEPTH} levels", event)
         self._depth += 1
         try:
             node = super().compose_node(parent, index)

@@ -23,7 +23,7 @@ _ITERATIONS = 6
 _BEARING_SIGMA = 2e-3  # rad, a pixel of a usual lens; larger residuals lose weight
 _MIN_SHARED = 8  # tracks that two views share, for their rotation to be used
 _TINY = 1e-12
-_LEAST_DEPTH_M = 0.1  # of a point in a weight: a nearer one is noise
+_MIN_DEPTH_M = 0.1  # of a point in a weight: a nearer one is noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +159,7 @@ def align_visual_inertial(
             by_v[..., None] * x[:3] + by_g[..., None] * x[3:] + (fixed[first][:, None] - fixed)
         )
         depth = np.maximum(
-            np.linalg.norm(centres + d[:, None, None] * m[:, None], axis=2), _LEAST_DEPTH_M
+            np.linalg.norm(centres + d[:, None, None] * m[:, None], axis=2), _MIN_DEPTH_M
         )
         off = np.linalg.norm(A_x @ x + A_d * d[:, None, None] - b, axis=2) / depth
         weight = seen * (d > 0)[:, None] / depth**2 / (1 + (off / _BEARING_SIGMA) ** 2)

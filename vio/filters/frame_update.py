@@ -83,7 +83,7 @@ _NEARER = 1.25  # by which factor a step must have come nearer for another one
 _CONTRADICTED = 2.0
 # over the window in a frame: one is the rule, two bring in a start in motion, a third is an
 # exception
-_MOST_STEPS = 4
+_MAX_STEPS = 4
 
 
 class FrameUpdate:
@@ -267,7 +267,7 @@ class FrameUpdate:
         """Gauss-Newton over the window; returns the tracks linearised at the estimate, and the
         last fit.
         """
-        for _ in range(_MOST_STEPS):
+        for _ in range(_MAX_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b, _ = self._information(window, tracks, everything, pixels)
             fitted = self._move_to_optimum(window, tracks, tracks.stereo, A, b, len(A))

@@ -19,14 +19,13 @@ import numpy as np
 from vio.filters.pose_loops import lacks_samples
 from vio.geometry.lie import FloatArray
 from vio.numerics.robust import median
-from vio.records import ImuSample, IntArray
+from vio.records import S_PER_NS, ImuSample, IntArray
 
-_NS = 1e-9
 _MEMORY_S = 2.0  # samples that the structure function is learned from
-_MOST_SAMPLES = 8000  # of them, whatever their stamps say
+_MAX_SAMPLES = 8000  # of them, whatever their stamps say
 # half of it; beyond, the signal is taken to have changed as much as it ever does
 _LONGEST_LAG_S = 1.0
-_LEAST_SAMPLES = 10  # with fewer the signal is not characterised
+_MIN_SAMPLES = 10  # with fewer the signal is not characterised
 # D then: accelerometer (m/s^2)^2, gyro (rad/s)^2, of a vehicle that manoeuvres
 _UNKNOWN = np.array([3.0, 1.0]) ** 2
 _MEASURED_SHARE = 8  # of the samples in memory, 1 / 8: so many new ones change their median little
@@ -36,7 +35,7 @@ _LONG_PERIODS = 1.5
 _SLOW_NS = 30e6
 _SLOW_CUT_NS = 10e6  # of its intervals
 _SHORTEST_CUT_NS = 1e6  # of a gap, for the integration
-_MOST_CUTS = 1000
+_MAX_CUTS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +55,7 @@ class ImuHistory:
     """
 
     def __init__(self) -> None:
-        self._samples: deque[ImuSample] = deque(maxlen=_MOST_SAMPLES)
+        self._samples: deque[ImuSample] = deque(maxlen=_MAX_SAMPLES)
         self._period = 0.0  # median distance, and samples since it was computed
         self._unmeasured = 0
 
@@ -66,7 +65,7 @@ class ImuHistory:
         """
         self._samples.extend(samples)
         self._unmeasured += len(samples)
-        while len(self._samples) * self.period_ns() > _MEMORY_S / _NS:
+        while len(self._samples) * self.period_ns() > _MEMORY_S / S_PER_NS:
             self._samples.popleft()
 
     def period_ns(self) -> float:
@@ -98,7 +97,7 @@ class ImuHistory:
         uncertain = gap | held | (silent > _SLOW_NS)
         cut_ns = _SLOW_CUT_NS if period_ns > _SLOW_NS else max(period_ns, _SHORTEST_CUT_NS)
         counts = np.where(uncertain, np.ceil(np.diff(cuts_ns) / cut_ns), 1)
-        parts = np.clip(counts, 1, _MOST_CUTS).astype(np.int64)
+        parts = np.clip(counts, 1, _MAX_CUTS).astype(np.int64)
         ends = [
             np.linspace(a, b, n + 1)[:-1]
             for a, b, n in zip(cuts_ns[:-1], cuts_ns[1:], parts, strict=True)
@@ -106,7 +105,9 @@ class ImuHistory:
         cuts = np.concatenate([*ends, cuts_ns[-1:]])
         left, right, uncertain = (np.repeat(x, parts) for x in (left, right, uncertain))
         variance = np.where(
-            uncertain, self._hidden_variance(cuts * _NS, left * _NS, right * _NS), 0.0
+            uncertain,
+            self._hidden_variance(cuts * S_PER_NS, left * S_PER_NS, right * S_PER_NS),
+            0.0,
         )
         return Hidden(cuts, variance, bool(gap.any()))
 
@@ -141,17 +142,17 @@ class ImuHistory:
         """Lags (L,) in s and the mean squared change (2, L) of accelerometer and gyro over them,
         of the worst axis.
         """
-        if len(self._samples) < _LEAST_SAMPLES:
+        if len(self._samples) < _MIN_SAMPLES:
             return np.array([0.0, 1.0]), np.stack([_UNKNOWN, _UNKNOWN], axis=1)
         times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
         period = self.period_ns()
         lags = [0.0]
         change = [np.zeros(2)]
         lag = period
-        while lag <= _LONGEST_LAG_S / _NS and times[-1] - times[0] >= lag:
+        while lag <= _LONGEST_LAG_S / S_PER_NS and times[-1] - times[0] >= lag:
             pairs = _pairs(times, lag, 0.5 * period)
             if len(pairs):
-                lags.append(lag * _NS)
+                lags.append(lag * S_PER_NS)
                 change.append(np.array([self._change(pairs, "accel"), self._change(pairs, "gyro")]))
             lag *= 2**0.5
         return np.array(lags), np.array(change).T

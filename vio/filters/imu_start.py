@@ -22,7 +22,7 @@ from vio.records import ImuSample
 
 START_TILT_SIGMA_DEG = 8.0  # initial standard deviation of roll and pitch
 # beyond, the direction of gravity is unknown; a larger prior says no more
-_MOST_TILT_RAD = np.pi / 4
+_MAX_TILT_RAD = np.pi / 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ def imu_start(samples: Sequence[ImuSample], time_ns: int, settings: MsckfSetting
     base = s.gravity_mps2 * np.radians(START_TILT_SIGMA_DEG)
     sigma = min(
         float(np.linalg.norm([base, shown, scatter])),
-        s.gravity_mps2 * float(np.tan(_MOST_TILT_RAD)),
+        s.gravity_mps2 * float(np.tan(_MAX_TILT_RAD)),
     )
     return ImuStart(False, force, gyro[-1], np.zeros(3), s.gyro_bias_sigma_radps, sigma)
 

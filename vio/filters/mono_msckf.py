@@ -36,7 +36,7 @@ from vio.records import (
 
 # Measured in docs/notes/design_decisions.md, "of one camera".
 _LANDMARKS = 0  # one that is marginalised at a scale that is still off holds on to it
-_LEAST_CLONES = 20  # parallax comes from motion alone, so a second of poses instead of half
+_MIN_CLONES = 20  # parallax comes from motion alone, so a second of poses instead of half
 _WORLD = [0, 1, 2, 5]  # errors of position and yaw, which the start takes for the world's
 
 
@@ -198,7 +198,7 @@ class MonoMsckf(Msckf):
 
 
 def _for_one_camera(settings: MsckfSettings) -> MsckfSettings:
-    clones = max(settings.clones, _LEAST_CLONES)
+    clones = max(settings.clones, _MIN_CLONES)
     # The time offset trades against the scale, which rests on the IMU alone.
     calibrate = "none" if settings.calibrate_camera_imu == "auto" else settings.calibrate_camera_imu
     return replace(

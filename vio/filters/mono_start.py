@@ -49,23 +49,23 @@ from vio.numerics.statistics import chi_square_quantile
 from vio.records import ImuSample, Observations
 
 _SPAN_S = 3.0  # of views: what a gyro bias leaves of rotations is corrected to first order only
-_LEAST_SPAN_S = 0.6  # half of it shows less than the standard deviation of the accelerometer's bias
+_MIN_SPAN_S = 0.6  # half of it shows less than the standard deviation of the accelerometer's bias
 _VIEWS = 16
 _EVERY = 5  # frames between two attempts, whose time is that of a dozen updates
-_LEAST_TRACKS = 20
-_MOST_TRACKS = 150
+_MIN_TRACKS = 20
+_MAX_TRACKS = 150
 _STEPS = 30  # of Gauss-Newton at most: where the scale is hardly known it takes twenty
 _CONVERGED = 1e-3  # m, m/s and rad
 _STILL_PX = 0.5  # median motion of the tracks over half a second at standstill
 _TILT_SIGMA_RAD = np.radians(15.0)  # of gravity by the linear solution
 # of a start; the filter is linear in the scale to half the square of it, 0.5 %
-MOST_SCALE_SIGMA = 0.1
+MAX_SCALE_SIGMA = 0.1
 # chi-square probability of the fit's distance from the prior, which is that of the IMU
 _AGREEMENT = 0.999
 # from the first contradiction, after which a start is taken with a covariance that allows for it
 _PATIENCE_S = 5.0
 _BIASES = slice(9, DIM)  # of gyro and accelerometer, among the errors
-_LEAST_PX = 0.15  # pixel noise that fewer residuals than a filter's cannot prove
+_MIN_PX = 0.15  # pixel noise that fewer residuals than a filter's cannot prove
 # On the densities of accelerometer and gyro, until the filter has learned its own: too small ones
 # cost the scale, too large ones time (docs/notes/design_decisions.md, IMU noise at the start).
 START_FACTORS = np.array([2.0, 8.0])
@@ -100,7 +100,7 @@ def is_still(
     if not before:
         return False
     _, a, b = np.intersect1d(before[-1].ids, now.ids, assume_unique=True, return_indices=True)
-    if len(a) < _LEAST_TRACKS:
+    if len(a) < _MIN_TRACKS:
         return False
     moved = np.linalg.norm(before[-1].z[a, :2] - now.z[b, :2], axis=1)
     return bool(np.median(moved) < _STILL_PX) and imu_start(samples, now.time_ns, settings).still
@@ -114,7 +114,7 @@ class MonoStarter:
     ) -> None:
         self._camera = camera
         self._T_cam0_imu = T_cam0_imu
-        self._settings = replace(settings, clones=_VIEWS, max_features=_MOST_TRACKS)
+        self._settings = replace(settings, clones=_VIEWS, max_features=_MAX_TRACKS)
         self._frames: deque[Observations] = deque()
         self._passed = 0
         # stamp of the first view at which features and IMU did
@@ -139,9 +139,11 @@ class MonoStarter:
         if is_still(self._frames, motion.samples, self._settings):
             return self._still_start(motion)
         span_s = (seen.time_ns - self._frames[0].time_ns) * 1e-9
-        if span_s < _LEAST_SPAN_S:
-            self.why = f"there are {span_s:.2f} s of frames, and a start in motion takes {_LEAST_SPAN_S:g} s"
-        if span_s < _LEAST_SPAN_S or self._passed % _EVERY:
+        if span_s < _MIN_SPAN_S:
+            self.why = (
+                f"there are {span_s:.2f} s of frames, and a start in motion takes {_MIN_SPAN_S:g} s"
+            )
+        if span_s < _MIN_SPAN_S or self._passed % _EVERY:
             return None
         return self._moving_start(motion)
 
@@ -156,7 +158,7 @@ class MonoStarter:
         for k, seen in enumerate(views):
             table.table.add_frame(k, seen)
         rows = table.choose(len(views))
-        if len(rows) < _LEAST_TRACKS:
+        if len(rows) < _MIN_TRACKS:
             self.why = f"only {len(rows)} features are seen in several views"
             return None
         begin = self._aligned(motion, views, table)
@@ -167,10 +169,10 @@ class MonoStarter:
         if found is None:
             return None
         nav, P, sigma = found
-        if sigma > MOST_SCALE_SIGMA:
+        if sigma > MAX_SCALE_SIGMA:
             self.why = (
                 f"the scale is known to {100 * sigma:.0f} % only (more than "
-                f"{100 * MOST_SCALE_SIGMA:.0f} %); move "
+                f"{100 * MAX_SCALE_SIGMA:.0f} %); move "
                 "the camera sideways with changing speed"
             )
             return None
@@ -249,7 +251,7 @@ class MonoStarter:
             fitted = None
             for _ in range(_STEPS):
                 lin = tracks.linearise(window.T_cam0_world(), tracks.choose(len(views)), 2)
-                if len(lin.rows) < _LEAST_TRACKS:
+                if len(lin.rows) < _MIN_TRACKS:
                     self.why = f"only {len(lin.rows)} features show parallax"
                     return None
                 self._follow_noise(tracks, lin)
@@ -321,7 +323,7 @@ class MonoStarter:
         _, squares, dof = tracks.gate(lin.at)
         ratio = float(np.median(squares / chi_square_table(0.5)[dof]))
         tracks.variance = float(
-            np.clip(tracks.variance * ratio, _LEAST_PX**2, self._settings.pixel_sigma_max_px**2)
+            np.clip(tracks.variance * ratio, _MIN_PX**2, self._settings.pixel_sigma_max_px**2)
         )
 
 

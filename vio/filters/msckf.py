@@ -55,7 +55,7 @@ from vio.records import (
 )
 
 _SAMPLES = {"imu": ImuSample, "velocity": VelocitySample}  # of each motion source
-_MOST_SPEED_MPS = 100.0  # with an IMU, whose scale is metric: beyond it the filter has diverged
+_MAX_SPEED_MPS = 100.0  # with an IMU, whose scale is metric: beyond it the filter has diverged
 
 
 class Msckf(Backend):
@@ -514,4 +514,4 @@ def _is_sane(window: Window, source: MotionSource | None) -> bool:
     """Whether the state is made of numbers, and with an IMU of a possible speed."""
     if not np.isfinite(window.prior.P).all() or not np.isfinite(window.nav.T_world_imu).all():
         return False
-    return source != "imu" or float(np.linalg.norm(window.nav.velocity)) < _MOST_SPEED_MPS
+    return source != "imu" or float(np.linalg.norm(window.nav.velocity)) < _MAX_SPEED_MPS

@@ -24,7 +24,7 @@ MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
 CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
 _MEDIAN = 2.37  # of chi-square with 3 degrees of freedom, those of a stereo view
 # of a point at infinity: ten baselines of motion move it by a hundredth of a pixel
-LEAST_DISPARITY_PX = 1e-3
+MIN_DISPARITY_PX = 1e-3
 # per px^2, information on the disparity: its standard deviation is 1000 px, half of what MIN_DEPTH
 # shows
 _PRIOR = 1e-6
@@ -160,7 +160,7 @@ def first_points(
     """
     p = np.zeros((len(views.z), 3))
     known = np.empty(len(views.z), dtype=np.bool_)
-    disparities = LEAST_DISPARITY_PX, camera.fu / MIN_DEPTH
+    disparities = MIN_DISPARITY_PX, camera.fu / MIN_DEPTH
     loops.start_by_stereo(
         camera_args(camera), disparities, T_cam0_world, views.z, views.weight, p, known
     )
@@ -197,7 +197,7 @@ def refine_points(
     lens = camera_args(camera)
     least = MIN_DEPTH * camera.baseline_m
     views_of = T_cam0_world, views.z, views.weight
-    loops.refine(lens, least, LEAST_DISPARITY_PX, *views_of, steps, scale_px**2, _TINY, _PRIOR, p)
+    loops.refine(lens, least, MIN_DISPARITY_PX, *views_of, steps, scale_px**2, _TINY, _PRIOR, p)
     return p
 
 
@@ -277,7 +277,7 @@ class TrackInformation:
         q = self.q
         p = np.empty((len(self.C), 3))
         gradient = self.point_gradient - other
-        point = q.centre, q.p_D_q, q.disparity, LEAST_DISPARITY_PX
+        point = q.centre, q.p_D_q, q.disparity, MIN_DISPARITY_PX
         loops.substitute_back(
             self.G, self.C, gradient, *point, np.ascontiguousarray(clone_errors), p
         )

@@ -21,7 +21,7 @@ _LOG_VARIANCE_SIGMA = 1.5  # initial standard deviation of the logarithm of the 
 _LOG_VARIANCE_WALK = 0.15  # its random walk per sum of steps
 _SURPRISE = 0.9999  # chi-square probability beyond which a single step is an exception
 _SURPRISING = chi_square_quantile(_SURPRISE, np.arange(1, 4)).tolist()
-_MOST = 1e6
+_MAX = 1e6
 _PARTS = slice(0, 3), slice(3, 6)  # translation, rotation
 # d E[2 F_k(e^t x) - 1] / dt at t = 0 for x ~ chi-square(k), k = 0..3
 _SENSITIVITY = (0.0, 1 / np.pi, 0.5, 2 / np.pi)
@@ -59,7 +59,7 @@ class StepErrors:
         for k, part in enumerate(_PARTS):
             test = whitened_correction(self, part)
             if test.dof and test.squared > _SURPRISING[test.dof - 1]:
-                out[k] = min((test.squared / test.dof - 1) / max(test.share, 1e-12), _MOST)
+                out[k] = min((test.squared / test.dof - 1) / max(test.share, 1e-12), _MAX)
         return out
 
 

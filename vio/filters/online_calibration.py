@@ -47,10 +47,10 @@ _EXTRINSIC_TRANSLATION_WALK_M = 1.0e-4
 _TIME_OFFSET_WALK_S = 2.0e-6
 # initial standard deviation of the right camera's rotation about its vertical axis
 STEREO_YAW_SIGMA_DEG = 0.05
-LEAST_FIELD_SIGMA = 5.0e-4  # the same of the other rectification terms, in focal lengths
-MOST_FIELD_SIGMA = 2.0e-3
+MIN_FIELD_SIGMA = 5.0e-4  # the same of the other rectification terms, in focal lengths
+MAX_FIELD_SIGMA = 2.0e-3
 # at least that of what both lenses have in common, which moves no rows of far points
-_LEAST_COMMON_SIGMA = 1.0e-3
+_MIN_COMMON_SIGMA = 1.0e-3
 _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
 # random walk of the rectification error per root second, over its initial standard deviation
 _STEREO_WALK = 0.02
@@ -63,7 +63,7 @@ def stereo_field_sigmas(sigma: float, turn_rad: float = 0.0) -> FloatArray:
     Yaw, which moves no row, is known no better than by the turn `turn_rad` that pitch and roll
     would make of the rows.
     """
-    common = max(sigma, _LEAST_COMMON_SIGMA)
+    common = max(sigma, _MIN_COMMON_SIGMA)
     yaw = max(np.radians(STEREO_YAW_SIGMA_DEG), turn_rad)
     return np.array([yaw, *[sigma] * 3, *[_RADIAL * common] * 2, common, common])
 
@@ -329,7 +329,7 @@ class _StereoFieldBlock(StereoBlock):
         return False
 
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
-        return stereo_field_sigmas(MOST_FIELD_SIGMA)
+        return stereo_field_sigmas(MAX_FIELD_SIGMA)
 
     def report(
         self, calibration: Calibration, nav: NavState, covariance: FloatArray

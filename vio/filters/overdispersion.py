@@ -22,7 +22,7 @@ from vio.records import IntArray
 # before any track has ended: white noise has 1, front ends on real images 2 to 7
 PRIOR_FACTOR = 2.5
 _PRIOR_TRACKS = 30.0  # as many ended tracks count for it
-_MOST_FEATURES = 4096  # whose clusters are kept: far more than are seen at once
+_MAX_FEATURES = 4096  # whose clusters are kept: far more than are seen at once
 CELL_RAD = 0.2  # side of the cells of directions in which features are neighbours
 _FRAMES = 10  # of those in which tracks end, in which neighbours' are one cluster
 
@@ -58,8 +58,8 @@ class Overdispersion:
         cells = np.floor(directions / CELL_RAD).astype(np.int64).tolist()
         rows: IntArray = np.empty(len(ids), dtype=np.int64)
         if len(self._free) < len(ids):
-            self._free += range(len(self._scores), len(self._scores) + _MOST_FEATURES)
-            self._scores = np.concatenate([self._scores, np.zeros((_MOST_FEATURES, 6))])
+            self._free += range(len(self._scores), len(self._scores) + _MAX_FEATURES)
+            self._scores = np.concatenate([self._scores, np.zeros((_MAX_FEATURES, 6))])
         for k, (feature, (x, y)) in enumerate(zip(ids.tolist(), cells, strict=True)):
             cluster = self._cluster.pop(feature, (x, y, self._calls // _FRAMES))
             self._cluster[feature] = cluster  # a feature that began again stays in its cluster
@@ -69,9 +69,9 @@ class Overdispersion:
         self._calls += 1
         self._information += information.sum(axis=0)
         self._tracks += len(ids)
-        while len(self._cluster) > _MOST_FEATURES:
+        while len(self._cluster) > _MAX_FEATURES:
             del self._cluster[next(iter(self._cluster))]
-        while len(self._row) > _MOST_FEATURES:
+        while len(self._row) > _MAX_FEATURES:
             self._free.append(row := self._row.pop(next(iter(self._row))))
             self._scores[row] = 0.0
         known = self._information > 0

@@ -10,7 +10,7 @@ from vio.filters.window import Window
 from vio.geometry.lie import FloatArray
 from vio.records import IntArray, Landmarks, no_landmarks
 
-_LEAST_MERGE = 1000  # stored points up to which the map is not merged
+_MIN_MERGE = 1000  # stored points up to which the map is not merged
 
 
 class PointMap:
@@ -28,7 +28,7 @@ class PointMap:
             self.parts.append(_reported(window, ids, p_world, covariance))
             self._stored += len(ids)
             # Features that stay in view are stored again and again.
-            if self._stored > _LEAST_MERGE + len(self.parts[0].ids):
+            if self._stored > _MIN_MERGE + len(self.parts[0].ids):
                 self.parts = [newest_points(self.parts)]
                 self._stored = 0
 

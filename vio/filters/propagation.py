@@ -31,7 +31,7 @@ _TWIST_FACTORS = (1.0, 0.1, 10.0)
 # A start with a large uncertainty of the tilt is linearised far from the truth, which shows as
 # process noise.
 _FACTOR_PER_TILT_SIGMA = 1 / np.radians(8.0)
-_MOST_START_FACTOR = 5.0
+_MAX_START_FACTOR = 5.0
 _LINEAR_RAD = (
     # standard deviation of a rotation beyond which the errors of poses before and after it are not
     # linear
@@ -333,5 +333,5 @@ class Propagation:
 def first_imu_noise(P: FloatArray) -> MotionNoise:
     """The IMU's noise at a start whose navigation state has the covariance P (15, 15)."""
     tilt_sigma = float(np.sqrt(P[3:5, 3:5].diagonal().max()))
-    start = min(IMU_FACTORS[0] + _FACTOR_PER_TILT_SIGMA * tilt_sigma, _MOST_START_FACTOR)
+    start = min(IMU_FACTORS[0] + _FACTOR_PER_TILT_SIGMA * tilt_sigma, _MAX_START_FACTOR)
     return MotionNoise(start, *IMU_FACTORS[1:])

@@ -16,7 +16,7 @@ from vio.geometry.lie import FloatArray, se3_exp, so3_hat
 # A divergence begins before it shows, so the last good attitude is taken to be off by a few degrees
 # already.
 _ROTATION_SIGMA_RAD = np.radians(2.0)
-_LEAST_SPEED_MPS = 1.0  # the last velocity may have been wrong by itself, and by this
+_MIN_SPEED_MPS = 1.0  # the last velocity may have been wrong by itself, and by this
 # for which the last velocity and rate are believed; beyond it the pose is held
 _EXTRAPOLATED_S = 0.5
 _RATE_SIGMA_RADPS = 1.0  # of a body that nothing measures: a turn within a second is not seen
@@ -70,7 +70,7 @@ def restarted(
     velocity = motion.velocity_world(nav)
     twist = body_twist(T, velocity, nav.rate)
     moved = replace(nav, T_world_imu=T @ se3_exp(min(elapsed_s, _EXTRAPOLATED_S) * twist))
-    speed = float(np.linalg.norm(velocity)) + _LEAST_SPEED_MPS
+    speed = float(np.linalg.norm(velocity)) + _MIN_SPEED_MPS
     position = speed * elapsed_s
     rotation = float(np.hypot(_ROTATION_SIGMA_RAD, _RATE_SIGMA_RADPS * elapsed_s))
     rotation = min(rotation, _ANY_ROTATION_RAD)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from vio.filters.online_calibration import (
-    LEAST_FIELD_SIGMA,
-    MOST_FIELD_SIGMA,
+    MAX_FIELD_SIGMA,
+    MIN_FIELD_SIGMA,
     Calibration,
     prior_variances,
     stereo_field_sigmas,
@@ -54,7 +54,7 @@ def field_sigmas(camera: StereoCamera, offset_px: float) -> FloatArray:
     estimate of the standard deviation of the columns' (empirical Bayes).
     """
     sigma = float(
-        np.clip(_COLUMNS_BY_ROWS * rows_off(camera, offset_px), LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA)
+        np.clip(_COLUMNS_BY_ROWS * rows_off(camera, offset_px), MIN_FIELD_SIGMA, MAX_FIELD_SIGMA)
     )
     return stereo_field_sigmas(sigma, offset_px / camera.fu)
 
@@ -84,7 +84,7 @@ class RigCalibration:
         # (8,) before anything was seen of it
         self._field_variances = prior_variances(settings)["stereo_field"]
         # size of the rows' field that gave them, focal lengths
-        self._rows_off = LEAST_FIELD_SIGMA / _COLUMNS_BY_ROWS
+        self._rows_off = MIN_FIELD_SIGMA / _COLUMNS_BY_ROWS
         # at a calibration, by the present rows
         self._field: tuple[Calibration, StereoCorrection | None] | None = None
 

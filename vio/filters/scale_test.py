@@ -19,7 +19,7 @@ from vio.geometry.lie import FloatArray
 
 _SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
 # More than correct baselines show (docs/notes/design_decisions.md, contradiction of the scale).
-_LEAST = 0.04
+_MIN = 0.04
 _SIGMAS = 5.0
 # The accelerometer's noise is in the motion that is held against the images, and there passes for
 # motion at twice the scale. It has three degrees of freedom in a frame, of which images determine a
@@ -97,4 +97,4 @@ class ScaleTest:
         noise explains.
         """
         s, sigma = self.estimate()
-        return abs(s) > max(_LEAST + _BY_NOISE * self._frames / self._information, _SIGMAS * sigma)
+        return abs(s) > max(_MIN + _BY_NOISE * self._frames / self._information, _SIGMAS * sigma)

@@ -12,8 +12,8 @@ from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, IntArray, Observations
 
 # Of a pixel, over the frame's median: a residual can be small, or a patch fit badly, by chance.
-_MOST_SIGMA = 10.0
-_MOST_PRECISION = 3.0
+_MAX_SIGMA = 10.0
+_MAX_PRECISION = 3.0
 
 
 class TrackTable:
@@ -129,7 +129,7 @@ def precision(seen: Observations) -> FloatArray:
     weight = measured(seen.has_right)
     if seen.sigma is None:
         return weight
-    loops.weigh_by_sigma(seen.sigma, 1.0 / _MOST_SIGMA, _MOST_PRECISION, weight)
+    loops.weigh_by_sigma(seen.sigma, 1.0 / _MAX_SIGMA, _MAX_PRECISION, weight)
     return weight
 
 

@@ -17,7 +17,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import Estimate
 
-_LEAST_MOTION_M = 1e-3  # of all poses from the oldest one: less has no scale
+_MIN_MOTION_M = 1e-3  # of all poses from the oldest one: less has no scale
 _STATIONARY_LIMIT = float(chi_square_quantile(0.95, 6))  # of the motion over the window
 
 
@@ -166,7 +166,7 @@ def scale_sigma(posterior: WindowPosterior) -> float | None:
     T = posterior.clones.T_world_imu
     p = T[:, :3, 3] - T[0, :3, 3]
     length2 = float(np.sum(p**2))
-    if length2 < _LEAST_MOTION_M**2:
+    if length2 < _MIN_MOTION_M**2:
         return None
     # p = exp(phi) p_hat + rho, less that of the oldest pose
     moves = np.concatenate(

@@ -42,14 +42,14 @@ from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 
 MIN_TRACKS_FOR_NOISE = 15  # with fewer, neither the pixel noise nor the process noise is adapted
-LEAST_PIXEL_SIGMA_PX = 0.03  # lower bound of the estimated noise of one pixel coordinate
+MIN_PIXEL_SIGMA_PX = 0.03  # lower bound of the estimated noise of one pixel coordinate
 # Pixels of a track share errors that its residuals do not show, and no right image bounds what they
 # make of the scale (docs/notes/design_decisions.md, pixel noise of one camera).
-_LEAST_MONO_PX = 0.1
+_MIN_MONO_PX = 0.1
 _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals in the end
 # the noise at the start may be off by a factor of four, that of frames differs by one and a half
 _PRIOR_FRAMES = 0.1
-_MOST_CHANGE = 4.0  # of the variance from frame to frame that is believed in the end
+_MAX_CHANGE = 4.0  # of the variance from frame to frame that is believed in the end
 # Degrees of freedom: 2 for the mean of an inverse chi-square, over the efficiency of a median,
 # 0.64.
 _SPENT_ON_NOISE = 3.0
@@ -57,11 +57,11 @@ VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
 # of the tracks used, at least, that the newest frame shows and that stay in the window
 _GOING_ON = 0.1
-_MOST_DOF = 199
+_MAX_DOF = 199
 # left of a pose's own, at most: directions that pixels alone do not tell, as where the world is
 _NO_INFORMATION = 1e-8
 # of a frame over the learned variance: beyond twice the noise it is no blur
-_MOST_COMMON_NOISE = 4.0
+_MAX_COMMON_NOISE = 4.0
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class WindowTracks:
         self._camera = camera
         self._settings = settings
         self.table = TrackTable(settings.clones + 1)
-        self._least_px = _LEAST_MONO_PX if camera.kind == "mono" else LEAST_PIXEL_SIGMA_PX
+        self._least_px = _MIN_MONO_PX if camera.kind == "mono" else MIN_PIXEL_SIGMA_PX
         self._frames = 0  # from which the noise was learned
         # of one pixel coordinate, px^2; follows the residuals
         self.variance = settings.pixel_sigma_px**2
@@ -322,8 +322,8 @@ class WindowTracks:
         """
         squares = np.empty(len(at.r))
         dof = np.empty(len(at.r), dtype=np.int64)
-        loops.square_tracks(at.r, at.z_D_p, self.variance, _MOST_DOF, squares, dof)
-        self.common_noise = min(_misfit(squares, dof), _MOST_COMMON_NOISE)
+        loops.square_tracks(at.r, at.z_D_p, self.variance, _MAX_DOF, squares, dof)
+        self.common_noise = min(_misfit(squares, dof), _MAX_COMMON_NOISE)
         limits = chi_square_table(self._settings.gate_probability)[dof] * self.common_noise
         passed: BoolArray = squares <= limits
         return passed, squares, dof
@@ -352,9 +352,7 @@ class WindowTracks:
         total = int(dof.sum())
         if total > spent:
             left = (1 - float(y @ y) / squares) / (1 - spent / total)
-            self.common_noise = min(
-                max(_misfit(nis, dof) * min(left, 1.0), 1.0), _MOST_COMMON_NOISE
-            )
+            self.common_noise = min(max(_misfit(nis, dof) * min(left, 1.0), 1.0), _MAX_COMMON_NOISE)
 
     def update_pixel_noise(self, squares: FloatArray, dof: IntArray, fitted: float) -> None:
         """Let the pixel noise follow the median of squared residuals over that of chi-square,
@@ -374,7 +372,7 @@ class WindowTracks:
             return
         self._frames += 1
         gain = max(1 / (self._frames + _PRIOR_FRAMES), _NOISE_GAIN)
-        most = _MOST_CHANGE ** (gain / _NOISE_GAIN)
+        most = _MAX_CHANGE ** (gain / _NOISE_GAIN)
         # The mean of 1 / variance is that of the noise itself, where its estimate has about two
         # degrees less.
         total = float(dof.sum())
@@ -417,4 +415,4 @@ def _misfit(squares: FloatArray, dof: IntArray) -> float:
 @lru_cache(maxsize=8)
 def chi_square_table(probability: float) -> FloatArray:
     """Quantiles of chi-square for 0 to 199 degrees of freedom."""
-    return np.concatenate([[0.0], chi_square_quantile(probability, np.arange(1, _MOST_DOF + 1))])
+    return np.concatenate([[0.0], chi_square_quantile(probability, np.arange(1, _MAX_DOF + 1))])

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from vio.imu.findings import InertialFinding
-from vio.records import IntArray
+from vio.records import S_PER_NS, IntArray
 
 _COVERED = 0.97  # share of the frames that must have samples …
 _UNCOVERED_S = 1.0  # … unless the uncovered time is shorter
 _LATE_S = 0.1  # a frame has a sample if the last one is no older
 _NO_IMU_FRAMES = 10  # missing samples are reported after so many frames and so much time
 _NO_IMU_S = 0.4
-_NS = 1e-9
 
 
 def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[InertialFinding, ...]:
@@ -29,7 +28,7 @@ def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[Iner
     step_ns = float(np.median(np.diff(imu_times_ns))) if len(imu_times_ns) > 1 else 0.0
     if covered == 0.0:
         return (_no_overlap(frames, imu, step_ns),)
-    uncovered_s = (1 - covered) * (frames[1] - frames[0]) * _NS
+    uncovered_s = (1 - covered) * (frames[1] - frames[0]) * S_PER_NS
     enough = covered >= _COVERED or uncovered_s < _UNCOVERED_S
     return () if enough else (_part_overlap(frames, imu, step_ns, covered),)
 
@@ -50,7 +49,7 @@ class SampleCoverage:
         self._first_ns = time_ns if self._first_ns is None else self._first_ns
         self._last_ns = time_ns
         self._frames += 1
-        if last_imu_ns is not None and (time_ns - last_imu_ns) * _NS <= _LATE_S:
+        if last_imu_ns is not None and (time_ns - last_imu_ns) * S_PER_NS <= _LATE_S:
             self._covered += 1 + self._in_gap
             self._in_gap = 0
         elif self._covered:
@@ -75,7 +74,7 @@ class SampleCoverage:
         share = self._covered / self._frames
         if imu is None or (1 - share) * self._seconds < _UNCOVERED_S:
             return []
-        late_ns = _LATE_S / _NS
+        late_ns = _LATE_S / S_PER_NS
         if imu[0] - late_ns <= self._span[0] and self._span[1] <= imu[1] + late_ns:
             return []  # samples that came late, as where live use is under load
         return [_part_overlap(self._span, imu, step_ns, share)]
@@ -87,7 +86,7 @@ class SampleCoverage:
     @property
     def _seconds(self) -> float:
         first_ns, last_ns = self._span
-        return (last_ns - first_ns) * _NS
+        return (last_ns - first_ns) * S_PER_NS
 
 
 def _no_overlap(
@@ -106,8 +105,8 @@ def _no_overlap(
     unit = _unit_of_clock(frames, imu, step_ns)
     if unit is not None:
         return InertialFinding("clocks without overlap", seen, unit)
-    lengths = [(span[1] - span[0]) * _NS for span in (frames, imu)]
-    offset_s = (imu[0] - frames[0]) * _NS
+    lengths = [(span[1] - span[0]) * S_PER_NS for span in (frames, imu)]
+    offset_s = (imu[0] - frames[0]) * S_PER_NS
     alike = 0.5 < max(lengths[1], 1e-9) / max(lengths[0], 1e-9) < 2
     same = f"both last about as long ({lengths[0]:.1f} and {lengths[1]:.1f} s): " if alike else ""
     return InertialFinding(

@@ -23,7 +23,7 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
 from vio.numerics.robust import median, robust_sigmas
-from vio.records import ImuSample, IntArray
+from vio.records import S_PER_NS, ImuSample, IntArray
 
 ImuFaultKind: TypeAlias = Literal[
     "gyro spike", "accelerometer spike", "stuck IMU", "stuck gyro", "stuck accelerometer"
@@ -31,7 +31,7 @@ ImuFaultKind: TypeAlias = Literal[
 
 _HISTORY_NS = 2_000_000_000  # changes between samples that a spike is compared with
 # changes; with fewer nothing is called a spike, nor stuck: a simulated IMU may have no noise
-_LEAST_HISTORY = 20
+_MIN_HISTORY = 20
 _REFRESH = 20  # samples between two evaluations of their scale, and the least share of all, 1 / 4
 _REFRESH_SHARE = 4
 _SPIKE_SIGMAS = 30.0  # robust standard deviations of the changes; real motion reached 23
@@ -46,12 +46,11 @@ _PARTS: tuple[tuple[ImuFaultKind, slice], ...] = (
     ("stuck gyro", slice(0, 3)),
     ("stuck accelerometer", slice(3, 6)),
 )
-_LEAST_REPEATS = 4  # of all six numbers
-_LEAST_PART_S = 0.25  # of one sensor alone, which some drivers hold between its own slower samples
+_MIN_REPEATS = 4  # of all six numbers
+_MIN_PART_S = 0.25  # of one sensor alone, which some drivers hold between its own slower samples
 _RARE = 0.02  # share of repetitions below which one is held back
-_LEAST_CHANCE = 1e-8  # probability of so many repetitions in a row where they are independent
+_MIN_CHANCE = 1e-8  # probability of so many repetitions in a row where they are independent
 _COUNTED = 400  # samples over which the share of repetitions is counted
-_NS = 1e-9
 # (6,) gyro and accelerometer; plain numbers, as arrays of six cost ten times as much
 _Reading: TypeAlias = list[float]
 
@@ -202,11 +201,11 @@ class _Repetition:
     def _improbable(self, time_ns: int) -> bool:
         assert self._start is not None
         alone = self._kind != "stuck IMU"
-        if len(self._counted) < _LEAST_HISTORY or self.repeats < _LEAST_REPEATS:
+        if len(self._counted) < _MIN_HISTORY or self.repeats < _MIN_REPEATS:
             return False
-        if alone and (time_ns - self._start.time_ns) * _NS < _LEAST_PART_S:
+        if alone and (time_ns - self._start.time_ns) * S_PER_NS < _MIN_PART_S:
             return False
-        return bool(self.repeats * np.log(self._share) < np.log(_LEAST_CHANCE))
+        return bool(self.repeats * np.log(self._share) < np.log(_MIN_CHANCE))
 
     @property
     def _share(self) -> float:
@@ -317,10 +316,10 @@ class _SpikeCheck:
         old = int(np.searchsorted(together, self._last[0] - _HISTORY_NS))
         self._times = [together[old:]]
         self._changes = [changed[old:]]
-        if len(together) - old >= _LEAST_HISTORY:
+        if len(together) - old >= _MIN_HISTORY:
             self._until_refresh = max(_REFRESH, (len(together) - old) // _REFRESH_SHARE)
             self._period_ns = median(np.diff(together[old:]))
-            least = np.array(_SPIKE_IMPULSE) / max(self._period_ns * _NS, 1e-6)
+            least = np.array(_SPIKE_IMPULSE) / max(self._period_ns * S_PER_NS, 1e-6)
             self._limit = np.maximum(_SPIKE_SIGMAS * robust_sigmas(changed[old:]), least).tolist()
 
 

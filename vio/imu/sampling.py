@@ -11,9 +11,9 @@ from vio.numerics.robust import median
 from vio.records import NS_PER_S, ImuRecord, IntArray
 
 # below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
-_LEAST_HZ = 50.0
-_LEAST_ROWS = 20  # of equal readings, or bursts
-_LEAST_REPEATS = 3  # of a reading in a row, that a driver gives again and again
+_MIN_HZ = 50.0
+_MIN_ROWS = 20  # of equal readings, or bursts
+_MIN_REPEATS = 3  # of a reading in a row, that a driver gives again and again
 _ALIKE = 0.8  # share of the rows that are about as long as the median
 _BURST = 0.2  # of the mean interval, below which the median one is that of bursts
 _PAUSES = 0.8  # share of the time that passes between bursts
@@ -42,10 +42,10 @@ def sampling_notes(record: ImuRecord, where: str) -> tuple[str, ...]:
             f"{where}: each reading is given {repeats} times, so the IMU has {rate_hz:.3g} Hz, not "
             f"{rate_hz * repeats:.3g}; record each reading once"
         )
-    if rate_hz < _LEAST_HZ:
+    if rate_hz < _MIN_HZ:
         notes.append(
             f"{where}: the IMU has {rate_hz:.3g} Hz, too few to integrate the motion between "
-            f"images; record at least {_LEAST_HZ:g} Hz, or use --motion none"
+            f"images; record at least {_MIN_HZ:g} Hz, or use --motion none"
         )
     return tuple(notes)
 
@@ -82,11 +82,11 @@ def repeated_readings(values: FloatArray) -> int:
     """
     changed = np.flatnonzero((values[1:] != values[:-1]).any(axis=1))
     lengths = np.diff(changed)
-    if len(lengths) < _LEAST_ROWS:
+    if len(lengths) < _MIN_ROWS:
         return 0
     usual = round(median(lengths))
     alike = np.mean(np.abs(lengths - usual) <= 1)
-    return usual if usual >= _LEAST_REPEATS and alike >= _ALIKE else 0
+    return usual if usual >= _MIN_REPEATS and alike >= _ALIKE else 0
 
 
 def burst_length(times_ns: IntArray) -> int:
@@ -94,7 +94,7 @@ def burst_length(times_ns: IntArray) -> int:
     steps = np.diff(times_ns).astype(np.float64)
     mean = float(steps.mean())
     pauses = steps > mean
-    if pauses.sum() < _LEAST_ROWS or median(steps) >= _BURST * mean:
+    if pauses.sum() < _MIN_ROWS or median(steps) >= _BURST * mean:
         return 0
     share = float(steps[pauses].sum() / steps.sum())
     return round(len(steps) / int(pauses.sum())) if share >= _PAUSES else 0

@@ -16,7 +16,7 @@ STANDSTILL_S = 0.5  # samples that are judged, and parts whose means are compare
 _BLOCK_S = 0.1
 # by which a rig's noise may exceed the data sheet's, as the filter takes it at the start
 NOISE_FACTOR = 5.0
-_LEAST_BLOCKS = 4  # with samples in them for a standstill to be concluded
+_MIN_BLOCKS = 4  # with samples in them for a standstill to be concluded
 _PROBABILITY = 0.999  # of the chi-square test: a standstill passes so often
 
 
@@ -30,7 +30,7 @@ def blocks_agree(times_s: FloatArray, values: FloatArray, density: float) -> boo
     """
     blocks = np.minimum((-times_s / _BLOCK_S).astype(np.int64), round(STANDSTILL_S / _BLOCK_S) - 1)
     present = np.unique(blocks)
-    if len(present) < _LEAST_BLOCKS:
+    if len(present) < _MIN_BLOCKS:
         return False
     means = np.array([values[blocks == k].mean(axis=0) for k in present])
     statistic = np.sum((means - means.mean(axis=0)) ** 2) / (

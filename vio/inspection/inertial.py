@@ -15,7 +15,7 @@ _STILL_GYRO = 0.02  # rad/s, m/s^2: spread within a window; ten times the noise 
 _STILL_ACCEL = 0.15
 # Allan deviations where white noise outweighs quantisation and bias drift
 _NOISE_TAUS_S = (0.1, 0.2, 0.5)
-_LEAST_STILL_S = 3.0  # of one piece, for the noise
+_MIN_STILL_S = 3.0  # of one piece, for the noise
 _OFF_SHEET = 3.0  # measured over stated noise that is worth saying
 _FAR_M = 10.0  # an IMU further from its camera is no length in metres
 
@@ -84,7 +84,7 @@ def noise_part(record: ImuRecord, stated: ImuDensities | None) -> Part | None:
     step_s = float(np.median(np.diff(record.times_ns))) / NS_PER_S
     runs = [(a, b) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)]
     longest = max(runs, key=lambda r: r[1] - r[0], default=(0, 0))
-    if (longest[1] - longest[0]) * size * step_s < _LEAST_STILL_S:
+    if (longest[1] - longest[0]) * size * step_s < _MIN_STILL_S:
         return None
     piece = slice(longest[0] * size, longest[1] * size)
     facts: dict[str, float | None] = {}

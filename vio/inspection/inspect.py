@@ -236,7 +236,7 @@ def _missing_part(recording: Recording) -> Part:
 
 _GAP = 1.5  # intervals longer than this multiple of the median are gaps
 _EVEN_MS = 1e-3  # a jitter below it is rounding of the stamps
-_LEAST_IMU_HZ = 50.0  # as the readers say it
+_MIN_IMU_HZ = 50.0  # as the readers say it
 
 
 def frames_part(times: IntArray) -> Part:
@@ -262,11 +262,11 @@ def clock_part(
     facts |= {} if rate_hz is None else {"rate_hz": rate_hz}
     faults = []
     if name == "IMU":
-        if facts["rate_hz"] is not None and facts["rate_hz"] < _LEAST_IMU_HZ:
+        if facts["rate_hz"] is not None and facts["rate_hz"] < _MIN_IMU_HZ:
             faults.append(
                 f"{facts['rate_hz']:.3g} Hz are too few to integrate the motion between images; "
                 "record at least "
-                f"{_LEAST_IMU_HZ:g} Hz, or use --motion none"
+                f"{_MIN_IMU_HZ:g} Hz, or use --motion none"
             )
         faults += [finding.message for finding in judge_clocks(frame_times_ns, times_ns)]
     inside = (frame_times_ns >= times_ns[0]) & (frame_times_ns <= times_ns[-1])

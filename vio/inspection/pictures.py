@@ -19,14 +19,14 @@ from vio.records import Image, StereoFrame
 _RATIO = 0.8
 _FEATURES = 1500  # per image
 _RANSAC_PX = 1.5
-_LEAST_MATCHES = 20  # a pair with fewer says nothing about the calibration
+_MIN_MATCHES = 20  # a pair with fewer says nothing about the calibration
 _DARK = 12.0  # mean and standard deviation of gray levels of an image without content
 _BRIGHT = 243.0
 _FLAT = 3.0
 _ROWS_FAULT_PX = 2.0  # where matching along rows fails
 _NEAREST_M = 0.1  # medians outside are another unit: structured light ends at 5 m, lidars at 20
 _FARTHEST_M = 30.0
-_LEAST_POSITIVE = 0.5  # share of matches with ul > ur; true pairs have nearly all
+_MIN_POSITIVE = 0.5  # share of matches with ul > ur; true pairs have nearly all
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
         sift_pairs(f.left, f.right) for f in frames if f.left is not None and f.right is not None
     ]
     counts = [len(z) for z in matches]
-    z = np.concatenate([np.zeros((0, 4)), *(m for m in matches if len(m) >= _LEAST_MATCHES)])
+    z = np.concatenate([np.zeros((0, 4)), *(m for m in matches if len(m) >= _MIN_MATCHES)])
     image = next((f.left for f in frames if f.left is not None), None)
     size = (1.0, 1.0) if image is None else (float(image.shape[1]), float(image.shape[0]))
     found = row_residuals(z, *size)
@@ -143,7 +143,7 @@ def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
             "folders are of one "
             "stereo camera, its lenses clean and in focus"
         )
-        hopeless = max(counts, default=0) < _LEAST_MATCHES
+        hopeless = max(counts, default=0) < _MIN_MATCHES
         return [
             Part("stereo", str(found), {"matches": int(sum(counts))}, [fault] if hopeless else [])
         ]
@@ -175,7 +175,7 @@ def _rows_facts(found: RowResiduals) -> dict[str, object]:
 
 
 def _rows_faults(found: RowResiduals) -> list[str]:
-    if found.positive_disparity < _LEAST_POSITIVE:
+    if found.positive_disparity < _MIN_POSITIVE:
         return [
             f"{100 * (1 - found.positive_disparity):.0f} % of the matches are behind the cameras: "
             "left and right "
@@ -201,7 +201,7 @@ def sift_pairs(left: Image, right: Image) -> FloatArray:
     (points0, first), (points1, second) = (
         sift.detectAndCompute(image, None) for image in (left, right)
     )
-    if first is None or second is None or min(len(points0), len(points1)) < _LEAST_MATCHES:
+    if first is None or second is None or min(len(points0), len(points1)) < _MIN_MATCHES:
         return np.zeros((0, 4))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     near = [
@@ -209,7 +209,7 @@ def sift_pairs(left: Image, right: Image) -> FloatArray:
         for m in matcher.knnMatch(first, second, k=2)
         if len(m) == 2 and m[0].distance < _RATIO * m[1].distance
     ]
-    if len(near) < _LEAST_MATCHES:
+    if len(near) < _MIN_MATCHES:
         return np.zeros((0, 4))
     z = np.array(
         [[*points0[m[0].queryIdx].pt, *points1[m[0].trainIdx].pt] for m in near], dtype=np.float64

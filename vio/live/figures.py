@@ -13,7 +13,7 @@ import numpy as np
 _KEPT = 1000  # results that the median and the bound of 95 % are taken of
 _LATE_S = 0.5  # results older than that, one after another, mean that the computer is too slow
 _LATE_RESULTS = 10
-_MOST_LEFT_OUT = 10  # of the newest hundred frames
+_MAX_LEFT_OUT = 10  # of the newest hundred frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class LiveMonitor:
         if (
             self._warned
             or not self._judges
-            or (self._late < _LATE_RESULTS and left_out < _MOST_LEFT_OUT)
+            or (self._late < _LATE_RESULTS and left_out < _MAX_LEFT_OUT)
         ):
             return None
         self._warned = True

@@ -17,7 +17,7 @@ from vio.imu.findings import ImuVerdict
 from vio.protocols import Backend
 from vio.records import Estimate, ImuSample, MotionSample, Observations
 
-_MOST_FRAMES = 600  # that are kept
+_MAX_FRAMES = 600  # that are kept
 AS_GIVEN = ImuVerdict()
 
 
@@ -48,7 +48,7 @@ class ImuTrial:
             return
         self._taken.append(event)
         self._frames += isinstance(event, Observations)
-        if self._frames > _MOST_FRAMES:
+        if self._frames > _MAX_FRAMES:
             self.close()
 
     def again(self, verdict: ImuVerdict) -> tuple[Backend, dict[int, Estimate]] | None:

@@ -28,7 +28,7 @@ from vio.records import (
     observations,
 )
 
-_MOST_NS = 2**62  # differences of times stay within 64 bits
+_MAX_NS = 2**62  # differences of times stay within 64 bits
 # a stamp so far ahead, and so many times the last step, is to be confirmed
 _JUMP_NS = 2_000_000_000
 _JUMP_STEPS = 5
@@ -280,7 +280,7 @@ def checked_time(t_ns: Any) -> int:
         time_ns = operator.index(t_ns)
     except TypeError as error:
         raise DataError(f"a time must be an integer number of nanoseconds, got {t_ns!r}") from error
-    if abs(time_ns) > _MOST_NS:
+    if abs(time_ns) > _MAX_NS:
         raise DataError(f"{time_ns} ns is no time of a clock; give nanoseconds")
     return time_ns
 
@@ -308,7 +308,7 @@ def checked_samples(
     rows = [
         _checked_values(name, value, (len(times), 3), first_ns) for name, value in values.items()
     ]
-    if np.any((times > _MOST_NS) | (times < -_MOST_NS)):
+    if np.any((times > _MAX_NS) | (times < -_MAX_NS)):
         raise DataError(f"{times[0]} to {times[-1]} ns are no times of a clock; give nanoseconds")
     if (times[1:] <= times[:-1]).any():  # differences of unsigned ones are never negative
         raise DataError("times of samples must increase; sort them and give each once")

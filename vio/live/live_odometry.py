@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 # results after which the points that will not change any more are taken from the filter
 _LANDMARK_FRAMES = 100
 # estimates that wait for the reader; of a slower one, the oldest are forgotten
-_MOST_WAITING = 1000
+_MAX_WAITING = 1000
 
 
 class EstimateStream(Iterator[Estimate]):
@@ -49,7 +49,7 @@ class EstimateStream(Iterator[Estimate]):
         failed.
         """
         self.trajectory = self._resets = 0
-        self._estimates: deque[tuple[int, Estimate]] = deque(maxlen=_MOST_WAITING)
+        self._estimates: deque[tuple[int, Estimate]] = deque(maxlen=_MAX_WAITING)
         self._changed = threading.Condition()
         self._ended = False
         self._raise_failure = raise_failure

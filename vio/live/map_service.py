@@ -30,7 +30,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.mapping.lookup import FoundPose, MapLookup
 from vio.records import Image
 
-_MOST_BYTES = 64 << 20  # of a request: two images of 16 megapixels
+_MAX_BYTES = 64 << 20  # of a request: two images of 16 megapixels
 _SILENT_S = 30.0  # after which a connection that says nothing is closed
 _CAMERA = ("fu", "fv", "cu", "cv", "baseline_m")
 _SAME = 1e-3  # by which the lengths of one camera may differ
@@ -110,9 +110,9 @@ class _Handler(BaseHTTPRequestHandler):
             length = int(self.headers["Content-Length"])
         except (TypeError, ValueError):
             raise _RefusedError(HTTPStatus.LENGTH_REQUIRED, "Content-Length is missing") from None
-        if not 0 <= length <= _MOST_BYTES:
+        if not 0 <= length <= _MAX_BYTES:
             raise _RefusedError(
-                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a request has at most {_MOST_BYTES >> 20} MB"
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a request has at most {_MAX_BYTES >> 20} MB"
             )
         body = self.rfile.read(length)
         if len(body) < length:

@@ -8,7 +8,7 @@ from vio.datasets.frame_times import PAIRED_NS
 
 T = TypeVar("T")
 
-_MOST = 10  # images of one side that wait for the other's
+_MAX = 10  # images of one side that wait for the other's
 
 
 class Pairing(Generic[T]):
@@ -27,7 +27,7 @@ class Pairing(Generic[T]):
         near = min(others, key=lambda t: abs(t - time_ns), default=None)
         if near is None or abs(near - time_ns) > PAIRED_NS:
             own[time_ns] = image
-            if len(own) > _MOST:
+            if len(own) > _MAX:
                 own.pop(next(iter(own)))
                 self.alone += 1
             return None

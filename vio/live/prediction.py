@@ -11,12 +11,11 @@ import numpy as np
 
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
-from vio.records import Estimate, ImuSample, MotionSample, VelocitySample, imu_matrices
+from vio.records import S_PER_NS, Estimate, ImuSample, MotionSample, VelocitySample, imu_matrices
 
-_NS = 1e-9
 _KEPT_NS = 2_000_000_000  # samples that a late estimate can be carried over
 _LONGEST_STEP_S = 0.5  # a motion is held no longer than this beyond the last sample or frame
-_MOST_STATES = 10_000  # after the newest estimate: beyond, older ones are forgotten
+_MAX_STATES = 10_000  # after the newest estimate: beyond, older ones are forgotten
 _ZERO: FloatArray = np.zeros(3)
 
 
@@ -71,8 +70,8 @@ class PosePredictor:
         states = self._states
         if states and sample.time_ns > states[-1].time_ns:
             states.append(self._carried(states[-1], sample))
-            if len(states) > _MOST_STATES:
-                self._states = [states[0], *states[-_MOST_STATES // 2 :]]
+            if len(states) > _MAX_STATES:
+                self._states = [states[0], *states[-_MAX_STATES // 2 :]]
 
     def estimate(self, estimate: Estimate) -> None:
         """Take a new estimate, and carry it over the samples that have come since."""
@@ -119,7 +118,7 @@ class PosePredictor:
                     "that one"
                 )
         state = next(state for state in reversed(states) if state.time_ns <= time_ns)
-        R, p, v = _moved(state, min((time_ns - state.time_ns) * _NS, _LONGEST_STEP_S))
+        R, p, v = _moved(state, min((time_ns - state.time_ns) * S_PER_NS, _LONGEST_STEP_S))
         return PredictedPose(time_ns, se3_from_parts(R, p), v)
 
     def _motion_of(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
@@ -130,7 +129,7 @@ class PosePredictor:
         omega = _ZERO
         v = _ZERO
         if last is not None and estimate.time_ns > last.time_ns:
-            dt = (estimate.time_ns - last.time_ns) * _NS
+            dt = (estimate.time_ns - last.time_ns) * S_PER_NS
             omega = se3_log(se3_inverse(last.T_world_imu) @ estimate.T_world_imu)[3:] / dt
             v = (estimate.T_world_imu[:3, 3] - last.T_world_imu[:3, 3]) / dt
         return omega, v if estimate.velocity_world is None else estimate.velocity_world
@@ -160,7 +159,7 @@ class PosePredictor:
 
     def _carried(self, state: _State, sample: MotionSample) -> _State:
         """The state at a later sample; with an IMU by the mean of its readings at both ends."""
-        dt = (sample.time_ns - state.time_ns) * _NS
+        dt = (sample.time_ns - state.time_ns) * S_PER_NS
         if isinstance(sample, VelocitySample):
             R, p, v = _moved(state, dt)
             return self._held(_State(sample.time_ns, R, p, v, state.gyro, state.accel), sample)

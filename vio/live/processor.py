@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # a frame waits until one that is so much newer has come: then the IMU is silent
 LONGEST_WAIT_NS = 100_000_000
-_MOST_SAMPLES = 100_000  # that wait: minutes in which no frame came
+_MAX_SAMPLES = 100_000  # that wait: minutes in which no frame came
 
 
 class EventOrder:
@@ -37,7 +37,7 @@ class EventOrder:
         """
         self._wait = wait_for_imu
         self._frames: deque[StereoFrame] = deque()
-        self._samples: deque[MotionSample] = deque(maxlen=_MOST_SAMPLES)
+        self._samples: deque[MotionSample] = deque(maxlen=_MAX_SAMPLES)
         self._newest_ns: int | None = None  # sample that has come
         self._released_ns: int | None = None  # newest sample that was released
         # from a frame's stamp to its exposure on the IMU's clock, 0 or more, as estimated
@@ -99,7 +99,7 @@ class EventOrder:
         return frame.time_ns + self.exposed_after_ns
 
 
-_LEAST_WAIT_S = 1e-3  # a velocity carries the pose that far as well as the IMU does
+_MIN_WAIT_S = 1e-3  # a velocity carries the pose that far as well as the IMU does
 _CLEAR = 3.0  # standard deviations of a time offset that is waited for
 
 
@@ -109,7 +109,7 @@ def _wait_ns(estimate: Estimate) -> int:
     """
     offset_s = estimate.time_offset_s
     sigma_s = estimate.time_offset_sigma_s
-    if offset_s is None or sigma_s is None or offset_s < max(_LEAST_WAIT_S, _CLEAR * sigma_s):
+    if offset_s is None or sigma_s is None or offset_s < max(_MIN_WAIT_S, _CLEAR * sigma_s):
         return 0
     return round(1e9 * offset_s)
 

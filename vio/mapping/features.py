@@ -22,16 +22,16 @@ Bits: TypeAlias = npt.NDArray[np.uint8]
 
 DESCRIPTOR_BYTES = 32
 # of a keyframe; 30 kB, so that 10 minutes of driving (2000 keyframes) need 60 MB
-MOST_FEATURES = 600
+MAX_FEATURES = 600
 _DETECTED = 3  # key points found for each that is kept, so that they can be spread over the image
 _CELLS = 10  # along the larger side of the image
 _LEVELS = 8  # pyramid of the detector: up to 3.6 times nearer
 _SCALE = 1.2
 _CORNER_CONTRAST = 7  # gray levels; low, since the best ones of each cell are kept
 _ROWS_PX = 2.0  # of a left and a right key point, at the scale of the detector's first level
-_MOST_DISPARITY = 0.4  # of the width
-_LEAST_DISPARITY_PX = 0.5
-_MOST_BITS = 64  # in which the descriptors of one point differ: a quarter
+_MAX_DISPARITY = 0.4  # of the width
+_MIN_DISPARITY_PX = 0.5
+_MAX_BITS = 64  # in which the descriptors of one point differ: a quarter
 # bits of a byte
 _ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint16)
 _LK_WINDOW = 11  # pixels
@@ -39,7 +39,7 @@ _LK_WINDOW = 11  # pixels
 _LK_CONTRAST = 15
 _LK_GRAY = 128.0  # mean and standard deviation then; below 6 gray levels less
 _LK_DEVIATION = 40.0
-_LK_LEAST = 6.0
+_LK_MIN = 6.0
 # by which the rows of a refined match may differ: rectifications are off by up to a pixel
 _LK_ROWS_PX = 2.0
 
@@ -83,7 +83,7 @@ def no_keyframe_features() -> KeyframeFeatures:
     )
 
 
-def extract(left: Image, right: Image, *, most: int = MOST_FEATURES) -> KeyframeFeatures:
+def extract(left: Image, right: Image, *, most: int = MAX_FEATURES) -> KeyframeFeatures:
     """Find and describe key points (N <= `most`) of the left image (H, W), and match them in the
     right one.
     """
@@ -144,7 +144,7 @@ def _right_pixels(
     size = np.array([_SCALE**p.octave for p in there])
     i, j = _near_rows(uv[:, 1], at[:, 1], _ROWS_PX * scale)
     shift = uv[i, 0] - at[j, 0]
-    allowed = (shift > -1.0) & (shift < _MOST_DISPARITY * left.shape[1])
+    allowed = (shift > -1.0) & (shift < _MAX_DISPARITY * left.shape[1])
     allowed &= np.abs(np.log(scale[i] / size[j])) < 1.5 * np.log(_SCALE)
     rows, best = _most_alike(i[allowed], j[allowed], bits, np.asarray(there_bits, dtype=np.uint8))
     if not len(rows):
@@ -162,7 +162,7 @@ def _right_pixels(
     found = refined[:, 0].astype(np.float64)
     good = (status[:, 0] > 0) & (np.abs(found[:, 1] - uv[rows, 1]) <= _LK_ROWS_PX)
     good &= np.abs(found[:, 0] - start[:, 0, 0]) <= _ROWS_PX * scale[rows]
-    good &= uv[rows, 0] - found[:, 0] >= _LEAST_DISPARITY_PX
+    good &= uv[rows, 0] - found[:, 0] >= _MIN_DISPARITY_PX
     out[rows[good]] = found[good]
     valid[rows[good]] = True
     return out, valid
@@ -187,7 +187,7 @@ def _most_alike(i: IntArray, j: IntArray, a: Bits, b: Bits) -> tuple[IntArray, I
     order = np.lexsort((j, differing, i))
     rows, first = np.unique(i[order], return_index=True)
     best = order[first]
-    good = differing[best] <= _MOST_BITS
+    good = differing[best] <= _MAX_BITS
     return rows[good], j[best[good]]
 
 
@@ -196,5 +196,5 @@ def _equal_contrast(image: Image) -> Image:
     gray = image.astype(np.float32)
     mean, squared = (cv2.blur(x, (_LK_CONTRAST, _LK_CONTRAST)) for x in (gray, gray * gray))
     deviation = np.sqrt(np.maximum(squared - mean * mean, 0.0))
-    out = _LK_GRAY + _LK_DEVIATION * (gray - mean) / (deviation + _LK_LEAST)
+    out = _LK_GRAY + _LK_DEVIATION * (gray - mean) / (deviation + _LK_MIN)
     return np.clip(out, 0, 255).astype(np.uint8)

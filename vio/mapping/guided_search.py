@@ -24,7 +24,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.loop_geometry import (
-    LEAST_DISPARITY_PX,
+    MIN_DISPARITY_PX,
     Fitted,
     StereoPoints,
     Terms,
@@ -34,29 +34,29 @@ from vio.mapping.loop_geometry import (
     points_of,
     pose_of_most,
 )
-from vio.mapping.overlap import LEAST_DEPTH_M, SCALES, VIEW_COS
+from vio.mapping.overlap import MIN_DEPTH_M, SCALES, VIEW_COS
 from vio.numerics.compiled import compiled
 from vio.records import IntArray
 
-_MOST_BITS = 64  # in which the descriptors of one point differ: a quarter
+_MAX_BITS = 64  # in which the descriptors of one point differ: a quarter
 # by which the size of a feature differs from the predicted one: two and a half levels
 _LEVELS = 1.6
 _SIGMAS = 3.0
 _WINDOW_PX = 3.0  # half of a window's side at the scale of its feature, where the pose is known
 # half of a window's side: in larger ones, the best of all descriptors is seldom the point's
-_MOST_WINDOW_PX = 40.0
+_MAX_WINDOW_PX = 40.0
 _SEARCHES = 2  # with the pose found
-_LEAST_SAMPLE = 8  # pairs that agree before the next search
+_MIN_SAMPLE = 8  # pairs that agree before the next search
 # features closer together are of one corner, on several levels of the pyramid, and count once
 _CELL_PX = 8.0
 _ROWS = 1 << 20  # more than an image has
 # by which all points are moved to find the pairs of chance: more than a window of the last search
 _ASIDE_PX = 25.0
 _ASIDE = 8  # directions
-LEAST_CORNERS = 12
-# Times the mean number of corners of chance; or half as many times beside LEAST_CORNERS, which is
+MIN_CORNERS = 12
+# Times the mean number of corners of chance; or half as many times beside MIN_CORNERS, which is
 # less where chance is above 4: large means scatter less. Of searches at wrong poses none had more
-# than 1.9 times beside LEAST_CORNERS there.
+# than 1.9 times beside MIN_CORNERS there.
 _OVER_CHANCE = 6.0
 # Share of the odometry's information in the measurement, since the map has it already: enough to
 # hold what the pixels leave open to where the covariance is linear.
@@ -158,7 +158,7 @@ class Guided:
 
 def shown(camera: StereoCamera, features: KeyframeFeatures) -> Shown:
     """Return the stereo points of a keyframe."""
-    p, valid = triangulate(camera, features.z, min_disparity_px=LEAST_DISPARITY_PX)
+    p, valid = triangulate(camera, features.z, min_disparity_px=MIN_DISPARITY_PX)
     row = np.flatnonzero(valid & features.has_right)
     return Shown(
         camera, features, row, p[row], features.sigma_px[row], _as_words(features.descriptors[row])
@@ -200,12 +200,12 @@ def search(
         prior: where it stands by the odometry: it decides which pairs agree, and what the pixels
             leave open; pose and covariance of the result are those of the pixels; None: not known.
     """
-    if len(here) < LEAST_CORNERS:
+    if len(here) < MIN_CORNERS:
         return None
     target = _Target.of(camera, here)
     place = place.take(_in_reach(place, camera, start.T_i_j))
     pairs = _pairs(place, target, start.T_i_j, start.covariance)
-    seen_from = pose_of_most(camera, place.p[pairs.point], here.z[pairs.feature, :2], _LEAST_SAMPLE)
+    seen_from = pose_of_most(camera, place.p[pairs.point], here.z[pairs.feature, :2], _MIN_SAMPLE)
     T = None if seen_from is None else se3_inverse(seen_from)
     fitted = None
     for _ in range(_SEARCHES):
@@ -216,22 +216,22 @@ def search(
         rows = pairs.feature
         stereo = points.with_covariance()
         fitted = fit_terms(
-            [Terms(stereo, camera, here, rows, inverse=True)], T, prior=prior, least=LEAST_CORNERS
+            [Terms(stereo, camera, here, rows, inverse=True)], T, prior=prior, least=MIN_CORNERS
         )
         T = None if fitted is None else fitted.T_i_j
     if fitted is None:
         return None
     agree = np.flatnonzero(fitted.fits)
     inliers = _corners(here.z[rows[agree]])
-    if inliers < LEAST_CORNERS:
+    if inliers < MIN_CORNERS:
         return None
     chance = _chance(pairs, target)
-    if inliers < min(_OVER_CHANCE * chance, LEAST_CORNERS + 0.5 * _OVER_CHANCE * chance):
+    if inliers < min(_OVER_CHANCE * chance, MIN_CORNERS + 0.5 * _OVER_CHANCE * chance):
         return None
     own = _of_one_segment(points, here, rows, agree)
     weak = None if prior is None else RelativePose(prior.T_i_j, prior.covariance / _PRIOR_SHARE)
     terms = Terms(stereo.take(own), camera, here, rows[own], inverse=True)
-    measured = fit_terms([terms], fitted.T_i_j, prior=weak, least=_LEAST_SAMPLE)
+    measured = fit_terms([terms], fitted.T_i_j, prior=weak, least=_MIN_SAMPLE)
     if measured is None:
         return None
     by_fields = _covariance_by_fields(
@@ -274,7 +274,7 @@ def _of_one_segment(
     measurement.
     """
     own = agree[points.take(agree).main_segment()]
-    return own if _corners(here.z[rows[own]]) >= LEAST_CORNERS else agree
+    return own if _corners(here.z[rows[own]]) >= MIN_CORNERS else agree
 
 
 def _guided(
@@ -299,7 +299,7 @@ def _in_reach(place: PlacePoints, camera: StereoCamera, T_i_k: FloatArray) -> In
     q = transform_points(se3_inverse(T_i_k), place.p)
     ahead = np.flatnonzero(q[:, 2] > 0)
     uv = project(camera, q[ahead])[:, :2]
-    margin = _MOST_WINDOW_PX + _ASIDE_PX
+    margin = _MAX_WINDOW_PX + _ASIDE_PX
     w = camera.width or np.inf
     h = camera.height or np.inf
     return ahead[(uv > -margin).all(axis=1) & (uv < [w + margin, h + margin]).all(axis=1)]
@@ -426,7 +426,7 @@ def _predict(
         away = np.sqrt(away)
         near = np.sqrt(near)
         if (
-            q[2] <= LEAST_DEPTH_M
+            q[2] <= MIN_DEPTH_M
             or dot <= VIEW_COS * away * near
             or not 1 / SCALES < away / near < SCALES
         ):
@@ -457,7 +457,7 @@ def _predict(
             largest = max(largest, total)
         size[n] = size[n] * away / near
         half = _WINDOW_PX * max(size[n], 1.0) + np.sqrt(largest)
-        if half <= _MOST_WINDOW_PX and -half < u < width + half and -half < v < height + half:
+        if half <= _MAX_WINDOW_PX and -half < u < width + half and -half < v < height + half:
             uv[n, 0] = u
             uv[n, 1] = v
             radius[n] = half
@@ -481,7 +481,7 @@ def _best_in_windows(
     Features z (M, 2) are in the order of their columns.
     """
     for i in range(len(uv)):
-        least = np.uint64(_MOST_BITS + 1)
+        least = np.uint64(_MAX_BITS + 1)
         j = np.searchsorted(z[:, 0], uv[i, 0] - radius[i])
         while j < len(z) and z[j, 0] <= uv[i, 0] + radius[i]:
             ratio = sizes[j] / size[i]

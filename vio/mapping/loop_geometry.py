@@ -23,12 +23,12 @@ from vio.numerics.compiled import compiled
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray, LoopMatches
 
-LEAST_INLIERS = 20
-_LEAST_SHARE = 0.25  # of the pairs that must agree; wrong pairs are at random
-_MOST_BITS = 64
+MIN_INLIERS = 20
+_MIN_SHARE = 0.25  # of the pairs that must agree; wrong pairs are at random
+_MAX_BITS = 64
 _WORSE = 1000  # more than the 256 bits in which two descriptors can differ
 _RATIO = 0.85  # to the second-best descriptor
-_MOST_PAIRS = 200  # that enter the fit, which takes 4 ms then
+_MAX_PAIRS = 200  # that enter the fit, which takes 4 ms then
 _RANSAC_PX = 4.0
 _RANSAC_STEPS = 300
 _RANSAC_SURE = 0.999
@@ -38,14 +38,14 @@ _SAME_DEPTH = 0.05
 _STEPS = 10  # largest change, m and rad
 _CONVERGED = 1e-5
 _GATE = 3.0  # standard deviations, of a pixel coordinate
-LEAST_DISPARITY_PX = 1.0
+MIN_DISPARITY_PX = 1.0
 # Floor of a loop's standard deviations: errors that its points share, such as those of the
 # calibration.
 _FLOOR_DEPTH = 0.002
 _FLOOR_DEG = 0.05
 # Variance of a pixel over the one assumed, which is one pixel at the scale of its level: key points
 # lie on whole pixels of their level, so that the errors are at least those of rounding.
-_LEAST_VARIANCE = 1 / 12
+_MIN_VARIANCE = 1 / 12
 # of its standard deviations: key points of neighbouring levels and edges are not independent
 _INFLATION = 2.0
 
@@ -72,7 +72,7 @@ def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
     mutual = bits.argmin(axis=0)[best] == rows
     least = bits[rows, best]
     bits[rows, best] = _WORSE
-    good = np.flatnonzero(mutual & (least <= np.minimum(_MOST_BITS, _RATIO * bits.min(axis=1))))
+    good = np.flatnonzero(mutual & (least <= np.minimum(_MAX_BITS, _RATIO * bits.min(axis=1))))
     return np.stack([good, best[good]], axis=1)
 
 
@@ -116,11 +116,11 @@ def verify(
 ) -> Verified | None:
     """Return where camera j stands in the frame of camera i; None: they do not show one place."""
     pairs = match(i, j)
-    if len(pairs) < LEAST_INLIERS:
+    if len(pairs) < MIN_INLIERS:
         return None
     # features are in the order of their columns, so these are spread over the image
-    if len(pairs) > _MOST_PAIRS:
-        pairs = pairs[np.linspace(0, len(pairs) - 1, _MOST_PAIRS).astype(np.int64)]
+    if len(pairs) > _MAX_PAIRS:
+        pairs = pairs[np.linspace(0, len(pairs) - 1, _MAX_PAIRS).astype(np.int64)]
     a, b = pairs.T
     T_j_i = _pnp(camera_i, i, a, camera_j, j, b)
     T_i_j = None if T_j_i is None else _pnp(camera_j, j, b, camera_i, i, a)
@@ -136,7 +136,7 @@ def verify(
     if fitted is None:
         return None
     pose, good = fitted
-    if good.sum() < max(LEAST_INLIERS, _LEAST_SHARE * len(pairs)):
+    if good.sum() < max(MIN_INLIERS, _MIN_SHARE * len(pairs)):
         return None
     a = a[good]
     b = b[good]
@@ -151,7 +151,7 @@ def matches_of(i: KeyframeFeatures, a: IntArray, j: KeyframeFeatures, b: IntArra
 def _points(
     camera: StereoCamera, f: KeyframeFeatures, rows: IntArray
 ) -> tuple[FloatArray, BoolArray]:
-    p, valid = triangulate(camera, f.z[rows], min_disparity_px=LEAST_DISPARITY_PX)
+    p, valid = triangulate(camera, f.z[rows], min_disparity_px=MIN_DISPARITY_PX)
     return p, valid & f.has_right[rows]
 
 
@@ -173,7 +173,7 @@ def _pnp(
     None: too few agree.
     """
     p, valid = _points(camera_a, a, rows_a)
-    return pose_of_most(camera_b, p[valid], b.z[rows_b[valid], :2], LEAST_INLIERS)
+    return pose_of_most(camera_b, p[valid], b.z[rows_b[valid], :2], MIN_INLIERS)
 
 
 def pose_of_most(
@@ -292,7 +292,7 @@ def fit_terms(
     T_i_j: FloatArray,
     *,
     prior: RelativePose | None = None,
-    least: int = LEAST_INLIERS,
+    least: int = MIN_INLIERS,
 ) -> Fitted | None:
     """Fit a motion by iterated reweighted least squares; None: too few pixels agree.
 
@@ -336,7 +336,7 @@ def _variance_factor(squared: FloatArray, stereo: BoolArray) -> float:
     Of a left and a right pixel they have three degrees of freedom, of a left one alone two.
     """
     expected = np.where(stereo, *chi_square_quantile(0.5, [3, 2]))
-    return max(float(np.median(squared / expected)), _LEAST_VARIANCE)
+    return max(float(np.median(squared / expected)), _MIN_VARIANCE)
 
 
 @dataclass(frozen=True, slots=True)

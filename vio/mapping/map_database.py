@@ -47,7 +47,7 @@ KEYS = {
     "earth": "id",
 }
 _ROTATION_TOLERANCE = 1e-3  # of R R^T
-_MOST_S = 300.0  # of one step with the file
+_MAX_S = 300.0  # of one step with the file
 _STEP = 10_000  # instructions of SQLite between two looks at the clock, and at signals
 APPLICATION_ID = 0x53564D50  # "SVMP" in the file's header
 _SCHEMA = """
@@ -234,7 +234,7 @@ class MapDatabase(ABC):
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
-        self._end_s = time.monotonic() + _MOST_S
+        self._end_s = time.monotonic() + _MAX_S
         with _errors_of(self.path):
             try:
                 yield
@@ -242,7 +242,7 @@ class MapDatabase(ABC):
                 if not self._is_late():
                     raise
                 raise DataError(
-                    f"{self.path}: a step took more than {_MOST_S:.0f} s; build the map again"
+                    f"{self.path}: a step took more than {_MAX_S:.0f} s; build the map again"
                 ) from error
 
     def _is_late(self) -> bool:

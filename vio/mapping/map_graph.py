@@ -32,8 +32,8 @@ _DRIFT_RAD_PER_M = float(np.radians(0.005))
 _FIRST_REACH = 30.0  # of the search for them, in mean variances of a motion; and from try to try
 _FURTHER = 2.0
 _WINDOW = 1000  # keyframes that are optimised for a new loop, beside those of its cycle
-_MOST_EXACT = 200  # keyframes whose covariance is computed, beside the first of each session
-_LEAST_VARIANCE_M2 = 1e-8  # of a keyframe's position since its session began
+_MAX_EXACT = 200  # keyframes whose covariance is computed, beside the first of each session
+_MIN_VARIANCE_M2 = 1e-8  # of a keyframe's position since its session began
 # variance of the motion from one session to the next, m^2 and rad^2: nothing is known of it
 UNKNOWN = 1e6
 
@@ -280,7 +280,7 @@ class MapGraph:
             self.drift(begins, numbers, systematic=0.0)[:, :3, :3], axis1=1, axis2=2
         )
         w = np.zeros(len(self))
-        w[numbers] = 1.0 / (variance + np.median(variance) + _LEAST_VARIANCE_M2)
+        w[numbers] = 1.0 / (variance + np.median(variance) + _MIN_VARIANCE_M2)
         return w / w.sum()
 
     def placed(self, part: int, stays: BoolArray, before: Placed | None) -> Placed:
@@ -325,7 +325,7 @@ class MapGraph:
         if not len(numbers):
             return np.zeros((0, 6, 6))
         begins = np.unique(self.session[numbers], return_index=True)[1]
-        few = np.linspace(0, len(numbers) - 1, min(_MOST_EXACT, len(numbers))).astype(np.int64)
+        few = np.linspace(0, len(numbers) - 1, min(_MAX_EXACT, len(numbers))).astype(np.int64)
         exact = np.union1d(begins, few)
         P = self._marginals(rows, exact)
         T = self.T_map_cam.rows[rows]

@@ -12,7 +12,7 @@ from vio.mapping.map_graph import Rows
 from vio.records import BoolArray, IntArray
 
 _POINTS = 32  # of a keyframe; 0.8 kB
-LEAST_DEPTH_M = 0.1
+MIN_DEPTH_M = 0.1
 # between two views of a point: beyond, descriptors have little in common
 VIEW_COS = float(np.cos(np.radians(45.0)))
 SCALES = 2.5  # between the distances of two views of a point, likewise
@@ -82,6 +82,6 @@ def is_visible(p: FloatArray, there: FloatArray, q: FloatArray, here: FloatArray
     cosine = np.einsum("...i,...i->...", then, now) / np.maximum(away * near, 1e-9)
     scale = away / np.maximum(near, 1e-9)
     out: BoolArray = (
-        (q[..., 2] > LEAST_DEPTH_M) & (cosine > VIEW_COS) & (scale > 1 / SCALES) & (scale < SCALES)
+        (q[..., 2] > MIN_DEPTH_M) & (cosine > VIEW_COS) & (scale > 1 / SCALES) & (scale < SCALES)
     )
     return out

@@ -19,7 +19,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.guided_search import (
-    LEAST_CORNERS,
+    MIN_CORNERS,
     Guided,
     PlaceView,
     Shown,
@@ -27,7 +27,7 @@ from vio.mapping.guided_search import (
     search,
     shown,
 )
-from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, Verified, matches_of, verify
+from vio.mapping.loop_geometry import MIN_DISPARITY_PX, Verified, matches_of, verify
 from vio.mapping.map_graph import UNKNOWN, MapGraph
 from vio.mapping.map_store import LoopRow, MapStore, PlacesRow
 from vio.mapping.overlap import Overlaps
@@ -163,7 +163,7 @@ class PlaceFinder:
     def remember(self, camera: StereoCamera, features: KeyframeFeatures) -> None:
         """Let the next keyframe be found again."""
         self._index.add(features.descriptors)
-        p, valid = triangulate(camera, features.z, min_disparity_px=LEAST_DISPARITY_PX)
+        p, valid = triangulate(camera, features.z, min_disparity_px=MIN_DISPARITY_PX)
         self._overlaps.add(p[valid & features.has_right])
         words = self._index.full_segment()
         if words is not None and self._writes:
@@ -286,7 +286,7 @@ class PlaceFinder:
         kernel = np.ones(2 * _GUIDED_NEIGHBOURS + 1)
         around = np.convolve(score, kernel)[_GUIDED_NEIGHBOURS : _GUIDED_NEIGHBOURS + len(score)]
         around[score == 0] = 0.0
-        while len(out) < _GUIDED_PLACES and around.max(initial=0.0) >= LEAST_CORNERS:
+        while len(out) < _GUIDED_PLACES and around.max(initial=0.0) >= MIN_CORNERS:
             middle = int(np.argmax(around))
             out.append(middle)
             around[

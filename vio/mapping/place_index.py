@@ -32,7 +32,7 @@ _WORDS = 1 << _BITS
 _SEED = 20120617  # of the choice of bits: any, but the same in all maps
 # keyframes before and after a candidate whose scores are added to its own: they show the same place
 _NEIGHBOURS = 2
-_LEAST_TAIL = 32  # keyframes; a merge takes as long as the comparison with ten times as many
+_MIN_TAIL = 32  # keyframes; a merge takes as long as the comparison with ten times as many
 _TAIL_SHARE = 1 / 16
 _UNIT = 1 << 16  # of the weights
 SEGMENT = 256  # keyframes whose words a file keeps in the order of the index
@@ -111,7 +111,7 @@ class PlaceIndex:
         self._unsaved.append(words)
         self._sizes.append(words.shape[1])
         _count_words(words, self._newest, len(self._sizes), self._frequency)
-        if len(self._tail) >= max(_LEAST_TAIL, int(_TAIL_SHARE * len(self))):
+        if len(self._tail) >= max(_MIN_TAIL, int(_TAIL_SHARE * len(self))):
             self._merge()
 
     def restore(self, segments: Sequence[Segment]) -> None:

@@ -32,8 +32,8 @@ from vio.records import BoolArray, IntArray
 
 _TRUNCATION = 0.999  # probability at which a loop's residual is cut off
 _MU_GROWTH = 1.6  # of the control parameter, from one step to the next
-_MOST_STEPS = 15
-_MOST_GNC_STEPS = 30
+_MAX_STEPS = 15
+_MAX_GNC_STEPS = 30
 _CONVERGED = 1e-6  # largest change, m and rad
 # by which (G7) weighs an error xi: |R - R'|_F^2 = 2 |phi|^2
 _FRAME_METRIC = np.repeat([1.0, 2.0], 3)
@@ -107,16 +107,16 @@ def optimise(
     weight = np.ones(len(loops))
     if not len(loops):
         return Optimum(
-            _descend(T, odometry, loops, weight, up_directions, free, _MOST_STEPS),
+            _descend(T, odometry, loops, weight, up_directions, free, _MAX_STEPS),
             weight > 0.5,
             weight,
         )
-    T = _descend(T, odometry, loops, weight, up_directions, free, _MOST_STEPS)
+    T = _descend(T, odometry, loops, weight, up_directions, free, _MAX_STEPS)
     squared = _squared(T, loops)
     worst = float(squared.max())
     if worst > limit:  # else every loop fits with full weight, and there is nothing to decide
         mu = limit / (2 * worst - limit)
-        for _ in range(_MOST_GNC_STEPS):
+        for _ in range(_MAX_GNC_STEPS):
             weight = truncated_weights(squared, mu, limit)
             T = _descend(T, odometry, loops, weight, up_directions, free, 2)
             squared = _squared(T, loops)
@@ -124,7 +124,7 @@ def optimise(
                 break
             mu *= _MU_GROWTH
         weight = (squared < limit).astype(np.float64)
-        T = _descend(T, odometry, loops, weight, up_directions, free, _MOST_STEPS)
+        T = _descend(T, odometry, loops, weight, up_directions, free, _MAX_STEPS)
     return Optimum(T, weight > 0.5, weight)
 
 

@@ -38,14 +38,14 @@ Relative: TypeAlias = Callable[[int, int], "RelativePose | None"]
 
 _SHARED = 0.6  # of the last keyframe's features that are still seen: below it, a new keyframe
 # with a right pixel; or half of the most that a frame had, where features are set to be few
-_LEAST_FEATURES = 30
-_LEAST_TRACKED = 6  # likewise, by which the odometry can still follow
+_MIN_FEATURES = 30
+_MIN_TRACKED = 6  # likewise, by which the odometry can still follow
 # frames between keyframes of a session that is localised, where nothing is stored
 _LOCALISE_STEP = 5
 _LOST_STEP = 3  # likewise while it has no place
 _LOST_M = 1.0  # standard deviation of the position, likewise
 # keyframes without a result, where the odometry waits for none: beyond, the next one comes later
-_MOST_WAITING = 3
+_MAX_WAITING = 3
 HANDOVER_FRAMES = 10  # from a keyframe to the frame at which its result is taken over
 # from a keyframe to the frame after which its motion is no longer corrected by the window
 SETTLED_FRAMES = 3
@@ -59,7 +59,7 @@ _MOTION_INFLATION = 2.0
 # leave.
 _MOTION_SHARES = (5e-4, 2e-4)
 # errors of the vertical last longer than from keyframe to keyframe
-_LEAST_UP_SIGMA_RAD = float(np.radians(0.1))
+_MIN_UP_SIGMA_RAD = float(np.radians(0.1))
 # Where images show nothing, a filter without a motion sensor holds its velocity; a hand or a car in
 # a curve does not.
 _DARK_S = 0.5
@@ -185,7 +185,7 @@ class MapSession:
         self._release(relative)
         events = self._take(lambda due, done: due <= self._frames and (done or self._wait))
         fresh = seen.take(seen.has_right & ~seen.stale)
-        seen_now = len(fresh) >= _LEAST_TRACKED
+        seen_now = len(fresh) >= _MIN_TRACKED
         lost = seen_now and self._is_lost(frame.time_ns)
         motion = self._motion_to(frame.index, estimate, _unknown if lost else relative)
         self._dark = (
@@ -198,7 +198,7 @@ class MapSession:
             self._seen = estimate
         self._most_features = max(self._most_features, len(fresh))
         if (
-            len(fresh) < min(_LEAST_FEATURES, 0.5 * self._most_features)
+            len(fresh) < min(_MIN_FEATURES, 0.5 * self._most_features)
             or frame.left is None
             or frame.right is None
         ):
@@ -206,7 +206,7 @@ class MapSession:
         self._since += 1
         if motion is None and self._newest is not None:
             return events
-        busy = not self._wait and len(self._waiting) + len(self._held) >= _MOST_WAITING
+        busy = not self._wait and len(self._waiting) + len(self._held) >= _MAX_WAITING
         if not busy and self._is_due(fresh.ids, motion):
             self._hold(frame, fresh.ids, estimate, motion)
         return events
@@ -443,7 +443,7 @@ class MapSession:
         if estimate.gravity_world is not None:
             up_world = -estimate.gravity_world / np.linalg.norm(estimate.gravity_world)
             up_body = estimate.T_world_imu[:3, :3].T @ up_world
-        return self._T_cam_body[:3, :3] @ up_body, max(estimate.tilt_sigma_rad, _LEAST_UP_SIGMA_RAD)
+        return self._T_cam_body[:3, :3] @ up_body, max(estimate.tilt_sigma_rad, _MIN_UP_SIGMA_RAD)
 
     # Results
 

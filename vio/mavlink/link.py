@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from vio.errors import ConfigError, DataError, MissingDependencyError
 
 _BAUD = 921_600
-_MOST_BYTES = 4096
+_MAX_BYTES = 4096
 _WAIT_S = 0.1
 _FORMS = "give udp:HOST:PORT, or serial:DEVICE[:BAUD]"
 MISSING = (
@@ -55,7 +55,7 @@ class UdpLink:
     def read(self) -> bytes:
         """Return a datagram of the address; those of others are left out."""
         try:
-            data, sender = self._socket.recvfrom(_MOST_BYTES)
+            data, sender = self._socket.recvfrom(_MAX_BYTES)
         except (TimeoutError, ConnectionRefusedError):
             return b""
         return data if sender[:2] == self._address[:2] else b""
@@ -91,7 +91,7 @@ class SerialLink:
     def read(self) -> bytes:
         """Return what has come."""
         waiting = self._line.in_waiting
-        return bytes(self._line.read(max(1, min(waiting, _MOST_BYTES))))
+        return bytes(self._line.read(max(1, min(waiting, _MAX_BYTES))))
 
     def close(self) -> None:
         """Close the line."""

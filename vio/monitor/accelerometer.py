@@ -17,10 +17,11 @@ from vio.calibration.lever_arm import estimate_lever_arm
 from vio.calibration.verdicts import judge_imu
 from vio.geometry.lie import FloatArray
 from vio.imu.findings import InertialFinding
-from vio.monitor.force_fit import LEAST_WINDOWS, WINDOW_S, Evidence, ForceFit
+from vio.monitor.force_fit import MIN_WINDOWS, WINDOW_S, Evidence, ForceFit
 from vio.monitor.gyro_fit import GyroFit
 from vio.monitor.motion import Record
 from vio.monitor.samples import Size, gravity_removed
+from vio.records import S_PER_NS
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +31,6 @@ AXES_WORSE = 3.0  # ratio of the given axes' squared misfit to that of others
 _AXES_WORSE_EARLY = 9.0
 _UPSIDE_DOWN = 0.5  # cosine between image-down and up: within 60 degrees
 _UPSIDE_SHARE = 0.95
-_NS = 1e-9
 
 
 def signed_permutations() -> Iterator[FloatArray]:
@@ -107,7 +107,7 @@ def _wrong_axes(force: ForceFit, C: FloatArray) -> InertialFinding | None:
     others = [P for P in signed_permutations() if abs(np.trace(P)) < 2.5]
     costs = [force.cost(C @ P) for P in others]
     k = int(np.argmin(costs))
-    worse = AXES_WORSE if force.windows >= LEAST_WINDOWS else _AXES_WORSE_EARLY
+    worse = AXES_WORSE if force.windows >= MIN_WINDOWS else _AXES_WORSE_EARLY
     # Neither the given axes nor their negative may explain the readings: the sign is judged
     # separately.
     if costs[k] * worse > min(given, force.cost(-C)):
@@ -164,7 +164,7 @@ def judge_lever_arm(
     `T_cam0_imu` (4, 4) is as given; the gyro must agree with its rotation.
     """
     times_ns = record.origin_ns + np.round(
-        np.concatenate([record.begin, record.end[-1:]]) / _NS
+        np.concatenate([record.begin, record.end[-1:]]) / S_PER_NS
     ).astype(np.int64)
     # whose interval ends where the next frame is
     frames = np.flatnonzero(np.append(record.joined[1:], True))

@@ -18,7 +18,7 @@ from vio.records import BoolArray
 # intervals before the first evaluation; there are fewer only at the end of a short run
 FIRST_EVALUATION = 60
 WINDOW_S = 2.0
-LEAST_WINDOWS = 3  # for all but axes that are clearly wrong
+MIN_WINDOWS = 3  # for all but axes that are clearly wrong
 _FEWEST_WINDOWS = 2
 _BIAS_PRIOR_MPS2 = 0.3
 _LEVER_ARM_PRIOR_M = 1.0

@@ -21,6 +21,7 @@ from vio.numerics.compiled import compiled
 from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import (
+    S_PER_NS,
     Image,
     ImuSample,
     IntArray,
@@ -32,20 +33,19 @@ from vio.records import (
 
 _RADIUS = 4  # of the patches whose flow is measured, pixels
 _CORNERS = 60  # measured per image
-_LEAST_CORNERS = 15
+_MIN_CORNERS = 15
 _PREDICTED_PX = 1.0  # a corner that is predicted to move less is no evidence …
 _ERRORS = 3.0  # … nor one that moves by less than so many times what predictions were off by …
 _RECENT = 20  # … at most in so many frames
-_LEAST_RECENT = 5
+_MIN_RECENT = 5
 _UNMOVED_PX = 0.15  # the flow of an unmoved corner under noise of a few gray levels
 _SHARE = 0.8  # of the corners that must be unmoved
 _FIRST_ROWS = 8  # compared before all others
 # of the predicted motion for no motion to be possible
 _LIMIT = float(chi_square_quantile(0.9999, 6))
-_MOST_LINES = 3  # rows of repetitions that are reported one by one
+_MAX_LINES = 3  # rows of repetitions that are reported one by one
 _GYRO_NOISE = 2e-4  # rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), of a rig's IMU by its data sheet
 _ACCEL_NOISE = 1.2e-2
-_NS = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class FrozenImages:
     def sample(self, sample: ImuSample) -> None:
         """Take a sample of the IMU."""
         self._imu.append(sample)
-        while (sample.time_ns - self._imu[0].time_ns) * _NS > STANDSTILL_S:
+        while (sample.time_ns - self._imu[0].time_ns) * S_PER_NS > STANDSTILL_S:
             self._imu.popleft()
 
     def observations(self, seen: Observations) -> None:
@@ -132,7 +132,7 @@ class FrozenImages:
             return None
         if again:
             return Repeated(shown.index, False) if _unmoved(shown, frame, self._seen) else None
-        if len(self._errors_px) < _LEAST_RECENT or not self._contradicts(expected.motion):
+        if len(self._errors_px) < _MIN_RECENT or not self._contradicts(expected.motion):
             return None
         moving = _predicted_to_move(
             self._seen, expected, max(_PREDICTED_PX, _ERRORS * max(self._errors_px))
@@ -153,7 +153,7 @@ class FrozenImages:
         """
         if not self._imu:
             return False
-        times_s = np.array([x.time_ns - self._imu[-1].time_ns for x in self._imu]) * _NS
+        times_s = np.array([x.time_ns - self._imu[-1].time_ns for x in self._imu]) * S_PER_NS
         gyro = np.array([x.gyro for x in self._imu])
         accel = np.array([x.accel for x in self._imu])
         return blocks_agree(times_s, gyro, _GYRO_NOISE) and blocks_agree(
@@ -201,10 +201,7 @@ def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
     of_images = seen.z[:_CORNERS, :2], seen.z[seen.has_right][:_CORNERS, 2:]
     for old, new, pixels in zip(_images(before), _images(now), of_images, strict=False):
         flow = corner_flow(old, new, pixels)
-        if (
-            len(flow) < _LEAST_CORNERS
-            or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE
-        ):
+        if len(flow) < _MIN_CORNERS or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE:
             return False
     return True
 
@@ -253,7 +250,7 @@ class RepeatReport:
         if repeated is None:
             row = self._row
             self._row = []
-            seconds = (frame.time_ns - row[0].time_ns) * _NS if row else 0.0
+            seconds = (frame.time_ns - row[0].time_ns) * S_PER_NS if row else 0.0
             after = f"after {len(row)} repetitions ({seconds:.2f} s)"
             return (
                 [f"frame {frame.index}: the {self._words.what} change again, {after}"]
@@ -262,7 +259,7 @@ class RepeatReport:
             )
         self._row.append(frame)
         self._total += 1
-        if len(self._row) > 1 or self._reported >= _MOST_LINES:
+        if len(self._row) > 1 or self._reported >= _MAX_LINES:
             return []
         self._reported += 1
         if all(image.min() == image.max() for image in _images(frame)):  # black, or blown out

@@ -28,12 +28,12 @@ _NAMED_OFFSET_S = 0.02
 _NEAR_OFFSETS_S = np.arange(-0.1, 0.1001, 0.01)
 FAR_OFFSETS_S = np.arange(-5.0, 5.001, 0.025)
 # Of stamps that jitter.
-_LEAST_INTERVALS = 40
-_LEAST_RATE_RADPS = 0.1  # where a millisecond is 0.1 mrad, about what the images resolve
-_LEAST_JITTER_S = 5e-4  # standard deviation of the intervals; smaller does little harm
+_MIN_INTERVALS = 40
+_MIN_JITTER_RATE_RADPS = 0.1  # where a millisecond is 0.1 mrad, about what the images resolve
+_MIN_JITTER_S = 5e-4  # standard deviation of the intervals; smaller does little harm
 # of the time missed by the gyro over the stamps' deviation: 1 for jitter, 0 for true intervals
 _SLOPE = 0.7, 1.3
-_LEAST_CORRELATION = 0.7
+_MIN_CORRELATION = 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,8 +215,8 @@ def judge_stamps(record: Record) -> InertialFinding | None:
     camera = np.linalg.norm(record.twists[:, 3:], axis=1)
     dt = record.end - record.begin
     usual = float(np.median(dt)) if len(dt) else 0.0
-    used = covered[0] & (gyro > _LEAST_RATE_RADPS) & (np.abs(dt - usual) < 0.5 * usual)
-    if used.sum() < _LEAST_INTERVALS or robust_sigma(dt[used] - usual) < _LEAST_JITTER_S:
+    used = covered[0] & (gyro > _MIN_JITTER_RATE_RADPS) & (np.abs(dt - usual) < 0.5 * usual)
+    if used.sum() < _MIN_INTERVALS or robust_sigma(dt[used] - usual) < _MIN_JITTER_S:
         return None
     # the angle's error is the same everywhere, the time's error falls with the rate
     weight = gyro[used]
@@ -224,7 +224,7 @@ def judge_stamps(record: Record) -> InertialFinding | None:
     missed = weight * (dt[used] - dt[used] * camera[used] / gyro[used])
     slope = float(deviation @ missed / (deviation @ deviation))
     correlation = float(deviation @ missed / np.sqrt((deviation @ deviation) * (missed @ missed)))
-    if not _SLOPE[0] < slope < _SLOPE[1] or correlation < _LEAST_CORRELATION:
+    if not _SLOPE[0] < slope < _SLOPE[1] or correlation < _MIN_CORRELATION:
         return None
     jitter_ms = 1e3 * robust_sigma(dt[used] - usual) / np.sqrt(2)
     return InertialFinding(

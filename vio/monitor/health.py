@@ -18,7 +18,7 @@ from vio.records import BoolArray, Estimate, IntArray, Observations, UpdateRepor
 _NO_FEATURES_S = 1.0  # without a usable feature for longer, the pose is a prediction only
 _GAP_S = 0.5  # between frames: a gap if longer, and so many times the usual time
 _GAP_STEPS = 5.0
-_LEAST_STEPS = 5  # between frames, for the usual time to be known; and that it is taken from
+_MIN_STEPS = 5  # between frames, for the usual time to be known; and that it is taken from
 _RECENT_STEPS = 50
 # No rig comes to this by a camera that turns in its mount (docs/notes/design_decisions.md,
 # exchanged cameras).
@@ -99,7 +99,7 @@ class RunHealth:
         step_s = (estimate.time_ns - last[0]) * 1e-9
         usual_s = np.inf
         # a shorter one is no gap, whatever is usual
-        if step_s > _GAP_S and len(self._steps_s) >= _LEAST_STEPS:
+        if step_s > _GAP_S and len(self._steps_s) >= _MIN_STEPS:
             usual_s = median(self._steps_s)
         self._steps_s.append(step_s)
         if step_s <= max(_GAP_S, _GAP_STEPS * usual_s):
@@ -228,8 +228,8 @@ class RunHealth:
 
 
 _SPAN_S = 1.0
-_LEAST_FRAMES = 3
-_MOST_REFUSED = 0.4  # of the features over the span; healthy recordings come to a third at most
+_MIN_FRAMES = 3
+_MAX_REFUSED = 0.4  # of the features over the span; healthy recordings come to a third at most
 _CELLS = 6, 4  # columns and rows that the image is divided into
 _TOGETHER = 0.2  # of the features, at most, where half of those refused are: then they lie together
 # innovations over their standard deviation: more, and the motion sensor contradicts the images
@@ -276,7 +276,7 @@ class RefusalReport:
             full = True
         kept = sum(f.used for f in self._frames)
         gone = sum(f.gated for f in self._frames)
-        if not full or len(self._frames) < _LEAST_FRAMES or gone <= _MOST_REFUSED * (kept + gone):
+        if not full or len(self._frames) < _MIN_FRAMES or gone <= _MAX_REFUSED * (kept + gone):
             return []
         self._reported = True
         share = gone / (kept + gone)

@@ -10,9 +10,8 @@ import numpy as np
 
 from vio.imu.faults import ImuFault, ImuFaultKind, ImuSampleCheck
 from vio.monitor.samples import GAP_S, GAP_STEPS
-from vio.records import ImuSample
+from vio.records import S_PER_NS, ImuSample
 
-_NS = 1e-9
 _RECENT = 200  # samples whose median distance is the usual one
 _UNITS: dict[ImuFaultKind, str] = {"gyro spike": "rad/s", "accelerometer spike": "m/s^2"}
 _SENSORS: dict[ImuFaultKind, str] = {
@@ -63,7 +62,7 @@ class ImuFaultReport:
 
     def _line(self, fault: ImuFault) -> list[str]:
         if fault.kind in _SENSORS:
-            seconds = (fault.end_ns - fault.start_ns) * _NS
+            seconds = (fault.end_ns - fault.start_ns) * S_PER_NS
             what = (
                 "repeated one reading to the last bit"
                 if fault.size > 0
@@ -115,7 +114,7 @@ class ImuSilence:
             self._waiting += 1
         elif not self._late_said:
             self._late_said = True
-            late_s = (first_ns - self._first_frame[1]) * _NS
+            late_s = (first_ns - self._first_frame[1]) * S_PER_NS
             if late_s > GAP_S:
                 return (
                     f"frame {index}: the first IMU sample came {late_s:.2f} s after frame "
@@ -139,10 +138,10 @@ class ImuSilence:
         """The line on the silence from the last sample to a time, if it is one."""
         if not self._times:
             return ()
-        length_s = (until_ns - self._times[-1]) * _NS
+        length_s = (until_ns - self._times[-1]) * S_PER_NS
         if length_s <= GAP_S:  # as for nearly every sample; the median below is slow
             return ()
-        usual_s = float(np.median(np.diff(self._times))) * _NS if len(self._times) > 1 else 0.0
+        usual_s = float(np.median(np.diff(self._times))) * S_PER_NS if len(self._times) > 1 else 0.0
         if length_s <= max(GAP_S, GAP_STEPS * usual_s):
             return ()
         assert self._last_frame is not None

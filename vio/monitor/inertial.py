@@ -19,19 +19,24 @@ from vio.geometry.stereo import StereoCamera
 from vio.imu.clocks import SampleCoverage
 from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import judge_force, judge_lever_arm, judge_up, resolve_size
-from vio.monitor.force_fit import FIRST_EVALUATION, LEAST_WINDOWS, Evidence, fit_force
+from vio.monitor.force_fit import FIRST_EVALUATION, MIN_WINDOWS, Evidence, fit_force
 from vio.monitor.gyro import judge_gyro
 from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset, judge_stamps
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
 from vio.monitor.rotation_comparison import compare_rotations, judge_rotations
 from vio.monitor.samples import Samples, Size, judge_size
-from vio.records import ROTATION_NOT_COMPARABLE, ImuSample, Observations, RotationComparison
+from vio.records import (
+    ROTATION_NOT_COMPARABLE,
+    S_PER_NS,
+    ImuSample,
+    Observations,
+    RotationComparison,
+)
 
-_LEAST_AT_END = 20  # intervals needed to judge at the end of a run
+_MIN_AT_END = 20  # intervals needed to judge at the end of a run
 # intervals between evaluations after `_ENOUGH`; until then `FIRST_EVALUATION`
 _LATER_EVALUATIONS = 150
 _ENOUGH = 400  # intervals with rotation about all axes after which the comparison ends
-_NS = 1e-9
 
 
 class InertialCheck:
@@ -87,7 +92,7 @@ class InertialCheck:
         """Add the observations of one frame, and return new findings."""
         self._frames += 1
         self._coverage.frame(observations.time_ns, self._samples.last_ns)
-        found = self._coverage.so_far(self._samples.span_ns, self._samples.step_s / _NS)
+        found = self._coverage.so_far(self._samples.span_ns, self._samples.step_s / S_PER_NS)
         if not self.done:
             found += self._compare(observations)
         elif self._frames % BATCH == 0:
@@ -96,7 +101,7 @@ class InertialCheck:
 
     def finish(self) -> tuple[InertialFinding, ...]:
         """Return the findings at the end of the run; call it also when the run fails."""
-        found = self._coverage.at_end(self._samples.span_ns, self._samples.step_s / _NS)
+        found = self._coverage.at_end(self._samples.span_ns, self._samples.step_s / S_PER_NS)
         found += self._samples.check_new(keep=not self.done)
         if not self.done:
             motion = self._camera.flush()
@@ -140,14 +145,14 @@ class InertialCheck:
         if motion is None:
             return [] if size.finding is None else [size.finding]
         record = record_of(motion, times_ns, values)
-        gyro_fit = fit_gyro(record, _LEAST_AT_END)
+        gyro_fit = fit_gyro(record, _MIN_AT_END)
         if gyro_fit is None:
             if self._seen >= _ENOUGH:
                 self.rotation_comparison = self.rotation_comparison or ROTATION_NOT_COMPARABLE
                 self.axes_compared = True
             return self._judge_stationary(size, record, last=last)
         early = None if size.unit is None else fit_force(record, gyro_fit, self._T[:3, 3])
-        force = None if early is None or early.windows < LEAST_WINDOWS else early
+        force = None if early is None or early.windows < MIN_WINDOWS else early
         self.axes_compared |= early is not None
         evidence = Evidence(
             R_cam0_imu=self._T[:3, :3],
@@ -168,7 +173,7 @@ class InertialCheck:
         """
         found = [] if size.finding is None else [size.finding]
         means, covered = record.means(np.zeros(1))
-        if last and size.unit is not None and int(covered.sum()) >= _LEAST_AT_END:
+        if last and size.unit is not None and int(covered.sum()) >= _MIN_AT_END:
             found += judge_up(means[0, covered[0], 3:], self._T[:3, :3], measured=False)
         return found
 
@@ -179,7 +184,7 @@ class InertialCheck:
         gyro_fit = evidence.gyro_fit
         last = evidence.last
         size = resolve_size(size, evidence)
-        offset = judge_offset(gyro_fit, record, _LEAST_AT_END)
+        offset = judge_offset(gyro_fit, record, _MIN_AT_END)
         found = [f for f in (size.finding, offset, judge_stamps(record)) if f is not None]
         rotation = judge_gyro(evidence, size.unit or 1.0)
         found += rotation
@@ -215,7 +220,7 @@ class InertialCheck:
             return
         self.imu_at_fault = judge_size(times_ns, values[:, 3:]).finding is not None
         record = record_of(motion, times_ns, values)
-        gyro_fit = fit_gyro(record, _LEAST_AT_END)
+        gyro_fit = fit_gyro(record, _MIN_AT_END)
         turns = None if gyro_fit is None else compare_rotations(record, gyro_fit, self._T[:3, :3])
         if turns is not None and np.isfinite(turns.sigma) and turns.agree:
             self.rotation_comparison = turns

@@ -14,14 +14,13 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.monitor.samples import GAP_S, MEMORY_S
 from vio.numerics.robust import median
-from vio.records import BoolArray, IntArray, Observations, feature_tracks
+from vio.records import S_PER_NS, BoolArray, IntArray, Observations, feature_tracks
 
 BATCH = 20  # frames whose motion is computed at once
 _TRACKS = 80  # tracks of a frame that the camera's motion is computed from
-_LEAST_LINKS = 15  # tracks between two frames
+_MIN_LINKS = 15  # tracks between two frames
 _LONGEST_INTERVAL_S = 0.25
 _SAME_S = 1e-6  # intervals whose end and start differ by less are contiguous
-_NS = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +67,7 @@ class CameraTwists:
     ) -> FloatArray:
         """Return the initial twist of a pure rotation: flow du = -fu wy dt, dv = fv wx dt."""
         out = np.zeros(6)
-        dt = (kept.time_ns - last.time_ns) * _NS
+        dt = (kept.time_ns - last.time_ns) * S_PER_NS
         if len(flow) and dt > 0:
             du = median(flow[:, 0])
             dv = median(flow[:, 1])
@@ -85,8 +84,8 @@ class CameraTwists:
         tracks = feature_tracks(dict(enumerate(kept)), len(kept))
         times_ns = np.array([o.time_ns for o in kept], dtype=np.int64)
         found = stereo_twists(self._camera, tracks, times_ns, np.array(self._guess))
-        good = (links[found.frames] >= _LEAST_LINKS) & (
-            np.diff(times_ns)[found.frames] * _NS < _LONGEST_INTERVAL_S
+        good = (links[found.frames] >= _MIN_LINKS) & (
+            np.diff(times_ns)[found.frames] * S_PER_NS < _LONGEST_INTERVAL_S
         )
         frames = found.frames[good]
         self._kept = kept[-1:]
@@ -106,7 +105,7 @@ class RecentMotion:
         if not len(motion):
             return
         self._parts.append(motion)
-        while motion.end_ns[-1] - self._parts[0].end_ns[-1] > MEMORY_S / _NS:
+        while motion.end_ns[-1] - self._parts[0].end_ns[-1] > MEMORY_S / S_PER_NS:
             del self._parts[0]
 
     def joined(self) -> Intervals | None:
@@ -161,7 +160,7 @@ def record_of(intervals: Intervals, times_ns: IntArray, values: FloatArray) -> R
     """Convert intervals and readings (S, 6) [gyro; accel] at times (S,) to one clock."""
     origin = int(intervals.begin_ns[0])
     t, begin, end = (
-        np.asarray((x - origin) * _NS, dtype=np.float64)
+        np.asarray((x - origin) * S_PER_NS, dtype=np.float64)
         for x in (times_ns, intervals.begin_ns, intervals.end_ns)
     )
     steps = np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2

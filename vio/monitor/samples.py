@@ -12,22 +12,21 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.imu.findings import InertialFinding
 from vio.numerics.robust import robust_sigma
-from vio.records import BoolArray, ImuSample, IntArray
+from vio.records import S_PER_NS, BoolArray, ImuSample, IntArray
 
 GAP_S = 0.1  # readings further apart are a gap …
 GAP_STEPS = 8.0  # … if that is so many times their usual interval
 MEMORY_S = 60.0  # older readings and motions are dropped
 
-_LEAST_RUN = 5  # equal readings at the extreme in a row
-_LEAST_CHANCE = 1e-8  # probability of such a run by quantisation alone
+_MIN_RUN = 5  # equal readings at the extreme in a row
+_MIN_CHANCE = 1e-8  # probability of such a run by quantisation alone
 _SMOOTH = 0.1  # share of changes of another sign than the one before; of noise it is 2/3
-_LEAST_LEVELS = 20  # different readings on the axis
+_MIN_LEVELS = 20  # different readings on the axis
 
 _SMOOTH_S = 0.2  # readings are averaged over this time before their magnitude is judged
-_LEAST_SIZE_S = 1.0
+_MIN_SIZE_S = 1.0
 _GRAVITY = 9.80665  # m/s^2, and what readings in mg have
 _MILLI_G = 1000.0
-_NS = 1e-9
 
 
 class Samples:
@@ -54,7 +53,7 @@ class Samples:
     def step_s(self) -> float:
         """The usual time between two readings; 0.0 before there are two."""
         if self._step_s is None and len(self._new) > 1:
-            self._step_s = float(np.median(np.diff([s.time_ns for s in self._new]))) * _NS
+            self._step_s = float(np.median(np.diff([s.time_ns for s in self._new]))) * S_PER_NS
         return self._step_s or 0.0
 
     def add(self, sample: ImuSample) -> None:
@@ -72,12 +71,12 @@ class Samples:
         times = np.array([s.time_ns for s in self._new], dtype=np.int64)
         values = np.array([[*s.gyro, *s.accel] for s in self._new])
         before = self._times[-1][-1:] if self._times else times[:0]
-        steps = np.diff(np.concatenate([before, times])) * _NS
+        steps = np.diff(np.concatenate([before, times])) * S_PER_NS
         found = [*_gap(times, steps, self.step_s), *_saturation(times, values)]
         if keep:
             self._times.append(times)
             self._values.append(values)
-            while self._times[-1][-1] - self._times[0][-1] > MEMORY_S / _NS:
+            while self._times[-1][-1] - self._times[0][-1] > MEMORY_S / S_PER_NS:
                 del self._times[0], self._values[0]
         else:
             self._times = [times[-1:]]
@@ -111,23 +110,23 @@ def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFind
     """Yield runs of equal readings at the extreme of an axis that quantisation or held samples
     do not explain.
     """
-    if len(values) < 4 * _LEAST_RUN:
+    if len(values) < 4 * _MIN_RUN:
         return
     equal = values[1:] == values[:-1]
     for axis in range(6):
         for extreme in (values[:, axis].max(), values[:, axis].min()):
             at = values[:, axis] == extreme
             # no sensor's range ends at 0: that of a simulator without noise, at rest
-            if extreme == 0.0 or at.sum() < _LEAST_RUN or at.all():
+            if extreme == 0.0 or at.sum() < _MIN_RUN or at.all():
                 continue
             if _has_no_noise(values, at, axis):
                 continue
             # Equal neighbours elsewhere are due to chance: a run of n has the probability
             # held^(n-1).
             held = float(np.mean(equal[~(at[1:] & at[:-1]), axis]))
-            chance = np.log(_LEAST_CHANCE) / np.log(held) if held > 0 else 0.0
+            chance = np.log(_MIN_CHANCE) / np.log(held) if held > 0 else 0.0
             run = _longest_run(at)
-            if run < max(_LEAST_RUN, 1 + chance) or len(np.unique(values[:, axis])) < _LEAST_LEVELS:
+            if run < max(_MIN_RUN, 1 + chance) or len(np.unique(values[:, axis])) < _MIN_LEVELS:
                 continue
             name, unit = ("gyro", "rad/s") if axis < 3 else ("accelerometer", "m/s^2")
             yield InertialFinding(
@@ -177,8 +176,8 @@ class Size:
 
 def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
     """Judge the accelerometer's unit by the magnitude of its mean readings (S, 3) at times (S,)."""
-    t = np.asarray((times_ns - times_ns[0]) * _NS, dtype=np.float64)
-    if t[-1] < _LEAST_SIZE_S:
+    t = np.asarray((times_ns - times_ns[0]) * S_PER_NS, dtype=np.float64)
+    if t[-1] < _MIN_SIZE_S:
         return Size(None, 1.0)
     integral = np.concatenate(
         [np.zeros((1, 3)), np.cumsum(np.diff(t)[:, None] * (accel[1:] + accel[:-1]) / 2, axis=0)]

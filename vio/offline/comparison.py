@@ -19,7 +19,7 @@ from vio.offline.keyframes import TrackedPath
 from vio.records import BoolArray, IntArray, Trajectory
 
 _SCALE_SIGMA = 0.02  # a scale with a larger standard deviation is not reported
-_LEAST_MOTIONS = 8  # keyframes needed to detect outlying motions
+_MIN_MOTIONS = 8  # keyframes needed to detect outlying motions
 _OUTLYING = 6.0  # robust standard deviations
 # What COLMAP's own path may be off by at its end, beside the run's standard deviations.
 _END_SHARE = 0.01
@@ -205,7 +205,7 @@ def _disagreements(
     """Return segments where motions between neighbouring keyframes, where there is no gap,
     differ by outliers.
     """
-    if linked.sum() < _LEAST_MOTIONS - 1:
+    if linked.sum() < _MIN_MOTIONS - 1:
         return ()
     off_m, off_deg = motion_differences(T_own, T_other)
     bad = _stands_out(off_m, linked) | _stands_out(off_deg, linked)
@@ -224,7 +224,7 @@ def _longest_piece(
 
     And how many there are between gaps.
     """
-    if len(T_own) < _LEAST_MOTIONS and linked.all():
+    if len(T_own) < _MIN_MOTIONS and linked.all():
         return np.ones(len(T_own), dtype=bool), 1
     moved_m = np.linalg.norm(np.diff(T_own[:, :3, 3], axis=0), axis=1)
     off_m, _ = motion_differences(T_own, T_other)

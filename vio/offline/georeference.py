@@ -28,7 +28,7 @@ from vio.runs.mapped import read_keyframes, read_loops, read_trajectories
 FACTS = "earth.json"
 _UP_RAD = float(np.radians(0.3))  # of an IMU's vertical; of an upright camera's
 _MOUNT_RAD = float(np.radians(5.0))
-_LEAST_COMMON = 3  # keyframes that run and map share
+_MIN_COMMON = 3  # keyframes that run and map share
 _SAME = 0.05  # by which a motion between two of them may differ, m and rad, and share of it
 _SAME_SHARE = 0.1
 
@@ -190,7 +190,7 @@ def place_by_map(of: Placed, run: FilePath, file: FilePath, folder: FilePath) ->
         if sessions[row.session].part == sessions[0].part
     }
     before, now = _common(run, home)
-    if len(before) < _LEAST_COMMON or not _is_one_path(before, now):
+    if len(before) < _MIN_COMMON or not _is_one_path(before, now):
         raise DataError(
             f"{run}: was localised in another map than {file}; give the map that the run found its "
             "place in"

@@ -48,7 +48,7 @@ _WIDER = 2  # … doubled in so many first steps, once each
 _SETTLED = 7  # steps after which neither width nor preintegration change
 # of the cost, from step to step: what goes on is rows that turn into outliers, and moves no pose
 _CONVERGED = 1e-4
-_MOST_DAMPING = 1e3
+_MAX_DAMPING = 1e3
 _CELL_S = 1.0  # tracks that end within it in one cell of directions share their errors, as in (R7)
 # inverse standard deviation, 1/m and 1/rad, of position and heading of the first keyframe
 _GAUGE = 1e4
@@ -155,7 +155,7 @@ class InertialAdjustment:
                 if after <= before:
                     break
                 damping *= 10
-                if damping > _MOST_DAMPING:
+                if damping > _MAX_DAMPING:
                     # no step is shorter: rounding is all that is left
                     return at, steps, n > _SETTLED
             at = new

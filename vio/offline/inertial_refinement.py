@@ -26,7 +26,7 @@ _EVERY_S = 0.25  # from keyframe to keyframe
 # On the standard deviations of pixels: errors of a track last longer than from keyframe to
 # keyframe. The same as on the motions of a map's odometry, where it was measured.
 _LASTING = 2.0
-_LEAST_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
+_MIN_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
 _TINY = 1e-7  # focal lengths: of coefficients that are known
 
 
@@ -132,7 +132,7 @@ def _row_sigmas(path: TrackedPath, T_world_cam0: FloatArray, tracks: PointTracks
     for group in (tracks.by_loop, ~tracks.by_loop):
         seen = group & tracks.has_right
         if seen.any():
-            out[group] = _LASTING * max(robust_sigma(r[seen]), _LEAST_SIGMA_PX)
+            out[group] = _LASTING * max(robust_sigma(r[seen]), _MIN_SIGMA_PX)
     return out
 
 

@@ -22,8 +22,8 @@ _SCENE_SHARE = 0.08  # of the median depth: translation to a new keyframe …
 _TURN_DEG = 6.0  # … or rotation to it
 _SPARSER = 1.15  # factor on both limits, from one attempt to the next
 _LOST_SHARE = 0.2  # of the features that are seen, from keyframe to keyframe
-_LEAST_SEEN = 10  # features of a frame that may become a keyframe
-_LEAST_STRETCH = 20  # frames
+_MIN_SEEN = 10  # features of a frame that may become a keyframe
+_MIN_STRETCH = 20  # frames
 _LOOP_SHARE = 3  # of the keyframes that may be spent on loops: one in three
 
 
@@ -117,7 +117,7 @@ def keyframes_by_overlap(run: TrackedPath, *, most: int) -> IntArray:
         return np.arange(len(run.frames))
     ends = loop_ends(run, most)
     ids = [run.fresh(k).ids for k in range(len(run.frames))]
-    shown = [k for k in range(len(ids)) if k in (0, len(ids) - 1) or len(ids[k]) >= _LEAST_SEEN]
+    shown = [k for k in range(len(ids)) if k in (0, len(ids) - 1) or len(ids[k]) >= _MIN_SEEN]
     lost = [
         1 - np.isin(ids[a], ids[b]).mean() if len(ids[a]) else 0.0
         for a, b in itertools.pairwise(shown)
@@ -180,7 +180,7 @@ def tracked_segments(
         for part in np.split(rows, breaks)
         for k in range(0, len(part), longest)
     ]
-    parts = [part for part in parts if len(part) >= min(longest, _LEAST_STRETCH)]
+    parts = [part for part in parts if len(part) >= min(longest, _MIN_STRETCH)]
     if not parts:
         return []
     out: list[TrackedPath] = []

@@ -23,8 +23,8 @@ from vio.records import MapKeyframes, feature_tracks
 from vio.runs.mapped import MappedRun, corrected
 from vio.runs.pipeline import RunResult
 
-MOST_KEYFRAMES = 1500  # of the adjustment, four a second: its time and memory grow with them
-_MOST_SIGMAS = 3.0  # by which it may move the map, by the map's covariance
+MAX_KEYFRAMES = 1500  # of the adjustment, four a second: its time and memory grow with them
+_MAX_SIGMAS = 3.0  # by which it may move the map, by the map's covariance
 
 
 def adjust_map(
@@ -78,8 +78,8 @@ def _adjusted(
     path = _path(result, mapped)
     T_cam0_body = result.T_cam0_body
     keyframes = inertial_keyframes(path, None)
-    if len(keyframes) > MOST_KEYFRAMES:
-        raise VioError(f"it would need {len(keyframes)} keyframes, {MOST_KEYFRAMES} at most")
+    if len(keyframes) > MAX_KEYFRAMES:
+        raise VioError(f"it would need {len(keyframes)} keyframes, {MAX_KEYFRAMES} at most")
     seen = feature_tracks(
         {o.frame_index: o for o in (result.observations[int(k)] for k in keyframes)},
         len(result.recording.frame_times_ns),
@@ -119,7 +119,7 @@ def _adjusted(
         np.sqrt(np.mean(np.sum((T_map_body - mapped.T_map_body)[:, :3, 3] ** 2, axis=1)))
     )
     size = f"by {metres_text(moved_m)} (rms), {sigmas:.1f} of the map's standard deviations"
-    if sigmas > _MOST_SIGMAS:
+    if sigmas > _MAX_SIGMAS:
         raise VioError(f"it would move the map {size}: one of them is wrong")
     text = f"with the IMU at {len(keyframes)} keyframes, in {time.perf_counter() - began:.0f} s; moved {size}"
     return replace(

@@ -16,7 +16,7 @@ from vio.records import BoolArray, IntArray, Landmarks
 _MIN_DISPARITY_PX = 0.5
 MIN_DEPTH_M = 0.05
 _POINT_STEPS = 8
-_LEAST_VIEWS = 2  # of a point
+_MIN_VIEWS = 2  # of a point
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ def build_tracks(
     if not len(tracks.ids):
         raise EstimationError(
             f"{run.where}: not observable because no feature is seen consistently in "
-            f"{_LEAST_VIEWS} keyframes; the "
+            f"{_MIN_VIEWS} keyframes; the "
             "views do not overlap, the scene has no texture, or the run's poses are wrong"
         )
     return tracks
@@ -103,7 +103,7 @@ def keep_rows(tracks: PointTracks, rows: BoolArray) -> PointTracks:
     count = len(tracks.ids)
     views = np.bincount(tracks.point[rows], minlength=count)
     stereo = np.bincount(tracks.point[rows & tracks.has_right], minlength=count)
-    points = (views >= _LEAST_VIEWS) & (stereo > 0)
+    points = (views >= _MIN_VIEWS) & (stereo > 0)
     rows = rows & points[tracks.point]
     renumbered = np.cumsum(points) - 1
     return PointTracks(

@@ -14,7 +14,7 @@ import numpy as np
 from vio.config import Config, merge
 from vio.errors import ConfigError, EvaluationError
 from vio.files.inputs import read_input
-from vio.files.yaml_text import MOST_BYTES, read_yaml
+from vio.files.yaml_text import MAX_BYTES, read_yaml
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.numerics.robust import robust_sigma
@@ -34,7 +34,7 @@ from vio.runs.pipeline import run as process
 log = logging.getLogger(__name__)
 
 STEPS = 4  # that `progress` counts
-_MOST_SIGMAS = 3.0  # by which refined poses and the run's may differ
+_MAX_SIGMAS = 3.0  # by which refined poses and the run's may differ
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +129,7 @@ def refine_run(
     moved_rms_m = aligned_distance_m(path.trajectory.T_world_body, refined.T_world_body)
     if path.sigmas is not None:
         sigma_m = float(np.sqrt(np.mean(path.sigmas[:, 0] ** 2)))
-        if moved_rms_m > _MOST_SIGMAS * sigma_m:
+        if moved_rms_m > _MAX_SIGMAS * sigma_m:
             log.warning(
                 "the refined poses are %.2g m (rms) from the run's, %.1f times its standard "
                 "deviation of %.2g m: "
@@ -217,7 +217,7 @@ def _estimator_settings(path: Path) -> Config:
     not need.
     """
     try:
-        values = read_yaml(read_input(path, MOST_BYTES).decode("utf-8"))
+        values = read_yaml(read_input(path, MAX_BYTES).decode("utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(f"cannot read {path} ({error}); repeat the run") from error
     if not isinstance(values, dict):
@@ -227,8 +227,8 @@ def _estimator_settings(path: Path) -> Config:
 
 
 _POSE_STEPS = 12
-_LEAST_ROWS = 6
-_LEAST_SIGMA_M = 1e-4  # of a prior: the first pose of a filter has no uncertainty by definition
+_MIN_ROWS = 6
+_MIN_SIGMA_M = 1e-4  # of a prior: the first pose of a filter has no uncertainty by definition
 
 
 def align_to_points(
@@ -256,7 +256,7 @@ def align_to_points(
         H[~has_right, 2:] = 0
         width = 2.0 ** max(4 - step, 0)
         weight = ahead / (1 + np.sum(r**2, axis=1) / width**2) ** 2
-        if (weight > 0.25).sum() < _LEAST_ROWS:
+        if (weight > 0.25).sum() < _MIN_ROWS:
             return None
         weighted = H * weight[:, None, None]
         normal = np.einsum("nki,nkj->ij", weighted, H)
@@ -307,4 +307,4 @@ def position_covariances(estimates: Sequence[Estimate], T_cam0_imu: FloatArray) 
     R = np.array([e.T_world_imu[:3, :3] for e in estimates])
     P = np.array([e.covariance for e in estimates])
     J = R @ p_D_xi
-    return J @ P @ np.swapaxes(J, 1, 2) + _LEAST_SIGMA_M**2 * np.eye(3)
+    return J @ P @ np.swapaxes(J, 1, 2) + _MIN_SIGMA_M**2 * np.eye(3)

@@ -60,7 +60,7 @@ _LENS_DIRECTION_DEG = 0.3
 _HELD = 1e-9  # standard deviation of what is not free
 _STEPS = 30  # of Levenberg-Marquardt, at most
 _FIRST_DAMPING = 1e-4  # over the diagonal of the information
-_LEAST_DAMPING = 1e-10
+_MIN_DAMPING = 1e-10
 _SETTLED = 1e-6  # relative decrease of the cost at which the steps end
 # robust standard deviation above which the tracks are not of one rigid scene and rig
 _LARGEST_RESIDUAL_PX = 1.5
@@ -69,7 +69,7 @@ _GATE = 5.0  # rows with larger residuals, in standard deviations, are left out
 # of a point's information, against rounding; more of it passes for knowledge of depths
 _ROUNDING = 1e-12
 _CELLS = (8, 4)  # regions of the image, along u and v
-_LEAST_RESIDUAL_PX = 0.02  # of exact tracks, so that weights stay finite
+_MIN_RESIDUAL_PX = 0.02  # of exact tracks, so that weights stay finite
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,7 +255,7 @@ def _optimum(
         if after < before:
             x = x + dx
             pieces = moved
-            damping = max(damping / 30, _LEAST_DAMPING)
+            damping = max(damping / 30, _MIN_DAMPING)
         else:
             damping = 10 * max(damping, 1e-8)
         if abs(before - after) < _SETTLED * before:
@@ -287,7 +287,7 @@ def _spread(camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment]) -> f
     """Return the robust standard deviation of a pixel coordinate."""
     return max(
         robust_sigma(np.concatenate([_residuals(camera, x, s)[1] for s in pieces])),
-        _LEAST_RESIDUAL_PX,
+        _MIN_RESIDUAL_PX,
     )
 
 

@@ -36,7 +36,7 @@ from vio.errors import DataError
 from vio.ros2.transport import Quality
 
 _DEPTH = 1000  # messages that wait for `spin`; of a topic that must not lose any, all
-_MOST_IMAGES = 50  # that wait where none must be lost: then the sender waits
+_MAX_IMAGES = 50  # that wait where none must be lost: then the sender waits
 _TAKEN = 10_000  # at a time
 _LAST_S = 30.0  # that a receiver may take for the last messages
 _BASE: dict[str, Any] = {
@@ -105,7 +105,7 @@ def _qos(quality: Quality, *, of_images: bool = False) -> Qos:
     if quality == "sensor":
         return Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(_DEPTH), format_of_ros)
     if quality == "reliable":
-        limits = [Policy.ResourceLimits(max_samples=_MOST_IMAGES)] if of_images else []
+        limits = [Policy.ResourceLimits(max_samples=_MAX_IMAGES)] if of_images else []
         return Qos(reliable, Policy.History.KeepAll, format_of_ros, *limits)
     return Qos(
         reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(1), format_of_ros

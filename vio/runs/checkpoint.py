@@ -30,7 +30,7 @@ from vio.protocols import Dataset
 
 _FORMAT = "stereo-vio checkpoint 2"
 _PACKAGE = __name__.split(".", maxsplit=1)[0]
-_MOST_BYTES = 4 << 30
+_MAX_BYTES = 4 << 30
 _BIT_GENERATORS = {
     own.__name__: own for own in (np.random.PCG64, np.random.PCG64DXSM, np.random.SFC64)
 }
@@ -48,7 +48,7 @@ _DAMAGE = (
     ImportError,
     RecursionError,
 )
-_MOST_CHANGES = 3  # of the inputs, named in an error
+_MAX_CHANGES = 3  # of the inputs, named in an error
 
 
 class NotSavableError(Exception):
@@ -87,7 +87,7 @@ def load_checkpoint(path: Path, dataset: Dataset, inputs: Mapping[str, Any] | No
         DataError: the file is damaged, another program wrote it, or the run had other inputs.
     """
     try:
-        data = read_input(path, _MOST_BYTES)
+        data = read_input(path, _MAX_BYTES)
         if data[:8] != b"%08x" % zlib.crc32(memoryview(data)[8:]):
             raise ValueError(
                 "its checksum does not agree with its content; or an earlier version wrote it"
@@ -129,11 +129,9 @@ def _program() -> dict[str, str]:
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Name the values that are not what they were; empty: all are."""
     names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-    texts = [
-        f"{name} was {before.get(name)}, now {now.get(name)}" for name in names[:_MOST_CHANGES]
-    ]
+    texts = [f"{name} was {before.get(name)}, now {now.get(name)}" for name in names[:_MAX_CHANGES]]
     return "; ".join(
-        texts + [f"and {len(names) - _MOST_CHANGES} more"] * (len(names) > _MOST_CHANGES)
+        texts + [f"and {len(names) - _MAX_CHANGES} more"] * (len(names) > _MAX_CHANGES)
     )
 
 

@@ -24,8 +24,8 @@ FEATURE_WORDS = {
     "matched": "with a right match",
     "used": "used",
 }
-_MOST = 3000  # samples of a curve; more are not seen on a screen
-_MOST_POINTS = 6000
+_MAX = 3000  # samples of a curve; more are not seen on a screen
+_MAX_POINTS = 6000
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ def curves_of(runs: Sequence[FinishedRun]) -> list[Curves]:
         view = drawn.view_of_reference() if first else views[source]
         if view is not None:
             views[source] = view
-        found = draw(drawn, view, most=_MOST)
+        found = draw(drawn, view, most=_MAX)
         curves.append(
             replace(found, mapped=_mapped(run, drawn, found.T_view_world, view), draws_truth=first)
         )
@@ -244,7 +244,7 @@ def _sigmas(P: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
 
 
-def thinned(count: int, most: int | None = _MOST) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def thinned(count: int, most: int | None = _MAX) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """Return at most `most` row numbers of `count` (None: all), evenly spread, with the first
     and the last.
     """
@@ -255,6 +255,6 @@ def _chosen_points(run: FinishedRun) -> np.ndarray[tuple[int], np.dtype[np.int64
     """Return the row numbers of the landmarks to draw: the most certain ones, relative to their
     distance.
     """
-    if len(run.points) <= _MOST_POINTS:
+    if len(run.points) <= _MAX_POINTS:
         return np.arange(len(run.points))
-    return np.sort(np.argsort(run.point_sigmas, kind="stable")[:_MOST_POINTS])
+    return np.sort(np.argsort(run.point_sigmas, kind="stable")[:_MAX_POINTS])

@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 _FORMER = {"watch_ms": "monitor_ms"}  # columns of frames.csv by their names until 0.2
 
 _PLY_POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "sigma")])
-_MOST_PLY_BYTES = 2 << 30
+_MAX_PLY_BYTES = 2 << 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +167,7 @@ def read_points(path: Path) -> np.ndarray[Any, Any]:
     """Read the points (M,) of `write_landmarks_ply`; a missing file has none."""
     if not path.is_file():
         return np.zeros(0, dtype=_PLY_POINT)
-    data = read_input(path, _MOST_PLY_BYTES)
+    data = read_input(path, _MAX_PLY_BYTES)
     end = data.find(b"end_header\n")
     body = data[end + len(b"end_header\n") :]
     if end < 0 or len(body) % _PLY_POINT.itemsize:

@@ -44,7 +44,7 @@ _UNUSABLE = "#d64545"  # … or not to be used
 _PURPLE = "#8a5fb0"
 # a stereo calibration that ends within so many standard deviations of zero is not drawn
 _MOVED_SIGMAS = 3.0
-_LEAST_MARGIN_M = 0.02  # about a rig that stands
+_MIN_MARGIN_M = 0.02  # about a rig that stands
 _MILLIMETRES_BELOW_M = 0.02  # largest error of trajectories that are compared
 _SCALE = 1.3  # of the largest value to the end of an axis
 _BINS = 250  # of the curves that are medians over frames
@@ -232,7 +232,7 @@ def _view(paths: FloatArray, shape: float) -> tuple[FloatArray, FloatArray]:
     """
     low = paths.min(axis=0)
     high = paths.max(axis=0)
-    size = high - low + 2 * max(0.1 * float((high - low).max()), _LEAST_MARGIN_M)
+    size = high - low + 2 * max(0.1 * float((high - low).max()), _MIN_MARGIN_M)
     half = 0.5 * np.array([max(size[0], shape * size[1]), max(size[1], size[0] / shape)])
     return 0.5 * (low + high) - half, 0.5 * (low + high) + half
 

@@ -52,9 +52,9 @@ if TYPE_CHECKING:
 
 __all__ = ["STAGES", "FrameLog", "RunControl", "RunResult", "Viewers", "run"]
 
-_MOST_NAMED = 5  # frames that could not be read
+_MAX_NAMED = 5  # frames that could not be read
 # frames that the front end refused, and more of them than not, before a run gives up
-_LEAST_REFUSED = 10
+_MIN_REFUSED = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -409,7 +409,7 @@ class _Loop:
                 )
             self._take(event)
             state.note(event)
-            if _LEAST_REFUSED <= monitor.frames_refused > len(recorder):
+            if _MIN_REFUSED <= monitor.frames_refused > len(recorder):
                 break
             stopped = should_stop()
             if recorder.is_save_due or (stopped and recorder.can_save):
@@ -509,7 +509,7 @@ def _taken_frames(dataset: Dataset, config: Config, start: int, stop: int | None
 
 def _unread_line(unread: list[int], frames: int) -> str:
     """The line on frames that could not be read."""
-    named = ", ".join(map(str, unread[:_MOST_NAMED])) + (", …" if len(unread) > _MOST_NAMED else "")
+    named = ", ".join(map(str, unread[:_MAX_NAMED])) + (", …" if len(unread) > _MAX_NAMED else "")
     return f"{len(unread)} of {frames} frames could not be read and were skipped: {named}"
 
 

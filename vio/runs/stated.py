@@ -23,7 +23,7 @@ from vio.files.schema import (
     an_object,
 )
 
-_MOST_BYTES = 2**26
+_MAX_BYTES = 2**26
 _NUMBERS = a_list(NUMBER)
 
 REQUEST_SHAPE = an_object(
@@ -109,7 +109,7 @@ def read_stated(path: Path, shape: Shape, remedy: str) -> dict[str, Any]:
             remedy.
     """
     try:
-        values = json.loads(read_input(path, _MOST_BYTES))
+        values = json.loads(read_input(path, _MAX_BYTES))
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: is damaged ({error}); {remedy}") from error
     fault = shape.fault(values, "") or _parted(values)

@@ -27,7 +27,7 @@ from vio.selection.information import (
 )
 from vio.setting import Section, setting
 
-_LEAST_KEPT = 12  # observations of a frame, where a share of them is kept
+_MIN_KEPT = 12  # observations of a frame, where a share of them is kept
 # the gain is summed over the last motion, the next one and the one so many frames ahead
 _HORIZON_FRAMES = 4
 _PIXEL_SIGMA_PX = 0.5  # standard deviation of one pixel coordinate
@@ -80,7 +80,7 @@ class _VisibilityCount:
 def _budget(s: SelectorSettings, n: int) -> int:
     """Return how many of n rows may be chosen."""
     return min(
-        n, max(int(np.ceil(n * s.keep_fraction)), _LEAST_KEPT) if s.budget is None else s.budget
+        n, max(int(np.ceil(n * s.keep_fraction)), _MIN_KEPT) if s.budget is None else s.budget
     )
 
 

@@ -61,7 +61,7 @@ logger = logging.getLogger(__name__)
 _CLEARANCE_STEP_NS = 20_000_000
 _FLOW_GRID = 16  # pixels between exact flow vectors of the approximate blur
 _TAP_SPACING_PX = 1.2  # between samples along a blur; linear interpolation fills the gaps
-_MOST_TAPS = 21
+_MAX_TAPS = 21
 _WALL_MARGIN_M = 1.2  # of a room built around a recorded flight
 
 
@@ -393,7 +393,7 @@ class SimulatedRecording:
         # short shutters need fewer taps, and long ones leave no gaps between them
         if effects.auto_exposure:
             length = max(float(np.abs(before).max()), float(np.abs(after).max()))
-            taps = int(np.clip(2 * round(length / _TAP_SPACING_PX) + 1, 1, _MOST_TAPS))
+            taps = int(np.clip(2 * round(length / _TAP_SPACING_PX) + 1, 1, _MAX_TAPS))
         return blur_along_flow(self._sharp(camera, time_ns), before, after, taps)
 
     def flow(

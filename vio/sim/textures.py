@@ -27,7 +27,7 @@ _Canvas: TypeAlias = npt.NDArray[np.float32]
 _GUTTER = 3  # texels of repeated border around each level, for the interpolation kernel
 _MAX_SIDE = 32000  # cv2.remap addresses its source with 16-bit integers
 _SMALLEST_LEVEL = 4
-_MOST_MARKS = 6000  # of one kind on one surface
+_MAX_MARKS = 6000  # of one kind on one surface
 LEVELS_PER_OCTAVE = 2
 _COARSE_TEXELS = 16  # of the shorter side of the copy that exposure is metered on
 
@@ -233,7 +233,7 @@ def _scatter(
     for low, high, weight in ((0.15, 0.5, 1.5), (0.05, 0.15, 8.0), (0.015, 0.05, 30.0)):
         if high * per_m < 2.5:
             continue
-        count = min(int(area * density * weight), 2 * _MOST_MARKS)
+        count = min(int(area * density * weight), 2 * _MAX_MARKS)
         sides = (low * per_m, high * per_m)
         _rectangles(canvas, rng, count // 2, sides, contrast)
         _polygons(canvas, rng, count - count // 2, (sides[0] / 2, sides[1] / 2), contrast)
@@ -454,13 +454,13 @@ def _asphalt(width: int, height: int, per_m: float, rng: np.random.Generator) ->
     canvas = 95 + 24 * _noise(width, height, per_m, rng, 4.0, 0.92)
     canvas = np.ascontiguousarray(canvas, dtype=np.float32)
     area = width * height / per_m**2
-    _rectangles(canvas, rng, min(int(area / 12), _MOST_MARKS), (0.4 * per_m, 3.0 * per_m), 22)
-    _polygons(canvas, rng, min(int(area / 3), _MOST_MARKS), (0.05 * per_m, 0.4 * per_m), 45)
+    _rectangles(canvas, rng, min(int(area / 12), _MAX_MARKS), (0.4 * per_m, 3.0 * per_m), 22)
+    _polygons(canvas, rng, min(int(area / 3), _MAX_MARKS), (0.05 * per_m, 0.4 * per_m), 45)
     if 0.08 * per_m > 2:
         _polygons(
-            canvas, rng, min(int(area * 2.5), 2 * _MOST_MARKS), (0.02 * per_m, 0.08 * per_m), 70
+            canvas, rng, min(int(area * 2.5), 2 * _MAX_MARKS), (0.02 * per_m, 0.08 * per_m), 70
         )
-    for _ in range(min(int(area / 8), _MOST_MARKS)):
+    for _ in range(min(int(area / 8), _MAX_MARKS)):
         steps = rng.normal(0, 0.35, (12, 2)).cumsum(axis=0) * per_m
         points = rng.uniform((0, 0), (width, height)) + steps
         dark = float(rng.uniform(25, 55))
@@ -472,7 +472,7 @@ def _asphalt(width: int, height: int, per_m: float, rng: np.random.Generator) ->
             max(1, round(0.02 * per_m)),
             shift=4,
         )
-    for _ in range(min(int(area / 25), _MOST_MARKS)):
+    for _ in range(min(int(area / 25), _MAX_MARKS)):
         x, y = rng.uniform((0, 0), (width, height))
         _fill(
             canvas,

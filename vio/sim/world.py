@@ -39,7 +39,7 @@ _CORNER_FREE_M = 13.0  # no parked box this close to a corner, which cars cut
 _EMISSION: dict[TextureKind, float] = {"window": 7.0, "sky": 1.5, "skyline": 1.3}
 _MOVER_LIGHT = 0.7  # illumination of moving boxes, which is the same wherever they are
 _LIGHT_CELL_M = 0.25  # at which illumination is computed; also the width of a shadow's soft edge
-_MOST_LIGHT_CELLS = 400  # along each side of a surface
+_MAX_LIGHT_CELLS = 400  # along each side of a surface
 _ROOM_AMBIENT = 0.22
 _STREET_AMBIENT = 0.4
 _SUN_ELEVATION_RAD = 0.3
@@ -145,7 +145,7 @@ class TextureStore:
 
 def _light_on(patch: Patch, lighting: Lighting) -> FloatArray:
     """Illumination (R, C) at the middles of a grid of cells over a fixed surface."""
-    columns, rows = np.clip(np.ceil(patch.size / _LIGHT_CELL_M), 2, _MOST_LIGHT_CELLS).astype(int)
+    columns, rows = np.clip(np.ceil(patch.size / _LIGHT_CELL_M), 2, _MAX_LIGHT_CELLS).astype(int)
     s, t = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
     along = (
         s.reshape(-1, 1) * patch.size[0] * patch.axis_s

@@ -14,7 +14,7 @@ from vio.errors import DataError
 from vio.records import Image
 from vio.sources.source import Layout, SourceEvent, SourceFrame
 
-_MOST_FAILED = 50  # reads in a row without an image, after which a device has gone
+_MAX_FAILED = 50  # reads in a row without an image, after which a device has gone
 _PAUSE_S = 0.02  # between them
 
 
@@ -67,7 +67,7 @@ class VideoSource:
                 if self._is_file:
                     return
                 failed += 1
-                if failed > _MOST_FAILED:
+                if failed > _MAX_FAILED:
                     raise DataError(
                         f"{self._name}: no image for {failed * _PAUSE_S:.0f} s; check the cable or "
                         "the network"

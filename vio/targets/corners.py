@@ -39,7 +39,7 @@ _MIN_LIKENESS = 0.5  # normalised correlation with the board, of a tag or the sq
 _SAMPLES = 16  # along a side of what is correlated
 _MIN_CONTRAST = 12.0  # standard deviation of the gray values there
 _OUTLIER_SIGMAS = 6.0  # of a corner against the homography of its neighbours
-_LEAST_OUTLIER_PX = 0.3
+_MIN_OUTLIER_PX = 0.3
 _MIN_CORNERS = 8  # of a view
 
 
@@ -178,7 +178,7 @@ class CornerDetector:
             board = self.points_m[ids[keep]]
             predicted, _ = _predict(self.points_m[ids], board, uv[keep], leave_out=True)
             off = np.linalg.norm(predicted - uv, axis=1)
-            limit = max(_OUTLIER_SIGMAS * float(np.median(off[keep])) / 1.18, _LEAST_OUTLIER_PX)
+            limit = max(_OUTLIER_SIGMAS * float(np.median(off[keep])) / 1.18, _MIN_OUTLIER_PX)
             keep = off < limit
             if keep.sum() < _MIN_CORNERS:
                 return np.zeros(len(ids), dtype=bool)

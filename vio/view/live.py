@@ -45,7 +45,7 @@ _WIDEST_PX = 752  # images are shown at this width at most
 _JPEG_QUALITY = 75
 _CHUNK = 64  # poses of a path that are sent together; the last chunk is sent again with every pose
 _TAIL = 12  # positions of a track that are drawn
-_LEAST_DISPARITY_PX = 3.0  # of points drawn from one stereo pair
+_MIN_DISPARITY_PX = 3.0  # of points drawn from one stereo pair
 _SIGMAS = 3.0
 _OLD_FRAMES = 40  # age of a track whose colour is the last of the scale
 _STATES = {
@@ -394,7 +394,7 @@ class RerunViewer:
 
         camera = self._rig.camera
         z = seen.z
-        near = seen.has_right & (z[:, 0] - z[:, 2] > _LEAST_DISPARITY_PX)
+        near = seen.has_right & (z[:, 0] - z[:, 2] > _MIN_DISPARITY_PX)
         depth = camera.fu * camera.baseline_m / (z[near, 0] - z[near, 2])
         p_cam = left_rays(camera, z[near, :2]) * depth[:, None]
         T_world_cam0 = estimate.T_world_imu @ se3_inverse(self._rig.T_cam0_body)

@@ -16,12 +16,12 @@ import numpy as np
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, IntArray
 
-_LEAST_NS = 10_000_000  # smaller corrections are those of a clock that is steered
+_MIN_NS = 10_000_000  # smaller corrections are those of a clock that is steered
 _AROUND = 20  # messages on either side that tell how far stamps are behind the recorder's clock
 _TOGETHER_NS = NS_PER_S  # steps of several topics within this time are one
 _NEAR_NS = 100_000_000  # messages are recorded within this time after they are stamped
 _ALIKE = 0.25  # of a step, by which those of several topics may differ to be one
-_MOST = 0.8  # of the messages after a step are behind by it
+_MAX = 0.8  # of the messages after a step are behind by it
 _SHARE = 0.5  # of the messages after a step whose stamps were given before it
 
 
@@ -111,7 +111,7 @@ def _size_of_step(times: IntArray, logged: IntArray, row: int, last_ns: int) -> 
         last_ns: the last stamp before it.
     """
     size_ns = _fallen_behind(times, logged, row)
-    if size_ns < max(_LEAST_NS, 0.5 * (last_ns - int(times[row]))):
+    if size_ns < max(_MIN_NS, 0.5 * (last_ns - int(times[row]))):
         return None
     after = times[row : row + _AROUND]
     after = after[after <= last_ns]
@@ -137,7 +137,7 @@ def _fallen_behind(times: IntArray, logged: IntArray, row: int) -> float:
     behind = (logged[around] - times[around]).astype(np.float64)
     more = behind[row - first :] - median(behind[: row - first])
     size_ns = median(more)
-    return size_ns if np.mean(more > 0.5 * size_ns) > _MOST else 0.0
+    return size_ns if np.mean(more > 0.5 * size_ns) > _MAX else 0.0
 
 
 def _joined(found: Sequence[_Found]) -> list[list[_Found]]:
@@ -146,7 +146,7 @@ def _joined(found: Sequence[_Found]) -> list[list[_Found]]:
     for step in sorted(found, key=lambda each: each.logged_ns):
         last = groups[-1] if groups else []
         alike = last and abs(step.size_ns - last[0].size_ns) <= max(
-            _ALIKE * last[0].size_ns, _LEAST_NS
+            _ALIKE * last[0].size_ns, _MIN_NS
         )
         near = last and step.logged_ns - last[0].logged_ns <= _TOGETHER_NS
         if alike and near and step.topic not in {each.topic for each in last}:

@@ -24,7 +24,7 @@ from vio.offline.colmap.model import (
 from vio.offline.points import PointTracks, keep_rows, reprojection
 from vio.records import BoolArray
 
-_LEAST_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
+_MIN_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
 # robust standard deviations beyond which rows are excluded from the second round
 _GATE_SIGMAS = 5.0
 
@@ -110,9 +110,9 @@ def adjust(
 def _sigma_px(residual: FloatArray, has_right: BoolArray, rows: BoolArray) -> float:
     """Robust standard deviation of a coordinate's residual (R, 4) over a mask (R,) of rows."""
     if not rows.any():
-        return _LEAST_SIGMA_PX
+        return _MIN_SIGMA_PX
     entries = np.concatenate([residual[rows, :2].ravel(), residual[rows & has_right, 2:].ravel()])
-    return max(robust_sigma(entries), _LEAST_SIGMA_PX)
+    return max(robust_sigma(entries), _MIN_SIGMA_PX)
 
 
 def _rms(residual: FloatArray) -> float:

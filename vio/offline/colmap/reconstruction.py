@@ -30,8 +30,8 @@ _CROSS_NEXT = (1,)  # likewise between right images and later left ones
 _EXHAUSTIVE = 60
 # index offsets from both keyframes of a loop, whose left images are matched with one another
 _AROUND_LOOP = (-1, 0, 1)
-_LEAST_REGISTERED = 3
-LEAST_SHARED = 15  # points that two left images show, from which the model counts as joined there
+_MIN_REGISTERED = 3
+MIN_SHARED = 15  # points that two left images show, from which the model counts as joined there
 # keyframes across which a step of the path may be joined; those further apart are joined by a loop
 _LINK = 6
 
@@ -170,7 +170,7 @@ def reconstruct(
         for image in model.images.values()
         if image.has_pose and image.name in place
     )
-    if len(found) < _LEAST_REGISTERED:
+    if len(found) < _MIN_REGISTERED:
         return None
     keyframes = np.array([k for k, _ in found], dtype=np.int64)
     points = _common_points(model, [names.left[k] for k in keyframes.tolist()])
@@ -200,13 +200,13 @@ def linked_steps(points: IntArray, keyframes: IntArray) -> BoolArray:
     points (R, R) shared.
     """
     near = np.abs(keyframes[None, :] - keyframes[:, None]) <= _LINK
-    joined = near & (points >= LEAST_SHARED)
+    joined = near & (points >= MIN_SHARED)
     return np.array([joined[:n, n:].any() for n in range(1, len(points))], dtype=np.bool_)
 
 
 def _revisits(points: IntArray, keyframes: IntArray) -> IntArray:
     far = keyframes[None, :] - keyframes[:, None] > _NEXT[-1]
-    a, b = np.nonzero(far & (points >= LEAST_SHARED))
+    a, b = np.nonzero(far & (points >= MIN_SHARED))
     best = np.argsort(-points[a, b], kind="stable")
     return np.stack([keyframes[a[best]], keyframes[b[best]]], axis=1)
 
@@ -214,7 +214,7 @@ def _revisits(points: IntArray, keyframes: IntArray) -> IntArray:
 def _incremental_options(threads: int) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=SEED)
     options.multiple_models = options.extract_colors = False
-    options.min_model_size = _LEAST_REGISTERED
+    options.min_model_size = _MIN_REGISTERED
     options.ba_refine_focal_length = options.ba_refine_principal_point = (
         options.ba_refine_extra_params
     ) = False

@@ -1,0 +1,46 @@
+"""Calibrations of other tools, against the rig that they state in another form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vio
+from tests.calibration_forms import FORMS, Form, table
+from vio.cameras.rig import Rig
+
+ROOT = Path(__file__).parents[2]
+BEGIN = "<!-- table of formats, by tests.calibration_forms -->"
+
+
+def _close(found: Rig, truth: Rig) -> None:
+    for a, b in zip(found.cameras, truth.cameras, strict=True):
+        assert (a.model, a.width, a.height) == (b.model, b.width, b.height)
+        pixels = [[c.fu, c.fv, c.cu, c.cv] for c in (a, b)]
+        np.testing.assert_allclose(pixels[0], pixels[1], atol=1e-9)
+        count = max(len(a.coefficients), len(b.coefficients))
+        bends = [[*c.coefficients, *[0.0] * 8][:count] for c in (a, b)]
+        np.testing.assert_allclose(bends[0], bends[1], atol=1e-12)
+    np.testing.assert_allclose(found.right[1], truth.right[1], atol=1e-9)
+    assert (found.T_cam0_imu is None) == (truth.T_cam0_imu is None)
+    if truth.T_cam0_imu is not None and found.T_cam0_imu is not None:
+        np.testing.assert_allclose(found.T_cam0_imu, truth.T_cam0_imu, atol=1e-9)
+    assert (found.imu_noise is None) == (truth.imu_noise is None)
+    if truth.imu_noise is not None and found.imu_noise is not None:
+        for name in ("gyro", "gyro_walk", "accel", "accel_walk"):
+            assert getattr(found.imu_noise, name) == pytest.approx(getattr(truth.imu_noise, name))
+    assert found.time_offset_s == pytest.approx(truth.time_offset_s, abs=1e-12)
+
+
+@pytest.mark.parametrize("form", [f for f in FORMS if f.truth], ids=lambda f: f"{f.name} {f.files}")
+def test_every_form_of_a_rig_is_read_as_that_rig(form: Form, tmp_path: Path) -> None:
+    rig = vio.load_rig(form.write(tmp_path), image_size=form.known_size)
+    assert form.truth is not None
+    _close(rig, form.truth)
+
+
+def test_table_of_formats_is_what_the_readers_do() -> None:
+    page = (ROOT / "docs" / "recordings.md").read_text(encoding="utf-8")
+    assert table() == page.split(BEGIN)[1].split("<!-- end -->")[0].strip()

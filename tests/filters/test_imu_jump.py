@@ -1,0 +1,139 @@
+"""A gyro whose bias jumps during a run: the images estimate it anew; shocks and things that move
+do not count as one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.filters.test_msckf import EXACT_RIG, STEP_NS, Flight
+from vio.filters.imu_jump import GyroJump, turn_of_images
+from vio.filters.msckf import Msckf
+from vio.filters.multiview import Residuals
+from vio.filters.settings import MsckfSettings
+from vio.filters.window_tracks import LinearTracks
+from vio.geometry.lie import FloatArray
+from vio.records import ImuSample, Observations, UpdateReport
+
+FRAMES = 70
+JUMP_FRAME = 40
+SETTINGS = replace(EXACT_RIG, calibrate_camera_imu="none")
+
+
+class _Noted(Msckf):
+    """Keeps what each update reported."""
+
+    def update(self, observations: Observations) -> UpdateReport:
+        report = super().update(observations)
+        self.jumps = [*getattr(self, "jumps", []), report.gyro_jump_radps]
+        return report
+
+
+class _Shaken(Flight):
+    """A flight whose gyro is off by a bias (3,) from a frame on, up to another one."""
+
+    def __init__(self, bias: FloatArray, *, last: int = FRAMES) -> None:
+        super().__init__(frames=FRAMES)
+        self.bias = bias
+        self.last = last
+
+    def imu(
+        self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
+    ) -> list[ImuSample]:
+        # the jump is within a frame's interval
+        first_ns = round((JUMP_FRAME - 0.4) * STEP_NS)
+        last_ns = round((self.last - 0.4) * STEP_NS)
+        return [
+            replace(x, gyro=x.gyro + self.bias) if first_ns <= x.time_ns < last_ns else x
+            for x in super().imu(noise, settings, bias)
+        ]
+
+
+@pytest.mark.parametrize("size", [0.05, 0.15, 0.4])
+def test_images_estimate_a_bias_that_has_jumped(size: float) -> None:
+    bias = size * np.array([0.6, -0.64, 0.48])
+    flight = _Shaken(bias)
+    errors, covariances, filt = flight.run(
+        SETTINGS, "imu", sigma=0.2, limit=120, filter_class=_Noted
+    )
+    named = [k for k, jump in enumerate(filt.jumps) if jump is not None]
+    assert named
+    assert JUMP_FRAME <= named[0] <= JUMP_FRAME + 10
+    assert filt.jumps[named[0]] == pytest.approx(size, rel=0.2)
+    np.testing.assert_allclose(filt.estimate().gyro_bias, bias, atol=0.02)
+    error_m = np.linalg.norm(errors[:, :3], axis=1)
+    sigma_m = np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2))
+    assert (error_m[5:] < 3 * sigma_m[5:]).all()
+
+
+def test_a_gyro_that_stays_right_is_not_named() -> None:
+    _, _, filt = Flight(frames=FRAMES).run(
+        SETTINGS, "imu", sigma=0.2, limit=120, filter_class=_Noted
+    )
+    assert not any(filt.jumps)
+
+
+def test_a_shock_of_two_frames_leaves_the_bias_where_it_was() -> None:
+    flight = _Shaken(np.array([0.3, 0.2, -0.2]), last=JUMP_FRAME + 2)
+    errors, _, filt = flight.run(SETTINGS, "imu", sigma=0.2, limit=120, filter_class=_Noted)
+    np.testing.assert_allclose(filt.estimate().gyro_bias, 0.0, atol=0.02)
+    assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.1
+
+
+def _tracks(turn: FloatArray, moving: FloatArray, *, views: int = 6) -> LinearTracks:
+    """Sixty tracks of a camera at the origin whose newest pixels are off by a rotation, and some
+    of them (60,) by a motion of their own, pixels.
+    """
+    rng = np.random.default_rng(3)
+    p = np.column_stack([rng.uniform(-3, 3, (60, 2)), rng.uniform(4, 9, 60)])
+    f = 400.0
+    J = np.zeros((60, views, 4, 3))
+    for row, shift in ((0, 0.0), (2, 0.1)):
+        x = p[:, 0] - shift
+        J[:, :, row, 0] = (f / p[:, 2])[:, None]
+        J[:, :, row, 2] = (-f * x / p[:, 2] ** 2)[:, None]
+        J[:, :, row + 1, 1] = (f / p[:, 2])[:, None]
+        J[:, :, row + 1, 2] = (-f * p[:, 1] / p[:, 2] ** 2)[:, None]
+    r = rng.normal(0, 0.2, (60, views, 4))
+    r[:, -1] += np.einsum("fki,fi->fk", J[:, -1], np.cross(turn, p))
+    r[:, -1, [0, 2]] += moving[:, None]
+    at = Residuals(r, J, np.ones(60, dtype=np.bool_), np.ones((60, views, 4)))
+    T = np.broadcast_to(np.eye(4), (views, 4, 4)).copy()
+    return LinearTracks(None, 0.04, T, np.arange(60), p, at, np.zeros((60, views, 4)), None)  # type: ignore[arg-type]
+
+
+MOVED = np.diag([1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4]) ** 2
+
+
+def test_one_rotation_of_all_old_tracks_is_found() -> None:
+    turn = np.array([0.004, -0.006, 0.003])
+    still = np.zeros(60)
+    found = turn_of_images(_tracks(turn, still), MOVED, np.eye(4))
+    assert found is not None
+    np.testing.assert_allclose(np.abs(found), np.abs(turn), atol=3e-4)
+
+
+def test_things_that_move_are_no_rotation() -> None:
+    moving = np.where(np.arange(60) < 25, 6.0, 0.0)
+    assert turn_of_images(_tracks(np.zeros(3), moving), MOVED, np.eye(4)) is None
+
+
+def test_what_has_just_come_into_view_is_not_asked() -> None:
+    young = _tracks(np.array([0.004, -0.006, 0.003]), np.zeros(60), views=3)
+    assert turn_of_images(young, MOVED, np.eye(4)) is None
+
+
+def test_a_bias_that_comes_back_has_not_jumped() -> None:
+    jump = GyroJump()
+    assert not jump.repeats(np.array([0.1, 0, 0]))
+    assert jump.repeats(np.array([0.12, 0.01, 0]))
+    assert not jump.repeats(np.array([-0.1, 0, 0]))
+    jump.doubt(np.zeros(3), np.full(3, 0.002))
+    jump.doubt(np.array([0.1, 0, 0]), np.full(3, 0.05))  # the first one counts
+    assert jump.agrees(np.array([0.004, 0, 0])) is None
+    jump.doubt(np.zeros(3), np.full(3, 0.002))
+    assert jump.agrees(np.array([0.1, 0, 0])) == pytest.approx(0.1)
+    assert jump.agrees(np.array([0.1, 0, 0])) is None

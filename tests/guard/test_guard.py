@@ -1,0 +1,231 @@
+"""The checks of the images, the same for every front end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.frontend.test_frontend_scene import CAMERA, flight, stereo_frame
+from tests.guards import codes
+from vio.findings import CODES
+from vio.frontend import build_frontend
+from vio.frontend.precomputed import PrecomputedFrontend
+from vio.frontend.right_delay import PairingCounts
+from vio.frontend.settings import FrontendSettings, GridSettings
+from vio.guard.guarded import GuardedFrontend, guarded
+from vio.guard.pairing import find_delay, told_delay
+from vio.guard.repairing import repaired
+from vio.records import (
+    FrontendOutput,
+    ImuSample,
+    StereoFrame,
+    TrackPrior,
+    no_features,
+    observations,
+)
+
+FRAMES = 12
+FAULT = range(4, 8)
+FRONT_ENDS = ("klt", "orb", "sift")
+SETTINGS = FrontendSettings(grid=GridSettings(target_features=150))
+Change = Callable[[StereoFrame], StereoFrame]
+
+
+@cache
+def frames() -> tuple[StereoFrame, ...]:
+    return tuple(stereo_frame(k, pose) for k, pose in enumerate(flight(FRAMES)))
+
+
+def run(name: str, change: Change | None = None) -> list[FrontendOutput]:
+    """Outputs of a front end between the checks; `change` makes the fault."""
+    frontend = guarded(build_frontend(name, CAMERA, SETTINGS), CAMERA)
+    changed = [change(frame) if change and frame.index in FAULT else frame for frame in frames()]
+    return [frontend.process(frame) for frame in changed]
+
+
+def _frozen_right(frame: StereoFrame) -> StereoFrame:
+    return replace(frame, right=frames()[FAULT.start - 1].right)
+
+
+def _frozen_left(frame: StereoFrame) -> StereoFrame:
+    return replace(frame, left=frames()[FAULT.start - 1].left)
+
+
+def _dark_right(frame: StereoFrame) -> StereoFrame:
+    assert frame.right is not None
+    return replace(frame, right=np.full_like(frame.right, 5))
+
+
+def _exchanged(frame: StereoFrame) -> StereoFrame:
+    return replace(frame, left=frame.right, right=frame.left)
+
+
+def _black(frame: StereoFrame) -> StereoFrame:
+    assert frame.left is not None
+    return replace(frame, left=np.zeros_like(frame.left), right=np.zeros_like(frame.left))
+
+
+@pytest.mark.parametrize("name", FRONT_ENDS)
+def test_healthy_images_are_silent(name: str) -> None:
+    outputs = run(name)
+    assert codes(outputs) == []
+    assert all(output.observations.has_right.mean() > 0.5 for output in outputs)
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        (_frozen_right, "right-image-frozen"),
+        (_dark_right, "right-image-dark"),
+        (_exchanged, "images-exchanged"),
+    ],
+    ids=["frozen", "dark", "exchanged"],
+)
+@pytest.mark.parametrize("name", FRONT_ENDS)
+def test_every_front_end_reports_a_faulty_camera_once(name: str, change: Change, code: str) -> None:
+    assert codes(run(name, change)) == [code, f"-{code}"]
+
+
+@pytest.mark.parametrize("name", FRONT_ENDS)
+def test_no_right_pixel_of_a_frozen_image_is_output(name: str) -> None:
+    outputs = run(name, _frozen_right)
+    for output in outputs:
+        index = output.observations.frame_index
+        assert not (index in FAULT and output.observations.has_right.any())
+    assert outputs[-1].observations.has_right.mean() > 0.5
+    assert min(len(output.observations) for output in outputs) > 30
+
+
+@pytest.mark.parametrize("name", FRONT_ENDS)
+def test_exchanged_images_are_put_back_to_the_bit(name: str) -> None:
+    for expected, found in zip(run(name), run(name, _exchanged), strict=True):
+        np.testing.assert_array_equal(found.observations.ids, expected.observations.ids)
+        np.testing.assert_array_equal(found.observations.z, expected.observations.z)
+
+
+@pytest.mark.parametrize("name", ["orb", "sift"])
+def test_frames_with_a_frozen_left_image_give_no_features(name: str) -> None:
+    outputs = run(name, _frozen_left)
+    assert codes(outputs) == ["left-image-frozen", "-left-image-frozen"]
+    assert [len(output.observations) == 0 for output in outputs] == [
+        k in FAULT for k in range(FRAMES)
+    ]
+
+
+@pytest.mark.parametrize("name", FRONT_ENDS)
+def test_tracks_outlast_black_frames(name: str) -> None:
+    outputs = run(name, _black)
+    before = outputs[FAULT.start - 1].observations.ids
+    after = outputs[FAULT.stop].observations.ids
+    assert [len(outputs[k].observations) for k in FAULT] == [0] * len(FAULT)
+    assert np.isin(before, after).mean() > 0.2
+
+
+class OwnFrontend:
+    """A front end of one's own, which knows nothing of checks: it believes every right image."""
+
+    def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
+        z = np.tile([200.0, 100.0, 190.0, 100.0], (30, 1))
+        seen = observations(frame.index, frame.time_ns, np.arange(30), z)
+        return FrontendOutput(seen, 30, 30, 0)
+
+
+def test_a_front_end_of_ones_own_loses_the_right_pixels_of_a_frozen_camera() -> None:
+    frontend = GuardedFrontend(OwnFrontend(), CAMERA)
+    outputs = [frontend.process(_frozen_right(f) if f.index in FAULT else f) for f in frames()]
+    used = [bool(output.observations.has_right.all()) for output in outputs]
+    assert used == [k not in FAULT for k in range(FRAMES)]
+    assert codes(outputs) == ["right-image-frozen", "-right-image-frozen"]
+    assert outputs[5].matched == 0
+
+
+def test_frames_without_images_are_handed_on() -> None:
+    seen = observations(0, 0, [1], [[200.0, 100.0, 190.0, 100.0]])
+    frontend = GuardedFrontend(PrecomputedFrontend(lambda index: seen), CAMERA)
+    output = frontend.process(StereoFrame(0, 0, None, None))
+    assert output.observations is seen
+    assert guarded(frontend, CAMERA) is frontend
+
+
+def test_every_code_is_documented() -> None:
+    for name, code in CODES.items():
+        assert name == name.lower()
+        assert code.meaning
+        assert code.effect in ("nominal", "degraded", "unusable")
+
+
+# Pairs of different times
+
+
+def shifted(delay: int) -> list[StereoFrame]:
+    """Frames whose right images are late by some frames."""
+    pairs = frames()
+    return [
+        replace(pair, right=pairs[pair.index - delay].right)
+        for pair in pairs
+        if 0 <= pair.index - delay < FRAMES
+    ]
+
+
+@pytest.mark.parametrize("delay", [-1, 0, 1])
+def test_finds_by_how_many_frames_right_images_are_late(delay: int) -> None:
+    assert find_delay(shifted(delay), CAMERA) == delay
+
+
+def test_pairs_of_a_rig_at_standstill_are_not_judged() -> None:
+    still = [replace(frames()[0], index=k, time_ns=k) for k in range(10)]
+    assert find_delay(still, CAMERA) is None
+
+
+@pytest.mark.parametrize(
+    ("counts", "delay"),
+    [
+        (PairingCounts(80, 60, 20, 20), 0),
+        (PairingCounts(80, 20, 60, 20), 1),
+        (PairingCounts(80, 20, 20, 60), -1),
+        (PairingCounts(80, 50, 60, 20), None),  # not clearly
+        (PairingCounts(80, 5, 20, 5), None),  # hardly any match
+        (PairingCounts(20, 0, 20, 0), None),  # few corners
+    ],
+)
+def test_a_pairing_must_be_clearly_the_best(counts: PairingCounts, delay: int | None) -> None:
+    assert told_delay(counts) == delay
+
+
+@pytest.mark.parametrize("delay", [-1, 1])
+@pytest.mark.parametrize("name", FRONT_ENDS)
+def test_shifted_pairs_are_reported_in_the_first_frames(name: str, delay: int) -> None:
+    frontend = guarded(build_frontend(name, CAMERA, SETTINGS), CAMERA)
+    outputs = [frontend.process(frame) for frame in shifted(delay)]
+    found = [f for output in outputs for f in output.findings if f.code == "pairs-shifted"]
+    (finding,) = found
+    assert finding.figures["delay_frames"] == delay
+    assert finding.first_frame == 0
+    assert finding.frame is not None
+    assert finding.frame < 6
+
+
+@pytest.mark.parametrize("delay", [-1, 0, 1])
+def test_repaired_pairs_are_those_of_one_time_in_order(delay: int) -> None:
+    sample = ImuSample(0, np.zeros(3), np.zeros(3))
+    events: list[StereoFrame | ImuSample] = []
+    for frame in shifted(delay):
+        events += [frame, replace(sample, time_ns=frame.time_ns + 1)]
+    out = list(repaired(events, delay))
+    times = [event.time_ns for event in out]
+    assert times == sorted(times)
+    for event in out:
+        if isinstance(event, StereoFrame):
+            true = frames()[event.index]
+            np.testing.assert_array_equal(event.left, true.left)
+            np.testing.assert_array_equal(event.right, true.right)
+    count = sum(isinstance(event, StereoFrame) for event in out)
+    assert count == FRAMES - 2 * abs(delay)
+
+
+def test_no_features_has_no_findings() -> None:
+    assert no_features(frames()[0]).findings == ()

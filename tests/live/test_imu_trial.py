@@ -1,0 +1,171 @@
+"""An IMU in a wrong unit or with wrong axes: the frames so far are estimated again, with what is
+left of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.monitor.test_inertial_check import Watched, _recording
+from vio import evaluate, load_config, run
+from vio.imu.findings import ImuVerdict, InertialFinding
+from vio.live.odometry import Odometry
+from vio.records import Event, ImuSample, Observations, Recording, StereoFrame, Trajectory
+from vio.runs.pipeline import RunControl, RunResult
+from vio.runs.recorder import GrowingFolder
+
+FRAMES = 110
+
+
+def _changed(sample: ImuSample, gyro: float, accel: float, axes: list[int]) -> ImuSample:
+    return ImuSample(sample.time_ns, gyro * sample.gyro[axes], accel * sample.accel[axes])
+
+
+@dataclass(frozen=True)
+class _Features:
+    """Features and IMU samples of a flight as a recording."""
+
+    it: Watched
+    samples: list[ImuSample]
+    recording: Recording
+
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
+        frames = [
+            StereoFrame(seen.frame_index, seen.time_ns, None, None)
+            for seen in self.it.frames[start:FRAMES]
+        ]
+        yield from sorted(
+            [*self.samples, *frames], key=lambda e: (e.time_ns, isinstance(e, StereoFrame))
+        )
+
+    def observations(self, index: int) -> Observations | None:
+        return self.it.frames[index]
+
+
+def _flight(
+    gyro: float = 1.0, accel: float = 1.0, axes: tuple[int, int, int] = (0, 1, 2)
+) -> _Features:
+    it = _recording("room")
+    times = np.array([seen.time_ns for seen in it.frames[:FRAMES]])
+    samples = [
+        _changed(s, gyro, accel, list(axes))
+        for s in it.samples
+        if s.time_ns <= times[-1] + 10_000_000
+    ]
+    sensors = frozenset({"imu"})
+    recording = Recording(
+        "fake", Path("flight"), it.camera, it.T_cam0_imu, times, False, sensors, None
+    )  # type: ignore[arg-type]
+    return _Features(it, samples, recording)
+
+
+def _run(flight: _Features, motion: str = "imu", folder: Path | None = None) -> RunResult:
+    control = RunControl() if folder is None else RunControl(GrowingFolder(folder, {}))
+    return run(flight, load_config(overrides=[f"motion={motion}"]), control=control)
+
+
+@pytest.fixture(scope="module")
+def alone() -> Trajectory:
+    return _run(_flight(), "none").trajectory
+
+
+@pytest.fixture(scope="module")
+def as_recorded() -> RunResult:
+    return _run(_flight())
+
+
+def _worst_m(found: Trajectory, expected: Trajectory) -> float:
+    assert len(found.T_world_body) == len(expected.T_world_body)
+    return evaluate(found, expected).ate_m.max
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel"), [(180 / np.pi, 1.0), (1.0, 1 / 9.80665)], ids=["deg/s", "g"]
+)
+def test_a_unit_is_applied_from_the_start(
+    gyro: float, accel: float, as_recorded: RunResult, tmp_path: Path
+) -> None:
+    result = _run(_flight(gyro, accel), folder=tmp_path / "run")
+    assert _worst_m(result.trajectory, as_recorded.trajectory) < 0.01
+    (line,) = [line for line in result.warnings if "estimated again" in line]
+    assert "readings are multiplied by" in line
+    written = (tmp_path / "run" / "trajectory.tum").read_text().splitlines()
+    assert sum(not row.startswith("#") for row in written) == FRAMES
+    assert np.allclose(
+        np.array(written[-FRAMES].split()[1:4], float), result.trajectory.positions[0], atol=1e-6
+    )
+
+
+def test_without_a_factor_images_alone_go_on(alone: Trajectory) -> None:
+    """Not one pose of the frames before the verdict is left of the estimate that was lost."""
+    result = _run(_flight(axes=(1, 0, 2)))
+    assert _worst_m(result.trajectory, alone) < 0.03
+    (line,) = [line for line in result.warnings if "estimated again" in line]
+    assert "the IMU is not used, and images alone go on" in line
+
+
+def test_a_right_imu_is_used_to_the_bit_as_without_a_trial(
+    as_recorded: RunResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert not [line for line in as_recorded.warnings if "again" in line]
+    monkeypatch.setattr("vio.live.build.ImuTrial", lambda backend: None)
+    np.testing.assert_array_equal(
+        _run(_flight()).trajectory.T_world_body, as_recorded.trajectory.T_world_body
+    )
+
+
+def test_live_estimates_are_right_once_the_unit_is_known(as_recorded: RunResult) -> None:
+    flight = _flight(180 / np.pi)
+    odometry = Odometry(flight.it.camera, T_cam0_imu=flight.it.T_cam0_imu)
+    for event in flight.events():
+        if isinstance(event, StereoFrame):
+            seen = flight.it.frames[event.index]
+            odometry.add_observations(seen.time_ns, seen.ids, seen.z, seen.has_right)
+        elif isinstance(event, ImuSample):
+            odometry.add_imu(event.time_ns, event.gyro, event.accel)
+    odometry.finish()
+    apart = odometry.estimate.T_world_imu[:3, 3] - as_recorded.trajectory.positions[-1]
+    assert np.linalg.norm(apart) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("fault", "factor", "certain", "expected"),
+    [
+        ("gyro units", 0.5, True, ImuVerdict(gyro_factor=0.5)),
+        ("accelerometer units", 9.8, True, ImuVerdict(accel_factor=9.8)),
+        ("accelerometer units", None, True, ImuVerdict(usable=False)),
+        ("gyro axes", None, True, ImuVerdict(usable=False)),
+        ("extrinsics rotation", None, False, ImuVerdict()),
+        ("saturation", None, True, ImuVerdict()),
+        ("clocks apart", None, True, ImuVerdict()),
+    ],
+)
+def test_verdict_follows_from_what_is_certain(
+    fault: str, factor: float | None, certain: bool, expected: ImuVerdict
+) -> None:
+    finding = InertialFinding(fault, "", "", certain=certain, factor=factor)  # type: ignore[arg-type]
+    assert ImuVerdict().after(finding) == expected
+
+
+def test_images_carry_on_by_the_depths_of_before_when_the_right_camera_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("tests.live.test_imu_trial.FRAMES", 80)
+    it = _recording("slow", 2)
+    frames = [
+        replace(seen, has_right=seen.has_right & (seen.frame_index < 40)) for seen in it.frames
+    ]
+    recording = replace(
+        _flight().recording, frame_times_ns=np.array([seen.time_ns for seen in frames[:80]])
+    )
+    used = np.array(
+        _run(_Features(replace(it, frames=frames), [], recording), "none").frames.column("used")
+    )
+    assert used[40:].min() > 10

@@ -1,0 +1,142 @@
+"""Integrity of estimates: what holds, from which frame on, and what the covariance covers then."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tools.findings_page import page
+from vio.errors import ConfigError
+from vio.findings import CODES, Finding
+from vio.geometry.lie import se3_exp, se3_inverse
+from vio.integrity import position_covariance, protection_level
+from vio.monitor.integrity import IntegrityMonitor, Mark, marked
+from vio.records import Estimate
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "findings.md"
+STEP_NS = 100_000_000
+
+
+def estimate(k: int, speed_mps: float = 2.0) -> Estimate:
+    T = np.eye(4)
+    T[0, 3] = speed_mps * k * STEP_NS * 1e-9
+    return Estimate(k * STEP_NS, T, 1e-4 * np.eye(6))
+
+
+def judge(monitor: IntegrityMonitor, frames: range) -> list[Estimate]:
+    return [monitor.judged(k, estimate(k)) for k in frames]
+
+
+def test_estimates_are_nominal_and_unchanged_without_findings() -> None:
+    given = estimate(3)
+    assert IntegrityMonitor().judged(3, given) is given
+
+
+def test_a_lasting_finding_holds_until_it_has_ended() -> None:
+    monitor = IntegrityMonitor()
+    monitor.take(Finding("right-image-frozen", "", 2, lasts=True))
+    held = judge(monitor, range(2, 30))
+    assert {e.integrity for e in held} == {"degraded"}
+    assert held[0].findings == ("right-image-frozen",)
+    np.testing.assert_array_equal(held[-1].covariance, estimate(0).covariance)
+    monitor.take(Finding("right-image-frozen", "", 30, ended=True))
+    assert judge(monitor, range(30, 31))[0].integrity == "nominal"
+
+
+def test_an_event_without_an_end_counts_for_a_second() -> None:
+    monitor = IntegrityMonitor()
+    monitor.take(Finding("estimate-restarted", "", 0))
+    states = [e.integrity for e in judge(monitor, range(15))]
+    assert states == ["degraded"] * 10 + ["nominal"] * 5
+
+
+def test_information_leaves_an_estimate_nominal() -> None:
+    monitor = IntegrityMonitor()
+    monitor.take(Finding("stereo-calibration-off", "", 0))
+    assert judge(monitor, range(1))[0].integrity == "nominal"
+
+
+def test_the_worst_of_several_findings_counts() -> None:
+    monitor = IntegrityMonitor()
+    monitor.take(Finding("right-image-frozen", "", 0, lasts=True))
+    monitor.take(Finding("object-or-scene", "", 0, lasts=True))
+    (judged,) = judge(monitor, range(1))
+    assert judged.integrity == "unusable"
+    assert judged.findings == ("object-or-scene", "right-image-frozen")
+
+
+def test_an_unusable_covariance_covers_any_motion_since_the_fault_began() -> None:
+    monitor = IntegrityMonitor()
+    judge(monitor, range(5))  # 2 m/s
+    monitor.take(Finding("object-or-scene", "", 5, lasts=True))
+    held = judge(monitor, range(5, 26))
+    elapsed_s = 20 * STEP_NS * 1e-9
+    sigma = float(np.sqrt(held[-1].covariance[0, 0]))
+    assert sigma == pytest.approx(2.0 * elapsed_s, rel=0.01)
+    assert np.sqrt(held[0].covariance[0, 0]) < 0.02
+
+
+def test_frames_before_a_fault_was_found_are_marked() -> None:
+    monitor = IntegrityMonitor()
+    judge(monitor, range(8))
+    monitor.take(Finding("right-contradicts-left", "", 8, 5, lasts=True))
+    judge(monitor, range(8, 9))
+    assert monitor.take_marks() == (Mark(5, 8, "degraded", "right-contradicts-left"),)
+    assert monitor.take_marks() == ()
+    late = marked(estimate(6), Mark(5, 8, "unusable", "pairs-shifted"), 3.0)
+    assert late.integrity == "unusable"
+    assert late.covariance[1, 1] == pytest.approx(9.0, rel=1e-3)
+
+
+def test_unknown_codes_are_refused() -> None:
+    with pytest.raises(ConfigError, match="no finding 'something'"):
+        Finding("something", "")
+
+
+def test_a_finding_as_plain_values() -> None:
+    finding = Finding("right-image-late", "text", 7, figures={"delay_ms": 5.0}, lasts=True)
+    plain = finding.to_json()
+    assert (plain["code"], plain["frame"], plain["since"]) == ("right-image-late", 7, 7)
+    assert plain["effect"] == "degraded"
+    assert plain["figures"] == {"delay_ms": 5.0}
+
+
+def test_the_position_covariance_is_that_of_drawn_poses() -> None:
+    rng = np.random.default_rng(1)
+    root = 0.01 * rng.normal(size=(6, 6))
+    T_world_imu = se3_exp([1.0, -2.0, 0.5, 0.4, 1.1, -0.3])
+    given = Estimate(0, T_world_imu, root @ root.T)
+    T_imu_world = se3_inverse(T_world_imu)
+    drawn = [
+        se3_inverse(se3_exp(root @ rng.normal(size=6)) @ T_imu_world)[:3, 3] for _ in range(4000)
+    ]
+    np.testing.assert_allclose(np.cov(np.array(drawn).T), position_covariance(given), atol=2e-5)
+
+
+def test_a_protection_level_contains_the_position_as_often_as_stated() -> None:
+    rng = np.random.default_rng(2)
+    sigma = np.array([0.3, 0.3, 0.1])
+    given = Estimate(0, np.eye(4), np.diag([*sigma**2, 0, 0, 0]).astype(float), tilt_sigma_rad=0.01)
+    level = protection_level(given, 0.95)
+    errors = rng.normal(size=(20000, 3)) * sigma
+    inside = np.hypot(errors[:, 0], errors[:, 1]) <= level.horizontal_m
+    assert inside.mean() == pytest.approx(0.95, abs=0.006)
+    assert (np.abs(errors[:, 2]) <= level.vertical_m).mean() == pytest.approx(0.95, abs=0.006)
+
+
+def test_without_an_imu_up_is_that_of_the_first_image() -> None:
+    given = Estimate(0, np.eye(4), np.diag([1e-4, 4.0, 1e-4, 0, 0, 0]).astype(float))
+    level = protection_level(given)
+    assert level.vertical_m > 5.0
+    assert level.horizontal_m < 0.1
+    with pytest.raises(ConfigError, match=r"in \(0, 1\)"):
+        protection_level(given, 1.0)
+
+
+def test_the_page_of_findings_is_that_of_todays_codes() -> None:
+    assert PAGE.read_text(encoding="utf-8") == page(), (
+        "run: python -m tools.findings_page > docs/findings.md"
+    )
+    assert all(f"| `{name}` |" in page() for name in CODES)

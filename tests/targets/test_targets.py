@@ -1,0 +1,400 @@
+"""Calibration with a printed board: descriptions, corners, cameras, verdict, files, command."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.board_views import (
+    GRID,
+    LEFT,
+    RIGHT,
+    SMALL,
+    SMALL_LEFT,
+    T_RIGHT_LEFT,
+    Flaws,
+    made_views,
+    render_pairs,
+)
+from vio import load_rig
+from vio.cli import main
+from vio.datasets import DatasetSettings, open_dataset
+from vio.errors import CalibrationError, DataError
+from vio.geometry.distortion import CameraModel, project_point
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
+from vio.targets.bundle import (
+    Adjusted,
+    BoardAdjustment,
+    RigFit,
+    layout_of,
+    lens_moved,
+    pixels_by_lens,
+    pixels_by_point,
+)
+from vio.targets.calibrate import calibrate_cameras
+from vio.targets.corners import CornerDetector
+from vio.targets.description import Target, marker_dictionary, read_target, target_text
+from vio.targets.lenses import LENSES, choose_lens
+from vio.targets.printing import page_of, svg_text
+from vio.targets.recording import Filmed
+from vio.targets.rendering import BoardRenderer, Exposure
+from vio.targets.results import basalt_text
+from vio.targets.start import one_camera, pair_start, poses_of
+from vio.targets.verdict import depths, projection_sigma
+from vio.targets.views import View, sightings
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get("VIO_DATA") or ROOT.parent / "shared" / "data") / "targets"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="needs the real boards of VIO_DATA")
+
+DESCRIPTIONS = {
+    "kalibr": (
+        "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 4\ntagSize: 0.088\ntagSpacing: 0.3\n",
+        Target("aprilgrid", 4, 6, 0.088, 0.3),
+    ),
+    "kalibr checkerboard": (
+        "target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\nrowSpacingMeters: 0.06\n"
+        "colSpacingMeters: 0.06\n",
+        Target("checkerboard", 8, 7, 0.06),
+    ),
+    "opencv": (
+        "%YAML:1.0\n---\nBoardSize_Width: 9\nBoardSize_Height: 6\nSquare_Size: 0.05\n"
+        "Calibrate_Pattern: CHESSBOARD\n",
+        Target("checkerboard", 7, 10, 0.05),
+    ),
+    "boofcv": (
+        "boofcv.alg.fiducial.calib.ConfigCalibrationTarget:\n  grid:\n    numRows: 7\n"
+        "    shapeSize: 0.03\n    numCols: 5\n",
+        Target("checkerboard", 7, 5, 0.03),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DESCRIPTIONS)
+def test_reads_descriptions_of_other_tools(name: str, tmp_path: Path) -> None:
+    text, expected = DESCRIPTIONS[name]
+    file = tmp_path / "target.yaml"
+    file.write_text(text)
+    assert read_target(file) == expected
+
+
+@pytest.mark.parametrize(
+    "target",
+    [GRID, Target("charuco", 5, 7, 0.04, 0.7, "DICT_4X4_50"), Target("checkerboard", 7, 10, 0.02)],
+    ids=lambda target: target.kind,
+)
+def test_reads_what_it_writes(target: Target, tmp_path: Path) -> None:
+    file = tmp_path / "target.yaml"
+    file.write_text(target_text(target))
+    assert read_target(file) == target
+    assert read_target(file, size_m=0.05).size_m == 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("tagSize: 0.088", "tagSize: 88"), "in metres"),
+        (("tagSpacing: 0.3", "tagSpacing: 26.4"), "tagSpacing"),
+        (("tagCols: 6", ""), "tagCols"),
+        (("'aprilgrid'", "'circlegrid'"), "circlegrid"),
+    ],
+)
+def test_names_what_is_wrong_with_a_description(
+    change: tuple[str, str], words: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "target.yaml"
+    file.write_text(DESCRIPTIONS["kalibr"][0].replace(*change))
+    with pytest.raises(CalibrationError, match=words) as caught:
+        read_target(file)
+    assert str(file) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_page_has_the_size_of_the_board_and_a_ruler() -> None:
+    page = page_of(GRID)
+    width = 1e3 * (6 * GRID.pitch_m + GRID.pitch_m - GRID.size_m)
+    board = page.rectangles[: len(GRID.dark_rectangles())]
+    assert np.ptp(board[:, [0, 2]]) == pytest.approx(width, abs=0.01)
+    assert f'width="{page.width:.4f}mm"' in svg_text(page)
+    assert any("ruler" in text for _, _, text in page.words)
+
+
+def _detected(target: Target, camera: CameraModel, T: FloatArray, exposure: Exposure) -> tuple:
+    renderer = BoardRenderer(target, camera)
+    found = CornerDetector(target).detect(renderer.render(T, exposure))
+    uv, seen = renderer.corners(T)
+    inside = seen & (uv > 4).all(axis=1)
+    inside &= (uv < np.array([camera.width, camera.height]) - 5).all(axis=1)
+    return found, uv, inside
+
+
+@pytest.mark.parametrize(
+    ("exposure", "share", "error_px"),
+    [(Exposure(0.7, 3.0), 0.95, 0.09), (Exposure(0.7, 10.0), 0.85, 0.2)],
+    ids=["sharp", "noisy"],
+)
+def test_finds_corners_of_a_grid(exposure: Exposure, share: float, error_px: float) -> None:
+    T = se3_from_parts(so3_exp([0.3, -0.2, 0.1]), [-0.3, -0.25, 0.5])
+    found, uv, inside = _detected(GRID, SMALL_LEFT, T, exposure)
+    off = np.linalg.norm(found.uv - uv[found.ids], axis=1)
+    assert len(found) > share * inside.sum()
+    assert np.median(off) < error_px
+    assert np.abs(np.median(found.uv - uv[found.ids], axis=0)).max() < 0.02  # no half pixel
+
+
+def test_finds_corners_through_a_lens_of_150_degrees() -> None:
+    camera = CameraModel(213, 213, 281.5, 179.5, 564, 360, "equidistant", (0.0,) * 4)
+    T = se3_from_parts(so3_exp([0.1, -0.1, 0.1]), [-0.3, -0.3, 0.42])
+    found, uv, inside = _detected(GRID, camera, T, Exposure())
+    assert len(found) > 0.75 * inside.sum()
+    assert np.median(np.linalg.norm(found.uv - uv[found.ids], axis=1)) < 0.08
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        Target("charuco", 6, 8, 0.05, 0.7, "DICT_4X4_50"),
+        Target("charuco", 6, 8, 0.05, 0.7, "DICT_4X4_50", legacy=True),
+        Target("checkerboard", 6, 9, 0.05),
+        Target("checkerboard", 6, 8, 0.05),
+    ],
+    ids=["charuco", "legacy charuco", "checkerboard", "even checkerboard"],
+)
+@pytest.mark.parametrize("turn", [0.1, 3.0], ids=["upright", "turned"])
+def test_finds_corners_of_other_boards(target: Target, turn: float) -> None:
+    R = so3_exp([0, 0, turn]) @ so3_exp([0.3, -0.2, 0])
+    centre = np.array([*(0.5 * np.array(target.extent_m)), 0.0])
+    T = se3_from_parts(R, [0.0, 0.0, 0.6] - R @ centre)
+    found, uv, inside = _detected(target, SMALL_LEFT, T, Exposure(0.6, 2.0))
+    truth = uv[found.ids]
+    if target.kind == "checkerboard" and (target.rows + target.cols) % 2 == 0 and turn > 1:
+        truth = uv[::-1][found.ids]  # which nobody can tell apart
+    assert len(found) > 0.9 * inside.sum()
+    assert np.median(np.linalg.norm(found.uv - truth, axis=1)) < 0.15
+    assert np.abs(np.mean(found.uv - truth, axis=0)).max() < 0.05
+
+
+def test_opencv_agrees_on_the_charuco_board() -> None:
+    target = Target("charuco", 5, 7, 0.04, 0.7, "DICT_4X4_50")
+    board = cv2.aruco.CharucoBoard((7, 5), 0.04, 0.028, marker_dictionary("DICT_4X4_50"))
+    assert np.allclose(np.array(board.getChessboardCorners())[:, :2], target.points_m)
+    ours = np.stack([marker.corners_m for marker in target.markers()])
+    assert np.allclose(np.array(board.getObjPoints())[:, :, :2], ours, atol=1e-6)
+
+
+def test_the_border_of_kalibrs_tags_has_two_bits() -> None:
+    marker = GRID.markers()[0]
+    assert marker.is_dark.shape == (10, 10)
+    assert marker.is_dark[:2].all()
+    assert marker.is_dark[:, -2:].all()
+    assert not marker.is_dark[2:-2, 2:-2].all()
+
+
+@needs_data
+@pytest.mark.parametrize(("name", "least"), [("001", 140), ("004", 80)])
+def test_real_photographs_have_the_numbering_and_corner_order_of_the_description(
+    name: str, least: int
+) -> None:
+    image = cv2.imread(str(DATA / "aprilgrid_6x6" / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
+    found = CornerDetector(GRID).detect(image)
+    assert len(found) >= least
+    # One homography for the whole board: a wrong corner order is off by a tag, 70 px.
+    H, _ = cv2.findHomography(GRID.points_m[found.ids], found.uv)
+    expected = cv2.perspectiveTransform(GRID.points_m[found.ids][:, None], H)[:, 0]
+    assert np.median(np.linalg.norm(expected - found.uv, axis=1)) < 6
+
+
+def _pair(seed: int, flaws: Flaws | None = None, count: int = 20) -> tuple[Adjusted, RigFit]:
+    """Adjust a pair from lenses that are off."""
+    seen = sightings(made_views(seed, count, flaws), GRID.points_m)
+    step = np.array([4.0, -3, 2, 2, 0.02, -0.01, 0, 0])
+    cameras = (lens_moved(LEFT, step), lens_moved(RIGHT, step))
+    poses = np.stack([T for T in poses_of(cameras[0], seen.of_camera(0)) if T is not None])
+    T_cam_cam0 = np.stack([np.eye(4), se3_from_parts(np.eye(3), [-0.1, 0.0, 0.0])])
+    found = BoardAdjustment(seen).solve(RigFit(cameras, T_cam_cam0, poses, np.zeros(2)))
+    return found, found.at
+
+
+def test_starts_without_a_guess() -> None:
+    seen = sightings(made_views(4, 10), GRID.points_m)
+    alone = [one_camera(seen.of_camera(c), (752, 480), "radtan", 4) for c in (0, 1)]
+    fit = pair_start(seen, (alone[0], alone[1]))
+    assert fit.cameras[0].fu == pytest.approx(LEFT.fu, rel=2e-3)
+    xi = se3_log(fit.T_cam_cam0[1] @ se3_inverse(T_RIGHT_LEFT))
+    assert np.linalg.norm(xi[:3]) < 3e-3
+
+
+def _depth_error(fit: RigFit) -> float:
+    p = np.array([[0.0, 0.0, 5.0]])
+    uv0, _ = project_point(LEFT, p)
+    uv1, _ = project_point(RIGHT, p @ T_RIGHT_LEFT[:3, :3].T + T_RIGHT_LEFT[:3, 3])
+    return float(depths(fit, uv0, uv1)[0] / 5 - 1)
+
+
+@pytest.mark.parametrize(
+    "flaws",
+    [Flaws(), Flaws(bow_m=(0.001, -0.0005)), Flaws(wrong_share=0.01)],
+    ids=["good", "bowed board", "wrong corners"],
+)
+def test_calibrates_a_pair_within_the_stated_sigmas(flaws: Flaws) -> None:
+    found, fit = _pair(5, flaws)
+    layout = layout_of(fit.cameras)
+    sigma = np.sqrt(np.diag(found.covariance))
+    a = fit.cameras[0]
+    assert abs(a.fu - LEFT.fu) < 0.15
+    assert abs(a.cu - LEFT.cu) < 0.15
+    xi = se3_log(fit.T_cam_cam0[1] @ se3_inverse(T_RIGHT_LEFT))
+    assert np.linalg.norm(xi[:3]) < 1e-4
+    assert np.degrees(np.linalg.norm(xi[3:])) < 0.02
+    assert np.abs(xi / sigma[layout.poses[0]]).max() < 4
+    assert abs(_depth_error(fit)) < 0.002
+    assert np.abs(fit.bow - flaws.bow_m).max() < 1e-4
+    assert found.sigma_px == pytest.approx([0.05, 0.05], rel=0.1)
+
+
+def test_stated_sigmas_are_those_of_the_errors() -> None:
+    ratios = []
+    for seed in range(3):
+        found, fit = _pair(20 + seed, count=12)
+        layout = layout_of(fit.cameras)
+        sigma = np.sqrt(np.diag(found.covariance))
+        for lens, camera, truth in zip(layout.lenses, fit.cameras, (LEFT, RIGHT), strict=True):
+            values = (camera.fu, camera.fv, camera.cu, camera.cv, *camera.coefficients)
+            exact = (truth.fu, truth.fv, truth.cu, truth.cv, *truth.coefficients)
+            ratios += ((np.array(values) - exact) / sigma[lens]).tolist()
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        LEFT,
+        CameraModel(300, 301, 320, 240, 640, 480, "equidistant", (0.01, -0.02, 0.003, 0.001)),
+        CameraModel(300, 301, 320, 240, 640, 480, "double_sphere", (-0.2, 0.6)),
+        CameraModel(500, 501, 320, 240, 640, 480, "unified", (0.9, 0.01, 0.0, 1e-3, 1e-3)),
+    ],
+    ids=lambda camera: camera.model,
+)
+def test_derivatives_of_the_projection(camera: CameraModel) -> None:
+    p = np.array([[0.1, 0.2, 1.0], [-0.3, 0.1, 0.8]])
+    uv, _ = project_point(camera, p)
+    D = pixels_by_point(camera, p, uv)
+    for k in range(3):
+        step = 1e-5 * np.eye(3)[k]
+        central = (project_point(camera, p + step)[0] - project_point(camera, p - step)[0]) / 2e-5
+        assert np.allclose(D[:, :, k], central, atol=2e-2, rtol=1e-3)
+    D = pixels_by_lens(camera, p, uv)
+    for k in range(D.shape[2]):
+        step = 1e-5 * np.eye(D.shape[2])[k]
+        ahead = project_point(lens_moved(camera, step), p)[0]
+        behind = project_point(lens_moved(camera, -step), p)[0]
+        assert np.allclose(D[:, :, k], (ahead - behind) / 2e-5, atol=2e-2, rtol=1e-3)
+
+
+def test_chooses_the_lens_by_views_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in set(LENSES) - {"radtan", "equidistant"}:
+        monkeypatch.delitem(LENSES, name)
+    wide = CameraModel(285, 285, 370, 242, 752, 480, "equidistant", (0.02, -0.01, 0.004, -0.001))
+    seen = sightings(made_views(1, 10, cameras=(wide,)), GRID.points_m)
+    name, scores = choose_lens(seen, (752, 480))
+    assert name == "equidistant"
+    assert next(s for s in scores if s.name == name).rms_px < 0.06
+
+
+def _filmed(views: list[View], frames: int = 40) -> Filmed:
+    return Filmed(views, ((752, 480), (752, 480)), frames, None, ())
+
+
+def test_names_pairs_that_are_not_of_one_moment() -> None:
+    good = calibrate_cameras(_filmed(made_views(2, 12)), GRID, "radtan")
+    assert good.verdict.findings == ()
+    assert good.verdict.inflation == 1
+    late = calibrate_cameras(_filmed(made_views(2, 12, Flaws(moved_m=0.002))), GRID, "radtan")
+    assert any("not exposed at the same moment" in finding for finding in late.verdict.findings)
+
+
+def test_names_what_the_views_do_not_show() -> None:
+    views = []
+    for view in made_views(2, 40):
+        left, right = view.corners
+        if (left.uv[:, 0] > 260).all():
+            views.append(View(view.time_ns, (left, right)))
+    assert len(views) >= 8
+    found = calibrate_cameras(_filmed(views), GRID, "radtan")
+    assert any("left image is empty at upper left" in text for text in found.verdict.findings)
+
+
+def test_uncertainty_grows_where_there_are_no_corners() -> None:
+    found, fit = _pair(7)
+    lens = layout_of(fit.cameras).lenses[0]
+    sigma = projection_sigma(fit.cameras[0], found.covariance[lens, lens]).reshape(9, 13)
+    corners = sigma[[0, 0, -1, -1], [0, -1, 0, -1]]
+    assert corners.min() > 2 * sigma[4, 6]
+
+
+def test_says_what_to_record_where_views_are_missing() -> None:
+    views = made_views(3, 12)
+    with pytest.raises(DataError, match="sees the board in 3 of 40 frames"):
+        calibrate_cameras(_filmed(views[:3]), GRID)
+    none = type(views[0].corners[0])(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+    apart = [
+        View(view.time_ns, (view.corners[0], none) if k % 2 else (none, view.corners[1]))
+        for k, view in enumerate(made_views(3, 20))
+    ]
+    with pytest.raises(DataError, match="see the board together in 0 frames"):
+        calibrate_cameras(_filmed(apart), GRID)
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return render_pairs(tmp_path_factory.mktemp("board") / "pairs", 10)
+
+
+def test_the_command_calibrates_a_folder_of_pairs(
+    rendered: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "target.yaml"
+    target.write_text(target_text(SMALL))
+    out = tmp_path / "rig"
+    command = ["calibrate-rig", str(rendered), "--target", str(target), "--lens", "radtan"]
+    assert main([*command, "--out", str(out)]) == 0
+    assert "vio run" in capsys.readouterr().out
+    facts = json.loads((out / "calibration.json").read_text())
+    assert facts["cameras"][0]["fu_fv_cu_cv"][0] == pytest.approx(SMALL_LEFT.fu, rel=5e-3)
+    assert (out / "calibration.png").stat().st_size > 10_000
+    kalibr = load_rig(out / "camchain-imucam.yaml")
+    assert np.linalg.norm(kalibr.right[1][:3, 3]) == pytest.approx(0.11, abs=1e-3)
+    for name in ("stereo.yml", "left.yaml"):
+        other = load_rig(out / name, image_size=(376, 240))
+        assert np.allclose(other.right[1], kalibr.right[1], atol=1e-6)
+        assert np.allclose(other.cam0.K, kalibr.cam0.K)
+    settings = DatasetSettings(calibration=out / "camchain-imucam.yaml")
+    dataset = open_dataset(rendered, settings)  # as vio run --calibration does
+    assert dataset.recording.camera.baseline_m == pytest.approx(0.11, abs=1e-3)
+    basalt = json.loads((out / "basalt.json").read_text())["value0"]
+    assert basalt["intrinsics"][0]["camera_type"] == "pinhole-radtan8"
+    assert basalt_text(kalibr) is not None
+
+
+def test_another_board_is_refused_in_one_line(
+    rendered: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "target.yaml"
+    target.write_text(target_text(Target("charuco", 5, 7, 0.04, 0.7, "DICT_4X4_50")))
+    assert main(["calibrate-rig", str(rendered), "--target", str(target)]) == 1
+    message = capsys.readouterr().err
+    assert "check that the target file" in message
+    assert message.count("\n") == 1
+
+
+@pytest.mark.parametrize("suffix", ["svg", "pdf"])
+def test_the_command_writes_a_board_and_its_description(suffix: str, tmp_path: Path) -> None:
+    page = tmp_path / f"board.{suffix}"
+    assert main(["target", str(page), "--kind", "charuco", "--size", "0.03"]) == 0
+    assert page.stat().st_size > 1000
+    assert read_target(page.with_suffix(".yaml")).size_m == 0.03
