@@ -70,6 +70,30 @@ def made_views(
     return views
 
 
+def views_around(
+    camera: CameraModel, count: int, seed: int = 0, noise_px: float = 0.05, max_deg: float = 75.0
+) -> list[View]:
+    """Views of one wide camera, with the board in all directions up to an angle off the axis."""
+    rng = np.random.default_rng(seed)
+    points = board_points(GRID, np.zeros(2))
+    middle = points.mean(axis=0)
+    limit = np.array([camera.width, camera.height]) - 3
+    views: list[View] = []
+    while len(views) < count:
+        theta = np.radians(max_deg) * np.sqrt(rng.uniform())
+        around = rng.uniform(-np.pi, np.pi)
+        axis = np.array([-np.sin(around), np.cos(around), 0.0])
+        R = so3_exp(theta * axis) @ so3_exp(rng.normal(size=3) * [0.3, 0.3, 0.3])
+        ahead = so3_exp(theta * axis)[:, 2] * rng.uniform(0.35, 0.8)
+        T = se3_from_parts(R, ahead - R @ middle)
+        uv, seen = project_point(camera, transform_points(T, points))
+        ids = np.flatnonzero(seen & (uv > 2).all(axis=1) & (uv < limit).all(axis=1))
+        noisy = uv[ids] + noise_px * rng.normal(size=(len(ids), 2))
+        if len(ids) >= 30:
+            views.append(View(len(views) * 100_000_000, (Corners(ids, noisy),)))
+    return views
+
+
 SMALL = Target("aprilgrid", 3, 4, 0.08, 0.3)
 SMALL_LEFT = CameraModel(230, 231, 186, 121, 376, 240, "radtan", (-0.25, 0.06, 1e-4, 1e-4))
 SMALL_RIGHT = CameraModel(231, 230, 189, 118, 376, 240, "radtan", (-0.26, 0.06, 1e-4, -1e-4))

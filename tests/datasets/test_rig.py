@@ -22,9 +22,9 @@ from vio.datasets.rigs.camera_info import CameraInfo, rig_from_camera_infos
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel
+from vio.geometry.lenses.registry import LENSES as LENS_MODELS
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import lookup, rectified_cameras
-from vio.geometry.sphere_models import double_sphere, unified
 from vio.records import ImuDensities
 
 LENSES = {
@@ -91,8 +91,8 @@ def test_double_sphere_with_one_centre_is_the_unified_model_in_other_parameters(
     `1 - alpha`.
     """
     points = np.random.default_rng(4).normal(size=(200, 3))
-    a, valid_a = double_sphere((0.0, 0.6), points)
-    b, valid_b = unified(1.5, points)
+    a, valid_a = LENS_MODELS["double_sphere"].project((0.0, 0.6), points)
+    b, valid_b = LENS_MODELS["unified"].project((1.5,), points)
     np.testing.assert_array_equal(valid_a, valid_b)
     np.testing.assert_allclose(a[valid_a] * (1 - 0.6), b[valid_a], rtol=1e-12, atol=1e-12)
 
@@ -125,7 +125,7 @@ def test_rejects_impossible_spheres() -> None:
         ("double_sphere", (0.5, 1.2), "check their order"),
     ):
         with pytest.raises(CalibrationError, match=message):
-            CameraModel(300, 300, 320, 240, 640, 480, model, coefficients)  # type: ignore[arg-type]
+            CameraModel(300, 300, 320, 240, 640, 480, model, coefficients)
 
 
 # --- from matrices
