@@ -690,12 +690,12 @@ BAD = {
         r"cam0: 'intrinsics' is \[1, 2, 3\] instead of 4 finite numbers",
     ),
     "unknown projection": (
-        _camchain(lambda c: c["cam1"].update(camera_model="eucm")),
-        "'eucm' is not read",
+        _camchain(lambda c: c["cam1"].update(camera_model="ocam")),
+        "'ocam' is not read",
     ),
     "unknown distortion": (
-        _camchain(lambda c: c["cam1"].update(distortion_model="fov")),
-        "'fov' is not read",
+        _camchain(lambda c: c["cam1"].update(distortion_model="thin-prism")),
+        "'thin-prism' is not read",
     ),
     "a reflection": (
         _camchain(lambda c: c["cam1"].update(T_cn_cnm1=np.diag([1.0, 1, -1, 1]).tolist())),

@@ -6,15 +6,19 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import yaml
 
 import vio
 from tests.board_views import GRID, views_around
 from tests.jacobians import numeric_jacobian
-from vio.cameras.rig import Rig
+from tests.plain_maker import rig_of
+from vio.cameras.rig import Rectifier, Rig
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError
+from vio.evaluation.alignment import align_poses
 from vio.geometry.distortion import (
     CameraModel,
     StereoRig,
@@ -27,10 +31,15 @@ from vio.geometry.distortion import (
 from vio.geometry.lenses.model import Coefficients, FileNames, KalibrForm, Lens
 from vio.geometry.lenses.registry import LENSES
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
-from vio.sim.motion import hand_held
+from vio.geometry.rectify import field_of_view
+from vio.live.odometry import Odometry
+from vio.records import FrameResult
+from vio.sim.effects import CLEAN
+from vio.sim.imu import ImuNoise
+from vio.sim.motion import hand_held, motion_at
 from vio.sim.render import camera_rays, render
 from vio.sim.rigs import fisheye_rig
-from vio.sim.sequence import simulate, views
+from vio.sim.sequence import SimulatedRecording, simulate, views
 from vio.sim.world import room
 from vio.targets.results import basalt_text
 from vio.targets.start import one_camera
@@ -49,6 +58,9 @@ EXAMPLES = {
     "unified1": CameraModel(300, 301, *SIZE, "unified", (0.9,)),
     "unified5": CameraModel(660, 661, *SIZE, "unified", (1.4, -0.2, 0.05, 1e-3, -2e-3)),
     "double_sphere": CameraModel(170, 171, *SIZE, "double_sphere", (-0.25, 0.57)),
+    "eucm": CameraModel(180, 181, *SIZE, "eucm", (0.61, 1.1)),
+    "eucm, less than 180 deg": CameraModel(300, 301, *SIZE, "eucm", (0.35, 0.9)),
+    "fov": CameraModel(270, 271, *SIZE, "fov", (0.93,)),
 }
 # Pixels of three points before the models had files of their own.
 POINTS = [[0.31, -0.22, 1.0], [-0.45, 0.4, 0.9], [0.05, 0.6, 1.3]]
@@ -234,6 +246,121 @@ def test_rig_files_are_read_as_written(camera: CameraModel, tmp_path: Path) -> N
         np.testing.assert_allclose(project_point(back.cam0, POINTS)[0], uv, atol=1e-9)
 
 
+# --- EUCM, FOV
+# ----------------------------------------------------------------------------------------------------
+
+
+def test_eucm_of_a_sphere_is_the_unified_model_in_other_parameters() -> None:
+    """Khomutenko et al., section 2: beta = 1, `alpha / (1 - alpha)` is Mei's xi, and focal lengths
+    scale by `1 - alpha`.
+    """
+    points = np.random.default_rng(4).normal(size=(200, 3))
+    for alpha in (0.3, 0.6):
+        a, valid_a = LENSES["eucm"].project((alpha, 1.0), points)
+        b, valid_b = LENSES["unified"].project((alpha / (1 - alpha),), points)
+        np.testing.assert_array_equal(valid_a, valid_b)
+        np.testing.assert_allclose(a[valid_a] * (1 - alpha), b[valid_a], rtol=1e-12)
+
+
+def test_fov_is_the_arc_tangent_of_its_authors() -> None:
+    """Devernay & Faugeras, equations 13 and 14, on the plane of tangents."""
+    w = 0.93
+    p = _inside(EXAMPLES["pinhole"])
+    xy, valid = LENSES["fov"].project((w,), p)
+    assert valid.all()
+    ru = np.linalg.norm(p[:, :2], axis=1) / p[:, 2]
+    rd = np.linalg.norm(xy, axis=1)
+    np.testing.assert_allclose(rd, np.arctan(2 * ru * np.tan(w / 2)) / w, atol=1e-12)
+    np.testing.assert_allclose(np.tan(rd * w) / (2 * np.tan(w / 2)), ru, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"), [("eucm", (0.0, 1.3)), ("fov", (0.0,)), ("fov", (1e-7,))]
+)
+def test_without_its_parameter_a_model_is_a_pinhole(model: str, coefficients: Coefficients) -> None:
+    pinhole = EXAMPLES["pinhole"]
+    p = _inside(pinhole)
+    same = replace(pinhole, model=model, coefficients=coefficients)
+    uv, _ = project_point(pinhole, p)
+    np.testing.assert_allclose(project_point(same, p)[0], uv, atol=1e-7)
+    np.testing.assert_allclose(
+        unproject_pixel(same, uv)[0], unproject_pixel(pinhole, uv)[0], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "message"),
+    [
+        ("eucm", (1.1, 0.6), "alpha=1.1, beta=0.6; check their order"),
+        ("eucm", (0.6, 0.0), "beta > 0"),
+        ("fov", (-0.1,), "an angle in radians"),
+        ("fov", (53.0,), "0 <= w < pi, got 53"),
+    ],
+)
+def test_rejects_impossible_coefficients(
+    model: str, coefficients: Coefficients, message: str
+) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        CameraModel(300, 300, *SIZE, model, coefficients)
+
+
+# Kalibr's `ConfigReader.py`: what stands before fu fv pu pv, and the distortion.
+KALIBR = {
+    "pinhole-fov": ("pinhole", "fov", [], [0.93], ("fov", (0.93,))),
+    "pinhole-fov of zero": ("pinhole", "fov", [], [0.0], ("pinhole", ())),
+    "eucm-none": ("eucm", "none", [0.61, 1.1], [], ("eucm", (0.61, 1.1))),
+    "ds-none": ("ds", "none", [-0.25, 0.57], [], ("double_sphere", (-0.25, 0.57))),
+    "omni-radtan": (
+        "omni",
+        "radtan",
+        [1.4],
+        [-0.2, 0.05, 1e-3, -2e-3],
+        ("unified", (1.4, -0.2, 0.05, 1e-3, -2e-3)),
+    ),
+    "omni-none": ("omni", "none", [0.9], [], ("unified", (0.9,))),
+}
+
+
+@pytest.mark.parametrize("name", KALIBR)
+def test_reads_the_models_of_kalibr(name: str, tmp_path: Path) -> None:
+    kind, bend, leading, coefficients, expected = KALIBR[name]
+    sheet = {
+        "camera_model": kind,
+        "distortion_model": bend,
+        "distortion_coeffs": coefficients,
+        "intrinsics": [*leading, 300.0, 301.0, 320.5, 240.5],
+        "resolution": [640, 480],
+    }
+    (tmp_path / "camchain.yaml").write_text(yaml.safe_dump({"cam0": sheet}))
+    camera = vio.load_rig(tmp_path / "camchain.yaml").cam0
+    assert (camera.model, camera.coefficients) == expected
+    assert (camera.fu, camera.fv, camera.cu, camera.cv) == (300.0, 301.0, 320.5, 240.5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "bend", "message"),
+    [
+        ("eucm", "radtan", "eucm with distortion 'radtan' is not read; calibrate eucm-none"),
+        ("omni", "fov", "calibrate omni-none or omni-radtan"),
+        ("ocam", "none", "'ocam' is not read; calibrate with pinhole, omni, ds, eucm"),
+    ],
+)
+def test_names_what_kalibr_calls_the_models(
+    kind: str, bend: str, message: str, tmp_path: Path
+) -> None:
+    leading = {"eucm": [0.61, 1.1], "omni": [0.9]}.get(kind, [])
+    sheet = {
+        "camera_model": kind,
+        "distortion_model": bend,
+        "distortion_coeffs": [0.1] * (1 if bend == "fov" else 4),
+        "intrinsics": [*leading, 300.0, 301.0, 320.5, 240.5],
+        "resolution": [640, 480],
+    }
+    (tmp_path / "camchain.yaml").write_text(yaml.safe_dump({"cam0": sheet}))
+    with pytest.raises(CalibrationError, match=message):
+        vio.load_rig(tmp_path / "camchain.yaml")
+
+
 # --- a new model
 # ----------------------------------------------------------------------------------------------------
 
@@ -316,10 +443,66 @@ def test_files_without_a_name_for_a_model_say_so(
 # ----------------------------------------------------------------------------------------------------
 
 
-def _rows_apart(rig: StereoRig) -> float:
-    """Median distance in pixels of the rows of features that rectified rendered images share."""
-    import cv2
+WIDE = {
+    "eucm": CameraModel(106.0, 106.3, 158.0, 121.0, 320, 240, "eucm", (0.62, 1.05)),
+    "double_sphere": CameraModel(86.0, 86.3, 158.0, 121.0, 320, 240, "double_sphere", (-0.2, 0.57)),
+    "fov": CameraModel(128.0, 128.5, 158.0, 121.0, 320, 240, "fov", (1.2,)),
+    "unified": CameraModel(
+        190.0, 190.6, 158.0, 121.0, 320, 240, "unified", (1.2, -0.02, 0.01, 1e-3, 0)
+    ),
+}
 
+
+@pytest.mark.parametrize("camera", WIDE.values(), ids=WIDE)
+def test_rectified_images_of_a_wide_pair_agree_in_rows(camera: CameraModel) -> None:
+    assert np.degrees(field_of_view(camera)[0]) > 115
+    rig = _pair(camera).stereo
+    assert _rows_apart(rig) < 0.15
+    # With a focal length that is off by 2 % the right image's rows are not those of the left.
+    other = replace(rig.cam1, fu=1.02 * rig.cam1.fu, fv=1.02 * rig.cam1.fv)
+    assert _rows_apart(rig, replace(rig, cam1=other)) > 0.25
+
+
+@pytest.mark.parametrize("name", ["eucm", "fov"])
+def test_a_run_follows_rendered_images_of_a_wide_pair(name: str) -> None:
+    mounted = fisheye_rig()
+    rig = replace(mounted, cam0=WIDE[name], cam1=replace(WIDE[name], cu=160.0))
+    plan = simulate(
+        room(seed=1),
+        rig,
+        hand_held(duration_s=1.0),
+        rate_hz=10.0,
+        imu=ImuNoise(),
+        effects=CLEAN,
+        seed=1,
+    )
+    sim = SimulatedRecording(plan)
+    assert plan.imu is not None
+    results: list[FrameResult] = []
+    odometry = Odometry(rig_of(rig), on_frame=results.append)
+    odometry.add_imu(plan.imu.times_ns, plan.imu.gyro, plan.imu.accel)
+    for k in range(len(sim)):
+        odometry.add_stereo(int(plan.stamps_ns[k]), *sim.images(k))
+    odometry.finish()
+    poses = np.stack([r.estimate.T_world_imu for r in results])
+    truth = motion_at(plan.motion, plan.stamps_ns).T_world_imu
+    aligned = align_poses(poses, truth, "se3")
+    moved = poses[:, :3, 3] @ aligned.R.T + aligned.t
+    off = np.linalg.norm(moved - truth[:, :3, 3], axis=1)
+    assert np.sqrt(np.mean(off**2)) < 0.001
+
+
+def _rectifier(rig: StereoRig) -> Rectifier:
+    return Rig(rig.cam0, rig.cam1, se3_inverse(rig.T_cam0_cam1)).rectifier()
+
+
+def _rows_apart(rig: StereoRig, believed: StereoRig | None = None) -> float:
+    """Median distance in pixels of the rows of features that rectified rendered images share.
+
+    Args:
+        rig: the true one.
+        believed: by which the images are rectified; None: the true one.
+    """
     mounted = fisheye_rig()
     T_imu_cam1 = mounted.T_imu_cam0 @ rig.T_cam0_cam1
     rig = replace(rig, T_imu_cam0=mounted.T_imu_cam0, T_imu_cam1=T_imu_cam1)
@@ -332,7 +515,7 @@ def _rows_apart(rig: StereoRig) -> float:
         .astype(np.uint8)
         for view in both
     ]
-    left, right = Rig(rig.cam0, rig.cam1, se3_inverse(rig.T_cam0_cam1)).rectifier()(*raw)
+    left, right = _rectifier(believed or rig)(*raw)
     corners = cv2.goodFeaturesToTrack(left, 300, 0.01, 6)
     there, status, _ = cv2.calcOpticalFlowPyrLK(left, right, corners, None, winSize=(15, 15))
     back, _, _ = cv2.calcOpticalFlowPyrLK(right, left, there, None, winSize=(15, 15))

@@ -13,6 +13,8 @@ _FILES = (
     "equidistant",
     "unified",
     "double_sphere",
+    "eucm",
+    "fov",
 )
 LENSES: dict[str, Lens] = {
     name: import_module(f"vio.geometry.lenses.{name}").LENS for name in _FILES
