@@ -519,6 +519,42 @@ def test_halved_images_of_a_calibration_without_a_size_are_doubted(tmp_path: Pat
         vio.load_rig(tmp_path, image_size=(320, 240))
 
 
+# Twice the principal point over the size of the images, of real cameras.
+_REAL_CENTRES = {
+    "KITTI 03": (0.982, 0.922),
+    "KITTI 06": (0.982, 0.990),
+    "KITTI raw, left": (0.991, 0.911),
+    "Karlsruhe": (0.946, 1.044),
+    "EuRoC, rectified": (0.969, 1.059),
+    "EuRoC, right": (1.011, 1.063),
+    "TUM-VI": (0.987, 0.997),
+    "Bumblebee 2": (0.976, 1.031),
+}
+
+
+@pytest.mark.parametrize("name", _REAL_CENTRES)
+@pytest.mark.parametrize(("scale", "doubted"), [(1.0, False), (0.8, True), (1.25, True)])
+def test_scaled_images_of_real_cameras_are_doubted(
+    name: str, scale: float, doubted: bool, tmp_path: Path
+) -> None:
+    u, v = 0.5 * np.array(_REAL_CENTRES[name]) * (1000, 600)
+    write_calibration(tmp_path, Rig.rectified(700.0, 700.0, u, v, 0.12, 1000, 600).camera, None)
+    size = (round(1000 * scale), round(600 * scale))
+    notes = vio.load_rig(tmp_path, image_size=size).notes
+    assert any("if they were scaled" in note for note in notes) == doubted
+
+
+@pytest.mark.parametrize(
+    ("scale", "doubted"), [(0.88, True), (0.93, False), (1.07, False), (1.13, True)]
+)
+def test_images_scaled_by_an_eighth_are_doubted(
+    scale: float, doubted: bool, tmp_path: Path
+) -> None:
+    write_calibration(tmp_path, Rig.rectified(700.0, 700.0, 500, 300, 0.12, 1000, 600).camera, None)
+    size = (round(1000 * scale), round(600 * scale))
+    assert bool(vio.load_rig(tmp_path, image_size=size).notes) == doubted
+
+
 def test_principal_point_outside_stated_images_is_refused(tmp_path: Path) -> None:
     make = _camchain(lambda c: c["cam1"].update(intrinsics=[40.0, 40.0, 70.0, 24.0]))
     with pytest.raises(CalibrationError, match="principal point 70, 24 lies outside images"):
