@@ -519,6 +519,21 @@ def test_halved_images_of_a_calibration_without_a_size_are_doubted(tmp_path: Pat
         vio.load_rig(tmp_path, image_size=(320, 240))
 
 
+def test_opencv_matrices_with_a_model_that_opencv_lacks_keep_its_coefficients(
+    tmp_path: Path,
+) -> None:
+    """Of other tools, which write the same form."""
+    m = opencv_matrices()
+    path = write_storage(
+        tmp_path / "stereo.yml",
+        {**m, "D1": np.array([0.93]), "D2": np.array([0.92])},
+        (RIG.cam0.width, RIG.cam0.height),
+    )
+    path.write_text(path.read_text() + "distortion_model: fov\n")
+    rig = vio.load_rig(path)
+    assert [(c.model, c.coefficients) for c in rig.cameras] == [("fov", (0.93,)), ("fov", (0.92,))]
+
+
 # Twice the principal point over the size of the images, of real cameras.
 _REAL_CENTRES = {
     "KITTI 03": (0.982, 0.922),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.board_views import GRID, poses_around, views_around
+from vio.cli import main
 from vio.datasets.rigs import load_rig
 from vio.geometry.distortion import CameraModel, project_point, unproject_pixel
 from vio.geometry.lenses.registry import LENSES as MODELS
@@ -79,3 +80,11 @@ def test_calibrates_a_rendered_lens_of_150_degrees(tmp_path: Path) -> None:
     # The choice sees the corners' noise alone; where it has few corners it may be worse.
     chosen = calibrate_cameras(filmed, GRID)
     assert _largest_error(chosen.rig.cam0, true, 0.8) < 0.3
+
+
+def test_an_unknown_lens_is_an_error_of_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["calibrate-rig", "pairs", "--target", "board.yaml", "--lens", "ocam"])
+    assert ended.value.code == 2
+    message = capsys.readouterr().err
+    assert f"'ocam' is none of auto, {', '.join(LENSES)}" in message

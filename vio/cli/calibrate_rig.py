@@ -43,7 +43,11 @@ def add_parser(commands: Any) -> None:
         "--size", type=float, metavar="M", help="side of a tag or square as measured, metres"
     )
     parser.add_argument(
-        "--lens", type=_lens, default=_AUTO, metavar="NAME", help="model (default: compared)"
+        "--lens",
+        type=_lens,
+        default=_AUTO,
+        metavar="NAME",
+        help="lens model, such as radtan or eucm (default: all are compared)",
     )
     parser.add_argument(
         "--imu-noise",
