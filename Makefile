@@ -77,9 +77,8 @@ results: $(VENV)/.base
 	$(if $(RESULTS),,$(BIN)/python -m tools.faults --data "$(VIO_DATA)" --work "$(WORK)")
 	$(BIN)/python -m tools.results --data "$(VIO_DATA)" --work "$(WORK)" $(RESULTS)
 
-# The documentation site, into site/; a broken link or a page without a place in the menu is an error. Of the tests it
-# makes the page of bad inputs, so it needs what they need.
-docs: $(VENV)/.dev
+# The documentation site, into site/; a broken link or a page without a place in the menu is an error.
+docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 # Build the wheel, and run it in an environment and a folder of its own, with the newest versions of what it needs. On Linux
@@ -107,9 +106,13 @@ $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e . setuptools
 	@touch $@
 
+$(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
+	$(PIP_INSTALL) -e '.[docs]'
+	@touch $@ $(VENV)/.base
+
 $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev]'
-	@touch $@ $(VENV)/.base
+	@touch $@ $(VENV)/.docs $(VENV)/.base
 
 $(VENV)/.learned: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev,learned]'

@@ -19,7 +19,7 @@ _ROOT = str(Path(__file__).resolve().parents[1])
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
-    """Return the site's files with the page of bad inputs, which needs the extra `dev`."""
+    """Return the site's files with the page of bad inputs, which is made of the tests."""
     from mkdocs.structure.files import File
 
     if _ROOT not in sys.path:
