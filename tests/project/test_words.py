@@ -34,7 +34,7 @@ _ELSE = 800
 LIMITS = {
     "README.md": 2000,
     "CHANGELOG.md": 1500,
-    "docs/architecture.md": 1400,
+    "docs/architecture.md": 1700,
     "docs/bench.md": 1550,
     "docs/colmap.md": 950,
     "docs/commands.md": 1200,
@@ -59,7 +59,7 @@ LIMITS = {
     "docs/tutorials/features.md": 900,
     "docs/tutorials/target.md": 1300,
 }
-ALL_PAGES = 52_000
+ALL_PAGES = 53_000
 
 # Each with what to write in its place.
 BANNED = {
