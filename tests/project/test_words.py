@@ -69,7 +69,6 @@ BANNED = {
     r"\bsaid\b": "stated, reported",
     r"\b(stands?|stood) (at|on|above|below|beside|where|there)\b": "is, are",
     r"\b[Ww]ho(ever)? (reads|uses|knows)\b": "name the reader, or the action",
-    r"\bmade[- ]up\b": "simulated",
     r"\bfor good\b": "permanently",
     r"pip install '?stereo-vio": "the package is on no index: install from the folder or the wheel",
 }
@@ -87,7 +86,7 @@ def test_all_pages_together_keep_a_limit() -> None:
 def test_limits_are_of_pages_that_exist_and_are_close() -> None:
     """A limit far above its page would let it grow unseen."""
     assert set(LIMITS) <= set(PAGES)
-    assert not [name for name, limit in LIMITS.items() if limit > max(2 * _words(name), _ELSE)]
+    assert not [name for name, limit in LIMITS.items() if limit > max(3 * _words(name), _ELSE)]
 
 
 @pytest.mark.parametrize("name", [name for name in PAGES if name not in GENERATED | LATER])
