@@ -48,7 +48,12 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--topics", metavar="A=/B,…", help="topics of a bag: same as --set dataset.topics=A=/B,…"
     )
-    parser.add_argument("--frontend", metavar="NAME", help="same as --set frontend.name=NAME")
+    parser.add_argument(
+        "--frontend",
+        metavar="NAME",
+        help="same as --set frontend.name=NAME; vio run also takes FILE.py:CLASS, a front end or a "
+        "detector of your own",
+    )
 
 
 def add_span_arguments(parser: argparse.ArgumentParser) -> None:

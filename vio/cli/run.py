@@ -100,6 +100,10 @@ def execute(args: argparse.Namespace) -> int:
         print_result(metrics, metric_rows(metrics, plot=not args.no_plot), as_json=args.json)
         sys.stdout.flush()
 
+    own = None
+    if args.frontend is not None and ":" in args.frontend:  # no name of a setting
+        own = args.frontend
+        args.frontend = None
     if args.resume is not None:
         given = [f"--{name.replace('_', '-')}" for name in _OF_A_NEW_RUN if getattr(args, name)]
         if given:
@@ -108,6 +112,7 @@ def execute(args: argparse.Namespace) -> int:
             args.resume,
             save_calibration=args.save_calibration,
             map_file=args.map,
+            frontend=own,
             progress=not args.quiet,
             finished=finished,
         )
@@ -127,6 +132,7 @@ def execute(args: argparse.Namespace) -> int:
         map_density=args.map_density,
         view=args.view,
         plot=not args.no_plot,
+        frontend=own,
         command=args.command_line,
         finished=finished,
     )
