@@ -12,6 +12,7 @@ from vio.cli.arguments import (
     add_lengths_argument,
     add_span_arguments,
     config_from,
+    examples,
 )
 from vio.cli.output import print_result
 from vio.errors import ConfigError
@@ -22,9 +23,13 @@ def add_parser(commands: Any) -> None:
         "run",
         help="process a recording",
         description="Process a recording and write a folder of results. The kind of SOURCE is "
-        "detected from its "
-        "content; 'kind:path' sets it (kitti, kitti_raw, euroc, plain, bag, video, ece276a, utias, "
-        "log).",
+        "detected from its content; 'kind:path' sets it (kitti, kitti_raw, euroc, plain, mono, "
+        "rgbd, bag, video, ece276a, utias, gtsam, log).",
+        **examples(
+            "vio run dataset/sequences/07 --report --open  # and show the page about it",
+            "vio run MH_01_easy --motion none --out images_alone  # without the IMU",
+            "vio run flight.bag --calibration rig.yaml --map yard.map  # close loops in a map",
+        ),
     )
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
