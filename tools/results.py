@@ -154,9 +154,10 @@ def _joined(rows: Sequence[Row], systems: Sequence[str]) -> list[Row]:
 
 def _with_lengths(lines: Iterable[str], rows: Sequence[Row]) -> list[str]:
     """Return a table with the length of each sequence in its second column."""
-    lengths: dict[str, str] = {}
+    lengths = dict.fromkeys((row.sequence for row in rows), " – ")
     for row in rows:
-        lengths.setdefault(row.sequence, f" {row.cells['reference_m'].median:.0f} m ")
+        if "reference_m" in row.cells:
+            lengths[row.sequence] = f" {row.cells['reference_m'].median:.0f} m "
     added = iter([" length ", "---:", *lengths.values()])
     whole = []
     for line in lines:

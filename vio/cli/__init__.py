@@ -30,7 +30,7 @@ from vio.files.printable import printable
 
 # The commands by what they are for, and the files of those that have another name.
 BY_PURPOSE = {
-    "Try it": ("demo",),
+    "Try it": ("demo", "course"),
     "Before a run": (
         "inspect",
         "target",
