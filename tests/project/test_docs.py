@@ -538,6 +538,20 @@ def test_yaml_of_the_docs_is_a_configuration(name: str) -> None:
             merge(Config(), yaml.safe_load(block.text), where=name)
 
 
+def test_nothing_installs_this_package_from_an_index() -> None:
+    """It is on none, and the name is anybody's."""
+    pages = [ROOT / name for name in DOCS] + sorted((ROOT / "docs").rglob("*.md"))
+    code = [*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")]
+    notebooks = [*(ROOT / "vio").rglob("*.ipynb"), *(ROOT / "examples").rglob("*.ipynb")]
+    found = [
+        f"{path}: {line.strip()}"
+        for path in (*pages, *code, *notebooks)
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if "pip install" in line and re.search(r"stereo[-_]vio(\[|'|\"|\s|$)", line)
+    ]
+    assert not found
+
+
 @pytest.mark.parametrize("name", [*DOCS, *NOTES])
 def test_links_are_valid(name: str) -> None:
     broken = []
