@@ -168,7 +168,6 @@ def smaller_is_better(run: FinishedRun) -> dict[str, float | None]:
         "attitude error (deg)": None if evaluation is None else evaluation.ate_deg.rmse,
         "drift (%)": None if kitti is None else kitti.t_err_percent,
         "drift of rotation": None if kitti is None else kitti.r_err_deg_per_100m,
-        "observations refused (%)": refused_share(run.frames["used"], run.frames["gated"]),
         "ms a frame, median": float(np.nanmedian(work)),
         "ms a frame, 95 %": float(np.nanpercentile(work, 95)),
     }
