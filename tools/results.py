@@ -117,6 +117,7 @@ class Results:
         systems = [name for joined in lists["systems"] for name in joined.split("+")]
         rows = self.rows(suite, lists["sequences"], systems)
         facts = self.suites[suite]
+        lines: Iterable[str]
         if figure:
             rows = _joined(rows, lists["systems"])
             shown = [joined.partition("+")[0] for joined in lists["systems"]]

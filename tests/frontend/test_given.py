@@ -14,7 +14,8 @@ from vio.cli import main
 from vio.errors import ConfigError, DataError
 from vio.frontend import FrontendSettings
 from vio.frontend.detect import detect_corners, min_distance_px
-from vio.frontend.given import as_frontend, build_given, given_corners, load_given
+from vio.frontend.given import as_frontend, build_given, load_given
+from vio.frontend.given_corners import given_corners
 from vio.frontend.klt import KltFrontend
 from vio.frontend.patches import half_image
 from vio.frontend.settings import GridSettings

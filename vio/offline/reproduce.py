@@ -264,7 +264,8 @@ def _panels(
         axes.set_title(f"{ours}{name}{ate}", fontsize=10)
         axes.set_xlabel("m")
         axes.grid(alpha=0.25)
-    low, high = np.min(np.vstack(drawn), axis=0), np.max(np.vstack(drawn), axis=0)
+    low = np.min(np.vstack(drawn), axis=0)
+    high = np.max(np.vstack(drawn), axis=0)
     middle = 0.5 * (low + high)
     half = 0.6 * float((high - low).max())
     for axes in every:  # landmarks far away are cut off
