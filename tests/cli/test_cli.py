@@ -638,7 +638,7 @@ def test_evo_reads_every_trajectory_file(finished: str) -> None:
     assert file_interface.read_kitti_poses_file(f"{finished}/trajectory.kitti").num_poses == FRAMES
 
 
-def test_reproduce_writes_a_table_and_a_figure(
+def test_reproduce_writes_a_table_and_figures(
     recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tables = json_of(capsys, "reproduce", f"{recording}={truth}", "--out", tmp_path / "table")
@@ -649,6 +649,9 @@ def test_reproduce_writes_a_table_and_a_figure(
         "table.md",
         "table.json",
         "trajectories.png",
+        "dead_reckoning.png",
+        "landmarks.png",
+        "selection.png",
     }
     assert "| recommended |" in (tmp_path / "table" / "drive" / "table.md").read_text()
 
