@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vio import Parts, evaluate, load_config, open_dataset, run
+from vio import Odometry, Parts, evaluate, load_config, open_dataset, run
 from vio.cli import main
 from vio.errors import ConfigError, DataError
 from vio.frontend import FrontendSettings
@@ -237,3 +237,20 @@ def test_a_run_takes_a_detector_from_a_file(
         main(["run", str(flight), "--frontend", "nowhere.py:A", "--out", str(tmp_path / "x")]) == 1
     )
     assert "no such file" in capsys.readouterr().err
+
+
+def test_a_detector_runs_live(flight: Path) -> None:
+    """With the poses of the run to the bit."""
+    dataset = open_dataset(flight)
+    recording = dataset.recording
+    config = load_config(overrides=["motion=none"])
+    wanted = run(dataset, config, stop=8, parts=Parts(frontend=Corners()))
+    parts = Parts(frontend=Corners())
+    live = Odometry(recording.camera, config, T_cam0_imu=recording.T_cam0_imu, parts=parts)
+    poses = []
+    for frame in dataset.events(stop=8):
+        if isinstance(frame, StereoFrame) and frame.left is not None and frame.right is not None:
+            estimate = live.add_stereo(frame.time_ns, frame.left, frame.right)
+            assert estimate is not None
+            poses.append(estimate.T_world_imu)
+    np.testing.assert_array_equal(poses, wanted.estimates.column("T_world_imu"))
