@@ -184,8 +184,9 @@ class FrameUpdate:
             doubted = False
             turn = None
             contradicted = (innovation_ratio or 0.0) > _CONTRADICTED
-            settled = self._gyro_jump.is_settled()
-            if (missing[1] or contradicted) and self._has_imu and settled:
+            off = bool(missing[1]) or contradicted
+            settled = self._gyro_jump.is_settled(off=off)
+            if off and self._has_imu and settled:
                 turn = turn_of_images(at_prediction, expected, T_world_predicted)
             if turn is None:
                 jump_radps = self._gyro_jump.agrees(window.nav.gyro_bias)

@@ -10,6 +10,8 @@ estimate both anew: equation (N15) of docs/math.md.
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from vio.filters.multiview import CAUCHY, Residuals
@@ -24,6 +26,11 @@ _AGREEMENT = 0.8  # share of the old tracks that one rotation must explain
 _MAX_TURN_RAD = 0.2  # standard deviation of the rotation before it is fitted
 _ITERATIONS = 8  # of the robust fit
 _START_STEPS = 30  # of a filter that has begun, in which a bias that is learned looks like a jump
+# A jump comes after steps that agreed: of so many before the newest ones (which may belong to it) so
+# few are off. A gyro that is wrong all the time (its axes, clock, scale) is no gyro that jumped.
+_QUIET_STEPS = 20
+_NEWEST_STEPS = 3
+_MAX_OFF = 3
 _CHANGED_SIGMAS = 3.0  # of the bias before: less is no jump
 _LIKE = 0.5  # of the larger one: rates of two steps that differ by less are one jump
 
@@ -94,14 +101,19 @@ class GyroJump:
 
     def __init__(self) -> None:
         self._steps = 0  # of the filter since its start
+        self._off = deque[bool](maxlen=_QUIET_STEPS + _NEWEST_STEPS)  # which were off
         self._rate: FloatArray | None = None  # (3,) that the last step was off by
         # (3,) the bias before it was doubted, and its standard deviations then; None: it is not
         self._before: tuple[FloatArray, FloatArray] | None = None
 
-    def is_settled(self) -> bool:
-        """Take a step; return whether the start, which learns bias and tilt, is over."""
+    def is_settled(self, *, off: bool) -> bool:
+        """Take a step, and whether the images contradict it; return whether the start, which learns
+        bias and tilt, is over, and the steps before agreed.
+        """
         self._steps += 1
-        return self._steps > _START_STEPS
+        self._off.append(off)
+        before = list(self._off)[:-_NEWEST_STEPS]
+        return self._steps > _START_STEPS and sum(before) <= _MAX_OFF
 
     def repeats(self, rate: FloatArray) -> bool:
         """Take the rate (3,) that a step was off by; return whether the last step was off by the

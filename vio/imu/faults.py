@@ -290,7 +290,7 @@ class _Range:
         began = clipped & ~np.concatenate([[self._is_clipped], clipped[:-1]])
         self._is_clipped = bool(clipped[-1])
         end = 0.0 if self._end is None else self._end
-        times = [samples[k].time_ns for k in np.flatnonzero(began)]
+        times = [samples[k].time_ns for k in np.flatnonzero(began).tolist()]
         return [ImuFault(self._kind, time_ns, time_ns, end) for time_ns in times]
 
     def _learn(self, equal: BoolArray, at_end: BoolArray, sizes: FloatArray) -> int:
