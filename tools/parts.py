@@ -1,4 +1,4 @@
-"""The eight parts of the package, from the lowest to the highest, and which module is in which.
+"""The nine parts of the package, from the lowest to the highest, and which module is in which.
 
 A module imports from its own part and from parts below it. `docs/architecture.md` describes the
 parts; `tests/project/test_architecture.py` holds every import to their order.
@@ -30,6 +30,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "estimator": ("vio.frontend", "vio.selection", "vio.filters"),
     "guards": ("vio.calibration", "vio.guard", "vio.monitor"),
     "input and output": ("vio.datasets", "vio.interop"),
+    "maps": ("vio.mapping", "vio.dense", "vio.earth"),
     "runs and live": (
         "vio.config",
         "vio.live",
@@ -40,14 +41,7 @@ PARTS: dict[str, tuple[str, ...]] = {
         "vio.view",
         "vio.report",
     ),
-    "maps and offline": (
-        "vio.mapping",
-        "vio.dense",
-        "vio.earth",
-        "vio.inspection",
-        "vio.targets",
-        "vio.offline",
-    ),
+    "offline": ("vio.inspection", "vio.targets", "vio.offline"),
     "laboratory": ("vio.sim", "vio.bench", "vio.testing", "vio.offline.reproduce"),
     "command line": ("vio.cli", "vio.__main__", "vio"),
 }

@@ -91,7 +91,7 @@ def test_a_checkout_is_measured(tmp_path: Path) -> None:
 
 def test_a_module_without_a_part_is_an_error() -> None:
     assert part_of("vio.offline.reproduce") == "laboratory"
-    assert part_of("vio.offline.refine") == "maps and offline"
+    assert part_of("vio.offline.refine") == "offline"
     assert part_of("vio") == "command line"
     with pytest.raises(KeyError, match=r"vio\.newpackage\.x is in no part"):
         part_of("vio.newpackage.x")

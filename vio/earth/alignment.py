@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix
 
+from vio.datasets.gnss_fixes import GnssFixes
 from vio.earth.geodesy import LocalFrame
-from vio.earth.gnss import GnssFixes
 from vio.errors import EstimationError
 from vio.geometry.lie import (
     FloatArray,

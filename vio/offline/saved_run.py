@@ -28,8 +28,8 @@ from vio.offline.run_images import RunImages, field_coefficients, original_sourc
 from vio.records import FIELD_TERMS, FeatureTracks, Image, IntArray, LoopEvent, need_stereo
 from vio.runs.files import RunFile
 from vio.runs.finished import read_estimates
-from vio.runs.folder import read_metrics
 from vio.runs.mapped import read_loops
+from vio.runs.stated import read_metrics
 
 if TYPE_CHECKING:
     from vio.offline.colmap.model import ModelImages

@@ -5,8 +5,11 @@ another hand.
 from __future__ import annotations
 
 import json
+import logging
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from vio.errors import DataError
 from vio.files.inputs import read_input
@@ -22,6 +25,12 @@ from vio.files.schema import (
     a_list,
     an_object,
 )
+from vio.files.trajectories import read_trajectory
+from vio.geometry.lie import FloatArray, checked_transform
+from vio.records import Trajectory
+from vio.runs.files import RunFile
+
+log = logging.getLogger(__name__)
 
 _MAX_BYTES = 2**26
 _NUMBERS = a_list(NUMBER)
@@ -117,6 +126,43 @@ def read_stated(path: Path, shape: Shape, remedy: str) -> dict[str, Any]:
         raise DataError(f"{path}: is damaged ({fault}); {remedy}")
     checked: dict[str, Any] = values
     return checked
+
+
+def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:
+    """Read a trajectory file, or the trajectory and extrinsics of a run's folder.
+
+    Raises:
+        DataError: the path contains no trajectory.
+    """
+    if not path.is_dir():
+        return read_trajectory(path), None
+    _, T_cam0_imu = read_metrics(path)
+    return read_trajectory(path / RunFile.TRAJECTORY), T_cam0_imu
+
+
+def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
+    """Read the metrics of a run's folder, and `T_cam0_imu` (4, 4) from them.
+
+    Raises:
+        DataError: the folder is not a run's, or its metrics are damaged.
+    """
+    path = folder / RunFile.METRICS
+    if not path.is_file():
+        raise DataError(
+            f"{folder}: no run folder (it has no {RunFile.METRICS}); give a folder that `vio run` "
+            "wrote"
+        )
+    metrics = read_stated(path, METRICS_SHAPE, "repeat the run")
+    try:
+        T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
+    except ValueError as error:  # rows of different lengths
+        raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
+    if metrics.get("complete") is False:
+        log.warning(
+            "%s: the run has not reached the end of its recording; these are its results so far",
+            folder,
+        )
+    return metrics, checked_transform(T_cam0_imu, f"{path}, T_cam0_imu")
 
 
 def _parted(values: dict[str, Any]) -> str | None:
