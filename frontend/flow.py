@@ -4,6 +4,8 @@ full image.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -143,10 +145,7 @@ def _flow(
         target,
         points / 2,
         guess / 2,
-        window_px=_WINDOW_PX,
-        levels=levels,
-        iterations=_ITERATIONS,
-        epsilon_px=_LK_EPSILON_PX,
+        PyramidSearch(_WINDOW_PX, levels, _ITERATIONS, _LK_EPSILON_PX),
     )
     pixels *= 2
     lost = (~seen).nonzero()[0]
@@ -154,16 +153,22 @@ def _flow(
     return pixels, seen
 
 
+@dataclass(frozen=True, slots=True)
+class PyramidSearch:
+    """How Lucas-Kanade searches."""
+
+    window_px: int  # side of the window
+    levels: int  # of the pyramids beside the images themselves
+    iterations: int  # largest number per level
+    epsilon_px: float  # step below which a point has converged
+
+
 def lucas_kanade(
     source: Image,
     target: Image,
     points: FloatArray,
     guess: FloatArray,
-    *,
-    window_px: int,
-    levels: int,
-    iterations: int,
-    epsilon_px: float,
+    search: PyramidSearch,
 ) -> tuple[FloatArray, BoolArray]:
     """Track points by OpenCV's pyramidal Lucas-Kanade.
 
@@ -172,10 +177,7 @@ def lucas_kanade(
         target: image (H, W) to find them in.
         points: pixels (N, 2).
         guess: pixels (N, 2) to start from.
-        window_px: side of the window.
-        levels: pyramid levels beside the images themselves.
-        iterations: largest number of iterations per level.
-        epsilon_px: step below which a point has converged.
+        search: windows, levels and steps.
 
     Returns:
         Pixels (N, 2), arbitrary where not found, and a mask (N,) of those found.
@@ -185,9 +187,13 @@ def lucas_kanade(
         target,
         points.astype(np.float32).reshape(-1, 1, 2),
         guess.astype(np.float32).reshape(-1, 1, 2),
-        winSize=(window_px, window_px),
-        maxLevel=levels,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, epsilon_px),
+        winSize=(search.window_px, search.window_px),
+        maxLevel=search.levels,
+        criteria=(
+            cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT,
+            search.iterations,
+            search.epsilon_px,
+        ),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=_LK_MIN_EIGENVALUE,
     )

@@ -17,6 +17,7 @@ for the case of pure rotation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -125,36 +126,99 @@ def _gauss_newton(
     points = np.ascontiguousarray(p_prev)
     seen = np.ascontiguousarray(pixels)
     w = np.ascontiguousarray(weight)
-    _iterate(camera_args(camera), T, points, seen, w, np.inf, iterations, free.stop, 0.0)
+    _iterate(
+        camera_args(camera), T, _Seen(points, seen, w), _Steps(np.inf, iterations, free.stop, 0.0)
+    )
     return T
 
 
+class _Seen(NamedTuple):
+    """Points before each of H motions, and their pixels after it."""
+
+    points: FloatArray  # (H, K, 3)
+    pixels: FloatArray  # (H, K, 2)
+    weight: FloatArray  # (H, K)
+
+
+class _Steps(NamedTuple):
+    """Gauss-Newton steps on motions."""
+
+    scale_px: float  # of the weights of Geman and McClure, which multiply others; infinite: of none
+    iterations: int  # at most
+    free: int  # how many entries of the twist `[rho; phi]` are estimated, from its beginning
+    converged: float  # a motion is done when no entry of it changes by this
+
+
 @compiled
-def _iterate(
+def _pixel_D_twist(
     camera: CameraArgs,
-    T: FloatArray,
-    points: FloatArray,
-    pixels: FloatArray,
-    weight: FloatArray,
-    scale_px: float,
-    iterations: int,
-    free: int,
-    converged: float,
+    point: tuple[float, float, float],
+    turn: tuple[float, float, float],
+    u_D_xi: FloatArray,
+    v_D_xi: FloatArray,
 ) -> None:
+    """Write how the pixel of a point moves with the camera's twist (6,).
+
+    The point is x / z, y / z and z in the camera turned to it; the turn is its azimuth, its sine
+    and cosine.
+    """
+    fu = camera[0]
+    fv = camera[1]
+    a, b, z = point
+    azimuth, s, c = turn
+    # pixel_D_point circledot(point)
+    u_D_xi[0] = fu / z
+    u_D_xi[1] = 0.0
+    u_D_xi[2] = -fu * a / z
+    u_D_xi[3] = -fu * a * b
+    u_D_xi[4] = fu * (1.0 + a * a)
+    u_D_xi[5] = -fu * b
+    v_D_xi[0] = 0.0
+    v_D_xi[1] = fv / z
+    v_D_xi[2] = -fv * b / z
+    v_D_xi[3] = -fv * (1.0 + b * b)
+    v_D_xi[4] = fv * a * b
+    v_D_xi[5] = fv * a
+    if azimuth != 0.0:
+        for i in range(1, 5, 3):  # back from the turned camera
+            u_D_xi[i], u_D_xi[i + 1] = (
+                c * u_D_xi[i] + s * u_D_xi[i + 1],
+                c * u_D_xi[i + 1] - s * u_D_xi[i],
+            )
+            v_D_xi[i], v_D_xi[i + 1] = (
+                c * v_D_xi[i] + s * v_D_xi[i + 1],
+                c * v_D_xi[i + 1] - s * v_D_xi[i],
+            )
+
+
+@compiled
+def _move_to(T: FloatArray, moved: FloatArray) -> float:
+    """Overwrite a motion (4, 4) by another one; return the largest change of an entry."""
+    change = 0.0
+    for i in range(4):
+        for j in range(4):
+            change = max(change, abs(moved[i, j] - T[i, j]))
+            T[i, j] = moved[i, j]
+    return change
+
+
+@compiled
+def _iterate(camera: CameraArgs, T: FloatArray, seen: _Seen, steps: _Steps) -> None:
     """Gauss-Newton on the first entries of the twists of motions (H, 4, 4), in place; see
     `_gauss_newton`.
-
-    Weights (H, K) are multiplied by those of Geman and McClure at a scale; infinite: by none. A
-    motion is done when no entry of it changes by `converged`.
     """
     fu, fv, cu, cv, _, _ = camera
+    points = seen.points
+    pixels = seen.pixels
+    scale_px = steps.scale_px
+    free = steps.free
     A = np.empty((free, free))
     xi = np.empty(6)
     u_D_xi = np.empty(6)
     v_D_xi = np.empty(6)
-    before = np.empty((4, 4))
+    moved = np.empty((4, 4))
     for h in range(len(T)):
-        for _ in range(iterations):
+        for _ in range(steps.iterations):
             for i in range(6):
                 xi[i] = 0.0
             for i in range(free):
@@ -168,7 +232,7 @@ def _iterate(
                 y = T[h, 1, 0] * px + T[h, 1, 1] * py + T[h, 1, 2] * pz + T[h, 1, 3]
                 z = T[h, 2, 0] * px + T[h, 2, 1] * py + T[h, 2, 2] * pz + T[h, 2, 3]
                 azimuth, s, c, y, z = turn_to(camera, y, z)
-                w2 = weight[h, n] ** 2
+                w2 = seen.weight[h, n] ** 2
                 if not z > _MIN_DEPTH_M or w2 == 0.0:
                     continue
                 a = x / z
@@ -183,29 +247,7 @@ def _iterate(
                     continue
                 robust = 1.0 / (1.0 + (error / scale_px) ** 2)
                 w2 *= robust * robust
-                # pixel_D_point circledot(point)
-                u_D_xi[0] = fu / z
-                u_D_xi[1] = 0.0
-                u_D_xi[2] = -fu * a / z
-                u_D_xi[3] = -fu * a * b
-                u_D_xi[4] = fu * (1.0 + a * a)
-                u_D_xi[5] = -fu * b
-                v_D_xi[0] = 0.0
-                v_D_xi[1] = fv / z
-                v_D_xi[2] = -fv * b / z
-                v_D_xi[3] = -fv * (1.0 + b * b)
-                v_D_xi[4] = fv * a * b
-                v_D_xi[5] = fv * a
-                if azimuth != 0.0:
-                    for i in range(1, 5, 3):  # back from the turned camera
-                        u_D_xi[i], u_D_xi[i + 1] = (
-                            c * u_D_xi[i] + s * u_D_xi[i + 1],
-                            c * u_D_xi[i + 1] - s * u_D_xi[i],
-                        )
-                        v_D_xi[i], v_D_xi[i + 1] = (
-                            c * v_D_xi[i] + s * v_D_xi[i + 1],
-                            c * v_D_xi[i + 1] - s * v_D_xi[i],
-                        )
+                _pixel_D_twist(camera, (a, b, z), (azimuth, s, c), u_D_xi, v_D_xi)
                 for i in range(free):
                     xi[i] += w2 * (u_D_xi[i] * du + v_D_xi[i] * dv)
                     for j in range(i + 1):
@@ -220,13 +262,9 @@ def _iterate(
                 xi[i] = min(max(xi[i], -5.0), 5.0)
             for i in range(4):
                 for j in range(4):
-                    before[i, j] = T[h, i, j]
-            move_by_twist(xi, T[h])
-            change = 0.0
-            for i in range(4):
-                for j in range(4):
-                    change = max(change, abs(T[h, i, j] - before[i, j]))
-            if change < converged:
+                    moved[i, j] = T[h, i, j]
+            move_by_twist(xi, moved)
+            if _move_to(T[h], moved) < steps.converged:
                 break
 
 
@@ -247,13 +285,8 @@ def _refine(
     _iterate(
         camera_args(camera),
         T,
-        points[None],
-        seen[None],
-        equal,
-        scale_px,
-        _REFINE_ITERATIONS,
-        free.stop,
-        converged,
+        _Seen(points[None], seen[None], equal),
+        _Steps(scale_px, _REFINE_ITERATIONS, free.stop, converged),
     )
     return T[0]
 
@@ -311,6 +344,14 @@ def _best_start(
     return int(np.argmin(errors[:, (count - 1) // 2] + errors[:, count // 2]))  # twice the medians
 
 
+@dataclass(frozen=True, slots=True)
+class MotionPriors:
+    """What is expected of the motion from the previous to the current cam0 frame."""
+
+    R: FloatArray | None = None  # (3, 3); None: not known
+    T: FloatArray | None = None  # (4, 4) `T_curr_prev`, likewise
+
+
 def static_tracks(
     problem: RansacProblem,
     left: FloatArray,
@@ -318,8 +359,7 @@ def static_tracks(
     has_depth: BoolArray,
     pixels: FloatArray,
     expected: FloatArray,
-    R_prior: FloatArray | None,
-    T_prior: FloatArray | None,
+    priors: MotionPriors,
 ) -> tuple[BoolArray, Consensus | None]:
     """Find the tracks of static points: by the tracks with depth, else by two-view geometry of the
     left images.
@@ -332,8 +372,7 @@ def static_tracks(
         has_depth: mask (N,) of tracks with known depth.
         pixels: left pixels (N, 2) in the current frame.
         expected: motion (4, 4) `T_curr_prev` to start from.
-        R_prior: prior rotation (3, 3) from the previous to the current cam0 frame, or None.
-        T_prior: prior motion (4, 4) `T_curr_prev`, or None.
+        priors: of the motion.
 
     Returns:
         Mask (N,) of the tracks to keep, and the consensus motion of the tracks with depth (its
@@ -341,12 +380,14 @@ def static_tracks(
         kept: the caller may check them against it.
     """
     motion = rigid_consensus(
-        problem, p_prev[has_depth], pixels[has_depth], expected, R_prior, T_prior
+        problem, p_prev[has_depth], pixels[has_depth], expected, priors.R, priors.T
     )
     keep = np.ones(len(left), dtype=np.bool_)
     if motion is not None:
         keep[has_depth] = motion.inliers
-    elif (agree := bearing_consensus(problem, left, pixels, expected[:3, :3], R_prior)) is not None:
+    elif (
+        agree := bearing_consensus(problem, left, pixels, expected[:3, :3], priors.R)
+    ) is not None:
         keep = agree
     return keep, motion
 

@@ -7,6 +7,8 @@ The alignment starts at the disparity of a known depth, else at the result of a 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args, point_at
@@ -318,13 +320,8 @@ class StereoFit:
 
     def _fit(
         self, tracks: Tracks, rows: IntArray, right: ImageLevels, disparity: FloatArray
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Align anchors of rows (K,) with the right image near expected disparities (K,).
-
-        Returns:
-            Right pixels (K, 2), the change of the warp's linear part (K, 2, 2), and a mask (K,) of
-            the good ones.
-        """
+    ) -> _Matches:
+        """Align anchors of rows (K,) with the right image near expected disparities (K,)."""
         count = len(rows)
         left = np.empty((count, 2))
         start = np.empty((count, 2, 3))
@@ -334,13 +331,12 @@ class StereoFit:
         warp, score = align(
             self._bank.store, tracks.slot.take(rows), right.full, start, _ITERATIONS, expected
         )
-        pixels = np.empty((count, 2))
-        skew = np.empty((count, 2, 2))
-        valid = np.empty(count, dtype=np.bool_)
-        _judge(
-            tracks.warp, rows, left, start, warp, score, self.max_disparity_px, pixels, skew, valid
+        found = _Matches(
+            np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, dtype=np.bool_)
         )
-        return pixels, skew, valid
+        fits = _Fits(left, start, warp, score)
+        _judge(tracks.warp, rows, fits, self.max_disparity_px, found)
+        return found
 
     def _with_right_pixels(
         self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray, good: BoolArray
@@ -357,10 +353,9 @@ class StereoFit:
         point = tracks.point.copy()
         has_point = tracks.has_point.copy()
         f_baseline = self._camera.fu * self._camera.baseline_m
-        columns = right, has_right, skews, point, has_point
-        _match(
-            camera_args(self._camera), f_baseline, tracks.left, rows, pixels, skew, good, *columns
-        )
+        matches = _Matches(pixels, skew, good)
+        columns = _RightColumns(right, has_right, skews, point, has_point)
+        _match(camera_args(self._camera), f_baseline, tracks.left, rows, matches, columns)
         return changed(
             tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point
         )
@@ -393,26 +388,45 @@ def _begin(
         start[k, 0, 2] -= disparity[k]
 
 
+class _Fits(NamedTuple):
+    """Alignments of K anchors with the right image."""
+
+    left: FloatArray  # (K, 2) left pixels
+    start: FloatArray  # (K, 2, 3) warps before, in the expected row
+    warp: FloatArray  # (K, 2, 3) warps after
+    score: FloatArray  # (K,) correlations
+
+
+class _Matches(NamedTuple):
+    """Matches of K features in the right image."""
+
+    pixels: FloatArray  # (K, 2) in the right image
+    skew: FloatArray  # (K, 2, 2) change of the warp's linear part
+    good: BoolArray  # (K,)
+
+
+class _RightColumns(NamedTuple):
+    """Columns of `Tracks` that a match sets."""
+
+    right: FloatArray
+    has_right: BoolArray
+    skew: FloatArray
+    point: FloatArray
+    has_point: BoolArray
+
+
 @compiled
 def _judge(
-    before: FloatArray,
-    rows: IntArray,
-    left: FloatArray,
-    start: FloatArray,
-    warp: FloatArray,
-    score: FloatArray,
-    max_disparity: float,
-    pixels: FloatArray,
-    skew: FloatArray,
-    valid: BoolArray,
+    before: FloatArray, rows: IntArray, fits: _Fits, max_disparity: float, out: _Matches
 ) -> None:
-    """Write right pixels (K, 2), skews (K, 2, 2), and a mask (K,) of matches that a point ahead of
-    the camera may have.
+    """Write matches; good are those that a point ahead of the camera may have.
 
-    They are given by warps (N, 2, 3) of the left image and rows (K,) of these, left pixels (K, 2),
-    warps (K, 2, 3) before and after the alignment, which starts in the expected row, and
-    correlations (K,).
+    `before` are the warps (N, 2, 3) of the left image, of which rows (K,) were aligned.
     """
+    pixels = out.pixels
+    skew = out.skew
+    valid = out.good
+    warp = fits.warp
     for k, n in enumerate(rows):
         steep = 0.0
         for i in range(2):
@@ -420,11 +434,11 @@ def _judge(
             for j in range(2):
                 skew[k, i, j] = warp[k, i, j] - before[n, i, j]
                 steep = max(steep, abs(skew[k, i, j]))
-        du = pixels[k, 0] - start[k, 0, 2]
-        dv = pixels[k, 1] - start[k, 1, 2]
-        valid[k] = score[k] >= _MIN_CORRELATION and is_on_peak(du, dv) and steep <= _MAX_SKEW
+        du = pixels[k, 0] - fits.start[k, 0, 2]
+        dv = pixels[k, 1] - fits.start[k, 1, 2]
+        valid[k] = fits.score[k] >= _MIN_CORRELATION and is_on_peak(du, dv) and steep <= _MAX_SKEW
         valid[k] &= abs(dv) <= _MAX_ROW_DIFFERENCE_PX
-        valid[k] &= MIN_MATCH_DISPARITY_PX <= left[k, 0] - pixels[k, 0] <= max_disparity
+        valid[k] &= MIN_MATCH_DISPARITY_PX <= fits.left[k, 0] - pixels[k, 0] <= max_disparity
 
 
 def common_offset(expected: FloatArray, off: FloatArray) -> tuple[float, float]:
@@ -452,33 +466,27 @@ def _match(
     f_baseline: float,
     left: FloatArray,
     rows: IntArray,
-    pixels: FloatArray,
-    skew: FloatArray,
-    good: BoolArray,
-    right: FloatArray,
-    has_right: BoolArray,
-    skews: FloatArray,
-    point: FloatArray,
-    has_point: BoolArray,
+    matches: _Matches,
+    out: _RightColumns,
 ) -> None:
-    """Set the columns of features, at left pixels (N, 2), in those rows (K,) whose match is `good`
-    (K,).
+    """Set the columns of features, at left pixels (N, 2), in those rows (K,) whose match is good.
 
-    A match is a right pixel (K, 2) and a skew (K, 2, 2); a point has the mean row of both images.
+    A point has the mean row of both images.
     """
+    pixels = matches.pixels
     for k, n in enumerate(rows):
-        if not good[k]:
+        if not matches.good[k]:
             continue
-        has_right[n] = True
-        right[n, 0] = pixels[k, 0]
-        right[n, 1] = pixels[k, 1]
+        out.has_right[n] = True
+        out.right[n, 0] = pixels[k, 0]
+        out.right[n, 1] = pixels[k, 1]
         for i in range(2):
             for j in range(2):
-                skews[n, i, j] = skew[k, i, j]
+                out.skew[n, i, j] = matches.skew[k, i, j]
         disparity = left[n, 0] - pixels[k, 0]
         if disparity >= _MIN_DISPARITY_PX:
             v = (left[n, 1] + pixels[k, 1]) / 2.0
-            point[n, 0], point[n, 1], point[n, 2] = point_at(
+            out.point[n, 0], out.point[n, 1], out.point[n, 2] = point_at(
                 camera, left[n, 0], v, f_baseline / disparity
             )
-            has_point[n] = True
+            out.has_point[n] = True

@@ -15,8 +15,6 @@ from vio.filters.imu_jump import GyroJump, gyro_doubt, turn_of_images
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
     MIN_DEPTH,
-    LandmarkResiduals,
-    Views,
     landmark_residuals,
     relative_stereo_sigma,
     unweighted,
@@ -35,6 +33,7 @@ from vio.filters.stereo_calibration import (
     eliminate_points,
     stereo_columns,
 )
+from vio.filters.track_records import ErrorRows, Information, LandmarkResiduals, Views
 from vio.filters.tracks import precision, rows_of
 from vio.filters.window import Window
 from vio.filters.window_posterior import WindowPosterior, landmark_covariance, move_covariance
@@ -377,11 +376,9 @@ class FrameUpdate:
                     unweighted(pixels.z, at.r, at.precision)
                 )
             # In their anchor, the newest clone: dp = xi_f - xi_rho.
-            rows = state.clone(-1).start, state.landmarks.start, state.stereo.start
-            weight = at.weight / self._variance
-            track_loops.add_landmarks(
-                at.r, at.J, H, at.precision, weight, *rows, A, b, by_considered
-            )
+            rows = ErrorRows(state.clone(-1).start, state.landmarks.start, state.stereo.start)
+            weighted = at._replace(weight=at.weight / self._variance)
+            track_loops.add_landmarks(weighted, H, rows, Information(A, b, by_considered))
         return A, b, None if joint is None else by_considered
 
     def _joint_columns(self, window: Window, tracks: LinearTracks) -> StereoColumns | None:

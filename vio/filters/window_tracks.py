@@ -15,15 +15,14 @@ import numpy as np
 from vio.filters import track_loops as loops
 from vio.filters.multiview import (
     CAUCHY,
-    Residuals,
     TrackInformation,
-    Views,
     first_points,
     refine_points,
     residuals,
     robust_weights,
     squared_residuals,
     track_information,
+    unweighted,
     usable_points,
 )
 from vio.filters.settings import MsckfSettings
@@ -33,6 +32,7 @@ from vio.filters.stereo_calibration import (
     eliminate_points,
     stereo_columns,
 )
+from vio.filters.track_records import Residuals, Views
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -183,7 +183,7 @@ class WindowTracks:
             p = p[keep]
             at = at.take(keep)
             views = views.take(keep)
-        return self._linear(T, rows, p, at, field, at.predicted(views.z))
+        return self._linear(T, rows, p, at, field, unweighted(views.z, at.r, at.weight))
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
         """Drop single views that contradict the rest of their track permanently, and linearise
@@ -272,9 +272,8 @@ class WindowTracks:
         info = tracks.information
         T = tracks.T_cam0_world[-1]
         scores, information = np.empty((2, len(chosen), 6))
-        of_tracks = info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient
         loops.score_drifts(
-            chosen, *of_tracks, -T[:3, :3].T @ T[:3, 3], self.variance, scores, information
+            chosen, info, -T[:3, :3].T @ T[:3, 3], self.variance, scores, information
         )
         return scores, information
 

@@ -16,8 +16,8 @@ from vio.datasets.images import write_png
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
 from vio.files.trajectories import read_trajectory
-from vio.filters.multiview import Views
 from vio.filters.stereo_calibration import StereoCorrection
+from vio.filters.track_records import Views
 from vio.filters.tracks import measured
 from vio.geometry.lie import FloatArray, se3_inverse, so3_hat
 from vio.geometry.rectify import pinhole_pixels, pinhole_within
