@@ -350,7 +350,9 @@ def _pairs(
     size = place.size_px.copy()
     C = np.zeros((6, 6)) if covariance is None else _SIGMAS**2 * covariance
     camera = np.array([c.fu, c.fv, c.cu, c.cv, c.width or np.inf, c.height or np.inf])
-    _predict(place.p, place.eye, se3_inverse(T_i_k), T_i_k[:3, 3], C, camera, uv, radius, size)
+    points = _SeenFrom(place.p, place.eye)
+    pose = _Pose(se3_inverse(T_i_k), T_i_k[:3, 3], C)
+    _predict(points, pose, camera, uv, radius, size)
     seen = np.flatnonzero(radius > 0)
     uv = uv[seen]
     radius = radius[seen]
@@ -375,19 +377,49 @@ def _looked_for(
     """
     best = np.full(len(uv), -1, dtype=np.int64)
     bits = np.zeros(len(uv), dtype=np.int64)
-    _best_in_windows(
-        uv, radius, size, descriptors, target.z, target.size_px, target.descriptors, best, bits
-    )
+    windows = _Windows(uv, radius, size, descriptors)
+    features = _Features(target.z, target.size_px, target.descriptors)
+    _best_in_windows(windows, features, best, bits)
     return best, bits
+
+
+class _SeenFrom(NamedTuple):
+    """Points, and the cameras that saw them."""
+
+    p: FloatArray  # (N, 3)
+    eye: FloatArray  # (N, 3) positions of the cameras
+
+
+class _Pose(NamedTuple):
+    """Where the camera is that looks for points."""
+
+    T: FloatArray  # (4, 4) maps points to the camera
+    here: FloatArray  # (3,) its position
+    # (6, 6) covariance, times the square of the standard deviations that a window has
+    covariance: FloatArray
+
+
+class _Windows(NamedTuple):
+    """Where points are looked for, and how they look."""
+
+    uv: FloatArray  # (N, 2) pixels
+    radius: FloatArray  # (N,) half of a window, pixels
+    size_px: FloatArray  # (N,) of the features
+    descriptors: npt.NDArray[np.uint64]  # (N, 4)
+
+
+class _Features(NamedTuple):
+    """The features of a keyframe in the order of their columns."""
+
+    z: FloatArray  # (M, 4) pixels
+    size_px: FloatArray  # (M,)
+    descriptors: npt.NDArray[np.uint64]  # (M, 4)
 
 
 @compiled
 def _predict(
-    p: FloatArray,
-    eye: FloatArray,
-    T: FloatArray,
-    here: FloatArray,
-    C: FloatArray,
+    points: _SeenFrom,
+    pose: _Pose,
     camera: FloatArray,
     uv: FloatArray,
     radius: FloatArray,
@@ -397,17 +429,16 @@ def _predict(
     features (N,).
 
     Args:
-        p: (N, 3) points.
-        eye: (N, 3) positions of the cameras that saw them.
-        T: (4, 4) maps points to the camera.
-        here: (3,) position of the camera.
-        C: (6, 6) covariance of the pose, times the square of the standard deviations that a window
-            has.
+        points: those that are looked for.
+        pose: of the camera.
         camera: [fu fv cu cv width height].
         uv: pixels, written.
         radius: windows, written.
         size: of the features in their keyframes; replaced.
     """
+    p = points.p
+    T = pose.T
+    C = pose.covariance
     fu, fv, cu, cv, width, height = camera
     D = np.zeros((2, 6))
     q = np.zeros(3)
@@ -418,8 +449,8 @@ def _predict(
         away = 0.0
         near = 0.0
         for i in range(3):
-            there = p[n, i] - eye[n, i]
-            now = p[n, i] - here[i]
+            there = p[n, i] - points.eye[n, i]
+            now = p[n, i] - pose.here[i]
             dot = dot + there * now
             away = away + there * there
             near = near + now * now
@@ -465,28 +496,21 @@ def _predict(
 
 @compiled
 def _best_in_windows(
-    uv: FloatArray,
-    radius: FloatArray,
-    size: FloatArray,
-    a: npt.NDArray[np.uint64],
-    z: FloatArray,
-    sizes: FloatArray,
-    b: npt.NDArray[np.uint64],
-    best: IntArray,
-    bits: IntArray,
+    windows: _Windows, features: _Features, best: IntArray, bits: IntArray
 ) -> None:
-    """Find for each point the feature around its pixel (N, 2) whose descriptor differs least; -1:
+    """Find for each point the feature (N,) around its pixel whose descriptor differs least; -1:
     none does well.
-
-    Features z (M, 2) are in the order of their columns.
     """
+    uv = windows.uv
+    radius = windows.radius
+    z = features.z
     for i in range(len(uv)):
         least = np.uint64(_MAX_BITS + 1)
         j = np.searchsorted(z[:, 0], uv[i, 0] - radius[i])
         while j < len(z) and z[j, 0] <= uv[i, 0] + radius[i]:
-            ratio = sizes[j] / size[i]
+            ratio = features.size_px[j] / windows.size_px[i]
             if abs(z[j, 1] - uv[i, 1]) <= radius[i] and ratio < _LEVELS and ratio * _LEVELS > 1.0:
-                total = differing_bits(a[i], b[j])
+                total = differing_bits(windows.descriptors[i], features.descriptors[j])
                 if total < least:
                     least = total
                     best[i] = j

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -417,30 +418,43 @@ class Terms:
         """
         T_t_s = se3_inverse(T_i_j) if self._inverse else T_i_j
         squared = np.full(len(self._p), np.inf)
-        pairs = self._p, self._P, self._used, self._z, self.stereo, self._variance
-        _add_pairs(*pairs, T_t_s, self._inverse, self._camera, 3 * width**2, normal, pull, squared)
+        pairs = _Pairs(self._p, self._P, self._used, self._z, self.stereo, self._variance)
+        target = _Target(T_t_s, self._inverse, self._camera)
+        _add_pairs(pairs, target, 3 * width**2, normal, pull, squared)
         return squared
+
+
+class _Pairs(NamedTuple):
+    """Points of one keyframe and the pixels of the other one that show them."""
+
+    p: FloatArray  # (K, 3) m, in the frame of the former
+    P: FloatArray  # (K, 3, 3) their covariances
+    used: BoolArray  # (K,)
+    z: FloatArray  # (K, 4) pixels
+    stereo: BoolArray  # (K,) whether the right one is measured
+    variance: FloatArray  # (K,) px^2
+
+
+class _Target(NamedTuple):
+    """The keyframe whose pixels are predicted."""
+
+    T: FloatArray  # (4, 4) from the frame of the points to its own
+    inverse: bool  # as of `Terms`
+    camera: FloatArray  # fu, fv, cu, cv (pixels), baseline (m)
 
 
 @compiled
 def _add_pairs(
-    p: FloatArray,
-    P: FloatArray,
-    used: BoolArray,
-    z: FloatArray,
-    stereo: BoolArray,
-    variance: FloatArray,
-    T: FloatArray,
-    inverse: bool,
-    camera: FloatArray,
+    pairs: _Pairs,
+    target: _Target,
     scale: float,
     normal: FloatArray,
     pull: FloatArray,
     squared: FloatArray,
 ) -> None:
-    """Whiten the residuals of pairs (K,) by Cholesky, and add their normal equations; arguments
-    as `Terms` has them.
-    """
+    """Whiten the residuals of pairs (K,) by Cholesky, and add their normal equations."""
+    p = pairs.p
+    T = target.T
     A = np.zeros((3, 7))  # A: rows [J | r]; M: z_D_p
     M = np.zeros((3, 3))
     C = np.zeros((3, 3))
@@ -448,27 +462,17 @@ def _add_pairs(
     for k in range(len(p)):
         for i in range(3):
             q[i] = T[i, 0] * p[k, 0] + T[i, 1] * p[k, 1] + T[i, 2] * p[k, 2] + T[i, 3]
-        if not used[k] or q[2] <= 0.05:
+        if not pairs.used[k] or q[2] <= 0.05:
             continue
-        rows = 3 if stereo[k] else 2  # of a left pixel alone, two
-        _linearise(p[k], q, z[k], T, inverse, camera, A, M)
+        rows = 3 if pairs.stereo[k] else 2  # of a left pixel alone, two
+        _linearise(p[k], q, pairs.z[k], target, A, M)
         for i in range(rows):
             for j in range(i + 1):
-                C[i, j] = variance[k] if i == j else 0.0
+                C[i, j] = pairs.variance[k] if i == j else 0.0
                 for a in range(3):
                     for b in range(3):
-                        C[i, j] += M[i, a] * P[k, a, b] * M[j, b]
-        for i in range(rows):  # Cholesky factor of C, and A by forward substitution
-            for j in range(i):
-                for n in range(j):
-                    C[i, j] -= C[i, n] * C[j, n]
-                C[i, j] /= C[j, j]
-                C[i, i] -= C[i, j] ** 2
-                for c in range(7):
-                    A[i, c] -= C[i, j] * A[j, c]
-            C[i, i] = np.sqrt(C[i, i])
-            for c in range(7):
-                A[i, c] /= C[i, i]
+                        C[i, j] += M[i, a] * pairs.P[k, a, b] * M[j, b]
+        _whiten(C, A, rows)
         total = 0.0
         for i in range(rows):
             total += A[i, 6] ** 2
@@ -482,15 +486,24 @@ def _add_pairs(
 
 
 @compiled
+def _whiten(C: FloatArray, A: FloatArray, rows: int) -> None:
+    """Replace C (3, 3) by its Cholesky factor L, and A (3, 7) by `L^-1 A`: so many rows of both."""
+    for i in range(rows):
+        for j in range(i):
+            for n in range(j):
+                C[i, j] -= C[i, n] * C[j, n]
+            C[i, j] /= C[j, j]
+            C[i, i] -= C[i, j] ** 2
+            for c in range(7):
+                A[i, c] -= C[i, j] * A[j, c]
+        C[i, i] = np.sqrt(C[i, i])
+        for c in range(7):
+            A[i, c] /= C[i, i]
+
+
+@compiled
 def _linearise(
-    p: FloatArray,
-    q: FloatArray,
-    z: FloatArray,
-    T: FloatArray,
-    inverse: bool,
-    camera: FloatArray,
-    A: FloatArray,
-    M: FloatArray,
+    p: FloatArray, q: FloatArray, z: FloatArray, target: _Target, A: FloatArray, M: FloatArray
 ) -> None:
     """Write Jacobian and residual [ul vl ur] of a point p (3,), at q in the target (3,), into A (3,
     7), z_D_p into M.
@@ -498,7 +511,8 @@ def _linearise(
     `q = exp(-xi) T_hat^-1 p` if `inverse`, else `q = T_hat exp(xi) p`: its derivative is [-I, q^]
     or R [I, -p^].
     """
-    fu, fv, cu, cv, baseline = camera
+    fu, fv, cu, cv, baseline = target.camera
+    T = target.T
     z_D_q = np.zeros((3, 3))
     for i in range(3):
         f = fv if i == 1 else fu
@@ -512,7 +526,7 @@ def _linearise(
         for c in range(3):
             a = (c + 1) % 3
             b = (c + 2) % 3
-            if inverse:
+            if target.inverse:
                 A[i, c] = -z_D_q[i, c]
                 A[i, 3 + c] = z_D_q[i, a] * q[b] - z_D_q[i, b] * q[a]
             else:
