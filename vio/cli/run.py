@@ -88,7 +88,7 @@ _OF_A_NEW_RUN = (
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.running import metric_rows, process, resume
+    from vio.cli.running import RunOptions, Shown, metric_rows, process, resume
 
     if args.open and not args.report:
         raise ConfigError("--open shows the page of --report; give both")
@@ -100,6 +100,7 @@ def execute(args: argparse.Namespace) -> int:
         print_result(metrics, metric_rows(metrics, plot=not args.no_plot), as_json=args.json)
         sys.stdout.flush()
 
+    shown = Shown(not args.quiet, args.view, finished)
     if args.resume is not None:
         given = [f"--{name.replace('_', '-')}" for name in _OF_A_NEW_RUN if getattr(args, name)]
         if given:
@@ -108,13 +109,10 @@ def execute(args: argparse.Namespace) -> int:
             args.resume,
             save_calibration=args.save_calibration,
             map_file=args.map,
-            progress=not args.quiet,
-            finished=finished,
+            shown=shown,
         )
         return _reported(args.resume, shown=args.open) if args.report else 0
-    metrics = process(
-        args.source,
-        config_from(args),
+    options = RunOptions(
         out=args.out,
         reference=args.reference,
         start=args.start,
@@ -122,14 +120,12 @@ def execute(args: argparse.Namespace) -> int:
         lengths_m=args.lengths,
         save_observations=args.save_observations,
         save_calibration=args.save_calibration,
-        progress=not args.quiet,
         map_file=args.map,
         map_density=args.map_density,
-        view=args.view,
         plot=not args.no_plot,
         command=args.command_line,
-        finished=finished,
     )
+    metrics = process(args.source, config_from(args), options, shown)
     return _reported(Path(metrics["out"]), shown=args.open) if args.report else 0
 
 

@@ -721,6 +721,20 @@ def mark_usable(
 
 
 @compiled
+def _is_zero(row: FloatArray) -> bool:
+    """Whether a pixel's Jacobian (3,) is zero: it was not measured."""
+    return row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0
+
+
+@compiled
+def _clear(A: FloatArray) -> None:
+    """Write zeros into a matrix."""
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            A[i, j] = 0.0
+
+
+@compiled
 def _by_point(J: FloatArray, p_D_q: FloatArray, row: FloatArray) -> None:
     """Write a pixel's Jacobian (3,) by the coordinates (M5), from that by the point (3,)."""
     for i in range(3):
@@ -937,14 +951,9 @@ def collect_tracks(
                 for j in range(3):
                     C_i[i, j] = 0.0
             for a in range(4):
-                if J[f, n, a, 0] == 0.0 and J[f, n, a, 1] == 0.0 and J[f, n, a, 2] == 0.0:
+                if _is_zero(J[f, n, a]):
                     continue
-                for i in range(3):
-                    row[i] = (
-                        J[f, n, a, 0] * p_D_q[f, 0, i]
-                        + J[f, n, a, 1] * p_D_q[f, 1, i]
-                        + J[f, n, a, 2] * p_D_q[f, 2, i]
-                    )
+                _by_point(J[f, n, a], p_D_q[f], row)
                 for i in range(3):
                     g_i[i] += weight[f, n] * row[i] * r[f, n, a]
                     for j in range(3):
@@ -1202,20 +1211,18 @@ def eliminate_columns(
     of_view = np.empty((3, terms))
     sums = np.empty((3, terms))
     for c, f in enumerate(rows):
+        _clear(sums)
+        _clear(own)
         for s in range(terms):
-            own_b[s] = sums[0, s] = sums[1, s] = sums[2, s] = 0.0
-            for t in range(terms):
-                own[s, t] = 0.0
+            own_b[s] = 0.0
         for n in range(J.shape[1]):
             if weight[f, n] == 0.0:
                 continue
             write_view(terms_of.lens, terms_of.z[f, n], terms_of.rows_D_common, H)
-            for i in range(3):
-                for s in range(terms):
-                    of_view[i, s] = 0.0
+            _clear(of_view)
             for a in range(3):
                 row = J[f, n, a]
-                if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
+                if _is_zero(row):
                     continue
                 _by_point(row, info.q.p_D_q[f], by_q)
                 for s in range(terms):

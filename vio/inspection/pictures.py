@@ -53,17 +53,12 @@ def gray_levels_of(image: Image) -> GrayLevels:
 
 def images_part(frames: Sequence[StereoFrame]) -> Part:
     """Describe the images of some frames."""
-    shown = [
-        tuple(image for image in (f.left, f.right) if image is not None)
-        for f in frames
-        if f.left is not None
-    ]
-    cameras = max((len(images) for images in shown), default=0)
-    shown = [images for images in shown if len(images) == cameras]
+    shown = _shown(frames)
     if not shown:
         return Part(
             "images", "none could be read", {}, ["no image could be read; see the warnings above"]
         )
+    cameras = len(shown[0])
     found = [[gray_levels_of(image) for image in side] for side in zip(*shown, strict=True)]
     means = [float(np.mean([e.mean for e in side])) for side in found]
     clipped = max(e.clipped for side in found for e in side)
@@ -76,6 +71,30 @@ def images_part(frames: Sequence[StereoFrame]) -> Part:
         "clipped": clipped,
         "sharpness": sharpness,
     }
+    gray = f"{means[0]:.0f} left and {means[1]:.0f} right" if cameras == 2 else f"{means[0]:.0f}"
+    text = (
+        f"{width} x {height}, mean gray {gray}, at most {100 * clipped:.1f} % at 0 or 255, "
+        f"sharpness {sharpness:.1f} (1: blurred by 2 px or more)"
+    )
+    return Part("images", text, facts, _image_faults(shown, found))
+
+
+def _shown(frames: Sequence[StereoFrame]) -> list[tuple[Image, ...]]:
+    """Return the images of the frames that show as many cameras as any."""
+    shown = [
+        tuple(image for image in (f.left, f.right) if image is not None)
+        for f in frames
+        if f.left is not None
+    ]
+    cameras = max((len(images) for images in shown), default=0)
+    return [images for images in shown if len(images) == cameras]
+
+
+def _image_faults(
+    shown: Sequence[tuple[Image, ...]], found: Sequence[Sequence[GrayLevels]]
+) -> list[str]:
+    """Say what is wrong with images, whose gray levels were measured by camera."""
+    cameras = len(found)
     faults = []
     flat = [e for side in found for e in side if e.spread < _FLAT or not _DARK < e.mean < _BRIGHT]
     if 2 * len(flat) > cameras * len(shown):
@@ -88,12 +107,7 @@ def images_part(frames: Sequence[StereoFrame]) -> Part:
             "left and right are the same images, so there is no depth; give the other camera's "
             "images"
         )
-    gray = f"{means[0]:.0f} left and {means[1]:.0f} right" if cameras == 2 else f"{means[0]:.0f}"
-    text = (
-        f"{width} x {height}, mean gray {gray}, at most {100 * clipped:.1f} % at 0 or 255, "
-        f"sharpness {sharpness:.1f} (1: blurred by 2 px or more)"
-    )
-    return Part("images", text, facts, faults)
+    return faults
 
 
 def depths_part(frames: Sequence[StereoFrame]) -> Part:

@@ -10,7 +10,7 @@ import platform
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from vio.runs.mapped import MappedRun, write_keyframes, write_loops
 from vio.runs.picture import RunPicture
 from vio.runs.pipeline import STAGES, RunResult, given_rig
 from vio.runs.recorder import GrowingFolder
-from vio.runs.stated import REQUEST_SHAPE, read_metrics, read_stated
+from vio.runs.stated import REQUEST_SHAPE, RunRequest, read_metrics, read_stated
 from vio.runs.tables import frames_csv
 
 log = logging.getLogger(__name__)
@@ -79,16 +79,19 @@ def write_run_folder(
     return metrics
 
 
+@dataclass(frozen=True, slots=True)
+class Finishing:
+    """What is written of a run that ends beside its results."""
+
+    lengths_m: Sequence[float] | None  # path lengths of the drift, see `evaluate`
+    save_observations: bool
+    more: Mapping[str, Any]  # into the metrics
+    plot: bool
+    finished: Callable[[dict[str, Any]], None]  # gets the metrics before the picture is drawn
+
+
 def finish_run_folder(
-    folder: Path,
-    result: RunResult,
-    reference: Trajectory | None,
-    *,
-    lengths_m: Sequence[float] | None = None,
-    save_observations: bool = False,
-    more: Mapping[str, Any] | None = None,
-    plot: bool = True,
-    finished: Callable[[dict[str, Any]], None] | None = None,
+    folder: Path, result: RunResult, reference: Trajectory | None, how: Finishing
 ) -> dict[str, Any]:
     """Write the results of a run into the folder in which it grew, and return the metrics.
 
@@ -112,18 +115,17 @@ def finish_run_folder(
             folder,
             result,
             reference,
-            lengths_m,
-            save_observations=save_observations,
-            more=more,
+            how.lengths_m,
+            save_observations=how.save_observations,
+            more=how.more,
         )
         shutil.copyfile(unfinished / RunFile.ESTIMATES, final / RunFile.ESTIMATES)
         for name in sorted(path.name for path in final.iterdir() if path.name != RunFile.METRICS):
             (final / name).replace(folder / name)
         (final / RunFile.METRICS).replace(folder / RunFile.METRICS)
         shutil.rmtree(final)
-    if finished is not None:
-        finished(metrics)
-    if plot:
+    how.finished(metrics)
+    if how.plot:
         try:
             picture.write(folder / RunFile.PICTURE)
         except KeyboardInterrupt:
@@ -197,7 +199,7 @@ def _flat(name: str, value: Any) -> dict[str, Any]:
     return {name: value.tolist() if isinstance(value, np.ndarray) else value}
 
 
-def read_request(folder: Path) -> dict[str, Any]:
+def read_request(folder: Path) -> RunRequest:
     """Read what an unfinished run was asked to do.
 
     Raises:
@@ -207,7 +209,7 @@ def read_request(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         read_metrics(folder)
         raise DataError(f"{folder}: its run is complete; there is nothing to go on with")
-    return read_stated(path, REQUEST_SHAPE, "repeat the run from its start")
+    return RunRequest.of(read_stated(path, REQUEST_SHAPE, "repeat the run from its start"))
 
 
 def _write_files(

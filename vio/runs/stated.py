@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +59,43 @@ REQUEST_SHAPE = an_object(
     "lengths_m",
     "save_observations",
 )
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """What a run was asked to do, as its folder keeps it while it can go on: `REQUEST_SHAPE`.
+
+    Files outside of the folder are absolute; defaults are those of folders that do not say.
+    """
+
+    source: str  # kind:path
+    reference: str | None  # file of the ground truth; None: that of the recording
+    start: int  # first frame
+    stop: int | None  # frame after the last one; None: the end
+    lengths_m: list[float] | None  # of the drift; None: the usual ones
+    save_observations: bool
+    save_calibration: str | None = None  # file, by its name alone where it is in the folder
+    map: str | None = None  # file
+    map_density: int | None = None
+    localise: bool = False  # leave the map as it is
+    plot: bool = True
+    command: str | None = None  # as typed
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> RunRequest:
+        """Return what JSON of `REQUEST_SHAPE` states."""
+        known = {field.name for field in fields(cls)}
+        return cls(**{name: value for name, value in values.items() if name in known})
+
+    def values(self) -> dict[str, Any]:
+        """Return it as values of JSON."""
+        return asdict(self)
+
+    @property
+    def writes_map(self) -> bool:
+        """Whether the run makes or continues a map."""
+        return self.map is not None and not self.localise
+
 
 _CAMERA = an_object(
     {
