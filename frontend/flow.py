@@ -15,19 +15,29 @@ from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image
 
-_WINDOW_PX = 11  # side of the window, of the half-resolution image
+
+@dataclass(frozen=True, slots=True)
+class _Flow:
+    """How features are followed by Lucas-Kanade, and found again."""
+
+    window_px: int = 11  # side of the window, of the half-resolution image
+    lk_epsilon_px: float = 0.02  # of the half-resolution image
+    lk_min_eigenvalue: float = 1e-4  # as OpenCV's own default
+    # share of lost points above which tracking is repeated with all pyramid levels
+    retry_share: float = 0.25
+    lost_share: float = 0.5  # the same for the last attempt, which starts from the old pixels
+    stride: int = 4  # brightness is computed from every fourth pixel of the half image
+    min_contrast: float = 1.0  # gray levels, lower bound of the contrast in the gain
+    max_contrast_change: float = 0.06  # relative change of contrast, and
+    # change of the mean gray level, up to which images are not adjusted
+    max_mean_change: float = 6.0
+    max_gain: float = 4.0
+
+
+_FLOW = _Flow()
 _TRUSTED_LEVELS = 1  # pyramid levels above half resolution where the pixels are predicted
 _ITERATIONS = 20  # per level
 _MAX_FORWARD_BACKWARD_PX = 1.5
-_LK_EPSILON_PX = 0.02  # of the half-resolution image
-_LK_MIN_EIGENVALUE = 1e-4  # as OpenCV's own default
-_RETRY_SHARE = 0.25  # share of lost points above which tracking is repeated with all pyramid levels
-_LOST_SHARE = 0.5  # the same for the last attempt, which starts from the old pixels
-_STRIDE = 4  # brightness is computed from every fourth pixel of the half image
-_MIN_CONTRAST = 1.0  # gray levels, lower bound of the contrast in the gain
-_MAX_CONTRAST_CHANGE = 0.06  # relative change of contrast, and
-_MAX_MEAN_CHANGE = 6.0  # change of the mean gray level, up to which images are not adjusted
-_MAX_GAIN = 4.0
 
 
 def track_with_retries(
@@ -60,7 +70,9 @@ def track_with_retries(
     few = min(_TRUSTED_LEVELS, levels) if trusted else levels
     found, good = _track_forward_backward(last, view, points, guess, few, trusted=trusted)
     attempts = (
-        [(guess, _RETRY_SHARE), (points, _LOST_SHARE)] if trusted else [(points, _LOST_SHARE)]
+        [(guess, _FLOW.retry_share), (points, _FLOW.lost_share)]
+        if trusted
+        else [(points, _FLOW.lost_share)]
     )
     for start, share in attempts:
         retry = (~good).nonzero()[0]
@@ -77,14 +89,14 @@ def match_brightness(image: Image, other: Image) -> Image:
     compares gray levels.
     """
     (mean, contrast), (other_mean, other_contrast) = (
-        mean_and_contrast(part, _STRIDE) for part in (image, other)
+        mean_and_contrast(part, _FLOW.stride) for part in (image, other)
     )
-    gain = other_contrast / max(contrast, _MIN_CONTRAST)
+    gain = other_contrast / max(contrast, _FLOW.min_contrast)
     if (
-        abs(gain - 1) < _MAX_CONTRAST_CHANGE and abs(other_mean - mean) < _MAX_MEAN_CHANGE
+        abs(gain - 1) < _FLOW.max_contrast_change and abs(other_mean - mean) < _FLOW.max_mean_change
     ) or gain <= 0:
         return image
-    gain = min(max(gain, 1 / _MAX_GAIN), _MAX_GAIN)
+    gain = min(max(gain, 1 / _FLOW.max_gain), _FLOW.max_gain)
     levels = gain * (np.arange(256) - mean) + other_mean
     return np.asarray(
         cv2.LUT(image, np.clip(np.rint(levels), 0, 255).astype(np.uint8)), dtype=np.uint8
@@ -145,7 +157,7 @@ def _flow(
         target,
         points / 2,
         guess / 2,
-        PyramidSearch(_WINDOW_PX, levels, _ITERATIONS, _LK_EPSILON_PX),
+        PyramidSearch(_FLOW.window_px, levels, _ITERATIONS, _FLOW.lk_epsilon_px),
     )
     pixels *= 2
     lost = (~seen).nonzero()[0]
@@ -195,7 +207,7 @@ def lucas_kanade(
             search.epsilon_px,
         ),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=_LK_MIN_EIGENVALUE,
+        minEigThreshold=_FLOW.lk_min_eigenvalue,
     )
     pixels = np.asarray(found, dtype=np.float64).reshape(-1, 2)
     return pixels, (np.asarray(status).reshape(-1) == 1) & np.isfinite(pixels).all(axis=1)

@@ -32,30 +32,40 @@ from vio.records import BoolArray, IntArray
 
 _MIN_DEPTH_M = 0.05
 _SAMPLES = 96  # random minimal sets of RANSAC
-_SURE_SHARE = 0.7  # share of inliers of the refined expected motion above which RANSAC is skipped
-# of the consensus rotation from the prior, before a motion near the prior is tried
-_PRIOR_MAX_DEVIATION_DEG = 1.0
+
+
+class _ConsensusRules(NamedTuple):
+    """How the motion of the scene is found, and what contradicts it."""
+
+    # share of inliers of the refined expected motion above which RANSAC is skipped
+    sure_share: float = 0.7
+    # of the consensus rotation from the prior, before a motion near the prior is tried
+    prior_max_deviation_deg: float = 1.0
+    prior_points: int = 64  # predicted pixels that are used
+    prior_px: float = 2.0  # median distance from them below which a motion represents them
+    # change of that motion, in radians and metres, below which it is not refined further
+    prior_converged: float = 1e-4
+    sample_iterations: int = 5
+    damping: float = 1e-4
+    # two views constrain a track in one direction only, so most tracks must be inliers
+    min_bearing_share: float = 0.5
+    # share of inliers of a predicted rotation above which no other rotation is tried
+    sure_bearing_share: float = 0.9
+    five_point_confidence: float = 0.999
+    epsilon: float = 1e-9  # added to denominators
+    # of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as
+    # large
+    min_forward: float = 0.5
+
+
+_CONSENSUS = _ConsensusRules()
 # inliers of the prior motion only, over the consensus', above which it replaces the consensus
 _PRIOR_MIN_SUPPORT = 0.4
 _MIN_POINTS = 8  # with fewer points, a consensus may be chance
 _MIN_SHARE = 0.2  # smallest share of inliers of a consensus
-_PRIOR_POINTS = 64  # predicted pixels that are used
-_PRIOR_PX = 2.0  # median distance from them below which a motion represents them
-# change of that motion, in radians and metres, below which it is not refined further
-_PRIOR_CONVERGED = 1e-4
-_SAMPLE_ITERATIONS = 5
 _REFINE_ITERATIONS = 6
-_DAMPING = 1e-4
 # change of a motion, in radians and metres, below which it is not refined further
 _CONVERGED = 3e-6
-# two views constrain a track in one direction only, so most tracks must be inliers
-_MIN_BEARING_SHARE = 0.5
-# share of inliers of a predicted rotation above which no other rotation is tried
-_SURE_BEARING_SHARE = 0.9
-_FIVE_POINT_CONFIDENCE = 0.999
-_EPSILON = 1e-9  # added to denominators
-# of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as large
-_MIN_FORWARD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +266,7 @@ def _iterate(camera: CameraArgs, T: FloatArray, seen: _Seen, steps: _Steps) -> N
             for i in range(free):
                 trace += A[i, i]
             for i in range(free):
-                A[i, i] += _DAMPING * trace / free + 1e-9
+                A[i, i] += _CONSENSUS.damping * trace / free + 1e-9
             solve_positive(A, xi)
             for i in range(free):
                 xi[i] = min(max(xi[i], -5.0), 5.0)
@@ -302,7 +312,7 @@ def _ransac(
     begin = starts[_best_start(camera, starts, p_prev, pixels, limit)]
     refined = _refine(camera, begin, p_prev, pixels, limit / 2, free)
     inliers = pixel_errors(camera, refined, p_prev, pixels) <= limit
-    if share_of(inliers) >= _SURE_SHARE:
+    if share_of(inliers) >= _CONSENSUS.sure_share:
         return refined, inliers
     sets = problem.rng.integers(0, len(p_prev), size=(_SAMPLES, 3))
     T = np.broadcast_to(begin, (len(sets), 4, 4))
@@ -312,7 +322,7 @@ def _ransac(
         p_prev[sets],
         pixels[sets],
         np.ones(sets.shape),
-        iterations=_SAMPLE_ITERATIONS,
+        iterations=_CONSENSUS.sample_iterations,
         free=free,
     )
     T = np.concatenate([starts, refined[None], T])
@@ -461,7 +471,10 @@ def _prior_candidates(
     near: list[FloatArray] = []
     if T_prior is not None and not _motions_agree(problem.camera, T, T_prior, p_prev):
         near.append(_refine(problem.camera, T_prior, p_prev, pixels, problem.limit_px, slice(0, 6)))
-    if R_prior is not None and _rotation_difference_deg(T, R_prior) > _PRIOR_MAX_DEVIATION_DEG:
+    if (
+        R_prior is not None
+        and _rotation_difference_deg(T, R_prior) > _CONSENSUS.prior_max_deviation_deg
+    ):
         fixed = np.stack([se3_from_parts(R_prior, t) for t in (expected[:3, 3], np.zeros(3))])
         near.append(_ransac(problem, p_prev, pixels, fixed, slice(0, 3))[0])
     return near
@@ -476,7 +489,7 @@ def _motions_agree(
     if not ahead.any():
         return False
     gap = pixel_errors(camera, T_other, p_prev[ahead], project(camera, moved[ahead])[:, :2])
-    return bool(median(gap) <= _PRIOR_PX)
+    return bool(median(gap) <= _CONSENSUS.prior_px)
 
 
 def _rotation_difference_deg(T: FloatArray, R: FloatArray) -> float:
@@ -554,21 +567,23 @@ def predicted_motion(
 
     None with too few points, or if no motion fits most of them.
     """
-    few = slice(None, None, max(1, len(p_prev) // _PRIOR_POINTS))
+    few = slice(None, None, max(1, len(p_prev) // _CONSENSUS.prior_points))
     p = p_prev[few]
     z = pixels[few]
     if len(p) < _MIN_POINTS:
         return None
     T = expected
     weight = np.ones((1, len(p)))
-    for _ in range(_SAMPLE_ITERATIONS):
-        if median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX:
+    for _ in range(_CONSENSUS.sample_iterations):
+        if median(pixel_errors(camera, T, p, z)) <= _CONSENSUS.prior_px:
             return T
         T = _gauss_newton(
             camera, T[None], p[None], z[None], weight, iterations=1, free=slice(0, 6)
         )[0]
-    T = _refine(camera, T, p, z, _PRIOR_PX, slice(0, 6), converged=_PRIOR_CONVERGED)
-    return T if median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX else None
+    T = _refine(
+        camera, T, p, z, _CONSENSUS.prior_px, slice(0, 6), converged=_CONSENSUS.prior_converged
+    )
+    return T if median(pixel_errors(camera, T, p, z)) <= _CONSENSUS.prior_px else None
 
 
 # --- two views, no depth
@@ -616,7 +631,7 @@ def bearing_consensus(
     near_prior = None
     if R_prior is not None:
         near_prior = _bearing_inliers(problem, seen, _bearing_ransac(problem, seen, [R_prior]))
-        if near_prior.mean() >= _SURE_BEARING_SHARE:
+        if near_prior.mean() >= _CONSENSUS.sure_bearing_share:
             return near_prior
     rotations = [expected_R, _pure_rotation(problem, seen)]
     T = _bearing_ransac(problem, seen, rotations, _five_point(problem, previous, current))
@@ -624,13 +639,15 @@ def bearing_consensus(
     if (
         R_prior is not None
         and near_prior is not None
-        and _rotation_difference_deg(T, R_prior) > _PRIOR_MAX_DEVIATION_DEG
+        and _rotation_difference_deg(T, R_prior) > _CONSENSUS.prior_max_deviation_deg
     ):
         # A wrong prior shares some inliers with the consensus: only outliers of the consensus
         # support the prior.
         supported = (near_prior & ~kept).sum() >= max(_MIN_POINTS, _PRIOR_MIN_SUPPORT * kept.sum())
         kept = near_prior if supported else kept
-    return kept if kept.sum() >= max(_MIN_POINTS, _MIN_BEARING_SHARE * len(kept)) else None
+    return (
+        kept if kept.sum() >= max(_MIN_POINTS, _CONSENSUS.min_bearing_share * len(kept)) else None
+    )
 
 
 def _ray_distance(
@@ -652,7 +669,9 @@ def _ray_distance(
     off_v = after[:, 1] - camera.fv * y - camera.cv
     way_u = camera.fu * (t[..., 0] - x * t[..., 2])
     way_v = camera.fv * (t[..., 1] - y * t[..., 2])
-    along = np.maximum(off_u * way_u + off_v * way_v, 0.0) / (way_u**2 + way_v**2 + _EPSILON)
+    along = np.maximum(off_u * way_u + off_v * way_v, 0.0) / (
+        way_u**2 + way_v**2 + _CONSENSUS.epsilon
+    )
     distance = np.hypot(off_u - along * way_u, off_v - along * way_v)
     return np.where(ahead, distance, np.inf)
 
@@ -718,7 +737,7 @@ def _bearing_step(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> Flo
     turned = seen.before @ R.T
     line = np.cross(t, turned)
     normal = facing(camera, seen.after, line)[1]
-    scale = np.hypot(normal[:, 0] / camera.fu, normal[:, 1] / camera.fv) + _EPSILON
+    scale = np.hypot(normal[:, 0] / camera.fu, normal[:, 1] / camera.fv) + _CONSENSUS.epsilon
     distance = _ray_distance(camera, seen, R, t)
     weight = (
         np.where(
@@ -732,7 +751,9 @@ def _bearing_step(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> Flo
     r_D_t = np.cross(turned, seen.rays) @ plane.T
     J = weight[:, None] * np.concatenate([r_D_turn, r_D_t], axis=1)
     A = J.T @ J
-    step = -np.linalg.solve(A + (_DAMPING * np.trace(A) / 5 + _EPSILON) * np.eye(5), J.T @ residual)
+    step = -np.linalg.solve(
+        A + (_CONSENSUS.damping * np.trace(A) / 5 + _CONSENSUS.epsilon) * np.eye(5), J.T @ residual
+    )
     moved = t + step[3:] @ plane
     return se3_from_parts(so3_exp(step[:3]) @ R, moved / np.linalg.norm(moved))
 
@@ -768,7 +789,7 @@ def _triads(rays: FloatArray, pairs: IntArray) -> FloatArray:
     a = rays[pairs[:, 0]]
     b = rays[pairs[:, 1]]
     across = np.cross(a, b)
-    across = across / (np.linalg.norm(across, axis=1, keepdims=True) + _EPSILON)
+    across = across / (np.linalg.norm(across, axis=1, keepdims=True) + _CONSENSUS.epsilon)
     return np.stack([a, across, np.cross(a, across)], axis=2)
 
 
@@ -786,7 +807,7 @@ def _five_point(
             return None
     K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
     params = cv2.UsacParams()
-    params.confidence = _FIVE_POINT_CONFIDENCE
+    params.confidence = _CONSENSUS.five_point_confidence
     params.threshold = problem.limit_px
     params.maxIterations = 10 * _SAMPLES
     params.randomGeneratorState = int(problem.rng.integers(0, 2**31 - 1))
@@ -809,7 +830,9 @@ def _pinhole_pixels(
     cylinder's (N, 2).
     """
     rays = [left_rays(camera, pixels) for pixels in (previous, current)]
-    ahead = np.all([r[:, 2] > _MIN_FORWARD * np.linalg.norm(r, axis=1) for r in rays], axis=0)
+    ahead = np.all(
+        [r[:, 2] > _CONSENSUS.min_forward * np.linalg.norm(r, axis=1) for r in rays], axis=0
+    )
     a, b = (
         r[ahead, :2] / r[ahead, 2:] * [camera.fu, camera.fv] + [camera.cu, camera.cv] for r in rays
     )

@@ -31,33 +31,42 @@ from vio.records import BoolArray, Image, IntArray
 
 _ITERATIONS = 5
 _MIN_CORRELATION = 0.8  # normalised, of a match
-_MIN_PEAK_MARGIN = 0.03  # lead in correlation over the second-best match in the row
+
+
+class _StereoRules(NamedTuple):
+    """How features are matched in the right image."""
+
+    min_peak_margin: float = 0.03  # lead in correlation over the second-best match in the row
+    max_skew: float = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
+    # how much lower the correlation of the coarse search may be than that of the alignment
+    coarse_slack: float = 0.2
+    min_depth_m: float = 0.05
+    min_disparity_px: float = 0.1  # below, a point is too far away to be located
+    # share of features with a right match below which other row differences are tried
+    few_matches: float = 0.2
+    good_match: float = 0.9  # correlation of patches whose rows agree
+    # root mean square over the matches: from here on the run reports the calibration, too
+    rows_off_px: float = 0.2
+    row_search_frames: int = 10  # between two such searches, while matches are few
+    # of the image width: largest disparity that is searched where the scene is near
+    max_reach: float = 0.64
+    reach_frames: int = 10  # between two searches beyond the present reach
+    # of the points without a match that must have one beyond the reach for it to be doubled …
+    beyond_share: float = 0.1
+    min_beyond: int = 10  # … and this many at least …
+    within_reach: float = 0.9  # … until this share of them is within it
+    offset_gain: float = 0.2  # part of a frame's common offset that is believed
+    depth_slack: float = 0.1  # standard deviation of a point's depth by motion alone, over it
+    min_spread_px: float = 2.0  # between near and far disparities, to tell an offset from a factor
+    max_rows_half: int = 16  # row difference, pixels at half resolution
+
+
+_STEREO = _StereoRules()
 _MAX_ROW_DIFFERENCE_PX = 1.0  # of a match, after the estimated row differences are subtracted
-_MAX_SKEW = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
-# how much lower the correlation of the coarse search may be than that of the alignment
-_COARSE_SLACK = 0.2
-_MIN_DEPTH_M = 0.05
-_MIN_DISPARITY_PX = 0.1  # below, a point is too far away to be located
-# share of features with a right match below which other row differences are tried
-_FEW_MATCHES = 0.2
-_GOOD_MATCH = 0.9  # correlation of patches whose rows agree
 _MIN_POINTS = 20
-# root mean square over the matches: from here on the run reports the calibration, too
-_ROWS_OFF_PX = 0.2
-_ROW_SEARCH_FRAMES = 10  # between two such searches, while matches are few
-_MAX_REACH = 0.64  # of the image width: largest disparity that is searched where the scene is near
-_REACH_FRAMES = 10  # between two searches beyond the present reach
-# of the points without a match that must have one beyond the reach for it to be doubled …
-_BEYOND_SHARE = 0.1
-_MIN_BEYOND = 10  # … and this many at least …
-_WITHIN_REACH = 0.9  # … until this share of them is within it
 # A pair turns so much in its mount, three times the prior of its calibration, or exposes so far
 # apart.
 _MAX_TURN_RAD = 0.3 * np.pi / 180.0
-_OFFSET_GAIN = 0.2  # part of a frame's common offset that is believed
-_DEPTH_SLACK = 0.1  # standard deviation of a point's depth by motion alone, over it
-_MIN_SPREAD_PX = 2.0  # between near and far disparities, to tell an offset from a factor
-_MAX_ROWS_HALF = 16  # row difference, pixels at half resolution
 
 
 class StereoFit:
@@ -77,7 +86,7 @@ class StereoFit:
         """
         # doubled where the scene is nearer
         self.max_disparity_px = disparity.max_disparity * size[0]
-        self._most_reach_px = _MAX_REACH * size[0]
+        self._most_reach_px = _STEREO.max_reach * size[0]
         self._reach_wait = 0  # frames until the reach is tried again
         self._camera = camera
         self._bank = bank
@@ -141,9 +150,9 @@ class StereoFit:
         )
         if abs(offset) > self._camera.fu * _MAX_TURN_RAD:
             return tracks
-        tolerance = INLIER_PX + (_DEPTH_SLACK * expected if by_motion else 0.0)
+        tolerance = INLIER_PX + (_STEREO.depth_slack * expected if by_motion else 0.0)
         agree = np.abs(off - offset * grows - slope * expected) <= tolerance
-        self._offset_px = (1.0 - _OFFSET_GAIN) * offset
+        self._offset_px = (1.0 - _STEREO.offset_gain) * offset
         return self._with_right_pixels(tracks, rows, pixels, skew, agree)
 
     def _offset_growth(self, left: FloatArray) -> FloatArray:
@@ -158,7 +167,7 @@ class StereoFit:
         it.
         """
         depth = depth_of(self._camera, tracks.point)
-        rows = (tracks.has_point & (depth > _MIN_DEPTH_M)).nonzero()[0]
+        rows = (tracks.has_point & (depth > _STEREO.min_depth_m)).nonzero()[0]
         return rows, self._camera.fu * self._camera.baseline_m / depth[rows]
 
     def match_near(
@@ -176,14 +185,14 @@ class StereoFit:
         unique.
         """
         offset = round(self._rows.offset_px / 2)
-        if self._unmatched % _ROW_SEARCH_FRAMES == 1:
+        if self._unmatched % _STEREO.row_search_frames == 1:
             offset = self._best_offset(left_half, right_half, points, offset)
-        correlation = _MIN_CORRELATION - _COARSE_SLACK
+        correlation = _MIN_CORRELATION - _STEREO.coarse_slack
         right_half = shifted_rows(right_half, offset)
         found = self._search(left_half, right_half, points, correlation)
         if self._reach_wait:
             return found
-        self._reach_wait = _REACH_FRAMES
+        self._reach_wait = _STEREO.reach_frames
         if not self._reaches_further(left_half, right_half, points[~found[1]]):
             return found
         return self._search(left_half, right_half, points, correlation)
@@ -195,7 +204,7 @@ class StereoFit:
         beyond = self._beyond(left_half, right_half, points)
         if not _are_enough(len(beyond), len(points)):
             return False
-        farthest = min(np.quantile(beyond, _WITHIN_REACH), self._most_reach_px)
+        farthest = min(np.quantile(beyond, _STEREO.within_reach), self._most_reach_px)
         while self.max_disparity_px < farthest:
             self._double_reach()
         return True
@@ -207,7 +216,7 @@ class StereoFit:
         if reach >= most:
             return np.zeros(0)
         disparity, good = match_rows(
-            left_half, right_half, points, most, _GOOD_MATCH, _MIN_PEAK_MARGIN
+            left_half, right_half, points, most, _STEREO.good_match, _STEREO.min_peak_margin
         )
         return disparity[good & (disparity > reach)]
 
@@ -229,17 +238,17 @@ class StereoFit:
 
         Rows may be far apart where the right camera has been pitched since it was calibrated.
         """
-        tried = range(-_MAX_ROWS_HALF, _MAX_ROWS_HALF + 1)
+        tried = range(-_STEREO.max_rows_half, _STEREO.max_rows_half + 1)
         counts = [
             int(
-                self._search(left_half, shifted_rows(right_half, rows), points, _GOOD_MATCH)[
+                self._search(left_half, shifted_rows(right_half, rows), points, _STEREO.good_match)[
                     1
                 ].sum()
             )
             for rows in tried
         ]
         best = int(np.argmax(counts))
-        if counts[best] < max(_MIN_POINTS, 2 * counts[offset + _MAX_ROWS_HALF]):
+        if counts[best] < max(_MIN_POINTS, 2 * counts[offset + _STEREO.max_rows_half]):
             return offset
         self._rows.restart(2.0 * tried[best])
         return tried[best]
@@ -265,7 +274,7 @@ class StereoFit:
         """Count the left pixels (N, 2) that match well on their row between two images at half
         resolution.
         """
-        return int(self._search(left_half, right_half, points, _GOOD_MATCH)[1].sum())
+        return int(self._search(left_half, right_half, points, _STEREO.good_match)[1].sum())
 
     def forget_offset(self) -> None:
         """Take nothing out of the disparities that follow."""
@@ -283,7 +292,7 @@ class StereoFit:
         """Whether the rows of the matches differ by a smooth field: the calibration is off, and
         so are the depths.
         """
-        return self._rows.rms_px >= _ROWS_OFF_PX
+        return self._rows.rms_px >= _STEREO.rows_off_px
 
     def row_differences(self, left: FloatArray) -> FloatArray:
         """Right minus left rows (N,) that are expected at left pixels (N, 2)."""
@@ -295,7 +304,7 @@ class StereoFit:
 
     def update_rows(self, tracks: Tracks) -> None:
         """Update the row differences with the matches of a frame."""
-        few = len(tracks) >= _MIN_POINTS and share_of(tracks.has_right) < _FEW_MATCHES
+        few = len(tracks) >= _MIN_POINTS and share_of(tracks.has_right) < _STEREO.few_matches
         self._unmatched = self._unmatched + 1 if few else 0
         self._rows.update(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
         self._reach_wait = max(0, self._reach_wait - 1)
@@ -315,7 +324,12 @@ class StereoFit:
         self, left_half: Image, right_half: Image, points: FloatArray, min_correlation: float
     ) -> tuple[FloatArray, BoolArray]:
         return match_rows(
-            left_half, right_half, points, self.max_disparity_px, min_correlation, _MIN_PEAK_MARGIN
+            left_half,
+            right_half,
+            points,
+            self.max_disparity_px,
+            min_correlation,
+            _STEREO.min_peak_margin,
         )
 
     def _fit(
@@ -363,7 +377,7 @@ class StereoFit:
 
 def _are_enough(beyond: int, points: int) -> bool:
     """Whether so many of some points are beyond the reach that the search is to go further."""
-    return beyond >= max(_MIN_BEYOND, _BEYOND_SHARE * points)
+    return beyond >= max(_STEREO.min_beyond, _STEREO.beyond_share * points)
 
 
 @compiled
@@ -436,7 +450,9 @@ def _judge(
                 steep = max(steep, abs(skew[k, i, j]))
         du = pixels[k, 0] - fits.start[k, 0, 2]
         dv = pixels[k, 1] - fits.start[k, 1, 2]
-        valid[k] = fits.score[k] >= _MIN_CORRELATION and is_on_peak(du, dv) and steep <= _MAX_SKEW
+        valid[k] = (
+            fits.score[k] >= _MIN_CORRELATION and is_on_peak(du, dv) and steep <= _STEREO.max_skew
+        )
         valid[k] &= abs(dv) <= _MAX_ROW_DIFFERENCE_PX
         valid[k] &= MIN_MATCH_DISPARITY_PX <= fits.left[k, 0] - pixels[k, 0] <= max_disparity
 
@@ -454,7 +470,7 @@ def common_offset(expected: FloatArray, off: FloatArray) -> tuple[float, float]:
     far = order[: len(order) // 2]
     d_near = median(expected[near])
     d_far = median(expected[far])
-    if d_near - d_far < _MIN_SPREAD_PX:
+    if d_near - d_far < _STEREO.min_spread_px:
         return median(off), 0.0
     slope = (median(off[near]) - median(off[far])) / (d_near - d_far)
     return median(off - slope * expected), slope
@@ -484,7 +500,7 @@ def _match(
             for j in range(2):
                 out.skew[n, i, j] = matches.skew[k, i, j]
         disparity = left[n, 0] - pixels[k, 0]
-        if disparity >= _MIN_DISPARITY_PX:
+        if disparity >= _STEREO.min_disparity_px:
             v = (left[n, 1] + pixels[k, 1]) / 2.0
             out.point[n, 0], out.point[n, 1], out.point[n, 2] = point_at(
                 camera, left[n, 0], v, f_baseline / disparity

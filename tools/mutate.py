@@ -123,11 +123,26 @@ def constant_mutations(root: Path, words: Sequence[str] = ()) -> list[Mutation]:
 
 def _larger(text: str) -> Iterator[tuple[str, str, str]]:
     """Yield name, old and new text of each constant of a module, from the end of the line
-    before.
+    before: numbers at its top, and those of records that are made there as they are declared.
     """
     tree = ast.parse(text)
     numbers = set(number_constants(tree))
-    for node in tree.body:
+    made = {
+        node.value.func.id
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+        and isinstance(node.value, ast.Call)
+        and isinstance(node.value.func, ast.Name)
+        and not node.value.args
+        and not node.value.keywords
+    }
+    nodes = list(tree.body)
+    for record in tree.body:
+        if isinstance(record, ast.ClassDef) and record.name in made:
+            fields = ast.Module(body=record.body, type_ignores=[])
+            numbers |= set(number_constants(fields))
+            nodes += record.body
+    for node in nodes:
         if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None:
             continue
         target = node.targets[0] if isinstance(node, ast.Assign) else node.target
@@ -138,7 +153,8 @@ def _larger(text: str) -> Iterator[tuple[str, str, str]]:
         number = eval(compile(ast.Expression(node.value), "", "eval"), {})  # of numbers alone
         larger = tuple(map(_half_more, number)) if isinstance(number, tuple) else _half_more(number)
         if larger != number:
-            yield target.id, f"\n{old}", f"\n{old.removesuffix(value)}{larger!r}"
+            indent = "\n" + " " * node.col_offset
+            yield target.id, f"{indent}{old}", f"{indent}{old.removesuffix(value)}{larger!r}"
 
 
 def _half_more(number: float) -> float:

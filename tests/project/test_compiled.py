@@ -41,7 +41,7 @@ from vio.frontend.align import (
 )
 from vio.frontend.outliers import _gauss_newton, _refine, pixel_errors
 from vio.frontend.prediction import _borrowed, moved_pixels
-from vio.frontend.stereo_fit import _match
+from vio.frontend.stereo_fit import _match, _Matches, _RightColumns
 from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import (
     FloatArray,
@@ -207,8 +207,9 @@ def test_features_are_moved_and_triangulated_as_single_points_are_in_numpy(
     )
     good[5] = False
     skews, has_right, left = np.zeros((40, 2, 2)), np.zeros(40, dtype=np.bool_), z[:, :2].copy()
-    columns = right, has_right, skews, point, has_point
-    _match(camera_args(camera), f_baseline, left, rows, z[rows, 2:].copy(), skew, good, *columns)
+    columns = _RightColumns(right, has_right, skews, point, has_point)
+    matches = _Matches(z[rows, 2:].copy(), skew, good)
+    _match(camera_args(camera), f_baseline, left, rows, matches, columns)
     matched = rows[good]
     assert has_right.nonzero()[0].tolist() == sorted(matched.tolist())
     np.testing.assert_array_equal(right[matched], z[matched, 2:])

@@ -74,6 +74,17 @@ _SHARE: float = 0.5
 _PAIR = (-4, 2.0)
 _ZERO = 0
 _NAME = "1"
+
+
+class _Rules(NamedTuple):
+    share: float = 0.25  # of all
+
+
+class _Other(NamedTuple):
+    given: int = 1
+
+
+_RULES = _Rules()
 """
     (tmp_path / "vio" / "part.py").write_text(text)
     (tmp_path / "vio" / "unnamed.py").write_text("_A = 1\n")
@@ -84,6 +95,7 @@ _NAME = "1"
         ("\n_ONE = 1", "\n_ONE = 2"),
         ("\n_SHARE: float = 0.5", "\n_SHARE: float = 0.75"),
         ("\n_PAIR = (-4, 2.0)", "\n_PAIR = (-6, 3.0)"),
+        ("\n    share: float = 0.25", "\n    share: float = 0.375"),
     ]
     assert {m.tests for m in found} == {("tests/test_part.py",)}
     assert "_PAIR = (-6, 3.0)\n_ZERO" in mutated(found[2], text)

@@ -25,30 +25,40 @@ from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray, LoopMatches
 
 MIN_INLIERS = 20
-_MIN_SHARE = 0.25  # of the pairs that must agree; wrong pairs are at random
+
+
+@dataclass(frozen=True, slots=True)
+class _Fitting:
+    """How the motion of a loop is found and judged."""
+
+    min_share: float = 0.25  # of the pairs that must agree; wrong pairs are at random
+    worse: int = 1000  # more than the 256 bits in which two descriptors can differ
+    ratio: float = 0.85  # to the second-best descriptor
+    max_pairs: int = 200  # that enter the fit, which takes 4 ms then
+    ransac_px: float = 4.0
+    ransac_steps: int = 300
+    ransac_sure: float = 0.999
+    same_m: float = 0.1  # by which both directions may differ; metres, beside a share of the depth
+    same_deg: float = 3.0
+    same_depth: float = 0.05
+    steps: int = 10  # largest change, m and rad
+    converged: float = 1e-5
+    gate: float = 3.0  # standard deviations, of a pixel coordinate
+    # Floor of a loop's standard deviations: errors that its points share, such as those of the
+    # calibration.
+    floor_depth: float = 0.002
+    floor_deg: float = 0.05
+    # Variance of a pixel over the one assumed, which is one pixel at the scale of its level: key
+    # points lie on whole pixels of their level, so that the errors are at least those of
+    # rounding.
+    min_variance: float = 1 / 12
+    # of its standard deviations: key points of neighbouring levels and edges are not independent
+    inflation: float = 2.0
+
+
+_FITTING = _Fitting()
 _MAX_BITS = 64
-_WORSE = 1000  # more than the 256 bits in which two descriptors can differ
-_RATIO = 0.85  # to the second-best descriptor
-_MAX_PAIRS = 200  # that enter the fit, which takes 4 ms then
-_RANSAC_PX = 4.0
-_RANSAC_STEPS = 300
-_RANSAC_SURE = 0.999
-_SAME_M = 0.1  # by which both directions may differ; metres, beside a share of the depth
-_SAME_DEG = 3.0
-_SAME_DEPTH = 0.05
-_STEPS = 10  # largest change, m and rad
-_CONVERGED = 1e-5
-_GATE = 3.0  # standard deviations, of a pixel coordinate
 MIN_DISPARITY_PX = 1.0
-# Floor of a loop's standard deviations: errors that its points share, such as those of the
-# calibration.
-_FLOOR_DEPTH = 0.002
-_FLOOR_DEG = 0.05
-# Variance of a pixel over the one assumed, which is one pixel at the scale of its level: key points
-# lie on whole pixels of their level, so that the errors are at least those of rounding.
-_MIN_VARIANCE = 1 / 12
-# of its standard deviations: key points of neighbouring levels and edges are not independent
-_INFLATION = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +82,10 @@ def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
     best = bits.argmin(axis=1)
     mutual = bits.argmin(axis=0)[best] == rows
     least = bits[rows, best]
-    bits[rows, best] = _WORSE
-    good = np.flatnonzero(mutual & (least <= np.minimum(_MAX_BITS, _RATIO * bits.min(axis=1))))
+    bits[rows, best] = _FITTING.worse
+    good = np.flatnonzero(
+        mutual & (least <= np.minimum(_MAX_BITS, _FITTING.ratio * bits.min(axis=1)))
+    )
     return np.stack([good, best[good]], axis=1)
 
 
@@ -120,8 +132,8 @@ def verify(
     if len(pairs) < MIN_INLIERS:
         return None
     # features are in the order of their columns, so these are spread over the image
-    if len(pairs) > _MAX_PAIRS:
-        pairs = pairs[np.linspace(0, len(pairs) - 1, _MAX_PAIRS).astype(np.int64)]
+    if len(pairs) > _FITTING.max_pairs:
+        pairs = pairs[np.linspace(0, len(pairs) - 1, _FITTING.max_pairs).astype(np.int64)]
     a, b = pairs.T
     T_j_i = _pnp(camera_i, i, a, camera_j, j, b)
     T_i_j = None if T_j_i is None else _pnp(camera_j, j, b, camera_i, i, a)
@@ -129,15 +141,15 @@ def verify(
         return None
     depth = _median_depth(camera_j, j, b)
     gap = se3_log(T_i_j @ T_j_i)
-    if np.linalg.norm(gap[:3]) > _SAME_M + _SAME_DEPTH * depth or np.linalg.norm(
+    if np.linalg.norm(gap[:3]) > _FITTING.same_m + _FITTING.same_depth * depth or np.linalg.norm(
         gap[3:]
-    ) > np.radians(_SAME_DEG):
+    ) > np.radians(_FITTING.same_deg):
         return None
     fitted = _fit(camera_i, i, a, camera_j, j, b, T_i_j)
     if fitted is None:
         return None
     pose, good = fitted
-    if good.sum() < max(MIN_INLIERS, _MIN_SHARE * len(pairs)):
+    if good.sum() < max(MIN_INLIERS, _FITTING.min_share * len(pairs)):
         return None
     a = a[good]
     b = b[good]
@@ -197,9 +209,9 @@ def pose_of_most(
         uv,
         K,
         None,
-        iterationsCount=_RANSAC_STEPS,
-        reprojectionError=_RANSAC_PX,
-        confidence=_RANSAC_SURE,
+        iterationsCount=_FITTING.ransac_steps,
+        reprojectionError=_FITTING.ransac_px,
+        confidence=_FITTING.ransac_sure,
         flags=cv2.SOLVEPNP_P3P,
     )
     if not done or inliers is None or len(inliers) < least:
@@ -254,9 +266,11 @@ class Fitted:
         """Return it with a covariance; errors that all points share are in proportion to their
         median depth.
         """
-        floor = np.repeat([(_FLOOR_DEPTH * depth_m) ** 2, np.radians(_FLOOR_DEG) ** 2], 3)
+        floor = np.repeat(
+            [(_FITTING.floor_depth * depth_m) ** 2, np.radians(_FITTING.floor_deg) ** 2], 3
+        )
         noise = _variance_factor(self.squared[self.fits], self.stereo[self.fits])
-        covariance = noise * _INFLATION**2 * np.asarray(
+        covariance = noise * _FITTING.inflation**2 * np.asarray(
             np.linalg.inv(self.normal), dtype=np.float64
         ) + np.diag(floor)
         return RelativePose(self.T_i_j, covariance)
@@ -278,7 +292,7 @@ def covariance_by_shifts(
     def step(terms: Terms) -> tuple[FloatArray, FloatArray]:
         normal = np.zeros((6, 6))
         pull = np.zeros(6)
-        terms.add(T_i_j, _GATE, normal, pull)
+        terms.add(T_i_j, _FITTING.gate, normal, pull)
         return normal, pull
 
     normal, pull = step(terms)
@@ -310,22 +324,22 @@ def fit_terms(
     normal = np.eye(6)
     P = 1e-9 * np.eye(6) if prior is None else np.asarray(np.linalg.inv(prior.covariance))
     squared = np.zeros(sum(len(part.stereo) for part in parts))
-    for step in range(_STEPS):
-        width = _GATE * 2.0 ** max(2 - step, 0)
+    for step in range(_FITTING.steps):
+        width = _FITTING.gate * 2.0 ** max(2 - step, 0)
         normal = np.zeros((6, 6))
         pull = np.zeros(6)
         begin = 0
         for part in parts:
             squared[begin : begin + len(part.stereo)] = part.add(T, width, normal, pull)
             begin += len(part.stereo)
-        fits: BoolArray = squared < 3 * _GATE**2
+        fits: BoolArray = squared < 3 * _FITTING.gate**2
         if fits.sum() < least:
             return None
         if prior is not None:
             pull += P @ se3_log(se3_inverse(T) @ prior.T_i_j)
         xi = np.linalg.solve(normal + P, pull)
         T = T @ se3_exp(xi)
-        if step > 2 and np.abs(xi).max() < _CONVERGED:
+        if step > 2 and np.abs(xi).max() < _FITTING.converged:
             break
     return Fitted(T, normal, squared, fits, np.concatenate([part.stereo for part in parts]))
 
@@ -337,7 +351,7 @@ def _variance_factor(squared: FloatArray, stereo: BoolArray) -> float:
     Of a left and a right pixel they have three degrees of freedom, of a left one alone two.
     """
     expected = np.where(stereo, *chi_square_quantile(0.5, [3, 2]))
-    return max(float(np.median(squared / expected)), _MIN_VARIANCE)
+    return max(float(np.median(squared / expected)), _FITTING.min_variance)
 
 
 @dataclass(frozen=True, slots=True)
