@@ -64,6 +64,8 @@ class _StereoRules(NamedTuple):
 _STEREO = _StereoRules()
 _MAX_ROW_DIFFERENCE_PX = 1.0  # of a match, after the estimated row differences are subtracted
 _MIN_POINTS = 20
+# the third of three like angles over the root mean square of two, at most, at 99 %
+_THIRD_ANGLE = 7.0
 # A pair turns so much in its mount, three times the prior of its calibration, or exposes so far
 # apart.
 _MAX_TURN_RAD = 0.3 * np.pi / 180.0
@@ -293,6 +295,17 @@ class StereoFit:
         so are the depths.
         """
         return self._rows.rms_px >= _STEREO.rows_off_px
+
+    @property
+    def disparity_error_px(self) -> float:
+        """Bound of the error of disparities that the rows suggest, pixels; 0: they agree.
+
+        Of three like angles of a mount, two shift rows: the third is of their size, and Student's t
+        with two degrees of freedom bounds it. What it does to the rows itself is added.
+        """
+        if not self.rows_are_off:
+            return 0.0
+        return _THIRD_ANGLE * self._rows.rms_px + self._rows.disparity_px(self._camera.fu)
 
     def row_differences(self, left: FloatArray) -> FloatArray:
         """Right minus left rows (N,) that are expected at left pixels (N, 2)."""
