@@ -20,7 +20,6 @@ from vio.frontend.moving_object import (
     ObjectReport,
     choose_motion,
     one_motion_explains,
-    squared_distance,
     static_by_prediction,
     voters,
 )
@@ -408,11 +407,9 @@ class KltFrontend:
             ):
                 chosen = replace(chosen, object_share=0.0)
             if chosen.decision is None and expected_motion is not None and measured is None:
-                inliers = deep_point[chosen.motion.inliers]
-                distance = squared_distance(
-                    camera, chosen.motion.T_curr_prev, inliers, expected_motion, error_px
+                chosen = self._objects.questioned(
+                    chosen, camera, deep_point, expected_motion, voting, error_px
                 )
-                chosen = self._objects.questioned(chosen, voting, distance)
             motion = chosen.motion
             kept[has_depth] = chosen.motion.inliers
             self._objects.frame(index, chosen)
