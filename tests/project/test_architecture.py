@@ -16,7 +16,7 @@ from tools.parts import ORDER, PARTS, part_of, read_edges, source_files, wrong_w
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")])
 
-# Only the configuration, live use, the pipeline, the simulated front end and the command line know
+# Only the configuration, live use, the pipeline, the test bench and the command line know
 # the front end.
 USES_FRONTEND = (
     "vio.config",
@@ -25,6 +25,7 @@ USES_FRONTEND = (
     "vio.runs",
     "vio.sim.oracle",
     "vio.cli",
+    "vio.testing",
     "vio.frontend",
 )
 # The estimator, free of images and files.

@@ -27,7 +27,7 @@ from vio.files.atomic import (
     locked_folder,
 )
 from vio.files.trajectories import read_trajectory
-from vio.live.build import MapUse, resolve_motion
+from vio.live.build import CONFIGURED, MapUse, Parts, resolve_motion
 from vio.live.first_use import Part, compiled_beside
 from vio.protocols import Dataset, Viewer
 from vio.records import FrameResult, Recording, RunMotion, Trajectory
@@ -89,6 +89,8 @@ class RunOptions:
     map_density: int | None = None
     localise: bool = False
     plot: bool = True
+    # front end or detector of the caller's own, FILE.py:CLASS or module:CLASS
+    frontend: str | None = None
     command: str | None = None  # as typed, for the metrics
 
 
@@ -131,6 +133,7 @@ def process(
         map_density=options.map_density,
         localise=options.localise,
         plot=options.plot,
+        frontend=options.frontend,
         command=options.command,
     )
     return _process(dataset, config, folder, request, shown, resume=False)
@@ -167,12 +170,13 @@ def resume(
     *,
     save_calibration: Path | None = None,
     map_file: Path | None = None,
+    frontend: str | None = None,
     shown: Shown = SHOWN,
 ) -> dict[str, Any]:
     """Go on with an unfinished run and return its metrics.
 
-    The folder may be of another hand: what it wants written outside of itself is written only where
-    the caller names the same file, and all is checked as for a new run.
+    The folder may be of another hand: what it wants written outside of itself is written, and code
+    that it names is run, only where the caller names the same, and all is checked as for a new run.
 
     Raises:
         VioError: the folder holds no unfinished run, one that another program began, or one that
@@ -190,6 +194,15 @@ def resume(
     request = replace(request, save_calibration=calibration)
     if not request.localise:  # which only reads the map
         request = replace(request, map=_named_again(folder, request.map, "--map", map_file))
+    if request.frontend != frontend:
+        raise ConfigError(
+            f"{folder}: this run began "
+            + (
+                "without a front end of your own; leave --frontend out"
+                if request.frontend is None
+                else f"with code of your own; name it again: --frontend {request.frontend}"
+            )
+        )
     density = request.map_density
     if density is not None and density < 1:
         raise DataError(f"{folder}: its map_density is {density}, not at least 1; repeat the run")
@@ -247,6 +260,8 @@ def _resume_command(folder: Path, request: RunRequest) -> str:
         words += ["--save-calibration", str(asked)]
     if request.map is not None and not request.localise:
         words += ["--map", request.map]
+    if request.frontend is not None:
+        words += ["--frontend", request.frontend]
     return shlex.join(words)
 
 
@@ -273,6 +288,7 @@ def _process(
     view = None if shown.view is None else _open_view(shown.view, dataset, config, truth)
     if view is not None:
         viewers.append(view)
+    parts = _own_parts(request, recording, config)
     beside: tuple[Part, ...] = ("filter",) if recording.camera.kind == "stereo" else ()
     motion = _likely_motion(recording, config)
     with locked_folder(folder), compiled_beside(beside, motion), StopRequest() as asked:
@@ -285,6 +301,7 @@ def _process(
                 # which the adjustment of a map takes
                 keep_observations=request.save_observations or request.writes_map,
                 viewer=Viewers(viewers),
+                parts=parts,
                 map=_map_use(request),
                 control=RunControl(
                     growing_folder(folder, dataset, config, request.values()), resume, asked.reason
@@ -371,6 +388,18 @@ def _leave_view(view: RerunViewer, result: RunResult) -> None:
         from vio.view.stream import wait_for_interrupt
 
         wait_for_interrupt(view.address)
+
+
+def _own_parts(request: RunRequest, recording: Recording, config: Config) -> Parts:
+    """Return the parts of the caller's own that a run was asked for."""
+    text = request.frontend
+    if text is None:
+        return CONFIGURED
+    from vio.frontend.given import load_given
+
+    if not recording.has_images:
+        raise ConfigError(f"--frontend {text}: {recording.path} holds features, and no images")
+    return Parts(frontend=load_given(text, recording.camera, config.frontend))
 
 
 def _likely_motion(recording: Recording, config: Config) -> RunMotion:

@@ -50,6 +50,7 @@ REQUEST_SHAPE = an_object(
         "map_density": WHOLE_OR_NULL,
         "localise": TRUTH,
         "plot": TRUTH,
+        "frontend": TEXT_OR_NULL,
         "command": TEXT_OR_NULL,
     },
     "source",
@@ -79,6 +80,7 @@ class RunRequest:
     map_density: int | None = None
     localise: bool = False  # leave the map as it is
     plot: bool = True
+    frontend: str | None = None  # code of the caller's own, FILE.py:CLASS or module:CLASS
     command: str | None = None  # as typed
 
     @classmethod
