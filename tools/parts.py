@@ -42,7 +42,13 @@ PARTS: dict[str, tuple[str, ...]] = {
         "vio.report",
     ),
     "offline": ("vio.inspection", "vio.targets", "vio.offline"),
-    "laboratory": ("vio.sim", "vio.bench", "vio.testing", "vio.offline.reproduce"),
+    "laboratory": (
+        "vio.sim",
+        "vio.bench",
+        "vio.testing",
+        "vio.course",
+        "vio.offline.reproduce",
+    ),
     "command line": ("vio.cli", "vio.__main__", "vio"),
 }
 _PART_OF = {name: part for part, names in PARTS.items() for name in names}
