@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -256,23 +257,51 @@ def templates(wide: Patches) -> Templates:
 def replace_templates(store: Templates, slots: IntArray, wide: Patches) -> None:
     """Prepare templates from patches (N, 2r+3, 2r+3) in rows (N,) of others."""
     radius = wide.shape[1] // 2 - 1
-    columns = store.patch, store.gradient, store.energy, store.inverse, store.row_inverse
-    _prepare(wide, disc(radius), window(radius), slots, *columns)
+    columns = _Columns(store.patch, store.gradient, store.energy, store.inverse)
+    _prepare(wide, _Disc(disc(radius), window(radius)), slots, columns, store.row_inverse)
+
+
+class _Disc(NamedTuple):
+    """The pixels of a template."""
+
+    xy: Pixels  # (2, S) as of `disc`
+    weights: Pixels  # (S,) as of `window`
+
+
+class _Columns(NamedTuple):
+    """Columns of templates, as in `Templates`; the inverse is that of all or of the row's
+    parameters.
+    """
+
+    patch: Pixels
+    gradient: Pixels
+    energy: Pixels
+    inverse: Pixels
+
+
+class _RowPrior(NamedTuple):
+    """The expected image rows (N,) of the centres, and their weight; without weight, not read."""
+
+    rows: FloatArray
+    weight: float
+
+
+class _Aligned(NamedTuple):
+    """What an alignment writes."""
+
+    warp: FloatArray  # (N, 2, 3) refined in place
+    score: FloatArray  # (N,) correlations
+    sigma: Pixels  # (M, 3) of which rows (N,) are written
 
 
 @compiled
-def _prepare(
-    wide: Patches,
-    xy: Pixels,
-    weights: Pixels,
-    slots: IntArray,
-    patch: Pixels,
-    gradient: Pixels,
-    energy: Pixels,
-    inverse: Pixels,
-    row_inverse: Pixels,
-) -> None:
+def _prepare(wide: Patches, of: _Disc, slots: IntArray, out: _Columns, row_inverse: Pixels) -> None:
     """Write rows (N,) of the columns of templates."""
+    xy = of.xy
+    weights = of.weights
+    patch = out.patch
+    gradient = out.gradient
+    energy = out.energy
     size = xy.shape[1]
     side = wide.shape[1]
     basis = np.empty((_PARAMETERS, size))
@@ -312,7 +341,7 @@ def _prepare(
             for j in range(i + 1):
                 normal[i, j] = _product(basis[i], basis[j])
             normal[i, i] += _DAMPING * normal[i, i] + 1e-6
-        invert_positive(normal, inverse[slot])
+        invert_positive(normal, out.inverse[slot])
         for i in range(_ROW_PARAMETERS):
             for j in range(i + 1):
                 on_row[i, j] = normal[i, j]
@@ -367,44 +396,42 @@ def align(
     warp, score = warp.copy(), np.empty(len(warp))
     inverse, row_weight = (store.inverse, 0.0) if rows is None else (store.row_inverse, _ROW_WEIGHT)
     expected = score if rows is None else rows  # not read without a weight
-    columns = store.patch, store.gradient, store.energy, inverse, disc(radius), window(radius)
+    columns = _Columns(store.patch, store.gradient, store.energy, inverse)
     image = np.ascontiguousarray(image)
     _refine(
-        *columns,
+        columns,
+        _Disc(disc(radius), window(radius)),
         slots,
-        image,
-        _pairs(image),
-        warp,
-        expected,
-        row_weight,
+        (image, _pairs(image)),
+        _RowPrior(expected, row_weight),
         iterations,
-        score,
-        store.sigma,
+        _Aligned(warp, score, store.sigma),
     )
     return warp, score
 
 
 @compiled
 def _refine(
-    patch: Pixels,
-    gradient: Pixels,
-    energy: Pixels,
-    inverse: Pixels,
-    xy: Pixels,
-    weights: Pixels,
+    templates: _Columns,
+    of: _Disc,
     slots: IntArray,
-    image: Image,
-    pairs: Pairs,
-    warp: FloatArray,
-    rows: FloatArray,
-    row_weight: float,
+    images: tuple[Image, Pairs],
+    prior: _RowPrior,
     iterations: int,
-    score: FloatArray,
-    sigma: Pixels,
+    out: _Aligned,
 ) -> None:
-    """Refine the warps (N, 2, 3) in place; write the correlations (N,) into `score` and rows
-    (N,) of `sigma` (M, 3).
-    """
+    """Refine the warps of templates in rows (N,), by an image and its pairs of pixels."""
+    patch = templates.patch
+    gradient = templates.gradient
+    energy = templates.energy
+    inverse = templates.inverse
+    xy = of.xy
+    weights = of.weights
+    image, pairs = images
+    row_weight = prior.weight
+    warp = out.warp
+    score = out.score
+    sigma = out.sigma
     pixels = patch.shape[1]
     parameters = inverse.shape[1]
     size = 0.0
@@ -428,7 +455,7 @@ def _refine(
             score[n] = _correlation(energy[slot], moments[2], square - moments[3] ** 2 / size, size)
             if row_weight > 0.0:
                 gain = max(moments[2] / max(energy[slot], 1.0), 0.1)
-                moments[1] += row_weight * gain * (warp[n, 1, 2] - rows[n])
+                moments[1] += row_weight * gain * (warp[n, 1, 2] - prior.rows[n])
             for i in range(parameters):
                 fit[i] = 0.0
                 for j in range(parameters):

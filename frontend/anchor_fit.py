@@ -4,6 +4,8 @@ Lucas-Kanade does.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args, moved_pixel, turn_to
@@ -65,8 +67,15 @@ class AnchorFit:
         rows = np.empty(len(old), np.int64)
         start = np.empty((len(old), 2))
         scale = np.empty(len(old))
-        view = old.left, old.point, old.has_point, point, found, seen
-        count = _begin(camera, T, motion is not None, width, height, *view, rows, start, scale)
+        moved = _Moved(camera, T, old.point, point, old.has_point)
+        count = _begin(
+            moved,
+            motion is not None,
+            (width, height),
+            old.left,
+            _Found(found, seen),
+            _Starts(rows, start, scale),
+        )
         rows = rows[:count]
         start = start[:count]
         scale = scale[:count]
@@ -88,7 +97,8 @@ class AnchorFit:
             warp[retry], kept[retry] = self._realign(before, left, *again)
         distance = 0.5 * min_distance_px(width, height, self._grid)
         if motion is not None:
-            _reject_deviating(camera, T, old.point, old.has_right, rows, warp, has_point, kept)
+            moved = moved._replace(has_point=has_point)
+            _reject_deviating(moved, old.has_right, rows, warp, kept)
         _reject_crowded(warp, distance, kept)
         chosen = kept.nonzero()[0]
         rows = rows[chosen]
@@ -144,76 +154,93 @@ class AnchorFit:
         return warp, (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start)
 
 
+class _Moved(NamedTuple):
+    """The points of N features, moved by the consensus motion."""
+
+    camera: CameraArgs
+    T: FloatArray  # (4, 4)
+    before: FloatArray  # (N, 3)
+    after: FloatArray  # (N, 3)
+    has_point: BoolArray  # (N,)
+
+
+class _Found(NamedTuple):
+    """Features by Lucas-Kanade."""
+
+    pixels: FloatArray  # (N, 2)
+    seen: BoolArray  # (N,)
+
+
+class _Starts(NamedTuple):
+    """Where alignments start; room for N features."""
+
+    rows: IntArray  # (K,)
+    pixels: FloatArray  # (K, 2) in the left image
+    scale: FloatArray  # (K,) predicted change
+
+
 @compiled
 def _begin(
-    camera: CameraArgs,
-    T: FloatArray,
+    points: _Moved,
     moved: bool,
-    width: int,
-    height: int,
+    size: tuple[int, int],
     left: FloatArray,
-    old_point: FloatArray,
-    has_point: BoolArray,
-    point: FloatArray,
-    found: FloatArray,
-    seen: BoolArray,
-    rows: IntArray,
-    start: FloatArray,
-    scale: FloatArray,
+    found: _Found,
+    out: _Starts,
 ) -> int:
-    """Write which of the previous frame's features are aligned, and return their number K.
+    """Write which of the previous frame's features, at pixels (N, 2), are aligned, and return their
+    number K.
 
-    Written are their rows (K,), the left pixels (K, 2) to start from, and the predicted changes of
-    scale (K,). These are `found` (N, 2) where `seen`; with a consensus motion T (4, 4) (`moved`),
-    others with a point are at the pixels where it takes that. Points (N, 3) are those before and
-    after the motion.
+    They start where they were found; with a consensus motion (`moved`), others with a point start
+    at the pixel where it takes that. The size is the image's width and height.
     """
+    camera = points.camera
+    old_point = points.before
+    point = points.after
+    has_point = points.has_point
+    width, height = size
     count = 0
     margin = ANCHOR_REACH_PX + 2.0
     for n in range(len(left)):
-        u = found[n, 0]
-        v = found[n, 1]
+        u = found.pixels[n, 0]
+        v = found.pixels[n, 1]
         change = 1.0
         if moved and has_point[n]:
             depth = turn_to(camera, point[n, 1], point[n, 2])[4]
             if depth > _MIN_DEPTH_M:
                 change = turn_to(camera, old_point[n, 1], old_point[n, 2])[4] / depth
-        if not seen[n]:
+        if not found.seen[n]:
             if not (moved and has_point[n]):
                 continue
-            u, v, depth = moved_pixel(camera, T, old_point[n, 0], old_point[n, 1], old_point[n, 2])
+            u, v, depth = moved_pixel(
+                camera, points.T, old_point[n, 0], old_point[n, 1], old_point[n, 2]
+            )
             if not depth > _MIN_DEPTH_M:
                 u = left[n, 0]
                 v = left[n, 1]
             if not (margin <= u <= width - 1 - margin and margin <= v <= height - 1 - margin):
                 continue
-        rows[count] = n
-        start[count, 0] = u
-        start[count, 1] = v
-        scale[count] = change
+        out.rows[count] = n
+        out.pixels[count, 0] = u
+        out.pixels[count, 1] = v
+        out.scale[count] = change
         count += 1
     return count
 
 
 @compiled
 def _reject_deviating(
-    camera: CameraArgs,
-    T: FloatArray,
-    point: FloatArray,
-    has_right: BoolArray,
-    rows: IntArray,
-    warp: FloatArray,
-    has_point: BoolArray,
-    kept: BoolArray,
+    points: _Moved, has_right: BoolArray, rows: IntArray, warp: FloatArray, kept: BoolArray
 ) -> None:
-    """Clear the mask (K,) of aligned features that are not where a motion (4, 4) takes their points
-    (N, 3).
+    """Clear the mask (K,) of aligned features that are not where the motion takes their points.
 
-    A point whose depth was propagated without a measurement is dropped in place of its feature:
-    `has_point` (N,).
+    A point whose depth was propagated without a measurement is dropped in place of its feature, in
+    `points.has_point`.
     """
+    point = points.before
+    has_point = points.has_point
     for k, n in enumerate(rows):
-        u, v, depth = moved_pixel(camera, T, point[n, 0], point[n, 1], point[n, 2])
+        u, v, depth = moved_pixel(points.camera, points.T, point[n, 0], point[n, 1], point[n, 2])
         du = u - warp[k, 0, 2]
         dv = v - warp[k, 1, 2]
         if not depth > _NEAREST_M or np.sqrt(du * du + dv * dv) > INLIER_PX:

@@ -24,7 +24,7 @@ from vio.frontend.align import (
 from vio.frontend.columns import joined, take
 from vio.frontend.detect import spread_evenly
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output
-from vio.frontend.outliers import RansacProblem, predicted_motion, static_tracks
+from vio.frontend.outliers import MotionPriors, RansacProblem, predicted_motion, static_tracks
 from vio.frontend.patches import inside
 from vio.frontend.prediction import moved_pixels, prior_pixels, usable_prior
 from vio.frontend.settings import FrontendSettings, MatchSettings
@@ -405,17 +405,19 @@ class DescriptorFrontend:
         rows = rows[alike]
         found = found[alike]
         pixels = pixels[alike]
-        R_prior = T_prior = None
+        priors = MotionPriors()
         if prior is not None:
             named, predicted = prior_pixels(old.ids[has_depth], prior)
-            R_prior = prior.R_cam_prev
-            T_prior = predicted_motion(self._camera, p_prev[has_depth][named], predicted, expected)
+            priors = MotionPriors(
+                prior.R_cam_prev,
+                predicted_motion(self._camera, p_prev[has_depth][named], predicted, expected),
+            )
         rng = np.random.default_rng((self._seed, frame.index))
         problem = RansacProblem(self._camera, _INLIER_PX, rng)
         known = has_depth[rows]
         p_rows = p_prev[rows]
         keep, motion = static_tracks(
-            problem, old.left[rows], p_rows, known, pixels, expected, R_prior, T_prior
+            problem, old.left[rows], p_rows, known, pixels, expected, priors
         )
         # The right pixel belongs to the key point; it is shifted by the refinement.
         right = pair.right[found] + np.stack(

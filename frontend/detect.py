@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import ConfigError
+from vio.files.inputs import read_input
 from vio.frontend.settings import GridSettings
 from vio.frontend.tracks import ANCHOR_REACH_PX
 from vio.geometry.lie import FloatArray
@@ -389,17 +390,21 @@ def load_mask(path: Path) -> Image:
     """Read the image (H, W) whose black pixels are excluded from corner detection.
 
     Raises:
-        ConfigError: the file does not decode.
+        ConfigError: the file cannot be read or does not decode.
     """
-    from vio.datasets.images import UnreadableImageError, load_gray
-
+    fault = "it is no image, or damaged"
+    mask = None
     try:
-        return load_gray(path)[0]
-    except UnreadableImageError as error:
+        data = np.frombuffer(read_input(path), np.uint8)
+        mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except (OSError, cv2.error) as error:  # OpenCV's of an empty file
+        fault = getattr(error, "strerror", None) or fault
+    if mask is None:
         raise ConfigError(
-            f"frontend.klt.mask: {path} cannot be read as an image ({error}); give a PNG of the "
+            f"frontend.klt.mask: {path} cannot be read as an image ({fault}); give a PNG of the "
             "recording's size"
-        ) from error
+        )
+    return np.asarray(mask)
 
 
 def half_mask(mask: Image, shape: tuple[int, ...]) -> BoolArray:

@@ -4,6 +4,8 @@ full image.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -13,19 +15,29 @@ from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image
 
-_WINDOW_PX = 11  # side of the window, of the half-resolution image
+
+@dataclass(frozen=True, slots=True)
+class _Flow:
+    """How features are followed by Lucas-Kanade, and found again."""
+
+    window_px: int = 11  # side of the window, of the half-resolution image
+    lk_epsilon_px: float = 0.02  # of the half-resolution image
+    lk_min_eigenvalue: float = 1e-4  # as OpenCV's own default
+    # share of lost points above which tracking is repeated with all pyramid levels
+    retry_share: float = 0.25
+    lost_share: float = 0.5  # the same for the last attempt, which starts from the old pixels
+    stride: int = 4  # brightness is computed from every fourth pixel of the half image
+    min_contrast: float = 1.0  # gray levels, lower bound of the contrast in the gain
+    max_contrast_change: float = 0.06  # relative change of contrast, and
+    # change of the mean gray level, up to which images are not adjusted
+    max_mean_change: float = 6.0
+    max_gain: float = 4.0
+
+
+_FLOW = _Flow()
 _TRUSTED_LEVELS = 1  # pyramid levels above half resolution where the pixels are predicted
 _ITERATIONS = 20  # per level
 _MAX_FORWARD_BACKWARD_PX = 1.5
-_LK_EPSILON_PX = 0.02  # of the half-resolution image
-_LK_MIN_EIGENVALUE = 1e-4  # as OpenCV's own default
-_RETRY_SHARE = 0.25  # share of lost points above which tracking is repeated with all pyramid levels
-_LOST_SHARE = 0.5  # the same for the last attempt, which starts from the old pixels
-_STRIDE = 4  # brightness is computed from every fourth pixel of the half image
-_MIN_CONTRAST = 1.0  # gray levels, lower bound of the contrast in the gain
-_MAX_CONTRAST_CHANGE = 0.06  # relative change of contrast, and
-_MAX_MEAN_CHANGE = 6.0  # change of the mean gray level, up to which images are not adjusted
-_MAX_GAIN = 4.0
 
 
 def track_with_retries(
@@ -58,7 +70,9 @@ def track_with_retries(
     few = min(_TRUSTED_LEVELS, levels) if trusted else levels
     found, good = _track_forward_backward(last, view, points, guess, few, trusted=trusted)
     attempts = (
-        [(guess, _RETRY_SHARE), (points, _LOST_SHARE)] if trusted else [(points, _LOST_SHARE)]
+        [(guess, _FLOW.retry_share), (points, _FLOW.lost_share)]
+        if trusted
+        else [(points, _FLOW.lost_share)]
     )
     for start, share in attempts:
         retry = (~good).nonzero()[0]
@@ -75,14 +89,14 @@ def match_brightness(image: Image, other: Image) -> Image:
     compares gray levels.
     """
     (mean, contrast), (other_mean, other_contrast) = (
-        mean_and_contrast(part, _STRIDE) for part in (image, other)
+        mean_and_contrast(part, _FLOW.stride) for part in (image, other)
     )
-    gain = other_contrast / max(contrast, _MIN_CONTRAST)
+    gain = other_contrast / max(contrast, _FLOW.min_contrast)
     if (
-        abs(gain - 1) < _MAX_CONTRAST_CHANGE and abs(other_mean - mean) < _MAX_MEAN_CHANGE
+        abs(gain - 1) < _FLOW.max_contrast_change and abs(other_mean - mean) < _FLOW.max_mean_change
     ) or gain <= 0:
         return image
-    gain = min(max(gain, 1 / _MAX_GAIN), _MAX_GAIN)
+    gain = min(max(gain, 1 / _FLOW.max_gain), _FLOW.max_gain)
     levels = gain * (np.arange(256) - mean) + other_mean
     return np.asarray(
         cv2.LUT(image, np.clip(np.rint(levels), 0, 255).astype(np.uint8)), dtype=np.uint8
@@ -143,10 +157,7 @@ def _flow(
         target,
         points / 2,
         guess / 2,
-        window_px=_WINDOW_PX,
-        levels=levels,
-        iterations=_ITERATIONS,
-        epsilon_px=_LK_EPSILON_PX,
+        PyramidSearch(_FLOW.window_px, levels, _ITERATIONS, _FLOW.lk_epsilon_px),
     )
     pixels *= 2
     lost = (~seen).nonzero()[0]
@@ -154,16 +165,22 @@ def _flow(
     return pixels, seen
 
 
+@dataclass(frozen=True, slots=True)
+class PyramidSearch:
+    """How Lucas-Kanade searches."""
+
+    window_px: int  # side of the window
+    levels: int  # of the pyramids beside the images themselves
+    iterations: int  # largest number per level
+    epsilon_px: float  # step below which a point has converged
+
+
 def lucas_kanade(
     source: Image,
     target: Image,
     points: FloatArray,
     guess: FloatArray,
-    *,
-    window_px: int,
-    levels: int,
-    iterations: int,
-    epsilon_px: float,
+    search: PyramidSearch,
 ) -> tuple[FloatArray, BoolArray]:
     """Track points by OpenCV's pyramidal Lucas-Kanade.
 
@@ -172,10 +189,7 @@ def lucas_kanade(
         target: image (H, W) to find them in.
         points: pixels (N, 2).
         guess: pixels (N, 2) to start from.
-        window_px: side of the window.
-        levels: pyramid levels beside the images themselves.
-        iterations: largest number of iterations per level.
-        epsilon_px: step below which a point has converged.
+        search: windows, levels and steps.
 
     Returns:
         Pixels (N, 2), arbitrary where not found, and a mask (N,) of those found.
@@ -185,11 +199,15 @@ def lucas_kanade(
         target,
         points.astype(np.float32).reshape(-1, 1, 2),
         guess.astype(np.float32).reshape(-1, 1, 2),
-        winSize=(window_px, window_px),
-        maxLevel=levels,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, epsilon_px),
+        winSize=(search.window_px, search.window_px),
+        maxLevel=search.levels,
+        criteria=(
+            cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT,
+            search.iterations,
+            search.epsilon_px,
+        ),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=_LK_MIN_EIGENVALUE,
+        minEigThreshold=_FLOW.lk_min_eigenvalue,
     )
     pixels = np.asarray(found, dtype=np.float64).reshape(-1, 2)
     return pixels, (np.asarray(status).reshape(-1) == 1) & np.isfinite(pixels).all(axis=1)

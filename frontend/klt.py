@@ -4,7 +4,7 @@ along the row.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import cv2
@@ -28,6 +28,7 @@ from vio.frontend.new_features import NewFeatures
 from vio.frontend.one_camera import with_depths, with_prior_depths
 from vio.frontend.outliers import (
     Consensus,
+    MotionPriors,
     RansacProblem,
     epipolar_distance,
     predicted_motion,
@@ -39,7 +40,7 @@ from vio.frontend.reappearance import contradicts_gyro, motion_across
 from vio.frontend.right_alone import RightAlone
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.right_delay import RightDelay
-from vio.frontend.right_match import RightMatcher
+from vio.frontend.right_match import FrameImages, RightMatcher
 from vio.frontend.settings import FrontendSettings
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import (
@@ -71,16 +72,6 @@ _VERY_FEW = 0.25  # share of the target below which new features are output at o
 _LONG_GAP_S = 0.8  # a rig that flies or is carried shows other things after it …
 _LONG_GAP_STEPS = 5.0  # … where frames usually come so many times as often
 _BANK_SPARE = 3  # templates allocated, over the number of features
-
-
-@dataclass(frozen=True, slots=True)
-class _FrameImages:
-    """The images of a frame in the forms that tracking needs."""
-
-    frame: StereoFrame
-    left: ImageLevels
-    right: ImageLevels | None  # None: one camera
-    stereo: StereoFit
 
 
 class KltFrontend:
@@ -200,7 +191,7 @@ class KltFrontend:
         parts = (self._right, self._delay, self._objects)
         return tuple(found for part in parts for found in part.take_findings())
 
-    def _images(self, frame: StereoFrame) -> tuple[_FrameImages | None, BoolArray | None]:
+    def _images(self, frame: StereoFrame) -> tuple[FrameImages | None, BoolArray | None]:
         """Return the images of a frame, and the mask (H/2, W/2) of allowed corners.
 
         None: the right image of its time was not kept.
@@ -208,9 +199,7 @@ class KltFrontend:
         if self._camera.kind != "stereo":
             (left,) = self._validator.validate_one(frame)
             stereo, allowed = self._set_up(left.shape)
-            return _FrameImages(
-                frame, self._view(left, _half(frame, "left")), None, stereo
-            ), allowed
+            return FrameImages(frame, self._view(left, _half(frame, "left")), None, stereo), allowed
         left, right = self._validator.validate(frame)
         stereo, allowed = self._set_up(left.shape)
         lives = not isinstance(frame, CheckedFrame) or frame.right_usable
@@ -225,7 +214,7 @@ class KltFrontend:
         if paired is None:
             return None, allowed
         levels = self._view(paired, right_half)
-        return _FrameImages(frame, self._view(left, _half(frame, "left")), levels, stereo), allowed
+        return FrameImages(frame, self._view(left, _half(frame, "left")), levels, stereo), allowed
 
     def _begin_again(self, stereo: StereoFit) -> None:
         """Forget all features: their depths are those of images of different times."""
@@ -255,7 +244,7 @@ class KltFrontend:
             self._setup = stereo, allowed
         return self._setup
 
-    def _follow_in_right(self, images: _FrameImages, prior: TrackPrior | None) -> Tracks:
+    def _follow_in_right(self, images: FrameImages, prior: TrackPrior | None) -> Tracks:
         """The features of the last good pair, by the right image of a frame whose left one is
         frozen.
         """
@@ -280,7 +269,7 @@ class KltFrontend:
         self._alone = alone
         return alone.in_left(self._camera, images.stereo)
 
-    def _store(self, images: _FrameImages, tracks: Tracks, motion: Consensus | None) -> None:
+    def _store(self, images: FrameImages, tracks: Tracks, motion: Consensus | None) -> None:
         """Store the state that the next frame needs."""
         frame = images.frame
         left = images.left
@@ -299,7 +288,7 @@ class KltFrontend:
         )
 
     def _track(
-        self, images: _FrameImages, prior: TrackPrior | None, watch: Stopwatch
+        self, images: FrameImages, prior: TrackPrior | None, watch: Stopwatch
     ) -> tuple[Tracks, Consensus | None]:
         """Track the features of the previous frame; return those kept and the consensus motion.
 
@@ -334,24 +323,20 @@ class KltFrontend:
         watch.lap("track")
         rng = np.random.default_rng((self._seed, frame.index))
         problem = RansacProblem(self._camera, INLIER_PX, rng)
-        seen, motion = self._reject_outliers(
-            problem, old, found, seen, prior, expected, stereo, frame.index
-        )
+        seen, motion = self._reject_outliers(problem, old, found, seen, prior, expected, images)
         watch.lap("reject")
         tracks = self._anchor_fit.track(old, previous.left, left, found, seen, motion)
         watch.lap("align")
         if right is None:
             tracks = with_prior_depths(self._camera, tracks, prior)
         else:
-            tracks = self._matcher.match(
-                frame, previous, tracks, left, right, prior, stereo, motion
-            )
+            tracks = self._matcher.match(images, right, previous, tracks, prior, motion)
         watch.lap("stereo")
         return tracks, motion
 
     def _found_again(
         self,
-        images: _FrameImages,
+        images: FrameImages,
         previous: PreviousFrame,
         expected: FloatArray,
         prior: TrackPrior | None,
@@ -393,28 +378,28 @@ class KltFrontend:
         seen: BoolArray,
         prior: TrackPrior | None,
         expected: FloatArray,
-        stereo: StereoFit,
-        index: int,
+        images: FrameImages,
     ) -> tuple[BoolArray, Consensus | None]:
         """Return the mask (N,) of the found features that are static, and the consensus motion
         if there is one.
         """
         camera = self._camera
+        stereo = images.stereo
+        index = images.frame.index
         rows = seen.nonzero()[0]
         has_depth = (old.has_point & (old.has_right | (not self._needs_right)))[rows]
         deep = has_depth.nonzero()[0]
         point = old.point.take(rows, axis=0)
         deep_point = old.point.take(rows[deep], axis=0)
-        R_prior = T_prior = None
+        priors = MotionPriors()
         if prior is not None:
             known, predicted = prior_rows(old, rows[deep], prior)
-            R_prior = prior.R_cam_prev
-            T_prior = predicted_motion(camera, old.point[known], predicted, expected)
+            priors = MotionPriors(
+                prior.R_cam_prev, predicted_motion(camera, old.point[known], predicted, expected)
+            )
         before = old.left.take(rows, axis=0)
         after = found.take(rows, axis=0)
-        kept, motion = static_tracks(
-            problem, before, point, has_depth, after, expected, R_prior, T_prior
-        )
+        kept, motion = static_tracks(problem, before, point, has_depth, after, expected, priors)
         expected_motion = None if prior is None else prior.motion
         near_m = camera.fu * camera.baseline_m / stereo.max_disparity_px
         measured = None if prior is None else prior.measured_motion

@@ -17,6 +17,7 @@ for the case of pure rotation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -31,30 +32,40 @@ from vio.records import BoolArray, IntArray
 
 _MIN_DEPTH_M = 0.05
 _SAMPLES = 96  # random minimal sets of RANSAC
-_SURE_SHARE = 0.7  # share of inliers of the refined expected motion above which RANSAC is skipped
-# of the consensus rotation from the prior, before a motion near the prior is tried
-_PRIOR_MAX_DEVIATION_DEG = 1.0
+
+
+class _ConsensusRules(NamedTuple):
+    """How the motion of the scene is found, and what contradicts it."""
+
+    # share of inliers of the refined expected motion above which RANSAC is skipped
+    sure_share: float = 0.7
+    # of the consensus rotation from the prior, before a motion near the prior is tried
+    prior_max_deviation_deg: float = 1.0
+    prior_points: int = 64  # predicted pixels that are used
+    prior_px: float = 2.0  # median distance from them below which a motion represents them
+    # change of that motion, in radians and metres, below which it is not refined further
+    prior_converged: float = 1e-4
+    sample_iterations: int = 5
+    damping: float = 1e-4
+    # two views constrain a track in one direction only, so most tracks must be inliers
+    min_bearing_share: float = 0.5
+    # share of inliers of a predicted rotation above which no other rotation is tried
+    sure_bearing_share: float = 0.9
+    five_point_confidence: float = 0.999
+    epsilon: float = 1e-9  # added to denominators
+    # of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as
+    # large
+    min_forward: float = 0.5
+
+
+_CONSENSUS = _ConsensusRules()
 # inliers of the prior motion only, over the consensus', above which it replaces the consensus
 _PRIOR_MIN_SUPPORT = 0.4
 _MIN_POINTS = 8  # with fewer points, a consensus may be chance
 _MIN_SHARE = 0.2  # smallest share of inliers of a consensus
-_PRIOR_POINTS = 64  # predicted pixels that are used
-_PRIOR_PX = 2.0  # median distance from them below which a motion represents them
-# change of that motion, in radians and metres, below which it is not refined further
-_PRIOR_CONVERGED = 1e-4
-_SAMPLE_ITERATIONS = 5
 _REFINE_ITERATIONS = 6
-_DAMPING = 1e-4
 # change of a motion, in radians and metres, below which it is not refined further
 _CONVERGED = 3e-6
-# two views constrain a track in one direction only, so most tracks must be inliers
-_MIN_BEARING_SHARE = 0.5
-# share of inliers of a predicted rotation above which no other rotation is tried
-_SURE_BEARING_SHARE = 0.9
-_FIVE_POINT_CONFIDENCE = 0.999
-_EPSILON = 1e-9  # added to denominators
-# of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as large
-_MIN_FORWARD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,36 +136,99 @@ def _gauss_newton(
     points = np.ascontiguousarray(p_prev)
     seen = np.ascontiguousarray(pixels)
     w = np.ascontiguousarray(weight)
-    _iterate(camera_args(camera), T, points, seen, w, np.inf, iterations, free.stop, 0.0)
+    _iterate(
+        camera_args(camera), T, _Seen(points, seen, w), _Steps(np.inf, iterations, free.stop, 0.0)
+    )
     return T
 
 
+class _Seen(NamedTuple):
+    """Points before each of H motions, and their pixels after it."""
+
+    points: FloatArray  # (H, K, 3)
+    pixels: FloatArray  # (H, K, 2)
+    weight: FloatArray  # (H, K)
+
+
+class _Steps(NamedTuple):
+    """Gauss-Newton steps on motions."""
+
+    scale_px: float  # of the weights of Geman and McClure, which multiply others; infinite: of none
+    iterations: int  # at most
+    free: int  # how many entries of the twist `[rho; phi]` are estimated, from its beginning
+    converged: float  # a motion is done when no entry of it changes by this
+
+
 @compiled
-def _iterate(
+def _pixel_D_twist(
     camera: CameraArgs,
-    T: FloatArray,
-    points: FloatArray,
-    pixels: FloatArray,
-    weight: FloatArray,
-    scale_px: float,
-    iterations: int,
-    free: int,
-    converged: float,
+    point: tuple[float, float, float],
+    turn: tuple[float, float, float],
+    u_D_xi: FloatArray,
+    v_D_xi: FloatArray,
 ) -> None:
+    """Write how the pixel of a point moves with the camera's twist (6,).
+
+    The point is x / z, y / z and z in the camera turned to it; the turn is its azimuth, its sine
+    and cosine.
+    """
+    fu = camera[0]
+    fv = camera[1]
+    a, b, z = point
+    azimuth, s, c = turn
+    # pixel_D_point circledot(point)
+    u_D_xi[0] = fu / z
+    u_D_xi[1] = 0.0
+    u_D_xi[2] = -fu * a / z
+    u_D_xi[3] = -fu * a * b
+    u_D_xi[4] = fu * (1.0 + a * a)
+    u_D_xi[5] = -fu * b
+    v_D_xi[0] = 0.0
+    v_D_xi[1] = fv / z
+    v_D_xi[2] = -fv * b / z
+    v_D_xi[3] = -fv * (1.0 + b * b)
+    v_D_xi[4] = fv * a * b
+    v_D_xi[5] = fv * a
+    if azimuth != 0.0:
+        for i in range(1, 5, 3):  # back from the turned camera
+            u_D_xi[i], u_D_xi[i + 1] = (
+                c * u_D_xi[i] + s * u_D_xi[i + 1],
+                c * u_D_xi[i + 1] - s * u_D_xi[i],
+            )
+            v_D_xi[i], v_D_xi[i + 1] = (
+                c * v_D_xi[i] + s * v_D_xi[i + 1],
+                c * v_D_xi[i + 1] - s * v_D_xi[i],
+            )
+
+
+@compiled
+def _move_to(T: FloatArray, moved: FloatArray) -> float:
+    """Overwrite a motion (4, 4) by another one; return the largest change of an entry."""
+    change = 0.0
+    for i in range(4):
+        for j in range(4):
+            change = max(change, abs(moved[i, j] - T[i, j]))
+            T[i, j] = moved[i, j]
+    return change
+
+
+@compiled
+def _iterate(camera: CameraArgs, T: FloatArray, seen: _Seen, steps: _Steps) -> None:
     """Gauss-Newton on the first entries of the twists of motions (H, 4, 4), in place; see
     `_gauss_newton`.
-
-    Weights (H, K) are multiplied by those of Geman and McClure at a scale; infinite: by none. A
-    motion is done when no entry of it changes by `converged`.
     """
     fu, fv, cu, cv, _, _ = camera
+    points = seen.points
+    pixels = seen.pixels
+    scale_px = steps.scale_px
+    free = steps.free
     A = np.empty((free, free))
     xi = np.empty(6)
     u_D_xi = np.empty(6)
     v_D_xi = np.empty(6)
-    before = np.empty((4, 4))
+    moved = np.empty((4, 4))
     for h in range(len(T)):
-        for _ in range(iterations):
+        for _ in range(steps.iterations):
             for i in range(6):
                 xi[i] = 0.0
             for i in range(free):
@@ -168,7 +242,7 @@ def _iterate(
                 y = T[h, 1, 0] * px + T[h, 1, 1] * py + T[h, 1, 2] * pz + T[h, 1, 3]
                 z = T[h, 2, 0] * px + T[h, 2, 1] * py + T[h, 2, 2] * pz + T[h, 2, 3]
                 azimuth, s, c, y, z = turn_to(camera, y, z)
-                w2 = weight[h, n] ** 2
+                w2 = seen.weight[h, n] ** 2
                 if not z > _MIN_DEPTH_M or w2 == 0.0:
                     continue
                 a = x / z
@@ -183,29 +257,7 @@ def _iterate(
                     continue
                 robust = 1.0 / (1.0 + (error / scale_px) ** 2)
                 w2 *= robust * robust
-                # pixel_D_point circledot(point)
-                u_D_xi[0] = fu / z
-                u_D_xi[1] = 0.0
-                u_D_xi[2] = -fu * a / z
-                u_D_xi[3] = -fu * a * b
-                u_D_xi[4] = fu * (1.0 + a * a)
-                u_D_xi[5] = -fu * b
-                v_D_xi[0] = 0.0
-                v_D_xi[1] = fv / z
-                v_D_xi[2] = -fv * b / z
-                v_D_xi[3] = -fv * (1.0 + b * b)
-                v_D_xi[4] = fv * a * b
-                v_D_xi[5] = fv * a
-                if azimuth != 0.0:
-                    for i in range(1, 5, 3):  # back from the turned camera
-                        u_D_xi[i], u_D_xi[i + 1] = (
-                            c * u_D_xi[i] + s * u_D_xi[i + 1],
-                            c * u_D_xi[i + 1] - s * u_D_xi[i],
-                        )
-                        v_D_xi[i], v_D_xi[i + 1] = (
-                            c * v_D_xi[i] + s * v_D_xi[i + 1],
-                            c * v_D_xi[i + 1] - s * v_D_xi[i],
-                        )
+                _pixel_D_twist(camera, (a, b, z), (azimuth, s, c), u_D_xi, v_D_xi)
                 for i in range(free):
                     xi[i] += w2 * (u_D_xi[i] * du + v_D_xi[i] * dv)
                     for j in range(i + 1):
@@ -214,19 +266,15 @@ def _iterate(
             for i in range(free):
                 trace += A[i, i]
             for i in range(free):
-                A[i, i] += _DAMPING * trace / free + 1e-9
+                A[i, i] += _CONSENSUS.damping * trace / free + 1e-9
             solve_positive(A, xi)
             for i in range(free):
                 xi[i] = min(max(xi[i], -5.0), 5.0)
             for i in range(4):
                 for j in range(4):
-                    before[i, j] = T[h, i, j]
-            move_by_twist(xi, T[h])
-            change = 0.0
-            for i in range(4):
-                for j in range(4):
-                    change = max(change, abs(T[h, i, j] - before[i, j]))
-            if change < converged:
+                    moved[i, j] = T[h, i, j]
+            move_by_twist(xi, moved)
+            if _move_to(T[h], moved) < steps.converged:
                 break
 
 
@@ -247,13 +295,8 @@ def _refine(
     _iterate(
         camera_args(camera),
         T,
-        points[None],
-        seen[None],
-        equal,
-        scale_px,
-        _REFINE_ITERATIONS,
-        free.stop,
-        converged,
+        _Seen(points[None], seen[None], equal),
+        _Steps(scale_px, _REFINE_ITERATIONS, free.stop, converged),
     )
     return T[0]
 
@@ -269,7 +312,7 @@ def _ransac(
     begin = starts[_best_start(camera, starts, p_prev, pixels, limit)]
     refined = _refine(camera, begin, p_prev, pixels, limit / 2, free)
     inliers = pixel_errors(camera, refined, p_prev, pixels) <= limit
-    if share_of(inliers) >= _SURE_SHARE:
+    if share_of(inliers) >= _CONSENSUS.sure_share:
         return refined, inliers
     sets = problem.rng.integers(0, len(p_prev), size=(_SAMPLES, 3))
     T = np.broadcast_to(begin, (len(sets), 4, 4))
@@ -279,7 +322,7 @@ def _ransac(
         p_prev[sets],
         pixels[sets],
         np.ones(sets.shape),
-        iterations=_SAMPLE_ITERATIONS,
+        iterations=_CONSENSUS.sample_iterations,
         free=free,
     )
     T = np.concatenate([starts, refined[None], T])
@@ -311,6 +354,14 @@ def _best_start(
     return int(np.argmin(errors[:, (count - 1) // 2] + errors[:, count // 2]))  # twice the medians
 
 
+@dataclass(frozen=True, slots=True)
+class MotionPriors:
+    """What is expected of the motion from the previous to the current cam0 frame."""
+
+    R: FloatArray | None = None  # (3, 3); None: not known
+    T: FloatArray | None = None  # (4, 4) `T_curr_prev`, likewise
+
+
 def static_tracks(
     problem: RansacProblem,
     left: FloatArray,
@@ -318,8 +369,7 @@ def static_tracks(
     has_depth: BoolArray,
     pixels: FloatArray,
     expected: FloatArray,
-    R_prior: FloatArray | None,
-    T_prior: FloatArray | None,
+    priors: MotionPriors,
 ) -> tuple[BoolArray, Consensus | None]:
     """Find the tracks of static points: by the tracks with depth, else by two-view geometry of the
     left images.
@@ -332,8 +382,7 @@ def static_tracks(
         has_depth: mask (N,) of tracks with known depth.
         pixels: left pixels (N, 2) in the current frame.
         expected: motion (4, 4) `T_curr_prev` to start from.
-        R_prior: prior rotation (3, 3) from the previous to the current cam0 frame, or None.
-        T_prior: prior motion (4, 4) `T_curr_prev`, or None.
+        priors: of the motion.
 
     Returns:
         Mask (N,) of the tracks to keep, and the consensus motion of the tracks with depth (its
@@ -341,12 +390,14 @@ def static_tracks(
         kept: the caller may check them against it.
     """
     motion = rigid_consensus(
-        problem, p_prev[has_depth], pixels[has_depth], expected, R_prior, T_prior
+        problem, p_prev[has_depth], pixels[has_depth], expected, priors.R, priors.T
     )
     keep = np.ones(len(left), dtype=np.bool_)
     if motion is not None:
         keep[has_depth] = motion.inliers
-    elif (agree := bearing_consensus(problem, left, pixels, expected[:3, :3], R_prior)) is not None:
+    elif (
+        agree := bearing_consensus(problem, left, pixels, expected[:3, :3], priors.R)
+    ) is not None:
         keep = agree
     return keep, motion
 
@@ -420,7 +471,10 @@ def _prior_candidates(
     near: list[FloatArray] = []
     if T_prior is not None and not _motions_agree(problem.camera, T, T_prior, p_prev):
         near.append(_refine(problem.camera, T_prior, p_prev, pixels, problem.limit_px, slice(0, 6)))
-    if R_prior is not None and _rotation_difference_deg(T, R_prior) > _PRIOR_MAX_DEVIATION_DEG:
+    if (
+        R_prior is not None
+        and _rotation_difference_deg(T, R_prior) > _CONSENSUS.prior_max_deviation_deg
+    ):
         fixed = np.stack([se3_from_parts(R_prior, t) for t in (expected[:3, 3], np.zeros(3))])
         near.append(_ransac(problem, p_prev, pixels, fixed, slice(0, 3))[0])
     return near
@@ -435,7 +489,7 @@ def _motions_agree(
     if not ahead.any():
         return False
     gap = pixel_errors(camera, T_other, p_prev[ahead], project(camera, moved[ahead])[:, :2])
-    return bool(median(gap) <= _PRIOR_PX)
+    return bool(median(gap) <= _CONSENSUS.prior_px)
 
 
 def _rotation_difference_deg(T: FloatArray, R: FloatArray) -> float:
@@ -513,21 +567,23 @@ def predicted_motion(
 
     None with too few points, or if no motion fits most of them.
     """
-    few = slice(None, None, max(1, len(p_prev) // _PRIOR_POINTS))
+    few = slice(None, None, max(1, len(p_prev) // _CONSENSUS.prior_points))
     p = p_prev[few]
     z = pixels[few]
     if len(p) < _MIN_POINTS:
         return None
     T = expected
     weight = np.ones((1, len(p)))
-    for _ in range(_SAMPLE_ITERATIONS):
-        if median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX:
+    for _ in range(_CONSENSUS.sample_iterations):
+        if median(pixel_errors(camera, T, p, z)) <= _CONSENSUS.prior_px:
             return T
         T = _gauss_newton(
             camera, T[None], p[None], z[None], weight, iterations=1, free=slice(0, 6)
         )[0]
-    T = _refine(camera, T, p, z, _PRIOR_PX, slice(0, 6), converged=_PRIOR_CONVERGED)
-    return T if median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX else None
+    T = _refine(
+        camera, T, p, z, _CONSENSUS.prior_px, slice(0, 6), converged=_CONSENSUS.prior_converged
+    )
+    return T if median(pixel_errors(camera, T, p, z)) <= _CONSENSUS.prior_px else None
 
 
 # --- two views, no depth
@@ -575,7 +631,7 @@ def bearing_consensus(
     near_prior = None
     if R_prior is not None:
         near_prior = _bearing_inliers(problem, seen, _bearing_ransac(problem, seen, [R_prior]))
-        if near_prior.mean() >= _SURE_BEARING_SHARE:
+        if near_prior.mean() >= _CONSENSUS.sure_bearing_share:
             return near_prior
     rotations = [expected_R, _pure_rotation(problem, seen)]
     T = _bearing_ransac(problem, seen, rotations, _five_point(problem, previous, current))
@@ -583,13 +639,15 @@ def bearing_consensus(
     if (
         R_prior is not None
         and near_prior is not None
-        and _rotation_difference_deg(T, R_prior) > _PRIOR_MAX_DEVIATION_DEG
+        and _rotation_difference_deg(T, R_prior) > _CONSENSUS.prior_max_deviation_deg
     ):
         # A wrong prior shares some inliers with the consensus: only outliers of the consensus
         # support the prior.
         supported = (near_prior & ~kept).sum() >= max(_MIN_POINTS, _PRIOR_MIN_SUPPORT * kept.sum())
         kept = near_prior if supported else kept
-    return kept if kept.sum() >= max(_MIN_POINTS, _MIN_BEARING_SHARE * len(kept)) else None
+    return (
+        kept if kept.sum() >= max(_MIN_POINTS, _CONSENSUS.min_bearing_share * len(kept)) else None
+    )
 
 
 def _ray_distance(
@@ -611,7 +669,9 @@ def _ray_distance(
     off_v = after[:, 1] - camera.fv * y - camera.cv
     way_u = camera.fu * (t[..., 0] - x * t[..., 2])
     way_v = camera.fv * (t[..., 1] - y * t[..., 2])
-    along = np.maximum(off_u * way_u + off_v * way_v, 0.0) / (way_u**2 + way_v**2 + _EPSILON)
+    along = np.maximum(off_u * way_u + off_v * way_v, 0.0) / (
+        way_u**2 + way_v**2 + _CONSENSUS.epsilon
+    )
     distance = np.hypot(off_u - along * way_u, off_v - along * way_v)
     return np.where(ahead, distance, np.inf)
 
@@ -677,7 +737,7 @@ def _bearing_step(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> Flo
     turned = seen.before @ R.T
     line = np.cross(t, turned)
     normal = facing(camera, seen.after, line)[1]
-    scale = np.hypot(normal[:, 0] / camera.fu, normal[:, 1] / camera.fv) + _EPSILON
+    scale = np.hypot(normal[:, 0] / camera.fu, normal[:, 1] / camera.fv) + _CONSENSUS.epsilon
     distance = _ray_distance(camera, seen, R, t)
     weight = (
         np.where(
@@ -691,7 +751,9 @@ def _bearing_step(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> Flo
     r_D_t = np.cross(turned, seen.rays) @ plane.T
     J = weight[:, None] * np.concatenate([r_D_turn, r_D_t], axis=1)
     A = J.T @ J
-    step = -np.linalg.solve(A + (_DAMPING * np.trace(A) / 5 + _EPSILON) * np.eye(5), J.T @ residual)
+    step = -np.linalg.solve(
+        A + (_CONSENSUS.damping * np.trace(A) / 5 + _CONSENSUS.epsilon) * np.eye(5), J.T @ residual
+    )
     moved = t + step[3:] @ plane
     return se3_from_parts(so3_exp(step[:3]) @ R, moved / np.linalg.norm(moved))
 
@@ -727,7 +789,7 @@ def _triads(rays: FloatArray, pairs: IntArray) -> FloatArray:
     a = rays[pairs[:, 0]]
     b = rays[pairs[:, 1]]
     across = np.cross(a, b)
-    across = across / (np.linalg.norm(across, axis=1, keepdims=True) + _EPSILON)
+    across = across / (np.linalg.norm(across, axis=1, keepdims=True) + _CONSENSUS.epsilon)
     return np.stack([a, across, np.cross(a, across)], axis=2)
 
 
@@ -745,7 +807,7 @@ def _five_point(
             return None
     K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
     params = cv2.UsacParams()
-    params.confidence = _FIVE_POINT_CONFIDENCE
+    params.confidence = _CONSENSUS.five_point_confidence
     params.threshold = problem.limit_px
     params.maxIterations = 10 * _SAMPLES
     params.randomGeneratorState = int(problem.rng.integers(0, 2**31 - 1))
@@ -768,7 +830,9 @@ def _pinhole_pixels(
     cylinder's (N, 2).
     """
     rays = [left_rays(camera, pixels) for pixels in (previous, current)]
-    ahead = np.all([r[:, 2] > _MIN_FORWARD * np.linalg.norm(r, axis=1) for r in rays], axis=0)
+    ahead = np.all(
+        [r[:, 2] > _CONSENSUS.min_forward * np.linalg.norm(r, axis=1) for r in rays], axis=0
+    )
     a, b = (
         r[ahead, :2] / r[ahead, 2:] * [camera.fu, camera.fv] + [camera.cu, camera.cv] for r in rays
     )

@@ -4,6 +4,8 @@ late, or another one.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vio.frontend.one_camera import with_prior_depths
@@ -18,6 +20,16 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, StereoFrame, TrackPrior
 
 _PAIRING_POINTS = 150  # features that are tried with images of other frames
+
+
+@dataclass(frozen=True, slots=True)
+class FrameImages:
+    """The images of a frame in the forms that tracking needs."""
+
+    frame: StereoFrame
+    left: ImageLevels
+    right: ImageLevels | None  # None: one camera
+    stereo: StereoFit
 
 
 class RightMatcher:
@@ -35,20 +47,22 @@ class RightMatcher:
 
     def match(
         self,
-        frame: StereoFrame,
+        images: FrameImages,
+        right: ImageLevels,
         previous: PreviousFrame,
         tracks: Tracks,
-        left: ImageLevels,
-        right: ImageLevels,
         prior: TrackPrior | None,
-        stereo: StereoFit,
         motion: Consensus | None,
     ) -> Tracks:
         """Match features of known depth in the right image; no match where the right image cannot
         be used.
 
-        While it cannot, depths come from the prior, where it has them.
+        While it cannot, depths come from the prior, where it has them. `right` is the right image
+        of the frame.
         """
+        frame = images.frame
+        left = images.left
+        stereo = images.stereo
         if not self._right.usable:
             tracks = with_prior_depths(self._camera, tracks, prior)
         testable = stereo.testable(tracks)

@@ -7,6 +7,8 @@ The alignment starts at the disparity of a known depth, else at the result of a 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args, point_at
@@ -29,35 +31,44 @@ from vio.records import BoolArray, Image, IntArray
 
 _ITERATIONS = 5
 _MIN_CORRELATION = 0.8  # normalised, of a match
-_MIN_PEAK_MARGIN = 0.03  # lead in correlation over the second-best match in the row
+
+
+class _StereoRules(NamedTuple):
+    """How features are matched in the right image."""
+
+    min_peak_margin: float = 0.03  # lead in correlation over the second-best match in the row
+    max_skew: float = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
+    # how much lower the correlation of the coarse search may be than that of the alignment
+    coarse_slack: float = 0.2
+    min_depth_m: float = 0.05
+    min_disparity_px: float = 0.1  # below, a point is too far away to be located
+    # share of features with a right match below which other row differences are tried
+    few_matches: float = 0.2
+    good_match: float = 0.9  # correlation of patches whose rows agree
+    # root mean square over the matches: from here on the run reports the calibration, too
+    rows_off_px: float = 0.2
+    row_search_frames: int = 10  # between two such searches, while matches are few
+    # of the image width: largest disparity that is searched where the scene is near
+    max_reach: float = 0.64
+    reach_frames: int = 10  # between two searches beyond the present reach
+    # of the points without a match that must have one beyond the reach for it to be doubled …
+    beyond_share: float = 0.1
+    min_beyond: int = 10  # … and this many at least …
+    within_reach: float = 0.9  # … until this share of them is within it
+    offset_gain: float = 0.2  # part of a frame's common offset that is believed
+    depth_slack: float = 0.1  # standard deviation of a point's depth by motion alone, over it
+    min_spread_px: float = 2.0  # between near and far disparities, to tell an offset from a factor
+    max_rows_half: int = 16  # row difference, pixels at half resolution
+
+
+_STEREO = _StereoRules()
 _MAX_ROW_DIFFERENCE_PX = 1.0  # of a match, after the estimated row differences are subtracted
-_MAX_SKEW = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
-# how much lower the correlation of the coarse search may be than that of the alignment
-_COARSE_SLACK = 0.2
-_MIN_DEPTH_M = 0.05
-_MIN_DISPARITY_PX = 0.1  # below, a point is too far away to be located
-# share of features with a right match below which other row differences are tried
-_FEW_MATCHES = 0.2
-_GOOD_MATCH = 0.9  # correlation of patches whose rows agree
 _MIN_POINTS = 20
-# root mean square over the matches: from here on the run reports the calibration, too
-_ROWS_OFF_PX = 0.2
 # the third of three like angles over the root mean square of two, at most, at 99 %
 _THIRD_ANGLE = 7.0
-_ROW_SEARCH_FRAMES = 10  # between two such searches, while matches are few
-_MAX_REACH = 0.64  # of the image width: largest disparity that is searched where the scene is near
-_REACH_FRAMES = 10  # between two searches beyond the present reach
-# of the points without a match that must have one beyond the reach for it to be doubled …
-_BEYOND_SHARE = 0.1
-_MIN_BEYOND = 10  # … and this many at least …
-_WITHIN_REACH = 0.9  # … until this share of them is within it
 # A pair turns so much in its mount, three times the prior of its calibration, or exposes so far
 # apart.
 _MAX_TURN_RAD = 0.3 * np.pi / 180.0
-_OFFSET_GAIN = 0.2  # part of a frame's common offset that is believed
-_DEPTH_SLACK = 0.1  # standard deviation of a point's depth by motion alone, over it
-_MIN_SPREAD_PX = 2.0  # between near and far disparities, to tell an offset from a factor
-_MAX_ROWS_HALF = 16  # row difference, pixels at half resolution
 
 
 class StereoFit:
@@ -77,7 +88,7 @@ class StereoFit:
         """
         # doubled where the scene is nearer
         self.max_disparity_px = disparity.max_disparity * size[0]
-        self._most_reach_px = _MAX_REACH * size[0]
+        self._most_reach_px = _STEREO.max_reach * size[0]
         self._reach_wait = 0  # frames until the reach is tried again
         self._camera = camera
         self._bank = bank
@@ -141,9 +152,9 @@ class StereoFit:
         )
         if abs(offset) > self._camera.fu * _MAX_TURN_RAD:
             return tracks
-        tolerance = INLIER_PX + (_DEPTH_SLACK * expected if by_motion else 0.0)
+        tolerance = INLIER_PX + (_STEREO.depth_slack * expected if by_motion else 0.0)
         agree = np.abs(off - offset * grows - slope * expected) <= tolerance
-        self._offset_px = (1.0 - _OFFSET_GAIN) * offset
+        self._offset_px = (1.0 - _STEREO.offset_gain) * offset
         return self._with_right_pixels(tracks, rows, pixels, skew, agree)
 
     def _offset_growth(self, left: FloatArray) -> FloatArray:
@@ -158,7 +169,7 @@ class StereoFit:
         it.
         """
         depth = depth_of(self._camera, tracks.point)
-        rows = (tracks.has_point & (depth > _MIN_DEPTH_M)).nonzero()[0]
+        rows = (tracks.has_point & (depth > _STEREO.min_depth_m)).nonzero()[0]
         return rows, self._camera.fu * self._camera.baseline_m / depth[rows]
 
     def match_near(
@@ -176,14 +187,14 @@ class StereoFit:
         unique.
         """
         offset = round(self._rows.offset_px / 2)
-        if self._unmatched % _ROW_SEARCH_FRAMES == 1:
+        if self._unmatched % _STEREO.row_search_frames == 1:
             offset = self._best_offset(left_half, right_half, points, offset)
-        correlation = _MIN_CORRELATION - _COARSE_SLACK
+        correlation = _MIN_CORRELATION - _STEREO.coarse_slack
         right_half = shifted_rows(right_half, offset)
         found = self._search(left_half, right_half, points, correlation)
         if self._reach_wait:
             return found
-        self._reach_wait = _REACH_FRAMES
+        self._reach_wait = _STEREO.reach_frames
         if not self._reaches_further(left_half, right_half, points[~found[1]]):
             return found
         return self._search(left_half, right_half, points, correlation)
@@ -195,7 +206,7 @@ class StereoFit:
         beyond = self._beyond(left_half, right_half, points)
         if not _are_enough(len(beyond), len(points)):
             return False
-        farthest = min(np.quantile(beyond, _WITHIN_REACH), self._most_reach_px)
+        farthest = min(np.quantile(beyond, _STEREO.within_reach), self._most_reach_px)
         while self.max_disparity_px < farthest:
             self._double_reach()
         return True
@@ -207,7 +218,7 @@ class StereoFit:
         if reach >= most:
             return np.zeros(0)
         disparity, good = match_rows(
-            left_half, right_half, points, most, _GOOD_MATCH, _MIN_PEAK_MARGIN
+            left_half, right_half, points, most, _STEREO.good_match, _STEREO.min_peak_margin
         )
         return disparity[good & (disparity > reach)]
 
@@ -229,17 +240,17 @@ class StereoFit:
 
         Rows may be far apart where the right camera has been pitched since it was calibrated.
         """
-        tried = range(-_MAX_ROWS_HALF, _MAX_ROWS_HALF + 1)
+        tried = range(-_STEREO.max_rows_half, _STEREO.max_rows_half + 1)
         counts = [
             int(
-                self._search(left_half, shifted_rows(right_half, rows), points, _GOOD_MATCH)[
+                self._search(left_half, shifted_rows(right_half, rows), points, _STEREO.good_match)[
                     1
                 ].sum()
             )
             for rows in tried
         ]
         best = int(np.argmax(counts))
-        if counts[best] < max(_MIN_POINTS, 2 * counts[offset + _MAX_ROWS_HALF]):
+        if counts[best] < max(_MIN_POINTS, 2 * counts[offset + _STEREO.max_rows_half]):
             return offset
         self._rows.restart(2.0 * tried[best])
         return tried[best]
@@ -265,7 +276,7 @@ class StereoFit:
         """Count the left pixels (N, 2) that match well on their row between two images at half
         resolution.
         """
-        return int(self._search(left_half, right_half, points, _GOOD_MATCH)[1].sum())
+        return int(self._search(left_half, right_half, points, _STEREO.good_match)[1].sum())
 
     def forget_offset(self) -> None:
         """Take nothing out of the disparities that follow."""
@@ -283,7 +294,7 @@ class StereoFit:
         """Whether the rows of the matches differ by a smooth field: the calibration is off, and
         so are the depths.
         """
-        return self._rows.rms_px >= _ROWS_OFF_PX
+        return self._rows.rms_px >= _STEREO.rows_off_px
 
     @property
     def disparity_error_px(self) -> float:
@@ -306,7 +317,7 @@ class StereoFit:
 
     def update_rows(self, tracks: Tracks) -> None:
         """Update the row differences with the matches of a frame."""
-        few = len(tracks) >= _MIN_POINTS and share_of(tracks.has_right) < _FEW_MATCHES
+        few = len(tracks) >= _MIN_POINTS and share_of(tracks.has_right) < _STEREO.few_matches
         self._unmatched = self._unmatched + 1 if few else 0
         self._rows.update(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
         self._reach_wait = max(0, self._reach_wait - 1)
@@ -326,18 +337,18 @@ class StereoFit:
         self, left_half: Image, right_half: Image, points: FloatArray, min_correlation: float
     ) -> tuple[FloatArray, BoolArray]:
         return match_rows(
-            left_half, right_half, points, self.max_disparity_px, min_correlation, _MIN_PEAK_MARGIN
+            left_half,
+            right_half,
+            points,
+            self.max_disparity_px,
+            min_correlation,
+            _STEREO.min_peak_margin,
         )
 
     def _fit(
         self, tracks: Tracks, rows: IntArray, right: ImageLevels, disparity: FloatArray
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Align anchors of rows (K,) with the right image near expected disparities (K,).
-
-        Returns:
-            Right pixels (K, 2), the change of the warp's linear part (K, 2, 2), and a mask (K,) of
-            the good ones.
-        """
+    ) -> _Matches:
+        """Align anchors of rows (K,) with the right image near expected disparities (K,)."""
         count = len(rows)
         left = np.empty((count, 2))
         start = np.empty((count, 2, 3))
@@ -347,13 +358,12 @@ class StereoFit:
         warp, score = align(
             self._bank.store, tracks.slot.take(rows), right.full, start, _ITERATIONS, expected
         )
-        pixels = np.empty((count, 2))
-        skew = np.empty((count, 2, 2))
-        valid = np.empty(count, dtype=np.bool_)
-        _judge(
-            tracks.warp, rows, left, start, warp, score, self.max_disparity_px, pixels, skew, valid
+        found = _Matches(
+            np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, dtype=np.bool_)
         )
-        return pixels, skew, valid
+        fits = _Fits(left, start, warp, score)
+        _judge(tracks.warp, rows, fits, self.max_disparity_px, found)
+        return found
 
     def _with_right_pixels(
         self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray, good: BoolArray
@@ -370,10 +380,9 @@ class StereoFit:
         point = tracks.point.copy()
         has_point = tracks.has_point.copy()
         f_baseline = self._camera.fu * self._camera.baseline_m
-        columns = right, has_right, skews, point, has_point
-        _match(
-            camera_args(self._camera), f_baseline, tracks.left, rows, pixels, skew, good, *columns
-        )
+        matches = _Matches(pixels, skew, good)
+        columns = _RightColumns(right, has_right, skews, point, has_point)
+        _match(camera_args(self._camera), f_baseline, tracks.left, rows, matches, columns)
         return changed(
             tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point
         )
@@ -381,7 +390,7 @@ class StereoFit:
 
 def _are_enough(beyond: int, points: int) -> bool:
     """Whether so many of some points are beyond the reach that the search is to go further."""
-    return beyond >= max(_MIN_BEYOND, _BEYOND_SHARE * points)
+    return beyond >= max(_STEREO.min_beyond, _STEREO.beyond_share * points)
 
 
 @compiled
@@ -406,26 +415,45 @@ def _begin(
         start[k, 0, 2] -= disparity[k]
 
 
+class _Fits(NamedTuple):
+    """Alignments of K anchors with the right image."""
+
+    left: FloatArray  # (K, 2) left pixels
+    start: FloatArray  # (K, 2, 3) warps before, in the expected row
+    warp: FloatArray  # (K, 2, 3) warps after
+    score: FloatArray  # (K,) correlations
+
+
+class _Matches(NamedTuple):
+    """Matches of K features in the right image."""
+
+    pixels: FloatArray  # (K, 2) in the right image
+    skew: FloatArray  # (K, 2, 2) change of the warp's linear part
+    good: BoolArray  # (K,)
+
+
+class _RightColumns(NamedTuple):
+    """Columns of `Tracks` that a match sets."""
+
+    right: FloatArray
+    has_right: BoolArray
+    skew: FloatArray
+    point: FloatArray
+    has_point: BoolArray
+
+
 @compiled
 def _judge(
-    before: FloatArray,
-    rows: IntArray,
-    left: FloatArray,
-    start: FloatArray,
-    warp: FloatArray,
-    score: FloatArray,
-    max_disparity: float,
-    pixels: FloatArray,
-    skew: FloatArray,
-    valid: BoolArray,
+    before: FloatArray, rows: IntArray, fits: _Fits, max_disparity: float, out: _Matches
 ) -> None:
-    """Write right pixels (K, 2), skews (K, 2, 2), and a mask (K,) of matches that a point ahead of
-    the camera may have.
+    """Write matches; good are those that a point ahead of the camera may have.
 
-    They are given by warps (N, 2, 3) of the left image and rows (K,) of these, left pixels (K, 2),
-    warps (K, 2, 3) before and after the alignment, which starts in the expected row, and
-    correlations (K,).
+    `before` are the warps (N, 2, 3) of the left image, of which rows (K,) were aligned.
     """
+    pixels = out.pixels
+    skew = out.skew
+    valid = out.good
+    warp = fits.warp
     for k, n in enumerate(rows):
         steep = 0.0
         for i in range(2):
@@ -433,11 +461,13 @@ def _judge(
             for j in range(2):
                 skew[k, i, j] = warp[k, i, j] - before[n, i, j]
                 steep = max(steep, abs(skew[k, i, j]))
-        du = pixels[k, 0] - start[k, 0, 2]
-        dv = pixels[k, 1] - start[k, 1, 2]
-        valid[k] = score[k] >= _MIN_CORRELATION and is_on_peak(du, dv) and steep <= _MAX_SKEW
+        du = pixels[k, 0] - fits.start[k, 0, 2]
+        dv = pixels[k, 1] - fits.start[k, 1, 2]
+        valid[k] = (
+            fits.score[k] >= _MIN_CORRELATION and is_on_peak(du, dv) and steep <= _STEREO.max_skew
+        )
         valid[k] &= abs(dv) <= _MAX_ROW_DIFFERENCE_PX
-        valid[k] &= MIN_MATCH_DISPARITY_PX <= left[k, 0] - pixels[k, 0] <= max_disparity
+        valid[k] &= MIN_MATCH_DISPARITY_PX <= fits.left[k, 0] - pixels[k, 0] <= max_disparity
 
 
 def common_offset(expected: FloatArray, off: FloatArray) -> tuple[float, float]:
@@ -453,7 +483,7 @@ def common_offset(expected: FloatArray, off: FloatArray) -> tuple[float, float]:
     far = order[: len(order) // 2]
     d_near = median(expected[near])
     d_far = median(expected[far])
-    if d_near - d_far < _MIN_SPREAD_PX:
+    if d_near - d_far < _STEREO.min_spread_px:
         return median(off), 0.0
     slope = (median(off[near]) - median(off[far])) / (d_near - d_far)
     return median(off - slope * expected), slope
@@ -465,33 +495,27 @@ def _match(
     f_baseline: float,
     left: FloatArray,
     rows: IntArray,
-    pixels: FloatArray,
-    skew: FloatArray,
-    good: BoolArray,
-    right: FloatArray,
-    has_right: BoolArray,
-    skews: FloatArray,
-    point: FloatArray,
-    has_point: BoolArray,
+    matches: _Matches,
+    out: _RightColumns,
 ) -> None:
-    """Set the columns of features, at left pixels (N, 2), in those rows (K,) whose match is `good`
-    (K,).
+    """Set the columns of features, at left pixels (N, 2), in those rows (K,) whose match is good.
 
-    A match is a right pixel (K, 2) and a skew (K, 2, 2); a point has the mean row of both images.
+    A point has the mean row of both images.
     """
+    pixels = matches.pixels
     for k, n in enumerate(rows):
-        if not good[k]:
+        if not matches.good[k]:
             continue
-        has_right[n] = True
-        right[n, 0] = pixels[k, 0]
-        right[n, 1] = pixels[k, 1]
+        out.has_right[n] = True
+        out.right[n, 0] = pixels[k, 0]
+        out.right[n, 1] = pixels[k, 1]
         for i in range(2):
             for j in range(2):
-                skews[n, i, j] = skew[k, i, j]
+                out.skew[n, i, j] = matches.skew[k, i, j]
         disparity = left[n, 0] - pixels[k, 0]
-        if disparity >= _MIN_DISPARITY_PX:
+        if disparity >= _STEREO.min_disparity_px:
             v = (left[n, 1] + pixels[k, 1]) / 2.0
-            point[n, 0], point[n, 1], point[n, 2] = point_at(
+            out.point[n, 0], out.point[n, 1], out.point[n, 2] = point_at(
                 camera, left[n, 0], v, f_baseline / disparity
             )
-            has_point[n] = True
+            out.has_point[n] = True

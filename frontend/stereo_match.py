@@ -317,15 +317,14 @@ def match_rows(
     valid = np.empty(len(points), dtype=np.bool_)
     images = np.ascontiguousarray(left_half), np.ascontiguousarray(right_half)
     _match(
-        *images, points / 2, math.ceil(max_disparity / 2), min_correlation, margin, disparity, valid
+        images, points / 2, math.ceil(max_disparity / 2), min_correlation, margin, disparity, valid
     )
     return disparity, valid
 
 
 @compiled
 def _match(
-    left: Image,
-    right: Image,
+    images: tuple[Image, Image],
     points: FloatArray,
     reach: int,
     min_correlation: float,
@@ -334,6 +333,7 @@ def _match(
     valid: BoolArray,
 ) -> None:
     """Write what `match_rows` returns, for points (N, 2) in pixels of the half image."""
+    left, right = images
     count = 0
     shift = np.empty(len(points))
     top = np.empty((2, len(points)))

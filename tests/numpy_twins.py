@@ -9,15 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from vio.filters.multiview import (
-    CAUCHY,
-    MIN_DEPTH,
-    MIN_DISPARITY_PX,
-    InverseDepth,
-    Residuals,
-    TrackInformation,
-    Views,
-)
+from vio.filters.multiview import CAUCHY, MIN_DEPTH, MIN_DISPARITY_PX, TrackInformation
+from vio.filters.track_records import InverseDepth, Residuals, Views
 from vio.frontend.align import FLAT_RMS, Templates, disc, offsets, window
 from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam

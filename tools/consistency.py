@@ -33,10 +33,10 @@ from vio.errors import VioError
 from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters import imu_start, navigation, window_tracks
 from vio.filters.msckf import Msckf
-from vio.filters.multiview import Residuals
 from vio.filters.navigation import NavState
 from vio.filters.noise import MotionNoise
 from vio.filters.settings import MsckfSettings
+from vio.filters.track_records import Residuals
 from vio.filters.window import Window
 from vio.filters.window_tracks import WindowTracks
 from vio.geometry.lie import (

@@ -1,12 +1,12 @@
 """The figure of docs/architecture.md: every package, what it imports, and in which layer it stands.
 
-    python tools/draw_structure.py docs/images/structure.png [--root CHECKOUT]
+    python -m tools.draw_structure docs/images/structure.png [--root CHECKOUT]
 
 A package here is a package or a single module directly in `vio/`; `frontend/` is `vio.frontend`. It
 is one layer above the highest one that it imports. Arrows point at what is imported; those that a
 longer path implies are left out, and so are those to the foundation (records, protocols, geometry,
 errors, setting, numerics, files), which nearly everything imports. Imports inside functions count.
-An import that closes a cycle is red.
+An import that closes a cycle is red. A colour is a part of `tools/parts.py`.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
+from tools.parts import PARTS, part_of
+
 FOUNDATION = (
     "vio.records",
     "vio.protocols",
@@ -34,13 +36,16 @@ FOUNDATION = (
     "vio.files",
 )
 _COLOURS = {
-    "vio.cli": "#e8d5b5",
-    "vio.frontend": "#f0c9c9",
-    "vio.filters": "#cfe3cf",
-    "vio.sim": "#dcd3ea",
+    "base": "#e9e9e9",
+    "estimator": "#cfe3cf",
+    "guards": "#f0c9c9",
+    "input and output": "#f3e3b3",
+    "maps": "#c9e4e4",
+    "runs and live": "#c5d8f0",
+    "offline": "#e3cfc0",
+    "laboratory": "#dcd3ea",
+    "command line": "#ffffff",
 }
-_PLAIN = "#d6e2f0"
-_GROUND = "#e9e9e9"
 _CLOSING = "#c23b5a"
 _WIDTH = 1.0
 _HEIGHT = 0.62
@@ -181,7 +186,7 @@ def draw(packages: Mapping[str, Package], path: Path) -> None:
         start = (x0 + _WIDTH / 2, y0)
         axes.annotate("", end, start, arrowprops={**style, "color": colour, "lw": 0.9}, zorder=1)
     for name, (x, y) in place.items():
-        colour = _GROUND if name in FOUNDATION else _COLOURS.get(name, _PLAIN)
+        colour = _COLOURS[part_of(name)]
         corners = "round,pad=0,rounding_size=0.06"
         axes.add_patch(
             FancyBboxPatch((x, y), _WIDTH, _HEIGHT, boxstyle=corners, fc=colour, ec="#55606e")
@@ -200,6 +205,13 @@ def draw(packages: Mapping[str, Package], path: Path) -> None:
             va="center",
             fontsize=6.5,
         )
+    for row, part in enumerate(PARTS):
+        y = up - 0.45 - 0.21 * row
+        corners = "round,pad=0,rounding_size=0.03"
+        axes.add_patch(
+            FancyBboxPatch((0.0, y), 0.2, 0.14, boxstyle=corners, fc=_COLOURS[part], ec="#55606e")
+        )
+        axes.text(0.28, y + 0.07, part, va="center", fontsize=8)
     figure.savefig(path)
 
 

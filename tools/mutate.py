@@ -1,18 +1,25 @@
 """Break the estimator's algebra on purpose, one line at a time, and name the test that detects it.
 
     python -m tools.mutate [WORD …] [--list]
+    python -m tools.mutate --constants N [--seed S] [WORD …] [--list]
 
 Each mutation of `tools/mutations.txt` (with WORDs, those whose name or file contains one) is
 applied to a copy of the repository, and its test files run there until the first failure. The table
 says which test that was. A mutation that no test detects is a survivor: the exit status is then 1,
 and a test is missing. At the end the tests that detected something run on an unchanged copy, where
 all must pass. Recordings are taken from VIO_DATA.
+
+With --constants, N constants are drawn from a seed in place of the list: numbers at the top of a
+module, each made half as large again (whole numbers by one at least). The tests of such a mutation
+are those of the list for its file, and the test files that name its module.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import os
+import random
 import re
 import shutil
 import subprocess
@@ -23,6 +30,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+
+from tools.measures import number_constants
+from tools.parts import source_files
 
 ROOT = Path(__file__).resolve().parent.parent
 _COPIED = (
@@ -74,6 +84,83 @@ def read_mutations(text: str) -> tuple[Mutation, ...]:
 
 
 MUTATIONS = read_mutations(Path(__file__).with_name("mutations.txt").read_text(encoding="utf-8"))
+
+
+def constant_mutations(root: Path, words: Sequence[str] = ()) -> list[Mutation]:
+    """Return, for each number at the top of a module, the mutation that makes it half as large
+    again.
+
+    Left out are zeros, and modules that no test file names.
+
+    Args:
+        root: the checkout.
+        words: only of files whose name contains one; none: of all.
+    """
+    listed = {mutation.file: mutation.tests for mutation in MUTATIONS}
+    texts = {
+        path.relative_to(root).as_posix(): path.read_text(encoding="utf-8")
+        for path in sorted((root / "tests").rglob("test_*.py"))
+    }
+    out = list[Mutation]()
+    for module, path in source_files(root).items():
+        file = path.relative_to(root).as_posix()
+        if words and not any(word in file for word in words):
+            continue
+        package, _, name = module.rpartition(".")
+        imported = re.compile(
+            rf"{re.escape(module)}\b|from {re.escape(package)} import [^()\n]*\b{name}\b"
+        )
+        naming = (test for test, text in texts.items() if imported.search(text))
+        tests = tuple(dict.fromkeys((*listed.get(file, ()), *naming)))
+        text = path.read_text(encoding="utf-8")
+        if tests:
+            out += [
+                Mutation(f"{module} {name} times 1.5", file, old, new, tests)
+                for name, old, new in _larger(text)
+            ]
+    return out
+
+
+def _larger(text: str) -> Iterator[tuple[str, str, str]]:
+    """Yield name, old and new text of each constant of a module, from the end of the line
+    before: numbers at its top, and those of records that are made there as they are declared.
+    """
+    tree = ast.parse(text)
+    numbers = set(number_constants(tree))
+    made = {
+        node.value.func.id
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+        and isinstance(node.value, ast.Call)
+        and isinstance(node.value.func, ast.Name)
+        and not node.value.args
+        and not node.value.keywords
+    }
+    nodes = list(tree.body)
+    for record in tree.body:
+        if isinstance(record, ast.ClassDef) and record.name in made:
+            fields = ast.Module(body=record.body, type_ignores=[])
+            numbers |= set(number_constants(fields))
+            nodes += record.body
+    for node in nodes:
+        if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None:
+            continue
+        target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+        old = ast.get_source_segment(text, node)
+        value = ast.get_source_segment(text, node.value)
+        if not isinstance(target, ast.Name) or target.id not in numbers or not (old and value):
+            continue
+        number = eval(compile(ast.Expression(node.value), "", "eval"), {})  # of numbers alone
+        larger = tuple(map(_half_more, number)) if isinstance(number, tuple) else _half_more(number)
+        if larger != number:
+            indent = "\n" + " " * node.col_offset
+            yield target.id, f"{indent}{old}", f"{indent}{old.removesuffix(value)}{larger!r}"
+
+
+def _half_more(number: float) -> float:
+    if isinstance(number, int):
+        return number + (max(1, abs(number) // 2) if number > 0 else -(abs(number) // 2))
+    return 1.5 * number
 
 
 def mutated(mutation: Mutation, text: str) -> str:
@@ -158,10 +245,20 @@ def main() -> int:
         "words", nargs="*", metavar="WORD", help="only mutations whose name or file contains it"
     )
     parser.add_argument("--list", action="store_true", help="name the mutations and change nothing")
+    parser.add_argument(
+        "--constants", type=int, metavar="N", help="in place of the list, N constants by chance"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the chance (0)")
     args = parser.parse_args()
-    chosen = [
-        m for m in MUTATIONS if not args.words or any(w in f"{m.name} {m.file}" for w in args.words)
-    ]
+    if args.constants is None:
+        chosen = [
+            m
+            for m in MUTATIONS
+            if not args.words or any(w in f"{m.name} {m.file}" for w in args.words)
+        ]
+    else:
+        found = constant_mutations(ROOT, args.words)
+        chosen = random.Random(args.seed).sample(found, min(args.constants, len(found)))
     if not chosen:
         parser.error("no mutation has such a name or file; see --list")
     if args.list:

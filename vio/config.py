@@ -281,17 +281,7 @@ def _checked(value: Any, hint: Any, path: str, where: str) -> Any:
         members = [member for member in get_args(hint) if member is not type(None)]
         return _checked(value, members[0], path, where)
     if origin is Literal:
-        choices = get_args(hint)
-        # YAML reads the bare words as truth values
-        if isinstance(value, bool) and {"on", "off"} <= set(choices):
-            value = "on" if value else "off"
-        if value in choices and type(value) in {type(c) for c in choices}:
-            return value
-        near = difflib.get_close_matches(_short(str(value)), choices, 1)
-        hint_text = f"; did you mean '{near[0]}'?" if near else ""
-        raise ConfigError(
-            f"{where}: {path} is one of {', '.join(choices)}, not {_short(repr(value))}{hint_text}"
-        )
+        return _chosen(value, get_args(hint), path, where)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value) if abs(value) < 2**1000 else math.inf  # which no range allows
     if hint is Path and isinstance(value, str):
@@ -302,6 +292,20 @@ def _checked(value: Any, hint: Any, path: str, where: str) -> Any:
         return value
     got = f"{_short(repr(value))}{_number_hint(value, hint)}"
     raise ConfigError(f"{where}: {path} takes {_TYPES.get(hint, hint)}, got {got}")
+
+
+def _chosen(value: Any, choices: tuple[Any, ...], path: str, where: str) -> Any:
+    """Return the value where it is one of the choices, or raise."""
+    # YAML reads the bare words as truth values
+    if isinstance(value, bool) and {"on", "off"} <= set(choices):
+        value = "on" if value else "off"
+    if value in choices and type(value) in {type(c) for c in choices}:
+        return value
+    near = difflib.get_close_matches(_short(str(value)), choices, 1)
+    hint_text = f"; did you mean '{near[0]}'?" if near else ""
+    raise ConfigError(
+        f"{where}: {path} is one of {', '.join(choices)}, not {_short(repr(value))}{hint_text}"
+    )
 
 
 def _number_hint(value: Any, hint: Any) -> str:

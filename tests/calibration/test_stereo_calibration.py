@@ -28,9 +28,7 @@ from vio.cameras.rectification_error import (
 )
 from vio.filters.multiview import (
     _PRIOR,
-    Residuals,
     TrackInformation,
-    Views,
     refine_points,
     residuals,
     track_information,
@@ -42,6 +40,7 @@ from vio.filters.stereo_calibration import (
     eliminate_points,
     stereo_columns,
 )
+from vio.filters.track_records import Residuals, Views
 from vio.geometry.distortion import CameraModel, project_point
 from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, project

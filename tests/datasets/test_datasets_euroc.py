@@ -34,7 +34,7 @@ from tests.euroc_maker import (
 from tests.same_events import frames_of
 from tests.sift import match_sift
 from vio.cameras.rig import rectifier_of
-from vio.cli.running import process
+from vio.cli.running import RunOptions, process
 from vio.config import load_config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.euroc import read_euroc
@@ -257,8 +257,7 @@ def test_a_copy_that_ended_early_is_used_as_far_as_it_goes(
             process(
                 str(tmp_path),
                 load_config(overrides=[f"motion={motion}"]),
-                out=tmp_path / motion,
-                plot=False,
+                RunOptions(out=tmp_path / motion, plot=False),
             )
         assert sum("ends too early" in record.getMessage() for record in caplog.records) == said
     samples = [event for event in dataset.events() if isinstance(event, ImuSample)]

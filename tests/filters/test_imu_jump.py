@@ -12,8 +12,8 @@ import pytest
 from tests.filters.test_msckf import EXACT_RIG, STEP_NS, Flight
 from vio.filters.imu_jump import GyroJump, turn_of_images
 from vio.filters.msckf import Msckf
-from vio.filters.multiview import Residuals
 from vio.filters.settings import MsckfSettings
+from vio.filters.track_records import Residuals
 from vio.filters.window_tracks import LinearTracks
 from vio.geometry.lie import FloatArray
 from vio.records import ImuSample, Observations, UpdateReport

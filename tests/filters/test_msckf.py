@@ -16,19 +16,13 @@ from vio.errors import ConfigError, DataError, DivergedError, EstimationError
 from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters import imu_start
 from vio.filters.msckf import Msckf
-from vio.filters.multiview import (
-    Residuals,
-    Views,
-    first_points,
-    refine_points,
-    residuals,
-    track_information,
-)
+from vio.filters.multiview import first_points, refine_points, residuals, track_information
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.prior import posterior
 from vio.filters.restart import restarted
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import eliminate_points
+from vio.filters.track_records import Residuals, Views
 from vio.filters.tracks import TrackTable, precision, rows_of
 from vio.filters.window import Window
 from vio.geometry.lie import (

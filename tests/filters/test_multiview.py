@@ -11,8 +11,6 @@ from tests.jacobians import numeric_jacobian
 from tests.numpy_twins import inverse_depth, moved, point_D_pose
 from vio.filters.multiview import (
     CAUCHY,
-    Residuals,
-    Views,
     first_points,
     refine_points,
     residuals,
@@ -21,6 +19,7 @@ from vio.filters.multiview import (
     usable_points,
 )
 from vio.filters.stereo_calibration import eliminate_points
+from vio.filters.track_records import Residuals, Views
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
 

@@ -9,9 +9,9 @@ import pytest
 from scipy.stats import chi2
 
 from tests.numpy_twins import point_D_pose
-from vio.filters.multiview import Residuals
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import eliminate_points
+from vio.filters.track_records import Residuals
 from vio.filters.window_tracks import MIN_PIXEL_SIGMA_PX, WindowTracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project

@@ -9,6 +9,7 @@ import pytest
 
 from vio.frontend import outliers
 from vio.frontend.outliers import (
+    MotionPriors,
     RansacProblem,
     bearing_consensus,
     epipolar_distance,
@@ -344,17 +345,17 @@ def test_static_tracks_use_depth_or_fall_back_to_two_views() -> None:
     before, after, bad = two_views(T_TRUE, 9, 0.3)
     p = scene(300, 9)
     deep = np.arange(300) % 2 == 0
-    kept, motion = static_tracks(make_problem(), before, p, deep, after, np.eye(4), None, None)
+    kept, motion = static_tracks(make_problem(), before, p, deep, after, np.eye(4), MotionPriors())
     np.testing.assert_array_equal(kept[deep], motion.inliers)
     assert not kept[deep & bad].any()
     assert kept[~deep].all()
     few = np.arange(300) < 5
-    kept, motion = static_tracks(make_problem(), before, p, few, after, np.eye(4), None, None)
+    kept, motion = static_tracks(make_problem(), before, p, few, after, np.eye(4), MotionPriors())
     assert motion is None
     assert kept[bad].mean() < 0.15
     assert kept[~bad].mean() > 0.97
     kept, motion = static_tracks(
-        make_problem(), before[:5], p[:5], few[:5], after[:5], np.eye(4), None, None
+        make_problem(), before[:5], p[:5], few[:5], after[:5], np.eye(4), MotionPriors()
     )
     assert motion is None
     assert kept.all()  # too few for a consensus: nothing is dropped

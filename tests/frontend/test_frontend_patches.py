@@ -635,3 +635,11 @@ def test_spread_evenly_equals_a_greedy_loop(monkeypatch: pytest.MonkeyPatch) -> 
         expected.append(best)
     assert len(expected) == 50
     assert rows.tolist() == expected
+
+
+@pytest.mark.parametrize("count", [4, 12, 100])
+def test_rows_are_held_at_zero_by_as_much_as_four_matches(count: int) -> None:
+    field = EpipolarRowModel(640, 360)
+    centre = np.tile([320.0, 180.0], (count, 1))
+    field.update(centre, centre + np.array([0.0, 0.01]))  # a small one, of full weight
+    assert field.offset_px == pytest.approx(0.01 * count / (count + 4), rel=0.02)

@@ -28,12 +28,14 @@ from vio.frontend.moving_object import (
     voters,
 )
 from vio.frontend.outliers import Consensus, pixel_errors, rigid_consensus
+from vio.frontend.patches import ImageLevels
 from vio.frontend.prediction import usable_prior
+from vio.frontend.right_match import FrameImages
 from vio.frontend.settings import FrontendSettings
 from vio.frontend.tracks import new_tracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import project, triangulate
-from vio.records import BoolArray, MotionPrior, TrackPrior
+from vio.records import BoolArray, MotionPrior, StereoFrame, TrackPrior
 
 # what the camera would have done by the object's points
 T_OBJECT = se3_exp([0.4, 0.1, -0.6, 0.0, 0.01, 0.0])
@@ -373,15 +375,15 @@ def _lines(p: FloatArray, z: FloatArray, uv: FloatArray) -> list[str]:
     """
     frontend = KltFrontend(CAMERA, FrontendSettings())
     stereo, _ = frontend._set_up((480, 1220))
+    blank = ImageLevels(np.zeros((480, 1220), np.uint8), np.zeros((240, 610), np.uint8))
     everything = np.ones(len(p), dtype=np.bool_)
     new = new_tracks(z[:, :2].copy(), np.zeros(len(p), dtype=np.int64))
     tracks = replace(new, right=z[:, 2:], has_right=everything, point=p, has_point=everything)
     for _ in range(20):
         stereo.update_rows(tracks)
     for k in range(6):
-        frontend._reject_outliers(
-            make_problem(), tracks, uv, everything, None, np.eye(4), stereo, k
-        )
+        images = FrameImages(StereoFrame(k, 0, None, None), blank, None, stereo)
+        frontend._reject_outliers(make_problem(), tracks, uv, everything, None, np.eye(4), images)
     return [finding.message for finding in frontend._take_findings()]
 
 

@@ -28,10 +28,10 @@ from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
 from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters import multiview
-from vio.filters.multiview import Views
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import StereoCorrection, VerticalDisparityModel
 from vio.filters.track_loops import start_by_parallax
+from vio.filters.track_records import Views
 from vio.frontend.outliers import RansacProblem, bearing_consensus, epipolar_distance
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, transform_points
 from vio.geometry.rectify import PINHOLE_REACH

@@ -19,11 +19,11 @@ from tests.jacobians import numeric_jacobian
 from tests.mapping.test_map_store import CAMERA, _features, _row
 from vio.cli import main
 from vio.datasets.gnss import read_gnss
+from vio.datasets.gnss_fixes import SIGMA_M, GnssFixes, checked_fixes
 from vio.earth.alignment import Georeference, _between, _Problem, georeference, heading_deg
 from vio.earth.alignment import Path as GraphPath
 from vio.earth.exports import write_utm
 from vio.earth.geodesy import LocalFrame, ecef, geodetic_of, utm, utm_zone
-from vio.earth.gnss import SIGMA_M, GnssFixes, checked_fixes
 from vio.errors import DataError, EstimationError
 from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp

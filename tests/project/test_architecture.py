@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tools.draw_structure import layers, read_packages
+from tools.parts import ORDER, PARTS, part_of, read_edges, source_files, wrong_way
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")])
@@ -142,6 +143,66 @@ def test_imports_go_one_way(file: Path) -> None:
             "nothing imports the command line"
         )
     assert not {"torch", "kornia"} & _heads(file, top_level_only=True)
+
+
+def test_every_module_is_in_a_part() -> None:
+    modules = source_files(ROOT)
+    assert {part_of(module) for module in modules} == set(PARTS)
+    named = [name for names in PARTS.values() for name in names]
+    assert len(named) == len(set(named))
+    assert [name for name in named if not any(_within(m, name) for m in modules)] == []
+
+
+def test_parts_import_from_themselves_and_from_below() -> None:
+    edges = read_edges(ROOT)
+    assert len(edges) > 2000
+    assert wrong_way(edges) == []
+    # Most imports between parts that are allowed exist: the order is no table of exceptions.
+    between = {(ORDER[part_of(a)], ORDER[part_of(b)]) for a, b in edges}
+    assert len([pair for pair in between if pair[0] > pair[1]]) > len(PARTS) * (len(PARTS) - 1) // 3
+
+
+def test_an_import_of_a_part_above_is_found() -> None:
+    edges = [("vio.filters.msckf", "vio.guard.bands"), ("vio.guard.bands", "vio.filters.msckf")]
+    assert wrong_way(edges) == edges[:1]
+
+
+# A transport is chosen by importing it: vio/ros2/transport.py.
+_MODULES_IN_A_CIRCLE = {
+    ("vio.ros2.dds", "vio.ros2.transport"),
+    ("vio.ros2.rclpy_transport", "vio.ros2.transport"),
+}
+
+
+def test_modules_have_no_import_circle_inside_functions() -> None:
+    edges = read_edges(ROOT)
+    assert _circles(edges) <= _MODULES_IN_A_CIRCLE
+    assert _circles([("a", "b"), ("b", "c"), ("c", "a"), ("c", "d")]) == {
+        ("a", "b"),
+        ("a", "c"),
+        ("b", "c"),
+    }
+
+
+def _circles(edges: list[tuple[str, str]]) -> set[tuple[str, str]]:
+    """Pairs of modules, in the order of the alphabet, one of which imports the other and is
+    reached from it.
+    """
+    imports: dict[str, set[str]] = {}
+    for module, imported in edges:
+        imports.setdefault(module, set()).add(imported)
+
+    @cache
+    def reached(module: str) -> frozenset[str]:
+        seen: set[str] = set()
+        waiting = [module]
+        while waiting:
+            new = imports.get(waiting.pop(), set()) - seen
+            seen |= new
+            waiting += new
+        return frozenset(seen)
+
+    return {(min(a, b), max(a, b)) for a, b in edges if a in reached(b)}
 
 
 def test_packages_have_no_import_cycle() -> None:

@@ -6,8 +6,9 @@ import importlib.util
 import os
 import subprocess
 import sys
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -21,7 +22,14 @@ from vio.cameras.rectification_error import ErrorColumns
 from vio.datasets import png_rows
 from vio.filters import gate_loops, multiview, pose_loops, stereo_calibration, track_loops
 from vio.filters.landmark_gate import leave_one_out_nis
-from vio.filters.multiview import Views
+from vio.filters.track_records import (
+    ErrorRows,
+    Information,
+    LandmarkResiduals,
+    Residuals,
+    RowEquations,
+    Views,
+)
 from vio.frontend import outliers, patches
 from vio.frontend.align import (
     align,
@@ -34,7 +42,7 @@ from vio.frontend.align import (
 )
 from vio.frontend.outliers import _gauss_newton, _refine, pixel_errors
 from vio.frontend.prediction import _borrowed, moved_pixels
-from vio.frontend.stereo_fit import _match
+from vio.frontend.stereo_fit import _match, _Matches, _RightColumns
 from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import (
     FloatArray,
@@ -200,8 +208,9 @@ def test_features_are_moved_and_triangulated_as_single_points_are_in_numpy(
     )
     good[5] = False
     skews, has_right, left = np.zeros((40, 2, 2)), np.zeros(40, dtype=np.bool_), z[:, :2].copy()
-    columns = right, has_right, skews, point, has_point
-    _match(camera_args(camera), f_baseline, left, rows, z[rows, 2:].copy(), skew, good, *columns)
+    columns = _RightColumns(right, has_right, skews, point, has_point)
+    matches = _Matches(z[rows, 2:].copy(), skew, good)
+    _match(camera_args(camera), f_baseline, left, rows, matches, columns)
     matched = rows[good]
     assert has_right.nonzero()[0].tolist() == sorted(matched.tolist())
     np.testing.assert_array_equal(right[matched], z[matched, 2:])
@@ -288,15 +297,15 @@ def _scene(camera: StereoCamera = CAMERA) -> tuple[FloatArray, FloatArray, Views
     return T, p, Views(z, weight)
 
 
-def _same(ours: object, twin: object) -> None:
+def _same(ours: Any, twin: Any) -> None:
     """Compare the arrays of two records."""
-    for field in fields(ours):  # type: ignore[arg-type]
-        a, b = getattr(ours, field.name), getattr(twin, field.name)
-        if is_dataclass(a):
+    for name in ours._fields:
+        a, b = getattr(ours, name), getattr(twin, name)
+        if isinstance(a, tuple):
             _same(a, b)
         else:
             np.testing.assert_allclose(
-                a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max(initial=0.0), err_msg=field.name
+                a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max(initial=0.0), err_msg=name
             )
 
 
@@ -368,7 +377,9 @@ def test_landmarks_are_added_as_in_numpy() -> None:
     by_terms, precision = rng.normal(size=(7, 4, 5)), rng.uniform(0.5, 2.0, (7, 4))
     J[2, 1] = r[2, 1] = 0.0  # not measured
     A, b, considered = np.zeros((33, 33)), np.zeros(33), np.zeros((33, 2))
-    track_loops.add_landmarks(r, J, by_terms, precision, w, 6, 12, 3, A, b, considered)
+    seen = LandmarkResiduals(r, J, w, precision)
+    rows = ErrorRows(exposure=6, landmarks=12, stereo=3)
+    track_loops.add_landmarks(seen, by_terms, rows, Information(A, b, considered))
     H = np.zeros((7, 4, 35))
     for k in range(7):
         H[k, :, 12 + 3 * k : 15 + 3 * k], H[k, :, 6:9] = J[k], -J[k]
@@ -436,7 +447,11 @@ def test_the_imu_is_integrated_as_in_numpy() -> None:
         np.empty((15, 15)),
         np.array([1e-4, 2e-3]),
     )
-    pose_loops.integrate(*given[:-1], walks, hidden, T, v, turned, Phi, Q, summed)
+    pose_loops.integrate(
+        *given[:4],
+        pose_loops.ImuNoise(densities, walks, hidden),
+        pose_loops.ImuStep(T, v, turned, Phi, Q, summed),
+    )
     np.testing.assert_allclose(T, se3_from_parts(R_k[-1], p_k[-1]), atol=1e-13)
     np.testing.assert_allclose(v, v_k[-1], atol=1e-13)
     gyro = readings[:, :3] - bias[:3]
@@ -545,7 +560,8 @@ def test_information_and_covariances_find_their_places() -> None:
     A = root @ root.T
     own = np.concatenate([clones + np.arange(size), stereo + np.arange(estimated)])
     out, vector, by_considered = np.ones((D, D)), np.ones(D), np.ones((D, considered))
-    track_loops.place_information(A, b, 0.3, size, clones, stereo, out, vector, by_considered)
+    information = Information(out, vector, by_considered)
+    track_loops.place_information(A, b, 0.3, size, clones, stereo, information)
     expected, last = np.zeros((D, D)), len(own)
     expected[np.ix_(own, own)] = A[:last, :last] / 0.3
     np.testing.assert_array_equal(out, expected)
@@ -582,7 +598,7 @@ def test_rows_scores_and_gates_are_summed_as_in_numpy() -> None:
         0.9 * old + (basis * weight[:, None]).T @ x
         for old, x in ((A, basis), (b, rows), (C, common))
     ]
-    track_loops.add_rows(basis, common, rows, weight, 0.9, A, b, C)
+    track_loops.add_rows(basis, common, rows, weight, 0.9, RowEquations(A, b, C))
     for found, twin in zip((A, b, C), expected, strict=True):
         np.testing.assert_allclose(found, twin, atol=1e-12)
     fitted = basis @ solution
@@ -604,7 +620,7 @@ def test_rows_scores_and_gates_are_summed_as_in_numpy() -> None:
     J[..., 3, :], r[..., 3] = 0.0, 0.0
     J[0, 1:4], r[0, 1:4], J[1, 2, 2], r[1, 2, 2] = 0.0, 0.0, 0.0, 0.0
     of_views, counts = multiview.squared_residuals(
-        multiview.Residuals(r, J, np.ones(6, np.bool_), np.ones(r.shape))
+        Residuals(r, J, np.ones(6, np.bool_), np.ones(r.shape))
     )
     limits, wrong, enough = (
         np.array([0.0, 1.0, 2.0, 3.0, 4.0]),
@@ -697,9 +713,8 @@ def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     np.testing.assert_allclose(b[:size], clones[1], rtol=1e-9, atol=1e-9 * np.abs(clones[1]).max())
     rows = np.flatnonzero(chosen)
     scores, information = np.empty((2, len(rows), 6))
-    of_tracks = info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient
     centre = np.array([0.3, -0.2, 0.5])
-    track_loops.score_drifts(rows, *of_tracks, centre, 0.5, scores, information)
+    track_loops.score_drifts(rows, info, centre, 0.5, scores, information)
     for k, row in enumerate(rows):
         views = np.flatnonzero(np.any(info.G[row].reshape(len(T), 18), axis=1))
         drift = np.zeros((len(T), 6, 6))

@@ -101,7 +101,7 @@ class _Helper:
 def helpers(monkeypatch: pytest.MonkeyPatch) -> list[_Helper]:
     """The processes that are started where nothing is compiled."""
     monkeypatch.setattr(prebuilt, "is_usable", lambda: False)
-    monkeypatch.setattr(compiling, "is_cached", lambda: False)
+    monkeypatch.setattr(first_use, "is_cached", lambda: False)
     monkeypatch.setattr(subprocess, "Popen", _Helper)
     monkeypatch.setattr(_Helper, "made", [])
     return _Helper.made
@@ -126,7 +126,7 @@ def test_each_part_is_compiled_beside_and_waited_for(
 def test_nothing_is_started_where_the_loops_are_at_hand(
     helpers: list[_Helper], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for found in (prebuilt, "is_usable"), (compiling, "is_cached"):
+    for found in (prebuilt, "is_usable"), (first_use, "is_cached"):
         with monkeypatch.context() as patch, compiled_beside((), "imu"):
             patch.setattr(*found, lambda: True)
             with compiled_beside(("filter",), "imu"):

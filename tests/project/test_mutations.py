@@ -10,7 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from tools.mutate import MUTATIONS, Mutation, MutationError, mutated, read_mutations, run_tests
+from tools.mutate import (
+    MUTATIONS,
+    Mutation,
+    MutationError,
+    constant_mutations,
+    mutated,
+    read_mutations,
+    run_tests,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -54,3 +62,48 @@ def test_another_package_than_the_copy_is_an_error(tmp_path: Path) -> None:
     """An empty folder holds no vio, so the installed one would be tested instead."""
     with pytest.raises(MutationError, match="instead of"):
         run_tests(tmp_path, ["tests/geometry/test_lie.py"])
+
+
+def test_constants_are_made_half_as_large_again(tmp_path: Path) -> None:
+    (tmp_path / "vio").mkdir()
+    (tmp_path / "tests").mkdir()
+    text = """\"\"\"A module.\"\"\"
+
+_ONE = 1  # at least one more
+_SHARE: float = 0.5
+_PAIR = (-4, 2.0)
+_ZERO = 0
+_NAME = "1"
+
+
+class _Rules(NamedTuple):
+    share: float = 0.25  # of all
+
+
+class _Other(NamedTuple):
+    given: int = 1
+
+
+_RULES = _Rules()
+"""
+    (tmp_path / "vio" / "part.py").write_text(text)
+    (tmp_path / "vio" / "unnamed.py").write_text("_A = 1\n")
+    (tmp_path / "tests" / "test_part.py").write_text("from vio import part\n")
+    (tmp_path / "tests" / "test_other.py").write_text("import vio.partner\n")
+    found = constant_mutations(tmp_path)
+    assert [(m.old, m.new) for m in found] == [
+        ("\n_ONE = 1", "\n_ONE = 2"),
+        ("\n_SHARE: float = 0.5", "\n_SHARE: float = 0.75"),
+        ("\n_PAIR = (-4, 2.0)", "\n_PAIR = (-6, 3.0)"),
+        ("\n    share: float = 0.25", "\n    share: float = 0.375"),
+    ]
+    assert {m.tests for m in found} == {("tests/test_part.py",)}
+    assert "_PAIR = (-6, 3.0)\n_ZERO" in mutated(found[2], text)
+
+
+def test_constants_of_this_checkout_can_be_changed() -> None:
+    found = constant_mutations(ROOT, ["frontend/", "filters/"])
+    assert len(found) > 100
+    for mutation in found[::10]:
+        text, tree = _read(mutation.file)
+        assert ast.dump(ast.parse(mutated(mutation, text))) != tree

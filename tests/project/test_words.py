@@ -40,7 +40,7 @@ LIMITS = {
     "docs/colmap.md": 950,
     "docs/commands.md": 1200,
     "docs/conventions.md": 950,
-    "docs/dependencies.md": 900,
+    "docs/dependencies.md": 950,
     "docs/faults.md": 3000,
     "docs/findings.md": 1200,
     "docs/frontend.md": 1300,

@@ -22,9 +22,9 @@ from vio.datasets import open_dataset
 from vio.errors import ConfigError, DataError
 from vio.files.schema import NUMBER, TEXT, WHOLE, a_list, an_object
 from vio.runs.files import RunFile
-from vio.runs.folder import growing_folder, read_metrics
+from vio.runs.folder import growing_folder
 from vio.runs.pipeline import RunControl, run
-from vio.runs.stated import METRICS_SHAPE, REQUEST_SHAPE
+from vio.runs.stated import METRICS_SHAPE, REQUEST_SHAPE, read_metrics
 
 FRAMES = 12
 COMPARED = (RunFile.TRAJECTORY, RunFile.ESTIMATES, RunFile.LANDMARKS, RunFile.OBSERVATIONS)

@@ -37,8 +37,9 @@ from vio.records import (
     VelocitySample,
     observations,
 )
-from vio.runs.folder import read_run, write_run_folder
+from vio.runs.folder import write_run_folder
 from vio.runs.pipeline import run
+from vio.runs.stated import read_run
 from vio.runs.tables import ESTIMATE, FRAME
 
 CAMERA = StereoCamera(700.0, 700.0, 600.0, 180.0, 0.54, 1242, 375)

@@ -42,6 +42,7 @@ from vio.runs.checkpoint import NotSavableError, load_checkpoint, save_checkpoin
 from vio.runs.folder import growing_folder
 from vio.runs.pipeline import RunControl, RunResult, run
 from vio.runs.recorder import GrowingFolder
+from vio.runs.stated import RunRequest
 from vio.runs.tables import estimate_of, estimate_row
 from vio.sim.effects import CLEAN
 from vio.sim.imu import ImuNoise
@@ -461,15 +462,15 @@ def interrupted(flight_log: Path, tmp_path_factory: pytest.TempPathFactory) -> t
     place.mkdir()
     shutil.copy(flight_log, place / "flight.npz")
     dataset, config = open_dataset(place / "flight.npz"), Config()
-    request = {
-        "source": f"log:{place / 'flight.npz'}",
-        "start": 0,
-        "stop": None,
-        "reference": None,
-        "map": None,
-    }
-    request |= {"save_observations": True, "lengths_m": None}
-    folder = growing_folder(place / "run", dataset, config, request)
+    request = RunRequest(
+        source=f"log:{place / 'flight.npz'}",
+        reference=None,
+        start=0,
+        stop=None,
+        lengths_m=None,
+        save_observations=True,
+    )
+    folder = growing_folder(place / "run", dataset, config, request.values())
     run(dataset, config, keep_observations=True, control=RunControl(folder, should_stop=Stop(300)))
     shutil.copytree(place, kept)
     return place, kept

@@ -59,7 +59,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from vio.files.atomic import atomic_folder
-    from vio.offline.check import check_run
+    from vio.offline.check import CheckOptions, check_run
     from vio.offline.colmap import quiet
     from vio.offline.saved_run import read_saved_run
     from vio.offline.verdict import overall_verdict
@@ -80,9 +80,7 @@ def execute(args: argparse.Namespace) -> int:
             run,
             folder,
             mappers,
-            most=args.keyframes,
-            source=args.source,
-            threads=args.threads,
+            CheckOptions(args.keyframes, args.source, args.threads),
             progress=bar.update,
             announce=lambda text: print(text, file=sys.stderr),
         )

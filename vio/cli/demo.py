@@ -23,7 +23,7 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.running import check_out, metric_rows, process
+    from vio.cli.running import RunOptions, check_out, metric_rows, process
     from vio.config import load_config
     from vio.live.first_use import compiled_beside
     from vio.sim.scenarios import write_demo_recording
@@ -32,5 +32,5 @@ def execute(args: argparse.Namespace) -> int:
     with compiled_beside(("frontend", "filter"), "velocity"):  # while the street is rendered
         with ProgressBar("rendering the street", announced=True) as bar:
             recording = write_demo_recording(args.out / "street", bar.update)
-        metrics = process(str(recording), load_config(), out=args.out / "run")
+        metrics = process(str(recording), load_config(), RunOptions(out=args.out / "run"))
     return print_result(metrics, metric_rows(metrics), as_json=args.json)

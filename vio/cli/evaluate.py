@@ -287,7 +287,7 @@ def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
     them.
     """
     from vio.runs.files import RunFile
-    from vio.runs.folder import read_run
+    from vio.runs.stated import read_run
 
     if path.is_dir() and not (path / RunFile.METRICS).is_file():
         from vio.offline.colmap import quiet

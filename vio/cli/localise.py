@@ -37,16 +37,11 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.running import metric_rows, process
+    from vio.cli.running import RunOptions, Shown, metric_rows, process
 
-    metrics = process(
-        args.source,
-        config_from(args),
-        out=args.out,
-        start=args.start,
-        stop=args.stop,
-        progress=not args.quiet,
-        map_file=args.map,
-        localise=True,
+    options = RunOptions(
+        out=args.out, start=args.start, stop=args.stop, map_file=args.map, localise=True
     )
+    shown = Shown(progress=not args.quiet)
+    metrics = process(args.source, config_from(args), options, shown)
     return print_result(metrics, metric_rows(metrics), as_json=args.json)

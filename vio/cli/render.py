@@ -198,39 +198,16 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
     Raises:
         VioError: arguments contradict each other, or name what does not exist.
     """
-    from vio.sim.scenarios import READY_MOTIONS, Scenario, flight_files
+    from vio.sim.scenarios import Scenario
 
     car = args.trajectory == "car"
-    trajectory: Any = args.trajectory
-    frame_times = args.frame_times
-    imu = args.imu
     if args.frame_times is not None and args.rate is not None:
         raise ConfigError("--frame-times and --rate exclude each other; give one of them")
-    if trajectory not in READY_MOTIONS:
-        trajectory = Path(trajectory)
-        if trajectory.is_dir():
-            trajectory, own_times, own_imu = flight_files(trajectory)
-            frame_times = own_times if frame_times is None and args.rate is None else frame_times
-            imu = own_imu if imu is None else imu
-        elif not trajectory.exists():
-            raise ConfigError(
-                f"--trajectory {trajectory}: there is no such file; give "
-                f"{', '.join(READY_MOTIONS)}, a TUM file or the "
-                "folder of a recorded flight"
-            )
+    trajectory, frame_times, imu = _flight(args)
     rig: Any = args.rig or (
         "euroc" if isinstance(trajectory, Path) else "kitti" if car else "euroc-rectified"
     )
-    form = args.format or ("kitti" if rig == "kitti" else "euroc")
-    if form == "euroc" and imu == "none":
-        raise ConfigError(
-            "an EuRoC folder needs an IMU; give --imu simulated or a recorded one, or --format "
-            "kitti"
-        )
-    if form == "euroc" and args.velocity not in (None, "none"):
-        raise ConfigError("an EuRoC folder cannot contain body velocities; give --format kitti")
-    if form == "kitti" and args.imu not in (None, "none"):
-        raise ConfigError("a KITTI folder cannot contain an IMU; give --format euroc")
+    form = _form_of(args, rig, imu)
     if form == "kitti":
         imu = "none"
     scenario = Scenario(
@@ -247,6 +224,51 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
         seed=args.seed,
     )
     return scenario, form
+
+
+def _flight(args: argparse.Namespace) -> tuple[Any, Any, Any]:
+    """Return trajectory, frame times and IMU, those of a recorded flight where none are given.
+
+    Raises:
+        VioError: the trajectory does not exist.
+    """
+    from vio.sim.scenarios import READY_MOTIONS, flight_files
+
+    trajectory: Any = args.trajectory
+    frame_times = args.frame_times
+    imu = args.imu
+    if trajectory not in READY_MOTIONS:
+        trajectory = Path(trajectory)
+        if trajectory.is_dir():
+            trajectory, own_times, own_imu = flight_files(trajectory)
+            frame_times = own_times if frame_times is None and args.rate is None else frame_times
+            imu = own_imu if imu is None else imu
+        elif not trajectory.exists():
+            raise ConfigError(
+                f"--trajectory {trajectory}: there is no such file; give "
+                f"{', '.join(READY_MOTIONS)}, a TUM file or the "
+                "folder of a recorded flight"
+            )
+    return trajectory, frame_times, imu
+
+
+def _form_of(args: argparse.Namespace, rig: Any, imu: Any) -> str:
+    """Return the format of the folder.
+
+    Raises:
+        ConfigError: it cannot hold what was asked for.
+    """
+    form: str = args.format or ("kitti" if rig == "kitti" else "euroc")
+    if form == "euroc" and imu == "none":
+        raise ConfigError(
+            "an EuRoC folder needs an IMU; give --imu simulated or a recorded one, or --format "
+            "kitti"
+        )
+    if form == "euroc" and args.velocity not in (None, "none"):
+        raise ConfigError("an EuRoC folder cannot contain body velocities; give --format kitti")
+    if form == "kitti" and args.imu not in (None, "none"):
+        raise ConfigError("a KITTI folder cannot contain an IMU; give --format euroc")
+    return form
 
 
 def _conditions(args: argparse.Namespace) -> Conditions:

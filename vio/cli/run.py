@@ -93,7 +93,7 @@ _OF_A_NEW_RUN = (
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.running import metric_rows, process, resume
+    from vio.cli.running import RunOptions, Shown, metric_rows, process, resume
 
     if args.open and not args.report:
         raise ConfigError("--open shows the page of --report; give both")
@@ -105,6 +105,7 @@ def execute(args: argparse.Namespace) -> int:
         print_result(metrics, metric_rows(metrics, plot=not args.no_plot), as_json=args.json)
         sys.stdout.flush()
 
+    shown = Shown(not args.quiet, args.view, finished)
     own = None
     if args.frontend is not None and ":" in args.frontend:  # no name of a setting
         own = args.frontend
@@ -118,13 +119,10 @@ def execute(args: argparse.Namespace) -> int:
             save_calibration=args.save_calibration,
             map_file=args.map,
             frontend=own,
-            progress=not args.quiet,
-            finished=finished,
+            shown=shown,
         )
         return _reported(args.resume, shown=args.open) if args.report else 0
-    metrics = process(
-        args.source,
-        config_from(args),
+    options = RunOptions(
         out=args.out,
         reference=args.reference,
         start=args.start,
@@ -132,15 +130,13 @@ def execute(args: argparse.Namespace) -> int:
         lengths_m=args.lengths,
         save_observations=args.save_observations,
         save_calibration=args.save_calibration,
-        progress=not args.quiet,
         map_file=args.map,
         map_density=args.map_density,
-        view=args.view,
         plot=not args.no_plot,
         frontend=own,
         command=args.command_line,
-        finished=finished,
     )
+    metrics = process(args.source, config_from(args), options, shown)
     return _reported(Path(metrics["out"]), shown=args.open) if args.report else 0
 
 

@@ -6,8 +6,8 @@ import logging
 import math
 import shlex
 import signal
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,8 +33,15 @@ from vio.protocols import Dataset, Viewer
 from vio.records import FrameResult, Recording, RunMotion, Trajectory
 from vio.report.words import camera_imu_findings, scale_findings
 from vio.runs.files import CHECKPOINT, FILES, RunFile
-from vio.runs.folder import calibration_text, finish_run_folder, growing_folder, read_request
+from vio.runs.folder import (
+    Finishing,
+    calibration_text,
+    finish_run_folder,
+    growing_folder,
+    read_request,
+)
 from vio.runs.pipeline import RunControl, RunResult, Viewers, given_rig, run
+from vio.runs.stated import RunRequest
 from vio.view.annotated import AnnotatedImage
 
 if TYPE_CHECKING:
@@ -66,68 +73,74 @@ class ProgressViewer:
         self._bar.close()
 
 
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """What is to be done with a source, as the command line has it."""
+
+    out: Path | None = None  # folder; None: the first free one of runs/NAME
+    reference: Path | None = None  # ground truth
+    start: int | Seconds = 0
+    stop: int | Seconds | None = None
+    lengths_m: Sequence[float] | None = None
+    save_observations: bool = False
+    # file for the calibration that the run finds; `Path()`: in the run's folder
+    save_calibration: Path | None = None
+    map_file: Path | None = None
+    map_density: int | None = None
+    localise: bool = False
+    plot: bool = True
+    # front end or detector of the caller's own, FILE.py:CLASS or module:CLASS
+    frontend: str | None = None
+    command: str | None = None  # as typed, for the metrics
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What a run shows while it goes on; no result depends on it."""
+
+    progress: bool = True  # a bar
+    view: str | None = None  # where rerun's viewer shows it; None: nowhere
+    # gets the metrics before the picture is drawn
+    finished: Callable[[dict[str, Any]], None] | None = None
+
+
+SHOWN = Shown()
+
+
 def process(
-    source: str,
-    config: Config,
-    *,
-    out: Path | None,
-    reference: Path | None = None,
-    start: int | Seconds = 0,
-    stop: int | Seconds | None = None,
-    lengths_m: Sequence[float] | None = None,
-    save_observations: bool = False,
-    save_calibration: Path | None = None,
-    progress: bool = True,
-    map_file: Path | None = None,
-    map_density: int | None = None,
-    localise: bool = False,
-    view: str | None = None,
-    plot: bool = True,
-    frontend: str | None = None,
-    command: str | None = None,
-    finished: Callable[[dict[str, Any]], None] | None = None,
+    source: str, config: Config, options: RunOptions, shown: Shown = SHOWN
 ) -> dict[str, Any]:
-    """Process a source into a run folder, which grows meanwhile, and return its metrics.
-
-    `frontend` names a front end or detector of the caller's own, FILE.py:CLASS or module:CLASS.
-
-    `save_calibration` names the file for the calibration that the run found; `Path()`, one in the
-    run's folder. `command` is kept in the metrics; `finished` gets them before the picture is
-    drawn.
-    """
-    dataset = _opened(source, config, mapped=map_file is not None)
+    """Process a source into a run folder, which grows meanwhile, and return its metrics."""
+    dataset = _opened(source, config, mapped=options.map_file is not None)
     unused = dataset.recording.motion_notes if config.motion == "none" else ()
     for note in dataset.recording.notes:
         if note not in unused:
             log.log(NOTE, "%s", note)
+    out = options.out
     folder = check_out(out if out is not None else free_folder(dataset.recording.path))
-    calibration = _calibration_file(dataset, folder, save_calibration)
-    first, end = frames_between(dataset.recording, start, stop)
-    request = {
-        "source": f"{dataset.recording.kind}:{dataset.recording.path.absolute()}",
-        "reference": None if reference is None else str(reference.absolute()),
-        "start": first,
-        "stop": end,
-        "lengths_m": None if lengths_m is None else list(lengths_m),
-        "save_observations": save_observations,
-        "save_calibration": _stated_calibration(folder, calibration),
-        "map": None if map_file is None else str(map_file.absolute()),
-        "map_density": map_density,
-        "localise": localise,
-        "plot": plot,
-        "frontend": frontend,
-        "command": command,
-    }
-    return _process(
-        dataset,
-        config,
-        folder,
-        request,
-        progress=progress,
-        resume=False,
-        view=view,
-        finished=finished,
+    calibration = _calibration_file(dataset, folder, options.save_calibration)
+    first, end = frames_between(dataset.recording, options.start, options.stop)
+    lengths_m = options.lengths_m
+    request = RunRequest(
+        source=f"{dataset.recording.kind}:{dataset.recording.path.absolute()}",
+        reference=_absolute(options.reference),
+        start=first,
+        stop=end,
+        lengths_m=None if lengths_m is None else list(lengths_m),
+        save_observations=options.save_observations,
+        save_calibration=_stated_calibration(folder, calibration),
+        map=_absolute(options.map_file),
+        map_density=options.map_density,
+        localise=options.localise,
+        plot=options.plot,
+        frontend=options.frontend,
+        command=options.command,
     )
+    return _process(dataset, config, folder, request, shown, resume=False)
+
+
+def _absolute(file: Path | None) -> str | None:
+    return None if file is None else str(file.absolute())
 
 
 def _stated_calibration(folder: Path, file: Path | None) -> str | None:
@@ -139,12 +152,10 @@ def _stated_calibration(folder: Path, file: Path | None) -> str | None:
     return str(file.absolute())
 
 
-def _map_use(request: Mapping[str, Any]) -> MapUse | None:
-    if request.get("map") is None:
+def _map_use(request: RunRequest) -> MapUse | None:
+    if request.map is None:
         return None
-    return MapUse(
-        Path(request["map"]), request.get("localise", False), density=request.get("map_density")
-    )
+    return MapUse(Path(request.map), request.localise, density=request.map_density)
 
 
 def _opened(source: str, config: Config, *, mapped: bool) -> Dataset:
@@ -160,10 +171,9 @@ def resume(
     save_calibration: Path | None = None,
     map_file: Path | None = None,
     frontend: str | None = None,
-    progress: bool = True,
-    finished: Callable[[dict[str, Any]], None] | None = None,
+    shown: Shown = SHOWN,
 ) -> dict[str, Any]:
-    """Go on with an unfinished run and return its metrics; `finished` is that of `process`.
+    """Go on with an unfinished run and return its metrics.
 
     The folder may be of another hand: what it wants written outside of itself is written, and code
     that it names is run, only where the caller names the same, and all is checked as for a new run.
@@ -174,38 +184,37 @@ def resume(
     """
     request = read_request(folder)
     check_out(folder)
-    request["save_calibration"] = _named_again(
+    calibration = _named_again(
         folder,
-        request.get("save_calibration"),
+        request.save_calibration,
         "--save-calibration",
         save_calibration,
         inside=folder / RunFile.CALIBRATION,
     )
-    if not request.get("localise", False):  # which only reads the map
-        request["map"] = _named_again(folder, request.get("map"), "--map", map_file)
-    if request.get("frontend") != frontend:
+    request = replace(request, save_calibration=calibration)
+    if not request.localise:  # which only reads the map
+        request = replace(request, map=_named_again(folder, request.map, "--map", map_file))
+    if request.frontend != frontend:
         raise ConfigError(
             f"{folder}: this run began "
             + (
                 "without a front end of your own; leave --frontend out"
-                if request.get("frontend") is None
-                else f"with code of your own; name it again: --frontend {request['frontend']}"
+                if request.frontend is None
+                else f"with code of your own; name it again: --frontend {request.frontend}"
             )
         )
-    density = request.get("map_density")
+    density = request.map_density
     if density is not None and density < 1:
         raise DataError(f"{folder}: its map_density is {density}, not at least 1; repeat the run")
     config = load_config(folder / RunFile.CONFIG)
-    dataset = _opened(request["source"], config, mapped=request.get("map") is not None)
-    if request["save_calibration"] is not None:
+    dataset = _opened(request.source, config, mapped=request.map is not None)
+    if request.save_calibration is not None:
         _calibration_file(dataset, folder, _asked_calibration(folder, request))
-    frames_between(dataset.recording, request["start"], request["stop"])
+    frames_between(dataset.recording, request.start, request.stop)
     saved = (folder / RunFile.UNFINISHED / CHECKPOINT).is_file()
     if not saved:
         log.warning("%s: the run ended before its first checkpoint; it begins again", folder)
-    return _process(
-        dataset, config, folder, request, progress=progress, resume=saved, finished=finished
-    )
+    return _process(dataset, config, folder, request, shown, resume=saved)
 
 
 def _named_again(
@@ -233,26 +242,26 @@ def _named_again(
     return stated
 
 
-def _asked_calibration(folder: Path, request: Mapping[str, Any]) -> Path | None:
+def _asked_calibration(folder: Path, request: RunRequest) -> Path | None:
     """Return the file of `--save-calibration` as the command line has it; `Path()`: in the
     folder.
     """
-    stated = request.get("save_calibration")
+    stated = request.save_calibration
     if stated is None:
         return None
     return Path() if stated == RunFile.CALIBRATION else Path(stated)
 
 
-def _resume_command(folder: Path, request: Mapping[str, Any]) -> str:
+def _resume_command(folder: Path, request: RunRequest) -> str:
     """Return what goes on with a run, with the files outside of its folder that it writes."""
     words = ["vio", "run", "--resume", str(folder)]
     asked = _asked_calibration(folder, request)
     if asked not in (None, Path()):
         words += ["--save-calibration", str(asked)]
-    if request.get("map") is not None and not request.get("localise", False):
-        words += ["--map", request["map"]]
-    if request.get("frontend") is not None:
-        words += ["--frontend", request["frontend"]]
+    if request.map is not None and not request.localise:
+        words += ["--map", request.map]
+    if request.frontend is not None:
+        words += ["--frontend", request.frontend]
     return shlex.join(words)
 
 
@@ -260,41 +269,25 @@ def _process(
     dataset: Dataset,
     config: Config,
     folder: Path,
-    request: dict[str, Any],
+    request: RunRequest,
+    shown: Shown,
     *,
-    progress: bool,
     resume: bool,
-    view: str | None = None,
-    finished: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Run, write the results and return the metrics; an interrupted run reports how to go on."""
     recording = dataset.recording
-    reference = request["reference"]
+    reference = request.reference
     truth = recording.reference if reference is None else read_trajectory(Path(reference))
-    start = request["start"]
-    stop = request["stop"]
-    save_observations = request["save_observations"]
-    frames = int(
-        (used_frames(recording.frame_times_ns[:stop], config.dataset.max_frame_rate) >= start).sum()
-    )
-    builds_map = bool(request.get("map")) and not request.get("localise", False)
+    span = recording.frame_times_ns[: request.stop]
+    frames = int((used_frames(span, config.dataset.max_frame_rate) >= request.start).sum())
     annotated = AnnotatedImage(frames)
-    viewers: list[Viewer] = (
-        [ProgressViewer(frames, f"running {recording.path.name}")] if progress else []
-    )
+    viewers: list[Viewer] = []
+    if shown.progress:
+        viewers.append(ProgressViewer(frames, f"running {recording.path.name}"))
     viewers.append(annotated)
-    shown = None if view is None else _open_view(view, dataset, config, truth)
-    if shown is not None:
-        viewers.append(shown)
-
-    def complete(metrics: dict[str, Any]) -> None:
-        if isinstance(calibration, str) and file is not None:
-            atomic_write_text(file, calibration)
-        if (picture := annotated.jpeg()) is not None:
-            atomic_write_bytes(folder / RunFile.FEATURES, picture)
-        if finished is not None and metrics["complete"]:
-            finished(metrics)
-
+    view = None if shown.view is None else _open_view(shown.view, dataset, config, truth)
+    if view is not None:
+        viewers.append(view)
     parts = _own_parts(request, recording, config)
     beside: tuple[Part, ...] = ("filter",) if recording.camera.kind == "stereo" else ()
     motion = _likely_motion(recording, config)
@@ -303,40 +296,22 @@ def _process(
             result = run(
                 dataset,
                 config,
-                start=start,
-                stop=stop,
-                keep_observations=save_observations or builds_map,  # which its adjustment takes
+                start=request.start,
+                stop=request.stop,
+                # which the adjustment of a map takes
+                keep_observations=request.save_observations or request.writes_map,
                 viewer=Viewers(viewers),
                 parts=parts,
                 map=_map_use(request),
                 control=RunControl(
-                    growing_folder(folder, dataset, config, request), resume, asked.reason
+                    growing_folder(folder, dataset, config, request.values()), resume, asked.reason
                 ),
             )
-            if builds_map:
+            if request.map is not None and request.writes_map:
                 from vio.offline.map_adjustment import adjust_map
 
-                result = adjust_map(result, Path(request["map"]), asked.reason)
-            stated = request.get("save_calibration")  # unfinished runs of before have none
-            file = None if stated is None else folder / stated  # an absolute path stays itself
-            calibration = None if file is None else _calibration_or_fault(result)
-            metrics = finish_run_folder(
-                folder,
-                result,
-                truth,
-                lengths_m=request["lengths_m"],
-                save_observations=save_observations,
-                more={
-                    "command": request.get("command"),
-                    "calibration": str(file.absolute())
-                    if file is not None and isinstance(calibration, str)
-                    else None,
-                },
-                plot=request.get("plot", True),
-                finished=complete,
-            )
-            if isinstance(calibration, CalibrationError):  # on which the results do not depend
-                raise calibration
+                result = adjust_map(result, Path(request.map), asked.reason)
+            metrics = _finish(folder, request, result, truth, annotated, shown)
         except KeyboardInterrupt as error:
             if not (folder / RunFile.UNFINISHED).is_dir():
                 raise
@@ -347,13 +322,8 @@ def _process(
             )
             number = signal.SIGINT if asked.number is None else asked.number
             raise StoppedError(text, status=128 + number) from error
-    if shown is not None:
-        shown.landmarks(result.landmarks)
-        shown.close()
-        if shown.address is not None and result.stopped is None:
-            from vio.view.stream import wait_for_interrupt
-
-            wait_for_interrupt(shown.address)
+    if view is not None:
+        _leave_view(view, result)
     if result.stopped is not None:
         text = f"{result.stopped}; the results of {len(result.frames)} of {frames} frames are in {folder}"
         if asked.number is None:
@@ -364,9 +334,65 @@ def _process(
     return metrics
 
 
-def _own_parts(request: Mapping[str, Any], recording: Recording, config: Config) -> Parts:
+def _finish(
+    folder: Path,
+    request: RunRequest,
+    result: RunResult,
+    truth: Trajectory | None,
+    annotated: AnnotatedImage,
+    shown: Shown,
+) -> dict[str, Any]:
+    """Write the results and return the metrics.
+
+    Raises:
+        CalibrationError: no calibration could be saved; all other results are written.
+    """
+    stated = request.save_calibration
+    file = None if stated is None else folder / stated  # an absolute path stays itself
+    calibration = None if file is None else _calibration_or_fault(result)
+
+    def complete(metrics: dict[str, Any]) -> None:
+        if isinstance(calibration, str) and file is not None:
+            atomic_write_text(file, calibration)
+        if (picture := annotated.jpeg()) is not None:
+            atomic_write_bytes(folder / RunFile.FEATURES, picture)
+        if shown.finished is not None and metrics["complete"]:
+            shown.finished(metrics)
+
+    saved = file is not None and isinstance(calibration, str)
+    metrics = finish_run_folder(
+        folder,
+        result,
+        truth,
+        Finishing(
+            lengths_m=request.lengths_m,
+            save_observations=request.save_observations,
+            more={
+                "command": request.command,
+                "calibration": str(file.absolute()) if saved and file is not None else None,
+            },
+            plot=request.plot,
+            finished=complete,
+        ),
+    )
+    if isinstance(calibration, CalibrationError):  # on which the results do not depend
+        raise calibration
+    return metrics
+
+
+def _leave_view(view: RerunViewer, result: RunResult) -> None:
+    """Show the landmarks, and keep a web page up until it is interrupted."""
+    view.landmarks(result.landmarks)
+    view.close()
+    if view.address is not None and result.stopped is None:
+        from vio.view.stream import wait_for_interrupt
+
+        wait_for_interrupt(view.address)
+
+
+def _own_parts(request: RunRequest, recording: Recording, config: Config) -> Parts:
     """Return the parts of the caller's own that a run was asked for."""
-    text = request.get("frontend")
+    text = request.frontend
     if text is None:
         return CONFIGURED
     from vio.frontend.given import load_given
@@ -502,6 +528,24 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
             )
         )
     rows.append(("back end", f"{metrics['backend']}, motion {metrics['motion']}"))
+    rows += _refused_rows(metrics)
+    rows += _scale_rows(metrics)
+    rows += _stereo_rows(metrics)
+    rows += _calibration_rows(metrics)
+    rows += _error_rows(metrics)
+    rows += _map_rows(metrics)
+    if metrics.get("calibration") is not None:
+        rows.append(("calib.", f"{metrics['calibration']} (next: --calibration FILE)"))
+    rows.append(("results", metrics["out"]))
+    if plot:
+        rows.append(("plot", str(Path(metrics["out"]) / RunFile.PICTURE)))
+    rows.append(("next", f"vio report {shlex.quote(metrics['out'])} --open"))
+    return rows
+
+
+def _refused_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """What the gates refused."""
+    rows: list[tuple[str, str]] = []
     if metrics["refused_share"] is not None:
         refused = (
             f"{100 * metrics['refused_share']:.1f} % of the observations, by the chi-square gates"
@@ -513,6 +557,13 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
             else f"; innovations are {ratio:.2g} of their standard deviation (median)"
         )
         rows.append(("refused", refused + more))
+    return rows
+
+
+def _scale_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """How many estimates may be used, and what is known of the scale."""
+    rows: list[tuple[str, str]] = []
+    frames = metrics["frames"]
     integrity = metrics.get("integrity") or {}
     unusable = integrity.get("unusable", 0)
     if unusable or integrity.get("degraded"):
@@ -537,12 +588,23 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
         known = f"known to {100 * share:.2g} % by the calibration: {of_path}"
         doubted = bool(metrics.get("doubts"))
         rows.append(("scale", "in doubt: settle what the notes above name" if doubted else known))
+    return rows
+
+
+def _stereo_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """What the stereo calibration is off by."""
+    rows: list[tuple[str, str]] = []
     if metrics["stereo_field"] is not None:
         field = metrics["stereo_field"]
         rows.append(("stereo", f"{field['text']}; corrected in this run"))
         found = [] if field["rig"] is None else field["rig"]["lines"]
         rows += [("", line) for line in found[:_LINES]]
-    rows += _calibration_rows(metrics)
+    return rows
+
+
+def _error_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """Errors against the reference."""
+    rows: list[tuple[str, str]] = []
     if metrics["ate_m"] is None:
         rows.append(("ATE", "no reference"))
     else:
@@ -562,6 +624,12 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
         over = lengths_text(metrics["drift_lengths_m"])
         turned = rotation_drift_text(metrics["r_err_deg_per_100m"], metrics["drift_lengths_m"])
         rows.append(("drift", f"{metrics['t_err_percent']:.2f} %, {turned} over {over}"))
+    return rows
+
+
+def _map_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """The map, and errors of landmarks."""
+    rows: list[tuple[str, str]] = []
     if metrics.get("map") is not None:
         rows.append(("map", _map_row(metrics["map"])))
         if metrics["map"].get("adjustment") is not None:
@@ -575,12 +643,6 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
                 "surveyed ones)",
             )
         )
-    if metrics.get("calibration") is not None:
-        rows.append(("calib.", f"{metrics['calibration']} (next: --calibration FILE)"))
-    rows.append(("results", metrics["out"]))
-    if plot:
-        rows.append(("plot", str(Path(metrics["out"]) / RunFile.PICTURE)))
-    rows.append(("next", f"vio report {shlex.quote(metrics['out'])} --open"))
     return rows
 
 

@@ -192,11 +192,7 @@ def _unknown(path: Path) -> str:
 
 
 def _folder_kind(path: Path) -> str | None:
-    from vio.datasets import plain
     from vio.datasets.bags import is_bag
-    from vio.datasets.euroc import is_euroc_folder
-    from vio.datasets.gtsam import factor_files
-    from vio.datasets.videos import video_files
 
     try:
         names = sorted(child.name for child in path.iterdir())
@@ -212,6 +208,22 @@ def _folder_kind(path: Path) -> str | None:
         )
     if is_bag(path):
         return "bag"
+    kind = _image_kind(path)
+    if kind is None and "sequences" in names:
+        raise DataError(
+            f"{path} holds several KITTI sequences; name one of them, such as "
+            f"{path / 'sequences' / '00'}"
+        )
+    return kind
+
+
+def _image_kind(path: Path) -> str | None:
+    """Return the kind of a folder of images, videos or factors; None: it is none."""
+    from vio.datasets import plain
+    from vio.datasets.euroc import is_euroc_folder
+    from vio.datasets.gtsam import factor_files
+    from vio.datasets.videos import video_files
+
     if plain.is_kitti_folder(path):
         return "plain" if plain.holds_more_than_kitti(path) else "kitti"
     if plain.is_kitti_raw_folder(path):
@@ -233,14 +245,7 @@ def _folder_kind(path: Path) -> str | None:
         return "plain"
     if plain.is_mono_folder(path):
         return "mono"
-    if videos is not None:
-        return "video"
-    if "sequences" in names:
-        raise DataError(
-            f"{path} holds several KITTI sequences; name one of them, such as "
-            f"{path / 'sequences' / '00'}"
-        )
-    return None
+    return None if videos is None else "video"
 
 
 def _file_kind(path: Path) -> str | None:

@@ -88,6 +88,8 @@ class Beside:
     motion_notes: Sequence[str]
     reference: Trajectory | None
     files: Sequence[Path]  # that were read, or are known not to matter
+    notes: Sequence[str]  # about all but motion samples
+    stated_by: Sequence[Path]  # file that states the size of the images, for each camera
 
 
 Parts: TypeAlias = tuple[
@@ -102,8 +104,6 @@ def parts_of(
     settings: DatasetSettings,
     times_ns: IntArray,
     beside: Beside,
-    notes: Sequence[str],
-    stated_by: Sequence[Path],
     *,
     has_body: bool = True,
 ) -> Parts:
@@ -116,8 +116,6 @@ def parts_of(
         settings: reader settings.
         times_ns: of the frames (F,).
         beside: what was read beside the images.
-        notes: about all but motion samples.
-        stated_by: file that states the size of the images, for each camera.
         has_body: whether the pose of an IMU is known.
     """
     recording = Recording(
@@ -129,10 +127,15 @@ def parts_of(
         has_images=True,
         motion=beside.motion.kinds,
         reference=beside.reference,
-        notes=(*notes, *rectifier.notes, *beside.motion_notes, *unused_note(layout, beside.files)),
+        notes=(
+            *beside.notes,
+            *rectifier.notes,
+            *beside.motion_notes,
+            *unused_note(layout, beside.files),
+        ),
         motion_notes=tuple(beside.motion_notes),
     )
-    cameras = zip(rectifier.cameras, stated_by, strict=True)
+    cameras = zip(rectifier.cameras, beside.stated_by, strict=True)
     sizes = tuple(ImageSize(camera.width, camera.height, file) for camera, file in cameras)
     return recording, beside.motion, sizes, settings, rectifier
 
@@ -179,20 +182,16 @@ def read_companions(
     if reference is None:
         reference, reference_file = _read_reference(layout, rig, rectifier, times_ns)
     read = [source for source in (file, times_file, reference_file) if source is not None]
-    beside = Beside(motion, motion_notes, reference, [*read, *extrinsics, *motion_files, *used])
-    has_body = rig.T_cam0_imu is not None and (rig.cam1 is not None or len(motion_files) > 0)
-    stated_by = [file] * len(rig.cameras)
-    return parts_of(
-        kind,
-        layout,
-        rectifier,
-        settings,
-        times_ns,
-        beside,
+    beside = Beside(
+        motion,
+        motion_notes,
+        reference,
+        [*read, *extrinsics, *motion_files, *used],
         (*notes, *rig.notes),
-        stated_by,
-        has_body=has_body,
+        [file] * len(rig.cameras),
     )
+    has_body = rig.T_cam0_imu is not None and (rig.cam1 is not None or len(motion_files) > 0)
+    return parts_of(kind, layout, rectifier, settings, times_ns, beside, has_body=has_body)
 
 
 def _with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Path]]:

@@ -92,11 +92,15 @@ def read_euroc(path: Path, settings: DatasetSettings) -> ImageDataset:
     ]
     layout = Layout(path, mav, mav / "cam0" / "data", mav / "cam1" / "data")
     reference = None if truth is None else _read_reference(truth, T_body_imu, rig.T_imu_cam0)
-    beside = Beside(samples, imu_notes, reference, read if truth is None else [*read, truth])
-    sheets = [mav / name / "sensor.yaml" for name in ("cam0", "cam1")]
-    parts = parts_of(
-        "euroc", layout, rectifier, settings, times_ns, beside, (*notes, *depth_notes), sheets
+    beside = Beside(
+        samples,
+        imu_notes,
+        reference,
+        read if truth is None else [*read, truth],
+        (*notes, *depth_notes),
+        [mav / name / "sensor.yaml" for name in ("cam0", "cam1")],
     )
+    parts = parts_of("euroc", layout, rectifier, settings, times_ns, beside)
     return ImageDataset(*parts, pairs, imu_noise=noise, levels=levels)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from vio.datasets.bags import is_bag
 from vio.datasets.bags.index import stamp_of
 from vio.datasets.bags.store import Bag
+from vio.datasets.gnss_fixes import UP_SHARE, GnssFixes, checked_fixes
 from vio.datasets.tables import drive_times, read_table, stamps_ns
-from vio.earth.gnss import UP_SHARE, GnssFixes, checked_fixes
 from vio.errors import DataError
 from vio.files.text import text_lines
 

@@ -50,19 +50,7 @@ def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple
     Raises:
         DataError: the names share nothing.
     """
-    keys: list[list[str | int]] = [[p.stem for p in lefts], [p.stem for p in rights]]
-    shared = len(set(keys[0]) & set(keys[1]))
-    stamps = [_name_times(files) for files in (lefts, rights)]
-    left_ns, right_ns = stamps
-    if left_ns is not None and right_ns is not None and 2 * shared < min(len(lefts), len(rights)):
-        a, b = pair_stamps(left_ns, right_ns)
-        keys = [list(range(len(lefts))), [-1] * len(rights)]
-        for i, j in zip(a.tolist(), b.tolist(), strict=True):
-            keys[1][j] = i
-    elif not shared:
-        keys = [[without_side(p.stem) for p in files] for files in (lefts, rights)]
-        if not set(keys[0]) & set(keys[1]):
-            keys = [[_last_number(p) for p in files] for files in (lefts, rights)]
+    keys = _partner_keys(lefts, rights)
     right_of = {key: k for k, key in enumerate(keys[1])}
     if len(right_of) < len(rights) and -1 not in right_of:
         raise DataError(
@@ -80,6 +68,26 @@ def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple
     if not any(alone):
         return pairs, ()
     return pairs, (f"{alone[0]} left and {alone[1]} right images have no partner and are skipped",)
+
+
+def _partner_keys(lefts: ImageFiles, rights: ImageFiles) -> list[list[str | int]]:
+    """Return what left and right files are paired by; -1: no left file's."""
+    keys: list[list[str | int]] = [[p.stem for p in lefts], [p.stem for p in rights]]
+    shared = len(set(keys[0]) & set(keys[1]))
+    left_ns = _name_times(lefts)
+    right_ns = _name_times(rights)
+    if left_ns is not None and right_ns is not None and 2 * shared < min(len(lefts), len(rights)):
+        a, b = pair_stamps(left_ns, right_ns)
+        keys = [list(range(len(lefts))), [-1] * len(rights)]
+        for i, j in zip(a.tolist(), b.tolist(), strict=True):
+            keys[1][j] = i
+        return keys
+    if shared:
+        return keys
+    keys = [[without_side(p.stem) for p in files] for files in (lefts, rights)]
+    if not set(keys[0]) & set(keys[1]):
+        keys = [[_last_number(p) for p in files] for files in (lefts, rights)]
+    return keys
 
 
 def _last_number(path: Path) -> int | str:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import cast, get_args
+from typing import TypeAlias, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -115,16 +115,35 @@ def write_observation_log(
         raise ValueError(
             "the observations are not in the order of the recording's frames, or have other times"
         )
-    camera = recording.camera
-    sigma = joined_sigmas(observations)
     motion = as_arrays(motion_samples)
-    reference = recording.reference
-    landmarks = recording.landmarks_reference
-    entries: dict[str, npt.ArrayLike | None] = {  # None: absent
+    entries = {
         "format": FORMAT,
         "version": np.int64(VERSION),
         "source": f"{recording.kind}:{recording.path}",
         "notes": np.array(recording.notes, dtype=np.str_),
+        **_camera_entries(recording.camera),
+        "frame_times_ns": recording.frame_times_ns,
+        "frame_indices": frames,
+        **_observation_entries(observations),
+        "motion_times_ns": motion.times_ns,
+        "motion_is_imu": motion.is_imu,
+        "motion_values": motion.values,
+        "T_cam0_imu": recording.T_cam0_imu,
+        **_reference_entries(recording),
+        "run_motion": run_motion,
+    }
+    arrays = {key: np.asarray(value) for key, value in entries.items() if value is not None}
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)  # type: ignore[arg-type] # the stubs take every keyword for allow_pickle
+    atomic_write_bytes(path, stream.getvalue())
+
+
+# Arrays by their keys; None: absent.
+_Entries: TypeAlias = dict[str, npt.ArrayLike | None]
+
+
+def _camera_entries(camera: StereoCamera) -> _Entries:
+    return {
         "intrinsics": np.array(
             [camera.fu, camera.fv, camera.cu, camera.cv, camera.baseline_m], dtype=np.float64
         ),
@@ -132,8 +151,14 @@ def write_observation_log(
             [k for k in (camera.width, camera.height) if k is not None], dtype=np.int64
         ),
         "projection": None if camera.projection == "pinhole" else camera.projection,
-        "frame_times_ns": recording.frame_times_ns,
-        "frame_indices": frames,
+        "camera_kind": None if camera.kind == "stereo" else camera.kind,
+        "residual_px": camera.residual_px or None,
+    }
+
+
+def _observation_entries(observations: Sequence[Observations]) -> _Entries:
+    sigma = joined_sigmas(observations)
+    return {
         "offsets": np.cumsum([0, *(len(o) for o in observations)], dtype=np.int64),
         "ids": np.concatenate([np.zeros(0, dtype=np.int64), *(o.ids for o in observations)]),
         "z": np.concatenate([np.zeros((0, 4)), *(o.z for o in observations)]),
@@ -141,10 +166,14 @@ def write_observation_log(
             [np.zeros(0, dtype=np.bool_), *(o.has_right for o in observations)]
         ),
         "stale": np.concatenate([np.zeros(0, dtype=np.bool_), *(o.stale for o in observations)]),
-        "motion_times_ns": motion.times_ns,
-        "motion_is_imu": motion.is_imu,
-        "motion_values": motion.values,
-        "T_cam0_imu": recording.T_cam0_imu,
+        "sigma": None if sigma is None or not sigma.any() else sigma,
+    }
+
+
+def _reference_entries(recording: Recording) -> _Entries:
+    reference = recording.reference
+    landmarks = recording.landmarks_reference
+    return {
         "reference_T_world_body": None if reference is None else reference.T_world_body,
         "reference_body": None if reference is None else reference.body,
         "reference_times_ns": None if reference is None else reference.times_ns,
@@ -152,15 +181,7 @@ def write_observation_log(
         "landmark_ids": None if landmarks is None else landmarks.ids,
         "landmark_p_world": None if landmarks is None else landmarks.p_world,
         "landmark_covariance": None if landmarks is None else landmarks.covariance,
-        "run_motion": run_motion,
-        "camera_kind": None if camera.kind == "stereo" else camera.kind,
-        "residual_px": camera.residual_px or None,
-        "sigma": None if sigma is None or not sigma.any() else sigma,
     }
-    arrays = {key: np.asarray(value) for key, value in entries.items() if value is not None}
-    stream = io.BytesIO()
-    np.savez(stream, **arrays)  # type: ignore[arg-type] # the stubs take every keyword for allow_pickle
-    atomic_write_bytes(path, stream.getvalue())
 
 
 def write_observations(
@@ -301,11 +322,15 @@ def _with_defaults(arrays: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]
 
 def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
     """Describe an inconsistency; None: there is none."""
+    checks = (_of_rows, _of_times, _of_camera, _of_words, _of_reference)
+    return next((fault for check in checks if (fault := check(arrays)) is not None), None)
+
+
+def _of_rows(arrays: Mapping[str, np.ndarray]) -> str | None:
+    """Whether the rows of observations fit each other and the frames."""
     rows = len(arrays["ids"])
     offsets = arrays["offsets"]
     frames = arrays["frame_indices"]
-    times_ns = arrays["frame_times_ns"]
-    samples = len(arrays["motion_times_ns"])
     if (
         arrays["z"].shape != (rows, 4)
         or len(arrays["has_right"]) != rows
@@ -323,6 +348,16 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
     in_order = in_frame[:, np.lexsort(in_frame)]
     if (in_order[:, 1:] == in_order[:, :-1]).all(axis=0).any():
         return "an id occurs twice in a frame"
+    if "sigma" in arrays and arrays["sigma"].shape != (rows, 3):
+        return f"{rows} ids, but sigma is {shape_text(arrays['sigma'])}"
+    return None
+
+
+def _of_times(arrays: Mapping[str, np.ndarray]) -> str | None:
+    """Whether frames and motion samples are in the order of time."""
+    frames = arrays["frame_indices"]
+    times_ns = arrays["frame_times_ns"]
+    samples = len(arrays["motion_times_ns"])
     if (np.diff(times_ns) <= 0).any() or (np.diff(arrays["motion_times_ns"]) < 0).any():
         return "a clock does not increase"
     if len(frames) and (
@@ -331,8 +366,21 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
         return f"frame numbers do not increase within 0 to {len(times_ns) - 1}"
     if arrays["motion_values"].shape != (samples, 6) or len(arrays["motion_is_imu"]) != samples:
         return f"{samples} motion times, but values {arrays['motion_values'].shape}"
+    return None
+
+
+def _of_camera(arrays: Mapping[str, np.ndarray]) -> str | None:
+    """Whether the camera is complete."""
     if arrays["intrinsics"].shape != (5,) or len(arrays["image_size"]) not in (0, 2):
         return "the camera is incomplete"
+    residual = arrays.get("residual_px", np.zeros(()))
+    if not 0 <= residual < np.inf:
+        return f"residual_px is {residual.tolist()!r}, no number of pixels"
+    return None
+
+
+def _of_words(arrays: Mapping[str, np.ndarray]) -> str | None:
+    """Whether keys have those that they need, and words are known."""
     for first, group in _GROUPS.items():
         if first in arrays and any(key not in arrays for key in group):
             return f"{first} lacks {' '.join(key for key in group if key not in arrays)}"
@@ -343,11 +391,11 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
     ):
         if key in arrays and str(arrays[key]) not in get_args(names):
             return f"{key} is {str(arrays[key])!r}, none of {', '.join(get_args(names))}"
-    residual = arrays.get("residual_px", np.zeros(()))
-    if not 0 <= residual < np.inf:
-        return f"residual_px is {residual.tolist()!r}, no number of pixels"
-    if "sigma" in arrays and arrays["sigma"].shape != (rows, 3):
-        return f"{rows} ids, but sigma is {shape_text(arrays['sigma'])}"
+    return None
+
+
+def _of_reference(arrays: Mapping[str, np.ndarray]) -> str | None:
+    """Whether the reference has a time or frame number for each pose."""
     poses = arrays.get("reference_T_world_body", np.zeros((0, 4, 4)))
     stamps = [
         len(arrays[key])

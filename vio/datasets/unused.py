@@ -38,12 +38,28 @@ def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
 
     Files in `used` need not exist.
     """
-    used = [file for file in used if file.exists()]
+    found = _not_read(layout, _kept(layout, [file for file in used if file.exists()]))
+    photometric = [name for name in found if _fits(Path(name).name, _PHOTOMETRIC)]
+    others = [name for name in found if name not in photometric]
+    notes = []
+    if photometric:
+        why = "photometric calibration is not applied, as the tracks gain nothing by it"
+        notes.append(f"{why}: {listed(photometric)}")
+    return [*notes, f"not used: {listed(others)}"] if others else notes
+
+
+def _kept(layout: Layout, used: Sequence[Path]) -> set[Path]:
+    """Return all files and folders that were read, with the folders that hold them."""
     kept = {layout.left.absolute(), layout.right.absolute(), *(file.absolute() for file in used)}
     kept |= {parent for path in kept for parent in path.parents}
     for path in used:  # the other files of a calibration that lies in several
         if path.suffix.lower() in (".yaml", ".yml", ".txt", ".xml"):
             kept |= {other.absolute() for other in path.parent.iterdir() if _belongs(other, path)}
+    return kept
+
+
+def _not_read(layout: Layout, kept: set[Path]) -> list[str]:
+    """Return the names of what else lies in the folders of a recording."""
     images = [side for side in (layout.left, layout.right) if side.is_dir()]
     folders = dict.fromkeys((layout.root, layout.base, *images, *(side.parent for side in images)))
     found = []
@@ -51,26 +67,16 @@ def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
         if folder != layout.root and layout.root not in folder.parents:
             continue
         with_images = folder in images
-        children = (
-            child
-            for child in folder.iterdir()
-            if not (with_images and child.suffix.lower() in SUFFIXES)
-        )
-        for child in sorted(children):
-            silent = child.name.startswith(".") or any(
-                fnmatch.fnmatch(child.name.lower(), s) for s in _SILENT
-            )
-            if not silent and child.absolute() not in kept:
+        for child in sorted(folder.iterdir()):
+            is_image = with_images and child.suffix.lower() in SUFFIXES
+            silent = child.name.startswith(".") or _fits(child.name.lower(), _SILENT)
+            if not is_image and not silent and child.absolute() not in kept:
                 found.append(str(child.relative_to(layout.root)) + ("/" if child.is_dir() else ""))
-    photometric = [
-        name for name in found if any(fnmatch.fnmatch(Path(name).name, p) for p in _PHOTOMETRIC)
-    ]
-    others = [name for name in found if name not in photometric]
-    notes = []
-    if photometric:
-        why = "photometric calibration is not applied, as the tracks gain nothing by it"
-        notes.append(f"{why}: {listed(photometric)}")
-    return [*notes, f"not used: {listed(others)}"] if others else notes
+    return found
+
+
+def _fits(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatch.fnmatch(name, pattern) for pattern in patterns)
 
 
 def listed(names: Sequence[str]) -> str:

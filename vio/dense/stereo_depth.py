@@ -4,6 +4,8 @@ known depth.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
@@ -13,15 +15,24 @@ from vio.records import Image
 DepthImage = npt.NDArray[np.float32]  # (H, W) metres along the optical axis, 0 where unknown
 
 DISPARITY_SIGMA_PX = 0.25  # of a match, as rendered images show it
-_WIDTH_SHARE = 8  # the largest disparity is the image's width over this
-_BLOCK_PX = 5
-_UNIQUENESS_PERCENT = 10  # by which the best match must beat the others
-_SPECKLE_PX = 200  # smaller regions of one disparity are dropped
-_SPECKLE_RANGE = 2
-_SLANT_BOX_PX = 9  # over which the surface's direction is measured
-_SLANT_STEP_PX = 12
-_MIN_SLANT = 0.05  # a road 1.6 m below the camera, 30 m ahead
-_FIXED_POINT = 16.0  # parts of a pixel in OpenCV's disparities
+
+
+@dataclass(frozen=True, slots=True)
+class _DepthRules:
+    """How depths are matched and filtered."""
+
+    width_share: int = 8  # the largest disparity is the image's width over this
+    block_px: int = 5
+    uniqueness_percent: int = 10  # by which the best match must beat the others
+    speckle_px: int = 200  # smaller regions of one disparity are dropped
+    speckle_range: int = 2
+    slant_box_px: int = 9  # over which the surface's direction is measured
+    slant_step_px: int = 12
+    min_slant: float = 0.05  # a road 1.6 m below the camera, 30 m ahead
+    fixed_point: float = 16.0  # parts of a pixel in OpenCV's disparities
+
+
+_DEPTH = _DepthRules()
 
 
 class StereoMatcher:
@@ -34,18 +45,18 @@ class StereoMatcher:
         import cv2
 
         self._camera = camera
-        self._count = 16 * max(1, round(width / _WIDTH_SHARE / 16))
+        self._count = 16 * max(1, round(width / _DEPTH.width_share / 16))
         self._sgm = cv2.StereoSGBM.create(
             minDisparity=0,
             numDisparities=self._count,
-            blockSize=_BLOCK_PX,
-            P1=8 * _BLOCK_PX**2,
-            P2=32 * _BLOCK_PX**2,
+            blockSize=_DEPTH.block_px,
+            P1=8 * _DEPTH.block_px**2,
+            P2=32 * _DEPTH.block_px**2,
             disp12MaxDiff=1,
             preFilterCap=31,
-            uniquenessRatio=_UNIQUENESS_PERCENT,
-            speckleWindowSize=_SPECKLE_PX,
-            speckleRange=_SPECKLE_RANGE,
+            uniquenessRatio=_DEPTH.uniqueness_percent,
+            speckleWindowSize=_DEPTH.speckle_px,
+            speckleRange=_DEPTH.speckle_range,
             mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )
 
@@ -54,7 +65,7 @@ class StereoMatcher:
         # Columns left of the first disparity would stay unknown: the pair is continued there.
         pad = [np.pad(image, ((0, 0), (self._count, 0)), mode="edge") for image in (left, right)]
         disparity = self._sgm.compute(*pad)[:, self._count :].astype(np.float32) / np.float32(
-            _FIXED_POINT
+            _DEPTH.fixed_point
         )
         # A match that lies left of the right image is one with the padding.
         inside = (disparity > 0.5) & (disparity <= np.arange(left.shape[1], dtype=np.float32))
@@ -74,7 +85,7 @@ def slant(depth: DepthImage, camera: StereoCamera) -> DepthImage:
     import cv2
 
     known = (depth > 0).astype(np.float32)
-    size = (_SLANT_BOX_PX, _SLANT_BOX_PX)
+    size = (_DEPTH.slant_box_px, _DEPTH.slant_box_px)
     share = cv2.blur(known, size)
     inverse = cv2.blur(known / np.maximum(depth, np.float32(1e-3)), size) / np.maximum(
         share, np.float32(1e-6)
@@ -89,8 +100,8 @@ def slant(depth: DepthImage, camera: StereoCamera) -> DepthImage:
         step = np.full_like(inverse, np.inf)
         inner = [slice(None)] * 2
         ahead = [slice(None)] * 2
-        inner[axis] = slice(0, -_SLANT_STEP_PX)
-        ahead[axis] = slice(_SLANT_STEP_PX, None)
+        inner[axis] = slice(0, -_DEPTH.slant_step_px)
+        ahead[axis] = slice(_DEPTH.slant_step_px, None)
         here = tuple(inner)
         there = tuple(ahead)
         both = (known[here] > 0) & (known[there] > 0)
@@ -99,7 +110,7 @@ def slant(depth: DepthImage, camera: StereoCamera) -> DepthImage:
         closer = np.abs(difference) < np.abs(step[there])
         step[there][closer] = difference[closer]
         slopes.append(
-            np.where(np.isfinite(step), step * np.float32(focal / _SLANT_STEP_PX), 0).astype(
+            np.where(np.isfinite(step), step * np.float32(focal / _DEPTH.slant_step_px), 0).astype(
                 np.float32
             )
         )
@@ -108,7 +119,9 @@ def slant(depth: DepthImage, camera: StereoCamera) -> DepthImage:
     third = inverse - slopes[0] * x - slopes[1] * y
     length = np.sqrt(slopes[0] ** 2 + slopes[1] ** 2 + third**2)
     return np.clip(
-        inverse / np.maximum(length, np.float32(1e-9)), np.float32(_MIN_SLANT), np.float32(1.5)
+        inverse / np.maximum(length, np.float32(1e-9)),
+        np.float32(_DEPTH.min_slant),
+        np.float32(1.5),
     )
 
 

@@ -8,6 +8,7 @@ edge of the lattice.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -49,15 +50,10 @@ def extract_surface(grid: VoxelGrid, *, least_seen: int = _MIN_SEEN) -> Mesh:
         colour = np.empty((SIDE**3, 3), dtype=np.uint8)
         quad = np.empty((3 * SIDE**3, 4, 3), dtype=np.int64)
         vertices, faces = _surface_nets(
-            block["distance"],
-            block["seen"],
-            block["colour"],
+            _Block(block["distance"], block["seen"], block["colour"]),
             least_seen,
             first,
-            cell,
-            point,
-            colour,
-            quad,
+            _Pieces(cell, point, colour, quad),
         )
         keys.append(pack(cell[:vertices]))
         points.append(grid.voxel_m * point[:vertices])
@@ -111,28 +107,27 @@ def _normals(points: FloatArray, triangles: IntArray) -> FloatArray:
     return out
 
 
-@compiled
-def _surface_nets(
-    distance: npt.NDArray[np.float32],
-    seen: npt.NDArray[np.uint8],
-    colour: npt.NDArray[np.uint8],
-    least: int,
-    first: IntArray,
-    cell: IntArray,
-    point: npt.NDArray[np.float32],
-    shade: npt.NDArray[np.uint8],
-    quad: IntArray,
-) -> tuple[int, int]:
-    """Write vertices and quadrilaterals of one block with a margin of one sample; return how many
-    of both.
+class _Block(NamedTuple):
+    """The samples of a block with a margin of one, as of `VoxelGrid.padded`."""
 
-    A sample (i, j, k) of the block is at [i + 1, j + 1, k + 1]; a cell has the coordinates of its
-    first sample.
-    """
-    side = len(distance)
-    vertices = 0
-    faces = 0
-    whole = np.zeros((side, side, side), dtype=np.uint8)  # cells of samples that were all seen
+    distance: npt.NDArray[np.float32]
+    seen: npt.NDArray[np.uint8]
+    colour: npt.NDArray[np.uint8]
+
+
+class _Pieces(NamedTuple):
+    """Room for vertices and quadrilaterals."""
+
+    cell: IntArray  # (V, 3)
+    point: npt.NDArray[np.float32]  # (V, 3) voxels
+    colour: npt.NDArray[np.uint8]  # (V, 3)
+    quad: IntArray  # (Q, 4, 3) cells
+
+
+@compiled
+def _mark_whole(seen: npt.NDArray[np.uint8], least: int, whole: npt.NDArray[np.uint8]) -> None:
+    """Write 1 for cells whose eight samples were all seen often enough, else 0."""
+    side = len(seen)
     for i in range(side - 1):
         for j in range(side - 1):
             for k in range(side - 1):
@@ -142,6 +137,27 @@ def _surface_nets(
                         all_seen = False
                         break
                 whole[i, j, k] = 1 if all_seen else 0
+
+
+@compiled
+def _surface_nets(block: _Block, least: int, first: IntArray, out: _Pieces) -> tuple[int, int]:
+    """Write vertices and quadrilaterals of one block with a margin of one sample; return how many
+    of both.
+
+    A sample (i, j, k) of the block is at [i + 1, j + 1, k + 1]; a cell has the coordinates of its
+    first sample.
+    """
+    distance = block.distance
+    colour = block.colour
+    cell = out.cell
+    point = out.point
+    shade = out.colour
+    quad = out.quad
+    side = len(distance)
+    vertices = 0
+    faces = 0
+    whole = np.zeros((side, side, side), dtype=np.uint8)  # cells of samples that were all seen
+    _mark_whole(block.seen, least, whole)
     for i in range(1, side - 1):
         for j in range(1, side - 1):
             for k in range(1, side - 1):

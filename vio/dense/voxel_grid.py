@@ -11,6 +11,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from types import TracebackType
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -106,26 +107,26 @@ class VoxelGrid:
         slots = self._slots(keys, T_world_cam[:3, 3])
         colour = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
         pool = self._pool
+        lengths = np.array(
+            [
+                self.voxel_m,
+                self.truncation_m,
+                far_m,
+                DISPARITY_SIGMA_PX / (camera.fu * camera.baseline_m),
+            ]
+        )
         _integrate(
-            pool["distance"],
-            pool["weight"],
-            pool["seen"],
-            pool["colour"],
+            _Samples(pool["distance"], pool["weight"], pool["seen"], pool["colour"]),
             slots,
             SIDE * unpack(keys),
-            se3_inverse(T_world_cam),
-            np.array([camera.fu, camera.fv, camera.cu, camera.cv]),
-            np.array(
-                [
-                    self.voxel_m,
-                    self.truncation_m,
-                    far_m,
-                    DISPARITY_SIGMA_PX / (camera.fu * camera.baseline_m),
-                ]
+            _View(
+                se3_inverse(T_world_cam),
+                np.array([camera.fu, camera.fv, camera.cu, camera.cv]),
+                np.ascontiguousarray(depth),
+                slant(depth, camera),
+                np.ascontiguousarray(colour),
             ),
-            np.ascontiguousarray(depth),
-            slant(depth, camera),
-            np.ascontiguousarray(colour),
+            lengths,
         )
 
     def keys(self) -> IntArray:
@@ -236,25 +237,43 @@ class VoxelGrid:
         return np.frombuffer(self._file.read(BLOCK.itemsize), dtype=BLOCK)[0]
 
 
+class _Samples(NamedTuple):
+    """The fields of blocks, as of `BLOCK`."""
+
+    distance: npt.NDArray[np.float32]
+    weight: npt.NDArray[np.float32]
+    seen: npt.NDArray[np.uint8]
+    colour: npt.NDArray[np.uint8]
+
+
+class _View(NamedTuple):
+    """A depth image and its camera."""
+
+    T: FloatArray  # (4, 4) from the world to the camera
+    pinhole: FloatArray  # fu, fv, cu, cv, pixels
+    depth: DepthImage  # (H, W) m
+    cosine: DepthImage  # (H, W) of the angle between ray and normal
+    image: Image  # (H, W, 3)
+
+
 @compiled
 def _integrate(
-    distance: npt.NDArray[np.float32],
-    weight: npt.NDArray[np.float32],
-    seen: npt.NDArray[np.uint8],
-    colour: npt.NDArray[np.uint8],
-    slots: IntArray,
-    first: IntArray,
-    T: FloatArray,
-    pinhole: FloatArray,
-    lengths: FloatArray,
-    depth: DepthImage,
-    cosine: DepthImage,
-    image: Image,
+    samples: _Samples, slots: IntArray, first: IntArray, view: _View, lengths: FloatArray
 ) -> None:
     """Average the distances of samples from the depth image's surface, along its normals, by
     weights 1 / variance.
+
+    Lengths are those of a voxel, of the truncation, the farthest depth (m), and the standard
+    deviation of a depth over its square (1/m).
     """
-    fu, fv, cu, cv = pinhole
+    distance = samples.distance
+    weight = samples.weight
+    seen = samples.seen
+    colour = samples.colour
+    T = view.T
+    depth = view.depth
+    image = view.image
+    fu, fv, cu, cv = view.pinhole
     voxel, truncation, far, sigma_per_z2 = lengths
     height, width = depth.shape
     for m in range(len(slots)):
@@ -277,7 +296,7 @@ def _integrate(
                     d = depth[row, column]
                     if d <= 0.0 or d >= far:
                         continue
-                    off = (d - z) * cosine[row, column]
+                    off = (d - z) * view.cosine[row, column]
                     if off < -truncation:
                         continue
                     sigma = max(voxel, sigma_per_z2 * d * d)

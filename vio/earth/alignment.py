@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix
 
+from vio.datasets.gnss_fixes import GnssFixes
 from vio.earth.geodesy import LocalFrame
-from vio.earth.gnss import GnssFixes
 from vio.errors import EstimationError
 from vio.geometry.lie import (
     FloatArray,
@@ -33,24 +33,32 @@ from vio.numerics.sparse import factors
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 
-# What odometry drifts by between neighbours beyond its scale: 0.2 m and 0.3 deg over 100 m, as
-# random walks.
-_DRIFT_M = 0.02  # per square root of a metre
+
+@dataclass(frozen=True, slots=True)
+class _AlignmentRules:
+    """How a trajectory is fitted to GNSS positions."""
+
+    # What odometry drifts by between neighbours beyond its scale: 0.2 m and 0.3 deg over 100 m, as
+    # random walks.
+    drift_m: float = 0.02  # per square root of a metre
+    min_m: float = 1e-3  # of a motion at standstill
+    min_rad: float = 1e-5
+    correlated_s: float = 5.0  # errors of GNSS last: positions within it count as one
+    # of the antenna beside the stated error: 10 ms of the clocks at 10 m/s, the lever arm
+    timing_m: float = 0.1
+    truncation: float = 0.999  # probability at which a residual is cut off
+    mu_growth: float = 1.6
+    max_steps: int = 40
+    settled: float = 1e-5
+    start_steps: int = 20  # of the robust alignment that it starts from
+    min_fixes: int = 3
+    height_sigma_m: float = 1e3  # of the first pose, where no position states a height
+    metre_per_rad: float = 100.0  # weights a turn of a pose against its position in the rigid fit
+
+
+_ALIGNMENT = _AlignmentRules()
 _DRIFT_RAD = float(np.radians(0.03))
-_MIN_M = 1e-3  # of a motion at standstill
-_MIN_RAD = 1e-5
 _SCALE_SIGMA = 0.01  # prior
-_CORRELATED_S = 5.0  # errors of GNSS last: positions within it count as one
-# of the antenna beside the stated error: 10 ms of the clocks at 10 m/s, the lever arm
-_TIMING_M = 0.1
-_TRUNCATION = 0.999  # probability at which a residual is cut off
-_MU_GROWTH = 1.6
-_MAX_STEPS = 40
-_SETTLED = 1e-5
-_START_STEPS = 20  # of the robust alignment that it starts from
-_MIN_FIXES = 3
-_HEIGHT_SIGMA_M = 1e3  # of the first pose, where no position states a height
-_METRE_PER_RAD = 100.0  # weights a turn of a pose against its position in the rigid fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +121,7 @@ def georeference(
             determine nothing.
     """
     before, share, inside = _between(path, fixes.times_ns + time_offset_ns)
-    if int(inside.sum()) < _MIN_FIXES:
+    if int(inside.sum()) < _ALIGNMENT.min_fixes:
         own_ns = fixes.times_ns + time_offset_ns
         spans = [f"{t[0] * 1e-9:.3f} to {t[-1] * 1e-9:.3f} s" for t in (own_ns, path.times_ns)]
         raise EstimationError(
@@ -137,7 +145,7 @@ def georeference(
     residuals = np.full((len(fixes), 3), np.nan)
     used[inside] = weight[:, 0] > 0.5
     used_height[inside] = weight[:, 1] > 0.5
-    if int(used.sum()) < _MIN_FIXES:
+    if int(used.sum()) < _ALIGNMENT.min_fixes:
         raise EstimationError(
             f"only {int(used.sum())} of {int(inside.sum())} GNSS positions agree with the "
             "trajectory"
@@ -207,16 +215,20 @@ class _Problem:
         self._T_i_j = se3_inverse(path.T_map_body[self._i]) @ path.T_map_body[self._j]
         length = np.linalg.norm(self._T_i_j[:, :3, 3], axis=1)
         root = np.sqrt(length + np.linalg.norm(se3_log(self._T_i_j)[:, 3:], axis=1))
-        sigma_m = np.maximum(_DRIFT_M * root, _MIN_M)
-        sigma_rad = np.maximum(_DRIFT_RAD * root, _MIN_RAD)
+        sigma_m = np.maximum(_ALIGNMENT.drift_m * root, _ALIGNMENT.min_m)
+        sigma_rad = np.maximum(_DRIFT_RAD * root, _ALIGNMENT.min_rad)
         self._edge_weight = 1 / np.repeat(np.stack([sigma_m, sigma_rad], axis=1), 3, axis=1) ** 2
         self._up_body = path.up_map @ path.T_map_body[:, :3, :3]
-        covariance = covariance + _TIMING_M**2 * np.eye(3)
+        covariance = covariance + _ALIGNMENT.timing_m**2 * np.eye(3)
         self._horizontal = np.linalg.inv(covariance[:, :2, :2])
         self._vertical = 1 / covariance[:, 2, 2]
         times = (1 - share) * path.times_ns[before] + share * path.times_ns[before + 1]
-        gap_s = float(np.median(np.diff(times))) * 1e-9 if len(times) > 1 else _CORRELATED_S
-        self._independent = float(np.clip(gap_s / _CORRELATED_S, 1e-3, 1.0))  # share of information
+        gap_s = (
+            float(np.median(np.diff(times))) * 1e-9 if len(times) > 1 else _ALIGNMENT.correlated_s
+        )
+        self._independent = float(
+            np.clip(gap_s / _ALIGNMENT.correlated_s, 1e-3, 1.0)
+        )  # share of information
 
     def antenna(self, T: FloatArray) -> FloatArray:
         """Return where the antenna is (N, 3) at the times of the positions."""
@@ -238,9 +250,11 @@ class _Problem:
         )
         log_scale = 0.0
         weight = known
-        limits = np.array([chi_square_quantile(_TRUNCATION, n) for n in (2, 1)], dtype=np.float64)
+        limits = np.array(
+            [chi_square_quantile(_ALIGNMENT.truncation, n) for n in (2, 1)], dtype=np.float64
+        )
         mu = None
-        for _ in range(_MAX_STEPS):
+        for _ in range(_ALIGNMENT.max_steps):
             squared = self._squared(T)
             if mu is None:
                 worst = (squared / limits * (weight > 0)).max(axis=0)
@@ -250,14 +264,16 @@ class _Problem:
             for _ in range(2):
                 T, log_scale, moved = self._step(T, log_scale, weight)
             if (mu > 1e3).all() or (
-                ((weight == 0) | (weight == 1)).all() and moved < _SETTLED and (mu > 1).all()
+                ((weight == 0) | (weight == 1)).all()
+                and moved < _ALIGNMENT.settled
+                and (mu > 1).all()
             ):
                 break
-            mu = mu * _MU_GROWTH
+            mu = mu * _ALIGNMENT.mu_growth
         weight = (self._squared(T) < limits) * known
-        for _ in range(_MAX_STEPS):
+        for _ in range(_ALIGNMENT.max_steps):
             T, log_scale, moved = self._step(T, log_scale, weight)
-            if moved < _SETTLED:
+            if moved < _ALIGNMENT.settled:
                 break
         return T, log_scale, weight
 
@@ -347,7 +363,7 @@ class _Problem:
                 [np.zeros(1, dtype=np.int64)],
                 [rise],
                 T[:1, 2, 3:4],
-                np.full((1, 1, 1), _HEIGHT_SIGMA_M**-2),
+                np.full((1, 1, 1), _ALIGNMENT.height_sigma_m**-2),
             )
         add(
             [np.array([6 * count])],
@@ -395,7 +411,7 @@ def _start(p: FloatArray, measured: FloatArray, up: FloatArray) -> FloatArray:
     p = p @ level.T
     T = np.eye(4)
     weight = np.ones(len(p))
-    for _ in range(_START_STEPS):
+    for _ in range(_ALIGNMENT.start_steps):
         share = weight / weight.sum()
         mean_p = share @ p
         mean_m = share @ measured
@@ -413,7 +429,7 @@ def _rigid_fit(T_map: FloatArray, T_enu: FloatArray) -> tuple[FloatArray, FloatA
     """Return the transform (4, 4) that takes poses (K, 4, 4) nearest to others, and its Jacobian
     (6, 6K) by those.
     """
-    W = np.repeat([1.0, _METRE_PER_RAD], 3) ** 2
+    W = np.repeat([1.0, _ALIGNMENT.metre_per_rad], 3) ** 2
     T = T_enu[len(T_enu) // 2] @ se3_inverse(T_map[len(T_map) // 2])
     A = se3_adjoint(se3_inverse(T_map))
     AW = np.swapaxes(A, 1, 2) * W

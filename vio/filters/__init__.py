@@ -19,9 +19,9 @@ def _vislam() -> type[Backend]:
 
 
 def _msckf() -> type[Backend]:
-    from vio.filters.msckf import Msckf
+    from vio.filters.msckf_of_rig import MsckfOfRig
 
-    return Msckf
+    return MsckfOfRig
 
 
 # The back ends by their names in the configuration; the settings of one are the section of the same

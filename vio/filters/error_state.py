@@ -20,6 +20,7 @@ import numpy as np
 from vio.filters import track_loops as loops
 from vio.filters.navigation import DIM
 from vio.filters.online_calibration import BLOCKS
+from vio.filters.track_records import Information
 from vio.geometry.lie import FloatArray
 
 
@@ -91,7 +92,7 @@ class ErrorState:
 
     def information(
         self, A: FloatArray, b: FloatArray, variance: float = 1.0, considered: int = 0
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    ) -> Information:
         """Turn information about clones and stereo coefficients into that about the error vector.
 
         Args:
@@ -104,13 +105,13 @@ class ErrorState:
             Matrix (D, D), vector (D,), and the information of all errors with the coefficients
             considered (D, C).
         """
-        out: tuple[FloatArray, FloatArray, FloatArray] = (
+        out = Information(
             np.empty((self.size, self.size)),
             np.empty(self.size),
             np.empty((self.size, considered)),
         )
         clones = self.clones
         loops.place_information(
-            A, b, variance, clones.stop - clones.start, clones.start, self.stereo.start, *out
+            A, b, variance, clones.stop - clones.start, clones.start, self.stereo.start, out
         )
         return out

@@ -7,6 +7,8 @@ clone. Tracks that continue are linearised anew in every frame and absorbed into
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vio.cameras.rectification_error import CONSIDERED, ErrorColumns
@@ -15,8 +17,6 @@ from vio.filters.imu_jump import GyroJump, gyro_doubt, turn_of_images
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
     MIN_DEPTH,
-    LandmarkResiduals,
-    Views,
     landmark_residuals,
     relative_stereo_sigma,
     unweighted,
@@ -35,6 +35,7 @@ from vio.filters.stereo_calibration import (
     eliminate_points,
     stereo_columns,
 )
+from vio.filters.track_records import ErrorRows, Information, LandmarkResiduals, Views
 from vio.filters.tracks import precision, rows_of
 from vio.filters.window import Window
 from vio.filters.window_posterior import WindowPosterior, landmark_covariance, move_covariance
@@ -59,31 +60,39 @@ from vio.records import (
     UpdateReport,
 )
 
-_FIRST_STEPS = 0  # Gauss-Newton steps on each point, before and after the poses moved
-_LATER_STEPS = 1
-# Standard deviations of a point's inverse depth over itself, at most. A landmark is linearised and
-# marginalised frame by frame as a Cartesian point, which biases scale in second order of it where
-# the depth comes from motion. With left images and an IMU, position NEES after 2 s is 24 of 3 at
-# 0.2, 15 at 0.05, 6 at 0.02, 2.8 at 0.01, 2.5 without any.
-_LANDMARK_DEPTH_SIGMA = 0.01  # by all views
-_LANDMARK_STEREO_SIGMA = 0.1  # or by the right views alone, which know the scale
-# Standard deviation of the baseline over it, and that of a point's stereo depth by the
-# rectification, over it, at most: while the scale is open, the same bias falls on the baseline, and
-# on the field. With a prior of 5 % and a baseline that is off by 9.5 %, 15 s of a flight with an
-# IMU end at 4.07 +- 0.03 % with landmarks from the start, at 9.02 +- 0.29 % without any. Where no
-# right image gives depths any more, the bias is the lesser evil: on MH_01 36 such frames by images
-# alone cost 86 mm without landmarks, 4 mm with them.
-_SCALE_SIGMA = 0.001
-# by all views; a point of the map is reported with its covariance, and not used
-_MAP_DEPTH_SIGMA = 0.2
-# pixels by which the predicted pose may be off before one step over the window is too few
-_FAR = 0.5
-_NEARER = 1.25  # by which factor a step must have come nearer for another one
-# innovations over their standard deviation (median): more, and the gyro may have jumped
-_CONTRADICTED = 2.0
-# over the window in a frame: one is the rule, two bring in a start in motion, a third is an
-# exception
-_MAX_STEPS = 4
+
+@dataclass(frozen=True, slots=True)
+class _UpdateRules:
+    """How a frame's pixels are fitted and gated."""
+
+    first_steps: int = 0  # Gauss-Newton steps on each point, before and after the poses moved
+    later_steps: int = 1
+    # Standard deviations of a point's inverse depth over itself, at most. A landmark is
+    # linearised and marginalised frame by frame as a Cartesian point, which biases scale in
+    # second order of it where the depth comes from motion. With left images and an IMU, position
+    # NEES after 2 s is 24 of 3 at 0.2, 15 at 0.05, 6 at 0.02, 2.8 at 0.01, 2.5 without any.
+    landmark_depth_sigma: float = 0.01  # by all views
+    landmark_stereo_sigma: float = 0.1  # or by the right views alone, which know the scale
+    # Standard deviation of the baseline over it, and that of a point's stereo depth by the
+    # rectification, over it, at most: while the scale is open, the same bias falls on the
+    # baseline, and on the field. With a prior of 5 % and a baseline that is off by 9.5 %, 15 s of
+    # a flight with an IMU end at 4.07 +- 0.03 % with landmarks from the start, at 9.02 +- 0.29 %
+    # without any. Where no right image gives depths any more, the bias is the lesser evil: on
+    # MH_01 36 such frames by images alone cost 86 mm without landmarks, 4 mm with them.
+    scale_sigma: float = 0.001
+    # by all views; a point of the map is reported with its covariance, and not used
+    map_depth_sigma: float = 0.2
+    # pixels by which the predicted pose may be off before one step over the window is too few
+    far: float = 0.5
+    nearer: float = 1.25  # by which factor a step must have come nearer for another one
+    # innovations over their standard deviation (median): more, and the gyro may have jumped
+    contradicted: float = 2.0
+    # over the window in a frame: one is the rule, two bring in a start in motion, a third is an
+    # exception
+    max_steps: int = 4
+
+
+_UPDATE = _UpdateRules()
 
 
 class FrameUpdate:
@@ -172,7 +181,9 @@ class FrameUpdate:
 
         predicted = window.camera_move_since(-2) if len(window.clones) > 1 else None
         T_world_predicted = window.nav.T_world_imu
-        tracks = self._linearise(window, self.tracks.choose(len(window.clones)), _FIRST_STEPS)
+        tracks = self._linearise(
+            window, self.tracks.choose(len(window.clones)), _UPDATE.first_steps
+        )
         at_prediction = tracks
         innovation = tracks.newest_innovation()
         innovation_ratio = self.tracks.innovation_ratio(tracks, expected)
@@ -183,7 +194,7 @@ class FrameUpdate:
             missing = step.missing_noise()
             doubted = False
             turn = None
-            contradicted = (innovation_ratio or 0.0) > _CONTRADICTED
+            contradicted = (innovation_ratio or 0.0) > _UPDATE.contradicted
             off = bool(missing[1]) or contradicted
             settled = self._gyro_jump.is_settled(off=off)
             if off and self._has_imu and settled:
@@ -268,14 +279,18 @@ class FrameUpdate:
         """Gauss-Newton over the window; returns the tracks linearised at the estimate, and the
         last fit.
         """
-        for _ in range(_MAX_STEPS):
+        for _ in range(_UPDATE.max_steps):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b, _ = self._information(window, tracks, everything, pixels)
             fitted = self._move_to_optimum(window, tracks, tracks.stereo, A, b, len(A))
-            tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
+            tracks = self._linearise(window, tracks.rows, _UPDATE.later_steps)
             residual = tracks.newest_innovation()
             # Another step pays only where this one had far to go, and came nearer.
-            if innovation is None or residual is None or innovation < max(_FAR, _NEARER * residual):
+            if (
+                innovation is None
+                or residual is None
+                or innovation < max(_UPDATE.far, _UPDATE.nearer * residual)
+            ):
                 break
             innovation = residual
         return tracks, fitted
@@ -284,7 +299,9 @@ class FrameUpdate:
         """Fit to what is left of views that contradict the IMU and one another: a person in the
         view, not a shock.
         """
-        tracks = self._linearise(window, self.tracks.choose(len(window.clones)), _LATER_STEPS)
+        tracks = self._linearise(
+            window, self.tracks.choose(len(window.clones)), _UPDATE.later_steps
+        )
         return self._fit(window, tracks, pixels, tracks.newest_innovation())
 
     def _move_to_optimum(
@@ -378,11 +395,9 @@ class FrameUpdate:
                     unweighted(pixels.z, at.r, at.precision)
                 )
             # In their anchor, the newest clone: dp = xi_f - xi_rho.
-            rows = state.clone(-1).start, state.landmarks.start, state.stereo.start
-            weight = at.weight / self._variance
-            track_loops.add_landmarks(
-                at.r, at.J, H, at.precision, weight, *rows, A, b, by_considered
-            )
+            rows = ErrorRows(state.clone(-1).start, state.landmarks.start, state.stereo.start)
+            weighted = at._replace(weight=at.weight / self._variance)
+            track_loops.add_landmarks(weighted, H, rows, Information(A, b, by_considered))
         return A, b, None if joint is None else by_considered
 
     def _joint_columns(self, window: Window, tracks: LinearTracks) -> StereoColumns | None:
@@ -493,7 +508,7 @@ class FrameUpdate:
         self._propagation.reported = FramePosterior.of(window, reported)
         self.smoothed = WindowPosterior.of(window, P, reported)
 
-        done = np.flatnonzero(ending & good & (depth_sigma < _MAP_DEPTH_SIGMA))
+        done = np.flatnonzero(ending & good & (depth_sigma < _UPDATE.map_depth_sigma))
         covariance = self._variance * tracks.information.point_covariance(done)
         if joint is not None:
             of_points = tracks.information.point_D_clones(done) @ V[window.state.clones]
@@ -535,7 +550,7 @@ class FrameUpdate:
                 depths.
         """
         room = self._settings.max_landmarks - len(window.landmarks)
-        unsure = _scale_sigma(window) > _SCALE_SIGMA
+        unsure = _scale_sigma(window) > _UPDATE.scale_sigma
         if room <= 0 or unsure or not candidates.any():
             return np.zeros(0, dtype=np.int64)
         chosen = np.flatnonzero(candidates)
@@ -543,13 +558,14 @@ class FrameUpdate:
             tracks.at, tracks.information.q, chosen
         )
         chosen = chosen[
-            (depth_sigma[chosen] < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)
+            (depth_sigma[chosen] < _UPDATE.landmark_depth_sigma)
+            | (by_stereo < _UPDATE.landmark_stereo_sigma)
         ]
         field = self._rig.field(window)
         if field is not None:
             p = transform_points(window.T_cam0_world(-1)[0], tracks.p_world[chosen])
             of_field = window.prior.P[window.state.stereo, window.state.stereo]
-            limit = _SCALE_SIGMA if stereo else _LANDMARK_STEREO_SIGMA
+            limit = _UPDATE.scale_sigma if stereo else _UPDATE.landmark_stereo_sigma
             chosen = chosen[field.depth_sigma(p, of_field) < limit]
         if not len(chosen):
             return chosen

@@ -13,6 +13,30 @@ from vio.numerics.compiled import compiled, eigenvectors
 
 
 @compiled
+def _inverse_factor(B: FloatArray, first: int, scale: float, V: FloatArray) -> bool:
+    """Write the inverse (3, 3) of the Cholesky factor of three rows of a covariance of a scale.
+
+    Returns:
+        Whether they are positive.
+    """
+    L = np.empty((3, 3))
+    for i in range(3):  # L L' = B, and the rows of V are the inverse of L
+        for j in range(i + 1):
+            total = B[first + i, first + j] + (1e-12 * scale if i == j else 0.0)
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j and not total > 0.0:
+                return False
+            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
+        for j in range(3):
+            total = 1.0 if i == j else 0.0
+            for k in range(i):
+                total -= L[i, k] * V[k, j]
+            V[i, j] = total / L[i, i]
+    return True
+
+
+@compiled
 def whiten_correction(
     correction: FloatArray,
     expected: FloatArray,
@@ -29,22 +53,10 @@ def whiten_correction(
     scale = expected[first, first] + expected[first + 1, first + 1] + expected[first + 2, first + 2]
     if not scale > 0.0:
         return 0.0, 0, 0.0
-    L = np.empty((3, 3))
     M = np.empty((3, 3))
     V = np.empty((3, 3))
-    for i in range(3):  # L L' = B, and the rows of V are the inverse of L
-        for j in range(i + 1):
-            total = expected[first + i, first + j] + (1e-12 * scale if i == j else 0.0)
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j and not total > 0.0:
-                return np.nan, 0, 0.0
-            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
-        for j in range(3):
-            total = 1.0 if i == j else 0.0
-            for k in range(i):
-                total -= L[i, k] * V[k, j]
-            V[i, j] = total / L[i, i]
+    if not _inverse_factor(expected, first, scale, V):
+        return np.nan, 0, 0.0
     for i in range(3):
         for j in range(3):
             M[i, j] = 0.0

@@ -21,21 +21,32 @@ from vio.geometry.lie import FloatArray
 from vio.numerics.robust import median
 from vio.records import S_PER_NS, ImuSample, IntArray
 
-_MEMORY_S = 2.0  # samples that the structure function is learned from
-_MAX_SAMPLES = 8000  # of them, whatever their stamps say
-# half of it; beyond, the signal is taken to have changed as much as it ever does
-_LONGEST_LAG_S = 1.0
-_MIN_SAMPLES = 10  # with fewer the signal is not characterised
+
+@dataclass(frozen=True, slots=True)
+class _GapRules:
+    """What missing IMU samples may hide."""
+
+    memory_s: float = 2.0  # samples that the structure function is learned from
+    max_samples: int = 8000  # of them, whatever their stamps say
+    # half of it; beyond, the signal is taken to have changed as much as it ever does
+    longest_lag_s: float = 1.0
+    min_samples: int = 10  # with fewer the signal is not characterised
+    # of the samples in memory, 1 / 8: so many new ones change their median little
+    measured_share: int = 8
+    # an interval longer than so many median periods lacks a sample; jitter of the clock stays
+    # below
+    long_periods: float = 1.5
+    # between samples; a slower IMU misses motions that matter, and its straight lines are
+    # bridges, too
+    slow_ns: float = 30e6
+    slow_cut_ns: float = 10e6  # of its intervals
+    shortest_cut_ns: float = 1e6  # of a gap, for the integration
+    max_cuts: int = 1000
+
+
+_GAPS = _GapRules()
 # D then: accelerometer (m/s^2)^2, gyro (rad/s)^2, of a vehicle that manoeuvres
 _UNKNOWN = np.array([3.0, 1.0]) ** 2
-_MEASURED_SHARE = 8  # of the samples in memory, 1 / 8: so many new ones change their median little
-# an interval longer than so many median periods lacks a sample; jitter of the clock stays below
-_LONG_PERIODS = 1.5
-# between samples; a slower IMU misses motions that matter, and its straight lines are bridges, too
-_SLOW_NS = 30e6
-_SLOW_CUT_NS = 10e6  # of its intervals
-_SHORTEST_CUT_NS = 1e6  # of a gap, for the integration
-_MAX_CUTS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +66,7 @@ class ImuHistory:
     """
 
     def __init__(self) -> None:
-        self._samples: deque[ImuSample] = deque(maxlen=_MAX_SAMPLES)
+        self._samples: deque[ImuSample] = deque(maxlen=_GAPS.max_samples)
         self._period = 0.0  # median distance, and samples since it was computed
         self._unmeasured = 0
 
@@ -65,12 +76,12 @@ class ImuHistory:
         """
         self._samples.extend(samples)
         self._unmeasured += len(samples)
-        while len(self._samples) * self.period_ns() > _MEMORY_S / S_PER_NS:
+        while len(self._samples) * self.period_ns() > _GAPS.memory_s / S_PER_NS:
             self._samples.popleft()
 
     def period_ns(self) -> float:
         """Median distance of the samples, up to a few of them ago; 0 where there are not two."""
-        if self._unmeasured >= len(self._samples) // _MEASURED_SHARE:
+        if self._unmeasured >= len(self._samples) // _GAPS.measured_share:
             times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
             self._period = median(np.diff(times)) if len(times) > 1 else 0.0
             self._unmeasured = 0
@@ -85,8 +96,8 @@ class ImuHistory:
             times_ns: (S,) of the samples at hand, on the same scale, increasing.
         """
         period_ns = self.period_ns()
-        longest_ns = _LONG_PERIODS * period_ns
-        if not lacks_samples(cuts_ns, times_ns, min(longest_ns, _SLOW_NS)):
+        longest_ns = _GAPS.long_periods * period_ns
+        if not lacks_samples(cuts_ns, times_ns, min(longest_ns, _GAPS.slow_ns)):
             return None
         after = np.searchsorted(times_ns, 0.5 * (cuts_ns[1:] + cuts_ns[:-1]))
         left = np.concatenate([[-np.inf], times_ns])[after]  # the samples around each step
@@ -94,10 +105,14 @@ class ImuHistory:
         held = np.isinf(right - left)
         silent = np.where(held, np.minimum(cuts_ns[1:] - left, right - cuts_ns[:-1]), right - left)
         gap = silent > longest_ns
-        uncertain = gap | held | (silent > _SLOW_NS)
-        cut_ns = _SLOW_CUT_NS if period_ns > _SLOW_NS else max(period_ns, _SHORTEST_CUT_NS)
+        uncertain = gap | held | (silent > _GAPS.slow_ns)
+        cut_ns = (
+            _GAPS.slow_cut_ns
+            if period_ns > _GAPS.slow_ns
+            else max(period_ns, _GAPS.shortest_cut_ns)
+        )
         counts = np.where(uncertain, np.ceil(np.diff(cuts_ns) / cut_ns), 1)
-        parts = np.clip(counts, 1, _MAX_CUTS).astype(np.int64)
+        parts = np.clip(counts, 1, _GAPS.max_cuts).astype(np.int64)
         ends = [
             np.linspace(a, b, n + 1)[:-1]
             for a, b, n in zip(cuts_ns[:-1], cuts_ns[1:], parts, strict=True)
@@ -125,7 +140,7 @@ class ImuHistory:
             out = [
                 np.where(
                     held,
-                    np.interp(age, lags, D) * np.minimum(age, _LONGEST_LAG_S),
+                    np.interp(age, lags, D) * np.minimum(age, _GAPS.longest_lag_s),
                     np.interp(T, lags, D) * bridge,
                 )
                 for D in change
@@ -142,14 +157,14 @@ class ImuHistory:
         """Lags (L,) in s and the mean squared change (2, L) of accelerometer and gyro over them,
         of the worst axis.
         """
-        if len(self._samples) < _MIN_SAMPLES:
+        if len(self._samples) < _GAPS.min_samples:
             return np.array([0.0, 1.0]), np.stack([_UNKNOWN, _UNKNOWN], axis=1)
         times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
         period = self.period_ns()
         lags = [0.0]
         change = [np.zeros(2)]
         lag = period
-        while lag <= _LONGEST_LAG_S / S_PER_NS and times[-1] - times[0] >= lag:
+        while lag <= _GAPS.longest_lag_s / S_PER_NS and times[-1] - times[0] >= lag:
             pairs = _pairs(times, lag, 0.5 * period)
             if len(pairs):
                 lags.append(lag * S_PER_NS)

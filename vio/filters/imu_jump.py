@@ -14,8 +14,9 @@ from collections import deque
 
 import numpy as np
 
-from vio.filters.multiview import CAUCHY, Residuals
+from vio.filters.multiview import CAUCHY
 from vio.filters.navigation import Growth, NavState
+from vio.filters.track_records import Residuals
 from vio.filters.window_tracks import VIEW_PROBABILITY, LinearTracks, chi_square_table
 from vio.geometry.lie import FloatArray, so3_hat
 from vio.records import BoolArray

@@ -48,24 +48,34 @@ from vio.imu.standstill import STANDSTILL_S
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import ImuSample, Observations
 
-_SPAN_S = 3.0  # of views: what a gyro bias leaves of rotations is corrected to first order only
-_MIN_SPAN_S = 0.6  # half of it shows less than the standard deviation of the accelerometer's bias
-_VIEWS = 16
-_EVERY = 5  # frames between two attempts, whose time is that of a dozen updates
-_MIN_TRACKS = 20
-_MAX_TRACKS = 150
-_STEPS = 30  # of Gauss-Newton at most: where the scale is hardly known it takes twenty
-_CONVERGED = 1e-3  # m, m/s and rad
-_STILL_PX = 0.5  # median motion of the tracks over half a second at standstill
+
+@dataclass(frozen=True, slots=True)
+class _StartRules:
+    """When one camera and an IMU can start, and how the start is found."""
+
+    # of views: what a gyro bias leaves of rotations is corrected to first order only
+    span_s: float = 3.0
+    # half of it shows less than the standard deviation of the accelerometer's bias
+    min_span_s: float = 0.6
+    views: int = 16
+    every: int = 5  # frames between two attempts, whose time is that of a dozen updates
+    min_tracks: int = 20
+    max_tracks: int = 150
+    steps: int = 30  # of Gauss-Newton at most: where the scale is hardly known it takes twenty
+    converged: float = 1e-3  # m, m/s and rad
+    still_px: float = 0.5  # median motion of the tracks over half a second at standstill
+    # chi-square probability of the fit's distance from the prior, which is that of the IMU
+    agreement: float = 0.999
+    min_px: float = 0.15  # pixel noise that fewer residuals than a filter's cannot prove
+
+
+_START = _StartRules()
 _TILT_SIGMA_RAD = np.radians(15.0)  # of gravity by the linear solution
 # of a start; the filter is linear in the scale to half the square of it, 0.5 %
 MAX_SCALE_SIGMA = 0.1
-# chi-square probability of the fit's distance from the prior, which is that of the IMU
-_AGREEMENT = 0.999
 # from the first contradiction, after which a start is taken with a covariance that allows for it
 _PATIENCE_S = 5.0
 _BIASES = slice(9, DIM)  # of gyro and accelerometer, among the errors
-_MIN_PX = 0.15  # pixel noise that fewer residuals than a filter's cannot prove
 # On the densities of accelerometer and gyro, until the filter has learned its own: too small ones
 # cost the scale, too large ones time (docs/notes/design_decisions.md, IMU noise at the start).
 START_FACTORS = np.array([2.0, 8.0])
@@ -100,10 +110,12 @@ def is_still(
     if not before:
         return False
     _, a, b = np.intersect1d(before[-1].ids, now.ids, assume_unique=True, return_indices=True)
-    if len(a) < _MIN_TRACKS:
+    if len(a) < _START.min_tracks:
         return False
     moved = np.linalg.norm(before[-1].z[a, :2] - now.z[b, :2], axis=1)
-    return bool(np.median(moved) < _STILL_PX) and imu_start(samples, now.time_ns, settings).still
+    return (
+        bool(np.median(moved) < _START.still_px) and imu_start(samples, now.time_ns, settings).still
+    )
 
 
 class MonoStarter:
@@ -114,7 +126,7 @@ class MonoStarter:
     ) -> None:
         self._camera = camera
         self._T_cam0_imu = T_cam0_imu
-        self._settings = replace(settings, clones=_VIEWS, max_features=_MAX_TRACKS)
+        self._settings = replace(settings, clones=_START.views, max_features=_START.max_tracks)
         self._frames: deque[Observations] = deque()
         self._passed = 0
         # stamp of the first view at which features and IMU did
@@ -130,7 +142,7 @@ class MonoStarter:
         """
         self._passed += 1
         self._frames.append(seen)
-        while seen.time_ns - self._frames[0].time_ns > _SPAN_S * 1e9:
+        while seen.time_ns - self._frames[0].time_ns > _START.span_s * 1e9:
             self._frames.popleft()
         motion.forget_before(self._frames[0].time_ns - round(1.1 * STANDSTILL_S * 1e9))
         if not motion.ready:
@@ -139,11 +151,9 @@ class MonoStarter:
         if is_still(self._frames, motion.samples, self._settings):
             return self._still_start(motion)
         span_s = (seen.time_ns - self._frames[0].time_ns) * 1e-9
-        if span_s < _MIN_SPAN_S:
-            self.why = (
-                f"there are {span_s:.2f} s of frames, and a start in motion takes {_MIN_SPAN_S:g} s"
-            )
-        if span_s < _MIN_SPAN_S or self._passed % _EVERY:
+        if span_s < _START.min_span_s:
+            self.why = f"there are {span_s:.2f} s of frames, and a start in motion takes {_START.min_span_s:g} s"
+        if span_s < _START.min_span_s or self._passed % _START.every:
             return None
         return self._moving_start(motion)
 
@@ -158,7 +168,7 @@ class MonoStarter:
         for k, seen in enumerate(views):
             table.table.add_frame(k, seen)
         rows = table.choose(len(views))
-        if len(rows) < _MIN_TRACKS:
+        if len(rows) < _START.min_tracks:
             self.why = f"only {len(rows)} features are seen in several views"
             return None
         begin = self._aligned(motion, views, table)
@@ -187,7 +197,7 @@ class MonoStarter:
 
     def _views(self) -> list[Observations]:
         """Some of the frames, evenly spaced, with the first and the newest."""
-        count = min(_VIEWS, len(self._frames))
+        count = min(_START.views, len(self._frames))
         return [
             self._frames[k]
             for k in np.linspace(0, len(self._frames) - 1, count).round().astype(int)
@@ -249,9 +259,9 @@ class MonoStarter:
             window = self._window(motion, views, begin)
             tracks.table.has_point[:] = False
             fitted = None
-            for _ in range(_STEPS):
+            for _ in range(_START.steps):
                 lin = tracks.linearise(window.T_cam0_world(), tracks.choose(len(views)), 2)
-                if len(lin.rows) < _MIN_TRACKS:
+                if len(lin.rows) < _START.min_tracks:
                     self.why = f"only {len(lin.rows)} features show parallax"
                     return None
                 self._follow_noise(tracks, lin)
@@ -265,7 +275,7 @@ class MonoStarter:
                     lin, lin.stereo, error[window.state.clones], error[window.state.stereo]
                 )
                 window.relinearise(error)
-                if np.abs(error).max() < _CONVERGED:
+                if np.abs(error).max() < _START.converged:
                     break
             else:
                 self.why = "features and IMU do not agree on one motion"
@@ -323,14 +333,14 @@ class MonoStarter:
         _, squares, dof = tracks.gate(lin.at)
         ratio = float(np.median(squares / chi_square_table(0.5)[dof]))
         tracks.variance = float(
-            np.clip(tracks.variance * ratio, _MIN_PX**2, self._settings.pixel_sigma_max_px**2)
+            np.clip(tracks.variance * ratio, _START.min_px**2, self._settings.pixel_sigma_max_px**2)
         )
 
 
 def _disagreement(prior: Prior, rows: slice) -> float:
     """Squared distance of the means of some errors from the prior, over the limit by chi-square."""
     squared, dimensions = prior.squared_distance(rows)
-    return squared / float(chi_square_quantile(_AGREEMENT, dimensions))
+    return squared / float(chi_square_quantile(_START.agreement, dimensions))
 
 
 def _upright(nav: NavState, found: VisualInertialAlignment) -> NavState:

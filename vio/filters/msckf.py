@@ -115,29 +115,6 @@ class Msckf(Backend):
         self._tilted: FloatArray = np.eye(3)
         self._good: GoodState | None = None  # after the last plausible update
 
-    @classmethod
-    def build(
-        cls,
-        camera: StereoCamera,
-        T_cam0_body: FloatArray,
-        settings: MsckfSettings,
-        motion: MotionSource | None,
-    ) -> Msckf:
-        """Build the filter of a run, see `Backend`: that of one camera, or one whose IMU may begin
-        late, included.
-
-        Raises:
-            ConfigError: one camera without an IMU, or settings that need another motion or camera.
-        """
-        from vio.filters.late_imu import LateImuMsckf
-        from vio.filters.mono_msckf import MonoMsckf
-
-        if camera.kind == "mono":
-            return MonoMsckf.build(camera, T_cam0_body, settings, motion)
-        if motion == "imu":
-            return LateImuMsckf(camera, T_cam0_body, settings)
-        return cls(camera, T_cam0_body, settings, motion=motion)
-
     def propagate(self, sample: MotionSample) -> None:
         """Take a motion sample.
 

@@ -10,12 +10,20 @@ Equation numbers (M1) … are those of docs/math.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from vio.cameras.projection import camera_args
 from vio.filters import track_loops as loops
+from vio.filters.track_records import (
+    Cameras,
+    Damping,
+    DepthLimits,
+    InverseDepth,
+    LandmarkResiduals,
+    Residuals,
+    TrackColumns,
+    Views,
+)
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray
@@ -39,42 +47,6 @@ _TINY = 1e-12  # keeps what nothing was seen of invertible
 _PARALLAX_STEPS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class Views:
-    """What F tracks showed in N clones."""
-
-    z: FloatArray  # (F, N, 4) pixels [ul vl ur vr]; arbitrary where unseen
-    # (F, N, 4) one over a coordinate's relative standard deviation; 0: not measured
-    weight: FloatArray
-
-    def take(self, index: BoolArray) -> Views:
-        """Return the tracks of a mask (F,)."""
-        return self if index.all() else Views(self.z[index], self.weight[index])
-
-
-@dataclass(frozen=True, slots=True)
-class Residuals:
-    """Residuals of tracks at given poses and points, and their Jacobians, times the weights of
-    the views.
-    """
-
-    r: FloatArray  # (F, N, 4) pixels, zero where unseen
-    # (F, N, 4, 3) with respect to the point in the world frame, zero where unseen
-    z_D_p: FloatArray
-    ahead: BoolArray  # (F,) the point lies in front of every camera that saw it
-    weight: FloatArray  # (F, N, 4) as in `Views`
-
-    def take(self, index: BoolArray | IntArray) -> Residuals:
-        """Return the tracks of a mask (F,) or of rows (K,)."""
-        if index.dtype == np.bool_ and index.all():
-            return self
-        return Residuals(self.r[index], self.z_D_p[index], self.ahead[index], self.weight[index])
-
-    def predicted(self, z: FloatArray) -> FloatArray:
-        """Pixels (F, N, 4) that are expected where z (F, N, 4) were seen."""
-        return unweighted(z, self.r, self.weight)
-
-
 def residuals(
     camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views
 ) -> Residuals:
@@ -86,24 +58,21 @@ def residuals(
         p_world: (F, 3).
         views: what was seen.
     """
-    F = len(p_world)
-    N = len(T_cam0_world)
-    at = Residuals(
-        np.empty((F, N, 4)), np.empty((F, N, 4, 3)), np.empty(F, dtype=np.bool_), views.weight
-    )
-    least = MIN_DEPTH * camera.baseline_m
-    loops.compare_views(
-        camera_args(camera),
-        least,
-        T_cam0_world,
-        p_world,
-        views.z,
-        views.weight,
-        at.r,
-        at.z_D_p,
-        at.ahead,
-    )
+    at = _room(views.weight)
+    loops.compare_views(_cameras(camera, T_cam0_world), p_world, views, at)
     return at
+
+
+def _cameras(camera: StereoCamera, T_cam0_world: FloatArray) -> Cameras:
+    return Cameras(camera_args(camera), MIN_DEPTH * camera.baseline_m, T_cam0_world)
+
+
+def _room(weight: FloatArray) -> Residuals:
+    """Room for the residuals of views (F, N) of given weights."""
+    F, N = weight.shape[:2]
+    return Residuals(
+        np.empty((F, N, 4)), np.empty((F, N, 4, 3)), np.empty(F, dtype=np.bool_), weight
+    )
 
 
 def unweighted(z: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArray:
@@ -123,29 +92,6 @@ def squared_residuals(at: Residuals) -> tuple[FloatArray, IntArray]:
     count = np.empty(at.r.shape[:2], dtype=np.int64)
     loops.square_views(at.r, at.z_D_p, squares, count)
     return squares, count
-
-
-@dataclass(frozen=True, slots=True)
-class InverseDepth:
-    """Coordinates of F points as one of their cameras sees them, equation (M5).
-
-    `q = fu [x/z, y/z, b/z]`, pixels: the place in the left image, and the disparity, measured or
-    not.
-    """
-
-    anchor: IntArray  # (F,) the clone whose camera it is: the first that saw the point
-    centre: FloatArray  # (F, 3) of that camera, world
-    disparity: FloatArray  # (F,) the third coordinate
-    # (F, 3, 3) metres in the world per pixel; the third column points from the point to the camera
-    p_D_q: FloatArray
-    q_D_p: FloatArray  # (F, 3, 3) its inverse
-
-    def take(self, rows: IntArray) -> InverseDepth:
-        """Return the points of rows (K,)."""
-        q = self
-        return InverseDepth(
-            q.anchor[rows], q.centre[rows], q.disparity[rows], q.p_D_q[rows], q.q_D_p[rows]
-        )
 
 
 def first_points(
@@ -194,10 +140,11 @@ def refine_points(
     that saw the point.
     """
     p = p_world.copy()
-    lens = camera_args(camera)
-    least = MIN_DEPTH * camera.baseline_m
-    views_of = T_cam0_world, views.z, views.weight
-    loops.refine(lens, least, MIN_DISPARITY_PX, *views_of, steps, scale_px**2, _TINY, _PRIOR, p)
+    damping = Damping(scale_px**2, _TINY, _PRIOR, MIN_DISPARITY_PX)
+    room = InverseDepth.empty(len(p))
+    loops.refine(
+        _cameras(camera, T_cam0_world), views, steps, damping, _room(views.weight), room, p
+    )
     return p
 
 
@@ -212,18 +159,6 @@ def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
     weights = np.empty(at.r.shape[:2])
     loops.weigh_views(at.r, at.z_D_p, sigma2, _MEDIAN, CAUCHY, weights)
     return weights
-
-
-@dataclass(frozen=True, slots=True)
-class LandmarkResiduals:
-    """Residuals of landmarks in one camera, their Jacobians `dz = J dp`, and the weights that
-    they enter a fit with.
-    """
-
-    r: FloatArray  # (K, 4) pixels, zero where not measured, times the precision
-    J: FloatArray  # (K, 4, 3) with respect to the point in the world frame, likewise
-    weight: FloatArray  # (K,) robust weights
-    precision: FloatArray  # (K, 4) the weight of `Views`
 
 
 def landmark_residuals(
@@ -245,19 +180,12 @@ def landmark_residuals(
     return LandmarkResiduals(r, J, robust_weights(at, sigma2)[:, 0], views.weight)
 
 
-@dataclass(frozen=True, slots=True)
-class TrackInformation:
+class TrackInformation(TrackColumns):
     """What tracks say of the clones once their points are eliminated; pixel noise is one pixel
     here.
     """
 
-    q: InverseDepth  # the points' coordinates, pixels
-    G: FloatArray  # (F, 6N, 3) cross information of clones and point
-    C: FloatArray  # (F, 3, 3) information of the point
-    # (F, 3, 6) how a clone's error moves a point as that clone sees it: S^-1 B
-    q_D_clone: FloatArray
-    gradient: FloatArray  # (F, 6N) before the point is eliminated
-    point_gradient: FloatArray  # (F, 3)
+    __slots__ = ()
 
     def take(self, rows: IntArray) -> TrackInformation:
         """Return what the tracks of rows (K,) say."""
@@ -274,12 +202,10 @@ class TrackInformation:
         Returns:
             Points (F, 3) in the world.
         """
-        q = self.q
         p = np.empty((len(self.C), 3))
         gradient = self.point_gradient - other
-        point = q.centre, q.p_D_q, q.disparity, MIN_DISPARITY_PX
         loops.substitute_back(
-            self.G, self.C, gradient, *point, np.ascontiguousarray(clone_errors), p
+            self, gradient, MIN_DISPARITY_PX, np.ascontiguousarray(clone_errors), p
         )
         return p
 
@@ -330,23 +256,13 @@ def track_information(
         weight: (F, N) robust weight of each view.
     """
     F, N = at.r.shape[:2]
-    q = InverseDepth(
-        np.empty(F, np.int64),
-        np.empty((F, 3)),
-        np.empty(F),
-        np.empty((F, 3, 3)),
-        np.empty((F, 3, 3)),
-    )
     of_clones = np.empty((F, 6 * N, 3))
     B = np.empty((F, 3, 6))
     C = np.empty((F, 3, 3))
-    info = TrackInformation(q, of_clones, C, B, np.empty((F, 6 * N)), np.empty((F, 3)))
-    place = q.anchor, q.centre, q.disparity, q.p_D_q, q.q_D_p
-    out = *place, info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient
-    least = MIN_DEPTH * camera.baseline_m
-    loops.collect_tracks(
-        camera_args(camera), least, T_cam0_world, at.r, at.z_D_p, weight, p_world, _PRIOR, *out
+    info = TrackInformation(
+        InverseDepth.empty(F), of_clones, C, B, np.empty((F, 6 * N)), np.empty((F, 3))
     )
+    loops.collect_tracks(_cameras(camera, T_cam0_world), at, weight, p_world, _PRIOR, info)
     return info
 
 
@@ -373,9 +289,9 @@ def usable_points(
     is arbitrary, the depth must be known relative to itself.
     """
     keep: BoolArray = np.empty(len(p_world), dtype=np.bool_)
-    limits = (0.0, _MONO_DEPTH_SIGMA**2) if camera.kind == "mono" else (_STEREO_VARIANCE, 0.0)
-    seen = T_cam0_world, p_world, views.weight, at.z_D_p, at.ahead
-    loops.mark_usable(
-        camera_args(camera), MIN_DEPTH * camera.baseline_m, *seen, _TINY, _PRIOR, limits, keep
-    )
+    variances = (0.0, _MONO_DEPTH_SIGMA**2) if camera.kind == "mono" else (_STEREO_VARIANCE, 0.0)
+    limits = DepthLimits(*variances, _TINY, _PRIOR)
+    room = InverseDepth.empty(1)
+    seen = at._replace(weight=views.weight)
+    loops.mark_usable(_cameras(camera, T_cam0_world), p_world, seen, limits, room, keep)
     return keep

@@ -257,8 +257,9 @@ class ImuMotion:
         Q_parts = np.zeros((2, DIM, DIM))
         Q = np.empty((DIM, DIM))
         bias = np.concatenate([nav.gyro_bias, nav.accel_bias])
-        noise = (densities, self._walks, variance)
-        loops.integrate(times, readings, bias, self._gravity, *noise, T, v, turned, Phi, Q_parts, Q)
+        noise = loops.ImuNoise(densities, self._walks, variance)
+        step = loops.ImuStep(T, v, turned, Phi, Q_parts, Q)
+        loops.integrate(times, readings, bias, self._gravity, noise, step)
         moved = NavState(
             T, v, readings[-1, :3] - nav.gyro_bias, nav.gyro_bias, nav.accel_bias, nav.imu_terms
         )

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -35,9 +35,6 @@ from vio.records import (
     StereoFieldEstimate,
     StereoScaleEstimate,
 )
-
-if TYPE_CHECKING:
-    from vio.filters.error_state import ErrorState
 
 # squared half of a twist in its standard deviations at standstill
 _NOISE_ONLY = float(chi_square_quantile(0.999, 3))
@@ -158,7 +155,7 @@ class Calibration:
         return out
 
     def transition(
-        self, state: ErrorState, step: Transition | Growth, T_moved: FloatArray
+        self, state: OwnRows, step: Transition | Growth, T_moved: FloatArray
     ) -> FloatArray:
         """Transition (15 + C, 15 + C) of the errors of navigation state and calibration, equation
         (C4).
@@ -178,7 +175,7 @@ class Calibration:
                 out[state[name], state[name]] = moved
         return out
 
-    def report(self, state: ErrorState, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+    def report(self, state: OwnRows, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
         """Return the fields of `Estimate` that say what is estimated, by the errors' covariance
         (15 + C, 15 + C).
         """
@@ -197,6 +194,15 @@ def _stereo_terms(names: tuple[str, ...]) -> IntArray:
     blocks = [BLOCKS[name] for name in names]
     terms = [np.arange(TERMS)[block.terms] for block in blocks if isinstance(block, StereoBlock)]
     return np.concatenate([np.arange(0), *terms])
+
+
+class OwnRows(Protocol):
+    """Rows of an error vector, as far as the calibration needs them: see `ErrorState`."""
+
+    own: slice  # of navigation state and calibration
+
+    def __getitem__(self, name: str) -> slice:
+        """Rows of a block."""
 
 
 class CalibrationBlock:

@@ -7,6 +7,8 @@ come last. `tests/numpy_twins.py` holds the same in NumPy.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.geometry.lie import FloatArray
@@ -254,27 +256,47 @@ def append_rows(
             out[D + a, D + b] = out[D + b, D + a] = total
 
 
+class ImuNoise(NamedTuple):
+    """Noise of IMU readings over K times, accelerometer first."""
+
+    densities: FloatArray  # (2,)
+    walks: FloatArray  # (2,) of the biases of gyro and accelerometer
+    hidden: FloatArray  # (2, K - 1) what gaps hide, variances
+
+
+class ImuStep(NamedTuple):
+    """What an integration moves and writes."""
+
+    T: FloatArray  # (4, 4) pose, moved
+    v: FloatArray  # (3,) velocity, moved
+    turned: FloatArray  # (3,) rotation, added to
+    Phi: FloatArray  # (15, 15) an identity at first
+    Q_parts: FloatArray  # (2, 15, 15) noise of accelerometer and gyro, zero at first
+    Q: FloatArray  # (15, 15) their sum, with the walks of the biases
+
+
 @compiled
 def _add_noise(
     R: FloatArray,
     p: FloatArray,
     v: FloatArray,
     gravity: FloatArray,
-    left: float,
-    dt: float,
-    gyro2: float,
-    accel2: float,
-    Phi: FloatArray,
-    Q_parts: FloatArray,
+    span: tuple[float, float],
+    variances: tuple[float, float],
+    out: ImuStep,
 ) -> None:
-    """Add what one step of dt (s), `left` (s) before the end, brings to Phi and Q_parts (2, 15,
-    15): (N3), (N4).
+    """Add what one step brings to Phi and Q_parts: (N3), (N4).
 
-    `gyro2` and `accel2` are the variances of the integrals of gyro and accelerometer over it.
+    `span` is its duration, and how long before the end its middle is (s); the variances are those
+    of the integrals of accelerometer and gyro over it.
     """
+    dt, left = span
+    accel2, gyro2 = variances
+    Phi = out.Phi
+    Q_parts = out.Q_parts
     # How noise and bias errors of gyro and accelerometer enter [rho phi xi_v] (9, 6) there, carried
     # to the end.
-    out = np.empty((9, 6))
+    enters = np.empty((9, 6))
     lever = np.empty(3)
     swing = np.empty(3)
     for i in range(3):
@@ -284,21 +306,25 @@ def _add_noise(
         j = (i + 1) % 3
         k = (i + 2) % 3
         for c in range(3):
-            out[i, c] = lever[k] * R[j, c] - lever[j] * R[k, c]
-            out[3 + i, c] = -R[i, c]
-            out[6 + i, c] = swing[k] * R[j, c] - swing[j] * R[k, c]
-            out[i, 3 + c] = -left * R[i, c]
-            out[3 + i, 3 + c] = 0.0
-            out[6 + i, 3 + c] = -R[i, c]
+            enters[i, c] = lever[k] * R[j, c] - lever[j] * R[k, c]
+            enters[3 + i, c] = -R[i, c]
+            enters[6 + i, c] = swing[k] * R[j, c] - swing[j] * R[k, c]
+            enters[i, 3 + c] = -left * R[i, c]
+            enters[3 + i, 3 + c] = 0.0
+            enters[6 + i, 3 + c] = -R[i, c]
     for i in range(9):
         for j in range(6):
-            Phi[i, 9 + j] += out[i, j] * dt
+            Phi[i, 9 + j] += enters[i, j] * dt
         for j in range(9):
             Q_parts[0, i, j] += accel2 * (
-                out[i, 3] * out[j, 3] + out[i, 4] * out[j, 4] + out[i, 5] * out[j, 5]
+                enters[i, 3] * enters[j, 3]
+                + enters[i, 4] * enters[j, 4]
+                + enters[i, 5] * enters[j, 5]
             )
             Q_parts[1, i, j] += gyro2 * (
-                out[i, 0] * out[j, 0] + out[i, 1] * out[j, 1] + out[i, 2] * out[j, 2]
+                enters[i, 0] * enters[j, 0]
+                + enters[i, 1] * enters[j, 1]
+                + enters[i, 2] * enters[j, 2]
             )
 
 
@@ -308,23 +334,16 @@ def integrate(
     readings: FloatArray,
     bias: FloatArray,
     gravity: FloatArray,
-    densities: FloatArray,
-    walks: FloatArray,
-    hidden: FloatArray,
-    T: FloatArray,
-    v: FloatArray,
-    turned: FloatArray,
-    Phi: FloatArray,
-    Q_parts: FloatArray,
-    Q: FloatArray,
+    noise: ImuNoise,
+    out: ImuStep,
 ) -> None:
-    """Integrate readings (K, 6) `[gyro, accel]` at times (K,), equations (N1) to (N4).
-
-    Moves the pose T (4, 4) and the velocity v (3,); adds the rotation to `turned` (3,), the step to
-    Phi (15, 15), an identity, and to Q_parts (2, 15, 15) the noise of accelerometer and gyro, of
-    densities (2,) and what gaps hide (2, K - 1). Q (15, 15) is their sum, with the walks of the
-    biases of gyro and accelerometer (2,).
-    """
+    """Integrate readings (K, 6) `[gyro, accel]` at times (K,), equations (N1) to (N4)."""
+    T = out.T
+    v = out.v
+    Phi = out.Phi
+    Q = out.Q
+    densities = noise.densities
+    walks = noise.walks
     R = T[:3, :3].copy()
     p = T[:3, 3].copy()
     new = np.empty((3, 3))
@@ -337,7 +356,7 @@ def integrate(
         dt = (times_ns[k + 1] - times_ns[k]) * 1e-9
         for i in range(3):
             phi[i] = (0.5 * (readings[k, i] + readings[k + 1, i]) - bias[i]) * dt
-            turned[i] += phi[i]
+            out.turned[i] += phi[i]
         a, b, _ = _sinc_terms(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
         for i in range(3):  # R exp(phi) is the transpose of exp(-phi) R'
             new[i, 0], new[i, 1], new[i, 2] = _turned(-phi[0], -phi[1], -phi[2], a, b, R[i])
@@ -355,16 +374,16 @@ def integrate(
             pm[i] = 0.5 * (pm[i] + p[i])
             vm[i] = 0.5 * (vm[i] + v[i])
         left = (end - 0.5 * (times_ns[k] + times_ns[k + 1])) * 1e-9
-        accel2 = densities[0] ** 2 * dt + hidden[0, k]
-        gyro2 = densities[1] ** 2 * dt + hidden[1, k]
-        _add_noise(R, pm, vm, gravity, left, dt, gyro2, accel2, Phi, Q_parts)
+        accel2 = densities[0] ** 2 * dt + noise.hidden[0, k]
+        gyro2 = densities[1] ** 2 * dt + noise.hidden[1, k]
+        _add_noise(R, pm, vm, gravity, (dt, left), (accel2, gyro2), out)
         for i in range(3):
             for j in range(3):
                 R[i, j] = new[i, j]
     total = end * 1e-9
     for i in range(15):
         for j in range(15):
-            Q[i, j] = Q_parts[0, i, j] + Q_parts[1, i, j]
+            Q[i, j] = out.Q_parts[0, i, j] + out.Q_parts[1, i, j]
     for i in range(3):
         T[i, 3] = p[i]
         for j in range(3):

@@ -23,7 +23,8 @@ import numpy as np
 from vio.cameras.projection import camera_args
 from vio.cameras.rectification_error import ErrorColumns, corrected_pixels, vertical_disparity_terms
 from vio.filters import track_loops as loops
-from vio.filters.multiview import CAUCHY, Residuals, TrackInformation, Views
+from vio.filters.multiview import CAUCHY, TrackInformation
+from vio.filters.track_records import Eliminated, Residuals, RowEquations, TermColumns, Views
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, project
 from vio.numerics.compiled import invert_positive, solve_positive
@@ -66,7 +67,8 @@ class VerticalDisparityModel:
         # The median is taken out, as in the first frames the field itself is not yet known.
         weight = np.empty(len(z))
         loops.weigh_rows(rows - camera.fv * (basis @ self.coefficients), CAUCHY, weight)
-        loops.add_rows(basis, common, rows, weight, _ROW_MEMORY, self._A, self._b, self._common)
+        learned = RowEquations(self._A, self._b, self._common)
+        loops.add_rows(basis, common, rows, weight, _ROW_MEMORY, learned)
         solution = self._b.copy()
         solve_positive(self._A + (1 - _ROW_MEMORY) * _ROW_PRIOR, solution)
         self._inverse = np.empty(self._A.shape)
@@ -223,19 +225,20 @@ def eliminate_points(
     rows = np.flatnonzero(chosen)
     size = info.G.shape[1]
     D = size if columns is None else size + len(columns.wanted.chosen)
-    V = np.empty((3 * len(rows), D))
-    A = np.zeros((D, D))
-    b = np.zeros(D)
-    loops.eliminate_tracks(
-        rows, info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient, V, A, b
-    )
+    out = Eliminated(np.empty((3 * len(rows), D)), np.zeros((D, D)), np.zeros(D))
+    loops.eliminate_tracks(rows, info, out)
+    A = out.A
     if columns is not None:
         wanted = columns.wanted
-        at = columns.at
-        of_views = columns.z, at.r, at.z_D_p, at.weight, columns.weight
-        points = info.q.p_D_q, info.C, info.q_D_clone, info.point_gradient
-        of_terms = camera_args(wanted.camera), wanted.chosen, wanted.rows_D_common
-        loops.eliminate_columns(rows, *of_terms, *of_views, *points, columns.G, V, A, b)
+        terms = TermColumns(
+            camera_args(wanted.camera),
+            wanted.chosen,
+            wanted.rows_D_common,
+            columns.z,
+            columns.weight,
+            columns.G,
+        )
+        loops.eliminate_columns(rows, terms, columns.at, info, out)
         A[size:, :size] = A[:size, size:].T
-    A -= V.T @ V
-    return A, b
+    A -= out.V.T @ out.V
+    return A, out.b

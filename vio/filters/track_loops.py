@@ -11,6 +11,21 @@ import numpy as np
 
 from vio.cameras.projection import CameraArgs, point_at, turn_to
 from vio.cameras.rectification_error import write_view
+from vio.filters.track_records import (
+    Cameras,
+    Damping,
+    DepthLimits,
+    Eliminated,
+    ErrorRows,
+    Information,
+    InverseDepth,
+    LandmarkResiduals,
+    Residuals,
+    RowEquations,
+    TermColumns,
+    TrackColumns,
+    Views,
+)
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled, index_of, solve_positive
 from vio.records import BoolArray, IntArray, SigmaArray
@@ -27,20 +42,18 @@ def _turned_rows(T: FloatArray, s: float, c: float, row1: FloatArray, row2: Floa
 
 
 @compiled
-def compare_views(
-    camera: CameraArgs,
-    least_depth: float,
-    T: FloatArray,
-    p: FloatArray,
-    z: FloatArray,
-    weight: FloatArray,
-    r: FloatArray,
-    J: FloatArray,
-    ahead: BoolArray,
-) -> None:
+def compare_views(cameras: Cameras, p: FloatArray, views: Views, at: Residuals) -> None:
     """Write residuals (F, N, 4), Jacobians (F, N, 4, 3) by the points (F, 3), and which points
     are ahead (F,): (M1).
     """
+    camera = cameras.lens
+    least_depth = cameras.min_depth
+    T = cameras.T_cam0_world
+    z = views.z
+    weight = views.weight
+    r = at.r
+    J = at.z_D_p
+    ahead = at.ahead
     fu, fv, cu, cv, baseline, _ = camera
     row1 = np.empty(3)
     row2 = np.empty(3)
@@ -160,19 +173,14 @@ def square_tracks(
 
 
 @compiled
-def anchor_points(
-    camera: CameraArgs,
-    least_depth: float,
-    T: FloatArray,
-    p: FloatArray,
-    seen: BoolArray,
-    anchor: IntArray,
-    centre: FloatArray,
-    disparity: FloatArray,
-    p_D_q: FloatArray,
-    q_D_p: FloatArray,
-) -> None:
-    """Write the coordinates (M5) of points (F, 3): the columns of `InverseDepth`."""
+def anchor_points(cameras: Cameras, p: FloatArray, seen: BoolArray, q: InverseDepth) -> None:
+    """Write the coordinates (M5) of points (F, 3), which were seen by clones (F, N)."""
+    camera = cameras.lens
+    T = cameras.T_cam0_world
+    centre = q.centre
+    disparity = q.disparity
+    p_D_q = q.p_D_q
+    q_D_p = q.q_D_p
     fu = camera[0]
     baseline = camera[4]
     row1 = np.empty(3)
@@ -182,7 +190,7 @@ def anchor_points(
         for n in range(len(T) - 1, -1, -1):
             if seen[f, n]:
                 k = n
-        anchor[f] = k
+        q.anchor[f] = k
         for i in range(3):
             centre[f, i] = -(
                 T[k, 0, i] * T[k, 0, 3] + T[k, 1, i] * T[k, 1, 3] + T[k, 2, i] * T[k, 2, 3]
@@ -192,7 +200,7 @@ def anchor_points(
         z = T[k, 2, 0] * p[f, 0] + T[k, 2, 1] * p[f, 1] + T[k, 2, 2] * p[f, 2] + T[k, 2, 3]
         _, s, c, y, z = turn_to(camera, y, z)
         _turned_rows(T[k], s, c, row1, row2)
-        z = max(z, least_depth)
+        z = max(z, cameras.min_depth)
         disparity[f] = fu * baseline / z
         for i in range(3):
             p_D_q[f, i, 0] = T[k, 0, i] * z / fu
@@ -354,13 +362,14 @@ def add_rows(
     rows: FloatArray,
     weight: FloatArray,
     memory: float,
-    A: FloatArray,
-    b: FloatArray,
-    C: FloatArray,
+    out: RowEquations,
 ) -> None:
     """Add normal equations of rows (M,) in terms (M, 7), and what others (M, 4) do to them, to
     those remembered.
     """
+    A = out.A
+    b = out.b
+    C = out.common
     for i in range(len(b)):
         b[i] *= memory
         for j in range(len(b)):
@@ -508,40 +517,29 @@ def start_by_parallax(
 
 
 @compiled
-def put_ahead(
-    camera: CameraArgs,
-    least_depth: float,
-    least_disparity: float,
-    T: FloatArray,
-    z: FloatArray,
-    weight: FloatArray,
-    p: FloatArray,
-) -> None:
+def put_ahead(cameras: Cameras, min_disparity: float, views: Views, p: FloatArray) -> None:
     """Put points (F, 3) that are behind the first camera that saw them far away on its ray, in
     place.
     """
+    camera = cameras.lens
+    T = cameras.T_cam0_world
+    z = views.z
     for f in range(len(p)):
-        k = _first_view(weight, f)
+        k = _first_view(views.weight, f)
         y = T[k, 1, 0] * p[f, 0] + T[k, 1, 1] * p[f, 1] + T[k, 1, 2] * p[f, 2] + T[k, 1, 3]
         z_cam = T[k, 2, 0] * p[f, 0] + T[k, 2, 1] * p[f, 1] + T[k, 2, 2] * p[f, 2] + T[k, 2, 3]
-        if turn_to(camera, y, z_cam)[4] > least_depth:
+        if turn_to(camera, y, z_cam)[4] > cameras.min_depth:
             continue
-        _put_on_ray(camera, T[k], z[f, k, 0], z[f, k, 1], least_disparity, p[f])
+        _put_on_ray(camera, T[k], z[f, k, 0], z[f, k, 1], min_disparity, p[f])
 
 
 @compiled
-def step_points(
-    r: FloatArray,
-    J: FloatArray,
-    p_D_q: FloatArray,
-    scale2: float,
-    tiny: float,
-    prior: float,
-    dq: FloatArray,
-) -> None:
+def step_points(at: Residuals, p_D_q: FloatArray, damping: Damping, dq: FloatArray) -> None:
     """Write a Gauss-Newton step (F, 3) of each point in the coordinates (M5), with Cauchy
     weights of a scale.
     """
+    r = at.r
+    J = at.z_D_p
     C = np.empty((3, 3))
     row = np.empty(3)
     for f in range(len(r)):
@@ -549,14 +547,14 @@ def step_points(
             dq[f, i] = 0.0
             for j in range(3):
                 C[i, j] = 0.0
-        C[0, 0] = tiny
-        C[1, 1] = tiny
-        C[2, 2] = prior
+        C[0, 0] = damping.tiny
+        C[1, 1] = damping.tiny
+        C[2, 2] = damping.prior
         for n in range(r.shape[1]):
             if not _is_measured(J, f, n):
                 continue
             squares = r[f, n, 0] ** 2 + r[f, n, 1] ** 2 + r[f, n, 2] ** 2 + r[f, n, 3] ** 2
-            w = 1.0 / (1.0 + squares / (4.0 * scale2))
+            w = 1.0 / (1.0 + squares / (4.0 * damping.scale2))
             for a in range(4):
                 if J[f, n, a, 0] == 0.0 and J[f, n, a, 1] == 0.0 and J[f, n, a, 2] == 0.0:
                     continue
@@ -575,18 +573,14 @@ def step_points(
 
 @compiled
 def _most_disparity(
-    camera: CameraArgs,
-    least: float,
-    T: FloatArray,
-    weight: FloatArray,
-    f: int,
-    centre: FloatArray,
-    disparity: float,
-    p: FloatArray,
+    cameras: Cameras, least: float, weight: FloatArray, f: int, q: InverseDepth, p: FloatArray
 ) -> float:
     """Disparity beyond which a point (3,) would come nearer to one of its cameras than the least
     depth.
     """
+    camera = cameras.lens
+    T = cameras.T_cam0_world
+    centre = q.centre[f]
     # of a cylinder, a point that comes too near to another camera than its anchor is dropped
     # afterwards
     if camera[5]:
@@ -599,7 +593,7 @@ def _most_disparity(
             c = T[n, 2, 2]
             ray = (
                 a * (p[0] - centre[0]) + b * (p[1] - centre[1]) + c * (p[2] - centre[2])
-            ) * disparity
+            ) * q.disparity[f]
             room = least - (a * centre[0] + b * centre[1] + c * centre[2] + T[n, 2, 3])
             if room > 0.0 and ray > 0.0:
                 most = min(most, ray / room)
@@ -627,14 +621,10 @@ def _move(
 
 @compiled
 def step_inverse_depths(
-    camera: CameraArgs,
-    least_depth: float,
-    least_disparity: float,
-    T: FloatArray,
+    cameras: Cameras,
+    min_disparity: float,
     weight: FloatArray,
-    centre: FloatArray,
-    p_D_q: FloatArray,
-    disparity: FloatArray,
+    q: InverseDepth,
     dq: FloatArray,
     p: FloatArray,
 ) -> None:
@@ -642,49 +632,34 @@ def step_inverse_depths(
     cameras that saw them.
     """
     for f in range(len(p)):
-        most = _most_disparity(
-            camera, 1.01 * least_depth, T, weight, f, centre[f], disparity[f], p[f]
-        )
-        _move(centre[f], p_D_q[f], disparity[f], dq[f], least_disparity, most, p[f])
+        most = _most_disparity(cameras, 1.01 * cameras.min_depth, weight, f, q, p[f])
+        _move(q.centre[f], q.p_D_q[f], q.disparity[f], dq[f], min_disparity, most, p[f])
 
 
 @compiled
 def refine(
-    camera: CameraArgs,
-    least_depth: float,
-    least_disparity: float,
-    T: FloatArray,
-    z: FloatArray,
-    weight: FloatArray,
+    cameras: Cameras,
+    views: Views,
     steps: int,
-    scale2: float,
-    tiny: float,
-    prior: float,
+    damping: Damping,
+    at: Residuals,
+    q: InverseDepth,
     p: FloatArray,
 ) -> None:
     """Move points (F, 3) by Gauss-Newton steps in the coordinates (M5), each after what is
     behind was put ahead.
+
+    `at` and `q` are room for the residuals and the coordinates of the last step.
     """
-    F, N = weight.shape[:2]
-    r = np.empty((F, N, 4))
-    J = np.empty((F, N, 4, 3))
-    ahead = np.empty(F, np.bool_)
-    seen = np.empty((F, N), np.bool_)
-    anchor = np.empty(F, np.int64)
-    centre = np.empty((F, 3))
-    disparity = np.empty(F)
-    p_D_q = np.empty((F, 3, 3))
-    q_D_p = np.empty((F, 3, 3))
-    dq = np.empty((F, 3))
-    _mark_seen(weight, seen)
+    seen = np.empty(views.weight.shape[:2], np.bool_)
+    dq = np.empty(p.shape)
+    _mark_seen(views.weight, seen)
     for _ in range(steps):
-        put_ahead(camera, least_depth, least_disparity, T, z, weight, p)
-        compare_views(camera, least_depth, T, p, z, weight, r, J, ahead)
-        anchor_points(camera, least_depth, T, p, seen, anchor, centre, disparity, p_D_q, q_D_p)
-        step_points(r, J, p_D_q, scale2, tiny, prior, dq)
-        step_inverse_depths(
-            camera, least_depth, least_disparity, T, weight, centre, p_D_q, disparity, dq, p
-        )
+        put_ahead(cameras, damping.min_disparity, views, p)
+        compare_views(cameras, p, views, at)
+        anchor_points(cameras, p, seen, q)
+        step_points(at, q.p_D_q, damping, dq)
+        step_inverse_depths(cameras, damping.min_disparity, views.weight, q, dq, p)
 
 
 @compiled
@@ -697,37 +672,28 @@ def _mark_seen(weight: FloatArray, out: BoolArray) -> None:
 
 @compiled
 def mark_usable(
-    camera: CameraArgs,
-    least_depth: float,
-    T: FloatArray,
+    cameras: Cameras,
     p: FloatArray,
-    weight: FloatArray,
-    J: FloatArray,
-    ahead: BoolArray,
-    tiny: float,
-    prior: float,
-    limits: tuple[float, float],
+    at: Residuals,
+    limits: DepthLimits,
+    q: InverseDepth,
     keep: BoolArray,
 ) -> None:
     """Write which points (F, 3) are finite, ahead of their cameras and, without a right view, fixed
     by parallax.
 
-    The variance of their disparity, for one pixel of noise, is below the first limit, in px^2, plus
-    the second one times the squared disparity.
+    `q` is room for the coordinates of one point.
     """
+    weight = at.weight
+    J = at.z_D_p
     F, N = weight.shape[:2]
     seen = np.empty((1, N), np.bool_)
-    anchor = np.empty(1, np.int64)
-    centre = np.empty((1, 3))
-    disparity = np.empty(1)
-    p_D_q = np.empty((1, 3, 3))
-    q_D_p = np.empty((1, 3, 3))
     C = np.empty((3, 3))
     L = np.empty((3, 3))
     row = np.empty(3)
     for f in range(F):
         keep[f] = (
-            ahead[f] and np.isfinite(p[f, 0]) and np.isfinite(p[f, 1]) and np.isfinite(p[f, 2])
+            at.ahead[f] and np.isfinite(p[f, 0]) and np.isfinite(p[f, 1]) and np.isfinite(p[f, 2])
         )
         by_right = False
         for n in range(N):
@@ -735,23 +701,37 @@ def mark_usable(
         if by_right or not keep[f]:
             continue
         _mark_seen(weight[f : f + 1], seen)
-        anchor_points(
-            camera, least_depth, T, p[f : f + 1], seen, anchor, centre, disparity, p_D_q, q_D_p
-        )
+        anchor_points(cameras, p[f : f + 1], seen, q)
         for i in range(3):
             for j in range(3):
                 C[i, j] = 0.0
-        C[0, 0] = tiny
-        C[1, 1] = tiny
-        C[2, 2] = prior
+        C[0, 0] = limits.tiny
+        C[1, 1] = limits.tiny
+        C[2, 2] = limits.prior
         for n in range(N):
             for a in range(4):
-                _by_point(J[f, n, a], p_D_q[0], row)
+                _by_point(J[f, n, a], q.p_D_q[0], row)
                 for i in range(3):
                     for j in range(i + 1):
                         C[i, j] += row[i] * row[j]
         _factor(C, L)
-        keep[f] = 1.0 / L[2, 2] ** 2 < limits[0] + limits[1] * disparity[0] ** 2
+        keep[f] = 1.0 / L[2, 2] ** 2 < (
+            limits.variance + limits.relative_variance * q.disparity[0] ** 2
+        )
+
+
+@compiled
+def _is_zero(row: FloatArray) -> bool:
+    """Whether a pixel's Jacobian (3,) is zero: it was not measured."""
+    return row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0
+
+
+@compiled
+def _clear(A: FloatArray) -> None:
+    """Write zeros into a matrix."""
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            A[i, j] = 0.0
 
 
 @compiled
@@ -800,45 +780,35 @@ def weigh_views(
 
 @compiled
 def add_landmarks(
-    r: FloatArray,
-    J: FloatArray,
-    H: FloatArray,
-    precision: FloatArray,
-    weight: FloatArray,
-    exposure: int,
-    first: int,
-    stereo: int,
-    A: FloatArray,
-    b: FloatArray,
-    considered: FloatArray,
+    seen: LandmarkResiduals, H: FloatArray, rows: ErrorRows, out: Information
 ) -> None:
-    """Add what landmarks' pixels say of `dp = xi_f - xi_rho` and of S coefficients to A (D, D) and
-    b (D,).
+    """Add what landmarks' pixels say of `dp = xi_f - xi_rho` and of S coefficients to information.
 
     Args:
-        r: residuals (K, 4).
-        J: their Jacobians by dp (K, 4, 3), times the precision as r is.
-        H: by the coefficients (K, 4, S), not times the precision; S may be zero.
-        precision: (K, 4).
-        weight: (K,) over the pixels' variance.
-        exposure: first row of xi_rho.
-        first: row of the first landmark.
-        stereo: row of the first coefficient.
-        A: information about all errors.
-        b: its vector.
-        considered: of all errors with the last of the coefficients (D, C), which have no rows in A.
+        seen: residuals, and Jacobians by dp; the weights are over the pixels' variance.
+        H: Jacobians by the coefficients (K, 4, S), not times the precision; S may be zero.
+        rows: of xi_rho, the landmarks and the coefficients.
+        out: information; the last of the coefficients are considered.
     """
+    r = seen.r
+    J = seen.J
+    weight = seen.weight
+    exposure = rows.exposure
+    stereo = rows.stereo
+    A = out.A
+    b = out.b
+    considered = out.considered
     terms = H.shape[2]
     estimated = terms - considered.shape[1]
     h = np.empty(terms)
     for k in range(len(r)):
-        own = first + 3 * k
+        own = rows.landmarks + 3 * k
         for a in range(4):
             row = J[k, a]
             if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
                 continue
             for s in range(terms):
-                h[s] = precision[k, a] * H[k, a, s]
+                h[s] = seen.precision[k, a] * H[k, a, s]
             for i in range(3):
                 wJ = weight[k] * row[i]
                 b[own + i] += wJ * r[k, a]
@@ -875,9 +845,7 @@ def place_information(
     size: int,
     clones: int,
     stereo: int,
-    out: FloatArray,
-    vector: FloatArray,
-    considered: FloatArray,
+    out: Information,
 ) -> None:
     """Place information (6N + S + C, same) and (6N + S + C,), over a variance, among D errors.
 
@@ -888,43 +856,41 @@ def place_information(
         size: 6N.
         clones: row of the first clone.
         stereo: row of the first coefficient.
-        out: (D, D).
-        vector: (D,).
-        considered: of all errors with the coefficients considered (D, C).
+        out: about all errors.
     """
+    considered = out.considered
     last = len(b) - considered.shape[1]
-    for i in range(len(out)):
-        vector[i] = 0.0
-        for j in range(len(out)):
-            out[i, j] = 0.0
+    for i in range(len(out.b)):
+        out.b[i] = 0.0
+        for j in range(len(out.b)):
+            out.A[i, j] = 0.0
         for j in range(considered.shape[1]):
             considered[i, j] = 0.0
     for i in range(last):
         row = clones + i if i < size else stereo + i - size
-        vector[row] = b[i] / variance
+        out.b[row] = b[i] / variance
         for j in range(size):
-            out[row, clones + j] = A[i, j] / variance
+            out.A[row, clones + j] = A[i, j] / variance
         for j in range(size, last):
-            out[row, stereo + j - size] = A[i, j] / variance
+            out.A[row, stereo + j - size] = A[i, j] / variance
         for j in range(last, len(b)):
             considered[row, j - last] = A[i, j] / variance
 
 
 @compiled
 def substitute_back(
-    G: FloatArray,
-    C: FloatArray,
+    info: TrackColumns,
     gradient: FloatArray,
-    centre: FloatArray,
-    p_D_q: FloatArray,
-    disparity: FloatArray,
-    least_disparity: float,
+    min_disparity: float,
     clone_errors: FloatArray,
     p: FloatArray,
 ) -> None:
-    """Write points (F, 3) that solve their own equations once the clones (6N,) have moved; see
-    `TrackInformation`.
+    """Write points (F, 3) that solve their own equations once the clones (6N,) have moved.
+
+    `gradient` (F, 3) is that of the points, with what else has moved.
     """
+    G = info.G
+    q = info.q
     dq = np.empty(3)
     factor = np.empty((3, 3))
     for f in range(len(p)):
@@ -940,49 +906,43 @@ def substitute_back(
         dq[2] = d2
         for i in range(3):
             for j in range(3):
-                factor[i, j] = C[f, i, j]
+                factor[i, j] = info.C[f, i, j]
         solve_positive(factor, dq)
-        _move(centre[f], p_D_q[f], disparity[f], dq, least_disparity, np.inf, p[f])
+        _move(q.centre[f], q.p_D_q[f], q.disparity[f], dq, min_disparity, np.inf, p[f])
 
 
 @compiled
 def collect_tracks(
-    camera: CameraArgs,
-    least_depth: float,
-    T: FloatArray,
-    r: FloatArray,
-    J: FloatArray,
+    cameras: Cameras,
+    at: Residuals,
     weight: FloatArray,
     p: FloatArray,
     prior: float,
-    anchor: IntArray,
-    centre: FloatArray,
-    disparity: FloatArray,
-    p_D_q: FloatArray,
-    q_D_p: FloatArray,
-    G: FloatArray,
-    C: FloatArray,
-    B: FloatArray,
-    gradient: FloatArray,
-    point_gradient: FloatArray,
+    out: TrackColumns,
 ) -> None:
-    """Write the normal equations of tracks, (M2), (M3), (M5), (M6): the columns of
-    `TrackInformation`.
-    """
+    """Write the normal equations of tracks, (M2), (M3), (M5), (M6), with robust weights (F, N)."""
+    r = at.r
+    J = at.z_D_p
+    p_D_q = out.q.p_D_q
+    G = out.G
+    C = out.C
+    B = out.q_D_clone
+    gradient = out.gradient
+    point_gradient = out.point_gradient
     C_i = np.empty((3, 3))
     g_i = np.empty(3)
     row = np.empty(3)
     seen = np.empty(weight.shape, np.bool_)
     _mark_views(J, seen)
-    anchor_points(camera, least_depth, T, p, seen, anchor, centre, disparity, p_D_q, q_D_p)
+    anchor_points(cameras, p, seen, out.q)
     for f in range(len(r)):
-        _point_D_pose(q_D_p[f], p[f], B[f])
+        _point_D_pose(out.q.q_D_p[f], p[f], B[f])
         for i in range(3):
             point_gradient[f, i] = 0.0
             for j in range(3):
                 C[f, i, j] = 0.0
         for n in range(r.shape[1]):
-            if weight[f, n] == 0.0 and n != anchor[f]:
+            if weight[f, n] == 0.0 and n != out.q.anchor[f]:
                 for k in range(6 * n, 6 * n + 6):
                     gradient[f, k] = G[f, k, 0] = G[f, k, 1] = G[f, k, 2] = 0.0
                 continue
@@ -991,19 +951,14 @@ def collect_tracks(
                 for j in range(3):
                     C_i[i, j] = 0.0
             for a in range(4):
-                if J[f, n, a, 0] == 0.0 and J[f, n, a, 1] == 0.0 and J[f, n, a, 2] == 0.0:
+                if _is_zero(J[f, n, a]):
                     continue
-                for i in range(3):
-                    row[i] = (
-                        J[f, n, a, 0] * p_D_q[f, 0, i]
-                        + J[f, n, a, 1] * p_D_q[f, 1, i]
-                        + J[f, n, a, 2] * p_D_q[f, 2, i]
-                    )
+                _by_point(J[f, n, a], p_D_q[f], row)
                 for i in range(3):
                     g_i[i] += weight[f, n] * row[i] * r[f, n, a]
                     for j in range(3):
                         C_i[i, j] += weight[f, n] * row[i] * row[j]
-            if n == anchor[f]:
+            if n == out.q.anchor[f]:
                 C_i[2, 2] += prior
             for i in range(3):
                 point_gradient[f, i] += g_i[i]
@@ -1054,35 +1009,29 @@ def _factor(C: FloatArray, L: FloatArray) -> None:
 
 
 @compiled
-def eliminate_tracks(
-    chosen: IntArray,
-    G: FloatArray,
-    C: FloatArray,
-    B: FloatArray,
-    gradient: FloatArray,
-    point_gradient: FloatArray,
-    V: FloatArray,
-    A: FloatArray,
-    b: FloatArray,
-) -> None:
+def eliminate_tracks(chosen: IntArray, info: TrackColumns, out: Eliminated) -> None:
     """Write the clones' columns of `V` (3K, 6N + S): `V' V` is what points of the chosen tracks
     take away, (M4).
 
     What they say of the clones but for that is added to A (6N + S, 6N + S), and the vector with the
     points taken out to b (6N + S,).
     """
+    G = info.G
+    B = info.q_D_clone
+    V = out.V
+    A = out.A
     L = np.empty((3, 3))
     y = np.empty(3)
     for c, f in enumerate(chosen):
-        _factor(C[f], L)
-        _solve_lower(L, point_gradient[f], y)
+        _factor(info.C[f], L)
+        _solve_lower(L, info.point_gradient[f], y)
         for n in range(G.shape[1] // 6):
             takes_part = _has_part(G, f, n)
             for k in range(6 * n, 6 * n + 6):
                 if not takes_part:
                     V[3 * c, k] = V[3 * c + 1, k] = V[3 * c + 2, k] = 0.0
                     continue
-                b[k] += gradient[f, k] - _whiten(L, G[f, k], y, V, c, k)
+                out.b[k] += info.gradient[f, k] - _whiten(L, G[f, k], y, V, c, k)
                 g0 = G[f, k, 0]
                 g1 = G[f, k, 1]
                 g2 = G[f, k, 2]
@@ -1233,31 +1182,22 @@ def innovations(
 
 @compiled
 def eliminate_columns(
-    rows: IntArray,
-    camera: CameraArgs,
-    chosen: IntArray,
-    rows_D_common: FloatArray,
-    z: FloatArray,
-    r: FloatArray,
-    J: FloatArray,
-    precision: FloatArray,
-    weight: FloatArray,
-    p_D_q: FloatArray,
-    C: FloatArray,
-    B: FloatArray,
-    point_gradient: FloatArray,
-    G: FloatArray,
-    V: FloatArray,
-    A: FloatArray,
-    b: FloatArray,
+    rows: IntArray, terms_of: TermColumns, at: Residuals, info: TrackColumns, out: Eliminated
 ) -> None:
     """Do what `eliminate_tracks` does for the S coefficients that `ErrorColumns` has chosen, behind
     the clones.
 
-    Of A the rows of the clones and those of the coefficients. G (F, S, 3) is `H' W J`, the sum over
-    the views of each of these tracks. H are the derivatives of the pixels z (F, N, 4), of which
-    those count that were measured. r and J are times the precision (F, N, 4), H not.
+    Of A the rows of the clones and those of the coefficients. `terms_of.G` becomes `H' W J`, the
+    sum over the views of each of these tracks (K,). H are the derivatives of the pixels, of which
+    those count that were measured; residuals and Jacobians are times their precision, H not.
     """
+    chosen = terms_of.chosen
+    weight = terms_of.weight
+    G = terms_of.G
+    J = at.z_D_p
+    B = info.q_D_clone
+    A = out.A
+    b = out.b
     terms = len(chosen)
     size = 6 * J.shape[1]
     H = np.empty((3, 12))
@@ -1271,26 +1211,24 @@ def eliminate_columns(
     of_view = np.empty((3, terms))
     sums = np.empty((3, terms))
     for c, f in enumerate(rows):
+        _clear(sums)
+        _clear(own)
         for s in range(terms):
-            own_b[s] = sums[0, s] = sums[1, s] = sums[2, s] = 0.0
-            for t in range(terms):
-                own[s, t] = 0.0
+            own_b[s] = 0.0
         for n in range(J.shape[1]):
             if weight[f, n] == 0.0:
                 continue
-            write_view(camera, z[f, n], rows_D_common, H)
-            for i in range(3):
-                for s in range(terms):
-                    of_view[i, s] = 0.0
+            write_view(terms_of.lens, terms_of.z[f, n], terms_of.rows_D_common, H)
+            _clear(of_view)
             for a in range(3):
                 row = J[f, n, a]
-                if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
+                if _is_zero(row):
                     continue
-                _by_point(row, p_D_q[f], by_q)
+                _by_point(row, info.q.p_D_q[f], by_q)
                 for s in range(terms):
-                    h[s] = precision[f, n, a] * H[a, chosen[s]]
+                    h[s] = at.weight[f, n, a] * H[a, chosen[s]]
                     wh[s] = weight[f, n] * h[s]
-                    own_b[s] += wh[s] * r[f, n, a]
+                    own_b[s] += wh[s] * at.r[f, n, a]
                 for s in range(terms):
                     if h[s] != 0.0:  # left pixels do not depend on the right camera
                         for t in range(terms):
@@ -1307,13 +1245,13 @@ def eliminate_columns(
                     A[6 * n + k, size + s] += (
                         b0 * of_view[0, s] + b1 * of_view[1, s] + b2 * of_view[2, s]
                     )
-        _factor(C[f], L)
-        _solve_lower(L, point_gradient[f], y)
+        _factor(info.C[f], L)
+        _solve_lower(L, info.point_gradient[f], y)
         for s in range(terms):
             G[f, s, 0] = sums[0, s]
             G[f, s, 1] = sums[1, s]
             G[f, s, 2] = sums[2, s]
-            b[size + s] += own_b[s] - _whiten(L, G[f, s], y, V, c, size + s)
+            b[size + s] += own_b[s] - _whiten(L, G[f, s], y, out.V, c, size + s)
             for t in range(terms):
                 A[size + s, size + t] += own[s, t] if t <= s else own[t, s]
 
@@ -1348,11 +1286,7 @@ def write_directions(rows: IntArray, T: FloatArray, p: FloatArray, out: FloatArr
 @compiled
 def score_drifts(
     rows: IntArray,
-    G: FloatArray,
-    C: FloatArray,
-    q_D_clone: FloatArray,
-    gradient: FloatArray,
-    point_gradient: FloatArray,
+    info: TrackColumns,
     centre: FloatArray,
     variance: float,
     scores: FloatArray,
@@ -1364,6 +1298,7 @@ def score_drifts(
     The drift is a motion `[rho; phi]` of the clones along the world's axes, about `centre` (3,),
     that grows linearly from -1/2 in a track's first view to 1/2 in its last one.
     """
+    G = info.G
     L = np.empty((3, 3))
     sums = np.empty((6, 3))
     own = np.empty((6, 6))
@@ -1392,14 +1327,14 @@ def score_drifts(
         for n in range(first, last + 1):
             w = (n - first) / max(last - first, 1) - 0.5
             for i in range(6):
-                g[i] += w * gradient[f, 6 * n + i]
+                g[i] += w * info.gradient[f, 6 * n + i]
                 for j in range(3):
                     Gij = G[f, 6 * n + i, j]
                     sums[i, j] += w * Gij
                     for m in range(6):
-                        own[i, m] += w * w * Gij * q_D_clone[f, j, m]
-        _factor(C[f], L)
-        y = point_gradient[f]
+                        own[i, m] += w * w * Gij * info.q_D_clone[f, j, m]
+        _factor(info.C[f], L)
+        y = info.point_gradient[f]
         for s in range(6):
             g0 = 0.0
             g1 = 0.0

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from vio.filters import track_loops as loops
-from vio.filters.multiview import Views
+from vio.filters.track_records import Views
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, IntArray, Observations
 

@@ -15,15 +15,14 @@ import numpy as np
 from vio.filters import track_loops as loops
 from vio.filters.multiview import (
     CAUCHY,
-    Residuals,
     TrackInformation,
-    Views,
     first_points,
     refine_points,
     residuals,
     robust_weights,
     squared_residuals,
     track_information,
+    unweighted,
     usable_points,
 )
 from vio.filters.settings import MsckfSettings
@@ -33,6 +32,7 @@ from vio.filters.stereo_calibration import (
     eliminate_points,
     stereo_columns,
 )
+from vio.filters.track_records import Residuals, Views
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -43,25 +43,36 @@ from vio.records import BoolArray, IntArray
 
 MIN_TRACKS_FOR_NOISE = 15  # with fewer, neither the pixel noise nor the process noise is adapted
 MIN_PIXEL_SIGMA_PX = 0.03  # lower bound of the estimated noise of one pixel coordinate
-# Pixels of a track share errors that its residuals do not show, and no right image bounds what they
-# make of the scale (docs/notes/design_decisions.md, pixel noise of one camera).
-_MIN_MONO_PX = 0.1
-_NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals in the end
-# the noise at the start may be off by a factor of four, that of frames differs by one and a half
-_PRIOR_FRAMES = 0.1
-_MAX_CHANGE = 4.0  # of the variance from frame to frame that is believed in the end
-# Degrees of freedom: 2 for the mean of an inverse chi-square, over the efficiency of a median,
-# 0.64.
-_SPENT_ON_NOISE = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class _TrackRules:
+    """Which tracks the filter uses, and which views of them."""
+
+    # Pixels of a track share errors that its residuals do not show, and no right image bounds
+    # what they make of the scale (docs/notes/design_decisions.md, pixel noise of one camera).
+    min_mono_px: float = 0.1
+    noise_gain: float = 0.05  # how fast the pixel noise follows the residuals in the end
+    # the noise at the start may be off by a factor of four, that of frames differs by one and a
+    # half
+    prior_frames: float = 0.1
+    max_change: float = 4.0  # of the variance from frame to frame that is believed in the end
+    # Degrees of freedom: 2 for the mean of an inverse chi-square, over the efficiency of a median,
+    # 0.64.
+    spent_on_noise: float = 3.0
+    # of the tracks used, at least, that the newest frame shows and that stay in the window
+    going_on: float = 0.1
+    max_dof: int = 199
+    # left of a pose's own, at most: directions that pixels alone do not tell, as where the world
+    # is
+    no_information: float = 1e-8
+    # of a frame over the learned variance: beyond twice the noise it is no blur
+    max_common_noise: float = 4.0
+
+
+_TRACKS = _TrackRules()
 VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
-# of the tracks used, at least, that the newest frame shows and that stay in the window
-_GOING_ON = 0.1
-_MAX_DOF = 199
-# left of a pose's own, at most: directions that pixels alone do not tell, as where the world is
-_NO_INFORMATION = 1e-8
-# of a frame over the learned variance: beyond twice the noise it is no blur
-_MAX_COMMON_NOISE = 4.0
 
 
 @dataclass(frozen=True)
@@ -114,7 +125,7 @@ class WindowTracks:
         self._camera = camera
         self._settings = settings
         self.table = TrackTable(settings.clones + 1)
-        self._least_px = _MIN_MONO_PX if camera.kind == "mono" else MIN_PIXEL_SIGMA_PX
+        self._least_px = _TRACKS.min_mono_px if camera.kind == "mono" else MIN_PIXEL_SIGMA_PX
         self._frames = 0  # from which the noise was learned
         # of one pixel coordinate, px^2; follows the residuals
         self.variance = settings.pixel_sigma_px**2
@@ -138,7 +149,7 @@ class WindowTracks:
             order = np.lexsort((self.table.ids(rows), -length[enough], ~ends))
             count = int(ends.sum())
             most = self._settings.max_features
-            going_on = order[count:][: round(_GOING_ON * most)]
+            going_on = order[count:][: round(_TRACKS.going_on * most)]
             best = np.concatenate([going_on, order[:count], order[count + len(going_on) :]])[:most]
             rows = rows[np.sort(best)]
         return rows
@@ -183,7 +194,7 @@ class WindowTracks:
             p = p[keep]
             at = at.take(keep)
             views = views.take(keep)
-        return self._linear(T, rows, p, at, field, at.predicted(views.z))
+        return self._linear(T, rows, p, at, field, unweighted(views.z, at.r, at.weight))
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
         """Drop single views that contradict the rest of their track permanently, and linearise
@@ -272,9 +283,8 @@ class WindowTracks:
         info = tracks.information
         T = tracks.T_cam0_world[-1]
         scores, information = np.empty((2, len(chosen), 6))
-        of_tracks = info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient
         loops.score_drifts(
-            chosen, *of_tracks, -T[:3, :3].T @ T[:3, 3], self.variance, scores, information
+            chosen, info, -T[:3, :3].T @ T[:3, 3], self.variance, scores, information
         )
         return scores, information
 
@@ -322,8 +332,8 @@ class WindowTracks:
         """
         squares = np.empty(len(at.r))
         dof = np.empty(len(at.r), dtype=np.int64)
-        loops.square_tracks(at.r, at.z_D_p, self.variance, _MAX_DOF, squares, dof)
-        self.common_noise = min(_misfit(squares, dof), _MAX_COMMON_NOISE)
+        loops.square_tracks(at.r, at.z_D_p, self.variance, _TRACKS.max_dof, squares, dof)
+        self.common_noise = min(_misfit(squares, dof), _TRACKS.max_common_noise)
         limits = chi_square_table(self._settings.gate_probability)[dof] * self.common_noise
         passed: BoolArray = squares <= limits
         return passed, squares, dof
@@ -345,14 +355,18 @@ class WindowTracks:
         scale = np.sqrt(np.where(A.diagonal() > 0, A.diagonal(), 1.0))
         # `b' A^+ b` by Cholesky with pivots, in the directions that A determines: b has no part in
         # the others.
-        U, order, spent, _ = lapack.dpstrf(A / np.outer(scale, scale), tol=_NO_INFORMATION, lower=0)
+        U, order, spent, _ = lapack.dpstrf(
+            A / np.outer(scale, scale), tol=_TRACKS.no_information, lower=0
+        )
         determined = order[:spent] - 1
         y, _ = lapack.dtrtrs(U[:spent, :spent], (b / scale)[determined], trans=1)
         squares = float(np.sum(tracks.weight * squared_residuals(tracks.at)[0]))
         total = int(dof.sum())
         if total > spent:
             left = (1 - float(y @ y) / squares) / (1 - spent / total)
-            self.common_noise = min(max(_misfit(nis, dof) * min(left, 1.0), 1.0), _MAX_COMMON_NOISE)
+            self.common_noise = min(
+                max(_misfit(nis, dof) * min(left, 1.0), 1.0), _TRACKS.max_common_noise
+            )
 
     def update_pixel_noise(self, squares: FloatArray, dof: IntArray, fitted: float) -> None:
         """Let the pixel noise follow the median of squared residuals over that of chi-square,
@@ -371,12 +385,12 @@ class WindowTracks:
         if len(squares) < MIN_TRACKS_FOR_NOISE:
             return
         self._frames += 1
-        gain = max(1 / (self._frames + _PRIOR_FRAMES), _NOISE_GAIN)
-        most = _MAX_CHANGE ** (gain / _NOISE_GAIN)
+        gain = max(1 / (self._frames + _TRACKS.prior_frames), _TRACKS.noise_gain)
+        most = _TRACKS.max_change ** (gain / _TRACKS.noise_gain)
         # The mean of 1 / variance is that of the noise itself, where its estimate has about two
         # degrees less.
         total = float(dof.sum())
-        left = max(total - fitted - _SPENT_ON_NOISE, 0.25 * total)
+        left = max(total - fitted - _TRACKS.spent_on_noise, 0.25 * total)
         ratio = min(
             max(total / left * median(squares / chi_square_table(0.5)[dof]), 1 / most), most
         )
@@ -415,4 +429,6 @@ def _misfit(squares: FloatArray, dof: IntArray) -> float:
 @lru_cache(maxsize=8)
 def chi_square_table(probability: float) -> FloatArray:
     """Quantiles of chi-square for 0 to 199 degrees of freedom."""
-    return np.concatenate([[0.0], chi_square_quantile(probability, np.arange(1, _MAX_DOF + 1))])
+    return np.concatenate(
+        [[0.0], chi_square_quantile(probability, np.arange(1, _TRACKS.max_dof + 1))]
+    )

@@ -38,29 +38,46 @@ ImuFaultKind: TypeAlias = Literal[
     "accelerometer clipped",
 ]
 
-_HISTORY_NS = 2_000_000_000  # changes between samples that a spike is compared with
-# changes; with fewer nothing is called a spike, nor stuck: a simulated IMU may have no noise
-_MIN_HISTORY = 20
-_REFRESH = 20  # samples between two evaluations of their scale, and the least share of all, 1 / 4
-_REFRESH_SHARE = 4
-_SPIKE_SIGMAS = 30.0  # robust standard deviations of the changes; real motion reached 23
-# rad and m/s over the sample's period; below, no spike does harm
-_SPIKE_IMPULSE = (5e-3, 5e-3, 5e-3, 0.15, 0.15, 0.15)
-# of the first change, by which the sample after a spike may lie from the one before it; a shock
-# rings
-_RETURN = 0.25
-_LONG_PERIODS = 3.0  # after a longer interval a change is no spike
+
+@dataclass(frozen=True, slots=True)
+class _FaultRules:
+    """Which IMU samples count as spikes and as repeated."""
+
+    history_ns: int = 2_000_000_000  # changes between samples that a spike is compared with
+    # changes; with fewer nothing is called a spike, nor stuck: a simulated IMU may have no noise
+    min_history: int = 20
+    # samples between two evaluations of their scale, and the least share of all, 1 / 4
+    refresh: int = 20
+    refresh_share: int = 4
+    spike_sigmas: float = 30.0  # robust standard deviations of the changes; real motion reached 23
+    # rad and m/s over the sample's period; below, no spike does harm
+    spike_impulse: tuple[float, float, float, float, float, float] = (
+        5e-3,
+        5e-3,
+        5e-3,
+        0.15,
+        0.15,
+        0.15,
+    )
+    # of the first change, by which the sample after a spike may lie from the one before it; a
+    # shock rings
+    returned: float = 0.25
+    long_periods: float = 3.0  # after a longer interval a change is no spike
+    min_repeats: int = 4  # of all six numbers
+    # of one sensor alone, which some drivers hold between its own slower samples
+    min_part_s: float = 0.25
+    rare: float = 0.02  # share of repetitions below which one is held back
+    counted: int = 400  # samples over which the share of repetitions is counted
+
+
+_FAULTS = _FaultRules()
 _PARTS: tuple[tuple[ImuFaultKind, slice], ...] = (
     ("stuck IMU", slice(0, 6)),
     ("stuck gyro", slice(0, 3)),
     ("stuck accelerometer", slice(3, 6)),
 )
-_MIN_REPEATS = 4  # of all six numbers
-_MIN_PART_S = 0.25  # of one sensor alone, which some drivers hold between its own slower samples
-_RARE = 0.02  # share of repetitions below which one is held back
 _MIN_CHANCE = 1e-8  # probability of so many repetitions in a row where they are independent
 _RANGE_SLACK = 1e-3  # of a range's end: a reading beyond it shows that it is none
-_COUNTED = 400  # samples over which the share of repetitions is counted
 # (6,) gyro and accelerometer; plain numbers, as arrays of six cost ten times as much
 _Reading: TypeAlias = list[float]
 
@@ -183,7 +200,7 @@ class _Repetition:
         self._kind = kind
         self._part = part
         # repetitions before the present row of them
-        self._counted: deque[bool] = deque(maxlen=_COUNTED)
+        self._counted: deque[bool] = deque(maxlen=_FAULTS.counted)
         self._equal = 0  # of these, that were repetitions
         self._start: ImuSample | None = None  # the reading that is repeated
         self.repeats = 0  # in the present row
@@ -216,7 +233,7 @@ class _Repetition:
     @property
     def unusual(self) -> bool:
         """Whether the last sample repeats the one before it, as few did."""
-        return self.repeats > 0 and self._share < _RARE
+        return self.repeats > 0 and self._share < _FAULTS.rare
 
     def fault(self, end_ns: int) -> ImuFault:
         """Return the fault that the present row of repetitions is, up to a time."""
@@ -227,9 +244,9 @@ class _Repetition:
     def _improbable(self, time_ns: int) -> bool:
         assert self._start is not None
         alone = self._kind != "stuck IMU"
-        if len(self._counted) < _MIN_HISTORY or self.repeats < _MIN_REPEATS:
+        if len(self._counted) < _FAULTS.min_history or self.repeats < _FAULTS.min_repeats:
             return False
-        if alone and (time_ns - self._start.time_ns) * S_PER_NS < _MIN_PART_S:
+        if alone and (time_ns - self._start.time_ns) * S_PER_NS < _FAULTS.min_part_s:
             return False
         return bool(self.repeats * np.log(self._share) < np.log(_MIN_CHANCE))
 
@@ -239,7 +256,7 @@ class _Repetition:
         return (self._equal + 1) / (len(self._counted) + 2)
 
     def _count(self, equal: bool) -> None:
-        if len(self._counted) == _COUNTED:
+        if len(self._counted) == _FAULTS.counted:
             self._equal -= self._counted[0]
         self._counted.append(equal)
         self._equal += equal
@@ -303,7 +320,7 @@ class _Range:
         for k, row in enumerate(at_end):
             self._repeats = np.where(row, self._repeats + 1, 0)
             seen = self._count + k
-            if not row.any() or seen < _MIN_HISTORY:
+            if not row.any() or seen < _FAULTS.min_history:
                 continue
             share = (self._equal + (equal & ~at_end)[:k].sum(axis=0) + 1) / (seen + 2)
             improbable = self._repeats * np.log(share) < np.log(_MIN_CHANCE)
@@ -340,7 +357,7 @@ class _SpikeCheck:
         readings = readings[:most]
         changes = np.empty(readings.shape)
         limit = np.array([np.inf] * 6 if self._limit is None else self._limit)
-        longest = _LONG_PERIODS * self._period_ns
+        longest = _FAULTS.long_periods * self._period_ns
         last_ns, last = self._last
         passed = _count_plain(times, readings, last_ns, np.array(last), limit, longest, changes)
         if passed:
@@ -371,7 +388,7 @@ class _SpikeCheck:
 
     def _is_suspect(self, time_ns: int, reading: _Reading) -> bool:
         assert self._last is not None
-        if self._limit is None or time_ns - self._last[0] > _LONG_PERIODS * self._period_ns:
+        if self._limit is None or time_ns - self._last[0] > _FAULTS.long_periods * self._period_ns:
             return False
         pairs = zip(reading, self._last[1], self._limit, strict=True)
         return any(abs(now - last) > limit for now, last, limit in pairs)
@@ -384,7 +401,7 @@ class _SpikeCheck:
         jump = np.concatenate([suspect.gyro, suspect.accel]) - last
         axes = np.abs(jump) > self._limit
         back = np.abs(reading - last)
-        if (back > self._limit).any() or (back > _RETURN * np.abs(jump))[axes].any():
+        if (back > self._limit).any() or (back > _FAULTS.returned * np.abs(jump))[axes].any():
             return False
         for kind, part in (("gyro spike", slice(0, 3)), ("accelerometer spike", slice(3, 6))):
             if axes[part].any():
@@ -407,14 +424,18 @@ class _SpikeCheck:
             return
         together = np.concatenate(self._times)
         changed = np.concatenate(self._changes)
-        old = int(np.searchsorted(together, self._last[0] - _HISTORY_NS))
+        old = int(np.searchsorted(together, self._last[0] - _FAULTS.history_ns))
         self._times = [together[old:]]
         self._changes = [changed[old:]]
-        if len(together) - old >= _MIN_HISTORY:
-            self._until_refresh = max(_REFRESH, (len(together) - old) // _REFRESH_SHARE)
+        if len(together) - old >= _FAULTS.min_history:
+            self._until_refresh = max(
+                _FAULTS.refresh, (len(together) - old) // _FAULTS.refresh_share
+            )
             self._period_ns = median(np.diff(together[old:]))
-            least = np.array(_SPIKE_IMPULSE) / max(self._period_ns * S_PER_NS, 1e-6)
-            self._limit = np.maximum(_SPIKE_SIGMAS * robust_sigmas(changed[old:]), least).tolist()
+            least = np.array(_FAULTS.spike_impulse) / max(self._period_ns * S_PER_NS, 1e-6)
+            self._limit = np.maximum(
+                _FAULTS.spike_sigmas * robust_sigmas(changed[old:]), least
+            ).tolist()
 
 
 def _reading(sample: ImuSample) -> _Reading:

@@ -14,19 +14,28 @@ from vio.geometry.lie import FloatArray
 from vio.inspection.finding import Part
 from vio.records import Image, StereoFrame
 
-# of the best to the second best descriptor distance. Reference: Lowe, Distinctive image features
-# (2004)
-_RATIO = 0.8
-_FEATURES = 1500  # per image
-_RANSAC_PX = 1.5
-_MIN_MATCHES = 20  # a pair with fewer says nothing about the calibration
-_DARK = 12.0  # mean and standard deviation of gray levels of an image without content
-_BRIGHT = 243.0
-_FLAT = 3.0
-_ROWS_FAULT_PX = 2.0  # where matching along rows fails
-_NEAREST_M = 0.1  # medians outside are another unit: structured light ends at 5 m, lidars at 20
-_FARTHEST_M = 30.0
-_MIN_POSITIVE = 0.5  # share of matches with ul > ur; true pairs have nearly all
+
+@dataclass(frozen=True, slots=True)
+class _PictureRules:
+    """What images and depths are named for."""
+
+    # of the best to the second best descriptor distance. Reference: Lowe, Distinctive image
+    # features (2004)
+    ratio: float = 0.8
+    features: int = 1500  # per image
+    ransac_px: float = 1.5
+    min_matches: int = 20  # a pair with fewer says nothing about the calibration
+    dark: float = 12.0  # mean and standard deviation of gray levels of an image without content
+    bright: float = 243.0
+    flat: float = 3.0
+    rows_fault_px: float = 2.0  # where matching along rows fails
+    # medians outside are another unit: structured light ends at 5 m, lidars at 20
+    nearest_m: float = 0.1
+    farthest_m: float = 30.0
+    min_positive: float = 0.5  # share of matches with ul > ur; true pairs have nearly all
+
+
+_PICTURES = _PictureRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,17 +62,12 @@ def gray_levels_of(image: Image) -> GrayLevels:
 
 def images_part(frames: Sequence[StereoFrame]) -> Part:
     """Describe the images of some frames."""
-    shown = [
-        tuple(image for image in (f.left, f.right) if image is not None)
-        for f in frames
-        if f.left is not None
-    ]
-    cameras = max((len(images) for images in shown), default=0)
-    shown = [images for images in shown if len(images) == cameras]
+    shown = _shown(frames)
     if not shown:
         return Part(
             "images", "none could be read", {}, ["no image could be read; see the warnings above"]
         )
+    cameras = len(shown[0])
     found = [[gray_levels_of(image) for image in side] for side in zip(*shown, strict=True)]
     means = [float(np.mean([e.mean for e in side])) for side in found]
     clipped = max(e.clipped for side in found for e in side)
@@ -76,8 +80,37 @@ def images_part(frames: Sequence[StereoFrame]) -> Part:
         "clipped": clipped,
         "sharpness": sharpness,
     }
+    gray = f"{means[0]:.0f} left and {means[1]:.0f} right" if cameras == 2 else f"{means[0]:.0f}"
+    text = (
+        f"{width} x {height}, mean gray {gray}, at most {100 * clipped:.1f} % at 0 or 255, "
+        f"sharpness {sharpness:.1f} (1: blurred by 2 px or more)"
+    )
+    return Part("images", text, facts, _image_faults(shown, found))
+
+
+def _shown(frames: Sequence[StereoFrame]) -> list[tuple[Image, ...]]:
+    """Return the images of the frames that show as many cameras as any."""
+    shown = [
+        tuple(image for image in (f.left, f.right) if image is not None)
+        for f in frames
+        if f.left is not None
+    ]
+    cameras = max((len(images) for images in shown), default=0)
+    return [images for images in shown if len(images) == cameras]
+
+
+def _image_faults(
+    shown: Sequence[tuple[Image, ...]], found: Sequence[Sequence[GrayLevels]]
+) -> list[str]:
+    """Say what is wrong with images, whose gray levels were measured by camera."""
+    cameras = len(found)
     faults = []
-    flat = [e for side in found for e in side if e.spread < _FLAT or not _DARK < e.mean < _BRIGHT]
+    flat = [
+        e
+        for side in found
+        for e in side
+        if e.spread < _PICTURES.flat or not _PICTURES.dark < e.mean < _PICTURES.bright
+    ]
     if 2 * len(flat) > cameras * len(shown):
         faults.append(
             f"{len(flat)} of {cameras * len(shown)} images are black, white or without content; "
@@ -88,12 +121,7 @@ def images_part(frames: Sequence[StereoFrame]) -> Part:
             "left and right are the same images, so there is no depth; give the other camera's "
             "images"
         )
-    gray = f"{means[0]:.0f} left and {means[1]:.0f} right" if cameras == 2 else f"{means[0]:.0f}"
-    text = (
-        f"{width} x {height}, mean gray {gray}, at most {100 * clipped:.1f} % at 0 or 255, "
-        f"sharpness {sharpness:.1f} (1: blurred by 2 px or more)"
-    )
-    return Part("images", text, facts, faults)
+    return faults
 
 
 def depths_part(frames: Sequence[StereoFrame]) -> Part:
@@ -113,7 +141,7 @@ def depths_part(frames: Sequence[StereoFrame]) -> Part:
         return Part("depth", "no depth is known", {"known": 0.0}, [fault])
     near, middle, far = (float(q) for q in np.quantile(z, [0.05, 0.5, 0.95]))
     faults = []
-    if not _NEAREST_M < middle < _FARTHEST_M:
+    if not _PICTURES.nearest_m < middle < _PICTURES.farthest_m:
         faults.append(
             f"the median depth is {middle:.3g} m, which is not that of a depth camera; check "
             "depth_factor (levels per "
@@ -133,7 +161,7 @@ def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
         sift_pairs(f.left, f.right) for f in frames if f.left is not None and f.right is not None
     ]
     counts = [len(z) for z in matches]
-    z = np.concatenate([np.zeros((0, 4)), *(m for m in matches if len(m) >= _MIN_MATCHES)])
+    z = np.concatenate([np.zeros((0, 4)), *(m for m in matches if len(m) >= _PICTURES.min_matches)])
     image = next((f.left for f in frames if f.left is not None), None)
     size = (1.0, 1.0) if image is None else (float(image.shape[1]), float(image.shape[0]))
     found = row_residuals(z, *size)
@@ -143,7 +171,7 @@ def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
             "folders are of one "
             "stereo camera, its lenses clean and in focus"
         )
-        hopeless = max(counts, default=0) < _MIN_MATCHES
+        hopeless = max(counts, default=0) < _PICTURES.min_matches
         return [
             Part("stereo", str(found), {"matches": int(sum(counts))}, [fault] if hopeless else [])
         ]
@@ -175,13 +203,13 @@ def _rows_facts(found: RowResiduals) -> dict[str, object]:
 
 
 def _rows_faults(found: RowResiduals) -> list[str]:
-    if found.positive_disparity < _MIN_POSITIVE:
+    if found.positive_disparity < _PICTURES.min_positive:
         return [
             f"{100 * (1 - found.positive_disparity):.0f} % of the matches are behind the cameras: "
             "left and right "
             "images are exchanged; exchange the folders or topics"
         ]
-    if abs(found.median_px) + found.spread_px > _ROWS_FAULT_PX:
+    if abs(found.median_px) + found.spread_px > _PICTURES.rows_fault_px:
         return [
             f"rows differ by {found.median_px:+.1f} px with spread {found.spread_px:.1f} px: a "
             "camera has been turned "
@@ -197,23 +225,23 @@ def sift_pairs(left: Image, right: Image) -> FloatArray:
     """Match SIFT points of two images: `[ul vl ur vr]` (N, 4) that fit one fundamental matrix."""
     import cv2
 
-    sift = cv2.SIFT_create(_FEATURES)  # type: ignore[attr-defined] # missing in OpenCV's stubs
+    sift = cv2.SIFT_create(_PICTURES.features)  # type: ignore[attr-defined] # missing in OpenCV's stubs
     (points0, first), (points1, second) = (
         sift.detectAndCompute(image, None) for image in (left, right)
     )
-    if first is None or second is None or min(len(points0), len(points1)) < _MIN_MATCHES:
+    if first is None or second is None or min(len(points0), len(points1)) < _PICTURES.min_matches:
         return np.zeros((0, 4))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     near = [
         m
         for m in matcher.knnMatch(first, second, k=2)
-        if len(m) == 2 and m[0].distance < _RATIO * m[1].distance
+        if len(m) == 2 and m[0].distance < _PICTURES.ratio * m[1].distance
     ]
-    if len(near) < _MIN_MATCHES:
+    if len(near) < _PICTURES.min_matches:
         return np.zeros((0, 4))
     z = np.array(
         [[*points0[m[0].queryIdx].pt, *points1[m[0].trainIdx].pt] for m in near], dtype=np.float64
     )
     cv2.setRNGSeed(0)
-    _, mask = cv2.findFundamentalMat(z[:, :2], z[:, 2:], cv2.FM_RANSAC, _RANSAC_PX, 0.999)
+    _, mask = cv2.findFundamentalMat(z[:, :2], z[:, 2:], cv2.FM_RANSAC, _PICTURES.ransac_px, 0.999)
     return z if mask is None else z[mask.ravel() > 0]

@@ -18,7 +18,7 @@ from vio.filters import backend_class
 from vio.frontend import build_frontend
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.live.frame_pipeline import FramePipeline
+from vio.live.frame_pipeline import FramePipeline, RunParts
 from vio.live.imu_trial import ImuTrial
 from vio.live.processor import EventProcessor
 from vio.protocols import Backend, Dataset, Detector, Frontend, Selector
@@ -204,10 +204,12 @@ def build_processor(
         camera,
         source.T_cam0_body,
         source.motion,
-        frontend=guarded(frontend, seen),
-        selector=parts.selector
-        or build_selector(config.selector, whole_record=_record(features), camera=seen),
-        backend=backend,
+        RunParts(
+            frontend=guarded(frontend, seen),
+            selector=parts.selector
+            or build_selector(config.selector, whole_record=_record(features), camera=seen),
+            backend=backend,
+        ),
         use_prior=config.frontend.prior,
         # One camera has no scale without its IMU; a map holds keyframes of the poses that were
         # replaced.

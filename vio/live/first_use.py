@@ -23,6 +23,7 @@ from vio.errors import NOTE
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics import compiling, prebuilt
+from vio.numerics.compiled import is_cached
 from vio.records import IntArray, RunMotion, StereoFrame
 
 log = logging.getLogger(__name__)
@@ -45,7 +46,7 @@ def compiled_beside(parts: tuple[Part, ...], motion: RunMotion) -> Iterator[None
 
     A loop that this process calls first, and that such a process compiles, is waited for.
     """
-    if compiling.before_first_call is not None or prebuilt.is_usable() or compiling.is_cached():
+    if compiling.before_first_call is not None or prebuilt.is_usable() or is_cached():
         yield
         return
     log.log(

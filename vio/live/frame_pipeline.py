@@ -5,6 +5,7 @@ them.
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 
 from vio.errors import DataError, DivergedError
 from vio.findings import INTEGRITIES
@@ -29,6 +30,15 @@ from vio.records import (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class RunParts:
+    """The parts that a frame goes through."""
+
+    frontend: Frontend
+    selector: Selector
+    backend: Backend
+
+
 class FramePipeline:
     """Front end, selector and filter, fed with events in the order of `EventOrder`."""
 
@@ -37,16 +47,14 @@ class FramePipeline:
         camera: StereoCamera,
         T_cam0_body: FloatArray,
         motion: MotionSource | None,
+        parts: RunParts,
         *,
-        frontend: Frontend,
-        selector: Selector,
-        backend: Backend,
         use_prior: bool,
         trial: ImuTrial | None = None,
     ) -> None:
-        self.frontend = frontend
-        self.selector = selector
-        self.backend = backend
+        self.frontend = parts.frontend
+        self.selector = parts.selector
+        self.backend = parts.backend
         self.monitor = RunMonitor(camera, T_cam0_body, imu=motion == "imu")
         self._motion = motion
         self._use_prior = use_prior

@@ -23,25 +23,36 @@ Bits: TypeAlias = npt.NDArray[np.uint8]
 DESCRIPTOR_BYTES = 32
 # of a keyframe; 30 kB, so that 10 minutes of driving (2000 keyframes) need 60 MB
 MAX_FEATURES = 600
-_DETECTED = 3  # key points found for each that is kept, so that they can be spread over the image
+
+
+@dataclass(frozen=True, slots=True)
+class _Extraction:
+    """What features a keyframe keeps."""
+
+    # key points found for each that is kept, so that they can be spread over the image
+    detected: int = 3
+    corner_contrast: int = 7  # gray levels; low, since the best ones of each cell are kept
+    # of a left and a right key point, at the scale of the detector's first level
+    rows_px: float = 2.0
+    lk_window: int = 11  # pixels
+    # pixels; the images are brought to one brightness and contrast over squares of this size
+    lk_contrast: int = 15
+    lk_gray: float = 128.0  # mean and standard deviation then; below 6 gray levels less
+    lk_deviation: float = 40.0
+    lk_min: float = 6.0
+    # by which the rows of a refined match may differ: rectifications are off by up to a pixel
+    lk_rows_px: float = 2.0
+
+
+_EXTRACTION = _Extraction()
 _CELLS = 10  # along the larger side of the image
 _LEVELS = 8  # pyramid of the detector: up to 3.6 times nearer
 _SCALE = 1.2
-_CORNER_CONTRAST = 7  # gray levels; low, since the best ones of each cell are kept
-_ROWS_PX = 2.0  # of a left and a right key point, at the scale of the detector's first level
 _MAX_DISPARITY = 0.4  # of the width
 _MIN_DISPARITY_PX = 0.5
 _MAX_BITS = 64  # in which the descriptors of one point differ: a quarter
 # bits of a byte
 _ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint16)
-_LK_WINDOW = 11  # pixels
-# pixels; the images are brought to one brightness and contrast over squares of this size
-_LK_CONTRAST = 15
-_LK_GRAY = 128.0  # mean and standard deviation then; below 6 gray levels less
-_LK_DEVIATION = 40.0
-_LK_MIN = 6.0
-# by which the rows of a refined match may differ: rectifications are off by up to a pixel
-_LK_ROWS_PX = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +98,9 @@ def extract(left: Image, right: Image, *, most: int = MAX_FEATURES) -> KeyframeF
     """Find and describe key points (N <= `most`) of the left image (H, W), and match them in the
     right one.
     """
-    orb = cv2.ORB.create(_DETECTED * most, _SCALE, _LEVELS, fastThreshold=_CORNER_CONTRAST)
+    orb = cv2.ORB.create(
+        _EXTRACTION.detected * most, _SCALE, _LEVELS, fastThreshold=_EXTRACTION.corner_contrast
+    )
     found = orb.detect(left, None)
     if not found:
         return no_keyframe_features()
@@ -142,7 +155,7 @@ def _right_pixels(
         return out, valid
     at = np.array([p.pt for p in there])
     size = np.array([_SCALE**p.octave for p in there])
-    i, j = _near_rows(uv[:, 1], at[:, 1], _ROWS_PX * scale)
+    i, j = _near_rows(uv[:, 1], at[:, 1], _EXTRACTION.rows_px * scale)
     shift = uv[i, 0] - at[j, 0]
     allowed = (shift > -1.0) & (shift < _MAX_DISPARITY * left.shape[1])
     allowed &= np.abs(np.log(scale[i] / size[j])) < 1.5 * np.log(_SCALE)
@@ -155,13 +168,13 @@ def _right_pixels(
         _equal_contrast(right),
         uv[rows].astype(np.float32)[:, None],
         start.copy(),
-        winSize=(_LK_WINDOW, _LK_WINDOW),
+        winSize=(_EXTRACTION.lk_window, _EXTRACTION.lk_window),
         maxLevel=0,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     found = refined[:, 0].astype(np.float64)
-    good = (status[:, 0] > 0) & (np.abs(found[:, 1] - uv[rows, 1]) <= _LK_ROWS_PX)
-    good &= np.abs(found[:, 0] - start[:, 0, 0]) <= _ROWS_PX * scale[rows]
+    good = (status[:, 0] > 0) & (np.abs(found[:, 1] - uv[rows, 1]) <= _EXTRACTION.lk_rows_px)
+    good &= np.abs(found[:, 0] - start[:, 0, 0]) <= _EXTRACTION.rows_px * scale[rows]
     good &= uv[rows, 0] - found[:, 0] >= _MIN_DISPARITY_PX
     out[rows[good]] = found[good]
     valid[rows[good]] = True
@@ -194,7 +207,11 @@ def _most_alike(i: IntArray, j: IntArray, a: Bits, b: Bits) -> tuple[IntArray, I
 def _equal_contrast(image: Image) -> Image:
     """Return an image (H, W) with the same mean and standard deviation around each pixel."""
     gray = image.astype(np.float32)
-    mean, squared = (cv2.blur(x, (_LK_CONTRAST, _LK_CONTRAST)) for x in (gray, gray * gray))
+    mean, squared = (
+        cv2.blur(x, (_EXTRACTION.lk_contrast, _EXTRACTION.lk_contrast)) for x in (gray, gray * gray)
+    )
     deviation = np.sqrt(np.maximum(squared - mean * mean, 0.0))
-    out = _LK_GRAY + _LK_DEVIATION * (gray - mean) / (deviation + _LK_MIN)
+    out = _EXTRACTION.lk_gray + _EXTRACTION.lk_deviation * (gray - mean) / (
+        deviation + _EXTRACTION.lk_min
+    )
     return np.clip(out, 0, 255).astype(np.uint8)

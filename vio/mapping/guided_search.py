@@ -38,29 +38,38 @@ from vio.mapping.overlap import MIN_DEPTH_M, SCALES, VIEW_COS
 from vio.numerics.compiled import compiled
 from vio.records import IntArray
 
-_MAX_BITS = 64  # in which the descriptors of one point differ: a quarter
-# by which the size of a feature differs from the predicted one: two and a half levels
-_LEVELS = 1.6
+
+class _Guidance(NamedTuple):
+    """How points of a place are looked for."""
+
+    max_bits: int = 64  # in which the descriptors of one point differ: a quarter
+    # by which the size of a feature differs from the predicted one: two and a half levels
+    levels: float = 1.6
+    # half of a window's side at the scale of its feature, where the pose is known
+    window_px: float = 3.0
+    # half of a window's side: in larger ones, the best of all descriptors is seldom the point's
+    max_window_px: float = 40.0
+    searches: int = 2  # with the pose found
+    min_sample: int = 8  # pairs that agree before the next search
+    # features closer together are of one corner, on several levels of the pyramid, and count once
+    cell_px: float = 8.0
+    rows: int = 1 << 20  # more than an image has
+    # by which all points are moved to find the pairs of chance: more than a window of the last
+    # search
+    aside_px: float = 25.0
+    aside: int = 8  # directions
+    # Times the mean number of corners of chance; or half as many times beside MIN_CORNERS, which
+    # is less where chance is above 4: large means scatter less. Of searches at wrong poses none
+    # had more than 1.9 times beside MIN_CORNERS there.
+    over_chance: float = 6.0
+    # Share of the odometry's information in the measurement, since the map has it already: enough
+    # to hold what the pixels leave open to where the covariance is linear.
+    prior_share: float = 0.1
+
+
+_GUIDANCE = _Guidance()
 _SIGMAS = 3.0
-_WINDOW_PX = 3.0  # half of a window's side at the scale of its feature, where the pose is known
-# half of a window's side: in larger ones, the best of all descriptors is seldom the point's
-_MAX_WINDOW_PX = 40.0
-_SEARCHES = 2  # with the pose found
-_MIN_SAMPLE = 8  # pairs that agree before the next search
-# features closer together are of one corner, on several levels of the pyramid, and count once
-_CELL_PX = 8.0
-_ROWS = 1 << 20  # more than an image has
-# by which all points are moved to find the pairs of chance: more than a window of the last search
-_ASIDE_PX = 25.0
-_ASIDE = 8  # directions
 MIN_CORNERS = 12
-# Times the mean number of corners of chance; or half as many times beside MIN_CORNERS, which is
-# less where chance is above 4: large means scatter less. Of searches at wrong poses none had more
-# than 1.9 times beside MIN_CORNERS there.
-_OVER_CHANCE = 6.0
-# Share of the odometry's information in the measurement, since the map has it already: enough to
-# hold what the pixels leave open to where the covariance is linear.
-_PRIOR_SHARE = 0.1
 
 
 class Shown(NamedTuple):
@@ -205,10 +214,12 @@ def search(
     target = _Target.of(camera, here)
     place = place.take(_in_reach(place, camera, start.T_i_j))
     pairs = _pairs(place, target, start.T_i_j, start.covariance)
-    seen_from = pose_of_most(camera, place.p[pairs.point], here.z[pairs.feature, :2], _MIN_SAMPLE)
+    seen_from = pose_of_most(
+        camera, place.p[pairs.point], here.z[pairs.feature, :2], _GUIDANCE.min_sample
+    )
     T = None if seen_from is None else se3_inverse(seen_from)
     fitted = None
-    for _ in range(_SEARCHES):
+    for _ in range(_GUIDANCE.searches):
         if T is None:
             return None
         pairs = _pairs(place, target, T, None)
@@ -226,12 +237,18 @@ def search(
     if inliers < MIN_CORNERS:
         return None
     chance = _chance(pairs, target)
-    if inliers < min(_OVER_CHANCE * chance, MIN_CORNERS + 0.5 * _OVER_CHANCE * chance):
+    if inliers < min(
+        _GUIDANCE.over_chance * chance, MIN_CORNERS + 0.5 * _GUIDANCE.over_chance * chance
+    ):
         return None
     own = _of_one_segment(points, here, rows, agree)
-    weak = None if prior is None else RelativePose(prior.T_i_j, prior.covariance / _PRIOR_SHARE)
+    weak = (
+        None
+        if prior is None
+        else RelativePose(prior.T_i_j, prior.covariance / _GUIDANCE.prior_share)
+    )
     terms = Terms(stereo.take(own), camera, here, rows[own], inverse=True)
-    measured = fit_terms([terms], fitted.T_i_j, prior=weak, least=_MIN_SAMPLE)
+    measured = fit_terms([terms], fitted.T_i_j, prior=weak, least=_GUIDANCE.min_sample)
     if measured is None:
         return None
     by_fields = _covariance_by_fields(
@@ -299,7 +316,7 @@ def _in_reach(place: PlacePoints, camera: StereoCamera, T_i_k: FloatArray) -> In
     q = transform_points(se3_inverse(T_i_k), place.p)
     ahead = np.flatnonzero(q[:, 2] > 0)
     uv = project(camera, q[ahead])[:, :2]
-    margin = _MAX_WINDOW_PX + _ASIDE_PX
+    margin = _GUIDANCE.max_window_px + _GUIDANCE.aside_px
     w = camera.width or np.inf
     h = camera.height or np.inf
     return ahead[(uv > -margin).all(axis=1) & (uv < [w + margin, h + margin]).all(axis=1)]
@@ -350,7 +367,9 @@ def _pairs(
     size = place.size_px.copy()
     C = np.zeros((6, 6)) if covariance is None else _SIGMAS**2 * covariance
     camera = np.array([c.fu, c.fv, c.cu, c.cv, c.width or np.inf, c.height or np.inf])
-    _predict(place.p, place.eye, se3_inverse(T_i_k), T_i_k[:3, 3], C, camera, uv, radius, size)
+    points = _SeenFrom(place.p, place.eye)
+    pose = _Pose(se3_inverse(T_i_k), T_i_k[:3, 3], C)
+    _predict(points, pose, camera, uv, radius, size)
     seen = np.flatnonzero(radius > 0)
     uv = uv[seen]
     radius = radius[seen]
@@ -375,19 +394,49 @@ def _looked_for(
     """
     best = np.full(len(uv), -1, dtype=np.int64)
     bits = np.zeros(len(uv), dtype=np.int64)
-    _best_in_windows(
-        uv, radius, size, descriptors, target.z, target.size_px, target.descriptors, best, bits
-    )
+    windows = _Windows(uv, radius, size, descriptors)
+    features = _Features(target.z, target.size_px, target.descriptors)
+    _best_in_windows(windows, features, best, bits)
     return best, bits
+
+
+class _SeenFrom(NamedTuple):
+    """Points, and the cameras that saw them."""
+
+    p: FloatArray  # (N, 3)
+    eye: FloatArray  # (N, 3) positions of the cameras
+
+
+class _Pose(NamedTuple):
+    """Where the camera is that looks for points."""
+
+    T: FloatArray  # (4, 4) maps points to the camera
+    here: FloatArray  # (3,) its position
+    # (6, 6) covariance, times the square of the standard deviations that a window has
+    covariance: FloatArray
+
+
+class _Windows(NamedTuple):
+    """Where points are looked for, and how they look."""
+
+    uv: FloatArray  # (N, 2) pixels
+    radius: FloatArray  # (N,) half of a window, pixels
+    size_px: FloatArray  # (N,) of the features
+    descriptors: npt.NDArray[np.uint64]  # (N, 4)
+
+
+class _Features(NamedTuple):
+    """The features of a keyframe in the order of their columns."""
+
+    z: FloatArray  # (M, 4) pixels
+    size_px: FloatArray  # (M,)
+    descriptors: npt.NDArray[np.uint64]  # (M, 4)
 
 
 @compiled
 def _predict(
-    p: FloatArray,
-    eye: FloatArray,
-    T: FloatArray,
-    here: FloatArray,
-    C: FloatArray,
+    points: _SeenFrom,
+    pose: _Pose,
     camera: FloatArray,
     uv: FloatArray,
     radius: FloatArray,
@@ -397,17 +446,16 @@ def _predict(
     features (N,).
 
     Args:
-        p: (N, 3) points.
-        eye: (N, 3) positions of the cameras that saw them.
-        T: (4, 4) maps points to the camera.
-        here: (3,) position of the camera.
-        C: (6, 6) covariance of the pose, times the square of the standard deviations that a window
-            has.
+        points: those that are looked for.
+        pose: of the camera.
         camera: [fu fv cu cv width height].
         uv: pixels, written.
         radius: windows, written.
         size: of the features in their keyframes; replaced.
     """
+    p = points.p
+    T = pose.T
+    C = pose.covariance
     fu, fv, cu, cv, width, height = camera
     D = np.zeros((2, 6))
     q = np.zeros(3)
@@ -418,8 +466,8 @@ def _predict(
         away = 0.0
         near = 0.0
         for i in range(3):
-            there = p[n, i] - eye[n, i]
-            now = p[n, i] - here[i]
+            there = p[n, i] - points.eye[n, i]
+            now = p[n, i] - pose.here[i]
             dot = dot + there * now
             away = away + there * there
             near = near + now * now
@@ -456,8 +504,12 @@ def _predict(
                     total += D[r, i] * C[i, j] * D[r, j]
             largest = max(largest, total)
         size[n] = size[n] * away / near
-        half = _WINDOW_PX * max(size[n], 1.0) + np.sqrt(largest)
-        if half <= _MAX_WINDOW_PX and -half < u < width + half and -half < v < height + half:
+        half = _GUIDANCE.window_px * max(size[n], 1.0) + np.sqrt(largest)
+        if (
+            half <= _GUIDANCE.max_window_px
+            and -half < u < width + half
+            and -half < v < height + half
+        ):
             uv[n, 0] = u
             uv[n, 1] = v
             radius[n] = half
@@ -465,28 +517,25 @@ def _predict(
 
 @compiled
 def _best_in_windows(
-    uv: FloatArray,
-    radius: FloatArray,
-    size: FloatArray,
-    a: npt.NDArray[np.uint64],
-    z: FloatArray,
-    sizes: FloatArray,
-    b: npt.NDArray[np.uint64],
-    best: IntArray,
-    bits: IntArray,
+    windows: _Windows, features: _Features, best: IntArray, bits: IntArray
 ) -> None:
-    """Find for each point the feature around its pixel (N, 2) whose descriptor differs least; -1:
+    """Find for each point the feature (N,) around its pixel whose descriptor differs least; -1:
     none does well.
-
-    Features z (M, 2) are in the order of their columns.
     """
+    uv = windows.uv
+    radius = windows.radius
+    z = features.z
     for i in range(len(uv)):
-        least = np.uint64(_MAX_BITS + 1)
+        least = np.uint64(_GUIDANCE.max_bits + 1)
         j = np.searchsorted(z[:, 0], uv[i, 0] - radius[i])
         while j < len(z) and z[j, 0] <= uv[i, 0] + radius[i]:
-            ratio = sizes[j] / size[i]
-            if abs(z[j, 1] - uv[i, 1]) <= radius[i] and ratio < _LEVELS and ratio * _LEVELS > 1.0:
-                total = differing_bits(a[i], b[j])
+            ratio = features.size_px[j] / windows.size_px[i]
+            if (
+                abs(z[j, 1] - uv[i, 1]) <= radius[i]
+                and ratio < _GUIDANCE.levels
+                and ratio * _GUIDANCE.levels > 1.0
+            ):
+                total = differing_bits(windows.descriptors[i], features.descriptors[j])
                 if total < least:
                     least = total
                     best[i] = j
@@ -496,15 +545,15 @@ def _best_in_windows(
 
 def _corners(z: FloatArray) -> int:
     """Count the parts of the image that features (P, 4) are in."""
-    cell = (z[:, :2] // _CELL_PX).astype(np.int64)
-    return len(np.unique(cell[:, 0] * _ROWS + cell[:, 1]))
+    cell = (z[:, :2] // _GUIDANCE.cell_px).astype(np.int64)
+    return len(np.unique(cell[:, 0] * _GUIDANCE.rows + cell[:, 1]))
 
 
 def _chance(pairs: _Pairs, target: _Target) -> float:
     """Return the mean number of corners that pair where no point is where it should be."""
     counts = []
-    for angle in np.linspace(0, 2 * np.pi, _ASIDE, endpoint=False):
-        aside = pairs.uv + _ASIDE_PX * np.array([np.cos(angle), np.sin(angle)])
+    for angle in np.linspace(0, 2 * np.pi, _GUIDANCE.aside, endpoint=False):
+        aside = pairs.uv + _GUIDANCE.aside_px * np.array([np.cos(angle), np.sin(angle)])
         best, _ = _looked_for(aside, pairs.radius, pairs.size_px, pairs.descriptors, target)
         counts.append(_corners(target.z[best[best >= 0]]))
     return float(np.mean(counts))

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,30 +25,40 @@ from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray, LoopMatches
 
 MIN_INLIERS = 20
-_MIN_SHARE = 0.25  # of the pairs that must agree; wrong pairs are at random
+
+
+@dataclass(frozen=True, slots=True)
+class _Fitting:
+    """How the motion of a loop is found and judged."""
+
+    min_share: float = 0.25  # of the pairs that must agree; wrong pairs are at random
+    worse: int = 1000  # more than the 256 bits in which two descriptors can differ
+    ratio: float = 0.85  # to the second-best descriptor
+    max_pairs: int = 200  # that enter the fit, which takes 4 ms then
+    ransac_px: float = 4.0
+    ransac_steps: int = 300
+    ransac_sure: float = 0.999
+    same_m: float = 0.1  # by which both directions may differ; metres, beside a share of the depth
+    same_deg: float = 3.0
+    same_depth: float = 0.05
+    steps: int = 10  # largest change, m and rad
+    converged: float = 1e-5
+    gate: float = 3.0  # standard deviations, of a pixel coordinate
+    # Floor of a loop's standard deviations: errors that its points share, such as those of the
+    # calibration.
+    floor_depth: float = 0.002
+    floor_deg: float = 0.05
+    # Variance of a pixel over the one assumed, which is one pixel at the scale of its level: key
+    # points lie on whole pixels of their level, so that the errors are at least those of
+    # rounding.
+    min_variance: float = 1 / 12
+    # of its standard deviations: key points of neighbouring levels and edges are not independent
+    inflation: float = 2.0
+
+
+_FITTING = _Fitting()
 _MAX_BITS = 64
-_WORSE = 1000  # more than the 256 bits in which two descriptors can differ
-_RATIO = 0.85  # to the second-best descriptor
-_MAX_PAIRS = 200  # that enter the fit, which takes 4 ms then
-_RANSAC_PX = 4.0
-_RANSAC_STEPS = 300
-_RANSAC_SURE = 0.999
-_SAME_M = 0.1  # by which both directions may differ; metres, beside a share of the depth
-_SAME_DEG = 3.0
-_SAME_DEPTH = 0.05
-_STEPS = 10  # largest change, m and rad
-_CONVERGED = 1e-5
-_GATE = 3.0  # standard deviations, of a pixel coordinate
 MIN_DISPARITY_PX = 1.0
-# Floor of a loop's standard deviations: errors that its points share, such as those of the
-# calibration.
-_FLOOR_DEPTH = 0.002
-_FLOOR_DEG = 0.05
-# Variance of a pixel over the one assumed, which is one pixel at the scale of its level: key points
-# lie on whole pixels of their level, so that the errors are at least those of rounding.
-_MIN_VARIANCE = 1 / 12
-# of its standard deviations: key points of neighbouring levels and edges are not independent
-_INFLATION = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +82,10 @@ def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
     best = bits.argmin(axis=1)
     mutual = bits.argmin(axis=0)[best] == rows
     least = bits[rows, best]
-    bits[rows, best] = _WORSE
-    good = np.flatnonzero(mutual & (least <= np.minimum(_MAX_BITS, _RATIO * bits.min(axis=1))))
+    bits[rows, best] = _FITTING.worse
+    good = np.flatnonzero(
+        mutual & (least <= np.minimum(_MAX_BITS, _FITTING.ratio * bits.min(axis=1)))
+    )
     return np.stack([good, best[good]], axis=1)
 
 
@@ -119,8 +132,8 @@ def verify(
     if len(pairs) < MIN_INLIERS:
         return None
     # features are in the order of their columns, so these are spread over the image
-    if len(pairs) > _MAX_PAIRS:
-        pairs = pairs[np.linspace(0, len(pairs) - 1, _MAX_PAIRS).astype(np.int64)]
+    if len(pairs) > _FITTING.max_pairs:
+        pairs = pairs[np.linspace(0, len(pairs) - 1, _FITTING.max_pairs).astype(np.int64)]
     a, b = pairs.T
     T_j_i = _pnp(camera_i, i, a, camera_j, j, b)
     T_i_j = None if T_j_i is None else _pnp(camera_j, j, b, camera_i, i, a)
@@ -128,15 +141,15 @@ def verify(
         return None
     depth = _median_depth(camera_j, j, b)
     gap = se3_log(T_i_j @ T_j_i)
-    if np.linalg.norm(gap[:3]) > _SAME_M + _SAME_DEPTH * depth or np.linalg.norm(
+    if np.linalg.norm(gap[:3]) > _FITTING.same_m + _FITTING.same_depth * depth or np.linalg.norm(
         gap[3:]
-    ) > np.radians(_SAME_DEG):
+    ) > np.radians(_FITTING.same_deg):
         return None
     fitted = _fit(camera_i, i, a, camera_j, j, b, T_i_j)
     if fitted is None:
         return None
     pose, good = fitted
-    if good.sum() < max(MIN_INLIERS, _MIN_SHARE * len(pairs)):
+    if good.sum() < max(MIN_INLIERS, _FITTING.min_share * len(pairs)):
         return None
     a = a[good]
     b = b[good]
@@ -196,9 +209,9 @@ def pose_of_most(
         uv,
         K,
         None,
-        iterationsCount=_RANSAC_STEPS,
-        reprojectionError=_RANSAC_PX,
-        confidence=_RANSAC_SURE,
+        iterationsCount=_FITTING.ransac_steps,
+        reprojectionError=_FITTING.ransac_px,
+        confidence=_FITTING.ransac_sure,
         flags=cv2.SOLVEPNP_P3P,
     )
     if not done or inliers is None or len(inliers) < least:
@@ -253,9 +266,11 @@ class Fitted:
         """Return it with a covariance; errors that all points share are in proportion to their
         median depth.
         """
-        floor = np.repeat([(_FLOOR_DEPTH * depth_m) ** 2, np.radians(_FLOOR_DEG) ** 2], 3)
+        floor = np.repeat(
+            [(_FITTING.floor_depth * depth_m) ** 2, np.radians(_FITTING.floor_deg) ** 2], 3
+        )
         noise = _variance_factor(self.squared[self.fits], self.stereo[self.fits])
-        covariance = noise * _INFLATION**2 * np.asarray(
+        covariance = noise * _FITTING.inflation**2 * np.asarray(
             np.linalg.inv(self.normal), dtype=np.float64
         ) + np.diag(floor)
         return RelativePose(self.T_i_j, covariance)
@@ -277,7 +292,7 @@ def covariance_by_shifts(
     def step(terms: Terms) -> tuple[FloatArray, FloatArray]:
         normal = np.zeros((6, 6))
         pull = np.zeros(6)
-        terms.add(T_i_j, _GATE, normal, pull)
+        terms.add(T_i_j, _FITTING.gate, normal, pull)
         return normal, pull
 
     normal, pull = step(terms)
@@ -309,22 +324,22 @@ def fit_terms(
     normal = np.eye(6)
     P = 1e-9 * np.eye(6) if prior is None else np.asarray(np.linalg.inv(prior.covariance))
     squared = np.zeros(sum(len(part.stereo) for part in parts))
-    for step in range(_STEPS):
-        width = _GATE * 2.0 ** max(2 - step, 0)
+    for step in range(_FITTING.steps):
+        width = _FITTING.gate * 2.0 ** max(2 - step, 0)
         normal = np.zeros((6, 6))
         pull = np.zeros(6)
         begin = 0
         for part in parts:
             squared[begin : begin + len(part.stereo)] = part.add(T, width, normal, pull)
             begin += len(part.stereo)
-        fits: BoolArray = squared < 3 * _GATE**2
+        fits: BoolArray = squared < 3 * _FITTING.gate**2
         if fits.sum() < least:
             return None
         if prior is not None:
             pull += P @ se3_log(se3_inverse(T) @ prior.T_i_j)
         xi = np.linalg.solve(normal + P, pull)
         T = T @ se3_exp(xi)
-        if step > 2 and np.abs(xi).max() < _CONVERGED:
+        if step > 2 and np.abs(xi).max() < _FITTING.converged:
             break
     return Fitted(T, normal, squared, fits, np.concatenate([part.stereo for part in parts]))
 
@@ -336,7 +351,7 @@ def _variance_factor(squared: FloatArray, stereo: BoolArray) -> float:
     Of a left and a right pixel they have three degrees of freedom, of a left one alone two.
     """
     expected = np.where(stereo, *chi_square_quantile(0.5, [3, 2]))
-    return max(float(np.median(squared / expected)), _MIN_VARIANCE)
+    return max(float(np.median(squared / expected)), _FITTING.min_variance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -417,30 +432,43 @@ class Terms:
         """
         T_t_s = se3_inverse(T_i_j) if self._inverse else T_i_j
         squared = np.full(len(self._p), np.inf)
-        pairs = self._p, self._P, self._used, self._z, self.stereo, self._variance
-        _add_pairs(*pairs, T_t_s, self._inverse, self._camera, 3 * width**2, normal, pull, squared)
+        pairs = _Pairs(self._p, self._P, self._used, self._z, self.stereo, self._variance)
+        target = _Target(T_t_s, self._inverse, self._camera)
+        _add_pairs(pairs, target, 3 * width**2, normal, pull, squared)
         return squared
+
+
+class _Pairs(NamedTuple):
+    """Points of one keyframe and the pixels of the other one that show them."""
+
+    p: FloatArray  # (K, 3) m, in the frame of the former
+    P: FloatArray  # (K, 3, 3) their covariances
+    used: BoolArray  # (K,)
+    z: FloatArray  # (K, 4) pixels
+    stereo: BoolArray  # (K,) whether the right one is measured
+    variance: FloatArray  # (K,) px^2
+
+
+class _Target(NamedTuple):
+    """The keyframe whose pixels are predicted."""
+
+    T: FloatArray  # (4, 4) from the frame of the points to its own
+    inverse: bool  # as of `Terms`
+    camera: FloatArray  # fu, fv, cu, cv (pixels), baseline (m)
 
 
 @compiled
 def _add_pairs(
-    p: FloatArray,
-    P: FloatArray,
-    used: BoolArray,
-    z: FloatArray,
-    stereo: BoolArray,
-    variance: FloatArray,
-    T: FloatArray,
-    inverse: bool,
-    camera: FloatArray,
+    pairs: _Pairs,
+    target: _Target,
     scale: float,
     normal: FloatArray,
     pull: FloatArray,
     squared: FloatArray,
 ) -> None:
-    """Whiten the residuals of pairs (K,) by Cholesky, and add their normal equations; arguments
-    as `Terms` has them.
-    """
+    """Whiten the residuals of pairs (K,) by Cholesky, and add their normal equations."""
+    p = pairs.p
+    T = target.T
     A = np.zeros((3, 7))  # A: rows [J | r]; M: z_D_p
     M = np.zeros((3, 3))
     C = np.zeros((3, 3))
@@ -448,27 +476,17 @@ def _add_pairs(
     for k in range(len(p)):
         for i in range(3):
             q[i] = T[i, 0] * p[k, 0] + T[i, 1] * p[k, 1] + T[i, 2] * p[k, 2] + T[i, 3]
-        if not used[k] or q[2] <= 0.05:
+        if not pairs.used[k] or q[2] <= 0.05:
             continue
-        rows = 3 if stereo[k] else 2  # of a left pixel alone, two
-        _linearise(p[k], q, z[k], T, inverse, camera, A, M)
+        rows = 3 if pairs.stereo[k] else 2  # of a left pixel alone, two
+        _linearise(p[k], q, pairs.z[k], target, A, M)
         for i in range(rows):
             for j in range(i + 1):
-                C[i, j] = variance[k] if i == j else 0.0
+                C[i, j] = pairs.variance[k] if i == j else 0.0
                 for a in range(3):
                     for b in range(3):
-                        C[i, j] += M[i, a] * P[k, a, b] * M[j, b]
-        for i in range(rows):  # Cholesky factor of C, and A by forward substitution
-            for j in range(i):
-                for n in range(j):
-                    C[i, j] -= C[i, n] * C[j, n]
-                C[i, j] /= C[j, j]
-                C[i, i] -= C[i, j] ** 2
-                for c in range(7):
-                    A[i, c] -= C[i, j] * A[j, c]
-            C[i, i] = np.sqrt(C[i, i])
-            for c in range(7):
-                A[i, c] /= C[i, i]
+                        C[i, j] += M[i, a] * pairs.P[k, a, b] * M[j, b]
+        _whiten(C, A, rows)
         total = 0.0
         for i in range(rows):
             total += A[i, 6] ** 2
@@ -482,15 +500,24 @@ def _add_pairs(
 
 
 @compiled
+def _whiten(C: FloatArray, A: FloatArray, rows: int) -> None:
+    """Replace C (3, 3) by its Cholesky factor L, and A (3, 7) by `L^-1 A`: so many rows of both."""
+    for i in range(rows):
+        for j in range(i):
+            for n in range(j):
+                C[i, j] -= C[i, n] * C[j, n]
+            C[i, j] /= C[j, j]
+            C[i, i] -= C[i, j] ** 2
+            for c in range(7):
+                A[i, c] -= C[i, j] * A[j, c]
+        C[i, i] = np.sqrt(C[i, i])
+        for c in range(7):
+            A[i, c] /= C[i, i]
+
+
+@compiled
 def _linearise(
-    p: FloatArray,
-    q: FloatArray,
-    z: FloatArray,
-    T: FloatArray,
-    inverse: bool,
-    camera: FloatArray,
-    A: FloatArray,
-    M: FloatArray,
+    p: FloatArray, q: FloatArray, z: FloatArray, target: _Target, A: FloatArray, M: FloatArray
 ) -> None:
     """Write Jacobian and residual [ul vl ur] of a point p (3,), at q in the target (3,), into A (3,
     7), z_D_p into M.
@@ -498,7 +525,8 @@ def _linearise(
     `q = exp(-xi) T_hat^-1 p` if `inverse`, else `q = T_hat exp(xi) p`: its derivative is [-I, q^]
     or R [I, -p^].
     """
-    fu, fv, cu, cv, baseline = camera
+    fu, fv, cu, cv, baseline = target.camera
+    T = target.T
     z_D_q = np.zeros((3, 3))
     for i in range(3):
         f = fv if i == 1 else fu
@@ -512,7 +540,7 @@ def _linearise(
         for c in range(3):
             a = (c + 1) % 3
             b = (c + 2) % 3
-            if inverse:
+            if target.inverse:
                 A[i, c] = -z_D_q[i, c]
                 A[i, 3 + c] = z_D_q[i, a] * q[b] - z_D_q[i, b] * q[a]
             else:

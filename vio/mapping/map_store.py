@@ -278,10 +278,8 @@ class MapStore(MapDatabase):
     def keyframes(self) -> list[KeyframeRow]:
         """Return all keyframes."""
 
-        def made(
-            _: int, session: int, frame: int, time_ns: int, T_map: FloatArray, T_odom: FloatArray, drift: FloatArray,
-            path_m: float, up: bytes | None, sigma: float | None,
-        ) -> KeyframeRow:  # fmt: skip
+        def made(_: int, session: int, frame: int, time_ns: int, *of_pose: Any) -> KeyframeRow:
+            T_map, T_odom, drift, path_m, up, sigma = of_pose
             numbers = _integer(session), _integer(frame), _integer(time_ns)
             vertical = (
                 None if up is None else _array(up, 3),

@@ -35,31 +35,43 @@ from vio.mapping.place_index import SEGMENT, PlaceIndex
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 
-_CANDIDATES = 3  # keyframes that are compared by geometry
-_RECENT = 10  # newest keyframes, which the filter's own tracks join
-_REVISIT_DEPTHS = 1.5  # path since a keyframe, in median depths, before it counts as seen again
-_VIEW_DEPTHS = 1.5  # how far apart two views of a place are, in median depths
+
+@dataclass(frozen=True, slots=True)
+class _Finding:
+    """What finds and proves a place."""
+
+    candidates: int = 3  # keyframes that are compared by geometry
+    recent: int = 10  # newest keyframes, which the filter's own tracks join
+    # path since a keyframe, in median depths, before it counts as seen again
+    revisit_depths: float = 1.5
+    view_depths: float = 1.5  # how far apart two views of a place are, in median depths
+    # standard deviation of the position beyond which one confirmation is not enough …
+    lost_m: float = 3.0
+    confirmations: int = 1  # other keyframes that must agree; … and how many then
+    confirmations_lost: int = 2
+    sure_inliers: int = 60  # three times what is asked of any loop: one confirmation is enough
+    # share of the best candidate's inliers at which one elsewhere makes the place ambiguous
+    other_place: float = 0.5
+    same_depths: float = 0.1  # by which what two candidates say of the position may differ
+    same_m: float = 0.1
+    guided_places: int = 3  # that are searched together
+    # keyframes to each side that belong to the first place, and to the others
+    guided_neighbours: int = 3
+    guided_others: int = 2
+    # Of what errors of the calibration may do (`MapGraph.drift`), what a search and its gate
+    # count on: it looks where the odometry is right to 0.25 % and 0.12 deg/100 m, which is a
+    # quarter of what a place found without it is held against.
+    guided_share: float = 0.25
+    guided_m: float = 0.5  # standard deviation of the position up to which places are searched
+    # keyframes whose points are held, 6 MB: from query to query, most of those searched are the
+    # same
+    shown: int = 64
+
+
+_FINDING = _Finding()
 _VIEW_RAD = float(np.radians(70.0))
 _SIGMAS = 3.0
 GATE = float(chi_square_quantile(0.999, 6))
-_LOST_M = 3.0  # standard deviation of the position beyond which one confirmation is not enough …
-_CONFIRMATIONS = 1  # other keyframes that must agree; … and how many then
-_CONFIRMATIONS_LOST = 2
-_SURE_INLIERS = 60  # three times what is asked of any loop: one confirmation is enough
-# share of the best candidate's inliers at which one elsewhere makes the place ambiguous
-_OTHER_PLACE = 0.5
-_SAME_DEPTHS = 0.1  # by which what two candidates say of the position may differ
-_SAME_M = 0.1
-_GUIDED_PLACES = 3  # that are searched together
-_GUIDED_NEIGHBOURS = 3  # keyframes to each side that belong to the first place, and to the others
-_GUIDED_OTHERS = 2
-# Of what errors of the calibration may do (`MapGraph.drift`), what a search and its gate count on:
-# it looks where the odometry is right to 0.25 % and 0.12 deg/100 m, which is a quarter of what a
-# place found without it is held against.
-_GUIDED_SHARE = 0.25
-_GUIDED_M = 0.5  # standard deviation of the position up to which places are searched
-# keyframes whose points are held, 6 MB: from query to query, most of those searched are the same
-_SHOWN = 64
 _OF_THE_FILE = ("_store", "_index", "_overlaps", "_shown")
 
 
@@ -77,7 +89,7 @@ class FoundPlace:
         """Whether it shows enough to need one confirmation alone where nothing else is known of
         the place.
         """
-        return self.seen.inliers >= _SURE_INLIERS
+        return self.seen.inliers >= _FINDING.sure_inliers
 
 
 class PlaceFinder:
@@ -118,7 +130,7 @@ class PlaceFinder:
         self._store = store
         self._index = PlaceIndex()
         self._overlaps = Overlaps()
-        self._shown = lru_cache(_SHOWN)(self._read_shown)
+        self._shown = lru_cache(_FINDING.shown)(self._read_shown)
         self._restore(keyframes)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -209,13 +221,23 @@ class PlaceFinder:
         if expected is not None:
             return expected
         found: list[FoundPlace] = []
-        for i in self._index.candidates(features.descriptors, allowed, _CANDIDATES).tolist():
+        for i in self._index.candidates(
+            features.descriptors, allowed, _FINDING.candidates
+        ).tolist():
             camera = self._graph.sessions[int(self._graph.session[i])].camera
             seen = verify(camera, self.features(i), self._camera, features)
             if seen is not None and self.fits(i, number, seen, drift[i]):
-                lost = drift[i, :3, :3].trace() > _LOST_M**2 and seen.inliers < _SURE_INLIERS
+                lost = (
+                    drift[i, :3, :3].trace() > _FINDING.lost_m**2
+                    and seen.inliers < _FINDING.sure_inliers
+                )
                 found.append(
-                    FoundPlace(i, number, seen, _CONFIRMATIONS_LOST if lost else _CONFIRMATIONS)
+                    FoundPlace(
+                        i,
+                        number,
+                        seen,
+                        _FINDING.confirmations_lost if lost else _FINDING.confirmations,
+                    )
                 )
         if not found:
             return None
@@ -257,14 +279,14 @@ class PlaceFinder:
         first, *others = places
         views = self._views(first, first)
         for i in others:
-            views += self._views(i, first, reach=_GUIDED_OTHERS)
+            views += self._views(i, first, reach=_FINDING.guided_others)
         seen = search(place_points(views), self._camera, features, prior, prior)
         if seen is None:
             return None
         r = se3_log(se3_inverse(prior.T_i_j) @ seen.pose.T_i_j)
         if squared(r, prior.covariance + seen.pose.covariance) > GATE:
             return None
-        return _as_place(views, number, seen, features, _CONFIRMATIONS)
+        return _as_place(views, number, seen, features, _FINDING.confirmations)
 
     def _priors(self, rows: IntArray, k: int) -> dict[int, RelativePose]:
         """Return where keyframe k stands in those of keyframes `rows` from which the odometry
@@ -272,8 +294,8 @@ class PlaceFinder:
         """
         graph = self._graph
         rows = rows[graph.part[rows] == graph.part[k]]
-        drift = self.drift_since(rows, k, systematic=_GUIDED_SHARE)
-        known = np.flatnonzero(np.trace(drift[:, :3, :3], axis1=1, axis2=2) < _GUIDED_M**2)
+        drift = self.drift_since(rows, k, systematic=_FINDING.guided_share)
+        known = np.flatnonzero(np.trace(drift[:, :3, :3], axis1=1, axis2=2) < _FINDING.guided_m**2)
         T = se3_inverse(graph.T_map_cam[rows[known]]) @ graph.T_map_cam[k]
         return {int(rows[n]): RelativePose(T[m], drift[n]) for m, n in enumerate(known.tolist())}
 
@@ -283,18 +305,24 @@ class PlaceFinder:
         out = list[int]()
         score = np.zeros(len(self._index))
         score[rows] = self._overlaps.expected(rows, T[rows], self._camera, T[number])
-        kernel = np.ones(2 * _GUIDED_NEIGHBOURS + 1)
-        around = np.convolve(score, kernel)[_GUIDED_NEIGHBOURS : _GUIDED_NEIGHBOURS + len(score)]
+        kernel = np.ones(2 * _FINDING.guided_neighbours + 1)
+        around = np.convolve(score, kernel)[
+            _FINDING.guided_neighbours : _FINDING.guided_neighbours + len(score)
+        ]
         around[score == 0] = 0.0
-        while len(out) < _GUIDED_PLACES and around.max(initial=0.0) >= MIN_CORNERS:
+        while len(out) < _FINDING.guided_places and around.max(initial=0.0) >= MIN_CORNERS:
             middle = int(np.argmax(around))
             out.append(middle)
             around[
-                max(middle - 2 * _GUIDED_NEIGHBOURS, 0) : middle + 2 * _GUIDED_NEIGHBOURS + 1
+                max(middle - 2 * _FINDING.guided_neighbours, 0) : middle
+                + 2 * _FINDING.guided_neighbours
+                + 1
             ] = 0.0
         return out
 
-    def _views(self, i: int, origin: int, *, reach: int = _GUIDED_NEIGHBOURS) -> list[PlaceView]:
+    def _views(
+        self, i: int, origin: int, *, reach: int = _FINDING.guided_neighbours
+    ) -> list[PlaceView]:
         """Return keyframe i and its neighbours in its session, with their motion from another
         keyframe.
         """
@@ -322,11 +350,11 @@ class PlaceFinder:
         part = self._graph.part
         if (
             part[other.first] != part[best.first]
-            or other.seen.inliers < _OTHER_PLACE * best.seen.inliers
+            or other.seen.inliers < _FINDING.other_place * best.seen.inliers
         ):
             return False
         gap = self._position(other) - self._position(best)
-        return float(np.linalg.norm(gap)) > _SAME_M + _SAME_DEPTHS * depth
+        return float(np.linalg.norm(gap)) > _FINDING.same_m + _FINDING.same_depths * depth
 
     def _position(self, loop: FoundPlace) -> FloatArray:
         """Position (3,) of the later keyframe in the map, as a loop says it."""
@@ -372,14 +400,14 @@ class PlaceFinder:
         passed = graph.path_m[number] - graph.path_m[:count]
         # large numbers cancel
         sigma = np.sqrt(np.maximum(np.trace(covariance, axis1=1, axis2=2), 0.0))
-        near_path = (passed < _REVISIT_DEPTHS * depth) & (sigma < _LOST_M)
-        recent = own & ((np.arange(count) > number - _RECENT) | near_path)
+        near_path = (passed < _FINDING.revisit_depths * depth) & (sigma < _FINDING.lost_m)
+        recent = own & ((np.arange(count) > number - _FINDING.recent) | near_path)
         T = se3_inverse(graph.T_map_cam[number]) @ graph.T_map_cam[:count]
-        near = np.linalg.norm(T[:, :3, 3], axis=1) <= _VIEW_DEPTHS * depth + _SIGMAS * sigma
+        near = np.linalg.norm(T[:, :3, 3], axis=1) <= _FINDING.view_depths * depth + _SIGMAS * sigma
         ahead = np.arccos(np.clip(T[:, 2, 2], -1.0, 1.0)) <= _VIEW_RAD
         part = graph.part
         unknown = (part[:count] != part[number]) | (sigma > 0.5 * UNKNOWN**0.5)
-        return ~recent & (unknown | (near & (ahead | (sigma > _LOST_M))))
+        return ~recent & (unknown | (near & (ahead | (sigma > _FINDING.lost_m))))
 
     def fits(self, i: int, k: int, seen: Verified, drift: FloatArray) -> bool:
         """Whether a place agrees with the odometry, where that knows anything of it."""

@@ -37,32 +37,41 @@ _T = TypeVar("_T")
 Relative: TypeAlias = Callable[[int, int], "RelativePose | None"]
 
 _SHARED = 0.6  # of the last keyframe's features that are still seen: below it, a new keyframe
-# with a right pixel; or half of the most that a frame had, where features are set to be few
-_MIN_FEATURES = 30
-_MIN_TRACKED = 6  # likewise, by which the odometry can still follow
-# frames between keyframes of a session that is localised, where nothing is stored
-_LOCALISE_STEP = 5
-_LOST_STEP = 3  # likewise while it has no place
-_LOST_M = 1.0  # standard deviation of the position, likewise
+
+
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """What becomes a keyframe, and what its motion is worth."""
+
+    # with a right pixel; or half of the most that a frame had, where features are set to be few
+    min_features: int = 30
+    min_tracked: int = 6  # likewise, by which the odometry can still follow
+    # frames between keyframes of a session that is localised, where nothing is stored
+    localise_step: int = 5
+    lost_step: int = 3  # likewise while it has no place
+    lost_m: float = 1.0  # standard deviation of the position, likewise
+    # On the standard deviations of a motion: errors of a track last longer than a frame, which
+    # the window does not count. Measured over a keyframe's step: 1.6 to 3.1 times the standard
+    # deviation (street), 1.2 to 3.1 (room).
+    motion_inflation: float = 2.0
+    # Added to them, as shares of a motion's length and angle: what stays the same from motion to
+    # motion, such as errors of the calibration. Rendered street and room come out 0.05 % off in
+    # length and 0.02 % in angle, in each motion, which is many times the standard deviation that
+    # the tracks leave.
+    motion_shares: tuple[float, float] = (5e-4, 2e-4)
+    # Where images show nothing, a filter without a motion sensor holds its velocity; a hand or a
+    # car in a curve does not.
+    dark_s: float = 0.5
+
+
+_CHOICE = _Choice()
 # keyframes without a result, where the odometry waits for none: beyond, the next one comes later
 _MAX_WAITING = 3
 HANDOVER_FRAMES = 10  # from a keyframe to the frame at which its result is taken over
 # from a keyframe to the frame after which its motion is no longer corrected by the window
 SETTLED_FRAMES = 3
-# On the standard deviations of a motion: errors of a track last longer than a frame, which the
-# window does not count. Measured over a keyframe's step: 1.6 to 3.1 times the standard deviation
-# (street), 1.2 to 3.1 (room).
-_MOTION_INFLATION = 2.0
-# Added to them, as shares of a motion's length and angle: what stays the same from motion to
-# motion, such as errors of the calibration. Rendered street and room come out 0.05 % off in length
-# and 0.02 % in angle, in each motion, which is many times the standard deviation that the tracks
-# leave.
-_MOTION_SHARES = (5e-4, 2e-4)
 # errors of the vertical last longer than from keyframe to keyframe
 _MIN_UP_SIGMA_RAD = float(np.radians(0.1))
-# Where images show nothing, a filter without a motion sensor holds its velocity; a hand or a car in
-# a curve does not.
-_DARK_S = 0.5
 # variance of the motion where the filter began anew, m^2 and rad^2
 _BROKEN = np.repeat([30.0**2, 1.0**2], 3)
 
@@ -185,7 +194,7 @@ class MapSession:
         self._release(relative)
         events = self._take(lambda due, done: due <= self._frames and (done or self._wait))
         fresh = seen.take(seen.has_right & ~seen.stale)
-        seen_now = len(fresh) >= _MIN_TRACKED
+        seen_now = len(fresh) >= _CHOICE.min_tracked
         lost = seen_now and self._is_lost(frame.time_ns)
         motion = self._motion_to(frame.index, estimate, _unknown if lost else relative)
         self._dark = (
@@ -198,7 +207,7 @@ class MapSession:
             self._seen = estimate
         self._most_features = max(self._most_features, len(fresh))
         if (
-            len(fresh) < min(_MIN_FEATURES, 0.5 * self._most_features)
+            len(fresh) < min(_CHOICE.min_features, 0.5 * self._most_features)
             or frame.left is None
             or frame.right is None
         ):
@@ -337,7 +346,9 @@ class MapSession:
     def _is_lost(self, time_ns: int) -> bool:
         """Whether the odometry cannot know the motion since the newest frame with features."""
         return (
-            self._alone and self._seen_ns is not None and 1e-9 * (time_ns - self._seen_ns) > _DARK_S
+            self._alone
+            and self._seen_ns is not None
+            and 1e-9 * (time_ns - self._seen_ns) > _CHOICE.dark_s
         )
 
     def _motion_to(self, frame: int, estimate: Estimate, relative: Relative) -> RelativePose | None:
@@ -373,12 +384,12 @@ class MapSession:
         """Whether a frame becomes a keyframe: it shows little of what the last one showed."""
         if motion is None:
             return True
-        if self._unconfirmed and self._since >= _LOST_STEP:
+        if self._unconfirmed and self._since >= _CHOICE.lost_step:
             return True
-        if self._localise and self._since >= _LOST_STEP:
+        if self._localise and self._since >= _CHOICE.lost_step:
             covariance = self.covariance
-            lost = covariance is None or covariance[:3, :3].trace() > _LOST_M**2
-            if lost or self._since >= _LOCALISE_STEP:
+            lost = covariance is None or covariance[:3, :3].trace() > _CHOICE.lost_m**2
+            if lost or self._since >= _CHOICE.localise_step:
                 return True
         return bool(np.isin(self._ids, ids).mean() < _SHARED)
 
@@ -531,9 +542,11 @@ def _inflated(motion: RelativePose) -> RelativePose:
     """
     xi = se3_log(motion.T_i_j)
     sigma = np.repeat(
-        np.multiply(_MOTION_SHARES, [np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])]), 3
+        np.multiply(_CHOICE.motion_shares, [np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])]), 3
     )
-    return RelativePose(motion.T_i_j, _MOTION_INFLATION**2 * motion.covariance + np.diag(sigma**2))
+    return RelativePose(
+        motion.T_i_j, _CHOICE.motion_inflation**2 * motion.covariance + np.diag(sigma**2)
+    )
 
 
 def _done(result: _T) -> Future[_T]:

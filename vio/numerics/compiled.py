@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -143,6 +144,14 @@ def _loop(function: Function, options: dict[str, Any]) -> Function:
     counts = not _ALLOCATE.isdisjoint(function.__code__.co_names)
     LOOPS.append(loop := Loop(function, _OPTIONS | options | {"_nrt": counts}))
     return cast(Function, loop)
+
+
+def is_cached() -> bool:
+    """Whether numba's cache holds loops of an earlier run, or can hold none."""
+    stats = getattr(index_of.by_numba, "stats", None)  # type: ignore[attr-defined]
+    if stats is None or stats.cache_path is None:
+        return True
+    return any(Path(stats.cache_path).glob("compiled.*.nbi"))
 
 
 def has_compiled() -> bool:

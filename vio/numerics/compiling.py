@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 from vio.errors import NOTE
@@ -85,13 +84,3 @@ def watch(is_own: Callable[[Any], bool]) -> None:
 
     _watched.append(Listener())
     event.register("numba:compile", _watched[0])  # type: ignore[no-untyped-call]
-
-
-def is_cached() -> bool:
-    """Whether numba's cache holds loops of an earlier run, or can hold none."""
-    from vio.numerics import compiled
-
-    stats = getattr(compiled.index_of.by_numba, "stats", None)  # type: ignore[attr-defined]
-    if stats is None or stats.cache_path is None:
-        return True
-    return any(Path(stats.cache_path).glob("compiled.*.nbi"))

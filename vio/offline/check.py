@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -41,14 +42,21 @@ def expected_minutes(keyframes: int, mappers: Sequence[Mapper]) -> float:
     return keyframes * (_MATCH_S + _MAP_S * len(mappers)) / 60
 
 
+@dataclass(frozen=True, slots=True)
+class CheckOptions:
+    """How much of a run is checked, and by what."""
+
+    keyframes: int  # largest number
+    source: str | None  # the recording, if it is not at the path stored in the run
+    threads: int  # for all steps; one makes the result repeatable
+
+
 def check_run(
     run: SavedRun,
     folder: Path,
     mappers: Sequence[Mapper],
+    options: CheckOptions,
     *,
-    most: int,
-    source: str | None,
-    threads: int,
     progress: Callable[[int, int], None],
     announce: Callable[[str], None] = log.info,
 ) -> tuple[MapperResult, ...]:
@@ -63,9 +71,7 @@ def check_run(
         run: the run.
         folder: an existing, empty folder.
         mappers: COLMAP's.
-        most: largest number of keyframes.
-        source: the recording, if it is not at the path stored in the run.
-        threads: for all steps; one makes the result repeatable.
+        options: how much, by what.
         progress: called with (done, total).
         announce: called with the number of keyframes and the time that they take.
 
@@ -74,21 +80,21 @@ def check_run(
     """
     path = run.tracked
     steps = 2 + len(mappers)
-    keyframes = keyframes_by_overlap(path, most=most)
+    keyframes = keyframes_by_overlap(path, most=options.keyframes)
     names = keyframe_images(path.frames[keyframes])
     images = folder / "images"
     database = folder / "database.db"
     minutes = expected_minutes(len(keyframes), mappers)
     announce(f"{len(keyframes)} keyframes: about {minutes:.2g} minutes on one slow core")
-    write_images(run, source, keyframes, names, images)
+    write_images(run, options.source, keyframes, names, images)
     progress(1, steps)
     loops = loop_pairs(path.loops, path.frames[keyframes])
-    match_images(database, images, names, path.camera, loops, threads=threads)
+    match_images(database, images, names, path.camera, loops, threads=options.threads)
     progress(2, steps)
     results: list[MapperResult] = []
     for mapper in mappers:
         model = reconstruct(
-            database, images, names, mapper, folder / mapper, loops, threads=threads
+            database, images, names, mapper, folder / mapper, loops, threads=options.threads
         )
         found = None
         if model is not None:

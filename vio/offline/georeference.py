@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from vio.datasets.gnss_fixes import GnssFixes
 from vio.earth.alignment import Georeference, Path, georeference, heading_deg
 from vio.earth.exports import write_geojson, write_kml, write_points_geojson, write_utm
 from vio.earth.geodesy import LocalFrame
-from vio.earth.gnss import GnssFixes
 from vio.errors import DataError
 from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log
@@ -22,8 +22,8 @@ from vio.geometry.upright import mean_up, up_in
 from vio.mapping.map_store import EarthRow, KeyframeRow, MapStore
 from vio.records import BoolArray, Trajectory
 from vio.runs.finished import point_positions, up_of_odometry
-from vio.runs.folder import read_metrics
 from vio.runs.mapped import read_keyframes, read_loops, read_trajectories
+from vio.runs.stated import read_metrics
 
 FACTS = "earth.json"
 _UP_RAD = float(np.radians(0.3))  # of an IMU's vertical; of an upright camera's

@@ -25,8 +25,8 @@ from vio.offline.keyframes import after_motion
 from vio.offline.run_images import RunImages, run_images
 from vio.records import Image, IntArray, StereoFrame, Trajectory
 from vio.runs.finished import point_positions, up_of_odometry
-from vio.runs.folder import read_metrics
 from vio.runs.mapped import corrected, read_trajectories
+from vio.runs.stated import read_metrics
 
 _VOXEL_SHARE = 1 / 250  # of the landmarks' depth, at least
 # of the landmarks' depth: motion from one image that is used to the next; or turn

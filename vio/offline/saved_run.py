@@ -16,8 +16,8 @@ from vio.datasets.images import write_png
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
 from vio.files.trajectories import read_trajectory
-from vio.filters.multiview import Views
 from vio.filters.stereo_calibration import StereoCorrection
+from vio.filters.track_records import Views
 from vio.filters.tracks import measured
 from vio.geometry.lie import FloatArray, se3_inverse, so3_hat
 from vio.geometry.rectify import pinhole_pixels, pinhole_within
@@ -28,8 +28,8 @@ from vio.offline.run_images import RunImages, field_coefficients, original_sourc
 from vio.records import FIELD_TERMS, FeatureTracks, Image, IntArray, LoopEvent, need_stereo
 from vio.runs.files import RunFile
 from vio.runs.finished import read_estimates
-from vio.runs.folder import read_metrics
 from vio.runs.mapped import read_loops
+from vio.runs.stated import read_metrics
 
 if TYPE_CHECKING:
     from vio.offline.colmap.model import ModelImages

@@ -53,23 +53,32 @@ _FREE = tuple(name for name in PARAMETERS if _OF_RIGHT.get(name, name) in NAMES)
 # of the right camera, as of both
 _LIKE_BOTH = (("right_cu", "cu"), ("right_cv", "cv"), ("p1", "q1"), ("p2", "q2"))
 INTRINSICS = ("focal", "aspect", "cu", "cv")
-# What lens models leave, beside the scatter: this and the sliding window differ by so much on the
-# same drives.
-_LENS_DEG = 0.01
-_LENS_DIRECTION_DEG = 0.3
-_HELD = 1e-9  # standard deviation of what is not free
-_STEPS = 30  # of Levenberg-Marquardt, at most
-_FIRST_DAMPING = 1e-4  # over the diagonal of the information
-_MIN_DAMPING = 1e-10
-_SETTLED = 1e-6  # relative decrease of the cost at which the steps end
-# robust standard deviation above which the tracks are not of one rigid scene and rig
-_LARGEST_RESIDUAL_PX = 1.5
-_CAUCHY = 2.0  # residuals of so many standard deviations count half
-_GATE = 5.0  # rows with larger residuals, in standard deviations, are left out
-# of a point's information, against rounding; more of it passes for knowledge of depths
-_ROUNDING = 1e-12
-_CELLS = (8, 4)  # regions of the image, along u and v
-_MIN_RESIDUAL_PX = 0.02  # of exact tracks, so that weights stay finite
+
+
+@dataclass(frozen=True, slots=True)
+class _Rules:
+    """How a calibration is refined by its own images."""
+
+    # What lens models leave, beside the scatter: this and the sliding window differ by so much on
+    # the same drives.
+    lens_deg: float = 0.01
+    lens_direction_deg: float = 0.3
+    held: float = 1e-9  # standard deviation of what is not free
+    steps: int = 30  # of Levenberg-Marquardt, at most
+    first_damping: float = 1e-4  # over the diagonal of the information
+    min_damping: float = 1e-10
+    settled: float = 1e-6  # relative decrease of the cost at which the steps end
+    # robust standard deviation above which the tracks are not of one rigid scene and rig
+    largest_residual_px: float = 1.5
+    cauchy: float = 2.0  # residuals of so many standard deviations count half
+    gate: float = 5.0  # rows with larger residuals, in standard deviations, are left out
+    # of a point's information, against rounding; more of it passes for knowledge of depths
+    rounding: float = 1e-12
+    cells: tuple[int, int] = (8, 4)  # regions of the image, along u and v
+    min_residual_px: float = 0.02  # of exact tracks, so that weights stay finite
+
+
+_RULES = _Rules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +128,8 @@ class SelfCalibration:
         return (
             so3_exp(off[:3]),
             direction / np.linalg.norm(direction),
-            float(np.hypot(rotation, _LENS_DEG)),
-            float(np.hypot(swing, _LENS_DIRECTION_DEG)),
+            float(np.hypot(rotation, _RULES.lens_deg)),
+            float(np.hypot(swing, _RULES.lens_direction_deg)),
         )
 
     def after(self, parameters: FloatArray) -> SelfCalibration:
@@ -145,7 +154,7 @@ class SelfCalibration:
         gradient = np.where(np.isin(NAMES, INTRINSICS), 0.0, J[0, 0] - J[0, 2])
         z = project_off(camera, x, np.array([[0.0, 0.0, depth_m]]))[0]
         sigma = np.hypot(
-            np.sqrt(gradient @ self.covariance @ gradient), camera.fu * np.radians(_LENS_DEG)
+            np.sqrt(gradient @ self.covariance @ gradient), camera.fu * np.radians(_RULES.lens_deg)
         )
         return float(z[0] - z[2] - disparity_px), float(sigma)
 
@@ -223,10 +232,10 @@ def self_calibrate(
     pieces = [s for s in segments if len(s.tracks.ids)]
     if not pieces:
         raise EstimationError("not observable because no track is consistent over the keyframes")
-    width = np.where(np.isin(NAMES, INTRINSICS) & (not intrinsics), _HELD, _PRIOR)
+    width = np.where(np.isin(NAMES, INTRINSICS) & (not intrinsics), _RULES.held, _PRIOR)
     x, pieces = _optimum(camera, x, pieces, width)
     sigma = _spread(camera, x, pieces)
-    if sigma > _LARGEST_RESIDUAL_PX:
+    if sigma > _RULES.largest_residual_px:
         raise EstimationError(
             f"not observable because tracks and motion disagree by {sigma:.1f} px"
         )
@@ -240,8 +249,8 @@ def _optimum(
     camera: StereoCamera, x: FloatArray, pieces: list[Segment], width: FloatArray
 ) -> tuple[FloatArray, list[Segment]]:
     """Return parameters (18,) and segments at the least robust cost, by Levenberg-Marquardt."""
-    damping = _FIRST_DAMPING
-    for _ in range(_STEPS):
+    damping = _RULES.first_damping
+    for _ in range(_RULES.steps):
         sigma = _spread(camera, x, pieces)
         prior = np.diag(1 / (width**2 + x**2))
         solved = [_normal_equations(camera, x, piece, sigma, damping) for piece in pieces]
@@ -255,10 +264,10 @@ def _optimum(
         if after < before:
             x = x + dx
             pieces = moved
-            damping = max(damping / 30, _MIN_DAMPING)
+            damping = max(damping / 30, _RULES.min_damping)
         else:
             damping = 10 * max(damping, 1e-8)
-        if abs(before - after) < _SETTLED * before:
+        if abs(before - after) < _RULES.settled * before:
             break
     return x, pieces
 
@@ -287,7 +296,7 @@ def _spread(camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment]) -> f
     """Return the robust standard deviation of a pixel coordinate."""
     return max(
         robust_sigma(np.concatenate([_residuals(camera, x, s)[1] for s in pieces])),
-        _MIN_RESIDUAL_PX,
+        _RULES.min_residual_px,
     )
 
 
@@ -296,7 +305,9 @@ def _cost(
 ) -> float:
     """Return what the steps decrease: Cauchy losses of rows and parameters (18,)."""
     squares = [np.sum(_residuals(camera, x, piece)[0] ** 2, axis=1) / sigma**2 for piece in pieces]
-    rows = sum(float(np.sum(2 * _CAUCHY**2 * np.log1p(q / (4 * _CAUCHY**2)))) for q in squares)
+    rows = sum(
+        float(np.sum(2 * _RULES.cauchy**2 * np.log1p(q / (4 * _RULES.cauchy**2)))) for q in squares
+    )
     return rows + 0.5 * float(np.sum(np.log1p(x**2 / width**2)))
 
 
@@ -329,7 +340,7 @@ def _residuals(
 
 def _without_outliers(camera: StereoCamera, x: FloatArray, piece: Segment, sigma: float) -> Segment:
     r, _, _ = _residuals(camera, x, piece)
-    kept = keep_rows(piece.tracks, np.abs(r).max(axis=1) < _GATE * sigma)
+    kept = keep_rows(piece.tracks, np.abs(r).max(axis=1) < _RULES.gate * sigma)
     return replace(piece, tracks=kept) if len(kept.ids) else piece
 
 
@@ -368,7 +379,10 @@ def _normal_equations(
     J_q[~tracks.has_right, 2:] = 0
     J_x[~tracks.has_right, 2:] = 0
     root = (
-        1 / (sigma * np.sqrt(1 + np.sum(r**2, axis=1) / (4 * _CAUCHY**2 * sigma**2)))[:, None, None]
+        1
+        / (sigma * np.sqrt(1 + np.sum(r**2, axis=1) / (4 * _RULES.cauchy**2 * sigma**2)))[
+            :, None, None
+        ]
     )
     r = r * root[:, 0]
     J_q = J_q * root
@@ -393,7 +407,7 @@ def _normal_equations(
     gradient[tracks.point, tracks.keyframe] = (r[:, None] @ J_pose)[:, 0]
     g_c[:, : 6 * K] = gradient.reshape(M, 6 * K)
     g_c[:, 6 * K :] = _sums((r[:, None] @ J_x)[:, 0], tracks.point, M)
-    H_pp += _ROUNDING * np.trace(H_pp, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    H_pp += _RULES.rounding * np.trace(H_pp, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     H_pp[:, range(3), range(3)] *= 1 + damping
     H_cc[range(6 * K), range(6 * K)] *= 1 + damping
     return _eliminated(H_pp, H_pc, g_p, g_c, H_cc, _regions(camera, tracks))
@@ -491,9 +505,9 @@ def _regions(camera: StereoCamera, tracks: PointTracks) -> IntArray:
     u, v = (np.bincount(tracks.point, tracks.z[:, k], len(tracks.ids)) / count for k in (0, 1))
     width = camera.width or float(u.max()) + 1
     height = camera.height or float(v.max()) + 1
-    column = np.clip(_CELLS[0] * u / width, 0, _CELLS[0] - 1).astype(np.int64)
-    row = np.clip(_CELLS[1] * v / height, 0, _CELLS[1] - 1).astype(np.int64)
-    return np.asarray(_CELLS[0] * row + column, dtype=np.int64)
+    column = np.clip(_RULES.cells[0] * u / width, 0, _RULES.cells[0] - 1).astype(np.int64)
+    row = np.clip(_RULES.cells[1] * v / height, 0, _RULES.cells[1] - 1).astype(np.int64)
+    return np.asarray(_RULES.cells[0] * row + column, dtype=np.int64)
 
 
 def _eliminated(

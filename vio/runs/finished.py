@@ -24,8 +24,8 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.upright import up_of
 from vio.records import LoopEvent, MapKeyframes, Trajectory
 from vio.runs.files import RunFile
-from vio.runs.folder import read_metrics
 from vio.runs.mapped import read_keyframes, read_lines, read_loops
+from vio.runs.stated import read_metrics
 from vio.runs.tables import ESTIMATE
 
 log = logging.getLogger(__name__)

@@ -10,10 +10,10 @@ import platform
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,21 +27,19 @@ from vio.evaluation.errors_along_path import error_statistics, path_length_m
 from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.files.atomic import atomic_folder, check_own
 from vio.files.printable import json_text, printable
-from vio.files.trajectories import in_first_cam0, read_trajectory, write_kitti, write_tum
+from vio.files.trajectories import in_first_cam0, write_kitti, write_tum
 from vio.findings import INTEGRITIES
-from vio.geometry.lie import FloatArray, checked_transform, se3_inverse, se3_log, transform_points
+from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.numerics.compiled import has_compiled
 from vio.protocols import Dataset
 from vio.records import IMU_ENTRIES, Landmarks, Trajectory
 from vio.runs.files import FILES, REQUEST, RunFile
 from vio.runs.mapped import MappedRun, write_keyframes, write_loops
+from vio.runs.picture import RunPicture
 from vio.runs.pipeline import STAGES, RunResult, given_rig
 from vio.runs.recorder import GrowingFolder
-from vio.runs.stated import METRICS_SHAPE, REQUEST_SHAPE, read_stated
+from vio.runs.stated import REQUEST_SHAPE, RunRequest, read_metrics, read_stated
 from vio.runs.tables import frames_csv
-
-if TYPE_CHECKING:
-    from vio.runs.picture import RunPicture
 
 log = logging.getLogger(__name__)
 
@@ -81,16 +79,19 @@ def write_run_folder(
     return metrics
 
 
+@dataclass(frozen=True, slots=True)
+class Finishing:
+    """What is written of a run that ends beside its results."""
+
+    lengths_m: Sequence[float] | None  # path lengths of the drift, see `evaluate`
+    save_observations: bool
+    more: Mapping[str, Any]  # into the metrics
+    plot: bool
+    finished: Callable[[dict[str, Any]], None]  # gets the metrics before the picture is drawn
+
+
 def finish_run_folder(
-    folder: Path,
-    result: RunResult,
-    reference: Trajectory | None,
-    *,
-    lengths_m: Sequence[float] | None = None,
-    save_observations: bool = False,
-    more: Mapping[str, Any] | None = None,
-    plot: bool = True,
-    finished: Callable[[dict[str, Any]], None] | None = None,
+    folder: Path, result: RunResult, reference: Trajectory | None, how: Finishing
 ) -> dict[str, Any]:
     """Write the results of a run into the folder in which it grew, and return the metrics.
 
@@ -114,18 +115,17 @@ def finish_run_folder(
             folder,
             result,
             reference,
-            lengths_m,
-            save_observations=save_observations,
-            more=more,
+            how.lengths_m,
+            save_observations=how.save_observations,
+            more=how.more,
         )
         shutil.copyfile(unfinished / RunFile.ESTIMATES, final / RunFile.ESTIMATES)
         for name in sorted(path.name for path in final.iterdir() if path.name != RunFile.METRICS):
             (final / name).replace(folder / name)
         (final / RunFile.METRICS).replace(folder / RunFile.METRICS)
         shutil.rmtree(final)
-    if finished is not None:
-        finished(metrics)
-    if plot:
+    how.finished(metrics)
+    if how.plot:
         try:
             picture.write(folder / RunFile.PICTURE)
         except KeyboardInterrupt:
@@ -199,7 +199,7 @@ def _flat(name: str, value: Any) -> dict[str, Any]:
     return {name: value.tolist() if isinstance(value, np.ndarray) else value}
 
 
-def read_request(folder: Path) -> dict[str, Any]:
+def read_request(folder: Path) -> RunRequest:
     """Read what an unfinished run was asked to do.
 
     Raises:
@@ -209,7 +209,7 @@ def read_request(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         read_metrics(folder)
         raise DataError(f"{folder}: its run is complete; there is nothing to go on with")
-    return read_stated(path, REQUEST_SHAPE, "repeat the run from its start")
+    return RunRequest.of(read_stated(path, REQUEST_SHAPE, "repeat the run from its start"))
 
 
 def _write_files(
@@ -225,8 +225,6 @@ def _write_files(
     """Write all results but `estimates.npy` into `target`; return the metrics, which name
     `folder`, and the picture.
     """
-    from vio.runs.picture import RunPicture  # which imports this module by way of finished runs
-
     evaluation, dead_reckoning = score(result, reference, lengths_m=lengths_m)
     metrics = {**metrics_of(result, evaluation, dead_reckoning, folder), **(more or {})}
     (target / RunFile.CONFIG).write_text(to_yaml(result.config), encoding="utf-8")
@@ -607,43 +605,6 @@ def calibration_text(result: RunResult) -> str:
     if not result.recording.has_images:
         lines.append("of the rectified images that the features come from")
     return "".join(f"# {printable(line)}\n" for line in lines) + kalibr_text(found.rig)
-
-
-def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:
-    """Read a trajectory file, or the trajectory and extrinsics of a run's folder.
-
-    Raises:
-        DataError: the path contains no trajectory.
-    """
-    if not path.is_dir():
-        return read_trajectory(path), None
-    _, T_cam0_imu = read_metrics(path)
-    return read_trajectory(path / RunFile.TRAJECTORY), T_cam0_imu
-
-
-def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
-    """Read the metrics of a run's folder, and `T_cam0_imu` (4, 4) from them.
-
-    Raises:
-        DataError: the folder is not a run's, or its metrics are damaged.
-    """
-    path = folder / RunFile.METRICS
-    if not path.is_file():
-        raise DataError(
-            f"{folder}: no run folder (it has no {RunFile.METRICS}); give a folder that `vio run` "
-            "wrote"
-        )
-    metrics = read_stated(path, METRICS_SHAPE, "repeat the run")
-    try:
-        T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
-    except ValueError as error:  # rows of different lengths
-        raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
-    if metrics.get("complete") is False:
-        log.warning(
-            "%s: the run has not reached the end of its recording; these are its results so far",
-            folder,
-        )
-    return metrics, checked_transform(T_cam0_imu, f"{path}, T_cam0_imu")
 
 
 def write_landmarks_ply(path: Path, landmarks: Landmarks) -> None:

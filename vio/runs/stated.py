@@ -5,8 +5,13 @@ another hand.
 from __future__ import annotations
 
 import json
+import logging
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from vio.errors import DataError
 from vio.files.inputs import read_input
@@ -22,6 +27,12 @@ from vio.files.schema import (
     a_list,
     an_object,
 )
+from vio.files.trajectories import read_trajectory
+from vio.geometry.lie import FloatArray, checked_transform
+from vio.records import Trajectory
+from vio.runs.files import RunFile
+
+log = logging.getLogger(__name__)
 
 _MAX_BYTES = 2**26
 _NUMBERS = a_list(NUMBER)
@@ -49,6 +60,44 @@ REQUEST_SHAPE = an_object(
     "lengths_m",
     "save_observations",
 )
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """What a run was asked to do, as its folder keeps it while it can go on: `REQUEST_SHAPE`.
+
+    Files outside of the folder are absolute; defaults are those of folders that do not say.
+    """
+
+    source: str  # kind:path
+    reference: str | None  # file of the ground truth; None: that of the recording
+    start: int  # first frame
+    stop: int | None  # frame after the last one; None: the end
+    lengths_m: list[float] | None  # of the drift; None: the usual ones
+    save_observations: bool
+    save_calibration: str | None = None  # file, by its name alone where it is in the folder
+    map: str | None = None  # file
+    map_density: int | None = None
+    localise: bool = False  # leave the map as it is
+    plot: bool = True
+    frontend: str | None = None  # code of the caller's own, FILE.py:CLASS or module:CLASS
+    command: str | None = None  # as typed
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> RunRequest:
+        """Return what JSON of `REQUEST_SHAPE` states."""
+        known = {field.name for field in fields(cls)}
+        return cls(**{name: value for name, value in values.items() if name in known})
+
+    def values(self) -> dict[str, Any]:
+        """Return it as values of JSON."""
+        return asdict(self)
+
+    @property
+    def writes_map(self) -> bool:
+        """Whether the run makes or continues a map."""
+        return self.map is not None and not self.localise
+
 
 _CAMERA = an_object(
     {
@@ -118,6 +167,43 @@ def read_stated(path: Path, shape: Shape, remedy: str) -> dict[str, Any]:
         raise DataError(f"{path}: is damaged ({fault}); {remedy}")
     checked: dict[str, Any] = values
     return checked
+
+
+def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:
+    """Read a trajectory file, or the trajectory and extrinsics of a run's folder.
+
+    Raises:
+        DataError: the path contains no trajectory.
+    """
+    if not path.is_dir():
+        return read_trajectory(path), None
+    _, T_cam0_imu = read_metrics(path)
+    return read_trajectory(path / RunFile.TRAJECTORY), T_cam0_imu
+
+
+def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
+    """Read the metrics of a run's folder, and `T_cam0_imu` (4, 4) from them.
+
+    Raises:
+        DataError: the folder is not a run's, or its metrics are damaged.
+    """
+    path = folder / RunFile.METRICS
+    if not path.is_file():
+        raise DataError(
+            f"{folder}: no run folder (it has no {RunFile.METRICS}); give a folder that `vio run` "
+            "wrote"
+        )
+    metrics = read_stated(path, METRICS_SHAPE, "repeat the run")
+    try:
+        T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
+    except ValueError as error:  # rows of different lengths
+        raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
+    if metrics.get("complete") is False:
+        log.warning(
+            "%s: the run has not reached the end of its recording; these are its results so far",
+            folder,
+        )
+    return metrics, checked_transform(T_cam0_imu, f"{path}, T_cam0_imu")
 
 
 def _parted(values: dict[str, Any]) -> str | None:

@@ -12,18 +12,26 @@ from vio.records import NS_PER_S, IntArray
 from vio.sim.motion import MotionSpline, motion_at
 from vio.sim.world import MovingBox, ObjectMotion, Solid, World
 
-_STEPS_PER_S = 1.8
-_PAUSE_S = 1.2  # at each end of the way, in which the person turns round
-_SWAY_M = 0.03
-_BOB_M = 0.025
-_TWIST_RAD = 0.08
-_LEAN_RAD = 0.03
-_RADIUS_M = 0.3  # of the space that a person takes
-_HEIGHT_M = 1.8
-_SPACING_NS = 50_000_000  # between the times at which camera and person are kept apart
-_COARSE = 20  # of these times one is tried first
-_ATTEMPTS = 300  # for each person
-_KEEP_CLEAR_M = 0.3  # height of the points on a way that keep furniture off
+
+@dataclass(frozen=True, slots=True)
+class _PeopleRules:
+    """How people look and walk."""
+
+    steps_per_s: float = 1.8
+    pause_s: float = 1.2  # at each end of the way, in which the person turns round
+    sway_m: float = 0.03
+    bob_m: float = 0.025
+    twist_rad: float = 0.08
+    lean_rad: float = 0.03
+    radius_m: float = 0.3  # of the space that a person takes
+    height_m: float = 1.8
+    spacing_ns: int = 50_000_000  # between the times at which camera and person are kept apart
+    coarse: int = 20  # of these times one is tried first
+    attempts: int = 300  # for each person
+    keep_clear_m: float = 0.3  # height of the points on a way that keep furniture off
+
+
+_PEOPLE = _PeopleRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +60,16 @@ def plan_walks(
         clearance_m: least distance from the camera.
     """
     rng = np.random.default_rng([seed, 6])
-    times: IntArray = np.arange(motion.start_ns, motion.end_ns, _SPACING_NS, dtype=np.int64)
+    times: IntArray = np.arange(motion.start_ns, motion.end_ns, _PEOPLE.spacing_ns, dtype=np.int64)
     path = motion_at(motion, times).T_world_imu[:, :3, 3]
     walks: list[Walk] = []
     for _ in range(count):
-        for _ in range(_ATTEMPTS):
+        for _ in range(_PEOPLE.attempts):
             walk = _random_walk(world, path, rng, reach_m, motion.start_ns)
             # A few of the times show at once that most ways will not do.
             if _unobstructed(world, walk) and all(
-                _clearance(walk, times[::step], path[::step]) > clearance_m for step in (_COARSE, 1)
+                _clearance(walk, times[::step], path[::step]) > clearance_m
+                for step in (_PEOPLE.coarse, 1)
             ):
                 walks.append(walk)
                 break
@@ -73,7 +82,8 @@ def along_walks(walks: Sequence[Walk]) -> FloatArray:
     """
     shares = np.linspace(0, 1, 12)[:, None]
     points = [
-        walk.start + shares * (walk.end - walk.start) + [0.0, 0.0, _KEEP_CLEAR_M] for walk in walks
+        walk.start + shares * (walk.end - walk.start) + [0.0, 0.0, _PEOPLE.keep_clear_m]
+        for walk in walks
     ]
     return np.concatenate(points) if points else np.zeros((0, 3))
 
@@ -100,8 +110,8 @@ def _random_walk(
 def _unobstructed(world: World, walk: Walk) -> bool:
     """Whether the way is within the scene and clear of its boxes."""
     points = walk.start + np.linspace(0, 1, 30)[:, None] * (walk.end - walk.start)
-    low = world.bounds[0, :2] + _RADIUS_M
-    high = world.bounds[1, :2] - _RADIUS_M
+    low = world.bounds[0, :2] + _PEOPLE.radius_m
+    high = world.bounds[1, :2] - _PEOPLE.radius_m
     if ((points[:, :2] < low) | (points[:, :2] > high)).any():
         return False
     return all(_apart(solid, points) for solid in world.solids)
@@ -111,17 +121,17 @@ def _apart(solid: Solid, points: FloatArray) -> bool:
     """Whether people at points (N, 3) on the ground stay off a box."""
     T = solid.T_world_box
     half = solid.half_size
-    if T[2, 3] - half[2] > points[0, 2] + _HEIGHT_M:
+    if T[2, 3] - half[2] > points[0, 2] + _PEOPLE.height_m:
         return True
     local = (points - T[:3, 3]) @ T[:3, :3]
-    return bool((np.abs(local[:, :2]) > half[:2] + _RADIUS_M).any(axis=1).all())
+    return bool((np.abs(local[:, :2]) > half[:2] + _PEOPLE.radius_m).any(axis=1).all())
 
 
 def _clearance(walk: Walk, times: IntArray, path: FloatArray) -> float:
     """Least distance (m) of a camera at positions (N, 3) at times (N,) from a person."""
     at = np.array([_place(walk, int(t))[0] for t in times])
-    aside = np.maximum(np.linalg.norm(path[:, :2] - at[:, :2], axis=1) - _RADIUS_M, 0.0)
-    above = np.maximum(path[:, 2] - at[:, 2] - _HEIGHT_M, 0.0)
+    aside = np.maximum(np.linalg.norm(path[:, :2] - at[:, :2], axis=1) - _PEOPLE.radius_m, 0.0)
+    above = np.maximum(path[:, 2] - at[:, 2] - _PEOPLE.height_m, 0.0)
     return float(np.hypot(aside, above).min())
 
 
@@ -131,13 +141,13 @@ def _place(walk: Walk, time_ns: int) -> tuple[FloatArray, float, float]:
     """
     way = walk.end - walk.start
     length = float(np.linalg.norm(way))
-    leg_s = length / walk.speed + _PAUSE_S
+    leg_s = length / walk.speed + _PEOPLE.pause_s
     elapsed = (time_ns - walk.origin_ns) / NS_PER_S + walk.phase_s
     leg, within = divmod(elapsed, leg_s)
     forth = leg % 2 == 0
     share = min(within * walk.speed / length, 1.0)
     walking = share < 1.0
-    turned = 0.0 if walking else (within - length / walk.speed) / _PAUSE_S * np.pi
+    turned = 0.0 if walking else (within - length / walk.speed) / _PEOPLE.pause_s * np.pi
     heading = float(np.arctan2(way[1], way[0])) + (0.0 if forth else np.pi) + turned
     return walk.start + way * (share if forth else 1 - share), heading, float(walking)
 
@@ -164,15 +174,15 @@ def _body(walk: Walk, rng: np.random.Generator) -> Sequence[MovingBox]:
 def _step(walk: Walk, time_ns: int) -> FloatArray:
     """Pose (4, 4) of a person's middle line on the ground."""
     ground, heading, walking = _place(walk, time_ns)
-    step = np.pi * _STEPS_PER_S * (time_ns - walk.origin_ns) / NS_PER_S
+    step = np.pi * _PEOPLE.steps_per_s * (time_ns - walk.origin_ns) / NS_PER_S
     swing = walking * float(np.sin(step))  # from foot to foot, so once in two steps
     left = np.array([-np.sin(heading), np.cos(heading), 0.0])
     at = (
         ground
-        + _SWAY_M * swing * left
-        + np.array([0.0, 0.0, _BOB_M * walking * abs(float(np.cos(step)))])
+        + _PEOPLE.sway_m * swing * left
+        + np.array([0.0, 0.0, _PEOPLE.bob_m * walking * abs(float(np.cos(step)))])
     )
-    turn = so3_exp([0.0, 0.0, heading + _TWIST_RAD * swing]) @ so3_exp(
-        [_LEAN_RAD * swing, 0.0, 0.0]
+    turn = so3_exp([0.0, 0.0, heading + _PEOPLE.twist_rad * swing]) @ so3_exp(
+        [_PEOPLE.lean_rad * swing, 0.0, 0.0]
     )
     return se3_from_parts(turn, at)

@@ -26,24 +26,34 @@ SceneName: TypeAlias = Literal["room", "street", "corridor", "doors"]
 ObjectMotion: TypeAlias = Callable[[int], FloatArray]  # time_ns to T_world_object (4, 4)
 
 _OF_WOOD: tuple[TextureKind, ...] = ("wood", "crate")
-_CLEAR_M = 0.05  # of a camera from what it may not be in
+
+
+@dataclass(frozen=True, slots=True)
+class _WorldRules:
+    """How rooms and streets are built."""
+
+    clear_m: float = 0.05  # of a camera from what it may not be in
+    doors: int = 10  # of a corridor of equal doors, and from one to the next
+    door_m: float = 3.0
+    street_m: float = 15.0  # width
+    parked: int = 36  # boxes
+    onward_m: float = 80.0  # length of the streets beyond the block
+    corner_free_m: float = 13.0  # no parked box this close to a corner, which cars cut
+    mover_light: float = 0.7  # illumination of moving boxes, which is the same wherever they are
+    # at which illumination is computed; also the width of a shadow's soft edge
+    light_cell_m: float = 0.25
+    max_light_cells: int = 400  # along each side of a surface
+    room_ambient: float = 0.22
+    street_ambient: float = 0.4
+    sun_elevation_rad: float = 0.3
+    bare_houses: int = 3  # one house in so many has a blank wall
+
+
+_WORLD = _WorldRules()
 _CORRIDOR_M = np.array([30.0, 2.6, 2.7])  # length, width, height
-_DOORS = 10  # of a corridor of equal doors, and from one to the next
-_DOOR_M = 3.0
-_STREET_M = 15.0  # width
-_PARKED = 36  # boxes
-_ONWARD_M = 80.0  # length of the streets beyond the block
-_CORNER_FREE_M = 13.0  # no parked box this close to a corner, which cars cut
 # Radiance over the texture's own gray levels, of what is bright by itself: nine stops of a room's
 # light and a window do not fit one exposure, and a bright sky is about a stop above sunlit walls.
 _EMISSION: dict[TextureKind, float] = {"window": 7.0, "sky": 1.5, "skyline": 1.3}
-_MOVER_LIGHT = 0.7  # illumination of moving boxes, which is the same wherever they are
-_LIGHT_CELL_M = 0.25  # at which illumination is computed; also the width of a shadow's soft edge
-_MAX_LIGHT_CELLS = 400  # along each side of a surface
-_ROOM_AMBIENT = 0.22
-_STREET_AMBIENT = 0.4
-_SUN_ELEVATION_RAD = 0.3
-_BARE_HOUSES = 3  # one house in so many has a blank wall
 _FACES: dict[str, tuple[int, int]] = {
     "+x": (0, 1), "-x": (0, -1), "+y": (1, 1), "-y": (1, -1), "+z": (2, 1), "-z": (2, -1),
 }  # fmt: skip
@@ -137,7 +147,7 @@ class TextureStore:
         if self._lighting is None:
             return build_mips(texture)
         if patch.kind in _EMISSION or self._movers[surface]:
-            return replace(build_mips(texture), gain=_EMISSION.get(patch.kind, _MOVER_LIGHT))
+            return replace(build_mips(texture), gain=_EMISSION.get(patch.kind, _WORLD.mover_light))
         light = _light_on(patch, self._lighting)
         shaded, gain = lit(texture, light, np.random.default_rng([self._seed, surface, 1]))
         return replace(build_mips(shaded), gain=gain)
@@ -145,7 +155,9 @@ class TextureStore:
 
 def _light_on(patch: Patch, lighting: Lighting) -> FloatArray:
     """Illumination (R, C) at the middles of a grid of cells over a fixed surface."""
-    columns, rows = np.clip(np.ceil(patch.size / _LIGHT_CELL_M), 2, _MAX_LIGHT_CELLS).astype(int)
+    columns, rows = np.clip(
+        np.ceil(patch.size / _WORLD.light_cell_m), 2, _WORLD.max_light_cells
+    ).astype(int)
     s, t = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
     along = (
         s.reshape(-1, 1) * patch.size[0] * patch.axis_s
@@ -193,8 +205,8 @@ def check_clear(world: World, positions: npt.ArrayLike, what: str = "the camera"
         SimulationError: a position is not; the message names the first one.
     """
     p = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
-    low = world.bounds[0] + _CLEAR_M
-    high = world.bounds[1] - _CLEAR_M
+    low = world.bounds[0] + _WORLD.clear_m
+    high = world.bounds[1] - _WORLD.clear_m
     outside = ((p < low) | (p > high)).any(axis=1) | ~np.isfinite(p).all(1)
     if outside.any():
         i = int(np.flatnonzero(outside)[0])
@@ -205,7 +217,7 @@ def check_clear(world: World, positions: npt.ArrayLike, what: str = "the camera"
         )
     for number, solid in enumerate(world.solids):
         local = (p - solid.T_world_box[:3, 3]) @ solid.T_world_box[:3, :3]
-        inside = (np.abs(local) < solid.half_size + _CLEAR_M).all(axis=1)
+        inside = (np.abs(local) < solid.half_size + _WORLD.clear_m).all(axis=1)
         if inside.any():
             i = int(np.flatnonzero(inside)[0])
             raise SimulationError(
@@ -278,7 +290,7 @@ def room(
             patches += _box_patches(picture, "picture", texel)
             solids.append(picture)
     lights, panes = _windows(box, windows, seed, scale)
-    lighting = Lighting(lights, _ROOM_AMBIENT) if lights else None
+    lighting = Lighting(lights, _WORLD.room_ambient) if lights else None
     return _build("room", patches + panes, solids, box, seed, moving, lighting)
 
 
@@ -347,28 +359,30 @@ def equal_doors(seed: int = 0, *, texel_m: float = 0.003) -> World:
     another.
     """
     _, width_m, height_m = _CORRIDOR_M
-    box = np.array([[0.0, -width_m / 2, 0.0], [_DOORS * _DOOR_M, width_m / 2, height_m]])
+    box = np.array(
+        [[0.0, -width_m / 2, 0.0], [_WORLD.doors * _WORLD.door_m, width_m / 2, height_m]]
+    )
     ends: dict[str, TextureKind] = {"+x": "wall", "-x": "wall"}
     centre = _pose((box[0] + box[1]) / 2, 0.0)
     patches = _axis_rectangles(centre, (box[1] - box[0]) / 2, ends, texel_m, inwards=True)
     kinds: dict[str, TextureKind] = {"+y": "wall", "-y": "wall", "-z": "floor", "+z": "ceiling"}
-    half = np.array([_DOOR_M, width_m, height_m]) / 2
+    half = np.array([_WORLD.door_m, width_m, height_m]) / 2
     rng = np.random.default_rng([seed, 4])
     places = [
-        (side * (width_m / 2 - 0.02), rng.uniform(0.5, _DOOR_M - 0.5))
+        (side * (width_m / 2 - 0.02), rng.uniform(0.5, _WORLD.door_m - 0.5))
         for side in (-1, 1)
         for _ in range(2)
     ]
     solids: list[Solid] = []
-    for number in range(_DOORS):
-        middle = np.array([(number + 0.5) * _DOOR_M, 0.0, height_m / 2])
+    for number in range(_WORLD.doors):
+        middle = np.array([(number + 0.5) * _WORLD.door_m, 0.0, height_m / 2])
         cell = _axis_rectangles(_pose(middle, 0.0), half, kinds, texel_m, inwards=True)
         door = Solid(_pose((middle[0], -width_m / 2 + 0.03, 1.0), 0.0), np.array([0.45, 0.03, 1.0]))
         solids.append(door)
         cell += _box_patches(door, "wood", texel_m, hidden=("-z",))
         for y, along in places:
             picture = Solid(
-                _pose((number * _DOOR_M + along, y, 1.6), 0.0), np.array([0.3, 0.02, 0.25])
+                _pose((number * _WORLD.door_m + along, y, 1.6), 0.0), np.array([0.3, 0.02, 0.25])
             )
             solids.append(picture)
             cell += _box_patches(picture, "picture", texel_m)
@@ -394,19 +408,21 @@ def street(
     """
     rng = np.random.default_rng([seed, 3])
     half = np.array(loop_m) / 2
-    if min(loop_m) < 2.5 * _STREET_M:
+    if min(loop_m) < 2.5 * _WORLD.street_m:
         raise SimulationError(
-            f"a street {_STREET_M:g} m wide needs loop_m of at least {2.5 * _STREET_M:g} m each way"
+            f"a street {_WORLD.street_m:g} m wide needs loop_m of at least {2.5 * _WORLD.street_m:g} m each way"
         )
-    inner = half - _STREET_M / 2
-    outer = half + _STREET_M / 2
+    inner = half - _WORLD.street_m / 2
+    outer = half + _WORLD.street_m / 2
     patches: list[Patch] = []
     solids: list[Solid] = []
     houses = [*_house_row(inner, rng, outwards=True), *_house_row(outer, rng, outwards=False)]
     for number, (solid, back) in enumerate(houses):
         solids.append(solid)
         onward = bool(abs(solid.T_world_box[0, 3]) > outer[0] + 10)
-        kind: TextureKind = "plaster" if bare_houses and number % _BARE_HOUSES == 0 else "facade"
+        kind: TextureKind = (
+            "plaster" if bare_houses and number % _WORLD.bare_houses == 0 else "facade"
+        )
         patches += _box_patches(
             solid, kind, (2 if onward else 1) * texel_m, hidden=("-z", "+z", back)
         )
@@ -429,10 +445,10 @@ def _sunlight(casters: Sequence[Solid], seed: int) -> Lighting:
     boxes.
     """
     azimuth = np.random.default_rng([seed, 5]).choice([0.0, np.pi]) + 0.25
-    light = sun(float(azimuth), _SUN_ELEVATION_RAD, power=1.1, radiance=60_000.0)
+    light = sun(float(azimuth), _WORLD.sun_elevation_rad, power=1.1, radiance=60_000.0)
     poses = np.stack([s.T_world_box for s in casters])
     halves = np.stack([s.half_size for s in casters])
-    return Lighting((light,), _STREET_AMBIENT, poses, halves)
+    return Lighting((light,), _WORLD.street_ambient, poses, halves)
 
 
 def _bounds(bounds: npt.ArrayLike) -> FloatArray:
@@ -630,7 +646,9 @@ def _house_row(
         for sign in (-1, 1):
             # The streets along x continue beyond the block, towards the skyline.
             extent = (
-                rim[axis] if outwards else (rim[0] + _ONWARD_M if axis == 0 else rim[1] - _STREET_M)
+                rim[axis]
+                if outwards
+                else (rim[0] + _WORLD.onward_m if axis == 0 else rim[1] - _WORLD.street_m)
             )
             x = -extent
             while x < extent - 3:
@@ -671,8 +689,8 @@ def _road(inner: FloatArray, outer: FloatArray, texel_m: float) -> list[Patch]:
         out.append(_rectangle(np.array([0.0, y, 0.0]), up, down, long_size, "asphalt", texel_m))
         out.append(_rectangle(np.array([x, 0.0, 0.0]), up, down, short_size, "asphalt", texel_m))
         for other in (-1, 1):
-            size = np.array([_ONWARD_M, high[1] - low[1]])
-            middle = np.array([other * (high[0] + _ONWARD_M / 2), y, 0.0])
+            size = np.array([_WORLD.onward_m, high[1] - low[1]])
+            middle = np.array([other * (high[0] + _WORLD.onward_m / 2), y, 0.0])
             out.append(_rectangle(middle, up, down, size, "asphalt", 2 * texel_m))
     plain = np.array([2 * (max(high) + 250.0)] * 2)
     out.append(_rectangle(np.array([0.0, 0.0, -0.05]), up, down, plain, "asphalt", 0.25))
@@ -683,15 +701,15 @@ def _roadside(half: FloatArray, rng: np.random.Generator) -> list[Solid]:
     """Parked boxes the size of cars and vans, and poles, at both sides of the middle line."""
     out: list[Solid] = []
     perimeter = 4 * float(half.sum())
-    for number in range(_PARKED + _PARKED // 2):
-        is_pole = number >= _PARKED
+    for number in range(_WORLD.parked + _WORLD.parked // 2):
+        is_pole = number >= _WORLD.parked
         for _ in range(20):
             place = rng.uniform(0, perimeter)
             point, heading, to_corner = _on_rectangle(half, place)
-            if to_corner < _CORNER_FREE_M:
+            if to_corner < _WORLD.corner_free_m:
                 continue
             side = rng.choice([-1.0, 1.0]) * (
-                _STREET_M / 2 - (0.7 if is_pole else rng.uniform(1.5, 1.9))
+                _WORLD.street_m / 2 - (0.7 if is_pole else rng.uniform(1.5, 1.9))
             )
             normal = np.array([-np.sin(heading), np.cos(heading)])
             size = (

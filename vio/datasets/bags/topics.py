@@ -168,16 +168,18 @@ def _cameras(
         raise DataError(
             f"{where}: holds {len(images)} image topics with messages ({have}); {needed}"
         )
-    by_name = {t.name: t for t in images}
-    pairs = []
-    for a, b in _SIDES:
-        for left in images:
-            head, found, tail = left.name.rpartition(a)
-            right = by_name.get(f"{head}{b}{tail}") if found else None
-            if right is not None and right != left and right.kind == left.kind:
-                pairs.append((left, right))
-        if pairs:
-            break
+    return _pair(images, given, where)
+
+
+def _pair(
+    images: Sequence[Topic], given: dict[str, Topic | None], where: str
+) -> tuple[Topic, Topic]:
+    """Choose left and right of several image topics by their names.
+
+    Raises:
+        DataError: no pair, or several, could be meant.
+    """
+    pairs = _named_as_pairs(images)
     for role, k in (("left", 0), ("right", 1)):
         if given.get(role) is not None:
             pairs = [p for p in pairs if p[k] == given[role]]
@@ -193,6 +195,23 @@ def _cameras(
         names = listed([t.name for t in images])
         raise DataError(f"{where}: {what} ({names}); name them with --topics left=/A,right=/B")
     return pairs[0]
+
+
+def _named_as_pairs(images: Sequence[Topic]) -> list[tuple[Topic, Topic]]:
+    """Return the pairs of topics whose names differ by the first words for the sides that any
+    pair has.
+    """
+    by_name = {t.name: t for t in images}
+    for a, b in _SIDES:
+        pairs = []
+        for left in images:
+            head, found, tail = left.name.rpartition(a)
+            right = by_name.get(f"{head}{b}{tail}") if found else None
+            if right is not None and right != left and right.kind == left.kind:
+                pairs.append((left, right))
+        if pairs:
+            return pairs
+    return []
 
 
 def _one_camera(images: Sequence[Topic]) -> tuple[Topic | None, list[str]]:
@@ -223,14 +242,10 @@ def _imu(
     if "imu" in given and (named is None or "accel" in given or _sensor_of(named) != "gyro"):
         return named, given.get("accel")
     sensors = [t for t in filled if t.kind == IMU or (t.kind == VECTOR and _sensor_of(t))]
-    both = [t for t in sensors if not _sensor_of(t)]
-    if named is not None:
-        sensors = [named, *(t for t in sensors if _sensor_of(t) == "accel")]
-        both = []
-    gyros = [t for t in sensors if _sensor_of(t) == "gyro"]
-    accels = [t for t in sensors if _sensor_of(t) == "accel"]
-    if given.get("accel") is not None:
-        accels = [t for t in (given["accel"],) if t is not None]
+    both = _of_sensor(sensors, "") if named is None else []
+    gyros = _of_sensor(sensors if named is None else [named], "gyro")
+    accel_named = given.get("accel")
+    accels = _of_sensor(sensors, "accel") if accel_named is None else [accel_named]
     if both or not (gyros and accels):
         return _single([t for t in both or gyros if t.kind == IMU], left, notes), None
     gyro = max(gyros, key=lambda t: (_shared(t.name, left.name), t.count))
@@ -240,6 +255,10 @@ def _imu(
         "the gyro's stamps (choose with --topics imu=/GYRO,accel=/ACCEL)"
     )
     return gyro, accel
+
+
+def _of_sensor(topics: Sequence[Topic], sensor: str) -> list[Topic]:
+    return [t for t in topics if _sensor_of(t) == sensor]
 
 
 def _sensor_of(topic: Topic) -> str:

@@ -1,4 +1,4 @@
-"""Positions by GNSS."""
+"""Positions by GNSS, as the readers of `gnss` give them."""
 
 from __future__ import annotations
 

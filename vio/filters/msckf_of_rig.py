@@ -1,0 +1,38 @@
+"""Which sliding-window filter a run has: that of two cameras, of one, or with an IMU that may begin
+late.
+"""
+
+from __future__ import annotations
+
+from vio.filters.late_imu import LateImuMsckf
+from vio.filters.mono_msckf import MonoMsckf
+from vio.filters.msckf import Msckf
+from vio.filters.settings import MsckfSettings
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.records import MotionSource
+
+
+class MsckfOfRig(Msckf):
+    """The sliding-window filter as a back end: `build` chooses the class for the cameras and the
+    motion sensor.
+    """
+
+    @classmethod
+    def build(
+        cls,
+        camera: StereoCamera,
+        T_cam0_body: FloatArray,
+        settings: MsckfSettings,
+        motion: MotionSource | None,
+    ) -> Msckf:
+        """Build the filter of a run, see `Backend`.
+
+        Raises:
+            ConfigError: one camera without an IMU, or settings that need another motion or camera.
+        """
+        if camera.kind == "mono":
+            return MonoMsckf.build(camera, T_cam0_body, settings, motion)
+        if motion == "imu":
+            return LateImuMsckf(camera, T_cam0_body, settings)
+        return Msckf(camera, T_cam0_body, settings, motion=motion)
