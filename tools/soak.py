@@ -30,7 +30,8 @@ from vio.datasets.bags.cdr import decoded
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.protocols import Dataset
 from vio.records import Event, ImuSample, StereoFrame
-from vio.ros2.transport import Transport, open_transport, publisher
+from vio.ros2.opening import open_transport
+from vio.ros2.transport import Transport, publisher
 
 _LOOPBACK = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>

@@ -31,6 +31,7 @@ from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.distortion import project_point
 from vio.records import ImuSample, StereoFrame
+from vio.runs.live_folder import LiveRunSettings
 from vio.sources.oak import OakSource
 from vio.sources.realsense import RealSenseSource
 from vio.sources.recorder import Form, Recorder
@@ -125,7 +126,7 @@ def test_recordings_have_all_digits_and_ending_early_keeps_everything(
         say=lambda _: None,
         record=kept,
         record_as=form,
-        out=out,
+        kept=LiveRunSettings(out, "camera"),
         drop="none",
     )
     assert source.closed
@@ -166,7 +167,7 @@ def test_a_camera_that_fails_leaves_the_trajectory_so_far(flight: Path, tmp_path
             None,
             should_stop=slow.should_stop,
             say=lambda _: None,
-            out=tmp_path / "out",
+            kept=LiveRunSettings(tmp_path / "out", "camera"),
             drop="none",
             on_start=slow.start,
         )

@@ -34,6 +34,7 @@ from vio.records import FrameResult, Recording, RunMotion, Trajectory
 from vio.report.words import camera_imu_findings, scale_findings
 from vio.runs.files import CHECKPOINT, FILES, RunFile
 from vio.runs.folder import calibration_text, finish_run_folder, growing_folder, read_request
+from vio.runs.live_folder import finish_live_folder, is_live
 from vio.runs.pipeline import RunControl, RunResult, Viewers, given_rig, run
 from vio.view.annotated import AnnotatedImage
 
@@ -169,6 +170,8 @@ def resume(
     """
     request = read_request(folder)
     check_out(folder)
+    if is_live(request):
+        return _finish_live(folder, request, finished)
     request["save_calibration"] = _named_again(
         folder,
         request.get("save_calibration"),
@@ -192,6 +195,17 @@ def resume(
     return _process(
         dataset, config, folder, request, progress=progress, resume=saved, finished=finished
     )
+
+
+def _finish_live(
+    folder: Path, request: Mapping[str, Any], finished: Callable[[dict[str, Any]], None] | None
+) -> dict[str, Any]:
+    """Write the results of a live run whose program was killed, and return its metrics."""
+    log.warning("%s: a live run cannot go on; its results so far are written", folder)
+    metrics = finish_live_folder(folder, request)
+    if finished is not None:
+        finished(metrics)
+    return metrics
 
 
 def _named_again(

@@ -183,6 +183,11 @@ class Worker:
             return "failed"
         return "closed" if self._queue.is_closed else "running"
 
+    @property
+    def failure(self) -> Exception | None:
+        """What the worker failed with; None: it has not."""
+        return self._failure
+
     def put(self, make: Callable[[], object], *, frame: bool = False) -> bool:
         """Add a call; False: a frame that waited was left out for it.
 
