@@ -418,13 +418,26 @@ def finish_live_folder(folder: Path, request: Mapping[str, Any]) -> dict[str, An
             f"{folder}: its program ended within seconds; {RunFile.TRAJECTORY} and "
             f"{RunFile.FRAMES} are all that is known"
         )
-    with locked_folder(folder):
+    with locked_folder(folder), _named_damage(folder):
         recorder = _recorder(GrowingFolder(folder, {}), "imu", config, keeps=keeps)
         with contextlib.closing(recorder):
-            state: _LiveState = recorder.restore(None)
+            state = recorder.restore(None)
+            if not isinstance(state, _LiveState):
+                raise TypeError("its checkpoint is of another run")
             end = _End(state.findings, no_landmarks(), None, "the program was ended")
             result = _result(config, state, recorder, end)
         return _write(folder, result, keeps, request.get("command"), plot=True)
+
+
+@contextlib.contextmanager
+def _named_damage(folder: Path) -> Iterator[None]:
+    """Name what the parts of a checkpoint raise that are not what they were, as someone changed
+    them and its checksum.
+    """
+    try:
+        yield
+    except (AttributeError, TypeError, ValueError, LookupError, ArithmeticError) as error:
+        raise DataError(f"{folder}: its checkpoint is damaged ({error})") from error
 
 
 def _recorder(

@@ -8,6 +8,7 @@ after topic is stored in no order of time, either, but within each topic it is.
 from __future__ import annotations
 
 import heapq
+import importlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -51,9 +52,10 @@ def _unpacking(reader: Any) -> Callable[[bytes], bytes]:
     """Return what decompresses a message of a ROS 2 bag, each of which may be compressed."""
     if reader.compression_mode != "message":
         return lambda data: data
-    from rosbags.rosbag2 import reader as library  # whose zstd is Python's own, or a package
+    module = importlib.import_module("rosbags.rosbag2.reader")
+    zstd: Any = vars(module)["zstd"]  # Python's own, or that of a package
 
-    return lambda data: bytes(library.zstd.decompress(data))
+    return lambda data: bytes(zstd.decompress(data))
 
 
 def _times_by_topic(reader: Any) -> Iterable[Sequence[int]]:
