@@ -206,7 +206,8 @@ def _soak(
         seen.largest_m = 0.0
     lived = node.poll() is None
     if lived:
-        node.send_signal(signal.SIGINT)
+        # SIGINT is ignored where a shell started this program behind it
+        node.send_signal(signal.SIGTERM)
         node.wait(timeout=300)
     folders = sorted(path.parent for path in root.glob("out*/metrics.json"))
     whole = [folder for folder in folders if read_metrics(folder)[0]["complete"]]

@@ -783,6 +783,62 @@ def test_three_processes_give_the_poses_of_the_file_run(
     np.testing.assert_array_equal(again.trajectory.T_world_body, poses)
 
 
+@pytest.mark.slow
+@needs_dds
+@needs_loopback
+def test_a_node_that_is_killed_leaves_a_folder_that_can_be_finished(
+    flight: Path, domain: int, tmp_path: Path
+) -> None:
+    """By SIGKILL, while the recording is played to it again and again for longer than it takes to
+    write a checkpoint.
+    """
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "vio"]
+    arguments = ["--left", TOPICS.left, "--right", str(TOPICS.right), "--imu", str(TOPICS.imu)]
+    node = subprocess.Popen(
+        [*command, "ros2", *arguments, "--reliable", "--calibration", str(flight), "--out", out],
+        stderr=subprocess.DEVNULL,
+    )
+    player = open_transport("dds")
+    try:
+        play(
+            player,
+            Repeated(vio.open_dataset(flight), 200),
+            TOPICS,
+            rate=1.0,
+            quality="reliable",
+            should_stop=(out / "unfinished" / "checkpoint").is_file,
+        )
+        assert (out / "unfinished" / "checkpoint").is_file()
+        time.sleep(1.0)
+        node.kill()
+        node.wait()
+    finally:
+        player.close()
+        node.kill()
+    poses = read_trajectory(out / "trajectory.tum")
+    assert len(poses) > 10
+    subprocess.run([*command, "run", "--resume", out, "--quiet"], check=True)
+    run = read_finished_run(out)
+    assert run.metrics["stopped"] == "the program was ended"
+    assert len(run.trajectory) > 10
+    subprocess.run([*command, "report", out], check=True, stdout=subprocess.DEVNULL)
+
+
+class Repeated:
+    """A recording several times, a second later each time."""
+
+    def __init__(self, dataset: Any, times: int) -> None:
+        self._dataset = dataset
+        self._times = times
+        self.recording = dataset.recording
+
+    def events(self, start: int = 0, stop: int | None = None) -> Any:
+        for k in range(self._times):
+            for event in self._dataset.events(start, stop):
+                yield replace(event, time_ns=event.time_ns + k * 10**9)
+
+
 def test_the_files_for_colcon_name_the_command() -> None:
     folder = Path(__file__).resolve().parents[2] / "ros2" / "stereo_vio"
     launch = (folder / "launch" / "stereo_vio.launch.py").read_text(encoding="utf-8")

@@ -254,6 +254,7 @@ class LiveOdometry(EventInputs[None]):
         for stream in self._streams.read():
             stream.reset()
         self._forget()
+        self._collector.renew()
 
     def _forget(self) -> None:
         """Begin with an empty trajectory."""

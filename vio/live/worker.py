@@ -313,6 +313,14 @@ class QuietCollector:
                 QuietCollector._users += 1
                 self._holds = True
 
+    def renew(self) -> None:
+        """Search everything once more, as after a reset: what was held before and is no longer
+        used has cycles, which would stay for ever.
+        """
+        gc.unfreeze()
+        if self._holds:
+            self.hold()
+
     def release(self) -> None:
         """Let the collector do as before."""
         if not self._holds:
