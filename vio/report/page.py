@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
@@ -11,8 +11,9 @@ from vio._version import __version__
 from vio.files.atomic import atomic_write_text
 from vio.files.inputs import read_input
 from vio.files.printable import printable
+from vio.report.compared import apart, compared_figures
 from vio.report.figures import ReportSection, sections
-from vio.report.words import calibration_findings, run_figures, summary
+from vio.report.words import calibration_findings, summary
 from vio.runs.curves import COLOURS, curves_of
 from vio.runs.files import MeshFile, RunFile
 from vio.runs.finished import FinishedRun
@@ -124,9 +125,23 @@ def _lists(title: str, runs: Sequence[FinishedRun], lines: Sequence[Sequence[str
 
 
 def _key_figures(runs: Sequence[FinishedRun]) -> str:
-    columns = [run_figures(run) for run in runs]
-    rows = {name: [column[name] for column in columns] for name in columns[0]}
-    return _table("Figures", [run.name for run in runs], rows)
+    found = compared_figures(runs)
+    names = [run.name for run in runs]
+    rows = {name: [text for text, _ in cells] for name, cells in found.items()}
+    best = {
+        (name, k)
+        for name, cells in found.items()
+        for k, (_, is_best) in enumerate(cells)
+        if is_best
+    }
+    if len(runs) == 1:
+        return _table("Figures", names, rows)
+    between = [apart(runs[0], run) for run in runs[1:]]
+    if any(between):
+        cells = ["" if other is None else str(other) for other in between]
+        rows[f"distance from {runs[0].name}"] = ["–", *(cell or "–" for cell in cells)]
+    remark = f"In brackets the change from {runs[0].name}; bold: the best." if best else ""
+    return _table("Figures", names, rows, best, remark)
 
 
 def _settings(runs: Sequence[FinishedRun]) -> str:
@@ -143,15 +158,25 @@ def _settings(runs: Sequence[FinishedRun]) -> str:
     )
 
 
-def _table(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
-    """Return a section with a table of named columns and rows."""
+def _table(
+    title: str,
+    columns: Sequence[str],
+    rows: Mapping[str, Sequence[str]],
+    bold: Collection[tuple[str, int]] = (),
+    remark: str = "",
+) -> str:
+    """Return a section with a table of named columns and rows; `bold`: cells by row and column."""
     head = "".join(f"<th>{_text(name)}</th>" for name in columns)
-    body = "".join(
-        f"<tr><th>{_text(name)}</th>{''.join(f'<td>{_text(cell)}</td>' for cell in cells)}</tr>"
-        for name, cells in rows.items()
-    )
+    body = ""
+    for name, cells in rows.items():
+        body += f"<tr><th>{_text(name)}</th>"
+        for k, cell in enumerate(cells):
+            text = _text(cell)
+            body += f"<td><b>{text}</b></td>" if (name, k) in bold else f"<td>{text}</td>"
+        body += "</tr>"
+    said = f'<p class="remark">{_text(remark)}</p>' if remark else ""
     table = f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{body}</tbody></table>"
-    return f'<section><h2>{title}</h2><div class="scroll">{table}</div></section>'
+    return f'<section><h2>{title}</h2>{said}<div class="scroll">{table}</div></section>'
 
 
 def _figure(section: ReportSection, number: int) -> str:

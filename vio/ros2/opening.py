@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from typing import Literal, TypeAlias
 
-from vio.errors import MissingDependencyError
+from vio.errors import MissingDependencyError, extra_text
 from vio.ros2.transport import Transport
 
 TransportName: TypeAlias = Literal["auto", "dds", "rclpy"]
@@ -28,8 +28,7 @@ def open_transport(name: TransportName = "auto", domain: int | None = None) -> T
     if importlib.util.find_spec("cyclonedds") is None:
         raise MissingDependencyError(
             "ROS 2 needs the package cyclonedds, or an installed ROS 2 whose setup.bash was "
-            "sourced; install it with: "
-            "pip install 'stereo-vio[ros2]'"
+            f"sourced; {extra_text('ros2')}"
         )
     from vio.ros2.dds import DdsTransport  # which needs the extra
 

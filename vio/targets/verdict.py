@@ -14,7 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vio.geometry.distortion import CameraModel, project_point, unproject_pixel
+from vio.geometry.distortion import (
+    CameraModel,
+    project_point,
+    unproject_pixel,
+    uv_D_camera,
+    uv_D_point,
+)
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, transform_points
 from vio.targets.bundle import (
     Adjusted,
@@ -23,8 +29,6 @@ from vio.targets.bundle import (
     RigFit,
     layout_of,
     lens_moved,
-    pixels_by_lens,
-    pixels_by_point,
 )
 from vio.targets.views import Sightings
 
@@ -98,8 +102,8 @@ def projection_sigma(
     uv = pixel_grid(camera)
     rays, valid = unproject_pixel(camera, uv)
     p = rays * (1.0 if distance_m is None else distance_m)
-    D = pixels_by_lens(camera, p, uv)
-    by_p = pixels_by_point(camera, p, uv)
+    D = uv_D_camera(camera, p)
+    by_p = uv_D_point(camera, p)
     motion = -by_p @ so3_hat(p)
     if distance_m is not None:
         motion = np.concatenate([by_p, motion], axis=2)
@@ -126,7 +130,7 @@ def projection_difference(a: CameraModel, b: CameraModel) -> FloatArray:
         there, seen = project_point(b, turned)
         both = valid & seen
         off = np.where(both[:, None], uv - there, np.nan)
-        D = (-pixels_by_point(b, turned, there) @ so3_hat(turned))[both].reshape(-1, 3)
+        D = (-uv_D_point(b, turned) @ so3_hat(turned))[both].reshape(-1, 3)
         R = so3_exp(np.linalg.lstsq(D, off[both].ravel(), rcond=None)[0]) @ R
     return np.asarray(np.linalg.norm(off, axis=1))
 
