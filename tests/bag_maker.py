@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -189,14 +189,19 @@ class Script:
         )
         self.add(topic, kind, time_ns, fields)
 
-    def write(self, path: Path, *, sort: bool = True) -> Path:
+    def write(self, path: Path, *, sort: bool = True, packed: bool = False) -> Path:
         """Write the bag, its messages sorted by their times of recording unless that order is to
-        be kept in which they were added; a ROS 2 bag is a folder.
+        be kept in which they were added; a ROS 2 bag is a folder. `packed`: each message of a ROS 2
+        bag is compressed.
         """
         store = STORES[self.storage]
         ros1 = self.storage == "bag"
         plugin = StoragePlugin.MCAP if self.storage == "mcap" else StoragePlugin.SQLITE3
-        with Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=plugin) as writer:
+        made = Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=plugin)
+        if packed:
+            assert isinstance(made, Writer2)
+            made.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+        with made as writer:
             pairs = dict.fromkeys([(n.topic, n.kind) for n in self.notes] + self.empty)
             connections = {pair: writer.add_connection(*pair, typestore=store) for pair in pairs}
             notes = sorted(self.notes, key=lambda n: n.logged_ns) if sort else self.notes

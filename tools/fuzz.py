@@ -31,17 +31,20 @@ import numpy as np
 import vio
 from vio.cli import main as vio_main
 from vio.config import Config
+from vio.datasets.rigs import load_rig
 from vio.errors import VioError
 from vio.geometry.stereo import StereoCamera
 from vio.live.live_odometry import LiveOdometry
-from vio.records import ImuSample
+from vio.records import ImuSample, StereoFrame
 from vio.ros2.sensors import Sensors, SensorTopics
 from vio.ros2.transport import Quality, publisher
 from vio.runs.folder import growing_folder
+from vio.runs.live_folder import LiveFolder, LiveRunSettings
 from vio.runs.pipeline import RunControl, run
 
 _MAX_S = 120.0  # that a case may take, on a busy computer
 _FRAMES = 8  # of a case
+_CHECKPOINT_S = 6.0  # longer than between two checkpoints
 _WRONG: tuple[Any, ...] = (
     None,
     True,
@@ -86,7 +89,7 @@ def _checksum(folder: Path) -> str:
 
 
 class Folders:
-    """Finished and stopped runs of a rendered flight, of which one file is changed."""
+    """Finished, stopped and killed live runs of a rendered flight, of which one file is changed."""
 
     def __init__(self, root: Path) -> None:
         """Render, and run."""
@@ -99,6 +102,26 @@ class Folders:
             vio_main([*command, "--out", str(root / "done")])
         self._log = root / "done" / "observations.npz"
         self._stop()
+        self._kill()
+
+    def _kill(self) -> None:
+        """Keep the folder of a live run as it is before its end."""
+        rig = load_rig(self._flight)
+        folder = LiveFolder(LiveRunSettings(self._root / "ended", "camera", True), Config(), rig)
+        with LiveOdometry(rig, Config(), drop="none", sink=folder) as live:
+            for event in vio.open_dataset(self._flight).events():
+                if isinstance(event, ImuSample):
+                    live.add_imu(event.time_ns, event.gyro, event.accel)
+                elif isinstance(event, StereoFrame) and event.left is not None:
+                    assert event.right is not None
+                    if event.index == _FRAMES // 2:
+                        time.sleep(_CHECKPOINT_S)  # after which a frame writes a checkpoint
+                    live.add_stereo(event.time_ns, event.left, event.right)
+            live.landmarks()  # which waits for all frames
+            folder.save()
+            time.sleep(1.0)
+            shutil.copytree(self._root / "ended", self._root / "killed")
+        folder.close()
 
     def _stop(self) -> None:
         dataset = vio.open_dataset(self._log)
@@ -117,7 +140,7 @@ class Folders:
 
     def __call__(self, rng: np.random.Generator) -> None:
         """Change a file of a run, and use the run."""
-        kind = str(rng.choice(["done", "stopped"]))
+        kind = str(rng.choice(["done", "stopped", "killed"]))
         place = self._root / "place"
         outside = self._root / "outside"
         for folder in (place, outside):
@@ -130,6 +153,7 @@ class Folders:
         commands = {
             "done": (["report", str(place)], ["eval", str(place), str(self._root / "done")]),
             "stopped": (["run", "--resume", str(place), "--quiet"],),
+            "killed": (["run", "--resume", str(place), "--quiet"],),
         }[kind]
         for command in commands:
             with _quietly() as printed:

@@ -6,7 +6,8 @@ RECORDING has stereo images, and an IMU where it has one. The node runs in a pro
 robot's would; this one plays the recording again and again in real time and disturbs it: lost and
 repeated messages, bursts, images of another size, steps of the clock, restarts of the publishers.
 Prints the node's memory as it goes on, how many poses came, how far from its start the largest was
-while nothing disturbed, with its standard deviation, and whether the node ended in order.
+while nothing disturbed, with its standard deviation, whether the node ended in order, and whether
+its run folders are whole.
 """
 
 from __future__ import annotations
@@ -30,7 +31,10 @@ from vio.datasets.bags.cdr import decoded
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.protocols import Dataset
 from vio.records import Event, ImuSample, StereoFrame
-from vio.ros2.transport import Transport, open_transport, publisher
+from vio.ros2.opening import open_transport
+from vio.ros2.transport import Transport, publisher
+from vio.runs.finished import read_finished_run
+from vio.runs.stated import read_metrics
 
 _LOOPBACK = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>
@@ -202,17 +206,21 @@ def _soak(
         seen.largest_m = 0.0
     lived = node.poll() is None
     if lived:
-        node.send_signal(signal.SIGINT)
+        # SIGINT is ignored where a shell started this program behind it
+        node.send_signal(signal.SIGTERM)
         node.wait(timeout=300)
-    files = sorted((root / "out").glob("trajectory*.tum")) if (root / "out").is_dir() else []
-    poses = sum(
-        not line.startswith("#") for file in files for line in file.read_text().splitlines()
+    folders = sorted(path.parent for path in root.glob("out*/metrics.json"))
+    whole = [folder for folder in folders if read_metrics(folder)[0]["complete"]]
+    poses = sum(len(read_finished_run(folder).trajectory) for folder in whole)
+    print(
+        f"lived {lived}, exit {node.returncode}, {len(folders)} run folders, {len(whole)} whole, "
+        f"of {poses} poses"
     )
-    print(f"lived {lived}, exit {node.returncode}, {len(files)} trajectories of {poses} poses")
     print((root / "node.txt").read_text(encoding="utf-8", errors="replace"))
     player.transport.close()
     watcher.close()
-    return 0 if lived and node.returncode == 0 and seen.poses else 1
+    kept = bool(folders) and len(whole) == len(folders)
+    return 0 if lived and node.returncode == 0 and seen.poses and kept else 1
 
 
 if __name__ == "__main__":

@@ -223,6 +223,8 @@ def test_a_recording_becomes_one_of_spectacular_ai(flight: Path, tmp_path: Path)
             sample.time_ns for sample in samples
         ]
     assert [row["number"] for row in rows if "frames" in row] == [0, 1, 2, 3, 4]
+    settings = (out / "vio_config.yaml").read_text()
+    assert "wrapper-base" in settings
     cameras = json.loads((out / "calibration.json").read_text())["cameras"]
     T0, T1 = (np.array(camera["imuToCamera"]) for camera in cameras)
     np.testing.assert_array_equal(T0, dataset.recording.T_cam0_imu)

@@ -190,6 +190,73 @@ def test_a_clock_set_back_does_not_mix_two_periods(
         np.testing.assert_array_equal(frame.right, right)
 
 
+def test_a_clock_set_back_in_a_bag_whose_messages_are_compressed(tmp_path: Path) -> None:
+    script = _with_clock_set_back("db3", 1_530_000_000, log_too=True)
+    packed = open_dataset(script.write(tmp_path / "packed", sort=False, packed=True))
+    plain = open_dataset(script.write(tmp_path / "plain", sort=False))
+    assert any("the clock was set back" in note for note in packed.recording.notes)
+    assert packed.recording.frame_times_ns.tolist() == plain.recording.frame_times_ns.tolist()
+    for one, other in zip(frames_of(packed), frames_of(plain), strict=True):
+        np.testing.assert_array_equal(one.left, other.left)
+
+
+def _with_clock_set_forward(step_ns: int, *topics: str) -> Script:
+    """A recording in which the clock behind the stamps of topics is set forward after 1.8 s."""
+    script = plain_script(frames=FRAMES)
+    rng = np.random.default_rng(3)
+    for k, note in enumerate(script.notes):
+        if note.topic == "/tf_static" or note.topic.endswith("info"):
+            continue
+        is_after = note.logged_ns >= START_NS + 1_800_000_000 and note.topic in topics
+        time_ns = note.logged_ns + (step_ns if is_after else 0)
+        note.fields.header.stamp.sec = time_ns // 10**9
+        note.fields.header.stamp.nanosec = time_ns % 10**9
+        logged_ns = note.logged_ns + int(rng.integers(2e6, 4e6))
+        script.notes[k] = replace(note, logged_ns=logged_ns)
+    return script
+
+
+SENSORS = ("/imu", "/left/image_raw", "/right/image_raw")
+
+
+@pytest.mark.parametrize("step_s", [0.3, 1.53, 1000.0])
+def test_a_clock_set_forward_leaves_no_gap(step_s: float, tmp_path: Path) -> None:
+    script = _with_clock_set_forward(round(step_s * 1e9), *SENSORS)
+    dataset = open_dataset(script.write(tmp_path / "f"))
+    times = dataset.recording.frame_times_ns
+    assert len(times) == FRAMES
+    np.testing.assert_allclose(1e-9 * np.diff(times), 0.05, atol=0.008)
+    (note,) = [note for note in dataset.recording.notes if "the clock was set" in note]
+    size_s = float(note.split("set forward by ")[1].split(" s")[0])
+    assert size_s == pytest.approx(step_s, abs=0.008)
+    assert all(topic in note for topic in SENSORS)
+    samples = _imu_of(dataset)
+    assert max(b.time_ns - a.time_ns for a, b in pairwise(samples)) < 2e7
+    first_ns = min(times[0], samples[0].time_ns)
+    whole = plain_script(frames=FRAMES)
+    expected = open_dataset(whole.write(tmp_path / "whole")).recording.frame_times_ns
+    np.testing.assert_allclose(times - first_ns, expected - first_ns, atol=8e6)
+
+
+@pytest.mark.parametrize("topics", [SENSORS[:1], SENSORS[1:2], SENSORS[1:]])
+def test_streams_that_leap_without_the_others_are_no_step(
+    topics: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Cameras whose latency falls as they lose frames look alike."""
+    script = _with_clock_set_forward(1_530_000_000, *topics)
+    recording = open_dataset(script.write(tmp_path / "f")).recording
+    assert not any("the clock was set" in note for note in recording.notes)
+
+
+def test_frames_and_samples_that_are_lost_are_no_step(tmp_path: Path) -> None:
+    script = _with_clock_set_forward(0)
+    gap = range(START_NS + 10**9, START_NS + 1_800_000_000)
+    script.notes = [note for note in script.notes if note.logged_ns not in gap]
+    recording = open_dataset(script.write(tmp_path / "gap")).recording
+    assert not any("the clock was set" in note for note in recording.notes)
+    assert np.diff(recording.frame_times_ns).max() > 7e8
+
+
 def test_messages_that_are_recorded_late_are_no_step(tmp_path: Path) -> None:
     """A burst of 30 readings, 150 ms, that arrives 200 ms late."""
     script = plain_script(frames=FRAMES)

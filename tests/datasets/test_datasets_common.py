@@ -5,6 +5,7 @@ readers.
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,10 @@ from tests.dataset_makers import (
     make_npz,
     utias_arrays,
 )
-from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets import MODULES, DatasetSettings, _detect, open_dataset, readers
 from vio.datasets.common import clock_ns, merge_events, read_npz, seconds_to_ns
 from vio.datasets.observation_log import write_observation_log
+from vio.datasets.reader import never
 from vio.errors import CalibrationError, ConfigError, DataError
 from vio.geometry.lie import checked_transform
 from vio.records import ImuSample, Recording, StereoFrame, VelocitySample
@@ -246,8 +248,8 @@ def test_a_path_with_a_colon_is_a_path_when_it_exists(
         ),
         ("kitti:nowhere", "nowhere does not exist"),
         ("kitti:", "names no path; write kitti:PATH"),
-        ("empty", "empty is empty; give a KITTI folder"),
-        ("other", "other: no known recording; looked for a KITTI folder"),
+        ("empty", "empty is empty; give a ROS bag .*, a KITTI folder"),
+        ("other", "other: no known recording; looked for a ROS bag .*, a KITTI folder"),
         ("root", re.escape("root holds several KITTI sequences")),
         ("text.txt", "text.txt: no known recording; looked for"),
         ("half.npz", "half.npz: is damaged"),
@@ -308,3 +310,52 @@ def test_a_place_that_may_not_be_read_is_an_error_in_one_line(
         monkeypatch.setattr("zipfile.is_zipfile", lambda _: True)
         with pytest.raises(DataError, match="Permission denied; give a readable file"):
             read_npz(path)
+
+
+OWN_READER = """
+from vio.datasets.plain import read_kitti
+from vio.datasets.reader import Reader
+
+READERS = (
+    Reader(
+        kind="mine",
+        looked_for="a folder with mine.txt",
+        read=read_kitti,
+        is_folder=lambda path: (path / "mine.txt").is_file(),
+    ),
+)
+"""
+
+
+def test_a_reader_is_one_file_and_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is found by content and by name, and named where nothing is found."""
+    (tmp_path / "my_readers").mkdir()
+    (tmp_path / "my_readers" / "__init__.py").touch()
+    (tmp_path / "my_readers" / "mine.py").write_text(OWN_READER)
+    monkeypatch.syspath_prepend(tmp_path)
+    folder = make_kitti(tmp_path / "recording")
+    assert open_dataset(folder).recording.kind == "kitti"
+    (folder / "mine.txt").touch()
+    monkeypatch.setattr("vio.datasets.MODULES", ["my_readers.mine", *MODULES])
+    assert _detect(folder) == "mine"
+    assert open_dataset(f"mine:{folder}").recording.camera.kind == "stereo"
+    (tmp_path / "nothing").mkdir()
+    (tmp_path / "nothing" / "a.txt").touch()
+    with pytest.raises(DataError, match=r"a folder with mine\.txt, a ROS bag"):
+        open_dataset(tmp_path / "nothing")
+    with pytest.raises(DataError, match="kind mine has its own"):
+        open_dataset(folder, DatasetSettings(calibration=folder / "calib.txt"))
+
+
+def test_every_kind_is_read_by_one_reader() -> None:
+    found = [reader for name in MODULES for reader in _module(name).READERS]
+    kinds = [reader.kind for reader in found]
+    assert len(set(kinds)) == len(kinds)
+    assert list(readers()) == kinds
+    for reader in found:
+        signs = (reader.is_folder, reader.may_be_folder, reader.is_file)
+        assert any(sign is not never for sign in signs), f"{reader.kind} is never found"
+
+
+def _module(name: str) -> Any:
+    return import_module(f"vio.datasets.{name}")

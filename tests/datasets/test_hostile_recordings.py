@@ -81,7 +81,7 @@ def _text(folder: Path) -> Path:
 
 
 BAD = {
-    "an empty folder": (_empty, "is empty; give a KITTI folder"),
+    "an empty folder": (_empty, "is empty; give a ROS bag"),
     "a file of another kind": (_text, r"a\.csv: no known recording"),
     "pickled arrays": (
         _npz(features=np.array([{}], dtype=object)),

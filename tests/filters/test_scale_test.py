@@ -120,3 +120,17 @@ def test_the_test_equals_a_filter_with_the_scale_as_a_state(scaled: bool) -> Non
     V = prior.error_D_constants[:, 0]
     np.testing.assert_allclose(V * s_sigma**2, covariance[:D, D])
     np.testing.assert_allclose(V * s - prior.delta, (covariance @ vector)[:D])
+
+
+def test_information_that_rounding_makes_negative_is_passed_over() -> None:
+    """Found by the soak, after a clock that stepped by an hour: complex standard deviations ended
+    the node.
+    """
+    test = ScaleTest()
+    before = test.estimate()
+    W = np.array([1e16])
+    P = np.array([[1e-16 * (1 + 1e-7)]])
+    test.absorb(np.ones(1), W, np.array([1e12]), P)
+    test.end_frame()
+    assert test.estimate() == before
+    assert not test.is_confirmed

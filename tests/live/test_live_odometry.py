@@ -7,6 +7,7 @@ from __future__ import annotations
 import gc
 import logging
 import threading
+import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -342,6 +343,21 @@ def test_reset_begins_a_new_trajectory() -> None:
     np.testing.assert_array_equal(*passes)
     with pytest.raises(ConfigError, match="drop='newest'"):
         LiveOdometry(CAMERA, drop="newest")  # type: ignore[arg-type]
+
+
+def test_a_reset_lets_the_trajectory_before_it_go() -> None:
+    """Found by the soak: the collector was told to pass over it, and 3 MiB stayed at each reset."""
+    _, seen = _events()
+    with LiveOdometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, drop="block") as live:
+        live.add_observations(0, seen[0].ids, seen[0].z)
+        live.landmarks()  # which waits for the frame
+        earlier = weakref.ref(live._odometry._processor.pipeline)
+        holding = [earlier()]
+        holding.append(holding)  # type: ignore[arg-type] # a cycle that holds it
+        del holding
+        gc.freeze()
+        live.reset()
+        assert earlier() is None
 
 
 def test_a_slow_computer_is_named_once(monkeypatch: pytest.MonkeyPatch) -> None:

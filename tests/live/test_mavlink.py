@@ -338,6 +338,34 @@ def test_positions_are_sent_without_a_velocity_where_asked_or_needed(
     assert caplog.text.count("no velocity is estimated") == lacks_velocity
 
 
+def test_unusable_poses_are_sent_by_the_message_that_can_say_so_alone(
+    autopilot: Autopilot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = LocalFrame.state
+    seen: list[int] = []
+
+    def state(self: LocalFrame, estimate: Estimate, trajectory: int) -> VehicleState:
+        seen.append(estimate.time_ns)
+        is_first = len(seen) == 1
+        word: Any = "unusable" if is_first else "degraded"
+        return original(self, replace(estimate, integrity=word), trajectory)
+
+    monkeypatch.setattr(LocalFrame, "state", state)
+    settings = MavlinkSettings(autopilot.address, "vision")
+    live = LiveOdometry(CAMERA, T_cam0_imu=T_CAM0_IMU, drop="block")
+    from_ns = time.monotonic_ns()
+    with MavlinkOutput(live, settings), live:
+        _fly(live, frames=4, from_ns=from_ns)
+    assert len(seen) >= 2
+    assert autopilot.until("VISION_POSITION_ESTIMATE").usec == seen[1] // 1000
+    seen.clear()
+    live = LiveOdometry(CAMERA, T_cam0_imu=T_CAM0_IMU, drop="block")
+    with MavlinkOutput(live, MavlinkSettings(autopilot.address)), live:
+        _fly(live, frames=4, from_ns=from_ns)
+    qualities = [autopilot.until("ODOMETRY").quality for _ in range(2)]
+    assert qualities == [-1, 50]
+
+
 def test_the_autopilot_learns_the_clock_of_the_stamps(autopilot: Autopilot) -> None:
     """As PX4's MavlinkTimesync does: it sends its own time, and halves the way there and back."""
     from_ns = time.time_ns()

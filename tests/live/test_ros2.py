@@ -30,15 +30,19 @@ from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
 from vio.datasets.rigs import load_rig
 from vio.errors import DataError, EstimationError, MissingDependencyError
 from vio.files.trajectories import read_trajectory
+from vio.findings import Integrity
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw
 from vio.live.live_odometry import LiveOdometry
 from vio.live.pairing import Pairing
-from vio.live.results import GrowingTrajectory
-from vio.records import ImuSample
+from vio.records import Estimate, ImuSample
 from vio.ros2.node import NodeSettings, run_node
+from vio.ros2.opening import open_transport
+from vio.ros2.outputs import FrameNames, Outputs
 from vio.ros2.play import play
 from vio.ros2.sensors import Sensors, SensorTopics, Silence, check_types
-from vio.ros2.transport import Quality, open_transport, publisher
+from vio.ros2.transport import Quality, publisher
+from vio.runs.finished import read_finished_run
+from vio.runs.live_folder import LiveRunSettings
 
 TOPICS = SensorTopics("/cam0/image_raw", "/cam1/image_raw", "/imu0")
 IMAGES_ALONE = replace(Config(), motion="none")
@@ -133,7 +137,8 @@ def test_the_node_gives_the_poses_of_the_file_run(
     receiver = Member(graph)
     for topic in topics:
         receiver.subscribe(topic, "", taken.setdefault(topic, []).append, "reliable")
-    settings = NodeSettings(TOPICS, quality="reliable", drop="block", out=tmp_path / "out")
+    kept = LiveRunSettings(tmp_path / "out", "/cam0/image_raw", waits=True)
+    settings = NodeSettings(TOPICS, quality="reliable", drop="block", kept=kept)
     times, poses = _file_run(flight)
     failures: list[Exception] = []
 
@@ -187,7 +192,10 @@ def test_the_node_gives_the_poses_of_the_file_run(
     assert {v.key: v.value for v in status.status[0].values}["dropped"] == "0"
     twist = decoded(taken["/vio/odometry"][-1], "nav_msgs/msg/Odometry", "o").twist
     assert 0 < twist.covariance[0] < 1
-    assert (tmp_path / "out" / "trajectory.tum").is_file()
+    run = read_finished_run(tmp_path / "out")
+    assert run.metrics["complete"]
+    np.testing.assert_allclose(run.estimates["T_world_imu"], poses, rtol=0, atol=tolerance)
+    assert len(run.points) > 10
     assert (tmp_path / "out" / "camchain-imucam.yaml").is_file()
 
 
@@ -327,7 +335,8 @@ def test_the_node_goes_on_after_a_reset_and_after_a_step_of_the_clock(
     graph, taken, done = Graph(), list[bytes](), threading.Event()
     receiver, player, asks = Member(graph), Member(graph), Member(graph)
     receiver.subscribe("/vio/odometry", "", taken.append, "reliable")
-    settings = NodeSettings(TOPICS, quality="reliable", drop="block", out=tmp_path)
+    kept = LiveRunSettings(tmp_path / "out", "/cam0/image_raw", waits=True)
+    settings = NodeSettings(TOPICS, quality="reliable", drop="block", kept=kept)
     node = threading.Thread(
         target=run_node,
         args=(Member(graph), settings, Config(), load_rig(flight)),
@@ -359,7 +368,9 @@ def test_the_node_goes_on_after_a_reset_and_after_a_step_of_the_clock(
     first_ns = int(dataset.recording.frame_times_ns[8]) + step_ns
     poses = [pose for pose in poses if pose[0] >= first_ns]
     assert len(poses) >= 6
-    saved = read_trajectory(tmp_path / "trajectory.tum")
+    folder = tmp_path / ("out-2" if what == "reset" else "out")
+    assert read_finished_run(folder).metrics["complete"]
+    saved = read_trajectory(folder / "trajectory.tum")
     assert saved.times_ns is not None
     if what == "reset":  # a new trajectory, from the origin
         np.testing.assert_allclose(poses[0][1][:3, 3], 0.0, atol=1e-9)
@@ -477,27 +488,36 @@ def test_the_fault_of_the_odometry_is_no_message_s() -> None:
         member.spin(0.0)
 
 
-def test_a_live_trajectory_grows_and_keeps_those_before(tmp_path: Path) -> None:
-    file = GrowingTrajectory(tmp_path / "out", "imu")
-    assert not file.has_poses
-    for k in range(3):
-        file.add(k * 10**8, np.eye(4))
-    file.flush()
-    assert len(read_trajectory(tmp_path / "out" / "trajectory.tum")) == 3
-    file.close()
-    file.add(10**9, np.eye(4))  # after a reset
-    file.add(2 * 10**9, np.eye(4))
-    file.close()
-    other = GrowingTrajectory(tmp_path / "out", "imu")  # of another process
-    for k in range(4):
-        other.add(k, np.eye(4))
-    other.close()
-    names = ("trajectory-1.tum", "trajectory-2.tum", "trajectory.tum")
-    assert [len(read_trajectory(tmp_path / "out" / name)) for name in names] == [3, 2, 4]
-    assert read_trajectory(tmp_path / "out" / "trajectory.tum").body == "imu"
-    (tmp_path / "file").touch()
-    with pytest.raises(DataError, match="cannot write"):
-        GrowingTrajectory(tmp_path / "file", "imu").add(0, np.eye(4))
+@pytest.mark.parametrize(("word", "level"), [("nominal", 0), ("degraded", 1), ("unusable", 2)])
+def test_diagnostics_have_the_integrity_of_the_estimate(
+    word: Integrity, level: int, flight: Path
+) -> None:
+    graph = Graph()
+    receiver = Member(graph)
+    taken: list[bytes] = []
+    receiver.subscribe("/diagnostics", "", taken.append, "reliable")
+    rig = load_rig(flight)
+    findings = () if word == "nominal" else ("images-frozen",)
+    with LiveOdometry(rig, Config(), drop="block") as odometry:
+        member = Member(graph)
+        sensors = Sensors(member, TOPICS, odometry, "reliable")
+        outputs = Outputs(
+            member, odometry, sensors, frames=FrameNames(), prefix="/vio", with_tf=False
+        )
+        estimate = Estimate(10**9, np.eye(4), np.eye(6), integrity=word, findings=findings)
+        for stream in odometry._streams.read():
+            stream.put(estimate)
+        while not taken:
+            receiver.spin(0.1)
+    outputs.finish()
+    status: Any = decoded(taken[0], "diagnostic_msgs/msg/DiagnosticArray", "d").status[0]
+    level_of_status = status.level
+    assert (
+        int(level_of_status[0] if isinstance(level_of_status, bytes) else level_of_status) == level
+    )
+    values = {v.key: v.value for v in status.values}
+    assert values["integrity"] == word
+    assert values["findings"] == ", ".join(findings)
 
 
 def test_silent_unknown_and_wrong_topics_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -531,6 +551,20 @@ def test_silent_unknown_and_wrong_topics_are_named(monkeypatch: pytest.MonkeyPat
 
 
 # The command line and the ways to the graph
+
+
+def test_the_ways_to_the_graph_import_no_one_that_imports_them() -> None:
+    """Also inside of functions."""
+    folder = Path(vio.__file__).parent / "ros2"
+    imports: dict[str, set[str]] = {}
+    for file in folder.glob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        imports[file.stem] = set(re.findall(r"^ *from vio\.ros2\.(\w+) import", text, re.MULTILINE))
+    assert imports["opening"] == {"transport", "dds", "rclpy_transport"}
+    while free := [name for name, others in imports.items() if not others & imports.keys()]:
+        for name in free:
+            del imports[name]
+    assert imports == {}
 
 
 @pytest.mark.parametrize(
@@ -700,7 +734,9 @@ def test_messages_pass_over_dds_and_late_ones_get_the_last(domain: int) -> None:
 @pytest.mark.slow
 @needs_dds
 @needs_loopback
-def test_three_processes_give_the_poses_of_the_file_run(flight: Path, domain: int) -> None:
+def test_three_processes_give_the_poses_of_the_file_run(
+    flight: Path, domain: int, tmp_path: Path
+) -> None:
     """Recording, node and this process, which receives; nothing is lost, and the poses are equal
     to the bit.
     """
@@ -717,8 +753,9 @@ def test_three_processes_give_the_poses_of_the_file_run(flight: Path, domain: in
         str(TOPICS.imu),
         "--reliable",
     ]
+    kept = ["--out", str(tmp_path / "out"), "--save-observations"]
     node = subprocess.Popen(
-        [*command, "ros2", *arguments, "--calibration", str(flight), "--drop", "block"],
+        [*command, "ros2", *arguments, *kept, "--calibration", str(flight), "--drop", "block"],
         stderr=subprocess.PIPE,
     )
     try:
@@ -739,6 +776,67 @@ def test_three_processes_give_the_poses_of_the_file_run(flight: Path, domain: in
     received = [_pose(data) for data in taken]
     assert [t for t, _ in received] == times
     np.testing.assert_array_equal([T[:3, 3] for _, T in received], poses[:, :3, 3])
+    run = read_finished_run(tmp_path / "out")
+    np.testing.assert_array_equal(run.estimates["T_world_imu"], poses)
+    assert run.metrics["complete"]
+    again = vio.run(vio.open_dataset(tmp_path / "out" / "observations.npz"), Config())
+    np.testing.assert_array_equal(again.trajectory.T_world_body, poses)
+
+
+@pytest.mark.slow
+@needs_dds
+@needs_loopback
+def test_a_node_that_is_killed_leaves_a_folder_that_can_be_finished(
+    flight: Path, domain: int, tmp_path: Path
+) -> None:
+    """By SIGKILL, while the recording is played to it again and again for longer than it takes to
+    write a checkpoint.
+    """
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "vio"]
+    arguments = ["--left", TOPICS.left, "--right", str(TOPICS.right), "--imu", str(TOPICS.imu)]
+    node = subprocess.Popen(
+        [*command, "ros2", *arguments, "--reliable", "--calibration", str(flight), "--out", out],
+        stderr=subprocess.DEVNULL,
+    )
+    player = open_transport("dds")
+    try:
+        play(
+            player,
+            Repeated(vio.open_dataset(flight), 200),
+            TOPICS,
+            rate=1.0,
+            quality="reliable",
+            should_stop=(out / "unfinished" / "checkpoint").is_file,
+        )
+        assert (out / "unfinished" / "checkpoint").is_file()
+        time.sleep(1.0)
+        node.kill()
+        node.wait()
+    finally:
+        player.close()
+        node.kill()
+    poses = read_trajectory(out / "trajectory.tum")
+    assert len(poses) > 10
+    subprocess.run([*command, "run", "--resume", out, "--quiet"], check=True)
+    run = read_finished_run(out)
+    assert run.metrics["stopped"] == "the program was ended"
+    assert len(run.trajectory) > 10
+    subprocess.run([*command, "report", out], check=True, stdout=subprocess.DEVNULL)
+
+
+class Repeated:
+    """A recording several times, a second later each time."""
+
+    def __init__(self, dataset: Any, times: int) -> None:
+        self._dataset = dataset
+        self._times = times
+        self.recording = dataset.recording
+
+    def events(self, start: int = 0, stop: int | None = None) -> Any:
+        for k in range(self._times):
+            for event in self._dataset.events(start, stop):
+                yield replace(event, time_ns=event.time_ns + k * 10**9)
 
 
 def test_the_files_for_colcon_name_the_command() -> None:

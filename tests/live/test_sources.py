@@ -24,13 +24,17 @@ import pytest
 
 import vio
 from tests.same_events import frames_of
+from vio.cameras.rig import Rig
 from vio.cli import main
 from vio.config import Config
 from vio.datasets.rigs import load_rig
+from vio.datasets.rigs.kalibr import kalibr_text
+from vio.datasets.settings import DatasetSettings
 from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.distortion import project_point
 from vio.records import ImuSample, StereoFrame
+from vio.runs.live_folder import LiveRunSettings
 from vio.sources.oak import OakSource
 from vio.sources.realsense import RealSenseSource
 from vio.sources.recorder import Form, Recorder
@@ -125,7 +129,7 @@ def test_recordings_have_all_digits_and_ending_early_keeps_everything(
         say=lambda _: None,
         record=kept,
         record_as=form,
-        out=out,
+        kept=LiveRunSettings(out, "camera"),
         drop="none",
     )
     assert source.closed
@@ -166,7 +170,7 @@ def test_a_camera_that_fails_leaves_the_trajectory_so_far(flight: Path, tmp_path
             None,
             should_stop=slow.should_stop,
             say=lambda _: None,
-            out=tmp_path / "out",
+            kept=LiveRunSettings(tmp_path / "out", "camera"),
             drop="none",
             on_start=slow.start,
         )
@@ -301,6 +305,37 @@ def test_a_realsense_made_by_its_library_gives_pairs_samples_and_calibration(
         open_source("realsense:12345")
     with pytest.raises(DataError, match="there is no such file"):
         open_source("realsense:nowhere.bag")
+
+
+def test_the_bag_of_realsenses_own_recorder_is_read_with_the_times_of_its_frames(
+    tmp_path: Path,
+) -> None:
+    """Its headers have the times of recording, its metadata those of the frames."""
+    pytest.importorskip(
+        "pyrealsense2", reason="pyrealsense2 or libusb is not installed", exc_type=ImportError
+    )
+    path = tmp_path / "camera.db3"
+    _record_realsense(path)
+    dataset = vio.open_dataset(path)
+    recording = dataset.recording
+    assert recording.frame_times_ns.tolist() == [10**9 + 50_000_000 * k for k in range(5)]
+    assert recording.camera.baseline_m == pytest.approx(0.05)
+    assert any("the times of the frames are taken" in note for note in recording.notes)
+    frames = [event for event in dataset.events() if isinstance(event, StereoFrame)]
+    for k, frame in enumerate(frames):
+        assert frame.left is not None
+        assert frame.right is not None
+        assert (frame.left[0, 0], frame.right[0, 0]) == (20 * k + 1, 20 * k + 2)
+    assert recording.motion == frozenset()
+    assert any("its pose in the camera is unknown" in note for note in recording.notes)
+    camera = recording.camera
+    rig = Rig.rectified(camera.fu, camera.fv, camera.cu, camera.cv, 0.05, 160, 90)
+    calibration = tmp_path / "camchain-imucam.yaml"
+    calibration.write_text(kalibr_text(replace(rig, T_cam0_imu=np.eye(4))))
+    dataset = vio.open_dataset(path, DatasetSettings(calibration=calibration))
+    samples = [event for event in dataset.events() if isinstance(event, ImuSample)]
+    assert [sample.time_ns for sample in samples[:3]] == [10**9 + 5_000_000 * j for j in range(3)]
+    np.testing.assert_allclose(samples[3].accel, [0.0, 3.0, 1.0])
 
 
 def _record_realsense(path: Path) -> None:

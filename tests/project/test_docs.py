@@ -581,6 +581,8 @@ def test_every_page_is_reached_from_the_readme() -> None:
 
 
 def _anchors(file: Path) -> set[str]:
-    """The anchors of a document's headings, as GitHub forms them."""
-    headings = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    """The anchors of a document's headings, as GitHub forms them, and those that it states."""
+    text = file.read_text(encoding="utf-8")
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    formed = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    return formed | set(re.findall(r'<a id="([\w-]+)"></a>', text))

@@ -1,7 +1,8 @@
 """Replay a recording with the SDK of Spectacular AI and write its poses.
 
 A program by itself: it runs in an environment that has the SDK and nothing of this project.
-`python spectacularai_player.py FOLDER ORIGIN_NS OUT.tum`, where times count from ORIGIN_NS.
+`python spectacularai_player.py FOLDER ORIGIN_NS OUT.tum`, where times count from ORIGIN_NS. Poses
+are those of the left camera: whether `pose` is the IMU's or the camera's depends on the settings.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ def main(folder: str, origin_ns: int, out: str) -> None:
     """Replay a folder and write the poses that are tracked."""
     import spectacularAI
 
-    lines = ["# body: imu"]
+    lines = ["# body: cam0"]
 
     def take(output: Any) -> None:
         if output.status != spectacularAI.TrackingStatus.TRACKING:
             return
-        pose = output.pose
+        pose = output.getCameraPose(0).pose
         p = pose.position
         q = pose.orientation
         time_ns = origin_ns + round(_NS * pose.time)

@@ -21,7 +21,7 @@ from vio.bench.identity import (
 )
 from vio.bench.suite import Sequence, Suite, config_of
 from vio.config import as_dict
-from vio.datasets import READERS
+from vio.datasets import readers
 from vio.errors import ConfigError, DataError
 from vio.files.trajectories import read_trajectory
 
@@ -193,7 +193,7 @@ def _common(
 def _source(text: str, data: Path) -> tuple[str, Path]:
     """Split `kind:path` into `kind:` (or nothing) and an absolute path."""
     head, colon, tail = text.partition(":")
-    if colon and head in READERS and not (data / text).exists():
+    if colon and head in readers() and not (data / text).exists():
         return f"{head}:", (data / tail).absolute()
     return "", (data / text).absolute()
 

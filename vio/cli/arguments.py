@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from vio.datasets.frame_times import Seconds
     from vio.live.build import MapUse
     from vio.mavlink.output import MavlinkSettings
+    from vio.runs.live_folder import LiveRunSettings
 
 _EXAMPLES = "examples:"
 
@@ -101,10 +102,35 @@ def add_map_arguments(parser: argparse.ArgumentParser) -> None:
         "--localise", action="store_true", help="find poses in --map, and leave it as it is"
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="write trajectory and calibration there at the end"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="run folder, as vio run writes it; it grows meanwhile",
+    )
+    parser.add_argument(
+        "--save-observations",
+        action="store_true",
+        help="with --out, also write the log of features",
     )
     parser.add_argument(
         "--drop", choices=("oldest", "none", "block"), default="oldest", help="of frames that wait"
+    )
+
+
+def kept_from(args: argparse.Namespace, source: str) -> LiveRunSettings | None:
+    """Return what is to be kept of a live run of a source; None: nothing."""
+    from vio.runs.live_folder import LiveRunSettings
+
+    if args.out is None:
+        if args.save_observations:
+            raise ConfigError("--save-observations needs --out DIR")
+        return None
+    return LiveRunSettings(
+        args.out,
+        source,
+        save_observations=args.save_observations,
+        waits=args.drop == "block",
+        command=args.command_line,
     )
 
 

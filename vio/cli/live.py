@@ -14,6 +14,7 @@ from vio.cli.arguments import (
     add_settings_arguments,
     config_from,
     examples,
+    kept_from,
     map_from,
     mavlink_from,
 )
@@ -68,6 +69,7 @@ def execute(args: argparse.Namespace) -> int:
     config = config_from(args)
     map_use = map_from(args)
     mavlink = mavlink_from(args)
+    kept = kept_from(args, args.source)
     rig = None
     if args.calibration is not None:
         rig = load_rig(args.calibration, cameras=1 if args.layout == "single" else 2)
@@ -101,7 +103,7 @@ def execute(args: argparse.Namespace) -> int:
             rig,
             should_stop=asked.reason,
             say=lambda line: print(line, file=sys.stderr, flush=True),
-            out=args.out,
+            kept=kept,
             record=args.record,
             record_as=args.record_as,
             map=map_use,

@@ -45,9 +45,9 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets import open_dataset
+    from vio.ros2.opening import open_transport
     from vio.ros2.play import play
     from vio.ros2.sensors import SensorTopics
-    from vio.ros2.transport import open_transport
 
     rate = _rate(args.rate)
     dataset = open_dataset(args.source)

@@ -13,6 +13,7 @@ from vio.cli.arguments import (
     add_mavlink_arguments,
     add_settings_arguments,
     config_from,
+    kept_from,
     map_from,
     mavlink_from,
 )
@@ -66,9 +67,9 @@ def add_transport_arguments(parser: argparse.ArgumentParser, reliable: str) -> N
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets.rigs import load_rig
     from vio.ros2.node import NodeSettings, run_node
+    from vio.ros2.opening import open_transport
     from vio.ros2.outputs import FrameNames
     from vio.ros2.sensors import SensorTopics
-    from vio.ros2.transport import open_transport
 
     config = config_from(args)
     map_use = map_from(args)
@@ -83,14 +84,15 @@ def execute(args: argparse.Namespace) -> int:
         if args.calibration is None
         else load_rig(args.calibration, cameras=1 if args.right is None else 2)
     )
+    topics = SensorTopics(args.left, args.right, args.imu)
     settings = NodeSettings(
-        SensorTopics(args.left, args.right, args.imu),
+        topics,
         FrameNames(*names),
         args.prefix.rstrip("/"),
         "reliable" if args.reliable else "sensor",
         args.drop,
         not args.no_tf,
-        args.out,
+        kept_from(args, " ".join(topics.kinds)),
         map_use,
         mavlink,
     )

@@ -40,6 +40,7 @@ from vio.runs.folder import (
     growing_folder,
     read_request,
 )
+from vio.runs.live_folder import finish_live_folder, is_live
 from vio.runs.pipeline import RunControl, RunResult, Viewers, given_rig, run
 from vio.runs.stated import RunRequest
 from vio.view.annotated import AnnotatedImage
@@ -184,6 +185,8 @@ def resume(
     """
     request = read_request(folder)
     check_out(folder)
+    if is_live(request):
+        return _finish_live(folder, request, shown)
     calibration = _named_again(
         folder,
         request.save_calibration,
@@ -215,6 +218,15 @@ def resume(
     if not saved:
         log.warning("%s: the run ended before its first checkpoint; it begins again", folder)
     return _process(dataset, config, folder, request, shown, resume=saved)
+
+
+def _finish_live(folder: Path, request: RunRequest, shown: Shown) -> dict[str, Any]:
+    """Write the results of a live run whose program was killed, and return its metrics."""
+    log.warning("%s: a live run cannot go on; its results so far are written", folder)
+    metrics = finish_live_folder(folder, request)
+    if shown.finished is not None:
+        shown.finished(metrics)
+    return metrics
 
 
 def _named_again(

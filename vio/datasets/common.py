@@ -356,3 +356,9 @@ def _open_npz(path: Path) -> Iterator[zipfile.ZipFile]:
         raise DataError(
             f"cannot read {path}: {error.strerror or error}; give a readable file"
         ) from error
+
+
+def begins_as_zip(path: Path) -> bool:
+    """Return whether a file begins as an archive such as `.npz`."""
+    with path.open("rb") as stream:
+        return stream.read(2) == b"PK"

@@ -20,6 +20,7 @@ import numpy as np
 
 from vio.calibration.lever_arm import LeverArmVerdict, judge_lever_arms
 from vio.datasets.common import (
+    begins_as_zip,
     check_intrinsics,
     clock_ns,
     finite_rows,
@@ -29,6 +30,7 @@ from vio.datasets.common import (
     shape_text,
 )
 from vio.datasets.features import FeatureDataset
+from vio.datasets.reader import Reader
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings, ExtrinsicsMode
 from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
@@ -241,3 +243,13 @@ def _explain(verdict: LeverArmVerdict, t: FloatArray) -> str:
         "(+1); "
         "corrected to t = -R t (dataset.extrinsics=literal keeps it)"
     )
+
+
+READERS = (
+    Reader(
+        kind="ece276a",
+        looked_for="an ECE276A .npz",
+        read=read_ece276a,
+        is_file=begins_as_zip,  # a log of observations is asked for before
+    ),
+)

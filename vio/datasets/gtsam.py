@@ -19,6 +19,7 @@ import numpy as np
 
 from vio.datasets.common import naming
 from vio.datasets.features import FeatureDataset
+from vio.datasets.reader import Reader
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import refuse_swapped
 from vio.errors import CalibrationError, DataError
@@ -173,3 +174,14 @@ def _reference(path: Path, numbers: IntArray, times_ns: IntArray) -> Trajectory:
     return Trajectory(
         T_world_cam[in_poses], times_ns[in_frames], "cam0", in_frames.astype(np.int64)
     )
+
+
+READERS = (
+    Reader(
+        kind="gtsam",
+        looked_for="GTSAM's stereo factors (*stereo_factors*.txt)",
+        read=read_gtsam,
+        is_folder=lambda path: bool(factor_files(path)),
+        is_file=is_factor_file,
+    ),
+)

@@ -10,6 +10,7 @@ needs the first six of them only.
 from __future__ import annotations
 
 import io
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias, cast, get_args
@@ -18,8 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.cameras.rig import Rig
-from vio.datasets.common import read_npz, shape_text
+from vio.datasets.common import begins_as_zip, read_npz, shape_text
 from vio.datasets.features import FeatureDataset
+from vio.datasets.reader import Reader
 from vio.datasets.samples import MotionSamples
 from vio.datasets.samples import motion_samples as as_arrays
 from vio.datasets.settings import DatasetSettings
@@ -440,3 +442,29 @@ def _landmarks(arrays: Mapping[str, np.ndarray]) -> Landmarks | None:
     return Landmarks(
         arrays["landmark_ids"], arrays["landmark_p_world"], arrays["landmark_covariance"]
     )
+
+
+def _is_log(path: Path) -> bool:
+    """Whether a file is a log, by the names of its members.
+
+    Raises:
+        DataError: it is a damaged `.npz`.
+    """
+    if not begins_as_zip(path):
+        return False
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+    except (zipfile.BadZipFile, OSError) as error:
+        raise DataError(f"{path}: is damaged ({error}); copy it again") from error
+    return is_observation_log(names)
+
+
+READERS = (
+    Reader(
+        kind="log",
+        looked_for="an observation log .npz",
+        read=read_observation_log,
+        is_file=_is_log,
+    ),
+)

@@ -28,11 +28,13 @@ from vio.datasets.companions import (
     find_calibration_of,
     read_companions,
 )
+from vio.datasets.euroc import is_euroc_folder, read_euroc
 from vio.datasets.image_files import FilePairs
 from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
 from vio.datasets.image_times import frame_times, pair_files, times_of
 from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_gray
 from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
+from vio.datasets.reader import Reader
 from vio.datasets.rigs import find_calibration, kitti_rig, load_rig
 from vio.datasets.rigs.bare import NAMES as BARE_NAMES
 from vio.datasets.settings import DatasetSettings
@@ -524,3 +526,65 @@ def _frame_numbers(pairs: ImagePairs) -> IntArray:
             "same number of digits"
         )
     return numbers
+
+
+def _is_side_by_side(path: Path) -> bool:
+    return side_by_side(path) is not None
+
+
+def _is_mono_of_euroc(path: Path) -> bool:
+    return is_euroc_folder(path) and not is_plain_folder(path) and is_mono_folder(path)
+
+
+def _is_euroc(path: Path) -> bool:
+    if is_kitti_folder(path) or not is_euroc_folder(path):
+        return False
+    return not _is_mono_of_euroc(path) and not lacks_sensor_yaml(path)
+
+
+READERS = (
+    Reader(
+        kind="kitti",
+        looked_for="a KITTI folder (image_0 image_1 calib.txt times.txt)",
+        read=read_kitti,
+        is_folder=lambda path: is_kitti_folder(path) and not holds_more_than_kitti(path),
+        calibrated_as="plain",
+    ),
+    Reader(
+        kind="kitti_raw",
+        looked_for="a KITTI raw drive (image_00 image_01)",
+        read=read_kitti_raw,
+        is_folder=lambda path: is_kitti_raw_folder(path) and not is_kitti_folder(path),
+        calibrated_as="plain",
+    ),
+    Reader(
+        kind="rgbd",
+        looked_for="one camera with depth images (rgb.txt depth.txt, or left depth)",
+        read=read_rgbd,
+        may_be_folder=is_rgbd_folder,
+        calibrated_as="rgbd",
+    ),
+    Reader(
+        kind="euroc",
+        looked_for="an EuRoC folder (mav0)",
+        read=read_euroc,
+        is_folder=_is_euroc,
+        calibrated_as="plain",
+    ),
+    Reader(
+        kind="plain",
+        looked_for="a plain folder (left right and a calibration)",
+        read=read_plain,
+        is_folder=is_plain_folder,
+        may_be_folder=_is_side_by_side,
+        calibrated_as="plain",
+    ),
+    Reader(
+        kind="mono",
+        looked_for="one camera (left or cam0, a calibration and an IMU)",
+        read=read_mono,
+        is_folder=_is_mono_of_euroc,
+        may_be_folder=is_mono_folder,
+        calibrated_as="mono",
+    ),
+)

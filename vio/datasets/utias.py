@@ -16,6 +16,7 @@ import numpy as np
 
 from vio.datasets.common import check_array_bytes, clock_ns, finite_rows, naming, shape_text
 from vio.datasets.features import FeatureDataset
+from vio.datasets.reader import Reader
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
@@ -172,3 +173,13 @@ def _landmarks(arrays: Mapping[str, FloatArray], path: Path, count: int) -> Land
         return None
     p = _finite(arrays, "rho_i_pj_i", path, count)
     return Landmarks(np.arange(count), p, np.zeros((count, 3, 3)))
+
+
+def _is_matlab_file(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(6) == b"MATLAB"
+
+
+READERS = (
+    Reader(kind="utias", looked_for="a UTIAS .mat", read=read_utias, is_file=_is_matlab_file),
+)

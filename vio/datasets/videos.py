@@ -21,6 +21,7 @@ from vio.datasets.companions import find_calibration_of, read_companions
 from vio.datasets.image_pairs import ImageRecording, half_of
 from vio.datasets.image_times import times_of
 from vio.datasets.images import prefetch
+from vio.datasets.reader import Reader
 from vio.datasets.rigs import load_rig
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.sides import pairs_of
@@ -198,3 +199,20 @@ class VideoDataset(ImageRecording):
         code = cv2.COLOR_BGR2RGB if self.colour else cv2.COLOR_BGR2GRAY
         image: Image = np.asarray(pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, code))
         return image
+
+
+def _is_pair(path: Path) -> bool:
+    files = video_files(path)
+    return files is not None and files[0] != files[1]
+
+
+READERS = (
+    Reader(
+        kind="video",
+        looked_for="two videos (left.mp4 right.mp4)",
+        read=read_video,
+        is_folder=_is_pair,
+        may_be_folder=lambda path: video_files(path) is not None,
+        calibrated_as="video",
+    ),
+)

@@ -83,8 +83,14 @@ class ScaleTest:
             W: their information (D, D) times V, (D,).
             remaining: their information vector (D,) at the means after them.
             P: covariance of the errors (D, D) after them.
+
+        What they say is 0 or more; where positions are known to kilometres only, after a clock that
+        stepped by an hour, rounding may leave less than the start had, and they are passed over.
         """
-        self._information += float(V @ W - W @ P @ W)
+        information = self._information + float(V @ W - W @ P @ W)
+        if not information >= _SIGMA**-2:
+            return
+        self._information = information
         self._vector += float(V @ remaining)
 
     def estimate(self) -> tuple[float, float]:

@@ -27,6 +27,7 @@ from vio.live.figures import LiveFigures, LiveMonitor
 from vio.live.inputs import GivenFrame, Inputs, checked_time
 from vio.live.odometry import Odometry
 from vio.live.prediction import PredictedPose, SharedPredictor
+from vio.live.sink import LiveSink
 from vio.live.warm_up import warm_up
 from vio.live.worker import DROPS, Drop, QuietCollector, Worker, WorkerState
 from vio.records import Estimate, FrameResult, Landmarks, MotionSample
@@ -145,6 +146,7 @@ class LiveOdometry(EventInputs[None]):
         queue_frames: int = 3,
         keep_landmarks: int = 100_000,
         copy_images: bool = True,
+        sink: LiveSink | None = None,
     ) -> None:
         """Start the worker; the first frame begins the trajectory.
 
@@ -160,6 +162,7 @@ class LiveOdometry(EventInputs[None]):
             keep_landmarks: of the points that do not change any more, how many are kept for
                 `landmarks`, at least.
             copy_images: False: the caller does not write into an array again that it has added.
+            sink: keeps the results, as `vio.runs.live_folder.LiveFolder`.
 
         Raises:
             VioError: as `Odometry`.
@@ -182,8 +185,9 @@ class LiveOdometry(EventInputs[None]):
         self.camera = odometry.camera
         self.T_cam0_body = odometry.T_cam0_body
         self.motion = odometry.motion
-        self._T_cam0_imu = rig.T_rect0_imu if isinstance(rig, Rig) else T_cam0_imu
+        self.T_cam0_imu = odometry.T_cam0_imu
         self._on_frame = on_frame
+        self._sink = sink
         self._with_map = use is not None
         self._predictor = SharedPredictor(self._config.msckf.gravity_mps2)
         self._monitor = LiveMonitor(judges_latency=drop != "block")
@@ -193,7 +197,7 @@ class LiveOdometry(EventInputs[None]):
         self._keep_landmarks = keep_landmarks
         self._copies = copy_images
         self._lines: list[str] = []
-        self._worker = Worker(queue_frames, drop, finish=self._odometry.finish, close=self._let_go)
+        self._worker = Worker(queue_frames, drop, finish=self._finish, close=self._let_go)
 
     def warm_up(self) -> None:
         """Process made-up images of the camera's size, so that the first frame takes no longer than
@@ -208,7 +212,7 @@ class LiveOdometry(EventInputs[None]):
         self._worker.ask(self._warm_up)
 
     def _warm_up(self) -> None:
-        warm_up(self.camera, self._T_cam0_imu, self._config, with_map=self._with_map)
+        warm_up(self.camera, self.T_cam0_imu, self._config, with_map=self._with_map)
         self._odometry.prepare()
         self._collector.hold()
 
@@ -227,6 +231,8 @@ class LiveOdometry(EventInputs[None]):
         """
         if isinstance(given, GivenFrame):
             self._monitor.arrived(given.time_ns)
+            if self._sink is not None:
+                self._sink.given(given.index, given.time_ns)
             self._monitor.queued(fits=self._worker.put(lambda: self._process(given), frame=True))
         elif given is not None:
             self._worker.put(lambda: self._process(given))
@@ -243,10 +249,12 @@ class LiveOdometry(EventInputs[None]):
         self._worker.ask(self._reset)
 
     def _reset(self) -> None:
+        self._end_trajectory(is_last=False)
         self._odometry.reset()
         for stream in self._streams.read():
             stream.reset()
         self._forget()
+        self._collector.renew()
 
     def _forget(self) -> None:
         """Begin with an empty trajectory."""
@@ -352,12 +360,29 @@ class LiveOdometry(EventInputs[None]):
 
     def _process(self, given: GivenFrame | Sequence[MotionSample]) -> None:
         """Process what was added; what only the odometry itself refuses is counted and logged."""
+        if self._sink is not None and not isinstance(given, GivenFrame):
+            self._sink.samples(given)
         try:
             self._odometry.take(given)
         except DataError as error:
             self._monitor.refused += 1
             self._say(str(error))
+        if self._sink is not None:
+            self._sink.corrections(self._odometry)
         self._predictor.catch_up()
+
+    def _finish(self) -> None:
+        """Process the frames that still wait."""
+        self._odometry.finish()
+        if self._sink is not None:
+            self._sink.corrections(self._odometry)
+
+    def _end_trajectory(self, *, is_last: bool) -> None:
+        """Let the results so far be written."""
+        if self._sink is not None:
+            failure = self._worker.failure
+            text = None if failure is None else str(failure)
+            self._sink.end(self._odometry, failure=text, is_last=is_last)
 
     def _take_result(self, result: FrameResult) -> None:
         """Hand the result of a frame to all who wait for it."""
@@ -367,6 +392,8 @@ class LiveOdometry(EventInputs[None]):
             self._say(line)
         for stream in self._streams.read():
             stream.put(result.estimate)
+        if self._sink is not None:
+            self._sink.frame(result, self._odometry)
         if self._on_frame is not None:
             try:
                 self._on_frame(result)
@@ -381,7 +408,10 @@ class LiveOdometry(EventInputs[None]):
         """Take the points that will not change any more from the filter, which would keep all of
         them.
         """
-        self._points.append(self._odometry.take_landmarks())
+        settled = self._odometry.take_landmarks()
+        self._points.append(settled)
+        if self._sink is not None:
+            self._sink.points(settled)
         while (
             sum(len(part.ids) for part in self._points) - len(self._points[0].ids)
             >= self._keep_landmarks
@@ -391,6 +421,7 @@ class LiveOdometry(EventInputs[None]):
     def _let_go(self) -> None:
         """Write the map, and leave no iterator waiting."""
         try:
+            self._end_trajectory(is_last=True)
             self._odometry.close()
         finally:
             self._collector.release()

@@ -45,6 +45,8 @@ from vio.records import (
 
 if TYPE_CHECKING:
     from vio.cameras.rig import Rectifier
+    from vio.mapping.session import MapSession
+    from vio.monitor.integrity import Mark
 
 
 class Odometry(EventInputs["Estimate | None"]):
@@ -112,6 +114,7 @@ class Odometry(EventInputs["Estimate | None"]):
         # Extrinsics (4, 4) of the estimated body in the rectified left camera, and what propagates
         # its pose between frames; None: images alone.
         self.T_cam0_body = self._source.T_cam0_body
+        self.T_cam0_imu = T_cam0_imu  # (4, 4); None: without, the body is the left camera
         self.motion = self._source.motion
         self._parts = parts
         self._map = MapUse(Path(map), localise) if isinstance(map, (str, Path)) else map
@@ -246,6 +249,11 @@ class Odometry(EventInputs["Estimate | None"]):
         return () if session is None else tuple(session.loops)
 
     @property
+    def map_session(self) -> MapSession | None:
+        """The present trajectory's part of the map; None: there is no map."""
+        return self._processor.map
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What the checks have found so far, one line each."""
         return tuple(self._processor.pipeline.monitor.lines)
@@ -303,6 +311,14 @@ class Odometry(EventInputs["Estimate | None"]):
         """
         with self._lock:
             return self._processor.pipeline.backend.smoothed(frame_index)
+
+    def take_corrections(self) -> tuple[dict[int, Estimate], tuple[Mark, ...]]:
+        """Return what has changed of earlier frames, and forget it: estimates that replace others,
+        by frame number, and marks of frames in which a fault had begun before it was found.
+        """
+        with self._lock:
+            pipeline = self._processor.pipeline
+            return pipeline.take_revised(), pipeline.monitor.take_marks()
 
     def __enter__(self) -> Odometry:
         return self

@@ -183,6 +183,11 @@ class Worker:
             return "failed"
         return "closed" if self._queue.is_closed else "running"
 
+    @property
+    def failure(self) -> Exception | None:
+        """What the worker failed with; None: it has not."""
+        return self._failure
+
     def put(self, make: Callable[[], object], *, frame: bool = False) -> bool:
         """Add a call; False: a frame that waited was left out for it.
 
@@ -307,6 +312,14 @@ class QuietCollector:
                     gc.set_threshold(_YOUNG, *QuietCollector._before[1:])
                 QuietCollector._users += 1
                 self._holds = True
+
+    def renew(self) -> None:
+        """Search everything once more, as after a reset: what was held before and is no longer
+        used has cycles, which would stay for ever.
+        """
+        gc.unfreeze()
+        if self._holds:
+            self.hold()
 
     def release(self) -> None:
         """Let the collector do as before."""

@@ -115,6 +115,9 @@ class MavlinkOutput:
             return
         if self._settings.message == "odometry":
             self._say("no velocity is estimated: VISION_POSITION_ESTIMATE is sent, not ODOMETRY")
+        if state.quality < 0:  # which this message cannot state
+            self._say("poses that are unusable are not sent, as their message has no quality")
+            return
         with self._sending:
             self._mav.vision_position_estimate_send(
                 time_us,

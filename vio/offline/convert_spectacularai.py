@@ -1,5 +1,5 @@
-"""Write a recording as Spectacular AI's SDK replays it: `data.jsonl`, `calibration.json`, and a
-video without loss for each camera.
+"""Write a recording as Spectacular AI's SDK replays it: `data.jsonl`, `calibration.json`,
+`vio_config.yaml`, and a video without loss for each camera.
 
 Times are seconds from the first event. `imuToCamera` maps points of the IMU to the camera. The
 images are rectified, so that the cameras are pinholes without distortion.
@@ -22,8 +22,17 @@ from vio.records import NS_PER_S, Image, ImuSample, Recording, StereoFrame
 
 DATA = "data.jsonl"
 CALIBRATION = "calibration.json"
+CONFIG = "vio_config.yaml"
 VIDEOS = ("data.avi", "data2.avi")  # left and right, as the SDK looks for them
 _CODEC = "FFV1"
+# What `sai-cli process` sets for a recording. A folder without it is replayed with the bare
+# defaults of the estimator, which no wrapper of the SDK uses: on EuRoC MH_01, 0.024 m for 0.013 m.
+_SETTINGS = """\
+parameterSets: ["wrapper-base", "offline-base"]
+useSlam: true
+maxKeypoints: 1000
+optimizerMaxIterations: 30
+"""
 
 
 def write_spectacularai(
@@ -79,6 +88,7 @@ def write_spectacularai(
     write_text(out / DATA, "\n".join([*lines, ""]))
     text = json.dumps(calibration(recording), indent=2)
     write_text(out / CALIBRATION, text + "\n")
+    write_text(out / CONFIG, _SETTINGS)
     return frames, samples, origin_ns or 0
 
 

@@ -9,7 +9,6 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 from vio.cameras.rig import Rig
 from vio.config import Config
@@ -22,6 +21,7 @@ from vio.ros2.calibration import CameraInfos
 from vio.ros2.outputs import RESET, SAVE, FrameNames, Outputs
 from vio.ros2.sensors import SILENT_S, Sensors, SensorTopics, Silence, check_types
 from vio.ros2.transport import Quality, Transport
+from vio.runs.live_folder import LiveFolder, LiveRunSettings
 
 log = logging.getLogger(__name__)
 
@@ -40,8 +40,7 @@ class NodeSettings:
     quality: Quality = "sensor"
     drop: Drop = "oldest"  # see `LiveOdometry`
     with_tf: bool = True
-    # folder for the trajectory, which grows, and the calibration, at the end and on request
-    out: Path | None = None
+    kept: LiveRunSettings | None = None  # run folder, which grows
     map: MapUse | None = None
     mavlink: MavlinkSettings | None = None  # where poses also go
 
@@ -55,11 +54,12 @@ def run_node(
     should_stop: Callable[[], object],
     say: Callable[[str], None],
 ) -> None:
-    """Run until it is asked to stop; the map and the trajectory are written as they come, and
+    """Run until it is asked to stop; the map and the run folder are written as results come, and
     finished however the node ends.
 
     Raises:
-        VioError: a topic has another type, or the estimation has failed.
+        VioError: a topic has another type, the estimation has failed, or the folder could not be
+            written, which ends nothing before.
     """
     topics = settings.topics
     check_types(topics.kinds, transport)
@@ -75,7 +75,10 @@ def run_node(
         )
     outputs: Outputs | None = None
     others = contextlib.ExitStack()
-    odometry = LiveOdometry(found, config, drop=settings.drop, map=settings.map, copy_images=False)
+    folder = None if settings.kept is None else LiveFolder(settings.kept, config, found)
+    odometry = LiveOdometry(
+        found, config, drop=settings.drop, map=settings.map, copy_images=False, sink=folder
+    )
     try:
         with others, odometry:  # which is closed first
             say("warming up")
@@ -90,9 +93,8 @@ def run_node(
                 frames=settings.frames,
                 prefix=settings.prefix,
                 with_tf=settings.with_tf,
-                out=settings.out,
             )
-            _take_requests(transport, settings, odometry, outputs)
+            _take_requests(transport, settings, odometry, folder)
             say(f"ready: {', '.join(topics.kinds)} to {settings.prefix}")
             silence = Silence(topics.kinds)
             while not should_stop():
@@ -103,11 +105,16 @@ def run_node(
                 outputs.check()
     finally:
         if outputs is not None:
-            outputs.finish(settings.out)
+            outputs.finish()
+        if folder is not None:
+            folder.close()
 
 
 def _take_requests(
-    transport: Transport, settings: NodeSettings, odometry: LiveOdometry, outputs: Outputs
+    transport: Transport,
+    settings: NodeSettings,
+    odometry: LiveOdometry,
+    folder: LiveFolder | None,
 ) -> None:
     """Subscribe to the topics of reset and save; what cannot be done is said, and ends nothing."""
 
@@ -119,20 +126,17 @@ def _take_requests(
             log.warning("reset: %s", error)
 
     def save(_: bytes) -> None:
-        try:
-            _save(outputs, settings)
-        except VioError as error:
-            log.warning("save: %s", error)
+        if folder is None:
+            log.warning(
+                "save was asked for, but the node has no folder; start it with --out FOLDER"
+            )
+        elif folder.has_poses:
+            folder.save()
+        else:
+            log.warning("save: there is no pose yet, nothing was written")
 
     transport.subscribe(f"{settings.prefix}/{RESET}", _EMPTY, reset, "reliable")
     transport.subscribe(f"{settings.prefix}/{SAVE}", _EMPTY, save, "reliable")
-
-
-def _save(outputs: Outputs, settings: NodeSettings) -> None:
-    if settings.out is None:
-        log.warning("save was asked for, but the node has no folder; start it with --out FOLDER")
-    else:
-        outputs.save(settings.out)
 
 
 def _awaited(

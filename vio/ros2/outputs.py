@@ -1,6 +1,4 @@
-"""What the node publishes: odometry, frames, path, landmarks, diagnostics; and the files that it
-writes.
-"""
+"""What the node publishes: odometry, frames, path, landmarks, diagnostics."""
 
 from __future__ import annotations
 
@@ -9,7 +7,6 @@ import logging
 import threading
 from collections import deque
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -18,8 +15,7 @@ from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.interop.ros import to_fixed_axes_covariance
 from vio.live.live_odometry import EstimateStream, LiveOdometry
-from vio.live.results import GrowingTrajectory, live_body, live_trajectory, write_calibration
-from vio.records import NS_PER_S, Estimate
+from vio.records import NS_PER_S, BodyFrame, Estimate, Trajectory
 from vio.ros2.sensors import Sensors
 from vio.ros2.transport import Transport, publisher
 
@@ -66,9 +62,8 @@ class Outputs:
         frames: FrameNames,
         prefix: str,
         with_tf: bool,
-        out: Path | None = None,
     ) -> None:
-        """Advertise, and begin to publish, and to write the trajectory into the folder `out`."""
+        """Advertise, and begin to publish."""
         self._odometry = odometry
         self._sensors = sensors
         self._frames = frames
@@ -80,8 +75,6 @@ class Outputs:
         late = (self._names[PATH], self._names[POINTS])
         self._out = publisher(transport, topics, latched=late)
         self._recent: deque[tuple[int, FloatArray]] = deque(maxlen=_PATH_POSES)
-        self._file = None if out is None else GrowingTrajectory(out, live_body(odometry))
-        self._save_asked = threading.Event()
         self._failure: Exception | None = None
         self._slow_ns: int | None = None  # newest time of path, landmarks and diagnostics
         self._thread = threading.Thread(
@@ -90,7 +83,7 @@ class Outputs:
         self._thread.start()
 
     def check(self) -> None:
-        """Raise what publishing or writing has failed with.
+        """Raise what publishing has failed with.
 
         Raises:
             Exception: that error.
@@ -98,26 +91,9 @@ class Outputs:
         if self._failure is not None:
             raise self._failure
 
-    def finish(self, folder: Path | None) -> None:
-        """Publish and write what is left, after the odometry was closed or has failed, and the
-        calibration.
-        """
+    def finish(self) -> None:
+        """Publish what is left, after the odometry was closed or has failed."""
         self._thread.join()
-        if self._file is None or folder is None:
-            return
-        if not self._file.has_poses:
-            log.warning("%s: there is no pose yet, nothing was written", folder)
-            return
-        self._file.close()
-        write_calibration(folder, self._odometry)
-
-    def save(self, folder: Path) -> None:
-        """Bring the trajectory so far to the disk and, once it is estimated, the calibration."""
-        if self._file is None or not self._file.has_poses:
-            log.warning("%s: there is no pose yet, nothing was written", folder)
-            return
-        self._save_asked.set()
-        write_calibration(folder, self._odometry)
 
     def _run(self, estimates: EstimateStream) -> None:
         trajectory = 0
@@ -127,21 +103,10 @@ class Outputs:
                     trajectory = estimates.trajectory
                     self._recent.clear()
                     self._slow_ns = None
-                    if self._file is not None:
-                        self._file.close()
-                self._write(estimate)
                 self._publish(estimate)
             except Exception as error:  # noqa: BLE001 # raised by `check`
                 self._failure = error
                 return
-
-    def _write(self, estimate: Estimate) -> None:
-        if self._file is None:
-            return
-        self._file.add(estimate.time_ns, estimate.T_world_imu)
-        if self._save_asked.is_set():
-            self._save_asked.clear()
-            self._file.flush()
 
     def _publish(self, estimate: Estimate) -> None:
         time_ns = estimate.time_ns
@@ -168,10 +133,7 @@ class Outputs:
             self._publish_slowly(time_ns, estimate)
 
     def _publish_slowly(self, time_ns: int, estimate: Estimate) -> None:
-        recent = list(self._recent)
-        self._out.path(
-            self._names[PATH], self._frames.odom, live_trajectory(self._odometry, recent), time_ns
-        )
+        self._out.path(self._names[PATH], self._frames.odom, self._path(), time_ns)
         figures = self._odometry.figures
         with contextlib.suppress(VioError):  # the odometry is being closed
             points = self._odometry.landmarks()
@@ -195,6 +157,12 @@ class Outputs:
         text = warnings[-1] if warnings else "running"
         level = max(INTEGRITIES.index(integrity), 1 if warnings else 0)
         self._out.diagnostics("vio", time_ns, level, text, values)
+
+    def _path(self) -> Trajectory:
+        """Return the newest poses."""
+        body: BodyFrame = "cam0" if self._odometry.T_cam0_imu is None else "imu"
+        times_ns = np.array([time_ns for time_ns, _ in self._recent], dtype=np.int64)
+        return Trajectory(np.array([T for _, T in self._recent]), times_ns, body)
 
     def _twist(self, estimate: Estimate) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return linear and angular velocity (3,) of the body in its own axes, and their

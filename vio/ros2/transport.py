@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, Protocol, TypeAlias
 
 from vio.datasets.bags.writer import BagWriter
-from vio.errors import MissingDependencyError, extra_text
 
 # "sensor": unreliable, as drivers publish; "reliable": none is lost, and the sender waits for a
 # slow receiver; "latched": whoever comes late gets the last message.
 Quality: TypeAlias = Literal["sensor", "reliable", "latched"]
-TransportName: TypeAlias = Literal["auto", "dds", "rclpy"]
 
 
 class Transport(Protocol):
@@ -40,30 +37,6 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """Leave the graph."""
-
-
-def open_transport(name: TransportName = "auto", domain: int | None = None) -> Transport:
-    """Join the graph: with rclpy where ROS 2 is installed, else over DDS.
-
-    Args:
-        name: "dds" and "rclpy" choose one.
-        domain: the graph's number; None: that of the environment (ROS_DOMAIN_ID), or 0.
-
-    Raises:
-        MissingDependencyError: neither is installed, or not the one that is named.
-    """
-    if name == "rclpy" or (name == "auto" and importlib.util.find_spec("rclpy") is not None):
-        from vio.ros2.rclpy_transport import RclpyTransport
-
-        return RclpyTransport(domain)
-    if importlib.util.find_spec("cyclonedds") is None:
-        raise MissingDependencyError(
-            "ROS 2 needs the package cyclonedds, or an installed ROS 2 whose setup.bash was "
-            f"sourced; {extra_text('ros2')}"
-        )
-    from vio.ros2.dds import DdsTransport
-
-    return DdsTransport(domain)
 
 
 class _Published:

@@ -80,7 +80,9 @@ def save_checkpoint(
     atomic_write_bytes(path, b"".join((b"%08x" % zlib.crc32(body), body)))
 
 
-def load_checkpoint(path: Path, dataset: Dataset, inputs: Mapping[str, Any] | None = None) -> Any:
+def load_checkpoint(
+    path: Path, dataset: Dataset | None, inputs: Mapping[str, Any] | None = None
+) -> Any:
     """Read a state; what referred to the recording refers to `dataset` then.
 
     Raises:
@@ -248,7 +250,7 @@ class _Reader:
     exception.
     """
 
-    def __init__(self, dataset: Dataset, blobs: memoryview) -> None:
+    def __init__(self, dataset: Dataset | None, blobs: memoryview) -> None:
         self._dataset = dataset
         self._blobs = blobs
         self._made: list[Any] = []  # by number; None: not yet
@@ -310,6 +312,8 @@ class _Reader:
             array = self._array(*parts)
             return array if kind == "array" else array[()] if kind == "scalar" else array.tobytes()
         if kind in ("dataset", "observations"):
+            if self._dataset is None:
+                raise ValueError("its state refers to a recording")
             return self._dataset if kind == "dataset" else self._dataset.observations
         if kind == "generator":
             generator = np.random.Generator(_BIT_GENERATORS[parts[0]]())

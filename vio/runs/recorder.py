@@ -294,6 +294,15 @@ class RunRecorder:
         rows = joined.rows()
         return Landmarks(rows["id"], rows["p_world"], rows["covariance"])
 
+    def put_away(self, points: Landmarks) -> None:
+        """Take points of the map that will not change any more, after the first frame.
+
+        Raises:
+            DataError: the folder cannot be written.
+        """
+        with self._writing():
+            self._put_away(points)
+
     def _put_away(self, points: Landmarks) -> None:
         rows = np.zeros(len(points.ids), dtype=POINT)
         rows["id"] = points.ids
@@ -322,8 +331,7 @@ class RunRecorder:
         has.
         """
         assert self._folder is not None
-        with self._writing():
-            self._put_away(finished)
+        self.put_away(finished)
         self.flush()
         settled = max(len(self) - self._lag, 0)  # estimates after these will be replaced
         tables = {}
@@ -346,8 +354,10 @@ class RunRecorder:
             log.warning("this run cannot go on with --resume if it is interrupted: %s", error)
         self._saved_s = time.monotonic()
 
-    def restore(self, dataset: Dataset) -> Any:
+    def restore(self, dataset: Dataset | None) -> Any:
         """Go on from the folder's checkpoint; return the state that `save` was given.
+
+        `dataset` is what the state refers to; None: to no recording.
 
         Raises:
             DataError: there is none, it or a table is damaged, or the run depends on what has

@@ -12,13 +12,12 @@ from pathlib import Path
 from vio.cameras.rig import Rig
 from vio.config import Config
 from vio.errors import CalibrationError, DataError
-from vio.geometry.lie import FloatArray
 from vio.live.build import MapUse
 from vio.live.figures import LiveFigures
 from vio.live.live_odometry import LiveOdometry
-from vio.live.results import write_results
 from vio.live.worker import Drop
 from vio.records import FrameResult
+from vio.runs.live_folder import LiveFolder, LiveRunSettings
 from vio.sources.recorder import Form, Recorder
 from vio.sources.source import LiveSource, SourceFrame
 
@@ -39,7 +38,7 @@ def run_source(
     *,
     should_stop: Callable[[], object],
     say: Callable[[str], None],
-    out: Path | None = None,
+    kept: LiveRunSettings | None = None,
     record: Path | None = None,
     record_as: Form = "plain",
     map: MapUse | None = None,
@@ -48,7 +47,7 @@ def run_source(
         [LiveOdometry, Rig], Callable[[FrameResult], None] | None
     ] = lambda odometry, rig: None,
 ) -> LiveRun:
-    """Run until the source ends or is asked to stop; then write what was asked for.
+    """Run until the source ends or is asked to stop; what was asked for is written meanwhile.
 
     Args:
         source: opened; it is closed at the end.
@@ -56,7 +55,7 @@ def run_source(
         rig: calibration in place of the device's.
         should_stop: asked with each event, and about each second.
         say: reports that it is ready.
-        out: folder for `trajectory.tum` and the calibration that was found.
+        kept: the run folder; None: there is none.
         record: new folder for what the source gave, which `vio run` repeats.
         record_as: its form, see `Recorder`.
         map: a map to begin or to continue.
@@ -80,17 +79,25 @@ def run_source(
         if not source.has_imu:
             config = replace(config, motion="none")
             rig = replace(rig, T_cam0_imu=None)
-        poses: list[tuple[int, FloatArray]] = []
         watcher: Callable[[FrameResult], None] | None = None
+        has_poses = False
 
         def on_frame(result: FrameResult) -> None:
-            poses.append((result.estimate.time_ns, result.estimate.T_world_imu))
+            nonlocal has_poses
+            has_poses = True
             if watcher is not None:
                 watcher(result)
 
+        folder = None if kept is None else LiveFolder(kept, config, rig)
         samples = 0
         odometry = LiveOdometry(
-            rig, config, on_frame=on_frame, map=map, drop=drop, copy_images=False
+            rig,
+            config,
+            on_frame=on_frame,
+            map=map,
+            drop=drop,
+            copy_images=False,
+            sink=folder,
         )
         try:
             with odometry, contextlib.ExitStack() as stack:
@@ -115,8 +122,8 @@ def run_source(
                         samples += 1
                         odometry.add_imu(event.time_ns, event.gyro, event.accel)
         finally:  # however it ends, what was computed is kept
-            if out is not None and poses:
-                write_results(out, odometry, poses)
-        if out is not None and not poses:
-            raise DataError(f"{out}: no frame has a pose; nothing was written")
+            if folder is not None:
+                folder.close()
+        if kept is not None and not has_poses:
+            raise DataError(f"{kept.out}: no frame has a pose; nothing was written")
         return LiveRun(odometry.figures, odometry.warnings, samples)

@@ -6,6 +6,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from vio.datasets.reader import Reader
+from vio.datasets.settings import DatasetSettings
+from vio.protocols import Dataset
+
 _ROS1 = b"#ROSBAG V"
 _SQLITE = b"SQLite format 3\0"
 _MCAP = b"\x89MCAP0\r\n"
@@ -40,3 +44,21 @@ def _is_ros2_folder(path: Path) -> bool:
     return metadata.is_file() and "rosbag2_bagfile_information" in metadata.read_text(
         encoding="utf-8", errors="replace"
     )
+
+
+def _read(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.bags.reader import read_bag  # which imports this package
+
+    return read_bag(path, settings)
+
+
+READERS = (
+    Reader(
+        kind="bag",
+        looked_for="a ROS bag (.bag, .db3, .mcap)",
+        read=_read,
+        is_folder=is_bag,
+        is_file=is_bag,
+        calibrated_as="bag",
+    ),
+)

@@ -1,9 +1,14 @@
-"""Steps of a clock during a recording: stamps go back while messages go on being recorded.
+"""Steps of a clock during a recording: stamps go back, or leap ahead, while messages go on being
+recorded.
 
 A computer whose clock is set back stamps the messages after it with times that were given before,
 and sorted by their stamps two periods interleave. The order of recording tells them apart: at a
 step the stamps go back, and stay behind the recorder's clock by as much. A message that is recorded
 late goes back, too, but into a place that no other message had.
+
+Of a clock that is set forward the stamps leave a gap where the recording has none. The cameras alone
+may do that otherwise, as they lose frames while their latency falls: so all streams must leap alike.
+A clock of stamps and of the recorder that leaps cannot be told from a pause of the recording.
 """
 
 from __future__ import annotations
@@ -22,14 +27,16 @@ _TOGETHER_NS = NS_PER_S  # steps of several topics within this time are one
 _NEAR_NS = 100_000_000  # messages are recorded within this time after they are stamped
 _ALIKE = 0.25  # of a step, by which those of several topics may differ to be one
 _MAX = 0.8  # of the messages after a step are behind by it
+_MIN_LEAP_NS = 100_000_000  # a leap that is less passes for a gap of some frames
+_MIN_LEAPING = 2  # streams that leap together
 _SHARE = 0.5  # of the messages after a step whose stamps were given before it
 
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """A clock that was set back, and the first message after it of each topic concerned."""
+    """A clock that was set, and the first message after it of each topic concerned."""
 
-    size_ns: int
+    size_ns: int  # by which it was set back; of one that was set forward, below 0
     logged_ns: int  # when
     first: Mapping[str, int]  # row in the order of recording, by topic
 
@@ -37,10 +44,12 @@ class ClockStep:
         """Return what was found and done, given when the recording began."""
         size_s = self.size_ns / NS_PER_S
         topics = ", ".join(sorted(self.first))
+        way = "back" if size_s > 0 else "forward"
+        purpose = "no two periods mix" if size_s > 0 else "there is no gap"
         return (
-            f"the clock was set back by {size_s:.3f} s at "
+            f"the clock was set {way} by {abs(size_s):.3f} s at "
             f"{(self.logged_ns - begin_ns) / NS_PER_S:.2f} s of the recording ({topics}): what was "
-            f"recorded after it is moved by {size_s:+.3f} s, so that no two periods mix"
+            f"recorded after it is moved by {size_s:+.3f} s, so that {purpose}"
         )
 
 
@@ -77,7 +86,49 @@ def mended(
         for topic, row in first.items():
             stamps[topic][row:] += size_ns
         steps.append(ClockStep(size_ns, begin_ns, first))
+    for leap in _leaps(stamps, logged):
+        for topic, row in leap.first.items():
+            stamps[topic][row:] += leap.size_ns
+        steps.append(leap)
     return stamps, steps
+
+
+def _leaps(stamps: Mapping[str, IntArray], logged: Mapping[str, IntArray]) -> list[ClockStep]:
+    """Return the steps forward that all topics share, two at least."""
+    found = [leap for topic in stamps for leap in _leaps_of(topic, stamps[topic], logged[topic])]
+    steps = []
+    for together in _joined(found):
+        if len(together) < _MIN_LEAPING:
+            continue
+        best = max(together, key=lambda leap: len(stamps[leap.topic]))
+        first = {leap.topic: leap.row for leap in together}
+        begin_ns = min(leap.logged_ns for leap in together)
+        if any(_goes_on(logged[topic], begin_ns) for topic in stamps.keys() - first.keys()):
+            continue
+        steps.append(ClockStep(-round(best.size_ns), begin_ns, first))
+    return steps
+
+
+def _goes_on(logged: IntArray, time_ns: int) -> bool:
+    """Whether a topic has messages enough on either side of a time to show a leap."""
+    before = int(np.searchsorted(logged, time_ns))
+    return min(before, len(logged) - before) >= _AROUND
+
+
+def _leaps_of(topic: str, stamps: IntArray, logged: IntArray) -> list[_Found]:
+    """Return the steps forward of one topic, with their sizes above 0."""
+    usual_ns = _usual_ns(stamps)
+    gap_ns = np.diff(stamps) - np.diff(logged)  # that the recorder's clock did not see
+    found = []
+    for row in (np.flatnonzero(gap_ns > max(_MIN_LEAP_NS, usual_ns)) + 1).tolist():
+        before = (logged - stamps)[max(row - _AROUND, 0) : row]
+        after = (logged - stamps)[row : row + _AROUND]
+        size_ns = median(before) - median(after)
+        late_ns = np.abs(np.concatenate([before - median(before), after - median(after)]))
+        is_steady = np.mean(late_ns < _ALIKE * size_ns) > _MAX
+        if is_steady and abs(size_ns - gap_ns[row - 1]) < _ALIKE * size_ns:
+            found.append(_Found(topic, row, size_ns, int(logged[row])))
+    return found
 
 
 def _steps_of(topic: str, stamps: IntArray, logged: IntArray) -> list[_Found]:

@@ -63,6 +63,7 @@ def contents(path: Path, settings: DatasetSettings) -> Contents:
         if settings.calibration is None:
             add_frames_of_tf(bag, index, roles, infos)
         size = index.left.size or _compressed_size(bag, roles.left)
+        notes = (*notes, *bag.notes)
     return Contents(path, roles, index, infos, size, beside, (*joined, *notes))
 
 

@@ -8,7 +8,8 @@ after topic is stored in no order of time, either, but within each topic it is.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Sequence
+import importlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,8 +23,6 @@ _FEW_CHUNKS = 4  # of an MCAP file that is looked at message by message
 
 def is_set_back(reader: Any) -> bool:
     """Return whether the times of recording of some topic go back in the order of storage."""
-    if getattr(reader, "compression_mode", None) == "message":
-        return False  # which the library alone can read
     return any(_goes_back(times) for times in _times_by_topic(reader))
 
 
@@ -41,11 +40,22 @@ def as_stored(
     if isinstance(reader, Reader1):
         yield from _as_stored_in_ros1(reader, connections)
         return
+    unpacked = _unpacking(reader)
     for storage in _storages(reader):
         names = {(c.topic, c.msgtype): c for c in connections}
         own = [c for c in storage.connections if (c.topic, c.msgtype) in names]
         for connection, logged_ns, data in _stored(storage, own):
-            yield names[connection.topic, connection.msgtype], logged_ns, data
+            yield names[connection.topic, connection.msgtype], logged_ns, unpacked(data)
+
+
+def _unpacking(reader: Any) -> Callable[[bytes], bytes]:
+    """Return what decompresses a message of a ROS 2 bag, each of which may be compressed."""
+    if reader.compression_mode != "message":
+        return lambda data: data
+    module = importlib.import_module("rosbags.rosbag2.reader")
+    zstd: Any = vars(module)["zstd"]  # Python's own, or that of a package
+
+    return lambda data: bytes(zstd.decompress(data))
 
 
 def _times_by_topic(reader: Any) -> Iterable[Sequence[int]]:

@@ -8,13 +8,16 @@ import contextlib
 import functools
 import struct
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vio.datasets.bags import bag_files
+from vio.datasets.bags.sdk_stamps import NOTE as SDK_NOTE
+from vio.datasets.bags.sdk_stamps import SdkStamps, metadata_topics, sdk_stamps
 from vio.datasets.bags.storage_order import STEP_NS, as_stored, is_set_back
 from vio.errors import DataError, MissingDependencyError
+from vio.records import NS_PER_S
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -70,6 +73,7 @@ class Bag:
 
     _reader: AnyReader
     _set_back: bool
+    _sdk: dict[str, SdkStamps]
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -92,7 +96,23 @@ class Bag:
             # of several files each is in order, and they are merged by time
             only = self._reader.readers[0] if len(self._reader.readers) == 1 else None
             self._set_back = only is not None and is_set_back(only)
+        with named_damage(self.path):
+            self._sdk = self._sdk_stamps()
         return self
+
+    def _sdk_stamps(self) -> dict[str, SdkStamps]:
+        """Return the stamps that RealSense's recorder keeps beside its messages, by topic."""
+        kinds = {connection.topic: connection.msgtype for connection in self._reader.connections}
+        stamps: dict[str, SdkStamps] = {}
+        for data, metadata in metadata_topics(kinds).items():
+            texts = self.messages([metadata])
+            stamps[data] = sdk_stamps((text.logged_ns, text.data) for text in texts)
+        return stamps
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was found of the bag as a whole."""
+        return (SDK_NOTE,) if self._sdk else ()
 
     def __exit__(self, *_: object) -> None:
         self._reader.close()
@@ -138,7 +158,15 @@ class Bag:
             DataError: the message does not fit its type.
         """
         with named_damage(f"{self.path}, {message.topic}"):
-            return self._reader.deserialize(message.data, message.kind)
+            fields: Any = self._reader.deserialize(message.data, message.kind)
+        stamps = self._sdk.get(message.topic)
+        stamp_ns = None if stamps is None else stamps.at(message.logged_ns)
+        if stamp_ns is not None:
+            header = fields.header
+            header.stamp = replace(
+                header.stamp, sec=stamp_ns // NS_PER_S, nanosec=stamp_ns % NS_PER_S
+            )
+        return fields
 
 
 @contextlib.contextmanager
