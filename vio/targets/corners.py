@@ -163,7 +163,7 @@ class CornerDetector:
         windows = window.astype(int)
         for size in np.unique(windows[good]).tolist():
             rows = np.flatnonzero(good & (windows == size))
-            out[rows] = _subpixel(image, uv[rows], size)
+            out[rows] = subpixel(image, uv[rows], size)
         moved = np.linalg.norm(out - uv, axis=1)
         good &= moved < np.maximum(1.0, 0.8 * window)
         inside = (out > _MARGIN_PX) & (out < np.array([width, height]) - 1 - _MARGIN_PX)
@@ -219,7 +219,8 @@ class CornerDetector:
         return keep
 
 
-def _subpixel(image: Image, uv: FloatArray, half: int) -> FloatArray:
+def subpixel(image: Image, uv: FloatArray, half: int) -> FloatArray:
+    """Return the saddle points (K, 2) next to pixels (K, 2), by windows of `2 half + 1` pixels."""
     import cv2
 
     start = np.ascontiguousarray(uv.reshape(-1, 1, 2), dtype=np.float32)

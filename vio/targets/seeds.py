@@ -24,6 +24,7 @@ from vio.targets.homography import homographies, mapped
 
 # Scale of the image in which candidates are looked for, and the pixels there by which light grows.
 _LOOKS = ((0.5, 3), (1.0, 3), (0.5, 1), (0.5, 5), (1.0, 5), (0.25, 1), (0.25, 3))
+_LOOKS_ALONE = ((0.5, 1), (1.0, 1), (0.25, 1), (1.0, 3))  # where nothing touches a marker
 _ENOUGH = 8  # markers, from which all others are found
 _ENOUGH_SHARE = 0.6  # of the board's markers
 _GROWTHS = (1.0, 1.12, 1.25, 1.4)  # of a candidate, which grown light has made smaller
@@ -71,12 +72,13 @@ class MarkerReader:
         self._detector: Any = cv2.aruco.ArucoDetector(dictionary, settings)
         markers = target.markers()
         self._wanted = min(_ENOUGH, _ENOUGH_SHARE * len(markers))
+        self._looks = _LOOKS if target.kind == "aprilgrid" else _LOOKS_ALONE
         self._prints = _Prints(markers, target.border_bits)
 
     def find(self, image: Image) -> list[Read]:
         """Return the markers that are read, each once."""
         found: list[Read] = []
-        for scale, grown_px in _LOOKS:
+        for scale, grown_px in self._looks:
             found = _each_once(
                 found + self._prints.read(image, self._quads(image, scale, grown_px))
             )
