@@ -47,7 +47,7 @@ from vio.targets.recording import Filmed
 from vio.targets.rendering import BoardRenderer, Exposure
 from vio.targets.results import basalt_text
 from vio.targets.start import one_camera, pair_start, poses_of
-from vio.targets.verdict import depths, projection_sigma
+from vio.targets.verdict import depths, projection_sigma, projection_sigma_from_views
 from vio.targets.views import View, sightings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -372,6 +372,17 @@ def test_uncertainty_grows_where_there_are_no_corners() -> None:
     assert corners.min() > 2 * sigma[4, 6]
 
 
+def test_uncertainty_is_least_at_the_distances_of_the_board() -> None:
+    seen = sightings(made_views(7, 20), GRID.points_m)
+    found, _ = _pair(7)
+    middle = [
+        projection_sigma_from_views(found, seen, 1, distance)[9 * 13 // 2]
+        for distance in (0.1, 0.8, 100.0)
+    ]
+    assert middle[1] < 0.5 * middle[0]
+    assert middle[1] < middle[2]
+
+
 def test_says_what_to_record_where_views_are_missing() -> None:
     views = made_views(3, 12)
     with pytest.raises(DataError, match="sees the board in 3 of 40 frames"):
@@ -402,6 +413,10 @@ def test_the_command_calibrates_a_folder_of_pairs(
     facts = json.loads((out / "calibration.json").read_text())
     assert facts["cameras"][0]["fu_fv_cu_cv"][0] == pytest.approx(SMALL_LEFT.fu, rel=5e-3)
     assert (out / "calibration.png").stat().st_size > 10_000
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert page.count("<img") == 5
+    assert "A point 5 m away is placed within" in page
+    assert "http" not in page  # it holds all it shows
     kalibr = load_rig(out / "camchain-imucam.yaml")
     assert np.linalg.norm(kalibr.right[1][:3, 3]) == pytest.approx(0.11, abs=1e-3)
     for name in ("stereo.yml", "left.yaml"):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from vio.targets.inertial import CameraImu
 
 MARKER = "calibration.json"
+PAGE = "report.html"
 _LENSES = ("radtan", "equidistant", "double_sphere", "radtan5", "unified", "rational")
 
 
@@ -70,6 +71,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.targets.calibrate import calibrate_cameras, calibrate_with_imu
     from vio.targets.corners import CornerDetector
     from vio.targets.description import read_target
+    from vio.targets.page import write_page
     from vio.targets.picture import draw
     from vio.targets.recording import film, open_raw
     from vio.targets.results import CAMCHAIN, write_rig
@@ -99,17 +101,21 @@ def execute(args: argparse.Namespace) -> int:
     facts = {"out": str(out), "target": str(target), **_facts(found)}
     if inertial is not None:
         facts["imu"] = _imu_facts(inertial)
-    with atomic_folder(out, replace=True, marker=MARKER) as folder:
-        files = write_rig(folder, rig)
-        draw(found, folder / "calibration.png")
-        (folder / MARKER).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
-    command = f"vio run {shlex.quote(args.source)} --calibration {shlex.quote(str(out / CAMCHAIN))}"
-    rows = [
+    results = [
         ("target", str(target)),
         ("frames", f"{filmed.frames}, the board in {len(filmed.views)}; {found.seen.views} used"),
         *_rows(found),
         *([] if inertial is None else _imu_rows(inertial)),
-        ("results", f"{out}: {', '.join(files)}, calibration.png"),
+    ]
+    with atomic_folder(out, replace=True, marker=MARKER) as folder:
+        files = write_rig(folder, rig)
+        draw(found, folder / "calibration.png")
+        write_page(folder / PAGE, f"Calibration of {raw.path.name}", found, inertial, results)
+        (folder / MARKER).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
+    command = f"vio run {shlex.quote(args.source)} --calibration {shlex.quote(str(out / CAMCHAIN))}"
+    rows = [
+        *results,
+        ("results", f"{out}: {', '.join(files)}, {PAGE}, calibration.png"),
         ("next", command),
     ]
     return print_result(facts, rows, as_json=args.json, name_width=16)

@@ -21,6 +21,7 @@ from vio.targets.bundle import (
     BoardAdjustment,
     BoolArray,
     RigFit,
+    bow_shape,
     layout_of,
     lens_moved,
     pixels_by_lens,
@@ -30,6 +31,7 @@ from vio.targets.views import Sightings
 
 DEPTH_M = 5.0  # where a pair's uncertainty is stated
 _GRID = (13, 9)  # pixels along width and height at which maps are made
+_COMPENSATED = 500  # corners by which a motion of the camera is determined
 _STEP_SIGMAS = 0.1  # of numerical differences
 _HONEST = 1.5  # halves further apart than so many times what is stated inflate the sigmas
 _MEDIAN_LENGTH = 1.1774  # of a vector of two Gaussian components of unit variance
@@ -111,6 +113,46 @@ def projection_sigma(
     out = np.full(len(uv), np.nan)
     out[valid] = np.sqrt(np.maximum(np.linalg.eigvalsh(P)[:, 1], 0))
     return out
+
+
+def projection_sigma_from_views(
+    found: Adjusted, seen: Sightings, camera: int, distance_m: float
+) -> FloatArray:
+    """Standard deviation (G,) in pixels of the projection of points at a distance, in its worst
+    direction, after the motion of the camera that undoes most of it at the corners in its views.
+
+    It is least at the distances at which the board was shown.
+    """
+    fit = found.at
+    model = fit.cameras[camera]
+    lens = layout_of(fit.cameras).lenses[camera]
+    rows = np.flatnonzero((seen.camera == camera) & found.used)
+    rows = rows[:: -(-len(rows) // _COMPENSATED)]
+    board = np.column_stack([seen.points_m, bow_shape(seen.points_m) @ fit.bow])
+    T = fit.T_cam_cam0[camera] @ fit.T_cam0_board[seen.view[rows]]
+    corners = np.einsum("rij,rj->ri", T[:, :3, :3], board[seen.point[rows]]) + T[:, :3, 3]
+    D, motion = _lens_and_motion(model, corners, project_point(model, corners)[0])
+    undone = np.linalg.lstsq(
+        motion.reshape(-1, motion.shape[2]), D.reshape(-1, D.shape[2]), rcond=None
+    )[0]
+    uv = pixel_grid(model)
+    rays, valid = unproject_pixel(model, uv)
+    D, motion = _lens_and_motion(model, distance_m * rays, uv)
+    J = D - motion @ undone
+    P = J @ found.covariance[lens, lens] @ np.swapaxes(J, 1, 2)
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(P)[:, 1], 0))
+    return np.where(valid, sigma, np.nan)
+
+
+def _lens_and_motion(
+    camera: CameraModel, p: FloatArray, uv: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of pixels (N, 2) of points (N, 3) by the lens, (N, 2, 4 + n), and by a motion of
+    the camera, (N, 2, 6).
+    """
+    by_p = pixels_by_point(camera, p, uv)
+    motion = np.concatenate([by_p, -by_p @ so3_hat(p)], axis=2)
+    return pixels_by_lens(camera, p, uv), motion
 
 
 def projection_difference(a: CameraModel, b: CameraModel) -> FloatArray:
@@ -282,11 +324,19 @@ def coverage_findings(seen: Sightings, cameras: Sequence[CameraModel]) -> list[s
     return out
 
 
+def board_tilts_deg(fit: RigFit) -> FloatArray:
+    """Return by how much the board was tilted in each view (V, 2): forwards and backwards, and to
+    the left and right.
+    """
+    normal = fit.T_cam0_board[:, :3, 2]
+    about_x = np.arctan2(normal[:, 1], normal[:, 2])
+    about_y = np.arctan2(normal[:, 0], normal[:, 2])
+    return np.degrees(np.column_stack([about_x, about_y]))
+
+
 def tilt_findings(fit: RigFit) -> list[str]:
     """Return the axes about which the board was not tilted."""
-    normal = fit.T_cam0_board[:, :3, 2]
-    about_x = np.degrees(np.arctan2(normal[:, 1], normal[:, 2]))
-    about_y = np.degrees(np.arctan2(normal[:, 0], normal[:, 2]))
+    about_x, about_y = board_tilts_deg(fit).T
     out: list[str] = []
     for tilt, words in ((about_x, "forwards and backwards"), (about_y, "to the left and right")):
         if float(np.percentile(np.abs(tilt), 90)) < _MIN_TILT_DEG:
