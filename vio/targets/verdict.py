@@ -36,8 +36,8 @@ _STEP_SIGMAS = 0.1  # of numerical differences
 _HONEST = 1.5  # halves further apart than so many times what is stated inflate the sigmas
 _MEDIAN_LENGTH = 1.1774  # of a vector of two Gaussian components of unit variance
 _UNSYNCHRONISED = 1.5  # residual of the pair over that of the cameras alone
-_MIN_TILT_DEG = 15.0
-_CELLS = 3  # along each side of the image, which must hold corners
+MIN_TILT_DEG = 15.0
+CELLS = 3  # along each side of the image, which must hold corners
 _MIN_CELL_SHARE = 0.01  # of all corners, in a cell of the image
 _ROWS = ("upper", "middle", "lower")
 _COLS = ("left", "centre", "right")
@@ -306,18 +306,27 @@ def _unsynchronised(found: Adjusted, alone_sigma_px: Sequence[float]) -> list[st
     ]
 
 
+def corners_by_part(uv: FloatArray, width: int, height: int) -> FloatArray:
+    """Return how many pixels (K, 2) lie in each of the image's parts (CELLS^2,), row by row."""
+    cell = np.clip(uv * CELLS / [width, height], 0, CELLS - 0.01).astype(int)
+    counts = np.bincount(CELLS * cell[:, 1] + cell[:, 0], minlength=CELLS**2)
+    return counts.astype(np.float64)
+
+
+def part_name(number: int) -> str:
+    """Return the name of one of the image's parts."""
+    return f"{_ROWS[number // CELLS]} {_COLS[number % CELLS]}"
+
+
 def coverage_findings(seen: Sightings, cameras: Sequence[CameraModel]) -> list[str]:
     """Return which parts of the images hold no corners, one line for each camera."""
     out: list[str] = []
     names = ("left", "right") if len(cameras) > 1 else ("",)
     for c, camera in enumerate(cameras):
         uv = seen.uv[seen.camera == c]
-        cell = np.minimum(uv * _CELLS / [camera.width, camera.height], _CELLS - 0.01).astype(int)
-        counts = np.bincount(_CELLS * cell[:, 1] + cell[:, 0], minlength=_CELLS**2)
-        empty = [
-            f"{_ROWS[k // _CELLS]} {_COLS[k % _CELLS]}"
-            for k in np.flatnonzero(counts < _MIN_CELL_SHARE * len(uv)).tolist()
-        ]
+        counts = corners_by_part(uv, camera.width, camera.height)
+        few = np.flatnonzero(counts < _MIN_CELL_SHARE * len(uv)).tolist()
+        empty = [part_name(k) for k in few]
         if empty:
             image = f"{names[c]} image" if names[c] else "image"
             out.append(f"the {image} is empty at {', '.join(empty)}: show the board there")
@@ -339,9 +348,9 @@ def tilt_findings(fit: RigFit) -> list[str]:
     about_x, about_y = board_tilts_deg(fit).T
     out: list[str] = []
     for tilt, words in ((about_x, "forwards and backwards"), (about_y, "to the left and right")):
-        if float(np.percentile(np.abs(tilt), 90)) < _MIN_TILT_DEG:
+        if float(np.percentile(np.abs(tilt), 90)) < MIN_TILT_DEG:
             out.append(
-                f"the board is tilted {words} by less than {_MIN_TILT_DEG:.0f} degrees: tilt it "
+                f"the board is tilted {words} by less than {MIN_TILT_DEG:.0f} degrees: tilt it "
                 "more, up to 40 degrees"
             )
     return out
