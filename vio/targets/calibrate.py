@@ -97,10 +97,14 @@ def calibrate_with_imu(
     seen = sightings(filmed.views, target.points_m)
     left = np.bincount(seen.view[seen.camera == 0], minlength=seen.views)
     chosen = np.flatnonzero(left >= _MIN_CORNERS)
-    problem, found = pose_only(cameras.found.at, seen.of_views(chosen))
-    times_ns = np.array([filmed.views[v].time_ns for v in chosen.tolist()], dtype=np.int64)
+    seen = seen.of_views(chosen)
+    problem, found = pose_only(cameras.found.at, seen)
+    # A view that fits badly has a wrong pose.
+    used = np.bincount(seen.view[found.used & (seen.camera == 0)], minlength=seen.views)
+    good = np.flatnonzero(used >= _MIN_CORNERS)
+    times_ns = np.array([filmed.views[v].time_ns for v in chosen[good].tolist()], dtype=np.int64)
     information = problem.pose_information(found) / cameras.verdict.inflation**2
-    poses = BoardPoses(times_ns, found.at.T_cam0_board, information)
+    poses = BoardPoses(times_ns, found.at.T_cam0_board[good], information[good])
     return calibrate_imu(poses, filmed.imu, densities)
 
 
