@@ -52,6 +52,12 @@ def add_parser(commands: Any) -> None:
         metavar="FILE",
         help="Kalibr's imu.yaml, as vio imu-noise writes it (default: those of a usual MEMS)",
     )
+    parser.add_argument(
+        "--imu-terms",
+        choices=("off", "scale", "full"),
+        default="off",
+        help="estimate scales of the IMU's axes, or their misalignment, too (default off)",
+    )
     parser.add_argument("--no-imu", action="store_true", help="calibrate the cameras alone")
     parser.add_argument(
         "--frames", type=int, metavar="N", help="frames in which the board is looked for"
@@ -91,7 +97,7 @@ def execute(args: argparse.Namespace) -> int:
         inertial = None
         if filmed.imu is not None and not args.no_imu:
             densities = _densities(args.imu_noise)
-            inertial = calibrate_with_imu(filmed, target, found, densities)
+            inertial = calibrate_with_imu(filmed, target, found, densities, args.imu_terms)
             rig = replace(
                 rig,
                 T_cam0_imu=inertial.T_cam0_imu,
@@ -152,6 +158,10 @@ def _imu_facts(found: CameraImu) -> dict[str, Any]:
         "imu_chi": found.imu_chi,
         "views": found.views,
         "weak": list(found.weak),
+        "board_scale": found.board_scale,
+        "board_scale_sigma": found.board_scale_sigma,
+        "terms": found.terms.tolist(),
+        "term_sigmas": found.term_sigmas.tolist(),
     }
 
 
@@ -179,8 +189,36 @@ def _imu_rows(found: CameraImu) -> list[tuple[str, str]]:
             f"{found.views} views; squared errors of poses {found.camera_chi:.2f}, of the IMU "
             f"{found.imu_chi:.2f} times those expected",
         ),
+        (
+            "board by the IMU",
+            f"{100 * (found.board_scale - 1):+.2f} ± {100 * found.board_scale_sigma:.2f} % larger "
+            "than in the target file (accelerometers are off by up to 1 %)",
+        ),
+        *_term_rows(found),
         *(("FOUND", text) for text in found.weak),
     ]
+
+
+def _term_rows(found: CameraImu) -> list[tuple[str, str]]:
+    """Scales in per cent and misalignments in degrees, of those that were estimated."""
+    import numpy as np
+
+    from vio.records import IMU_ENTRIES
+
+    parts: dict[str, list[str]] = {}
+    for (sensor, row, column), value, sigma in zip(
+        IMU_ENTRIES, found.terms.tolist(), found.term_sigmas.tolist(), strict=True
+    ):
+        if sigma == 0:
+            continue
+        name = ("accelerometer", "gyro")[sensor]
+        if row == column:
+            text = f"{'xyz'[row]} {100 * value:+.2f} ± {100 * sigma:.2f} %"
+        else:
+            turn, turn_sigma = np.degrees([value, sigma]).tolist()
+            text = f"{'xyz'[row]}{'xyz'[column]} {turn:+.2f} ± {turn_sigma:.2f} deg"
+        parts.setdefault(name, []).append(text)
+    return [(name, ", ".join(texts)) for name, texts in parts.items()]
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from vio.cameras.rig import Rig
 from vio.errors import CalibrationError, DataError
+from vio.filters.imu_terms import ImuTerms
 from vio.numerics.robust import median
 from vio.records import ImuDensities, IntArray
 from vio.targets.bundle import Adjusted, BoardAdjustment
@@ -85,9 +86,15 @@ def calibrate_cameras(
 
 
 def calibrate_with_imu(
-    filmed: Filmed, target: Target, cameras: CameraCalibration, densities: ImuDensities
+    filmed: Filmed,
+    target: Target,
+    cameras: CameraCalibration,
+    densities: ImuDensities,
+    terms: ImuTerms = "off",
 ) -> CameraImu:
     """Calibrate the IMU of a recording whose cameras are calibrated.
+
+    `terms`: which of its scales and misalignments are estimated, see `calibrate_imu`.
 
     Raises:
         DataError: the recording has no IMU, or its motion shows too little; says what to record.
@@ -105,7 +112,7 @@ def calibrate_with_imu(
     times_ns = np.array([filmed.views[v].time_ns for v in chosen[good].tolist()], dtype=np.int64)
     information = problem.pose_information(found) / cameras.verdict.inflation**2
     poses = BoardPoses(times_ns, found.at.T_cam0_board[good], information[good])
-    return calibrate_imu(poses, filmed.imu, densities)
+    return calibrate_imu(poses, filmed.imu, densities, terms=terms)
 
 
 def chosen_views(seen: Sightings) -> Sightings:
