@@ -20,6 +20,7 @@ from vio.frontend.moving_object import (
     ObjectReport,
     choose_motion,
     one_motion_explains,
+    squared_distance,
     static_by_prediction,
     voters,
 )
@@ -405,20 +406,28 @@ class KltFrontend:
             kept = static_by_prediction(problem, before, after, kept, measured, near_m)
         if motion is not None:
             after_deep = after.take(deep, axis=0)
+            voting = voters(old.age[rows[deep]])
+            error_px = stereo.disparity_error_px
             chosen = choose_motion(
                 problem,
                 deep_point,
                 after_deep,
                 motion,
                 expected_motion,
-                voting=voters(old.age[rows[deep]]),
+                voting=voting,
                 in_event=self._objects.active,
-                depths_off=stereo.rows_are_off,
+                disparity_error_px=error_px,
             )
             if stereo.rows_are_off and one_motion_explains(
-                problem, chosen, before[has_depth], after_deep
+                problem, chosen, deep_point, after_deep, error_px
             ):
                 chosen = replace(chosen, object_share=0.0)
+            if chosen.decision is None and expected_motion is not None and measured is None:
+                inliers = deep_point[chosen.motion.inliers]
+                distance = squared_distance(
+                    camera, chosen.motion.T_curr_prev, inliers, expected_motion, error_px
+                )
+                chosen = self._objects.questioned(chosen, voting, distance)
             motion = chosen.motion
             kept[has_depth] = chosen.motion.inliers
             self._objects.frame(index, chosen)

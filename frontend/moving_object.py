@@ -10,13 +10,19 @@ few or at odds, the prediction is that of a body that goes on as before, and whe
 possible the larger consensus is used, and it is said.
 
 A stereo calibration that is off makes two groups of a static scene, too: its depths are wrong by
-their size. Where the rows show such a calibration, an object is reported only if the left images
-alone, without depths, show it as well.
+their size, and so is a prediction that no sensor has measured. Where the rows show such a
+calibration, both are believed as far as disparities can be off, and a group that the camera's
+motion explains at depths within that is no object.
+
+A consensus far off the prediction, further than those of the frames before, that none of the older
+points supports, is either the rig's, after a shock, or that of an object that hides the scene.
+Nothing tells which: it is used, and reported at once.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -35,7 +41,7 @@ from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray, MotionPrior
 
-Decision: TypeAlias = Literal["predicted", "voted", "undecided"]
+Decision: TypeAlias = Literal["predicted", "voted", "undecided", "unsupported"]
 
 _PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test
 # ratio of two motions' squared distances from a measured one, above which the nearer agrees
@@ -43,8 +49,9 @@ _CLEARLY_NEARER = 10.0
 _MIN_POINTS = 12  # of a second motion
 _MIN_SUPPORT = 0.1  # points of a second motion that may replace the first, over the first's
 _LARGE_SHARE = 0.25  # share of all points above which a second motion is reported
-# of the smaller group's points that must be off the epipolar lines of the others to prove an object
+# of the smaller group's points that no depth within the disparities' error explains: an object
 _SEEN_SHARE = 0.5
+_BOUND_SIGMAS = 3.0  # of the bound of the disparities' error
 _PIXEL_SIGMA = 0.5  # of a point's position by its depth and its track
 # errors of neighbours have much in common: a fit is no better than that of so many points
 _INDEPENDENT_POINTS = 50
@@ -56,6 +63,7 @@ _VOTERS = 50  # how many points vote, and for how many frames each must have bee
 _VOTING_FRAMES = 5
 _CLEAR_VOTE = 0.7  # share of the voting points that must follow a motion
 _FRAMES = 5  # in a row before an object is reported
+_EVENT_FRAMES = 2  # in a row before an object is known, and may hide the scene
 # of the points that the scene has, during an event, below which the object hides it …
 _HIDDEN_SHARE = 0.1
 _HIDDEN_FRAMES = 3  # … in so many frames in a row
@@ -80,7 +88,7 @@ def choose_motion(
     *,
     voting: BoolArray | None = None,
     in_event: bool = False,
-    depths_off: bool = False,
+    disparity_error_px: float = 0.0,
 ) -> TwoMotions:
     """Choose between the consensus motion and that of its outliers.
 
@@ -95,21 +103,33 @@ def choose_motion(
         in_event: whether an object has been seen in the frames before. It may hide all but a few
             points of the scene, and then the prediction is taken in place of a consensus that
             contradicts it.
-        depths_off: whether the points' depths are known to be off, so that no motion explains all
-            of a static scene; a prediction that is not measured is off with them.
+        disparity_error_px: bound of the error of the disparities that the points are triangulated
+            from, pixels. Where it is not 0, no motion explains all of a static scene, and a
+            prediction that is not measured is off with the depths.
     """
     measured = predicted is not None and predicted.measured
-    # the scene may be, and then the prediction is to be believed
-    hidden = in_event and (measured or not depths_off)
     if voting is not None and not measured:
         voted = _voted(problem, p_prev, pixels, found, voting)
         if voted is not None and not _prediction_overrules(
-            problem, p_prev, found, voted, None if depths_off else predicted
+            problem, p_prev, found, voted, predicted, disparity_error_px
         ):
             return TwoMotions(voted, _if_large((found.inliers & ~voted.inliers).mean()), "voted")
     others = np.flatnonzero(~found.inliers)
     least = max(_MIN_POINTS, _MIN_SUPPORT * found.inliers.sum())
-    if len(others) < least and not hidden:
+    limit = float(chi_square_quantile(_PROBABILITY, 6))
+    # the prediction is that of a body that goes on as before
+    extrapolated = predicted is not None and not measured
+    of_first = np.inf
+    if predicted is not None and (len(others) >= least or in_event or extrapolated):
+        of_first = squared_distance(
+            problem.camera,
+            found.T_curr_prev,
+            p_prev[found.inliers],
+            predicted,
+            disparity_error_px,
+        )
+    contradicted = extrapolated and of_first > limit
+    if len(others) < least and not (in_event or contradicted):
         return TwoMotions(found, 0.0, None)
     second = np.eye(4)
     support = np.zeros(len(others), dtype=np.bool_)
@@ -118,16 +138,10 @@ def choose_motion(
         second, support = best_motion(problem, p_prev[others], pixels[others], starts)
     large = bool(support.sum() >= least)
     reported = _if_large(support.sum() / len(p_prev)) if large else 0.0
-    # the prediction is that of a body that goes on as before
-    extrapolated = not (measured or depths_off)
-    limit = float(chi_square_quantile(_PROBABILITY, 6))
-    of_first = np.inf
-    if predicted is not None and (large or in_event or extrapolated):
-        of_first = _squared_distance(
-            problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted
+    if predicted is not None and contradicted:
+        near = _near_prediction(
+            problem, p_prev, pixels, found, predicted, limit, disparity_error_px
         )
-    if predicted is not None and extrapolated and of_first > limit:
-        near = _near_prediction(problem, p_prev, pixels, found, predicted, limit)
         if near is not None:
             second = near.T_curr_prev
             support = near.inliers[others]
@@ -138,18 +152,20 @@ def choose_motion(
         else np.zeros(len(p_prev), dtype=np.bool_)
     )
     if large and not measured and voting is not None:
-        elected = None if depths_off else _elected(found.inliers[voting], follows_second[voting])
+        elected = _elected(found.inliers[voting], follows_second[voting])
         if elected == "second":
             object_share = _if_large((found.inliers & ~follows_second).mean())
             return TwoMotions(Consensus(second, follows_second), object_share, "voted")
-        if elected == "first" or (depths_off and _votes_for(found, voting)):
+        if elected == "first":
             return TwoMotions(found, reported, "voted" if reported else None)
     if predicted is None:
         return TwoMotions(found, reported, "undecided" if reported else None)
     if not (large or in_event):
         return TwoMotions(found, 0.0, None)
     of_second = (
-        _squared_distance(problem.camera, second, p_prev[others[support]], predicted)
+        squared_distance(
+            problem.camera, second, p_prev[others[support]], predicted, disparity_error_px
+        )
         if large
         else np.inf
     )
@@ -161,7 +177,7 @@ def choose_motion(
     second_agrees = of_second <= limit
     if not (second_agrees or in_event or reported):
         return TwoMotions(found, 0.0, None)  # whether the first agrees or not
-    if first_agrees or not (second_agrees or hidden):
+    if first_agrees or not (second_agrees or in_event):
         return TwoMotions(
             found, reported, "predicted" if first_agrees and not second_agrees else "undecided"
         )
@@ -179,6 +195,7 @@ def _prediction_overrules(
     found: Consensus,
     voted: Consensus,
     predicted: MotionPrior | None,
+    disparity_error_px: float,
 ) -> bool:
     """Return whether a prediction agrees with the consensus, and better than with the vote.
 
@@ -188,7 +205,9 @@ def _prediction_overrules(
     if predicted is None or found.inliers.sum() < voted.inliers.sum():
         return False
     of_found, of_voted = (
-        _squared_distance(problem.camera, each.T_curr_prev, p_prev[each.inliers], predicted)
+        squared_distance(
+            problem.camera, each.T_curr_prev, p_prev[each.inliers], predicted, disparity_error_px
+        )
         for each in (found, voted)
     )
     return of_found <= min(of_voted, float(chi_square_quantile(_PROBABILITY, 6)))
@@ -213,6 +232,7 @@ def _near_prediction(
     found: Consensus,
     predicted: MotionPrior,
     limit: float,
+    disparity_error_px: float,
 ) -> Consensus | None:
     """The motion near a predicted one that the consensus contradicts, if some points follow this
     one alone.
@@ -232,8 +252,8 @@ def _near_prediction(
     others = found.inliers & ~inliers
     if alone.sum() < max(_MIN_POINTS, _MIN_SUPPORT * others.sum()):
         return None
-    agrees = _squared_distance(problem.camera, T, p_prev[inliers], predicted) <= limit
-    return Consensus(T, inliers) if agrees else None
+    distance = squared_distance(problem.camera, T, p_prev[inliers], predicted, disparity_error_px)
+    return Consensus(T, inliers) if distance <= limit else None
 
 
 def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] | None:
@@ -343,30 +363,73 @@ def _agree_with(
 
 
 def one_motion_explains(
-    problem: RansacProblem, chosen: TwoMotions, before: FloatArray, after: FloatArray
+    problem: RansacProblem,
+    chosen: TwoMotions,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    disparity_error_px: float,
 ) -> bool:
-    """Return whether one motion of the camera explains the second group of points too, at depths of
-    their own.
-
-    An object that moves along the epipolar lines of the scene passes for static here: this is asked
-    only where the depths are known to be wrong.
+    """Return whether the camera's motion explains the second group of points too, at depths of
+    their own that disparities with an error allow.
 
     Args:
         problem: camera, thresholds and random generator.
         chosen: the motions by the points' depths.
-        before: left pixels (N, 2) of the points in the previous frame.
-        after: left pixels (N, 2) in the current frame.
+        p_prev: points (N, 3) triangulated in the previous frame, metres, previous cam0 frame.
+        pixels: left pixels (N, 2) of the same points in the current frame.
+        disparity_error_px: bound of the error of the disparities, pixels.
     """
-    if chosen.object_share == 0.0:
+    if chosen.object_share == 0.0 or chosen.decision == "unsupported":
         return False
-    static = bearing_consensus(problem, before, after, chosen.motion.T_curr_prev[:3, :3], None)
+    motion = chosen.motion
+    before = project(problem.camera, p_prev)[:, :2]
+    static = bearing_consensus(problem, before, pixels, motion.T_curr_prev[:3, :3], None)
+    if static is None:
+        return False
+    off = ~static | ~_within_depths(problem, motion.T_curr_prev, p_prev, pixels, disparity_error_px)
     # of the groups: the larger one is fitted
-    smaller = min(chosen.object_share, share_of(chosen.motion.inliers))
-    return static is not None and float((~static).mean()) < _SEEN_SHARE * smaller
+    smaller = min(chosen.object_share, share_of(motion.inliers))
+    return float(off.mean()) < _SEEN_SHARE * smaller
 
 
-def _squared_distance(
-    camera: StereoCamera, T: FloatArray, p_prev: FloatArray, predicted: MotionPrior
+def _within_depths(
+    problem: RansacProblem,
+    T: FloatArray,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    disparity_error_px: float,
+) -> BoolArray:
+    """Which points (N, 3) a motion (4, 4) moves to left pixels (N, 2), along their epipolar lines,
+    at a depth that disparities with an error allow.
+    """
+    camera = problem.camera
+    constant = camera.fu * camera.baseline_m
+    disparity = constant / depth_of(camera, p_prev)
+    # A yaw moves them by more beside the middle, (R1). Twice: those that the motion was fitted to
+    # are off, too.
+    aside = p_prev[:, 0] / p_prev[:, 2]
+    span = 2.0 * disparity_error_px * (1.0 + aside * aside)
+    ends = []
+    for off in (-span, span):
+        changed = np.maximum(disparity + off, constant / _FAR_M)
+        p = transform_points(T, p_prev * (disparity / changed)[:, None])
+        ahead = depth_of(camera, p) > 0.0
+        p[~ahead] = [0.0, 0.0, 1.0]
+        ends.append(project(camera, p)[:, :2])
+    start, end = ends
+    along = end - start
+    length = np.linalg.norm(along, axis=1) + 1e-12
+    place_px = np.sum((pixels - start) * along, axis=1) / length
+    limit = problem.limit_px
+    return np.asarray((place_px >= -limit) & (place_px <= length + limit))
+
+
+def squared_distance(
+    camera: StereoCamera,
+    T: FloatArray,
+    p_prev: FloatArray,
+    predicted: MotionPrior,
+    disparity_error_px: float,
 ) -> float:
     """Squared distance of a motion (4, 4), fitted to points (N, 3), from the prediction, over
     their covariance.
@@ -375,7 +438,16 @@ def _squared_distance(
     J = _pixel_D_motion(camera, p).reshape(-1, 6)
     points = min(len(p), _INDEPENDENT_POINTS)
     fit = _PIXEL_SIGMA**2 * np.linalg.inv(points * J.T @ J / len(p) + 1e-9 * np.eye(6))
-    fit[:3, :3] += _SCALE_SIGMA**2 * float(T[:3, 3] @ T[:3, 3]) * np.eye(3)
+    moved_m2 = float(T[:3, 3] @ T[:3, 3])
+    fit[:3, :3] += _SCALE_SIGMA**2 * moved_m2 * np.eye(3)
+    if disparity_error_px > 0.0:
+        # a translation is off as its depths are; one that no sensor has measured is, too
+        depth = float(np.median(depth_of(camera, p_prev)))
+        scale = disparity_error_px / _BOUND_SIGMAS * depth / (camera.fu * camera.baseline_m)
+        if not predicted.measured:
+            t = predicted.T_curr_prev[:3, 3]
+            moved_m2 += float(t @ t)
+        fit[:3, :3] += scale**2 * moved_m2 * np.eye(3)
     xi = se3_log(T @ se3_inverse(predicted.T_curr_prev))
     return float(xi @ np.linalg.solve(predicted.covariance + fit, xi))
 
@@ -406,6 +478,8 @@ class ObjectReport(Finder):
 
     def __init__(self) -> None:
         super().__init__()
+        # squared distances from the prediction of motions that older points support
+        self._usual = deque[float](maxlen=_CLEAR_FRAMES)
         self._frames = 0  # with an object, in a row
         self._since = 0  # the first of them
         self._clear = 0  # without one, in a row
@@ -420,6 +494,25 @@ class ObjectReport(Finder):
         frames.
         """
         return self._active
+
+    def questioned(self, motions: TwoMotions, voting: BoolArray, distance: float) -> TwoMotions:
+        """Return the motions of a frame, as unsupported ones where the camera's is far off an
+        extrapolated prediction, and no older point supports it.
+
+        Args:
+            motions: the camera's is the only one.
+            voting: (N,) which points have been static for long.
+            distance: squared distance of the camera's motion from the prediction.
+        """
+        if int((motions.motion.inliers & voting).sum()) >= _MIN_POINTS:
+            self._usual.append(distance)
+            return motions
+        limit = max([float(chi_square_quantile(_PROBABILITY, 6)), *self._usual])
+        if not self._usual or distance <= _CLEARLY_NEARER * limit:
+            return motions
+        return replace(
+            motions, object_share=share_of(motions.motion.inliers), decision="unsupported"
+        )
 
     def hides_scene(self, index: int, motions: TwoMotions) -> bool:
         """Return whether a known object has left too few points of the scene for some frames, so
@@ -445,8 +538,11 @@ class ObjectReport(Finder):
             self._since = index
         self._frames = self._frames + 1
         self._clear = 0
+        if motions.decision == "unsupported":
+            self._report_unsupported(index, motions)
+            return
         undecided = motions.decision == "undecided"
-        self._active = self._active or (self._frames >= _FRAMES and not undecided)
+        self._active = self._active or (self._frames >= _EVENT_FRAMES and not undecided)
         if self._frames >= _FRAMES and self._reported is None:
             self._report(index, motions)
 
@@ -462,6 +558,25 @@ class ObjectReport(Finder):
             self._found.append(Finding("object-hides-scene", message, index, ended=True))
         self._reported = None
         self._hidden_reported = False
+
+    def _report_unsupported(self, index: int, motions: TwoMotions) -> None:
+        if self._reported == "object-or-scene":
+            return
+        if self._reported is not None:
+            self._found.append(
+                Finding(self._reported, f"frame {index}: see below", index, ended=True)
+            )
+        self._reported = "object-or-scene"
+        share = round(100 * motions.object_share)
+        message = (
+            f"frame {index}: {share} % of the points move as the rig did not before, and hardly "
+            "one of them was seen before: the rig was pushed, or an object hides the scene; they "
+            "are taken for the scene"
+        )
+        figures = {"object_share": motions.object_share}
+        self._found.append(
+            Finding("object-or-scene", message, index, index, lasts=True, figures=figures)
+        )
 
     def _report(self, index: int, motions: TwoMotions) -> None:
         share = round(100 * motions.object_share)

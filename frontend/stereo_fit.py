@@ -42,6 +42,8 @@ _GOOD_MATCH = 0.9  # correlation of patches whose rows agree
 _MIN_POINTS = 20
 # root mean square over the matches: from here on the run reports the calibration, too
 _ROWS_OFF_PX = 0.2
+# the third of three like angles over the root mean square of two, at most, at 99 %
+_THIRD_ANGLE = 7.0
 _ROW_SEARCH_FRAMES = 10  # between two such searches, while matches are few
 _MAX_REACH = 0.64  # of the image width: largest disparity that is searched where the scene is near
 _REACH_FRAMES = 10  # between two searches beyond the present reach
@@ -282,6 +284,17 @@ class StereoFit:
         so are the depths.
         """
         return self._rows.rms_px >= _ROWS_OFF_PX
+
+    @property
+    def disparity_error_px(self) -> float:
+        """Bound of the error of disparities that the rows suggest, pixels; 0: they agree.
+
+        Of three like angles of a mount, two shift rows: the third is of their size, and Student's t
+        with two degrees of freedom bounds it. What it does to the rows itself is added.
+        """
+        if not self.rows_are_off:
+            return 0.0
+        return _THIRD_ANGLE * self._rows.rms_px + self._rows.disparity_px(self._camera.fu)
 
     def row_differences(self, left: FloatArray) -> FloatArray:
         """Right minus left rows (N,) that are expected at left pixels (N, 2)."""

@@ -56,6 +56,13 @@ class EpipolarRowModel:
         """Row difference at the image's centre, pixels."""
         return float(self._field[0])
 
+    def disparity_px(self, focal_px: float) -> float:
+        """Size of the common error of disparities, pixels, of the yaw that the rows show.
+
+        A yaw shifts rows by u v / f for what it shifts disparities by f, (R1): the term in x y.
+        """
+        return abs(float(self._field[3])) * (focal_px / self._centre[0]) ** 2
+
     def restart(self, offset_px: float) -> None:
         """Begin again with the same row difference over the whole image."""
         self._normal = _FIELD_PRIOR * np.eye(5)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import logging
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,15 +16,14 @@ from tools.faults.draws import draw, rows_of
 from tools.faults.kinds import HALVES, KINDS
 from tools.faults.recordings import SOURCES
 from tools.faults.scores import (
-    Flag,
-    Listener,
+    UNUSABLE,
     Usual,
-    code_of,
     flagged_frame,
     new_flags,
     pose_errors,
     score,
 )
+from vio.findings import Finding
 from vio.geometry.lie import se3_exp
 from vio.records import ImuSample, StereoFrame, Trajectory
 
@@ -85,24 +83,19 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def test_flags_are_what_the_clean_recording_does_not_say() -> None:
-    listener = Listener()
-    log = logging.getLogger("vio.test_fault_draws")
-    log.addHandler(listener)
-    log.propagate = False
-    log.warning("frame 3: rows differ by %.2f px: calibrate", 0.31)
-    listener.frame(SimpleNamespace(log=SimpleNamespace(index=3)))  # type: ignore[arg-type]
-    log.warning("frame 12: the right camera is frozen: look")
-    listener.frame(SimpleNamespace(log=SimpleNamespace(index=12)))  # type: ignore[arg-type]
-    log.warning("7 of 90 samples were spikes")
-    listener.close()
-    assert [flag.frame for flag in listener.flags] == [3, 12, None]
-    said = new_flags(listener.flags, [code_of("frame 8: rows differ by 0.44 px: calibrate")])
-    assert [flag.frame for flag in said] == [12, None]
+    found = [
+        Finding("features-refused", "frame 3: many", 3),
+        Finding("bands", "frame 4: bands are taken out", 4),
+        Finding("right-image-frozen", "frame 12: look", 12),
+        Finding("imu-readings", "7 of 90 samples were spikes"),
+    ]
+    said = new_flags(found, ["features-refused"])
+    assert [flag.code for flag in said] == ["right-image-frozen", "imu-readings"]
     assert flagged_frame(said, 10) == 12
     assert flagged_frame(said, 13) is None
 
 
-def _result(error_m: float, sigma_m: float) -> Any:
+def _result(error_m: float, sigma_m: float, *findings: Finding, unusable: bool = False) -> Any:
     """Ten poses on a line in a turned world, the last of them off by an error."""
     steps = np.array([se3_exp(np.array([0.1 * k, 0, 0, 0, 0, 0])) for k in range(10)])
     times = STEP_NS * np.arange(10)
@@ -111,13 +104,14 @@ def _result(error_m: float, sigma_m: float) -> Any:
     reference = Trajectory(se3_exp(np.array([1, 2, 3, 0.1, 0.2, 0.3])) @ steps, times, "cam0")
     columns: dict[str, Any] = {"covariance": [np.eye(6) * sigma_m**2 / 3] * 10}
     columns |= {"index": list(range(10)), "gravity_world": [np.full(3, np.nan)] * 10}
-    columns |= {"tilt_sigma_rad": [np.nan] * 10}
+    columns |= {"tilt_sigma_rad": [np.nan] * 10, "integrity": [UNUSABLE * unusable] * 10}
     return SimpleNamespace(
         recording=SimpleNamespace(reference=reference, path=Path("x")),
         T_cam0_body=np.eye(4),
         body="cam0",
         trajectory=Trajectory(wrong, times, "cam0"),
         estimates=SimpleNamespace(column=columns.__getitem__),
+        findings=findings,
     )
 
 
@@ -125,15 +119,19 @@ def test_an_error_is_covered_up_to_three_stated_standard_deviations() -> None:
     errors = pose_errors(_result(0.2, 0.1), 0.0)
     assert errors.ratio[-1] == pytest.approx(2.0, rel=1e-3)
     assert errors.ratio[:-1].max() < 1e-6
-    assert score(_result(0.2, 0.1), [], Usual(), 2, 0.0)["covered"]
-    silent = score(_result(0.4, 0.1), [Flag(None, "at the end")], Usual(), 2, 0.0)
+    assert score(_result(0.2, 0.1), Usual(), 2, 0.0)["covered"]
+    at_end = Finding("imu-readings", "spikes")
+    silent = score(_result(0.4, 0.1, at_end), Usual(), 2, 0.0)
     assert silent["silent"]
     assert silent["beyond_since"] == 9
-    named = score(_result(0.4, 0.1), [Flag(1, "before"), Flag(6, "x")], Usual(), 2, 0.0)
+    assert silent["misleading"] == 1
+    flags = Finding("imu-gap", "before", 1), Finding("imu-gap", "x", 6)
+    named = score(_result(0.4, 0.1, *flags), Usual(), 2, 0.0)
     assert not named["silent"]
     assert named["flagged_after"] == 4
-    assert score(_result(0.4, 0.1), [], Usual(ratio=3.9), 2, 0.0)["covered"]
-    assert score(_result(0.4, 0.1), [], Usual(), 2, 0.3)["covered"]  # as the truth is no better
+    assert score(_result(0.4, 0.1, *flags, unusable=True), Usual(), 2, 0.0)["misleading"] == 0
+    assert score(_result(0.4, 0.1), Usual(ratio=3.9), 2, 0.0)["covered"]
+    assert score(_result(0.4, 0.1), Usual(), 2, 0.3)["covered"]  # as the truth is no better
 
 
 def test_the_page_counts_by_kind(tmp_path: Path) -> None:

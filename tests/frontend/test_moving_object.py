@@ -224,7 +224,7 @@ def test_the_prediction_outweighs_an_object_that_shares_what_is_far_away_with_th
     assert chosen.decision == "predicted"
     assert chosen.motion.inliers[part < 2].mean() > 0.9
     assert not chosen.motion.inliers[part == 2].any()
-    for changed in ({"predicted": None}, {"predicted": guess, "depths_off": True}):
+    for changed in ({"predicted": None}, {"predicted": guess, "disparity_error_px": 50.0}):
         assert choose_motion(make_problem(), p, uv, found, voting=voting, **changed).motion is found
 
 
@@ -358,7 +358,7 @@ def test_left_images_show_an_object_that_covers_most_of_them() -> None:
     p, uv, _ = scenery(60, 240)
     chosen, _, _ = choose(60, 240, prediction())
     assert chosen.object_share > 0.7
-    assert not one_motion_explains(make_problem(), chosen, project(CAMERA, p)[:, :2], uv)
+    assert not one_motion_explains(make_problem(), chosen, p, uv, 5.0)
 
 
 def test_an_object_that_moves_along_the_road_is_reported_where_the_rows_agree() -> None:

@@ -18,8 +18,9 @@ _PAGE = """# Faults that are drawn
 real ones and renders, short (2 to 11 s). Commit {commit}, seeds {seeds}.
 
 *Covered*: the position, relative to the first pose, is within {covered:g} stated standard deviations (root of the
-trace) in every frame, or at most a fifth further off than in the recording as it is. *Flagged*: something is said that
-is not said of the recording as it is; *soon* within {soon} frames of the fault's first frame. *Silent*: neither covered
+trace) in every frame, or at most a fifth further off than in the recording as it is. *Flagged*: there is a
+[finding](findings.md) that makes estimates degraded or unusable and that the recording as it is does not have; *soon*
+within {soon} frames of the fault's first frame. *Silent*: neither covered
 nor flagged before the end of the run. *Refused*: the run ends with an error. Kinds marked * were kept aside while the
 checks were written.
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -33,7 +34,7 @@ from tools.faults.drawn_page import page, tables
 from tools.faults.healthy import HEALTHY
 from tools.faults.kinds import HALVES, KINDS, Half, Kind
 from tools.faults.recordings import SOURCES, Source, ready
-from tools.faults.scores import Listener, Usual, code_of, score
+from tools.faults.scores import Usual, code_of, new_flags, score
 from vio import evaluate, load_config, open_dataset
 from vio.bench.identity import commit_of
 from vio.errors import VioError
@@ -103,12 +104,12 @@ class Folders:
 def run_clean(source: Source, motion: MotionSource | None, folders: Folders) -> dict[str, Any]:
     """Run a recording as it is."""
     dataset = _opened(source, folders)
-    listener, outcome = _run(dataset, source, motion)
-    row: dict[str, Any] = {"kind": CLEAN, "source": source.name, "motion": motion}
-    row["codes"] = list(dict.fromkeys(flag.code for flag in listener.flags))
+    outcome = _run(dataset, source, motion)
+    row: dict[str, Any] = {"kind": CLEAN, "source": source.name, "motion": motion, "codes": []}
     if isinstance(outcome, VioError):
         return row | {"error": str(outcome)}
-    return row | {"ate_m": _ate_m(outcome)} | score(outcome, [], Usual(), 0, source.truth_sigma_m)
+    row["codes"] = list(dict.fromkeys(flag.code for flag in new_flags(outcome.findings, ())))
+    return row | {"ate_m": _ate_m(outcome)} | score(outcome, Usual(), 0, source.truth_sigma_m)
 
 
 def run_draw(drawn: Draw, clean: dict[str, Any], folders: Folders) -> dict[str, Any]:
@@ -123,13 +124,13 @@ def run_draw(drawn: Draw, clean: dict[str, Any], folders: Folders) -> dict[str, 
     onset = _onset(kind, period, times_ns)
     row: dict[str, Any] = asdict(drawn) | {"onset": onset, "clean_ate_m": clean.get("ate_m")}
     start = time.process_time()
-    listener, outcome = _run(changed, source, drawn.motion)
+    outcome = _run(changed, source, drawn.motion)
     row["cpu_s"] = round(time.process_time() - start, 1)
     if isinstance(outcome, VioError):
         return row | {"error": code_of(str(outcome)), "flagged_after": None, "silent": False}
     row["ate_m"] = _ate_m(outcome)
     usual = Usual(tuple(clean["codes"]), clean.get("ratio", 0.0))
-    return row | score(outcome, listener.flags, usual, onset, source.truth_sigma_m)
+    return row | score(outcome, usual, onset, source.truth_sigma_m)
 
 
 def _opened(source: Source, folders: Folders) -> Dataset:
@@ -150,22 +151,14 @@ def _onset(kind: Kind | None, period: Period, times_ns: np.ndarray) -> int:
     return int(np.searchsorted(times_ns, period.begin_ns))
 
 
-def _run(
-    dataset: Dataset, source: Source, motion: MotionSource | None
-) -> tuple[Listener, RunResult | VioError]:
-    log = logging.getLogger("vio")
-    listener = Listener()
-    log.addHandler(listener)
-    log.propagate = False
+def _run(dataset: Dataset, source: Source, motion: MotionSource | None) -> RunResult | VioError:
     config = load_config(overrides=[f"motion={motion or 'none'}"])
     stop = source.frames
     stop = None if stop is None else min(stop, len(dataset.recording.frame_times_ns))
     try:
-        return listener, run(dataset, config, stop=stop, viewer=listener)
+        return run(dataset, config, stop=stop)
     except VioError as error:
-        return listener, error
-    finally:
-        log.removeHandler(listener)
+        return error
 
 
 def _ate_m(result: RunResult) -> float:
@@ -269,7 +262,10 @@ def _run_all(
     wanted = [d for d in drawn if (d.seed, d.number) not in done]
     by_name = {source.name: source for source in sources}
     needed = list(dict.fromkeys((d.source, d.motion) for d in wanted))
-    with ProcessPoolExecutor(options.workers) as pool, out.open("a", encoding="utf-8") as file:
+    # not forked: what rendered holds locks of threads
+    spawned = multiprocessing.get_context("spawn")
+    pools = ProcessPoolExecutor(options.workers, mp_context=spawned)
+    with pools as pool, out.open("a", encoding="utf-8") as file:
 
         def kept(works: Iterator[Work]) -> Iterator[dict[str, Any]]:
             for row in _rows_by(pool, works, options.workers, until):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,9 +11,10 @@ import numpy as np
 
 from vio.errors import EvaluationError
 from vio.evaluation.association import associate
+from vio.findings import INTEGRITIES, Finding
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.upright import yaw_and_position
-from vio.records import BoolArray, FrameResult, IntArray, Trajectory
+from vio.records import BoolArray, IntArray, Trajectory
 from vio.runs.pipeline import RunResult
 
 COVERED = 3.0  # standard deviations
@@ -22,56 +22,26 @@ WORSE = 1.2  # times the ratio of the recording as it is: no worse than that
 SOON_FRAMES = 10
 _SETTLED_FRAMES = 5  # the first poses are millimetres apart, with a stated sigma near zero
 _MIN_SIGMA_M = 1e-4
-
-
-@dataclass(frozen=True, slots=True)
-class Flag:
-    """Something that a run said."""
-
-    frame: int | None  # after which it was said; None: at the end of the run
-    code: str  # the line without its numbers: what is equal is one flag
-
-
-class Listener(logging.Handler):
-    """Collects what a run says, with the frame of each line; a viewer and a handler of logs."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.flags: list[Flag] = []
-        self._lines: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Take a line."""
-        self._lines.append(record.getMessage())
-
-    def frame(self, result: FrameResult) -> None:
-        """Give the lines since the last frame the number of this one."""
-        self._take(result.log.index)
-
-    def close(self) -> None:
-        """Take what was said after the last frame."""
-        self._take(None)
-        super().close()
-
-    def _take(self, index: int | None) -> None:
-        self.flags += [Flag(index, code_of(line)) for line in self._lines]
-        self._lines = []
+UNUSABLE = INTEGRITIES.index("unusable")
 
 
 def code_of(line: str) -> str:
-    """Return a line up to its first explanation, without numbers and without the frame."""
+    """Return an error's line up to its first explanation, without numbers and without the frame."""
     without_place = re.sub(r"^frame \d+: ", "", line)
     return re.sub(r"[-+]?\d[\d.]*", "#", re.split(r"[:;] ", without_place)[0])
 
 
-def new_flags(flags: Iterable[Flag], usual: Iterable[str]) -> list[Flag]:
-    """Return what was said of a run, but not of the recording as it is (codes)."""
+def new_flags(findings: Iterable[Finding], usual: Iterable[str]) -> list[Finding]:
+    """Return what a run found to be other than nominal, less the codes of the recording as it is."""
     known = set(usual)
-    return [flag for flag in flags if flag.code not in known]
+    return [f for f in findings if f.effect != "nominal" and f.code not in known]
 
 
-def flagged_frame(flags: Iterable[Flag], onset: int) -> int | None:
-    """Return the frame after which the first flag from an onset on was raised; None: none was."""
+def flagged_frame(flags: Iterable[Finding], onset: int) -> int | None:
+    """Return the frame of the first flag from an onset on; None: there is none.
+
+    What holds for the whole recording was found at its end.
+    """
     frames = [flag.frame for flag in flags if flag.frame is not None and flag.frame >= onset]
     return min(frames, default=None)
 
@@ -83,6 +53,7 @@ class PoseErrors:
     frames: IntArray  # (N,) their numbers
     error_m: FloatArray  # (N,)
     sigma_m: FloatArray  # (N,) root of the trace of the stated covariance of the position
+    unusable: BoolArray  # (N,) the run says that the pose may not be used
 
     @property
     def ratio(self) -> FloatArray:
@@ -120,8 +91,9 @@ def pose_errors(result: RunResult, truth_sigma_m: float) -> PoseErrors:
     variance = np.trace(covariances[:, :3, :3], axis1=1, axis2=2)
     sigma_m = np.sqrt(variance + truth_sigma_m**2 + _MIN_SIGMA_M**2)
     indices = np.array(result.estimates.column("index"))[rows]
+    unusable = np.array(result.estimates.column("integrity"))[rows] == UNUSABLE
     kept = slice(_SETTLED_FRAMES, None)
-    return PoseErrors(indices[kept], error_m[kept], sigma_m[kept])
+    return PoseErrors(indices[kept], error_m[kept], sigma_m[kept], unusable[kept])
 
 
 def _is_upright(result: RunResult) -> BoolArray:
@@ -153,19 +125,18 @@ def _errors_m(T_est: FloatArray, T_ref: FloatArray, upright: BoolArray) -> Float
 class Usual:
     """What is known of a recording as it is."""
 
-    codes: tuple[str, ...] = ()  # what is said of it
+    codes: tuple[str, ...] = ()  # of what is found in it
     ratio: float = 0.0  # its largest error over the stated standard deviation
 
 
-def score(
-    result: RunResult, flags: list[Flag], usual: Usual, onset: int, truth_sigma_m: float
-) -> dict[str, Any]:
+def score(result: RunResult, usual: Usual, onset: int, truth_sigma_m: float) -> dict[str, Any]:
     """Return the figures of a run with a fault that begins at a frame."""
     errors = pose_errors(result, truth_sigma_m)
     ratio = errors.ratio
     worst = int(np.argmax(ratio))
-    beyond = errors.frames[ratio > max(COVERED, WORSE * usual.ratio)]
-    said = new_flags(flags, usual.codes)
+    is_beyond = ratio > max(COVERED, WORSE * usual.ratio)
+    beyond = errors.frames[is_beyond]
+    said = new_flags(result.findings, usual.codes)
     flagged = flagged_frame(said, onset)
     covered = not len(beyond)
     return {
@@ -175,6 +146,7 @@ def score(
         "error_m": float(errors.error_m[worst]),
         "sigma_m": float(errors.sigma_m[worst]),
         "beyond_since": None if covered else int(beyond[0]),
+        "misleading": int(np.count_nonzero(is_beyond & ~errors.unusable)),
         "flagged_after": None if flagged is None else flagged - onset,
         "said": list(dict.fromkeys(flag.code for flag in said)),
         "silent": not covered and flagged is None,
