@@ -438,7 +438,8 @@ def test_another_board_is_refused_in_one_line(
     target.write_text(target_text(Target("charuco", 5, 7, 0.04, 0.7, "DICT_4X4_50")))
     assert main(["calibrate-rig", str(rendered), "--target", str(target)]) == 1
     message = capsys.readouterr().err
-    assert "check that the target file" in message
+    assert "the images show an AprilGrid with tags 0 to 11" in message
+    assert "give the file of the board that was recorded" in message
     assert message.count("\n") == 1
 
 

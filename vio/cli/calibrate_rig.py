@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vio.cli.output import ProgressBar, print_result
-from vio.errors import ConfigError
+from vio.errors import ConfigError, DataError
 from vio.files.printable import json_text
 
 if TYPE_CHECKING:
@@ -97,7 +97,10 @@ def execute(args: argparse.Namespace) -> int:
         inertial = None
         if filmed.imu is not None and not args.no_imu:
             densities = _densities(args.imu_noise)
-            inertial = calibrate_with_imu(filmed, target, found, densities, args.imu_terms)
+            try:
+                inertial = calibrate_with_imu(filmed, target, found, densities, args.imu_terms)
+            except DataError as error:
+                raise DataError(f"{error}; or leave the IMU out by --no-imu") from error
             rig = replace(
                 rig,
                 T_cam0_imu=inertial.T_cam0_imu,
