@@ -66,6 +66,16 @@ def test_names_a_board_of_another_kind(shown: Target, images: dict[str, Image]) 
 
 
 @pytest.mark.parametrize("target", [SMALL, CHARUCO], ids=lambda target: target.kind)
+def test_does_not_name_the_right_board_that_is_hardly_seen(
+    target: Target, images: dict[str, Image]
+) -> None:
+    part = images[target.kind].copy()
+    part[:, : part.shape[1] // 2] = 120
+    part[part.shape[0] // 2 :] = 120
+    assert diagnose([part], target) is None
+
+
+@pytest.mark.parametrize("target", [SMALL, CHARUCO], ids=lambda target: target.kind)
 def test_names_mirrored_images(target: Target, images: dict[str, Image]) -> None:
     mirrored = np.ascontiguousarray(images[target.kind][:, ::-1])
     reason = diagnose([mirrored], target)
@@ -76,7 +86,9 @@ def test_names_mirrored_images(target: Target, images: dict[str, Image]) -> None
 @pytest.mark.parametrize("target", [SMALL, CHARUCO, CHECKERBOARD], ids=lambda target: target.kind)
 def test_finds_nothing_wrong_with_the_right_file(target: Target, images: dict[str, Image]) -> None:
     assert diagnose([images[target.kind]], target) is None
-    assert diagnose([np.full_like(images[target.kind], 120)], target) is None
+    empty = np.full_like(images[target.kind], 120)
+    assert diagnose([empty], target) is None
+    assert diagnose([images[target.kind], empty], target) is None
 
 
 def test_the_command_names_mirrored_images_in_one_line(

@@ -32,7 +32,7 @@ def add_parser(commands: Any) -> None:
         "other, and what to record where something is missing; and the pose "
         "and clock of an IMU that the recording has. The recording needs no calibration. "
         "Writes Kalibr's camchain-imucam.yaml, which vio run --calibration takes, and the files of "
-        "ROS, OpenCV and Basalt.",
+        "ROS, OpenCV and Basalt, and a page about it, report.html.",
     )
     parser.add_argument(
         "source", metavar="RECORDING", help="any recording with images, or a folder of pairs"

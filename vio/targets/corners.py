@@ -2,7 +2,8 @@
 
 Seeds are markers that are read, or a whole checkerboard. From them the place of every
 further corner is predicted by the homography of its nearest neighbours, refined in the image, and
-kept if the image there looks like the board. No corner is taken from OpenCV's refinements of
+kept if the image there looks like the board. In blurred images the print itself is aligned, see
+`vio.targets.blurred`. No corner is taken from OpenCV's refinements of
 markers and ChArUco boards, which are off by half a pixel in some versions.
 References: Förstner & Gülch, A fast operator for detection and precise location of distinct points
 (1987), for the refinement that `cv2.cornerSubPix` implements; Duda & Frese, Accurate detection and

@@ -54,9 +54,7 @@ def diagnose(images: Sequence[Image], target: Target) -> str | None:
             )
         if (other := _other_arrangement(images, target)) is not None:
             return other
-    if seen == len(images) and target.kind != "checkerboard":
-        return None
-    return _other_kind(images, target)
+    return _other_kind(images, target, is_seen=seen > 0)
 
 
 def _other_arrangement(images: Sequence[Image], target: Target) -> str | None:
@@ -154,16 +152,16 @@ def _corners_of(target: Target, numbers: Sequence[int]) -> FloatArray:
     return np.stack([corners[number] for number in numbers])
 
 
-def _other_kind(images: Sequence[Image], target: Target) -> str | None:
-    """Say which board the images show, where it is of another kind."""
+def _other_kind(images: Sequence[Image], target: Target, *, is_seen: bool) -> str | None:
+    """Say which board the images show, where it is another one."""
     shown: str | None = None
-    if target.kind != "checkerboard":
-        shown = _tags_in(images) or _markers_in(images)
-    if shown is None and (size := _checkerboard_in(images)) is not None:
-        if target.kind == "checkerboard" and sorted(size) == sorted((target.cols, target.rows)):
-            return None
-        shown = f"a checkerboard of {size[0]} x {size[1]} squares"
-    shown = shown or _tags_in(images) or _markers_in(images)
+    if target.kind == "checkerboard":
+        # Part of a larger board may have been taken for it.
+        shown = _checkerboard_in(images, target)
+    if shown is None and not is_seen:
+        shown = _tags_in(images, target) or _markers_in(images, target)
+        if shown is None and target.kind != "checkerboard":
+            shown = _checkerboard_in(images, target)
     if shown is None:
         return None
     return (
@@ -172,8 +170,8 @@ def _other_kind(images: Sequence[Image], target: Target) -> str | None:
     )
 
 
-def _checkerboard_in(images: Sequence[Image]) -> tuple[int, int] | None:
-    """Return columns and rows of squares of a checkerboard."""
+def _checkerboard_in(images: Sequence[Image], target: Target) -> str | None:
+    """Return a checkerboard in the images that is not the target."""
     import cv2
 
     for image in images:
@@ -181,19 +179,33 @@ def _checkerboard_in(images: Sequence[Image]) -> tuple[int, int] | None:
         done, _, meta = cv2.findChessboardCornersSBWithMeta(image, (4, 4), flags)
         if done and meta is not None:
             rows, cols = meta.shape[:2]
-            return cols + 1, rows + 1
+            size = (cols + 1, rows + 1)
+            is_own = target.kind == "checkerboard" and sorted(size) == sorted(
+                (target.cols, target.rows)
+            )
+            return None if is_own else f"a checkerboard of {size[0]} x {size[1]} squares"
     return None
 
 
-def _tags_in(images: Sequence[Image]) -> str | None:
+def _tags_in(images: Sequence[Image], target: Target) -> str | None:
+    """Return tags of an AprilGrid in the images that are not those of the target."""
     read = _most_read(images, Target("aprilgrid", 1, _MARKERS_TRIED, 0.1, 0.3))
     if len(read) < _MIN_MARKERS:
         return None
     numbers = [one.id for one in read]
+    if target.kind == "aprilgrid" and _are_own(numbers, target):
+        return None
     return f"an AprilGrid with tags {min(numbers)} to {max(numbers)} among others"
 
 
-def _markers_in(images: Sequence[Image]) -> str | None:
+def _are_own(numbers: Sequence[int], target: Target) -> bool:
+    """Return whether markers of these numbers are on the target."""
+    first = target.first_id
+    return min(numbers) >= first and max(numbers) < first + len(target.marker_corners())
+
+
+def _markers_in(images: Sequence[Image], target: Target) -> str | None:
+    """Return markers of some dictionary in the images that are not those of the target."""
     import cv2
 
     most = _MIN_MARKERS - 1
@@ -202,8 +214,17 @@ def _markers_in(images: Sequence[Image]) -> str | None:
         detector = cv2.aruco.ArucoDetector(marker_dictionary(name), cv2.aruco.DetectorParameters())
         for image in images:
             ids = detector.detectMarkers(image)[1]
-            numbers = [] if ids is None else np.ravel(ids).tolist()
+            numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
             if len(numbers) > most:
                 most = len(numbers)
+                alike = _size_of(name) == _size_of(target.dictionary)
+                found = None
+                if alike and _are_own(numbers, target):
+                    continue
                 found = f"markers of {name}, {min(numbers)} to {max(numbers)} among others"
     return found
+
+
+def _size_of(dictionary: str) -> str:
+    """Return the name of a dictionary without the number of its markers."""
+    return dictionary.rpartition("_")[0]
