@@ -26,7 +26,7 @@ for seconds in times_ns * 1e-9:
     z[:, 2] -= disparity
     z += rng.normal(0, 0.3, z.shape)
     seen = (depth > 3) & (z > 0).all(axis=1) & (z[:, 0] < 1200) & (z[:, 1] < 370)
-    ids = np.flatnonzero(seen)  # one id for one point, for good
+    ids = np.flatnonzero(seen)  # one id for one point
     frames.append((ids, z[seen], disparity[seen] > 3))  # those far away: left pixels only
 
 vio.write_observations(sys.argv[1], rig, times_ns, frames)

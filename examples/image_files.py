@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 
 import vio
+from vio.datasets.images import natural_key
 
 left, right, calibration = map(Path, sys.argv[1:4])
 rate_hz = float(sys.argv[4]) if len(sys.argv) > 4 else 20.0
@@ -17,7 +18,8 @@ rate_hz = float(sys.argv[4]) if len(sys.argv) > 4 else 20.0
 rig = vio.load_rig(calibration)
 odometry = vio.Odometry(rig, vio.load_config(overrides=["motion=none"]))
 
-names = sorted({p.name for p in left.iterdir()} & {p.name for p in right.iterdir()})
+shared = {p.name for p in left.iterdir()} & {p.name for p in right.iterdir()}
+names = sorted(shared, key=natural_key)  # numbers as numbers: 2.png comes before 10.png
 if not names:
     sys.exit(f"no image of {left} has the name of one of {right}")
 for k, name in enumerate(names):
@@ -30,5 +32,6 @@ for k, name in enumerate(names):
     if estimate is not None:
         print(name, estimate.T_world_imu[:3, 3].round(4))
 odometry.finish()
-points = odometry.landmarks()
-print(f"{len(points.ids)} landmarks, {len(odometry.warnings)} warnings")
+print(f"{len(odometry.landmarks().ids)} landmarks")
+for line in odometry.warnings:
+    print("warning:", line)

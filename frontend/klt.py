@@ -16,11 +16,11 @@ from vio.frontend.columns import changed
 from vio.frontend.detect import detect_corners, half_mask, load_mask
 from vio.frontend.flow import track_with_retries
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output
+from vio.frontend.given_corners import given_corners
 from vio.frontend.moving_object import (
     ObjectReport,
     choose_motion,
     one_motion_explains,
-    squared_distance,
     static_by_prediction,
     voters,
 )
@@ -52,6 +52,7 @@ from vio.frontend.tracks import (
 )
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.geometry.stereo import StereoCamera
+from vio.protocols import Detector
 from vio.records import (
     BoolArray,
     CheckedFrame,
@@ -89,8 +90,15 @@ class KltFrontend:
     deterministic to the bit: it depends on the images, the priors and the settings only.
     """
 
-    def __init__(self, camera: StereoCamera, settings: FrontendSettings | None = None) -> None:
+    def __init__(
+        self,
+        camera: StereoCamera,
+        settings: FrontendSettings | None = None,
+        detector: Detector | None = None,
+    ) -> None:
+        """Prepare; a `detector` finds the corners in place of the built-in one."""
         settings = FrontendSettings() if settings is None else settings
+        self._detector = detector
         self._settings = settings.klt
         self._grid = settings.grid
         self._seed = settings.consensus.seed
@@ -132,7 +140,7 @@ class KltFrontend:
         watch.lap("prepare")
         tracks, motion = self._track(images, usable_prior(prior), watch)
         wanted = self._wanted_corners(len(tracks))
-        corners = detect_corners(left.half, tracks.left, wanted, self._grid, allowed)
+        corners = self._corners(left, tracks.left, wanted, allowed)
         watch.lap("detect")
         # Without a second camera no corner is searched along the row; `delayed` takes them without
         # a depth.
@@ -153,6 +161,14 @@ class KltFrontend:
         sigma = self._bank.sigma(tracks.slot, depth_image=kind == "rgbd")
         found = self._take_findings()
         return make_output(frame, tracks, tracked, watch, found, shown=tracks.shown, sigma=sigma)
+
+    def _corners(
+        self, left: ImageLevels, occupied: FloatArray, wanted: int, allowed: BoolArray | None
+    ) -> FloatArray:
+        """Return new corners (K, 2), best first, by the built-in detector or the caller's."""
+        if self._detector is None:
+            return detect_corners(left.half, occupied, wanted, self._grid, allowed)
+        return given_corners(self._detector, left.full, occupied, wanted, self._grid, allowed)
 
     def follow_right(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
         """Follow the features of the last good pair in the right image of a frame whose left one
@@ -423,11 +439,9 @@ class KltFrontend:
             ):
                 chosen = replace(chosen, object_share=0.0)
             if chosen.decision is None and expected_motion is not None and measured is None:
-                inliers = deep_point[chosen.motion.inliers]
-                distance = squared_distance(
-                    camera, chosen.motion.T_curr_prev, inliers, expected_motion, error_px
+                chosen = self._objects.questioned(
+                    chosen, camera, deep_point, expected_motion, voting, error_px
                 )
-                chosen = self._objects.questioned(chosen, voting, distance)
             motion = chosen.motion
             kept[has_depth] = chosen.motion.inliers
             self._objects.frame(index, chosen)

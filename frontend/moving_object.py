@@ -59,6 +59,8 @@ _MIN_STATIC = 0.8  # share of a consensus without depths that a measured motion 
 _FAR_M = 1e4  # depth of what is infinitely far away
 # of the length of a fitted translation: depths of one frame have errors in common
 _SCALE_SIGMA = 0.01
+# errors of points of the scene over the median of those that are static for long: of 1000 one more
+_FOLLOWING = 3.2
 _VOTERS = 50  # how many points vote, and for how many frames each must have been static
 _VOTING_FRAMES = 5
 _CLEAR_VOTE = 0.7  # share of the voting points that must follow a motion
@@ -120,15 +122,23 @@ def choose_motion(
     # the prediction is that of a body that goes on as before
     extrapolated = predicted is not None and not measured
     of_first = np.inf
-    if predicted is not None and (len(others) >= least or in_event or extrapolated):
-        of_first = squared_distance(
+    is_far = predicted is not None and _is_beyond(found.T_curr_prev, predicted, limit)
+    if predicted is not None and (len(others) >= least or in_event or is_far):
+        of_first = _squared_distance(
             problem.camera,
             found.T_curr_prev,
             p_prev[found.inliers],
             predicted,
             disparity_error_px,
         )
-    contradicted = extrapolated and of_first > limit
+    contradicted = is_far and of_first > limit
+    if predicted is not None and measured and contradicted and voting is not None:
+        slow = _without_slow_object(
+            problem, p_prev, pixels, found, predicted, limit, voting, disparity_error_px
+        )
+        if slow is not None:
+            return TwoMotions(slow, _if_large((found.inliers & ~slow.inliers).mean()), "predicted")
+    contradicted = contradicted and extrapolated
     if len(others) < least and not (in_event or contradicted):
         return TwoMotions(found, 0.0, None)
     second = np.eye(4)
@@ -163,7 +173,7 @@ def choose_motion(
     if not (large or in_event):
         return TwoMotions(found, 0.0, None)
     of_second = (
-        squared_distance(
+        _squared_distance(
             problem.camera, second, p_prev[others[support]], predicted, disparity_error_px
         )
         if large
@@ -205,7 +215,7 @@ def _prediction_overrules(
     if predicted is None or found.inliers.sum() < voted.inliers.sum():
         return False
     of_found, of_voted = (
-        squared_distance(
+        _squared_distance(
             problem.camera, each.T_curr_prev, p_prev[each.inliers], predicted, disparity_error_px
         )
         for each in (found, voted)
@@ -252,8 +262,41 @@ def _near_prediction(
     others = found.inliers & ~inliers
     if alone.sum() < max(_MIN_POINTS, _MIN_SUPPORT * others.sum()):
         return None
-    distance = squared_distance(problem.camera, T, p_prev[inliers], predicted, disparity_error_px)
+    distance = _squared_distance(problem.camera, T, p_prev[inliers], predicted, disparity_error_px)
     return Consensus(T, inliers) if distance <= limit else None
+
+
+def _without_slow_object(
+    problem: RansacProblem,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    found: Consensus,
+    predicted: MotionPrior,
+    limit: float,
+    voting: BoolArray,
+    disparity_error_px: float,
+) -> Consensus | None:
+    """The motion of the points that have been static for long, and those that follow it as well as
+    they do, if it agrees with a predicted one that the consensus contradicts.
+
+    What moves by less than the limit of an outlier in a frame is part of the consensus, and drags
+    it along.
+    """
+    old = voting & found.inliers
+    if old.sum() < _MIN_POINTS:
+        return None
+    T, _ = best_motion(problem, p_prev[old], pixels[old], predicted.T_curr_prev[None])
+    errors = pixel_errors(problem.camera, T, p_prev, pixels)
+    usual_px = _FOLLOWING * float(np.median(errors[old]))
+    follows = np.asarray(errors <= min(usual_px, problem.limit_px))
+    moving = found.inliers & ~follows
+    # old points that do not follow: the scene is no better known than what came into view
+    if moving.sum() < max(_MIN_POINTS, _LARGE_SHARE * len(p_prev)):
+        return None
+    if (moving & voting).sum() > (1.0 - _CLEAR_VOTE) * voting.sum():
+        return None
+    distance = _squared_distance(problem.camera, T, p_prev[old], predicted, disparity_error_px)
+    return Consensus(T, follows) if distance <= limit else None
 
 
 def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] | None:
@@ -424,7 +467,7 @@ def _within_depths(
     return np.asarray((place_px >= -limit) & (place_px <= length + limit))
 
 
-def squared_distance(
+def _squared_distance(
     camera: StereoCamera,
     T: FloatArray,
     p_prev: FloatArray,
@@ -450,6 +493,14 @@ def squared_distance(
         fit[:3, :3] += scale**2 * moved_m2 * np.eye(3)
     xi = se3_log(T @ se3_inverse(predicted.T_curr_prev))
     return float(xi @ np.linalg.solve(predicted.covariance + fit, xi))
+
+
+def _is_beyond(T: FloatArray, predicted: MotionPrior, limit: float) -> bool:
+    """Whether a motion (4, 4) is further from the prediction than a limit of the squared distance,
+    over the prediction's covariance alone: that of a fit to points is added only if it is.
+    """
+    xi = se3_log(T @ se3_inverse(predicted.T_curr_prev))
+    return float(xi @ np.linalg.solve(predicted.covariance, xi)) > limit
 
 
 def _pixel_D_motion(camera: StereoCamera, p: FloatArray) -> FloatArray:
@@ -495,24 +546,36 @@ class ObjectReport(Finder):
         """
         return self._active
 
-    def questioned(self, motions: TwoMotions, voting: BoolArray, distance: float) -> TwoMotions:
+    def questioned(
+        self,
+        motions: TwoMotions,
+        camera: StereoCamera,
+        p_prev: FloatArray,
+        predicted: MotionPrior,
+        voting: BoolArray,
+        disparity_error_px: float,
+    ) -> TwoMotions:
         """Return the motions of a frame, as unsupported ones where the camera's is far off an
         extrapolated prediction, and no older point supports it.
 
-        Args:
-            motions: the camera's is the only one.
-            voting: (N,) which points have been static for long.
-            distance: squared distance of the camera's motion from the prediction.
+        Arguments as of `choose_motion`; the camera's motion is the only one.
         """
-        if int((motions.motion.inliers & voting).sum()) >= _MIN_POINTS:
+        motion = motions.motion
+        supported = int((motion.inliers & voting).sum()) >= _MIN_POINTS
+        limit = float(chi_square_quantile(_PROBABILITY, 6))
+        if not supported:
+            limit = _CLEARLY_NEARER * max([limit, *self._usual])
+        distance = 0.0
+        if _is_beyond(motion.T_curr_prev, predicted, limit):
+            points = p_prev[motion.inliers]
+            distance = _squared_distance(
+                camera, motion.T_curr_prev, points, predicted, disparity_error_px
+            )
+        if supported:
             self._usual.append(distance)
+        if supported or not self._usual or distance <= limit:
             return motions
-        limit = max([float(chi_square_quantile(_PROBABILITY, 6)), *self._usual])
-        if not self._usual or distance <= _CLEARLY_NEARER * limit:
-            return motions
-        return replace(
-            motions, object_share=share_of(motions.motion.inliers), decision="unsupported"
-        )
+        return replace(motions, object_share=share_of(motion.inliers), decision="unsupported")
 
     def hides_scene(self, index: int, motions: TwoMotions) -> bool:
         """Return whether a known object has left too few points of the scene for some frames, so

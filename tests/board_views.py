@@ -10,6 +10,7 @@ import numpy as np
 from vio.datasets.images import write_png
 from vio.geometry.distortion import CameraModel, project_point
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, transform_points
+from vio.records import BoolArray, IntArray
 from vio.targets.corners import Corners
 from vio.targets.description import Target
 from vio.targets.rendering import BoardRenderer, Exposure, board_points
@@ -67,6 +68,42 @@ def made_views(
             found.append(Corners(ids, noisy))
         if min(len(one) for one in found) >= 20:
             views.append(View(len(views) * 100_000_000, tuple(found)))
+    return views
+
+
+def poses_around(
+    camera: CameraModel, count: int, seed: int = 0, max_deg: float = 75.0
+) -> list[FloatArray]:
+    """Poses of the board before one wide camera, in all directions up to an angle off the axis."""
+    rng = np.random.default_rng(seed)
+    points = board_points(GRID)
+    middle = points.mean(axis=0)
+    poses: list[FloatArray] = []
+    while len(poses) < count:
+        theta = np.radians(max_deg) * np.sqrt(rng.uniform())
+        around = rng.uniform(-np.pi, np.pi)
+        toward = so3_exp(theta * np.array([-np.sin(around), np.cos(around), 0.0]))
+        R = toward @ so3_exp(rng.normal(size=3) * [0.3, 0.3, 0.3])
+        T = se3_from_parts(R, toward[:, 2] * rng.uniform(0.35, 0.8) - R @ middle)
+        if len(_ids_inside(camera, *project_point(camera, transform_points(T, points)))) >= 30:
+            poses.append(T)
+    return poses
+
+
+def _ids_inside(camera: CameraModel, uv: FloatArray, seen: BoolArray) -> IntArray:
+    limit = np.array([camera.width, camera.height]) - 3
+    return np.flatnonzero(seen & (uv > 2).all(axis=1) & (uv < limit).all(axis=1))
+
+
+def views_around(camera: CameraModel, count: int, seed: int = 0) -> list[View]:
+    """Views at `poses_around`, with corners of 0.05 px."""
+    rng = np.random.default_rng(seed)
+    views: list[View] = []
+    for T in poses_around(camera, count, seed):
+        uv, seen = project_point(camera, transform_points(T, board_points(GRID)))
+        ids = _ids_inside(camera, uv, seen)
+        noisy = uv[ids] + 0.05 * rng.normal(size=(len(ids), 2))
+        views.append(View(len(views) * 100_000_000, (Corners(ids, noisy),)))
     return views
 
 

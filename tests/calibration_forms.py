@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,8 @@ _BENDS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "equidistant": ((0.003, 0.0007, -0.002, 0.0002), (0.0035, 0.0008, -0.0021, 0.0003)),
     "unified": ((1.2, -0.2, 0.05, 1e-3, -2e-3), (1.25, -0.21, 0.06, 1e-3, -1e-3)),
     "double_sphere": ((-0.25, 0.57), (-0.24, 0.58)),
+    "eucm": ((0.61, 1.1), (0.62, 1.05)),
+    "fov": ((0.93,), (0.92,)),
     "pinhole": ((), ()),
 }
 
@@ -49,8 +52,7 @@ _BENDS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 def true_rig(model: str = "radtan") -> Rig:
     """Return the rig with lenses of a model."""
     cam0, cam1 = (
-        CameraModel(*K, *SIZE, model, D)  # type: ignore[arg-type]
-        for K, D in zip(_INTRINSICS, _BENDS[model], strict=True)
+        CameraModel(*K, *SIZE, model, D) for K, D in zip(_INTRINSICS, _BENDS[model], strict=True)
     )
     return Rig(cam0, cam1, T_CAM1_CAM0, T_CAM0_IMU, NOISE, OFFSET_S)
 
@@ -135,8 +137,25 @@ def _intrinsics(c: CameraModel) -> tuple[float, float, float, float]:
     return c.fu, c.fv, c.cu, c.cv
 
 
-def kalibr(folder: Path) -> Path:
-    return _save(folder, "camchain-imucam.yaml", kalibr_text(replace(true_rig(), imu_noise=None)))
+def kalibr(folder: Path, model: str = "radtan") -> Path:
+    """As Kalibr names the model (its `ConfigReader.py`); what stands before the focal lengths."""
+    kinds = {
+        "radtan": ("pinhole", "radtan", 0),
+        "fov": ("pinhole", "fov", 0),
+        "eucm": ("eucm", "none", 2),
+        "double_sphere": ("ds", "none", 2),
+        "unified": ("omni", "radtan", 1),
+    }
+    kind, bend, leading = kinds[model]
+    chain = yaml.safe_load(kalibr_text(replace(true_rig(), imu_noise=None)))
+    for name, c in zip(("cam0", "cam1"), true_rig(model).cameras, strict=True):
+        chain[name] |= {
+            "camera_model": kind,
+            "distortion_model": bend,
+            "distortion_coeffs": list(c.coefficients[leading:]),
+            "intrinsics": [*c.coefficients[:leading], *_intrinsics(c)],
+        }
+    return _save(folder, "camchain-imucam.yaml", yaml.safe_dump(chain))
 
 
 def openvins(folder: Path) -> Path:
@@ -264,8 +283,13 @@ def vins(model: str, folder: Path) -> Path:
 
 def basalt(model: str, folder: Path) -> Path:
     rig = true_rig(model)
-    kinds = {"equidistant": "kb4", "double_sphere": "ds"}
-    names = {"equidistant": "k1 k2 k3 k4", "double_sphere": "xi alpha"}[model].split()
+    kinds = {"equidistant": "kb4", "double_sphere": "ds", "eucm": "eucm", "fov": "fov"}
+    names = {
+        "equidistant": "k1 k2 k3 k4",
+        "double_sphere": "xi alpha",
+        "eucm": "alpha beta",
+        "fov": "w",
+    }[model].split()
     poses = []
     lenses = []
     for c, T in zip(rig.cameras, _poses(rig), strict=True):
@@ -379,8 +403,9 @@ def okvis(folder: Path) -> Path:
     return _save(folder, "euroc.yaml", text)
 
 
-def ncamera(folder: Path) -> Path:
-    rig = true_rig()
+def ncamera(folder: Path, model: str = "radtan") -> Path:
+    rig = true_rig(model)
+    name = {"radtan": "radial-tangential", "fov": "fisheye"}[model]
     cameras = []
     for k, (c, T) in enumerate(zip(rig.cameras, _poses(rig), strict=True)):
 
@@ -395,7 +420,7 @@ def ncamera(folder: Path) -> Path:
             "type": "pinhole",
             "intrinsics": block(np.array(_intrinsics(c))[:, None]),
             "distortion": {
-                "type": "radial-tangential",
+                "type": name,
                 "parameters": block(np.array(c.coefficients)[:, None]),
             },
         }
@@ -492,11 +517,12 @@ def _boofcv(folder: Path, unit: float) -> Path:
     return _save(folder, "stereo.yaml", yaml.safe_dump(sheet))
 
 
-def _eucm(folder: Path) -> Path:
-    path = basalt("double_sphere", folder) / "calibration.json"
-    return _save(folder, "calibration.json", path.read_text().replace('"ds"', '"eucm"')).parent
-
-
+_OF_KALIBR = {
+    "pinhole-fov": "fov",
+    "omni-radtan": "unified",
+    "ds-none": "double_sphere",
+    "eucm-none": "eucm",
+}
 _LONGER = replace(
     imu_free(true_rig()),
     T_cam1_cam0=se3_from_parts(T_CAM1_CAM0[:3, :3], 40 * T_CAM1_CAM0[:3, 3]),
@@ -505,6 +531,10 @@ _NO_NOISE = replace(true_rig(), imu_noise=None)
 _NO_SHIFT = replace(true_rig(), time_offset_s=0.0)
 FORMS = (
     Form("Kalibr", "`camchain-imucam.yaml`", kalibr, _NO_NOISE),
+    *(
+        Form("Kalibr", f"likewise, `{name}`", partial(kalibr, model=model), replace(true_rig(model), imu_noise=None))
+        for name, model in _OF_KALIBR.items()
+    ),
     Form("OpenVINS", "`kalibr_imucam_chain.yaml` with `T_imu_cam`", openvins, true_rig()),
     Form("ORB-SLAM3", "`File.version`, `PinHole`", lambda f: orbslam3("radtan", f), _NO_SHIFT),
     Form(
@@ -542,7 +572,8 @@ FORMS = (
     ),
     Form("Basalt", "`calibration.json`, `ds`", lambda f: basalt("double_sphere", f), true_rig("double_sphere")),
     Form("Basalt", "likewise, `kb4`", lambda f: basalt("equidistant", f), true_rig("equidistant")),
-    Form("Basalt", "likewise, `eucm`", _eucm, None),
+    Form("Basalt", "likewise, `eucm`", lambda f: basalt("eucm", f), true_rig("eucm")),
+    Form("Basalt", "likewise, `fov`", lambda f: basalt("fov", f), true_rig("fov")),
     Form(
         "DepthAI",
         "JSON of an OAK, linked through the colour camera",
@@ -560,6 +591,7 @@ FORMS = (
     Form("ZED", "`SN*.conf`, images of another size", zed, None, (640, 480)),
     Form("OKVIS, OKVIS2", "`cameras:` with `T_SC`", okvis, true_rig()),
     Form("maplab, SVO", "`cameras:` with `T_B_C`", ncamera, true_rig()),
+    Form("maplab, SVO", "likewise, `fisheye`: the field-of-view model", lambda f: ncamera(f, "fov"), true_rig("fov")),
     Form(
         "maplab",
         "`sensors.yaml` with `T_C_B`",

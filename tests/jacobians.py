@@ -28,6 +28,8 @@ TESTED_JACOBIANS = {
     "vio.filters.stereo_calibration.rows_D_common",
     "vio.filters.vislam.z_D_landmark",
     "vio.filters.vislam.z_D_xi",
+    "vio.geometry.distortion.uv_D_camera",
+    "vio.geometry.distortion.uv_D_point",
     "vio.geometry.stereo.depth_D_yz",
     "vio.geometry.stereo.p_cam_D_z",
     "vio.geometry.stereo.ray_D_row",

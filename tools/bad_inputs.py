@@ -1,14 +1,16 @@
-"""Write docs/bad_inputs.md: every bad input that the tests make, and the line that a user gets.
+"""The site's page of bad inputs: every bad input that the tests make, and the line that a user gets.
 
-    python -m tools.bad_inputs
+    python -m tools.bad_inputs          # prints the page
 
-The cases are the dictionaries `BAD` of the tests of the readers; `tests/project/test_bad_inputs.py`
-compares the page's rows.
+The cases are the dictionaries `BAD` of the tests of the readers. The page is made when the site is
+built (`tools/site_hooks.py`), and is kept nowhere else.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
 import shutil
 import sys
 import tempfile
@@ -20,7 +22,7 @@ from vio.datasets.rigs import load_rig
 from vio.errors import VioError
 from vio.files.trajectories import read_trajectory
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "bad_inputs.md"
+PAGE = "bad_inputs.md"  # among the site's pages
 _MAKERS = {
     "tests.datasets.test_datasets_euroc": "make_euroc",
     "tests.datasets.test_datasets_kitti_raw": "make_kitti_raw",
@@ -39,9 +41,8 @@ MODULES = {
 _HEAD = """# Bad inputs
 
 An input that cannot be used ends in one line, which says what is wrong, where, and what to do, and in exit status 1.
-Each row is a test; `python -m tools.bad_inputs` writes this page from the same cases. What a run would not stop at but
-makes no sense of (exchanged cameras, readings in g, black images) is found by `vio inspect`, see
-[recordings](recordings.md).
+Each row is a test, and this page is made from the same cases. What a run can read but makes no sense of (swapped
+cameras, readings in g, black images) is found by `vio inspect`, see [recordings](recordings.md).
 """
 
 
@@ -76,8 +77,8 @@ def message_of(module: str, case: Any, folder: Path) -> str:
     raise AssertionError(f"{module}: a case gives no error")
 
 
-def main() -> int:
-    """Write the page."""
+def page() -> str:
+    """Return the page as Markdown; takes some ten seconds, in which every case is read."""
     parts = [_HEAD]
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
@@ -90,11 +91,15 @@ def main() -> int:
                     shutil.copytree(videos, folder)
                 else:
                     folder.mkdir()
-                    (
-                        folder / "r"
-                    ).mkdir() if module == "tests.datasets.test_datasets_bags" else None
+                if module == "tests.datasets.test_datasets_bags":
+                    (folder / "r").mkdir()
                 parts.append(f"| {label} | {message_of(module, case, folder)} |\n")
-    PAGE.write_text("".join(parts), encoding="utf-8")
+    return "".join(parts)
+
+
+def main() -> int:
+    """Print the page."""
+    sys.stdout.write(page())
     return 0
 
 
@@ -115,7 +120,8 @@ def _videos(root: Path) -> Path:
         "--format",
         "euroc",
     ]
-    assert vio(["render", "--out", str(flight), "--workers", "1", "--json", *options]) == 0
+    with contextlib.redirect_stdout(io.StringIO()):
+        assert vio(["render", "--out", str(flight), "--workers", "1", "--json", *options]) == 0
     folder: Path = importlib.import_module("tests.datasets.test_datasets_videos").make_videos(
         flight, root / "videos"
     )

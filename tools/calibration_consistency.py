@@ -9,7 +9,7 @@ Monte-Carlo flights as those of `tools.consistency`, each with a rig that is off
 of the settings expect: the extrinsics of camera and IMU and their clocks, the IMU's scales and
 misalignments, all of these, the right camera's attitude, or the length of the baseline. They begin
 in motion, at a velocity that the filter does not know, or at standstill. Prints NEES of what is
-estimated, halfway and at the end, in Markdown; docs/notes/consistency.md shows it.
+estimated, halfway and at the end, in Markdown.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@
 Monte-Carlo flights through exact points, with exact noise: pixels, IMU and its biases, velocities,
 and the place and yaw of the start are drawn from the very distributions that the filter assumes.
 Each flight is flown once by every variant, with the same noise. Prints tables in Markdown;
-docs/notes/consistency.md shows them.
+docs/notes/consistency.md sums them up.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-FOLDER = Path(__file__).resolve().parent.parent / "examples" / "course"
+FOLDER = Path(__file__).resolve().parent.parent / "vio" / "course"
 _SOLUTION = re.compile(r"^( *)# begin solution\n.*?# end solution", re.DOTALL | re.MULTILINE)
 _TASK = r'\1raise NotImplementedError("your solution")'
 

@@ -8,7 +8,8 @@ keeps the results of tasks: an interrupted call goes on where it stopped. docs/r
 the figures with commit, machine and date. A table of a document stands between
 `<!-- suite: NAME key=value … -->` and `<!-- end -->`:
 
-    figure=ate_m              sequences down, systems across
+    figure=ate_m              sequences down, systems across; `a+b` is the first of two that has
+                              the sequence, `length=m` adds the length of each
     figures=ate_m,cpu_ms      a line for each sequence and system, a column for each figure, or for
     `success` sequences=… systems=…     these alone, in this order
 
@@ -24,7 +25,8 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -106,15 +108,22 @@ class Results:
             for key in ("sequences", "systems", "figures")
         }
         figure = given.pop("figure", None)
+        length = given.pop("length", None)
         if given or bool(lists["figures"]) == bool(figure):
             raise KeyError(
                 f"table of {suite}: figure= or figures=, sequences= and systems=; not "
                 f"'{words.strip()}'"
             )
-        rows = self.rows(suite, lists["sequences"], lists["systems"])
+        systems = [name for joined in lists["systems"] for name in joined.split("+")]
+        rows = self.rows(suite, lists["sequences"], systems)
         facts = self.suites[suite]
+        lines: Iterable[str]
         if figure:
-            lines = matrix(rows, BY_NAME[figure], lists["systems"], facts["titles"])
+            rows = _joined(rows, lists["systems"])
+            shown = [joined.partition("+")[0] for joined in lists["systems"]]
+            lines = matrix(rows, BY_NAME[figure], shown, facts["titles"])
+            if length:
+                lines = _with_lengths(lines, rows)
         else:
             metrics = [BY_NAME[name] for name in lists["figures"] if name != "success"]
             success = "success" in lists["figures"]
@@ -129,6 +138,37 @@ class Results:
         suite, sequence, system, name, decimals = address.split("/")
         (row,) = self.rows(suite, [sequence], [system])
         return f"{row.cells[name].median:.{int(decimals)}f}"
+
+
+def _joined(rows: Sequence[Row], systems: Sequence[str]) -> list[Row]:
+    """Return rows in which systems `a+b` are one, `a`: for each sequence the first that has it."""
+    names = {own: joined.split("+") for joined in systems for own in joined.split("+")}
+    held = {(r.sequence, r.system) for r in rows}
+    found = []
+    for row in rows:
+        same = names.get(row.system, [row.system])
+        first = next(name for name in same if (row.sequence, name) in held)
+        if row.system == first:
+            found.append(replace(row, system=same[0]))
+    return found
+
+
+def _with_lengths(lines: Iterable[str], rows: Sequence[Row]) -> list[str]:
+    """Return a table with the length of each sequence in its second column."""
+    lengths = dict.fromkeys((row.sequence for row in rows), " – ")
+    for row in rows:
+        if "reference_m" in row.cells:
+            lengths[row.sequence] = f" {row.cells['reference_m'].median:.0f} m "
+    added = iter([" length ", "---:", *lengths.values()])
+    whole = []
+    for line in lines:
+        cell = next(added, None)
+        if cell is None:  # a line below the table
+            whole.append(line)
+            continue
+        _, first, *others = line.split("|")
+        whole.append("|".join(["", first, cell, *others]))
+    return whole
 
 
 def _outcome(values: Sequence[Any]) -> Outcome:

@@ -1,12 +1,40 @@
 """What the documentation site adds to mkdocs: mathematics as MathML, which needs neither a
-script nor a network.
+script nor a network, and the page of bad inputs, which is made of the tests.
 """
 
 from __future__ import annotations
 
+import functools
 import re
+import sys
 from html import unescape
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+
+_ROOT = str(Path(__file__).resolve().parents[1])
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> Files:
+    """Return the site's files with the page of bad inputs, which is made of the tests."""
+    from mkdocs.structure.files import File
+
+    if _ROOT not in sys.path:
+        sys.path.insert(0, _ROOT)
+    from tools.bad_inputs import PAGE
+
+    files.append(File.generated(config, PAGE, content=_bad_inputs()))
+    return files
+
+
+@functools.cache
+def _bad_inputs() -> str:
+    from tools.bad_inputs import page
+
+    return page()
 
 
 def on_page_content(html: str, **_: Any) -> str:

@@ -4,7 +4,7 @@ comparisons.
     python -m tools.verdicts [--repeat 1000]
 
 The ATE of A is log-normal over the sequences, and B is A times the change times noise. The other
-judged figures change with the ATE (correlation 0.7). Prints the table of docs/bench.md.
+judged figures change with the ATE (correlation 0.7). Prints the table, of which docs/bench.md has a part.
 """
 
 from __future__ import annotations

@@ -7,6 +7,14 @@ from __future__ import annotations
 NOTE = 25
 
 
+def extra_text(name: str) -> str:
+    """Return how to install an extra of this package, for messages; it is on no package index."""
+    return (
+        f"install the extra {name}: python -m pip install '.[{name}]' in a clone, or "
+        f"'FILE.whl[{name}]' with the wheel"
+    )
+
+
 class VioError(Exception):
     """An expected failure; the command line prints its message in one line and exits with 1."""
 

@@ -1,4 +1,4 @@
-"""The four replaceable boxes: dataset, front end, selector, viewer (and the back end they feed)."""
+"""The replaceable boxes: dataset, front end or its detector, selector, back end, viewer."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from vio.records import (
     Event,
     FrameResult,
     FrontendOutput,
+    Image,
     ImuDensities,
     Initialisation,
     Landmarks,
@@ -96,6 +97,25 @@ class Frontend(Protocol):
         Raises:
             DataError: the frame lacks what the front end needs, its images have a wrong size or
                 type, its time is not after the last one's, or left and right look swapped.
+        """
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """One image in, corners out; the front end `klt` tracks them and matches them in the right
+    image.
+
+    Wherever a front end of the caller's own is taken, a detector is taken too.
+    """
+
+    def detect(self, image: Image) -> FloatArray:
+        """Return corners (K, 2) `[u v]` of an image, pixels, the best first.
+
+        They may lie anywhere: those near tracked features, near the edge or too many in one place
+        are not used. It is called in frames that lack features.
+
+        Args:
+            image: (H, W), left, rectified, 8-bit gray; it must not be changed.
         """
 
 

@@ -338,12 +338,12 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class FrontendOutput:
-    """The observations of one frame and what it took to get them."""
+    """The observations of one frame and what it took to get them; the counts are for logs alone."""
 
     observations: Observations
-    tracked: int  # features carried over from the frame before, after all checks
-    matched: int  # features with a right match
-    detected: int  # features new in this frame
+    tracked: int = 0  # features carried over from the frame before, after all checks
+    matched: int = 0  # features with a right match
+    detected: int = 0  # features new in this frame
     stages_ms: dict[str, float] = field(default_factory=dict)  # wall time per stage
     warnings: tuple[str, ...] = ()  # remarks of a front end of one's own, one line an event
     findings: tuple[Finding, ...] = ()  # what is wrong with the images

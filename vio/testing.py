@@ -7,6 +7,8 @@ report = check_frontend(MyFrontend)  # called with the camera; has process(frame
 assert report.survival > 0.9
 assert report.disparity_error_px < 0.3
 ```
+
+A detector alone, with `detect(image)`, is taken as well: `klt` tracks and matches its corners.
 """
 
 from __future__ import annotations
@@ -20,9 +22,8 @@ import numpy as np
 from vio.errors import DataError
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import StereoCamera
-from vio.protocols import Frontend
-from vio.records import Observations, StereoFrame
+from vio.protocols import Detector, Frontend
+from vio.records import FrontendOutput, Observations, StereoFrame
 from vio.sim.render import View, correspondence, inside_image
 from vio.sim.scenarios import Scenario, conditions_of, plan
 from vio.sim.sequence import SimulatedRecording, Simulation, views
@@ -68,7 +69,7 @@ class FrontendErrors:
 
 
 def check_frontend(
-    build: Callable[[StereoCamera], Frontend],
+    build: Callable[..., Frontend | Detector],
     *,
     frames: int = 40,
     width: int = 320,
@@ -79,7 +80,8 @@ def check_frontend(
     """Run a front end over rendered images and compare what it finds with the truth; a few seconds.
 
     Args:
-        build: called with the rectified camera; returns the front end.
+        build: a class or function, called with the rectified camera (with nothing, where it takes
+            no argument); returns a front end, or a detector, whose corners `klt` tracks.
         frames: at 20 Hz along a hand-held flight (`room`, `corridor`), at 10 Hz along a drive
             (`street`).
         width: of the images, pixels.
@@ -88,10 +90,12 @@ def check_frontend(
         seed: of scene, motion and noise.
 
     Raises:
-        VioError: an argument is invalid.
+        VioError: an argument is invalid, or what `build` returns is no front end and no detector.
         DataError: the front end returned something else than observations of the frame that it was
             given.
     """
+    from vio.frontend.given import build_given  # it loads OpenCV
+
     rate_hz = 10.0 if scene == "street" else 20.0
     scenario = Scenario(
         scene=scene,
@@ -105,7 +109,7 @@ def check_frontend(
     )
     simulation = plan(scenario)
     recording = SimulatedRecording(simulation)
-    frontend = build(rectified_camera(simulation.rig))
+    frontend = build_given(build, rectified_camera(simulation.rig))
     errors = FrontendErrors()
     before: Observations | None = None
     for frame in recording.events():
@@ -118,12 +122,17 @@ def check_frontend(
 
 def _process(frontend: Frontend, frame: StereoFrame) -> Observations:
     """Return the fresh observations of a frame."""
+    name = f"{type(frontend).__name__}.process()"
     output = frontend.process(frame)
-    found = getattr(output, "observations", None)
+    if not isinstance(output, FrontendOutput):
+        raise DataError(
+            f"{name} returned a {type(output).__name__}; it returns a FrontendOutput(observations)"
+        )
+    found = output.observations
     if not isinstance(found, Observations):
         raise DataError(
-            f"process() returned {type(output).__name__}; it returns a FrontendOutput with "
-            "observations"
+            f"{name} returned a FrontendOutput whose observations are a {type(found).__name__}; "
+            "make them with vio.records.observations(frame.index, frame.time_ns, ids, z)"
         )
     if (found.frame_index, found.time_ns) != (frame.index, frame.time_ns):
         raise DataError(

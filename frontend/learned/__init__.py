@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.errors import MissingDependencyError
+from vio.errors import MissingDependencyError, extra_text
 from vio.frontend.descriptors import DescriptorFrontend, Matcher, MutualNearest
 from vio.frontend.learned.extractors import build_extractor
 from vio.frontend.learned.lightglue import build_lightglue
@@ -59,6 +59,5 @@ def _require_torch() -> None:
     except ImportError as error:
         raise MissingDependencyError(
             "the kornia front end needs torch and kornia 0.8.3 or newer, on Python 3.11 or newer "
-            f"({error}); "
-            "install them with: pip install 'stereo-vio[learned]'"
+            f"({error}); {extra_text('learned')}"
         ) from error

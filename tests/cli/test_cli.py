@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -17,7 +19,7 @@ import pytest
 
 from tests.commands import json_of, refused
 from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_kitti, make_npz
-from vio.cli import main
+from vio.cli import build_parser, main
 from vio.config import BASIC, Config, describe
 from vio.errors import DataError
 from vio.files.trajectories import read_trajectory, write_tum
@@ -636,7 +638,7 @@ def test_evo_reads_every_trajectory_file(finished: str) -> None:
     assert file_interface.read_kitti_poses_file(f"{finished}/trajectory.kitti").num_poses == FRAMES
 
 
-def test_reproduce_writes_a_table_and_a_figure(
+def test_reproduce_writes_a_table_and_figures(
     recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tables = json_of(capsys, "reproduce", f"{recording}={truth}", "--out", tmp_path / "table")
@@ -647,6 +649,9 @@ def test_reproduce_writes_a_table_and_a_figure(
         "table.md",
         "table.json",
         "trajectories.png",
+        "dead_reckoning.png",
+        "landmarks.png",
+        "selection.png",
     }
     assert "| recommended |" in (tmp_path / "table" / "drive" / "table.md").read_text()
 
@@ -751,3 +756,58 @@ def test_a_closed_pipe_is_norefused() -> None:
         check=True,
     )
     assert done.stderr == ""
+
+
+def test_the_plot_of_a_comparison_takes_axes_and_columns(
+    finished: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = f"{finished}/trajectory.tum"
+    pictures = []
+    for more in ([], ["--axes", "xz"], ["--columns", "position,attitude,z"], ["--over", "time"]):
+        picture = tmp_path / f"{len(pictures)}.png"
+        assert main(["eval", finished, truth, "--plot", str(picture), *more]) == 0
+        pictures.append(picture.read_bytes())
+    assert len(set(pictures)) == len(pictures)
+    assert "give --plot too" in refused(capsys, "eval", finished, truth, "--axes", "xz")
+    without_times = tmp_path / "a.kitti"
+    shutil.copy(f"{finished}/trajectory.kitti", without_times)
+    kitti = ["eval", without_times, without_times, "--plot", tmp_path / "a.png"]
+    assert "use --over distance" in refused(capsys, *kitti, "--over", "time")
+
+
+@pytest.mark.parametrize(
+    ("flag", "value"), [("--axes", "xx"), ("--axes", "xyz"), ("--columns", "a")]
+)
+def test_axes_and_columns_that_do_not_exist_are_usage_errors(flag: str, value: str) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["eval", "a", "b", "--plot", flag, value])
+    assert stop.value.code == 2
+
+
+def test_the_names_of_columns_are_those_that_can_be_drawn() -> None:
+    from vio.cli.evaluate import _COLUMNS
+    from vio.runs.picture import COMPARED_COLUMNS
+
+    assert tuple(COMPARED_COLUMNS) == _COLUMNS
+
+
+@pytest.mark.parametrize("name", ["inspect", "run", "live", "report", "eval"])
+def test_the_help_of_a_main_command_ends_with_three_examples(name: str) -> None:
+    parser = build_parser([name])
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    text = commands.choices[name].format_help().partition("\nexamples:\n")[2]
+    found = re.findall(rf"^  (vio {name} .*)\n      \S", text, re.MULTILINE)
+    assert len(found) == 3
+    for line in found:
+        assert parser.parse_args(shlex.split(line)[1:]).command == name
+
+
+def test_the_help_of_run_names_every_kind_of_recording() -> None:
+    from vio.datasets import READERS
+
+    (commands,) = (
+        a for a in build_parser(["run"])._actions if isinstance(a, argparse._SubParsersAction)
+    )
+    named = re.search(r"sets it \(([\w\s,]+)\)", commands.choices["run"].format_help())
+    assert named is not None
+    assert {word.strip() for word in named[1].split(",")} == set(READERS)

@@ -413,8 +413,8 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "unknown lens": (
         _edit("cam0/sensor.yaml", "radial-tangential", "double-sphere"),
         CalibrationError,
-        "'double-sphere' is not read; known: radial-tangential, radtan, plumb_bob, "
-        "rational_polynomial, equidistant",
+        "'double-sphere' is not read; known: none, radial-tangential, radtan, plumb_bob, "
+        "rational_polynomial,",
     ),
     "unknown camera": (
         _edit("cam0/sensor.yaml", "camera_model: pinhole", "camera_model: omni"),

@@ -22,9 +22,9 @@ from vio.datasets.rigs.camera_info import CameraInfo, rig_from_camera_infos
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel
+from vio.geometry.lenses.registry import LENSES as LENS_MODELS
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import lookup, rectified_cameras
-from vio.geometry.sphere_models import double_sphere, unified
 from vio.records import ImuDensities
 
 LENSES = {
@@ -91,8 +91,8 @@ def test_double_sphere_with_one_centre_is_the_unified_model_in_other_parameters(
     `1 - alpha`.
     """
     points = np.random.default_rng(4).normal(size=(200, 3))
-    a, valid_a = double_sphere((0.0, 0.6), points)
-    b, valid_b = unified(1.5, points)
+    a, valid_a = LENS_MODELS["double_sphere"].project((0.0, 0.6), points)
+    b, valid_b = LENS_MODELS["unified"].project((1.5,), points)
     np.testing.assert_array_equal(valid_a, valid_b)
     np.testing.assert_allclose(a[valid_a] * (1 - 0.6), b[valid_a], rtol=1e-12, atol=1e-12)
 
@@ -125,7 +125,7 @@ def test_rejects_impossible_spheres() -> None:
         ("double_sphere", (0.5, 1.2), "check their order"),
     ):
         with pytest.raises(CalibrationError, match=message):
-            CameraModel(300, 300, 320, 240, 640, 480, model, coefficients)  # type: ignore[arg-type]
+            CameraModel(300, 300, 320, 240, 640, 480, model, coefficients)
 
 
 # --- from matrices
@@ -519,6 +519,57 @@ def test_halved_images_of_a_calibration_without_a_size_are_doubted(tmp_path: Pat
         vio.load_rig(tmp_path, image_size=(320, 240))
 
 
+def test_opencv_matrices_with_a_model_that_opencv_lacks_keep_its_coefficients(
+    tmp_path: Path,
+) -> None:
+    """Of other tools, which write the same form."""
+    m = opencv_matrices()
+    path = write_storage(
+        tmp_path / "stereo.yml",
+        {**m, "D1": np.array([0.93]), "D2": np.array([0.92])},
+        (RIG.cam0.width, RIG.cam0.height),
+    )
+    path.write_text(path.read_text() + "distortion_model: fov\n")
+    rig = vio.load_rig(path)
+    assert [(c.model, c.coefficients) for c in rig.cameras] == [("fov", (0.93,)), ("fov", (0.92,))]
+
+
+# Twice the principal point over the size of the images, of real cameras.
+_REAL_CENTRES = {
+    "KITTI 03": (0.982, 0.922),
+    "KITTI 06": (0.982, 0.990),
+    "KITTI raw, left": (0.991, 0.911),
+    "Karlsruhe": (0.946, 1.044),
+    "EuRoC, rectified": (0.969, 1.059),
+    "EuRoC, right": (1.011, 1.063),
+    "TUM-VI": (0.987, 0.997),
+    "Bumblebee 2": (0.976, 1.031),
+}
+
+
+@pytest.mark.parametrize("name", _REAL_CENTRES)
+@pytest.mark.parametrize(("scale", "doubted"), [(1.0, False), (0.8, True), (1.25, True)])
+def test_scaled_images_of_real_cameras_are_doubted(
+    name: str, scale: float, doubted: bool, tmp_path: Path
+) -> None:
+    u, v = 0.5 * np.array(_REAL_CENTRES[name]) * (1000, 600)
+    write_calibration(tmp_path, Rig.rectified(700.0, 700.0, u, v, 0.12, 1000, 600).camera, None)
+    size = (round(1000 * scale), round(600 * scale))
+    notes = vio.load_rig(tmp_path, image_size=size).notes
+    assert any("if they were scaled" in note for note in notes) == doubted
+
+
+@pytest.mark.parametrize(
+    ("scale", "doubted"), [(0.88, True), (0.93, False), (1.07, False), (1.13, True)]
+)
+def test_images_scaled_by_an_eighth_are_doubted(
+    scale: float, doubted: bool, tmp_path: Path
+) -> None:
+    write_calibration(tmp_path, Rig.rectified(700.0, 700.0, 500, 300, 0.12, 1000, 600).camera, None)
+    size = (round(1000 * scale), round(600 * scale))
+    assert bool(vio.load_rig(tmp_path, image_size=size).notes) == doubted
+
+
 def test_principal_point_outside_stated_images_is_refused(tmp_path: Path) -> None:
     make = _camchain(lambda c: c["cam1"].update(intrinsics=[40.0, 40.0, 70.0, 24.0]))
     with pytest.raises(CalibrationError, match="principal point 70, 24 lies outside images"):
@@ -690,12 +741,12 @@ BAD = {
         r"cam0: 'intrinsics' is \[1, 2, 3\] instead of 4 finite numbers",
     ),
     "unknown projection": (
-        _camchain(lambda c: c["cam1"].update(camera_model="eucm")),
-        "'eucm' is not read",
+        _camchain(lambda c: c["cam1"].update(camera_model="ocam")),
+        "'ocam' is not read",
     ),
     "unknown distortion": (
-        _camchain(lambda c: c["cam1"].update(distortion_model="fov")),
-        "'fov' is not read",
+        _camchain(lambda c: c["cam1"].update(distortion_model="thin-prism")),
+        "'thin-prism' is not read",
     ),
     "a reflection": (
         _camchain(lambda c: c["cam1"].update(T_cn_cnm1=np.diag([1.0, 1, -1, 1]).tolist())),

@@ -234,3 +234,30 @@ def test_pairs_of_names_as_people_have_them(form: str, tmp_path: Path) -> None:
     steps = np.diff(recording.frame_times_ns)
     assert len(recording.frame_times_ns) == 12
     np.testing.assert_allclose(steps * 1e-9, 0.1 if "number" in form else 0.05, atol=1e-6)
+
+
+def test_real_readings_in_degrees_and_g_are_those_of_the_published_record(
+    data_dir: Path, tmp_path: Path
+) -> None:
+    """EuRoC MH_01's, in the units that many loggers write; 20 frames turn by 0.22 rad/s (median)."""
+    mav = data_dir / "euroc" / "MH_01_head" / "mav0"
+    table = np.loadtxt(mav / "imu0" / "data.csv", delimiter=",", skiprows=1)
+    stamps_ns = np.loadtxt(
+        mav / "imu0" / "data.csv", delimiter=",", skiprows=1, usecols=0, dtype=np.int64
+    )
+    gyro = table[:, 1:4]
+    accel = table[:, 4:7]
+    header = "time_ns,acc_x_g,acc_y_g,acc_z_g,gyr_x_dps,gyr_y_dps,gyr_z_dps"
+    values = np.hstack([accel / G, gyro / DEG])
+    rows = [
+        ",".join([str(t), *map(repr, row)])
+        for t, row in zip(stamps_ns.tolist(), values.tolist(), strict=True)
+    ]
+    file = tmp_path / "imu.csv"
+    file.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    record, _ = read_imu_table(file)
+    np.testing.assert_allclose(record.gyro, gyro, atol=1e-12)
+    np.testing.assert_allclose(record.accel, accel, atol=1e-12)
+    frames = sorted(int(path.stem) for path in (mav / "cam0" / "data").glob("*.png"))
+    shown = (record.times_ns >= frames[0]) & (record.times_ns <= frames[20])
+    assert np.median(np.linalg.norm(record.gyro[shown], axis=1)) == pytest.approx(0.2205, abs=2e-3)

@@ -36,7 +36,7 @@ SETTINGS = FrontendSettings(
 )
 needs_torch = pytest.mark.skipif(
     importlib.util.find_spec("kornia") is None or importlib.util.find_spec("torch") is None,
-    reason="torch and kornia are not installed: pip install 'stereo-vio[learned]'",
+    reason="torch and kornia are not installed: the extra learned",
 )
 IMAGE_BASED = ["klt", "orb", "sift", pytest.param("kornia", marks=needs_torch)]
 ALL = [*IMAGE_BASED, "precomputed", "oracle"]

@@ -21,7 +21,7 @@ from vio.frontend.settings import FrontendSettings, GridSettings, LearnedSetting
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, StereoFrame
 
-REASON = "not installed: pip install 'stereo-vio[learned]'"
+REASON = "not installed: the extra learned"
 MATCH = MatchSettings(max_keypoints=250)
 
 

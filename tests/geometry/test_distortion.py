@@ -15,12 +15,11 @@ from tests.jacobians import numeric_jacobian
 from vio.errors import CalibrationError
 from vio.geometry.distortion import (
     CameraModel,
-    _radtan,
-    _radtan_D_xy,
     project_point,
     rectified_camera,
     rig_from_rectified,
 )
+from vio.geometry.lenses.radtan import distort, distort_by_xy
 from vio.geometry.lie import se3_exp, se3_inverse
 from vio.geometry.stereo import StereoCamera
 
@@ -57,8 +56,8 @@ def test_jacobian_of_the_radial_tangential_model(count: int) -> None:
     coefficients = (-0.28, 0.07, 2e-4, 2e-5, 0.01, 0.02, 0.03, 0.004)[:count]
     for p in _points(20):
         xy = p[:2] / p[2]
-        numeric = numeric_jacobian(lambda x: _radtan(coefficients, x), xy)
-        np.testing.assert_allclose(_radtan_D_xy(coefficients, xy), numeric, rtol=1e-6, atol=1e-8)
+        numeric = numeric_jacobian(lambda x: distort(coefficients, x), xy)
+        np.testing.assert_allclose(distort_by_xy(coefficients, xy), numeric, rtol=1e-6, atol=1e-8)
 
 
 @settings(max_examples=100, deadline=None)
@@ -90,7 +89,7 @@ def test_rejects_invalid_cameras() -> None:
         CalibrationError,
         match="unknown distortion model 'fisheye'; use one of pinhole, radtan, equi",
     ):
-        CameraModel(400, 400, 320, 240, 640, 480, "fisheye", (0.1,))  # type: ignore[arg-type]
+        CameraModel(400, 400, 320, 240, 640, 480, "fisheye", (0.1,))
     with pytest.raises(CalibrationError, match="are not finite"):
         CameraModel(400, np.nan, 320, 240, 640, 480)
     with pytest.raises(CalibrationError, match=r"must be positive, got fu=400, fv=0"):

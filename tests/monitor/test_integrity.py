@@ -76,6 +76,19 @@ def test_an_unusable_covariance_covers_any_motion_since_the_fault_began() -> Non
     sigma = float(np.sqrt(held[-1].covariance[0, 0]))
     assert sigma == pytest.approx(2.0 * elapsed_s, rel=0.01)
     assert np.sqrt(held[0].covariance[0, 0]) < 0.02
+    # the motion is known again, where it began is not
+    monitor.take(Finding("object-or-scene", "", 26, ended=True))
+    (after, later) = judge(monitor, range(26, 28))
+    assert after.integrity == "nominal"
+    assert after.findings == ()
+    for estimate_after in (after, later):
+        assert np.sqrt(estimate_after.covariance[0, 0]) == pytest.approx(sigma, rel=1e-6)
+    # a second fault adds to it, from the frame that it began at
+    monitor.take(Finding("object-or-scene", "", 38, 28, lasts=True))
+    judge(monitor, range(28, 38))
+    (again,) = judge(monitor, range(38, 39))
+    expected = np.hypot(sigma, 2.0 * 10 * STEP_NS * 1e-9)
+    assert np.sqrt(again.covariance[0, 0]) == pytest.approx(expected, rel=0.01)
 
 
 def test_frames_before_a_fault_was_found_are_marked() -> None:

@@ -338,6 +338,8 @@ LENSES = (
         (0.2, 0.05, 1e-3, -2e-3, 0.01, 0.3, 0.1, 0.0),
     ),
     CameraModel(300.0, 300.0, 319.0, 241.5, 640, 480, "equidistant", (0.01, -0.02, 0.003, -4e-4)),
+    CameraModel(300.0, 301.0, 319.0, 241.5, 640, 480, "eucm", (0.6, 1.1)),
+    CameraModel(300.0, 301.0, 319.0, 241.5, 640, 480, "fov", (0.93,)),
 )
 
 
@@ -363,8 +365,10 @@ def test_pycolmap_refuses_a_lens_that_it_lacks() -> None:
         pycolmap.to_camera(
             CameraModel(300.0, 300.0, 319.0, 241.5, 640, 480, "double_sphere", (-0.2, 0.6))
         )
-    camera = theirs.Camera(model="FOV", width=640, height=480, params=[300, 300, 320, 240, 0.9])
-    with pytest.raises(CalibrationError, match="the lens model FOV of COLMAP"):
+    camera = theirs.Camera(
+        model="DIVISION", width=640, height=480, params=[300, 300, 320, 240, 0.9]
+    )
+    with pytest.raises(CalibrationError, match="the lens model DIVISION of COLMAP"):
         pycolmap.from_camera(camera)
 
 

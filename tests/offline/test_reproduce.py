@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from tests.dataset_makers import ece276a_arrays, make_drive, make_npz
 from vio.config import load_config
 from vio.datasets import open_dataset
 from vio.evaluation.trajectories import evaluate
-from vio.files.trajectories import read_trajectory
-from vio.offline.reproduce import VARIANTS
+from vio.files.trajectories import read_trajectory, write_tum
+from vio.offline.reproduce import FIGURES, VARIANTS, reproduce
+from vio.records import Trajectory
 from vio.runs.pipeline import run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,3 +47,26 @@ def test_configuration_file_gives_the_published_figures(
     figures = {name: published[name] for name in ("ate_m", "drift_percent", "drift_deg_per_100m")}
     found = (score.ate_m.rmse, score.kitti.t_err_percent, score.kitti.r_err_deg_per_100m)
     assert found == pytest.approx(tuple(figures.values()), rel=5e-4)  # three digits on any machine
+
+
+@pytest.mark.parametrize("with_truth", [True, False])
+def test_the_papers_figures_are_drawn_beside_ours(
+    with_truth: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: Any
+) -> None:
+    needed = {name for _, _, variants in FIGURES for name in variants}
+    assert all(variants[-1] == "sliding window" for _, _, variants in FIGURES)
+    monkeypatch.setattr("vio.offline.reproduce.VARIANTS", [v for v in VARIANTS if v.name in needed])
+    drive = make_drive(15)
+    file = make_npz(tmp_path / "0027.npz", ece276a_arrays(drive))
+    truth = None
+    if with_truth:
+        truth = tmp_path / "truth.tum"
+        times_ns = open_dataset(file).recording.frame_times_ns
+        write_tum(truth, Trajectory(drive.T_world_imu, times_ns, "imu"))
+    reproduce(file, truth, tmp_path / "out")
+    sizes = [
+        (tmp_path / "out" / "0027" / f"{name}.png").stat().st_size
+        for name in ("trajectories", *(name for name, _, _ in FIGURES))
+    ]
+    assert min(sizes) > 10_000
+    assert "was not drawn" not in caplog.text

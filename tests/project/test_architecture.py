@@ -15,7 +15,7 @@ from tools.draw_structure import layers, read_packages
 ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")])
 
-# Only the configuration, live use, the pipeline, the simulated front end and the command line know
+# Only the configuration, live use, the pipeline, the test bench and the command line know
 # the front end.
 USES_FRONTEND = (
     "vio.config",
@@ -24,6 +24,7 @@ USES_FRONTEND = (
     "vio.runs",
     "vio.sim.oracle",
     "vio.cli",
+    "vio.testing",
     "vio.frontend",
 )
 # The estimator, free of images and files.

@@ -10,7 +10,9 @@ from pathlib import Path
 import matplotlib
 import pytest
 
-from tools.exercises import exercise, pairs
+from tests.commands import refused
+from tools.exercises import FOLDER, exercise, pairs
+from vio.cli import main
 
 _PAIRS = sorted(pairs())
 
@@ -61,3 +63,33 @@ def test_an_unsolved_exercise_stops_at_its_first_task(tasks: Path) -> None:
     whole = "\n".join(_code(tasks))
     with pytest.raises(NotImplementedError, match="your solution"):
         exec(compile(whole, tasks.name, "exec"), scope)
+
+
+def test_the_command_copies_tasks_and_solutions(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tasks = {"README.md", "consistency.ipynb", "ekf_on_se3.ipynb"}
+    assert main(["course", str(tmp_path / "a")]) == 0
+    assert {path.name for path in (tmp_path / "a").iterdir()} == tasks
+    assert main(["course", str(tmp_path / "a"), "--solutions"]) == 0, "equal files stay"
+    solutions = {solution.name for solution, _ in _PAIRS}
+    assert {path.name for path in (tmp_path / "a").iterdir()} == tasks | solutions
+    for solution, exercises in _PAIRS:
+        for path in (solution, exercises):
+            assert (tmp_path / "a" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_the_work_of_a_student_is_not_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    work = tmp_path / "ekf_on_se3.ipynb"
+    work.write_text("solved")
+    assert "perhaps by your work" in refused(capsys, "course", tmp_path, "--solutions")
+    assert work.read_text() == "solved"
+    assert len(list(tmp_path.iterdir())) == 1, "and nothing is half copied"
+
+
+def test_the_list_of_exercises_names_every_notebook() -> None:
+    text = (FOLDER / "README.md").read_text(encoding="utf-8")
+    for _, exercises in _PAIRS:
+        assert f"`{exercises.name}`" in text

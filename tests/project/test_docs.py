@@ -1,8 +1,9 @@
 """The documentation's commands and Python blocks run, and all that they name exists.
 
-The README's commands run word for word in a folder where every path that they name exists, small. A
-line added to the README therefore fails here unless it works, and a line that is too long for a
-test needs an entry in `_SMALLER` or `_ELSEWHERE`.
+The commands of the README, of the page on installing and of that on commands run word for word
+in a folder where every path that they name exists, small. A line added there therefore fails here
+unless it works, and a line that is too long for a test needs an entry in `_SMALLER` or
+`_ELSEWHERE`.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import yaml
 
 import vio.sim.scenarios
 from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_npz
+from tools.bad_inputs import PAGE
 from vio.cli import build_parser, main
 from vio.cli.arguments import config_from
 from vio.cli.render import scenario_from
@@ -32,12 +34,16 @@ from vio.records import ImuSample, StereoFrame
 from vio.sim.sequence import SimulatedRecording
 
 ROOT = Path(__file__).resolve().parents[2]
-README, COMMANDS = "README.md", "docs/commands.md"
+README = "README.md"
+COMMANDS = "docs/commands.md"
+INSTALL = "docs/install.md"
+EXECUTED = (README, INSTALL, COMMANDS)
 DOCS = (
     README,
     "CHANGELOG.md",
     *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))),
 )
+GENERATED = {ROOT / "docs" / PAGE}  # of the site, and in no folder
 NOTES = tuple(f"docs/notes/{path.name}" for path in sorted((ROOT / "docs" / "notes").glob("*.md")))
 
 # Options behind a command of the README that make it small; the command itself is run as written.
@@ -87,22 +93,17 @@ def _make_test() -> None:
         assert part in recipe
 
 
-def _pytest_renders() -> None:
-    """The file that the README names holds tests; they run by themselves."""
-    assert _text("tests/frontend/test_frontend_renders.py").count("\ndef test_") > 3
-
-
 def _installs() -> None:
     """What is installed exists: the project here, the wheel's name with the present version, the
     extras.
     """
-    for command in (command for command in _commands(README) if "-m pip install" in command):
+    for command in (command for command in _commands(INSTALL) if "-m pip install" in command):
         target = shlex.split(command)[4]
         if target.endswith(".whl"):
             assert target == f"stereo_vio-{vio.__version__}-py3-none-any.whl"
     table = re.findall(
         r"^\| `(\w+)` \|",
-        _text(README).partition("## Install")[2].partition("\n## ")[0],
+        _text(INSTALL).partition("## Extras")[2].partition("\n## ")[0],
         re.MULTILINE,
     )
     declared = (
@@ -133,7 +134,6 @@ _ELSEWHERE: dict[str, Callable[[], None]] = {
     "vio demo": _vio_demo,
     "make quick": _make_quick,
     "make test": _make_test,
-    "python -m pytest tests/frontend/test_frontend_renders.py": _pytest_renders,
 }
 
 
@@ -241,7 +241,7 @@ def readme_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@pytest.mark.parametrize("command", dict.fromkeys([*_commands(README), *_commands(COMMANDS)]))
+@pytest.mark.parametrize("command", dict.fromkeys(c for name in EXECUTED for c in _commands(name)))
 def test_readme_commands_run(
     command: str,
     readme_folder: Path,
@@ -260,13 +260,18 @@ def test_readme_commands_run(
 
 
 def test_exception_entries_are_in_the_readme() -> None:
-    assert set(_SMALLER) | set(_ELSEWHERE) <= {*_commands(README), *_commands(COMMANDS)}
+    assert set(_SMALLER) | set(_ELSEWHERE) <= {c for name in EXECUTED for c in _commands(name)}
 
 
 def test_readme_blocks_hold_commands_or_the_demos_output() -> None:
     """Every line is either a command, tested above, or output of the demo."""
-    commands = _commands(README)
-    plain = [block.text for block in _blocks(README) if block.language not in ("python", "bibtex")]
+    commands = [*_commands(README), *_commands(INSTALL)]
+    plain = [
+        block.text
+        for name in (README, INSTALL)
+        for block in _blocks(name)
+        if block.language not in ("python", "bibtex")
+    ]
     outputs = [text for text in plain if text.startswith("frames ")]
     lines = [line for text in plain if text not in outputs for line in text.splitlines()]
     assert len(outputs) == 1
@@ -289,7 +294,7 @@ def test_readme_shows_what_the_demo_prints(
         "drift_lengths_m": [100],
     }
     print_result({}, metric_rows({**metrics, **shown_drift}), as_json=False)
-    shown = next(block.text for block in _blocks(README) if block.text.startswith("frames "))
+    shown = next(block.text for block in _blocks(INSTALL) if block.text.startswith("frames "))
     printed, shown = (
         re.sub(r"[+-]?[\d.]+\d( m?m\b)?", "#", text) for text in (capsys.readouterr().out, shown)
     )
@@ -535,6 +540,20 @@ def test_yaml_of_the_docs_is_a_configuration(name: str) -> None:
             merge(Config(), yaml.safe_load(block.text), where=name)
 
 
+def test_nothing_installs_this_package_from_an_index() -> None:
+    """It is on none, and the name is anybody's."""
+    pages = [ROOT / name for name in DOCS] + sorted((ROOT / "docs").rglob("*.md"))
+    code = [*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")]
+    notebooks = [*(ROOT / "vio").rglob("*.ipynb"), *(ROOT / "examples").rglob("*.ipynb")]
+    found = [
+        f"{path}: {line.strip()}"
+        for path in (*pages, *code, *notebooks)
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if "pip install" in line and re.search(r"stereo[-_]vio(\[|'|\"|\s|$)", line)
+    ]
+    assert not found
+
+
 @pytest.mark.parametrize("name", [*DOCS, *NOTES])
 def test_links_are_valid(name: str) -> None:
     broken = []
@@ -543,6 +562,8 @@ def test_links_are_valid(name: str) -> None:
         if path.startswith("https://"):
             continue
         file = (ROOT / name).parent / path if path else ROOT / name
+        if file in GENERATED and name != README:
+            continue  # in the site, which is built with all links checked
         if not file.is_file() or (heading and heading not in _anchors(file)):
             broken.append(target)
     assert not broken

@@ -63,8 +63,24 @@ def test_a_live_loop_prints_a_pose_for_every_frame(flight: Path) -> None:
 
 
 def test_image_files_give_poses(flight: Path, tmp_path: Path) -> None:
-    cameras = [flight / "mav0" / name / "data" for name in ("cam0", "cam1")]
-    assert "landmarks, 0 warnings" in _run("image_files.py", *cameras, flight)
+    """Also where names are numbers without leading zeros."""
+    cameras = [tmp_path / name for name in ("cam0", "cam1")]
+    for camera in cameras:
+        camera.mkdir()
+        images = sorted((flight / "mav0" / camera.name / "data").glob("*.png"))
+        for k, image in enumerate(images, start=1):
+            (camera / f"{k}.png").symlink_to(image)
+    lines = _run("image_files.py", *cameras, flight).splitlines()
+    poses = [line.split()[0] for line in lines if ".png" in line]
+    assert poses == [f"{k}.png" for k in range(1, len(images) + 1)][-len(poses) :]
+    assert len(poses) > 10
+    assert lines[-1].endswith(" landmarks"), "and no warning"
+
+
+def test_a_detector_of_ones_own_is_checked() -> None:
+    text = _run("own_detector.py")
+    assert float(re.search(r"survival +([\d.]+)", text)[1]) > 0.9
+    assert "reused_ids           0" in text
 
 
 def test_precomputed_features_run_again(flight: Path) -> None:

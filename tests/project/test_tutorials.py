@@ -18,6 +18,7 @@ pytest.importorskip("rosbags", reason="needs rosbags")
 
 import vio
 from tests.bag_maker import Script
+from tools.bad_inputs import PAGE
 from vio.cli import main
 from vio.datasets import open_dataset
 from vio.records import ImuSample, StereoFrame
@@ -85,7 +86,7 @@ def test_the_commands_of_a_tutorial_run(
 def test_every_page_is_in_the_menu() -> None:
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     named = set(re.findall(r"[\w/]+\.md", text))
-    assert named == {
+    assert named - {PAGE} == {
         path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")
     }
     yaml.safe_load(text)

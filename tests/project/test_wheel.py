@@ -47,6 +47,11 @@ def test_the_wheel_holds_the_packages_and_their_data_only(wheel: Path) -> None:
         for path in (ROOT / part).rglob("*.py")
     }
     assert {name for name in names if name.endswith(".py")} == sources
+    course = {
+        path.relative_to(ROOT).as_posix() for path in (ROOT / "vio" / "course").glob("*.ipynb")
+    }
+    assert len(course) == 4
+    assert course | {"vio/course/README.md"} <= set(names)
 
 
 def test_the_unpacked_wheel_runs_outside_the_repository(wheel: Path, tmp_path: Path) -> None:

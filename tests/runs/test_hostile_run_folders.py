@@ -118,6 +118,19 @@ def test_a_calibration_in_the_folder_needs_no_name(stopped: Path) -> None:
     assert (moved / RunFile.CALIBRATION).is_file()
 
 
+def test_code_is_run_only_where_it_is_named_again(
+    stopped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = stopped.parent / "code.py"
+    code.write_text("raise SystemExit('was run')\n")
+    _state(stopped, frontend=f"{code}:Mine")
+    said = refused(capsys, "run", "--resume", stopped, "--quiet")
+    assert said.rstrip().endswith(f"name it again: --frontend {code}:Mine")
+    _state(stopped, frontend=None)
+    said = refused(capsys, "run", "--resume", stopped, "--quiet", "--frontend", f"{code}:Mine")
+    assert "leave --frontend out" in said
+
+
 def test_flags_that_the_run_began_without_are_refused(
     stopped: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

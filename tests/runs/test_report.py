@@ -22,6 +22,7 @@ from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import se3_from_parts, so3_exp
 from vio.geometry.upright import attitude_deg, up_of, upright_axes
 from vio.records import LoopEvent, MapKeyframes
+from vio.report.compared import apart, compared_figures
 from vio.report.page import page
 from vio.report.words import run_figures, summary
 from vio.runs.curves import curves_of
@@ -104,7 +105,10 @@ def test_a_page_needs_no_network_and_shows_every_part(runs: tuple[Path, Path]) -
     ):
         assert f"<h2>{title}</h2>" in text
     assert f"<code>{escape(run.metrics['command'])}</code>" in text
-    assert "stamps off by" in text.partition("<h2>Calibration</h2>")[2].partition("</section>")[0]
+    assert (
+        "IMU: corrections of its calibration: time offset"
+        in text.partition("<h2>Calibration</h2>")[2].partition("</section>")[0]
+    )
     assert "All settings have their defaults" not in text  # --motion is one
     assert "<h2>IMU biases</h2>" not in page([read_finished_run(runs[1])])
 
@@ -298,3 +302,30 @@ def test_a_browser_draws_all_figures(runs: tuple[Path, Path], tmp_path: Path) ->
     assert figures >= 9
     assert len(drawn) == figures
     assert "Uncaught" not in shown.stderr
+
+
+def test_runs_of_one_recording_are_compared(runs: tuple[Path, Path]) -> None:
+    """Changes from the first run in per cent, the best in bold, and the distance between paths."""
+    found = with_distinct_names([read_finished_run(folder) for folder in runs])
+    cells = compared_figures(found)["ATE"]
+    errors = [run.metrics["ate_m"] for run in found]
+    assert cells[1][0].endswith(f"({100 * (errors[1] / errors[0] - 1):+.0f} %)")
+    assert [best for _, best in cells] == [error == min(errors) for error in errors]
+    text = page(found)
+    assert f"<b>{escape(cells[int(np.argmin(errors))][0])}</b>" in text
+    assert f"<h2>Distance from {found[0].name}</h2>" in text
+    between = apart(*found)
+    assert between is not None
+    assert len(between.seconds) == min(len(run.estimates) for run in found)
+    assert 0 < between.distance_m.max() < 2 * sum(run.evaluation.ate_m.max for run in found)
+    same = apart(found[0], found[0])
+    assert same is not None
+    assert same.distance_m.max() < 1e-9
+
+
+def test_runs_of_different_recordings_are_only_listed(runs: tuple[Path, Path]) -> None:
+    run = read_finished_run(runs[0])
+    other = replace(run, name="other", metrics={**run.metrics, "source": "euroc:/elsewhere"})
+    assert apart(run, other) is None
+    assert not any(best for cells in compared_figures([run, other]).values() for _, best in cells)
+    assert "Distance from" not in page([run, other])

@@ -240,6 +240,6 @@ def test_without_rerun_the_extra_is_named(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    assert "stereo-vio[view]" in refused(
+    assert "install the extra view" in refused(
         capsys, "run", flight, "--quiet", "--out", tmp_path / "run", "--view", "web"
     )

@@ -34,8 +34,6 @@ from vio.targets.bundle import (
     RigFit,
     layout_of,
     lens_moved,
-    pixels_by_lens,
-    pixels_by_point,
 )
 from vio.targets.calibrate import calibrate_cameras
 from vio.targets.corners import CornerDetector
@@ -303,32 +301,6 @@ def test_stated_sigmas_are_those_of_the_errors() -> None:
             exact = (truth.fu, truth.fv, truth.cu, truth.cv, *truth.coefficients)
             ratios += ((np.array(values) - exact) / sigma[lens]).tolist()
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
-
-
-@pytest.mark.parametrize(
-    "camera",
-    [
-        LEFT,
-        CameraModel(300, 301, 320, 240, 640, 480, "equidistant", (0.01, -0.02, 0.003, 0.001)),
-        CameraModel(300, 301, 320, 240, 640, 480, "double_sphere", (-0.2, 0.6)),
-        CameraModel(500, 501, 320, 240, 640, 480, "unified", (0.9, 0.01, 0.0, 1e-3, 1e-3)),
-    ],
-    ids=lambda camera: camera.model,
-)
-def test_derivatives_of_the_projection(camera: CameraModel) -> None:
-    p = np.array([[0.1, 0.2, 1.0], [-0.3, 0.1, 0.8]])
-    uv, _ = project_point(camera, p)
-    D = pixels_by_point(camera, p, uv)
-    for k in range(3):
-        step = 1e-5 * np.eye(3)[k]
-        central = (project_point(camera, p + step)[0] - project_point(camera, p - step)[0]) / 2e-5
-        assert np.allclose(D[:, :, k], central, atol=2e-2, rtol=1e-3)
-    D = pixels_by_lens(camera, p, uv)
-    for k in range(D.shape[2]):
-        step = 1e-5 * np.eye(D.shape[2])[k]
-        ahead = project_point(lens_moved(camera, step), p)[0]
-        behind = project_point(lens_moved(camera, -step), p)[0]
-        assert np.allclose(D[:, :, k], (ahead - behind) / 2e-5, atol=2e-2, rtol=1e-3)
 
 
 def test_chooses_the_lens_by_views_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from vio.bench.execute import end_processes, failed, perform_job
 from vio.bench.identity import code_and_packages
-from vio.errors import MissingDependencyError, VioError
+from vio.errors import MissingDependencyError, VioError, extra_text
 
 log = logging.getLogger(__name__)
 Job = dict[str, Any]
@@ -56,9 +56,7 @@ def run_on_dask(
     try:
         from distributed import Client
     except ImportError as error:
-        raise MissingDependencyError(
-            "--scheduler needs Dask; install it with pip install 'stereo-vio[cluster]'"
-        ) from error
+        raise MissingDependencyError(f"--scheduler needs Dask; {extra_text('cluster')}") from error
     connect: Any = Client  # its annotations are incomplete
     pending = dict(jobs)
     last_s = time.monotonic()

@@ -21,7 +21,12 @@ import numpy as np
 from vio.cameras.rectification_error import error_basis, radial_focal
 from vio.cameras.rig import Rig, rig_of_rectified
 from vio.errors import CalibrationError
-from vio.geometry.distortion import CameraModel, project_point, rectified_pair
+from vio.geometry.distortion import (
+    CameraModel,
+    holds_distortion,
+    project_point,
+    rectified_pair,
+)
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import MapArray, rectified_cameras, rectify_pixels
 from vio.geometry.stereo import StereoCamera, left_rays
@@ -54,7 +59,15 @@ _PRIOR = np.array(
 _MODEL = 1e-4  # focal lengths, 0.05 px: what terms beyond those of the field leave in a coefficient
 _NO_PARAMETER = 1.0  # focal lengths: a coefficient that says nothing of the rig
 # models that hold tangential distortion, or become one that does
-_BENDS = ("pinhole", "radtan", "unified")
+# of the parameters that a lens model may hold: k1 k2, and p1 p2
+_LENS_PARAMETERS = {
+    "k": ((1.0, 0.0), (0.0, 0.0)),
+    "k2": ((0.0, 1.0), (0.0, 0.0)),
+    "p1": ((0.0, 0.0), (1.0, 0.0)),
+    "p2": ((0.0, 0.0), (0.0, 1.0)),
+    "q1": ((0.0, 0.0), (1.0, 0.0)),
+    "q2": ((0.0, 0.0), (0.0, 1.0)),
+}
 _GRID = (11, 9)  # points along the image's width and height at which field and rig are compared
 _STEP = 1e-6  # of numeric derivatives by the parameters, which are all of the size of radians
 _STEPS = 15  # of Gauss-Newton; the weights of the prior need most of them
@@ -221,13 +234,9 @@ def _scaled(rig: Rig, baseline: float, focal: float) -> Rig:
     """
 
     def lens(camera: CameraModel) -> CameraModel:
-        powers = (
-            (2, 4, 1, 1, 6, 2, 4, 6)
-            if camera.model == "radtan"
-            else (0,) * len(camera.coefficients)
-        )
+        powers = camera.lens.radius_powers(len(camera.coefficients))
         coefficients = tuple(
-            c * math.exp(n * focal) for c, n in zip(camera.coefficients, powers, strict=False)
+            c * math.exp(n * focal) for c, n in zip(camera.coefficients, powers, strict=True)
         )
         factor = math.exp(focal)
         return replace(
@@ -282,9 +291,10 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
 
 def _expressible(given: Rig) -> BoolArray:
     """Return which parameters (14,) the lens models of a rig can hold."""
-    bends = all(c.model in _BENDS for c in given.cameras)
-    radial = all(c.model != "double_sphere" for c in given.cameras)
-    held = {"p1": bends, "p2": bends, "q1": bends, "q2": bends, "k": radial, "k2": radial}
+    held = {
+        name: all(holds_distortion(camera, *kind) for camera in given.cameras)
+        for name, kind in _LENS_PARAMETERS.items()
+    }
     return np.array([held.get(name, True) for name in PARAMETERS])
 
 
@@ -331,8 +341,8 @@ class _Frame:
         b, T_cam1_cam0 = given.right
         b = replace(b, cu=b.cu + b.fu * named["cu"], cv=b.cv + b.fv * named["cv"])
         b = replace(b, fu=b.fu * (1 + named["fu"]), fv=b.fv * (1 + named["fv"]))
-        cam0 = _bent(given.cam0, (k, k2), q1, q2)
-        cam1 = _bent(b, (k, k2), q1 + named["p1"], q2 + named["p2"])
+        cam0 = _bent(given.cam0, (k, k2), (q1, q2))
+        cam1 = _bent(b, (k, k2), (q1 + named["p1"], q2 + named["p2"]))
         R = self.R_rect_cam1.T @ so3_exp(x[:3]) @ self.R_rect_cam0
         centre = se3_inverse(T_cam1_cam0)[:3, 3]
         down = self.R_rect_cam0[1] * named["ty"] * np.linalg.norm(centre)
@@ -384,22 +394,12 @@ def rig_off_by(given: Rig, parameters: FloatArray) -> Rig:
     return _Frame.of(given).moved(parameters)
 
 
-def _bent(camera: CameraModel, radial: tuple[float, float], p1: float, p2: float) -> CameraModel:
+def _bent(
+    camera: CameraModel, radial: tuple[float, float], tangential: tuple[float, float]
+) -> CameraModel:
     """Return a camera with more radial and tangential distortion, as far as its model holds it."""
-    c = camera.coefficients
-    (k1, k2) = radial
-    if camera.model == "pinhole":
-        return replace(camera, model="radtan", coefficients=(k1, k2, p1, p2))
-    if camera.model == "unified":
-        bend = c[1:] or (0.0, 0.0, 0.0, 0.0)
-        return replace(
-            camera, coefficients=(c[0], bend[0] + k1, bend[1] + k2, bend[2] + p1, bend[3] + p2)
-        )
-    if camera.model == "radtan":
-        return replace(camera, coefficients=(c[0] + k1, c[1] + k2, c[2] + p1, c[3] + p2, *c[4:]))
-    if camera.model == "equidistant":
-        return replace(camera, coefficients=(c[0] + k1, c[1] + k2, *c[2:]))
-    return camera
+    model, coefficients = camera.lens.bent(camera.coefficients, radial, tangential)
+    return replace(camera, model=model, coefficients=coefficients)
 
 
 # a rig that leaves more of what the run saw is none of these cameras; true ones leave 0.3 px

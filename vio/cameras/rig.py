@@ -11,7 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import CalibrationError
-from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair
+from vio.geometry.distortion import (
+    CameraModel,
+    DistortionModel,
+    StereoRig,
+    rectified_pair,
+    simplest_lens,
+)
 from vio.geometry.lie import FloatArray, checked_transform, rigid_fault, se3_from_parts, se3_inverse
 from vio.geometry.rectify import (
     PINHOLE_REACH,
@@ -445,7 +451,7 @@ def camera_from_matrix(
 ) -> CameraModel:
     """Return a camera from its intrinsic matrix (3, 3) in pixels.
 
-    A radial-tangential lens without any distortion becomes a pinhole.
+    A lens whose coefficients, all zero, make it a pinhole becomes one.
 
     Raises:
         CalibrationError: K is no intrinsic matrix, or the model does not take these coefficients.
@@ -461,9 +467,7 @@ def camera_from_matrix(
             f"{name} has a skew of {M[0, 1]:g} px, which no lens model takes; calibrate without"
         )
     values = tuple(float(c) for c in np.ravel(np.asarray(coefficients, dtype=np.float64)))
-    if model == "radtan" and not any(values):
-        model = "pinhole"
-        values = ()
+    model, values = simplest_lens(model, values)
     fu, fv, cu, cv = M[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     return CameraModel(fu, fv, cu, cv, int(width), int(height), model, values)
 

@@ -30,7 +30,7 @@ from vio.files.printable import printable
 
 # The commands by what they are for, and the files of those that have another name.
 BY_PURPOSE = {
-    "Try it": ("demo",),
+    "Try it": ("demo", "course"),
     "Before a run": (
         "inspect",
         "target",
@@ -105,8 +105,9 @@ def build_parser(names: Iterable[str] = COMMANDS) -> argparse.ArgumentParser:
     """Return the parser of the command line with some commands."""
     parser = argparse.ArgumentParser(
         prog="vio",
-        description="Stereo visual-inertial odometry: from rectified stereo images to a "
-        "trajectory.",
+        description="Stereo visual-inertial odometry and SLAM: from the images of two cameras, "
+        "raw or rectified, or of one with an IMU or with depth, to a trajectory with its "
+        "covariance. Begin with `vio demo`, or with `vio inspect RECORDING`.",
     )
     parser.add_argument("--version", action="version", version=f"stereo-vio {__version__}")
     parser.add_argument(

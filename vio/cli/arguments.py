@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vio.errors import ConfigError
 
@@ -13,6 +13,26 @@ if TYPE_CHECKING:
     from vio.datasets.frame_times import Seconds
     from vio.live.build import MapUse
     from vio.mavlink.output import MavlinkSettings
+
+_EXAMPLES = "examples:"
+
+
+class HelpWithExamples(argparse.HelpFormatter):
+    """Wraps the description of a command, and keeps the lines of its examples."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        if not text.startswith(_EXAMPLES):
+            return super()._fill_text(text, width, indent)
+        return "".join(f"{indent}{line}" for line in text.splitlines(keepends=True))
+
+
+def examples(*lines: str) -> dict[str, Any]:
+    """Return what makes the help of a command end with examples, `command  # remark` each."""
+    text = [_EXAMPLES]
+    for line in lines:
+        command, _, remark = line.partition("  # ")
+        text += [f"  {command}", f"      {remark}"]
+    return {"epilog": "\n".join(text), "formatter_class": HelpWithExamples}
 
 
 def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +68,12 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--topics", metavar="A=/B,…", help="topics of a bag: same as --set dataset.topics=A=/B,…"
     )
-    parser.add_argument("--frontend", metavar="NAME", help="same as --set frontend.name=NAME")
+    parser.add_argument(
+        "--frontend",
+        metavar="NAME",
+        help="same as --set frontend.name=NAME; vio run also takes FILE.py:CLASS, a front end or a "
+        "detector of your own",
+    )
 
 
 def add_span_arguments(parser: argparse.ArgumentParser) -> None:

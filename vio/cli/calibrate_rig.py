@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 MARKER = "calibration.json"
 PAGE = "report.html"
-_LENSES = ("radtan", "equidistant", "double_sphere", "radtan5", "unified", "rational")
+_AUTO = "auto"
 
 
 def add_parser(commands: Any) -> None:
@@ -44,7 +44,11 @@ def add_parser(commands: Any) -> None:
         "--size", type=float, metavar="M", help="side of a tag or square as measured, metres"
     )
     parser.add_argument(
-        "--lens", choices=("auto", *_LENSES), default="auto", help="model (default: compared)"
+        "--lens",
+        type=_lens,
+        default=_AUTO,
+        metavar="NAME",
+        help="lens model, such as radtan or eucm (default: all are compared)",
     )
     parser.add_argument(
         "--imu-noise",
@@ -70,6 +74,16 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
+def _lens(name: str) -> str:
+    if name == _AUTO:
+        return name
+    from vio.targets.lenses import LENSES
+
+    if name not in LENSES:
+        raise argparse.ArgumentTypeError(f"{name!r} is none of {_AUTO}, {', '.join(LENSES)}")
+    return name
+
+
 def execute(args: argparse.Namespace) -> int:
     from vio.cli.running import free_folder
     from vio.files.atomic import atomic_folder, check_replaceable, check_writable
@@ -91,7 +105,7 @@ def execute(args: argparse.Namespace) -> int:
     check_writable(out)
     with one_blas_thread(), ProgressBar("look for the board", unit="frames") as bar:
         filmed = film(raw, CornerDetector(target), max_frames=args.frames, progress=bar.update)
-        lens = None if args.lens == "auto" else args.lens
+        lens = None if args.lens == _AUTO else args.lens
         found = calibrate_cameras(filmed, target, lens)
         rig = found.rig
         inertial = None

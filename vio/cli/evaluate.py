@@ -7,9 +7,9 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vio.cli.arguments import add_lengths_argument
+from vio.cli.arguments import add_lengths_argument, examples
 from vio.cli.output import print_result
-from vio.errors import DataError, EvaluationError
+from vio.errors import ConfigError, DataError, EvaluationError
 from vio.files.printable import printable
 
 if TYPE_CHECKING:
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+# `vio.runs.picture.COMPARED_COLUMNS`, which loads NumPy
+_COLUMNS = ("position", "attitude", "x", "y", "z")
 _NAME = 32  # letters of a trajectory's name in a table of several
 _ALIGNMENTS = {
     "se3": "rotation and position",
@@ -39,6 +41,11 @@ def add_parser(commands: Any) -> None:
         "TUM, KITTI or EuRoC format, or a COLMAP model; a reference in KITTI format, or a model "
         "whose images are "
         "numbered, is associated by frame number, others by time.",
+        **examples(
+            "vio eval results truth.txt  # a run against a trajectory file",
+            "vio eval first second MH_01_easy --plot  # two runs against a recording's ground truth",
+            "vio eval results truth.txt --plot e.png --axes xz --columns position,z  # other curves",
+        ),
     )
     parser.add_argument(
         "estimates",
@@ -81,32 +88,75 @@ def add_parser(commands: Any) -> None:
         help="draw paths and errors (eval.png)",
     )
     parser.add_argument(
+        "--axes",
+        type=plane,
+        metavar="AB",
+        help="with --plot: axes of the reference's world in which paths are drawn, as xy or xz "
+        "(default: the plane in which it extends furthest)",
+    )
+    parser.add_argument(
+        "--columns",
+        type=columns,
+        default=("position",),
+        metavar="A,B",
+        help=f"with --plot: curves beside the paths: {', '.join(_COLUMNS)} (default position)",
+    )
+    parser.add_argument(
+        "--over",
+        choices=("distance", "time"),
+        default="distance",
+        help="with --plot: what curves are drawn over (default distance)",
+    )
+    parser.add_argument(
         "--json", action="store_true", help="print one JSON object; of several by their names"
     )
 
 
+def plane(text: str) -> str:
+    """Parse two axes such as xz."""
+    if len(text) != 2 or text[0] == text[1] or not set(text) <= set("xyz"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no plane; give two of x, y and z, as in xz")
+    return text
+
+
+def columns(text: str) -> tuple[str, ...]:
+    """Parse names of curves."""
+    found = tuple(part.strip() for part in text.split(","))
+    unknown = [name for name in found if name not in _COLUMNS]
+    if unknown or len(set(found)) != len(found):
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: give some of {', '.join(_COLUMNS)}, separated by commas, each once"
+        )
+    return found
+
+
 def execute(args: argparse.Namespace) -> int:
     from vio.files.atomic import check_new_file
+
+    if args.plot is None and (
+        args.axes or args.over != "distance" or args.columns != ("position",)
+    ):
+        raise ConfigError("--axes, --columns and --over say what --plot draws; give --plot too")
 
     if args.plot is not None:
         check_new_file(args.plot, b"\x89PNG")
     estimates = {str(path): _read(path) for path in args.estimates}
     reference = _read(args.reference)
     results = {name: _evaluated(args, estimate, reference) for name, estimate in estimates.items()}
+    if args.plot is not None:
+        from vio.runs.picture import Compared, draw_comparison, write_picture
+
+        named = {printable(name): r for name, r in results.items()}
+        shown = Compared(args.axes, args.columns, args.over)
+        write_picture(args.plot, lambda: draw_comparison(named, shown))
     if len(results) == 1:
         (result,) = results.values()
         print_result(result.as_dict(), _rows(result), as_json=args.json)
     else:
         facts = {name: result.as_dict() for name, result in results.items()}
         print_result(facts, _side_by_side(results), as_json=args.json)
-    if args.plot is not None:
-        from vio.runs.picture import draw_comparison, write_picture
-
-        write_picture(
-            args.plot, lambda: draw_comparison({printable(name): r for name, r in results.items()})
-        )
-        if not args.json:
-            print_result({}, [("plot", str(args.plot))], as_json=False)
+    if args.plot is not None and not args.json:
+        print_result({}, [("plot", str(args.plot))], as_json=False)
     return 0
 
 

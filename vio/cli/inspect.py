@@ -7,7 +7,12 @@ import shlex
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from vio.cli.arguments import add_config_arguments, add_span_arguments, config_from
+from vio.cli.arguments import (
+    add_config_arguments,
+    add_span_arguments,
+    config_from,
+    examples,
+)
 from vio.cli.output import ProgressBar, print_result
 from vio.errors import ConfigError
 
@@ -24,6 +29,11 @@ def add_parser(commands: Any) -> None:
         "rows or depths, IMU (units, standstill, gravity, noise against the data sheet, agreement "
         "with images), ground "
         "truth, and what is missing. Exit status 1 where a run makes no sense, with the remedy.",
+        **examples(
+            "vio inspect cameras  # a folder of images with a calibration",
+            "vio inspect flight.bag --topics left=/cam0/image_raw,right=/cam1/image_raw  # a ROS bag",
+            "vio inspect cameras --start 60s --stop 90s --pairs 30  # a part of it, closely",
+        ),
     )
     parser.add_argument(
         "source", metavar="SOURCE", help="a recording: folder or file, or kind:path"

@@ -13,6 +13,7 @@ from vio.cli.arguments import (
     add_mavlink_arguments,
     add_settings_arguments,
     config_from,
+    examples,
     map_from,
     mavlink_from,
 )
@@ -26,6 +27,11 @@ def add_parser(commands: Any) -> None:
         description="Run on a camera until Ctrl-C. SOURCE is v4l2:/dev/video0, a URL as rtsp://…, "
         "video:FILE, "
         "realsense:[SERIAL] (extra realsense) or oak:[ID] (extra oak).",
+        **examples(
+            "vio live realsense: --view  # with the device's own calibration",
+            "vio live v4l2:/dev/video0 --calibration rig.yaml --record kept  # a webcam pair",
+            "vio live oak: --mavlink udpout:192.168.1.10:14550  # poses to an autopilot",
+        ),
     )
     parser.add_argument("source", metavar="SOURCE", help="the camera")
     parser.add_argument(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from vio.cli.arguments import examples
 from vio.errors import DataError
 
 
@@ -17,8 +18,12 @@ def add_parser(commands: Any) -> None:
         description="Write one self-contained HTML page about finished runs: summary, path, "
         "attitude, errors, "
         "features, innovations, biases, time, warnings and settings. Several runs are shown side "
-        "by side. The page "
-        "needs no network.",
+        "by side. The page needs no network.",
+        **examples(
+            "vio report runs/flight --open  # shown in the browser",
+            "vio report with_imu images_alone --out both.html  # two runs compared",
+            "vio report runs/flight --reference truth.txt  # with other ground truth",
+        ),
     )
     parser.add_argument(
         "runs", type=Path, nargs="+", metavar="RUN", help="folders that `vio run` wrote"

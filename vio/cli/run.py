@@ -12,6 +12,7 @@ from vio.cli.arguments import (
     add_lengths_argument,
     add_span_arguments,
     config_from,
+    examples,
 )
 from vio.cli.output import print_result
 from vio.errors import ConfigError
@@ -22,9 +23,13 @@ def add_parser(commands: Any) -> None:
         "run",
         help="process a recording",
         description="Process a recording and write a folder of results. The kind of SOURCE is "
-        "detected from its "
-        "content; 'kind:path' sets it (kitti, kitti_raw, euroc, plain, bag, video, ece276a, utias, "
-        "log).",
+        "detected from its content; 'kind:path' sets it (kitti, kitti_raw, euroc, plain, mono, "
+        "rgbd, bag, video, ece276a, utias, gtsam, log).",
+        **examples(
+            "vio run dataset/sequences/07 --report --open  # and show the page about it",
+            "vio run MH_01_easy --motion none --out images_alone  # without the IMU",
+            "vio run flight.bag --calibration rig.yaml --map yard.map  # close loops in a map",
+        ),
     )
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
@@ -100,6 +105,10 @@ def execute(args: argparse.Namespace) -> int:
         print_result(metrics, metric_rows(metrics, plot=not args.no_plot), as_json=args.json)
         sys.stdout.flush()
 
+    own = None
+    if args.frontend is not None and ":" in args.frontend:  # no name of a setting
+        own = args.frontend
+        args.frontend = None
     if args.resume is not None:
         given = [f"--{name.replace('_', '-')}" for name in _OF_A_NEW_RUN if getattr(args, name)]
         if given:
@@ -108,6 +117,7 @@ def execute(args: argparse.Namespace) -> int:
             args.resume,
             save_calibration=args.save_calibration,
             map_file=args.map,
+            frontend=own,
             progress=not args.quiet,
             finished=finished,
         )
@@ -127,6 +137,7 @@ def execute(args: argparse.Namespace) -> int:
         map_density=args.map_density,
         view=args.view,
         plot=not args.no_plot,
+        frontend=own,
         command=args.command_line,
         finished=finished,
     )

@@ -27,7 +27,7 @@ from vio.files.atomic import (
     locked_folder,
 )
 from vio.files.trajectories import read_trajectory
-from vio.live.build import MapUse, resolve_motion
+from vio.live.build import CONFIGURED, MapUse, Parts, resolve_motion
 from vio.live.first_use import Part, compiled_beside
 from vio.protocols import Dataset, Viewer
 from vio.records import FrameResult, Recording, RunMotion, Trajectory
@@ -83,10 +83,13 @@ def process(
     localise: bool = False,
     view: str | None = None,
     plot: bool = True,
+    frontend: str | None = None,
     command: str | None = None,
     finished: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Process a source into a run folder, which grows meanwhile, and return its metrics.
+
+    `frontend` names a front end or detector of the caller's own, FILE.py:CLASS or module:CLASS.
 
     `save_calibration` names the file for the calibration that the run found; `Path()`, one in the
     run's folder. `command` is kept in the metrics; `finished` gets them before the picture is
@@ -112,6 +115,7 @@ def process(
         "map_density": map_density,
         "localise": localise,
         "plot": plot,
+        "frontend": frontend,
         "command": command,
     }
     return _process(
@@ -155,13 +159,14 @@ def resume(
     *,
     save_calibration: Path | None = None,
     map_file: Path | None = None,
+    frontend: str | None = None,
     progress: bool = True,
     finished: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Go on with an unfinished run and return its metrics; `finished` is that of `process`.
 
-    The folder may be of another hand: what it wants written outside of itself is written only where
-    the caller names the same file, and all is checked as for a new run.
+    The folder may be of another hand: what it wants written outside of itself is written, and code
+    that it names is run, only where the caller names the same, and all is checked as for a new run.
 
     Raises:
         VioError: the folder holds no unfinished run, one that another program began, or one that
@@ -178,6 +183,15 @@ def resume(
     )
     if not request.get("localise", False):  # which only reads the map
         request["map"] = _named_again(folder, request.get("map"), "--map", map_file)
+    if request.get("frontend") != frontend:
+        raise ConfigError(
+            f"{folder}: this run began "
+            + (
+                "without a front end of your own; leave --frontend out"
+                if request.get("frontend") is None
+                else f"with code of your own; name it again: --frontend {request['frontend']}"
+            )
+        )
     density = request.get("map_density")
     if density is not None and density < 1:
         raise DataError(f"{folder}: its map_density is {density}, not at least 1; repeat the run")
@@ -237,6 +251,8 @@ def _resume_command(folder: Path, request: Mapping[str, Any]) -> str:
         words += ["--save-calibration", str(asked)]
     if request.get("map") is not None and not request.get("localise", False):
         words += ["--map", request["map"]]
+    if request.get("frontend") is not None:
+        words += ["--frontend", request["frontend"]]
     return shlex.join(words)
 
 
@@ -279,6 +295,7 @@ def _process(
         if finished is not None and metrics["complete"]:
             finished(metrics)
 
+    parts = _own_parts(request, recording, config)
     beside: tuple[Part, ...] = ("filter",) if recording.camera.kind == "stereo" else ()
     motion = _likely_motion(recording, config)
     with locked_folder(folder), compiled_beside(beside, motion), StopRequest() as asked:
@@ -290,6 +307,7 @@ def _process(
                 stop=stop,
                 keep_observations=save_observations or builds_map,  # which its adjustment takes
                 viewer=Viewers(viewers),
+                parts=parts,
                 map=_map_use(request),
                 control=RunControl(
                     growing_folder(folder, dataset, config, request), resume, asked.reason
@@ -344,6 +362,18 @@ def _process(
             f"{text}; go on with: {_resume_command(folder, request)}", status=128 + asked.number
         )
     return metrics
+
+
+def _own_parts(request: Mapping[str, Any], recording: Recording, config: Config) -> Parts:
+    """Return the parts of the caller's own that a run was asked for."""
+    text = request.get("frontend")
+    if text is None:
+        return CONFIGURED
+    from vio.frontend.given import load_given
+
+    if not recording.has_images:
+        raise ConfigError(f"--frontend {text}: {recording.path} holds features, and no images")
+    return Parts(frontend=load_given(text, recording.camera, config.frontend))
 
 
 def _likely_motion(recording: Recording, config: Config) -> RunMotion:

@@ -28,10 +28,10 @@ from vio.errors import CalibrationError
 from vio.files.text import exact_text, write_text
 from vio.geometry.distortion import (
     CameraModel,
-    DistortionModel,
     StereoRig,
     rectified_pair,
     rig_from_rectified,
+    simplest_lens,
 )
 from vio.geometry.lie import (
     FloatArray,
@@ -43,8 +43,6 @@ from vio.geometry.lie import (
 from vio.geometry.stereo import StereoCamera
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
 
-# those it has a name for
-SENSOR_YAML_MODELS: tuple[DistortionModel, ...] = ("pinhole", "radtan", "equidistant")
 STATE_CSV = Path("state_groundtruth_estimate0", "data.csv")  # ground truth, within mav0
 TUM_FILE = "groundtruth_tum.txt"  # ground truth beside mav0
 # units in the last place within which a translation is looked for that is read back as it was
@@ -79,9 +77,7 @@ def read_camera_yaml(path: Path) -> tuple[CameraModel, FloatArray]:
         )
     model = lens_model(entries.get("distortion_model", "none"), path)
     coefficients = () if model == "pinhole" else numbers(entries, "distortion_coefficients", path)
-    if model == "radtan" and not any(coefficients):
-        model = "pinhole"
-        coefficients = ()
+    model, coefficients = simplest_lens(model, coefficients)
     fu, fv, cu, cv = numbers(entries, "intrinsics", path, 4)
     width, height = image_size(numbers(entries, "resolution", path, 2), f"{path}, resolution")
     with naming(path):
@@ -98,11 +94,10 @@ def camera_yaml(
     Raises:
         CalibrationError: the format has no name for the lens model.
     """
-    if camera.model not in SENSOR_YAML_MODELS:
+    if (name := camera.lens.files.sensor_yaml) is None:
         raise CalibrationError(
             f"EuRoC's sensor.yaml has no {camera.model} lens; rectify the images first"
         )
-    name = "equidistant" if camera.model == "equidistant" else "radial-tangential"
     return (
         f"%YAML:1.0\nsensor_type: camera\ncomment: {comment}\n\n"
         f"{_T_BS_yaml(T_body_cam)}\n"

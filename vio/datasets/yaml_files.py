@@ -16,6 +16,7 @@ from vio.errors import CalibrationError
 from vio.files.text import text_lines
 from vio.files.yaml_text import read_yaml as read_yaml_text
 from vio.geometry.distortion import DistortionModel
+from vio.geometry.lenses.registry import LENSES
 from vio.geometry.lie import FloatArray
 from vio.records import ImuDensities
 
@@ -27,12 +28,6 @@ NOISE_UNITS = {
     "gyroscope_random_walk": "rad / s^2 / sqrt(Hz)",
     "accelerometer_noise_density": "m / s^2 / sqrt(Hz)",
     "accelerometer_random_walk": "m / s^3 / sqrt(Hz)",
-}
-_LENS_MODELS: dict[str, DistortionModel] = {  # by the names that calibrations give them
-    **dict.fromkeys(("radial-tangential", "radtan", "plumb_bob", "rational_polynomial"), "radtan"),
-    **dict.fromkeys(("equidistant", "equi", "fisheye", "kannala_brandt"), "equidistant"),
-    **dict.fromkeys(("radialtangential", "radialtangential8"), "radtan"),  # OKVIS
-    **dict.fromkeys(("none", ""), "pinhole"),
 }
 # 'data:[1, 2]' and 'Viewer.PointSize:2', which OpenCV's reader takes for 'key: value'
 _LAX_KEY = re.compile(r"^(\s*(?:- )?[A-Za-z_][\w.\-]*):(?=[^\s:/\\])", re.MULTILINE)
@@ -122,10 +117,10 @@ def lens_model(name: object, where: Path | str) -> DistortionModel:
     Raises:
         CalibrationError: the name is not known.
     """
-    if (model := _LENS_MODELS.get(str(name).lower())) is None:
-        raise CalibrationError(
-            f"{where}: distortion_model {name!r} is not read; known: {', '.join(_LENS_MODELS)}"
-        )
+    known = {word: model for model, lens in LENSES.items() for word in lens.files.distortion}
+    if (model := known.get(str(name).lower())) is None:
+        words = ", ".join(word for word in known if word)
+        raise CalibrationError(f"{where}: distortion_model {name!r} is not read; known: {words}")
     return model
 
 

@@ -16,7 +16,7 @@ from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts
 from vio.geometry.stereo import StereoCamera
 from vio.interop.loading import package
 
-_INSTALL = "stereo-vio[learned]"
+_INSTALL = ".[learned]"
 
 
 def to_pinhole_cameras(camera: StereoCamera, T_cam0_world: FloatArray) -> Any:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.errors import DataError, MissingDependencyError
+from vio.errors import DataError, MissingDependencyError, extra_text
 from vio.geometry.lie import FloatArray
 
 
@@ -16,7 +16,7 @@ def package(module: str, to_install: str) -> Any:
 
     Args:
         module: its dotted name.
-        to_install: what pip installs to have it.
+        to_install: what pip installs to have it; `.[NAME]` is an extra of this package.
 
     Raises:
         MissingDependencyError: it is not installed.
@@ -24,9 +24,10 @@ def package(module: str, to_install: str) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
-        raise MissingDependencyError(
-            f"vio.interop needs {module} ({error}); install it with: pip install '{to_install}'"
-        ) from error
+        how = f"install it with: pip install '{to_install}'"
+        if to_install.startswith(".["):
+            how = extra_text(to_install[2:-1])
+        raise MissingDependencyError(f"vio.interop needs {module} ({error}); {how}") from error
 
 
 def checked_covariance(covariance: FloatArray) -> FloatArray:

@@ -13,26 +13,13 @@ import numpy as np
 
 from vio.cameras.rig import Rig
 from vio.errors import CalibrationError
-from vio.geometry.distortion import CameraModel, DistortionModel
+from vio.geometry.distortion import CameraModel
+from vio.geometry.lenses.registry import LENSES
 from vio.geometry.lie import FloatArray, checked_transform, so3_hat
 from vio.interop.loading import checked_covariance, package
 
 _INSTALL = "pycolmap>=4.2,<5"
 _HALF_PX = 0.5  # COLMAP's pixel coordinates minus ours
-# Names of COLMAP, and how many coefficients each takes; missing ones of ours are zero.
-_MODELS: dict[tuple[DistortionModel, int], tuple[str, int]] = {
-    ("pinhole", 0): ("PINHOLE", 0),
-    ("radtan", 4): ("OPENCV", 4),
-    ("radtan", 5): ("FULL_OPENCV", 8),
-    ("radtan", 8): ("FULL_OPENCV", 8),
-    ("equidistant", 4): ("OPENCV_FISHEYE", 4),
-}
-_READ: dict[str, DistortionModel] = {
-    "PINHOLE": "pinhole",
-    "OPENCV": "radtan",
-    "FULL_OPENCV": "radtan",
-    "OPENCV_FISHEYE": "equidistant",
-}
 _LEFT = 1  # camera ids
 _RIGHT = 2
 
@@ -83,7 +70,7 @@ def to_camera(lens: CameraModel, camera_id: int = _LEFT) -> Any:
     Raises:
         CalibrationError: COLMAP has no such lens model.
     """
-    found = _MODELS.get((lens.model, len(lens.coefficients)))
+    found = lens.lens.files.colmap.get(len(lens.coefficients))
     if found is None:
         raise CalibrationError(
             f"COLMAP has no lens model {lens.model} with {len(lens.coefficients)} coefficients; "
@@ -109,15 +96,16 @@ def from_camera(camera: Any) -> CameraModel:
         CalibrationError: we have no such lens model.
     """
     name = camera.model.name
-    if name not in _READ:
+    known = {word: one.name for one in LENSES.values() for word, _ in one.files.colmap.values()}
+    if name not in known:
         raise CalibrationError(
-            f"the lens model {name} of COLMAP is not one of {', '.join(_READ)}; undistort the "
+            f"the lens model {name} of COLMAP is not one of {', '.join(known)}; undistort the "
             "model's images first"
         )
     fu, fv, cu, cv, *coefficients = np.asarray(camera.params).tolist()
     centre = (cu - _HALF_PX, cv - _HALF_PX)
     size = (int(camera.width), int(camera.height))
-    return CameraModel(fu, fv, *centre, *size, _READ[name], tuple(coefficients))
+    return CameraModel(fu, fv, *centre, *size, known[name], tuple(coefficients))
 
 
 def to_rig(rig: Rig, rig_id: int = 1) -> tuple[Any, tuple[Any, ...]]:

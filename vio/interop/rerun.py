@@ -16,7 +16,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.interop.loading import checked_covariance, package
 from vio.records import Landmarks
 
-_INSTALL = "stereo-vio[view]"
+_INSTALL = ".[view]"
 _HALF_PX = 0.5  # rerun's pixel coordinates minus ours
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from vio.interop.loading import package
 from vio.records import IntArray, Landmarks
 
-_INSTALL = "stereo-vio[learned]"
+_INSTALL = ".[learned]"
 
 
 def to_points(landmarks: Landmarks) -> tuple[Any, Any]:

@@ -21,7 +21,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.live.frame_pipeline import FramePipeline
 from vio.live.imu_trial import ImuTrial
 from vio.live.processor import EventProcessor
-from vio.protocols import Backend, Dataset, Frontend, Selector
+from vio.protocols import Backend, Dataset, Detector, Frontend, Selector
 from vio.records import MotionSource, Observations, Recording, RunMotion, need_stereo
 from vio.selection.selectors import build_selector
 
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 class Parts:
     """Parts of the caller's own, each used in place of the configured one; None: as configured."""
 
-    frontend: Frontend | None = None
+    frontend: Frontend | Detector | None = None  # a detector: `klt` with corners by it
     selector: Selector | None = None
     backend: Backend | None = None
 
@@ -183,7 +183,8 @@ def build_processor(
         ConfigError: the settings contradict one another, the camera or the back end.
         DataError: the map cannot be used.
     """
-    from vio.guard.guarded import guarded  # it loads OpenCV
+    from vio.frontend.given import as_frontend  # they load OpenCV
+    from vio.guard.guarded import guarded
 
     camera = source.camera
     features = source.features
@@ -194,13 +195,16 @@ def build_processor(
         )
     seen = camera if features is None else features.recording.camera
     name = config.frontend.name if config.frontend.features is None else "precomputed"
+    frontend = (
+        build_frontend(name, seen, config.frontend, features)
+        if parts.frontend is None
+        else as_frontend(parts.frontend, seen, config.frontend)
+    )
     pipeline = FramePipeline(
         camera,
         source.T_cam0_body,
         source.motion,
-        frontend=guarded(
-            parts.frontend or build_frontend(name, seen, config.frontend, features), seen
-        ),
+        frontend=guarded(frontend, seen),
         selector=parts.selector
         or build_selector(config.selector, whole_record=_record(features), camera=seen),
         backend=backend,

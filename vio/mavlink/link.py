@@ -6,16 +6,13 @@ import contextlib
 import socket
 from typing import Any, Protocol
 
-from vio.errors import ConfigError, DataError, MissingDependencyError
+from vio.errors import ConfigError, DataError, MissingDependencyError, extra_text
 
 _BAUD = 921_600
 _MAX_BYTES = 4096
 _WAIT_S = 0.1
 _FORMS = "give udp:HOST:PORT, or serial:DEVICE[:BAUD]"
-MISSING = (
-    "--mavlink needs pymavlink, over a serial line also pyserial; install them with: "
-    "pip install 'stereo-vio[mavlink]'"
-)
+MISSING = "--mavlink needs pymavlink, over a serial line also pyserial; " + extra_text("mavlink")
 
 
 class Link(Protocol):

@@ -1,7 +1,9 @@
 """Find images and depth images that show no motion although the rig moves: a camera or driver gives
 them again.
 
-Equal to the last bit is the same exposure, as noise differs from one to the next. Nearly equal
+Equal to the last bit is the same exposure, as noise differs from one to the next, unless images
+without noise, of a simulator, show a rig at standstill: what moved up to the frame before has not
+stopped at once. Nearly equal
 pairs (encoded again, or with noise on top) are the same where the tracked corners have not moved,
 while the motion predicted since the last frame moves them by more than its uncertainty allows and
 the IMU is not at standstill. A rig at standstill gives nearly equal images, too; there the
@@ -38,6 +40,8 @@ _PREDICTED_PX = 1.0  # a corner that is predicted to move less is no evidence �
 _ERRORS = 3.0  # … nor one that moves by less than so many times what predictions were off by …
 _RECENT = 20  # … at most in so many frames
 _MIN_RECENT = 5
+# flow between the two frames before (median), beyond which no rig stands still at once
+_MOVED_PX = 0.3
 _UNMOVED_PX = 0.15  # the flow of an unmoved corner under noise of a few gray levels
 _SHARE = 0.8  # of the corners that must be unmoved
 _FIRST_ROWS = 8  # compared before all others
@@ -63,6 +67,7 @@ class FrozenImages:
         self._imu: deque[ImuSample] = deque()
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
         self._seen: Observations | None = None  # its features
+        self._flow_px = 0.0  # of its features since the frame before (median)
         self._repeating: Repeated | None = None  # of the frame before
         # the last frame with a depth image that is no repetition
         self._deep: StereoFrame | None = None
@@ -86,6 +91,7 @@ class FrozenImages:
             if len(a):
                 off = seen.z[a, :2] - self._expected.tracks.z[b, :2]
                 self._errors_px.append(median(np.linalg.norm(off, axis=1)))
+        self._flow_px = 0.0 if self._seen is None else _median_flow_px(self._seen, seen)
         self._seen = seen
 
     def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
@@ -142,7 +148,11 @@ class FrozenImages:
         return Repeated(shown.index, False) if frozen else None
 
     def _moves(self, expected: Prediction | None) -> bool:
-        """Whether the rig moves: by the IMU's samples, else by the prediction."""
+        """Whether the rig moves: by the last frames' features, the IMU's samples, else by the
+        prediction.
+        """
+        if self._flow_px > _MOVED_PX:
+            return True
         if self._imu:
             return not self._at_standstill()
         return expected is not None and self._contradicts(expected.motion)
@@ -175,6 +185,14 @@ def _equal(a: Image, b: Image) -> bool:
     need no more.
     """
     return np.array_equal(a[:_FIRST_ROWS], b[:_FIRST_ROWS]) and np.array_equal(a, b)
+
+
+def _median_flow_px(before: Observations, now: Observations) -> float:
+    """Median flow of the features of two frames in the left image; 0: they share too few."""
+    _, a, b = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    if len(a) < _MIN_CORNERS:
+        return 0.0
+    return median(np.linalg.norm(now.z[b, :2] - before.z[a, :2], axis=1))
 
 
 def _same_depths(a: FloatArray, b: FloatArray) -> bool:

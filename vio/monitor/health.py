@@ -21,7 +21,7 @@ _GAP_STEPS = 5.0
 _MIN_STEPS = 5  # between frames, for the usual time to be known; and that it is taken from
 _RECENT_STEPS = 50
 # No rig comes to this by a camera that turns in its mount (docs/notes/design_decisions.md,
-# exchanged cameras).
+# swapped cameras).
 _OTHER_PAIR_PX = 10.0
 _SCALE_OFF_PERCENT = 1.0  # of baseline or focal length, both to be exceeded
 _SCALE_SIGMAS = 3.0

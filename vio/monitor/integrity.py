@@ -3,7 +3,8 @@
 A covariance is conditional on what the filter assumes. Where a finding says that an assumption does
 not hold, the estimate is marked, and the covariance of one that is unusable also covers that the
 rig has moved in any direction since the fault began, as fast as it moves at most: what the filter
-says of the motion since then may be wrong by all of it.
+says of the motion since then may be wrong by all of it. When the fault has ended, the motion is
+known again, and the position is not: what the covariance covered stays in it.
 """
 
 from __future__ import annotations
@@ -47,7 +48,10 @@ class IntegrityMonitor:
         self._marks: list[Mark] = []
         self._last: tuple[int, FloatArray] | None = None  # time and position of the last frame
         self._speed_mps = _MIN_SPEED_MPS  # the fastest so far
+        self._times = dict[int, int]()  # of the frames so far, by their numbers
         self._unusable_since_ns: int | None = None
+        self._carried_m = 0.0  # that the position may be off by since earlier faults
+        self._doubt_m = 0.0  # the same with the present one
 
     def take(self, finding: Finding) -> None:
         """Take a finding; it counts from the next estimate on."""
@@ -63,21 +67,37 @@ class IntegrityMonitor:
         """Return the estimate of a frame with its integrity and, where it is not nominal, the codes
         of what holds.
         """
+        self._times[index] = estimate.time_ns
         self._update(index, estimate.time_ns)
         held = [entry.finding for entry in self._holding.values()]
         integrity = worst([finding.effect for finding in held])
         self._measure_speed(estimate, usable=integrity != "unusable")
-        if integrity == "nominal":
-            self._unusable_since_ns = None
+        self._measure_doubt(estimate.time_ns, held)
+        if integrity == "nominal" and self._doubt_m == 0.0:
             return estimate
         codes = tuple(sorted(f.code for f in held if f.effect != "nominal"))
         covariance = estimate.covariance
-        if integrity == "unusable":
-            if self._unusable_since_ns is None:
-                self._unusable_since_ns = estimate.time_ns
-            elapsed_s = (estimate.time_ns - self._unusable_since_ns) / NS_PER_S
-            covariance = inflated(covariance, self._speed_mps * elapsed_s)
+        if self._doubt_m > 0.0:
+            covariance = inflated(covariance, self._doubt_m)
         return replace(estimate, integrity=integrity, findings=codes, covariance=covariance)
+
+    def _measure_doubt(self, now_ns: int, held: list[Finding]) -> None:
+        """Bring what the position may be off by to the present."""
+        since = [self._onset_ns(f, now_ns) for f in held if f.effect == "unusable"]
+        if not since:
+            self._unusable_since_ns = None
+            self._carried_m = self._doubt_m
+            return
+        if self._unusable_since_ns is None:
+            self._unusable_since_ns = now_ns
+        self._unusable_since_ns = min(self._unusable_since_ns, *since)
+        moved_m = self._speed_mps * (now_ns - self._unusable_since_ns) / NS_PER_S
+        self._doubt_m = float(np.hypot(self._carried_m, moved_m))
+
+    def _onset_ns(self, finding: Finding, now_ns: int) -> int:
+        """The time of the first frame that a finding holds for."""
+        first = finding.first_frame
+        return now_ns if first is None else self._times.get(first, now_ns)
 
     def _update(self, index: int, now_ns: int) -> None:
         """Take the new findings, and let go of those that have ended."""

@@ -12,7 +12,7 @@ from vio.calibration.lever_arm import LeverArm
 from vio.calibration.stereo import StereoEstimate
 from vio.calibration.stereo_field import rig_off_by
 from vio.cameras.rig import Rig
-from vio.datasets.euroc_files import SENSOR_YAML_MODELS, camera_yaml, median_rate_hz
+from vio.datasets.euroc_files import camera_yaml, median_rate_hz
 from vio.datasets.image_pairs import ImageDataset
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.geometry.distortion import StereoRig
@@ -43,7 +43,7 @@ def write_calibration_report(folder: Path, report: CalibrationReport) -> None:
     times = np.zeros(0, dtype=np.int64) if dataset is None else dataset.recording.frame_times_ns
     rate_hz = median_rate_hz(times) or _USUAL_RATE_HZ
     for name, camera in cameras.items():
-        if camera.model not in SENSOR_YAML_MODELS:
+        if camera.lens.files.sensor_yaml is None:
             continue  # Kalibr's file has names for the other models
         (folder / name).mkdir()
         (folder / name / "sensor.yaml").write_text(

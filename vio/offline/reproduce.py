@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from vio.files.atomic import atomic_folder, check_writable
 from vio.files.printable import json_text, printable
 from vio.files.trajectories import read_trajectory
 from vio.filters.settings import VislamSettings
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, transform_points
 from vio.numerics.threads import one_blas_thread
 from vio.records import Trajectory
 from vio.runs.picture import write_picture
@@ -97,6 +99,19 @@ VARIANTS = (
 )
 
 
+# The paper's figures: file, title, and variants side by side; the last panel is ours.
+_OURS = "sliding window"
+FIGURES = (
+    ("dead_reckoning", "Dead reckoning, without images", ("dead reckoning", _OURS)),
+    ("landmarks", "Landmarks mapped along the path of dead reckoning", ("mapping only", _OURS)),
+    (
+        "selection",
+        "All features, and the seventh that is seen most",
+        ("paper, all features", "paper, most seen 1/7", _OURS),
+    ),
+)
+
+
 @dataclass(frozen=True, slots=True)
 class ReproducedTable:
     """The experiment on one drive."""
@@ -129,7 +144,8 @@ class ReproducedTable:
 
 
 def reproduce(file: Path, reference: Path | None, out: Path) -> ReproducedTable:
-    """Run every variant on one ECE276A file; write `out/DRIVE/` with a table and a figure.
+    """Run every variant on one ECE276A file; write `out/DRIVE/` with a table and four figures:
+    all paths, and the paper's three, each beside ours.
 
     Raises:
         VioError: a file cannot be used.
@@ -160,6 +176,9 @@ def reproduce(file: Path, reference: Path | None, out: Path) -> ReproducedTable:
             json_text(table.as_dict(), indent=2) + "\n", encoding="utf-8"
         )
         write_picture(inside / "trajectories.png", lambda: _figure(file.stem, results))
+        for name, title, variants in FIGURES:
+            panels = partial(_panels, file.stem, title, variants, results)
+            write_picture(inside / f"{name}.png", panels)
     return table
 
 
@@ -215,6 +234,60 @@ def _figure(drive: str, results: list[tuple[Variant, RunResult, Evaluation | Non
     axes.grid(alpha=0.25)
     axes.legend(fontsize=9)
     return figure
+
+
+def _panels(
+    drive: str,
+    title: str,
+    variants: Sequence[str],
+    results: Sequence[tuple[Variant, RunResult, Evaluation | None]],
+) -> Any:
+    """Draw variants side by side from above, in equal frames: landmarks, path, ground truth."""
+    from matplotlib.figure import Figure
+
+    chosen = {variant.name: (result, score) for variant, result, score in results}
+    figure = Figure(figsize=(4.6 * len(variants), 4.9), dpi=110, layout="constrained")
+    every = figure.subplots(1, len(variants), sharex=True, sharey=True)
+    drawn = []
+    for axes, name in zip(every, variants, strict=True):
+        result, score = chosen[name]
+        path, points, truth = _from_above(result, score)
+        axes.scatter(*points.T, s=1.0, c="#9aa5b1", linewidths=0, rasterized=True)
+        if truth is not None:
+            axes.plot(*truth.T, color="#111111", lw=2.5, label="ground truth")
+            drawn.append(truth)
+        axes.plot(*path.T, color="#1f5fbf", lw=1.4, label="estimate")
+        axes.plot(*path[0], "o", color="#111111", mfc="white", ms=5, label="start")
+        drawn.append(path)
+        ate = "" if score is None else f", ATE {score.ate_m.rmse:.1f} m"
+        ours = "ours: " if name == _OURS else ""
+        axes.set_title(f"{ours}{name}{ate}", fontsize=10)
+        axes.set_xlabel("m")
+        axes.grid(alpha=0.25)
+    low = np.min(np.vstack(drawn), axis=0)
+    high = np.max(np.vstack(drawn), axis=0)
+    middle = 0.5 * (low + high)
+    half = 0.6 * float((high - low).max())
+    for axes in every:  # landmarks far away are cut off
+        axes.set_aspect("equal", adjustable="box")
+        axes.set_xlim(middle[0] - half, middle[0] + half)
+        axes.set_ylim(middle[1] - half, middle[1] + half)
+    every[0].set_ylabel("m")
+    figure.legend(*every[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.suptitle(f"{printable(drive)}: {title}", fontsize=12, parse_math=False)
+    return figure
+
+
+def _from_above(
+    result: RunResult, score: Evaluation | None
+) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Return path (N, 2), landmarks (M, 2) and ground truth (K, 2) in the ground plane, metres."""
+    points = result.landmarks.p_world
+    if score is None:
+        return result.trajectory.positions[:, :2], points[:, :2], None
+    ground = _ground(score.reference)
+    moved: FloatArray = transform_points(score.T_ref_est, points)[:, ground]
+    return score.aligned.positions[:, ground], moved, score.reference.positions[:, ground]
 
 
 def _ground(reference: Trajectory) -> list[int]:

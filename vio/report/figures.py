@@ -10,6 +10,7 @@ import numpy as np
 
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
+from vio.report.compared import apart
 from vio.runs.curves import (
     COLOURS,
     FEATURE_WORDS,
@@ -59,6 +60,7 @@ def sections(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Repo
         found.append(_velocity(runs, curves))
     if any(c.truth is not None for c in curves):
         found.append(_errors(runs, curves))
+    found += _apart(runs)
     found += _integrity(runs)
     found += [_features(runs), _innovations(runs), *_biases(runs), _timing(runs), *_stereo(runs)]
     return found
@@ -270,6 +272,22 @@ def _errors(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSect
     return _over_time(
         "Errors", figure, "Against the reference, after one rigid alignment of the whole path."
     )
+
+
+def _apart(runs: Sequence[FinishedRun]) -> list[ReportSection]:
+    """Draw how far runs of one recording are from the first of them."""
+    between = [apart(runs[0], run) for run in runs[1:]]
+    if not any(between):
+        return []
+    figure = _subplots(1, 1)
+    for run, found, colour in zip(runs[1:], between, COLOURS[1:], strict=False):
+        if found is not None:
+            rows = thinned(len(found.seconds))
+            _xy(figure, found.seconds[rows], found.distance_m[rows], run.name, colour, 1)
+    figure.update_layout(showlegend=True)
+    figure.update_yaxes(title_text="distance (m)", rangemode="tozero", row=1, col=1)
+    text = "At the frames that both have, after one rigid alignment of the whole path."
+    return [_over_time(f"Distance from {runs[0].name}", figure, text)]
 
 
 def _integrity(runs: Sequence[FinishedRun]) -> list[ReportSection]:

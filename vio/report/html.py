@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from html import escape
 
 from vio._version import __version__
@@ -37,15 +37,25 @@ def document(title: str, parts: Sequence[str], head: str = "") -> str:
     )
 
 
-def table(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
-    """Return a section with a table of named columns and rows."""
+def table(
+    title: str,
+    columns: Sequence[str],
+    rows: Mapping[str, Sequence[str]],
+    bold: Collection[tuple[str, int]] = (),
+    remark: str = "",
+) -> str:
+    """Return a section with a table of named columns and rows; `bold`: cells by row and column."""
     head = "".join(f"<th>{text(name)}</th>" for name in columns)
-    body = "".join(
-        f"<tr><th>{text(name)}</th>{''.join(f'<td>{text(cell)}</td>' for cell in cells)}</tr>"
-        for name, cells in rows.items()
-    )
+    body = ""
+    for name, cells in rows.items():
+        body += f"<tr><th>{text(name)}</th>"
+        for k, cell in enumerate(cells):
+            inner = text(cell)
+            body += f"<td><b>{inner}</b></td>" if (name, k) in bold else f"<td>{inner}</td>"
+        body += "</tr>"
+    said = f'<p class="remark">{text(remark)}</p>' if remark else ""
     grid = f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{body}</tbody></table>"
-    return f'<section><h2>{title}</h2><div class="scroll">{grid}</div></section>'
+    return f'<section><h2>{title}</h2>{said}<div class="scroll">{grid}</div></section>'
 
 
 def image(data: bytes, kind: str, words: str) -> str:

@@ -7,9 +7,10 @@ from pathlib import Path
 
 from vio.files.atomic import atomic_write_text
 from vio.files.inputs import read_input
+from vio.report.compared import apart, compared_figures
 from vio.report.figures import ReportSection, sections
 from vio.report.html import document, image, table, text
-from vio.report.words import calibration_findings, run_figures, summary
+from vio.report.words import calibration_findings, summary
 from vio.runs.curves import COLOURS, curves_of
 from vio.runs.files import MeshFile, RunFile
 from vio.runs.finished import FinishedRun
@@ -96,9 +97,23 @@ def _lists(title: str, runs: Sequence[FinishedRun], lines: Sequence[Sequence[str
 
 
 def _key_figures(runs: Sequence[FinishedRun]) -> str:
-    columns = [run_figures(run) for run in runs]
-    rows = {name: [column[name] for column in columns] for name in columns[0]}
-    return table("Figures", [run.name for run in runs], rows)
+    found = compared_figures(runs)
+    names = [run.name for run in runs]
+    rows = {name: [text for text, _ in cells] for name, cells in found.items()}
+    best = {
+        (name, k)
+        for name, cells in found.items()
+        for k, (_, is_best) in enumerate(cells)
+        if is_best
+    }
+    if len(runs) == 1:
+        return table("Figures", names, rows)
+    between = [apart(runs[0], run) for run in runs[1:]]
+    if any(between):
+        cells = ["" if other is None else str(other) for other in between]
+        rows[f"distance from {runs[0].name}"] = ["–", *(cell or "–" for cell in cells)]
+    remark = f"In brackets the change from {runs[0].name}; bold: the best." if best else ""
+    return table("Figures", names, rows, best, remark)
 
 
 def _settings(runs: Sequence[FinishedRun]) -> str:

@@ -96,7 +96,8 @@ def calibration_findings(metrics: Mapping[str, Any]) -> list[str]:
         text = field.get("text")
         lines += [f"Stereo pair: {text}; corrected in this run."] if text else []
         lines += [] if field.get("rig") is None else list(field["rig"]["lines"])
-    return lines + scale_findings(metrics) + camera_imu_findings(metrics)
+    imu = [f"IMU: {line}" for line in camera_imu_findings(metrics)]
+    return lines + scale_findings(metrics) + imu
 
 
 def scale_findings(metrics: Mapping[str, Any]) -> list[str]:
@@ -110,8 +111,8 @@ def scale_findings(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def camera_imu_findings(metrics: Mapping[str, Any]) -> list[str]:
-    """Return what a run found of the place and the clock of the IMU; they are near zero where
-    these are right.
+    """Return by how much a run corrected pose and clock of the IMU; near zero where these are
+    right.
     """
     found = metrics.get("camera_imu") or {}
     words = []
@@ -119,11 +120,11 @@ def camera_imu_findings(metrics: Mapping[str, Any]) -> list[str]:
         for key, unit, digits in (("rotation", "deg", 2), ("translation", "mm", 1)):
             size = math.hypot(*found[f"{key}_{unit}"])
             sigma = math.hypot(*found[f"{key}_sigma_{unit}"])
-            words.append(f"{key} off by {size:.{digits}f} ± {sigma:.{digits}f} {unit}")
+            words.append(f"{key} {size:.{digits}f} ± {sigma:.{digits}f} {unit}")
     if "time_offset_ms" in found:
         offset = f"{found['time_offset_ms']:+.2f} ± {found['time_offset_sigma_ms']:.2f} ms"
-        words.append(f"stamps off by {offset}")
-    return [f"against the camera: {', '.join(words)}"] if words else []
+        words.append(f"time offset {offset}")
+    return [f"corrections of its calibration: {', '.join(words)}"] if words else []
 
 
 def run_figures(run: FinishedRun) -> dict[str, str]:
@@ -153,4 +154,20 @@ def run_figures(run: FinishedRun) -> dict[str, str]:
         "landmarks": str(len(run.points)),
         "warnings and notes": str(len(m.get("warnings") or [])),
         "version": str(m.get("version", "–")),
+    }
+
+
+def smaller_is_better(run: FinishedRun) -> dict[str, float | None]:
+    """Return those of a run's figures that can be compared, by their names in `run_figures`."""
+    evaluation = run.evaluation
+    kitti = None if evaluation is None else evaluation.kitti
+    work = _work_ms(run)
+    return {
+        "ATE": None if evaluation is None else evaluation.ate_m.rmse,
+        "largest error": None if evaluation is None else evaluation.ate_m.max,
+        "attitude error (deg)": None if evaluation is None else evaluation.ate_deg.rmse,
+        "drift (%)": None if kitti is None else kitti.t_err_percent,
+        "drift of rotation": None if kitti is None else kitti.r_err_deg_per_100m,
+        "ms a frame, median": float(np.nanmedian(work)),
+        "ms a frame, 95 %": float(np.nanpercentile(work, 95)),
     }

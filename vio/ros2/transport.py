@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, Protocol, TypeAlias
 
 from vio.datasets.bags.writer import BagWriter
-from vio.errors import MissingDependencyError
+from vio.errors import MissingDependencyError, extra_text
 
 # "sensor": unreliable, as drivers publish; "reliable": none is lost, and the sender waits for a
 # slow receiver; "latched": whoever comes late gets the last message.
@@ -59,8 +59,7 @@ def open_transport(name: TransportName = "auto", domain: int | None = None) -> T
     if importlib.util.find_spec("cyclonedds") is None:
         raise MissingDependencyError(
             "ROS 2 needs the package cyclonedds, or an installed ROS 2 whose setup.bash was "
-            "sourced; install it with: "
-            "pip install 'stereo-vio[ros2]'"
+            f"sourced; {extra_text('ros2')}"
         )
     from vio.ros2.dds import DdsTransport
 

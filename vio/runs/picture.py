@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import logging
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from vio.errors import EvaluationError, VioError
 from vio.evaluation.trajectories import Evaluation, metres_text
 from vio.files.atomic import atomic_write_bytes
 from vio.files.printable import printable
 from vio.files.tables import Rows
 from vio.geometry.lie import FloatArray
-from vio.records import STAGES, IntArray
+from vio.records import S_PER_NS, STAGES, IntArray
 from vio.runs.curves import (
     COLOURS,
     FEATURE_WORDS,
@@ -104,6 +106,9 @@ class RunPicture:
 def write_picture(path: Path, draw: Callable[[], Any]) -> None:
     """Write the matplotlib figure that `draw` returns as a PNG; a failure gives a warning and
     leaves no file.
+
+    Raises:
+        VioError: `draw` raised it.
     """
     try:
         stream = io.BytesIO()
@@ -113,6 +118,8 @@ def write_picture(path: Path, draw: Callable[[], Any]) -> None:
             # a tenth larger, sooner
             draw().savefig(stream, format="png", pil_kwargs={"compress_level": 1})
         atomic_write_bytes(path, stream.getvalue())
+    except VioError:  # what was asked for cannot be drawn of these data
+        raise
     except Exception as error:
         log.warning(
             "%s was not drawn (%s: %s)",
@@ -215,7 +222,11 @@ def _draw_map(axes: Any, curves: Curves) -> None:
     )
     for label, positions, colour, style, width in paths:
         axes.plot(*positions[:, :2].T, color=colour, ls=style, lw=width, label=label)
-    axes.plot(0, 0, "o", color=_REFERENCE, ms=6, mfc="white", label="start")
+    for label, mark, position in (
+        ("start", "o", curves.position[0]),
+        ("end", "D", curves.position[-1]),
+    ):
+        axes.plot(*position[:2], mark, color=_REFERENCE, ms=6, mfc="white", label=label)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="box")
@@ -341,38 +352,110 @@ def _draw_calibration(axes: Any, seconds: FloatArray, estimates: Rows, focal: fl
     _legend_above(axes)
 
 
-def draw_comparison(results: Mapping[str, Evaluation]) -> Any:
-    """Draw evaluations against one reference, by name, in the plane in which the reference
-    extends furthest.
-    """
-    from matplotlib.figure import Figure
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """What is drawn of trajectories beside a reference."""
 
-    figure = Figure(figsize=(12, 5.6), dpi=110, layout="constrained")
-    above, along = figure.subplots(1, 2, width_ratios=(1, 1.2))
-    truth = max((r.reference.positions for r in results.values()), key=len)
-    plane = np.linalg.svd(truth - truth.mean(axis=0), full_matrices=False)[2][:2]
-    above.plot(*((truth - truth[0]) @ plane.T).T, color="#111111", lw=3.0, label="reference")
-    largest = max(float(r.errors_m.max()) for r in results.values())
-    factor, unit = (1e3, "mm") if largest < _MILLIMETRES_BELOW_M else (1.0, "m")
-    for k, (name, r) in enumerate(results.items()):
-        colour = COLOURS[k % len(COLOURS)]
-        label = f"{name}: ATE {metres_text(r.ate_m.rmse)}"
-        above.plot(
-            *((r.aligned.positions - truth[0]) @ plane.T).T, color=colour, lw=1.4, label=label
-        )
-        steps = np.linalg.norm(np.diff(r.reference.positions, axis=0), axis=1)
-        along.plot(
-            np.concatenate([[0.0], np.cumsum(steps)]), factor * r.errors_m, color=colour, lw=1.4
-        )
-    above.set_aspect("equal", "datalim")
-    above.set(xlabel="m, along the longest extent", ylabel="m", title="paths")
-    along.set(
-        xlabel="way on the reference (m)",
-        ylabel=f"position error ({unit})",
-        title="errors after alignment",
-    )
-    along.set_ylim(bottom=0)
-    for panel in (above, along):
-        panel.grid(alpha=0.25)
-    above.legend(fontsize=8, loc="best")
+    # axes of the reference's world, such as "xz", in which paths are drawn; None: the plane in
+    # which the reference extends furthest
+    axes: str | None = None
+    columns: tuple[str, ...] = ("position",)  # panels, of `COMPARED_COLUMNS`
+    over: Literal["distance", "time"] = "distance"
+
+
+def draw_comparison(results: Mapping[str, Evaluation], shown: Compared = Compared()) -> Any:
+    """Draw evaluations against one reference, by name: paths, and curves along them.
+
+    Raises:
+        EvaluationError: curves over time are asked for, and a reference has no times.
+    """
+    Figure = _figure_class()
+    height = max(5.6, 2.2 * len(shown.columns))
+    figure = Figure(figsize=(12, height), dpi=110, layout="constrained")
+    grid = figure.add_gridspec(len(shown.columns), 2, width_ratios=(1, 1.2))
+    _compare_paths(figure.add_subplot(grid[:, 0]), results, shown.axes)
+    for row, column in enumerate(shown.columns):
+        panel = figure.add_subplot(grid[row, 1])
+        _compare_curves(panel, results, column, shown.over)
+        if row == 0:
+            panel.set_title("after alignment", fontsize=9, loc="left")
+        panel.tick_params(labelbottom=row == len(shown.columns) - 1)
+    panel.set_xlabel("time (s)" if shown.over == "time" else "distance along the reference (m)")
     return figure
+
+
+def _compare_paths(axes: Any, results: Mapping[str, Evaluation], chosen: str | None) -> None:
+    """Draw the paths in a plane, with their start and end."""
+    truth = max((r.reference.positions for r in results.values()), key=len)
+    if chosen is None:
+        origin = truth[0]
+        plane = np.linalg.svd(truth - truth.mean(axis=0), full_matrices=False)[2][:2]
+        labels = ["along the longest extent (m)", "across (m)"]
+    else:
+        origin = np.zeros(3)
+        plane = np.eye(3)[["xyz".index(axis) for axis in chosen]]
+        labels = [f"{axis} (m)" for axis in chosen]
+    flat = (truth - origin) @ plane.T
+    axes.plot(*flat.T, color=_REFERENCE, lw=3.0, label="reference")
+    for (name, r), colour in zip(results.items(), itertools.cycle(COLOURS), strict=False):
+        label = f"{name}: ATE {metres_text(r.ate_m.rmse)}"
+        axes.plot(*((r.aligned.positions - origin) @ plane.T).T, color=colour, lw=1.4, label=label)
+    axes.plot(*flat[0], "o", color=_REFERENCE, ms=6, mfc="white", label="start")
+    axes.plot(*flat[-1], "D", color=_REFERENCE, ms=6, mfc="white", label="end")
+    axes.set_aspect("equal", "datalim")
+    axes.set(xlabel=labels[0], ylabel=labels[1], title="paths")
+    axes.grid(alpha=0.25)
+    # below the panel, where it hides no path
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12), frameon=False, ncols=2)
+
+
+def _compare_curves(
+    panel: Any, results: Mapping[str, Evaluation], column: str, over: Literal["distance", "time"]
+) -> None:
+    """Draw one quantity of all trajectories."""
+    values, label = COMPARED_COLUMNS[column]
+    largest = max(float(r.errors_m.max()) for r in results.values())
+    factor = 1.0
+    if column == "position" and largest < _MILLIMETRES_BELOW_M:
+        factor = 1e3
+        label = label.replace("(m)", "(mm)")
+    for (name, r), colour in zip(results.items(), itertools.cycle(COLOURS), strict=False):
+        curve = factor * values(r)
+        panel.plot(_abscissa(name, r, over), curve, color=colour, lw=1.4)
+    if column in "xyz":
+        longest = max(results, key=lambda name: results[name].matched)
+        r = results[longest]
+        truth = r.reference.positions[:, "xyz".index(column)]
+        panel.plot(_abscissa(longest, r, over), truth, ":", color=_REFERENCE, lw=1.2)
+    else:
+        panel.set_ylim(bottom=0)
+    panel.set_ylabel(label)
+    panel.grid(alpha=0.25)
+
+
+def _abscissa(name: str, r: Evaluation, over: Literal["distance", "time"]) -> FloatArray:
+    """Return the distance on the reference, or the time since its first pose, of M poses."""
+    if over == "distance":
+        steps = np.linalg.norm(np.diff(r.reference.positions, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+    times_ns = r.reference.times_ns
+    if times_ns is None:
+        times_ns = r.aligned.times_ns
+        times_ns = None if times_ns is None else times_ns[r.rows]
+    if times_ns is None:
+        raise EvaluationError(
+            f"{name}: neither it nor the reference has times; use --over distance"
+        )
+    return np.asarray((times_ns - times_ns[0]) * S_PER_NS, dtype=np.float64)
+
+
+def _component(axis: int) -> Callable[[Evaluation], FloatArray]:
+    return lambda r: r.aligned.positions[r.rows, axis]
+
+
+# What may be drawn of a comparison: values (M,) of an evaluation, and the axis' label.
+COMPARED_COLUMNS: dict[str, tuple[Callable[[Evaluation], FloatArray], str]] = {
+    "position": (lambda r: r.errors_m, "position error (m)"),
+    "attitude": (lambda r: r.errors_deg, "attitude error (deg)"),
+    **{axis: (_component(k), f"{axis} (m)") for k, axis in enumerate("xyz")},
+}

@@ -28,7 +28,7 @@ from vio.guard.repairing import repaired
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, recorded_source
 from vio.live.processor import EventProcessor
 from vio.numerics.threads import one_blas_thread
-from vio.protocols import Dataset, Frontend, RectifyingDataset, Viewer
+from vio.protocols import Dataset, Detector, Frontend, RectifyingDataset, Viewer
 from vio.records import (
     STAGES,
     BodyFrame,
@@ -514,7 +514,7 @@ def _unread_line(unread: list[int], frames: int) -> str:
 
 
 def _opencv_threads(
-    dataset: Dataset, config: Config, given: Frontend | None
+    dataset: Dataset, config: Config, given: Frontend | Detector | None
 ) -> AbstractContextManager[None]:
     """Limit OpenCV to one thread where the front end is `klt`, whose steps are too short for
     more.

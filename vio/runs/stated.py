@@ -39,6 +39,7 @@ REQUEST_SHAPE = an_object(
         "map_density": WHOLE_OR_NULL,
         "localise": TRUTH,
         "plot": TRUTH,
+        "frontend": TEXT_OR_NULL,
         "command": TEXT_OR_NULL,
     },
     "source",

@@ -7,9 +7,11 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 
 from vio.errors import SimulationError
-from vio.geometry.distortion import CameraModel, StereoRig
+from vio.geometry.distortion import CameraModel, StereoRig, holds_distortion
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.setting import setting
+
+_NONE = (0.0, 0.0)  # tangential distortion
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +79,7 @@ def drawn_rig(calibrated: StereoRig, sigmas: CalibrationSigmas, *, seed: int) ->
     """Return a true rig drawn about `calibrated`; the left camera's pose is exact.
 
     Raises:
-        SimulationError: the lens is of another model than pinhole, radtan or equidistant.
+        SimulationError: the lens is of a model that holds no more radial distortion.
     """
     if sigmas.scale == 0:
         return calibrated
@@ -135,19 +137,15 @@ def _changed(
     camera: CameraModel, shift_px: FloatArray, radial: FloatArray, zoom: float = 1.0
 ) -> CameraModel:
     """Return the camera with its principal point (2,) and first radial terms moved, and zoomed."""
-    model = camera.model
-    k = camera.coefficients
-    if model == "pinhole":
-        model = "radtan"
-        k = (0.0, 0.0, 0.0, 0.0)
-    elif model not in ("radtan", "equidistant"):
+    k1, k2 = [*radial.tolist(), 0.0][:2]
+    if not holds_distortion(camera, (1.0, 0.0), _NONE):
         raise SimulationError(
-            f"a {model} lens cannot be miscalibrated; use a pinhole, radtan or equidistant one"
+            f"a {camera.model} lens cannot be miscalibrated; use a pinhole, radtan, equidistant or "
+            "unified one"
         )
-    moved = [old + add for old, add in zip(k, radial.tolist(), strict=False)]
     cu = camera.cu + float(shift_px[0])
     cv = camera.cv + float(shift_px[1])
-    coefficients = (*moved, *k[len(moved) :])
+    model, coefficients = camera.lens.bent(camera.coefficients, (k1, k2), _NONE)
     return replace(
         camera,
         fu=camera.fu * zoom,

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import SimulationError
-from vio.geometry.distortion import CameraModel, DistortionModel, project_point, unproject_pixel
+from vio.geometry.distortion import CameraModel, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.records import BoolArray, IntArray
 from vio.sim.textures import LEVELS_PER_OCTAVE, MipTexture
@@ -30,15 +30,6 @@ Radiance: TypeAlias = npt.NDArray[np.float32]
 
 _TILE = 64  # pixels
 _COARSE = 2  # tiles along a coarse tile
-# Tiles shaded in one go; sample positions within a pixel follow the ray derivative at the middle of
-# the run.
-_RUN: dict[DistortionModel, int] = {
-    "pinhole": 4,
-    "radtan": 2,
-    "equidistant": 1,
-    "unified": 1,
-    "double_sphere": 1,
-}
 _EDGE_MARK = np.int16(-1)
 _NONE = np.int16(-2)
 _EMPTY = np.float32(90.0)  # gray level where no surface is hit
@@ -62,7 +53,7 @@ class CameraRays:
     """The rays of a camera's pixels, computed once."""
 
     camera: CameraModel
-    # Rays in the camera frame, unit length for fisheye cameras and of unit depth for others.
+    # Rays in the camera frame, of unit depth for planar lens models, unit length for others.
     centre: npt.NDArray[np.float32]  # (3, H, W) through pixel centres
     # (3, H + 1, W + 1) through pixel corners; [.., 0, 0] is pixel (-0.5, -0.5)
     corner: npt.NDArray[np.float32]
@@ -90,9 +81,11 @@ def camera_rays(camera: CameraModel) -> CameraRays:
     corner, found_corner = unproject_pixel(camera, _grid(camera.width + 1, camera.height + 1, -0.5))
     if not (found.all() and found_corner.all()):
         raise SimulationError(
-            "the distortion model does not reach every pixel of the image; check its coefficients"
+            "the distortion model does not reach every pixel of the image (it ends "
+            f"{np.degrees(camera.lens.max_angle(camera.coefficients)):.0f} deg off the axis); "
+            "check its coefficients"
         )
-    if camera.model in ("pinhole", "radtan"):
+    if camera.lens.planar:
         centre = centre / centre[..., 2:]
         corner = corner / corner[..., 2:]
     return CameraRays(
@@ -416,7 +409,8 @@ def _shade_row(
     of columns.
     """
     top = r * _TILE
-    longest = _RUN[rays.camera.model] * _TILE
+    # Sample positions within a pixel follow the ray derivative at the middle of a run of tiles.
+    longest = rays.camera.lens.linear_tiles * _TILE
     for k in np.flatnonzero(np.bincount(shown[shown >= 0], minlength=1)):
         tiles = np.flatnonzero(candidates[:, k])
         left = int(tiles[0]) * _TILE

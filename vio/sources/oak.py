@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
-from vio.errors import DataError, MissingDependencyError
+from vio.errors import DataError, MissingDependencyError, extra_text
 from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.live.pairing import Pairing
 from vio.records import Image
@@ -50,7 +50,7 @@ class OakSource:
             import depthai as dai
         except ImportError as error:
             raise MissingDependencyError(
-                "oak: needs the package depthai; install it with: pip install 'stereo-vio[oak]'"
+                f"oak: needs the package depthai; {extra_text('oak')}"
             ) from error
         self._dai = dai
         self._name = f"oak:{name}"

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
-from vio.errors import DataError, MissingDependencyError
+from vio.errors import DataError, MissingDependencyError, extra_text
 from vio.geometry.lie import FloatArray, se3_from_parts
 from vio.live.pairing import Pairing
 from vio.records import Image
@@ -61,8 +61,7 @@ class RealSenseSource:
             import pyrealsense2 as rs
         except ModuleNotFoundError as error:
             raise MissingDependencyError(
-                "realsense: needs the package pyrealsense2; install it with: pip install "
-                "'stereo-vio[realsense]'"
+                f"realsense: needs the package pyrealsense2; {extra_text('realsense')}"
             ) from error
         except ImportError as error:  # such as libusb, which the system must have
             raise MissingDependencyError(

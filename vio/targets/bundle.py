@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import CalibrationError
-from vio.geometry.distortion import CameraModel, project_point
+from vio.geometry.distortion import CameraModel, project_point, uv_D_camera, uv_D_point
 from vio.geometry.lie import FloatArray, se3_exp, so3_hat
 from vio.numerics.robust import median
 from vio.targets.views import Sightings
@@ -23,7 +23,6 @@ BoolArray = npt.NDArray[np.bool_]
 
 _INTRINSIC = 4  # fu fv cu cv, before a lens's coefficients
 _BOW = 2
-_STEP = 1e-6  # of numerical differences, relative for points
 _POSE = 6
 _STEPS = 60
 _CONVERGED = 1e-6  # relative change of the cost
@@ -100,45 +99,6 @@ def bow_shape(points_m: FloatArray) -> FloatArray:
     low = points_m.min(axis=0)
     half = 0.5 * (points_m.max(axis=0) - low)
     return np.asarray(1 - ((points_m - low - half) / half) ** 2)
-
-
-def pixels_by_point(camera: CameraModel, p_cam: FloatArray, uv: FloatArray) -> FloatArray:
-    """Derivative (N, 2, 3) of pixels (N, 2) by their points (N, 3) in the camera, by forward
-    differences.
-    """
-    step = _STEP * np.linalg.norm(p_cam, axis=1, keepdims=True)
-    out = np.empty((len(p_cam), 2, 3))
-    for k in range(3):
-        ahead, _ = project_point(camera, p_cam + step * np.eye(3)[k])
-        out[:, :, k] = (ahead - uv) / step
-    return out
-
-
-def pixels_by_lens(camera: CameraModel, p_cam: FloatArray, uv: FloatArray) -> FloatArray:
-    """Derivative (N, 2, 4 + n) of pixels (N, 2) of points (N, 3) by `fu fv cu cv` and the
-    coefficients, of these by differences to the side that the model allows.
-    """
-    count = len(camera.coefficients)
-    out = np.zeros((len(p_cam), 2, _INTRINSIC + count))
-    out[:, 0, 0] = (uv[:, 0] - camera.cu) / camera.fu
-    out[:, 1, 1] = (uv[:, 1] - camera.cv) / camera.fv
-    out[:, 0, 2] = 1
-    out[:, 1, 3] = 1
-    for k in range(count):
-        step = np.zeros(_INTRINSIC + count)
-        step[_INTRINSIC + k] = _STEP
-        moved = _allowed(camera, step)
-        change = moved.coefficients[k] - camera.coefficients[k]
-        out[:, :, _INTRINSIC + k] = (project_point(moved, p_cam)[0] - uv) / change
-    return out
-
-
-def _allowed(camera: CameraModel, step: FloatArray) -> CameraModel:
-    """Return the camera moved by a step, or by its opposite where the model ends."""
-    try:
-        return lens_moved(camera, step)
-    except CalibrationError:
-        return lens_moved(camera, -step)
 
 
 class BoardAdjustment:
@@ -267,11 +227,9 @@ class BoardAdjustment:
             T = at.T_cam_cam0[c]
             p_cam = p_cam0[rows] @ T[:3, :3].T + T[:3, 3]
             uv, valid = project_point(camera, p_cam)
-            D = pixels_by_point(camera, p_cam, uv) * valid[:, None, None]
+            D = uv_D_point(camera, p_cam) * valid[:, None, None]
             by_cam0 = D @ T[:3, :3]
-            shared[rows, :, layout.lenses[c]] = (
-                pixels_by_lens(camera, p_cam, uv) * valid[:, None, None]
-            )
+            shared[rows, :, layout.lenses[c]] = uv_D_camera(camera, p_cam) * valid[:, None, None]
             if c:
                 shared[rows, :, layout.poses[c - 1]] = _by_twist(D, p_cam)
             axis = at.T_cam0_board[seen.view[rows], :3, 2]

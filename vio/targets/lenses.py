@@ -15,6 +15,7 @@ import numpy as np
 
 from vio.errors import CalibrationError
 from vio.geometry.distortion import DistortionModel
+from vio.geometry.lenses import registry
 from vio.geometry.lie import FloatArray
 from vio.records import IntArray
 from vio.targets.bundle import Adjusted, BoardAdjustment, RigFit
@@ -23,12 +24,11 @@ from vio.targets.views import Sightings
 
 # Models and numbers of coefficients, in the order in which they are preferred.
 LENSES: dict[str, tuple[DistortionModel, int]] = {
-    "radtan": ("radtan", 4),
-    "equidistant": ("equidistant", 4),
-    "double_sphere": ("double_sphere", 2),
-    "radtan5": ("radtan", 5),
-    "unified": ("unified", 5),
-    "rational": ("radtan", 8),
+    choice.name: (model.name, choice.count)
+    for choice, model in sorted(
+        ((choice, model) for model in registry.LENSES.values() for choice in model.choices),
+        key=lambda pair: pair[0].rank,
+    )
 }
 _VIEWS = 16  # that are used for the choice, and every other corner of them
 _HOPELESS = 3.0  # times the least residual, beyond which a model is not judged further

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,6 @@ from vio.geometry.rectify import rectifying_rotations
 
 CAMCHAIN = "camchain-imucam.yaml"
 IMU = "imu.yaml"
-_ROS_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant"}
-_OPENCV_MODELS = ("pinhole", "radtan")
 
 
 def write_rig(folder: Path, rig: Rig) -> list[str]:
@@ -40,9 +37,9 @@ def write_rig(folder: Path, rig: Rig) -> list[str]:
 def _pair_texts(rig: Rig) -> dict[str, str]:
     """Return the files of OpenCV and ROS of a pair, where these know the lens model."""
     out: dict[str, str] = {}
-    if all(camera.model in _OPENCV_MODELS for camera in rig.cameras):
+    if all(camera.lens.files.opencv for camera in rig.cameras):
         out["stereo.yml"] = opencv_text(rig)
-    if all(camera.model in (*_ROS_MODELS, "pinhole") for camera in rig.cameras):
+    if all(_ros_name(camera) is not None for camera in rig.cameras):
         P = _projections(rig)
         for k, (name, camera) in enumerate(zip(("left", "right"), rig.cameras, strict=True)):
             out[f"{name}.yaml"] = _camera_info_text(name, camera, *P[k])
@@ -62,12 +59,14 @@ def _projections(rig: Rig) -> list[tuple[FloatArray, FloatArray]]:
     return [(R0, P0), (R1, P1)]
 
 
+def _ros_name(camera: CameraModel) -> str | None:
+    return camera.lens.files.ros.get(len(camera.coefficients))
+
+
 def _camera_info_text(name: str, camera: CameraModel, R: FloatArray, P: FloatArray) -> str:
     coefficients = list(camera.coefficients)
-    model = _ROS_MODELS.get(camera.model, "plumb_bob")
-    if len(coefficients) == 8:
-        model = "rational_polynomial"
-    elif model == "plumb_bob":
+    model = _ros_name(camera)
+    if model == "plumb_bob":
         coefficients = [*coefficients, *[0.0] * (5 - len(coefficients))]
 
     def block(values: FloatArray) -> dict[str, Any]:
@@ -141,25 +140,20 @@ def basalt_text(rig: Rig) -> str | None:
 
 
 def _basalt_camera(camera: CameraModel) -> dict[str, Any] | None:
-    focal = {"fx": camera.fu, "fy": camera.fv, "cx": camera.cu, "cy": camera.cv}
-    k = camera.coefficients
-    named: dict[str, Callable[[], tuple[str, dict[str, float]]]] = {
-        "pinhole": lambda: ("pinhole", {}),
-        "double_sphere": lambda: ("ds", {"xi": k[0], "alpha": k[1]}),
-        "equidistant": lambda: ("kb4", {f"k{i + 1}": k[i] for i in range(4)}),
-        "radtan": lambda: ("pinhole-radtan8", _radtan8(k)),
-    }
-    if camera.model not in named:
+    names = camera.lens.files
+    if names.basalt is None:
         return None
-    name, coefficients = named[camera.model]()
-    return {"camera_type": name, "intrinsics": {**focal, **coefficients}}
-
-
-def _radtan8(k: tuple[float, ...]) -> dict[str, float]:
-    full = (*k, *[0.0] * (8 - len(k)))
-    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    # 0: no limit of the radius
-    return {**dict(zip(names, full, strict=True)), "rpmax": 0.0}
+    missing = len(camera.lens.parameters) - len(camera.coefficients)
+    full = (*camera.coefficients, *[0.0] * missing)
+    values = {
+        "fx": camera.fu,
+        "fy": camera.fv,
+        "cx": camera.cu,
+        "cy": camera.cv,
+        **dict(zip(camera.lens.parameters, full, strict=True)),
+        **names.basalt_constants,
+    }
+    return {"camera_type": names.basalt, "intrinsics": values}
 
 
 def _basalt_pose(T: FloatArray) -> dict[str, float]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel, project_point, unproject_pixel
+from vio.geometry.lenses.registry import LENSES
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_inverse, se3_log
 from vio.numerics.robust import median
 from vio.records import IntArray
@@ -25,25 +26,22 @@ _STARTS = 2  # of them that are adjusted
 _START_VIEWS = 8
 _START_STEPS = 12
 _MIN_ROWS = 6  # corners of a view that give a pose
-# coefficients at the start
-_STRAIGHT: dict[tuple[DistortionModel, int], tuple[float, ...]] = {
-    ("pinhole", 0): (),
-    ("radtan", 4): (0.0,) * 4,
-    ("radtan", 5): (0.0,) * 5,
-    ("radtan", 8): (0.0,) * 8,
-    ("equidistant", 4): (0.0,) * 4,
-    ("unified", 5): (0.8, 0.0, 0.0, 0.0, 0.0),
-    ("double_sphere", 2): (0.0, 0.5),
-}
 
 
 def new_camera(
     model: DistortionModel, count: int, focal_px: float, size: tuple[int, int]
 ) -> CameraModel:
-    """Return a camera of a model without distortion, its centre in the middle of the image."""
-    coefficients = _STRAIGHT[model, count]
-    # The sphere models' focal length is that of an angle of view by 1 + xi.
-    focal = focal_px * (1 + coefficients[0]) if model == "unified" else focal_px
+    """Return a camera of a model at its start, with the centre in the middle of the image.
+
+    Args:
+        model: of the lens.
+        count: number of its coefficients.
+        focal_px: pixels per radian in the middle of the image.
+        size: width and height, pixels.
+    """
+    lens = LENSES[model]
+    coefficients = lens.start(count)
+    focal = focal_px * lens.focal_factor(coefficients)
     width, height = size
     return CameraModel(
         focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), width, height, model, coefficients

@@ -14,7 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vio.geometry.distortion import CameraModel, project_point, unproject_pixel
+from vio.geometry.distortion import (
+    CameraModel,
+    project_point,
+    unproject_pixel,
+    uv_D_camera,
+    uv_D_point,
+)
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, transform_points
 from vio.targets.bundle import (
     Adjusted,
@@ -24,8 +30,6 @@ from vio.targets.bundle import (
     bow_shape,
     layout_of,
     lens_moved,
-    pixels_by_lens,
-    pixels_by_point,
 )
 from vio.targets.views import Sightings
 
@@ -100,8 +104,8 @@ def projection_sigma(
     uv = pixel_grid(camera)
     rays, valid = unproject_pixel(camera, uv)
     p = rays * (1.0 if distance_m is None else distance_m)
-    D = pixels_by_lens(camera, p, uv)
-    by_p = pixels_by_point(camera, p, uv)
+    D = uv_D_camera(camera, p)
+    by_p = uv_D_point(camera, p)
     motion = -by_p @ so3_hat(p)
     if distance_m is not None:
         motion = np.concatenate([by_p, motion], axis=2)
@@ -131,28 +135,26 @@ def projection_sigma_from_views(
     board = np.column_stack([seen.points_m, bow_shape(seen.points_m) @ fit.bow])
     T = fit.T_cam_cam0[camera] @ fit.T_cam0_board[seen.view[rows]]
     corners = np.einsum("rij,rj->ri", T[:, :3, :3], board[seen.point[rows]]) + T[:, :3, 3]
-    D, motion = _lens_and_motion(model, corners, project_point(model, corners)[0])
+    D, motion = _lens_and_motion(model, corners)
     undone = np.linalg.lstsq(
         motion.reshape(-1, motion.shape[2]), D.reshape(-1, D.shape[2]), rcond=None
     )[0]
     uv = pixel_grid(model)
     rays, valid = unproject_pixel(model, uv)
-    D, motion = _lens_and_motion(model, distance_m * rays, uv)
+    D, motion = _lens_and_motion(model, distance_m * rays)
     J = D - motion @ undone
     P = J @ found.covariance[lens, lens] @ np.swapaxes(J, 1, 2)
     sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(P)[:, 1], 0))
     return np.where(valid, sigma, np.nan)
 
 
-def _lens_and_motion(
-    camera: CameraModel, p: FloatArray, uv: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _lens_and_motion(camera: CameraModel, p: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Derivatives of pixels (N, 2) of points (N, 3) by the lens, (N, 2, 4 + n), and by a motion of
     the camera, (N, 2, 6).
     """
-    by_p = pixels_by_point(camera, p, uv)
+    by_p = uv_D_point(camera, p)
     motion = np.concatenate([by_p, -by_p @ so3_hat(p)], axis=2)
-    return pixels_by_lens(camera, p, uv), motion
+    return uv_D_camera(camera, p), motion
 
 
 def projection_difference(a: CameraModel, b: CameraModel) -> FloatArray:
@@ -168,7 +170,7 @@ def projection_difference(a: CameraModel, b: CameraModel) -> FloatArray:
         there, seen = project_point(b, turned)
         both = valid & seen
         off = np.where(both[:, None], uv - there, np.nan)
-        D = (-pixels_by_point(b, turned, there) @ so3_hat(turned))[both].reshape(-1, 3)
+        D = (-uv_D_point(b, turned) @ so3_hat(turned))[both].reshape(-1, 3)
         R = so3_exp(np.linalg.lstsq(D, off[both].ravel(), rcond=None)[0]) @ R
     return np.asarray(np.linalg.norm(off, axis=1))
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from vio.errors import ConfigError, DataError
+from vio.errors import ConfigError, DataError, extra_text
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -36,9 +36,7 @@ def open_stream(where: str, name: str) -> tuple[rr.RecordingStream, str | None]:
     try:
         import rerun as rr
     except ImportError as error:
-        raise ConfigError(
-            "--view needs rerun; install it with: pip install 'stereo-vio[view]'"
-        ) from error
+        raise ConfigError(f"--view needs rerun; {extra_text('view')}") from error
     stream = rr.RecordingStream(_APPLICATION, recording_id=None)
     stream.send_recording_name(name)
     address = None

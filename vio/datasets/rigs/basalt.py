@@ -3,7 +3,7 @@
 `T_imu_cam` maps coordinates of a camera to the IMU (position px py pz in metres, quaternion
 qx qy qz qw); `cam_time_offset_ns` is added to the cameras' stamps to have the IMU's; noise: densities
 in SI units, of each axis. Lens models: `pinhole`, `kb4`, `ds`, `ucm` (the double sphere with one
-centre) and `pinhole-radtan8` (OpenCV's rational model). The file's corrections of the IMU's readings
+centre), `eucm`, `fov` and `pinhole-radtan8` (OpenCV's rational model). The file's corrections of the IMU's readings
 (`calib_accel_bias`, `calib_gyro_bias`) are not applied: biases are estimated.
 Reference: Usenko et al., The double sphere camera model (2018); basalt-headers' `calibration.hpp`.
 """
@@ -21,19 +21,14 @@ from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.rigs.source import ImuSheet, Source, rig_of_poses
 from vio.datasets.yaml_files import Entries, as_number, numbers, section
 from vio.errors import CalibrationError
-from vio.geometry.distortion import CameraModel, DistortionModel
+from vio.geometry.distortion import CameraModel, simplest_lens
+from vio.geometry.lenses.registry import LENSES
 from vio.geometry.lie import FloatArray, checked_transform, rotation_from_quat_xyzw, se3_from_parts
 from vio.records import NS_PER_S, ImuDensities
 
 _NOISE = ("gyro_noise_std", "gyro_bias_std", "accel_noise_std", "accel_bias_std")
 _BIAS_ENTRIES = ("calib_accel_bias", "calib_gyro_bias")
-_LENSES: dict[str, tuple[DistortionModel, str]] = {  # and the names of their coefficients
-    "pinhole": ("pinhole", ""),
-    "kb4": ("equidistant", "k1 k2 k3 k4"),
-    "ds": ("double_sphere", "xi alpha"),
-    "ucm": ("double_sphere", "alpha"),
-    "pinhole-radtan8": ("radtan", "k1 k2 p1 p2 k3 k4 k5 k6"),
-}
+_UCM = "ucm"  # the double sphere with one centre
 
 
 def matches(entries: Entries) -> bool:
@@ -67,19 +62,19 @@ def read(source: Source) -> Rig:
 
 def _camera(lens: Mapping[str, Any], size: Sequence[float], where: str) -> CameraModel:
     kind = str(lens.get("camera_type"))
-    if kind not in _LENSES:
+    known = {one.files.basalt: one for one in LENSES.values() if one.files.basalt is not None}
+    known[_UCM] = LENSES["double_sphere"]
+    if kind not in known:
         raise CalibrationError(
-            f"{where}: camera_type {kind!r} is not read; calibrate with {', '.join(_LENSES)}"
+            f"{where}: camera_type {kind!r} is not read; calibrate with {', '.join(known)}"
         )
-    model, names = _LENSES[kind]
     values = section(lens, "intrinsics", where)
     fu, fv, cu, cv = (numbers(values, name, where, 1)[0] for name in ("fx", "fy", "cx", "cy"))
-    bend = tuple(numbers(values, name, where, 1)[0] for name in names.split())
-    if kind == "ucm":
-        bend = (0.0, *bend)
-    if model == "radtan" and not any(bend):
-        model = "pinhole"
-        bend = ()
+    if kind == _UCM:
+        values = {"xi": 0.0, **values}
+    names = known[kind].parameters
+    bend = tuple(numbers(values, name, where, 1)[0] for name in names)
+    model, bend = simplest_lens(known[kind].name, bend)
     width, height = image_size([as_number(x) for x in size][:2], f"{where}, resolution")
     with naming(where):
         return CameraModel(fu, fv, cu, cv, width, height, model, bend)

@@ -29,11 +29,11 @@ from vio.datasets.yaml_files import (
     section,
 )
 from vio.errors import CalibrationError, DataError
-from vio.geometry.distortion import CameraModel
+from vio.geometry.distortion import CameraModel, simplest_lens
+from vio.geometry.lenses.registry import LENSES
 from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
 from vio.records import ImuDensities
 
-_LEADING = {"pinhole": 0, "omni": 1, "ds": 2}  # parameters of the projection before fu fv cu cv
 _SAME_M = 2e-3  # how far the two statements of the stereo pose may be apart before it is said
 _SAME_RAD = 5e-3
 
@@ -117,34 +117,43 @@ def _stereo_pose(
 
 
 def _camera(block: Mapping[str, Any], where: str) -> CameraModel:
-    kind = block.get("camera_model", "pinhole")
+    kind = str(block.get("camera_model", "pinhole"))
     bend = str(block.get("distortion_model", "none"))
-    if kind not in _LEADING:
+    # Of each camera_model: the lens by the model of the distortion, and the leading parameters.
+    known: dict[str, dict[str, str]] = {}
+    leading: dict[str, int] = {}
+    for lens in LENSES.values():
+        for form in lens.files.kalibr.values():
+            known.setdefault(form.camera, {})[lens_model(form.distortion, where)] = lens.name
+            leading[form.camera] = form.leading
+    if kind not in known:
         raise CalibrationError(
-            f"{where}: camera_model {kind!r} is not read; calibrate with {', '.join(_LEADING)}"
+            f"{where}: camera_model {kind!r} is not read; calibrate with {', '.join(known)}"
         )
-    leading = _LEADING[str(kind)]
-    values = numbers(block, "intrinsics", where, leading + 4)
-    fu, fv, cu, cv = values[leading:]
-    model = lens_model(bend, where)
-    coefficients = () if model == "pinhole" else numbers(block, "distortion_coeffs", where)
-    if kind == "ds" and not any(coefficients):
-        model = "double_sphere"
-        coefficients = values[:2]
-    elif kind == "omni" and (model == "radtan" or not any(coefficients)):
-        model = "unified"
-        coefficients = (values[0], *(coefficients if any(coefficients) else ()))
-    elif kind != "pinhole":
+    values = numbers(block, "intrinsics", where, leading[kind] + 4)
+    fu, fv, cu, cv = values[leading[kind] :]
+    stated = lens_model(bend, where)
+    bends = () if stated == "pinhole" else numbers(block, "distortion_coeffs", where)
+    stated, bends = simplest_lens(stated, bends)
+    if stated not in known[kind] and not any(bends):
+        stated = "pinhole"
+        bends = ()
+    model = known[kind].get(stated)
+    if model is None:
         raise CalibrationError(
-            f"{where}: {kind} with distortion {bend!r} is not read; calibrate {kind}-none or "
-            "omni-radtan"
+            f"{where}: {kind} with distortion {bend!r} is not read; calibrate {_forms(kind)}"
         )
-    elif model == "radtan" and not any(coefficients):
-        model = "pinhole"
-        coefficients = ()
+    coefficients = (*values[: leading[kind]], *bends)
     width, height = image_size(numbers(block, "resolution", where, 2), f"{where}, resolution")
     with naming(where):
         return CameraModel(fu, fv, cu, cv, width, height, model, coefficients)
+
+
+def _forms(kind: str) -> str:
+    """Return Kalibr's names of the lens models with a camera_model, for a message."""
+    forms = [form for lens in LENSES.values() for form in lens.files.kalibr.values()]
+    names = [f"{form.camera}-{form.distortion}" for form in forms if form.camera == kind]
+    return " or ".join(dict.fromkeys(names))
 
 
 def _imu_pose(block: Mapping[str, Any], where: str) -> FloatArray | None:
@@ -249,27 +258,21 @@ def kalibr_text(rig: Rig) -> str:
 
 
 def _camera_sheet(camera: CameraModel) -> dict[str, Any]:
-    """Return a camera's entries; the parameters of the sphere models are before the focal
-    lengths.
+    """Return a camera's entries.
+
+    Raises:
+        CalibrationError: Kalibr's file has no name for the lens model.
     """
-    kind = "pinhole"
-    bend = "none" if camera.model == "pinhole" else camera.model
-    leading = list[float]()
-    coefficients = camera.coefficients
-    if camera.model == "double_sphere":
-        kind = "ds"
-        bend = "none"
-        leading = [float(x) for x in coefficients]
-        coefficients = ()
-    elif camera.model == "unified":
-        kind = "omni"
-        bend = "radtan" if len(coefficients) > 1 else "none"
-        leading = [float(coefficients[0])]
-        coefficients = coefficients[1:]
+    coefficients = [float(c) for c in camera.coefficients]
+    form = camera.lens.files.kalibr.get(len(coefficients))
+    if form is None:
+        raise CalibrationError(
+            f"Kalibr's camchain has no {camera.model} lens; rectify the images first (vio rectify)"
+        )
     return {
-        "camera_model": kind,
-        "distortion_model": bend,
-        "distortion_coeffs": [float(c) for c in coefficients],
-        "intrinsics": [*leading, camera.fu, camera.fv, camera.cu, camera.cv],
+        "camera_model": form.camera,
+        "distortion_model": form.distortion,
+        "distortion_coeffs": coefficients[form.leading :],
+        "intrinsics": [*coefficients[: form.leading], camera.fu, camera.fv, camera.cu, camera.cv],
         "resolution": [camera.width, camera.height],
     }

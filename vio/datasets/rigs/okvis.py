@@ -6,7 +6,8 @@ the cameras' stamps to have the IMU's. Noise: `sigma_g_c sigma_gw_c sigma_a_c si
 
 ncamera: `cameras` with a `camera` block each and `T_B_C`, which maps coordinates of the camera to the
 body, which is the IMU (or `T_C_B`, its inverse); SVO's `imu_params.delay_imu_cam` is subtracted likewise. Noise:
-`sigma_omega_c sigma_omega_bias_c sigma_acc_c sigma_acc_bias_c`.
+`sigma_omega_c sigma_omega_bias_c sigma_acc_c sigma_acc_bias_c`. A `distortion` of type `fisheye` is the field-of-view
+model with one parameter (aslam_cv2's `distortion-fisheye.cc`).
 Reference: OKVIS2's settings ("timestamp_camera_correct = timestamp_camera - image_delay"); SVO Pro's
 `imu_handler.cpp` (it integrates from `t - delay_imu_cam`); aslam_cv2's `camera-yaml-serialization`.
 """
@@ -109,7 +110,9 @@ def _ncamera(block: Mapping[str, Any], where: str) -> CameraModel:
     values = matrix(block.get("intrinsics"), None, f"{where}, intrinsics").ravel().tolist()
     stated = block.get("distortion")
     stated = stated if isinstance(stated, dict) else {}
-    model = lens_model(stated.get("type", "none"), where)
+    name = str(stated.get("type", "none")).lower()
+    # aslam_cv2's `FisheyeDistortion` is the field-of-view model, not OpenCV's fisheye.
+    model = lens_model("fov" if name == "fisheye" else name, where)
     parameters = stated.get("parameters")
     bend = (
         ()

@@ -171,7 +171,9 @@ def coefficients_of(model: DistortionModel, D: Sequence[float]) -> tuple[float, 
         if len(D) not in (0, 4) and any(D[4:]):
             raise CalibrationError(f"{len(D)} distortion coefficients; a fisheye lens has 4")
         return tuple([*(float(d) for d in D[:4]), 0.0, 0.0, 0.0, 0.0][:4])
-    return trimmed_coefficients(D)
+    if model == "radtan":
+        return trimmed_coefficients(D)
+    return tuple(float(d) for d in D)
 
 
 def trimmed_coefficients(D: Sequence[float]) -> tuple[float, ...]:

@@ -16,8 +16,9 @@ from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel
 
 # Ratio of twice the principal point to the image size, along both axes in one direction, beyond
-# which the images are of another size: real principal points are within a tenth of the middle.
-_OTHER_SIZE = 1.2
+# which the images are of another size. One axis may be off by a tenth (KITTI's raw images), but of
+# twelve real cameras none is off by more than 0.02 along both in one direction.
+_OTHER_SIZE = 1.1
 # Likewise along one axis, as of images that were cropped
 _CROPPED = 1.3
 # A board's square is 0.02 to 0.1 m and a rig's baseline 0.05 to 0.6 m, so that in squares a

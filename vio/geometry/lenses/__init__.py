@@ -1,0 +1,1 @@
+"""Lens models, one class in one file each, and their registry."""

@@ -1,0 +1,79 @@
+"""Runs beside the first of them: figures that changed, and how far apart the paths are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.evaluation.alignment import align_poses
+from vio.evaluation.trajectories import metres_text
+from vio.geometry.lie import FloatArray, se3_from_parts
+from vio.report.words import run_figures, smaller_is_better
+from vio.runs.finished import FinishedRun
+
+_MIN_FRAMES = 3  # in common, for an alignment
+
+
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """How far a run is from another at the K frames that both have, after one rigid alignment."""
+
+    seconds: FloatArray  # (K,) since the other's first frame
+    distance_m: FloatArray  # (K,)
+
+    def __str__(self) -> str:
+        rms = float(np.sqrt(np.mean(self.distance_m**2)))
+        most = float(self.distance_m.max())
+        return f"{metres_text(rms)} (rms), at most {metres_text(most)}, {len(self.seconds)} frames"
+
+
+def apart(first: FinishedRun, other: FinishedRun) -> Apart | None:
+    """Return how far a run is from the first; None: of other recordings, or of other frames."""
+    if first.metrics.get("source") != other.metrics.get("source"):
+        return None
+    if first.metrics.get("body") != other.metrics.get("body"):
+        return None
+    _, i, j = np.intersect1d(
+        first.estimates["time_ns"], other.estimates["time_ns"], return_indices=True
+    )
+    if len(i) < _MIN_FRAMES:
+        return None
+    reference = np.array(first.estimates["T_world_imu"][i])
+    T = np.array(other.estimates["T_world_imu"][j])
+    alignment = align_poses(T, reference, "se3")
+    moved = se3_from_parts(alignment.R, alignment.t) @ T
+    distance = np.linalg.norm(moved[:, :3, 3] - reference[:, :3, 3], axis=1)
+    return Apart(first.seconds[i], distance)
+
+
+def compared_figures(runs: Sequence[FinishedRun]) -> dict[str, list[tuple[str, bool]]]:
+    """Return the figures of each run by name, with their change from the first run in per cent, and
+    whether a figure is the best.
+
+    Figures of different recordings are not compared.
+    """
+    columns = [run_figures(run) for run in runs]
+    rows = {name: [(column[name], False) for column in columns] for name in columns[0]}
+    if len(runs) < 2 or len({str(run.metrics.get("source")) for run in runs}) > 1:
+        return rows
+    numbers = [smaller_is_better(run) for run in runs]
+    for name in numbers[0]:
+        values = [column[name] for column in numbers]
+        known = [value for value in values if value is not None]
+        if len(known) < 2:
+            continue
+        best = min(known)
+        rows[name] = [
+            (text + _change(values[0], value), value == best != max(known))
+            for (text, _), value in zip(rows[name], values, strict=True)
+        ]
+    return rows
+
+
+def _change(first: float | None, value: float | None) -> str:
+    """Return the change of a figure in words; nothing where there is none."""
+    if not first or value is None or value == first:
+        return ""
+    return f" ({100 * (value / first - 1):+.0f} %)"
