@@ -24,6 +24,7 @@ from tests.board_views import (
 from vio import load_rig
 from vio.cli import main
 from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.images import load_gray
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, project_point
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
@@ -36,7 +37,7 @@ from vio.targets.bundle import (
     lens_moved,
 )
 from vio.targets.calibrate import calibrate_cameras
-from vio.targets.corners import CornerDetector
+from vio.targets.corners import BoolArray, CornerDetector, Corners
 from vio.targets.description import Target, marker_dictionary, read_target, target_text
 from vio.targets.homography import predict
 from vio.targets.lenses import LENSES, choose_lens
@@ -124,7 +125,9 @@ def test_the_page_has_the_size_of_the_board_and_a_ruler() -> None:
     assert any("ruler" in text for _, _, text in page.words)
 
 
-def _detected(target: Target, camera: CameraModel, T: FloatArray, exposure: Exposure) -> tuple:
+def _detected(
+    target: Target, camera: CameraModel, T: FloatArray, exposure: Exposure
+) -> tuple[Corners, FloatArray, BoolArray]:
     renderer = BoardRenderer(target, camera)
     found = CornerDetector(target).detect(renderer.render(T, exposure))
     uv, seen = renderer.corners(T)
@@ -233,7 +236,7 @@ def test_the_border_of_kalibrs_tags_has_two_bits() -> None:
 def test_real_photographs_have_the_numbering_and_corner_order_of_the_description(
     name: str, least: int
 ) -> None:
-    image = cv2.imread(str(DATA / "aprilgrid_6x6" / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
+    image = load_gray(DATA / "aprilgrid_6x6" / f"{name}.jpg")[0]
     found = CornerDetector(GRID).detect(image)
     assert len(found) >= least
     # One homography for the whole board: a wrong corner order is off by a tag, 70 px.
