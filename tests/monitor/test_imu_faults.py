@@ -119,6 +119,57 @@ def test_a_real_step_and_a_real_shock_pass() -> None:
     assert _passed(_samples(shock)) == (list(range(400)), [])
 
 
+def _turning(count: int) -> FloatArray:
+    """Readings (N, 6) of a body that turns to and fro about x, up to 1 rad/s."""
+    out = _noise(count)
+    out[:, 0] += np.sin(np.arange(count) / 60)
+    return out
+
+
+def test_readings_at_the_end_of_the_range_are_left_out_from_the_fifth_on() -> None:
+    values = _turning(1600)
+    over = np.abs(values[:, 0]) > 0.7
+    values[:, :3] = np.clip(values[:, :3], -0.7, 0.7)
+    samples = _samples(values)
+    passed, kinds = _passed(samples)
+    left_out = np.ones(1600, dtype=np.bool_)
+    left_out[passed] = False
+    assert not left_out[~over].any()
+    first = np.flatnonzero(over)[0]
+    assert left_out[over].sum() >= over.sum() - 6
+    assert not left_out[: first + 3].any()  # a reading that repeats once or twice is chance
+    assert set(kinds) == {"gyro clipped"}
+    # whatever the batches are
+    check = ImuSampleCheck()
+    batches = [samples[k : k + 37] for k in range(0, 1600, 37)]
+    together = [u.time_ns // 5_000_000 for batch in batches for u in check.take_all(batch)]
+    assert together == passed
+    assert {fault.size for fault in check.finish()} == {0.7}
+
+
+def test_a_range_that_is_exceeded_was_none() -> None:
+    """A governor that holds 0.7 rad/s to the last bit for a while, and then turns faster."""
+    values = _turning(1600)
+    held = np.arange(100, 500)
+    values[held, 0] = np.clip(values[held, 0], -0.7, 0.7)
+    passed, _ = _passed(_samples(values))
+    assert set(range(501, 1600)) <= set(passed)
+
+
+@pytest.mark.parametrize("step", [0.02, 0.2])
+def test_coarse_steps_are_no_end_of_a_range(step: float) -> None:
+    values = np.round(_turning(1600) / step) * step
+    values[:, 5] = 9.81 + _noise(1600)[:, 0]
+    assert _passed(_samples(values)) == (list(range(1600)), [])
+
+
+def test_a_steady_turn_without_noise_is_no_end_of_a_range() -> None:
+    values = np.zeros((800, 6))
+    values[:, 0] = np.minimum(np.arange(800) / 200, 1.0)
+    values[:, 3:] = np.column_stack([np.sin(np.arange(800) / 90)] * 3) + 5.0
+    assert "gyro clipped" not in _passed(_samples(values))[1]
+
+
 def test_vibration_that_fills_the_band_passes() -> None:
     """The spike's limit follows the record: what vibrates by 4 rad/s is not called a spike at
     10.

@@ -36,6 +36,7 @@ LIMITS = {
     "CHANGELOG.md": 1500,
     "docs/architecture.md": 1700,
     "docs/bench.md": 1550,
+    "docs/cameras.md": 1200,
     "docs/colmap.md": 950,
     "docs/commands.md": 1200,
     "docs/conventions.md": 950,

@@ -1,5 +1,5 @@
-"""Faulty IMU samples: spikes, and readings that repeat to the last bit; both are left out as if
-they were missing.
+"""Faulty IMU samples: spikes, readings that repeat to the last bit, and readings at the end of the
+sensor's range; all are left out as if they were missing.
 
 A spike is one sample that lies far from both of its neighbours, while these agree. A rig cannot
 turn or accelerate so within one period and back within the next: a sensor's bandwidth is a fraction
@@ -9,6 +9,9 @@ changes (docs/notes/design_decisions.md, spikes of an IMU).
 
 Noise changes the last bits of every reading, so six equal numbers after six equal numbers are one
 reading given twice. How often that is due to coarse quantisation is learned from the record.
+
+Where the motion exceeds the range of a sensor, an axis repeats the largest reading so far, while
+the noise of its other axes goes on. From there on, that reading is the end of the range.
 """
 
 from __future__ import annotations
@@ -23,10 +26,16 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
 from vio.numerics.robust import median, robust_sigmas
-from vio.records import S_PER_NS, ImuSample, IntArray
+from vio.records import S_PER_NS, BoolArray, ImuSample, IntArray
 
 ImuFaultKind: TypeAlias = Literal[
-    "gyro spike", "accelerometer spike", "stuck IMU", "stuck gyro", "stuck accelerometer"
+    "gyro spike",
+    "accelerometer spike",
+    "stuck IMU",
+    "stuck gyro",
+    "stuck accelerometer",
+    "gyro clipped",
+    "accelerometer clipped",
 ]
 
 _HISTORY_NS = 2_000_000_000  # changes between samples that a spike is compared with
@@ -50,6 +59,7 @@ _MIN_REPEATS = 4  # of all six numbers
 _MIN_PART_S = 0.25  # of one sensor alone, which some drivers hold between its own slower samples
 _RARE = 0.02  # share of repetitions below which one is held back
 _MIN_CHANCE = 1e-8  # probability of so many repetitions in a row where they are independent
+_RANGE_SLACK = 1e-3  # of a range's end: a reading beyond it shows that it is none
 _COUNTED = 400  # samples over which the share of repetitions is counted
 # (6,) gyro and accelerometer; plain numbers, as arrays of six cost ten times as much
 _Reading: TypeAlias = list[float]
@@ -62,7 +72,8 @@ class ImuFault:
     kind: ImuFaultKind
     start_ns: int  # of the spike, or of the reading that was repeated
     end_ns: int  # of the last sample concerned
-    # spike: change from its neighbours, rad/s or m/s^2; stuck: the largest of the numbers repeated
+    # spike: change from its neighbours, rad/s or m/s^2; stuck: the largest of the numbers repeated;
+    # clipped: the end of the range
     size: float
 
 
@@ -75,6 +86,7 @@ class ImuSampleCheck:
 
     def __init__(self) -> None:
         self._spikes = _SpikeCheck()
+        self._ranges = (_Range("gyro clipped", 0), _Range("accelerometer clipped", 3))
         self._repeats = [_Repetition(kind, part) for kind, part in _PARTS]
         self._previous: ImuSample | None = None  # as received
         self._last_reading: _Reading = []  # its numbers
@@ -85,9 +97,13 @@ class ImuSampleCheck:
         """Take samples in order of time, one or more at once; return those that may be used now."""
         if not samples:
             return []
+        readings = readings_of(samples)
+        clipped = self._are_clipped(samples, readings)
+        if clipped.any():
+            samples = [x for x, left_out in zip(samples, clipped, strict=True) if not left_out]
+            readings = readings[~clipped]
         times = np.array([x.time_ns for x in samples], dtype=np.int64)
         usable: list[ImuSample] = []
-        readings = readings_of(samples)
         k = 0
         while k < len(samples):
             passed = self._pass_on(times[k:], readings[k:])
@@ -99,6 +115,16 @@ class ImuSampleCheck:
             self._previous = samples[k - 1]
             self._last_reading = readings[k - 1].tolist()
         return usable
+
+    def _are_clipped(self, samples: Sequence[ImuSample], readings: FloatArray) -> BoolArray:
+        """Which samples (K,), with readings (K, 6), are at the end of a sensor's range."""
+        clipped = np.zeros(len(samples), dtype=np.bool_)
+        for each in self._ranges:
+            of_sensor = each.take(readings[:, each.part])
+            if of_sensor.any():
+                self._faults += each.faults(samples, of_sensor)
+            clipped |= of_sensor
+        return clipped
 
     def _pass_on(self, times: IntArray, readings: FloatArray) -> int:
         """Count the first of some samples, of times (K,) and readings (K, 6), that nothing is to
@@ -217,6 +243,74 @@ class _Repetition:
             self._equal -= self._counted[0]
         self._counted.append(equal)
         self._equal += equal
+
+
+class _Range:
+    """Learns where the range of a sensor ends, and tells the readings there."""
+
+    def __init__(self, kind: ImuFaultKind, first: int) -> None:
+        self.part = slice(first, first + 3)
+        self._kind = kind
+        self._last: FloatArray | None = None  # (3,) the reading before
+        self._extreme = np.zeros(3)  # largest magnitude so far
+        self._repeats = np.zeros(3, dtype=np.int64)  # of it, in a row
+        self._count = 0  # changes so far
+        self._equal = np.zeros(3, dtype=np.int64)  # of these, that were none
+        self._end: float | None = None  # of the range; None: unknown
+        self._is_clipped = False  # the last sample was
+
+    def take(self, readings: FloatArray) -> BoolArray:
+        """Return which of the next readings (K, 3) are at the end of the range."""
+        sizes = np.abs(readings)
+        if self._end is not None and (sizes > (1 + _RANGE_SLACK) * self._end).any():
+            self._end = None
+        before = readings[:1] if self._last is None else self._last[None]
+        equal = readings == np.concatenate([before, readings[:-1]])
+        if self._last is None:
+            equal[0] = False
+        extreme = np.maximum.accumulate(np.concatenate([self._extreme[None], sizes]))
+        at_end = equal & (sizes >= extreme[1:]) & (sizes > 0) & ~equal.all(axis=1)[:, None]
+        first = len(readings)  # from which on the range is known
+        if self._end is None:
+            first = self._learn(equal, at_end, sizes)
+        else:
+            self._repeats[:] = 0
+            first = 0
+        self._last = readings[-1]
+        self._extreme = extreme[-1]
+        self._count += len(readings)
+        self._equal += (equal & ~at_end).sum(axis=0)
+        clipped = np.zeros(len(readings), dtype=np.bool_)
+        if self._end is not None:
+            clipped[first:] = (sizes[first:] >= self._end).any(axis=1)
+        return clipped
+
+    def faults(self, samples: Sequence[ImuSample], clipped: BoolArray) -> list[ImuFault]:
+        """Return a fault for each row of samples (K,) at the end of the range that begins here."""
+        began = clipped & ~np.concatenate([[self._is_clipped], clipped[:-1]])
+        self._is_clipped = bool(clipped[-1])
+        end = 0.0 if self._end is None else self._end
+        times = [samples[k].time_ns for k in np.flatnonzero(began)]
+        return [ImuFault(self._kind, time_ns, time_ns, end) for time_ns in times]
+
+    def _learn(self, equal: BoolArray, at_end: BoolArray, sizes: FloatArray) -> int:
+        """Count repetitions (K, 3) of the largest magnitude; return the first sample from which the
+        end of the range is known.
+        """
+        if not at_end.any():
+            self._repeats[:] = 0
+            return len(equal)
+        for k, row in enumerate(at_end):
+            self._repeats = np.where(row, self._repeats + 1, 0)
+            seen = self._count + k
+            if not row.any() or seen < _MIN_HISTORY:
+                continue
+            share = (self._equal + (equal & ~at_end)[:k].sum(axis=0) + 1) / (seen + 2)
+            improbable = self._repeats * np.log(share) < np.log(_MIN_CHANCE)
+            if (improbable & row).any():
+                self._end = float(sizes[k][improbable & row].max())
+                return k
+        return len(equal)
 
 
 class _SpikeCheck:

@@ -1,19 +1,25 @@
 """Report gaps of the IMU's stamps, and the samples that are left out: spikes, readings that
-repeat to the last bit.
+repeat to the last bit, and those at the end of a sensor's range.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 
 import numpy as np
 
+from vio.findings import Finding
 from vio.imu.faults import ImuFault, ImuFaultKind, ImuSampleCheck
 from vio.monitor.samples import GAP_S, GAP_STEPS
 from vio.records import S_PER_NS, ImuSample
 
 _RECENT = 200  # samples whose median distance is the usual one
 _UNITS: dict[ImuFaultKind, str] = {"gyro spike": "rad/s", "accelerometer spike": "m/s^2"}
+_RANGES: dict[ImuFaultKind, tuple[str, str]] = {
+    "gyro clipped": ("gyro", "rad/s"),
+    "accelerometer clipped": ("accelerometer", "m/s^2"),
+}
 _SENSORS: dict[ImuFaultKind, str] = {
     "stuck IMU": "IMU",
     "stuck gyro": "gyro",
@@ -37,28 +43,43 @@ class ImuFaultReport:
         """Take the number of a frame, for the lines that follow."""
         self._frame = index
 
-    def samples(self, samples: list[ImuSample]) -> tuple[list[ImuSample], list[str]]:
-        """Take samples; return those that may be used now, and the lines on faults that have
-        ended.
+    def samples(self, samples: list[ImuSample]) -> tuple[list[ImuSample], list[Finding]]:
+        """Take samples; return those that may be used now, and the findings on faults that have
+        ended, or whose end is not waited for.
         """
         self._samples += len(samples)
         usable = self._check.take_all(samples)
-        return usable, [line for fault in self._check.new_faults() for line in self._line(fault)]
+        return usable, self._found(self._check.new_faults())
 
-    def finish(self) -> list[str]:
-        """Return the lines at the end of the run."""
+    def finish(self) -> list[Finding]:
+        """Return the findings at the end of the run."""
         faults = self._check.finish()
         self.stuck_at_end = any(fault.kind in _SENSORS for fault in faults)
-        lines = [line for fault in faults for line in self._line(fault)]
+        findings = self._found(faults)
         for kind, spikes in self._spikes.items():
-            if len(spikes) > 1:
+            if len(spikes) > 1 and kind in _RANGES:
+                sensor, unit = _RANGES[kind]
+                line = (
+                    f"the {sensor} was at the end of its range, {spikes[0].size:.4g} {unit}, "
+                    f"{len(spikes)} times; these samples were left out"
+                )
+                findings.append(Finding(_code(kind), line, self._frame))
+            elif len(spikes) > 1:
                 largest = max(fault.size for fault in spikes)
-                lines.append(
+                line = (
                     f"{len(spikes)} of {self._samples} IMU samples were {kind}s, the largest "
                     f"{largest:.3g} "
                     f"{_UNITS[kind]}; they were left out"
                 )
-        return lines
+                findings.append(Finding(_code(kind), line, self._frame))
+        return findings
+
+    def _found(self, faults: Iterable[ImuFault]) -> list[Finding]:
+        return [
+            Finding(_code(fault.kind), line, self._frame)
+            for fault in faults
+            for line in self._line(fault)
+        ]
 
     def _line(self, fault: ImuFault) -> list[str]:
         if fault.kind in _SENSORS:
@@ -76,12 +97,23 @@ class ImuFaultReport:
         self._spikes.setdefault(fault.kind, []).append(fault)
         if len(self._spikes[fault.kind]) > 1:
             return []
+        if fault.kind in _RANGES:
+            sensor, unit = _RANGES[fault.kind]
+            return [
+                f"frame {self._frame}: the {sensor} is at the end of its range, {fault.size:.4g} "
+                f"{unit}, from {fault.start_ns} ns: the motion exceeds it; choose a larger range; "
+                "such samples are left out, carried by images"
+            ]
         return [
             f"frame {self._frame}: {fault.kind}: one sample at {fault.start_ns} ns is "
             f"{fault.size:.3g} "
             f"{_UNITS[fault.kind]} from both its neighbours, a fault of the sensor or its "
             "transfer; it is left out"
         ]
+
+
+def _code(kind: ImuFaultKind) -> str:
+    return "imu-saturated" if kind in _RANGES else "imu-readings"
 
 
 class ImuSilence:

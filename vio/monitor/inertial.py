@@ -71,6 +71,7 @@ class InertialCheck:
         self.rotation_comparison: RotationComparison | None = None
         # the accelerometer's with the images' path, or there will be no rotation for it
         self.axes_compared = False
+        self.clipped = False  # samples at the end of a range were left out
         # by the newest judgement of units, axes, signs and clocks, reported yet or not
         self.imu_at_fault = False
 
@@ -161,7 +162,7 @@ class InertialCheck:
             early_force=early,
             # The accelerometer decides whether gyro or extrinsics are at fault: wait for it.
             force_final=force is not None or size.unit is None or last or gyro_fit.count >= _ENOUGH,
-            clipped="saturation" in self._reported,
+            clipped=self.clipped or "saturation" in self._reported,
             last=last,
         )
         rates = Rates(times_ns, values[:, :3], values[:, 3:], True)

@@ -110,8 +110,10 @@ class RunMonitor:
         """Report faulty samples, and hand the others on."""
         if self._faults is None or self._inertial is None:
             return
-        usable, lines = self._faults.samples(samples)
-        self._report("imu-readings", lines)
+        usable, findings = self._faults.samples(samples)
+        self._add(findings)
+        if any(finding.code == "imu-saturated" for finding in findings):
+            self._inertial.clipped = True
         for x in usable:
             self._inertial.imu(x)
             self._frozen.sample(x)
@@ -296,7 +298,7 @@ class RunMonitor:
         if self._silence is not None:
             self._report("imu-gap", self._silence.finish())
         if self._faults is not None:
-            self._report("imu-readings", self._faults.finish())
+            self._add(self._faults.finish())
         if self._inertial is not None:
             findings = self._inertial.finish()
             # which is no matter of clocks
@@ -315,7 +317,9 @@ class RunMonitor:
 
     def _report_findings(self, findings: Iterable[InertialFinding]) -> None:
         """Log findings; gaps are reported one by one by `ImuSilence`."""
-        findings = tuple(findings)
+        clipped = self._inertial is not None and self._inertial.clipped
+        # samples at the end of a range were named when they were left out
+        findings = tuple(f for f in findings if not (clipped and f.fault == "saturation"))
         self._imu_at_fault |= any(f.certain and f.group in _PREVENTS_START for f in findings)
         for finding in findings:
             self.imu_verdict = self.imu_verdict.after(finding)
