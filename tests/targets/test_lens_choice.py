@@ -61,6 +61,7 @@ def test_explains_lenses_of_150_degrees_by_views_left_out(true: CameraModel) -> 
         assert name == "fov"
 
 
+@pytest.mark.slow
 def test_calibrates_a_rendered_lens_of_150_degrees(tmp_path: Path) -> None:
     """From pixels of images on: detection, choice of the model, adjustment, files."""
     true = CameraModel(225.0, 225.3, 279.0, 181.0, 564, 360, "eucm", (0.63, 1.08))

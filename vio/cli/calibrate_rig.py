@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vio.cli.output import ProgressBar, print_result
-from vio.errors import ConfigError
+from vio.errors import ConfigError, DataError
 from vio.files.printable import json_text
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from vio.targets.inertial import CameraImu
 
 MARKER = "calibration.json"
+PAGE = "report.html"
 _AUTO = "auto"
 
 
@@ -31,7 +32,7 @@ def add_parser(commands: Any) -> None:
         "other, and what to record where something is missing; and the pose "
         "and clock of an IMU that the recording has. The recording needs no calibration. "
         "Writes Kalibr's camchain-imucam.yaml, which vio run --calibration takes, and the files of "
-        "ROS, OpenCV and Basalt.",
+        "ROS, OpenCV and Basalt, and a page about it, report.html.",
     )
     parser.add_argument(
         "source", metavar="RECORDING", help="any recording with images, or a folder of pairs"
@@ -54,6 +55,12 @@ def add_parser(commands: Any) -> None:
         type=Path,
         metavar="FILE",
         help="Kalibr's imu.yaml, as vio imu-noise writes it (default: those of a usual MEMS)",
+    )
+    parser.add_argument(
+        "--imu-terms",
+        choices=("off", "scale", "full"),
+        default="off",
+        help="estimate scales of the IMU's axes, or their misalignment, too (default off)",
     )
     parser.add_argument("--no-imu", action="store_true", help="calibrate the cameras alone")
     parser.add_argument(
@@ -84,6 +91,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.targets.calibrate import calibrate_cameras, calibrate_with_imu
     from vio.targets.corners import CornerDetector
     from vio.targets.description import read_target
+    from vio.targets.page import write_page
     from vio.targets.picture import draw
     from vio.targets.recording import film, open_raw
     from vio.targets.results import CAMCHAIN, write_rig
@@ -103,7 +111,10 @@ def execute(args: argparse.Namespace) -> int:
         inertial = None
         if filmed.imu is not None and not args.no_imu:
             densities = _densities(args.imu_noise)
-            inertial = calibrate_with_imu(filmed, target, found, densities)
+            try:
+                inertial = calibrate_with_imu(filmed, target, found, densities, args.imu_terms)
+            except DataError as error:
+                raise DataError(f"{error}; or leave the IMU out by --no-imu") from error
             rig = replace(
                 rig,
                 T_cam0_imu=inertial.T_cam0_imu,
@@ -113,17 +124,21 @@ def execute(args: argparse.Namespace) -> int:
     facts = {"out": str(out), "target": str(target), **_facts(found)}
     if inertial is not None:
         facts["imu"] = _imu_facts(inertial)
-    with atomic_folder(out, replace=True, marker=MARKER) as folder:
-        files = write_rig(folder, rig)
-        draw(found, folder / "calibration.png")
-        (folder / MARKER).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
-    command = f"vio run {shlex.quote(args.source)} --calibration {shlex.quote(str(out / CAMCHAIN))}"
-    rows = [
+    results = [
         ("target", str(target)),
         ("frames", f"{filmed.frames}, the board in {len(filmed.views)}; {found.seen.views} used"),
         *_rows(found),
         *([] if inertial is None else _imu_rows(inertial)),
-        ("results", f"{out}: {', '.join(files)}, calibration.png"),
+    ]
+    with atomic_folder(out, replace=True, marker=MARKER) as folder:
+        files = write_rig(folder, rig)
+        draw(found, folder / "calibration.png")
+        write_page(folder / PAGE, f"Calibration of {raw.path.name}", found, inertial, results)
+        (folder / MARKER).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
+    command = f"vio run {shlex.quote(args.source)} --calibration {shlex.quote(str(out / CAMCHAIN))}"
+    rows = [
+        *results,
+        ("results", f"{out}: {', '.join(files)}, {PAGE}, calibration.png"),
         ("next", command),
     ]
     return print_result(facts, rows, as_json=args.json, name_width=16)
@@ -160,6 +175,10 @@ def _imu_facts(found: CameraImu) -> dict[str, Any]:
         "imu_chi": found.imu_chi,
         "views": found.views,
         "weak": list(found.weak),
+        "board_scale": found.board_scale,
+        "board_scale_sigma": found.board_scale_sigma,
+        "terms": found.terms.tolist(),
+        "term_sigmas": found.term_sigmas.tolist(),
     }
 
 
@@ -187,8 +206,36 @@ def _imu_rows(found: CameraImu) -> list[tuple[str, str]]:
             f"{found.views} views; squared errors of poses {found.camera_chi:.2f}, of the IMU "
             f"{found.imu_chi:.2f} times those expected",
         ),
+        (
+            "board by the IMU",
+            f"{100 * (found.board_scale - 1):+.2f} ± {100 * found.board_scale_sigma:.2f} % larger "
+            "than in the target file (accelerometers are off by up to 1 %)",
+        ),
+        *_term_rows(found),
         *(("FOUND", text) for text in found.weak),
     ]
+
+
+def _term_rows(found: CameraImu) -> list[tuple[str, str]]:
+    """Scales in per cent and misalignments in degrees, of those that were estimated."""
+    import numpy as np
+
+    from vio.records import IMU_ENTRIES
+
+    parts: dict[str, list[str]] = {}
+    for (sensor, row, column), value, sigma in zip(
+        IMU_ENTRIES, found.terms.tolist(), found.term_sigmas.tolist(), strict=True
+    ):
+        if sigma == 0:
+            continue
+        name = ("accelerometer", "gyro")[sensor]
+        if row == column:
+            text = f"{'xyz'[row]} {100 * value:+.2f} ± {100 * sigma:.2f} %"
+        else:
+            turn, turn_sigma = np.degrees([value, sigma]).tolist()
+            text = f"{'xyz'[row]}{'xyz'[column]} {turn:+.2f} ± {turn_sigma:.2f} deg"
+        parts.setdefault(name, []).append(text)
+    return [(name, ", ".join(texts)) for name, texts in parts.items()]
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

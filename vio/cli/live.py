@@ -44,6 +44,13 @@ def add_parser(commands: Any) -> None:
         default="side-by-side",
         help="how the images lie in a video (default side-by-side)",
     )
+    parser.add_argument(
+        "--target",
+        type=Path,
+        metavar="FILE",
+        help="film this printed board for vio calibrate-rig in place of odometry: says what is "
+        "still missing, and stops when nothing is",
+    )
     add_settings_arguments(parser)
     parser.add_argument(
         "--record", type=Path, metavar="DIR", help="keep images and samples, for vio run DIR"
@@ -66,6 +73,8 @@ def execute(args: argparse.Namespace) -> int:
     from vio.sources.run import run_source
     from vio.sources.source import open_source
 
+    if args.target is not None:
+        return _film_board(args)
     config = config_from(args)
     map_use = map_from(args)
     mavlink = mavlink_from(args)
@@ -120,4 +129,32 @@ def execute(args: argparse.Namespace) -> int:
         print(
             f"latency {found.latency_median_ms:.0f} ms (median), {found.latency_95_ms:.0f} (95 %)"
         )
+    return 0
+
+
+def _film_board(args: argparse.Namespace) -> int:
+    """Record a board with guidance, for `vio calibrate-rig`."""
+    import shlex
+
+    from vio.sources.board import film_board
+    from vio.sources.source import open_source
+    from vio.targets.description import read_target
+
+    target = read_target(args.target)
+    with StopRequest() as asked:
+        lacks = film_board(
+            open_source(args.source, args.layout),
+            target,
+            should_stop=asked.reason,
+            say=lambda line: print(line, file=sys.stderr, flush=True),
+            record=args.record,
+            record_as=args.record_as,
+            every_frame=args.drop == "none",
+        )
+    print(lacks)
+    if args.record is None:
+        print("nothing was kept: give --record DIR to calibrate by these views")
+    else:
+        folder = shlex.quote(str(args.record))
+        print(f"next: vio calibrate-rig {folder} --target {shlex.quote(str(args.target))}")
     return 0

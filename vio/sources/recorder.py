@@ -8,6 +8,7 @@ import contextlib
 import queue
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -29,17 +30,32 @@ _CAMERAS = ("cam0", "cam1")
 IMU_HEADER = "timestamp [ns],wx,wy,wz,ax,ay,az\n"
 
 
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What a source gives."""
+
+    pair: bool  # whether there is a right image
+    imu: bool
+
+
 class Recorder:
     """Writes images, times, samples and the calibration, in a thread of its own."""
 
-    def __init__(self, folder: Path, rig: Rig, form: Form = "plain") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        rig: Rig | None,
+        form: Form = "plain",
+        recorded: Recorded | None = None,
+    ) -> None:
         """Begin a recording.
 
         Args:
             folder: new or empty.
-            rig: calibration of the raw images.
+            rig: calibration of the raw images; None: it is not known yet, and none is written.
             form: a plain folder, which is whole up to its last frame however it ends, or a bag,
                 which has to be closed.
+            recorded: what the source gives; None: what the rig has.
 
         Raises:
             DataError: the folder holds something, or cannot be written.
@@ -51,9 +67,12 @@ class Recorder:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise self._unwritable(error) from error
-        name = "camchain.yaml" if rig.T_cam0_imu is None else "camchain-imucam.yaml"
-        atomic_write_text(folder / name, kalibr_text(rig))
-        self._open = _plain(folder, rig) if form == "plain" else _bag(folder, form)
+        if rig is not None:
+            name = "camchain.yaml" if rig.T_cam0_imu is None else "camchain-imucam.yaml"
+            atomic_write_text(folder / name, kalibr_text(rig))
+            recorded = recorded or Recorded(rig.cam1 is not None, rig.T_cam0_imu is not None)
+        assert recorded is not None, "a source without a rig says what it gives"
+        self._open = _plain(folder, recorded) if form == "plain" else _bag(folder, form)
         self._events: queue.SimpleQueue[SourceEvent | None] = queue.SimpleQueue()
         self._room = threading.Semaphore(_WAITING)
         self._failure: Exception | None = None
@@ -103,16 +122,16 @@ class Recorder:
 
 
 @contextlib.contextmanager
-def _plain(folder: Path, rig: Rig) -> Iterator[Callable[[SourceEvent], None]]:
+def _plain(folder: Path, recorded: Recorded) -> Iterator[Callable[[SourceEvent], None]]:
     """Open `left/`, `right/`, `times.txt` and `imu.csv`; times and samples are written out each
     frame.
     """
-    for name in ("left",) if rig.cam1 is None else ("left", "right"):
+    for name in ("left", "right") if recorded.pair else ("left",):
         (folder / name).mkdir()
     with contextlib.ExitStack() as stack:
         times = stack.enter_context((folder / "times.txt").open("w", encoding="utf-8"))
         imu = None
-        if rig.T_cam0_imu is not None:
+        if recorded.imu:
             imu = stack.enter_context((folder / "imu.csv").open("w", encoding="utf-8"))
             imu.write(IMU_HEADER)
 

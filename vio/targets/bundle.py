@@ -33,6 +33,7 @@ _MIN_SIGMA_PX = 0.01
 # by which coefficients of a lens may be off zero: holds those that no view shows
 _COEFFICIENT_SIGMA = 10.0
 _BOW_SHARE = 0.01  # of the board's width: standard deviation of its bow before any view
+_MIN_USED = 4  # corners of a view
 _BEHIND_PX = 100.0  # residual of a corner that the lens cannot project
 _MEDIAN_TO_SIGMA = 1.1774  # of the length of a vector of two Gaussian components
 
@@ -118,6 +119,8 @@ class BoardAdjustment:
         at = self._descend(at, steps, cut=True)
         r = self._residuals(at)
         used = self._weights(r, self._sigmas(r), cut=True) > 0
+        # A view with fewer corners has no pose.
+        used &= np.bincount(self.seen.view, used)[self.seen.view] >= _MIN_USED
         sigma = self._final_sigmas(r, used)
         weight = used / sigma[self.seen.camera] ** 2
         A, B, C, _, _ = self._normal(at, weight)
@@ -248,6 +251,8 @@ class BoardAdjustment:
             rows_of = slice(2 * self._first[v], 2 * self._first[v + 1])
             J = own.reshape(-1, _POSE)[rows_of]
             A[v] = J.T @ J + 1e-12 * np.eye(_POSE)
+            if not weight[self._first[v] : self._first[v + 1]].any():
+                A[v] = np.eye(_POSE)  # without a corner, the view stays where it is
             B[v] = J.T @ flat[rows_of]
             b[v] = J.T @ r.ravel()[rows_of]
         return A, B, C, b, g

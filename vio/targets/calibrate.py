@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vio.cameras.rig import Rig
 from vio.errors import CalibrationError, DataError
+from vio.filters.imu_terms import ImuTerms
 from vio.numerics.robust import median
 from vio.records import ImuDensities, IntArray
 from vio.targets.bundle import Adjusted, BoardAdjustment
 from vio.targets.description import Target
+from vio.targets.diagnosis import diagnose
 from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu
 from vio.targets.lenses import LENSES, LensScore, choose_lens
 from vio.targets.recording import Filmed
@@ -56,19 +59,21 @@ def calibrate_cameras(
         DataError: there are too few views, or the cameras never see the board together.
         CalibrationError: no lens fits: the board is another one.
     """
-    _check_views(filmed)
+    _check_views(filmed, target)
     seen = chosen_views(sightings(filmed.views, target.points_m))
     scores: list[LensScore] = []
     if lens is None:
         progress("choose the lens model")
-        lens, scores = choose_lens(seen.of_camera(0), filmed.sizes[0])
+        with _explained(filmed, 0, target):
+            lens, scores = choose_lens(seen.of_camera(0), filmed.sizes[0])
     model, count = LENSES[lens]
     progress("adjust each camera")
-    alone = [
-        one_camera(seen.of_camera(c), size, model, count) for c, size in enumerate(filmed.sizes)
-    ]
+    alone: list[Adjusted] = []
+    for c, size in enumerate(filmed.sizes):
+        with _explained(filmed, c, target):
+            alone.append(one_camera(seen.of_camera(c), size, model, count))
     for c, one in enumerate(alone):
-        _check_fit(one, c)
+        _check_fit(one, c, filmed, target)
     found = alone[0]
     if len(alone) > 1:
         progress("adjust the pair")
@@ -81,9 +86,15 @@ def calibrate_cameras(
 
 
 def calibrate_with_imu(
-    filmed: Filmed, target: Target, cameras: CameraCalibration, densities: ImuDensities
+    filmed: Filmed,
+    target: Target,
+    cameras: CameraCalibration,
+    densities: ImuDensities,
+    terms: ImuTerms = "off",
 ) -> CameraImu:
     """Calibrate the IMU of a recording whose cameras are calibrated.
+
+    `terms`: which of its scales and misalignments are estimated, see `calibrate_imu`.
 
     Raises:
         DataError: the recording has no IMU, or its motion shows too little; says what to record.
@@ -93,11 +104,15 @@ def calibrate_with_imu(
     seen = sightings(filmed.views, target.points_m)
     left = np.bincount(seen.view[seen.camera == 0], minlength=seen.views)
     chosen = np.flatnonzero(left >= _MIN_CORNERS)
-    problem, found = pose_only(cameras.found.at, seen.of_views(chosen))
-    times_ns = np.array([filmed.views[v].time_ns for v in chosen.tolist()], dtype=np.int64)
+    seen = seen.of_views(chosen)
+    problem, found = pose_only(cameras.found.at, seen)
+    # A view that fits badly has a wrong pose.
+    used = np.bincount(seen.view[found.used & (seen.camera == 0)], minlength=seen.views)
+    good = np.flatnonzero(used >= _MIN_CORNERS)
+    times_ns = np.array([filmed.views[v].time_ns for v in chosen[good].tolist()], dtype=np.int64)
     information = problem.pose_information(found) / cameras.verdict.inflation**2
-    poses = BoardPoses(times_ns, found.at.T_cam0_board, information)
-    return calibrate_imu(poses, filmed.imu, densities)
+    poses = BoardPoses(times_ns, found.at.T_cam0_board[good], information[good])
+    return calibrate_imu(poses, filmed.imu, densities, terms=terms)
 
 
 def chosen_views(seen: Sightings) -> Sightings:
@@ -115,11 +130,28 @@ def chosen_views(seen: Sightings) -> Sightings:
     return kept.of_views(views)
 
 
-def _check_views(filmed: Filmed) -> None:
+def _diagnosis(filmed: Filmed, camera: int, target: Target) -> str | None:
+    """Return why the board is not seen as described in the images of a camera, where it shows."""
+    return diagnose([images[camera] for images in filmed.samples], target)
+
+
+@contextmanager
+def _explained(filmed: Filmed, camera: int, target: Target) -> Iterator[None]:
+    """Give the reason where no lens fits, if the images show one."""
+    try:
+        yield
+    except CalibrationError as error:
+        reason = _diagnosis(filmed, camera, target)
+        raise (error if reason is None else CalibrationError(reason)) from error
+
+
+def _check_views(filmed: Filmed, target: Target) -> None:
     names = ("left", "right") if len(filmed.sizes) > 1 else ("only",)
     for c, name in enumerate(names):
         count = sum(len(view.corners[c]) >= _MIN_CORNERS for view in filmed.views)
         if count < MIN_VIEWS:
+            if (reason := _diagnosis(filmed, c, target)) is not None:
+                raise DataError(f"{name} camera: {reason}")
             raise DataError(
                 f"the {name} camera sees the board in {count} of {filmed.frames} frames, and "
                 f"{MIN_VIEWS} are needed; check that the target file is that of the board, move it "
@@ -133,12 +165,14 @@ def _check_views(filmed: Filmed) -> None:
         )
 
 
-def _check_fit(one: Adjusted, camera: int) -> None:
+def _check_fit(one: Adjusted, camera: int, filmed: Filmed, target: Target) -> None:
     residual = median(np.linalg.norm(one.residuals_px, axis=1))
     if residual > _MAX_RESIDUAL_PX:
+        reason = _diagnosis(filmed, camera, target)
+        advice = reason or "check rows, columns, tag spacing and numbering in the target file"
         raise CalibrationError(
             f"camera {camera}: corners are off by {residual:.1f} px (median) with the best lens; "
-            "check rows, columns, tag spacing and numbering in the target file"
+            f"{advice}"
         )
 
 

@@ -118,24 +118,25 @@ class Target:
 
     def markers(self) -> list[Marker]:
         """Return the coded squares; none on a checkerboard."""
+        return [
+            Marker(self.first_id + n, found, self._modules(self.first_id + n))
+            for n, found in enumerate(self.marker_corners())
+        ]
+
+    def marker_corners(self) -> list[FloatArray]:
+        """Return the corners (4, 2) of the coded squares, in the order of their numbers."""
         if self.kind == "checkerboard":
             return []
         if self.kind == "aprilgrid":
-            count = self.rows * self.cols
-            corners = [self._tag_corners(n) for n in range(count)]
-        else:
-            inset = 0.5 * self.size_m * (1 - self.ratio)
-            side = self.ratio * self.size_m
-            square = side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) + inset
-            corners = [
-                square + self.size_m * np.array([col, row])
-                for row in range(self.rows)
-                for col in range(self.cols)
-                if not self.square_is_dark(row, col)
-            ]
+            return [self._tag_corners(n) for n in range(self.rows * self.cols)]
+        inset = 0.5 * self.size_m * (1 - self.ratio)
+        side = self.ratio * self.size_m
+        square = side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) + inset
         return [
-            Marker(self.first_id + n, found, self._modules(self.first_id + n))
-            for n, found in enumerate(corners)
+            square + self.size_m * np.array([col, row])
+            for row in range(self.rows)
+            for col in range(self.cols)
+            if not self.square_is_dark(row, col)
         ]
 
     def square_is_dark(self, row: int, col: int) -> bool:

@@ -21,12 +21,13 @@ from vio.calibration.findings import NotObservable
 from vio.calibration.gyro import align_gyro
 from vio.calibration.inertial import Rates
 from vio.errors import DataError
+from vio.filters.imu_terms import CHOSEN, IMU_TERMS, ImuTerms, calibrated, term_sigmas
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.imu.preintegration import BodyStates, Preintegrated, Readings, preintegrate
 from vio.records import ImuDensities, ImuRecord, IntArray
 
 _STATE = 15  # of a view: xi of its pose, velocity, biases
-_SHARED = 9  # xi of `T_cam0_imu exp(xi)`, time, two turns of gravity
+_SHARED = 9  # xi of `T_cam0_imu exp(xi)`, time, two turns of gravity; then the IMU's terms
 _STEPS = 20
 _CONVERGED = 1e-5  # relative change of the cost
 _MIN_VIEWS = 20
@@ -38,6 +39,9 @@ _WEAK_ROTATION_DEG = 0.2  # standard deviations beyond which a quantity is calle
 _WEAK_M = 0.005
 _WEAK_S = 1e-3
 _NUMERIC_STEP = 1e-6
+_TERM_STEP = 1e-4
+_SIZE_SIGMAS = 4.0  # by which the board's size must be off to be named
+_MIN_SIZE_SHARE = 0.02  # and by how much: accelerometers are off by 1 %
 _GAUGE = 1e-9
 _MAX_DAMPING = 1e6
 
@@ -64,7 +68,11 @@ class CameraImu:
     camera_chi: float  # mean squared whitened residual of the poses; 1 expected
     imu_chi: float  # likewise of the IMU's motions
     views: int
-    weak: tuple[str, ...]  # what the motion hardly shows, with what to record
+    weak: tuple[str, ...]  # what the motion hardly shows or contradicts, with what to record
+    terms: FloatArray  # (15,) scale and misalignment, see `vio.records.IMU_ENTRIES`
+    term_sigmas: FloatArray  # (15,) 0: not estimated
+    board_scale: float  # size of the board as the IMU sees it over that of the file
+    board_scale_sigma: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,24 +81,54 @@ class _States:
     T_cam0_imu: FloatArray
     offset_s: float
     R_world_board: FloatArray  # (3, 3) the world's z axis is up
+    terms: FloatArray  # (15,) scale and misalignment of the IMU
+
+
+@dataclass(frozen=True, slots=True)
+class _Motions:
+    """What the IMU measured between the views, and how that follows its terms."""
+
+    steps: Preintegrated
+    terms: FloatArray  # (15,) with which it was integrated
+    r_D_terms: FloatArray  # (F, 9, T) of the residuals by those that are estimated
 
 
 def calibrate_imu(
-    poses: BoardPoses, imu: ImuRecord, densities: ImuDensities, gravity_mps2: float = 9.81
+    poses: BoardPoses,
+    imu: ImuRecord,
+    densities: ImuDensities,
+    gravity_mps2: float = 9.81,
+    terms: ImuTerms = "off",
 ) -> CameraImu:
     """Calibrate a camera and an IMU.
+
+    Args:
+        poses: of the board.
+        imu: its samples.
+        densities: its noise.
+        gravity_mps2: strength of gravity.
+        terms: which of the IMU's scales and misalignments are estimated, see
+            `vio.filters.imu_terms`.
 
     Raises:
         DataError: too few views lie within the IMU's record, or the motion shows no rotation.
     """
-    problem = _Problem(poses, imu, densities, gravity_mps2)
+    problem = _Problem(poses, imu, densities, gravity_mps2, CHOSEN[terms])
     return problem.result(problem.solve(problem.start()))
 
 
 class _Problem:
     def __init__(
-        self, poses: BoardPoses, imu: ImuRecord, densities: ImuDensities, gravity: float
+        self,
+        poses: BoardPoses,
+        imu: ImuRecord,
+        densities: ImuDensities,
+        gravity: float,
+        chosen: IntArray,
     ) -> None:
+        self._chosen = chosen  # (T,) terms of the IMU that are estimated
+        self._shared = _SHARED + len(chosen)
+        self._r_D_terms: FloatArray | None = None
         self._origin = int(imu.times_ns[0])
         inside = (poses.times_ns > imu.times_ns[0]) & (poses.times_ns < imu.times_ns[-1])
         if inside.sum() < _MIN_VIEWS:
@@ -135,7 +173,7 @@ class _Problem:
         bias = np.zeros((len(at), 6))
         bias[:, :3] = found.gyro_bias
         body = BodyStates(T_world_imu, velocity, bias)
-        return _States(body, T_cam0_imu, found.time_offset_s, R_world_board)
+        return _States(body, T_cam0_imu, found.time_offset_s, R_world_board, np.zeros(IMU_TERMS))
 
     def _at(self, values: FloatArray, seconds: FloatArray) -> FloatArray:
         t = self._readings.seconds
@@ -146,7 +184,7 @@ class _Problem:
         damping = 1e-4
         before = np.inf
         for _ in range(_STEPS):
-            steps = self._preintegrated(at)
+            steps = self._motions(at)
             weight = self._weights(at)
             H, g, cost = self._system(at, steps, weight)
             new = (at, 0.0)
@@ -166,17 +204,38 @@ class _Problem:
 
     def _preintegrated(self, at: _States) -> Preintegrated:
         seconds = self._seconds + at.offset_s
-        return preintegrate(self._readings, seconds[:-1], seconds[1:], at.body.bias[:-1])
+        readings = self._readings
+        if len(self._chosen):
+            both = calibrated(np.concatenate([readings.gyro, readings.accel], axis=1), at.terms)
+            readings = replace(readings, gyro=both[:, :3], accel=both[:, 3:])
+        return preintegrate(readings, seconds[:-1], seconds[1:], at.body.bias[:-1])
+
+    def _motions(self, at: _States) -> _Motions:
+        steps = self._preintegrated(at)
+        if self._r_D_terms is None:
+            # They hardly depend on the states.
+            i = at.body.take(slice(None, -1))
+            j = at.body.take(slice(1, None))
+            before = steps.residual(i, j, self._gravity)
+            self._r_D_terms = np.zeros((*before.shape, len(self._chosen)))
+            for k, term in enumerate(self._chosen.tolist()):
+                moved = replace(at, terms=at.terms + _TERM_STEP * np.eye(IMU_TERMS)[term])
+                after = self._preintegrated(moved).residual(i, j, self._gravity)
+                self._r_D_terms[:, :, k] = (after - before) / _TERM_STEP
+        return _Motions(steps, at.terms, self._r_D_terms)
 
     def _moved(self, at: _States, x: FloatArray) -> tuple[_States, float]:
         K = len(self._seconds)
         shared = x[_STATE * K :]
         turn = so3_exp(np.array([shared[7], shared[8], 0.0]))
+        terms = at.terms.copy()
+        terms[self._chosen] += shared[_SHARED:]
         states = _States(
             at.body.moved(x[: _STATE * K].reshape(K, _STATE)),
             at.T_cam0_imu @ se3_exp(shared[:6]),
             at.offset_s,
             turn @ at.R_world_board,
+            terms,
         )
         return states, float(shared[6])
 
@@ -193,12 +252,16 @@ class _Problem:
         body = replace(at.body, T_world_imu=at.body.T_world_imu @ se3_exp(late_s * twists))
         return replace(at, body=body, offset_s=at.offset_s + late_s)
 
-    def _camera(self, at: _States, late_s: float = 0.0) -> FloatArray:
-        """Whitened residuals (K, 6) of the board's poses, exposed late by a time."""
+    def _camera(self, at: _States, late_s: float = 0.0, scale: float = 1.0) -> FloatArray:
+        """Whitened residuals (K, 6) of the board's poses, exposed late by a time, of a board that
+        is larger than its description.
+        """
         T_world_imu = at.body.T_world_imu @ se3_exp(late_s * self._twists(at))
         T_world_board = se3_from_parts(at.R_world_board, np.zeros(3))
         expected = at.T_cam0_imu @ se3_inverse(T_world_imu) @ T_world_board
-        r = se3_log(self.poses.T_cam0_board @ se3_inverse(expected))
+        measured = self.poses.T_cam0_board.copy()
+        measured[:, :3, 3] *= scale
+        r = se3_log(measured @ se3_inverse(expected))
         return np.asarray(np.einsum("kij,kj->ki", self._root, r))
 
     def _weights(self, at: _States) -> FloatArray:
@@ -206,21 +269,24 @@ class _Problem:
         scale = max(float(np.median(chi)), _MIN_MEAN_CHI)
         return np.asarray(1 / (1 + chi / (_WIDTH * scale)) / np.sqrt(scale))
 
-    def _inertial(self, at: _States, steps: Preintegrated) -> FloatArray:
+    def _inertial(self, at: _States, motions: _Motions) -> FloatArray:
         i = at.body.take(slice(None, -1))
         j = at.body.take(slice(1, None))
-        r = steps.residual(i, j, self._gravity)
-        return np.asarray(np.einsum("fij,fj->fi", _whitening(steps.covariance), r))
+        r = motions.steps.residual(i, j, self._gravity)
+        if len(self._chosen):
+            r = r + motions.r_D_terms @ (at.terms - motions.terms)[self._chosen]
+        return np.asarray(np.einsum("fij,fj->fi", _whitening(motions.steps.covariance), r))
 
     def _walk_sigmas(self) -> FloatArray:
         d = self._readings.densities
         return np.sqrt(np.diff(self._seconds))[:, None] * np.repeat([d.gyro_walk, d.accel_walk], 3)
 
-    def _cost(self, moved: tuple[_States, float], steps: Preintegrated, w: FloatArray) -> float:
+    def _cost(self, moved: tuple[_States, float], steps: _Motions, w: FloatArray) -> float:
         at, late_s = moved
         cost = float(np.sum((w[:, None] * self._camera(at, late_s)) ** 2))
         cost += float(np.sum(self._inertial(at, steps) ** 2))
         cost += float(np.sum((np.diff(at.body.bias, axis=0) / self._walk_sigmas()) ** 2))
+        cost += float(np.sum((at.terms[self._chosen] / term_sigmas()[self._chosen]) ** 2))
         return cost + float(np.sum((at.body.bias[0] / _BIAS_SIGMA) ** 2))
 
     def _camera_jacobian(self, at: _States) -> tuple[FloatArray, FloatArray]:
@@ -231,7 +297,7 @@ class _Problem:
         for k in range(_STATE + _SHARED):
             ends = []
             for sign in (1.0, -1.0):
-                x = np.zeros(_STATE * K + _SHARED)
+                x = np.zeros(_STATE * K + self._shared)
                 column = slice(k, _STATE * K, _STATE) if k < _STATE else _STATE * K + k - _STATE
                 x[column] = sign * _NUMERIC_STEP
                 ends.append(self._camera(*self._moved(at, x)))
@@ -243,22 +309,37 @@ class _Problem:
         return own, shared
 
     def _system(
-        self, at: _States, steps: Preintegrated, w: FloatArray
+        self, at: _States, motions: _Motions, w: FloatArray, *, with_scale: bool = False
     ) -> tuple[csc_matrix, FloatArray, float]:
+        """Normal equations; `with_scale`: the board's scale is one unknown more, the last one."""
+        steps = motions.steps
         K = len(self._seconds)
-        rows = _Rows(_STATE * K + _SHARED)
+        rows = _Rows(_STATE * K + self._shared + with_scale)
         own, shared = self._camera_jacobian(at)
         scale = w[:, None, None]
         states = np.arange(K)
         common = np.tile(_STATE * K + np.arange(_SHARED), (K, 1))
         columns = _STATE * states[:, None] + np.arange(_STATE)
-        rows.add(w[:, None] * self._camera(at), [(columns, scale * own), (common, scale * shared)])
+        blocks = [(columns, scale * own), (common, scale * shared)]
+        if with_scale:
+            ends = [self._camera(at, scale=1 + sign * _NUMERIC_STEP) for sign in (1.0, -1.0)]
+            by_scale = (ends[0] - ends[1]) / (2 * _NUMERIC_STEP)
+            last = np.full((K, 1), _STATE * K + self._shared)
+            blocks.append((last, scale * by_scale[:, :, None]))
+        rows.add(w[:, None] * self._camera(at), blocks)
         r, A, B = steps.linearised(
             at.body.take(slice(None, -1)), at.body.take(slice(1, None)), self._gravity
         )
         W = _whitening(steps.covariance)
         r = np.einsum("fij,fj->fi", W, r)
-        rows.add(r, [(columns[:-1], W @ A), (columns[1:], W @ B)])
+        blocks = [(columns[:-1], W @ A), (columns[1:], W @ B)]
+        if len(self._chosen):
+            term_columns = _STATE * K + _SHARED + np.arange(len(self._chosen))
+            blocks.append((np.tile(term_columns, (K - 1, 1)), W @ motions.r_D_terms))
+            sigma = term_sigmas()[self._chosen]
+            prior = np.diag(1 / sigma)[None]
+            rows.add((at.terms[self._chosen] / sigma)[None], [(term_columns[None], prior)])
+        rows.add(r, blocks)
         inverse = 1 / self._walk_sigmas()
         change = np.diff(at.body.bias, axis=0) * inverse
         D = inverse[:, :, None] * np.eye(6)
@@ -270,15 +351,19 @@ class _Problem:
 
     def result(self, at: _States) -> CameraImu:
         """Return the calibration with its covariance."""
-        steps = self._preintegrated(at)
+        motions = self._motions(at)
         weight = self._weights(at)
-        H, _, _ = self._system(at, steps, weight)
-        K = len(self._seconds)
-        wanted = np.zeros((H.shape[0], 7))
-        wanted[_STATE * K + np.arange(7), np.arange(7)] = 1
-        P = splu(H).solve(wanted)[_STATE * K : _STATE * K + 7]
-        inertial = float(np.mean(self._inertial(at, steps) ** 2))
-        P = 0.5 * (P + P.T) * max(inertial, 1.0)
+        H, _, _ = self._system(at, motions, weight)
+        shared = self._shared_covariance(H, self._shared)
+        inertial = float(np.mean(self._inertial(at, motions) ** 2))
+        shared = shared * max(inertial, 1.0)
+        P = shared[:7, :7]
+        sigmas = np.zeros(IMU_TERMS)
+        sigmas[self._chosen] = np.sqrt(np.diag(shared)[_SHARED:])
+        H, g, _ = self._system(at, motions, weight, with_scale=True)
+        off = float(splu(H).solve(g)[-1])
+        variance = float(self._shared_covariance(H, self._shared + 1)[-1, -1])
+        off_sigma = float(np.sqrt(variance * max(inertial, 1.0)))
         return CameraImu(
             at.T_cam0_imu,
             at.offset_s,
@@ -288,9 +373,21 @@ class _Problem:
             P,
             float(np.mean(self._camera(at) ** 2)),
             inertial,
-            K,
-            _weak(np.sqrt(np.diag(P))),
+            len(self._seconds),
+            (*_weak(np.sqrt(np.diag(P))), *_size_findings(off, off_sigma)),
+            at.terms,
+            sigmas,
+            1 + off,
+            off_sigma,
         )
+
+    def _shared_covariance(self, H: csc_matrix, count: int) -> FloatArray:
+        """Covariance of the unknowns (count,) that follow the views' states."""
+        first = _STATE * len(self._seconds)
+        wanted = np.zeros((H.shape[0], count))
+        wanted[first + np.arange(count), np.arange(count)] = 1
+        P = splu(H).solve(wanted)[first : first + count]
+        return np.asarray(0.5 * (P + P.T))
 
 
 def _seconds(times_ns: IntArray, origin_ns: int) -> FloatArray:
@@ -314,6 +411,17 @@ def _weak(sigma: FloatArray) -> tuple[str, ...]:
     if sigma[6] > _WEAK_S:
         out.append(f"the time offset is known to {1e3 * sigma[6]:.1f} ms: turn the rig faster")
     return tuple(out)
+
+
+def _size_findings(off: float, sigma: float) -> tuple[str, ...]:
+    """Return whether the IMU sees a board of another size."""
+    if abs(off) < max(_SIZE_SIGMAS * sigma, _MIN_SIZE_SHARE):
+        return ()
+    word = "larger" if off > 0 else "smaller"
+    return (
+        f"by the IMU the board is {100 * abs(off):.1f} ± {100 * sigma:.1f} % {word} than in the "
+        "target file: measure the side of a tag or square, and give it by --size",
+    )
 
 
 def _turn_to_z(up: FloatArray) -> FloatArray:

@@ -1,55 +1,154 @@
-"""The verdict on a calibration as a picture: corners, uncertainty over the image, residuals, depth."""
+"""A calibration in pictures: corners and tilts, uncertainty over the image and over distance,
+halves of the views against each other, residuals.
+"""
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vio.geometry.distortion import CameraModel
+from vio.geometry.lie import FloatArray
 from vio.targets.calibrate import CameraCalibration
-from vio.targets.verdict import DEPTH_M, depth_sigma
+from vio.targets.verdict import DEPTH_M, board_tilts_deg, depth_sigma, projection_sigma_from_views
 
 _DISTANCES_M = (1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
+_NEAR_AND_FAR_M = (0.2, 0.3, 0.5, 0.7, 1.0, 2.0, 5.0, 10.0, 30.0)
+_ROW_INCHES = 3.7
+_WIDTH_INCHES = 13.0
+_DPI = 90
 
 
 def draw(found: CameraCalibration, path: Path) -> None:
     """Draw the corners, residuals and uncertainty of each camera, and the depth of a pair."""
+    cameras = found.found.at.cameras
+    figure, axes = _figure(len(cameras) + (len(cameras) > 1), 3)
+    for c in range(len(cameras)):
+        _draw_corners(axes[c][0], found, c)
+        _draw_uncertainty(axes[c][1], found, c)
+        _draw_residuals(axes[c][2], found, c)
+    if len(cameras) > 1:
+        _draw_depth(axes[-1], found)
+        axes[-1][2].axis("off")
+    figure.savefig(path, dpi=_DPI)
+
+
+def views_png(found: CameraCalibration) -> bytes:
+    """Return what the views show: corners in each image, tilts and distances of the board."""
+    cameras = found.found.at.cameras
+    figure, axes = _figure(1, len(cameras) + 2)
+    for c in range(len(cameras)):
+        _draw_corners(axes[0][c], found, c)
+    tilts = board_tilts_deg(found.found.at)
+    axes[0][-2].plot(tilts[:, 1], tilts[:, 0], "o", ms=4)
+    axes[0][-2].set_xlabel("to the left and right, deg")
+    axes[0][-2].set_ylabel("forwards and backwards, deg")
+    axes[0][-2].set_title("tilts of the board")
+    axes[0][-2].grid(alpha=0.3)
+    distance = np.linalg.norm(found.found.at.T_cam0_board[:, :3, 3], axis=1)
+    axes[0][-1].hist(distance, bins=12)
+    axes[0][-1].set_xlabel("distance, m")
+    axes[0][-1].set_title("views")
+    return _png(figure)
+
+
+def uncertainty_png(found: CameraCalibration) -> bytes:
+    """Return the uncertainty of each camera's projection over the image and over distance."""
+    cameras = found.found.at.cameras
+    figure, axes = _figure(1, len(cameras) + 1)
+    for c in range(len(cameras)):
+        _draw_uncertainty(axes[0][c], found, c)
+    last = axes[0][-1]
+    for c in range(len(cameras)):
+        sigmas = [
+            found.verdict.inflation
+            * projection_sigma_from_views(found.found, found.seen, c, distance)
+            for distance in _NEAR_AND_FAR_M
+        ]
+        middle = [sigma[len(sigma) // 2] for sigma in sigmas]
+        worst = [np.nanmax(sigma) for sigma in sigmas]
+        last.loglog(_NEAR_AND_FAR_M, worst, "o-", color=f"C{c}", label=f"{_name(found, c)}, worst")
+        last.loglog(
+            _NEAR_AND_FAR_M, middle, "o:", color=f"C{c}", label=f"{_name(found, c)}, middle"
+        )
+    last.set_xlabel("distance, m")
+    last.set_title("standard deviation of projection, px")
+    last.grid(True, which="both", alpha=0.3)
+    last.legend(fontsize=8)
+    return _png(figure)
+
+
+def halves_png(found: CameraCalibration) -> bytes:
+    """Return how far calibrations by either half of the views are apart, over each image."""
+    cameras = found.found.at.cameras
+    figure, axes = _figure(1, len(cameras))
+    for c, camera in enumerate(cameras):
+        _map(axes[0][c], found.verdict.grid[c], found.verdict.halves.off_px[c], camera)
+        axes[0][c].set_title(f"{_name(found, c)}: halves of the views apart, px")
+    return _png(figure)
+
+
+def residuals_png(found: CameraCalibration) -> bytes:
+    """Return the residuals of each camera's corners."""
+    figure, axes = _figure(1, len(found.found.at.cameras))
+    for c in range(len(found.found.at.cameras)):
+        _draw_residuals(axes[0][c], found, c)
+    return _png(figure)
+
+
+def depth_png(found: CameraCalibration) -> bytes:
+    """Return the uncertainty of a pair's depth over the image and over distance."""
+    figure, axes = _figure(1, 2)
+    _draw_depth(axes[0], found)
+    return _png(figure)
+
+
+def _figure(rows: int, columns: int) -> tuple[Any, Any]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    cameras = found.found.at.cameras
-    rows = len(cameras) + (len(cameras) > 1)
-    figure = Figure(figsize=(13, 3.7 * rows), layout="constrained")
+    figure = Figure(figsize=(_WIDTH_INCHES, _ROW_INCHES * rows), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, 3, squeeze=False)
-    for c, camera in enumerate(cameras):
-        _draw_camera(axes[c], found, c, camera)
-    if len(cameras) > 1:
-        _draw_depth(axes[-1], found)
-    figure.savefig(path, dpi=90)
+    return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _draw_camera(axes: Any, found: CameraCalibration, c: int, camera: CameraModel) -> None:
-    name = ("left", "right")[c] if len(found.found.at.cameras) > 1 else "camera"
+def _png(figure: Any) -> bytes:
+    out = BytesIO()
+    figure.savefig(out, dpi=_DPI, format="png")
+    return out.getvalue()
+
+
+def _name(found: CameraCalibration, c: int) -> str:
+    return ("left", "right")[c] if len(found.found.at.cameras) > 1 else "camera"
+
+
+def _draw_corners(axes: Any, found: CameraCalibration, c: int) -> None:
     rows = found.seen.camera == c
     uv = found.seen.uv[rows]
     used = found.found.used[rows]
-    r = found.found.residuals_px[rows]
-    axes[0].plot(*uv[used].T, ".", ms=1.5, color="tab:blue")
-    axes[0].plot(*uv[~used].T, "x", ms=4, color="tab:red")
-    axes[0].set_title(f"{name}: {used.sum()} corners, {np.sum(~used)} refused")
-    _image_axes(axes[0], camera)
+    axes.plot(*uv[used].T, ".", ms=1.5, color="tab:blue")
+    axes.plot(*uv[~used].T, "x", ms=4, color="tab:red")
+    axes.set_title(f"{_name(found, c)}: {used.sum()} corners, {np.sum(~used)} refused")
+    _image_axes(axes, found.found.at.cameras[c])
+
+
+def _draw_uncertainty(axes: Any, found: CameraCalibration, c: int) -> None:
     sigma = found.verdict.inflation * found.verdict.projection_sigma_px[c]
-    _map(axes[1], found.verdict.grid[c], sigma, camera)
-    axes[1].set_title(f"{name}: standard deviation of projection, px")
+    _map(axes, found.verdict.grid[c], sigma, found.found.at.cameras[c])
+    axes.set_title(f"{_name(found, c)}: standard deviation of projection, px")
+
+
+def _draw_residuals(axes: Any, found: CameraCalibration, c: int) -> None:
+    r = found.found.residuals_px[found.seen.camera == c]
     limit = 4 * float(found.found.sigma_px[c])
-    axes[2].plot(*np.clip(r, -limit, limit).T, ".", ms=1.5)
-    axes[2].set_xlim(-limit, limit)
-    axes[2].set_ylim(-limit, limit)
-    axes[2].set_aspect("equal")
-    axes[2].set_title(f"{name}: residuals, sigma {found.found.sigma_px[c]:.3f} px")
+    axes.plot(*np.clip(r, -limit, limit).T, ".", ms=1.5)
+    axes.set_xlim(-limit, limit)
+    axes.set_ylim(-limit, limit)
+    axes.set_aspect("equal")
+    axes.set_title(f"{_name(found, c)}: residuals, sigma {found.found.sigma_px[c]:.3f} px")
 
 
 def _draw_depth(axes: Any, found: CameraCalibration) -> None:
@@ -66,10 +165,9 @@ def _draw_depth(axes: Any, found: CameraCalibration) -> None:
     axes[1].set_xlabel("distance, m")
     axes[1].set_title("standard deviation of depth, m")
     axes[1].grid(True, which="both", alpha=0.3)
-    axes[2].axis("off")
 
 
-def _map(axes: Any, grid: Any, values: Any, camera: CameraModel) -> None:
+def _map(axes: Any, grid: FloatArray, values: FloatArray, camera: CameraModel) -> None:
     shape = (len(np.unique(grid[:, 1])), len(np.unique(grid[:, 0])))
     drawn = axes.contourf(
         grid[:, 0].reshape(shape),

@@ -53,6 +53,19 @@ def page_of(target: Target) -> Page:
     return Page(right + _MARGIN_MM, ruler_top + _RULER_MM, rectangles, words)
 
 
+def printed_light(target: Target, texels_per_m: float, margin_m: float) -> FloatArray:
+    """Return a board as an image (H, W) of ones where the paper is light and zeros where it is
+    dark, with a margin around the pattern, of its outermost tags or squares.
+    """
+    width, height = (round((side + 2 * margin_m) * texels_per_m) for side in target.extent_m)
+    out = np.ones((height, width))
+    for rectangle in target.dark_rectangles():
+        edges = np.rint((rectangle + margin_m) * texels_per_m).astype(int)
+        left, top, right, bottom = np.maximum(edges, 0).tolist()
+        out[top:bottom, left:right] = 0.0
+    return out
+
+
 def write_page(target: Target, path: Path) -> None:
     """Write a board as SVG or PDF, by the file's suffix.
 

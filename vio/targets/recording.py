@@ -37,6 +37,7 @@ MAX_FRAMES = 80  # in which the board is looked for, spread over the recording
 _ASSUMED_STEP_NS = 1_000_000_000  # between the pairs of a folder of photographs
 _MIN_MOTION_HZ = 5.0  # of frames, where an IMU is calibrated
 _MAX_MOTION_FRAMES = 400
+_SAMPLES = 4  # frames that are kept to explain a failure
 
 Images = tuple[Image, ...]
 
@@ -50,6 +51,7 @@ class Filmed:
     frames: int  # in which it was looked for
     imu: ImuRecord | None
     notes: tuple[str, ...]
+    samples: tuple[Images, ...] = ()  # images of some frames, by which a failure is explained
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,8 +224,10 @@ def film(
     wanted = max_frames or _frames_wanted(raw, has_imu=imu is not None)
     chosen = np.unique(np.linspace(0, count - 1, min(wanted, count)).round().astype(int)).tolist()
     views: list[View] = []
+    samples: list[Images] = []
     sizes: tuple[tuple[int, int], ...] = ()
     frames = 0
+    between = max(len(chosen) // _SAMPLES, 1)
     workers = os.cpu_count() or 1
     loaded = raw.load(chosen)
     with ThreadPoolExecutor(workers) as pool:
@@ -231,6 +235,8 @@ def film(
             flat = [image for _, images in batch for image in images]
             found = iter(list(pool.map(detector.detect, flat)))
             for time_ns, images in batch:
+                if frames % between == 0:
+                    samples.append(images)
                 frames += 1
                 sizes = tuple((image.shape[1], image.shape[0]) for image in images)
                 corners = tuple(next(found) for _ in images)
@@ -239,7 +245,7 @@ def film(
                 progress(frames, len(chosen))
     if not frames:
         raise DataError(f"{raw.path}: no image could be read; copy it again")
-    return Filmed(views, sizes, frames, imu, raw.notes)
+    return Filmed(views, sizes, frames, imu, raw.notes, tuple(samples))
 
 
 def _frames_wanted(raw: RawRecording, *, has_imu: bool) -> int:

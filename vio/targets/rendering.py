@@ -15,6 +15,7 @@ from vio.geometry.distortion import CameraModel, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.records import Image
 from vio.targets.description import Target
+from vio.targets.printing import printed_light
 
 DARK = 35.0  # gray values of print, paper and background
 LIGHT = 210.0
@@ -42,12 +43,8 @@ def texture(target: Target) -> tuple[FloatArray, float, float]:
         module = target.size_m / 16
     scale = _TEXELS / module
     margin = 0.5 * target.size_m
-    width, height = (round((side + 2 * margin) * scale) for side in target.extent_m)
-    out = np.full((height, width), LIGHT)
-    for rectangle in target.dark_rectangles():
-        left, top, right, bottom = np.rint((rectangle + margin) * scale).astype(int)
-        out[top:bottom, left:right] = DARK
-    return out, scale, margin
+    light = printed_light(target, scale, margin)
+    return np.where(light > 0, LIGHT, DARK), scale, margin
 
 
 def bow_depth(bow: FloatArray, target: Target, points_m: FloatArray) -> FloatArray:

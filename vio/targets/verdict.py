@@ -27,6 +27,7 @@ from vio.targets.bundle import (
     BoardAdjustment,
     BoolArray,
     RigFit,
+    bow_shape,
     layout_of,
     lens_moved,
 )
@@ -34,12 +35,13 @@ from vio.targets.views import Sightings
 
 DEPTH_M = 5.0  # where a pair's uncertainty is stated
 _GRID = (13, 9)  # pixels along width and height at which maps are made
+_COMPENSATED = 500  # corners by which a motion of the camera is determined
 _STEP_SIGMAS = 0.1  # of numerical differences
 _HONEST = 1.5  # halves further apart than so many times what is stated inflate the sigmas
 _MEDIAN_LENGTH = 1.1774  # of a vector of two Gaussian components of unit variance
 _UNSYNCHRONISED = 1.5  # residual of the pair over that of the cameras alone
-_MIN_TILT_DEG = 15.0
-_CELLS = 3  # along each side of the image, which must hold corners
+MIN_TILT_DEG = 15.0
+CELLS = 3  # along each side of the image, which must hold corners
 _MIN_CELL_SHARE = 0.01  # of all corners, in a cell of the image
 _ROWS = ("upper", "middle", "lower")
 _COLS = ("left", "centre", "right")
@@ -115,6 +117,44 @@ def projection_sigma(
     out = np.full(len(uv), np.nan)
     out[valid] = np.sqrt(np.maximum(np.linalg.eigvalsh(P)[:, 1], 0))
     return out
+
+
+def projection_sigma_from_views(
+    found: Adjusted, seen: Sightings, camera: int, distance_m: float
+) -> FloatArray:
+    """Standard deviation (G,) in pixels of the projection of points at a distance, in its worst
+    direction, after the motion of the camera that undoes most of it at the corners in its views.
+
+    It is least at the distances at which the board was shown.
+    """
+    fit = found.at
+    model = fit.cameras[camera]
+    lens = layout_of(fit.cameras).lenses[camera]
+    rows = np.flatnonzero((seen.camera == camera) & found.used)
+    rows = rows[:: -(-len(rows) // _COMPENSATED)]
+    board = np.column_stack([seen.points_m, bow_shape(seen.points_m) @ fit.bow])
+    T = fit.T_cam_cam0[camera] @ fit.T_cam0_board[seen.view[rows]]
+    corners = np.einsum("rij,rj->ri", T[:, :3, :3], board[seen.point[rows]]) + T[:, :3, 3]
+    D, motion = _lens_and_motion(model, corners)
+    undone = np.linalg.lstsq(
+        motion.reshape(-1, motion.shape[2]), D.reshape(-1, D.shape[2]), rcond=None
+    )[0]
+    uv = pixel_grid(model)
+    rays, valid = unproject_pixel(model, uv)
+    D, motion = _lens_and_motion(model, distance_m * rays)
+    J = D - motion @ undone
+    P = J @ found.covariance[lens, lens] @ np.swapaxes(J, 1, 2)
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(P)[:, 1], 0))
+    return np.where(valid, sigma, np.nan)
+
+
+def _lens_and_motion(camera: CameraModel, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of pixels (N, 2) of points (N, 3) by the lens, (N, 2, 4 + n), and by a motion of
+    the camera, (N, 2, 6).
+    """
+    by_p = uv_D_point(camera, p)
+    motion = np.concatenate([by_p, -by_p @ so3_hat(p)], axis=2)
+    return uv_D_camera(camera, p), motion
 
 
 def projection_difference(a: CameraModel, b: CameraModel) -> FloatArray:
@@ -268,34 +308,51 @@ def _unsynchronised(found: Adjusted, alone_sigma_px: Sequence[float]) -> list[st
     ]
 
 
+def corners_by_part(uv: FloatArray, width: int, height: int) -> FloatArray:
+    """Return how many pixels (K, 2) lie in each of the image's parts (CELLS^2,), row by row."""
+    cell = np.clip(uv * CELLS / [width, height], 0, CELLS - 0.01).astype(int)
+    counts = np.bincount(CELLS * cell[:, 1] + cell[:, 0], minlength=CELLS**2)
+    return counts.astype(np.float64)
+
+
+def part_name(number: int) -> str:
+    """Return the name of one of the image's parts."""
+    return f"{_ROWS[number // CELLS]} {_COLS[number % CELLS]}"
+
+
 def coverage_findings(seen: Sightings, cameras: Sequence[CameraModel]) -> list[str]:
     """Return which parts of the images hold no corners, one line for each camera."""
     out: list[str] = []
     names = ("left", "right") if len(cameras) > 1 else ("",)
     for c, camera in enumerate(cameras):
         uv = seen.uv[seen.camera == c]
-        cell = np.minimum(uv * _CELLS / [camera.width, camera.height], _CELLS - 0.01).astype(int)
-        counts = np.bincount(_CELLS * cell[:, 1] + cell[:, 0], minlength=_CELLS**2)
-        empty = [
-            f"{_ROWS[k // _CELLS]} {_COLS[k % _CELLS]}"
-            for k in np.flatnonzero(counts < _MIN_CELL_SHARE * len(uv)).tolist()
-        ]
+        counts = corners_by_part(uv, camera.width, camera.height)
+        few = np.flatnonzero(counts < _MIN_CELL_SHARE * len(uv)).tolist()
+        empty = [part_name(k) for k in few]
         if empty:
             image = f"{names[c]} image" if names[c] else "image"
             out.append(f"the {image} is empty at {', '.join(empty)}: show the board there")
     return out
 
 
+def board_tilts_deg(fit: RigFit) -> FloatArray:
+    """Return by how much the board was tilted in each view (V, 2): forwards and backwards, and to
+    the left and right.
+    """
+    normal = fit.T_cam0_board[:, :3, 2]
+    about_x = np.arctan2(normal[:, 1], normal[:, 2])
+    about_y = np.arctan2(normal[:, 0], normal[:, 2])
+    return np.degrees(np.column_stack([about_x, about_y]))
+
+
 def tilt_findings(fit: RigFit) -> list[str]:
     """Return the axes about which the board was not tilted."""
-    normal = fit.T_cam0_board[:, :3, 2]
-    about_x = np.degrees(np.arctan2(normal[:, 1], normal[:, 2]))
-    about_y = np.degrees(np.arctan2(normal[:, 0], normal[:, 2]))
+    about_x, about_y = board_tilts_deg(fit).T
     out: list[str] = []
     for tilt, words in ((about_x, "forwards and backwards"), (about_y, "to the left and right")):
-        if float(np.percentile(np.abs(tilt), 90)) < _MIN_TILT_DEG:
+        if float(np.percentile(np.abs(tilt), 90)) < MIN_TILT_DEG:
             out.append(
-                f"the board is tilted {words} by less than {_MIN_TILT_DEG:.0f} degrees: tilt it "
+                f"the board is tilted {words} by less than {MIN_TILT_DEG:.0f} degrees: tilt it "
                 "more, up to 40 degrees"
             )
     return out

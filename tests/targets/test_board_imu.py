@@ -1,0 +1,139 @@
+"""A camera and an IMU before a board: corners without rendering, records as a hand makes them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.board_views import GRID, LEFT
+from tests.calibration.test_camera_imu import DENSITIES, OFFSET_S, RATE_HZ, T_CAM_IMU, _errors
+from tests.calibration.test_camera_imu import _pose as hand_pose
+from vio.filters.imu_terms import CHOSEN, ImuTerms, term_sigmas
+from vio.geometry.distortion import project_point
+from vio.geometry.lie import (
+    FloatArray,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+    so3_log,
+    transform_points,
+)
+from vio.records import ImuRecord, imu_matrices
+from vio.targets.bundle import RigFit
+from vio.targets.corners import Corners
+from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu
+from vio.targets.rendering import board_points
+from vio.targets.start import pose_only
+from vio.targets.views import View, sightings
+
+NOISE_PX = 0.1
+VIEW_STEP_S = 0.2
+
+
+def _imu(seed: int, seconds: float, terms: FloatArray) -> ImuRecord:
+    """An IMU on a hand, with white noise and walking biases; scale and misalignment by `terms`."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0, seconds, 1 / RATE_HZ)
+    h = 1e-4
+    before, now, after = (hand_pose(t + d, seed, 1.0) for d in (-h, 0.0, h))
+    R = now[:, :3, :3]
+    gyro = so3_log(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]) / (2 * h)
+    a = (after[:, :3, 3] - 2 * now[:, :3, 3] + before[:, :3, 3]) / h**2
+    accel = np.einsum("nji,nj->ni", R, a + np.array([0, 0, 9.81]))
+    root = np.sqrt(RATE_HZ)
+    M_accel, M_gyro = imu_matrices(terms)
+    out = []
+    for values, M, bias, white, walk in (
+        (gyro, M_gyro, [0.01, -0.02, 0.005], DENSITIES.gyro, DENSITIES.gyro_walk),
+        (accel, M_accel, [0.1, 0.05, -0.08], DENSITIES.accel, DENSITIES.accel_walk),
+    ):
+        noise = np.cumsum(walk / root * rng.normal(size=values.shape), axis=0)
+        noise += white * root * rng.normal(size=values.shape)
+        out.append((values + bias + noise) @ np.linalg.inv(M).T)
+    return ImuRecord(np.round(1e9 * t).astype(np.int64), out[0], out[1])
+
+
+def _poses(seed: int, seconds: float, size: float = 1.0) -> BoardPoses:
+    """Poses by corners of a board that is `size` times as large as its file says."""
+    rng = np.random.default_rng(1000 + seed)
+    shots = np.arange(VIEW_STEP_S, seconds - VIEW_STEP_S, VIEW_STEP_S)
+    points = size * board_points(GRID)
+    centre = 0.5 * size * np.array(GRID.extent_m)
+    T_cam_board = se3_from_parts(so3_exp([0.3, 0.2, 0.1]), [*-centre, 0.9])
+    T_world_board = se3_inverse(T_CAM_IMU) @ T_cam_board
+    T_world_cam = hand_pose(shots, seed, 1.0) @ se3_inverse(T_CAM_IMU)
+    views: list[View] = []
+    for second, T in zip(shots.tolist(), se3_inverse(T_world_cam) @ T_world_board, strict=True):
+        uv, seen = project_point(LEFT, transform_points(T, points))
+        inside = seen & (uv > 4).all(axis=1) & (uv < [747, 475]).all(axis=1)
+        ids = np.flatnonzero(inside)
+        if len(ids) >= 12:
+            noisy = uv[ids] + NOISE_PX * rng.normal(size=(len(ids), 2))
+            views.append(View(round(1e9 * (second - OFFSET_S)), (Corners(ids, noisy),)))
+    seen_all = sightings(views, GRID.points_m)
+    fit = RigFit((LEFT,), np.eye(4)[None], np.zeros((1, 4, 4)), np.zeros(2))
+    problem, found = pose_only(fit, seen_all)
+    good = np.bincount(seen_all.view[found.used], minlength=len(views)) >= 12
+    times = np.array([view.time_ns for view in views], dtype=np.int64)
+    information = problem.pose_information(found)
+    return BoardPoses(times[good], found.at.T_cam0_board[good], information[good])
+
+
+def _found(
+    seed: int, seconds: float, *, size: float = 1.0, terms: ImuTerms = "off", wrong: float = 0.0
+) -> tuple[CameraImu, FloatArray]:
+    """The calibration, and the terms that are true; `wrong`: standard deviations they are off by."""
+    true = wrong * term_sigmas() * np.random.default_rng(seed).normal(size=15)
+    record = _imu(seed, seconds, true)
+    return calibrate_imu(_poses(seed, seconds, size), record, DENSITIES, terms=terms), true
+
+
+def _check(seeds: range, seconds: float, low: float, high: float) -> None:
+    nees: list[float] = []
+    for seed in seeds:
+        found, _ = _found(seed, seconds)
+        error = _errors(found)
+        assert np.linalg.norm(error[:3]) < 1e-3
+        assert np.degrees(np.linalg.norm(error[3:6])) < 0.02
+        assert abs(error[6]) < 5e-5
+        assert found.weak == ()
+        assert found.board_scale == pytest.approx(1, abs=5 * found.board_scale_sigma)
+        nees.append(float(error @ np.linalg.solve(found.covariance, error)))
+    # Bounds of chi-square with 7 degrees of freedom a seed.
+    assert low < np.sum(nees) < high
+
+
+def test_errors_are_those_of_the_covariance() -> None:
+    _check(range(2), 15.0, 5.6, 26.1)  # 95 % of 14 degrees of freedom
+
+
+@pytest.mark.slow
+def test_errors_of_a_minute_are_those_of_the_covariance() -> None:
+    _check(range(8), 60.0, 37.2, 78.6)  # 95 % of 56 degrees of freedom
+
+
+def test_finds_scale_and_misalignment_of_the_imu() -> None:
+    found, true = _found(3, 20.0, terms="full", wrong=1.0)
+    sigma = found.term_sigmas
+    assert (sigma[CHOSEN["full"]] < 0.5 * term_sigmas()).sum() > 10
+    assert np.sqrt(np.mean(((found.terms - true) / sigma) ** 2)) < 1.8
+    error = _errors(found)
+    assert np.linalg.norm(error[:3]) < 1e-3
+    assert np.degrees(np.linalg.norm(error[3:6])) < 0.05
+
+
+@pytest.mark.parametrize(("size", "words"), [(1.05, "larger"), (0.95, "smaller")])
+def test_names_a_board_of_another_size(size: float, words: str) -> None:
+    found, _ = _found(2, 15.0, size=size)
+    assert found.board_scale == pytest.approx(size, abs=0.01)
+    finding = next(text for text in found.weak if "by the IMU the board is" in text)
+    assert words in finding
+    assert "--size" in finding
+    assert "\n" not in finding
+
+
+def test_a_short_record_leaves_the_terms_at_their_priors() -> None:
+    found, _ = _found(1, 10.0, terms="scale")
+    assert (found.term_sigmas[np.setdiff1d(CHOSEN["full"], CHOSEN["scale"])] == 0).all()
+    assert (found.term_sigmas[CHOSEN["scale"]] > 0).all()
+    assert (found.term_sigmas <= 1.01 * term_sigmas()).all()

@@ -1,0 +1,230 @@
+"""Why a board is not found in images: they are mirrored, or it is another one than in the file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.numerics.robust import median
+from vio.records import Image
+from vio.targets.corners import CornerDetector, subpixel
+from vio.targets.description import APRILTAG, Target, marker_dictionary
+from vio.targets.homography import homographies, mapped
+from vio.targets.seeds import MarkerReader, Read
+
+_MIN_MARKERS = 4  # of one image that show which board it is
+_MAX_COLS = 14
+_SPACINGS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
+_MARKER_SHARES = (0.5, 0.6, 0.7, 0.75, 0.8)
+_MUCH_BETTER = 0.4  # misfit over that of the file's board, below which another one is named
+_MAX_MISFIT = 0.15  # of a marker's side, of the board that is named
+_WINDOW_SHARE = 0.12  # of a marker's side: half the window in which its corners are refined
+_COMPARED = 9  # markers by which boards are compared
+_MARKERS_TRIED = 100  # numbers that are read
+# Dictionaries of which all smaller ones of a size are the beginning.
+_DICTIONARIES = (
+    "DICT_4X4_1000",
+    "DICT_5X5_1000",
+    "DICT_6X6_1000",
+    "DICT_7X7_1000",
+    "DICT_ARUCO_ORIGINAL",
+    APRILTAG,
+)
+
+
+def diagnose(images: Sequence[Image], target: Target) -> str | None:
+    """Return what is wrong with images of one camera or with the target file, in a clause that
+    says what to do; None: it is not known.
+
+    Args:
+        images: some of a recording, (H, W) each.
+        target: the board as described.
+    """
+    detector = CornerDetector(target)
+    seen = sum(len(detector.detect(image)) > 0 for image in images)
+    if target.kind != "checkerboard":
+        turned = [np.ascontiguousarray(image[:, ::-1]) for image in images]
+        if sum(len(detector.detect(image)) > 0 for image in turned) > seen:
+            return (
+                "the images are mirrored: the board is found in their mirror images alone; record "
+                "them as the camera sees, without a flip"
+            )
+        if (other := _other_arrangement(images, target)) is not None:
+            return other
+    return _other_kind(images, target, is_seen=seen > 0)
+
+
+def _other_arrangement(images: Sequence[Image], target: Target) -> str | None:
+    """Say in which rows and at which distances the markers stand, where not as described."""
+    read = _close_together(_most_read(images, _with_more_markers(target)))
+    if len(read) < _MIN_MARKERS:
+        return None
+    best = min(_arrangements(target), key=lambda other: _misfit(read, other))
+    misfit = _misfit(read, best)
+    if misfit > _MAX_MISFIT or misfit > _MUCH_BETTER * _misfit(read, target):
+        return None
+    if best.cols != target.cols:
+        one = "tags" if target.kind == "aprilgrid" else "squares"
+        return (
+            f"the board in the images has rows of {best.cols} {one}, and the target file says "
+            f"{target.cols}; give the file of this board"
+        )
+    if best.legacy != target.legacy:
+        return (
+            "the board in the images is one of OpenCV "
+            f"{'before' if best.legacy else 'since'} 4.6; write legacyPattern: "
+            f"{str(best.legacy).lower()} into the target file"
+        )
+    name = "tagSpacing" if target.kind == "aprilgrid" else "markerSize / squareSize"
+    return (
+        f"{name} is about {best.ratio:g} in the images, and {target.ratio:g} in the target file; "
+        "measure it on the print"
+    )
+
+
+def _with_more_markers(target: Target) -> Target:
+    """Return a board with as many markers as are tried."""
+    known = len(marker_dictionary(target.dictionary).bytesList) - target.first_id
+    count = max(min(_MARKERS_TRIED, known), 1)
+    if target.kind == "aprilgrid":
+        return replace(target, rows=1, cols=count)
+    return replace(target, rows=max(2 * count // _MAX_COLS, 3), cols=_MAX_COLS, legacy=False)
+
+
+def _most_read(images: Sequence[Image], target: Target) -> list[Read]:
+    """Return the markers of the image that shows most of them."""
+    reader = MarkerReader(target)
+    return max((_refined(image, reader.find(image)) for image in images), key=len, default=[])
+
+
+def _refined(image: Image, read: Sequence[Read]) -> list[Read]:
+    """Return markers whose corners are where the image has theirs."""
+    half_px = [max(_WINDOW_SHARE * one.side_px, 2.0) for one in read]
+    return [
+        replace(one, uv=subpixel(image, one.uv, int(half)))
+        for one, half in zip(read, half_px, strict=True)
+    ]
+
+
+def _close_together(read: Sequence[Read]) -> list[Read]:
+    """Return markers next to each other, which one homography holds in spite of the lens."""
+    if not read:
+        return []
+    centre = np.stack([one.uv.mean(axis=0) for one in read])
+    middle = centre[np.argmin(np.linalg.norm(centre - centre.mean(axis=0), axis=1))]
+    near = np.argsort(np.linalg.norm(centre - middle, axis=1))[:_COMPARED]
+    return [read[k] for k in near.tolist()]
+
+
+def _arrangements(target: Target) -> Iterator[Target]:
+    """Yield boards of the same markers in other rows and at other distances."""
+    is_grid = target.kind == "aprilgrid"
+    ratios = _SPACINGS if is_grid else _MARKER_SHARES
+    for cols in range(2 if is_grid else 3, _MAX_COLS + 1):
+        for ratio in (target.ratio, *ratios):
+            yield replace(target, cols=cols, ratio=ratio)
+            if not is_grid:
+                yield replace(target, cols=cols, ratio=ratio, legacy=not target.legacy)
+
+
+def _misfit(read: Sequence[Read], target: Target) -> float:
+    """Median distance of markers' corners from one homography of a board, over their sides."""
+    numbers = [one.id - target.first_id for one in read]
+    board = _corners_of(target, numbers)
+    uv = np.stack([one.uv for one in read])
+    H = homographies(board.reshape(1, -1, 2), uv.reshape(1, -1, 2))
+    off = np.linalg.norm(mapped(H, board.reshape(1, -1, 2))[0] - uv.reshape(-1, 2), axis=1)
+    return median(off) / median(np.array([one.side_px for one in read]))
+
+
+def _corners_of(target: Target, numbers: Sequence[int]) -> FloatArray:
+    """Corners (M, 4, 2) of markers by their numbers, on a board with as many rows as they need."""
+    if target.kind == "aprilgrid":
+        rows = max(target.rows, max(numbers) // target.cols + 1)
+    else:
+        rows = max(target.rows, 2 * (max(numbers) + 1) // target.cols + 2)
+        # Whether the first square is dark depends on the rows of an old board.
+        rows += (rows - target.rows) % 2
+    corners = replace(target, rows=rows).marker_corners()
+    return np.stack([corners[number] for number in numbers])
+
+
+def _other_kind(images: Sequence[Image], target: Target, *, is_seen: bool) -> str | None:
+    """Say which board the images show, where it is another one."""
+    shown: str | None = None
+    if target.kind == "checkerboard":
+        # Part of a larger board may have been taken for it.
+        shown = _checkerboard_in(images, target)
+    if shown is None and not is_seen:
+        shown = _tags_in(images, target) or _markers_in(images, target)
+        if shown is None and target.kind != "checkerboard":
+            shown = _checkerboard_in(images, target)
+    if shown is None:
+        return None
+    return (
+        f"the images show {shown}, and the target file is of another board ({target}); give the "
+        "file of the board that was recorded"
+    )
+
+
+def _checkerboard_in(images: Sequence[Image], target: Target) -> str | None:
+    """Return a checkerboard in the images that is not the target."""
+    import cv2
+
+    for image in images:
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+        done, _, meta = cv2.findChessboardCornersSBWithMeta(image, (4, 4), flags)
+        if done and meta is not None:
+            rows, cols = meta.shape[:2]
+            size = (cols + 1, rows + 1)
+            is_own = target.kind == "checkerboard" and sorted(size) == sorted(
+                (target.cols, target.rows)
+            )
+            return None if is_own else f"a checkerboard of {size[0]} x {size[1]} squares"
+    return None
+
+
+def _tags_in(images: Sequence[Image], target: Target) -> str | None:
+    """Return tags of an AprilGrid in the images that are not those of the target."""
+    read = _most_read(images, Target("aprilgrid", 1, _MARKERS_TRIED, 0.1, 0.3))
+    if len(read) < _MIN_MARKERS:
+        return None
+    numbers = [one.id for one in read]
+    if target.kind == "aprilgrid" and _are_own(numbers, target):
+        return None
+    return f"an AprilGrid with tags {min(numbers)} to {max(numbers)} among others"
+
+
+def _are_own(numbers: Sequence[int], target: Target) -> bool:
+    """Return whether markers of these numbers are on the target."""
+    first = target.first_id
+    return min(numbers) >= first and max(numbers) < first + len(target.marker_corners())
+
+
+def _markers_in(images: Sequence[Image], target: Target) -> str | None:
+    """Return markers of some dictionary in the images that are not those of the target."""
+    import cv2
+
+    most = _MIN_MARKERS - 1
+    found: str | None = None
+    for name in _DICTIONARIES:
+        detector = cv2.aruco.ArucoDetector(marker_dictionary(name), cv2.aruco.DetectorParameters())
+        for image in images:
+            ids = detector.detectMarkers(image)[1]
+            numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
+            if len(numbers) > most:
+                most = len(numbers)
+                alike = _size_of(name) == _size_of(target.dictionary)
+                found = None
+                if alike and _are_own(numbers, target):
+                    continue
+                found = f"markers of {name}, {min(numbers)} to {max(numbers)} among others"
+    return found
+
+
+def _size_of(dictionary: str) -> str:
+    """Return the name of a dictionary without the number of its markers."""
+    return dictionary.rpartition("_")[0]
