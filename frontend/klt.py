@@ -188,7 +188,7 @@ class KltFrontend:
 
     def _take_findings(self) -> tuple[Finding, ...]:
         """Return what was found since the last frame."""
-        parts = (self._right, self._delay, self._objects)
+        parts = (self._right, self._delay, self._matcher.turn, self._objects)
         return tuple(found for part in parts for found in part.take_findings())
 
     def _images(self, frame: StereoFrame) -> tuple[FrameImages | None, BoolArray | None]:

@@ -13,12 +13,14 @@ from vio.frontend.outliers import Consensus
 from vio.frontend.patches import ImageLevels
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.right_delay import PairingCounts, RightDelay, at_exposure, at_present
+from vio.frontend.right_turn import RightTurn
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, StereoFrame, TrackPrior
 
+_NEARLY_ALL = 0.9  # of the matches without an offset, that one with it may have
 _PAIRING_POINTS = 150  # features that are tried with images of other frames
 
 
@@ -44,6 +46,7 @@ class RightMatcher:
         self._camera = camera
         self._right = right
         self._delay = delay
+        self.turn = RightTurn(camera.fu)
 
     def match(
         self,
@@ -73,12 +76,18 @@ class RightMatcher:
         tested = motion is not None and not stereo.has_few_matches
         if delay == 0.0:
             matched = stereo.track_right(tracks, right, motion is not None)
-            if tested and self._right.doubts(matched.has_right[testable]):
+            few = self._right.doubts(matched.has_right[testable])
+            # one that stays may be too small to lose matches by
+            if tested and (few or self.turn.may_stay):
                 off = stereo.track_off_right(tracks, left, right, by_motion=not self._right.usable)
-                if off.has_right.sum() > matched.has_right.sum():
+                least = matched.has_right.sum() * (1.0 if few else _NEARLY_ALL)
+                if off.has_right.sum() > least and self.turn.is_offset(stereo.offset_px):
                     matched = off
                 else:
                     stereo.forget_offset()
+            turn_px = self.turn.frame(frame.index, stereo.offset_px)
+            if turn_px is not None:
+                stereo.take_out(turn_px)
         else:
             T = np.eye(4) if prior is None or prior.motion is None else prior.motion.T_curr_prev
             T = T if motion is None else motion.T_curr_prev

@@ -55,7 +55,6 @@ class _StereoRules(NamedTuple):
     beyond_share: float = 0.1
     min_beyond: int = 10  # … and this many at least …
     within_reach: float = 0.9  # … until this share of them is within it
-    offset_gain: float = 0.2  # part of a frame's common offset that is believed
     depth_slack: float = 0.1  # standard deviation of a point's depth by motion alone, over it
     min_spread_px: float = 2.0  # between near and far disparities, to tell an offset from a factor
     max_rows_half: int = 16  # row difference, pixels at half resolution
@@ -95,6 +94,8 @@ class StereoFit:
         self._rows = EpipolarRowModel(*size)
         self._unmatched = 0  # frames in a row with hardly any match
         self._offset_px = 0.0  # that is taken out of all disparities of the present frame
+        # the same of all frames: what a right camera that has turned adds to disparities
+        self._turn_px = 0.0
 
     def track_right(self, tracks: Tracks, right: ImageLevels, moved: bool) -> Tracks:
         """Match features of known depth; with a consensus motion (`moved`), check the disparity
@@ -109,9 +110,10 @@ class StereoFit:
         rows, expected = self._expected(tracks)
         if moved:
             self._follow(expected[tracks.has_right[rows]])
-        pixels, skew, valid = self._fit(tracks, rows, right, expected)
+        shown = self._shown(tracks.left[rows], expected)
+        pixels, skew, valid = self._fit(tracks, rows, right, shown)
         if moved:
-            valid &= np.abs(tracks.left[rows, 0] - pixels[:, 0] - expected) <= INLIER_PX
+            valid &= np.abs(tracks.left[rows, 0] - pixels[:, 0] - shown) <= INLIER_PX
         return self._with_right_pixels(tracks, rows, pixels, skew, valid)
 
     def track_off_right(
@@ -122,8 +124,7 @@ class StereoFit:
 
         A pair that turns a little in its mount, or whose cameras expose a millisecond apart while
         the rig turns, has disparities that are off by as much at all depths, (R1). That is taken
-        out of all matches of the frame, less a small part, so that an offset that stays becomes
-        that of all points. No match where it is more than a pair may turn by.
+        out of all matches of the frame. No match where it is more than a pair may turn by.
 
         Args:
             tracks: as for `track_right`, whose matches with it are too few.
@@ -136,7 +137,8 @@ class StereoFit:
         coarse, unique = self.search(left.half, right.half, tracks.left[rows])
         rows = rows[unique]
         expected = expected[unique]
-        pixels, skew, valid = self._fit(tracks, rows, right, coarse[unique])
+        shown = self._shown(tracks.left[rows], coarse[unique])
+        pixels, skew, valid = self._fit(tracks, rows, right, shown)
         rows = rows[valid]
         expected = expected[valid]
         pixels = pixels[valid]
@@ -150,12 +152,27 @@ class StereoFit:
             if by_motion
             else (median(off / grows), 0.0)
         )
-        if abs(offset) > self._camera.fu * _MAX_TURN_RAD:
+        if abs(offset - self._turn_px) > self._camera.fu * _MAX_TURN_RAD:
             return tracks
         tolerance = INLIER_PX + (_STEREO.depth_slack * expected if by_motion else 0.0)
         agree = np.abs(off - offset * grows - slope * expected) <= tolerance
-        self._offset_px = (1.0 - _STEREO.offset_gain) * offset
+        self._offset_px = offset
         return self._with_right_pixels(tracks, rows, pixels, skew, agree)
+
+    @property
+    def offset_px(self) -> float | None:
+        """What was taken out of the disparities of this frame alone; None: nothing."""
+        return None if self._offset_px == self._turn_px else self._offset_px
+
+    def take_out(self, turn_px: float) -> None:
+        """Take an offset of the disparities in the image's centre out of all matches from now on."""
+        self._turn_px = turn_px
+
+    def _shown(self, left: FloatArray, disparity: FloatArray) -> FloatArray:
+        """Disparities (K,) at left pixels (K, 2) as a right camera that has turned shows them."""
+        if not self._turn_px:
+            return disparity
+        return disparity + self._turn_px * self._offset_growth(left)
 
     def _offset_growth(self, left: FloatArray) -> FloatArray:
         """By how much more (N,) a turn of the right camera moves pixels at left pixels (N, 2)
@@ -178,7 +195,8 @@ class StereoFit:
         """Match the given rows (K,) near their disparities (K,)."""
         if not len(rows):
             return tracks
-        return self._with_right_pixels(tracks, rows, *self._fit(tracks, rows, right, disparity))
+        shown = self._shown(tracks.left[rows], disparity)
+        return self._with_right_pixels(tracks, rows, *self._fit(tracks, rows, right, shown))
 
     def search(
         self, left_half: Image, right_half: Image, points: FloatArray
@@ -191,13 +209,14 @@ class StereoFit:
             offset = self._best_offset(left_half, right_half, points, offset)
         correlation = _MIN_CORRELATION - _STEREO.coarse_slack
         right_half = shifted_rows(right_half, offset)
-        found = self._search(left_half, right_half, points, correlation)
-        if self._reach_wait:
-            return found
-        self._reach_wait = _STEREO.reach_frames
-        if not self._reaches_further(left_half, right_half, points[~found[1]]):
-            return found
-        return self._search(left_half, right_half, points, correlation)
+        disparity, unique = self._search(left_half, right_half, points, correlation)
+        if not self._reach_wait:
+            self._reach_wait = _STEREO.reach_frames
+            if self._reaches_further(left_half, right_half, points[~unique]):
+                disparity, unique = self._search(left_half, right_half, points, correlation)
+        if self._turn_px:
+            disparity = disparity - self._turn_px * self._offset_growth(points)
+        return disparity, unique
 
     def _reaches_further(self, left_half: Image, right_half: Image, points: FloatArray) -> bool:
         """Search further from now on if enough of the left pixels (N, 2) without a match have
@@ -279,8 +298,8 @@ class StereoFit:
         return int(self._search(left_half, right_half, points, _STEREO.good_match)[1].sum())
 
     def forget_offset(self) -> None:
-        """Take nothing out of the disparities that follow."""
-        self._offset_px = 0.0
+        """Take nothing out of the disparities that follow but what all frames have."""
+        self._offset_px = self._turn_px
 
     @property
     def has_few_matches(self) -> bool:

@@ -118,6 +118,11 @@ CODES: dict[str, Code] = {
         "points of known depth are not where the right image should show them",
         "check the mount of the right camera, and that the cameras expose together",
     ),
+    "right-camera-turned": Code(
+        "degraded",
+        "the right camera has turned in its mount; what that does to disparities is taken out",
+        "fix the mount of the right camera, and calibrate anew",
+    ),
     "right-image-late": Code(
         "degraded", "the right camera exposes later than the left one", _EXPOSURES
     ),

@@ -24,6 +24,7 @@ from tests.frontend.test_frontend_scene import (
 from tests.guards import codes, guarded_klt, lines_of, messages
 from vio.frontend.prediction import prior_depths
 from vio.frontend.right_camera import RightCamera
+from vio.frontend.right_turn import RightTurn
 from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.frontend.stereo_fit import common_offset
 from vio.geometry.lie import FloatArray, se3_exp
@@ -298,10 +299,8 @@ def flight_with_turns(yaw_deg: Callable[[int], float]) -> list[FrontendOutput]:
 
 @pytest.mark.parametrize("yaw_deg", [0.26, -0.26])
 def test_a_right_camera_that_turns_a_little_is_used_without_the_offset(yaw_deg: float) -> None:
-    """A quarter of a degree moves all disparities by 1.4 px and more, for single frames and for
-    good.
-    """
-    outputs = flight_with_turns(lambda k: yaw_deg if k == 3 or k >= 6 else 0.0)
+    """A quarter of a degree moves all disparities by 1.4 px and more, in single frames."""
+    outputs = flight_with_turns(lambda k: yaw_deg if k in (3, 6) else 0.0)
     assert [line for output in outputs for line in messages(output)] == []
     for k, pose in enumerate(flight(FRAMES)):
         seen = outputs[k].observations
@@ -310,6 +309,33 @@ def test_a_right_camera_that_turns_a_little_is_used_without_the_offset(yaw_deg: 
         off = matched.z[:, 2] - truth(SLANTED, pose, matched.z[:, :2], pose)[:, 2]
         if k in (3, 6):
             assert abs(np.median(off)) < 0.3 * CAMERA.fu * np.radians(abs(yaw_deg))
+
+
+def test_a_right_camera_that_stays_turned_is_named_once_and_put_back() -> None:
+    """Depths remain those of the pair as it was, those of new features too."""
+    outputs = flight_with_turns(lambda k: 0.2 if k >= 3 else 0.0)
+    found = [finding for output in outputs for finding in output.findings]
+    (turned,) = [f for f in found if f.code == "right-camera-turned"]
+    assert (turned.frame, turned.since) == (8, 3)
+    assert abs(turned.figures["turned_deg"]) == pytest.approx(0.2, rel=0.1)
+    for k, (output, pose) in enumerate(zip(outputs, flight(FRAMES), strict=True)):
+        seen = output.observations
+        matched = seen.take(seen.has_right)
+        assert len(matched) > 0.6 * len(seen)
+        off = matched.z[:, 2] - truth(SLANTED, pose, matched.z[:, :2], pose)[:, 2]
+        assert abs(np.median(off)) < 0.1, k
+
+
+def test_offsets_that_change_are_no_turn_that_stays() -> None:
+    shaking = RightTurn(700.0)
+    offsets = np.random.default_rng(5).normal(0.0, 2.0, 400)
+    assert all(shaking.frame(k, float(o)) is None for k, o in enumerate(offsets))
+    assert shaking.take_findings() == ()
+    apart = RightTurn(700.0)  # five in a row, and one after a frame without
+    for k, offset in enumerate([2.0] * 5 + [None, 2.0]):
+        assert apart.frame(k, offset) is None
+    ramp = RightTurn(700.0)
+    assert all(ramp.frame(k, 1.0 + 0.1 * k) is None for k in range(10))
 
 
 def test_a_right_camera_that_turns_far_is_not_used() -> None:
