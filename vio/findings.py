@@ -160,6 +160,11 @@ CODES: dict[str, Code] = {
     "frame-refused": Code("degraded", "the front end refused a frame", "see the message"),
     "frames-missing": Code("degraded", "no frame came for some time", _CAMERA),
     "frames-repeated": Code("degraded", "frames show an earlier exposure again", _CAMERA),
+    "images-held": Code(
+        "unusable",
+        "equal images were taken for a rig at standstill, and were an earlier exposure again",
+        _CAMERA,
+    ),
     "depths-repeated": Code("nominal", "depth images repeat an earlier one", _CAMERA),
     "frames-unread": Code("degraded", "frames of the recording could not be read", "see the files"),
     "no-features": Code(

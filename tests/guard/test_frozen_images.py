@@ -22,6 +22,7 @@ from vio.records import (
     Event,
     Image,
     ImuSample,
+    IntArray,
     MotionPrior,
     Observations,
     Prediction,
@@ -93,6 +94,42 @@ def _watching(*, shaking: bool = True, off_px: float = 0.1) -> FrozenImages:
         gyro, accel = turn + rng.normal(0, 3e-3, 3), np.array([0, 0, 9.81]) + rng.normal(0, 0.15, 3)
         frozen.sample(ImuSample(k * 5_000_000 - 950_000_000, gyro, accel))
     return frozen
+
+
+@pytest.mark.parametrize(
+    ("moved_px", "new_ids", "held"),
+    [(20.0, False, 3), (1.0, False, None), (1.0, True, 3)],
+    ids=["jumped", "begins to move", "all features lost"],
+)
+def test_equal_images_that_end_with_a_jump_were_given_again(
+    moved_px: float, new_ids: bool, held: int | None
+) -> None:
+    """By images alone a rig that hardly moves, and stops, looks like it up to then."""
+    frozen = FrozenImages()
+
+    def take(k: int, px: float, ids: IntArray = IDS) -> None:
+        left, right = _shifted(LEFT, px), _shifted(RIGHT, px)
+        assert frozen.check(_frame(k, left, right), None) is None
+        frozen.observations(observations(k, k * STEP_NS, ids, Z + px))
+
+    for k in range(3):
+        take(k, 0.1 * k)
+    for k in range(3, 9):
+        take(k, 0.2)
+        assert frozen.take_held() is None
+    take(9, 0.2 + moved_px, IDS + 1000 * new_ids)
+    assert frozen.take_held() == held
+    take(10, 0.3 + moved_px, IDS + 1000 * new_ids)
+    assert frozen.take_held() is None
+
+
+def test_what_moved_up_to_the_frame_before_has_not_stopped_at_once() -> None:
+    frozen = FrozenImages()
+    for k in range(3):
+        frozen.check(_frame(k, _shifted(LEFT, 2.0 * k), _shifted(RIGHT, 2.0 * k)), None)
+        frozen.observations(observations(k, k * STEP_NS, IDS, Z + 2.0 * k))
+    repeated = frozen.check(_frame(3, _shifted(LEFT, 4.0), _shifted(RIGHT, 4.0)), None)
+    assert repeated == Repeated(2, exact=True)
 
 
 def test_a_bit_equal_pair_is_a_repetition_where_the_imu_moves() -> None:

@@ -42,6 +42,12 @@ _RECENT = 20  # … at most in so many frames
 _MIN_RECENT = 5
 # flow between the two frames before (median), beyond which no rig stands still at once
 _MOVED_PX = 0.3
+# Equal images that were taken for a standstill are ended by a motion that begins. One that is there
+# at once, beyond so many pixels and times the flow before, or loses so many features, has gone on
+# unseen.
+_BEGUN_PX = 3.0
+_BEGUN_FACTOR = 10.0
+_BEGUN_SHARE = 0.2
 _UNMOVED_PX = 0.15  # the flow of an unmoved corner under noise of a few gray levels
 _SHARE = 0.8  # of the corners that must be unmoved
 _FIRST_ROWS = 8  # compared before all others
@@ -68,6 +74,9 @@ class FrozenImages:
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
         self._seen: Observations | None = None  # its features
         self._flow_px = 0.0  # of its features since the frame before (median)
+        self._still: tuple[int, float] | None = None  # first frame of equal ones, flow before it
+        self._ended_still: tuple[int, float] | None = None  # with the present frame
+        self._held_since: int | None = None
         self._repeating: Repeated | None = None  # of the frame before
         # the last frame with a depth image that is no repetition
         self._deep: StereoFrame | None = None
@@ -91,7 +100,17 @@ class FrozenImages:
             if len(a):
                 off = seen.z[a, :2] - self._expected.tracks.z[b, :2]
                 self._errors_px.append(median(np.linalg.norm(off, axis=1)))
-        self._flow_px = 0.0 if self._seen is None else _median_flow_px(self._seen, seen)
+        shared = 0.0
+        self._flow_px = 0.0
+        if self._seen is not None and len(self._seen):
+            shared = np.isin(self._seen.ids, seen.ids).mean()
+            self._flow_px = _median_flow_px(self._seen, seen)
+        if self._ended_still is not None:
+            since, before_px = self._ended_still
+            begun = self._flow_px > max(_BEGUN_PX, _BEGUN_FACTOR * before_px)
+            if begun or shared < _BEGUN_SHARE:
+                self._held_since = since
+            self._ended_still = None
         self._seen = seen
 
     def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
@@ -105,6 +124,14 @@ class FrozenImages:
         if self._repeating is None:
             self._shown = frame
         return self._repeating
+
+    def take_held(self) -> int | None:
+        """Return the first of the equal frames that were taken for a rig at standstill, and were
+        not, as the present frame shows; None: there are none.
+        """
+        since = self._held_since
+        self._held_since = None
+        return since
 
     def check_depth(self, frame: StereoFrame) -> Repeated | None:
         """Return which frame's depth image a frame repeats; None: it is new, or the rig is at
@@ -133,7 +160,12 @@ class FrozenImages:
             return None  # the front end refuses it
         again = self._repeating is not None  # what was given again once is, until it changes
         if all(_equal(new, old) for new, old in zip(images, before, strict=True)):
-            return Repeated(shown.index, True) if again or self._moves(expected) else None
+            if again or self._moves(expected):
+                return Repeated(shown.index, True)
+            self._still = self._still or (frame.index, self._flow_px)
+            return None
+        self._ended_still = self._still
+        self._still = None
         if self._seen is None or expected is None:
             return None
         if again:

@@ -166,6 +166,15 @@ class RunMonitor:
         if self._repeated:
             return
         self._frozen.observations(seen)
+        held_since = self._frozen.take_held()
+        if held_since is not None:
+            message = (
+                f"frame {seen.frame_index}: the images were the same to the last bit since frame "
+                f"{held_since}, as of a rig at standstill, and now show a motion that did not begin "
+                "just now: the camera or its driver gave them again; how the rig moved meanwhile "
+                "is not known"
+            )
+            self._add([Finding("images-held", message, seen.frame_index, held_since)])
         if self._inertial is not None:
             self._report_findings(self._inertial.frame(seen))
 
