@@ -262,7 +262,10 @@ def _process(what: _Run, delay: int) -> RunResult:
     monitor.ends_at_shifted_pairs = what.can_begin_again and not delay
     stopped = None
     with contextlib.closing(recorder), contextlib.closing(processor):
-        loop = _Loop(state, recorder, shown, _taken_frames(dataset, config, start, stop))
+        taken = _taken_frames(dataset, config, start, stop)
+        if state.delay and taken:
+            taken.discard(max(taken))  # it lacks the image that comes with the next one
+        loop = _Loop(state, recorder, shown, taken)
         try:
             with _opencv_threads(dataset, config, parts.frontend):
                 images = _needs_images(dataset, config) or processor.map is not None
@@ -471,10 +474,11 @@ class _Loop:
 
 def _paired_anew_line(delay: int) -> str:
     """Say that a run has begun again."""
-    which = "after" if delay > 0 else "before"
+    late, other = ("right", "left") if delay > 0 else ("left", "right")
     return (
-        f"each left image belongs to the right image of the frame {which} it, by the rows that "
-        "match; the run began again with these pairs; pair the images by their times of exposure"
+        f"each {late} image comes a frame later than the {other} one of its time, by the rows that "
+        "match; the run began again with the right pairs; pair the images by their times of "
+        "exposure"
     )
 
 
