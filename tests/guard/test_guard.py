@@ -176,6 +176,13 @@ def test_finds_by_how_many_frames_right_images_are_late(delay: int) -> None:
     assert find_delay(shifted(delay), CAMERA) == delay
 
 
+@pytest.mark.parametrize("rows", [-4, -3, -2, -1, 1, 2, 3, 4])
+def test_a_pitched_right_camera_is_none_of_another_time(rows: int) -> None:
+    """Among these is what the images move by in a frame, so that those of another frame match."""
+    pitched = [replace(pair, right=np.roll(pair.right, rows, axis=0)) for pair in frames()]
+    assert find_delay(pitched, CAMERA) in (0, None)
+
+
 def test_pairs_of_a_rig_at_standstill_are_not_judged() -> None:
     still = [replace(frames()[0], index=k, time_ns=k) for k in range(10)]
     assert find_delay(still, CAMERA) is None

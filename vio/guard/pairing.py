@@ -1,9 +1,10 @@
 """Left images that were paired with the right images of another frame from the start.
 
 Rows of a true pair agree. While the rig moves, those of a left image and the right one of the frame
-before or after agree less. In the first frames, corners of both left images are searched along the
-rows of this right image and of the one before; the pairing in which clearly more of them match in
-several frames is the right one.
+before or after agree less, by another amount in each frame: a right camera that is pitched has rows that
+are off by the same in all of them. In the first frames, corners of both left images are searched
+along the rows of this right image and of the one before; the pairing in which clearly more of them
+match is the right one, unless one difference of all rows explains the pairs as they came as well.
 
 A right image that belongs to the *next* left one (it came early) is held back for it. One that
 belongs to the left image *before* (it is late) is marked, as its left image is gone already.
@@ -19,10 +20,11 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.image_change import image_change
 from vio.guard.image_check import FrameImages, ImageCheck, images_of
-from vio.guard.probe import RowProbe
-from vio.records import Image, StereoFrame
+from vio.guard.probe import NEAR_ROWS, RowProbe
+from vio.records import Image, IntArray, StereoFrame
 
-_FRAMES = 3  # that must tell, all alike
+_FRAMES = 3  # that must have been counted
+_ALIKE = 2  # frames in a row after which the counts so far tell the same
 _MAX_TESTS = 40  # frames in which the rig moves, after which the pairing counts as right
 _MIN_POINTS = 30  # corners in a frame
 _MIN_CHANGE = 2.0  # of the left image since the last frame, gray levels at the common contrast
@@ -47,8 +49,10 @@ class PairingCheck(ImageCheck):
         super().__init__()
         self._probe = probe
         self._last: tuple[Image, Image, FloatArray] | None = None  # halves, and left corners
-        self._votes: list[int] = []
-        self._tests = 0
+        self._told: list[int | None] = []  # by the counts so far, after each frame
+        # of all frames: corners, and those that match in each pairing, at each difference of rows
+        self._points = 0
+        self._matched: dict[int, IntArray] = {}
         self._held: Image | None = None  # right image that belongs to the next left one
         self._begun_again = False
         self.delay: int | None = None  # None: not decided yet
@@ -82,24 +86,30 @@ class PairingCheck(ImageCheck):
         self._last = left.copy(), right.copy(), points
         if last is None:
             return
-        counts = PairingCounts(
-            points=min(len(points), len(last[2])),
-            same=self._probe.on_rows(left, right, points),
-            late=self._probe.on_rows(last[0], right, last[2]),
-            early=self._probe.on_rows(left, last[1], points),
-        )
-        self._count(images.index, counts)
+        matched = {
+            0: self._probe.near_rows(left, right, points),
+            1: self._probe.near_rows(last[0], right, last[2]),
+            -1: self._probe.near_rows(left, last[1], points),
+        }
+        self._count(images.index, min(len(points), len(last[2])), matched)
 
-    def _count(self, index: int, counts: PairingCounts) -> None:
-        """Count what a frame tells, and decide once enough frames tell the same."""
-        self._tests += 1
-        told = told_delay(counts)
-        if told is not None:
-            self._votes.append(told)
-        recent = self._votes[-_FRAMES:]
-        if len(recent) == _FRAMES and len(set(recent)) == 1:
+    def _count(self, index: int, points: int, matched: dict[int, IntArray]) -> None:
+        """Count the matches of a frame, and decide once those of enough frames tell."""
+        if points >= _MIN_POINTS:
+            self._points += points
+            before = self._matched
+            self._matched = {
+                delay: counts + before[delay] if before else counts
+                for delay, counts in matched.items()
+            }
+        if not self._matched:
+            self._told.append(None)
+        else:
+            self._told.append(_told(self._points, self._matched))
+        recent = self._told[-_ALIKE:]
+        if len(self._told) >= _FRAMES and recent[0] is not None and len(set(recent)) == 1:
             self._decide(index, recent[0])
-        elif self._tests >= _MAX_TESTS:
+        elif len(self._told) >= _MAX_TESTS:
             self._decide(index, 0)
 
     def _decide(self, index: int, delay: int) -> None:
@@ -123,6 +133,23 @@ class PairingCheck(ImageCheck):
         if held is None:
             return images.marked(skipped=True)
         return images.with_raw((images.raw[0], held))
+
+
+def _told(points: int, matched: dict[int, IntArray]) -> int | None:
+    """Return the delay by the rows as calibrated, unless a row difference that all frames have in
+    common explains the pairs as they came as well.
+
+    Args:
+        points: corners that were tried.
+        matched: of each delay, those that matched (K,) at each of `NEAR_ROWS`.
+    """
+    calibrated = len(NEAR_ROWS) // 2
+    as_calibrated = {delay: int(counts[calibrated]) for delay, counts in matched.items()}
+    counts = PairingCounts(points, as_calibrated[0], as_calibrated[1], as_calibrated[-1])
+    told = told_delay(counts)
+    if told is None or told == 0:
+        return told
+    return told if matched[told].max() > matched[0].max() else None
 
 
 def find_delay(frames: Iterable[StereoFrame], camera: StereoCamera) -> int | None:

@@ -10,7 +10,7 @@ from vio.frontend.detect import detect_corners
 from vio.frontend.settings import GridSettings
 from vio.frontend.stereo_match import match_rows, shifted_rows
 from vio.geometry.lie import FloatArray
-from vio.records import Image
+from vio.records import Image, IntArray
 
 CORNERS = 80  # that are searched, at most
 _MAX_DISPARITY = 0.64  # of the image width: near scenes, too
@@ -21,6 +21,8 @@ _MIN_MARGIN = 0.03  # lead over the second-best match of a row
 _MIN_NEGATIVE_PX = 1.0  # of a disparity that counts as negative
 _MAX_ROWS_HALF = 16  # row difference that is searched, pixels at half resolution
 _FEW = 0.2  # share of the corners with a match below which other row differences are tried
+# row differences of a camera that is pitched a little, pixels at half resolution
+NEAR_ROWS = np.arange(-3.0, 3.1, 0.5)
 _CLEARLY = 2  # times as many matches at another row difference
 
 
@@ -62,11 +64,17 @@ class RowProbe:
         )
         return int((good & (disparity >= _MIN_NEGATIVE_PX)).sum())
 
-    def on_rows(self, left: Image, right: Image, points: FloatArray) -> int:
-        """Count the pixels (N, 2) of the left image that match well on their rows."""
-        other = shifted_rows(right, self._rows)
+    def near_rows(self, left: Image, right: Image, points: FloatArray) -> IntArray:
+        """Count (K,) the pixels (N, 2) of the left image that match well on their rows, and on rows
+        a little above and below.
+        """
         reach = _USUAL_DISPARITY * 2 * left.shape[1]
-        return int(match_rows(left, other, points, reach, _GOOD_CORRELATION, _MIN_MARGIN)[1].sum())
+        counts = []
+        for rows in NEAR_ROWS:
+            other = _between_rows(right, self._rows + rows)
+            matched = match_rows(left, other, points, reach, _GOOD_CORRELATION, _MIN_MARGIN)[1]
+            counts.append(int(matched.sum()))
+        return np.array(counts, dtype=np.int64)
 
     def _count(
         self, left: Image, right: Image, points: FloatArray, rows: int, correlation: float
@@ -84,3 +92,15 @@ class RowProbe:
         present = counts[self._rows + _MAX_ROWS_HALF]
         if counts[best] >= max(_FEW * len(points), _CLEARLY * present):
             self._rows = tried[best]
+
+
+def _between_rows(image: Image, rows: float) -> Image:
+    """The image (H, W) moved up by a number of rows, interpolated between two of them."""
+    whole = int(np.floor(rows))
+    moved = shifted_rows(image, whole)
+    if rows == whole:
+        return moved
+    further = shifted_rows(image, whole + 1)
+    share = round(256 * (rows - whole))
+    mixed = (256 - share) * moved.astype(np.uint32) + share * further.astype(np.uint32)
+    return np.asarray((mixed + 128) >> 8, dtype=np.uint8)
