@@ -41,7 +41,7 @@ PARTS: dict[str, tuple[str, ...]] = {
         "vio.view",
         "vio.report",
     ),
-    "offline": ("vio.inspection", "vio.targets", "vio.offline"),
+    "offline": ("vio.inspection", "vio.targets", "vio.sources.board", "vio.offline"),
     "laboratory": (
         "vio.sim",
         "vio.bench",

@@ -803,11 +803,11 @@ def test_the_help_of_a_main_command_ends_with_three_examples(name: str) -> None:
 
 
 def test_the_help_of_run_names_every_kind_of_recording() -> None:
-    from vio.datasets import READERS
+    from vio.datasets import readers
 
     (commands,) = (
         a for a in build_parser(["run"])._actions if isinstance(a, argparse._SubParsersAction)
     )
     named = re.search(r"sets it \(([\w\s,]+)\)", commands.choices["run"].format_help())
     assert named is not None
-    assert {word.strip() for word in named[1].split(",")} == set(READERS)
+    assert {word.strip() for word in named[1].split(",")} == set(readers())

@@ -48,7 +48,7 @@ LIMITS = {
     "docs/live.md": 2500,
     "docs/maps.md": 1550,
     "docs/math.md": 7000,
-    "docs/neighbours.md": 900,
+    "docs/neighbours.md": 1450,
     "docs/notes/consistency.md": 1150,
     "docs/notes/maps.md": 900,
     "docs/performance.md": 900,
@@ -60,7 +60,7 @@ LIMITS = {
     "docs/tutorials/features.md": 900,
     "docs/tutorials/target.md": 1300,
 }
-ALL_PAGES = 53_000
+ALL_PAGES = 54_000
 
 # Each with what to write in its place.
 BANNED = {

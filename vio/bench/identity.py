@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
+from vio.datasets import MODULES
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
 
@@ -64,6 +65,8 @@ def imported_code(root: str, later: tuple[str, ...]) -> list[str]:
             found.add(file)
             names += _imports(path, inside=name.startswith(later))
             names.append(name.rpartition(".")[0])
+            if name == "vio.datasets":  # which loads its readers by their names
+                names += [f"vio.datasets.{reader}" for reader in MODULES]
     return sorted(found)
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.bags import is_bag
 from vio.datasets.bags.index import stamp_of
+from vio.datasets.bags.kinds import is_bag
 from vio.datasets.bags.store import Bag
 from vio.datasets.gnss_fixes import UP_SHARE, GnssFixes, checked_fixes
 from vio.datasets.tables import drive_times, read_table, stamps_ns

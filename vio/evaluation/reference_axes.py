@@ -23,6 +23,7 @@ _LARGE_DEG = 20.0
 _CONSTANT = 0.2  # of that error may vary where one rotation explains it
 # by which another order of the numbers must explain it better than other axes of the body do
 _BETTER = 3.0
+_ALIKE_DEG = 1e-3  # between what two causes leave: nothing tells which one it is
 _SIGMAS = 5.0  # of the rotation about the path, where the positions leave it uncertain
 _NO_MEASURE = ", so attitude, RPE and drift, which use them, say nothing of the error"
 _ORDERS: dict[Literal["w last", "w first"], str] = {
@@ -78,8 +79,9 @@ def attitude_note(
     if min(of_body, left[best]) > _CONSTANT * off_deg:
         return f"{head}, and no exchange of axes explains it; check what the reference's orientations mean"
     if _BETTER * left[best] < of_body:
-        whose, words = best
-        return f"{head}: the {whose}'s orientations are {words}{_NO_MEASURE}; correct the file it was written from"
+        alike = [key for key in left if left[key] <= left[best] + _ALIKE_DEG]
+        causes = ", or ".join(f"the {whose}'s orientations are {words}" for whose, words in alike)
+        return f"{head}: {causes}{_NO_MEASURE}; correct the file it was written from"
     return (
         f"{head}, always by the same rotation ({_name(_mean(body))}): the reference describes a "
         "body with other axes"

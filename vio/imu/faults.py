@@ -77,6 +77,8 @@ _PARTS: tuple[tuple[ImuFaultKind, slice], ...] = (
     ("stuck accelerometer", slice(3, 6)),
 )
 _MIN_CHANCE = 1e-8  # probability of so many repetitions in a row where they are independent
+_NOISY = 8  # last readings of the other axes, which must turn so often
+_MIN_TURNS = 2
 _RANGE_SLACK = 1e-3  # of a range's end: a reading beyond it shows that it is none
 # (6,) gyro and accelerometer; plain numbers, as arrays of six cost ten times as much
 _Reading: TypeAlias = list[float]
@@ -273,6 +275,8 @@ class _Range:
         self._repeats = np.zeros(3, dtype=np.int64)  # of it, in a row
         self._count = 0  # changes so far
         self._equal = np.zeros(3, dtype=np.int64)  # of these, that were none
+        self._changed = np.zeros(3, dtype=np.int64)  # of these, that were some
+        self._recent = np.zeros((0, 3))  # the last readings
         self._end: float | None = None  # of the range; None: unknown
         self._is_clipped = False  # the last sample was
 
@@ -289,7 +293,7 @@ class _Range:
         at_end = equal & (sizes >= extreme[1:]) & (sizes > 0) & ~equal.all(axis=1)[:, None]
         first = len(readings)  # from which on the range is known
         if self._end is None:
-            first = self._learn(equal, at_end, sizes)
+            first = self._learn(equal, at_end, readings)
         else:
             self._repeats[:] = 0
             first = 0
@@ -297,6 +301,8 @@ class _Range:
         self._extreme = extreme[-1]
         self._count += len(readings)
         self._equal += (equal & ~at_end).sum(axis=0)
+        self._changed += (~equal).sum(axis=0)
+        self._recent = np.concatenate([self._recent, readings])[-_NOISY:]
         clipped = np.zeros(len(readings), dtype=np.bool_)
         if self._end is not None:
             clipped[first:] = (sizes[first:] >= self._end).any(axis=1)
@@ -310,9 +316,9 @@ class _Range:
         times = [samples[k].time_ns for k in np.flatnonzero(began).tolist()]
         return [ImuFault(self._kind, time_ns, time_ns, end) for time_ns in times]
 
-    def _learn(self, equal: BoolArray, at_end: BoolArray, sizes: FloatArray) -> int:
-        """Count repetitions (K, 3) of the largest magnitude; return the first sample from which the
-        end of the range is known.
+    def _learn(self, equal: BoolArray, at_end: BoolArray, readings: FloatArray) -> int:
+        """Count repetitions (K, 3) of the largest magnitude in readings (K, 3); return the first
+        from which the end of the range is known.
         """
         if not at_end.any():
             self._repeats[:] = 0
@@ -324,10 +330,22 @@ class _Range:
                 continue
             share = (self._equal + (equal & ~at_end)[:k].sum(axis=0) + 1) / (seen + 2)
             improbable = self._repeats * np.log(share) < np.log(_MIN_CHANCE)
-            if (improbable & row).any():
-                self._end = float(sizes[k][improbable & row].max())
+            changed = self._changed + (~equal[:k]).sum(axis=0)
+            clipped = improbable & row & (changed >= _FAULTS.min_history)
+            last = np.concatenate([self._recent, readings[: k + 1]])[-_NOISY:]
+            if clipped.any() and _has_noise(last[:, ~row]):
+                self._end = float(np.abs(readings[k])[clipped].max())
                 return k
         return len(equal)
+
+
+def _has_noise(readings: FloatArray) -> bool:
+    """Whether readings (S, A) of some axes go to and fro, unlike those of a simulator without
+    noise.
+    """
+    signs = np.sign(np.diff(readings, axis=0))
+    turns = (signs[1:] * signs[:-1] < 0).sum(axis=0)
+    return bool((turns >= _MIN_TURNS).any())
 
 
 class _SpikeCheck:

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vio.cameras.rig import Rig
-from vio.datasets.bags import bag_files
 from vio.datasets.bags.frames import add_frames_of_tf, rig_with_baseline, states_baseline
 from vio.datasets.bags.index import BagIndex, index_bag, info_topic
+from vio.datasets.bags.kinds import bag_files
 from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import Roles, choose
 from vio.datasets.companions import check_overlap, imu_on_camera_clock

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vio.datasets.bags import bag_files
+from vio.datasets.bags.kinds import bag_files
 from vio.datasets.bags.sdk_stamps import NOTE as SDK_NOTE
 from vio.datasets.bags.sdk_stamps import SdkStamps, metadata_topics, sdk_stamps
 from vio.datasets.bags.storage_order import STEP_NS, as_stored, is_set_back

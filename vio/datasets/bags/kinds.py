@@ -1,0 +1,40 @@
+"""Which files and folders are ROS bags."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_ROS1 = b"#ROSBAG V"
+_SQLITE = b"SQLite format 3\0"
+_MCAP = b"\x89MCAP0\r\n"
+_SUFFIXES = (".bag", ".db3", ".mcap")
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a file or folder is a ROS bag, by its beginning or by ROS 2's
+    `metadata.yaml`.
+    """
+    if path.is_dir():
+        return bool(bag_files(path))
+    with path.open("rb") as stream:
+        return stream.read(16).startswith((_ROS1, _SQLITE, _MCAP))
+
+
+def bag_files(path: Path) -> tuple[Path, ...]:
+    """Return what is opened together: a ROS 2 folder or a file itself, or all bags of one kind
+    of a folder by name.
+    """
+    if not path.is_dir() or _is_ros2_folder(path):
+        return (path,)
+    children = sorted(path.iterdir())
+    found = [child for child in children if child.suffix in _SUFFIXES and child.is_file()]
+    if found:
+        return tuple(found) if len({child.suffix for child in found}) == 1 else ()
+    return tuple(child for child in children if child.is_dir() and _is_ros2_folder(child))
+
+
+def _is_ros2_folder(path: Path) -> bool:
+    metadata = path / "metadata.yaml"
+    return metadata.is_file() and "rosbag2_bagfile_information" in metadata.read_text(
+        encoding="utf-8", errors="replace"
+    )
