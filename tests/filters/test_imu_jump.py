@@ -15,7 +15,7 @@ from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.filters.track_records import Residuals
 from vio.filters.window_tracks import LinearTracks
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, so3_exp
 from vio.records import ImuSample, Observations, UpdateReport
 
 FRAMES = 70
@@ -71,6 +71,34 @@ def test_images_estimate_a_bias_that_has_jumped(size: float) -> None:
 
 def test_a_gyro_that_stays_right_is_not_named() -> None:
     _, _, filt = Flight(frames=FRAMES).run(
+        SETTINGS, "imu", sigma=0.2, limit=120, filter_class=_Noted
+    )
+    assert not any(filt.jumps)
+
+
+def test_steps_that_were_off_before_make_no_jump() -> None:
+    """Axes, a scale or a clock that are wrong contradict the images in every turn."""
+    jump = GyroJump()
+    assert not any(jump.is_settled(off=False) for _ in range(30))  # the start learns the bias
+    assert jump.is_settled(off=False)
+    # the first steps of a jump are off themselves
+    assert all(jump.is_settled(off=True) for _ in range(4))
+    wrong = GyroJump()
+    assert not any([wrong.is_settled(off=k % 3 == 0) for k in range(90)][40:])
+
+
+class _Turned(Flight):
+    """A flight whose gyro is turned by 15 degrees about the camera's axis."""
+
+    def imu(
+        self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
+    ) -> list[ImuSample]:
+        R = so3_exp([0.0, 0.0, np.radians(15.0)])
+        return [replace(x, gyro=R @ x.gyro) for x in super().imu(noise, settings, bias)]
+
+
+def test_a_gyro_that_is_turned_has_not_jumped() -> None:
+    _, _, filt = _Turned(frames=FRAMES).run(
         SETTINGS, "imu", sigma=0.2, limit=120, filter_class=_Noted
     )
     assert not any(filt.jumps)
