@@ -13,6 +13,7 @@ belongs to the left image *before* (it is late) is marked, as its left image is 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TypeAlias
 
 from vio.findings import Finding
 from vio.frontend.right_delay import PairingCounts
@@ -20,9 +21,11 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.image_change import image_change
 from vio.guard.image_check import FrameImages, ImageCheck, images_of
-from vio.guard.probe import NEAR_ROWS, RowProbe
+from vio.guard.probe import RowProbe
 from vio.records import Image, IntArray, StereoFrame
 
+# left and right image at half resolution, and the left corners (N, 2)
+_Pairing: TypeAlias = tuple[Image, Image, FloatArray]
 _FRAMES = 3  # that must have been counted
 _ALIKE = 2  # frames in a row after which the counts so far tell the same
 _MAX_TESTS = 40  # frames in which the rig moves, after which the pairing counts as right
@@ -50,9 +53,10 @@ class PairingCheck(ImageCheck):
         self._probe = probe
         self._last: tuple[Image, Image, FloatArray] | None = None  # halves, and left corners
         self._told: list[int | None] = []  # by the counts so far, after each frame
-        # of all frames: corners, and those that match in each pairing, at each difference of rows
+        # of all frames: corners, and those that match in each pairing
         self._points = 0
-        self._matched: dict[int, IntArray] = {}
+        self._matched = {0: 0, 1: 0, -1: 0}
+        self._near: dict[int, IntArray] = {}  # likewise (K,) on rows a little above and below
         self._held: Image | None = None  # right image that belongs to the next left one
         self._begun_again = False
         self.delay: int | None = None  # None: not decided yet
@@ -86,31 +90,37 @@ class PairingCheck(ImageCheck):
         self._last = left.copy(), right.copy(), points
         if last is None:
             return
-        matched = {
-            0: self._probe.near_rows(left, right, points),
-            1: self._probe.near_rows(last[0], right, last[2]),
-            -1: self._probe.near_rows(left, last[1], points),
-        }
-        self._count(images.index, min(len(points), len(last[2])), matched)
+        self._count(
+            images.index,
+            min(len(points), len(last[2])),
+            {0: (left, right, points), 1: (last[0], right, last[2]), -1: (left, last[1], points)},
+        )
 
-    def _count(self, index: int, points: int, matched: dict[int, IntArray]) -> None:
+    def _count(self, index: int, points: int, pairings: dict[int, _Pairing]) -> None:
         """Count the matches of a frame, and decide once those of enough frames tell."""
         if points >= _MIN_POINTS:
             self._points += points
-            before = self._matched
-            self._matched = {
-                delay: counts + before[delay] if before else counts
-                for delay, counts in matched.items()
-            }
-        if not self._matched:
-            self._told.append(None)
-        else:
-            self._told.append(_told(self._points, self._matched))
+            for delay, pairing in pairings.items():
+                self._matched[delay] += self._probe.on_rows(*pairing)
+        self._told.append(self._tells(pairings))
         recent = self._told[-_ALIKE:]
         if len(self._told) >= _FRAMES and recent[0] is not None and len(set(recent)) == 1:
             self._decide(index, recent[0])
         elif len(self._told) >= _MAX_TESTS:
             self._decide(index, 0)
+
+    def _tells(self, pairings: dict[int, _Pairing]) -> int | None:
+        """Return the delay that the frames so far tell, unless a difference of all rows explains
+        the pairs as they came as well.
+        """
+        matched = self._matched
+        told = told_delay(PairingCounts(self._points, matched[0], matched[1], matched[-1]))
+        if told is None or told == 0:
+            return told
+        for delay in (0, told):
+            near = self._probe.near_rows(*pairings[delay])
+            self._near[delay] = self._near.get(delay, 0) + near
+        return told if self._near[told].max() > self._near[0].max() else None
 
     def _decide(self, index: int, delay: int) -> None:
         self.delay = delay
@@ -133,23 +143,6 @@ class PairingCheck(ImageCheck):
         if held is None:
             return images.marked(skipped=True)
         return images.with_raw((images.raw[0], held))
-
-
-def _told(points: int, matched: dict[int, IntArray]) -> int | None:
-    """Return the delay by the rows as calibrated, unless a row difference that all frames have in
-    common explains the pairs as they came as well.
-
-    Args:
-        points: corners that were tried.
-        matched: of each delay, those that matched (K,) at each of `NEAR_ROWS`.
-    """
-    calibrated = len(NEAR_ROWS) // 2
-    as_calibrated = {delay: int(counts[calibrated]) for delay, counts in matched.items()}
-    counts = PairingCounts(points, as_calibrated[0], as_calibrated[1], as_calibrated[-1])
-    told = told_delay(counts)
-    if told is None or told == 0:
-        return told
-    return told if matched[told].max() > matched[0].max() else None
 
 
 def find_delay(frames: Iterable[StereoFrame], camera: StereoCamera) -> int | None:

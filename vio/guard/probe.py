@@ -22,7 +22,7 @@ _MIN_NEGATIVE_PX = 1.0  # of a disparity that counts as negative
 _MAX_ROWS_HALF = 16  # row difference that is searched, pixels at half resolution
 _FEW = 0.2  # share of the corners with a match below which other row differences are tried
 # row differences of a camera that is pitched a little, pixels at half resolution
-NEAR_ROWS = np.arange(-3.0, 3.1, 0.5)
+_NEAR_ROWS = np.arange(-3.0, 3.1, 0.5)
 _CLEARLY = 2  # times as many matches at another row difference
 
 
@@ -64,17 +64,23 @@ class RowProbe:
         )
         return int((good & (disparity >= _MIN_NEGATIVE_PX)).sum())
 
+    def on_rows(self, left: Image, right: Image, points: FloatArray) -> int:
+        """Count the pixels (N, 2) of the left image that match well on their rows."""
+        return self._well_matched(left, shifted_rows(right, self._rows), points)
+
     def near_rows(self, left: Image, right: Image, points: FloatArray) -> IntArray:
         """Count (K,) the pixels (N, 2) of the left image that match well on their rows, and on rows
         a little above and below.
         """
-        reach = _USUAL_DISPARITY * 2 * left.shape[1]
-        counts = []
-        for rows in NEAR_ROWS:
-            other = _between_rows(right, self._rows + rows)
-            matched = match_rows(left, other, points, reach, _GOOD_CORRELATION, _MIN_MARGIN)[1]
-            counts.append(int(matched.sum()))
+        counts = [
+            self._well_matched(left, _between_rows(right, self._rows + rows), points)
+            for rows in _NEAR_ROWS
+        ]
         return np.array(counts, dtype=np.int64)
+
+    def _well_matched(self, left: Image, right: Image, points: FloatArray) -> int:
+        reach = _USUAL_DISPARITY * 2 * left.shape[1]
+        return int(match_rows(left, right, points, reach, _GOOD_CORRELATION, _MIN_MARGIN)[1].sum())
 
     def _count(
         self, left: Image, right: Image, points: FloatArray, rows: int, correlation: float
