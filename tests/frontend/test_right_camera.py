@@ -338,6 +338,25 @@ def test_offsets_that_change_are_no_turn_that_stays() -> None:
     assert all(ramp.frame(k, 1.0 + 0.1 * k) is None for k in range(10))
 
 
+def test_small_offsets_of_a_pair_that_shakes_are_taken_out_too() -> None:
+    turn = RightTurn(700.0)
+    assert not turn.may_stay
+    assert not turn.is_offset(0.2)
+    for k in range(10):
+        turn.frame(k, 1.0 + k if k % 2 else None)
+    assert turn.may_stay
+    assert turn.is_offset(0.2)
+    for k in range(10, 40):
+        turn.frame(k, 0.1)
+    assert not turn.may_stay
+    assert not turn.is_offset(0.2)
+    # beside a turn that stays, what is off is off from there
+    for k in range(40, 46):
+        turn.frame(k, 2.0)
+    assert turn.is_offset(0.0)
+    assert not turn.is_offset(2.1)
+
+
 def test_a_right_camera_that_turns_far_is_not_used() -> None:
     outputs = flight_with_turns(lambda k: 1.0 if k >= 5 else 0.0)
     assert [output.observations.has_right.any() for output in outputs] == [
