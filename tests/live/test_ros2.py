@@ -377,7 +377,11 @@ def test_the_node_goes_on_after_a_reset_and_after_a_step_of_the_clock(
         assert saved.times_ns[0] == poses[0][0]
     else:
         assert saved.times_ns[0] == before[0][0]
-        assert np.linalg.norm(poses[-1][1][:3, 3] - before[-1][1][:3, 3]) < 0.5
+        # nobody knows how far it has moved in an hour, and it is said
+        covariance = np.load(folder / "estimates.npy")["covariance"][-1]
+        sigma_m = float(np.sqrt(np.trace(covariance[:3, :3])))
+        moved_m = float(np.linalg.norm(poses[-1][1][:3, 3] - before[-1][1][:3, 3]))
+        assert moved_m < 3.0 * sigma_m
 
 
 class Shifted:
