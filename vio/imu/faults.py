@@ -282,6 +282,15 @@ class _Range:
 
     def take(self, readings: FloatArray) -> BoolArray:
         """Return which of the next readings (K, 3) are at the end of the range."""
+        if self._end is None and self._last is not None:
+            if len(readings) == 1:
+                equal_any = (readings[0] == self._last).any()
+            else:
+                equal_any = (readings[0] == self._last).any() or (
+                    readings[1:] == readings[:-1]
+                ).any()
+            if not equal_any:
+                return self._pass(readings)
         sizes = np.abs(readings)
         if self._end is not None and (sizes > (1 + _RANGE_SLACK) * self._end).any():
             self._end = None
@@ -307,6 +316,16 @@ class _Range:
         if self._end is not None:
             clipped[first:] = (sizes[first:] >= self._end).any(axis=1)
         return clipped
+
+    def _pass(self, readings: FloatArray) -> BoolArray:
+        """Count readings (K, 3) none of which repeats a number; none is clipped."""
+        self._repeats[:] = 0
+        self._last = readings[-1]
+        self._extreme = np.maximum(self._extreme, np.abs(readings).max(axis=0))
+        self._count += len(readings)
+        self._changed += len(readings)
+        self._recent = np.concatenate([self._recent, readings])[-_NOISY:]
+        return np.zeros(len(readings), dtype=np.bool_)
 
     def faults(self, samples: Sequence[ImuSample], clipped: BoolArray) -> list[ImuFault]:
         """Return a fault for each row of samples (K,) at the end of the range that begins here."""

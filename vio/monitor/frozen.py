@@ -73,7 +73,7 @@ class FrozenImages:
         self._imu: deque[ImuSample] = deque()
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
         self._seen: Observations | None = None  # its features
-        self._flow_px = 0.0  # of its features since the frame before (median)
+        self._seen_before: Observations | None = None  # those of the frame before
         self._still: tuple[int, float] | None = None  # first frame of equal ones, flow before it
         self._ended_still: tuple[int, float] | None = None  # with the present frame
         self._held_since: int | None = None
@@ -100,18 +100,14 @@ class FrozenImages:
             if len(a):
                 off = seen.z[a, :2] - self._expected.tracks.z[b, :2]
                 self._errors_px.append(median(np.linalg.norm(off, axis=1)))
-        shared = 0.0
-        self._flow_px = 0.0
-        if self._seen is not None and len(self._seen):
-            shared = np.isin(self._seen.ids, seen.ids).mean()
-            self._flow_px = _median_flow_px(self._seen, seen)
-        if self._ended_still is not None:
-            since, before_px = self._ended_still
-            begun = self._flow_px > max(_BEGUN_PX, _BEGUN_FACTOR * before_px)
-            if begun or shared < _BEGUN_SHARE:
-                self._held_since = since
-            self._ended_still = None
+        before = self._seen_before = self._seen
         self._seen = seen
+        if self._ended_still is not None and before is not None and len(before):
+            since, before_px = self._ended_still
+            begun = self._flow_px() > max(_BEGUN_PX, _BEGUN_FACTOR * before_px)
+            if begun or np.isin(before.ids, seen.ids).mean() < _BEGUN_SHARE:
+                self._held_since = since
+        self._ended_still = None
 
     def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
         """Return which frame a pair repeats; None: it shows something new, or a rig at standstill.
@@ -124,6 +120,12 @@ class FrozenImages:
         if self._repeating is None:
             self._shown = frame
         return self._repeating
+
+    def _flow_px(self) -> float:
+        """Flow of the features between the two frames before the present one (median)."""
+        if self._seen is None or self._seen_before is None:
+            return 0.0
+        return _median_flow_px(self._seen_before, self._seen)
 
     def take_held(self) -> int | None:
         """Return the first of the equal frames that were taken for a rig at standstill, and were
@@ -162,7 +164,7 @@ class FrozenImages:
         if all(_equal(new, old) for new, old in zip(images, before, strict=True)):
             if again or self._moves(expected):
                 return Repeated(shown.index, True)
-            self._still = self._still or (frame.index, self._flow_px)
+            self._still = self._still or (frame.index, self._flow_px())
             return None
         self._ended_still = self._still
         self._still = None
@@ -183,7 +185,7 @@ class FrozenImages:
         """Whether the rig moves: by the last frames' features, the IMU's samples, else by the
         prediction.
         """
-        if self._flow_px > _MOVED_PX:
+        if self._flow_px() > _MOVED_PX:
             return True
         if self._imu:
             return not self._at_standstill()
