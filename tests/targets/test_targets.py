@@ -307,8 +307,8 @@ def test_stated_sigmas_are_those_of_the_errors() -> None:
 
 
 def test_chooses_the_lens_by_views_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in set(LENSES) - {"radtan", "equidistant"}:
-        monkeypatch.delitem(LENSES, name)
+    two = {name: LENSES[name] for name in ("radtan", "equidistant")}
+    monkeypatch.setattr("vio.targets.lenses.LENSES", two)  # the order of the others stays
     wide = CameraModel(285, 285, 370, 242, 752, 480, "equidistant", (0.02, -0.01, 0.004, -0.001))
     seen = sightings(made_views(1, 10, cameras=(wide,)), GRID.points_m)
     name, scores = choose_lens(seen, (752, 480))
