@@ -44,6 +44,7 @@ from vio.records import BoolArray, IntArray, MotionPrior
 Decision: TypeAlias = Literal["predicted", "voted", "undecided", "unsupported"]
 
 _PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test
+_LIMIT = float(chi_square_quantile(_PROBABILITY, 6))  # of its squared distance
 # ratio of two motions' squared distances from a measured one, above which the nearer agrees
 _CLEARLY_NEARER = 10.0
 _MIN_POINTS = 12  # of a second motion
@@ -110,35 +111,24 @@ def choose_motion(
             prediction that is not measured is off with the depths.
     """
     measured = predicted is not None and predicted.measured
+    expected = (
+        None if predicted is None else _Expected(problem.camera, predicted, disparity_error_px)
+    )
     if voting is not None and not measured:
         voted = _voted(problem, p_prev, pixels, found, voting)
-        if voted is not None and not _prediction_overrules(
-            problem, p_prev, found, voted, predicted, disparity_error_px
-        ):
+        if voted is not None and not _prediction_overrules(p_prev, found, voted, expected):
             return TwoMotions(voted, _if_large((found.inliers & ~voted.inliers).mean()), "voted")
     others = np.flatnonzero(~found.inliers)
     least = max(_MIN_POINTS, _MIN_SUPPORT * found.inliers.sum())
-    limit = float(chi_square_quantile(_PROBABILITY, 6))
-    # the prediction is that of a body that goes on as before
-    extrapolated = predicted is not None and not measured
     of_first = np.inf
-    is_far = predicted is not None and _is_beyond(found.T_curr_prev, predicted, limit)
-    if predicted is not None and (len(others) >= least or in_event or is_far):
-        of_first = _squared_distance(
-            problem.camera,
-            found.T_curr_prev,
-            p_prev[found.inliers],
-            predicted,
-            disparity_error_px,
-        )
-    contradicted = is_far and of_first > limit
-    if predicted is not None and measured and contradicted and voting is not None:
-        slow = _without_slow_object(
-            problem, p_prev, pixels, found, predicted, limit, voting, disparity_error_px
-        )
+    is_far = expected is not None and expected.is_beyond(found.T_curr_prev, _LIMIT)
+    if expected is not None and (len(others) >= least or in_event or is_far):
+        of_first = expected.distance(found.T_curr_prev, p_prev[found.inliers])
+    contradicted = is_far and of_first > _LIMIT
+    if expected is not None and measured and contradicted and voting is not None:
+        slow = _without_slow_object(problem, p_prev, pixels, found, expected, voting)
         if slow is not None:
             return TwoMotions(slow, _if_large((found.inliers & ~slow.inliers).mean()), "predicted")
-    contradicted = contradicted and extrapolated
     if len(others) < least and not (in_event or contradicted):
         return TwoMotions(found, 0.0, None)
     second = np.eye(4)
@@ -148,10 +138,9 @@ def choose_motion(
         second, support = best_motion(problem, p_prev[others], pixels[others], starts)
     large = bool(support.sum() >= least)
     reported = _if_large(support.sum() / len(p_prev)) if large else 0.0
-    if predicted is not None and contradicted:
-        near = _near_prediction(
-            problem, p_prev, pixels, found, predicted, limit, disparity_error_px
-        )
+    # the prediction is that of a body that goes on as before
+    if expected is not None and contradicted and not measured:
+        near = _near_prediction(problem, p_prev, pixels, found, expected)
         if near is not None:
             second = near.T_curr_prev
             support = near.inliers[others]
@@ -168,18 +157,13 @@ def choose_motion(
             return TwoMotions(Consensus(second, follows_second), object_share, "voted")
         if elected == "first":
             return TwoMotions(found, reported, "voted" if reported else None)
-    if predicted is None:
+    if predicted is None or expected is None:
         return TwoMotions(found, reported, "undecided" if reported else None)
     if not (large or in_event):
         return TwoMotions(found, 0.0, None)
-    of_second = (
-        _squared_distance(
-            problem.camera, second, p_prev[others[support]], predicted, disparity_error_px
-        )
-        if large
-        else np.inf
-    )
+    of_second = expected.distance(second, p_prev[others[support]]) if large else np.inf
     nearer, farther = sorted((of_first, of_second))
+    limit = _LIMIT
     if measured and large and nearer * _CLEARLY_NEARER <= farther:
         # the sensor is worse than its covariance, but leaves no doubt which one it is
         limit = max(limit, nearer)
@@ -200,27 +184,19 @@ def choose_motion(
 
 
 def _prediction_overrules(
-    problem: RansacProblem,
-    p_prev: FloatArray,
-    found: Consensus,
-    voted: Consensus,
-    predicted: MotionPrior | None,
-    disparity_error_px: float,
+    p_prev: FloatArray, found: Consensus, voted: Consensus, expected: _Expected | None
 ) -> bool:
     """Return whether a prediction agrees with the consensus, and better than with the vote.
 
     The oldest points may all be far away: what they vote for is a rotation, and a translation that
     they hardly know. An object that comes into view has no prediction on its side.
     """
-    if predicted is None or found.inliers.sum() < voted.inliers.sum():
+    if expected is None or found.inliers.sum() < voted.inliers.sum():
         return False
     of_found, of_voted = (
-        _squared_distance(
-            problem.camera, each.T_curr_prev, p_prev[each.inliers], predicted, disparity_error_px
-        )
-        for each in (found, voted)
+        expected.distance(each.T_curr_prev, p_prev[each.inliers]) for each in (found, voted)
     )
-    return of_found <= min(of_voted, float(chi_square_quantile(_PROBABILITY, 6)))
+    return of_found <= min(of_voted, _LIMIT)
 
 
 def _if_large(share: float) -> float:
@@ -240,30 +216,25 @@ def _near_prediction(
     p_prev: FloatArray,
     pixels: FloatArray,
     found: Consensus,
-    predicted: MotionPrior,
-    limit: float,
-    disparity_error_px: float,
+    expected: _Expected,
 ) -> Consensus | None:
     """The motion near a predicted one that the consensus contradicts, if some points follow this
     one alone.
 
     A compromise between an object and what is far away can win the consensus, and leaves no second
-    group. `limit` is that of the squared distance from the prediction.
+    group.
     """
-    near = (
-        pixel_errors(problem.camera, predicted.T_curr_prev, p_prev, pixels)
-        <= 2.0 * problem.limit_px
-    )
+    start = expected.prior.T_curr_prev
+    near = pixel_errors(problem.camera, start, p_prev, pixels) <= 2.0 * problem.limit_px
     if near.sum() < _MIN_POINTS:
         return None
-    T, _ = best_motion(problem, p_prev[near], pixels[near], predicted.T_curr_prev[None])
+    T, _ = best_motion(problem, p_prev[near], pixels[near], start[None])
     inliers = _followers(problem, T, p_prev, pixels)
     alone = inliers & ~found.inliers
     others = found.inliers & ~inliers
     if alone.sum() < max(_MIN_POINTS, _MIN_SUPPORT * others.sum()):
         return None
-    distance = _squared_distance(problem.camera, T, p_prev[inliers], predicted, disparity_error_px)
-    return Consensus(T, inliers) if distance <= limit else None
+    return Consensus(T, inliers) if expected.distance(T, p_prev[inliers]) <= _LIMIT else None
 
 
 def _without_slow_object(
@@ -271,10 +242,8 @@ def _without_slow_object(
     p_prev: FloatArray,
     pixels: FloatArray,
     found: Consensus,
-    predicted: MotionPrior,
-    limit: float,
+    expected: _Expected,
     voting: BoolArray,
-    disparity_error_px: float,
 ) -> Consensus | None:
     """The motion of the points that have been static for long, and those that follow it as well as
     they do, if it agrees with a predicted one that the consensus contradicts.
@@ -285,7 +254,7 @@ def _without_slow_object(
     old = voting & found.inliers
     if old.sum() < _MIN_POINTS:
         return None
-    T, _ = best_motion(problem, p_prev[old], pixels[old], predicted.T_curr_prev[None])
+    T, _ = best_motion(problem, p_prev[old], pixels[old], expected.prior.T_curr_prev[None])
     errors = pixel_errors(problem.camera, T, p_prev, pixels)
     usual_px = _FOLLOWING * float(np.median(errors[old]))
     follows = np.asarray(errors <= min(usual_px, problem.limit_px))
@@ -295,8 +264,7 @@ def _without_slow_object(
         return None
     if (moving & voting).sum() > (1.0 - _CLEAR_VOTE) * voting.sum():
         return None
-    distance = _squared_distance(problem.camera, T, p_prev[old], predicted, disparity_error_px)
-    return Consensus(T, follows) if distance <= limit else None
+    return Consensus(T, follows) if expected.distance(T, p_prev[old]) <= _LIMIT else None
 
 
 def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] | None:
@@ -467,40 +435,44 @@ def _within_depths(
     return np.asarray((place_px >= -limit) & (place_px <= length + limit))
 
 
-def _squared_distance(
-    camera: StereoCamera,
-    T: FloatArray,
-    p_prev: FloatArray,
-    predicted: MotionPrior,
-    disparity_error_px: float,
-) -> float:
-    """Squared distance of a motion (4, 4), fitted to points (N, 3), from the prediction, over
-    their covariance.
-    """
-    p = transform_points(T, p_prev)
-    J = _pixel_D_motion(camera, p).reshape(-1, 6)
-    points = min(len(p), _INDEPENDENT_POINTS)
-    fit = _PIXEL_SIGMA**2 * np.linalg.inv(points * J.T @ J / len(p) + 1e-9 * np.eye(6))
-    moved_m2 = float(T[:3, 3] @ T[:3, 3])
-    fit[:3, :3] += _SCALE_SIGMA**2 * moved_m2 * np.eye(3)
-    if disparity_error_px > 0.0:
-        # a translation is off as its depths are; one that no sensor has measured is, too
-        depth = float(np.median(depth_of(camera, p_prev)))
-        scale = disparity_error_px / _BOUND_SIGMAS * depth / (camera.fu * camera.baseline_m)
-        if not predicted.measured:
-            t = predicted.T_curr_prev[:3, 3]
-            moved_m2 += float(t @ t)
-        fit[:3, :3] += scale**2 * moved_m2 * np.eye(3)
-    xi = se3_log(T @ se3_inverse(predicted.T_curr_prev))
-    return float(xi @ np.linalg.solve(predicted.covariance + fit, xi))
+@dataclass(frozen=True, slots=True)
+class _Expected:
+    """A predicted motion, and what fits to points are off by beside it."""
 
+    camera: StereoCamera
+    prior: MotionPrior
+    disparity_error_px: float  # see `choose_motion`
 
-def _is_beyond(T: FloatArray, predicted: MotionPrior, limit: float) -> bool:
-    """Whether a motion (4, 4) is further from the prediction than a limit of the squared distance,
-    over the prediction's covariance alone: that of a fit to points is added only if it is.
-    """
-    xi = se3_log(T @ se3_inverse(predicted.T_curr_prev))
-    return float(xi @ np.linalg.solve(predicted.covariance, xi)) > limit
+    def distance(self, T: FloatArray, p_prev: FloatArray) -> float:
+        """Squared distance of a motion (4, 4), fitted to points (N, 3), from the prediction, over
+        their covariance.
+        """
+        p = transform_points(T, p_prev)
+        J = _pixel_D_motion(self.camera, p).reshape(-1, 6)
+        points = min(len(p), _INDEPENDENT_POINTS)
+        fit = _PIXEL_SIGMA**2 * np.linalg.inv(points * J.T @ J / len(p) + 1e-9 * np.eye(6))
+        moved_m2 = float(T[:3, 3] @ T[:3, 3])
+        fit[:3, :3] += _SCALE_SIGMA**2 * moved_m2 * np.eye(3)
+        if self.disparity_error_px > 0.0:
+            # a translation is off as its depths are; one that no sensor has measured is, too
+            depth = float(np.median(depth_of(self.camera, p_prev)))
+            f_baseline = self.camera.fu * self.camera.baseline_m
+            scale = self.disparity_error_px / _BOUND_SIGMAS * depth / f_baseline
+            if not self.prior.measured:
+                t = self.prior.T_curr_prev[:3, 3]
+                moved_m2 += float(t @ t)
+            fit[:3, :3] += scale**2 * moved_m2 * np.eye(3)
+        return self._distance(T, self.prior.covariance + fit)
+
+    def is_beyond(self, T: FloatArray, limit: float) -> bool:
+        """Whether a motion (4, 4) is further off than a limit over the prediction's covariance
+        alone: that of a fit to points is added only if it is.
+        """
+        return self._distance(T, self.prior.covariance) > limit
+
+    def _distance(self, T: FloatArray, covariance: FloatArray) -> float:
+        xi = se3_log(T @ se3_inverse(self.prior.T_curr_prev))
+        return float(xi @ np.linalg.solve(covariance, xi))
 
 
 def _pixel_D_motion(camera: StereoCamera, p: FloatArray) -> FloatArray:
@@ -561,16 +533,12 @@ class ObjectReport(Finder):
         Arguments as of `choose_motion`; the camera's motion is the only one.
         """
         motion = motions.motion
+        expected = _Expected(camera, predicted, disparity_error_px)
         supported = int((motion.inliers & voting).sum()) >= _MIN_POINTS
-        limit = float(chi_square_quantile(_PROBABILITY, 6))
-        if not supported:
-            limit = _CLEARLY_NEARER * max([limit, *self._usual])
+        limit = _LIMIT if supported else _CLEARLY_NEARER * max([_LIMIT, *self._usual])
         distance = 0.0
-        if _is_beyond(motion.T_curr_prev, predicted, limit):
-            points = p_prev[motion.inliers]
-            distance = _squared_distance(
-                camera, motion.T_curr_prev, points, predicted, disparity_error_px
-            )
+        if expected.is_beyond(motion.T_curr_prev, limit):
+            distance = expected.distance(motion.T_curr_prev, p_prev[motion.inliers])
         if supported:
             self._usual.append(distance)
         if supported or not self._usual or distance <= limit:

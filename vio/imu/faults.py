@@ -282,15 +282,6 @@ class _Range:
 
     def take(self, readings: FloatArray) -> BoolArray:
         """Return which of the next readings (K, 3) are at the end of the range."""
-        if self._end is None and self._last is not None:
-            if len(readings) == 1:
-                equal_any = (readings[0] == self._last).any()
-            else:
-                equal_any = (readings[0] == self._last).any() or (
-                    readings[1:] == readings[:-1]
-                ).any()
-            if not equal_any:
-                return self._pass(readings)
         sizes = np.abs(readings)
         if self._end is not None and (sizes > (1 + _RANGE_SLACK) * self._end).any():
             self._end = None
@@ -300,12 +291,8 @@ class _Range:
             equal[0] = False
         extreme = np.maximum.accumulate(np.concatenate([self._extreme[None], sizes]))
         at_end = equal & (sizes >= extreme[1:]) & (sizes > 0) & ~equal.all(axis=1)[:, None]
-        first = len(readings)  # from which on the range is known
-        if self._end is None:
-            first = self._learn(equal, at_end, readings)
-        else:
-            self._repeats[:] = 0
-            first = 0
+        # the first from which on the end is known
+        first = self._learn(equal, at_end, readings) if self._end is None else 0
         self._last = readings[-1]
         self._extreme = extreme[-1]
         self._count += len(readings)
@@ -316,16 +303,6 @@ class _Range:
         if self._end is not None:
             clipped[first:] = (sizes[first:] >= self._end).any(axis=1)
         return clipped
-
-    def _pass(self, readings: FloatArray) -> BoolArray:
-        """Count readings (K, 3) none of which repeats a number; none is clipped."""
-        self._repeats[:] = 0
-        self._last = readings[-1]
-        self._extreme = np.maximum(self._extreme, np.abs(readings).max(axis=0))
-        self._count += len(readings)
-        self._changed += len(readings)
-        self._recent = np.concatenate([self._recent, readings])[-_NOISY:]
-        return np.zeros(len(readings), dtype=np.bool_)
 
     def faults(self, samples: Sequence[ImuSample], clipped: BoolArray) -> list[ImuFault]:
         """Return a fault for each row of samples (K,) at the end of the range that begins here."""
@@ -354,6 +331,7 @@ class _Range:
             last = np.concatenate([self._recent, readings[: k + 1]])[-_NOISY:]
             if clipped.any() and _has_noise(last[:, ~row]):
                 self._end = float(np.abs(readings[k])[clipped].max())
+                self._repeats[:] = 0
                 return k
         return len(equal)
 

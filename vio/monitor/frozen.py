@@ -31,6 +31,7 @@ from vio.records import (
     Observations,
     Prediction,
     StereoFrame,
+    TrackPrior,
 )
 
 _RADIUS = 4  # of the patches whose flow is measured, pixels
@@ -94,12 +95,9 @@ class FrozenImages:
     def observations(self, seen: Observations) -> None:
         """Take the features of a frame that `check` let pass."""
         if self._expected is not None:
-            _, a, b = np.intersect1d(
-                seen.ids, self._expected.tracks.ids, assume_unique=True, return_indices=True
-            )
-            if len(a):
-                off = seen.z[a, :2] - self._expected.tracks.z[b, :2]
-                self._errors_px.append(median(np.linalg.norm(off, axis=1)))
+            _, off_px = _moved(seen, self._expected.tracks)
+            if len(off_px):
+                self._errors_px.append(median(off_px))
         before = self._seen_before = self._seen
         self._seen = seen
         if self._ended_still is not None and before is not None and len(before):
@@ -221,12 +219,18 @@ def _equal(a: Image, b: Image) -> bool:
     return np.array_equal(a[:_FIRST_ROWS], b[:_FIRST_ROWS]) and np.array_equal(a, b)
 
 
+def _moved(before: Observations, now: Observations | TrackPrior) -> tuple[IntArray, FloatArray]:
+    """Features that two sets share: their rows (K,) in the first, and by how many pixels (K,) they
+    differ in the left image.
+    """
+    _, a, b = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    return a, np.asarray(np.linalg.norm(now.z[b, :2] - before.z[a, :2], axis=1))
+
+
 def _median_flow_px(before: Observations, now: Observations) -> float:
     """Median flow of the features of two frames in the left image; 0: they share too few."""
-    _, a, b = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
-    if len(a) < _MIN_CORNERS:
-        return 0.0
-    return median(np.linalg.norm(now.z[b, :2] - before.z[a, :2], axis=1))
+    _, moved_px = _moved(before, now)
+    return median(moved_px) if len(moved_px) >= _MIN_CORNERS else 0.0
 
 
 def _same_depths(a: FloatArray, b: FloatArray) -> bool:
@@ -238,9 +242,8 @@ def _same_depths(a: FloatArray, b: FloatArray) -> bool:
 
 def _predicted_to_move(seen: Observations, expected: Prediction, least_px: float) -> Observations:
     """The features of the last frame that the prediction moves clearly in the left image."""
-    _, a, b = np.intersect1d(seen.ids, expected.tracks.ids, assume_unique=True, return_indices=True)
-    moved = np.linalg.norm(expected.tracks.z[b, :2] - seen.z[a, :2], axis=1)
-    return seen.take(a[moved > least_px])
+    rows, moved_px = _moved(seen, expected.tracks)
+    return seen.take(rows[moved_px > least_px])
 
 
 def _images(frame: StereoFrame) -> list[Image]:

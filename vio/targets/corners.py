@@ -21,7 +21,7 @@ from vio.geometry.lie import FloatArray
 from vio.records import Image, IntArray
 from vio.targets.blurred import PrintAligner
 from vio.targets.description import Marker, Target
-from vio.targets.homography import derivative, homographies, mapped, predict
+from vio.targets.homography import derivative, gray_at, homographies, mapped, predict
 from vio.targets.seeds import MarkerReader, checkerboard_seeds
 
 BoolArray = npt.NDArray[np.bool_]
@@ -288,21 +288,13 @@ class _Templates:
         """Normalised correlation (K,) of the image with the board around corners that refinement
         moved (K, 2) from where homographies (K, 3, 3) predict them.
         """
-        import cv2
-
         if not len(ids):
             return np.zeros(0)
         at = mapped(H, self._points[ids][:, None] + self._offset[ids]) + moved[:, None]
         at = np.clip(at, -1e4, 2e4).astype(np.float32)
         inside = (at >= 0).all(axis=2) & (at[..., 0] <= image.shape[1] - 1)
         inside &= at[..., 1] <= image.shape[0] - 1
-        values = cv2.remap(
-            image,
-            np.ascontiguousarray(at[..., 0]),
-            np.ascontiguousarray(at[..., 1]),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        ).astype(np.float64)
+        values = gray_at(image, at)
         weight = inside.astype(np.float64)
         total = np.maximum(weight.sum(axis=1, keepdims=True), 1.0)
         light = self._light[ids]

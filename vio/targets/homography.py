@@ -1,10 +1,13 @@
-"""Homographies of many sets of corners at once, from a board's plane to pixels."""
+"""Homographies of many sets of corners at once, from a board's plane to pixels, and the light
+there.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from vio.geometry.lie import FloatArray
+from vio.records import Image
 
 NEIGHBOURS = 12  # nearest corners that predict another one
 
@@ -68,3 +71,18 @@ def _normalising(p: FloatArray) -> FloatArray:
     out[:, 2, 2] = 1
     out[:, :2, 2] = -scale[:, None] * centre
     return out
+
+
+def gray_at(image: Image, at: FloatArray) -> FloatArray:
+    """Gray values (K, S) of an image at pixels (K, S, 2); beside it, those of its border."""
+    import cv2
+
+    pixels = np.clip(at, -1e4, 2e4).astype(np.float32)
+    values = cv2.remap(
+        image,
+        np.ascontiguousarray(pixels[..., 0]),
+        np.ascontiguousarray(pixels[..., 1]),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.asarray(values, dtype=np.float64)

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from vio.geometry.lie import FloatArray
 from vio.records import Image
 from vio.targets.description import Marker, Target, marker_dictionary
-from vio.targets.homography import homographies, mapped
+from vio.targets.homography import gray_at, homographies, mapped
 
 # Scale of the image in which candidates are looked for, and the pixels there by which light grows.
 _LOOKS = ((0.5, 3), (1.0, 3), (0.5, 1), (0.5, 5), (1.0, 5), (0.25, 1), (0.25, 3))
@@ -172,19 +172,9 @@ class _Prints:
 
     def _sampled(self, image: Image, quads: FloatArray) -> FloatArray:
         """Gray values (K, S) of quadrilaterals (K, 4, 2)."""
-        import cv2
-
         square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
         H = homographies(np.broadcast_to(square, quads.shape), quads)
-        at = np.clip(mapped(H, self._at[None]), -1e4, 2e4).astype(np.float32)
-        values = cv2.remap(
-            image,
-            np.ascontiguousarray(at[..., 0]),
-            np.ascontiguousarray(at[..., 1]),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        return np.asarray(values, dtype=np.float64)
+        return gray_at(image, mapped(H, self._at[None]))
 
 
 def _unit_rows(values: FloatArray, weight: FloatArray) -> tuple[Single, FloatArray]:
