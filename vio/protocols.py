@@ -217,6 +217,16 @@ class Backend(Protocol):
         """
         raise EstimationError(f"{type(self).__name__} cannot restart after a divergence")
 
+    def begin_anew(self, good: Estimate) -> bool:
+        """Forget a state that no working rig can have, and begin again by the last seconds of
+        samples and frames; return whether that was possible.
+
+        Args:
+            good: the last estimate that could be used; the trajectory goes on from its position
+                and heading, with the uncertainty of the time since.
+        """
+        return False
+
     @property
     def initialisation(self) -> Initialisation:
         """How the state was initialised; asked after an update."""

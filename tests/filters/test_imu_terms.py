@@ -20,11 +20,11 @@ from vio.config import Config
 from vio.errors import ConfigError
 from vio.filters import imu_terms
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, accel_D_terms, gyro_D_terms, significant
-from vio.filters.late_imu import LateImuMsckf
 from vio.filters.msckf import Msckf
 from vio.filters.navigation import DIM, NO_STEP, ImuMotion, NavState
 from vio.filters.online_calibration import STEREO_YAW_SIGMA_DEG
 from vio.filters.settings import MsckfSettings
+from vio.filters.supervised import SupervisedMsckf
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_log
 from vio.geometry.stereo import CameraKind
 from vio.geometry.upright import rotation_to_up
@@ -398,7 +398,10 @@ def test_survives_a_late_imu_a_gap_a_checkpoint_and_a_restart(tmp_path: Path) ->
         s for s in _samples(flight, OFF_BY_1_PERCENT, FULL, noise) if s.time_ns > 10 * STEP_NS
     ]
     samples = [s for s in samples if not 25 * STEP_NS < s.time_ns < 29 * STEP_NS]
-    filters, dataset = [LateImuMsckf(CAMERA, T_CAM0_IMU, FULL)], SimpleNamespace(observations=None)
+    filters, dataset = (
+        [SupervisedMsckf(CAMERA, T_CAM0_IMU, FULL)],
+        SimpleNamespace(observations=None),
+    )
     for k in range(50):
         if k == 45:
             save_checkpoint(tmp_path / "state", filters[0], dataset)

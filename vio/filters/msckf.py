@@ -235,6 +235,11 @@ class Msckf(Backend):
             )
         return report
 
+    @property
+    def can_begin(self) -> bool:
+        """Whether a frame begins the state, or it has begun."""
+        return self._window is not None or self._propagation.motion.ready
+
     def _start_state(self, seen: Observations) -> tuple[NavState, FloatArray] | None:
         """The navigation state at the first frame and its covariance (15, 15).
 

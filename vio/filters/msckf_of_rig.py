@@ -4,12 +4,13 @@ late.
 
 from __future__ import annotations
 
-from vio.filters.late_imu import LateImuMsckf
 from vio.filters.mono_msckf import MonoMsckf
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
+from vio.filters.supervised import SupervisedMsckf
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.protocols import Backend
 from vio.records import MotionSource
 
 
@@ -25,7 +26,7 @@ class MsckfOfRig(Msckf):
         T_cam0_body: FloatArray,
         settings: MsckfSettings,
         motion: MotionSource | None,
-    ) -> Msckf:
+    ) -> Backend:
         """Build the filter of a run, see `Backend`.
 
         Raises:
@@ -34,5 +35,5 @@ class MsckfOfRig(Msckf):
         if camera.kind == "mono":
             return MonoMsckf.build(camera, T_cam0_body, settings, motion)
         if motion == "imu":
-            return LateImuMsckf(camera, T_cam0_body, settings)
+            return SupervisedMsckf(camera, T_cam0_body, settings)
         return Msckf(camera, T_cam0_body, settings, motion=motion)

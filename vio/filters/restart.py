@@ -12,6 +12,8 @@ from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.online_calibration import Calibration, body_twist
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp, so3_hat
+from vio.geometry.upright import rotated
+from vio.records import NS_PER_S, Estimate
 
 # A divergence begins before it shows, so the last good attitude is taken to be off by a few degrees
 # already.
@@ -70,13 +72,43 @@ def restarted(
     velocity = motion.velocity_world(nav)
     twist = body_twist(T, velocity, nav.rate)
     moved = replace(nav, T_world_imu=T @ se3_exp(min(elapsed_s, _EXTRAPOLATED_S) * twist))
-    speed = float(np.linalg.norm(velocity)) + _MIN_SPEED_MPS
-    position = speed * elapsed_s
-    rotation = float(np.hypot(_ROTATION_SIGMA_RAD, _RATE_SIGMA_RADPS * elapsed_s))
-    rotation = min(rotation, _ANY_ROTATION_RAD)
+    position, rotation = _unseen_motion(velocity, elapsed_s)
     J = np.eye(6)
     J[:3, 3:] = so3_hat(moved.T_world_imu[:3, 3])
     P = np.zeros((DIM, DIM))
     P[:6, :6] = good.covariance[:6, :6] + J @ np.diag(np.repeat([position, rotation], 3) ** 2) @ J.T
     P[6:, 6:] = motion.start_covariance(settings)[6:, 6:]
     return moved, P
+
+
+def held_covariance(good: Estimate, new: Estimate, up: FloatArray) -> FloatArray:
+    """Return the covariance (6, 6) of a pose whose position and yaw were held since a good
+    estimate, and whose tilt is that of a new start, `[rho; phi]` in the body.
+
+    Args:
+        good: the last estimate that could be used.
+        new: the estimate of the new start, in the same world.
+        up: (3,) the axis of the yaw, world.
+    """
+    elapsed_s = (new.time_ns - good.time_ns) / NS_PER_S
+    velocity = np.zeros(3) if good.velocity_world is None else good.velocity_world
+    position, rotation = _unseen_motion(velocity, elapsed_s)
+    R_good = good.T_world_imu[:3, :3]
+    up_good = R_good.T @ up
+    of_yaw = float(up_good @ good.covariance[3:, 3:] @ up_good) + rotation**2
+    of_position = rotated(R_good, good.covariance[:3, :3]) + position**2 * np.eye(3)
+    R = new.T_world_imu[:3, :3]
+    about_up = np.outer(R.T @ up, R.T @ up)
+    P = np.zeros((6, 6))
+    P[:3, :3] = rotated(R.T, of_position)
+    P[3:, 3:] = of_yaw * about_up + (new.tilt_sigma_rad or 0.0) ** 2 * (np.eye(3) - about_up)
+    return P
+
+
+def _unseen_motion(velocity: FloatArray, elapsed_s: float) -> tuple[float, float]:
+    """Standard deviations of how far, m, and by which angle, rad, a body has moved that had a
+    velocity (3,) when it was last seen.
+    """
+    position = (float(np.linalg.norm(velocity)) + _MIN_SPEED_MPS) * elapsed_s
+    rotation = float(np.hypot(_ROTATION_SIGMA_RAD, _RATE_SIGMA_RADPS * elapsed_s))
+    return position, min(rotation, _ANY_ROTATION_RAD)

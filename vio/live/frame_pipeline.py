@@ -12,6 +12,7 @@ from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.imu_trial import AS_GIVEN, ImuTrial, corrected
+from vio.live.recovery import Recovery
 from vio.monitor.run import RunMonitor
 from vio.numerics.robust import median
 from vio.protocols import Backend, Frontend, Selector
@@ -62,6 +63,7 @@ class FramePipeline:
         self._trial = trial
         self._imu = AS_GIVEN
         self._revised: dict[int, Estimate] = {}
+        self._recovery = Recovery()
 
     def sample(self, sample: MotionSample) -> None:
         """Take one motion sample."""
@@ -119,7 +121,7 @@ class FramePipeline:
         estimate = self.backend.estimate()
         timer.end("update")
         self.monitor.update(frame.index, report, estimate)
-        estimate = self.monitor.judged(frame.index, estimate)
+        estimate = self._recovered(frame.index, self.monitor.judged(frame.index, estimate))
         timer.ms["filter"] = timer.ms["predict"] + timer.ms["update"] + self._propagate_ms
         self._propagate_ms = 0.0
         return FrameResult(
@@ -169,6 +171,15 @@ class FramePipeline:
         revised = self._revised
         self._revised = {}
         return revised
+
+    def _recovered(self, index: int, estimate: Estimate) -> Estimate:
+        """Begin a back end anew whose state has become impossible; return the frame's estimate."""
+        good = self._recovery.take(estimate)
+        if good is None or not self.backend.begin_anew(good):
+            return estimate
+        estimate = self.backend.estimate()
+        self.monitor.begun_anew(index, good.time_ns, estimate)
+        return self.monitor.judged(index, estimate)
 
     def _update(self, seen: Observations) -> UpdateReport:
         """Update with a frame; a back end that diverges is restarted."""

@@ -13,7 +13,7 @@ from vio.calibration.severity import rows_grade
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.numerics.robust import median
-from vio.records import BoolArray, Estimate, IntArray, Observations, UpdateReport
+from vio.records import NS_PER_S, BoolArray, Estimate, IntArray, Observations, UpdateReport
 
 _NO_FEATURES_S = 1.0  # without a usable feature for longer, the pose is a prediction only
 _GAP_S = 0.5  # between frames: a gap if longer, and so many times the usual time
@@ -27,6 +27,8 @@ _SCALE_OFF_PERCENT = 1.0  # of baseline or focal length, both to be exceeded
 _SCALE_SIGMAS = 3.0
 _RESTART_EVENT_S = 1.0  # restarts that follow each other within this time are one event
 _MAX_SPEED_MPS = 100.0
+_STATE = ("speed", "gyro bias", "accelerometer bias")  # what is implausible of a state
+_SCALES = ("baseline", "focal length")
 _MAX_GYRO_BIAS_RADPS = 0.5
 _MAX_ACCEL_BIAS_MPS2 = 3.0
 
@@ -68,6 +70,21 @@ class RunHealth:
             f"of its position is {sigma:.2f} m"
         )
         return (Finding("estimate-restarted", message, index, figures={"sigma_m": sigma}),)
+
+    def begun_anew(self, index: int, good_ns: int, estimate: Estimate) -> Finding:
+        """Return the finding on a new start from the sensors, with an estimate after it; what was
+        found of the state before is forgotten.
+        """
+        self._last = estimate.time_ns, estimate.T_world_imu[:3, 3].copy()
+        sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+        ago_s = (estimate.time_ns - good_ns) / NS_PER_S
+        message = (
+            f"frame {index}: the filter was begun anew by the sensors, as its state was impossible; "
+            f"position and heading go on from {ago_s:.1f} s ago, the standard deviation of the "
+            f"position is {sigma:.2g} m"
+        )
+        self._reported -= {*_SCALES, *_STATE}
+        return Finding("estimate-restarted", message, index, figures={"sigma_m": sigma})
 
     def frame(self, index: int, report: UpdateReport, estimate: Estimate) -> tuple[Finding, ...]:
         """Return the findings of a frame, by what its update did and the estimate after it."""

@@ -57,6 +57,12 @@ class IntegrityMonitor:
         """Take a finding; it counts from the next estimate on."""
         self._new.append(finding)
 
+    def end(self, *codes: str) -> None:
+        """Let go of findings on a state that has been replaced."""
+        for code in codes:
+            self._holding.pop(code, None)
+        self._new = [finding for finding in self._new if finding.code not in codes]
+
     def take_marks(self) -> tuple[Mark, ...]:
         """Return the marks of earlier frames since the last call."""
         marks = tuple(self._marks)

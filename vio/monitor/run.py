@@ -272,6 +272,14 @@ class RunMonitor:
         """
         self._add(self._health.restarted(index, why, estimate))
 
+    def begun_anew(self, index: int, good_ns: int, estimate: Estimate) -> None:
+        """Report that the back end was begun anew in a frame, as its state was impossible; `good_ns`
+        is the time of the last estimate that could be used.
+        """
+        self._scale_lines = []
+        self._integrity.end("estimate-implausible", "scale-off")
+        self._add([self._health.begun_anew(index, good_ns, estimate)])
+
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
         self._add(self._health.frame(index, report, estimate))

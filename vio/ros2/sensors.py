@@ -23,7 +23,7 @@ from vio.errors import DataError, VioError
 from vio.geometry.lie import FloatArray
 from vio.live.live_odometry import LiveOdometry
 from vio.live.pairing import Pairing
-from vio.records import Image
+from vio.records import NS_PER_S, Image
 from vio.ros2.transport import Quality, Transport
 
 log = logging.getLogger(__name__)
@@ -31,6 +31,10 @@ log = logging.getLogger(__name__)
 SILENT_S = 5.0  # without a message, before it is said
 # a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
 _BACK_NS = 500_000_000
+# A stamp so far ahead of the last one begins anew, too, where less than a tenth of that time has
+# passed: the clock was set. A gap in a bag that is played ten times as fast is none.
+_AHEAD_NS = 5 * NS_PER_S
+_PASSED = 0.1
 _LEVEL_IMAGES = 8  # of 16 bits, looked at for the levels of black and white
 _MAX_REASONS = 50  # that are named
 
@@ -70,8 +74,9 @@ class Sensors:
         self._topics = topics
         self._odometry = odometry
         self._pairing: Pairing[Image] = Pairing()
-        self._newest: dict[str, tuple[int | None, int]] = {}  # the last two stamps, ns
-        self._back: set[str] = set()  # topics whose last stamp lay far before these
+        # the last two stamps, ns, and when the last one arrived
+        self._newest: dict[str, tuple[int | None, int, int]] = {}
+        self._stepped: set[str] = set()  # topics whose last stamp lay far from these
         self._bands: list[Band] = []  # of the levels of 16-bit images
         self.gyro: FloatArray | None = None  # (3,) rad/s, of the newest sample
         self.received = dict.fromkeys(topics.kinds, 0)  # messages
@@ -131,33 +136,48 @@ class Sensors:
     def _stamped(self, topic: str, fields: Any) -> int | None:
         """Return a message's stamp; None: it is not after the last one of its topic.
 
-        Where two in a row lie far before that one, all begins anew.
+        Where two in a row lie far before that one, or far ahead though little time has passed, all
+        begins anew.
         """
         time_ns = stamp_of(fields)
-        before, last = self._newest.get(topic, (None, None))
+        arrived_ns = round(time.monotonic() * NS_PER_S)
+        before, last, last_arrived_ns = self._newest.get(topic, (None, None, 0))
         back = last is not None and time_ns < last - _BACK_NS
+        ahead = last is not None and _is_ahead(time_ns - last, arrived_ns - last_arrived_ns)
         if last is not None and back and before is not None and before < time_ns:
             last = before  # that one was far ahead, alone; the odometry has left it out
-        elif back and topic in self._back:
-            log.warning(
-                "%s: the stamps went back by %.1f s, as of a publisher that was restarted: a new "
-                "trajectory begins",
-                topic,
-                ((last or 0) - time_ns) * 1e-9,
-            )
-            self._odometry.reset()
-            self._newest.clear()
-            self._back.clear()
-            self._pairing = Pairing()
+        elif last is not None and (back or ahead) and topic in self._stepped:
+            self._begin_anew(topic, time_ns - last)
             last = None
+        elif last is not None and ahead:
+            self._stepped.add(topic)
+            self._refuse(
+                topic,
+                f"the stamp {time_ns} ns is {(time_ns - last) / NS_PER_S:.1f} s ahead of the last "
+                "one, and less time has passed",
+            )
+            return None
         elif last is not None and time_ns <= last:
             if back:
-                self._back.add(topic)
+                self._stepped.add(topic)
             self._refuse(topic, f"the stamp {time_ns} ns is not after the last one, {last} ns")
             return None
-        self._newest[topic] = last, time_ns
-        self._back.discard(topic)
+        self._newest[topic] = last, time_ns, arrived_ns
+        self._stepped.discard(topic)
         return time_ns
+
+    def _begin_anew(self, topic: str, step_ns: int) -> None:
+        """Begin a new trajectory after a step of the stamps."""
+        why = (
+            f"went back by {-step_ns / NS_PER_S:.1f} s, as of a publisher that was restarted"
+            if step_ns < 0
+            else f"went ahead by {step_ns / NS_PER_S:.1f} s at once, as of a clock that was set"
+        )
+        log.warning("%s: the stamps %s: a new trajectory begins", topic, why)
+        self._odometry.reset()
+        self._newest.clear()
+        self._stepped.clear()
+        self._pairing = Pairing()
 
     def _gray_levels(self, fields: Any, kind: str, where: str) -> Levels:
         """Return the levels of black and white of 16-bit images, from the first ones."""
@@ -174,6 +194,11 @@ class Sensors:
             return
         self._reasons.add(reason)
         log.warning("%s; such messages are left out, and counted in /diagnostics", line)
+
+
+def _is_ahead(step_ns: int, passed_ns: int) -> bool:
+    """Whether stamps have gone ahead by far more than the time that has passed."""
+    return step_ns > _AHEAD_NS and passed_ns < _PASSED * step_ns
 
 
 class Silence:
