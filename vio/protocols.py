@@ -217,15 +217,18 @@ class Backend(Protocol):
         """
         raise EstimationError(f"{type(self).__name__} cannot restart after a divergence")
 
-    def begin_anew(self, good: Estimate) -> bool:
+    def begin_anew(self, good: Estimate) -> Estimate | None:
         """Forget a state that no working rig can have, and begin again by the last seconds of
-        samples and frames; return whether that was possible.
+        samples and frames, or as soon as that is possible.
 
         Args:
             good: the last estimate that could be used; the trajectory goes on from its position
                 and heading, with the uncertainty of the time since.
+
+        Returns:
+            The estimate of the newest frame; None: nothing has changed, as it cannot begin again.
         """
-        return False
+        return None
 
     @property
     def initialisation(self) -> Initialisation:

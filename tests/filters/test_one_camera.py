@@ -672,3 +672,34 @@ def test_a_filter_that_waits_to_begin_again_keeps_its_points() -> None:
     after = flown.filter.landmarks()
     assert set(after.ids.tolist()) <= set(before.ids.tolist())
     assert len(after.ids)
+
+
+def test_one_camera_begins_anew_where_it_was_good() -> None:
+    """After a state that is impossible it waits, and then goes on from the pose that is given."""
+    flight = Path3(80, "curve")
+    rng = np.random.default_rng(0)
+    filt = MonoMsckf(LEFT, T_CAM0_IMU, SETTINGS)
+    assert filt.begin_anew(filt.estimate()) is None  # nothing to begin anew
+    samples = flight.imu(rng, SETTINGS, np.zeros(6))
+    again: int | None = None
+    for k in range(80):
+        while samples and samples[0].time_ns <= k * STEP_NS:
+            filt.propagate(samples.pop(0))
+        started = filt.update(_left_only(flight.observe(k, PIXEL, rng, 80))).started
+        if k == 38:
+            good = filt.estimate()
+        if k == 40:
+            held = filt.begin_anew(good)
+        if started and k > 40 and again is None:
+            again = k
+    assert held is not None
+    np.testing.assert_array_equal(held.T_world_imu, good.T_world_imu)
+    assert held.covariance[0, 0] > good.covariance[0, 0]
+    assert again is not None
+    assert again > 41
+    last = filt.estimate()
+    moved = se3_inverse(good.T_world_imu) @ last.T_world_imu
+    a, b = (se3_from_parts(*flight.state(k * 0.05)[:2]) for k in (38, 79))
+    off = (se3_inverse(a) @ b)[:3, 3] - moved[:3, 3]
+    assert off @ np.linalg.solve(last.covariance[:3, :3], off) < 16.3  # 99.9 % of 3
+    assert np.arccos(last.T_world_imu[2, :3] @ b[2, :3]) < 3.0 * last.tilt_sigma_rad

@@ -95,11 +95,11 @@ class Breaking(Backend):
         """Return none."""
         return no_landmarks()
 
-    def begin_anew(self, good: Estimate) -> bool:
+    def begin_anew(self, good: Estimate) -> Estimate:
         """Note it."""
         self.begun_from.append(good)
         self._now = replace(self._now, accel_bias=np.zeros(3))
-        return True
+        return self._now
 
 
 def test_a_run_goes_on_with_a_state_that_is_possible() -> None:

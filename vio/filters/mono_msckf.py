@@ -15,7 +15,7 @@ from vio.filters.msckf import Msckf
 from vio.filters.navigation import DIM, ImuMotion, NavState
 from vio.filters.noise import MotionNoise
 from vio.filters.propagation import IMU_FACTORS
-from vio.filters.restart import GoodState, required, restarted
+from vio.filters.restart import GoodState, held_covariance, required, restarted
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
 from vio.filters.window_posterior import scale_sigma
@@ -150,14 +150,36 @@ class MonoMsckf(Msckf):
         """Begin anew after a divergence, see `Msckf`; there is no estimate until the start is
         observable again.
         """
-        self._resumed = good = required(self._good)
+        self._wait_again(required(self._good))
+        return self._update(observations)
+
+    def begin_anew(self, good: Estimate) -> Estimate | None:
+        """Wait for a new start in place of a state that has become impossible, see `Backend`."""
+        last = self._good
+        if last is None or good.velocity_world is None:
+            return None
+        up_from = se3_from_parts(last.calibration.R_upright_world, np.zeros(3))
+        T = up_from @ good.T_world_imu
+        covariance = last.covariance.copy()
+        A = se3_adjoint(T)
+        covariance[:6, :6] = A @ good.covariance @ A.T
+        nav = replace(
+            last.nav, T_world_imu=T, velocity=last.calibration.R_upright_world @ good.velocity_world
+        )
+        now = replace(good, time_ns=self._propagation.time_ns)
+        held = replace(now, covariance=held_covariance(good, now, np.array([0.0, 0.0, 1.0])))
+        self._wait_again(replace(last, time_ns=good.time_ns, nav=nav, covariance=covariance))
+        return held
+
+    def _wait_again(self, good: GoodState) -> None:
+        """Forget the state; the next start is placed by a good one."""
+        self._resumed = good
         self._window = None
         self._begun = None
         self._good = None
         self._propagation.forget()
         self._forget_tracks(good)
         self._starter = MonoStarter(self._rig.camera, self._calibration.T_cam0_imu, self._settings)
-        return self._update(observations)
 
     def _wait(self, observations: Observations) -> UpdateReport:
         return replace(super()._wait(observations), started=False)

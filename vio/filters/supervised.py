@@ -173,7 +173,7 @@ class SupervisedMsckf(Backend):
         """Start again at a frame after a divergence, see `Msckf`."""
         return self._active.restart(observations)
 
-    def begin_anew(self, good: Estimate) -> bool:
+    def begin_anew(self, good: Estimate) -> Estimate | None:
         """Replace a filter whose state has become impossible by a new one, see `Backend`.
 
         The new filter takes the samples and frames of the last seconds, so it has a window already.
@@ -181,16 +181,16 @@ class SupervisedMsckf(Backend):
         of what the rig may have done since.
         """
         if self._stand_in is not None:
-            return False
+            return None
         new = self._new()
         frame = self._give_recent(new)
         if frame is None:
-            return False
+            return None
         new.take_rotation_comparison(self._rotation)
         self._earlier = self.landmarks()
         self._handover = self._placed(good, new.estimate(), frame)
         self._filter = new
-        return True
+        return self.estimate()
 
     def _give_recent(self, new: Msckf) -> int | None:
         """Give a filter the last seconds; return the number of the newest frame.

@@ -175,11 +175,11 @@ class FramePipeline:
     def _recovered(self, index: int, estimate: Estimate) -> Estimate:
         """Begin a back end anew whose state has become impossible; return the frame's estimate."""
         good = self._recovery.take(estimate)
-        if good is None or not self.backend.begin_anew(good):
+        anew = None if good is None else self.backend.begin_anew(good)
+        if good is None or anew is None:
             return estimate
-        estimate = self.backend.estimate()
-        self.monitor.begun_anew(index, good.time_ns, estimate)
-        return self.monitor.judged(index, estimate)
+        self.monitor.begun_anew(index, good.time_ns, anew)
+        return self.monitor.judged(index, anew)
 
     def _update(self, seen: Observations) -> UpdateReport:
         """Update with a frame; a back end that diverges is restarted."""
