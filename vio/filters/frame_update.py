@@ -29,6 +29,7 @@ from vio.filters.prior import Fit
 from vio.filters.propagation import FramePosterior, Propagation
 from vio.filters.rig_calibration import RigCalibration
 from vio.filters.settings import MsckfSettings
+from vio.filters.step_by_images import explained_share, linked_points, step_by_images
 from vio.filters.stereo_calibration import (
     StereoColumns,
     StereoCorrection,
@@ -45,7 +46,9 @@ from vio.geometry.lie import (
     se3_adjoint,
     se3_inverse,
     se3_log,
+    so3_exp,
     so3_hat,
+    so3_left_jacobian_inverse,
     transform_points,
 )
 from vio.geometry.stereo import depth_of, project
@@ -82,6 +85,10 @@ class _UpdateRules:
     scale_sigma: float = 0.001
     # by all views; a point of the map is reported with its covariance, and not used
     map_depth_sigma: float = 0.2
+    # A fit does not begin at a predicted pose where fewer of the tracks have a usable point, or that
+    # is off by more pixels.
+    in_view: float = 0.5
+    lost: float = 15.0
     # pixels by which the predicted pose may be off before one step over the window is too few
     far: float = 0.5
     nearer: float = 1.25  # by which factor a step must have come nearer for another one
@@ -181,9 +188,11 @@ class FrameUpdate:
 
         predicted = window.camera_move_since(-2) if len(window.clones) > 1 else None
         T_world_predicted = window.nav.T_world_imu
-        tracks = self._linearise(
-            window, self.tracks.choose(len(window.clones)), _UPDATE.first_steps
-        )
+        rows = self.tracks.choose(len(window.clones))
+        tracks = self._linearise(window, rows, _UPDATE.first_steps)
+        if not self._has_imu and self._is_lost(window, tracks, len(rows), pixels):
+            self._begin_by_images(window, rows, pixels)
+            tracks = self._linearise(window, rows, _UPDATE.first_steps)
         at_prediction = tracks
         innovation = tracks.newest_innovation()
         innovation_ratio = self.tracks.innovation_ratio(tracks, expected)
@@ -257,6 +266,51 @@ class FrameUpdate:
         """Whether an IMU has measured the motion since the last frame."""
         propagation = self._propagation
         return propagation.source == "imu" and not propagation.since_frame.bridged
+
+    def _is_lost(self, window: Window, tracks: LinearTracks, given: int, pixels: Views) -> bool:
+        """Whether the predicted pose is too far off for a fit to begin there: of the tracks that
+        were given, fewer than half could be linearised, or they or the landmarks are far off.
+        """
+        innovation = tracks.newest_innovation()
+        lost = len(tracks.rows) < _UPDATE.in_view * given
+        if lost or (innovation is not None and innovation > _UPDATE.lost):
+            return True
+        if len(pixels.z) <= given or len(window.clones) < 2:
+            return False
+        T = window.T_cam0_world(-1)[0]
+        share = explained_share(
+            self._rig.camera, T, window.landmarks, self._corrected(window, pixels).z, _UPDATE.lost
+        )
+        return share < _UPDATE.in_view
+
+    def _corrected(self, window: Window, pixels: Views) -> Views:
+        field = self._rig.field(window)
+        return pixels if field is None else field.corrected(pixels)
+
+    def _begin_by_images(self, window: Window, rows: IntArray, pixels: Views) -> None:
+        """Move the newest pose to where the images alone have it; the prior stays where it is, and
+        so do points.
+        """
+        clones = len(window.clones)
+        if clones < 2:
+            return
+        T = window.T_cam0_world(clones - 2)
+        camera = self._rig.camera
+        p, z = linked_points(camera, self.tracks.views(rows, clones, self._rig.field(window)))
+        p = np.concatenate([p, transform_points(T[0], window.landmarks)])
+        z = np.concatenate([z, self._corrected(window, pixels).z])
+        step = step_by_images(camera, p, z)
+        if step is None:
+            return
+        xi = se3_log(se3_inverse(step @ T[0]) @ T[1])  # of the body, as of the camera: world's side
+        state = window.state
+        error = np.zeros(state.size)
+        error[:6] = xi
+        error[state.clone(-1)] = xi
+        landmarks = window.landmarks
+        kept = (landmarks - landmarks @ so3_exp(xi[3:]).T) @ so3_left_jacobian_inverse(xi[3:]).T
+        error[state.landmarks] = kept.reshape(-1)
+        window.relinearise(error)
 
     def _keep_landmarks(self, window: Window, kept: BoolArray) -> None:
         """Drop the landmarks outside a mask (M,) from the state; their points go to the map."""

@@ -173,7 +173,7 @@ class WindowTracks:
         table = self.table
         T = T_cam0_world
         clones = len(T_cam0_world)
-        views = self._views(rows, clones, field)
+        views = self.views(rows, clones, field)
         fresh = ~table.has_point[rows]
         if fresh.any():
             start, known = first_points(camera, T, views.take(fresh))
@@ -288,8 +288,8 @@ class WindowTracks:
         )
         return scores, information
 
-    def _views(self, rows: IntArray, clones: int, field: StereoCorrection | None) -> Views:
-        """What rows showed, without the rectification error."""
+    def views(self, rows: IntArray, clones: int, field: StereoCorrection | None) -> Views:
+        """Return what rows showed in the clones, without the rectification error."""
         views = self.table.views(rows, clones)
         return views if field is None else field.corrected(views)
 
