@@ -190,7 +190,7 @@ class FrameUpdate:
         T_world_predicted = window.nav.T_world_imu
         rows = self.tracks.choose(len(window.clones))
         tracks = self._linearise(window, rows, _UPDATE.first_steps)
-        if not self._has_imu and self._is_lost(window, tracks, len(rows), pixels):
+        if not self._is_measured and self._is_lost(window, tracks, len(rows), pixels):
             self._begin_by_images(window, rows, pixels)
             tracks = self._linearise(window, rows, _UPDATE.first_steps)
         at_prediction = tracks
@@ -262,10 +262,15 @@ class FrameUpdate:
         return True
 
     @property
+    def _is_measured(self) -> bool:
+        """Whether a sensor has measured the motion since the last frame."""
+        propagation = self._propagation
+        return propagation.source is not None and not propagation.since_frame.bridged
+
+    @property
     def _has_imu(self) -> bool:
         """Whether an IMU has measured the motion since the last frame."""
-        propagation = self._propagation
-        return propagation.source == "imu" and not propagation.since_frame.bridged
+        return self._propagation.source == "imu" and self._is_measured
 
     def _is_lost(self, window: Window, tracks: LinearTracks, given: int, pixels: Views) -> bool:
         """Whether the predicted pose is too far off for a fit to begin there: of the tracks that
