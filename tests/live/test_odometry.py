@@ -305,6 +305,26 @@ def test_a_pause_is_no_wrong_stamp_once_a_second_frame_confirms_it() -> None:
     assert _live(odometry, times) == [k != 6 for k in range(12)]
 
 
+@pytest.mark.parametrize("step_ns", [1, 50, 50_000])
+def test_stamps_in_another_unit_are_refused_for_ever(step_ns: int) -> None:
+    """Frame numbers, ms and us: the steps over several refused stamps are no right ones."""
+    odometry = Odometry(CAMERA, IMAGES_ALONE)
+    seen = Flight().observe(0, 0.0, np.random.default_rng(0))
+    for k in range(30):
+        if k < 3:
+            assert odometry.add_observations(k * step_ns, seen.ids, seen.z) is not None
+            continue
+        with pytest.raises(DataError, match=f"come {step_ns} ns apart, .* give integer nanosec"):
+            odometry.add_observations(k * step_ns, seen.ids, seen.z)
+
+
+def test_a_camera_whose_first_stamps_are_quick_goes_on() -> None:
+    odometry = Odometry(CAMERA, IMAGES_ALONE)
+    seen = Flight().observe(0, 0.0, np.random.default_rng(0))
+    for time_ns in (0, 1000, 2000, 50_000_000, 100_000_000, 100_001_000):
+        assert odometry.add_observations(time_ns, seen.ids, seen.z) is not None
+
+
 def test_slow_cameras_have_no_jumps() -> None:
     odometry = Odometry(CAMERA, IMAGES_ALONE)
     seen = Flight().observe(0, 0.0, np.random.default_rng(0))

@@ -212,6 +212,7 @@ class _Stamps:
         self._short = 0  # steps so far, where all of them are shorter than that
         self._units_known = False  # one was longer
         self._last_ns: int | None = None  # taken
+        self._refused_ns: int | None = None  # the last one, where steps are too short
         self._step_ns = 0
         self._held_ns: int | None = None  # left out
 
@@ -227,9 +228,14 @@ class _Stamps:
 
     def _check_unit(self, time_ns: int) -> None:
         """Raise DataError where all steps so far are too short for nanoseconds."""
-        if self._last_ns is None or self._units_known or self._short < _SHORT_STEPS:
+        last_ns = self._last_ns
+        if last_ns is None or self._units_known or self._short < _SHORT_STEPS:
             return
-        self._refuse(time_ns - self._last_ns)
+        # Refused stamps count as well: steps over several of them are as long as right ones.
+        if self._refused_ns is not None and last_ns < self._refused_ns < time_ns:
+            last_ns = self._refused_ns
+        self._refused_ns = time_ns
+        self._refuse(time_ns - last_ns)
 
     def check_steps(self, times_ns: list[int]) -> None:
         """Raise DataError where all steps between several first stamps are too short."""
