@@ -1162,3 +1162,31 @@ def test_garbage_ends_in_an_error_of_ours_or_in_numbers(seed: int, gap: int) -> 
         assert gap == 1, "steps of 1.6 years are survived by no filter"
         return
     assert f"msckf diverged at frame {k}: too few features for too long" in told
+
+
+@pytest.mark.parametrize("motion", [None, "velocity"])
+def test_a_filter_without_an_imu_is_begun_anew_where_it_was_good(motion: str | None) -> None:
+    """What it has estimated since is forgotten, whatever that was."""
+    flight = Flight(60)
+    rng = np.random.default_rng(0)
+    filt = Msckf(CAMERA, T_CAM0_IMU, EXACT_RIG, motion=motion)  # type: ignore[arg-type]
+    assert filt.begin_anew(filt.estimate()) is None
+    for k in range(45):
+        seen = flight.observe(k, 0.3, rng)
+        if motion == "velocity":
+            R, _, v, _, omega = flight.state(k * 0.05)
+            filt.propagate(VelocitySample(k * STEP_NS, R.T @ v, omega))
+        filt.update(seen)
+        if k == 20:
+            good = filt.estimate()
+        if k == 30:
+            anew = filt.begin_anew(good)
+        if k == 33:
+            first = filt.estimate()
+    assert anew is not None
+    assert np.linalg.norm(anew.T_world_imu[:3, 3] - good.T_world_imu[:3, 3]) < 1.0
+    assert np.sqrt(np.trace(anew.covariance[:3, :3])) > 0.3
+    last = filt.estimate()
+    truth = se3_inverse(flight.T_world_imu(33)) @ flight.T_world_imu(44)
+    moved = se3_inverse(first.T_world_imu) @ last.T_world_imu
+    assert np.linalg.norm(se3_log(se3_inverse(truth) @ moved)[:3]) < 0.1

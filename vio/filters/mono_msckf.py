@@ -15,7 +15,13 @@ from vio.filters.msckf import Msckf
 from vio.filters.navigation import DIM, ImuMotion, NavState
 from vio.filters.noise import MotionNoise
 from vio.filters.propagation import IMU_FACTORS
-from vio.filters.restart import GoodState, held_covariance, required, restarted
+from vio.filters.restart import (
+    GoodState,
+    as_good_state,
+    held_covariance,
+    required,
+    restarted,
+)
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
 from vio.filters.window_posterior import scale_sigma
@@ -156,19 +162,11 @@ class MonoMsckf(Msckf):
     def begin_anew(self, good: Estimate) -> Estimate | None:
         """Wait for a new start in place of a state that has become impossible, see `Backend`."""
         last = self._good
-        if last is None or good.velocity_world is None:
+        if last is None:
             return None
-        up_from = se3_from_parts(last.calibration.R_upright_world, np.zeros(3))
-        T = up_from @ good.T_world_imu
-        covariance = last.covariance.copy()
-        A = se3_adjoint(T)
-        covariance[:6, :6] = A @ good.covariance @ A.T
-        nav = replace(
-            last.nav, T_world_imu=T, velocity=last.calibration.R_upright_world @ good.velocity_world
-        )
         now = replace(good, time_ns=self._propagation.time_ns)
         held = replace(now, covariance=held_covariance(good, now, np.array([0.0, 0.0, 1.0])))
-        self._wait_again(replace(last, time_ns=good.time_ns, nav=nav, covariance=covariance))
+        self._wait_again(as_good_state(last, good))
         return held
 
     def _wait_again(self, good: GoodState) -> None:

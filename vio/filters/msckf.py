@@ -31,7 +31,7 @@ from vio.filters.noise import MotionNoise
 from vio.filters.online_calibration import Calibration, all_imu_terms, first_calibration
 from vio.filters.point_map import PointMap
 from vio.filters.propagation import Propagation, first_imu_noise
-from vio.filters.restart import GoodState, required, restarted
+from vio.filters.restart import GoodState, as_good_state, required, restarted
 from vio.filters.rig_calibration import RigCalibration
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Clone, Window
@@ -266,15 +266,26 @@ class Msckf(Backend):
             EstimationError: there was no good update.
             DivergedError: the filter diverges again at once.
         """
-        good = required(self._good)
-        propagation = self._propagation
-        nav, P = restarted(good, observations.time_ns, propagation.motion, self._settings)
-        window = self._window = self._first_window(nav, P, good.calibration)
-        propagation.begin(
-            window, observations.time_ns, propagation.body_time(window, observations.time_ns)
-        )
-        self._forget_tracks(good)
+        self._go_on_from(required(self._good), observations.time_ns)
         return self._update(observations)
+
+    def begin_anew(self, good: Estimate) -> Estimate | None:
+        """Go on from the last estimate that could be used, as `restart` does; velocity samples, if
+        any, come anyway, and with images alone there is nothing else to begin by.
+        """
+        if self._good is None:
+            return None
+        self._good = as_good_state(self._good, good)
+        self._go_on_from(self._good, self._propagation.time_ns)
+        return self.estimate()
+
+    def _go_on_from(self, good: GoodState, time_ns: int) -> None:
+        """Empty the window at the time of a frame, to which a good state is carried."""
+        propagation = self._propagation
+        nav, P = restarted(good, time_ns, propagation.motion, self._settings)
+        window = self._window = self._first_window(nav, P, good.calibration)
+        propagation.begin(window, time_ns, propagation.body_time(window, time_ns))
+        self._forget_tracks(good)
 
     def _forget_tracks(self, good: GoodState) -> None:
         """Forget all tracks and the motion's noise; go on with the calibration of the last good

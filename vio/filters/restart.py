@@ -11,7 +11,7 @@ from vio.errors import EstimationError
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.online_calibration import Calibration, body_twist
 from vio.filters.settings import MsckfSettings
-from vio.geometry.lie import FloatArray, se3_exp, so3_hat
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_from_parts, so3_hat
 from vio.geometry.upright import rotated
 from vio.records import NS_PER_S, Estimate
 
@@ -79,6 +79,22 @@ def restarted(
     P[:6, :6] = good.covariance[:6, :6] + J @ np.diag(np.repeat([position, rotation], 3) ** 2) @ J.T
     P[6:, 6:] = motion.start_covariance(settings)[6:, 6:]
     return moved, P
+
+
+def as_good_state(last: GoodState, good: Estimate) -> GoodState:
+    """Return the state of an estimate, in the form of the last plausible one, whose calibration it
+    keeps.
+    """
+    R = last.calibration.R_upright_world
+    T = se3_from_parts(R, np.zeros(3)) @ good.T_world_imu
+    velocity = last.nav.velocity
+    if good.velocity_world is not None:
+        velocity = R @ good.velocity_world
+    covariance = last.covariance.copy()
+    A = se3_adjoint(T)
+    covariance[:6, :6] = A @ good.covariance @ A.T
+    nav = replace(last.nav, T_world_imu=T, velocity=velocity)
+    return replace(last, time_ns=good.time_ns, nav=nav, covariance=covariance)
 
 
 def held_covariance(good: Estimate, new: Estimate, up: FloatArray) -> FloatArray:

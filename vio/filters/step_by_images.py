@@ -12,7 +12,6 @@ import numpy as np
 from vio.filters.track_records import Views
 from vio.geometry.lie import FloatArray, circledot, se3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, project, triangulate, z_D_p_cam
-from vio.records import BoolArray
 
 _MIN_LINKS = 12  # features that both frames show with a depth
 _MIN_DISPARITY_PX = 2.0
@@ -29,7 +28,7 @@ def linked_points(camera: StereoCamera, views: Views) -> tuple[FloatArray, Float
         camera: the rectified pair.
         views: of tracks (F, N, 4), the newest frame last; without the rectification error.
     """
-    both: BoolArray = (views.weight[:, -2:, :3] > 0).all(axis=(1, 2))
+    both = np.all(views.weight[:, -2:, :3] > 0, axis=(1, 2))
     p, known = triangulate(camera, views.z[both, -2], min_disparity_px=_MIN_DISPARITY_PX)
     return p[known], views.z[both, -1][known]
 
