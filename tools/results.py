@@ -135,15 +135,14 @@ class Results:
         return "\n".join([*lines, "", origin, ""])
 
     def origins(self) -> str:
-        """Return a table of the machines and versions behind the suites."""
+        """Return a list of the machines and versions behind the suites."""
         suites_of: dict[str, list[str]] = {}
         for name, facts in self.suites.items():
             packages = (f"{key} {value}" for key, value in facts["packages"].items())
-            where = f"{facts['version']} | {facts['machine']} | {', '.join(packages)}"
+            where = f"stereo-vio {facts['version']}, {facts['machine']}; {', '.join(packages)}"
             suites_of.setdefault(where, []).append(f"`{name}`")
-        rows = [f"| {', '.join(names)} | {where} |" for where, names in suites_of.items()]
-        head = ["| suites | stereo-vio | machine | packages |", "|---|---|---|---|"]
-        return "\n".join([*head, *rows, ""])
+        rows = [f"- {', '.join(names)}: {where}" for where, names in suites_of.items()]
+        return "\n".join([*rows, ""])
 
     def figure(self, address: str) -> str:
         """Return the median of a figure by SUITE/SEQUENCE/SYSTEM/FIGURE/DECIMALS.
@@ -330,7 +329,7 @@ def main() -> int:
     if not args.tables:
         if args.data is None:
             parser.error(
-                "--data takes the folder of recordings; the head of docs/results.md says what lies "
+                "--data takes the folder of recordings; the end of docs/results.md says what lies "
                 "there"
             )
         write_json({name: run_suite(name, args) for name in args.only or SUITES})
@@ -346,7 +345,7 @@ def _folder(parser: argparse.ArgumentParser, text: str) -> Path:
     path = Path(text)
     if not text or not path.is_dir():
         parser.error(
-            f"'{text}' is no folder; the head of docs/results.md says what lies in the folder of "
+            f"'{text}' is no folder; the end of docs/results.md says what lies in the folder of "
             "recordings"
         )
     return path.resolve()
