@@ -30,7 +30,7 @@ def page() -> str:
     ]
     for section in dict.fromkeys(row.key.rpartition(".")[0] for row in others):
         chosen = [row for row in others if row.key.rpartition(".")[0] == section]
-        parts.append(f"## Others: `{section}`\n\n{chosen[0].group}.\n\n" + _table(chosen))
+        parts.append(f"## Others: `{section}`\n\n" + _table(chosen))
     return "\n".join(parts)
 
 
