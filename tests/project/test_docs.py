@@ -248,6 +248,7 @@ def readme_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         # of the lines before; made here so that each test runs alone
         shutil.copytree("RUN", "results")
         shutil.copytree("RUN", "first")
+        shutil.copytree("RUN", "runs/folder")
     return root
 
 
