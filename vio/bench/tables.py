@@ -444,9 +444,7 @@ def full_table(
     before: list[str] = []
     for row in rows:
         runs = f"{row.runs}" if not row.failed else f"{row.runs - row.failed} of {row.runs}"
-        texts = [
-            row_text(row, metric, notes, for_documents=for_documents) for metric in metrics
-        ]
+        texts = [row_text(row, metric, notes, for_documents=for_documents) for metric in metrics]
         share = "–" if row.succeeded is None else f"{100 * row.succeeded / row.runs:.0f} %"
         labels = [named.get(getattr(row, name), getattr(row, name)) for name in names]
         shown = (
