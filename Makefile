@@ -103,14 +103,17 @@ $(BIN)/python$(EXE):
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
+	@echo "installing about 30 packages (0.9 GB) into $(VENV): a minute or more"
 	$(PIP_INSTALL) -e . setuptools
 	@touch $@
 
 $(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
+	@echo "installing the documentation's packages into $(VENV)"
 	$(PIP_INSTALL) -e '.[docs]'
 	@touch $@ $(VENV)/.base
 
 $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
+	@echo "installing about 100 packages (2 GB) into $(VENV): minutes"
 	$(PIP_INSTALL) -e '.[dev]'
 	@touch $@ $(VENV)/.docs $(VENV)/.base
 

@@ -13,13 +13,16 @@ from PIL import Image
 from vio import evaluate, load_config, open_dataset, run
 from vio.view.live import states_of
 
-WIDTH, LONGEST = 480, 10  # pixels of each half, steps of a feature's tail
+WIDTH = 480  # pixels of each half
+LONGEST = 10  # steps of a feature's tail
 # as in `vio view`
 COLOURS = np.array([(60, 130, 255), (60, 220, 130), (230, 50, 50), (170, 170, 170), (250, 150, 50)])
 
 
 class Film:  # has `frame(result)` and `close()`, and so can watch any run
-    tails, pictures = {}, []
+    def __init__(self):
+        self.tails = {}
+        self.pictures = []
 
     def frame(self, result):
         seen = result.output.observations
@@ -40,27 +43,29 @@ class Film:  # has `frame(result)` and `close()`, and so can watch any run
     def close(self): ...
 
 
-dataset, film, every = (
-    open_dataset(sys.argv[1]),
-    Film(),
-    int(sys.argv[3]) if len(sys.argv) > 3 else 2,
-)
+dataset = open_dataset(sys.argv[1])
+film = Film()
+every = int(sys.argv[3]) if len(sys.argv) > 3 else 2
 result = run(dataset, load_config(), viewer=film)
 score = evaluate(result.trajectory, dataset.recording.reference, T_cam0_imu=result.T_cam0_body)
-truth, path = score.reference.positions, score.aligned.positions
+truth = score.reference.positions
+path = score.aligned.positions
 # in which the path extends furthest
 plane = np.linalg.svd(truth - truth.mean(axis=0), full_matrices=False)[2][:2].T
-low, high = (truth @ plane).min(axis=0), (truth @ plane).max(axis=0)
+low = (truth @ plane).min(axis=0)
+high = (truth @ plane).max(axis=0)
 size = np.array([WIDTH, film.pictures[0].shape[0]])
 zoom = ((size - 60) / (high - low)).min()  # pixels a metre
 truth, path = (
     np.round(zoom * (p @ plane - (low + high) / 2) + size / 2 - [0, 10]).astype(int)
     for p in (truth, path)
 )
-bar_m, bottom = 10.0 ** np.floor(np.log10(0.4 * WIDTH / zoom)), int(size[1]) - 10
+bar_m = 10.0 ** np.floor(np.log10(0.4 * WIDTH / zoom))
+bottom = int(size[1]) - 10
 legend = f"{bar_m:g} m    gray: ground truth, blue: estimate"
 for k in range(0, len(film.pictures), every):
-    side, done = np.full_like(film.pictures[k], 255), path[: np.searchsorted(score.rows, k) + 1]
+    side = np.full_like(film.pictures[k], 255)
+    done = path[: np.searchsorted(score.rows, k) + 1]
     cv2.polylines(side, [truth], False, (190, 190, 190), 5, cv2.LINE_AA)
     cv2.polylines(side, [done], False, (31, 95, 191), 2, cv2.LINE_AA)
     cv2.circle(side, done[-1].tolist(), 5, (217, 130, 43), -1, cv2.LINE_AA)

@@ -20,48 +20,46 @@ class CornersAndFlow:
     """Shi-Tomasi corners, followed from frame to frame and into the right image by Lucas-Kanade."""
 
     def __init__(self, camera):
-        self.rows_px = 1.5  # left and right rows of a rectified pair agree
-        self.left, self.ids, self.points, self.next_id = (
-            None,
-            np.zeros(0, int),
-            np.zeros((0, 2), np.float32),
-            0,
-        )
+        self.left = None
+        self.ids = np.zeros(0, int)
+        self.points = np.zeros((0, 2), np.float32)
+        self.next_id = 0
 
     def process(self, frame, prior=None):
         """Return ids and pixels [ul vl ur vr] of a rectified pair."""
         if self.left is not None and len(self.points):
-            moved, found, _ = cv2.calcOpticalFlowPyrLK(
-                self.left, frame.left, self.points, None, winSize=(21, 21)
-            )
-            back, returned, _ = cv2.calcOpticalFlowPyrLK(
-                frame.left, self.left, moved, None, winSize=(21, 21)
-            )
-            keep = (found & returned).ravel().astype(bool) & (
-                np.linalg.norm(back - self.points, axis=1) < 0.5
-            )
-            self.points, self.ids = moved[keep], self.ids[keep]
-        mask = np.full(frame.left.shape, 255, np.uint8)
-        for u, v in self.points.round().astype(int):
-            cv2.circle(mask, (int(u), int(v)), 12, 0, -1)
-        new = cv2.goodFeaturesToTrack(
-            frame.left, max(300 - len(self.points), 1), 0.01, 12, mask=mask
-        )
-        new = np.zeros((0, 2), np.float32) if new is None else new.reshape(-1, 2)
-        tracked, self.points = (
-            len(self.points),
-            np.concatenate([self.points, new]).astype(np.float32),
-        )
+            moved, found = flow(self.left, frame.left, self.points)
+            back, returned = flow(frame.left, self.left, moved)
+            keep = found & returned & (np.linalg.norm(back - self.points, axis=1) < 0.5)
+            self.points = moved[keep]
+            self.ids = self.ids[keep]
+        tracked = len(self.points)
+        new = self.corners(frame.left)
+        self.points = np.concatenate([self.points, new]).astype(np.float32)
         self.ids = np.concatenate([self.ids, self.next_id + np.arange(len(new))])
-        self.next_id, self.left = self.next_id + len(new), frame.left
-        right, found, _ = cv2.calcOpticalFlowPyrLK(
-            frame.left, frame.right, self.points, None, winSize=(21, 21)
-        )
-        matched = found.ravel().astype(bool) & (np.abs(right - self.points)[:, 1] < self.rows_px)
+        self.next_id += len(new)
+        self.left = frame.left
+        right, matched = flow(frame.left, frame.right, self.points)
+        matched &= np.abs(right - self.points)[:, 1] < 1.5  # rows of a rectified pair agree
         matched &= right[:, 0] < self.points[:, 0] - 0.5  # points lie in front of the cameras
         z = np.concatenate([self.points, right], axis=1)
         seen = observations(frame.index, frame.time_ns, self.ids, z, has_right=matched)
         return FrontendOutput(seen, tracked=tracked, matched=int(matched.sum()), detected=len(new))
+
+    def corners(self, image):
+        """Return corners (K, 2) away from the tracked points."""
+        mask = np.full(image.shape, 255, np.uint8)
+        for u, v in self.points.round().astype(int):
+            cv2.circle(mask, (int(u), int(v)), 12, 0, -1)
+        wanted = max(300 - len(self.points), 1)
+        new = cv2.goodFeaturesToTrack(image, wanted, 0.01, 12, mask=mask)
+        return np.zeros((0, 2), np.float32) if new is None else new.reshape(-1, 2)
+
+
+def flow(first, second, points):
+    """Return where points of one image are in another (N, 2), and which were found (N,)."""
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(first, second, points, None, winSize=(21, 21))
+    return moved, found.ravel().astype(bool)
 
 
 if __name__ == "__main__":

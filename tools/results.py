@@ -13,7 +13,8 @@ the figures with commit, machine and date. A table of a document stands between
     figures=ate_m,cpu_ms      a line for each sequence and system, a column for each figure, or for
     `success` sequences=… systems=…     these alone, in this order
 
-and a figure in a sentence between `<!-- figure: SUITE/SEQUENCE/SYSTEM/FIGURE/DECIMALS -->` and
+the machines and versions of all suites between `<!-- origins -->` and `<!-- end -->`, and a figure
+in a sentence between `<!-- figure: SUITE/SEQUENCE/SYSTEM/FIGURE/DECIMALS -->` and
 `<!-- end figure -->`. `--tables` writes them from docs/results.json.
 """
 
@@ -33,7 +34,7 @@ from typing import Any
 
 from vio.bench.bench import has_succeeded, read_bench
 from vio.bench.suite import SUCCESS_PERCENT, read_suite
-from vio.bench.tables import BY_NAME, Outcome, Row, full_table, matrix, provenance, summary_rows
+from vio.bench.tables import BY_NAME, Outcome, Row, full_table, matrix, summary_rows
 
 ROOT = Path(__file__).resolve().parent.parent
 FIGURES = "docs/results.json"
@@ -56,6 +57,7 @@ PEERS = ("real", "real_imu", "flights", "maps")
 _KEPT = ("suite", "version", "commit", "machine", "written", "packages", "titles")
 _DIGITS = 6  # significant, of figures in the file
 _TABLE = re.compile(r"(<!-- suite: (\w+)((?: \w+=\S+)+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_ORIGINS = re.compile(r"(<!-- origins -->\n).*?(<!-- end -->)", re.DOTALL)
 _FIGURE = re.compile(r"(<!-- figure: (\S+) -->).*?(<!-- end figure -->)", re.DOTALL)
 
 
@@ -121,14 +123,26 @@ class Results:
         if figure:
             rows = _joined(rows, lists["systems"])
             shown = [joined.partition("+")[0] for joined in lists["systems"]]
-            lines = matrix(rows, BY_NAME[figure], shown, facts["titles"])
+            metric = BY_NAME[figure]
+            lines = matrix(rows, metric, shown, facts["titles"], for_documents=True)
             if length:
                 lines = _with_lengths(lines, rows)
         else:
             metrics = [BY_NAME[name] for name in lists["figures"] if name != "success"]
             success = "success" in lists["figures"]
             lines = full_table(rows, metrics, facts["titles"], for_documents=True, success=success)
-        return "\n".join([*lines, "", f"*Suite `{suite}`: {provenance(facts)}.*", ""])
+        origin = f"*Suite `{suite}`, commit {facts['commit']}, {facts['written'][:10]}.*"
+        return "\n".join([*lines, "", origin, ""])
+
+    def origins(self) -> str:
+        """Return a list of the machines and versions behind the suites."""
+        suites_of: dict[str, list[str]] = {}
+        for name, facts in self.suites.items():
+            packages = (f"{key} {value}" for key, value in facts["packages"].items())
+            where = f"stereo-vio {facts['version']}, {facts['machine']}; {', '.join(packages)}"
+            suites_of.setdefault(where, []).append(f"`{name}`")
+        rows = [f"- {', '.join(names)}: {where}" for where, names in suites_of.items()]
+        return "\n".join([*rows, ""])
 
     def figure(self, address: str) -> str:
         """Return the median of a figure by SUITE/SEQUENCE/SYSTEM/FIGURE/DECIMALS.
@@ -238,6 +252,7 @@ def with_figures(text: str, results: Results) -> str:
         KeyError: a suite, sequence, system or figure is not known.
     """
     text = _TABLE.sub(lambda m: m[1] + results.table(m[2], m[3]) + m[4], text)
+    text = _ORIGINS.sub(lambda m: m[1] + results.origins() + m[2], text)
     return _FIGURE.sub(lambda m: m[1] + results.figure(m[2]) + m[3], text)
 
 
@@ -314,7 +329,7 @@ def main() -> int:
     if not args.tables:
         if args.data is None:
             parser.error(
-                "--data takes the folder of recordings; the head of docs/results.md says what lies "
+                "--data takes the folder of recordings; the end of docs/results.md says what lies "
                 "there"
             )
         write_json({name: run_suite(name, args) for name in args.only or SUITES})
@@ -330,7 +345,7 @@ def _folder(parser: argparse.ArgumentParser, text: str) -> Path:
     path = Path(text)
     if not text or not path.is_dir():
         parser.error(
-            f"'{text}' is no folder; the head of docs/results.md says what lies in the folder of "
+            f"'{text}' is no folder; the end of docs/results.md says what lies in the folder of "
             "recordings"
         )
     return path.resolve()

@@ -5,15 +5,16 @@ python tools/settings_page.py > docs/settings.md
 
 from __future__ import annotations
 
+import re
+
 from vio.config import BASIC, Config, SettingInfo, describe
 
 _INTRODUCTION = """# Settings
 
 Settings come from the defaults, a YAML file that holds deviations only (`--config FILE`), and `--set a.b=value`, in
-that order. `--config fast` is a preset for small computers ([performance.md](performance.md)). `vio config --show`
-prints the basic settings, `vio config --all` every one with its range; a run's folder holds the configuration that was
-in effect. An unknown key, a wrong type or a number out of range is an error that names the file and the nearest valid
-key. This page is written by `python tools/settings_page.py`.
+that order. `--config fast` is a preset for small computers ([performance.md](performance.md)). `vio config --all`
+prints every one with its range; a run's folder holds those in effect. This page is written by
+`python tools/settings_page.py`.
 """
 _HEAD = "| setting | default | unit | meaning |\n|---|---:|---|---|\n"
 _WORDS = {None: "null", True: "true", False: "false"}
@@ -29,7 +30,7 @@ def page() -> str:
     ]
     for section in dict.fromkeys(row.key.rpartition(".")[0] for row in others):
         chosen = [row for row in others if row.key.rpartition(".")[0] == section]
-        parts.append(f"## Others: `{section}`\n\n{chosen[0].group}.\n\n" + _table(chosen))
+        parts.append(f"## Others: `{section}`\n\n" + _table(chosen))
     return "\n".join(parts)
 
 
@@ -47,7 +48,9 @@ def _default(value: object) -> str:
 
 
 def _meaning(row: SettingInfo) -> str:
-    choices = f" (one of {', '.join(row.choices)})" if row.choices else ""
+    words = set(re.findall(r"\w+", f"{row.doc} {row.default}"))
+    untold = row.choices if row.choices and not set(row.choices) <= words else ()
+    choices = f" (one of {', '.join(untold)})" if untold else ""
     return f"{row.doc}{choices}".replace("|", "\\|")
 
 

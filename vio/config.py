@@ -86,9 +86,8 @@ class Config(Section):
 
     motion: MotionName = setting(
         "auto",
-        "motion input for propagation: imu, velocity, none (images alone), or auto: the best that "
-        "the recording "
-        "contains and the back end supports (an observation log: what its run used)",
+        "what carries the pose between frames; none: images alone; auto: the best that the "
+        "recording has",
     )
     backend: BackendName = setting(
         "msckf", "the estimator: msckf, the sliding-window filter, or vislam, the paper's filter"

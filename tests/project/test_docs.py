@@ -44,6 +44,16 @@ DOCS = (
     *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))),
 )
 GENERATED = {ROOT / "docs" / PAGE}  # of the site, and in no folder
+_OF_COMMANDS = (
+    *DOCS,
+    "CONTRIBUTING.md",
+    "vio/course/README.md",
+    *(
+        path.relative_to(ROOT).as_posix()
+        for folder in ("tutorials", "notes")
+        for path in sorted((ROOT / "docs" / folder).glob("*.md"))
+    ),
+)
 NOTES = tuple(f"docs/notes/{path.name}" for path in sorted((ROOT / "docs" / "notes").glob("*.md")))
 
 # Options behind a command of the README that make it small; the command itself is run as written.
@@ -127,7 +137,7 @@ def _docker() -> None:
 # Commands of the README that are no `vio …`, and what is tested of them here.
 _ELSEWHERE: dict[str, Callable[[], None]] = {
     "python -m pip install .": _installs,
-    "python -m pip install stereo_vio-0.2.0-py3-none-any.whl": _installs,
+    "python -m pip install stereo_vio-0.3.0-py3-none-any.whl": _installs,
     "docker build -t stereo-vio .": _docker,
     'docker run --rm -v "$PWD/out:/data" stereo-vio': _docker,
     "make demo": _make_demo,
@@ -182,7 +192,7 @@ def _commands(name: str) -> list[str]:
     lines = [
         line
         for block in _blocks(name)
-        if block.language in ("", "bash")
+        if block.language in ("", "bash", "sh")
         for line in block.text.splitlines()
     ]
     bare = (re.sub(r"\s+# .*", "", line) for line in lines)
@@ -238,6 +248,7 @@ def readme_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         # of the lines before; made here so that each test runs alone
         shutil.copytree("RUN", "results")
         shutil.copytree("RUN", "first")
+        shutil.copytree("RUN", "runs/folder")
     return root
 
 
@@ -427,7 +438,7 @@ def _subcommands() -> dict[str, argparse.ArgumentParser]:
     return dict(commands.choices)
 
 
-_ALL_COMMANDS = [(name, command) for name in DOCS for command in _commands(name)]
+_ALL_COMMANDS = [(name, command) for name in _OF_COMMANDS for command in _commands(name)]
 _SETTINGS = {row.key for row in describe(Config())}
 
 
@@ -478,10 +489,10 @@ def test_every_dependency_has_its_row() -> None:
     rows = re.findall(
         r"^\| ([\w-]+) \| ([<>=][^|]*) \|", _text("docs/dependencies.md"), re.MULTILINE
     )
-    assert sorted("".join(row) for row in rows) == sorted(plain)
+    assert sorted("".join(row) for row in rows) == sorted(set(plain))
 
 
-@pytest.mark.parametrize("name", DOCS)
+@pytest.mark.parametrize("name", _OF_COMMANDS)
 def test_inline_code_names_what_exists(name: str) -> None:
     """Subcommands with their options, settings, files, tools with their options, make's targets."""
     commands = _subcommands()

@@ -153,8 +153,7 @@ def main() -> int:
         return 0
     if options.data is None or not options.data.is_dir():
         parser.error(
-            "--data takes the folder of recordings; the head of docs/results.md says what lies "
-            "there"
+            "--data takes the folder of recordings; the end of docs/results.md says what lies there"
         )
     work = partial(run_task, data=options.data, overrides=tuple(options.overrides))
     if options.only or options.variants or options.overrides:

@@ -232,7 +232,7 @@ def main() -> int:
             print("\n\n".join(tables(rows)))
         return 0
     if options.data is None or not options.data.is_dir():
-        parser.error("--data takes the folder of recordings, as the head of docs/results.md says")
+        parser.error("--data takes the folder of recordings, as the end of docs/results.md says")
     kinds = options.kind or [n for n in KINDS if options.kinds in ("all", HALVES[n])]
     sources = [s for s in SOURCES if options.recordings in ("all", s.half)]
     folders = Folders(options.data, options.work / "renders")

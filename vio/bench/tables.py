@@ -226,13 +226,17 @@ def number(value: float, digits: int) -> str:
     return f"{Decimal(f'{value:.{digits}g}'):f}"
 
 
-def cell_text(cell: Cell, metric: Metric, runs: int | None = None) -> str:
+def cell_text(
+    cell: Cell, metric: Metric, runs: int | None = None, *, for_documents: bool = False
+) -> str:
     """Return `median` or, where values differ, `median (mean ± standard deviation)`, with n
-    where it is not `runs`.
+    where it is not `runs`. `for_documents` leaves out the mean.
     """
     text = number(cell.median, metric.digits)
     if cell.count > 1 and cell.spread > 0:
-        text += f" ({number(cell.mean, metric.digits)} ± {number(cell.sd, 2)})"
+        mean = number(cell.mean, metric.digits)
+        sd = number(cell.sd, 2)
+        text += f" ± {sd}" if for_documents else f" ({mean} ± {sd})"
     return text if runs in (None, cell.count) else f"{text}, n = {cell.count}"
 
 
@@ -258,10 +262,12 @@ class Notes:
             yield "; ".join(f"[{k}] {printable(why)}" for why, k in self._numbers.items()) + "."
 
 
-def row_text(row: Row, metric: Metric, notes: Notes) -> str:
+def row_text(row: Row, metric: Metric, notes: Notes, *, for_documents: bool = False) -> str:
     """Return one figure of a row, or a dash with the number of its reason."""
     cell = row.cells.get(metric.name)
-    return notes.dash(row, metric) if cell is None else cell_text(cell, metric, row.runs)
+    if cell is None:
+        return notes.dash(row, metric)
+    return cell_text(cell, metric, row.runs, for_documents=for_documents)
 
 
 def markdown(
@@ -315,12 +321,14 @@ def matrix(
     metric: Metric = METRICS[0],
     systems: Sequence[str] = (),
     titles: Mapping[str, str] | None = None,
+    *,
+    for_documents: bool = False,
 ) -> Iterator[str]:
     """Yield the table of one figure: sequences down, systems across; the smallest of a line in
     bold.
 
     `systems` are the columns; none: all, ours first. `titles` are those of sequences and systems,
-    by name.
+    by name. `for_documents` gives a median without the mean.
     """
     named = titles or {}
     known = list(dict.fromkeys(row.system for row in sorted(rows, key=lambda row: row.is_peer)))
@@ -354,7 +362,9 @@ def matrix(
                     if own[system].failed
                     else ""
                 )
-                text = text or row_text(own[system], metric, notes) + _part(own[system], metric)
+                text = text or row_text(
+                    own[system], metric, notes, for_documents=for_documents
+                ) + _part(own[system], metric)
             texts.append(
                 f"**{text}**" if best is not None and medians.get(system) == best else text
             )
@@ -434,7 +444,7 @@ def full_table(
     before: list[str] = []
     for row in rows:
         runs = f"{row.runs}" if not row.failed else f"{row.runs - row.failed} of {row.runs}"
-        texts = [row_text(row, metric, notes) for metric in metrics]
+        texts = [row_text(row, metric, notes, for_documents=for_documents) for metric in metrics]
         share = "–" if row.succeeded is None else f"{100 * row.succeeded / row.runs:.0f} %"
         labels = [named.get(getattr(row, name), getattr(row, name)) for name in names]
         shown = (

@@ -79,12 +79,12 @@ _TEXT = {
     "wz": ("right camera turned by {} deg about its optical axis", 180 / np.pi, ".3f"),
     "fu": ("its focal length along u off by {} %", 100.0, ".3f"),
     "fv": ("its focal length along v off by {} %", 100.0, ".3f"),
-    "p1": ("its tangential distortion p1 off by {} e-3", 1e3, ".2f"),
-    "p2": ("its tangential distortion p2 off by {} e-3", 1e3, ".2f"),
-    "k": ("radial distortion k1 of both lenses off by {} e-3", 1e3, ".2f"),
-    "k2": ("radial distortion k2 of both lenses off by {} e-3", 1e3, ".2f"),
-    "q1": ("tangential distortion p1 of both lenses off by {} e-3", 1e3, ".2f"),
-    "q2": ("tangential distortion p2 of both lenses off by {} e-3", 1e3, ".2f"),
+    "p1": ("its tangential distortion p1 off by ({}) x 1e-3", 1e3, ".2f"),
+    "p2": ("its tangential distortion p2 off by ({}) x 1e-3", 1e3, ".2f"),
+    "k": ("radial distortion k1 of both lenses off by ({}) x 1e-3", 1e3, ".2f"),
+    "k2": ("radial distortion k2 of both lenses off by ({}) x 1e-3", 1e3, ".2f"),
+    "q1": ("tangential distortion p1 of both lenses off by ({}) x 1e-3", 1e3, ".2f"),
+    "q2": ("tangential distortion p2 of both lenses off by ({}) x 1e-3", 1e3, ".2f"),
     "ty": ("right camera {} % of the baseline below the left one's row", 100.0, ".3f"),
 }
 

@@ -26,32 +26,26 @@ class DatasetSettings(Section):
     )
     extrinsics: ExtrinsicsMode = setting(
         "auto",
-        "ECE276A files: the translation of cam_T_imu as stored (literal), read as the camera's "
-        "position in the "
-        "IMU frame (corrected), or whichever the file's own velocities and features support (auto)",
+        "ECE276A files: the translation of cam_T_imu as stored (literal), as the camera's position "
+        "in the IMU frame (corrected), or whichever the features support (auto)",
     )
     repeated_tracks: RepeatsMode = setting(
         "auto",
         "feature files, rows that repeat old pixels while the vehicle moves: mark them stale and "
-        "give the track a new "
-        "id from there on (split), mark them and keep the id (flag), use them as they are "
-        "(literal), or decide by the "
-        "motion of the pixels afterwards whether the track switched to another point (auto: split "
-        "if so, else flag)",
+        "give a new id (split), mark them (flag), use them (literal); auto: split where the track "
+        "went on at another point, else flag",
     )
     calibration: Path | None = setting(
         None,
-        "plain folders, bags and videos: the calibration file, in the place of the recording's own",
+        "the calibration file, in the place of the recording's own",
     )
     folders: str | None = setting(
         None,
-        "folders of images: those of the left and the right camera within the recording, such as "
-        "img_l,img_r, in the place of those found by their names",
+        "image folders of the left and the right camera within the recording, such as img_l,img_r",
     )
     camera: Literal["both", "left"] = setting(
         "both",
-        "stereo recordings: use both cameras, or the left one alone, which needs an IMU for the "
-        "scale",
+        "both cameras of a stereo recording, or the left one alone, which needs an IMU",
     )
     depth_factor: float | None = setting(
         None,
@@ -67,34 +61,28 @@ class DatasetSettings(Section):
     )
     topics: str | None = setting(
         None,
-        "bags: topics by name, such as left=/a,right=/b,imu=/c, in the place of those found by "
-        "type",
+        "bags: topics by name, such as left=/a,right=/b,imu=/c",
     )
     interpolation: Interpolation = setting(
         "linear",
-        "unrectified images: how gray values between pixels are interpolated in rectifying (cubic "
-        "and lanczos4 cost 5 "
-        "and 15 times as much for barely better tracks)",
+        "of gray values in rectifying; cubic and lanczos4 cost 5 and 15 times as much for barely "
+        "better tracks",
     )
     projection: ProjectionMode = setting(
         "auto",
-        "unrectified images: rectify to the image of a pinhole, or to a cylinder about the "
-        "baseline, which keeps what "
-        "a wide lens sees above and below; auto: a cylinder where a pinhole would crop there, "
-        "beyond 54 degrees",
+        "rectify to the image of a pinhole, or to a cylinder about the baseline, which keeps what a "
+        "wide lens sees above and below; auto: where a pinhole would crop, a cylinder",
     )
     max_bad_frames: int | None = setting(
         None,
-        "image folders: stereo frames with unreadable images or images of another size that are "
-        "skipped before the "
-        "reader stops with an error; null: all but the last usable one",
+        "unreadable frames that are skipped before the reader stops with an error; null: all but "
+        "the last usable one",
         at_least=0,
     )
     max_frame_rate: float | None = setting(
         None,
-        "frames that come sooner are left out, unread where images are files, so that a slow "
-        "computer follows a fast "
-        "camera; a tenth of an interval does not count; null: all are used",
+        "frames that come sooner are left out, so that a slow computer follows a fast camera; null: "
+        "all are used",
         unit="Hz",
         above=0,
     )

@@ -21,20 +21,17 @@ class VislamSettings(Section):
     )
     motion_model: Literal["twist", "input"] = setting(
         "twist",
-        "what carries the pose: 'twist' keeps the body twist as a state that drifts and that "
-        "velocities, if any, "
-        "measure; 'input' is the paper's, which takes each measured velocity as the truth plus W",
+        "twist: the body twist is a state that drifts and that velocities measure; input: the "
+        "paper's, each measured velocity is the truth plus W",
     )
     noise: Literal["consistent", "literal"] = setting(
         "consistent",
-        "model 'input', how W is read: 'consistent' adds (sigma * step)^2 per step; 'literal' adds "
-        "the paper's numbers "
-        "as variances",
+        "model 'input': consistent adds (sigma * step)^2 per step, literal the paper's numbers as "
+        "variances",
     )
     input_at: Literal["midpoint", "start", "end"] = setting(
         "midpoint",
-        "model 'input': which input carries the pose from one frame to the next; the paper holds "
-        "the one at the start",
+        "model 'input': which input carries the pose from frame to frame; the paper's is start",
     )
     linear_velocity_sigma_mps: float = setting(
         0.5, "noise of the measured body velocity", unit="m/s", above=0
@@ -157,21 +154,17 @@ class MsckfSettings(Section):
     )
     calibrate_camera_imu: Literal["auto", "none", "extrinsics", "time_offset", "both"] = setting(
         "auto",
-        "what is estimated of camera and IMU besides the motion: T_cam0_imu, the time offset, or "
-        "both; auto: the time "
-        "offset, where a stereo pair has an IMU",
+        "what is estimated besides the motion: T_cam0_imu (extrinsics), the time offset, or both; "
+        "auto: the time offset, where a stereo pair has an IMU",
     )
     calibrate_imu: Literal["off", "scale", "full"] = setting(
         "off",
-        "what is estimated of the IMU's own calibration besides the biases: nothing; the scales of "
-        "accelerometer and "
-        "gyro; or these, the misalignment of their axes, and the gyro's rotation against the "
-        "accelerometer",
+        "what is estimated of the IMU besides the biases: nothing; scales; or scales, misalignment "
+        "and the gyro's rotation against the accelerometer",
     )
     calibrate_stereo: Literal["on", "off"] = setting(
         "on",
-        "estimate what the calibration of a stereo pair is off by, a low-order field over the "
-        "image",
+        "estimate what the calibration of a stereo pair is off by",
     )
     stereo_baseline_sigma: float = setting(
         0.005,
@@ -186,9 +179,8 @@ class MsckfSettings(Section):
     )
     calibrate_scale: Literal["off", "on"] = setting(
         "off",
-        "estimate baseline and focal length with these standard deviations at the start, with IMU "
-        "or velocities only, "
-        "on whose scale the result depends; off: they are considered, and not corrected",
+        "estimate baseline and focal length by the scale of IMU or velocities; off: their "
+        "uncertainty is considered, and they are not corrected",
     )
     extrinsic_rotation_sigma_deg: float = setting(
         0.5,

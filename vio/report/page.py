@@ -135,7 +135,7 @@ def _figure(section: ReportSection, number: int) -> str:
         full_html=False,
         include_plotlyjs=False,
         div_id=f"figure-{number}",
-        config={"displaylogo": False},
+        config={"displaylogo": False, "responsive": True},
     )
     remark = f'<p class="remark">{text(section.remark)}</p>' if section.remark else ""
     return f"<section><h2>{text(section.title)}</h2>{remark}{drawing}</section>"

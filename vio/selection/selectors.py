@@ -43,11 +43,9 @@ class SelectorSettings(Section):
 
     name: SelectorName = setting(
         "all",
-        "all; visibility: the most often seen so far; visibility_whole: the most often seen in the "
-        "whole record, as "
-        "the paper does (precomputed features only); information: those that together add most "
-        "information on the "
-        "camera's motion now and in the next frames",
+        "visibility: the most often seen so far; visibility_whole: in the whole record, as the "
+        "paper does (precomputed features only); information: those that add most on the camera's "
+        "motion",
     )
     budget: int | None = setting(
         None, "observations kept of a frame; null: the share below", at_least=1
