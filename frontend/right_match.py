@@ -47,7 +47,7 @@ class RightMatcher:
         self._right = right
         self._delay = delay
         self.turn = RightTurn(camera.fu)
-        self.shake = PairShake()
+        self.shake = PairShake(camera.fu)
 
     def match(
         self,

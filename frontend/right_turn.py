@@ -21,16 +21,17 @@ from vio.findings import Finder, Finding
 _FRAMES = 6  # in a row whose offsets agree: cameras that expose apart in a turn ramp up
 _AGREE = 0.05  # of their mean: largest deviation
 _MIN_OFFSET_PX = 0.3  # an offset that is smaller is that of noise
-_JUMP_PX = (
-    0.5  # of all disparities since the frame before; a drive whose calibration is off has 0.3
-)
+_JUMP_PX = 0.5  # of all disparities since the frame before …
+# … and an angle: a drive whose calibration is off has 0.55 px, 0.044 degrees
+_JUMP_RAD = 0.07 * np.pi / 180.0
 _RECENT = 20  # frames, of which so many are off where a pair shakes
 _SHAKING = 5
 _CODE = "right-camera-turned"
 _SHAKE_CODE = "right-camera-shakes"
 _MIN_FRAMES = 8  # whose common errors are known, before a pair is said to shake
-# standard deviation of the common error; that of firm pairs on drives comes to half of it
-_SHAKES_PX = 0.12
+_SHAKES_PX = 0.12  # standard deviation of the common error …
+# … and of the angle: a drive whose calibration is off comes to 0.15 px, 0.012 degrees
+_SHAKES_RAD = 0.02 * np.pi / 180.0
 _SHARE = 0.8  # of the common errors, whose largest measures their size: events are in fewer frames
 _SHARE_SIGMAS = 1.2816  # of a normal distribution
 _PIXEL_SIGMA = 0.3  # of one disparity, pixels
@@ -59,7 +60,8 @@ class RightTurn(Finder):
         """Whether the disparities of a frame differ from those of the frame before by more than
         noise.
         """
-        return common_px is not None and abs(common_px) > _JUMP_PX
+        limit_px = max(_JUMP_PX, self._focal_px * _JUMP_RAD)
+        return common_px is not None and abs(common_px) > limit_px
 
     def is_offset(self, offset_px: float | None) -> bool:
         """Whether disparities are off by more than noise; of a pair that shakes, all are."""
@@ -103,8 +105,9 @@ class RightTurn(Finder):
 class PairShake(Finder):
     """Measures what the disparities of whole frames are off by, and reports a pair that shakes."""
 
-    def __init__(self) -> None:
+    def __init__(self, focal_px: float) -> None:
         super().__init__()
+        self._limit_px = max(_SHAKES_PX, focal_px * _SHAKES_RAD)
         self._common_px = deque[float](maxlen=_RECENT)
         self._matched = 0
         self._reported = False
@@ -117,7 +120,7 @@ class PairShake(Finder):
         together are as uncertain as what they have in common; 1: the pair is firm.
         """
         sigma_px = self.sigma_px
-        if sigma_px <= _SHAKES_PX:
+        if sigma_px <= self._limit_px:
             return 1.0
         return float(np.sqrt(1.0 + self._matched * (sigma_px / _PIXEL_SIGMA) ** 2))
 
@@ -130,7 +133,7 @@ class PairShake(Finder):
             return
         self._common_px.append(common_px)
         self.sigma_px = self._measured_px()
-        shakes = self.sigma_px > _SHAKES_PX
+        shakes = self.sigma_px > self._limit_px
         if shakes and not self._reported:
             self._reported = True
             message = (
@@ -143,7 +146,7 @@ class PairShake(Finder):
             self._found.append(
                 Finding(_SHAKE_CODE, message, index, since, lasts=True, figures=figures)
             )
-        elif self.sigma_px < 0.5 * _SHAKES_PX:
+        elif self.sigma_px < 0.5 * self._limit_px:
             self._end(index)
 
     def explained(self, index: int) -> None:

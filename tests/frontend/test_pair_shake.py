@@ -62,15 +62,28 @@ def test_a_firm_pair_is_not_named() -> None:
 
 
 def test_one_frame_that_is_off_is_no_shaking() -> None:
-    shake = PairShake()
+    shake = PairShake(300.0)
     for k in range(30):
         shake.frame(k, 1.5 if k in (9, 10) else 0.02, 100)
     assert shake.right_factor == 1.0
     assert not shake.take_findings()
 
 
+def test_what_a_drive_with_a_wrong_calibration_shows_is_no_shaking() -> None:
+    """A drive of KITTI comes to 0.15 px at a focal length of 722 px, as cars do not shake by."""
+    rng = np.random.default_rng(6)
+    common_px = np.diff(rng.normal(0.0, 0.15, 80)).tolist()
+    shakes = []
+    for focal_px in (722.0, 300.0):
+        shake = PairShake(focal_px)
+        for k, off in enumerate(common_px):
+            shake.frame(k, off, 100)
+        shakes.append(bool(shake.take_findings()))
+    assert shakes == [False, True]
+
+
 def test_the_factor_is_that_of_an_error_that_all_share() -> None:
-    shake = PairShake()
+    shake = PairShake(300.0)
     rng = np.random.default_rng(1)
     common_px = rng.normal(0.0, 0.2, 400)
     for k, off in enumerate(np.diff(common_px)):
@@ -85,7 +98,7 @@ def test_the_factor_is_that_of_an_error_that_all_share() -> None:
 
 
 def test_right_images_of_another_time_are_no_shaking_once_that_is_known() -> None:
-    shake = PairShake()
+    shake = PairShake(300.0)
     for k in range(12):
         shake.frame(k, 0.9 if k % 2 else -0.9, 100)
     assert shake.right_factor > 1.0
