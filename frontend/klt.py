@@ -150,6 +150,8 @@ class KltFrontend:
         self._store(images, tracks, motion)
         watch.lap("check")
         sigma = self._bank.sigma(tracks.slot, depth_image=kind == "rgbd")
+        if self._matcher.shake.right_factor > 1.0:
+            sigma[:, 2] *= self._matcher.shake.right_factor
         found = self._take_findings()
         return make_output(frame, tracks, tracked, watch, found, shown=tracks.shown, sigma=sigma)
 
@@ -188,7 +190,8 @@ class KltFrontend:
 
     def _take_findings(self) -> tuple[Finding, ...]:
         """Return what was found since the last frame."""
-        parts = (self._right, self._delay, self._matcher.turn, self._objects)
+        matcher = self._matcher
+        parts = (self._right, self._delay, matcher.turn, matcher.shake, self._objects)
         return tuple(found for part in parts for found in part.take_findings())
 
     def _images(self, frame: StereoFrame) -> tuple[FrameImages | None, BoolArray | None]:

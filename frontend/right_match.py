@@ -13,7 +13,7 @@ from vio.frontend.outliers import Consensus
 from vio.frontend.patches import ImageLevels
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.right_delay import PairingCounts, RightDelay, at_exposure, at_present
-from vio.frontend.right_turn import RightTurn
+from vio.frontend.right_turn import PairShake, RightTurn
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import FloatArray
@@ -47,6 +47,7 @@ class RightMatcher:
         self._right = right
         self._delay = delay
         self.turn = RightTurn(camera.fu)
+        self.shake = PairShake(camera.fu)
 
     def match(
         self,
@@ -77,8 +78,10 @@ class RightMatcher:
         if delay == 0.0:
             matched = stereo.track_right(tracks, right, motion is not None)
             few = self._right.doubts(matched.has_right[testable])
+            common_px = stereo.common_px
+            self.shake.frame(frame.index, common_px, int(matched.has_right.sum()))
             # one that stays may be too small to lose matches by
-            if tested and (few or self.turn.may_stay):
+            if tested and (few or self.turn.may_stay or self.turn.is_jump(common_px)):
                 off = stereo.track_off_right(tracks, left, right, by_motion=not self._right.usable)
                 least = matched.has_right.sum() * (1.0 if few else _NEARLY_ALL)
                 if off.has_right.sum() > least and self.turn.is_offset(stereo.offset_px):
@@ -89,6 +92,7 @@ class RightMatcher:
             if turn_px is not None:
                 stereo.take_out(turn_px)
         else:
+            self.shake.explained(frame.index)
             T = np.eye(4) if prior is None or prior.motion is None else prior.motion.T_curr_prev
             T = T if motion is None else motion.T_curr_prev
             matched = self._match_delayed(previous, tracks, right, flow, T, stereo)

@@ -5,6 +5,9 @@ What stays is taken out of all later matches, so that depths are again those of 
 pair that shakes, or whose cameras expose apart while the rig turns, is off by another amount in each
 frame: while it does so, the offset of every frame is measured, also where it is too small to lose
 matches by, as depths would follow it else.
+
+What is too small for that still moves all depths of a frame together. Its size over the last frames
+says how much less the disparities of a frame are known than those of as many features by themselves.
 """
 
 from __future__ import annotations
@@ -18,9 +21,20 @@ from vio.findings import Finder, Finding
 _FRAMES = 6  # in a row whose offsets agree: cameras that expose apart in a turn ramp up
 _AGREE = 0.05  # of their mean: largest deviation
 _MIN_OFFSET_PX = 0.3  # an offset that is smaller is that of noise
+_JUMP_PX = 0.5  # of all disparities since the frame before …
+# … and an angle: a drive whose calibration is off has 0.55 px, 0.044 degrees
+_JUMP_RAD = 0.07 * np.pi / 180.0
 _RECENT = 20  # frames, of which so many are off where a pair shakes
 _SHAKING = 5
 _CODE = "right-camera-turned"
+_SHAKE_CODE = "right-camera-shakes"
+_MIN_FRAMES = 8  # whose common errors are known, before a pair is said to shake
+_SHAKES_PX = 0.12  # standard deviation of the common error …
+# … and of the angle: a drive whose calibration is off comes to 0.15 px, 0.012 degrees
+_SHAKES_RAD = 0.02 * np.pi / 180.0
+_SHARE = 0.8  # of the common errors, whose largest measures their size: events are in fewer frames
+_SHARE_SIGMAS = 1.2816  # of a normal distribution
+_PIXEL_SIGMA = 0.3  # of one disparity, pixels
 
 
 class RightTurn(Finder):
@@ -41,6 +55,13 @@ class RightTurn(Finder):
     @property
     def _shakes(self) -> bool:
         return sum(self._were_off) >= _SHAKING
+
+    def is_jump(self, common_px: float | None) -> bool:
+        """Whether the disparities of a frame differ from those of the frame before by more than
+        noise.
+        """
+        limit_px = max(_JUMP_PX, self._focal_px * _JUMP_RAD)
+        return common_px is not None and abs(common_px) > limit_px
 
     def is_offset(self, offset_px: float | None) -> bool:
         """Whether disparities are off by more than noise; of a pair that shakes, all are."""
@@ -79,3 +100,73 @@ class RightTurn(Finder):
         figures = {"turned_deg": turned_deg, "offset_px": stays}
         self._found.append(Finding(_CODE, message, index, index - _FRAMES + 1, figures=figures))
         return stays
+
+
+class PairShake(Finder):
+    """Measures what the disparities of whole frames are off by, and reports a pair that shakes."""
+
+    def __init__(self, focal_px: float) -> None:
+        super().__init__()
+        self._limit_px = max(_SHAKES_PX, focal_px * _SHAKES_RAD)
+        self._common_px = deque[float](maxlen=_RECENT)
+        self._matched = 0
+        self._reported = False
+        # standard deviation of the common error of a frame's disparities, pixels
+        self.sigma_px = 0.0
+
+    @property
+    def right_factor(self) -> float:
+        """By how much larger the standard deviations of right pixels are, so that all of a frame
+        together are as uncertain as what they have in common; 1: the pair is firm.
+        """
+        sigma_px = self.sigma_px
+        if sigma_px <= self._limit_px:
+            return 1.0
+        return float(np.sqrt(1.0 + self._matched * (sigma_px / _PIXEL_SIGMA) ** 2))
+
+    def frame(self, index: int, common_px: float | None, matched: int) -> None:
+        """Take by how much the disparities of a frame's matches differ from those of the frame
+        before (median); None: it is not known.
+        """
+        self._matched = matched
+        if common_px is None:
+            return
+        self._common_px.append(common_px)
+        self.sigma_px = self._measured_px()
+        shakes = self.sigma_px > self._limit_px
+        if shakes and not self._reported:
+            self._reported = True
+            message = (
+                f"frame {index}: the disparities of whole frames scatter by {self.sigma_px:.2g} px: "
+                "the right camera shakes in its mount, or the cameras do not expose together; its "
+                "pixels count less; fix its mount, or synchronise the cameras"
+            )
+            figures = {"common_px": self.sigma_px}
+            since = index - len(self._common_px) + 1
+            self._found.append(
+                Finding(_SHAKE_CODE, message, index, since, lasts=True, figures=figures)
+            )
+        elif self.sigma_px < 0.5 * self._limit_px:
+            self._end(index)
+
+    def explained(self, index: int) -> None:
+        """Forget the errors so far: the right images are those of another time, which is known."""
+        self._common_px.clear()
+        self.sigma_px = 0.0
+        self._end(index)
+
+    def _end(self, index: int) -> None:
+        if self._reported:
+            self._reported = False
+            message = f"frame {index}: the disparities of whole frames agree again"
+            self._found.append(Finding(_SHAKE_CODE, message, index, ended=True))
+
+    def _measured_px(self) -> float:
+        """Size of the common errors. A frame's is the difference of two: its depths are those of
+        the frame before.
+        """
+        if len(self._common_px) < _MIN_FRAMES:
+            return 0.0
+        sizes = np.sort(np.abs(self._common_px))
+        largest = float(sizes[round(_SHARE * (len(sizes) - 1))])
+        return largest / (_SHARE_SIGMAS * float(np.sqrt(2.0)))

@@ -96,6 +96,9 @@ class StereoFit:
         self._offset_px = 0.0  # that is taken out of all disparities of the present frame
         # the same of all frames: what a right camera that has turned adds to disparities
         self._turn_px = 0.0
+        # by how much the disparities of the present frame exceed those that the depths of the frame
+        # before give (median); None: too few
+        self.common_px: float | None = None
 
     def track_right(self, tracks: Tracks, right: ImageLevels, moved: bool) -> Tracks:
         """Match features of known depth; with a consensus motion (`moved`), check the disparity
@@ -112,8 +115,12 @@ class StereoFit:
             self._follow(expected[tracks.has_right[rows]])
         shown = self._shown(tracks.left[rows], expected)
         pixels, skew, valid = self._fit(tracks, rows, right, shown)
+        off = tracks.left[rows, 0] - pixels[:, 0] - shown
         if moved:
-            valid &= np.abs(tracks.left[rows, 0] - pixels[:, 0] - shown) <= INLIER_PX
+            valid &= np.abs(off) <= INLIER_PX
+        self.common_px = None
+        if moved and valid.sum() >= _MIN_POINTS:
+            self.common_px = median(off[valid])
         return self._with_right_pixels(tracks, rows, pixels, skew, valid)
 
     def track_off_right(

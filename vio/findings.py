@@ -123,6 +123,11 @@ CODES: dict[str, Code] = {
         "the right camera has turned in its mount; what that does to disparities is taken out",
         "fix the mount of the right camera, and calibrate anew",
     ),
+    "right-camera-shakes": Code(
+        "degraded",
+        "all disparities of a frame are off together, by another amount in each; they count less",
+        "fix the mount of the right camera, or synchronise the cameras",
+    ),
     "right-image-late": Code(
         "degraded", "the right camera exposes later than the left one", _EXPOSURES
     ),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.bench.test_faults import PERIOD, STEP_NS, _Sorted
-from tools.faults.drawn_page import page, tables
+from tools.faults.drawn_page import is_observable, page, summary, tables
 from tools.faults.draws import draw, rows_of
 from tools.faults.kinds import HALVES, KINDS
 from tools.faults.recordings import SOURCES
@@ -147,6 +147,20 @@ def test_the_page_counts_by_kind(tmp_path: Path) -> None:
     assert "| 3 | 1 | 1 | 0 | 1 | 1 | 0 | 67 % | 12, 12 | 2, 2 |" in kinds
     assert "| night | 1 | 1 | 2, 2 | wrong |" in healthy
     assert "seeds 1" in page(rows, "abc")
+
+
+def test_a_scale_that_images_alone_cannot_show_is_counted_apart() -> None:
+    base = {"size": 5.0, "ratio": 9.0, "covered": False, "flagged_after": None, "silent": True}
+    by_images = base | {"kind": "baseline", "motion": None, "ratio": 18.0}
+    with_imu = base | {"kind": "baseline", "motion": "imu"}
+    covered = base | {"kind": "object", "motion": None, "covered": True, "silent": False}
+    assert [is_observable(row) for row in (by_images, with_imu, covered)] == [False, True, True]
+    text = summary([by_images, with_imu, covered])
+    assert "all 3 faults: 33 % covered or flagged soon, 1 silent beyond 10" in text
+    assert "the 2 that the sensors can show: 50 %, 0 silent" in text
+    # the settings' 0.5 % and 0.3 % together
+    assert "8.6 to 8.6 times the 0.58 %" in text
+    assert "2.1 to 2.1 times that" in text
 
 
 def test_rows_that_are_cut_are_run_again(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -19,10 +20,15 @@ import yaml
 
 from tests.commands import refused
 from tests.dataset_makers import FRAME_S, make_kitti
+from tests.frontend.test_frontend_scene import CAMERA
+from tests.guard.test_guard import shifted
 from vio.cli import main
+from vio.frontend import build_frontend
+from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.geometry.lie import so3_exp
+from vio.guard.guarded import guarded
 from vio.inspection.inertial import allan_deviation, noise_part, rest_part
-from vio.inspection.inspect import clock_facts
+from vio.inspection.inspect import _tracking_parts, clock_facts
 from vio.records import ImuDensities, ImuRecord
 
 
@@ -199,6 +205,30 @@ def test_faults_are_found_with_their_remedy(
     assert status == 1
     assert any(re.search(message, fault) for fault in facts["faults"]), facts["faults"]
     assert all("\n" not in fault for fault in facts["faults"])
+
+
+@pytest.mark.parametrize(
+    ("delay", "named"),
+    [
+        (1, "each right image comes a frame later than the left one of its time"),
+        (-2, "each left image comes 2 frames later than the right one of its time"),
+        (0, None),
+    ],
+)
+def test_pairs_of_different_times_are_named(delay: int, named: str | None) -> None:
+    pairs = shifted(delay)[:9]
+    recording = SimpleNamespace(camera=CAMERA, motion=(), T_cam0_imu=None)
+    dataset: Any = SimpleNamespace(recording=recording, events=lambda *span: iter(pairs))
+    settings = FrontendSettings(grid=GridSettings(target_features=60))
+    parts = _tracking_parts(
+        dataset,
+        lambda d: guarded(build_frontend("klt", CAMERA, settings), CAMERA),
+        range(len(pairs)),
+        lambda done, total: None,
+    )
+    faults = [fault for part in parts if part.name == "pairs" for fault in part.faults]
+    assert len(faults) == (named is not None)
+    assert named is None or faults[0].startswith(named)
 
 
 # --- figures

@@ -52,6 +52,8 @@ class Kind:
     largest: float
     unit: str
     make: Make  # of a size, and random numbers for what else is drawn
+    # False: a sensor of the motion is needed to show it, as images are explained by another scale
+    by_images: bool = True
 
     def drawn_size(self, rng: np.random.Generator) -> float:
         """Draw a size."""
@@ -231,8 +233,8 @@ KINDS: dict[str, Kind] = {
     "exchanged": Kind("cameras", "period", 1, 1, "", _exchanged),
     "black": Kind("cameras", "period", 1, 1, "", _black),
     "noise": Kind("cameras", "period", 1, 1, "", _noise),
-    "focal length": Kind("cameras", "always", 1, 6, "%", _factor("fu", "fv")),
-    "baseline": Kind("cameras", "always", 2, 15, "%", _factor("baseline_m")),
+    "focal length": Kind("cameras", "always", 1, 6, "%", _factor("fu", "fv"), by_images=False),
+    "baseline": Kind("cameras", "always", 2, 15, "%", _factor("baseline_m"), by_images=False),
     "pairs repeated": Kind("cameras", "always", 3, 12, "frames", _repeated),
     "no frames": Kind("cameras", "period", 1, 1, "", _constant(gap(frames=True, samples=False))),
     "gyro bias jumps": Kind("imu", "onwards", 0.03, 0.3, "rad/s", _jump(gyro=True)),

@@ -5,18 +5,21 @@ before or after agree less, by another amount in each frame: a right camera that
 are off by the same in all of them. In the first frames, corners of both left images are searched
 along the rows of this right image and of the one before; the pairing in which clearly more of them
 match is the right one, unless one difference of all rows explains the pairs as they came as well.
+Where the pairs as they came are not the best, those of up to three frames apart are compared, too: of
+images two frames apart, those one frame apart agree better than the pairs do.
 
-A right image that belongs to the *next* left one (it came early) is held back for it. One that
-belongs to the left image *before* (it is late) is marked, as its left image is gone already.
+A right image that belongs to a *later* left one (it came early) is held back for it. One that
+belongs to a left image *before* (it is late) is marked, as its left image is gone already.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TypeAlias
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 from vio.findings import Finding
-from vio.frontend.right_delay import PairingCounts
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.image_change import image_change
@@ -24,40 +27,61 @@ from vio.guard.image_check import FrameImages, ImageCheck, images_of
 from vio.guard.probe import RowProbe
 from vio.records import Image, IntArray, StereoFrame
 
-# left and right image at half resolution, and the left corners (N, 2)
-_Pairing: TypeAlias = tuple[Image, Image, FloatArray]
 _FRAMES = 3  # that must have been counted
 _ALIKE = 2  # frames in a row after which the counts so far tell the same
 _MAX_TESTS = 40  # frames in which the rig moves, after which the pairing counts as right
 _MIN_POINTS = 30  # corners in a frame
 _MIN_CHANGE = 2.0  # of the left image since the last frame, gray levels at the common contrast
 _STRIDE = 4  # of the pixels that are compared
+_MAX_DELAY = 3  # frames that images of a pair may be apart
 _MIN_SHARE = 0.4  # of the corners that match in the best pairing
 _CLEARLY = 1.3  # times as many as in both others
 
 
-def told_delay(counts: PairingCounts) -> int | None:
-    """Return the frames by which a right image is late; None: this frame does not tell."""
-    by_delay = {0: counts.same, 1: counts.late, -1: counts.early}
-    best = max(by_delay, key=lambda delay: by_delay[delay])
-    others = max(count for delay, count in by_delay.items() if delay != best)
-    clear = by_delay[best] >= max(_MIN_SHARE * counts.points, _CLEARLY * others)
-    return best if clear and counts.points >= _MIN_POINTS else None
+def told_delay(points: int, matched: Mapping[int, int]) -> int | None:
+    """Return the frames by which a right image is late; None: these counts do not tell.
+
+    Args:
+        points: corners that were searched.
+        matched: how many of them match, by the frames by which the right image may be late.
+    """
+    best = max(matched, key=lambda delay: matched[delay])
+    others = max(count for delay, count in matched.items() if delay != best)
+    clear = matched[best] >= max(_MIN_SHARE * points, _CLEARLY * others)
+    return best if clear and points >= _MIN_POINTS else None
+
+
+@dataclass(frozen=True)
+class _Halves:
+    """The images of a frame (H/2, W/2) at half resolution."""
+
+    left: Image
+    right: Image
+    probe: RowProbe
+
+    @cached_property
+    def corners(self) -> FloatArray:
+        """Those of the left image (N, 2), pixels of the full image."""
+        return self.probe.corners(self.left)
 
 
 class PairingCheck(ImageCheck):
-    """Finds in the first frames that right images are a frame late or early."""
+    """Finds in the first frames that right images are some frames late or early."""
 
     def __init__(self, probe: RowProbe) -> None:
         super().__init__()
         self._probe = probe
-        self._last: tuple[Image, Image, FloatArray] | None = None  # halves, and left corners
+        self._last: _Halves | None = None  # the last frame that was counted
+        self._recent = deque[_Halves](maxlen=_MAX_DELAY)  # the frames before this one
         self._told: list[int | None] = []  # by the counts so far, after each frame
         # of all frames: corners, and those that match in each pairing
         self._points = 0
         self._matched = {0: 0, 1: 0, -1: 0}
+        # likewise in all pairings, of the frames in which the pairs are not the best ones
+        self._far_points = 0
+        self._far_matched = dict.fromkeys(range(-_MAX_DELAY, _MAX_DELAY + 1), 0)
         self._near: dict[int, IntArray] = {}  # likewise (K,) on rows a little above and below
-        self._held: Image | None = None  # right image that belongs to the next left one
+        self._held = deque[Image]()  # right images that belong to later left ones
         self._begun_again = False
         self.delay: int | None = None  # None: not decided yet
 
@@ -67,10 +91,10 @@ class PairingCheck(ImageCheck):
             self._test(images)
         if self.delay is None or self.delay == 0:
             return images
-        if self.delay == -1:
-            images = self._with_held(images)
+        if self.delay < 0:
+            images = self._with_held(images, -self.delay)
         else:
-            images = images.marked(right_delay=1)
+            images = images.marked(right_delay=self.delay)
         if images.skipped or self._begun_again:
             return images
         self._begun_again = True
@@ -79,76 +103,93 @@ class PairingCheck(ImageCheck):
     def _test(self, images: FrameImages) -> None:
         if not (images.left_usable and images.right_usable):
             self._last = None
+            self._recent.clear()
             return
         left, right = images.halves
+        now = _Halves(left.copy(), right.copy(), self._probe)
         last = self._last
-        if last is not None:
-            change = image_change(left[::_STRIDE, ::_STRIDE], last[0][::_STRIDE, ::_STRIDE])
-            if change < _MIN_CHANGE:
-                return
-        points = self._probe.corners(left)
-        self._last = left.copy(), right.copy(), points
-        if last is None:
-            return
-        self._count(
-            images.index,
-            min(len(points), len(last[2])),
-            {0: (left, right, points), 1: (last[0], right, last[2]), -1: (left, last[1], points)},
+        moved = last is None or (
+            image_change(left[::_STRIDE, ::_STRIDE], last.left[::_STRIDE, ::_STRIDE]) >= _MIN_CHANGE
         )
+        if moved:
+            self._last = now
+        if moved and last is not None:
+            self._count(images.index, now, last)
+        if self.delay is None:
+            self._recent.append(now)
 
-    def _count(self, index: int, points: int, pairings: dict[int, _Pairing]) -> None:
+    def _count(self, index: int, now: _Halves, last: _Halves) -> None:
         """Count the matches of a frame, and decide once those of enough frames tell."""
+        points = min(len(now.corners), len(last.corners))
         if points >= _MIN_POINTS:
             self._points += points
-            for delay, pairing in pairings.items():
-                self._matched[delay] += self._probe.on_rows(*pairing)
-        self._told.append(self._tells(pairings))
+            for delay, (left, right) in {0: (now, now), 1: (last, now), -1: (now, last)}.items():
+                self._matched[delay] += self._probe.on_rows(left.left, right.right, left.corners)
+        told = told_delay(self._points, self._matched)
+        self._told.append(told if told == 0 else self._far_delay(now))
         recent = self._told[-_ALIKE:]
         if len(self._told) >= _FRAMES and recent[0] is not None and len(set(recent)) == 1:
             self._decide(index, recent[0])
         elif len(self._told) >= _MAX_TESTS:
             self._decide(index, 0)
 
-    def _tells(self, pairings: dict[int, _Pairing]) -> int | None:
-        """Return the delay that the frames so far tell, unless a difference of all rows explains
-        the pairs as they came as well.
+    def _far_delay(self, now: _Halves) -> int | None:
+        """Count the matches of a frame in all pairings, and return the delay that they tell, unless
+        a difference of all rows explains the pairs as they came as well.
         """
-        matched = self._matched
-        told = told_delay(PairingCounts(self._points, matched[0], matched[1], matched[-1]))
+        if len(self._recent) < _MAX_DELAY:
+            return None
+        pairings = {0: (now, now)}
+        for delay in range(1, _MAX_DELAY + 1):
+            before = self._recent[-delay]
+            pairings[delay] = before, now
+            pairings[-delay] = now, before
+        points = min(len(left.corners) for left, _ in pairings.values())
+        if points < _MIN_POINTS:
+            return None
+        self._far_points += points
+        for delay, (left, right) in pairings.items():
+            self._far_matched[delay] += self._probe.on_rows(left.left, right.right, left.corners)
+        told = told_delay(self._far_points, self._far_matched)
         if told is None or told == 0:
             return told
         for delay in (0, told):
-            near = self._probe.near_rows(*pairings[delay])
+            left, right = pairings[delay]
+            near = self._probe.near_rows(left.left, right.right, left.corners)
             self._near[delay] = self._near.get(delay, 0) + near
         return told if self._near[told].max() > self._near[0].max() else None
 
     def _decide(self, index: int, delay: int) -> None:
         self.delay = delay
         self._last = None
+        self._recent.clear()
         if delay == 0:
             return
-        which = "before" if delay == 1 else "after"
         message = (
-            f"frame {index}: each right image belongs to the left image of the frame {which} it, "
-            "by the rows that match; the poses so far are wrong; pair the images by their times of "
-            "exposure"
+            f"frame {index}: each right image belongs to the left image of "
+            f"{_frames_away(delay)} it, by the rows that match; the poses so far are wrong; pair "
+            "the images by their times of exposure"
         )
         figures = {"delay_frames": float(delay)}
         self._found.append(Finding("pairs-shifted", message, index, 0, figures=figures))
 
-    def _with_held(self, images: FrameImages) -> FrameImages:
-        """Return the left image with the right one that came with the frame before."""
-        held = self._held
-        self._held = images.raw[1].copy()
-        if held is None:
+    def _with_held(self, images: FrameImages, frames: int) -> FrameImages:
+        """Return the left image with the right one that came some frames before."""
+        self._held.append(images.raw[1].copy())
+        if len(self._held) <= frames:
             return images.marked(skipped=True)
-        return images.with_raw((images.raw[0], held))
+        return images.with_raw((images.raw[0], self._held.popleft()))
+
+
+def _frames_away(delay: int) -> str:
+    which = "before" if delay > 0 else "after"
+    return f"the frame {which}" if abs(delay) == 1 else f"{abs(delay)} frames {which}"
 
 
 def find_delay(frames: Iterable[StereoFrame], camera: StereoCamera) -> int | None:
     """Return by how many frames right images are late, by the first frames of a recording.
 
-    -1: they are a frame early. None: the frames do not tell, as the rig does not move.
+    Negative: they are early. None: the frames do not tell, as the rig does not move.
     """
     check = PairingCheck(RowProbe())
     if camera.kind != "stereo":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
@@ -12,31 +13,37 @@ def repaired(events: Iterable[Event], delay: int) -> Iterator[Event]:
     """Yield events with the images of each pair those of one time.
 
     No image comes before its exposure: where right images are early, the left ones are late, and
-    take the stamps of the frames that the right ones came with. Of two frames in a row, the image
-    that is late is taken from the second; the last frame is left out.
+    take the stamps of the frames that the right ones came with. The image that is late is taken from
+    a later frame; the last frames are left out.
 
     Args:
         events: as the recording gives them, in time order.
-        delay: frames by which right images are late: 1, 0, or -1 for early ones.
+        delay: frames by which right images are late; negative for early ones.
     """
-    return iter(events) if delay == 0 else _paired(events, right_is_late=delay > 0)
+    return iter(events) if delay == 0 else _paired(events, abs(delay), right_is_late=delay > 0)
 
 
-def _paired(events: Iterable[Event], *, right_is_late: bool) -> Iterator[Event]:
-    held: StereoFrame | None = None
-    behind: list[Event] = []  # events after the frame that waits
+def _paired(events: Iterable[Event], frames: int, *, right_is_late: bool) -> Iterator[Event]:
+    held = deque[Event]()  # from the frame on that waits
+    waiting = 0  # frames among them
     for event in events:
         if not isinstance(event, StereoFrame):
-            behind.append(event)
+            held.append(event)
             continue
-        if held is not None and right_is_late:
-            yield replace(held, right=event.right)
-        elif held is not None:
-            yield replace(held, left=event.left)
-        yield from behind
-        behind = []
-        held = replace(event, left=_copied(event.left), right=_copied(event.right))
-    yield from behind
+        if waiting == frames:
+            first = held.popleft()
+            while not isinstance(first, StereoFrame):
+                yield first
+                first = held.popleft()
+            yield (
+                replace(first, right=event.right)
+                if right_is_late
+                else replace(first, left=event.left)
+            )
+            waiting -= 1
+        held.append(replace(event, left=_copied(event.left), right=_copied(event.right)))
+        waiting += 1
+    yield from (event for event in held if not isinstance(event, StereoFrame))
 
 
 def _copied(image: Image | None) -> Image | None:

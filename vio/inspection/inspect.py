@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from vio.datasets.samples import motion_samples
+from vio.findings import Finding
 from vio.geometry.rectify import field_of_view
 from vio.imu.clocks import judge_clocks
 from vio.imu.findings import InertialFinding
@@ -153,12 +154,14 @@ def _tracking_parts(
     tracked: list[int] = []
     matched: list[int] = []
     findings: list[str] = []
+    shifted: list[str] = []
     mono = recording.camera.kind == "mono"
     for event in dataset.events(frames.start, frames.stop):
         if isinstance(event, StereoFrame):
             output = frontend.process(event)
             tracked.append(output.tracked)
             matched.append(output.matched)
+            shifted += [_shifted_text(f) for f in output.findings if f.code == "pairs-shifted"]
             progress(len(tracked), len(frames))
             if imu and check is not None:
                 findings += _messages(check.frame(output.observations), mono=mono)
@@ -181,6 +184,8 @@ def _tracking_parts(
             "or blurred"
         )
     parts = [Part("tracking", text, facts, faults)]
+    if shifted:
+        parts.append(Part("pairs", "of different times", {"shifted": True}, shifted))
     if imu:
         verdict = "agrees with the motion of the images, as far as they move"
         if mono:
@@ -188,6 +193,17 @@ def _tracking_parts(
         verdict = "see below" if findings else verdict
         parts.append(Part("IMU against images", verdict, {"findings": findings}, findings))
     return parts
+
+
+def _shifted_text(found: Finding) -> str:
+    """Return what is wrong with pairs of different times."""
+    delay = round(found.figures["delay_frames"])
+    late, other = ("right", "left") if delay > 0 else ("left", "right")
+    frames = "a frame" if abs(delay) == 1 else f"{abs(delay)} frames"
+    return (
+        f"each {late} image comes {frames} later than the {other} one of its time, by the rows that "
+        "match; pair the images by their times of exposure (a run pairs them anew, and says so)"
+    )
 
 
 def _messages(found: tuple[InertialFinding, ...], *, mono: bool) -> list[str]:

@@ -16,6 +16,7 @@ from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.imu.findings import ImuVerdict
+from vio.monitor.contradiction import ImuContradiction
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RefusalReport, RunHealth, is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
@@ -58,6 +59,8 @@ class RunMonitor:
         self._inertial: InertialCheck | None = None
         self._silence = ImuSilence() if imu else None
         self._faults = ImuFaultReport() if imu else None
+        # of one camera, the scale is the IMU's own
+        self._contradiction = ImuContradiction() if imu and camera.kind != "mono" else None
         self._frozen = FrozenImages()
         self._repeats = RepeatReport(IMAGES)
         self._depths = RepeatReport(DEPTHS)
@@ -234,6 +237,8 @@ class RunMonitor:
             what = " and ".join(factors)
         line = f"frame {index}: {what}; the {frames} frames so far were estimated again"
         self._report("imu-not-used", [line])
+        if self._contradiction is not None:
+            self._add(self._contradiction.end(index))
 
     def waiting(self, frame: StereoFrame, why: str) -> None:
         """Add a frame without a pose, as the back end's start is not observable yet; `why` is
@@ -283,6 +288,8 @@ class RunMonitor:
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
         self._add(self._health.frame(index, report, estimate))
+        if self._contradiction is not None:
+            self._add(self._contradiction.frame(index, report.innovation_ratio))
         if report.gyro_jump_radps is not None and self._inertial is not None:
             self._inertial.begin_after_jump()
         if self._seen is not None:

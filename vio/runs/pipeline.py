@@ -263,8 +263,8 @@ def _process(what: _Run, delay: int) -> RunResult:
     stopped = None
     with contextlib.closing(recorder), contextlib.closing(processor):
         taken = _taken_frames(dataset, config, start, stop)
-        if state.delay and taken:
-            taken.discard(max(taken))  # it lacks the image that comes with the next one
+        # these lack the images that come with later ones
+        taken -= set(sorted(taken)[len(taken) - abs(state.delay) :])
         loop = _Loop(state, recorder, shown, taken)
         try:
             with _opencv_threads(dataset, config, parts.frontend):
@@ -475,8 +475,9 @@ class _Loop:
 def _paired_anew_line(delay: int) -> str:
     """Say that a run has begun again."""
     late, other = ("right", "left") if delay > 0 else ("left", "right")
+    frames = "a frame" if abs(delay) == 1 else f"{abs(delay)} frames"
     return (
-        f"each {late} image comes a frame later than the {other} one of its time, by the rows that "
+        f"each {late} image comes {frames} later than the {other} one of its time, by the rows that "
         "match; the run began again with the right pairs; pair the images by their times of "
         "exposure"
     )

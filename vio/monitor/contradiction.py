@@ -1,0 +1,70 @@
+"""Whether the IMU contradicts the images: features are seen far from where it predicts them, frame
+after frame.
+
+Innovations over the standard deviations that the filter expects of them are about 1, whatever the
+motion is. Wrong axes, extrinsics, stamps or scales of an IMU show in them from the first turn on,
+long before enough motion has been seen to tell which of these it is (`vio.monitor.inertial`). A
+shock or an object that moves makes single frames stand out.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from vio.findings import Finding
+from vio.numerics.robust import median
+
+_CONTRADICTED = 4.0  # median innovation over its standard deviation
+_FRAMES = 8  # the newest, of which …
+# … so many are contradicted; four are where a healthy one is at its worst, a flight whose images are
+# rendered along poses of a motion capture, which its real IMU contradicts now and then
+_MIN_CONTRADICTED = 6
+_QUIET_FRAMES = 20  # in a row without one, after which IMU and images agree again
+_CODE = "imu-disagrees"
+
+
+class ImuContradiction:
+    """Reports once per event that the images contradict the motion by the IMU."""
+
+    def __init__(self) -> None:
+        self._ratios = deque[tuple[int, float]](maxlen=_FRAMES)  # with the numbers of the frames
+        self._quiet = 0  # frames in a row
+        self._reported = False
+
+    def frame(self, index: int, innovation_ratio: float | None) -> list[Finding]:
+        """Return what a frame shows.
+
+        Args:
+            index: frame number.
+            innovation_ratio: as in `UpdateReport`; None: nothing was seen.
+        """
+        if innovation_ratio is None:
+            return []
+        self._ratios.append((index, innovation_ratio))
+        is_off = innovation_ratio > _CONTRADICTED
+        self._quiet = 0 if is_off else self._quiet + 1
+        if self._reported:
+            return self.end(index) if self._quiet >= _QUIET_FRAMES else []
+        off = [(frame, ratio) for frame, ratio in self._ratios if ratio > _CONTRADICTED]
+        if len(off) < _MIN_CONTRADICTED:
+            return []
+        self._reported = True
+        ratio = median(np.array([ratio for _, ratio in off]))
+        message = (
+            f"frame {index}: in {len(off)} of {len(self._ratios)} frames the features lie "
+            f"{ratio:.1f} standard deviations from where the IMU predicts them; check its clock, "
+            "axes, units, range and mount (vio check)"
+        )
+        figures = {"innovation_ratio": ratio}
+        return [Finding(_CODE, message, index, off[0][0], lasts=True, figures=figures)]
+
+    def end(self, index: int) -> list[Finding]:
+        """Return that the event has ended, if there is one: the IMU agrees again, or is not used."""
+        self._ratios.clear()
+        if not self._reported:
+            return []
+        self._reported = False
+        message = f"frame {index}: the images agree with the predicted motion again"
+        return [Finding(_CODE, message, index, ended=True)]
