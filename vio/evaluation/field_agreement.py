@@ -91,10 +91,12 @@ def disparity_field(camera: StereoCamera, field: StereoFieldEstimate) -> Dispari
         coefficients[RIGHT_TERMS:] = field.rows[:-1]
     if field.rows_covariance is not None:
         covariance[RIGHT_TERMS:, RIGHT_TERMS:] = field.rows_covariance[:-1, :-1]
-    known = camera.width is not None and camera.height is not None
+    size_px = None
+    if camera.width is not None and camera.height is not None:
+        size_px = (camera.width, camera.height)
     return DisparityField(
         np.array([camera.fu, camera.fv, camera.cu, camera.cv]),
-        (int(camera.width), int(camera.height)) if known else None,
+        size_px,
         coefficients,
         covariance,
     )
@@ -104,7 +106,8 @@ def disparity_error(field: DisparityField, places: FloatArray) -> tuple[FloatArr
     """Return the measured disparity of far points less the true one (G,) at places (G, 2), and its
     derivatives (G, K) by the coefficients, px.
     """
-    camera = StereoCamera(*field.intrinsics.tolist(), baseline_m=1.0)
+    fu, fv, cu, cv = field.intrinsics.tolist()
+    camera = StereoCamera(fu, fv, cu, cv, baseline_m=1.0)
     basis = error_basis(camera, np.column_stack([places, places]))
     chosen = [*range(RIGHT_TERMS), *range(FIELD_TERMS, FIELD_TERMS + ROW_TERMS - 1)]
     jacobian = (basis[:, 0] - basis[:, 2])[:, chosen]
