@@ -171,7 +171,14 @@ configurations: {{images: {{motion: none}}}}
 """
     )
     out = tmp_path / "out"
-    folders = ["--data", drive.parent, "--out", out, "--cache", tmp_path / "cache"]
+    folders: list[str | Path] = [
+        "--data",
+        drive.parent,
+        "--out",
+        out,
+        "--cache",
+        tmp_path / "cache",
+    ]
     facts = json_of(capsys, "bench", suite, *folders, "--workers", "1", "--quiet")
     (one,) = facts["rigs"]
     assert one["kind"] == "backward"
