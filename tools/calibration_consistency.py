@@ -32,7 +32,6 @@ from vio.errors import VioError
 from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
 from vio.filters.msckf import Msckf
-from vio.filters.online_calibration import STEREO_YAW_SIGMA_DEG
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import left_rays
@@ -114,7 +113,7 @@ def drawn(rig: Rig, settings: MsckfSettings, noise: np.random.Generator) -> Off:
         )
     if rig == "baseline":
         return replace(right, baseline=float(noise.normal(0, s.stereo_baseline_sigma)))
-    return replace(right, turn=noise.normal(0, np.radians(STEREO_YAW_SIGMA_DEG), 3))
+    return replace(right, turn=noise.normal(0, np.radians(s.stereo_yaw_sigma_deg), 3))
 
 
 @one_blas_thread()

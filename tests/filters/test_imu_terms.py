@@ -22,7 +22,6 @@ from vio.filters import imu_terms
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, accel_D_terms, gyro_D_terms, significant
 from vio.filters.msckf import Msckf
 from vio.filters.navigation import DIM, NO_STEP, ImuMotion, NavState
-from vio.filters.online_calibration import STEREO_YAW_SIGMA_DEG
 from vio.filters.settings import MsckfSettings
 from vio.filters.supervised import SupervisedMsckf
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_log
@@ -339,7 +338,7 @@ def test_a_stereo_field_that_begins_later_finds_its_place_behind_the_terms() -> 
     estimate = filt.estimate()
     right = np.sqrt(np.diag(estimate.stereo_field.covariance))
     # not 1 %, of a scale
-    assert right[0] == pytest.approx(np.radians(STEREO_YAW_SIGMA_DEG), rel=0.3)
+    assert right[0] == pytest.approx(np.radians(FULL.stereo_yaw_sigma_deg), rel=0.3)
     assert estimate.imu_terms_sigma[:2] == pytest.approx([0.01, 0.01], rel=0.1)
 
 

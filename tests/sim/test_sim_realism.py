@@ -321,6 +321,17 @@ def test_the_true_rig_misses_its_calibration_by_what_is_stated(name: str) -> Non
     assert miscalibrated(rig, CalibrationErrors(), seed=0) is rig
 
 
+def test_renders_of_other_seeds_may_share_a_drawn_rig() -> None:
+    rig = kitti_like_rig()
+    shared = CalibrationSigmas(scale=1.0, seed=7)
+    first = drawn_rig(rig, shared, seed=0)
+    again = drawn_rig(rig, shared, seed=1)
+    np.testing.assert_array_equal(again.T_imu_cam1, first.T_imu_cam1)
+    own = CalibrationSigmas(scale=1.0)
+    np.testing.assert_array_equal(drawn_rig(rig, own, seed=7).T_imu_cam1, first.T_imu_cam1)
+    assert not np.array_equal(drawn_rig(rig, own, seed=1).T_imu_cam1, first.T_imu_cam1)
+
+
 def test_drawn_rigs_have_the_stated_standard_deviations() -> None:
     rig, s = kitti_like_rig(), CalibrationSigmas(scale=1.0)
     seen = []

@@ -50,6 +50,11 @@ class Sequence:
     map_of: str | None = None
     # from, to: the images are black meanwhile, and the rig is moved
     covered: tuple[tuple[str, str], ...] = ()
+    # name of the stereo rig that took it; fields of sequences of one rig are compared, and halves
+    # of the rigs are cross-validated; None: a rig of its own
+    rig: str | None = None
+    # the frames in reverse order, without motion samples
+    reverse: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,10 +258,10 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
     except (ValueError, TypeError) as error:
         text = "start and stop are frames or times as 12s, covered pairs of them, lengths_m metres"
         raise ConfigError(f"{place}: {text} ({error})") from error
-    for key in ("render_each_seed", "positions_only", "exact_truth", "map"):
+    for key in ("render_each_seed", "positions_only", "exact_truth", "map", "reverse"):
         if not isinstance(given.get(key, False), bool):
             raise ConfigError(f"{place}: {key} takes true or false, got {given[key]!r}")
-    for key in ("source", "reference", "map_of"):
+    for key in ("source", "reference", "map_of", "rig"):
         if given.get(key) is not None:
             given[key] = str(given[key])
     _mapping(given.get("settings") or {}, where, f"settings of sequence {name}")

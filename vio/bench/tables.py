@@ -96,6 +96,9 @@ class Outcome:
     notes: Sequence[str] = ()
     absent: Mapping[str, str] = field(default_factory=dict)  # by name of an undefined figure: why
     succeeded: bool | None = None  # None: undefined, without a reference
+    rig: str | None = None  # that took the sequence; None: one of its own
+    # what was found that the stereo calibration is off by, as `DisparityField.as_dict` returns it
+    stereo_field: Mapping[str, Any] | None = None
 
     def value(self, metric: Metric) -> float | None:
         """Return a figure; None: undefined, or the run failed."""
@@ -116,6 +119,8 @@ class Outcome:
             "failure",
             "absent",
             "succeeded",
+            "rig",
+            "stereo_field",
         )
         return {
             **{name: getattr(self, name) for name in names},

@@ -170,6 +170,7 @@ def _common(
         "exact_truth": exact and not sequence.positions_only,
         "map": sequence.map,
         "covered": [list(span) for span in sequence.covered],
+        "reverse": sequence.reverse,
         "code": code_digest(),
         "packages": package_versions(),
     }

@@ -34,12 +34,14 @@ from vio.bench.figures import (
     pose_nees,
 )
 from vio.bench.identity import code_digest, package_versions
+from vio.bench.reverse import Reversed
 from vio.config import Config, merge
 from vio.datasets import open_dataset
 from vio.datasets.frame_times import frames_between, parse_bound, used_frames
 from vio.errors import DataError, EvaluationError, VioError
 from vio.evaluation.association import associate
 from vio.evaluation.errors_along_path import path_length_m
+from vio.evaluation.field_agreement import disparity_field
 from vio.evaluation.trajectories import MIN_POSES, Evaluation, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
@@ -113,6 +115,7 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
         "keep": True,
         "curve": None,
         "trajectory": None,
+        "stereo_field": None,
     }
     timer = _CpuTimer()
     try:
@@ -147,6 +150,12 @@ def _truth(job: dict[str, Any], config: Config) -> _Truth:
         raise DataError(f"{dataset.recording.path}: a part that is covered ends before it begins")
     own = dataset.recording.reference
     reference = own if job["reference"] is None else read_trajectory(Path(job["reference"]))
+    if job["reverse"]:
+        backward = Reversed(dataset, first, total if end is None else min(end, total))
+        reference = None if reference is None else backward.backward(reference)
+        dataset = backward
+        first = 0
+        end = total = len(backward.recording.frame_times_ns)
     if spans:
         from vio.bench.maps import Covered
 
@@ -299,6 +308,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         timer.stages = _stages(result)
         record = {
             "figures": figures,
+            "stereo_field": _field(result),
             "failure": result.stopped,
             "warnings": list(result.warnings[:_MAX_WARNINGS]),
         }
@@ -328,6 +338,13 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         record["trajectory"] = text.splitlines()  # JSON of ours holds printable text only
     record["absent"] = _absent(job, figures, truth)
     return record
+
+
+def _field(result: RunResult) -> dict[str, Any] | None:
+    """What the run has found that the stereo calibration is off by; None: nothing is estimated."""
+    field = result.estimates[-1].stereo_field if len(result.estimates) else None
+    found = None if field is None else disparity_field(result.recording.camera, field)
+    return None if found is None else found.as_dict()
 
 
 def _world_of_map(result: RunResult, reference: Trajectory) -> Any:

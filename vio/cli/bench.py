@@ -107,6 +107,12 @@ def add_parser(commands: Any) -> None:
         metavar="X",
         help="compare: a change below this is none (default 1.1)",
     )
+    parser.add_argument(
+        "--folds",
+        action="store_true",
+        help="choose a configuration on one half of the rigs and judge it on the other, both ways; "
+        "compare: A and B are the choice",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -223,6 +229,7 @@ def _list(suite: Any, data: Path, args: argparse.Namespace) -> int:
 
 def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
     """Print the result; the status is 1 where a run has none."""
+    from vio.bench.folds import cross_validate, fold_lines
     from vio.bench.tables import METRICS, number, summary_of, summary_rows
 
     summary = summary_of(summary_rows(result.outcomes))
@@ -239,8 +246,13 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
     lines.append(("tasks", f"{len(result.outcomes)}, of which {result.reused} were done before"))
     lines.append(("report", f"{out / 'report.html'}, tables.md, tables.tex, table.csv, runs.csv"))
     facts = {**result.facts, "out": str(out), "reused": result.reused}
+    folds = cross_validate(result.outcomes) if args.folds and not result.failures else None
+    if folds is not None:
+        facts["folds"] = folds.as_dict()
     width = max(10, *(len(name) for name, _ in lines))
     print_result(facts, lines, as_json=args.json, name_width=width)
+    if folds is not None and not args.json:
+        print("\n".join(fold_lines(folds)))
     for outcome in result.failures:
         print(
             printable(f"failed: {outcome.sequence}, {outcome.system}: {outcome.failure}"),
@@ -258,12 +270,40 @@ def _compare(args: argparse.Namespace) -> int:
     a = args.folders[0]
     b = args.folders[-1]
     between = None if args.between is None else tuple(args.between)
+    if args.folds:
+        return _compare_folds(a, b, args)
     result = compare(a, b, between=between, factor=args.factor, margin=args.margin)
     if args.json:
         print_result(result.as_dict(), (), as_json=True)
     else:
         print("\n".join(comparison_lines(result)))
     return EXIT_STATUS[result.verdict]
+
+
+def _compare_folds(a: Path, b: Path, args: argparse.Namespace) -> int:
+    """Print whether B wins over A on rigs that it was not chosen on; the status is 3 where it does
+    not.
+    """
+    from vio.bench.bench import read_bench
+    from vio.bench.folds import cross_validate, fold_lines
+
+    if args.between is not None and a == b:
+        sides = [(a, args.between[0], "A"), (a, args.between[1], "B")]
+    else:
+        of_a, of_b = args.between or (None, None)
+        sides = [(a, of_a, "A"), (b, of_b, "B")]
+    outcomes = [
+        replace(outcome, system=f"{side}: {outcome.system}")
+        for folder, system, side in sides
+        for outcome in read_bench(folder)[0]
+        if system in (None, outcome.system)
+    ]
+    result = cross_validate(outcomes)
+    if args.json:
+        print_result(result.as_dict(), (), as_json=True)
+    else:
+        print("\n".join(fold_lines(result)))
+    return 0 if result.wins else 3
 
 
 def _names(text: str) -> list[str]:

@@ -42,8 +42,6 @@ _NOISE_ONLY = float(chi_square_quantile(0.999, 3))
 _EXTRINSIC_ROTATION_WALK_DEG = 2.0e-3
 _EXTRINSIC_TRANSLATION_WALK_M = 1.0e-4
 _TIME_OFFSET_WALK_S = 2.0e-6
-# initial standard deviation of the right camera's rotation about its vertical axis
-STEREO_YAW_SIGMA_DEG = 0.05
 MIN_FIELD_SIGMA = 5.0e-4  # the same of the other rectification terms, in focal lengths
 MAX_FIELD_SIGMA = 2.0e-3
 # at least that of what both lenses have in common, which moves no rows of far points
@@ -53,16 +51,21 @@ _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
 _STEREO_WALK = 0.02
 
 
-def stereo_field_sigmas(sigma: float, turn_rad: float = 0.0) -> FloatArray:
+def stereo_field_sigmas(sigma: float, yaw_rad: float, turn_rad: float = 0.0) -> FloatArray:
     """Initial standard deviations (8,) of the rectification error, in focal lengths, by that of its
-    lens terms.
+    lens terms and of the right camera's rotation about its vertical axis.
 
     Yaw, which moves no row, is known no better than by the turn `turn_rad` that pitch and roll
     would make of the rows.
     """
     common = max(sigma, _MIN_COMMON_SIGMA)
-    yaw = max(np.radians(STEREO_YAW_SIGMA_DEG), turn_rad)
+    yaw = max(yaw_rad, turn_rad)
     return np.array([yaw, *[sigma] * 3, *[_RADIAL * common] * 2, common, common])
+
+
+def stereo_yaw_rad(settings: MsckfSettings) -> float:
+    """Initial standard deviation of the right camera's rotation about its vertical axis."""
+    return float(np.radians(settings.stereo_yaw_sigma_deg))
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,7 +338,7 @@ class _StereoFieldBlock(StereoBlock):
         return False
 
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
-        return stereo_field_sigmas(MAX_FIELD_SIGMA)
+        return stereo_field_sigmas(MAX_FIELD_SIGMA, stereo_yaw_rad(settings))
 
     def report(
         self, calibration: Calibration, nav: NavState, covariance: FloatArray

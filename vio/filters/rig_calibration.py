@@ -14,6 +14,7 @@ from vio.filters.online_calibration import (
     Calibration,
     prior_variances,
     stereo_field_sigmas,
+    stereo_yaw_rad,
 )
 from vio.filters.scale_test import ScaleTest
 from vio.filters.settings import MsckfSettings
@@ -46,7 +47,7 @@ def rows_off(camera: StereoCamera, offset_px: float) -> float:
     return float(np.hypot(offset_px, camera.residual_px)) / camera.fu
 
 
-def field_sigmas(camera: StereoCamera, offset_px: float) -> FloatArray:
+def field_sigmas(camera: StereoCamera, offset_px: float, yaw_rad: float) -> FloatArray:
     """Standard deviations (8,) of the right columns' field, in focal lengths, by the rows' root
     mean square.
 
@@ -56,7 +57,7 @@ def field_sigmas(camera: StereoCamera, offset_px: float) -> FloatArray:
     sigma = float(
         np.clip(_COLUMNS_BY_ROWS * rows_off(camera, offset_px), MIN_FIELD_SIGMA, MAX_FIELD_SIGMA)
     )
-    return stereo_field_sigmas(sigma, offset_px / camera.fu)
+    return stereo_field_sigmas(sigma, yaw_rad, offset_px / camera.fu)
 
 
 def constant_sigmas(settings: MsckfSettings) -> FloatArray:
@@ -121,7 +122,8 @@ class RigCalibration:
         begins = "stereo_field" not in window.state
         if not begins and off <= _ROWS_MOVED * self._rows_off:
             return
-        variances = field_sigmas(self.camera, self._rows.offset_px) ** 2
+        yaw_rad = stereo_yaw_rad(self.settings)
+        variances = field_sigmas(self.camera, self._rows.offset_px, yaw_rad) ** 2
         if begins:
             calibration = window.calibration.estimating("stereo_field", self.settings)
             window.estimate_block("stereo_field", calibration, np.diag(variances))

@@ -166,6 +166,13 @@ class MsckfSettings(Section):
         "on",
         "estimate what the calibration of a stereo pair is off by",
     )
+    stereo_yaw_sigma_deg: float = setting(
+        0.05,
+        "calibrate_stereo: initial standard deviation of the right camera's rotation about its "
+        "vertical axis, which disparities alone show; where rows are off by more, that",
+        unit="deg",
+        above=0,
+    )
     stereo_baseline_sigma: float = setting(
         0.005,
         "standard deviation of the baseline's length, over it, as calibrations leave it; it is "

@@ -12,6 +12,7 @@ import numpy as np
 from vio.calibration.stereo_field import DisplacementField
 from vio.files.tables import Rows
 from vio.filters.imu_terms import term_sigmas
+from vio.filters.online_calibration import stereo_yaw_rad
 from vio.filters.rig_calibration import constant_sigmas, field_sigmas
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray
@@ -144,7 +145,8 @@ def _rig_prior(run: InertialRun, last: np.void) -> RigPrior:
     field = _TINY * np.eye(FIELD_TERMS + ROW_TERMS)
     at_start = np.zeros(FIELD_TERMS + ROW_TERMS)
     if run.field is not None:
-        sigmas = field_sigmas(run.path.camera, float(last["stereo_rows_rms_px"]))
+        rms_px = float(last["stereo_rows_rms_px"])
+        sigmas = field_sigmas(run.path.camera, rms_px, stereo_yaw_rad(s))
         field[:FIELD_TERMS, :FIELD_TERMS] = np.diag(sigmas)
         at_start[:FIELD_TERMS] = run.field.coefficients[:FIELD_TERMS] / sigmas
         rows = last["stereo_rows_covariance"]

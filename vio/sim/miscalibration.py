@@ -69,9 +69,12 @@ class CalibrationSigmas:
     cy_px: float = setting(0.2, "row of each camera's principal point", unit="px")
     k1: float = setting(1e-3, "first radial coefficient of each camera")
     k2: float = setting(1e-3, "second radial coefficient of each camera")
+    seed: int | None = setting(
+        None, "draws the rig in place of the render's seed, so that renders share it", at_least=0
+    )
 
     def __post_init__(self) -> None:
-        if not all(np.isfinite(v) and v >= 0 for v in astuple(self)):
+        if not all(np.isfinite(v) and v >= 0 for v in astuple(self) if v is not None):
             raise SimulationError("calibration sigmas are finite and not negative")
 
 
@@ -84,7 +87,7 @@ def drawn_rig(calibrated: StereoRig, sigmas: CalibrationSigmas, *, seed: int) ->
     if sigmas.scale == 0:
         return calibrated
     s = sigmas
-    rng = np.random.default_rng([seed, 72])
+    rng = np.random.default_rng([seed if s.seed is None else s.seed, 72])
     baseline, focal, difference, *turn_deg = s.scale * rng.standard_normal(6)
     lens = s.scale * rng.standard_normal((2, 4)) * [s.cx_px, s.cy_px, s.k1, s.k2]  # left, right
     lens[1, 1:] = lens[0, 1:] + s.rows * (lens[1, 1:] - lens[0, 1:])
