@@ -38,7 +38,7 @@ from vio.targets.bundle import (
     lens_moved,
 )
 from vio.targets.calibrate import calibrate_cameras
-from vio.targets.corners import BoolArray, CornerDetector, Corners
+from vio.targets.corners import BoolArray, CornerDetector, Corners, subpixel
 from vio.targets.description import Target, marker_dictionary, read_target, target_text
 from vio.targets.homography import predict
 from vio.targets.lenses import LENSES, choose_lens
@@ -236,6 +236,29 @@ def test_the_border_of_kalibrs_tags_has_two_bits() -> None:
     assert marker.is_dark[:2].all()
     assert marker.is_dark[:, -2:].all()
     assert not marker.is_dark[2:-2, 2:-2].all()
+
+
+def test_a_tag_is_printed_as_its_family_defines_it() -> None:
+    """OpenCV's dictionary has the family's tags turned by 180 degrees."""
+    first = 0xD5D628584  # of tag36h11, row by row from the top left; Olson, AprilTag (2011)
+    light = np.array([first >> (35 - k) & 1 for k in range(36)], dtype=bool).reshape(6, 6)
+    assert (~GRID.markers()[0].is_dark[2:-2, 2:-2] == light).all()
+
+
+def test_reads_refined_corners_of_either_shape(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV 5 returns (N, 2) where OpenCV 4 returns (N, 1, 2)."""
+    image = np.zeros((40, 60), dtype=np.uint8)
+    image[:20, :30] = 200
+    image[20:, 30:] = 200
+    near = np.array([[30.0, 20.0], [29.0, 19.0]])
+    as_usual = subpixel(image, near, 4)
+    assert np.allclose(as_usual, [29.5, 19.5], atol=0.05)
+    refine = cv2.cornerSubPix
+    for shape in ((-1, 2), (-1, 1, 2)):
+        monkeypatch.setattr(
+            cv2, "cornerSubPix", lambda *args, shape=shape: refine(*args).reshape(shape)
+        )
+        assert (subpixel(image, near, 4) == as_usual).all()
 
 
 @needs_data

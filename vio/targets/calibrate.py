@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -28,8 +28,7 @@ _MIN_CORNERS = 12  # of a view that is used
 _MAX_VIEWS = 60
 _DOUBT_SIGMAS = 2.0  # stated, beyond which another lens model's difference is named
 _MIN_DOUBT_PX = 0.1
-_MAX_PAIR_RATIO = 20.0  # residual of the pair over a camera's alone, beyond which it is none
-_MIN_PAIR_USED = 0.6  # of the corners
+_MAX_REFUSED = 0.3  # of a pair's corners, beyond which it is none
 _MAX_RESIDUAL_PX = 3.0  # beyond which the board or the lens is another one
 
 
@@ -86,7 +85,7 @@ def calibrate_cameras(
         progress("adjust the pair")
         start = pair_start(seen, (alone[0], alone[1]))
         found = BoardAdjustment(seen).solve(start)
-        _check_pair(found, alone)
+        _check_pair(found)
     progress("compare halves")
     sigmas = tuple(float(one.sigma_px[0]) for one in alone)
     verdict = judge(found, seen, sigmas)
@@ -216,14 +215,16 @@ def _check_fit(one: Adjusted, camera: int, filmed: Filmed, target: Target) -> No
         )
 
 
-def _check_pair(found: Adjusted, alone: Sequence[Adjusted]) -> None:
+def _check_pair(found: Adjusted) -> None:
     """Refuse images that are no pair, or exchanged."""
-    ratios = [float(found.sigma_px[c] / one.sigma_px[0]) for c, one in enumerate(alone)]
-    if max(ratios) > _MAX_PAIR_RATIO or found.used.mean() < _MIN_PAIR_USED:
+    refused = float(np.mean(~found.used))
+    off_px = float(found.sigma_px.max())
+    if refused > _MAX_REFUSED or off_px > _MAX_RESIDUAL_PX:
         raise DataError(
             "left and right images are not of the same moments: corners fit each camera alone, and "
-            f"{100 * np.mean(~found.used):.0f} % of them contradict every pose of the pair; pair "
-            "the images by their times, or hold the board still for each pair"
+            f"with one pose of the right camera they are off by {off_px:.0f} px, "
+            f"{100 * refused:.0f} % of them by more; pair the images by their times, or hold the "
+            "board still for each pair"
         )
     x, y, _ = (se3_inverse(found.at.T_cam_cam0[1])[:3, 3]).tolist()
     if x < -abs(y):
