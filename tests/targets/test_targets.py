@@ -24,10 +24,11 @@ from tests.board_views import (
 from vio import load_rig
 from vio.cli import main
 from vio.datasets import DatasetSettings, open_dataset
-from vio.datasets.images import load_gray
+from vio.datasets.images import load_gray, write_png
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, project_point
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
+from vio.numerics.statistics import chi_square_quantile
 from vio.targets.blurred import PrintAligner
 from vio.targets.bundle import (
     Adjusted,
@@ -37,16 +38,22 @@ from vio.targets.bundle import (
     lens_moved,
 )
 from vio.targets.calibrate import calibrate_cameras
-from vio.targets.corners import BoolArray, CornerDetector, Corners
+from vio.targets.corners import BoolArray, CornerDetector, Corners, subpixel
 from vio.targets.description import Target, marker_dictionary, read_target, target_text
 from vio.targets.homography import predict
 from vio.targets.lenses import LENSES, choose_lens
 from vio.targets.printing import page_of, svg_text
-from vio.targets.recording import Filmed
+from vio.targets.recording import Filmed, open_raw
 from vio.targets.rendering import BoardRenderer, Exposure
 from vio.targets.results import basalt_text
 from vio.targets.start import one_camera, pair_start, poses_of
-from vio.targets.verdict import depths, projection_sigma, projection_sigma_from_views
+from vio.targets.verdict import (
+    depths,
+    judge,
+    projection_sigma,
+    projection_sigma_from_views,
+    shared_difference,
+)
 from vio.targets.views import View, sightings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -231,6 +238,29 @@ def test_the_border_of_kalibrs_tags_has_two_bits() -> None:
     assert not marker.is_dark[2:-2, 2:-2].all()
 
 
+def test_a_tag_is_printed_as_its_family_defines_it() -> None:
+    """OpenCV's dictionary has the family's tags turned by 180 degrees."""
+    first = 0xD5D628584  # of tag36h11, row by row from the top left; Olson, AprilTag (2011)
+    light = np.array([first >> (35 - k) & 1 for k in range(36)], dtype=bool).reshape(6, 6)
+    assert (~GRID.markers()[0].is_dark[2:-2, 2:-2] == light).all()
+
+
+def test_reads_refined_corners_of_either_shape(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV 5 returns (N, 2) where OpenCV 4 returns (N, 1, 2)."""
+    image = np.zeros((40, 60), dtype=np.uint8)
+    image[:20, :30] = 200
+    image[20:, 30:] = 200
+    near = np.array([[30.0, 20.0], [29.0, 19.0]])
+    as_usual = subpixel(image, near, 4)
+    assert np.allclose(as_usual, [29.5, 19.5], atol=0.05)
+    refine = cv2.cornerSubPix
+    for shape in ((-1, 2), (-1, 1, 2)):
+        monkeypatch.setattr(
+            cv2, "cornerSubPix", lambda *args, shape=shape: refine(*args).reshape(shape)
+        )
+        assert (subpixel(image, near, 4) == as_usual).all()
+
+
 @needs_data
 @pytest.mark.parametrize(("name", "least"), [("001", 140), ("004", 80)])
 def test_real_photographs_have_the_numbering_and_corner_order_of_the_description(
@@ -293,17 +323,57 @@ def test_calibrates_a_pair_within_the_stated_sigmas(flaws: Flaws) -> None:
     assert found.sigma_px == pytest.approx([0.05, 0.05], rel=0.1)
 
 
+def _truth(fit: RigFit, flaws: Flaws) -> RigFit:
+    T_cam_cam0 = np.stack([np.eye(4), T_RIGHT_LEFT])
+    return RigFit((LEFT, RIGHT), T_cam_cam0, fit.T_cam0_board, np.array(flaws.bow_m))
+
+
+def _whitened(seeds: range, count: int, flaws: Flaws) -> tuple[FloatArray, FloatArray]:
+    """Errors over stated sigmas (D, S) of the shared unknowns, and the NEES (D,)."""
+    errors: list[FloatArray] = []
+    nees: list[float] = []
+    for seed in seeds:
+        found, fit = _pair(seed, flaws, count)
+        error = shared_difference(fit, _truth(fit, flaws))
+        errors.append(error / np.sqrt(np.diag(found.covariance)))
+        nees.append(float(error @ np.linalg.solve(found.covariance, error)))
+    return np.array(errors), np.array(nees)
+
+
+def _band(probability: float, dof: int) -> tuple[float, float]:
+    """Bounds of the mean of `dof` squared standard normal variables, at both ends."""
+    low, high = (chi_square_quantile(p, dof) / dof for p in (1 - probability, probability))
+    return float(low), float(high)
+
+
 def test_stated_sigmas_are_those_of_the_errors() -> None:
+    errors, nees = _whitened(range(20, 24), 12, Flaws())
+    low, high = _band(0.999, errors.size)
+    assert low < nees.sum() / errors.size < high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("flaws", [Flaws(), Flaws(bow_m=(0.001, -0.0005))], ids=["flat", "bowed"])
+def test_sigmas_of_thirty_views_hold_for_each_unknown(flaws: Flaws) -> None:
+    errors, nees = _whitened(range(100, 124), 30, flaws)
+    low, high = _band(0.9999, len(errors))  # 24 unknowns are looked at
+    each = np.mean(errors**2, axis=0)
+    assert (each > low).all()
+    assert (each < high).all()
+    low, high = _band(0.999, errors.size)
+    assert low < nees.sum() / errors.size < high
+
+
+def test_halves_that_agree_inflate_nothing() -> None:
+    """A map of the difference alone exceeds 1.5 in healthy recordings, as few unknowns rule it."""
     ratios = []
-    for seed in range(3):
-        found, fit = _pair(20 + seed, count=12)
-        layout = layout_of(fit.cameras)
-        sigma = np.sqrt(np.diag(found.covariance))
-        for lens, camera, truth in zip(layout.lenses, fit.cameras, (LEFT, RIGHT), strict=True):
-            values = (camera.fu, camera.fv, camera.cu, camera.cv, *camera.coefficients)
-            exact = (truth.fu, truth.fv, truth.cu, truth.cv, *truth.coefficients)
-            ratios += ((np.array(values) - exact) / sigma[lens]).tolist()
-    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+    for seed in range(40, 46):
+        found, _ = _pair(seed, count=12)
+        seen = sightings(made_views(seed, 12), GRID.points_m)
+        verdict = judge(found, seen, found.sigma_px.tolist())
+        assert verdict.inflation == 1
+        ratios.append(verdict.halves.ratio)
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1, abs=0.2)
 
 
 def test_chooses_the_lens_by_views_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -311,9 +381,9 @@ def test_chooses_the_lens_by_views_left_out(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr("vio.targets.lenses.LENSES", two)  # the order of the others stays
     wide = CameraModel(285, 285, 370, 242, 752, 480, "equidistant", (0.02, -0.01, 0.004, -0.001))
     seen = sightings(made_views(1, 10, cameras=(wide,)), GRID.points_m)
-    name, scores = choose_lens(seen, (752, 480))
-    assert name == "equidistant"
-    assert next(s for s in scores if s.name == name).rms_px < 0.06
+    choice = choose_lens(seen, (752, 480))
+    assert choice.name == "equidistant"
+    assert next(s for s in choice.scores if s.name == choice.name).rms_px < 0.06
 
 
 def _filmed(views: list[View], frames: int = 40) -> Filmed:
@@ -326,6 +396,46 @@ def test_names_pairs_that_are_not_of_one_moment() -> None:
     assert good.verdict.inflation == 1
     late = calibrate_cameras(_filmed(made_views(2, 12, Flaws(moved_m=0.002))), GRID, "radtan")
     assert any("not exposed at the same moment" in finding for finding in late.verdict.findings)
+
+
+def test_refuses_images_of_other_moments() -> None:
+    views = made_views(2, 12)
+    mixed = [
+        View(one.time_ns, (one.corners[0], other.corners[1]))
+        for one, other in zip(views, [*views[1:], views[0]], strict=True)
+    ]
+    with pytest.raises(DataError, match="not of the same moments") as caught:
+        calibrate_cameras(_filmed(mixed), GRID, "radtan")
+    assert "\n" not in str(caught.value)
+
+
+def test_refuses_exchanged_cameras() -> None:
+    exchanged = [View(one.time_ns, one.corners[::-1]) for one in made_views(2, 12)]
+    with pytest.raises(DataError, match="exchange left and right images"):
+        calibrate_cameras(_filmed(exchanged), GRID, "radtan")
+
+
+def _fill(folder: Path, shapes: dict[str, list[tuple[int, int]]]) -> Path:
+    for side, sizes in shapes.items():
+        (folder / side).mkdir(parents=True)
+        for k, shape in enumerate(sizes):
+            write_png(folder / side / f"{k:04d}.png", np.zeros(shape, dtype=np.uint8))
+    return folder
+
+
+def test_reads_images_of_the_size_that_most_have(tmp_path: Path) -> None:
+    shapes = [(120, 188), *[(240, 376)] * 5]
+    raw = open_raw(str(_fill(tmp_path / "mixed", {"left": shapes, "right": shapes})))
+    read = list(raw.load(range(6)))
+    assert len(read) == 5
+    assert all(image.shape == (240, 376) for _, images in read for image in images)
+
+
+def test_names_a_camera_whose_images_are_turned(tmp_path: Path) -> None:
+    folder = _fill(tmp_path / "turned", {"left": [(240, 376)] * 3, "right": [(376, 240)] * 3})
+    with pytest.raises(DataError, match="turn those of one camera") as caught:
+        open_raw(str(folder))
+    assert "left images have 376 x 240 pixels, and right ones 240 x 376" in str(caught.value)
 
 
 def test_names_what_the_views_do_not_show() -> None:

@@ -270,7 +270,10 @@ def _facts(found: CameraCalibration) -> dict[str, Any]:
     ]
     facts: dict[str, Any] = {
         "lens": found.lens,
-        "compared": {score.name: score.rms_px for score in found.scores},
+        "compared": {score.name: score.rms_px for score in found.choice.scores}
+        if found.choice
+        else {},
+        "rivals_max_px": {r.name: float(np.nanmax(r.off_px)) for r in found.rivals},
         "views": found.seen.views,
         "cameras": cameras,
         "bow_m": at.bow.tolist(),
@@ -299,9 +302,14 @@ def _rows(found: CameraCalibration) -> list[tuple[str, str]]:
     verdict = found.verdict
     sigma = verdict.inflation * np.sqrt(np.diag(found.found.covariance))
     rows: list[tuple[str, str]] = []
-    if found.scores:
-        scored = ", ".join(f"{score.name} {score.rms_px:.3f}" for score in found.scores)
+    if found.choice is not None:
+        scored = ", ".join(f"{score.name} {score.rms_px:.3f}" for score in found.choice.scores)
         rows.append(("lens", f"{found.lens}; views left out are off by (px) {scored}"))
+    for rival in found.rivals:
+        worst = float(np.nanmax(rival.off_px))
+        rows.append(
+            ("", f"{rival.name} explains them as well, and differs by {worst:.2f} px at worst")
+        )
     names = ("left", "right") if len(at.cameras) > 1 else ("camera",)
     for c, (name, camera) in enumerate(zip(names, at.cameras, strict=True)):
         own = sigma[layout.lenses[c]]

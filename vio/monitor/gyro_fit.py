@@ -49,7 +49,7 @@ class GyroFit:
     A: FloatArray  # (3, 3) camera rate = A gyro + b
     b: FloatArray  # (3,)
     unexplained: float  # share of the camera's rotation that the map leaves unexplained, 0 to 1
-    noise_radps: float  # of the camera's rates, each axis, from their second differences
+    noise_radps: float  # of the camera's rates, each axis
     count: int  # intervals with samples
     gyro: FloatArray  # (K, 3) mean rates of each interval, rad/s
     force: FloatArray  # (K, 3) mean specific forces, unit of the readings
@@ -95,10 +95,16 @@ class GyroFit:
         return scale > 0 and self.excess(C, scale) < self.tolerance
 
 
-def fit_gyro(record: Record, least: int) -> GyroFit | None:
-    """Fit the camera's rates by the gyro's at the best clock offset; None: too little rotation."""
+def fit_gyro(record: Record, least: int, noise_radps: float | None = None) -> GyroFit | None:
+    """Fit the camera's rates by the gyro's at the best clock offset; None: too little rotation.
+
+    `noise_radps`: of the camera's rates; None: by their second differences, which holds where
+    intervals are short beside the motion.
+    """
     omega = record.twists[:, 3:]
-    noise = robust_sigma(np.diff(omega, 2, axis=0)) / np.sqrt(6) if len(omega) > 4 else np.inf
+    noise = noise_radps
+    if noise is None:
+        noise = robust_sigma(np.diff(omega, 2, axis=0)) / np.sqrt(6) if len(omega) > 4 else np.inf
     best = _at_offset(record, _NEAR_OFFSETS_S, least, noise)
     if best is None or best.axes == 0:
         return None

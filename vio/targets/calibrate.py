@@ -11,20 +11,24 @@ import numpy as np
 from vio.cameras.rig import Rig
 from vio.errors import CalibrationError, DataError
 from vio.filters.imu_terms import ImuTerms
+from vio.geometry.lie import FloatArray, se3_inverse
 from vio.numerics.robust import median
 from vio.records import ImuDensities, IntArray
 from vio.targets.bundle import Adjusted, BoardAdjustment
 from vio.targets.description import Target
 from vio.targets.diagnosis import diagnose
 from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu
-from vio.targets.lenses import LENSES, LensScore, choose_lens
+from vio.targets.lenses import LENSES, LensChoice, Rival, choose_lens, rivals_of
 from vio.targets.recording import Filmed
 from vio.targets.start import one_camera, pair_start, pose_only
-from vio.targets.verdict import MIN_VIEWS, Verdict, judge
+from vio.targets.verdict import MIN_VIEWS, Verdict, corners_by_part, judge, part_name
 from vio.targets.views import Sightings, sightings
 
 _MIN_CORNERS = 12  # of a view that is used
 _MAX_VIEWS = 60
+_DOUBT_SIGMAS = 2.0  # stated, beyond which another lens model's difference is named
+_MIN_DOUBT_PX = 0.1
+_MAX_REFUSED = 0.3  # of a pair's corners, beyond which it is none
 _MAX_RESIDUAL_PX = 3.0  # beyond which the board or the lens is another one
 
 
@@ -34,7 +38,8 @@ class CameraCalibration:
 
     rig: Rig
     lens: str  # a key of `LENSES`
-    scores: tuple[LensScore, ...]  # of the models that were compared; empty: one was asked for
+    choice: LensChoice | None  # None: the model was asked for
+    rivals: tuple[Rival, ...]  # models by which the left camera might be calibrated as well
     found: Adjusted
     seen: Sightings
     alone_sigma_px: tuple[float, ...]  # residual of each camera without the other
@@ -61,11 +66,12 @@ def calibrate_cameras(
     """
     _check_views(filmed, target)
     seen = chosen_views(sightings(filmed.views, target.points_m))
-    scores: list[LensScore] = []
+    choice: LensChoice | None = None
     if lens is None:
         progress("choose the lens model")
         with _explained(filmed, 0, target):
-            lens, scores = choose_lens(seen.of_camera(0), filmed.sizes[0])
+            choice = choose_lens(seen.of_camera(0), filmed.sizes[0])
+        lens = choice.name
     model, count = LENSES[lens]
     progress("adjust each camera")
     alone: list[Adjusted] = []
@@ -79,10 +85,43 @@ def calibrate_cameras(
         progress("adjust the pair")
         start = pair_start(seen, (alone[0], alone[1]))
         found = BoardAdjustment(seen).solve(start)
+        _check_pair(found)
     progress("compare halves")
     sigmas = tuple(float(one.sigma_px[0]) for one in alone)
     verdict = judge(found, seen, sigmas)
-    return CameraCalibration(_rig_of(found), lens, tuple(scores), found, seen, sigmas, verdict)
+    rivals: tuple[Rival, ...] = ()
+    if choice is not None:
+        left = seen.of_camera(0)
+        rivals = rivals_of(choice, alone[0].at.cameras[0], left, filmed.sizes[0])
+        if (doubt := lens_finding(lens, rivals, verdict)) is not None:
+            verdict = replace(verdict, findings=(*verdict.findings, doubt))
+    rig = _rig_of(found)
+    return CameraCalibration(rig, lens, choice, rivals, found, seen, sigmas, verdict)
+
+
+def lens_finding(lens: str, rivals: tuple[Rival, ...], verdict: Verdict) -> str | None:
+    """Return where models that explain the views alike differ by more than is stated, if any do."""
+    stated = verdict.inflation * verdict.projection_sigma_px[0]
+    beyond: list[tuple[float, str, str]] = []
+    for rival in rivals:
+        limit = np.maximum(_DOUBT_SIGMAS * stated, _MIN_DOUBT_PX)
+        off = np.where(rival.off_px > limit, rival.off_px, 0.0)
+        worst = int(np.argmax(off))
+        if off[worst] > 0:
+            beyond.append((float(off[worst]), rival.name, _place(verdict.grid[0], worst)))
+    if not beyond:
+        return None
+    off_px, name, place = max(beyond)
+    return (
+        f"the views do not tell the lens models {lens} and {name} apart, which differ by "
+        f"{off_px:.2f} px at {place}: show the board there, up to the border of the image"
+    )
+
+
+def _place(grid: FloatArray, number: int) -> str:
+    """Return the name of the part of the image in which a pixel of a grid (G, 2) lies."""
+    width, height = (grid.max(axis=0) + 1).tolist()
+    return part_name(int(np.argmax(corners_by_part(grid[[number]], width, height))))
 
 
 def calibrate_with_imu(
@@ -176,13 +215,27 @@ def _check_fit(one: Adjusted, camera: int, filmed: Filmed, target: Target) -> No
         )
 
 
+def _check_pair(found: Adjusted) -> None:
+    """Refuse images that are no pair, or exchanged."""
+    refused = float(np.mean(~found.used))
+    off_px = float(found.sigma_px.max())
+    if refused > _MAX_REFUSED or off_px > _MAX_RESIDUAL_PX:
+        raise DataError(
+            "left and right images are not of the same moments: corners fit each camera alone, and "
+            f"with one pose of the right camera they are off by {off_px:.0f} px, "
+            f"{100 * refused:.0f} % of them by more; pair the images by their times, or hold the "
+            "board still for each pair"
+        )
+    x, y, _ = (se3_inverse(found.at.T_cam_cam0[1])[:3, 3]).tolist()
+    if x < -abs(y):
+        raise DataError(
+            "the right camera is to the left of the left one, as its images see it: exchange left "
+            "and right images, as is also needed where both cameras are mounted upside down"
+        )
+
+
 def _rig_of(found: Adjusted) -> Rig:
     cameras = found.at.cameras
     if len(cameras) == 1:
         return Rig(cameras[0])
     return Rig(cameras[0], cameras[1], found.at.T_cam_cam0[1])
-
-
-def with_inflated(found: Adjusted, factor: float) -> Adjusted:
-    """Return an adjustment whose standard deviations are larger by a factor."""
-    return replace(found, covariance=found.covariance * factor**2)

@@ -24,7 +24,9 @@ from vio.errors import DataError
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, ImuTerms, calibrated, term_sigmas
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.imu.preintegration import BodyStates, Preintegrated, Readings, preintegrate
-from vio.records import ImuDensities, ImuRecord, IntArray
+from vio.numerics.robust import median
+from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
+from vio.targets.imu_checks import check_imu
 
 _STATE = 15  # of a view: xi of its pose, velocity, biases
 _SHARED = 9  # xi of `T_cam0_imu exp(xi)`, time, two turns of gravity; then the IMU's terms
@@ -111,10 +113,18 @@ def calibrate_imu(
             `vio.filters.imu_terms`.
 
     Raises:
-        DataError: too few views lie within the IMU's record, or the motion shows no rotation.
+        DataError: units, axes, signs or stamps of the IMU are wrong, too few views lie within its
+            record, or the motion shows no rotation.
     """
-    problem = _Problem(poses, imu, densities, gravity_mps2, CHOSEN[terms])
-    return problem.result(problem.solve(problem.start()))
+    offset_s = check_imu(poses.times_ns, poses.T_cam0_board, _rotation_sigma(poses), imu)
+    apart_ns = round(NS_PER_S * offset_s)
+    at_imu = replace(poses, times_ns=poses.times_ns + apart_ns)
+    problem = _Problem(at_imu, imu, densities, gravity_mps2, CHOSEN[terms])
+    found = problem.result(problem.solve(problem.start()))
+    if not apart_ns:
+        return found
+    offset_s = found.time_offset_s + apart_ns / NS_PER_S
+    return replace(found, time_offset_s=offset_s, weak=(*found.weak, _clocks_apart(offset_s)))
 
 
 class _Problem:
@@ -392,6 +402,19 @@ class _Problem:
 
 def _seconds(times_ns: IntArray, origin_ns: int) -> FloatArray:
     return np.asarray((times_ns - origin_ns) * 1e-9, dtype=np.float64)
+
+
+def _rotation_sigma(poses: BoardPoses) -> float:
+    """Standard deviation in radians of the board's usual rotation about one axis."""
+    information = median(np.trace(poses.information[:, 3:, 3:], axis1=1, axis2=2) / 3)
+    return float(1 / np.sqrt(information))
+
+
+def _clocks_apart(offset_s: float) -> str:
+    return (
+        f"the IMU's clock is ahead of the camera's by {offset_s:+.3f} s: check which moments both "
+        "stamp, and that the offset is the same in every recording"
+    )
 
 
 def _weak(sigma: FloatArray) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.image_files import ImageFiles
 from vio.datasets.image_pairs import ImagePairs, ImageRecording, measured_images, pair_images
 from vio.datasets.image_times import pair_files
-from vio.datasets.images import SUFFIXES, list_images, load_gray
+from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_gray
 from vio.datasets.plain import image_layout
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.videos import video_files
@@ -37,6 +37,7 @@ MAX_FRAMES = 80  # in which the board is looked for, spread over the recording
 _ASSUMED_STEP_NS = 1_000_000_000  # between the pairs of a folder of photographs
 _MIN_MOTION_HZ = 5.0  # of frames, where an IMU is calibrated
 _MAX_MOTION_FRAMES = 400
+_MEASURED = 5  # images whose size is measured
 _SAMPLES = 4  # frames that are kept to explain a failure
 
 Images = tuple[Image, ...]
@@ -126,10 +127,9 @@ def _size_and_cameras(
     """Return width and height of the images, and the number of cameras."""
     layout = image_layout(path) if path.is_dir() else None
     if layout is not None and layout.left == layout.right:
-        files = list_images(layout.left)
-        return size or measured_images([(file, file) for file in files[:3]])[0], 1
+        return size or _usual_size(list_images(layout.left)), 1
     if layout is not None:
-        return size or measured_images(_some_pairs(layout.left, layout.right))[0], 2
+        return size or _size_of_pair(path, layout.left, layout.right), 2
     if size is not None:
         return size, 2
     videos = video_files(path) if path.is_dir() else None
@@ -147,10 +147,35 @@ def _size_and_cameras(
     return (first.width, first.height), len(dataset.sizes)
 
 
-def _some_pairs(left: Path, right: Path) -> ImagePairs:
+def _size_of_pair(path: Path, left: Path, right: Path) -> tuple[int, int]:
     lefts = list_images(left)
     rights = list_images(right)
-    return [(lefts[0], rights[0])] if len(lefts) and len(rights) else pair_images(left, right)
+    if not len(lefts) or not len(rights):
+        return measured_images(pair_images(left, right))[0]
+    sizes = (_usual_size(lefts), _usual_size(rights))
+    if sizes[0] != sizes[1]:
+        (width, height), (other_width, other_height) = sizes
+        turned = sizes[0] == sizes[1][::-1]
+        advice = "turn those of one camera" if turned else "record both cameras at one size"
+        raise DataError(
+            f"{path}: left images have {width} x {height} pixels, and right ones {other_width} x "
+            f"{other_height}: {advice}, or calibrate each camera alone"
+        )
+    return sizes[0]
+
+
+def _usual_size(files: Sequence[Path]) -> tuple[int, int]:
+    """Return width and height that most of a few images have."""
+    sizes: list[tuple[int, int]] = []
+    for k in np.unique(np.linspace(0, len(files) - 1, _MEASURED).astype(int)).tolist():
+        try:
+            image = load_gray(files[k])[0]
+        except UnreadableImageError:
+            continue
+        sizes.append((image.shape[1], image.shape[0]))
+    if not sizes:
+        return measured_images([(file, file) for file in files])[0]
+    return max(sizes, key=sizes.count)
 
 
 def _size_of_video(file: Path) -> tuple[int, int]:

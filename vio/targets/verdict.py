@@ -21,7 +21,16 @@ from vio.geometry.distortion import (
     uv_D_camera,
     uv_D_point,
 )
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, transform_points
+from vio.geometry.lie import (
+    FloatArray,
+    se3_exp,
+    se3_inverse,
+    se3_log,
+    so3_exp,
+    so3_hat,
+    transform_points,
+)
+from vio.numerics.statistics import chi_square_quantile
 from vio.targets.bundle import (
     Adjusted,
     BoardAdjustment,
@@ -37,8 +46,8 @@ DEPTH_M = 5.0  # where a pair's uncertainty is stated
 _GRID = (13, 9)  # pixels along width and height at which maps are made
 _COMPENSATED = 500  # corners by which a motion of the camera is determined
 _STEP_SIGMAS = 0.1  # of numerical differences
-_HONEST = 1.5  # halves further apart than so many times what is stated inflate the sigmas
 _MEDIAN_LENGTH = 1.1774  # of a vector of two Gaussian components of unit variance
+_CHANCE = 0.99  # of halves that agree as stated; further apart, they inflate the sigmas
 _UNSYNCHRONISED = 1.5  # residual of the pair over that of the cameras alone
 MIN_TILT_DEG = 15.0
 CELLS = 3  # along each side of the image, which must hold corners
@@ -54,6 +63,9 @@ class Halves:
 
     off_px: tuple[FloatArray, ...]  # (G,) difference of each camera's projection over the image
     depth_m: float  # of the pair at `DEPTH_M`: rms over the image of half the difference; 0: one
+    ratio: float  # rms of the whitened difference of all shared unknowns; 1 expected
+    unknowns: int
+    map_ratio: float  # largest, over the maps of projection and depth, of difference over expected
 
     @property
     def rms_px(self) -> tuple[float, ...]:
@@ -231,21 +243,61 @@ def depth_sigma(found: Adjusted, depth_m: float = DEPTH_M) -> FloatArray:
 
 def compare_halves(found: Adjusted, seen: Sightings) -> Halves:
     """Calibrate by every other view and return how far apart the results are."""
-    fits: list[RigFit] = []
+    fits: list[Adjusted] = []
     for part in (0, 1):
         chosen = np.arange(part, seen.views, 2)
         start = replace(found.at, T_cam0_board=found.at.T_cam0_board[chosen])
-        fits.append(BoardAdjustment(seen.of_views(chosen)).solve(start).at)
-    off = [
-        projection_difference(a, b) for a, b in zip(fits[0].cameras, fits[1].cameras, strict=True)
-    ]
+        fits.append(BoardAdjustment(seen.of_views(chosen)).solve(start))
+    one = fits[0].at
+    other = fits[1].at
+    off = [projection_difference(a, b) for a, b in zip(one.cameras, other.cameras, strict=True)]
     depth_m = 0.0
     if seen.cameras > 1:
         uv0, uv1, both = _pixels_at_depth(found.at, DEPTH_M)
         if both.any():
-            apart = depths(fits[0], uv0[both], uv1[both]) - depths(fits[1], uv0[both], uv1[both])
+            apart = depths(one, uv0[both], uv1[both]) - depths(other, uv0[both], uv1[both])
             depth_m = 0.5 * float(np.sqrt(np.mean(apart**2)))
-    return Halves(tuple(off), depth_m)
+    d = shared_difference(one, other)
+    covariance = fits[0].covariance + fits[1].covariance
+    nees = float(d @ np.linalg.solve(covariance, d))
+    ratio = float(np.sqrt(nees / len(d)))
+    map_ratio = _map_ratio(replace(found, covariance=covariance), off, depth_m)
+    return Halves(tuple(off), depth_m, ratio, len(d), map_ratio)
+
+
+def _map_ratio(difference: Adjusted, off_px: Sequence[FloatArray], depth_m: float) -> float:
+    """Return the largest ratio of what halves differ by to what is expected of it.
+
+    `difference`: with the covariance of the difference of both halves.
+    """
+    cameras = difference.at.cameras
+    lenses = layout_of(cameras).lenses
+    ratios: list[float] = []
+    for camera, lens, off in zip(cameras, lenses, off_px, strict=True):
+        sigma = projection_sigma(camera, difference.covariance[lens, lens])
+        ratios.append(float(np.nanmedian(off / (_MEDIAN_LENGTH * np.maximum(sigma, 1e-9)))))
+    if len(cameras) > 1:
+        depth = 0.5 * depth_sigma(difference)
+        depth = depth[np.isfinite(depth)]
+        if len(depth):
+            ratios.append(depth_m / max(float(np.sqrt(np.mean(depth**2))), 1e-9))
+    return max(ratios)
+
+
+def shared_difference(a: RigFit, b: RigFit) -> FloatArray:
+    """Return by how much the shared unknowns (S,) of one fit differ from another's, see `Layout`."""
+    layout = layout_of(a.cameras)
+    out = np.zeros(layout.size)
+    for lens, mine, its in zip(layout.lenses, a.cameras, b.cameras, strict=True):
+        out[lens] = _intrinsics(mine) - _intrinsics(its)
+    for c, pose in enumerate(layout.poses):
+        out[pose] = se3_log(a.T_cam_cam0[c + 1] @ se3_inverse(b.T_cam_cam0[c + 1]))
+    out[layout.bow] = a.bow - b.bow
+    return out
+
+
+def _intrinsics(camera: CameraModel) -> FloatArray:
+    return np.array([camera.fu, camera.fv, camera.cu, camera.cv, *camera.coefficients])
 
 
 def judge(found: Adjusted, seen: Sightings, alone_sigma_px: Sequence[float]) -> Verdict:
@@ -264,7 +316,7 @@ def judge(found: Adjusted, seen: Sightings, alone_sigma_px: Sequence[float]) -> 
     )
     depth = depth_sigma(found) if seen.cameras > 1 else np.full(1, np.nan)
     halves = compare_halves(found, seen)
-    inflation = _inflation(halves, sigma, depth)
+    inflation = _inflation(halves)
     findings = [
         *_unsynchronised(found, alone_sigma_px),
         *coverage_findings(seen, cameras),
@@ -280,20 +332,16 @@ def judge(found: Adjusted, seen: Sightings, alone_sigma_px: Sequence[float]) -> 
     return Verdict(grid, sigma, depth, halves, inflation, tuple(findings))
 
 
-def _inflation(halves: Halves, sigma: Sequence[FloatArray], depth: FloatArray) -> float:
+def _inflation(halves: Halves) -> float:
     """Return the factor by which stated sigmas are too small, as halves show it; 1: they are not.
 
-    The difference of halves has twice the standard deviation of the whole.
+    All unknowns together say whether chance explains the difference; where it does not, the factor
+    is the largest of the ratios. A map alone would not do: few unknowns rule it, and it exceeds 1.5
+    in one healthy recording of five.
+    Reference: Birge, The calculation of errors by the method of least squares (1932).
     """
-    factors = [1.0]
-    for off, mine in zip(halves.off_px, sigma, strict=True):
-        expected = 2 * _MEDIAN_LENGTH * np.maximum(mine, 1e-9)
-        factors.append(float(np.nanmedian(off / expected)))
-    stated = depth[np.isfinite(depth)]
-    if len(stated):
-        factors.append(halves.depth_m / max(float(np.sqrt(np.mean(stated**2))), 1e-9))
-    worst = max(factors)
-    return worst if worst > _HONEST else 1.0
+    by_chance = np.sqrt(chi_square_quantile(_CHANCE, halves.unknowns) / halves.unknowns)
+    return max(halves.ratio, halves.map_ratio) if halves.ratio > by_chance else 1.0
 
 
 def _unsynchronised(found: Adjusted, alone_sigma_px: Sequence[float]) -> list[str]:
