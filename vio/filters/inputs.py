@@ -7,11 +7,10 @@ sample.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.errors import CalibrationError, ConfigError, DataError
 from vio.geometry.lie import FloatArray, rigid_fault
 from vio.geometry.stereo import StereoCamera

@@ -87,7 +87,7 @@ def _estimates(
 
 def corrected(sample: MotionSample, verdict: ImuVerdict) -> MotionSample | None:
     """Return a sample in the right units; None: it is not to be used."""
-    if verdict == AS_GIVEN or not isinstance(sample, ImuSample):
+    if verdict is AS_GIVEN or verdict == AS_GIVEN or not isinstance(sample, ImuSample):
         return sample
     if not verdict.usable:
         return None

@@ -5,11 +5,11 @@ each event is one line.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
 from vio.calibration.severity import rows_grade
+from vio.dataclass import dataclass
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.numerics.robust import median
