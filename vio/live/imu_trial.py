@@ -47,9 +47,10 @@ class ImuTrial:
         if self._fresh is None:
             return
         self._taken.append(event)
-        self._frames += isinstance(event, Observations)
-        if self._frames > _MAX_FRAMES:
-            self.close()
+        if type(event) is Observations:
+            self._frames += 1
+            if self._frames > _MAX_FRAMES:
+                self.close()
 
     def again(self, verdict: ImuVerdict) -> tuple[Backend, dict[int, Estimate]] | None:
         """Give everything to a new back end, with the IMU that a verdict leaves; nothing can be

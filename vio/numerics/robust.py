@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -16,12 +18,11 @@ def median(values: npt.ArrayLike) -> float:
     """
     ordered = np.array(values, dtype=np.float64).ravel()
     ordered.sort()  # NaN come last
-    middle = len(ordered) // 2
-    if not len(ordered) or ordered[-1] != ordered[-1]:
-        return float("nan")
-    return float(
-        ordered[middle] if len(ordered) % 2 else 0.5 * (ordered[middle - 1] + ordered[middle])
-    )
+    count = len(ordered)
+    middle = count // 2
+    if not count or ordered[-1] != ordered[-1]:
+        return math.nan
+    return float(ordered[middle] if count % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))
 
 
 def quantile(values: npt.ArrayLike, share: float) -> float:
