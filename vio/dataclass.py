@@ -28,7 +28,7 @@ def _dataclass(*, slots: bool = False, frozen: bool = False) -> Callable[[type[A
         inherits = any(hasattr(base, "__dataclass_fields__") for base in cls.__bases__)
         if inherits or not slots or not cls.__doc__ or any(name in vars(cls) for name in _SHARED):
             return dataclasses.dataclass(frozen=frozen, slots=slots)(cls)
-        made = dataclasses.dataclass(init=False, repr=False, eq=False, slots=True)(cls)
+        made: Any = dataclasses.dataclass(init=False, repr=False, eq=False, slots=True)(cls)
         own = fields(made)
         if any(f.kw_only or not f.init for f in own):
             raise TypeError(f"{cls.__name__}: take dataclasses.dataclass for such fields")

@@ -124,9 +124,9 @@ class ImuSampleCheck:
         clipped = self._ranges.take(readings)
         if clipped.any():
             self._faults += self._ranges.faults(samples, clipped)
-            kept = ~clipped.any(axis=1)
-            samples = [x for x, is_kept in zip(samples, kept, strict=True) if is_kept]
-            readings = readings[kept]
+            left_out: BoolArray = clipped.any(axis=1)
+            samples = [x for x, out in zip(samples, left_out.tolist(), strict=True) if not out]
+            readings = readings[~left_out]
         times = np.array([x.time_ns for x in samples], dtype=np.int64)
         usable: list[ImuSample] = []
         k = 0
