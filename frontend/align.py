@@ -11,7 +11,7 @@ Reference: Baker & Matthews, Lucas-Kanade 20 years on, IJCV (2004).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from vio.dataclass import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 

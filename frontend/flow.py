@@ -4,7 +4,7 @@ full image.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from vio.dataclass import dataclass
 
 import cv2
 import numpy as np

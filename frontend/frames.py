@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import field
+from vio.dataclass import dataclass
 from typing import Protocol
 
 import numpy as np

@@ -16,7 +16,6 @@ from vio.frontend.columns import changed
 from vio.frontend.detect import detect_corners, half_mask, load_mask
 from vio.frontend.flow import track_with_retries
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output
-from vio.frontend.given_corners import given_corners
 from vio.frontend.moving_object import (
     ObjectReport,
     choose_motion,
@@ -161,6 +160,8 @@ class KltFrontend:
         """Return new corners (K, 2), best first, by the built-in detector or the caller's."""
         if self._detector is None:
             return detect_corners(left.half, occupied, wanted, self._grid, allowed)
+        from vio.frontend.given_corners import given_corners
+
         return given_corners(self._detector, left.full, occupied, wanted, self._grid, allowed)
 
     def follow_right(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:

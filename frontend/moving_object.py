@@ -22,7 +22,8 @@ Nothing tells which: it is used, and reported at once.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from vio.dataclass import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np

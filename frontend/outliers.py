@@ -16,7 +16,7 @@ for the case of pure rotation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from vio.dataclass import dataclass
 from typing import NamedTuple
 
 import cv2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from vio.dataclass import dataclass
 from typing import TypeAlias
 
 import cv2

@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 
 from vio.frontend.columns import share_of
-from vio.frontend.descriptors import MutualNearest, sift_extractor
 from vio.frontend.outliers import RansacProblem, best_motion
 from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import MatchSettings
@@ -63,6 +62,8 @@ def motion_across(
         right: the present right image.
         starts: motions (S, 4, 4) to try, beside those of minimal sets of points.
     """
+    from vio.frontend.descriptors import MutualNearest, sift_extractor
+
     assert previous.right_half is not None
     camera = problem.camera
     before, now = sift_extractor(MatchSettings())(previous.left.full, left.full)

@@ -10,7 +10,8 @@ followed, and no new ones are found.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from vio.dataclass import dataclass
 
 import numpy as np
 

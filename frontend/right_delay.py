@@ -12,7 +12,8 @@ takes the place of the one that came with it: they were paired wrongly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from vio.dataclass import dataclass
 
 import numpy as np
 

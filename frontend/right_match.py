@@ -4,7 +4,7 @@ late, or another one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from vio.dataclass import dataclass
 
 import numpy as np
 

@@ -5,7 +5,8 @@ Lengths that scale with the image size are given as fractions of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
+from vio.dataclass import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 

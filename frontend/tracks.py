@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from vio.dataclass import dataclass
 
 import numpy as np
 

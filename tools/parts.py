@@ -14,6 +14,7 @@ from pathlib import Path
 PARTS: dict[str, tuple[str, ...]] = {
     "base": (
         "vio._version",
+        "vio.dataclass",
         "vio.errors",
         "vio.setting",
         "vio.records",

@@ -13,12 +13,13 @@ import math
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import field, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 
+from vio.dataclass import dataclass
 from vio.datasets.settings import DatasetSettings
 from vio.errors import ConfigError
 from vio.files.inputs import read_input

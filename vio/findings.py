@@ -8,9 +8,10 @@ of the frames that they hold for.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal, TypeAlias
 
+from vio.dataclass import dataclass
 from vio.errors import ConfigError
 
 # of the estimates: use them; they are less certain than usual; do not use them

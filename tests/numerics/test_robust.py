@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vio.numerics.robust import jackknife, median, robust_sigma
+from vio.numerics.robust import jackknife, median, quantile, robust_sigma, robust_sigmas
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 100, 101])
@@ -49,3 +49,18 @@ def test_robust_sigma_ignores_outliers() -> None:
     assert robust_sigma(values) == pytest.approx(3.0, rel=0.03)
     values[:3000] = 1e6
     assert robust_sigma(values) == pytest.approx(3.0, rel=0.3)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 101])
+def test_quantiles_are_numpys_to_the_bit(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=count)
+    for share in (0.0, 0.02, 0.37, 0.5, 0.7, 0.95, 1.0):
+        assert quantile(values, share) == np.quantile(values, share)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 200])
+def test_sigmas_of_columns_are_those_of_each(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=(count, 6))
+    values[0, 1] = np.nan
+    expected = [robust_sigma(column) for column in values.T]
+    assert np.array_equal(robust_sigmas(values), expected, equal_nan=True)

@@ -4,12 +4,11 @@ motion sensor.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from vio.calibration.findings import NotObservable
 from vio.cameras.projection import CameraArgs, camera_args, turn_to
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.numerics.compiled import compiled, move_by_twist, solve_positive

@@ -4,8 +4,9 @@ calibration.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, TypeAlias
+
+from vio.dataclass import dataclass
 
 Fault: TypeAlias = Literal[
     "cameras swapped",

@@ -5,10 +5,10 @@ with the camera.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.records import ImuSample, IntArray, MotionSample
 

@@ -5,13 +5,13 @@ velocities.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from vio.calibration.egomotion import CameraMotion, stereo_twists
 from vio.calibration.findings import NotObservable
 from vio.calibration.inertial import ImuAlignment, Rates
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.robust import jackknife, robust_sigma

@@ -8,8 +8,9 @@ axis shows in disparities alone); motion does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
+
+from vio.dataclass import dataclass
 
 Grade: TypeAlias = Literal["negligible", "worth calibrating", "unusable"]
 

@@ -5,12 +5,13 @@ images.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
 
 from vio.calibration.findings import NotObservable
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, so3_exp, so3_log
 from vio.numerics.robust import robust_sigma
 from vio.records import BoolArray, IntArray

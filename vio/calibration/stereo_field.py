@@ -13,13 +13,14 @@ left.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
+from dataclasses import replace
 
 import numpy as np
 
 from vio.cameras.rectification_error import error_basis, radial_focal
 from vio.cameras.rig import Rig, rig_of_rectified
+from vio.dataclass import dataclass
 from vio.errors import CalibrationError
 from vio.geometry.distortion import (
     CameraModel,

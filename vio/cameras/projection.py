@@ -21,19 +21,18 @@ _known: dict[int, tuple[StereoCamera, CameraArgs]] = {}
 
 def camera_args(camera: StereoCamera) -> CameraArgs:
     """Return the intrinsics of both rectified images, as compiled functions take them."""
-    known = _known.get(id(camera))
-    if known is None:
+    try:
+        return _known[id(camera)][1]
+    except KeyError:
         fu = float(camera.fu)
         fv = float(camera.fv)
         cu = float(camera.cu)
         cv = float(camera.cv)
         if len(_known) == _MAX_KNOWN:
             _known.clear()
-        known = _known[id(camera)] = (
-            camera,
-            (fu, fv, cu, cv, float(camera.baseline_m), camera.is_cylinder),
-        )
-    return known[1]
+        args = fu, fv, cu, cv, float(camera.baseline_m), camera.is_cylinder
+        _known[id(camera)] = camera, args
+        return args
 
 
 @compiled

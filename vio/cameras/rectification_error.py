@@ -13,11 +13,12 @@ seventh, of the disparity, depends on both images.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled

@@ -4,12 +4,13 @@ rectification.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.errors import CalibrationError
 from vio.geometry.distortion import (
     CameraModel,

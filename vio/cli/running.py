@@ -7,13 +7,14 @@ import math
 import shlex
 import signal
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vio.cli.output import ProgressBar
 from vio.cli.stopping import StopRequest
 from vio.config import Config, load_config
+from vio.dataclass import dataclass
 from vio.datasets import open_dataset
 from vio.datasets.frame_times import Seconds, frames_between, used_frames
 from vio.errors import NOTE, CalibrationError, ConfigError, DataError, StoppedError, VioError
@@ -40,7 +41,6 @@ from vio.runs.folder import (
     growing_folder,
     read_request,
 )
-from vio.runs.live_folder import finish_live_folder, is_live
 from vio.runs.pipeline import RunControl, RunResult, Viewers, given_rig, run
 from vio.runs.stated import RunRequest
 from vio.view.annotated import AnnotatedImage
@@ -183,6 +183,8 @@ def resume(
         VioError: the folder holds no unfinished run, one that another program began, or one that
             writes a file outside of it that was not named.
     """
+    from vio.runs.live_folder import is_live
+
     request = read_request(folder)
     check_out(folder)
     if is_live(request):
@@ -222,6 +224,8 @@ def resume(
 
 def _finish_live(folder: Path, request: RunRequest, shown: Shown) -> dict[str, Any]:
     """Write the results of a live run whose program was killed, and return its metrics."""
+    from vio.runs.live_folder import finish_live_folder
+
     log.warning("%s: a live run cannot go on; its results so far are written", folder)
     metrics = finish_live_folder(folder, request)
     if shown.finished is not None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import os
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -35,8 +36,17 @@ MODULES = [
 
 def readers() -> dict[str, Reader]:
     """Return the readers by the kinds of recordings that they read, in the order of `MODULES`."""
-    modules = [import_module(name if "." in name else f"vio.datasets.{name}") for name in MODULES]
-    return {reader.kind: reader for module in modules for reader in module.READERS}
+    return {reader.kind: reader for reader in _readers()}
+
+
+def _readers() -> Iterator[Reader]:
+    """Yield the readers in the order of `MODULES`, each module imported when it is come to."""
+    for name in MODULES:
+        yield from import_module(name if "." in name else f"vio.datasets.{name}").READERS
+
+
+def _reader(kind: str) -> Reader:
+    return next(reader for reader in _readers() if reader.kind == kind)
 
 
 def _looked_for() -> str:
@@ -66,7 +76,7 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
     settings = options or DatasetSettings()
     if kind is None:
         kind = "plain" if settings.folders is not None and path.is_dir() else _detect(path)
-    dataset = readers()[_for_settings(kind, path, settings)].read(path, settings)
+    dataset = _reader(_for_settings(kind, path, settings)).read(path, settings)
     # The settings of a run that took the left camera also serve its observations, which are of that
     # camera.
     if settings.camera == "both" or (
@@ -102,7 +112,7 @@ def _for_settings(kind: str, path: Path, settings: DatasetSettings) -> str:
         )
     if settings.calibration is None:
         return kind
-    calibrated = readers()[kind].calibrated_as
+    calibrated = _reader(kind).calibrated_as
     if calibrated is None:
         raise DataError(
             f"{path}: --calibration takes the place of a camera's calibration, but kind {kind} "
@@ -197,11 +207,10 @@ def _folder_kind(path: Path) -> str | None:
             "it by vio eval, or "
             "give its observations.npz (of --save-observations)"
         )
-    known = readers().values()
-    for reader in known:
+    for reader in _readers():
         if reader.is_folder(path):
             return reader.kind
-    for reader in known:
+    for reader in _readers():
         if reader.may_be_folder(path):
             return reader.kind
     if "sequences" in names:
@@ -215,6 +224,6 @@ def _folder_kind(path: Path) -> str | None:
 def _file_kind(path: Path) -> str | None:
     try:
         check_regular(path)
-        return next((each.kind for each in readers().values() if each.is_file(path)), None)
+        return next((each.kind for each in _readers() if each.is_file(path)), None)
     except OSError as error:
         raise DataError(f"cannot read {path}: {error.strerror or error}") from error

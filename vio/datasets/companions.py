@@ -5,17 +5,18 @@ the rest.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
 from vio.cameras.rig import Rectifier, Rig
+from vio.dataclass import dataclass
+from vio.datasets import rigs
 from vio.datasets.common import naming
 from vio.datasets.image_pairs import ImageSize
 from vio.datasets.kitti import read_extrinsics
-from vio.datasets.rigs import find_calibration
 from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transform
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
@@ -59,7 +60,7 @@ def calibration_beside(layout: Layout) -> Path | None:
             continue
         if "undistorted" in str(layout.left) and (folder / STEREO).is_file():
             return folder / "undistorted_calib_0.txt"
-        if (found := find_calibration(folder)) is not None:
+        if (found := rigs.find_calibration(folder)) is not None:
             return found
     return None
 

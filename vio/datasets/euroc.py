@@ -13,12 +13,13 @@ Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from vio.cameras.rig import rectifier_of
+from vio.dataclass import dataclass
 from vio.datasets.common import naming
 from vio.datasets.companions import Beside, check_overlap, parts_of
 from vio.datasets.euroc_files import STATE_CSV, TUM_FILE, read_camera_yaml, read_imu_yaml

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.datasets.common import blank_frames, frame_range, merge_events
 from vio.records import Event, FeatureTracks, IntArray, MotionSample, Observations, Recording
 

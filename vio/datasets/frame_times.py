@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.records import NS_PER_S, IntArray, Recording
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
+
+from vio.dataclass import dataclass
 
 
 def stem_of(name: str) -> str:

@@ -7,11 +7,11 @@ is camera 2, some 6 cm beside it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.datasets.common import check_intrinsics, naming, numbers_in
 from vio.datasets.tables import VELOCITY_HEADER
 from vio.errors import CalibrationError

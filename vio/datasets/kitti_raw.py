@@ -8,11 +8,11 @@ Reference: Geiger et al., Vision meets robotics: the KITTI dataset (2013).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.datasets.common import check_intrinsics, image_size, naming, numbers_in
 from vio.errors import CalibrationError
 from vio.files.text import text_lines

@@ -16,12 +16,14 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from vio.cameras.rig import Rig
+from vio.dataclass import dataclass
+from vio.datasets import rigs
 from vio.datasets.companions import (
     IMU_FILES,
     calibration_beside,
@@ -35,7 +37,6 @@ from vio.datasets.image_times import frame_times, pair_files, times_of
 from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_gray
 from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
 from vio.datasets.reader import Reader
-from vio.datasets.rigs import find_calibration, kitti_rig, load_rig
 from vio.datasets.rigs.bare import NAMES as BARE_NAMES
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.sides import first_pair, pairs_of
@@ -126,7 +127,7 @@ def side_by_side(path: Path, calibration: Path | None = None) -> Layout | None:
         half = (image.shape[1] // 2, image.shape[0])
         # a size that the file does not state cannot tell; a ZED's states several
         stated = half if file.suffix.lower() == ".conf" else None
-        rig = load_rig(file, image_size=stated, cameras=2)
+        rig = rigs.load_rig(file, image_size=stated, cameras=2)
     except (UnreadableImageError, CalibrationError):
         return None
     return layout if (rig.cam0.width, rig.cam0.height) == half else None
@@ -184,7 +185,7 @@ def holds_more_than_kitti(path: Path) -> bool:
         return False
     if any((path / name).is_file() for name in IMU_FILES):
         return True
-    return find_calibration(path) not in (None, path / "calib.txt")
+    return rigs.find_calibration(path) not in (None, path / "calib.txt")
 
 
 def lacks_sensor_yaml(path: Path) -> bool:
@@ -294,7 +295,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     size, levels, notes = measured_images(pairs)
     file = path / "calib.txt"
     times_file = path / "times.txt"
-    rig, T_left_cam0 = kitti_rig(file, size, cameras)
+    rig, T_left_cam0 = rigs.kitti_rig(file, size, cameras)
     if not times_file.is_file():
         raise DataError(f"{times_file} is missing; it holds one time in seconds for each image")
     doubts = list[str]()
@@ -338,7 +339,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
             "calibration of that day there"
         )
     size, levels, notes = measured_images(pairs)
-    rig = load_rig(file, image_size=size, cameras=2)
+    rig = rigs.load_rig(file, image_size=size, cameras=2)
     # one trigger: the left ones serve
     used = [path / name / "timestamps.txt" for name in ("image_00", "image_01")]
     numbers = _frame_numbers(pairs)
@@ -415,7 +416,7 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
         file = layout.root / LISTS[0]
         rig = published_camera(layout.root, size)
     else:
-        rig = load_rig(file, image_size=size, cameras=2 if kind == "plain" else 1)
+        rig = rigs.load_rig(file, image_size=size, cameras=2 if kind == "plain" else 1)
         if is_tum and rig.depth_factor is None and file.name in BARE_NAMES:
             rig = replace(rig, depth_factor=DEPTH_FACTOR)
     depth_factor = 1.0

@@ -7,9 +7,9 @@ A reader is one file, whose `READERS` has one of these for each kind, and one li
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
+from vio.dataclass import dataclass
 from vio.datasets.settings import DatasetSettings
 from vio.protocols import Dataset
 

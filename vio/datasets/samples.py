@@ -72,7 +72,13 @@ class MotionSamples(Sequence[Sample_co]):
     @property
     def kinds(self) -> frozenset[MotionSource]:
         """Which kinds of samples there are."""
-        return frozenset("imu" if imu else "velocity" for imu in np.unique(self.is_imu).tolist())
+        # `np.unique` loads NumPy's masked arrays, which cost more than all samples of a short run
+        found: set[MotionSource] = set()
+        if self.is_imu.any():
+            found.add("imu")
+        if not self.is_imu.all():
+            found.add("velocity")
+        return frozenset(found)
 
     def take(self, rows: slice | BoolArray | IntArray) -> MotionSamples[Sample_co]:
         """Return some of the samples."""

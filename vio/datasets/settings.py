@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
 
+from vio.dataclass import dataclass
 from vio.geometry.rectify import Interpolation, ProjectionMode
 from vio.setting import Section, setting
 

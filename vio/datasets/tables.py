@@ -8,11 +8,12 @@ import contextlib
 import re
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.datasets.common import check_gravity_column
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError

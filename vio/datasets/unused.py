@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+from vio.dataclass import dataclass
 from vio.datasets.images import SUFFIXES
 
 # no data

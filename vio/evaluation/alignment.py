@@ -4,11 +4,11 @@ distances of the positions.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import EvaluationError
 from vio.geometry.lie import (
     FloatArray,

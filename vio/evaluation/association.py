@@ -5,12 +5,13 @@ interpolation.
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.errors import EvaluationError
 from vio.records import NS_PER_S, IntArray, Trajectory
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.errors import EvaluationError
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
+from vio.numerics.robust import median
 
 KITTI_LENGTHS_M: tuple[float, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_STEP_FRAMES = 10
@@ -166,7 +167,7 @@ def error_statistics(errors: npt.ArrayLike) -> ErrorStatistics:
     """Summarise errors (M,), M >= 1."""
     e = np.asarray(errors, dtype=np.float64)
     rmse = float(np.sqrt(np.mean(e * e)))
-    return ErrorStatistics(rmse, float(e.mean()), float(np.median(e)), float(e.max()))
+    return ErrorStatistics(rmse, float(e.mean()), median(e), float(e.max()))
 
 
 def rotation_angle_deg(R: npt.ArrayLike) -> FloatArray:

@@ -16,6 +16,7 @@ from vio.geometry.lie import (
     rotation_from_quat_xyzw,
     so3_log,
 )
+from vio.numerics.robust import median
 
 # median attitude error that no odometry has whose positions agree; other axes are 90 deg off or
 # more
@@ -51,7 +52,7 @@ def attitude_note(
     """
     R_align = np.eye(3) if R_ref_est is None else R_ref_est
     R_raw = R_align.T @ R_est
-    off_deg = float(np.median(rotation_angle_deg(np.swapaxes(R_ref, 1, 2) @ R_est)))
+    off_deg = median(rotation_angle_deg(np.swapaxes(R_ref, 1, 2) @ R_est))
     if off_deg < max(_LARGE_DEG, _SIGMAS * float(np.degrees(sigma_rad))):
         return None
     head = f"the attitudes differ by {off_deg:.0f} deg (median)"
@@ -109,7 +110,7 @@ def _mean(R: FloatArray) -> FloatArray:
 
 def _spread_deg(R: FloatArray) -> float:
     """Return the median angle of rotations (M, 3, 3) from their mean."""
-    return float(np.median(rotation_angle_deg(_mean(R).T @ R)))
+    return median(rotation_angle_deg(_mean(R).T @ R))
 
 
 def _name(R: FloatArray) -> str:

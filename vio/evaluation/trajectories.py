@@ -5,12 +5,13 @@ matched pairs.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, is_dataclass, replace
+from dataclasses import asdict, is_dataclass, replace
 from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.errors import EvaluationError
 from vio.evaluation.alignment import (
     Alignment,

@@ -33,6 +33,8 @@ _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NO_LINK = sum(
     getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY")
 )
+# what makes the name of a file in the making a free one, and its kind
+_LEFT_OVER = re.compile(r"[0-9a-f]{12}\.(partial|old)")
 _PROBE_BYTES = 2**22  # what a run of a thousand frames writes, about
 
 
@@ -66,9 +68,13 @@ def _remove_leftovers(target: Path) -> None:
     """Remove what killed processes left of their attempts to write `target`."""
     if fcntl is None:
         return
-    pattern = re.compile(re.escape(f".{target.name}.") + r"[0-9a-f]{12}\.(partial|old)")
+    prefix = f".{target.name}."
     try:
-        found = [path for path in target.parent.iterdir() if pattern.fullmatch(path.name)]
+        found = [
+            path
+            for path in target.parent.iterdir()
+            if path.name.startswith(prefix) and _LEFT_OVER.fullmatch(path.name, len(prefix))
+        ]
     except OSError:
         return
     for path in found:

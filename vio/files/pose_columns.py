@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+from vio.dataclass import dataclass
 from vio.files.units import header_cells, split_cells, time_unit, time_unit_in_words, without_unit
 from vio.records import Orientations
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
+
+from vio.dataclass import dataclass
 
 _LARGEST = 2**63 - 1  # of whole numbers: they end in arrays of 64 bits
 _SHOWN = 40  # characters of a wrong value

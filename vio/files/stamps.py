@@ -11,13 +11,13 @@ both.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.files.text import INT64_MAX, check_increasing
 from vio.records import IntArray

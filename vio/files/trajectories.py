@@ -10,13 +10,14 @@ import os
 import re
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal, NoReturn, TypeAlias, get_args
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
 from vio.files.pose_columns import PoseColumns, pose_columns

@@ -7,11 +7,10 @@ clone. Tracks that continue are linearised anew in every frame and absorbed into
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from vio.cameras.rectification_error import CONSIDERED, ErrorColumns
+from vio.dataclass import dataclass
 from vio.filters import track_loops
 from vio.filters.imu_jump import GyroJump, gyro_doubt, turn_of_images
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis

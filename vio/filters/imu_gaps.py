@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.filters.pose_loops import lacks_samples
 from vio.geometry.lie import FloatArray
 from vio.numerics.robust import median

@@ -10,10 +10,10 @@ come with the result. Equation (N10) of docs/math.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import EstimationError
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, so3_exp

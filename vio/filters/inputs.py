@@ -7,11 +7,10 @@ sample.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.errors import CalibrationError, ConfigError, DataError
 from vio.geometry.lie import FloatArray, rigid_fault
 from vio.geometry.stereo import StereoCamera
@@ -70,12 +69,14 @@ class InputOrder:
             DataError: it is not after the last one, a velocity is before the last frame, or a value
                 is not finite or absurdly large.
         """
-        imu = isinstance(sample, ImuSample)
-        first, second = (
-            (sample.gyro, sample.accel)
-            if isinstance(sample, ImuSample)
-            else (sample.linear, sample.angular)
-        )
+        if isinstance(sample, ImuSample):
+            imu = True
+            first = sample.gyro
+            second = sample.accel
+        else:
+            imu = False
+            first = sample.linear
+            second = sample.angular
         kind = "IMU" if imu else "velocity"
         now = sample.time_ns
         (a, b, c) = first.tolist()

@@ -4,7 +4,6 @@ late.
 
 from __future__ import annotations
 
-from vio.filters.mono_msckf import MonoMsckf
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.filters.supervised import SupervisedMsckf
@@ -33,6 +32,8 @@ class MsckfOfRig(Msckf):
             ConfigError: one camera without an IMU, or settings that need another motion or camera.
         """
         if camera.kind == "mono":
+            from vio.filters.mono_msckf import MonoMsckf
+
             return MonoMsckf.build(camera, T_cam0_body, settings, motion)
         if motion == "imu":
             return SupervisedMsckf(camera, T_cam0_body, settings)

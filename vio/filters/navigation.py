@@ -11,10 +11,11 @@ Hartley et al., Contact-aided invariant extended Kalman filtering for robot stat
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import EstimationError
 from vio.filters import pose_loops as loops
 from vio.filters.imu_gaps import Hidden, ImuHistory

@@ -5,10 +5,10 @@ motion.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.filters import gate_loops as loops
 from vio.geometry.lie import FloatArray
 from vio.numerics.statistics import chi_square_cdf, chi_square_quantile

@@ -15,13 +15,14 @@ Reference: Li & Mourikis, Online temporal calibration for camera-IMU systems (20
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import lru_cache
 from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
 from vio.cameras.rectification_error import TERMS
+from vio.dataclass import dataclass
 from vio.filters import pose_loops as loops
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
 from vio.filters.navigation import DIM, Growth, NavState, Transition

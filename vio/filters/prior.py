@@ -8,11 +8,10 @@ covariance `P`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from vio.cameras.rectification_error import CONSIDERED
+from vio.dataclass import dataclass
 from vio.filters import pose_loops as loops
 from vio.filters.scale_test import ScaleTest
 from vio.geometry.lie import FloatArray

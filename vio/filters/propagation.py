@@ -4,10 +4,9 @@ motion.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import EstimationError
 from vio.filters.navigation import (
     DIM,

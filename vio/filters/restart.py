@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import EstimationError
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.online_calibration import Calibration, body_twist

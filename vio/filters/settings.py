@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+from vio.dataclass import dataclass
 from vio.setting import Section, setting
 
 

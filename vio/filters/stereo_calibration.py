@@ -15,13 +15,14 @@ for improved odometry accuracy, ECMR (2021).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import lru_cache
 
 import numpy as np
 
 from vio.cameras.projection import camera_args
 from vio.cameras.rectification_error import ErrorColumns, corrected_pixels, vertical_disparity_terms
+from vio.dataclass import dataclass
 from vio.filters import track_loops as loops
 from vio.filters.multiview import CAUCHY, TrackInformation
 from vio.filters.track_records import Eliminated, Residuals, RowEquations, TermColumns, Views

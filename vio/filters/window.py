@@ -8,10 +8,11 @@ is, `vio.filters.prior` holds the covariance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.filters import pose_loops as loops
 from vio.filters.error_state import ErrorState
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion

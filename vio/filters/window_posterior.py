@@ -4,10 +4,11 @@ until the next frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.filters import pose_loops as loops
 from vio.filters.navigation import ImuMotion
 from vio.filters.prior import Fit

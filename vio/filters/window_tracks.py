@@ -7,11 +7,11 @@ about them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.filters import track_loops as loops
 from vio.filters.multiview import (
     CAUCHY,

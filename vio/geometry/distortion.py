@@ -7,12 +7,12 @@ each, with their sources.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.errors import CalibrationError
 from vio.geometry.lenses.model import Lens
 from vio.geometry.lenses.registry import LENSES

@@ -352,7 +352,8 @@ def rigid_fault(T: FloatArray) -> str | None:
     """
     if not np.isfinite(T).all():
         return "not finite; check the calibration"
-    if T.shape == (4, 4) and not np.allclose(T[3], [0, 0, 0, 1], atol=1e-9):
+    last = [0.0, 0.0, 0.0, 1.0]
+    if T.shape == (4, 4) and T[3].tolist() != last and not np.allclose(T[3], last, atol=1e-9):
         return f"the last row of the transform is {T[3].tolist()}, not 0 0 0 1"
     R = T[:3, :3]
     deviation = float(np.abs(R.T @ R - np.eye(3)).max())

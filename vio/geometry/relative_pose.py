@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
 
 

@@ -16,13 +16,14 @@ beyond 90 degrees off the axis.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from numbers import Integral, Real
 from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray
 

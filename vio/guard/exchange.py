@@ -10,12 +10,12 @@ round, matches decide: exchanged images match with negative disparities only.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.findings import Finding
 from vio.guard.image_change import image_change
 from vio.guard.image_check import FrameImages, ImageCheck

@@ -6,11 +6,11 @@ stays the same while the right one changes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.findings import Finding
 from vio.frontend.patches import mean_and_contrast
 from vio.guard.image_change import image_change

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.findings import Finder
 from vio.frontend.patches import half_image
 from vio.records import CheckedFrame, Image, StereoFrame

@@ -16,13 +16,14 @@ the noise of its other axes goes on. From there on, that reading is the end of t
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
 from vio.numerics.robust import median, robust_sigmas
@@ -76,7 +77,10 @@ _PARTS: tuple[tuple[ImuFaultKind, slice], ...] = (
     ("stuck gyro", slice(0, 3)),
     ("stuck accelerometer", slice(3, 6)),
 )
-_MIN_CHANCE = 1e-8  # probability of so many repetitions in a row where they are independent
+# kinds of faults at the end of each sensor's range
+_CLIPPED: tuple[ImuFaultKind, ImuFaultKind] = ("gyro clipped", "accelerometer clipped")
+# logarithm of the probability of so many repetitions in a row where they are independent
+_LOG_MIN_CHANCE = math.log(1e-8)
 _NOISY = 8  # last readings of the other axes, which must turn so often
 _MIN_TURNS = 2
 _RANGE_SLACK = 1e-3  # of a range's end: a reading beyond it shows that it is none
@@ -105,7 +109,7 @@ class ImuSampleCheck:
 
     def __init__(self) -> None:
         self._spikes = _SpikeCheck()
-        self._ranges = (_Range("gyro clipped", 0), _Range("accelerometer clipped", 3))
+        self._ranges = _Ranges()
         self._repeats = [_Repetition(kind, part) for kind, part in _PARTS]
         self._previous: ImuSample | None = None  # as received
         self._last_reading: _Reading = []  # its numbers
@@ -117,10 +121,12 @@ class ImuSampleCheck:
         if not samples:
             return []
         readings = readings_of(samples)
-        clipped = self._are_clipped(samples, readings)
+        clipped = self._ranges.take(readings)
         if clipped.any():
-            samples = [x for x, left_out in zip(samples, clipped, strict=True) if not left_out]
-            readings = readings[~clipped]
+            self._faults += self._ranges.faults(samples, clipped)
+            left_out: BoolArray = clipped.any(axis=1)
+            samples = [x for x, out in zip(samples, left_out.tolist(), strict=True) if not out]
+            readings = readings[~left_out]
         times = np.array([x.time_ns for x in samples], dtype=np.int64)
         usable: list[ImuSample] = []
         k = 0
@@ -134,16 +140,6 @@ class ImuSampleCheck:
             self._previous = samples[k - 1]
             self._last_reading = readings[k - 1].tolist()
         return usable
-
-    def _are_clipped(self, samples: Sequence[ImuSample], readings: FloatArray) -> BoolArray:
-        """Which samples (K,), with readings (K, 6), are at the end of a sensor's range."""
-        clipped = np.zeros(len(samples), dtype=np.bool_)
-        for each in self._ranges:
-            of_sensor = each.take(readings[:, each.part])
-            if of_sensor.any():
-                self._faults += each.faults(samples, of_sensor)
-            clipped |= of_sensor
-        return clipped
 
     def _pass_on(self, times: IntArray, readings: FloatArray) -> int:
         """Count the first of some samples, of times (K,) and readings (K, 6), that nothing is to
@@ -250,7 +246,7 @@ class _Repetition:
             return False
         if alone and (time_ns - self._start.time_ns) * S_PER_NS < _FAULTS.min_part_s:
             return False
-        return bool(self.repeats * np.log(self._share) < np.log(_MIN_CHANCE))
+        return bool(self.repeats * np.log(self._share) < _LOG_MIN_CHANCE)
 
     @property
     def _share(self) -> float:
@@ -264,85 +260,173 @@ class _Repetition:
         self._equal += equal
 
 
-class _Range:
-    """Learns where the range of a sensor ends, and tells the readings there."""
+class _Ranges:
+    """Learns where the ranges of both sensors end, and tells the readings there."""
 
-    def __init__(self, kind: ImuFaultKind, first: int) -> None:
-        self.part = slice(first, first + 3)
-        self._kind = kind
-        self._last: FloatArray | None = None  # (3,) the reading before
-        self._extreme = np.zeros(3)  # largest magnitude so far
-        self._repeats = np.zeros(3, dtype=np.int64)  # of it, in a row
-        self._count = 0  # changes so far
-        self._equal = np.zeros(3, dtype=np.int64)  # of these, that were none
-        self._changed = np.zeros(3, dtype=np.int64)  # of these, that were some
-        self._recent = np.zeros((0, 3))  # the last readings
-        self._end: float | None = None  # of the range; None: unknown
-        self._is_clipped = False  # the last sample was
+    def __init__(self) -> None:
+        self._last = np.zeros(6)  # the reading before
+        self._extreme = np.zeros(6)  # largest magnitude so far
+        self._repeats = np.zeros(6, dtype=np.int64)  # of it, in a row
+        self._equal = np.zeros(6, dtype=np.int64)  # readings so far that repeat another one
+        self._changed = np.zeros(6, dtype=np.int64)  # readings so far that repeat none
+        self._recent = np.zeros((_NOISY, 6))  # the last readings, as many as there are
+        self._counts = np.zeros(2, dtype=np.int64)  # readings so far, and recent ones
+        self._ends = np.full(2, np.inf)  # of the ranges; infinite: unknown
+        self._are_clipped = [False, False]  # the last sample's
 
     def take(self, readings: FloatArray) -> BoolArray:
-        """Return which of the next readings (K, 3) are at the end of the range."""
-        sizes = np.abs(readings)
-        if self._end is not None and (sizes > (1 + _RANGE_SLACK) * self._end).any():
-            self._end = None
-        before = readings[:1] if self._last is None else self._last[None]
-        equal = readings == np.concatenate([before, readings[:-1]])
-        if self._last is None:
-            equal[0] = False
-        extreme = np.maximum.accumulate(np.concatenate([self._extreme[None], sizes]))
-        at_end = equal & (sizes >= extreme[1:]) & (sizes > 0) & ~equal.all(axis=1)[:, None]
-        # the first from which on the end is known
-        first = self._learn(equal, at_end, readings) if self._end is None else 0
-        self._last = readings[-1]
-        self._extreme = extreme[-1]
-        self._count += len(readings)
-        self._equal += (equal & ~at_end).sum(axis=0)
-        self._changed += (~equal).sum(axis=0)
-        self._recent = np.concatenate([self._recent, readings])[-_NOISY:]
-        clipped = np.zeros(len(readings), dtype=np.bool_)
-        if self._end is not None:
-            clipped[first:] = (sizes[first:] >= self._end).any(axis=1)
+        """Return which (K, 2) of the next readings (K, 6) are at the end of each sensor's range."""
+        clipped = np.empty((len(readings), 2), dtype=np.bool_)
+        _mark_clipped(
+            readings,
+            self._last,
+            self._extreme,
+            self._repeats,
+            self._equal,
+            self._changed,
+            self._recent,
+            self._counts,
+            self._ends,
+            _FAULTS.min_history,
+            clipped,
+        )
         return clipped
 
     def faults(self, samples: Sequence[ImuSample], clipped: BoolArray) -> list[ImuFault]:
-        """Return a fault for each row of samples (K,) at the end of the range that begins here."""
-        began = clipped & ~np.concatenate([[self._is_clipped], clipped[:-1]])
-        self._is_clipped = bool(clipped[-1])
-        end = 0.0 if self._end is None else self._end
-        times = [samples[k].time_ns for k in np.flatnonzero(began).tolist()]
-        return [ImuFault(self._kind, time_ns, time_ns, end) for time_ns in times]
-
-    def _learn(self, equal: BoolArray, at_end: BoolArray, readings: FloatArray) -> int:
-        """Count repetitions (K, 3) of the largest magnitude in readings (K, 3); return the first
-        from which the end of the range is known.
+        """Return a fault for each row of samples (K,) at the end of a range, (K, 2), that begins
+        here.
         """
-        if not at_end.any():
-            self._repeats[:] = 0
-            return len(equal)
-        for k, row in enumerate(at_end):
-            self._repeats = np.where(row, self._repeats + 1, 0)
-            seen = self._count + k
-            if not row.any() or seen < _FAULTS.min_history:
+        found: list[ImuFault] = []
+        for sensor, kind in enumerate(_CLIPPED):
+            own = clipped[:, sensor]
+            if not own.any():
                 continue
-            share = (self._equal + (equal & ~at_end)[:k].sum(axis=0) + 1) / (seen + 2)
-            improbable = self._repeats * np.log(share) < np.log(_MIN_CHANCE)
-            changed = self._changed + (~equal[:k]).sum(axis=0)
-            clipped = improbable & row & (changed >= _FAULTS.min_history)
-            last = np.concatenate([self._recent, readings[: k + 1]])[-_NOISY:]
-            if clipped.any() and _has_noise(last[:, ~row]):
-                self._end = float(np.abs(readings[k])[clipped].max())
-                self._repeats[:] = 0
-                return k
-        return len(equal)
+            began = own & ~np.concatenate([[self._are_clipped[sensor]], own[:-1]])
+            self._are_clipped[sensor] = bool(own[-1])
+            end = float(self._ends[sensor])
+            times = [samples[k].time_ns for k in np.flatnonzero(began).tolist()]
+            found += [ImuFault(kind, time_ns, time_ns, end) for time_ns in times]
+        return found
 
 
-def _has_noise(readings: FloatArray) -> bool:
-    """Whether readings (S, A) of some axes go to and fro, unlike those of a simulator without
-    noise.
+@compiled
+def _mark_clipped(
+    readings: FloatArray,
+    last: FloatArray,
+    extreme: FloatArray,
+    repeats: IntArray,
+    unchanged: IntArray,
+    changed: IntArray,
+    recent: FloatArray,
+    counts: IntArray,
+    ends: FloatArray,
+    min_history: int,
+    clipped: BoolArray,
+) -> None:
+    """Mark which of the next readings (K, 6) are at the end of a sensor's range, (K, 2), and learn
+    from them where it is.
+
+    An axis that repeats its largest reading (`at_end`) more often than its repetitions so far make
+    probable, while another axis of the sensor goes to and fro, is at the end of the range.
+
+    Args:
+        readings: gyro and accelerometer.
+        last: (6,) the reading before, and all that follows; they are brought up to date.
+        extreme: (6,) largest magnitude so far.
+        repeats: (6,) of it, in a row.
+        unchanged: (6,) readings that repeat the one before, but for those.
+        changed: (6,) readings that do not.
+        recent: (S, 6) the last readings.
+        counts: readings so far, and how many of `recent` there are.
+        ends: (2,) of the ranges; infinite: unknown.
+        min_history: readings before an end is learned.
+        clipped: what is marked.
     """
-    signs = np.sign(np.diff(readings, axis=0))
-    turns = (signs[1:] * signs[:-1] < 0).sum(axis=0)
-    return bool((turns >= _MIN_TURNS).any())
+    n = len(readings)
+    equal = np.empty((n, 6), dtype=np.bool_)
+    at_end = np.empty((n, 6), dtype=np.bool_)
+    for sensor in range(2):
+        first = 3 * sensor
+        end = ends[sensor]
+        beyond = False
+        some_at_end = False
+        for k in range(n):
+            all_equal = True
+            for i in range(first, first + 3):
+                before = last[i] if k == 0 else readings[k - 1, i]
+                equal[k, i] = (k > 0 or counts[0] > 0) and readings[k, i] == before
+                all_equal = all_equal and equal[k, i]
+                beyond = beyond or abs(readings[k, i]) > (1 + _RANGE_SLACK) * end
+            for i in range(first, first + 3):
+                size = abs(readings[k, i])
+                if size > extreme[i]:
+                    extreme[i] = size
+                at_end[k, i] = equal[k, i] and size >= extreme[i] and size > 0 and not all_equal
+                some_at_end = some_at_end or at_end[k, i]
+        if beyond:
+            end = np.inf
+        known_from = 0  # the first from which on the end is known
+        if end == np.inf and not some_at_end:
+            for i in range(first, first + 3):
+                repeats[i] = 0
+        counted = end < np.inf or not some_at_end  # whether there is nothing to learn
+        for k in range(n):
+            seen = counts[0] + k
+            largest = 0.0
+            if not counted:
+                for i in range(first, first + 3):
+                    repeats[i] = repeats[i] + 1 if at_end[k, i] else 0
+                    if at_end[k, i] and seen >= min_history and changed[i] >= min_history:
+                        share = (unchanged[i] + 1) / (seen + 2)
+                        if repeats[i] * np.log(share) < _LOG_MIN_CHANCE:
+                            largest = max(largest, abs(readings[k, i]))
+            if largest > 0 and _has_noise(recent, counts[1], readings, k, at_end, first):
+                end = largest
+                known_from = k
+                counted = True
+                for i in range(first, first + 3):
+                    repeats[i] = 0
+            for i in range(first, first + 3):
+                unchanged[i] += equal[k, i] and not at_end[k, i]
+                changed[i] += not equal[k, i]
+        ends[sensor] = end
+        for k in range(n):
+            clipped[k, sensor] = False
+            for i in range(first, first + 3):
+                at = k >= known_from and end < np.inf and abs(readings[k, i]) >= end
+                clipped[k, sensor] = clipped[k, sensor] or at
+    kept = min(len(recent), counts[1] + n)
+    for m in range(kept):  # in order: what is read lies at or behind what is written
+        place = counts[1] + n - kept + m
+        for i in range(6):
+            recent[m, i] = recent[place, i] if place < counts[1] else readings[place - counts[1], i]
+    for i in range(6):
+        last[i] = readings[n - 1, i]
+    counts[0] += n
+    counts[1] = kept
+
+
+@compiled
+def _has_noise(
+    recent: FloatArray, count: int, readings: FloatArray, k: int, at_end: BoolArray, first: int
+) -> bool:
+    """Whether some axis of a sensor, whose axes begin at `first`, that is not at its end in reading
+    k went to and fro in the last readings, unlike those of a simulator without noise.
+    """
+    start = max(0, count + k + 1 - len(recent))
+    for i in range(first, first + 3):
+        turns = 0
+        before = 0.0
+        for place in range(start, count + k):
+            here = recent[place, i] if place < count else readings[place - count, i]
+            after = place + 1
+            there = recent[after, i] if after < count else readings[after - count, i]
+            change = there - here
+            turns += (before < 0 and change > 0) or (before > 0 and change < 0)
+            before = change
+        if turns >= _MIN_TURNS and not at_end[k, i]:
+            return True
+    return False
 
 
 class _SpikeCheck:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, TypeAlias
+
+from vio.dataclass import dataclass
 
 InertialFault: TypeAlias = Literal[
     "clocks without overlap",

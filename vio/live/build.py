@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vio.config import Config
+from vio.dataclass import dataclass
 from vio.errors import ConfigError
 from vio.filters import backend_class
 from vio.frontend import build_frontend

@@ -5,8 +5,8 @@ them.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
+from vio.dataclass import dataclass
 from vio.errors import DataError, DivergedError
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray

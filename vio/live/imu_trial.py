@@ -47,9 +47,10 @@ class ImuTrial:
         if self._fresh is None:
             return
         self._taken.append(event)
-        self._frames += isinstance(event, Observations)
-        if self._frames > _MAX_FRAMES:
-            self.close()
+        if type(event) is Observations:
+            self._frames += 1
+            if self._frames > _MAX_FRAMES:
+                self.close()
 
     def again(self, verdict: ImuVerdict) -> tuple[Backend, dict[int, Estimate]] | None:
         """Give everything to a new back end, with the IMU that a verdict leaves; nothing can be
@@ -87,7 +88,7 @@ def _estimates(
 
 def corrected(sample: MotionSample, verdict: ImuVerdict) -> MotionSample | None:
     """Return a sample in the right units; None: it is not to be used."""
-    if verdict == AS_GIVEN or not isinstance(sample, ImuSample):
+    if verdict is AS_GIVEN or verdict == AS_GIVEN or not isinstance(sample, ImuSample):
         return sample
     if not verdict.usable:
         return None

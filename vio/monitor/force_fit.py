@@ -5,10 +5,10 @@ accelerations, (I3).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, se3_exp, so3_exp
 from vio.monitor.gyro_fit import AGREES, GyroFit
 from vio.monitor.motion import Record

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, nearest_rotation
 from vio.imu.findings import InertialFault, InertialFinding

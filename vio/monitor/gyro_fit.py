@@ -4,11 +4,10 @@ jitter of stamps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.imu.findings import InertialFinding
 from vio.monitor.motion import Record

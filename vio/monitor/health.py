@@ -5,11 +5,11 @@ each event is one line.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
 from vio.calibration.severity import rows_grade
+from vio.dataclass import dataclass
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.numerics.robust import median
@@ -275,6 +275,8 @@ class RefusalReport:
         self.imu = imu
         self._reported = False
         self._frames: deque[_Frame] = deque()
+        self._used = 0  # features of these frames
+        self._gated = 0
 
     def frame(self, seen: Observations, report: UpdateReport, estimate: Estimate) -> list[Finding]:
         """Add the features of a frame and what the filter did with them; return the finding to
@@ -287,12 +289,16 @@ class RefusalReport:
         self._frames.append(
             _Frame(seen.time_ns, used, gated, seen, report.gated_ids, report.innovation_ratio)
         )
+        self._used += used
+        self._gated += gated
         full = False
         while seen.time_ns - self._frames[0].time_ns >= _SPAN_S * 1e9:
-            self._frames.popleft()
+            old = self._frames.popleft()
+            self._used -= old.used
+            self._gated -= old.gated
             full = True
-        kept = sum(f.used for f in self._frames)
-        gone = sum(f.gated for f in self._frames)
+        kept = self._used
+        gone = self._gated
         if not full or len(self._frames) < _MIN_FRAMES or gone <= _MAX_REFUSED * (kept + gone):
             return []
         self._reported = True

@@ -10,17 +10,15 @@ explanation does not; for equations (I1) to (I4) see docs/inertial.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vio.calibration.inertial import Rates
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.imu.clocks import SampleCoverage
 from vio.imu.findings import InertialFault, InertialFinding
-from vio.monitor.accelerometer import judge_force, judge_lever_arm, judge_up, resolve_size
 from vio.monitor.force_fit import FIRST_EVALUATION, MIN_WINDOWS, Evidence, fit_force
-from vio.monitor.gyro import judge_gyro
 from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset, judge_stamps
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
 from vio.monitor.rotation_comparison import compare_rotations, judge_rotations
@@ -32,6 +30,9 @@ from vio.records import (
     Observations,
     RotationComparison,
 )
+
+if TYPE_CHECKING:
+    from vio.calibration.inertial import Rates
 
 _MIN_AT_END = 20  # intervals needed to judge at the end of a run
 # intervals between evaluations after `_ENOUGH`; until then `FIRST_EVALUATION`
@@ -165,6 +166,8 @@ class InertialCheck:
             clipped=self.clipped or "saturation" in self._reported,
             last=last,
         )
+        from vio.calibration.inertial import Rates
+
         rates = Rates(times_ns, values[:, :3], values[:, 3:], True)
         return self._judge_rotating(evidence, size, record, rates)
 
@@ -175,6 +178,8 @@ class InertialCheck:
         found = [] if size.finding is None else [size.finding]
         means, covered = record.means(np.zeros(1))
         if last and size.unit is not None and int(covered.sum()) >= _MIN_AT_END:
+            from vio.monitor.accelerometer import judge_up
+
             found += judge_up(means[0, covered[0], 3:], self._T[:3, :3], measured=False)
         return found
 
@@ -182,6 +187,9 @@ class InertialCheck:
         self, evidence: Evidence, size: Size, record: Record, rates: Rates
     ) -> list[InertialFinding]:
         """Judge with rotation, and decide whether the comparison may end."""
+        from vio.monitor.accelerometer import judge_force, judge_lever_arm, resolve_size
+        from vio.monitor.gyro import judge_gyro
+
         gyro_fit = evidence.gyro_fit
         last = evidence.last
         size = resolve_size(size, evidence)

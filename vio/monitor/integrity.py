@@ -9,10 +9,11 @@ known again, and the position is not: what the covariance covered stays in it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.findings import CODES, INTEGRITIES, Finding, Integrity, worst
 from vio.geometry.lie import FloatArray
 from vio.records import NS_PER_S, Estimate

@@ -4,12 +4,11 @@ clock.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 from vio.calibration.egomotion import stereo_twists
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.monitor.samples import GAP_S, MEMORY_S

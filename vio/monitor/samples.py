@@ -5,13 +5,13 @@ clipping, magnitude.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.imu.findings import InertialFinding
-from vio.numerics.robust import robust_sigma
+from vio.numerics.robust import median, robust_sigma
 from vio.records import S_PER_NS, BoolArray, ImuSample, IntArray
 
 GAP_S = 0.1  # readings further apart are a gap …
@@ -53,7 +53,7 @@ class Samples:
     def step_s(self) -> float:
         """The usual time between two readings; 0.0 before there are two."""
         if self._step_s is None and len(self._new) > 1:
-            self._step_s = float(np.median(np.diff([s.time_ns for s in self._new]))) * S_PER_NS
+            self._step_s = median(np.diff([s.time_ns for s in self._new])) * S_PER_NS
         return self._step_s or 0.0
 
     def add(self, sample: ImuSample) -> None:
@@ -188,16 +188,16 @@ def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
         / _SMOOTH_S
     )
     size = np.linalg.norm(mean, axis=1)
-    median = float(np.median(size))
-    return _judge_median(median, robust_sigma(size - median) / max(median, 1e-300))
+    usual = median(size)
+    return _judge_median(usual, robust_sigma(size - usual) / max(usual, 1e-300))
 
 
-def _judge_median(median: float, spread: float) -> Size:
+def _judge_median(usual: float, spread: float) -> Size:
     """Judge a median magnitude and its relative spread."""
-    if 0.5 < median / _GRAVITY < 2.5:
+    if 0.5 < usual / _GRAVITY < 2.5:
         return Size(None, 1.0)
     seen = (
-        f"the accelerometer's median magnitude is {median:.4g} where gravity alone gives 9.8 m/s^2"
+        f"the accelerometer's median magnitude is {usual:.4g} where gravity alone gives 9.8 m/s^2"
     )
     units = {
         1.0: "in g: multiply by 9.81",
@@ -205,21 +205,21 @@ def _judge_median(median: float, spread: float) -> Size:
         9807.0: "in mm/s^2: divide by 1000",
     }
     for gravity, explanation in units.items():
-        if 0.6 < median / gravity < 1.6 and spread < 0.3:
+        if 0.6 < usual / gravity < 1.6 and spread < 0.3:
             factor = None if gravity == _MILLI_G else _GRAVITY / gravity  # of which there are two
             finding = InertialFinding(
                 "accelerometer units", seen, f"the readings are {explanation}", factor=factor
             )
-            clear = gravity > 1.0 or (abs(median - 1.0) < 0.1 and spread < 0.06)
+            clear = gravity > 1.0 or (abs(usual - 1.0) < 0.1 and spread < 0.06)
             return Size(finding, _GRAVITY / gravity, clear)
-    if median < 0.5 * _GRAVITY and (spread >= 0.3 or median < 0.5):
+    if usual < 0.5 * _GRAVITY and (spread >= 0.3 or usual < 0.5):
         return Size(gravity_removed(f"{seen}, and it varies by {100 * spread:.0f} %"), None)
     finding = InertialFinding(
         "accelerometer units",
         f"{seen} (spread {100 * spread:.0f} %)",
-        f"the unit or scale is unknown; a factor of {_GRAVITY / median:.4g} would make it 9.8",
+        f"the unit or scale is unknown; a factor of {_GRAVITY / usual:.4g} would make it 9.8",
     )
-    return Size(finding, _GRAVITY / median, median > 0.5 * _GRAVITY)
+    return Size(finding, _GRAVITY / usual, usual > 0.5 * _GRAVITY)
 
 
 def gravity_removed(seen: str) -> InertialFinding:

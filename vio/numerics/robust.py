@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -12,16 +14,33 @@ _MEDIAN_TO_SIGMA = 1.4826  # standard deviation over median absolute value of a 
 
 def median(values: npt.ArrayLike) -> float:
     """Return the median as NumPy does, to the bit (of nothing: NaN), but for few numbers in a
-    sixth of the time.
+    sixth of the time, and without NumPy's masked arrays, which its own loads.
     """
     ordered = np.array(values, dtype=np.float64).ravel()
     ordered.sort()  # NaN come last
-    middle = len(ordered) // 2
-    if not len(ordered) or ordered[-1] != ordered[-1]:
-        return float("nan")
-    return float(
-        ordered[middle] if len(ordered) % 2 else 0.5 * (ordered[middle - 1] + ordered[middle])
-    )
+    count = len(ordered)
+    middle = count // 2
+    if not count or ordered[-1] != ordered[-1]:
+        return math.nan
+    return float(ordered[middle] if count % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))
+
+
+def quantile(values: npt.ArrayLike, share: float) -> float:
+    """Return the quantile of some numbers, without NaN, by linear interpolation as NumPy does, to
+    the bit.
+
+    NumPy's own loads its masked arrays.
+    """
+    ordered = np.sort(np.asarray(values, dtype=np.float64), axis=None)
+    place = share * (len(ordered) - 1)
+    below = min(int(place), len(ordered) - 2)
+    if below < 0:
+        return float(ordered[0])
+    part = place - below
+    lower = float(ordered[below])
+    upper = float(ordered[below + 1])
+    step = upper - lower
+    return lower + step * part if part < 0.5 else upper - step * (1 - part)
 
 
 def robust_sigma(values: npt.ArrayLike) -> float:
@@ -35,7 +54,12 @@ def robust_sigmas(values: FloatArray) -> FloatArray:
     """Estimate the standard deviations (K,) of the columns of zero-mean values (N, K) as
     `robust_sigma` does.
     """
-    out: FloatArray = _MEDIAN_TO_SIGMA * np.median(np.abs(values), axis=0)
+    ordered = np.sort(np.abs(values), axis=0)  # NaN come last
+    middle = len(ordered) // 2
+    medians = ordered[middle]
+    if len(ordered) % 2 == 0:
+        medians = 0.5 * (ordered[middle - 1] + medians)
+    out: FloatArray = _MEDIAN_TO_SIGMA * np.where(np.isnan(ordered[-1]), np.nan, medians)
     return out
 
 

@@ -15,8 +15,6 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import scipy
-
 
 def _extension(package: str, name: str, functions: tuple[str, ...]) -> ModuleType:
     """Return an extension module of a package of SciPy that has some functions.
@@ -26,14 +24,31 @@ def _extension(package: str, name: str, functions: tuple[str, ...]) -> ModuleTyp
     whole = f"scipy.{package}"
     full_name = f"{whole}.{name}"
     if whole not in sys.modules:
-        folder = Path(scipy.__file__).with_name(package)
-        spec = importlib.machinery.PathFinder.find_spec(full_name, [str(folder)])
-        if spec is not None and spec.loader is not None:
-            module = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(module)
-            if all(hasattr(module, function) for function in functions):
-                return module
+        module = _alone(package, full_name)
+        if all(hasattr(module, function) for function in functions):
+            assert module is not None
+            return module
     return importlib.import_module(_PUBLIC[name])
+
+
+def _alone(package: str, full_name: str) -> ModuleType | None:
+    """Load an extension module without the packages around it; None: it is not there, or needs
+    them.
+    """
+    scipy = importlib.util.find_spec("scipy")
+    folders = None if scipy is None else scipy.submodule_search_locations
+    if not folders:
+        return None
+    folder = str(Path(folders[0]) / package)
+    spec = importlib.machinery.PathFinder.find_spec(full_name, [folder])
+    if spec is None or spec.loader is None:
+        return None
+    try:
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    except ImportError:
+        return None
+    return module
 
 
 _PUBLIC = {

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vio.evaluation.errors_along_path import path_length_m
 from vio.evaluation.trajectories import lengths_text, metres_text, rotation_drift_text
 from vio.records import STAGES
-from vio.runs.finished import FinishedRun
 from vio.runs.folder import refused_share
+
+if TYPE_CHECKING:
+    from vio.runs.finished import FinishedRun
 
 _MOTION = {"imu": "an IMU", "velocity": "velocities", "none": "images alone"}
 

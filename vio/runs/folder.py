@@ -10,10 +10,10 @@ import platform
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,7 @@ from vio._version import __version__
 from vio.calibration.severity import StereoError
 from vio.calibration.stereo_field import PARAMETERS
 from vio.config import Config, describe, to_yaml
+from vio.dataclass import dataclass
 from vio.errors import CalibrationError, DataError, EvaluationError
 from vio.evaluation.errors_along_path import error_statistics, path_length_m
 from vio.evaluation.trajectories import Evaluation, evaluate
@@ -30,16 +31,19 @@ from vio.files.printable import json_text, printable
 from vio.files.trajectories import in_first_cam0, write_kitti, write_tum
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
+from vio.numerics import robust
 from vio.numerics.compiled import has_compiled
 from vio.protocols import Dataset
 from vio.records import IMU_ENTRIES, Landmarks, Trajectory
 from vio.runs.files import FILES, REQUEST, RunFile
-from vio.runs.mapped import MappedRun, write_keyframes, write_loops
-from vio.runs.picture import RunPicture
 from vio.runs.pipeline import STAGES, RunResult, given_rig
 from vio.runs.recorder import GrowingFolder
 from vio.runs.stated import REQUEST_SHAPE, RunRequest, read_metrics, read_stated
 from vio.runs.tables import frames_csv
+
+if TYPE_CHECKING:
+    from vio.runs.mapped import MappedRun
+    from vio.runs.picture import RunPicture
 
 log = logging.getLogger(__name__)
 
@@ -75,6 +79,7 @@ def write_run_folder(
         metrics, picture = _write_files(
             temporary, folder, result, reference, lengths_m, save_observations=save_observations
         )
+        assert picture is not None
         picture.write(temporary / RunFile.PICTURE)
     return metrics
 
@@ -117,6 +122,7 @@ def finish_run_folder(
             reference,
             how.lengths_m,
             save_observations=how.save_observations,
+            plot=how.plot,
             more=how.more,
         )
         shutil.copyfile(unfinished / RunFile.ESTIMATES, final / RunFile.ESTIMATES)
@@ -125,7 +131,7 @@ def finish_run_folder(
         (final / RunFile.METRICS).replace(folder / RunFile.METRICS)
         shutil.rmtree(final)
     how.finished(metrics)
-    if how.plot:
+    if picture is not None:
         try:
             picture.write(folder / RunFile.PICTURE)
         except KeyboardInterrupt:
@@ -220,10 +226,11 @@ def _write_files(
     lengths_m: Sequence[float] | None,
     *,
     save_observations: bool,
+    plot: bool = True,
     more: Mapping[str, Any] | None = None,
-) -> tuple[dict[str, Any], RunPicture]:
+) -> tuple[dict[str, Any], RunPicture | None]:
     """Write all results but `estimates.npy` into `target`; return the metrics, which name
-    `folder`, and the picture.
+    `folder`, and the picture where it is to be drawn (`plot`).
     """
     evaluation, dead_reckoning = score(result, reference, lengths_m=lengths_m)
     metrics = {**metrics_of(result, evaluation, dead_reckoning, folder), **(more or {})}
@@ -265,6 +272,10 @@ def _write_files(
             target / RunFile.OBSERVATIONS, result.recording, seen, samples, run_motion=run_motion
         )
     (target / RunFile.METRICS).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
+    if not plot:
+        return metrics, None
+    from vio.runs.picture import RunPicture
+
     return metrics, RunPicture.of(result, evaluation, dead_reckoning)
 
 
@@ -272,6 +283,8 @@ def _write_mapped(
     target: Path, result: RunResult, mapped: MappedRun, reference: Trajectory | None
 ) -> dict[str, Any]:
     """Write the poses in the map and the loops, and return their metrics."""
+    from vio.runs.mapped import write_keyframes, write_loops
+
     final = replace(result.trajectory, T_world_body=mapped.T_map_body)
     write_tum(target / RunFile.MAP_TRAJECTORY, final)
     causal = mapped.causal
@@ -329,7 +342,7 @@ def start_s(work_ms: FloatArray) -> float:
     """Return the seconds that slow frames took beyond the median: those that compile loops,
     where any were compiled.
     """
-    median = float(np.median(work_ms))
+    median = robust.median(work_ms)
     return float(np.sum(work_ms[work_ms > _SLOW * median] - median)) * 1e-3
 
 
@@ -372,16 +385,16 @@ def metrics_of(
         "last_frame": frames[-1].index,
         "path_length_m": path_length_m(result.trajectory.positions),
         "ms_per_frame": float(work_ms.mean()),
-        "ms_per_frame_median": float(np.median(work_ms)),
-        "ms_per_frame_95": float(np.percentile(work_ms, 95)),
+        "ms_per_frame_median": robust.median(work_ms),
+        "ms_per_frame_95": robust.quantile(work_ms, 0.95),
         "start_s": start_s(work_ms) if has_compiled() else 0.0,
         "stages_ms": {
-            name: float(np.median([getattr(f, f"{name}_ms") for f in frames])) for name in STAGES
+            name: robust.median([getattr(f, f"{name}_ms") for f in frames]) for name in STAGES
         },
         "refused_share": refused_share(frames.column("used"), frames.column("gated")),
         "innovation_ratio": None
         if np.isnan(innovations).all()
-        else float(np.nanmedian(innovations)),
+        else robust.median(innovations[~np.isnan(innovations)]),
         "landmarks": len(result.landmarks.ids),
         **{name: scores.get(name) for name in ("ate_m", "rpe")},
         "drift_lengths_m": scores.get("drift_lengths_m", []),
@@ -422,7 +435,7 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
     seen = [px for px in result.frames.column("disparity_median_px") if px is not None and px == px]
     off = StereoError(
         field.rows_rms_px,
-        float(np.median(seen or [0.0])),
+        robust.median(seen or [0.0]),
         -float(coefficients[0]),
         float(sigmas[0]),
     )
@@ -474,7 +487,7 @@ def final_scale_sigma(result: RunResult) -> float | None:
         for sigma in result.estimates.column("scale_sigma")
         if sigma is not None and sigma == sigma
     ]
-    return float(np.median(known)) if known else None
+    return robust.median(known) if known else None
 
 
 def integrity_counts(result: RunResult) -> dict[str, int]:

@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
@@ -14,12 +14,12 @@ import numpy as np
 from vio.calibration.stereo_field import CalibratedRig, estimated_rig
 from vio.cameras.rig import Rig, rig_of_rectified
 from vio.config import Config
+from vio.dataclass import dataclass
 from vio.datasets.features import FeatureDataset
 from vio.datasets.frame_times import used_frames
 from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.files.tables import Records
 from vio.filters.settings import VislamSettings
-from vio.filters.vislam import Vislam
 from vio.findings import Finding
 from vio.frontend import one_opencv_thread
 from vio.geometry.lie import FloatArray, se3_inverse
@@ -44,11 +44,11 @@ from vio.records import (
     StereoFrame,
     Trajectory,
 )
-from vio.runs.mapped import MappedRun, mapped_run
 from vio.runs.recorder import GrowingFolder, RunRecorder
 
 if TYPE_CHECKING:
     from vio.mapping.session import MapSession
+    from vio.runs.mapped import MappedRun
 
 __all__ = ["STAGES", "FrameLog", "RunControl", "RunResult", "Viewers", "run"]
 
@@ -296,10 +296,15 @@ def _process(what: _Run, delay: int) -> RunResult:
             wall_s=time.perf_counter() - began,
             stopped=stopped,
             rig=given_rig(dataset),
-            mapped=None
-            if session is None
-            else mapped_run(session, recorder.estimates, recorder.mapped),
+            mapped=None if session is None else _mapped(session, recorder),
         )
+
+
+def _mapped(session: MapSession, recorder: RunRecorder) -> MappedRun:
+    """Return what a run has made of its map."""
+    from vio.runs.mapped import mapped_run
+
+    return mapped_run(session, recorder.estimates, recorder.mapped)
 
 
 def given_rig(dataset: Dataset) -> Rig | None:
@@ -556,6 +561,8 @@ class DeadReckoning:
         self, camera: StereoCamera, T_cam0_body: FloatArray, settings: VislamSettings
     ) -> None:
         settings = replace(settings, mode="dead_reckoning", motion_model="input")
+        from vio.filters.vislam import Vislam
+
         self._filter = Vislam(camera, T_cam0_body, settings, motion_sensor=True)
         self._begun = False
 

@@ -13,12 +13,13 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text, check_own, open_own
 from vio.files.tables import Records, Rows, Table, check_table

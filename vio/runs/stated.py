@@ -7,12 +7,13 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.files.inputs import read_input
 from vio.files.schema import (

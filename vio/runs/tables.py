@@ -10,6 +10,7 @@ import csv
 import dataclasses
 import io
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ _KEPT = {
     for field in dataclasses.fields(Estimate)
     if "shape" in field.metadata
 }
+_kept = attrgetter(*_KEPT)
 ESTIMATE = np.dtype(
     [
         ("index", "<i8"),  # number of the frame
@@ -84,6 +86,8 @@ FRAME = np.dtype(
         ("stages_ms", "<f8", (_STAGES,)),
     ]
 )
+_LOGGED = tuple(field.name for field in dataclasses.fields(FrameLog))[:-1]  # as columns
+_logged = attrgetter(*_LOGGED)
 OBSERVATION = np.dtype(
     [("id", "<i8"), ("z", "<f8", (4,)), ("has_right", "?"), ("stale", "?"), ("sigma", "<f4", (3,))]
 )
@@ -120,12 +124,11 @@ def estimate_row(index: int, estimate: Estimate) -> Rows:
     row["T_world_imu"] = estimate.T_world_imu
     row["covariance"] = estimate.covariance
     row["integrity"] = INTEGRITIES.index(estimate.integrity)
-    for name in _KEPT:
-        value = getattr(estimate, name)
+    for name, value in zip(_KEPT, _kept(estimate), strict=True):
         row[name] = np.nan if value is None else value
     for record, columns in ((estimate.stereo_field, _FIELD), (estimate.stereo_scale, _SCALE)):
         for column, name in columns.items():
-            value = getattr(record, name, None)
+            value = None if record is None else getattr(record, name)
             row[column] = np.nan if value is None else value
     return row
 
@@ -167,9 +170,8 @@ class FrameRows:
     def row(self, frame: FrameLog, read_ms: float) -> Rows:
         """Return a frame's log as a row (1,), with the time that reading took."""
         row = np.zeros(1, dtype=FRAME)
-        for field in dataclasses.fields(frame)[:-1]:
-            value = getattr(frame, field.name)
-            row[field.name] = np.nan if value is None else value
+        for name, value in zip(_LOGGED, _logged(frame), strict=True):
+            row[name] = np.nan if value is None else value
         row["read_ms"] = read_ms
         row["stages_ms"] = np.nan
         for name, ms in frame.stages_ms.items():
@@ -236,7 +238,7 @@ def sample_of(row: np.void) -> MotionSample:
 def frames_csv(frames: Sequence[FrameLog], stages: Sequence[str], *, header: bool = True) -> str:
     """Return logs as CSV text; the front end's stages are the last columns."""
     text = io.StringIO()
-    own = [field.name for field in dataclasses.fields(FrameLog)][:-1]
+    own = list(_LOGGED)
     writer = csv.writer(text, lineterminator="\n")
     if header:
         writer.writerow([*own, *(f"frontend_{name}_ms" for name in stages)])

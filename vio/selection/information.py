@@ -11,11 +11,10 @@ Zhao & Vela, Good feature matching (2020).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, triangulate, z_D_p_cam
 from vio.records import BoolArray, IntArray, MotionPrior, Observations

@@ -9,11 +9,11 @@ camera's motion. docs/notes/selection.md compares them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import ConfigError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.numerics.robust import quantile
 from vio.records import FrameResult, Observations, StereoFrame
 
 _WIDTH_PX = 1240  # of the picture; larger images are made smaller
@@ -48,7 +49,8 @@ class AnnotatedImage:
         image = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
         disparity = np.where(seen.has_right, seen.z[:, 0] - seen.z[:, 2], 0.0)
         known = disparity[seen.has_right & (disparity > 0)]
-        low, high = np.percentile(known, (2, 98)) if len(known) else (1.0, 2.0)
+        low = quantile(known, 0.02) if len(known) else 1.0
+        high = quantile(known, 0.98) if len(known) else 2.0
         share = np.log(np.maximum(disparity, 1e-3) / low) / max(np.log(high / low), 1e-6)
         colours = _coloured(np.clip(share, 0, 1))
         for (u, v), long, colour, has_right in zip(

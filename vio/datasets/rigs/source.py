@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from vio.cameras.rig import Rig
+from vio.dataclass import dataclass
 from vio.datasets.common import naming
 from vio.datasets.yaml_files import Entries
 from vio.errors import CalibrationError

@@ -51,13 +51,10 @@ def distort(c: Coefficients, xy: FloatArray) -> FloatArray:
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     if (divisor := _divisor(c, r2)) is not None:
         radial = radial / divisor[0]
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=-1,
-    )
+    out = np.empty(xy.shape)
+    out[..., 0] = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    out[..., 1] = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return out
 
 
 def distort_by_xy(c: Coefficients, xy: FloatArray) -> FloatArray:
@@ -146,13 +143,9 @@ def undistort(c: Coefficients, target: FloatArray) -> tuple[FloatArray, BoolArra
         J = distort_by_xy(c, xy)
         det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
         det = np.where(np.abs(det) < 1e-6, 1e-6, det)
-        step = np.stack(
-            [
-                J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1],
-                J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0],
-            ],
-            axis=-1,
-        )
+        step = np.empty(xy.shape)
+        step[..., 0] = J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1]
+        step[..., 1] = J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0]
         xy = xy - np.clip(step / det[..., None], -0.5, 0.5)
     found = np.linalg.norm(distort(c, xy) - target, axis=-1) < 1e-8
     radius = np.linalg.norm(xy, axis=-1)

@@ -1,0 +1,310 @@
+"""Which calibration file a folder holds, of which format it is, and what reads it. A format is a
+file here and a line in `_FORMATS`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from vio.cameras.rig import Rig
+from vio.datasets.common import naming
+from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
+from vio.datasets.kitti import read_calibration, read_extrinsics
+from vio.datasets.kitti_raw import (
+    CAMERAS,
+    PERSPECTIVE,
+    read_cam_to_cam,
+    read_imu_pose,
+    read_perspective,
+)
+from vio.datasets.rigs import bare, basalt, boofcv, camodocal, depthai, okvis, orbslam, zed
+from vio.datasets.rigs.boofcv import is_boofcv, read_boofcv
+from vio.datasets.rigs.camera_info import (
+    is_camera_info,
+    pair_of_files,
+    read_camera_info,
+    rig_from_camera_infos,
+)
+from vio.datasets.rigs.four_seasons import is_four_seasons, read_four_seasons
+from vio.datasets.rigs.kalibr import is_camchain, read_camchain
+from vio.datasets.rigs.kimera import pair_beside, read_kimera
+from vio.datasets.rigs.opencv import is_opencv, read_entries, rig_from_opencv
+from vio.datasets.rigs.plausible import checked_rig
+from vio.datasets.rigs.source import Source
+from vio.datasets.sides import side_word
+from vio.datasets.yaml_files import Entries, read_json_file
+from vio.errors import CalibrationError, DataError
+from vio.files.text import text_lines
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+
+__all__ = ["find_calibration", "kitti_rig", "load_rig"]
+
+Size = tuple[int, int]
+# by which KITTI's right camera may be off the left one's x axis before it is noted
+_OFF_AXIS_NOTE_M = 1e-3
+
+KNOWN = (
+    "Kalibr's camchain.yaml or camchain-imucam.yaml, EuRoC's sensor.yaml (mav0), KITTI's calib.txt "
+    "or calib_cam_to_cam.txt, OpenCV's stereo .yml or .xml (M1 D1 M2 D2 R T), ROS's left.yaml and "
+    "right.yaml, or BoofCV's stereo.xml; or the settings of ORB-SLAM, VINS, OKVIS, Kimera or SVO, "
+    "Basalt's or DepthAI's JSON, or a ZED's SN*.conf"
+)
+# File names looked for in a folder, in this order; the content decides what they are.
+_IN_FOLDER = (
+    "calibration.yaml", "calibration.yml", "camchain-imucam*.yaml", "*camchain-imucam*.yaml", "camchain*.yaml",
+    "*camchain*.yaml", "*imucam_chain*.y*ml", "calib_cam_to_cam.txt", "perspective.txt", "calib.txt", "left.y*ml",
+    "stereo*.y*ml", "intrinsics.y*ml", "stereo*.xml", "calibration.xml", "calib.xml", "calib.y*ml",
+    "calibration.json", "calib.json", "SN*.conf", "undistorted_calib_0.txt", *bare.NAMES,
+)  # fmt: skip
+_OTHERS = (".yaml", ".yml", ".json", ".xml", ".conf")  # whose content decides in any folder
+_MAX_OTHERS = 40  # files looked into; a folder with more is no recording's
+# whether entries are of a format, and what reads it; the first that fits does
+_FORMATS: tuple[tuple[Callable[[Entries], bool], Callable[[Source], Rig]], ...] = (
+    (is_camchain, lambda source: read_camchain(source.path)),
+    (camodocal.matches, camodocal.read),
+    (okvis.matches, okvis.read),
+    (orbslam.matches, orbslam.read),
+    (boofcv.matches, boofcv.read),
+    (basalt.matches, basalt.read),
+    (depthai.matches, depthai.read),
+    (zed.matches, zed.read),
+    (lambda entries: _is_sensor_sheet(entries), lambda source: _euroc(source)),
+    (is_camera_info, lambda source: _camera_infos(source)),
+    (is_opencv, lambda source: rig_from_opencv(source.entries, source.where, source.image_size)),
+)
+
+
+def load_rig(
+    path: str | os.PathLike[str],
+    *,
+    image_size: Size | None = None,
+    cameras: Literal[1, 2] | None = None,
+) -> Rig:
+    """Read the calibration of one camera or of a stereo pair; the format is detected from the
+    content.
+
+    Args:
+        path: a calibration file, or a folder that holds one.
+        image_size: width and height of the images in pixels, for formats that do not state it
+            (KITTI's calib.txt, OpenCV). With KITTI's calib_cam_to_cam.txt, the size decides between
+            the raw and the rectified cameras.
+        cameras: 1: of a pair, the left camera alone; 2: a pair; None: whichever the calibration
+            holds.
+
+    Raises:
+        CalibrationError: there is no calibration of a known format, an entry is missing or
+            impossible, the image size is neither stated nor given, or there is one camera of the
+            two asked for; the message names file, entry and remedy.
+    """
+    file = Path(path)
+    if not file.exists():
+        raise CalibrationError(f"{file} does not exist; give {KNOWN}")
+    if file.is_dir():
+        found = find_calibration(file)
+        if found is None:
+            raise CalibrationError(f"{file}: holds no calibration; looked for {KNOWN}")
+        file = found
+    rig = _read(file, image_size, cameras)
+    if cameras == 2 and rig.cam1 is None:
+        raise CalibrationError(
+            f"{file}: is the calibration of one camera; name the pair left.yaml and right.yaml "
+            "(ROS), or add cam1 and "
+            "its pose (Kalibr)"
+        )
+    return rig.left_alone() if cameras == 1 else rig
+
+
+def find_calibration(folder: Path) -> Path | None:
+    """Return the calibration file in a folder; None where there is none.
+
+    Usual names go first; else the content of the files there decides, that of a pair before that
+    of one camera.
+    """
+    for mav in (folder / "mav0", folder):
+        if (mav / "cam0" / "sensor.yaml").is_file():
+            return mav / "cam0" / "sensor.yaml"
+    for pattern in _IN_FOLDER:
+        if found := sorted(file for file in folder.glob(pattern) if file.is_file()):
+            return found[0]
+    pair = pair_of_files(folder)
+    return _by_content(folder) if pair is None else pair[0]
+
+
+def _by_content(folder: Path) -> Path | None:
+    """Return the first file of a folder whose content is that of a known format."""
+    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in _OTHERS and f.is_file())
+    known = [file for file in files[:_MAX_OTHERS] if _is_known(file)]
+    # the settings name the files of their cameras
+    return min(known, key=_is_of_one_camera, default=None)
+
+
+def _is_known(file: Path) -> bool:
+    try:
+        entries = _entries(file)
+    except DataError:
+        return False
+    return any(fits(entries) for fits, _ in _FORMATS)
+
+
+def _is_of_one_camera(file: Path) -> bool:
+    entries = _entries(file)
+    return "model_type" in entries or side_word(file.stem) == "right"
+
+
+def _entries(path: Path) -> Entries:
+    """Return what a file holds, by its suffix."""
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return read_json_file(path)
+    if suffix == ".conf":
+        return zed.read_conf(path)
+    if suffix == ".xml":
+        return {} if is_boofcv(path) else read_entries(path)
+    return read_entries(path)
+
+
+def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
+    suffix = path.suffix.lower()
+    if path.name == CAMERAS:
+        return checked_rig(_kitti_raw(path, image_size), path)
+    if path.name == PERSPECTIVE:
+        rect0, rect1, T_rect1_rect0 = read_perspective(path)
+        with naming(path):
+            return checked_rig(Rig(rect0, rect1, T_rect1_rect0), path)
+    if is_four_seasons(path):
+        return read_four_seasons(path, image_size)
+    if suffix == ".txt" and bare.is_bare(path):
+        return bare.read_bare(path, image_size)
+    if suffix == ".txt":
+        return kitti_rig(path, image_size)[0]
+    if suffix == ".xml" and is_boofcv(path):
+        return read_boofcv(path)
+    entries = _entries(path)
+    for fits, read in _FORMATS:
+        if fits(entries):
+            return read(Source(path, entries, image_size, cameras))
+    raise CalibrationError(f"{path}: is no calibration of a known format; give {KNOWN}")
+
+
+def _is_sensor_sheet(entries: Entries) -> bool:
+    """Return whether entries are those of a camera's `sensor.yaml`."""
+    return "T_BS" in entries and ("intrinsics" in entries or "camera_model" in entries)
+
+
+def _camera_infos(source: Source) -> Rig:
+    pair = None if source.cameras == 1 else pair_of_files(source.path)
+    infos = [read_camera_info(file) for file in pair or (source.path,)]
+    rig = rig_from_camera_infos(infos, image_size=source.image_size)
+    return rig if pair is not None else _alone(rig, source, stated=bool(infos[0].P[0, 3]))
+
+
+def _alone(rig: Rig, source: Source, *, stated: bool) -> Rig:
+    """Return a rig of one camera with a note where it seems to be one of a pair.
+
+    Args:
+        rig: of one camera.
+        source: its file.
+        stated: whether the file states a baseline.
+    """
+    if source.cameras == 1 or not (stated or side_word(source.path.stem)):
+        return rig
+    return rig.noting(
+        f"{source.where}: is read as one camera, and seems to be one of a pair, whose other file "
+        "is not beside it; name the two left.yaml and right.yaml"
+    )
+
+
+def _euroc(source: Source) -> Rig:
+    """Read EuRoC's `cam0/sensor.yaml`, `cam1/sensor.yaml` and, where it is beside them,
+    `imu0/sensor.yaml`; of Kimera, the three files of one folder.
+    """
+    path = source.path
+    cameras = source.cameras
+    if path.name != "sensor.yaml":
+        pair = None if cameras == 1 else pair_beside(path)
+        if pair is not None:
+            return read_kimera(*pair)
+        camera, T_body_cam = read_camera_yaml(path)
+        rig = Rig(camera, T_cam0_imu=se3_inverse(T_body_cam))
+        return _alone(checked_rig(rig, path), source, stated=False)
+    mav = path.parent.parent
+    T_body_imu = np.eye(4)
+    noise = None
+    if (imu := mav / "imu0" / "sensor.yaml").is_file():
+        T_body_imu, noise = read_imu_yaml(imu)
+    if cameras == 1 or (cameras is None and not (mav / "cam1" / "sensor.yaml").is_file()):
+        camera, T_body_cam = read_camera_yaml(path)
+        rig = Rig(camera, T_cam0_imu=se3_inverse(T_body_cam) @ T_body_imu, imu_noise=noise)
+        rig = checked_rig(rig, path)
+        return _alone(rig, source, stated=(mav / "cam1").is_dir())
+    (cam0, T_body_cam0), (cam1, T_body_cam1) = (
+        read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1")
+    )
+    T_imu_cam0, T_imu_cam1 = (se3_inverse(T_body_imu) @ T for T in (T_body_cam0, T_body_cam1))
+    T_cam1_cam0 = se3_inverse(T_imu_cam1) @ T_imu_cam0
+    with naming(mav):
+        return checked_rig(Rig(cam0, cam1, T_cam1_cam0, se3_inverse(T_imu_cam0), noise), mav)
+
+
+def kitti_rig(
+    path: Path, image_size: Size | None, cameras: tuple[int, int] | None = None
+) -> tuple[Rig, FloatArray]:
+    """Return KITTI's `calib.txt`, with `T_cam0_imu.txt` beside it, and `T_left_cam0` (4, 4) from
+    KITTI's camera 0.
+
+    Args:
+        path: the file.
+        image_size: width and height of the images, pixels.
+        cameras: numbers of the left and the right one; None: the gray pair, else that in colour.
+
+    Raises:
+        CalibrationError: a file is invalid, or no image size is given.
+    """
+    if cameras is None:
+        cameras = (0, 1) if any(line.startswith("P0:") for _, line in text_lines(path)) else (2, 3)
+    calibration = read_calibration(path, cameras)
+    if image_size is None:
+        raise CalibrationError(f"{path}: states no image size; pass image_size=(W, H)")
+    c = calibration.camera
+    T_cam0_imu = read_extrinsics(path.with_name("T_cam0_imu.txt"))
+    T_left_imu = None if T_cam0_imu is None else calibration.T_left_cam0 @ T_cam0_imu
+    with naming(path):
+        rig = Rig.rectified(
+            c.fu, c.fv, c.cu, c.cv, c.baseline_m, *image_size, T_cam0_imu=T_left_imu
+        )
+    if calibration.off_axis_m > _OFF_AXIS_NOTE_M:
+        off_axis = (
+            f"is {1e3 * calibration.off_axis_m:.1f} mm off the x axis of that of image_{cameras[0]}"
+        )
+        note = (
+            f"the camera of image_{cameras[1]} {off_axis}; the pair is treated as rectified anyway"
+        )
+        rig = rig.noting(note)
+    return checked_rig(rig, path, size_stated=False), calibration.T_left_cam0
+
+
+def _kitti_raw(path: Path, image_size: Size | None) -> Rig:
+    """Read `calib_cam_to_cam.txt`: the raw gray pair, or KITTI's rectified one where the images
+    have its size.
+    """
+    c = read_cam_to_cam(path)
+    T_cam0_imu, notes = read_imu_pose(path.parent)
+    raw = (c.cam0.width, c.cam0.height)
+    rectified = (c.rect0.width, c.rect0.height)
+    if image_size is not None and image_size not in (raw, rectified):
+        raise CalibrationError(
+            f"{path}: is for images of {raw[0]} x {raw[1]} (raw) or {rectified[0]} x "
+            f"{rectified[1]} (rectified), not "
+            f"{image_size[0]} x {image_size[1]} pixels; give the calibration of these images"
+        )
+    with naming(path):
+        if image_size == rectified != raw:
+            turn = se3_from_parts(c.R_rect_cam0, np.zeros(3))
+            T = None if T_cam0_imu is None else turn @ T_cam0_imu
+            return Rig(c.rect0, c.rect1, c.T_rect1_rect0, T, notes=notes)
+        return Rig(c.cam0, c.cam1, c.T_cam1_cam0, T_cam0_imu, notes=notes)
