@@ -40,6 +40,7 @@ _REFERENCES = (
     "reference.tum", "reference.txt", "groundtruth.tum", "groundtruth_tum.txt", "groundtruth.txt", "gt_imu.csv",
     "mocap0/data.csv", "state_groundtruth_estimate0/data.csv", "poses.txt",
 )  # fmt: skip
+_LONG_SHIFT_S = 1.0  # as of one that was written in milliseconds
 _CALIBRATION_FOLDERS = ("", "dso", "calibration", "calib", "extras")
 _SHARED_FOLDERS = ("calibration", "extras")  # of 4Seasons and Monado
 
@@ -235,7 +236,7 @@ def _read_motion(
     parts: list[Sequence[MotionSample]] = []
     notes: list[str] = []
     if imu is not None:
-        record, notes_read = read_imu_table(imu)
+        record, notes_read = read_imu_table(imu, cut=notes)
         samples, notes_moved = imu_on_camera_clock(record, rig, times_ns, imu)
         notes += [*notes_read, *notes_moved]
         parts.append(samples)
@@ -279,6 +280,8 @@ def imu_on_camera_clock(
     """
     shift_ns = round(rig.time_offset_s * NS_PER_S)
     record = replace(record, times_ns=record.times_ns - shift_ns)
+    if abs(rig.time_offset_s) > _LONG_SHIFT_S:
+        where = f"{where}, moved by the calibration's time shift of {rig.time_offset_s:g} s"
     check_overlap(frame_times_ns, record.times_ns, where)
     moved = f"the IMU's stamps are moved by {-1e3 * rig.time_offset_s:+.3f} ms, as the calibration states"
     return imu_samples(record), [moved] if shift_ns else []
