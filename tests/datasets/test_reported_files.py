@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import vio
+from tests.euroc_maker import RADTAN_RIG
 from tests.plain_maker import make_plain
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageDataset
@@ -21,8 +22,11 @@ from vio.datasets.images import exif_turn
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.sides import split_sides
 from vio.errors import CalibrationError, DataError, VioError
+from vio.geometry.distortion import CameraModel
+from vio.geometry.lie import quat_xyzw_from_rotation, se3_exp, se3_from_parts, so3_exp
 from vio.records import ImuSample, StereoFrame
 
+RADTAN_PAIR = (RADTAN_RIG.cam0, RADTAN_RIG.cam1)
 STAMPS = [1700000000_000000000 + 50_000_000 * k for k in range(4)]
 
 
@@ -245,3 +249,50 @@ def test_a_time_shift_in_milliseconds_is_named_where_nothing_overlaps(tmp_path: 
     file.write_text(re.sub(r"timeshift_cam_imu: .*", "timeshift_cam_imu: 12.5", file.read_text()))
     with pytest.raises(VioError, match=r"moved by the calibration's time shift of 12\.5 s"):
         open_dataset(folder)
+
+
+def _make_eth3d(folder: Path) -> vio.Rig:
+    """Write a pair as ETH3D publishes it; the poses are those of `rgb`, which is the right camera."""
+    make_plain(
+        folder,
+        folders=("rgb2", "rgb"),
+        name=lambda side, k: f"6502.{400000 + 50000 * k}.png",
+        imu=False,
+        times=False,
+        calibration=False,
+        reference=False,
+    )
+    left, right = (CameraModel(c.fu, c.fv, c.cu, c.cv, c.width, c.height) for c in RADTAN_PAIR)
+    T_right_left = se3_from_parts(so3_exp([0.01, -0.02, 0.03]), [-0.1, 0.002, -0.003])
+    for name, c in (("calibration2.txt", left), ("calibration.txt", right)):
+        (folder / name).write_text(f"{c.fu} {c.fv} {c.cu} {c.cv}\n")
+    np.savetxt(folder / "extrinsics_1_2.txt", T_right_left[:3], fmt="%.17g")
+    return vio.Rig(left, right, T_right_left)
+
+
+def test_the_second_camera_of_eth3d_is_the_left_one(tmp_path: Path) -> None:
+    truth = _make_eth3d(tmp_path)
+    found = vio.load_rig(
+        tmp_path / "extrinsics_1_2.txt", image_size=(truth.cam0.width, truth.cam0.height)
+    )
+    assert found.cameras == truth.cameras
+    np.testing.assert_allclose(found.right[1], truth.right[1], atol=1e-12)
+    T_world_right = [se3_exp([0.1 * k, 0.2, 0.3 * k, 0.1, 0.2 * k, 0.0]) for k in range(4)]
+    lines = []
+    for k, T in enumerate(T_world_right):
+        q = quat_xyzw_from_rotation(T[:3, :3])
+        lines.append(" ".join(map(repr, [6502.4 + 0.05 * k, *T[:3, 3].tolist(), *q.tolist()])))
+    (tmp_path / "groundtruth.txt").write_text(
+        "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines)
+    )
+    dataset = open_dataset(tmp_path)
+    recording = dataset.recording
+    assert recording.kind == "plain"
+    assert np.diff(recording.frame_times_ns).tolist() == [50_000_000] * 3
+    assert isinstance(dataset, ImageDataset)
+    left, right = dataset.pairs[0]
+    assert (left.parent.name, right.parent.name) == ("rgb2", "rgb")
+    assert recording.reference is not None
+    # the centre of the left camera, which rectifying does not move
+    centres = [(T @ truth.right[1])[:3, 3] for T in T_world_right]
+    np.testing.assert_allclose(recording.reference.T_world_body[:, :3, 3], centres, atol=1e-9)

@@ -16,6 +16,7 @@ from vio.datasets.common import naming
 from vio.datasets.image_pairs import ImageSize
 from vio.datasets.kitti import read_extrinsics
 from vio.datasets.rigs import find_calibration
+from vio.datasets.rigs.eth3d import EXTRINSICS, FOLDERS, is_eth3d, truth_of_left
 from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transform
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
@@ -55,6 +56,8 @@ def calibration_beside(layout: Layout) -> Path | None:
     ]
     # beside the recordings of one rig
     folders += [layout.root.absolute().parent / name for name in _SHARED_FOLDERS]
+    if is_pair_of_eth3d(layout):
+        return layout.root / EXTRINSICS
     for folder in folders:
         if not folder.is_dir():
             continue
@@ -79,6 +82,11 @@ def find_calibration_of(layout: Layout) -> Path:
         "calib.txt (KITTI's) or another that vio.load_rig reads, or name it with "
         "--calibration FILE; vio calibrate-rig makes one from a printed board"
     )
+
+
+def is_pair_of_eth3d(layout: Layout) -> bool:
+    """Return whether images are those of both cameras of ETH3D."""
+    return layout.left != layout.right and is_eth3d(layout.root) and layout.left.name == FOLDERS[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +273,8 @@ def _read_reference(
                 "each pair"
             )
         truth = replace(truth, times_ns=times_ns[: len(truth)], frame_indices=np.arange(len(truth)))
+    if is_pair_of_eth3d(layout):
+        truth = truth_of_left(truth, rig)
     with naming(file):
         return reference_of_body(truth, rig, rectifier), file
 

@@ -37,6 +37,8 @@ from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
 from vio.datasets.reader import Reader
 from vio.datasets.rigs import find_calibration, kitti_rig, load_rig
 from vio.datasets.rigs.bare import NAMES as BARE_NAMES
+from vio.datasets.rigs.eth3d import FOLDERS as ETH3D_FOLDERS
+from vio.datasets.rigs.eth3d import is_eth3d
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.sides import first_pair, pairs_of, split_sides
 from vio.datasets.tables import drive_times
@@ -84,6 +86,8 @@ def is_plain_folder(path: Path) -> bool:
     """Return whether a folder holds two image folders of known names, or of names that differ in
     their side alone.
     """
+    if is_eth3d(path) and is_tum_folder(path):  # as RGB-D, unless it is asked for as plain:PATH
+        return False
     return pair_layout(path) is not None
 
 
@@ -99,6 +103,8 @@ def pair_layout(path: Path, folders: str | None = None) -> Layout | None:
     """
     if folders is not None:
         return _named_layout(path, folders)
+    if is_eth3d(path):
+        return Layout(path, path, *(path / name for name in ETH3D_FOLDERS))
     known = _layout(path)
     if known is not None:
         return known

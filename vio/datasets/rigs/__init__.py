@@ -28,6 +28,7 @@ from vio.datasets.rigs import (
     boofcv,
     camodocal,
     depthai,
+    eth3d,
     monado,
     okvis,
     orbslam,
@@ -189,6 +190,8 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
             return checked_rig(Rig(rect0, rect1, T_rect1_rect0), path)
     if is_four_seasons(path):
         return read_four_seasons(path, image_size)
+    if path.name == eth3d.EXTRINSICS:
+        return eth3d.read_eth3d(path, image_size)
     if suffix == ".txt" and bare.is_bare(path):
         return bare.read_bare(path, image_size)
     if suffix == ".txt":
