@@ -397,7 +397,7 @@ def test_a_run_says_once_that_its_baseline_is_in_another_unit(factor: float) -> 
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.parametrize("factor", [4.0, 40.0])
+@pytest.mark.parametrize("factor", [6.0, 40.0])
 def test_a_baseline_in_squares_of_a_board_is_named_with_its_length(
     factor: float, seed: int
 ) -> None:

@@ -42,7 +42,6 @@ ACCEL_UNITS: Mapping[str, float] = {
 _BRACKETS = re.compile(r"[\[({<]\s*((?:[^\[\](){}<>]|[({][^(){}]*[)}])*?)\s*[\])}>]")
 # a number with a decimal comma, or with no decimals
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+(?:,\d*)?(?:[eE][+-]?\d+)?")
-_QUOTES = "\"'"
 _SEPARATORS = re.compile(r"[_\-.:\s,]")
 _SPELLINGS = (
     (re.compile(r"[°º◦˚]"), "deg"),
@@ -65,14 +64,16 @@ def split_cells(text: str) -> list[str]:
     Commas within numbers between semicolons or tabs are decimal points; quotes around cells are
     left out.
     """
+    if '"' in text:
+        text = text.replace('"', "")
     if "," in text and (";" in text or "\t" in text):
         cells = [cell.strip() for cell in text.split(";" if ";" in text else "\t")]
         if all(_DECIMAL_COMMA.fullmatch(cell) for cell in cells):
             return [cell.replace(",", ".") for cell in cells]
     for separator in (",", ";"):
         if separator in text:
-            return [cell.strip().strip(_QUOTES) for cell in text.split(separator)]
-    return [cell.strip(_QUOTES) for cell in text.split()]
+            return [cell.strip() for cell in text.split(separator)]
+    return text.split()
 
 
 def header_cells(text: str, columns: int) -> list[str]:
