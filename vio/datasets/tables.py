@@ -258,11 +258,11 @@ def _without_gaps(
 
     Of a line in which some are, or where most lines are such, more is wrong.
     """
-    lost = np.isnan(table.values).all(axis=1)
+    lost = np.asarray(np.isnan(table.values).all(axis=1))
     count = int(lost.sum())
     if not count or 2 * count > len(lost):
         return table, times_ns
-    kept = np.flatnonzero(~lost)
+    kept = np.flatnonzero(~lost).tolist()
     notes.append(f"{table.path}: {count} readings are not numbers and are left out")
     rest = replace(
         table,
