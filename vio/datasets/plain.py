@@ -287,10 +287,10 @@ def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
     """
     layout = pair_layout(path, settings.folders)
     if layout is None and (found := pair_in_one_folder(path)) is not None:
-        layout, pairs = found
-        alone = len(list_images(layout.left)) - 2 * len(pairs)
+        layout, together = found
+        alone = len(list_images(layout.left)) - 2 * len(together)
         lone = (f"{alone} images have no partner and are skipped",) if alone else ()
-        return _read("plain", layout, _Images(pairs, lone), settings)
+        return _read("plain", layout, _Images(together, lone), settings)
     if layout is None and (layout := side_by_side(path, settings.calibration)) is not None:
         files = list_images(layout.left)
         images = _Images(FilePairs(files, files), side_by_side=True)
