@@ -103,6 +103,7 @@ def test_a_calibration_for_basalt_is_read_as_the_rig(tmp_path: Path) -> None:
     found = vio.load_rig(tmp_path / "written" / "basalt.json")
     assert found.time_offset_s == pytest.approx(0.0125, abs=1e-12)
     assert found.T_cam0_imu is not None
+    assert rig.T_cam0_imu is not None
     np.testing.assert_allclose(found.T_cam0_imu, rig.T_cam0_imu, atol=1e-9)
     block = json.loads((tmp_path / "written" / "basalt.json").read_text())["value0"]
     assert block["imu_update_rate"] == 200.0

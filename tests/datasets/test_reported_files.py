@@ -56,7 +56,7 @@ def _seconds_and_nanoseconds(text: str) -> str:
     return "\n".join([head.replace("#timestamp [ns]", "sec,nanosec"), *split]) + "\n"
 
 
-IMU_FORMS = {
+IMU_FORMS: dict[str, Callable[[str], str | bytes]] = {
     "Windows' line ends and a byte order mark": lambda t: ("\ufeff" + t).replace("\n", "\r\n"),
     "UTF-16, as PowerShell writes": lambda t: t.encode("utf-16"),
     "decimal commas between semicolons": _decimal_commas(";"),
@@ -107,7 +107,7 @@ def test_a_unit_in_another_language_is_doubted(tmp_path: Path) -> None:
     assert "'grad/s' of the gyro is not known" in doubt
 
 
-TIME_LISTS = {
+TIME_LISTS: dict[str, Callable[[list[tuple[int, str]]], str | bytes]] = {
     "UTF-16": lambda rows: "".join(f"{s}\r\n" for _, s in rows).encode("utf-16"),
     "a number before each time": lambda rows: "".join(f"{k} {s}\n" for k, s in rows),
     "numbers from one": lambda rows: "".join(f"{k + 1} {s}\n" for k, s in rows),
@@ -171,6 +171,7 @@ def test_stamps_of_two_cameras_that_are_apart_are_said_to_be(tmp_path: Path) -> 
 def _jpeg_with_exif(path: Path, orientation: int, order: str) -> None:
     """Replace a PNG by a JPEG that asks to be turned."""
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None
     data = cv2.imencode(".jpg", image)[1].tobytes()
     start = b"MM\0*" if order == ">" else b"II*\0"
     entry = struct.pack(f"{order}IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
