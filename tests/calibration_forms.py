@@ -317,6 +317,56 @@ def basalt(model: str, folder: Path) -> Path:
     return folder
 
 
+def basalt_ucm(folder: Path) -> Path:
+    """The double sphere with one centre, which Basalt writes without `xi`."""
+    text = (basalt("double_sphere", folder) / "calibration.json").read_text()
+    sheet = json.loads(text)
+    for lens in sheet["value0"]["intrinsics"]:
+        lens["camera_type"] = "ucm"
+        del lens["intrinsics"]["xi"]
+    _save(folder, "calibration.json", json.dumps(sheet))
+    return folder
+
+
+def one_centre() -> Rig:
+    """Return the rig with double spheres of one centre."""
+    rig = true_rig("double_sphere")
+    cam0, cam1 = (replace(c, coefficients=(0.0, c.coefficients[1])) for c in rig.cameras)
+    return replace(rig, cam0=cam0, cam1=cam1)
+
+
+def monado(folder: Path, model: str = "radtan") -> Path:
+    """As its `t_file.cpp` writes it."""
+    rig = true_rig(model)
+    kinds = {
+        "radtan": ("pinhole_radtan5", "k1 k2 p1 p2 k3"),
+        "equidistant": ("fisheye_equidistant4", "k1 k2 k3 k4"),
+    }
+    kind, names = kinds[model]
+    cameras = []
+    for c in rig.cameras:
+        D = dict(zip(names.split(), [*c.coefficients, 0.0], strict=False))
+        K = dict(zip(("fx", "fy", "cx", "cy"), _intrinsics(c), strict=True))
+        size = dict(zip(("width", "height"), SIZE, strict=True))
+        cameras.append({"model": kind, "intrinsics": K, "distortion": D, "resolution": size})
+    R = T_CAM1_CAM0[:3, :3].ravel().tolist()
+    pose = {"rotation": R, "translation": T_CAM1_CAM0[:3, 3].tolist()}
+    sheet = {"metadata": {"version": 2}, "cameras": cameras, "opencv_stereo_calibrate": pose}
+    return _save(folder, "calibration.json", json.dumps(sheet))
+
+
+def depthai_of(folder: Path, kind: int, model: str = "radtan") -> Path:
+    """With a `cameraType`, and the lenses of a model."""
+    path = depthai(folder)
+    sheet = json.loads(path.read_text())
+    lenses = true_rig(model).cameras
+    for socket, block in sheet["cameraData"]:
+        block["cameraType"] = kind
+        lens = lenses[1 if socket == 2 else 0]
+        block["distortionCoeff"] = [*lens.coefficients, *[0.0] * (14 - len(lens.coefficients))]
+    return _save(folder, path.name, json.dumps(sheet))
+
+
 def depthai(folder: Path, *, inverted: bool = False) -> Path:
     """Left and right are linked through the colour camera between them, in centimetres."""
     rig = true_rig()
@@ -400,6 +450,18 @@ def okvis(folder: Path) -> Path:
     text += f"    sigma_g_c: {NOISE.gyro}\n    sigma_a_c: {NOISE.accel}\n"
     text += f"    sigma_gw_c: {NOISE.gyro_walk}\n    sigma_aw_c: {NOISE.accel_walk}\n"
     text += "    T_BS:\n        [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]\n"
+    return _save(folder, "euroc.yaml", text)
+
+
+def okvis2_eucm(folder: Path) -> Path:
+    """The extended unified model, whose parameters stand in an entry of their own."""
+    text = okvis(folder).read_text()
+    rig = true_rig("eucm")
+    for c, like in zip(rig.cameras, true_rig().cameras, strict=True):
+        old = f"distortion_coefficients: {list(like.coefficients)},"
+        new = "distortion_coefficients: [0.0, 0.0, 0.0, 0.0],"
+        new += f" cam_model: eucm, eucm_parameters: {list(c.coefficients)},"
+        text = text.replace(old, new, 1)
     return _save(folder, "euroc.yaml", text)
 
 
@@ -488,6 +550,30 @@ def _opencv(folder: Path, scale: float, *, sized: bool) -> Path:
     return _save(folder, "stereo.yml", text)
 
 
+def opencv_omnidir(folder: Path) -> Path:
+    """As the sample `omni_stereo_calibration.cpp` of OpenCV's contributions writes it."""
+    rig = true_rig("unified")
+    text = f"%YAML:1.0\n---\nimage_width: {SIZE[0]}\nimage_height: {SIZE[1]}\n"
+    for k, c in enumerate(rig.cameras, start=1):
+        text += _cv(f"camera_matrix_{k}", c.K)
+        text += _cv(f"distortion_coefficients_{k}", np.array(c.coefficients[1:]))
+        text += f"xi_{k}: {c.coefficients[0]}\n"
+    turn = so3_log(T_CAM1_CAM0[:3, :3])
+    text += _cv("rvec", turn[:, None]) + _cv("tvec", T_CAM1_CAM0[:3, 3:])
+    return _save(folder, "out_camera_params_stereo.yml", text)
+
+
+def _opencv_other_names(folder: Path) -> Path:
+    """The distortion by a name that is not known."""
+    path = _opencv(folder, 1.0, sized=True)
+    text = (
+        path.read_text()
+        .replace("D1:", "leftLensDistortion:")
+        .replace("D2:", "rightLensDistortion:")
+    )
+    return _save(folder, path.name, text)
+
+
 def _kitti(folder: Path) -> Path:
     c = rectified_rig().cam0
     P0 = np.column_stack([c.K, np.zeros(3)])
@@ -573,6 +659,7 @@ FORMS = (
     Form("Basalt", "`calibration.json`, `ds`", lambda f: basalt("double_sphere", f), true_rig("double_sphere")),
     Form("Basalt", "likewise, `kb4`", lambda f: basalt("equidistant", f), true_rig("equidistant")),
     Form("Basalt", "likewise, `eucm`", lambda f: basalt("eucm", f), true_rig("eucm")),
+    Form("Basalt", "likewise, `ucm`", basalt_ucm, one_centre(), row=False),
     Form("Basalt", "likewise, `fov`", lambda f: basalt("fov", f), true_rig("fov")),
     Form(
         "DepthAI",
@@ -586,10 +673,27 @@ FORMS = (
         lambda f: depthai(f, inverted=True),
         replace(true_rig(), imu_noise=None, time_offset_s=0.0),
     ),
+    Form(
+        "DepthAI",
+        "likewise, fisheye (`cameraType` 1)",
+        lambda f: depthai_of(f, 1, "equidistant"),
+        replace(true_rig("equidistant"), imu_noise=None, time_offset_s=0.0),
+        row=False,
+    ),
+    Form("DepthAI", "likewise, `cameraType` 3", lambda f: depthai_of(f, 3), None),
+    Form("Monado", "`calibration_v2` JSON, `pinhole_radtan5`", monado, imu_free(true_rig())),
+    Form(
+        "Monado",
+        "likewise, `fisheye_equidistant4`",
+        lambda f: monado(f, "equidistant"),
+        imu_free(true_rig("equidistant")),
+        row=False,
+    ),
     Form("ZED", "`SN*.conf`", zed, imu_free(true_rig()), SIZE),
     Form("ZED", "`SN*.conf` with `LEFT_DISTO`, fisheye", zed_x, imu_free(true_rig("equidistant")), SIZE),
     Form("ZED", "`SN*.conf`, images of another size", zed, None, (640, 480)),
     Form("OKVIS, OKVIS2", "`cameras:` with `T_SC`", okvis, true_rig()),
+    Form("OKVIS2", "likewise, `cam_model: eucm`", okvis2_eucm, true_rig("eucm"), row=False),
     Form("maplab, SVO", "`cameras:` with `T_B_C`", ncamera, true_rig()),
     Form("maplab, SVO", "likewise, `fisheye`: the field-of-view model", lambda f: ncamera(f, "fov"), true_rig("fov")),
     Form(
@@ -603,6 +707,8 @@ FORMS = (
     Form("OpenCV", "`M1 D1 M2 D2 R T`, size stated", lambda f: _opencv(f, 1.0, sized=True), imu_free(true_rig())),
     Form("OpenCV", "likewise, T in squares of the board", lambda f: _opencv(f, 40.0, sized=True), _LONGER),
     Form("OpenCV", "likewise, no size, images of half of it", lambda f: _opencv(f, 1.0, sized=False), None, (640, 360)),
+    Form("OpenCV", "`omnidir`: `xi_1`, `rvec`, `tvec`", opencv_omnidir, imu_free(true_rig("unified"))),
+    Form("OpenCV", "distortion by an unknown name", _opencv_other_names, None, row=False),
     Form("KITTI", "`calib.txt`", _kitti, imu_free(rectified_rig()), SIZE),
     Form("KITTI", "`calib.txt`, images of 0.6 of its size", _kitti, None, (768, 432)),
     Form("BoofCV", "`stereo.yaml`", lambda f: _boofcv(f, 1.0), imu_free(true_rig())),

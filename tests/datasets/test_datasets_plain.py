@@ -391,8 +391,8 @@ BAD = {
     ),
     "an empty IMU": (_write("imu.csv", "#timestamp,wx,wy,wz,ax,ay,az\n"), "holds no line of data"),
     "an IMU with decimal commas": (
-        _write("imu.csv", "time;wx;wy;wz;ax;ay;az\n1700000000;0,1;0,1;0,1;0,1;9,8;0,1\n"),
-        r"line 2, '1700000000;0,1;0,1;0,1;0,1;9,8;0,1', does not begin with a number \(decimals "
+        _write("imu.csv", "time wx wy wz ax ay az\n1700000000 0,1 0,1 0,1 0,1 9,8 0,1\n"),
+        r"line 2, '1700000000 0,1 0,1 0,1 0,1 9,8 0,1', does not begin with a number \(decimals "
         r"need a point\)",
     ),
     "gravity among the gyro's columns": (

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import vio
+from tests import calibration_forms as forms
 from tests.calibration_forms import FORMS, Form, table
 from vio.cameras.rig import Rig
+from vio.errors import CalibrationError
 
 ROOT = Path(__file__).parents[2]
 BEGIN = "<!-- table of formats, by tests.calibration_forms -->"
@@ -39,6 +42,42 @@ def test_every_form_of_a_rig_is_read_as_that_rig(form: Form, tmp_path: Path) -> 
     rig = vio.load_rig(form.write(tmp_path), image_size=form.known_size)
     assert form.truth is not None
     _close(rig, form.truth)
+
+
+# a form, and what its file calls the lens
+UNKNOWN_LENSES: dict[str, tuple[Callable[[Path], Path], str, str]] = {
+    "Kalibr": (forms.kalibr, "camera_model: pinhole", "camera_model: trioptar"),
+    "Kalibr's distortion": (forms.kalibr, "model: radtan", "model: trioptar"),
+    "OpenVINS": (forms.openvins, "model: radtan", "model: trioptar"),
+    "Kimera": (forms.kimera, "camera_model: pinhole", "camera_model: trioptar"),
+    "Kimera's distortion": (forms.kimera, "radial-tangential", "trioptar"),
+    "camodocal": (lambda f: forms.vins("radtan", f), "PINHOLE", "TRIOPTAR"),
+    "camodocal's SCARAMUZZA": (lambda f: forms.vins("radtan", f), "PINHOLE", "SCARAMUZZA"),
+    "ORB-SLAM3": (lambda f: forms.orbslam3("radtan", f), '"PinHole"', '"Trioptar"'),
+    "Basalt": (lambda f: forms.basalt("eucm", f), '"eucm"', '"trioptar"'),
+    "Monado": (forms.monado, "pinhole_radtan5", "trioptar"),
+    "DepthAI": (forms.depthai, '"cameraType": 0', '"cameraType": 77'),
+    "OKVIS": (forms.okvis, "type: radialtangential", "type: trioptar"),
+    "OKVIS2": (forms.okvis2_eucm, "cam_model: eucm", "cam_model: trioptar"),
+    "SVO": (forms.ncamera, "type: pinhole", "type: trioptar"),
+    "SVO's distortion": (forms.ncamera, "type: radial-tangential", "type: trioptar"),
+}
+
+
+@pytest.mark.parametrize("tool", UNKNOWN_LENSES)
+def test_a_lens_that_is_not_known_is_refused_by_its_name(tool: str, tmp_path: Path) -> None:
+    write, known, other = UNKNOWN_LENSES[tool]
+    path = write(tmp_path)
+    changed = 0
+    for file in tmp_path.iterdir():
+        text = file.read_text()
+        changed += known in text
+        file.write_text(text.replace(known, other))
+    assert changed
+    name = other.split(": ")[-1].strip('"')
+    with pytest.raises(CalibrationError, match=f"(?i){name}.* not (read|supported)") as found:
+        vio.load_rig(path)
+    assert "\n" not in str(found.value)
 
 
 def test_table_of_formats_is_what_the_readers_do() -> None:

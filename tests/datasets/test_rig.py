@@ -560,9 +560,9 @@ def test_scaled_images_of_real_cameras_are_doubted(
 
 
 @pytest.mark.parametrize(
-    ("scale", "doubted"), [(0.88, True), (0.93, False), (1.07, False), (1.13, True)]
+    ("scale", "doubted"), [(0.93, True), (0.97, False), (1.03, False), (1.07, True)]
 )
-def test_images_scaled_by_an_eighth_are_doubted(
+def test_images_scaled_by_a_fifteenth_are_doubted(
     scale: float, doubted: bool, tmp_path: Path
 ) -> None:
     write_calibration(tmp_path, Rig.rectified(700.0, 700.0, 500, 300, 0.12, 1000, 600).camera, None)

@@ -396,6 +396,23 @@ def test_a_run_says_once_that_its_baseline_is_in_another_unit(factor: float) -> 
     assert len(said) == (factor > 1)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("factor", [6.0, 40.0])
+def test_a_baseline_in_squares_of_a_board_is_named_with_its_length(
+    factor: float, seed: int
+) -> None:
+    """Beside a baseline that an IMU contradicts: 126 m of 1.07 m without a word."""
+    it = _recording("room", seed)
+    true_m = it.camera.baseline_m
+    wrong = replace(it, camera=replace(it.camera, baseline_m=factor * true_m))
+    for frames in (wrong.frames, wrong.frames[:95]):
+        (found,) = _watch(wrong, frames=frames)
+        assert found.fault == "camera scale"
+        assert not found.certain
+        words = found.explanation.split("would be ")[1]
+        assert float(words.split(" m")[0]) == pytest.approx(true_m, rel=0.15)
+
+
 def test_standstill_gives_no_finding_about_motion() -> None:
     it = _recording("still", 4)
     standstill = [f for f in it.frames if f.time_ns < 9_900_000_000]

@@ -63,10 +63,16 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument(
         "--run-peer",
-        choices=("spectacularai",),
-        help="first run this system on the suite's recordings, in an environment of its own below "
-        "--cache (made on request; its licence is said: free for non-commercial use), as further "
-        "rows of the tables",
+        choices=("spectacularai", "basalt"),
+        help="first run this system on the suite's recordings, as further rows of the tables: "
+        "spectacularai in an environment of its own below --cache (made on request; its licence is "
+        "said: free for non-commercial use), basalt by --peer-program",
+    )
+    parser.add_argument(
+        "--peer-program", type=Path, metavar="PATH", help="a basalt_vio that you have built"
+    )
+    parser.add_argument(
+        "--peer-settings", type=Path, metavar="FILE", help="its settings (default: its own)"
     )
     parser.add_argument("--only", default="", metavar="NAME,…", help="these sequences alone")
     parser.add_argument(
@@ -182,7 +188,7 @@ def _bench(args: argparse.Namespace) -> int:
 
 def _with_peer(suite: Any, place: Any, args: argparse.Namespace) -> Any:
     """Run another system, and return the place with its trajectories."""
-    from vio.bench.run_peers import run_peer
+    from vio.bench.run_peers import Program, run_peer
 
     if args.peers is not None:
         raise ConfigError("give --peers or --run-peer, not both")
@@ -192,6 +198,7 @@ def _with_peer(suite: Any, place: Any, args: argparse.Namespace) -> Any:
         place.data,
         place.cache,
         lambda text: None if args.quiet else print(text, file=sys.stderr),
+        None if args.peer_program is None else Program(args.peer_program, args.peer_settings),
     )
     return replace(place, peers=folder)
 

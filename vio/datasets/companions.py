@@ -17,6 +17,7 @@ from vio.datasets import rigs
 from vio.datasets.common import naming
 from vio.datasets.image_pairs import ImageSize
 from vio.datasets.kitti import read_extrinsics
+from vio.datasets.rigs.eth3d import EXTRINSICS, FOLDERS, is_eth3d, truth_of_left
 from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transform
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
@@ -41,6 +42,7 @@ _REFERENCES = (
     "reference.tum", "reference.txt", "groundtruth.tum", "groundtruth_tum.txt", "groundtruth.txt", "gt_imu.csv",
     "mocap0/data.csv", "state_groundtruth_estimate0/data.csv", "poses.txt",
 )  # fmt: skip
+_LONG_SHIFT_S = 1.0  # as of one that was written in milliseconds
 _CALIBRATION_FOLDERS = ("", "dso", "calibration", "calib", "extras")
 _SHARED_FOLDERS = ("calibration", "extras")  # of 4Seasons and Monado
 
@@ -55,6 +57,8 @@ def calibration_beside(layout: Layout) -> Path | None:
     ]
     # beside the recordings of one rig
     folders += [layout.root.absolute().parent / name for name in _SHARED_FOLDERS]
+    if is_pair_of_eth3d(layout):
+        return layout.root / EXTRINSICS
     for folder in folders:
         if not folder.is_dir():
             continue
@@ -79,6 +83,11 @@ def find_calibration_of(layout: Layout) -> Path:
         "calib.txt (KITTI's) or another that vio.load_rig reads, or name it with "
         "--calibration FILE; vio calibrate-rig makes one from a printed board"
     )
+
+
+def is_pair_of_eth3d(layout: Layout) -> bool:
+    """Return whether images are those of both cameras of ETH3D."""
+    return layout.left != layout.right and is_eth3d(layout.root) and layout.left.name == FOLDERS[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +245,7 @@ def _read_motion(
     parts: list[Sequence[MotionSample]] = []
     notes: list[str] = []
     if imu is not None:
-        record, notes_read = read_imu_table(imu)
+        record, notes_read = read_imu_table(imu, cut=notes)
         samples, notes_moved = imu_on_camera_clock(record, rig, times_ns, imu)
         notes += [*notes_read, *notes_moved]
         parts.append(samples)
@@ -265,6 +274,8 @@ def _read_reference(
                 "each pair"
             )
         truth = replace(truth, times_ns=times_ns[: len(truth)], frame_indices=np.arange(len(truth)))
+    if is_pair_of_eth3d(layout):
+        truth = truth_of_left(truth, rig)
     with naming(file):
         return reference_of_body(truth, rig, rectifier), file
 
@@ -280,6 +291,8 @@ def imu_on_camera_clock(
     """
     shift_ns = round(rig.time_offset_s * NS_PER_S)
     record = replace(record, times_ns=record.times_ns - shift_ns)
+    if abs(rig.time_offset_s) > _LONG_SHIFT_S:
+        where = f"{where}, moved by the calibration's time shift of {rig.time_offset_s:g} s"
     check_overlap(frame_times_ns, record.times_ns, where)
     moved = f"the IMU's stamps are moved by {-1e3 * rig.time_offset_s:+.3f} ms, as the calibration states"
     return imu_samples(record), [moved] if shift_ns else []

@@ -27,7 +27,7 @@ from vio.datasets.frame_times import paired
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImageDataset, gray_levels
 from vio.datasets.images import list_images
-from vio.datasets.rigs.plausible import check_principal_point
+from vio.datasets.rigs.plausible import check_camera
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import read_imu_table, stamped_rows
@@ -70,7 +70,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> ImageDataset:
     mav = euroc_base(path)
     left, right = (_read_camera(mav / name) for name in ("cam0", "cam1"))
     for name, camera in (("cam0", left), ("cam1", right)):
-        check_principal_point(camera.model, mav / name / "sensor.yaml")
+        check_camera(camera.model, mav / name / "sensor.yaml")
     T_body_imu, noise, samples, imu_notes = _read_imu(mav / "imu0")
     T_imu_body = se3_inverse(T_body_imu)
     rig = StereoRig(

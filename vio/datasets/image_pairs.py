@@ -19,6 +19,7 @@ from vio.datasets.common import blank_frames, chosen_frames, merge_events
 from vio.datasets.image_files import FilePairs, stem_of
 from vio.datasets.images import (
     UnreadableImageError,
+    exif_turn,
     levels_in,
     list_images,
     load_depth,
@@ -139,7 +140,20 @@ def gray_levels(pairs: ImagePairs) -> tuple[Levels, tuple[str, ...]]:
     last = len(pairs) - 1
     chosen = {last * k // (_LEVEL_FRAMES - 1) for k in range(_LEVEL_FRAMES)} if pairs else set()
     levels = levels_in([path for k in sorted(chosen) for path in pairs[k]])
-    return levels, (*levels.note, *_mosaic_notes(pairs))
+    return levels, (*levels.note, *_mosaic_notes(pairs), *_turn_notes(pairs))
+
+
+def _turn_notes(pairs: ImagePairs) -> tuple[str, ...]:
+    """Return the doubt about a first pair of images that ask to be turned."""
+    for path in dict.fromkeys(pairs[0] if pairs else ()):
+        with contextlib.suppress(OSError):
+            if turn := exif_turn(path):
+                return (
+                    f"{path.parent}: doubtful: the images ask to be turned by {turn} degrees (EXIF), "
+                    "as viewers and OpenCV's imread do; they are read as they are stored; if the "
+                    "calibration is of turned images, write the images turned, without EXIF",
+                )
+    return ()
 
 
 def _mosaic_notes(pairs: ImagePairs) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.frame_times import pair_stamps
+from vio.datasets.frame_times import PAIRED_NS, nearest, pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImagePairs
 from vio.datasets.sides import without_side
@@ -59,6 +59,7 @@ def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple
     rows = [(k, right_of[key]) for k, key in enumerate(keys[0]) if key in right_of]
     pairs = FilePairs(lefts.take(k for k, _ in rows), rights.take(k for _, k in rows))
     if not pairs:
+        _check_stamps_apart(lefts, rights)
         raise DataError(
             f"{lefts[0].parent} and {rights[0].parent}: no name of the one fits one of the other "
             f"({lefts[0].name}, "
@@ -68,6 +69,20 @@ def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple
     if not any(alone):
         return pairs, ()
     return pairs, (f"{alone[0]} left and {alone[1]} right images have no partner and are skipped",)
+
+
+def _check_stamps_apart(lefts: ImageFiles, rights: ImageFiles) -> None:
+    """Raise DataError where the names of both are times, which are too far apart for a pair."""
+    left_ns = _name_times(lefts)
+    right_ns = _name_times(rights)
+    if left_ns is None or right_ns is None:
+        return
+    apart_ms = np.median((right_ns[nearest(left_ns, right_ns)] - left_ns) / 1e6)
+    raise DataError(
+        f"{lefts[0].parent} and {rights[0].parent}: the times that images are named by are "
+        f"{apart_ms:+.4g} ms apart (right from left, median), and those of a pair must be within "
+        f"{PAIRED_NS / 1e6:g} ms; if they are of one exposure, give both the same name"
+    )
 
 
 def _partner_keys(lefts: ImageFiles, rights: ImageFiles) -> list[list[str | int]]:
@@ -243,13 +258,15 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
     by_name = {Path(fields[0]).stem: (n, fields[1]) for n, fields in rows if len(fields) > 1}
     if by_name and all(left.stem in by_name for left, _ in pairs):
         chosen = [by_name[left.stem] for left, _ in pairs]
+    elif (found := _by_number_or_time_first(rows, pairs)) is not None:
+        chosen = found
     elif len(rows) == len(pairs) and all(len(fields) == 1 for _, fields in rows):
         chosen = [(n, fields[0]) for n, fields in rows]
     else:
         raise DataError(
             f"{file} holds {len(rows)} times for {len(pairs)} image pairs; there must be one time "
             "an image, or lines "
-            "'name time'"
+            "'name time'; decimals need a point"
         )
     return parse_stamps(
         [text for _, text in chosen],
@@ -258,6 +275,27 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
         pace=FRAME_PACE,
         doubts=doubts,
     )
+
+
+def _by_number_or_time_first(
+    rows: Sequence[tuple[int, list[str]]], pairs: ImagePairs
+) -> list[tuple[int, str]] | None:
+    """Return line and time of each pair from lines 'time name', or 'number time' where numbers are
+    those of the images, or count them; None: the lines are others.
+    """
+    if not rows or any(len(fields) != 2 for _, fields in rows):
+        return None
+    by_name = {Path(fields[1]).stem: (n, fields[0]) for n, fields in rows}
+    if all(left.stem in by_name for left, _ in pairs):
+        return [by_name[left.stem] for left, _ in pairs]
+    if not all(fields[0].isdigit() for _, fields in rows):
+        return None
+    by_number = {int(fields[0]): (n, fields[1]) for n, fields in rows}
+    numbers = [_last_number(left) for left, _ in pairs]
+    if all(number in by_number for number in numbers):
+        return [by_number[int(number)] for number in numbers]
+    counted = sorted(by_number) == list(range(min(by_number), min(by_number) + len(pairs)))
+    return [by_number[k] for k in sorted(by_number)] if counted else None
 
 
 def time_lines(file: Path) -> tuple[list[tuple[int, list[str]]], str | None]:

@@ -31,15 +31,17 @@ from vio.datasets.companions import (
     read_companions,
 )
 from vio.datasets.euroc import is_euroc_folder, read_euroc
-from vio.datasets.image_files import FilePairs
+from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
 from vio.datasets.image_times import frame_times, pair_files, times_of
 from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_gray
 from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
 from vio.datasets.reader import Reader
 from vio.datasets.rigs.bare import NAMES as BARE_NAMES
+from vio.datasets.rigs.eth3d import FOLDERS as ETH3D_FOLDERS
+from vio.datasets.rigs.eth3d import is_eth3d
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.sides import first_pair, pairs_of
+from vio.datasets.sides import first_pair, pairs_of, split_sides
 from vio.datasets.tables import drive_times
 from vio.datasets.tum_rgbd import (
     DEPTH_FACTOR,
@@ -85,6 +87,8 @@ def is_plain_folder(path: Path) -> bool:
     """Return whether a folder holds two image folders of known names, or of names that differ in
     their side alone.
     """
+    if is_eth3d(path) and is_tum_folder(path):  # as RGB-D, unless it is asked for as plain:PATH
+        return False
     return pair_layout(path) is not None
 
 
@@ -100,6 +104,8 @@ def pair_layout(path: Path, folders: str | None = None) -> Layout | None:
     """
     if folders is not None:
         return _named_layout(path, folders)
+    if is_eth3d(path):
+        return Layout(path, path, *(path / name for name in ETH3D_FOLDERS))
     known = _layout(path)
     if known is not None:
         return known
@@ -131,6 +137,23 @@ def side_by_side(path: Path, calibration: Path | None = None) -> Layout | None:
     except (UnreadableImageError, CalibrationError):
         return None
     return layout if (rig.cam0.width, rig.cam0.height) == half else None
+
+
+def pair_in_one_folder(path: Path) -> tuple[Layout, FilePairs] | None:
+    """Return where the images of both cameras lie in one folder, by names that tell them apart, and
+    their pairs; None: there are none.
+    """
+    layout = _layout_of_one(path)
+    if layout is None and _holds_images(path):
+        layout = Layout(path, path, path, path)
+    if layout is None:
+        return None
+    files = list_images(layout.left)
+    sides = split_sides(files.names)
+    if sides is None:
+        return None
+    pairs = FilePairs(*(ImageFiles(files.folder, tuple(names)) for names in sides))
+    return layout, pairs
 
 
 def _named_layout(path: Path, folders: str) -> Layout:
@@ -216,6 +239,8 @@ def images_of_one_camera(path: Path) -> Path | None:
 def is_mono_folder(path: Path) -> bool:
     """Return whether a folder holds the images of one camera, and a calibration identifies them."""
     layout = _layout_of_one(path)
+    if layout is not None and split_sides(list_images(layout.left).names) is not None:
+        return False
     return layout is not None and calibration_beside(layout) is not None
 
 
@@ -262,6 +287,11 @@ def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
         CalibrationError: there is no calibration, or it is invalid.
     """
     layout = pair_layout(path, settings.folders)
+    if layout is None and (found := pair_in_one_folder(path)) is not None:
+        layout, together = found
+        alone = len(list_images(layout.left)) - 2 * len(together)
+        lone = (f"{alone} images have no partner and are skipped",) if alone else ()
+        return _read("plain", layout, _Images(together, lone), settings)
     if layout is None and (layout := side_by_side(path, settings.calibration)) is not None:
         files = list_images(layout.left)
         images = _Images(FilePairs(files, files), side_by_side=True)
@@ -529,8 +559,8 @@ def _frame_numbers(pairs: ImagePairs) -> IntArray:
     return numbers
 
 
-def _is_side_by_side(path: Path) -> bool:
-    return side_by_side(path) is not None
+def _is_both_in_one(path: Path) -> bool:
+    return pair_in_one_folder(path) is not None or side_by_side(path) is not None
 
 
 def _is_mono_of_euroc(path: Path) -> bool:
@@ -577,7 +607,7 @@ READERS = (
         looked_for="a plain folder (left right and a calibration)",
         read=read_plain,
         is_folder=is_plain_folder,
-        may_be_folder=_is_side_by_side,
+        may_be_folder=_is_both_in_one,
         calibrated_as="plain",
     ),
     Reader(

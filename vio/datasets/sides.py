@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Sequence
 from itertools import combinations
 
 # what may differ between the names of a pair, left first; in small letters, numbers as numbers
@@ -16,6 +18,7 @@ _SIDES = (
     ("2", "3"),
     ("a", "b"),
 )
+_CAMERAS = ("cam", "camera", "infra", "fisheye")  # whose number tells them apart
 _WORDS = re.compile(r"\d+|[A-Z]?[a-z]+|[A-Z]+(?![a-z])|/|\\")
 
 
@@ -59,6 +62,42 @@ def first_pair(pairs: list[tuple[str, str]]) -> tuple[str, str] | None:
 
 def _differing(left: str, right: str) -> set[str]:
     return {a for a, b in zip(words_of(left), words_of(right), strict=True) if a != b}
+
+
+def split_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
+    """Return the names of left and right images that lie in one folder, in pairs.
+
+    None: they are not of two cameras. A word for a side tells them apart, or the number of a
+    camera (`frame01_cam0`); those of one side without the other are left out.
+    """
+    sides: dict[tuple[str, ...], dict[str, str]] = {}
+    alone = 0
+    for name in names:
+        words = words_of(os.path.splitext(name)[0])
+        at = next((k for k in range(len(words)) if _side_at(words, k) is not None), None)
+        if at is None:
+            return None
+        side = _side_at(words, at)
+        assert side is not None
+        of_frame = sides.setdefault((*words[:at], "", *words[at + 1 :]), {})
+        if side in of_frame:
+            return None
+        of_frame[side] = name
+    pairs = [found for found in sides.values() if len(found) == 2]
+    alone = len(names) - 2 * len(pairs)
+    if not pairs or alone > len(pairs):
+        return None
+    return [pair["left"] for pair in pairs], [pair["right"] for pair in pairs]
+
+
+def _side_at(words: tuple[str, ...], k: int) -> str | None:
+    """Return the side that a word of a name states; None: it states none."""
+    for left, right in _SIDES[:3]:
+        if words[k] in (left, right):
+            return "left" if words[k] == left else "right"
+    if k and words[k] in ("0", "1") and words[k - 1] in _CAMERAS:
+        return "left" if words[k] == "0" else "right"
+    return None
 
 
 def side_word(name: str) -> str | None:

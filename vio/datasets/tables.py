@@ -33,14 +33,17 @@ from vio.files.units import (
 )
 from vio.geometry.lie import FloatArray
 from vio.imu.sampling import sampling_notes
-from vio.records import ImuRecord, IntArray, VelocitySample
+from vio.records import NS_PER_S, ImuRecord, IntArray, VelocitySample
 
 _NUMBER = re.compile(
     r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE
 )
+_SECONDS = re.compile(r"(^|[^n])secs?$|seconds?$")  # ends of names in small letters
+_NANOSECONDS = re.compile(r"n(ano)?secs?$|nanoseconds?$")
 _PLAIN = re.compile(r"[0-9.eE+-]*")  # numbers in these are written as `_NUMBER` says, or are none
 _IMU_COLUMNS = 7
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
+_OTHER_UNITS = {"rad/s": "deg/s or mdps", "m/s^2": "g or mg"}  # for messages
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
 
 
@@ -229,6 +232,7 @@ def read_imu_table(
         times_ns = _times_ns(table.stamps, table.where, _stated_unit(table))
     else:
         times_ns = stamps_ns(table, SAMPLE_PACE, notes)
+    table, times_ns = _without_gaps(table, times_ns, notes)
     values = _finite(table)
     order = _imu_order(table)
     if order is None:
@@ -247,6 +251,29 @@ def read_imu_table(
     return record, (*notes, *gyro_notes, *accel_notes, *sampling_notes(record, str(path)))
 
 
+def _without_gaps(
+    table: NumberTable, times_ns: IntArray, notes: list[str]
+) -> tuple[NumberTable, IntArray]:
+    """Leave out readings none of which is finite, which a driver writes before its first ones, with
+    a note.
+
+    Of a line in which some are, or where most lines are such, more is wrong.
+    """
+    lost = np.asarray(np.isnan(table.values).all(axis=1))
+    count = int(lost.sum())
+    if not count or 2 * count > len(lost):
+        return table, times_ns
+    kept = np.flatnonzero(~lost).tolist()
+    notes.append(f"{table.path}: {count} readings are not numbers and are left out")
+    rest = replace(
+        table,
+        stamps=tuple(table.stamps[k] for k in kept),
+        values=table.values[kept],
+        lines=[table.lines[k] for k in kept],
+    )
+    return rest, times_ns[kept]
+
+
 def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
     """Read the stamps and six readings, or what the header names of more columns."""
     count = 0
@@ -257,7 +284,7 @@ def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
             break
     if count <= _IMU_COLUMNS:
         return read_table(path, _IMU_COLUMNS, _IMU_FORM, cut)
-    table = read_table(path, count, _IMU_FORM, cut)
+    table = _joined_stamps(read_table(path, count, _IMU_FORM, cut))
     order = _imu_order(table) if table.header else None
     named = [bool(re.search(r"time|stamp|sec|\bt\b", cell)) for cell in table.header]
     if any(named) and not named[0]:
@@ -274,6 +301,24 @@ def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
         header=(table.header[0], *(table.header[1 + k] for k in order)),
         values=table.values[:, order],
     )
+
+
+def _joined_stamps(table: NumberTable) -> NumberTable:
+    """Return a table whose header names seconds and nanoseconds in its first two columns with one
+    time, in nanoseconds; others as they are.
+    """
+    names = [re.sub(r"[^a-z]", "", cell) for cell in table.header[:2]]
+    if len(names) < 2 or not (_SECONDS.search(names[0]) and _NANOSECONDS.search(names[1])):
+        return table
+    nanoseconds = table.values[:, 0]
+    if not all(map(str.isdigit, table.stamps)) or not np.isfinite(nanoseconds).all():
+        return table
+    joined = [
+        str(int(whole) * NS_PER_S + int(rest))
+        for whole, rest in zip(table.stamps, nanoseconds.tolist(), strict=True)
+    ]
+    header = ("time [ns]", *table.header[2:])
+    return replace(table, header=header, stamps=tuple(joined), values=table.values[:, 1:])
 
 
 def _factor(
@@ -298,7 +343,9 @@ def _factor(
     if factor is None:
         unknown = [word for cell in cells if (word := unknown_unit(cell, units)) is not None]
         note = (
-            f"{table.path}: the unit {unknown[0]!r} of the {name} is not known; it is read as {si}"
+            f"{table.path}: doubtful: the unit {unknown[0]!r} of the {name} is not known; it is read "
+            f"as {si}; if it is another, all its readings are off by a factor: write it as "
+            f"{' or '.join(list(units)[:1])}, {_OTHER_UNITS[si]}"
             if unknown
             else ""
         )

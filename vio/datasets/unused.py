@@ -89,7 +89,8 @@ def _belongs(other: Path, calibration: Path) -> bool:
     """Return whether a file is read together with a calibration file."""
     partners = {"left": "right", "intrinsic": "extrinsic", "camchain": "imu", "calibration": "imu"}
     named = any(a in calibration.name and b in other.name for a, b in partners.items())
-    return (named and other.suffix in (".yaml", ".yml")) or (
+    other_chain = "cam" in other.name and "chain" in other.name  # a calibration by itself
+    return (named and not other_chain and other.suffix in (".yaml", ".yml")) or (
         calibration.name.startswith("calib_cam_to_cam")
         and (other.name in ("calib_velo_to_cam.txt", "calib_imu_to_velo.txt"))
     )

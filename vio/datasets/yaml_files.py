@@ -124,6 +124,39 @@ def lens_model(name: object, where: Path | str) -> DistortionModel:
     return model
 
 
+def tool_lens(
+    tool: str,
+    name: object,
+    where: Path | str,
+    others: Mapping[str, tuple[DistortionModel, tuple[str, ...]]] | None = None,
+) -> tuple[DistortionModel, tuple[str, ...]]:
+    """Return the lens model that a tool's file names, and the names of its coefficients there, of
+    which an empty one is a zero.
+
+    Args:
+        tool: as `ToolForm.tool`.
+        name: in the file, in any case.
+        where: the file and the entry, for messages.
+        others: further names that the tool's files have, with what is returned for them.
+
+    Raises:
+        CalibrationError: the name is not known.
+    """
+    known = dict(others or {})
+    known |= {
+        form.name: (lens.name, form.coefficients)
+        for lens in LENSES.values()
+        for form in lens.files.tools
+        if form.tool == tool
+    }
+    found = known.get(str(name).lower())
+    if found is None:
+        raise CalibrationError(
+            f"{where}: the lens model {name!r} is not read; calibrate with {', '.join(known)}"
+        )
+    return found
+
+
 def as_number(value: object) -> float:
     """Parse a number from YAML or csv (PyYAML reads 1e-3 as text); NaN where it is none."""
     try:

@@ -4,6 +4,7 @@ nanoseconds.
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -59,8 +60,12 @@ def lines_of(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _decoded(data: bytes, path: Path) -> str:
-    """Return text in UTF-8, or in Latin-1 where nothing but signs of units tells the two apart."""
+    """Return text in UTF-8, in UTF-16 where its mark says so, or in Latin-1 where nothing but signs
+    of units tells it apart.
+    """
     try:
+        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            return data.decode("utf-16")
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         text = data.decode("latin-1")

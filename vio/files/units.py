@@ -40,6 +40,8 @@ ACCEL_UNITS: Mapping[str, float] = {
     **dict.fromkeys(("mm/s2", "mm_s2", "mmps2", "mms2"), 1e-3),
 }
 _BRACKETS = re.compile(r"[\[({<]\s*((?:[^\[\](){}<>]|[({][^(){}]*[)}])*?)\s*[\])}>]")
+# a number with a decimal comma, or with no decimals
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+(?:,\d*)?(?:[eE][+-]?\d+)?")
 _SEPARATORS = re.compile(r"[_\-.:\s,]")
 _SPELLINGS = (
     (re.compile(r"[°º◦˚]"), "deg"),
@@ -57,7 +59,17 @@ _SPELLINGS = (
 
 
 def split_cells(text: str) -> list[str]:
-    """Return the cells of a line, between commas, else semicolons, else white space."""
+    """Return the cells of a line, between commas, else semicolons, else white space.
+
+    Commas within numbers between semicolons or tabs are decimal points; quotes around cells are
+    left out.
+    """
+    if '"' in text:
+        text = text.replace('"', "")
+    if "," in text and (";" in text or "\t" in text):
+        cells = [cell.strip() for cell in text.split(";" if ";" in text else "\t")]
+        if all(_DECIMAL_COMMA.fullmatch(cell) for cell in cells):
+            return [cell.replace(",", ".") for cell in cells]
     for separator in (",", ";"):
         if separator in text:
             return [cell.strip() for cell in text.split(separator)]

@@ -27,6 +27,7 @@ InertialFault: TypeAlias = Literal[
     "IMU gap",
     "camera stamps",
     "camera turns",
+    "camera scale",
 ]
 
 # A second finding of a group would repeat the first.
@@ -73,6 +74,7 @@ _CODES: dict[InertialFault, str] = {
     "IMU gap": "imu-gap",
     "camera stamps": "imu-clock",
     "camera turns": "imu-disagrees",
+    "camera scale": "imu-disagrees",
 }
 
 

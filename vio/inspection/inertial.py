@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.datasets.rigs.plausible import FAR_IMU_M
 from vio.geometry.lie import FloatArray, so3_log
 from vio.inspection.finding import Part
 from vio.monitor.accelerometer import judge_up
@@ -17,7 +18,6 @@ _STILL_ACCEL = 0.15
 _NOISE_TAUS_S = (0.1, 0.2, 0.5)
 _MIN_STILL_S = 3.0  # of one piece, for the noise
 _OFF_SHEET = 3.0  # measured over stated noise that is worth saying
-_FAR_M = 10.0  # an IMU further from its camera is no length in metres
 
 
 def still_windows(record: ImuRecord) -> tuple[BoolArray, int]:
@@ -113,7 +113,7 @@ def extrinsics_part(T_cam0_imu: FloatArray) -> Part:
     turn = np.degrees(so3_log(R))
     distance = float(np.linalg.norm(t))
     faults = []
-    if distance > _FAR_M:
+    if distance > FAR_IMU_M:
         faults.append(
             f"the IMU is {distance:.4g} m from the camera; translations are metres: check the unit"
         )

@@ -26,10 +26,13 @@ from vio.records import (
     Recording,
     StereoFrame,
     VelocitySample,
+    doubts_among,
 )
 
 PAIRS = 12  # or single images looked at, spread over the recording
 TRACKED = 60  # frames tracked to compare the IMU with the images' motion
+_SETTLED_NS = 5 * NS_PER_S  # of frames that an accelerometer is compared with
+_MAX_TRACKED = 200
 _VIDEO_FRAMES = 300  # of a video, which can only be decoded in order
 
 
@@ -60,9 +63,20 @@ def inspect_recording(
             )
     parts += _motion_parts(dataset, span, times_ns)
     if recording.has_images and tracked > 1 and frames_seen:
+        tracked = _frames_to_track(recording, times_ns, tracked)
         parts += _tracking_parts(dataset, build_frontend, frames_seen[:tracked], progress)
     parts += [_reference_part(recording, times_ns), _missing_part(recording)]
     return Inspection(tuple(parts), recording.notes)
+
+
+def _frames_to_track(recording: Recording, times_ns: IntArray, tracked: int) -> int:
+    """Return the number of frames to track: more where the calibration is doubted and an IMU can
+    settle it, whose comparison of accelerations takes seconds.
+    """
+    if "imu" not in recording.motion or not doubts_among(recording.notes):
+        return tracked
+    within = int(np.searchsorted(times_ns, times_ns[0] + _SETTLED_NS))
+    return max(tracked, min(within, _MAX_TRACKED))
 
 
 def camera_part(recording: Recording) -> Part:

@@ -16,6 +16,7 @@ from vio.calibration.inertial import ImuAlignment, Rates
 from vio.calibration.lever_arm import estimate_lever_arm
 from vio.calibration.verdicts import judge_imu
 from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
 from vio.imu.findings import InertialFinding
 from vio.monitor.force_fit import MIN_WINDOWS, WINDOW_S, Evidence, ForceFit
 from vio.monitor.gyro_fit import GyroFit
@@ -29,6 +30,10 @@ _SIGN_SIGMAS = 6.0
 AXES_WORSE = 3.0  # ratio of the given axes' squared misfit to that of others
 # likewise in fewer windows; right axes came to at most 1.2 in 178 pieces of flights and drives
 _AXES_WORSE_EARLY = 9.0
+# Factor on the camera's motion from which on it is judged here; smaller ones are estimated while
+# running. Of right baselines it came to 0.96 to 1.11 in windows of 4 s and more of two flights.
+_OTHER_SCALE = 3.0
+_SCALE_EXPLAINS = 4.0  # of the camera's squared path, which the scaled readings leave a part of
 _UPSIDE_DOWN = 0.5  # cosine between image-down and up: within 60 degrees
 _UPSIDE_SHARE = 0.95
 
@@ -68,9 +73,11 @@ def resolve_size(size: Size, evidence: Evidence) -> Size:
     return size if evidence.force_final else Size(None, size.unit)
 
 
-def judge_force(evidence: Evidence, unit: float) -> tuple[list[InertialFinding], bool]:
-    """Judge axes and sign of the accelerometer, whose readings times `unit` are m/s^2; and if
-    the sign is known.
+def judge_force(
+    evidence: Evidence, unit: float, camera: StereoCamera
+) -> tuple[list[InertialFinding], bool]:
+    """Judge axes and sign of the accelerometer, whose readings times `unit` are m/s^2, and the
+    scale of the camera's motion; and if the sign is known.
     """
     gyro_fit = evidence.gyro_fit
     force = evidence.force
@@ -80,6 +87,9 @@ def judge_force(evidence: Evidence, unit: float) -> tuple[list[InertialFinding],
         wrong = _wrong_axes(evidence.early_force, R * unit)
         if wrong is not None:
             return [wrong], True
+        scaled = _wrong_scale(evidence.early_force, R * unit, camera)
+        if scaled is not None:
+            return [scaled], True
     if force is not None:
         scale, sigma = force.sign(R * unit)
         if abs(scale) > _SIGN_SIGMAS * sigma and 0.5 < abs(scale) < 2.0:
@@ -96,6 +106,36 @@ def _wrong_sign(scale: float, sigma: float) -> InertialFinding:
         "of the accelerometer",
         "all readings have the wrong sign (specific force is +9.8 m/s^2 upwards at standstill); "
         "change it",
+    )
+
+
+def _wrong_scale(force: ForceFit, C: FloatArray, camera: StereoCamera) -> InertialFinding | None:
+    """Return that the camera's accelerations are several times those of the accelerometer, as where
+    a baseline is in squares of a board or in centimetres, or depths are in another unit.
+
+    Smaller ones are no evidence, as noise of the accelerometer makes the factor small.
+    """
+    if camera.kind == "mono":
+        return None
+    scale, sigma = force.sign(C)
+    if scale < _OTHER_SCALE or scale < _SIGN_SIGMAS * sigma:
+        return None
+    best = force.cost(scale * C)
+    if best * AXES_WORSE > force.cost(C) or best * _SCALE_EXPLAINS > force.cost(0 * C):
+        return None
+    seen = (
+        f"the camera's accelerations are {scale:.3g} times (standard deviation {sigma:.2g}) those "
+        "of the accelerometer, while the gyro agrees"
+    )
+    if camera.kind == "rgbd":
+        remedy = "depths are too large by this factor: give their unit (dataset.depth_factor)"
+    else:
+        remedy = (
+            f"a baseline of {camera.baseline_m:.4g} m would be {camera.baseline_m / scale:.3g} m: "
+            "give the translation between the cameras in metres"
+        )
+    return InertialFinding(
+        "camera scale", seen, f"{remedy}; all lengths of the run are too long by it", certain=False
     )
 
 

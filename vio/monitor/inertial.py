@@ -201,7 +201,7 @@ class InertialCheck:
         agrees = gyro_fit.unexplained < AGREES
         measured = False
         if size.unit is not None and agrees and all(f.fault == "gyro units" for f in rotation):
-            forces, measured = judge_force(evidence, size.unit)
+            forces, measured = judge_force(evidence, size.unit, self._stereo)
             found += forces
         self.imu_at_fault |= any(f.certain and f.fault != "camera stamps" for f in found)
         # whatever turns out to be the cause

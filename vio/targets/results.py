@@ -15,9 +15,12 @@ from vio.datasets.yaml_files import densities_text
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.rectify import rectifying_rotations
+from vio.records import ImuDensities
 
 CAMCHAIN = "camchain-imucam.yaml"
 IMU = "imu.yaml"
+# of basalt-headers' `calibration.hpp`
+_BASALT_NOISE = ImuDensities(gyro=2.82e-4, gyro_walk=1e-4, accel=0.016, accel_walk=1e-3)
 
 
 def write_rig(folder: Path, rig: Rig) -> list[str]:
@@ -110,7 +113,7 @@ def opencv_text(rig: Rig) -> str:
     return "\n".join(lines) + "\n"
 
 
-def basalt_text(rig: Rig) -> str | None:
+def basalt_text(rig: Rig, imu_hz: float = 200.0) -> str | None:
     """Return a rig as Basalt's calibration; None: Basalt knows no such lens."""
     intrinsics = [_basalt_camera(camera) for camera in rig.cameras]
     if None in intrinsics:
@@ -125,17 +128,18 @@ def basalt_text(rig: Rig) -> str | None:
         "resolution": [[camera.width, camera.height] for camera in rig.cameras],
         "calib_accel_bias": [0.0] * 9,
         "calib_gyro_bias": [0.0] * 12,
-        "cam_time_offset_ns": round(-1e9 * rig.time_offset_s),
+        "cam_time_offset_ns": round(1e9 * rig.time_offset_s),
         "vignette": [],
+        "imu_update_rate": imu_hz,
     }
-    if rig.imu_noise is not None:
-        noise = rig.imu_noise
-        value |= {
-            "accel_noise_std": [noise.accel] * 3,
-            "gyro_noise_std": [noise.gyro] * 3,
-            "accel_bias_std": [noise.accel_walk] * 3,
-            "gyro_bias_std": [noise.gyro_walk] * 3,
-        }
+    # Basalt reads no file without them; these are its own where the rig states none
+    noise = rig.imu_noise or _BASALT_NOISE
+    value |= {
+        "accel_noise_std": [noise.accel] * 3,
+        "gyro_noise_std": [noise.gyro] * 3,
+        "accel_bias_std": [noise.accel_walk] * 3,
+        "gyro_bias_std": [noise.gyro_walk] * 3,
+    }
     return json.dumps({"value0": value}, indent=2) + "\n"
 
 

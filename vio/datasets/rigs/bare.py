@@ -8,6 +8,7 @@ Reference: ETH3D's SLAM documentation ("fx fy cx cy"); Schops et al., BAD SLAM (
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from vio.errors import CalibrationError
 from vio.files.text import text_lines
 from vio.geometry.lie import FloatArray
 
+# `458,654 457,296 367,215 248,375`: commas within numbers, and white space between them
+_DECIMAL_COMMAS = re.compile(r"(?=.*,)[+-]?\d+(?:,\d+)?(?:[\s;]+[+-]?\d+(?:,\d+)?)+")
 NAMES = (
     "calibration.txt",
     "intrinsics.txt",
@@ -58,9 +61,11 @@ def read_bare(path: Path, size: Size | None) -> Rig:
 
 def _numbers(path: Path) -> FloatArray | None:
     """Return one row of 4, 8 or 9 numbers, or a matrix; None: the file holds something else."""
-    lines = [line for _, line in text_lines(path) if line.strip()[:1] not in ("#", "")]
+    lines = [line.strip() for _, line in text_lines(path) if line.strip()[:1] not in ("#", "")]
+    if any(_DECIMAL_COMMAS.fullmatch(line) for line in lines):
+        lines = [line.replace(",", ".") for line in lines]
     try:
-        rows = [[float(x) for x in line.replace(",", " ").split()] for line in lines[:5]]
+        rows = [[float(x) for x in re.split(r"[\s,;]+", line) if x] for line in lines[:5]]
     except ValueError:
         return None
     widths = {len(row) for row in rows}

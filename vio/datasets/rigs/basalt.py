@@ -19,7 +19,7 @@ from vio.cameras.rig import Rig
 from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.rigs.source import ImuSheet, Source, rig_of_poses
-from vio.datasets.yaml_files import Entries, as_number, numbers, section
+from vio.datasets.yaml_files import Entries, as_number, numbers, section, tool_lens
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, simplest_lens
 from vio.geometry.lenses.registry import LENSES
@@ -28,7 +28,6 @@ from vio.records import NS_PER_S, ImuDensities
 
 _NOISE = ("gyro_noise_std", "gyro_bias_std", "accel_noise_std", "accel_bias_std")
 _BIAS_ENTRIES = ("calib_accel_bias", "calib_gyro_bias")
-_UCM = "ucm"  # the double sphere with one centre
 
 
 def matches(entries: Entries) -> bool:
@@ -62,19 +61,16 @@ def read(source: Source) -> Rig:
 
 def _camera(lens: Mapping[str, Any], size: Sequence[float], where: str) -> CameraModel:
     kind = str(lens.get("camera_type"))
-    known = {one.files.basalt: one for one in LENSES.values() if one.files.basalt is not None}
-    known[_UCM] = LENSES["double_sphere"]
-    if kind not in known:
-        raise CalibrationError(
-            f"{where}: camera_type {kind!r} is not read; calibrate with {', '.join(known)}"
-        )
+    known = {
+        one.files.basalt: (one.name, one.parameters)
+        for one in LENSES.values()
+        if one.files.basalt is not None
+    }
+    model, names = tool_lens("basalt", kind, f"{where}, camera_type", known)
     values = section(lens, "intrinsics", where)
     fu, fv, cu, cv = (numbers(values, name, where, 1)[0] for name in ("fx", "fy", "cx", "cy"))
-    if kind == _UCM:
-        values = {"xi": 0.0, **values}
-    names = known[kind].parameters
-    bend = tuple(numbers(values, name, where, 1)[0] for name in names)
-    model, bend = simplest_lens(known[kind].name, bend)
+    bend = tuple(numbers(values, name, where, 1)[0] if name else 0.0 for name in names)
+    model, bend = simplest_lens(model, bend)
     width, height = image_size([as_number(x) for x in size][:2], f"{where}, resolution")
     with naming(where):
         return CameraModel(fu, fv, cu, cv, width, height, model, bend)

@@ -12,7 +12,7 @@ Reference: VINS-Fusion's `parameters.cpp`, camodocal's camera models.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +22,28 @@ from vio.cameras.rig import Rig
 from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.rigs.source import ImuSheet, Source, rig_of_poses
-from vio.datasets.yaml_files import Entries, as_number, matrix, numbers, read_yaml_file, section
+from vio.datasets.yaml_files import (
+    Entries,
+    as_number,
+    matrix,
+    numbers,
+    read_yaml_file,
+    section,
+    tool_lens,
+)
 from vio.errors import CalibrationError
-from vio.geometry.distortion import CameraModel
+from vio.geometry.distortion import CameraModel, simplest_lens
 from vio.geometry.lie import FloatArray, checked_transform
 
 _NOISE = ("acc_n", "gyr_n")
 _UNKNOWN_POSES = 2  # of estimate_extrinsic
+# focal lengths and principal point of its models
+_PROJECTIONS = (
+    ("fx", "fy", "cx", "cy"),
+    ("gamma1", "gamma2", "u0", "v0"),
+    ("mu", "mv", "u0", "v0"),
+)
+_OPTIONAL = {"k3": 0.0, "k4": 0.0, "k5": 0.0, "k6": 0.0}  # of PINHOLE_FULL
 
 
 def matches(entries: Entries) -> bool:
@@ -108,42 +123,24 @@ def camodocal_camera(entries: Entries, where: str) -> CameraModel:
     Raises:
         CalibrationError: an entry is missing or impossible, or the lens model is not read.
     """
-    kind = str(entries.get("model_type")).upper()
+    model, coefficients = tool_lens("camodocal", entries.get("model_type"), f"{where}, model_type")
     size = [numbers(entries, f"image_{name}", where, 1)[0] for name in ("width", "height")]
     width, height = image_size(size, where)
     projection = section(entries, "projection_parameters", where)
-    if kind == "KANNALA_BRANDT":
-        fu, fv, cu, cv, *bend = _values(projection, "mu mv u0 v0 k2 k3 k4 k5", where)
-        return _camera((fu, fv, cu, cv, width, height), "equidistant", tuple(bend), where)
-    bend_block = entries.get("distortion_parameters")
-    block = {str(k): v for k, v in bend_block.items()} if isinstance(bend_block, dict) else {}
-    if kind == "MEI":
-        xi = _values(section(entries, "mirror_parameters", where), "xi", where)
-        fu, fv, cu, cv = _values(projection, "gamma1 gamma2 u0 v0", where)
-        four = _values(block, "k1 k2 p1 p2", where)
-        whole = (*xi, *(four if any(four) else ()))
-        return _camera((fu, fv, cu, cv, width, height), "unified", whole, where)
-    if kind not in ("PINHOLE", "PINHOLE_FULL"):
-        raise CalibrationError(
-            f"{where}: model_type {kind!r} is not read; calibrate with PINHOLE, MEI or "
-            "KANNALA_BRANDT"
-        )
-    names = "k1 k2 p1 p2" if kind == "PINHOLE" else "k1 k2 p1 p2 k3 k4 k5 k6"
-    fu, fv, cu, cv = _values(projection, "fx fy cx cy", where)
-    bend = list(_values({"k3": 0, "k4": 0, "k5": 0, "k6": 0, **block}, names, where))
-    model = "radtan" if any(bend) else "pinhole"
-    return _camera((fu, fv, cu, cv, width, height), model, tuple(bend) if any(bend) else (), where)
-
-
-def _camera(
-    intrinsics: tuple[float, float, float, float, int, int],
-    model: Any,
-    bend: tuple[float, ...],
-    where: str,
-) -> CameraModel:
+    # the coefficients stand in blocks of their own, or beside the focal lengths
+    blocks = [entries.get(name) for name in ("mirror_parameters", "distortion_parameters")]
+    stated = {**_OPTIONAL, **projection}
+    for block in blocks:
+        stated |= block if isinstance(block, dict) else {}
+    names = next((four for four in _PROJECTIONS if four[0] in projection), _PROJECTIONS[0])
+    fu, fv, cu, cv = _values(projection, names, where)
+    bend = _values(stated, coefficients, where)
+    if model == "unified" and not any(bend[1:]):
+        bend = bend[:1]
+    model, bend = simplest_lens(model, bend)
     with naming(where):
-        return CameraModel(*intrinsics, model, bend)
+        return CameraModel(fu, fv, cu, cv, width, height, model, bend)
 
 
-def _values(block: Mapping[str, Any], names: str, where: str) -> tuple[float, ...]:
-    return tuple(numbers(block, name, where, 1)[0] for name in names.split())
+def _values(block: Mapping[str, Any], names: Sequence[str], where: str) -> tuple[float, ...]:
+    return tuple(numbers(block, name, where, 1)[0] for name in names)

@@ -24,16 +24,17 @@ from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.opencv import coefficients_of
 from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.rigs.source import Size, Source
-from vio.datasets.yaml_files import Entries, as_number, matrix, numbers, section
+from vio.datasets.yaml_files import Entries, as_number, matrix, numbers, section, tool_lens
 from vio.errors import CalibrationError
-from vio.geometry.distortion import CameraModel, DistortionModel
+from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, se3_inverse
 
 _CM = 0.01  # metres
 _LEFT = 1  # sockets where none are stated
 _RIGHT = 2
 _IMU = -2  # stands for the IMU's socket
-_FISHEYE = 1  # of cameraType
+# of `cameraType`, by its number
+_TYPES = ("perspective", "fisheye", "equirectangular", "radial division", "cylindrical")
 _SAME_SCALE = 0.01
 Blocks = Mapping[int, Mapping[str, Any]]
 
@@ -105,8 +106,9 @@ def _camera(block: Mapping[str, Any], size: Size | None, where: str) -> CameraMo
     stated = image_size([as_number(block.get(name)) for name in ("width", "height")], where)
     K = matrix(block.get("intrinsicMatrix"), (3, 3), f"{where}, intrinsicMatrix")
     D = numbers(block, "distortionCoeff", where) if block.get("distortionCoeff") else ()
-    fisheye = as_number(block.get("cameraType", 0)) == _FISHEYE
-    model: DistortionModel = "equidistant" if fisheye else "radtan"
+    kind = as_number(block.get("cameraType", 0))
+    name = _TYPES[int(kind)] if kind in range(len(_TYPES)) else block.get("cameraType")
+    model, _ = tool_lens("depthai", name, f"{where}, cameraType")
     used = stated
     if size is not None and size != stated:
         scales = np.array(size) / stated

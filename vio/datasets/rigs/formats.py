@@ -22,7 +22,18 @@ from vio.datasets.kitti_raw import (
     read_imu_pose,
     read_perspective,
 )
-from vio.datasets.rigs import bare, basalt, boofcv, camodocal, depthai, okvis, orbslam, zed
+from vio.datasets.rigs import (
+    bare,
+    basalt,
+    boofcv,
+    camodocal,
+    depthai,
+    eth3d,
+    monado,
+    okvis,
+    orbslam,
+    zed,
+)
 from vio.datasets.rigs.boofcv import is_boofcv, read_boofcv
 from vio.datasets.rigs.camera_info import (
     is_camera_info,
@@ -52,7 +63,7 @@ KNOWN = (
     "Kalibr's camchain.yaml or camchain-imucam.yaml, EuRoC's sensor.yaml (mav0), KITTI's calib.txt "
     "or calib_cam_to_cam.txt, OpenCV's stereo .yml or .xml (M1 D1 M2 D2 R T), ROS's left.yaml and "
     "right.yaml, or BoofCV's stereo.xml; or the settings of ORB-SLAM, VINS, OKVIS, Kimera or SVO, "
-    "Basalt's or DepthAI's JSON, or a ZED's SN*.conf"
+    "Basalt's, Monado's or DepthAI's JSON, or a ZED's SN*.conf"
 )
 # File names looked for in a folder, in this order; the content decides what they are.
 _IN_FOLDER = (
@@ -67,6 +78,7 @@ _MAX_OTHERS = 40  # files looked into; a folder with more is no recording's
 _FORMATS: tuple[tuple[Callable[[Entries], bool], Callable[[Source], Rig]], ...] = (
     (is_camchain, lambda source: read_camchain(source.path)),
     (camodocal.matches, camodocal.read),
+    (monado.matches, monado.read),
     (okvis.matches, okvis.read),
     (orbslam.matches, orbslam.read),
     (boofcv.matches, boofcv.read),
@@ -178,6 +190,8 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
             return checked_rig(Rig(rect0, rect1, T_rect1_rect0), path)
     if is_four_seasons(path):
         return read_four_seasons(path, image_size)
+    if path.name == eth3d.EXTRINSICS:
+        return eth3d.read_eth3d(path, image_size)
     if suffix == ".txt" and bare.is_bare(path):
         return bare.read_bare(path, image_size)
     if suffix == ".txt":

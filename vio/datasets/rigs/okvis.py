@@ -2,7 +2,8 @@
 
 OKVIS: `cameras` with `T_SC`, which maps coordinates of the camera to the IMU (the sensor S);
 the `T_BS` of the IMU is its pose on a body and not needed. `image_delay` is subtracted from
-the cameras' stamps to have the IMU's. Noise: `sigma_g_c sigma_gw_c sigma_a_c sigma_aw_c`, densities.
+the cameras' stamps to have the IMU's. `cam_model: eucm` has `eucm_parameters`, alpha beta.
+Noise: `sigma_g_c sigma_gw_c sigma_a_c sigma_aw_c`, densities.
 
 ncamera: `cameras` with a `camera` block each and `T_B_C`, which maps coordinates of the camera to the
 body, which is the IMU (or `T_C_B`, its inverse); SVO's `imu_params.delay_imu_cam` is subtracted likewise. Noise:
@@ -22,7 +23,15 @@ from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.opencv import coefficients_of
 from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.rigs.source import ImuSheet, Source, rig_of_poses
-from vio.datasets.yaml_files import Entries, as_number, lens_model, matrix, numbers, section
+from vio.datasets.yaml_files import (
+    Entries,
+    as_number,
+    lens_model,
+    matrix,
+    numbers,
+    section,
+    tool_lens,
+)
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
@@ -32,8 +41,7 @@ _NOISE = (  # gyro, its walk, accelerometer, its walk
     ("sigma_g_c", "sigma_gw_c", "sigma_a_c", "sigma_aw_c"),
     ("sigma_omega_c", "sigma_omega_bias_c", "sigma_acc_c", "sigma_acc_bias_c"),
 )
-_OKVIS_TYPES = {"radialtangential8": 8}
-_UNIFIED = ("unified-projection", "omni")
+_OKVIS_TYPES = {"radialtangential8": 8, "plumb_bob8": 8}
 
 
 def matches(entries: Entries) -> bool:
@@ -91,11 +99,13 @@ def _pose(value: object, where: str) -> FloatArray:
 
 def _okvis_camera(item: Mapping[str, Any], where: str) -> CameraModel:
     kind = str(item.get("cam_model", "pinhole")).lower()
-    if kind != "pinhole":
-        raise CalibrationError(f"{where}: cam_model {kind!r} is not read; calibrate with pinhole")
     size = image_size(numbers(item, "image_dimension", where, 2), f"{where}, image_dimension")
     focal = numbers(item, "focal_length", where, 2)
     centre = numbers(item, "principal_point", where, 2)
+    if kind != "pinhole":
+        model, names = tool_lens("okvis", kind, f"{where}, cam_model")
+        bend = numbers(item, f"{kind}_parameters", where, len(names))
+        return _camera((*focal, *centre), size, model, bend, where)
     name = str(item.get("distortion_type", "none")).lower()
     model = lens_model(name, where)
     bend = () if model == "pinhole" else numbers(item, "distortion_coefficients", where)
@@ -119,15 +129,20 @@ def _ncamera(block: Mapping[str, Any], where: str) -> CameraModel:
         if model == "pinhole"
         else tuple(matrix(parameters, None, f"{where}, distortion").ravel().tolist())
     )
-    leading = 1 if kind in _UNIFIED else 0
-    if kind not in ("pinhole", *_UNIFIED) or len(values) != leading + 4:
+    leading = 0
+    if kind != "pinhole":
+        if model not in ("pinhole", "radtan") and any(bend):
+            raise CalibrationError(
+                f"{where}: a camera of type {kind!r} with distortion {name!r} is not read"
+            )
+        model, names = tool_lens("ncamera", kind, f"{where}, type")
+        leading = len(names)
+        bend = (*values[:leading], *(bend if any(bend) else ()))
+    if len(values) != leading + 4:
         raise CalibrationError(
             f"{where}: a camera of type {kind!r} with {len(values)} intrinsics is not read; "
-            "calibrate with pinhole or unified-projection"
+            f"calibrate one with {leading + 4}"
         )
-    if leading:
-        bend = (values[0], *(bend if any(bend) else ()))
-        model = "unified"
     return _camera(tuple(values[leading:]), image_size(size, where), str(model), bend, where)
 
 

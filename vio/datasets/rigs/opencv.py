@@ -3,7 +3,8 @@
 
 `R` and `T` map points of the first camera to the second. Names are those of OpenCV's samples
 (`M1 D1 M2 D2 R T` in one file, or in `intrinsics.yml` and `extrinsics.yml`), of common tutorials,
-and of ORB-SLAM's `LEFT.K`. A file with `P1` and `P2` and no raw matrices describes images that are
+and of ORB-SLAM's `LEFT.K`. With `xi1` and `xi2` (`omnidir::stereoCalibrate`) lenses are unified ones, and
+the rotation may be a vector `rvec`. A file with `P1` and `P2` and no raw matrices describes images that are
 rectified already.
 """
 
@@ -21,7 +22,7 @@ from vio.datasets.rigs.plausible import checked_rig, unit_doubt
 from vio.datasets.yaml_files import Entries, as_number, lens_model, matrix, read_yaml_file
 from vio.errors import CalibrationError
 from vio.geometry.distortion import DistortionModel
-from vio.geometry.lie import FloatArray, checked_transform
+from vio.geometry.lie import FloatArray, checked_transform, so3_exp
 from vio.geometry.rectify import vertical_fault
 
 _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
@@ -29,16 +30,21 @@ _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
             "mtxL", "KL"),
     "K1": ("M2", "K2", "cameraMatrix2", "camera_matrix_2", "cameraMatrixR", "K_right", "right_camera_matrix",
             "RIGHT.K", "mtxR", "KR"),
-    "D0": ("D1", "distCoeffs1", "dist_coeffs_1", "distCoeffsL", "D_left", "left_distortion", "LEFT.D", "distL", "DL"),
+    "D0": ("D1", "distCoeffs1", "dist_coeffs_1", "distCoeffsL", "D_left", "left_distortion", "LEFT.D", "distL", "DL",
+            "distortion_coefficients_1", "distCoeff1", "dist1", "distortion_left"),
     "D1": ("D2", "distCoeffs2", "dist_coeffs_2", "distCoeffsR", "D_right", "right_distortion", "RIGHT.D", "distR",
-            "DR"),
-    "R": ("R", "rotation", "Rot", "R_stereo"),
-    "T": ("T", "translation", "Trns", "T_stereo"),
+            "DR", "distortion_coefficients_2", "distCoeff2", "dist2", "distortion_right"),
+    "xi0": ("xi1", "xi_1", "xiL", "xi_left"),
+    "xi1": ("xi2", "xi_2", "xiR", "xi_right"),
+    "R": ("R", "rotation", "Rot", "R_stereo", "rotation_matrix", "rvec", "om"),
+    "T": ("T", "translation", "Trns", "T_stereo", "translation_vector", "tvec"),
     "R0": ("R1", "LEFT.R", "RL"),
     "R1": ("R2", "RIGHT.R", "RR"),
     "P0": ("P1", "LEFT.P", "projMatrixL", "PL"),
     "P1": ("P2", "RIGHT.P", "projMatrixR", "PR"),
 }  # fmt: skip
+_LONG_NAME = 6  # letters
+_ROTATION_VECTORS = ("rvec", "om")  # of `omnidir::stereoCalibrate`
 _SIZES = (
     ("image_width", "image_height"),
     ("width", "height"),
@@ -97,24 +103,48 @@ def _raw(entries: Entries, where: str, width: int, height: int) -> Rig:
     model = lens_model(stated, where) if named else "radtan"
     notes: list[str] = []
     cameras = []
-    for K, key in ((K0, "D0"), (K1, "D1")):
+    for K, key, mirror in ((K0, "D0", "xi0"), (K1, "D1", "xi1")):
         found = _find(entries, key)
+        if found is None:
+            notes.append(_no_distortion(entries, where))
         D = (
             ()
             if found is None
             else tuple(np.ravel(matrix(found, None, f"{where}, {_name(entries, key)}")).tolist())
         )
-        if len(D) == 4 and stated is None and any(D):
+        lens = model
+        if _find(entries, mirror) is not None:
+            xi = float(_required(entries, mirror, (1, 1), where)[0, 0])
+            lens = "unified"
+            D = (xi, *(D if any(D) else ()))
+        elif len(D) == 4 and stated is None and any(D):
             notes.append(
                 f"{where}: four coefficients without a model's name are read as k1 k2 p1 p2; for a "
                 "fisheye lens add "
                 "'distortion_model: equidistant'"
             )
         with naming(where):
-            cameras.append(camera_from_matrix(K, width, height, model, coefficients_of(model, D)))
+            cameras.append(camera_from_matrix(K, width, height, lens, coefficients_of(lens, D)))
     pose = _stereo_pose(entries, where)
     with naming(where):
         return Rig(cameras[0], cameras[1], pose, notes=tuple(dict.fromkeys(notes)))
+
+
+def _no_distortion(entries: Entries, where: str) -> str:
+    """Return the note that a camera has no distortion coefficients.
+
+    Raises:
+        CalibrationError: there are some, by a name that is not known.
+    """
+    known = {name for names in _NAMES.values() for name in names}
+    unread = [name for name in entries if "dist" in name.lower() and name not in known]
+    unread = [name for name in unread if isinstance(entries[name], (list, dict))]
+    if unread:
+        raise CalibrationError(
+            f"{where}: the distortion coefficients may be those of {unread[0]!r}, a name that is "
+            "not known; rename those of the two cameras D1 and D2"
+        )
+    return f"{where}: states no distortion coefficients; the lenses are read as having none"
 
 
 def _stereo_pose(entries: Entries, where: str) -> FloatArray:
@@ -123,6 +153,8 @@ def _stereo_pose(entries: Entries, where: str) -> FloatArray:
     """
     if _find(entries, "T") is not None:
         R = _required(entries, "R", None, where)
+        if R.size == 3 and _name(entries, "R") in _ROTATION_VECTORS:
+            R = so3_exp(R.ravel())
         if R.size == 3:
             raise CalibrationError(
                 f"{where}: R holds 3 numbers (a rotation vector); write the 3x3 matrix"
@@ -215,11 +247,19 @@ def _size(
 
 
 def _find(entries: Entries, key: str) -> object | None:
-    return next((entries[name] for name in _NAMES[key] if name in entries), None)
+    return entries.get(_name(entries, key))
 
 
 def _name(entries: Entries, key: str) -> str:
-    return next((name for name in _NAMES[key] if name in entries), _NAMES[key][0])
+    """Return the name of an entry in the file, else the first that it may have.
+
+    Long names are found in any case; of short ones `k1` is a coefficient and `K1` a matrix.
+    """
+    exact = next((name for name in _NAMES[key] if name in entries), None)
+    if exact is not None:
+        return exact
+    long = {name.lower() for name in _NAMES[key] if len(name) >= _LONG_NAME}
+    return next((name for name in entries if name.lower() in long), _NAMES[key][0])
 
 
 def _required(entries: Entries, key: str, shape: tuple[int, int] | None, where: str) -> FloatArray:

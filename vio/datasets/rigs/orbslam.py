@@ -17,10 +17,10 @@ import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import image_size, naming
-from vio.datasets.rigs.opencv import rig_from_opencv
+from vio.datasets.rigs.opencv import coefficients_of, rig_from_opencv
 from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.rigs.source import Size, Source
-from vio.datasets.yaml_files import Entries, as_number, matrix, numbers
+from vio.datasets.yaml_files import Entries, as_number, matrix, numbers, tool_lens
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
@@ -29,7 +29,6 @@ from vio.records import ImuDensities
 _NOISE = ("IMU.NoiseGyro", "IMU.GyroWalk", "IMU.NoiseAcc", "IMU.AccWalk")
 _POSES_OF_CAMERA = ("IMU.T_b_c1", "Tbc")
 _POSES_OF_RIGHT = ("Stereo.T_c1_c2", "Tlr")
-_FISHEYE = "kannalabrandt8"
 
 
 def matches(entries: Entries) -> bool:
@@ -95,21 +94,12 @@ def _camera(entries: Entries, name: str, size: Size, where: str) -> CameraModel:
         numbers(entries, f"{name}.{key}", where, 1)[0] for key in ("fx", "fy", "cx", "cy")
     )
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    kind = str(entries.get("Camera.type", "PinHole")).lower()
+    kind = entries.get("Camera.type", "PinHole")
+    model, names = tool_lens("orbslam", kind, f"{where}, Camera.type")
+    # absent ones are zero
+    bend = tuple(as_number(entries.get(f"{name}.{key}", 0.0)) for key in names)
     with naming(f"{where}, {name}"):
-        if kind == _FISHEYE:
-            return camera_from_matrix(K, *size, "equidistant", _bend(entries, name, "k1 k2 k3 k4"))
-        if kind == "rectified":
-            return camera_from_matrix(K, *size)
-        if kind != "pinhole":
-            raise CalibrationError(f"Camera.type {kind!r} is not read")
-        bend = _bend(entries, name, "k1 k2 p1 p2 k3")
-        return camera_from_matrix(K, *size, "radtan", bend if bend[4] else bend[:4])
-
-
-def _bend(entries: Entries, name: str, keys: str) -> tuple[float, ...]:
-    """Return distortion coefficients; absent ones are zero."""
-    return tuple(as_number(entries.get(f"{name}.{key}", 0.0)) for key in keys.split())
+        return camera_from_matrix(K, *size, model, coefficients_of(model, bend))
 
 
 def _baseline(entries: Entries, cam0: CameraModel, where: str) -> float | None:

@@ -17,10 +17,16 @@ from vio.geometry.distortion import CameraModel
 
 # Ratio of twice the principal point to the image size, along both axes in one direction, beyond
 # which the images are of another size. One axis may be off by a tenth (KITTI's raw images), but of
-# twelve real cameras none is off by more than 0.02 along both in one direction.
-_OTHER_SIZE = 1.1
+# twelve real cameras none is off by more than 0.02 along both in one direction. A smaller scaling
+# shows in the turns against a gyro alone (`vio.monitor.rotation_comparison`).
+_SCALED = 1.05
+# Ratio of the two focal lengths beyond which images were stretched
+_STRETCHED = 1.1
 # Likewise along one axis, as of images that were cropped
 _CROPPED = 1.3
+# tangent of half the field of view that no planar lens exceeds (170 degrees)
+_MAX_HALF_VIEW = 11.43
+FAR_IMU_M = 10.0  # an IMU further from its camera is no length in metres
 # A board's square is 0.02 to 0.1 m and a rig's baseline 0.05 to 0.6 m, so that in squares a
 # baseline is seldom below 1, and in metres seldom above.
 _SQUARES_M = 1.0
@@ -38,15 +44,59 @@ def checked_rig(rig: Rig, where: Path | str, *, size_stated: bool = True) -> Rig
         CalibrationError: a principal point lies outside the images.
     """
     for camera in rig.cameras:
-        check_principal_point(camera, where)
-    if size_stated:
-        return rig
-    doubt = _size_doubt(rig.cam0, where)
-    return rig if doubt is None else rig.noting(doubt)
+        check_camera(camera, where)
+    doubts = [_distance_doubt(rig, where)]
+    if not size_stated:
+        doubts += [_size_doubt(rig.cam0, where), _aspect_doubt(rig.cam0, where)]
+    for doubt in doubts:
+        rig = rig if doubt is None else rig.noting(doubt)
+    return rig
 
 
-def check_principal_point(camera: CameraModel, where: Path | str) -> None:
-    """Raise CalibrationError where the principal point of a camera is outside its images."""
+def _check_focal_length(camera: CameraModel, where: Path | str) -> None:
+    """Raise CalibrationError where a planar lens would see more than any does."""
+    if not camera.lens.planar or camera.fu * _MAX_HALF_VIEW > camera.width / 2:
+        return
+    angle = np.degrees(2 * np.arctan2(camera.width / 2, camera.fu))
+    raise CalibrationError(
+        f"{where}: a focal length of {camera.fu:g} pixels makes a field of view of {angle:.0f} "
+        f"degrees of images {camera.width} pixels wide; focal lengths and principal points must be "
+        "pixels, not millimetres or shares of the width"
+    )
+
+
+def _distance_doubt(rig: Rig, where: Path | str) -> str | None:
+    """Return the doubt about an IMU that is farther from the camera than on any rig."""
+    if rig.T_cam0_imu is None:
+        return None
+    distance_m = float(np.linalg.norm(rig.T_cam0_imu[:3, 3]))
+    if distance_m <= FAR_IMU_M:
+        return None
+    return (
+        f"{where}: doubtful: the IMU is {distance_m:.4g} m from the left camera, if the unit is the "
+        f"metre; if it is the millimetre, it is {distance_m / 1000:.4g} m: divide the translation of "
+        "its pose by 1000"
+    )
+
+
+def _aspect_doubt(camera: CameraModel, where: Path | str) -> str | None:
+    """Return the doubt about focal lengths that differ, as where fx cx fy cy are written for fx fy
+    cx cy.
+    """
+    ratio = camera.fu / camera.fv
+    if 1 / _STRETCHED <= ratio <= _STRETCHED:
+        return None
+    return (
+        f"{where}: doubtful: its focal lengths {camera.fu:g} and {camera.fv:g} pixels differ, as of "
+        "images that were stretched; if they were not, check the order of its numbers: fx fy cx cy"
+    )
+
+
+def check_camera(camera: CameraModel, where: Path | str) -> None:
+    """Raise CalibrationError where the focal length of a camera is no number of pixels, or its
+    principal point is outside its images.
+    """
+    _check_focal_length(camera, where)
     if 0 < camera.cu < camera.width and 0 < camera.cv < camera.height:
         return
     raise CalibrationError(
@@ -61,7 +111,7 @@ def _size_doubt(camera: CameraModel, where: Path | str) -> str | None:
     middle.
     """
     ratios = np.array([2 * camera.cu / camera.width, 2 * camera.cv / camera.height])
-    scaled = ratios.min() > _OTHER_SIZE or ratios.max() < 1 / _OTHER_SIZE
+    scaled = ratios.min() > _SCALED or ratios.max() < 1 / _SCALED
     cropped = ratios.max() > _CROPPED or ratios.min() < 2 - _CROPPED
     if not (scaled or cropped):
         return None

@@ -17,6 +17,7 @@ from vio.geometry.lenses.model import (
     FileNames,
     KalibrForm,
     Lens,
+    ToolForm,
     plane_by_point,
     unit_ray,
 )
@@ -36,7 +37,12 @@ class DoubleSphere(Lens):
     name = "double_sphere"
     parameters = ("xi", "alpha")
     counts = (2,)
-    files = FileNames(kalibr={2: KalibrForm("ds", "none", 2)}, basalt="ds")
+    files = FileNames(
+        kalibr={2: KalibrForm("ds", "none", 2)},
+        basalt="ds",
+        # the unified model in Basalt's parameters is a double sphere with one centre
+        tools=(ToolForm("basalt", "ucm", ("", "alpha")),),
+    )
     choices = (Choice("double_sphere", 2, 3),)
 
     def fault(self, c: Coefficients) -> str | None:

@@ -17,6 +17,7 @@ from vio.geometry.lenses.model import (
     FileNames,
     KalibrForm,
     Lens,
+    ToolForm,
     near_axis,
     plane_by_point,
 )
@@ -55,6 +56,12 @@ class Equidistant(Lens):
         kalibr={4: KalibrForm("pinhole", "equidistant", 0)},
         ros={4: "equidistant"},
         basalt="kb4",
+        tools=(
+            ToolForm("camodocal", "kannala_brandt", ("k2", "k3", "k4", "k5")),
+            ToolForm("orbslam", "kannalabrandt8", ("k1", "k2", "k3", "k4")),
+            ToolForm("monado", "fisheye_equidistant4", ("k1", "k2", "k3", "k4")),
+            ToolForm("depthai", "fisheye"),
+        ),
         sensor_yaml="equidistant",
         colmap={4: ("OPENCV_FISHEYE", 4)},
     )

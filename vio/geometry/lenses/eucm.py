@@ -19,6 +19,7 @@ from vio.geometry.lenses.model import (
     FileNames,
     KalibrForm,
     Lens,
+    ToolForm,
     plane_by_point,
     unit_ray,
 )
@@ -37,7 +38,10 @@ class EnhancedUnified(Lens):
     parameters = ("alpha", "beta")
     counts = (2,)
     files = FileNames(
-        kalibr={2: KalibrForm("eucm", "none", 2)}, basalt="eucm", colmap={2: ("EUCM", 2)}
+        kalibr={2: KalibrForm("eucm", "none", 2)},
+        basalt="eucm",
+        tools=(ToolForm("okvis", "eucm", ("alpha", "beta")),),
+        colmap={2: ("EUCM", 2)},
     )
     choices = (Choice("eucm", 2, 4),)
 

@@ -33,6 +33,16 @@ class KalibrForm:
 
 
 @dataclass(frozen=True, slots=True)
+class ToolForm:
+    """A model in the files of a tool that names models in a way of its own."""
+
+    tool: str  # whose files they are
+    name: str  # of the model there, in small letters
+    # names of its coefficients there, in our order; an empty name is a zero
+    coefficients: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class FileNames:
     """What files call a model, by the number of its coefficients; absent: they do not know it."""
 
@@ -46,6 +56,7 @@ class FileNames:
     )
     # entries of Basalt that are no coefficients, as written
     basalt_constants: Mapping[str, float] = field(default_factory=dict)
+    tools: tuple[ToolForm, ...] = ()  # of files that are read and not written
     sensor_yaml: str | None = None  # distortion_model of EuRoC's sensor.yaml, as written
     opencv: bool = False  # whether OpenCV's calib3d takes the coefficients as they are
     # name, and number of coefficients, the missing of which are zero there

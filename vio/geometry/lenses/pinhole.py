@@ -10,6 +10,7 @@ from vio.geometry.lenses.model import (
     FileNames,
     KalibrForm,
     Lens,
+    ToolForm,
     plane_by_point,
 )
 from vio.geometry.lie import FloatArray
@@ -41,6 +42,7 @@ class Pinhole(Lens):
         kalibr={0: KalibrForm("pinhole", "none", 0)},
         ros={0: "plumb_bob"},
         basalt="pinhole",
+        tools=(ToolForm("orbslam", "rectified"),),
         sensor_yaml="radial-tangential",
         opencv=True,
         colmap={0: ("PINHOLE", 0)},

@@ -17,6 +17,7 @@ from vio.geometry.lenses.model import (
     FileNames,
     KalibrForm,
     Lens,
+    ToolForm,
 )
 from vio.geometry.lenses.pinhole import pinhole, pinhole_by_point
 from vio.geometry.lie import FloatArray
@@ -166,12 +167,20 @@ class RadialTangential(Lens):
             "rational_polynomial",
             "radialtangential",  # OKVIS
             "radialtangential8",
+            "plumb_bob8",  # OKVIS2
         ),
         # Kalibr itself has four coefficients.
         kalibr=dict.fromkeys((4, 5, 8), KalibrForm("pinhole", "radtan", 0)),
         ros={4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"},
         basalt="pinhole-radtan8",
         basalt_constants={"rpmax": 0.0},  # no limit of the radius
+        tools=(
+            ToolForm("camodocal", "pinhole", ("k1", "k2", "p1", "p2")),
+            ToolForm("camodocal", "pinhole_full", parameters),
+            ToolForm("orbslam", "pinhole", parameters[:5]),
+            ToolForm("monado", "pinhole_radtan5", parameters[:5]),
+            ToolForm("depthai", "perspective"),
+        ),
         sensor_yaml="radial-tangential",
         opencv=True,
         colmap={4: ("OPENCV", 4), 5: ("FULL_OPENCV", 8), 8: ("FULL_OPENCV", 8)},

@@ -18,6 +18,7 @@ from vio.geometry.lenses.model import (
     FileNames,
     KalibrForm,
     Lens,
+    ToolForm,
     plane_by_point,
     unit_ray,
 )
@@ -61,6 +62,11 @@ class Unified(Lens):
     counts = (1, 5)
     files = FileNames(
         kalibr={1: KalibrForm("omni", "none", 1), 5: KalibrForm("omni", "radtan", 1)},
+        tools=(
+            ToolForm("camodocal", "mei", ("xi", "k1", "k2", "p1", "p2")),
+            ToolForm("ncamera", "unified-projection", ("xi",)),
+            ToolForm("ncamera", "omni", ("xi",)),
+        ),
     )
     choices = (Choice("unified", 5, 7),)
 

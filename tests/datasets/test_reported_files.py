@@ -1,0 +1,299 @@
+"""Files as people report that they have them: read as they are meant, doubted, or refused with the
+cause.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import vio
+from tests.euroc_maker import RADTAN_RIG
+from tests.plain_maker import make_plain
+from vio.datasets import open_dataset
+from vio.datasets.image_pairs import ImageDataset
+from vio.datasets.images import exif_turn
+from vio.datasets.rigs.kalibr import kalibr_text
+from vio.datasets.sides import split_sides
+from vio.errors import CalibrationError, DataError, VioError
+from vio.geometry.distortion import CameraModel
+from vio.geometry.lie import quat_xyzw_from_rotation, se3_exp, se3_from_parts, so3_exp
+from vio.records import ImuSample, StereoFrame
+
+RADTAN_PAIR = (RADTAN_RIG.cam0, RADTAN_RIG.cam1)
+STAMPS = [1700000000_000000000 + 50_000_000 * k for k in range(4)]
+
+
+def _samples(folder: Path) -> tuple[list[int], np.ndarray]:
+    dataset = open_dataset(folder)
+    assert isinstance(dataset, ImageDataset)
+    samples = [sample for sample in dataset.motion if isinstance(sample, ImuSample)]
+    return [e.time_ns for e in samples], np.array([[*e.gyro, *e.accel] for e in samples])
+
+
+def _rewritten(change: Callable[[str], str | bytes]) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        file = folder / "imu.csv"
+        found = change(file.read_text())
+        file.write_bytes(found.encode() if isinstance(found, str) else found)
+
+    return write
+
+
+def _decimal_commas(separator: str) -> Callable[[str], str]:
+    return lambda text: text.replace(",", separator).replace(".", ",")
+
+
+def _seconds_and_nanoseconds(text: str) -> str:
+    head, *lines = text.splitlines()
+    split = [re.sub(r"^(\d+)(\d{9}),", r"\1,\2,", line) for line in lines]
+    return "\n".join([head.replace("#timestamp [ns]", "sec,nanosec"), *split]) + "\n"
+
+
+IMU_FORMS: dict[str, Callable[[str], str | bytes]] = {
+    "Windows' line ends and a byte order mark": lambda t: ("\ufeff" + t).replace("\n", "\r\n"),
+    "UTF-16, as PowerShell writes": lambda t: t.encode("utf-16"),
+    "decimal commas between semicolons": _decimal_commas(";"),
+    "decimal commas between tabs": _decimal_commas("\t"),
+    "cells in quotes": lambda t: re.sub(r"[^,\n]+", lambda cell: f'"{cell[0]}"', t),
+    "a comma at each line's end": lambda t: t.replace("\n", ",\n"),
+    "seconds and nanoseconds in two columns": _seconds_and_nanoseconds,
+}
+
+
+@pytest.mark.parametrize("form", IMU_FORMS)
+def test_an_imu_is_read_alike_in_the_forms_of_other_programs(form: str, tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    times_ns, values = _samples(folder)
+    _rewritten(IMU_FORMS[form])(folder)
+    found_ns, found = _samples(folder)
+    assert found_ns == times_ns
+    np.testing.assert_array_equal(found, values)
+
+
+def test_a_recording_that_was_cut_in_its_last_line_is_read(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    times_ns, values = _samples(folder)
+    _rewritten(lambda text: text[:-20])(folder)
+    found_ns, found = _samples(folder)
+    assert found_ns == times_ns[:-1]
+    np.testing.assert_array_equal(found, values[:-1])
+    assert any("ends too early" in note for note in open_dataset(folder).recording.notes)
+
+
+def test_readings_of_a_driver_that_has_none_yet_are_left_out(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    times_ns, values = _samples(folder)
+    _rewritten(lambda text: re.sub(r"^(\d+),.*$", r"\1" + 6 * ",nan", text, count=2, flags=re.M))(
+        folder
+    )
+    found_ns, found = _samples(folder)
+    assert found_ns == times_ns[2:]
+    np.testing.assert_array_equal(found, values[2:])
+    notes = open_dataset(folder).recording.notes
+    assert any("2 readings are not numbers and are left out" in note for note in notes)
+
+
+def test_a_unit_in_another_language_is_doubted(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    _rewritten(lambda text: text.replace("wx,wy,wz", "wx [Grad/s],wy [Grad/s],wz [Grad/s]"))(folder)
+    (doubt,) = [n for n in open_dataset(folder).recording.notes if "doubtful" in n]
+    assert "'grad/s' of the gyro is not known" in doubt
+
+
+TIME_LISTS: dict[str, Callable[[list[tuple[int, str]]], str | bytes]] = {
+    "UTF-16": lambda rows: "".join(f"{s}\r\n" for _, s in rows).encode("utf-16"),
+    "a number before each time": lambda rows: "".join(f"{k} {s}\n" for k, s in rows),
+    "numbers from one": lambda rows: "".join(f"{k + 1} {s}\n" for k, s in rows),
+    "a header": lambda rows: "frame,timestamp\n" + "".join(f"{k},{s}\n" for k, s in rows),
+    "the time before the name": lambda rows: "".join(f"{s} left/{k}.png\n" for k, s in rows),
+}
+
+
+@pytest.mark.parametrize("form", TIME_LISTS)
+def test_lists_of_times_are_read(form: str, tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    rows = [(k, f"{t // 10**9}.{t % 10**9:09d}") for k, t in enumerate(STAMPS)]
+    found = TIME_LISTS[form](rows)
+    (folder / "times.txt").write_bytes(found.encode() if isinstance(found, str) else found)
+    assert open_dataset(folder).recording.frame_times_ns.tolist() == STAMPS
+
+
+@pytest.mark.parametrize(
+    ("folder", "name"),
+    [
+        ("images", lambda side, k: f"{('left', 'right')[side]}{k:02d}.png"),
+        ("images", lambda side, k: f"frame{k:04d}_cam{side}.png"),
+        (".", lambda side, k: f"{k}-{'LR'[side]}.png"),
+    ],
+)
+def test_both_cameras_in_one_folder_are_a_pair(
+    folder: str, name: Callable[[int, int], str], tmp_path: Path
+) -> None:
+    """They were read as one camera, of which every second image was the other's."""
+    apart = open_dataset(make_plain(tmp_path / "apart"))
+    made = make_plain(tmp_path / "together", folders=("a", "b"), name=name)
+    (made / folder).mkdir(exist_ok=True)
+    for side in ("a", "b"):
+        for file in (made / side).iterdir():
+            file.rename(made / folder / file.name)
+        (made / side).rmdir()
+    together = open_dataset(made)
+    assert together.recording.kind == "plain"
+    both = ([e for e in d.events() if isinstance(e, StereoFrame)] for d in (apart, together))
+    for a, b in zip(*both, strict=True):
+        assert a.time_ns == b.time_ns
+        np.testing.assert_array_equal(a.left, b.left)
+        np.testing.assert_array_equal(a.right, b.right)
+
+
+def test_names_of_one_camera_have_no_sides() -> None:
+    assert split_sides(["0.png", "1.png", "2.png"]) is None
+    assert split_sides(["left0.png", "left1.png"]) is None
+    assert split_sides(["image0.png", "image1.png"]) is None
+    assert split_sides(["cam0_0.png", "cam0_1.png"]) is None
+    assert split_sides(["a_l.png", "a_r.png", "b_l.png"]) == (["a_l.png"], ["a_r.png"])
+
+
+def test_stamps_of_two_cameras_that_are_apart_are_said_to_be(tmp_path: Path) -> None:
+    name = lambda side, k: f"{STAMPS[k] + side * 20_000_000}.png"  # noqa: E731
+    folder = make_plain(tmp_path, name=name, times=False)
+    with pytest.raises(DataError, match=r"are \+20 ms apart .* within 3 ms"):
+        open_dataset(folder)
+
+
+def _jpeg_with_exif(path: Path, orientation: int, order: str) -> None:
+    """Replace a PNG by a JPEG that asks to be turned."""
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    data = cv2.imencode(".jpg", image)[1].tobytes()
+    start = b"MM\0*" if order == ">" else b"II*\0"
+    entry = struct.pack(f"{order}IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
+    block = b"Exif\0\0" + start + entry
+    path.unlink()
+    head = b"\xff\xe1" + struct.pack(">H", len(block) + 2)
+    path.with_suffix(".jpg").write_bytes(data[:2] + head + block + data[2:])
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize(("orientation", "turn"), [(1, 0), (3, 180), (6, 90), (8, 270)])
+def test_images_that_ask_to_be_turned_are_doubted(
+    orientation: int, turn: int, order: str, tmp_path: Path
+) -> None:
+    folder = make_plain(tmp_path)
+    for file in list(folder.glob("*/*.png")):
+        _jpeg_with_exif(file, orientation, order)
+    assert exif_turn(folder / "left" / "0.jpg") == turn
+    said = [note for note in open_dataset(folder).recording.notes if "EXIF" in note]
+    assert len(said) == (turn != 0)
+    assert all(f"doubtful: the images ask to be turned by {turn} degrees" in note for note in said)
+
+
+def _bare(folder: Path, text: str) -> vio.Rig:
+    (folder / "intrinsics.txt").write_text(text)
+    return vio.load_rig(folder, image_size=(752, 480))
+
+
+def test_intrinsics_with_decimal_commas_are_read(tmp_path: Path) -> None:
+    """They were eight numbers: fx 458, fy 654, k1 367."""
+    for text in ("458,654 457,296 367,215 248,375\n", "458.654, 457.296, 367.215, 248.375\n"):
+        camera = _bare(tmp_path, text).cam0
+        assert (camera.fu, camera.fv, camera.cu, camera.cv) == (458.654, 457.296, 367.215, 248.375)
+        assert camera.model == "pinhole"
+
+
+@pytest.mark.parametrize("text", ["4.2 4.2 367.2 248.3", "0.6099 0.9527 0.4883 0.5174"])
+def test_focal_lengths_that_are_no_pixels_are_refused(text: str, tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="must be pixels, not millimetres or shares"):
+        _bare(tmp_path, text)
+
+
+def test_intrinsics_in_another_order_are_doubted(tmp_path: Path) -> None:
+    (doubt,) = _bare(tmp_path, "458.654 367.215 457.296 248.375").notes
+    assert "doubtful: its focal lengths" in doubt
+    assert "check the order" in doubt
+
+
+def test_a_lever_arm_in_millimetres_is_doubted(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    rig = vio.load_rig(folder)
+    assert rig.T_cam0_imu is not None
+    arm_m = float(np.linalg.norm(rig.T_cam0_imu[:3, 3]))
+    assert arm_m > 0.02
+    assert not [note for note in rig.notes if "doubtful" in note]
+    far = rig.T_cam0_imu.copy()
+    far[:3, 3] *= 1000
+    (folder / "camchain-imucam.yaml").write_text(
+        kalibr_text(vio.Rig(rig.cam0, rig.cam1, rig.T_cam1_cam0, far))
+    )
+    (doubt,) = [note for note in vio.load_rig(folder).notes if "doubtful" in note]
+    assert f"it is {arm_m:.4g} m" in doubt
+
+
+def test_a_second_calibration_is_named(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    chain = (folder / "camchain-imucam.yaml").read_text()
+    (folder / "calibration.yaml").write_text(chain)
+    notes = open_dataset(folder).recording.notes
+    assert any("not used: camchain-imucam.yaml" in note for note in notes)
+
+
+def test_a_time_shift_in_milliseconds_is_named_where_nothing_overlaps(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    file = folder / "camchain-imucam.yaml"
+    file.write_text(re.sub(r"timeshift_cam_imu: .*", "timeshift_cam_imu: 12.5", file.read_text()))
+    with pytest.raises(VioError, match=r"moved by the calibration's time shift of 12\.5 s"):
+        open_dataset(folder)
+
+
+def _make_eth3d(folder: Path) -> vio.Rig:
+    """Write a pair as ETH3D publishes it; the poses are those of `rgb`, which is the right camera."""
+    make_plain(
+        folder,
+        folders=("rgb2", "rgb"),
+        name=lambda side, k: f"6502.{400000 + 50000 * k}.png",
+        imu=False,
+        times=False,
+        calibration=False,
+        reference=False,
+    )
+    left, right = (CameraModel(c.fu, c.fv, c.cu, c.cv, c.width, c.height) for c in RADTAN_PAIR)
+    T_right_left = se3_from_parts(so3_exp([0.01, -0.02, 0.03]), [-0.1, 0.002, -0.003])
+    for name, c in (("calibration2.txt", left), ("calibration.txt", right)):
+        (folder / name).write_text(f"{c.fu} {c.fv} {c.cu} {c.cv}\n")
+    np.savetxt(folder / "extrinsics_1_2.txt", T_right_left[:3], fmt="%.17g")
+    return vio.Rig(left, right, T_right_left)
+
+
+def test_the_second_camera_of_eth3d_is_the_left_one(tmp_path: Path) -> None:
+    truth = _make_eth3d(tmp_path)
+    found = vio.load_rig(
+        tmp_path / "extrinsics_1_2.txt", image_size=(truth.cam0.width, truth.cam0.height)
+    )
+    assert found.cameras == truth.cameras
+    np.testing.assert_allclose(found.right[1], truth.right[1], atol=1e-12)
+    T_world_right = [se3_exp([0.1 * k, 0.2, 0.3 * k, 0.1, 0.2 * k, 0.0]) for k in range(4)]
+    lines = []
+    for k, T in enumerate(T_world_right):
+        q = quat_xyzw_from_rotation(T[:3, :3])
+        lines.append(" ".join(map(repr, [6502.4 + 0.05 * k, *T[:3, 3].tolist(), *q.tolist()])))
+    (tmp_path / "groundtruth.txt").write_text(
+        "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines)
+    )
+    dataset = open_dataset(tmp_path)
+    recording = dataset.recording
+    assert recording.kind == "plain"
+    assert np.diff(recording.frame_times_ns).tolist() == [50_000_000] * 3
+    assert isinstance(dataset, ImageDataset)
+    left, right = dataset.pairs[0]
+    assert (left.parent.name, right.parent.name) == ("rgb2", "rgb")
+    assert recording.reference is not None
+    # the centre of the left camera, which rectifying does not move
+    centres = [(T @ truth.right[1])[:3, 3] for T in T_world_right]
+    np.testing.assert_allclose(recording.reference.T_world_body[:, :3, 3], centres, atol=1e-9)
