@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from vio.errors import DataError
 from vio.findings import Finder, Finding
 from vio.guard.match_check import Hysteresis
 from vio.records import Observations
 
-_MIN_MATCHES = 20  # with fewer, a frame tells nothing
-_MIN_NEGATIVE_PX = 1.0  # of a disparity that counts as negative: far points have about none
-_MANY = 0.6  # share of negative disparities that proves an exchange; usual is below 0.02
-_FRAMES = 3  # the first ones that say so make the recording a wrong one
+
+@dataclass(frozen=True, slots=True)
+class _ExchangeRules:
+    """When left and right pixels count as exchanged."""
+
+    min_matches: int = 20  # with fewer, a frame tells nothing
+    # of a disparity that counts as negative: far points have about none
+    min_negative_px: float = 1.0
+    many: float = 0.6  # share of negative disparities that proves an exchange; usual is below 0.02
+    frames: int = 3  # the first ones that say so make the recording a wrong one
+
+
+_RULES = _ExchangeRules()
 _CODE = "images-exchanged"
 
 
@@ -33,21 +42,21 @@ class ExchangedMatches(Finder):
             DataError: the first frames are exchanged.
         """
         matched = seen.z[seen.has_right]
-        if len(matched) < _MIN_MATCHES:
+        if len(matched) < _RULES.min_matches:
             return self._put_back(seen)
-        negative = int((matched[:, 2] - matched[:, 0] >= _MIN_NEGATIVE_PX).sum())
+        negative = int((matched[:, 2] - matched[:, 0] >= _RULES.min_negative_px).sum())
         self._judge(seen.frame_index, negative, len(matched))
         return self._put_back(seen)
 
     def _judge(self, index: int, negative: int, matches: int) -> None:
-        exchanged = negative >= _MANY * matches
+        exchanged = negative >= _RULES.many * matches
         self._in_order |= not exchanged
         state = self._state
         state.show(index, exchanged)
-        if not self._in_order and state.frames >= _FRAMES:
+        if not self._in_order and state.frames >= _RULES.frames:
             raise DataError(
                 f"frame {index}: left and right pixels look exchanged ({negative} of {matches} "
-                f"disparities are negative, in {_FRAMES} frames); exchange the columns of the "
+                f"disparities are negative, in {_RULES.frames} frames); exchange the columns of the "
                 "features, or the cameras' calibration"
             )
         if self._in_order and state.to_report:

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vio.findings import Finding
 from vio.guard.match_check import Hysteresis, MatchCheck, SharedMatches, without_right
 from vio.records import Observations
 
-_MIN_MATCHES = 8  # shared with the frame before, with fewer of which a frame tells nothing
-_MIN_MOTION_PX = 2.0  # of the left pixels in their median: where they move less, likewise
-_FROZEN = 0.1  # motion of right pixels over that of the left ones, at most
-_MOVES = 0.5  # share from which on the camera moves again; usual is 0.7 to 1.3
+
+@dataclass(frozen=True, slots=True)
+class _FrozenRules:
+    """When right pixels count as frozen."""
+
+    min_matches: int = 8  # shared with the frame before, with fewer of which a frame tells nothing
+    min_motion_px: float = 2.0  # of the left pixels in their median: where they move less, likewise
+    frozen: float = 0.1  # motion of right pixels over that of the left ones, at most
+    moves: float = 0.5  # share from which on the camera moves again; usual is 0.7 to 1.3
+
+
+_RULES = _FrozenRules()
 _CODE = "right-image-frozen"
 
 
@@ -42,13 +52,13 @@ class FrozenMatches(MatchCheck):
 
 def _is_frozen(shared: SharedMatches) -> bool | None:
     """Whether the right pixels stay; None: the frame does not tell."""
-    if len(shared) < _MIN_MATCHES:
+    if len(shared) < _RULES.min_matches:
         return None
     moved = np.abs(shared.now - shared.before)
     left = float(np.median(moved[:, :2].max(axis=1)))
     right = float(np.median(moved[:, 2:].max(axis=1)))
-    if left < _MIN_MOTION_PX:
+    if left < _RULES.min_motion_px:
         return None
-    if right <= _FROZEN * left:
+    if right <= _RULES.frozen * left:
         return True
-    return False if right >= _MOVES * left else None
+    return False if right >= _RULES.moves * left else None

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from vio.findings import Finding
 from vio.guard.match_check import Hysteresis, MatchCheck, SharedMatches
 from vio.records import Observations
 
-_MIN_FEATURES = 20  # in a frame that tells
-_MIN_USUAL = 0.3  # share of features with a right match, below which few of them are usual
-_GAIN = 0.1  # how fast the usual share is learned
-_LOST = 0.2  # of the usual share, below which matches are lost …
-_BACK = 0.5  # … and from which on they are back
+
+@dataclass(frozen=True, slots=True)
+class _LostRules:
+    """When right matches count as lost."""
+
+    min_features: int = 20  # in a frame that tells
+    # share of features with a right match, below which few of them are usual
+    min_usual: float = 0.3
+    gain: float = 0.1  # how fast the usual share is learned
+    lost: float = 0.2  # of the usual share, below which matches are lost …
+    back: float = 0.5  # … and from which on they are back
+
+
+_RULES = _LostRules()
 _CODE = "right-matches-lost"
 
 
@@ -26,11 +37,11 @@ class LostMatches(MatchCheck):
         """Compare how many features have a right match with how many usually have one."""
         index = seen.frame_index
         state = self._state
-        share = float(seen.has_right.mean()) if len(seen) >= _MIN_FEATURES else None
+        share = float(seen.has_right.mean()) if len(seen) >= _RULES.min_features else None
         state.show(index, self._is_lost(share))
         if share is not None and state.since is None:
             usual = share if self._usual is None else self._usual
-            self._usual = usual + _GAIN * (share - usual)
+            self._usual = usual + _RULES.gain * (share - usual)
         if state.to_report and share is not None:
             state.reported = True
             message = (
@@ -48,8 +59,8 @@ class LostMatches(MatchCheck):
         return seen
 
     def _is_lost(self, share: float | None) -> bool | None:
-        if share is None or self._usual is None or self._usual < _MIN_USUAL:
+        if share is None or self._usual is None or self._usual < _RULES.min_usual:
             return None
-        if share < _LOST * self._usual:
+        if share < _RULES.lost * self._usual:
             return True
-        return False if share >= _BACK * self._usual else None
+        return False if share >= _RULES.back * self._usual else None

@@ -47,6 +47,6 @@ class RightMatches(Finder):
             seen = check.inspect(seen, shared)
             if not seen.has_right.any():
                 break
-        for check in (self._exchanged, *self._checks):
-            self._found += check.take_findings()
+        for finder in (self._exchanged, *self._checks):
+            self._found += finder.take_findings()
         return seen

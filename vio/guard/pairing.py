@@ -13,6 +13,7 @@ belongs to the left image *before* (it is late) is marked, as its left image is 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import TypeAlias
 
 from vio.findings import Finding
@@ -26,14 +27,24 @@ from vio.records import Image, IntArray, StereoFrame
 
 # left and right image at half resolution, and the left corners (N, 2)
 _Pairing: TypeAlias = tuple[Image, Image, FloatArray]
-_FRAMES = 3  # that must have been counted
-_ALIKE = 2  # frames in a row after which the counts so far tell the same
-_MAX_TESTS = 40  # frames in which the rig moves, after which the pairing counts as right
-_MIN_POINTS = 30  # corners in a frame
-_MIN_CHANGE = 2.0  # of the left image since the last frame, gray levels at the common contrast
-_STRIDE = 4  # of the pixels that are compared
-_MIN_SHARE = 0.4  # of the corners that match in the best pairing
-_CLEARLY = 1.3  # times as many as in both others
+
+
+@dataclass(frozen=True, slots=True)
+class _PairingRules:
+    """When the first frames tell which images belong together."""
+
+    frames: int = 3  # that must have been counted
+    alike: int = 2  # frames in a row after which the counts so far tell the same
+    max_tests: int = 40  # frames in which the rig moves, after which the pairing counts as right
+    min_points: int = 30  # corners in a frame
+    # of the left image since the last frame, gray levels at the common contrast
+    min_change: float = 2.0
+    stride: int = 4  # of the pixels that are compared
+    min_share: float = 0.4  # of the corners that match in the best pairing
+    clearly: float = 1.3  # times as many as in both others
+
+
+_RULES = _PairingRules()
 
 
 def told_delay(counts: PairingCounts) -> int | None:
@@ -41,8 +52,8 @@ def told_delay(counts: PairingCounts) -> int | None:
     by_delay = {0: counts.same, 1: counts.late, -1: counts.early}
     best = max(by_delay, key=lambda delay: by_delay[delay])
     others = max(count for delay, count in by_delay.items() if delay != best)
-    clear = by_delay[best] >= max(_MIN_SHARE * counts.points, _CLEARLY * others)
-    return best if clear and counts.points >= _MIN_POINTS else None
+    clear = by_delay[best] >= max(_RULES.min_share * counts.points, _RULES.clearly * others)
+    return best if clear and counts.points >= _RULES.min_points else None
 
 
 class PairingCheck(ImageCheck):
@@ -83,8 +94,11 @@ class PairingCheck(ImageCheck):
         left, right = images.halves
         last = self._last
         if last is not None:
-            change = image_change(left[::_STRIDE, ::_STRIDE], last[0][::_STRIDE, ::_STRIDE])
-            if change < _MIN_CHANGE:
+            change = image_change(
+                left[:: _RULES.stride, :: _RULES.stride],
+                last[0][:: _RULES.stride, :: _RULES.stride],
+            )
+            if change < _RULES.min_change:
                 return
         points = self._probe.corners(left)
         self._last = left.copy(), right.copy(), points
@@ -98,15 +112,15 @@ class PairingCheck(ImageCheck):
 
     def _count(self, index: int, points: int, pairings: dict[int, _Pairing]) -> None:
         """Count the matches of a frame, and decide once those of enough frames tell."""
-        if points >= _MIN_POINTS:
+        if points >= _RULES.min_points:
             self._points += points
             for delay, pairing in pairings.items():
                 self._matched[delay] += self._probe.on_rows(*pairing)
         self._told.append(self._tells(pairings))
-        recent = self._told[-_ALIKE:]
-        if len(self._told) >= _FRAMES and recent[0] is not None and len(set(recent)) == 1:
+        recent = self._told[-_RULES.alike :]
+        if len(self._told) >= _RULES.frames and recent[0] is not None and len(set(recent)) == 1:
             self._decide(index, recent[0])
-        elif len(self._told) >= _MAX_TESTS:
+        elif len(self._told) >= _RULES.max_tests:
             self._decide(index, 0)
 
     def _tells(self, pairings: dict[int, _Pairing]) -> int | None:
