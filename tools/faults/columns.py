@@ -14,6 +14,7 @@ import numpy as np
 
 from tools.faults.changes import Period
 from vio.datasets.features import FeatureDataset
+from vio.frontend.precomputed import with_right_of
 from vio.geometry.lie import FloatArray, so3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.records import Observations, Recording, feature_tracks
@@ -22,6 +23,13 @@ from vio.records import Observations, Recording, feature_tracks
 ColumnChange: TypeAlias = Callable[
     [Sequence[Observations], int, StereoCamera, Period], Observations
 ]
+
+
+def unchanged(
+    seen: Sequence[Observations], k: int, camera: StereoCamera, period: Period
+) -> Observations:
+    """What a frame shows without a fault."""
+    return seen[k]
 
 
 def during(change: ColumnChange) -> ColumnChange:
@@ -48,29 +56,17 @@ def onwards(change: ColumnChange) -> ColumnChange:
     return changed
 
 
-def right_of_frame(now: Observations, other: Observations) -> Observations:
-    """The features of a frame with the right pixels that another frame shows of them."""
-    place = {feature: row for row, feature in enumerate(other.ids.tolist())}
-    rows = np.array([place.get(feature, -1) for feature in now.ids.tolist()], dtype=np.int64)
-    known = rows >= 0
-    has_right = known.copy()
-    has_right[known] = other.has_right[rows[known]]
-    z = now.z.copy()
-    z[known, 2:] = other.z[rows[known], 2:]
-    return replace(now, z=z, has_right=has_right)
-
-
 def _frozen(
     seen: Sequence[Observations], k: int, camera: StereoCamera, period: Period
 ) -> Observations:
     before = max((o for o in seen if o.time_ns < period.begin_ns), key=lambda o: o.time_ns)
-    return right_of_frame(seen[k], before)
+    return with_right_of(seen[k], before)
 
 
 def _late(
     seen: Sequence[Observations], k: int, camera: StereoCamera, period: Period
 ) -> Observations:
-    return right_of_frame(seen[k], seen[max(k - 1, 0)])
+    return with_right_of(seen[k], seen[max(k - 1, 0)])
 
 
 def _exchanged(

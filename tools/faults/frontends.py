@@ -1,6 +1,7 @@
 """Which faults of the right camera are named, for each front end, and what they do to the path.
 
     python -m tools.faults.frontends --data DIR [--only RECORDING …] [--front-ends NAME …]
+                                     [--faults NAME …]
 
 Prints a table in Markdown: a row for each recording and front end, a column for each fault, with
 the codes of the findings and the ATE in metres. `replayed` are the features of `klt` from the
@@ -15,6 +16,7 @@ import argparse
 import importlib.util
 import logging
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +24,7 @@ import numpy as np
 
 from tools.faults.cameras import Wall, frozen_images, late_images, moving_object, turned_right
 from tools.faults.changes import Changed, Period, Variant, pairs, pairs_during
-from tools.faults.columns import COLUMNS, changed_features
+from tools.faults.columns import COLUMNS, changed_features, unchanged
 from vio import evaluate, load_config, open_dataset
 from vio.errors import VioError
 from vio.protocols import Dataset
@@ -91,28 +93,29 @@ def _ate_m(result: RunResult) -> float:
     return float(evaluate(result.trajectory, reference, T_cam0_imu=result.T_cam0_body).ate_m.rmse)
 
 
-def replayed_rows(clip: Clip, dataset: Dataset) -> dict[str, Row]:
+def replayed_rows(clip: Clip, dataset: Dataset, faults: Sequence[str]) -> dict[str, Row]:
     """Return the rows of the features that `klt` sees, changed by each fault."""
     config = load_config(overrides=["motion=none", "frontend.name=klt"])
     seen = run(dataset, config, keep_observations=True).observations
     assert seen is not None
     period = clip.period(dataset)
     rows = {}
-    for name, change in {"healthy": lambda seen, k, camera, period: seen[k], **COLUMNS}.items():
+    for name in ["healthy", *(fault for fault in faults if fault in COLUMNS)]:
+        change = COLUMNS.get(name, unchanged)
         features = changed_features(dataset.recording, seen, change, period)
         rows[name] = row_of(features, "precomputed")
     return rows
 
 
-def rows_of(clip: Clip, data: Path, front_end: str) -> dict[str, Row]:
+def rows_of(clip: Clip, data: Path, front_end: str, faults: Sequence[str]) -> dict[str, Row]:
     """Return the rows of a front end by fault, that without one first."""
     dataset = open_dataset(data / clip.source)
     if front_end == "replayed":
-        return replayed_rows(clip, dataset)
+        return replayed_rows(clip, dataset, faults)
     known = Changed(dataset, dataset.recording, iter)
     rows = {"healthy": row_of(known, front_end)}
-    for name, variant in FAULTS.items():
-        rows[name] = row_of(variant(known, clip.period(dataset)), front_end)
+    for name in faults:
+        rows[name] = row_of(FAULTS[name](known, clip.period(dataset)), front_end)
     return rows
 
 
@@ -124,9 +127,10 @@ def main() -> int:
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="the recordings")
     parser.add_argument("--only", nargs="+", default=[], metavar="RECORDING")
     parser.add_argument("--front-ends", nargs="+", default=FRONT_ENDS, choices=FRONT_ENDS)
+    parser.add_argument("--faults", nargs="+", default=list(FAULTS), choices=list(FAULTS))
     options = parser.parse_args()
     logging.basicConfig(level=logging.ERROR)
-    heads = ["healthy", *FAULTS]
+    heads = ["healthy", *options.faults]
     print(f"| recording, front end | {' | '.join(heads)} |")
     print("|---" * (len(heads) + 1) + "|")
     for clip in CLIPS:
@@ -136,7 +140,7 @@ def main() -> int:
             if front_end == "kornia" and importlib.util.find_spec("kornia") is None:
                 print(f"| {clip.source}, kornia | {' | '.join(['not installed'] * len(heads))} |")
                 continue
-            rows = rows_of(clip, options.data, front_end)
+            rows = rows_of(clip, options.data, front_end, options.faults)
             cells = [rows[head].text(rows["healthy"]) if head in rows else "" for head in heads]
             print(f"| {clip.source}, {front_end} | {' | '.join(cells)} |", flush=True)
     return 0
